@@ -1,0 +1,1 @@
+"""Static equilibrium of hyperelastic bodies by finite elements, batched, in torch float64."""

@@ -1,0 +1,156 @@
+"""Hyperelastic laws: one class = one energy density of the displacement gradient.
+
+Laws take the displacement gradient H = F - I and not F: for |H| near 1e-10 the strain is lost in
+the rounding of 1 + H, and with it the equilibrium of small loads.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Material:
+    """Isotropic hyperelastic law with Young's modulus 1.
+
+    A law is its `energy`; `stress` and `tangent` follow by automatic differentiation. A subclass
+    may give them in closed form as well, for speed.
+
+    Attributes:
+        poisson: Poisson's ratio at rest [-], in (-1, 0.5).
+    """
+
+    poisson: float
+
+    def __post_init__(self) -> None:
+        """Check the range.
+
+        Raises:
+            ValueError: `poisson` lies outside (-1, 0.5) or is no finite number.
+        """
+        if not (math.isfinite(self.poisson) and -1.0 < self.poisson < 0.5):
+            raise ValueError(f"poisson = {self.poisson} must lie between -1 and 0.5 (both excluded)")
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus over Young's modulus [-]."""
+        return 1.0 / (2.0 * (1.0 + self.poisson))
+
+    @property
+    def lam(self) -> float:
+        """First Lame parameter over Young's modulus [-]."""
+        return self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density over E, (...,) [-], of H (..., 3, 3) [-]."""
+        raise NotImplementedError(f"{type(self).__name__} has no energy")
+
+    def stress(self, H: Tensor) -> Tensor:
+        """Return the first Piola-Kirchhoff stress P = dW/dF over E, (..., 3, 3) [-]."""
+        gradient = torch.func.vmap(torch.func.grad(self.energy))
+        return gradient(H.reshape(-1, 3, 3)).reshape(H.shape)
+
+    def tangent(self, H: Tensor) -> Tensor:
+        """Return dP/dF over E, (..., 3, 3, 3, 3) [-], indexed iJkL."""
+        hessian = torch.func.vmap(torch.func.hessian(self.energy))
+        return hessian(H.reshape(-1, 3, 3)).reshape(*H.shape, 3, 3)
+
+
+@dataclass(frozen=True)
+class SaintVenantKirchhoff(Material):
+    """Saint Venant-Kirchhoff solid: lambda/2 (tr E)^2 + mu E:E, E = (F^T F - I)/2.
+
+    Source: Bonet, Wood (2008), eq. 6.28. It softens in compression: no answer need exist there.
+    """
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        E = green_lagrange(H)
+        return self.lam / 2 * trace(E).square() + self.mu * E.square().sum((-2, -1))
+
+    def stress(self, H: Tensor) -> Tensor:
+        """Return P = F S, see `Material.stress`."""
+        S = self._second_stress(H)
+        return S + H @ S
+
+    def tangent(self, H: Tensor) -> Tensor:
+        """Return dP/dF, see `Material.tangent`."""
+        eye = torch.eye(3, dtype=H.dtype, device=H.device)
+        F, S = eye + H, self._second_stress(H)
+        A = self.lam * torch.einsum("...ij,...kl->...ijkl", F, F)
+        A += self.mu * torch.einsum("...il,...kj->...ijkl", F, F)
+        A += self.mu * torch.einsum("...ik,jl->...ijkl", F @ F.mT, eye)
+        return A + torch.einsum("ik,...jl->...ijkl", eye, S)
+
+    def _second_stress(self, H: Tensor) -> Tensor:
+        E = green_lagrange(H)
+        eye = torch.eye(3, dtype=H.dtype, device=H.device)
+        return self.lam * trace(E)[..., None, None] * eye + 2 * self.mu * E
+
+
+@dataclass(frozen=True)
+class NeoHookean(Material):
+    """Compressible neo-Hookean solid NH-ln: mu/2 (I1 - 3 - 2 ln J) + lambda/2 (ln J)^2.
+
+    Source: Bonet, Wood (2008), eq. 6.27. Infinite at J = 0; undefined (NaN) below.
+    """
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        log_J = torch.log1p(volume_change(H))
+        I1_minus_3 = 2 * trace(H) + H.square().sum((-2, -1))
+        return self.mu / 2 * (I1_minus_3 - 2 * log_J) + self.lam / 2 * log_J.square()
+
+    def stress(self, H: Tensor) -> Tensor:
+        """Return P = (mu (F F^T - I) + lambda ln J I) F^-T, see `Material.stress`."""
+        change = volume_change(H)
+        eye = torch.eye(3, dtype=H.dtype, device=H.device)
+        kirchhoff = self.mu * (H + H.mT + H @ H.mT)
+        kirchhoff = kirchhoff + self.lam * torch.log1p(change)[..., None, None] * eye
+        return kirchhoff @ inverse_transpose(H, change)
+
+    def tangent(self, H: Tensor) -> Tensor:
+        """Return dP/dF, see `Material.tangent`."""
+        change = volume_change(H)
+        eye = torch.eye(3, dtype=H.dtype, device=H.device)
+        G = inverse_transpose(H, change)
+        shear = (self.mu - self.lam * torch.log1p(change))[..., None, None]
+        A = torch.einsum("...il,...kj->...ijkl", shear * G, G)
+        A += self.lam * torch.einsum("...ij,...kl->...ijkl", G, G)
+        return A + self.mu * torch.einsum("ik,jl->ijkl", eye, eye)
+
+
+def trace(H: Tensor) -> Tensor:
+    """Return tr H, (...,), of H (..., 3, 3)."""
+    return H.diagonal(dim1=-2, dim2=-1).sum(-1)
+
+
+def green_lagrange(H: Tensor) -> Tensor:
+    """Return the Green-Lagrange strain (H + H^T + H^T H)/2, (..., 3, 3) [-]."""
+    return (H + H.mT + H.mT @ H) / 2
+
+
+def volume_change(H: Tensor) -> Tensor:
+    """Return det F - 1, (...,) [-], of H = F - I (..., 3, 3), to full relative precision.
+
+    The principal invariants of H and not `torch.linalg.det`, whose second derivative at F = I is NaN.
+    """
+    a, b, c = H.unbind(-2)
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = a.unbind(-1), b.unbind(-1), c.unbind(-1)
+    second = ax * by - ay * bx + by * cz - bz * cy + ax * cz - az * cx
+    third = ax * (by * cz - bz * cy) - ay * (bx * cz - bz * cx) + az * (bx * cy - by * cx)
+    return ax + by + cz + second + third
+
+
+def inverse_transpose(H: Tensor, change: Tensor) -> Tensor:
+    """Return F^-T, (..., 3, 3) [-], of F = I + H with det F = 1 + change."""
+    a, b, c = (H + torch.eye(3, dtype=H.dtype, device=H.device)).unbind(-2)
+    cofactor = torch.stack([_cross(b, c), _cross(c, a), _cross(a, b)], dim=-2)
+    return cofactor / (1 + change)[..., None, None]
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=-1)

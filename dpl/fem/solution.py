@@ -1,0 +1,76 @@
+"""What every solver takes and gives: Load, Solution, and the one sentence they all say."""
+
+from collections.abc import Iterator
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from dpl.fem.problem import Problem
+
+
+class Load(NamedTuple):
+    """Dead nodal forces on a batch of bodies.
+
+    Attributes:
+        force: Nodal forces over E L^2 (E L in 2D), (B, N, D) [-].
+        young: Young's moduli E that these stand for, (B,) [Pa]; no answer depends on them.
+    """
+
+    force: Tensor
+    young: Tensor
+
+
+class Solution(NamedTuple):
+    """Displacements under a load, with what is known of them.
+
+    Attributes:
+        displacement: Over L, (B, N, D) [-].
+        residual: ||R_free|| / ||f|| at `displacement` under the whole load, (B,) [-].
+        volume_ratio: min det F at `displacement`, (B,) [-].
+        converged: Whether `residual` is below the solver's tolerance and nothing is inverted, (B,).
+        iterations: Linear solves with a tangent so far, (B,).
+        factorisations: Tangents factorised so far, (B,); that of the rest state is the scene's.
+        load_factor: Part of the load for which an equilibrium is known, (B,) [-].
+    """
+
+    displacement: Tensor
+    residual: Tensor
+    volume_ratio: Tensor
+    converged: Tensor
+    iterations: Tensor
+    factorisations: Tensor
+    load_factor: Tensor
+
+
+class Solver(Protocol):
+    """Anything that answers which displacement balances a load."""
+
+    def iterate(self, load: Load) -> Iterator[Solution]:
+        """Yield ever better answers; the last one is the answer."""
+        ...
+
+
+def solve(solver: Solver, load: Load) -> Solution:
+    """Return the last solution that a solver yields."""
+    *_, last = solver.iterate(load)
+    return last
+
+
+def judge(
+    problem: Problem, displacement: Tensor, load: Load, tol: float, *, iterations: int = 0
+) -> Solution:
+    """Return a displacement (B, N, D) as the solution it is: evaluated, nothing believed."""
+    residual = problem.residual_ratio(displacement, load.force)
+    volume = problem.volume_ratio(displacement)
+    converged = (residual < tol) & (volume > 0)
+    count = torch.full_like(residual, iterations, dtype=torch.int64)
+    return Solution(
+        displacement=displacement,
+        residual=residual,
+        volume_ratio=volume,
+        converged=converged,
+        iterations=count,
+        factorisations=torch.zeros_like(count),
+        load_factor=converged.to(residual.dtype),
+    )
