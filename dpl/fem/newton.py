@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dpl.fem.linear import Backend, Factor, SingularMatrix, backend
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, judge
+from dpl.fem.solution import Load, Solution, in_step, judge
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,17 +102,12 @@ class Newton:
             load: What acts.
             guess: Where to start, (B, N, D) [-]; zero if left out, and where it is inverted.
         """
-        members = [
-            self._member(force[None], None if guess is None else guess[k, None])
-            for k, force in enumerate(load.force)
-        ]
-        states = [next(member) for member in members]
-        while True:
-            yield Solution(*(torch.cat(column) for column in zip(*states, strict=True)))
-            news = [next(member, None) for member in members]
-            if all(new is None for new in news):
-                return
-            states = [old if new is None else new for old, new in zip(states, news, strict=True)]
+        yield from in_step(
+            [
+                self._member(force[None], None if guess is None else guess[k, None])
+                for k, force in enumerate(load.force)
+            ]
+        )
 
     def _member(self, force: Tensor, guess: Tensor | None) -> Iterator[Solution]:
         """Yield the states under one load (1, N, D)."""
@@ -177,12 +172,13 @@ class Newton:
     def _factor(self, displacement: Tensor, count: "_Count") -> Factor:
         """Return the factor of K(u); that of the rest state is kept."""
         if not displacement.any():
-            return self._linear.factor
+            return self.rest.factor
         count.factorisations += 1
         return self._backend.factorise(self.problem.tangent(displacement)[0].numpy())
 
     @cached_property
-    def _linear(self) -> Linear:
+    def rest(self) -> Linear:
+        """The linear answer, with the factor that every first step from zero uses."""
         return Linear(self.problem, self.tol, self.linear)
 
     @cached_property

@@ -1,6 +1,6 @@
 """What every solver takes and gives: Load, Solution, and the one sentence they all say."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Protocol
 
 import torch
@@ -55,6 +55,17 @@ def solve(solver: Solver, load: Load) -> Solution:
     """Return the last solution that a solver yields."""
     *_, last = solver.iterate(load)
     return last
+
+
+def in_step(members: Sequence[Iterator[Solution]]) -> Iterator[Solution]:
+    """Yield the solutions of single loads as batches; a load that has ended repeats its end."""
+    states = [next(member) for member in members]
+    while True:
+        yield Solution(*(torch.cat(column) for column in zip(*states, strict=True)))
+        news = [next(member, None) for member in members]
+        if all(new is None for new in news):
+            return
+        states = [old if new is None else new for old, new in zip(states, news, strict=True)]
 
 
 def judge(

@@ -1,0 +1,195 @@
+"""Solvers against each other on the same loads, one load at a time: how wrong, how sure, how slow."""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from threadpoolctl import threadpool_limits
+from torch import Tensor
+
+from dpl.fem.mesh import save as write_mesh
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, Solution, Solver, solve
+from dpl.figures import deformed
+from dpl.hybrid import Direct, Hybrid
+from dpl.metrics import RelativeL2, metrics
+from dpl.module import Surrogate
+from dpl.scene import Sample
+
+
+@dataclass(frozen=True)
+class Row:
+    """One solver over all loads.
+
+    Attributes:
+        solver: Its name.
+        errors: The numbers of `dpl.metrics` against the truth.
+        converged: Loads answered to the tolerance with nothing inverted.
+        loads: Loads asked.
+        iterations: Mean linear solves a load.
+        worst_iterations: Most of them for one load.
+        milliseconds: Median wall time of one load, batch 1 [ms].
+        slowest: 95th percentile of the same [ms].
+    """
+
+    solver: str
+    errors: dict[str, float]
+    converged: int
+    loads: int
+    iterations: float
+    worst_iterations: int
+    milliseconds: float
+    slowest: float
+
+
+def clock(
+    solvers: Mapping[str, Solver], batch: Sample, problem: Problem
+) -> tuple[list[Row], dict[str, Tensor]]:
+    """Return a row for each solver, and the displacements (B, N, D) [-] that it answered.
+
+    Every solver is warmed up on the first load, then asked each load alone; the solvers take turns
+    on each load, so that a change of the machine's speed meets them all.
+
+    Args:
+        solvers: Named.
+        batch: The loads with the truth.
+        problem: The body.
+    """
+    answers: dict[str, list[Solution]] = {name: [] for name in solvers}
+    seconds: dict[str, list[float]] = {name: [] for name in solvers}
+    singles = [
+        Load(batch.force[k : k + 1], batch.young[k : k + 1]) for k in range(len(batch.force))
+    ]
+    for solver in solvers.values():
+        solve(solver, singles[0])
+    for load in singles:
+        for name, solver in solvers.items():
+            start = time.perf_counter()
+            answers[name].append(solve(solver, load))
+            seconds[name].append(time.perf_counter() - start)
+    whole = {
+        name: Solution(*(torch.cat(column) for column in zip(*parts, strict=True)))
+        for name, parts in answers.items()
+    }
+    rows = [
+        _row(name, answer, torch.tensor(seconds[name]), batch, problem)
+        for name, answer in whole.items()
+    ]
+    return rows, {name: answer.displacement for name, answer in whole.items()}
+
+
+def _row(name: str, answer: Solution, seconds: Tensor, batch: Sample, problem: Problem) -> Row:
+    errors = metrics(problem)
+    errors.update(answer.displacement, batch)
+    return Row(
+        solver=name,
+        errors={key: float(value) for key, value in errors.compute().items()},
+        converged=int(answer.converged.sum()),
+        loads=len(answer.converged),
+        iterations=float(answer.iterations.double().mean()),
+        worst_iterations=int(answer.iterations.max()),
+        milliseconds=1e3 * float(seconds.median()),
+        slowest=1e3 * float(seconds.quantile(0.95)),
+    )
+
+
+def show(rows: Sequence[Row], title: str) -> None:
+    """Print rows as a table."""
+    table = Table(title=title, title_justify="left")
+    columns = (
+        "solver", "e_mean", "e_max", "SNR min [dB]", "rel. L2 median", "worst",
+        "||R||/||f||", "min det F", "converged", "iterations", "worst", "ms", "p95",
+    )  # fmt: skip
+    for column in columns:
+        table.add_column(column, justify="left" if column == "solver" else "right")
+    for row in rows:
+        e = row.errors
+        table.add_row(
+            row.solver,
+            f"{e['e_mean']:.1e}",
+            f"{e['e_max']:.1e}",
+            f"{e['SNR_min']:.1f}",
+            f"{e['rel_L2_median']:.2%}" if e["rel_L2_median"] > 1e-5 else f"{e['rel_L2_median']:.0e}",
+            f"{e['rel_L2_worst']:.1%}" if e["rel_L2_worst"] > 1e-4 else f"{e['rel_L2_worst']:.0e}",
+            f"{e['residual']:.1e}",
+            f"{e['min_det_F']:.2f}",
+            f"{row.converged}/{row.loads}",
+            f"{row.iterations:.1f}",
+            f"{row.worst_iterations}",
+            f"{row.milliseconds:.1f}",
+            f"{row.slowest:.1f}",
+        )
+    Console(width=max(Console().width, 150)).print(table)
+
+
+def save(rows: Sequence[Row], path: Path) -> None:
+    """Write rows as JSON."""
+    path.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+
+
+def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1e-8) -> list[Row]:
+    """Judge a surrogate: a table of four solvers, printed and saved, with a figure and one case.
+
+    Linear answer, network, hybrid Newton from the network and Newton from zero, each asked one
+    load at a time on one thread. Writes `evaluation.json`, `shapes.png` and `worst.vtu`.
+
+    Args:
+        surrogate: On the CPU.
+        test: Loads with the truth.
+        folder: Where results go.
+        tol: Residual ratio of Newton and the hybrid [-].
+    """
+    scene = surrogate.scene
+    newton = replace(scene.solver, tol=tol)
+    solvers = {
+        "linear": newton.rest,
+        "network": Direct(surrogate.predict, scene.problem, tol),
+        "hybrid Newton": Hybrid(surrogate.predict, newton),
+        "Newton from zero": newton,
+    }
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            rows, answers = clock(solvers, test, scene.problem)
+    finally:
+        torch.set_num_threads(threads)
+    show(rows, f"{len(test.force)} fresh loads, one at a time, 1 thread, tol {tol:g}")
+    save(rows, folder / "evaluation.json")
+    _picture(surrogate, test, answers, folder)
+    return rows
+
+
+def _picture(
+    surrogate: Surrogate, test: Sample, answers: Mapping[str, Tensor], folder: Path
+) -> None:
+    """Draw the best, the median and the worst load of the network; write the worst as VTU."""
+    scene, network = surrogate.scene, answers["network"]
+    error = RelativeL2().measure(network, test)
+    order = error.argsort()
+    chosen = order[[0, len(order) // 2, -1]]
+    names = [
+        f"{name} load: relative L2 {error[k]:.2%}"
+        for name, k in zip(("best", "median", "worst"), chosen, strict=True)
+    ]
+    shown = [(name, answers[name][chosen]) for name in ("network", "linear")]
+    figure = deformed(scene.problem, test.displacement[chosen], shown, names=names)
+    figure.savefig(folder / "shapes.png", dpi=150)
+    worst = int(order[-1])
+    length, force_unit = scene.length, scene.force_unit * float(test.young[worst])
+    fields = {
+        "displacement [m]": length * test.displacement[worst],
+        "network [m]": length * network[worst],
+        "error [m]": length * (network[worst] - test.displacement[worst]).norm(dim=1),
+        "force [N]": force_unit * test.force[worst],
+    }
+    write_mesh(
+        folder / "worst.vtu",
+        scene.problem.mesh.scaled(length),
+        {name: field.numpy() for name, field in fields.items()},
+    )

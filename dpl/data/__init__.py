@@ -1,0 +1,1 @@
+"""Samples: drawn, solved, kept on disk, streamed, handed to Lightning."""

@@ -1,0 +1,225 @@
+"""Eigenmodes of the rest stiffness and the random loads made of them.
+
+Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.2.2: f = Phi q with few modes, kept on
+random areas of the boundary.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, eigsh
+from torch import Tensor
+
+from dpl.fem.linear import full_matrix
+from dpl.fem.newton import Linear, gather, scatter
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load
+
+Array = NDArray[np.float64]
+Distribution = Callable[[np.random.Generator, int], Array]  # generator, M -> (M,) in [-1, 1]
+SAME = 1e-6  # eigenvalues closer than this, relatively, are one eigenspace
+CLUSTER = 0.05  # eigenvalues closer than this belong to one family and are excited together
+
+
+class Modes(NamedTuple):
+    """Lowest eigenpairs of K(0) on the free degrees of freedom.
+
+    Attributes:
+        values: Eigenvalues, ascending, (M,) [-].
+        vectors: Orthonormal eigenvectors, zero where held, (N, D, M) [-].
+    """
+
+    values: Tensor
+    vectors: Tensor
+
+
+def eigenmodes(linear: Linear, count: int) -> Modes:
+    """Return the lowest modes, those of the last family all: `count` or a few more.
+
+    Shift-invert Lanczos around zero with the stored factor of K(0). The same problem gives the
+    same vectors: within an eigenspace the basis is the one that leans on the fields 1, x, y, z, x^2,
+    ... in turn, with positive sign.
+
+    Args:
+        linear: The body, held, with the factor of its K(0).
+        count: How many modes at least.
+
+    Raises:
+        ValueError: `count` is not between 1 and a third of the degrees of freedom, or the body is
+            free to move.
+    """
+    problem = linear.problem
+    size = problem.pattern.size
+    if not 1 <= count <= size // 3:
+        raise ValueError(f"n_modes = {count} must lie between 1 and {size // 3}")
+    if loose := problem.loose_modes():
+        raise ValueError(f"{len(loose)} rigid modes are unconstrained: {', '.join(loose)}")
+    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    stiffness = full_matrix(problem.pattern, problem.tangent(rest)[0].numpy())
+    inverse = LinearOperator((size, size), matvec=linear.factor.solve, dtype=np.float64)
+    start = np.random.default_rng(0).standard_normal(size)
+    asked = min(count + 8, size - 2)
+    values, vectors = eigsh(stiffness, asked, sigma=0.0, OPinv=inverse, v0=start, tol=1e-12)
+    order = np.argsort(values)
+    values, vectors = values[order], vectors[:, order]
+    while count < asked and values[count] - values[count - 1] < CLUSTER * values[count]:
+        count += 1
+    probes = _probes(problem)
+    for space in _eigenspaces(values):
+        vectors[:, space] = _leaning(vectors[:, space], probes)
+    fields = torch.stack([scatter(vector, problem) for vector in vectors[:, :count].T], dim=-1)
+    return Modes(torch.from_numpy(values[:count]), fields)
+
+
+def _eigenspaces(values: Array) -> list[slice]:
+    """Return the runs of eigenvalues that are one."""
+    cuts = np.flatnonzero(np.diff(values) > SAME * values[1:]) + 1
+    edges = [0, *cuts.tolist(), len(values)]
+    return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def _probes(problem: Problem) -> Array:
+    """Return fields (n, P): monomials up to degree 2 in each component, then fixed noise."""
+    x = problem.points - problem.points.mean(dim=0)
+    x, dim = x / x.abs().max(), x.shape[1]
+    monomials = [torch.ones(len(x), dtype=torch.float64), *x.T]
+    monomials += [x[:, i] * x[:, j] for i in range(dim) for j in range(i, dim)]
+    axes = torch.eye(dim, dtype=torch.float64)
+    fields = [gather(m[:, None] * axis, problem) for m in monomials for axis in axes]
+    noise = np.random.default_rng(1).standard_normal((len(fields[0]), 4))
+    return np.column_stack([*fields, noise])
+
+
+def _leaning(basis: Array, probes: Array) -> Array:
+    """Return the basis of span(basis), (n, m), whose k-th vector is the k-th new probe in it."""
+    shadows = basis.T @ (probes / np.linalg.norm(probes, axis=0))  # (m, P)
+    chosen = np.zeros((len(shadows), 0))
+    for shadow in shadows.T:
+        rest = shadow - chosen @ (chosen.T @ shadow)
+        if np.linalg.norm(rest) > 1e-4:
+            rest -= chosen @ (chosen.T @ rest)
+            chosen = np.column_stack([chosen, rest / np.linalg.norm(rest)])
+        if chosen.shape[1] == len(shadows):
+            break
+    return basis @ chosen
+
+
+def uniform(rng: np.random.Generator, count: int) -> Array:
+    """Return `count` numbers uniform in [-1, 1]: the paper's sampling."""
+    return rng.uniform(-1.0, 1.0, count)
+
+
+def normal(rng: np.random.Generator, count: int) -> Array:
+    """Return `count` normal numbers of standard deviation 1/3, clipped to [-1, 1]: more small loads."""
+    return np.clip(rng.standard_normal(count) / 3, -1.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ModalLoads:
+    """Random loads f = Phi q on random areas of the boundary.
+
+    Each mode's q is drawn by `distribution` times its largest value: for the softest mode the
+    one whose linear answer moves some node by `deflection`, for the others that of equal energy.
+    The nodal force is then kept only on the boundary nodes within a random distance of a random one.
+
+    Load i of a seed is a function of (seed, i) alone.
+
+    Attributes:
+        linear: The body, with the factor of its K(0).
+        n_modes: Modes at least; the last family of neighbouring eigenvalues is taken whole.
+        deflection: Largest linear deflection of the softest mode over L [-].
+        patch: Smallest and largest radius of the area over L [-].
+        distribution: Draws q over its largest value, per mode.
+        young: Young's modulus [Pa], or a range of which each load draws its own.
+    """
+
+    linear: Linear
+    n_modes: int = 5
+    deflection: float = 0.4
+    patch: Sequence[float] = (0.0, 1.0)
+    distribution: Distribution = uniform
+    young: float | Sequence[float] = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            ValueError: An attribute is out of range.
+        """
+        if self.n_modes < 1:
+            raise ValueError(f"n_modes = {self.n_modes} must be 1 or more")
+        if not 0 < self.deflection <= 10:
+            raise ValueError(f"deflection = {self.deflection} must lie between 0 and 10 (times L)")
+        low, high = self.patch if len(self.patch) == 2 else (1, 0)
+        if not 0 <= low <= high < math.inf:
+            raise ValueError(f"patch = {list(self.patch)} must be a smallest and a largest radius")
+        moduli = self.young_range
+        if not 0 < moduli[0] <= moduli[1] < math.inf:
+            raise ValueError(f"young = {self.young} must be a positive modulus [Pa] or a range")
+
+    @property
+    def problem(self) -> Problem:
+        """The body."""
+        return self.linear.problem
+
+    @cached_property
+    def modes(self) -> Modes:
+        """The modes that are excited."""
+        return eigenmodes(self.linear, self.n_modes)
+
+    @cached_property
+    def q_max(self) -> Tensor:
+        """Largest modal loads, (M,) [-]."""
+        values, vectors = self.modes
+        softest = self.deflection * values[0] / vectors[..., 0].norm(dim=1).max()
+        return softest * (values / values[0]).sqrt()
+
+    @property
+    def largest_force(self) -> float:
+        """||Phi q_max|| [-], the scale of residuals in the paper's losses."""
+        return float(self.q_max.norm())
+
+    @property
+    def young_range(self) -> tuple[float, float]:
+        """Smallest and largest Young's modulus [Pa]."""
+        low, high = (self.young,) * 2 if isinstance(self.young, int | float) else self.young
+        return float(low), float(high)
+
+    @property
+    def reach(self) -> Tensor:
+        """Degrees of freedom that these loads can act on and that can move, (N, D)."""
+        return self.problem.boundary[:, None] & self.problem.free
+
+    def sample(self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0) -> Load:
+        """Return loads.
+
+        Args:
+            seed: Names the stream.
+            indices: Which loads of the stream, B of them.
+            amplitude: Factor on all forces [-].
+        """
+        drawn = [self._draw(seed, index) for index in indices]
+        forces = torch.stack([force for force, _ in drawn])
+        return Load(amplitude * forces, torch.tensor([young for _, young in drawn], dtype=torch.float64))
+
+    def _draw(self, seed: int | Sequence[int], index: int) -> tuple[Tensor, float]:
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
+        q = self.q_max * torch.from_numpy(self.distribution(rng, len(self.q_max)))
+        points = self.problem.points
+        loadable = self.reach.any(dim=1)
+        centre = points[loadable][rng.integers(int(loadable.sum()))]
+        radius = rng.uniform(*self.patch)
+        inside = (points - centre).norm(dim=1) <= radius * (1 + 1e-9)
+        force = torch.where(inside[:, None] & self.reach, self.modes.vectors @ q, 0.0)
+        return force, rng.uniform(*self.young_range)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Pickle with the modes, so that workers need not find them again."""
+        self.modes  # noqa: B018
+        return self.__dict__

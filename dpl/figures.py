@@ -1,0 +1,147 @@
+"""Pictures of deformed bodies."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import lightning as L
+import numpy as np
+import skfem
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dpl.fem.problem import Problem
+from dpl.scene import Sample
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Vertices of a cell's facets in turn around each facet, by cell shape.
+FACETS = {
+    "Tetrahedral": ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)),
+    "Hexahedral": (
+        (0, 1, 4, 2), (0, 1, 5, 3), (0, 2, 6, 3), (1, 4, 7, 5), (2, 4, 7, 6), (3, 5, 7, 6),
+    ),  # fmt: skip
+}
+
+
+def surface(mesh: skfem.Mesh) -> NDArray[np.int_]:
+    """Return what is seen of a mesh as polygons of vertices, (P, corners).
+
+    In 3D the facets on the boundary, in 2D the cells.
+    """
+    if mesh.dim() == 2:
+        corners = 3 if mesh.elem.refdom.name == "Triangular" else 4
+        return mesh.t[:corners].T
+    faces = np.concatenate([mesh.t[list(corners)].T for corners in FACETS[mesh.elem.refdom.name]])
+    _, first, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    return faces[first[count == 1]]
+
+
+def deformed(
+    problem: Problem,
+    truth: Tensor,
+    predictions: Sequence[tuple[str, Tensor]],
+    *,
+    names: Sequence[str] = (),
+) -> "Figure":
+    """Return a figure of deformed bodies coloured by the distance from where nodes should be.
+
+    One column a load, one row a prediction; the true shape as a grey net over each.
+
+    Args:
+        problem: The body.
+        truth: (B, N, D) [-].
+        predictions: Named, (B, N, D) [-] each.
+        names: Titles of the loads.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    polygons, points = surface(problem.mesh), problem.points.cpu().numpy()
+    right = truth.detach().cpu().numpy()
+    fields = [(name, field.detach().cpu().numpy()) for name, field in predictions]
+    columns, dim = len(right), points.shape[1]
+    figure = Figure(figsize=(3.6 * columns + 1.2, 2.6 * len(fields) + 0.4), layout="constrained")
+    axes = figure.subplots(
+        len(fields), columns, squeeze=False, subplot_kw={"projection": "3d"} if dim == 3 else {}
+    )
+    seen = np.concatenate([points[None] + right, points[None]])
+    for row, (name, field) in enumerate(fields):
+        error = np.linalg.norm(field - right, axis=2)
+        top = max(float(np.nanmax(error)), 1e-12)
+        scale = ScalarMappable(LogNorm(top * 1e-3, top), "viridis")
+        for column in range(columns):
+            ax = axes[row, column]
+            colours = scale.to_rgba(np.maximum(error[column][polygons].mean(axis=1), top * 1e-3))
+            _draw(ax, (points + field[column])[polygons], facecolors=colours, edgecolors="none")
+            _draw(
+                ax, (points + right[column])[polygons], facecolors="none", edgecolors="0.4", linewidths=0.3
+            )  # fmt: skip
+            _frame(ax, seen)
+            if row == 0 and names:
+                ax.set_title(names[column], fontsize=9)
+        figure.colorbar(scale, ax=axes[row, :], label=f"{name}: error / L", shrink=0.8)
+    return figure
+
+
+def _draw(ax: Any, polygons: NDArray[np.float64], **style: Any) -> None:
+    from matplotlib.collections import PolyCollection
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    if polygons.shape[-1] == 3:
+        ax.add_collection3d(Poly3DCollection(polygons, **style))
+    else:
+        ax.add_collection(PolyCollection(polygons, **style))
+
+
+def _frame(ax: Any, points: NDArray[np.float64]) -> None:
+    """Show the box of all points, equal scales, no axes."""
+    low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+    ax.set_xlim(low[0], high[0])
+    ax.set_ylim(low[1], high[1])
+    if len(low) == 3:
+        ax.set_zlim(low[2], high[2])
+        ax.set_box_aspect(high - low, zoom=1.2)
+        ax.view_init(elev=18, azim=-60)
+    else:
+        ax.set_aspect("equal")
+    ax.set_axis_off()
+
+
+class DeformedShapes(L.Callback):
+    """Puts a picture of predicted against true shapes into TensorBoard, now and then and at the end."""
+
+    def __init__(self, *, every: int = 20, loads: int = 3) -> None:
+        """Choose how often and how much.
+
+        Args:
+            every: Validations between pictures.
+            loads: Validation loads shown.
+        """
+        self.every, self.loads, self._seen = every, loads, 0
+
+    def on_validation_epoch_end(self, trainer: L.Trainer, module: Any) -> None:
+        """Draw after every so many validations."""
+        if trainer.sanity_checking:
+            return
+        self._seen += 1
+        if self._seen % self.every == 0:
+            self._draw(trainer, module)
+
+    def on_fit_end(self, trainer: L.Trainer, module: Any) -> None:
+        """Draw the last state."""
+        self._draw(trainer, module)
+
+    def _draw(self, trainer: L.Trainer, module: Any) -> None:
+        if not hasattr(getattr(trainer.logger, "experiment", None), "add_figure"):
+            return
+        some = trainer.datamodule.samples("val")
+        batch = Sample(*(column[: self.loads].to(module.device) for column in some))
+        with torch.no_grad():
+            prediction = module.predict(batch.load)
+        figure = deformed(module.scene.problem, batch.displacement, [("network", prediction)])
+        trainer.logger.experiment.add_figure("deformed shapes", figure, trainer.global_step)

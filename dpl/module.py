@@ -1,0 +1,169 @@
+"""Surrogate: a network with its scales and its loss, trained by Lightning."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.fabric.plugins import TorchCheckpointIO
+from torch import Tensor, nn
+
+from dpl.data.store import whole_file
+from dpl.fem.solution import Load
+from dpl.losses import Loss, Physics
+from dpl.metrics import metrics
+from dpl.scene import Sample, Scene
+
+SCALES = 3  # the stream of the loads that give the scales; those of samples are below
+
+
+class Surrogate(L.LightningModule):
+    """A network's answer to which displacement balances a load.
+
+    Here is the one border between float64 physics and the float32 network: `predict` scales,
+    casts, asks the network, scales back, and sets what is held to exactly zero. Called with newtons
+    and pascals the module answers in metres.
+
+    Attributes:
+        net: Scaled force (B, N, D) to scaled displacement (B, N, D).
+        scene: What it answers for.
+        loss: What it is trained with.
+    """
+
+    def __init__(
+        self,
+        net: nn.Module,
+        loss: Loss,
+        scene: Scene,
+        *,
+        optimizer: Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer] = torch.optim.AdamW,
+        scheduler: Callable[..., Any] | None = None,
+    ) -> None:
+        """Put the parts together.
+
+        Args:
+            net: The network.
+            loss: The loss.
+            scene: What it answers for.
+            optimizer: From parameters to an optimiser.
+            scheduler: From an optimiser and `total_steps` to a learning-rate schedule, stepped
+                every batch; none if left out.
+        """
+        super().__init__()
+        self.net, self.loss, self.scene = net, loss, scene
+        self._optimizer, self._scheduler = optimizer, scheduler
+        force_scale, displacement_scale = scales(scene)
+        self.register_buffer("force_scale", force_scale)
+        self.register_buffer("displacement_scale", displacement_scale)
+        self.register_buffer("largest_force", torch.tensor(scene.loads.largest_force).double())
+        self.physics = Physics(scene.problem, self.largest_force)
+        self.val_metrics = metrics(scene.problem).clone(prefix="val/")
+        self.test_metrics = metrics(scene.problem).clone(prefix="test/")
+
+    def forward(self, force: Tensor, young: Tensor) -> Tensor:
+        """Return displacements (B, N, D) [m] under nodal forces (B, N, D) [N], moduli (B,) [Pa]."""
+        return self.scene.length * self.predict(self.scene.load_of(force, young))
+
+    def predict(self, load: Load) -> Tensor:
+        """Return displacements over L, (B, N, D), float64."""
+        scaled = (load.force / self.force_scale).to(self.dtype)
+        answer = self.net(scaled).double() * self.displacement_scale
+        return torch.where(self.physics.problem.free, answer, 0.0)
+
+    def plan(self) -> list[str]:
+        """Return what network and loss leave out, a line each."""
+        return [*getattr(self.net, "plan", list)(), *self.loss.plan()]
+
+    def training_step(self, batch: Sample, _: int) -> Tensor:
+        """Return the loss."""
+        loss = self.loss(self.predict(batch.load), batch, self.physics)
+        self.log("loss/train", loss, prog_bar=True, batch_size=len(batch.force))
+        return loss
+
+    def validation_step(self, batch: Sample, _: int) -> None:
+        """Update the metrics."""
+        prediction = self.predict(batch.load)
+        loss = self.loss(prediction, batch, self.physics)
+        self.log("loss/val", loss, batch_size=len(batch.force))
+        self.val_metrics.update(prediction, batch)
+        self.log_dict(self.val_metrics, batch_size=len(batch.force))
+
+    def test_step(self, batch: Sample, _: int) -> None:
+        """Update the metrics."""
+        self.test_metrics.update(self.predict(batch.load), batch)
+        self.log_dict(self.test_metrics, batch_size=len(batch.force))
+
+    def setup(self, stage: str) -> None:
+        """Bring the physics to the device of the network."""
+        problem = self.scene.problem
+        if problem.points.device != self.device:
+            problem = problem.to(self.device)
+        self.physics = Physics(problem, self.largest_force)
+        for collection in (self.val_metrics, self.test_metrics):
+            for metric in collection.values():
+                if hasattr(metric, "problem"):
+                    metric.problem = problem
+
+    def configure_callbacks(self) -> list[L.Callback]:
+        """Carry the loss into the trainer."""
+        return [self.loss]
+
+    def configure_optimizers(self) -> Any:
+        """Return the optimiser with its schedule."""
+        optimizer = self._optimizer(self.parameters())
+        if self._scheduler is None:
+            return optimizer
+        steps = int(self.trainer.estimated_stepping_batches)
+        scheduler = self._scheduler(optimizer, total_steps=steps)
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+        }
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Write down whose surrogate this is."""
+        checkpoint["scene"] = self.scene.fingerprint
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse the checkpoint of another scene.
+
+        Raises:
+            ValueError: It is one.
+        """
+        theirs, ours = checkpoint.get("scene", "unknown"), self.scene.fingerprint
+        if theirs != ours:
+            raise ValueError(f"the checkpoint is of scene {theirs[:12]}, this scene is {ours[:12]}")
+
+
+def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:
+    """Return the scales of forces and of displacements, (N, D) each, of the scene's loads.
+
+    Root mean squares over the first loads of a stream of their own, the displacements those of the
+    linear answers: no sample is needed, online and offline training share them, and what nothing
+    acts on or what never moves has the scale 1, not 0.
+    """
+    force = scene.loads.sample((0, SCALES), range(count)).force
+    displacement = torch.stack([scene.linear.respond(one) for one in force])
+    return _root_mean_square(force), _root_mean_square(displacement)
+
+
+def _root_mean_square(fields: Tensor) -> Tensor:
+    mean = fields.square().mean(dim=0).sqrt()
+    return torch.where(mean > 1e-9 * mean.max(), mean, 1.0)
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Checkpoints that are whole or not there.
+
+    Lightning's own go through the default temporary folder; where that is another file system, a
+    kill while writing leaves half a file under the final name.
+    """
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
+    ) -> None:
+        """Write a checkpoint."""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(Path(path)) as file:
+            torch.save(checkpoint, file)

@@ -1,0 +1,264 @@
+"""Composition root: from a configuration to objects, from a run's folder back to its surrogate.
+
+The only file of the package that knows Hydra.
+"""
+
+import functools
+import importlib
+import inspect
+import logging
+import math
+import sys
+import types
+import typing
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from hydra.errors import InstantiationException
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from dpl.data.store import DataSetError
+from dpl.scene import Scene
+
+if typing.TYPE_CHECKING:
+    from dpl.module import Surrogate
+
+TRUSTED = ("dpl.", "torch.optim.", "lightning.")  # what a run's folder may name without being asked
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot work: which key, what is wrong, what to do."""
+
+
+def command(task: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+    """Return a task that ends bad input with one line and a status of 2, Ctrl-C with 130."""
+
+    @functools.wraps(task)
+    def wrapped(cfg: DictConfig) -> None:
+        logging.getLogger("skfem").setLevel(logging.WARNING)
+        try:
+            task(cfg)
+        except (ConfigError, DataSetError) as error:
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(2)
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            sys.exit(130)
+
+    return wrapped
+
+
+def plain(cfg: DictConfig) -> dict[str, Any]:
+    """Return a configuration as plain data, interpolations resolved.
+
+    Raises:
+        ConfigError: A value is missing.
+    """
+    try:
+        return typing.cast(
+            "dict[str, Any]", OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        )
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{error.full_key or 'config'}: {error.msg or error}") from None
+
+
+def check(cfg: DictConfig, *, trust: bool = True) -> None:
+    """Hold a configuration against the signatures that it calls, before anything is called.
+
+    Args:
+        cfg: The configuration.
+        trust: Whether it may name any object to call, or only those of `TRUSTED`.
+
+    Raises:
+        ConfigError: A key that its object does not know, a value of another type, a number that is
+            not finite, or an object that does not exist or is not trusted.
+    """
+    for path, value in _leaves(plain(cfg), ""):
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{path} = {value} is not a finite number")
+    for path, node in _calls(plain(cfg), ""):
+        name = node["_target_"]
+        if not trust and not name.startswith(TRUSTED):
+            raise ConfigError(f"{path} names {name}, which is none of this package's; not called")
+        try:
+            module, _, attribute = name.rpartition(".")
+            target = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError, ValueError):
+            raise ConfigError(f"{path}._target_ = {name!r} does not exist") from None
+        _check_call(path, node, target)
+
+
+def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> None:
+    function = target.__init__ if inspect.isclass(target) else target  # type: ignore[misc]
+    parameters = inspect.signature(target).parameters
+    if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+        parents = target.__mro__[1:] if inspect.isclass(target) else ()
+        known = set(parameters) | {n for c in parents for n in inspect.signature(c.__init__).parameters}
+    else:
+        known = set(parameters)
+    try:
+        hints = typing.get_type_hints(function)
+    except (NameError, TypeError):
+        hints = {}
+    for key, value in node.items():
+        if key.startswith("_") and key.endswith("_"):
+            continue
+        if key not in known:
+            named = ", ".join(sorted(known - {"self", "kwargs", "args"}))
+            raise ConfigError(f"{path}.{key}: {node['_target_']} has no such option; it has {named}")
+        if key in hints and not _fits(value, hints[key]):
+            raise ConfigError(f"{path}.{key} = {value!r} must be {_words(hints[key])}")
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a plain value can be what a type hint says; hints of objects accept all."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        return any(_fits(value, argument) for argument in arguments)
+    if isinstance(value, dict):
+        return True  # another call
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if hint in (bool, str, types.NoneType):
+        return isinstance(value, hint)
+    if origin is Sequence:
+        return isinstance(value, list) and all(_fits(item, arguments[0]) for item in value)
+    return True
+
+
+def _words(hint: Any) -> str:
+    names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
+    arguments = typing.get_args(hint)
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        return " or ".join(_words(argument) for argument in arguments)
+    if typing.get_origin(hint) is Sequence:
+        return f"a list, each {_words(arguments[0])}"
+    return names.get(hint, "null" if hint is types.NoneType else str(hint))
+
+
+def _leaves(node: Any, path: str) -> Iterator[tuple[str, Any]]:
+    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, value in items:
+        below = f"{path}.{key}" if path else str(key)
+        if isinstance(value, dict | list):
+            yield from _leaves(value, below)
+        else:
+            yield below, value
+
+
+def _calls(node: Any, path: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    if isinstance(node, dict) and "_target_" in node:
+        yield path, node
+    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, value in items:
+        yield from _calls(value, f"{path}.{key}" if path else str(key))
+
+
+def make(cfg: DictConfig, key: str, /, **more: Any) -> Any:
+    """Return the object of one node; `more` goes into the call (of a partial: into the second).
+
+    Raises:
+        ConfigError: Its values are out of range, or its file is not there.
+    """
+    node = cfg[key]
+    try:
+        made = hydra.utils.instantiate(node, _convert_="all")
+        return made(**more) if more else made
+    except InstantiationException as error:
+        raise ConfigError(f"{key}: {error.__cause__ or error}") from error
+    except (ValueError, TypeError, MemoryError, OSError) as error:
+        raise ConfigError(f"{key}: {error}") from error
+
+
+def build_scene(cfg: DictConfig) -> Scene:
+    """Return the scene of a configuration.
+
+    Raises:
+        ConfigError: Something in it cannot work.
+    """
+    from dpl.fem.problem import Problem
+
+    material, mesh, clamped = make(cfg, "material"), make(cfg, "mesh"), make(cfg, "clamped")
+    try:
+        problem = Problem.build(mesh, material, fixed=clamped, degree=cfg.degree)
+    except ValueError as error:
+        raise ConfigError(f"clamped, degree or mesh: {error}") from error
+    if loose := problem.loose_modes():
+        raise ConfigError(f"clamped: {len(loose)} rigid modes are unconstrained: {', '.join(loose)}")
+    solver = make(cfg, "solver", problem=problem)
+    young = OmegaConf.to_container(cfg.young) if isinstance(cfg.young, ListConfig) else cfg.young
+    if not _fits(young, float | Sequence[float]):
+        raise ConfigError(f"young = {young!r} must be a modulus [Pa] or a range [low, high]")
+    loads = make(cfg, "loads", linear=solver.rest, young=young)
+    return Scene(problem, loads, solver)
+
+
+def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
+    """Return the untrained surrogate of a configuration; its weights are a function of `seed`.
+
+    Raises:
+        ConfigError: Something in it cannot work.
+    """
+    from dpl.module import Surrogate
+
+    torch.manual_seed(cfg.seed)
+    return Surrogate(
+        make(cfg, "model", scene=scene),
+        make(cfg, "loss"),
+        scene,
+        optimizer=make(cfg, "optimizer"),
+        scheduler=make(cfg, "scheduler") if cfg.scheduler else None,
+    )
+
+
+def show_plan(*parts: Any) -> None:
+    """Print what the parts of a run do not need and skip."""
+    lines = [line for part in parts for line in part.plan()]
+    print("plan: skipped, because this scene does not need it")
+    print("\n".join(f"  - {line}" for line in lines), flush=True)
+
+
+def save_config(cfg: DictConfig, folder: Path) -> None:
+    """Write a configuration, resolved, into a run's folder.
+
+    Raises:
+        ConfigError: The folder holds a run already, and this one does not resume it.
+    """
+    there = folder / "config.yaml"
+    if there.exists() and not cfg.ckpt_path:
+        raise ConfigError(f"run: {folder} holds a run; resume it with ckpt_path=last or name another")
+    folder.mkdir(parents=True, exist_ok=True)
+    there.write_text(OmegaConf.to_yaml(OmegaConf.create(plain(cfg))))
+
+
+def load_run(folder: str | Path, *, trust: bool = False) -> tuple[DictConfig, "Surrogate"]:
+    """Return the configuration and the best surrogate of a training run.
+
+    Args:
+        folder: The run's.
+        trust: Whether its configuration may name objects outside this package, such as your own
+            law: they are imported and called.
+
+    Raises:
+        ConfigError: There is no finished run, or it names what is not trusted.
+    """
+    config, best = Path(folder) / "config.yaml", Path(folder) / "checkpoints" / "best.ckpt"
+    for path in (config, best):
+        if not path.is_file():
+            raise ConfigError(f"run = {folder} has no {path.relative_to(folder)}; train it first")
+    cfg = typing.cast(DictConfig, OmegaConf.load(config))
+    check(cfg, trust=trust)
+    surrogate = build_surrogate(cfg, build_scene(cfg))
+    checkpoint = torch.load(best, map_location="cpu", weights_only=True)
+    try:
+        surrogate.on_load_checkpoint(checkpoint)
+        surrogate.load_state_dict(checkpoint["state_dict"])
+    except (ValueError, KeyError, RuntimeError) as error:
+        raise ConfigError(f"{best}: {error}") from error
+    return cfg, surrogate.eval()

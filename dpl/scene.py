@@ -1,0 +1,142 @@
+"""Scene = body + loads + reference solver: the one object that is built once and handed on."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpl.fem.modes import ModalLoads
+from dpl.fem.newton import Linear, Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load
+
+
+class Sample(NamedTuple):
+    """Loads with their displacements; a batch is the same with a leading B.
+
+    Attributes:
+        force: (B, N, D) [-].
+        displacement: (B, N, D) [-].
+        young: (B,) [Pa].
+    """
+
+    force: Tensor
+    displacement: Tensor
+    young: Tensor
+
+    @property
+    def load(self) -> Load:
+        """The loads alone."""
+        return Load(self.force, self.young)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is simulated.
+
+    Attributes:
+        problem: The body, dimensionless.
+        loads: The family of loads to be answered.
+        solver: The reference that makes the truth.
+    """
+
+    problem: Problem
+    loads: ModalLoads
+    solver: Newton
+
+    @property
+    def linear(self) -> Linear:
+        """The linear answer, with the scene's one factor of K(0)."""
+        return self.solver.rest
+
+    @property
+    def length(self) -> float:
+        """L, longest side of the body [m]."""
+        return self.problem.length
+
+    @property
+    def force_unit(self) -> float:
+        """L^(D-1) [m^2 in 3D, m in 2D]: forces are this times E times the dimensionless ones."""
+        return self.length ** (self.problem.shape[1] - 1)
+
+    def load_of(self, force: Tensor, young: Tensor) -> Load:
+        """Return nodal forces (B, N, D) [N] (2D: [N/m]) on bodies of moduli (B,) [Pa] as a load."""
+        return Load(force.double() / (young.double()[:, None, None] * self.force_unit), young.double())
+
+    def identity(self) -> dict[str, object]:
+        """Return everything that decides a sample, as plain data; arrays as their SHA-256.
+
+        Sizes and Young's moduli are absent: u/L depends on f/(E L^2) alone. Coordinates count to
+        1e-9 L.
+        """
+        points = self.problem.points.numpy()
+        # Not rounded: the halves among dyadic coordinates would flip with the last bit.
+        lattice = np.floor((points - points.min(axis=0)) * 1e9 + 0.3).astype(np.int64)
+        law, loads = self.problem.material, self.loads
+        return {
+            "points": _digest(lattice),
+            "cells": _digest(self.problem.cells.numpy()),
+            "free": _digest(self.problem.free.numpy()),
+            "degree": self.problem.degree,
+            "law": {"name": type(law).__name__, **asdict(law)},
+            "loads": {
+                "name": type(loads).__name__,
+                "n_modes": loads.n_modes,
+                "deflection": loads.deflection,
+                "patch": [float(radius) for radius in loads.patch],
+                "distribution": _name(loads.distribution),
+            },
+            "tol": self.solver.tol,
+        }
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of `identity`, in hexadecimal."""
+        return hashlib.sha256(json.dumps(self.identity(), sort_keys=True).encode()).hexdigest()
+
+    def plan(self) -> list[str]:
+        """Return what this scene does not need and what is therefore skipped, a line each."""
+        problem, loads = self.problem, self.loads
+        cells, points = len(problem.cells), problem.dV.shape[1]
+        low, high = loads.young_range
+        young = f"E = {low:.4g} Pa" if low == high else f"E from {low:.4g} to {high:.4g} Pa"
+        lines = [f"no E input, no samples per E: u/L depends on f/(E L^2) only ({young})"]
+        if problem.equal_cells:
+            lines.append(f"one set of shape gradients for {cells} equal cells")
+        if points == 1:
+            lines.append(f"one quadrature point for each of {cells} cells: gradients are constant")
+        lines.append(
+            f"{len(problem.pattern.indices):,} tangent entries of "
+            f"{2 * len(problem.pattern.indices) - problem.pattern.size:,}: "
+            "symmetric, pattern and ordering analysed once"
+        )
+        lines.append("K(0) factorised once for modes, linear answers and every first Newton step")
+        lines.append("no factorisation for loads whose linear answer meets the tolerance")
+        if loads.modes.values.shape[0] > loads.n_modes:
+            lines.append(
+                f"{loads.modes.values.shape[0]} modes instead of {loads.n_modes}: a family is kept whole"
+            )
+        return lines
+
+
+def _name(function: Callable[..., object]) -> str:
+    """Return what a function or a partial of one is called, with its arguments."""
+    if isinstance(function, partial):
+        return f"{_name(function.func)}{function.args or ''}{function.keywords or ''}"
+    return getattr(function, "__name__", repr(function))
+
+
+def _digest(array: np.ndarray) -> str:
+    contiguous = np.ascontiguousarray(array)
+    return hashlib.sha256(f"{contiguous.dtype}{contiguous.shape}".encode() + contiguous.tobytes()).hexdigest()
+
+
+def stack(samples: list[Sample]) -> Sample:
+    """Return single samples (N, D) as a batch (B, N, D)."""
+    return Sample(*(torch.stack(column) for column in zip(*samples, strict=True)))

@@ -1,0 +1,37 @@
+"""Data set, training, evaluation: python scripts/train.py model=fcnn loss=lr_star."""
+
+from pathlib import Path
+
+import hydra
+import lightning as L
+from omegaconf import DictConfig
+
+from dpl import run
+from dpl.benchmark import evaluate
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="train")
+@run.command
+def main(cfg: DictConfig) -> None:
+    """Train a surrogate and judge it."""
+    run.check(cfg)
+    folder = Path(cfg.folder)
+    scene = run.build_scene(cfg)
+    data = run.make(cfg, "data", scene=scene)
+    surrogate = run.build_surrogate(cfg, scene)
+    trainer: L.Trainer = run.make(cfg, "trainer")
+    run.show_plan(scene, data, surrogate)
+    run.save_config(cfg, folder)
+    trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    _, best = run.load_run(folder, trust=True)
+    rows = evaluate(best, data.samples("test"), folder)
+    network = next(row for row in rows if row.solver == "network")
+    if isinstance(trainer.logger, L.pytorch.loggers.TensorBoardLogger):
+        trainer.logger.log_hyperparams(run.plain(cfg), network.errors)
+        trainer.logger.finalize("success")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Laws, small bodies and loads that the tests of the mechanics share."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import skfem
+import torch
+from torch import Tensor
+
+from dpl.fem.materials import Material, NeoHookean, SaintVenantKirchhoff
+from dpl.fem.mesh import Plane, box, rectangle
+from dpl.fem.problem import Problem
+from dpl.fem.supports import traction
+
+torch.set_num_threads(1)
+
+YOUNG, LENGTH = 4500.0, 100.0  # of the beam of VERIFICATION 1.8e [Pa], [m]
+KINDS = [(cell, d) for cell in ("triangle", "quad", "tetra", "hexahedron") for d in (1, 2)]
+
+
+@pytest.fixture(params=[SaintVenantKirchhoff, NeoHookean], ids=["svk", "neo-hookean"])
+def law(request) -> Material:
+    """Both laws, at a Poisson ratio of 0.3."""
+    return request.param(0.3)
+
+
+@pytest.fixture(params=KINDS, ids=lambda kind: f"{kind[0]}{kind[1]}")
+def kind(request) -> tuple[str, int]:
+    """Shape of the cell and degree of the displacement: all eight elements."""
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def grid() -> Callable[..., skfem.Mesh]:
+    """Grids of unit size, `count` cells a side, their vertices shaken by a part of the cell."""
+
+    def grid(cell: str, count: int = 2, shaken: float = 0.0, *, inside: bool = False) -> skfem.Mesh:
+        build, dim = (box, 3) if cell in ("tetra", "hexahedron") else (rectangle, 2)
+        mesh = build([1.0] * dim, [count + 1] * dim, cell)
+        shift = np.random.default_rng(7).uniform(-shaken / count, shaken / count, mesh.p.shape)
+        if inside:  # the boundary stays where it is
+            shift[:, mesh.boundary_nodes()] = 0.0
+        return type(mesh)(mesh.p + shift, mesh.t)
+
+    return grid
+
+
+@pytest.fixture(scope="session")
+def bend() -> Callable[..., Tensor]:
+    """Random smooth displacements (B, N, D) of points (N, D) that invert nothing."""
+
+    def bend(points: Tensor, batch: int = 1, seed: int = 0) -> Tensor:
+        random, dim = torch.Generator().manual_seed(seed), points.shape[1]
+
+        def uniform(*shape: int) -> Tensor:
+            return 2 * torch.rand(*shape, generator=random, dtype=torch.float64) - 1
+
+        waves = (points @ uniform(batch, dim, dim) * 2 + uniform(batch, 1, dim)).sin()
+        return points @ uniform(batch, dim, dim) * 0.12 + 0.05 * waves
+
+    return bend
+
+
+@pytest.fixture(scope="session")
+def beam() -> Callable[..., Problem]:
+    """The beam 100 x 25 x 25 m clamped at x = 0 of VERIFICATION 1.8e, (n, m, m) cells."""
+
+    def beam(material: Material, n: int = 8, m: int = 2, **options) -> Problem:
+        cell, degree = options.pop("cell", "hexahedron"), options.pop("degree", 1)
+        mesh = box([LENGTH, 25.0, 25.0], [n + 1, m + 1, m + 1], cell)
+        return Problem.build(mesh, material, fixed=Plane(0, "min"), degree=degree, **options)
+
+    return beam
+
+
+@pytest.fixture(scope="session")
+def pull() -> Callable[..., Tensor]:
+    """Nodal forces (1, N, 3) of the dead traction (0, 0, -q) [Pa] on the end x = max."""
+
+    def pull(problem: Problem, q: float) -> Tensor:
+        def stress(x):
+            return np.multiply.outer([0.0, 0.0, -q / YOUNG], np.ones(x.shape[1:]))
+
+        return traction(problem, Plane(0, "max"), stress)[None]
+
+    return pull
+
+
+@pytest.fixture(scope="session")
+def corner() -> Callable[[Problem, Tensor], Tensor]:
+    """Displacement (3,) [-] of the corner (max, max, max) of a box."""
+
+    def corner(problem: Problem, displacement: Tensor) -> Tensor:
+        return displacement[0, int(problem.points.sum(dim=1).argmax())]
+
+    return corner
