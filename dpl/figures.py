@@ -70,21 +70,21 @@ def deformed(
         len(fields), columns, squeeze=False, subplot_kw={"projection": "3d"} if dim == 3 else {}
     )
     seen = np.concatenate([points[None] + right, points[None]])
+    errors = [np.linalg.norm(field - right, axis=2) for _, field in fields]
+    top = max(1e-12, *(float(np.nanmax(error)) for error in errors))
+    scale = ScalarMappable(LogNorm(top * 1e-3, top), "viridis")
     for row, (name, field) in enumerate(fields):
-        error = np.linalg.norm(field - right, axis=2)
-        top = max(float(np.nanmax(error)), 1e-12)
-        scale = ScalarMappable(LogNorm(top * 1e-3, top), "viridis")
         for column in range(columns):
             ax = axes[row, column]
-            colours = scale.to_rgba(np.maximum(error[column][polygons].mean(axis=1), top * 1e-3))
-            _draw(ax, (points + field[column])[polygons], facecolors=colours, edgecolors="none")
-            _draw(
-                ax, (points + right[column])[polygons], facecolors="none", edgecolors="0.4", linewidths=0.3
-            )  # fmt: skip
+            error = errors[row][column][polygons].mean(axis=1)
+            colours = scale.to_rgba(np.maximum(error, top * 1e-3))
+            shape, true = (points + field[column])[polygons], (points + right[column])[polygons]
+            _draw(ax, shape, facecolors=colours, edgecolors="none")
+            _draw(ax, true, facecolors="none", edgecolors="0.4", linewidths=0.3)
             _frame(ax, seen)
-            if row == 0 and names:
-                ax.set_title(names[column], fontsize=9)
-        figure.colorbar(scale, ax=axes[row, :], label=f"{name}: error / L", shrink=0.8)
+            title = [names[column]] if row == 0 and names else []
+            ax.set_title("\n".join([*title, name]), fontsize=9)
+    figure.colorbar(scale, ax=axes, label="distance from the true position / L", shrink=0.8)
     return figure
 
 
@@ -93,7 +93,7 @@ def _draw(ax: Any, polygons: NDArray[np.float64], **style: Any) -> None:
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     if polygons.shape[-1] == 3:
-        ax.add_collection3d(Poly3DCollection(polygons, **style))
+        ax.add_collection3d(Poly3DCollection(polygons, clip_on=False, **style))
     else:
         ax.add_collection(PolyCollection(polygons, **style))
 
@@ -105,7 +105,7 @@ def _frame(ax: Any, points: NDArray[np.float64]) -> None:
     ax.set_ylim(low[1], high[1])
     if len(low) == 3:
         ax.set_zlim(low[2], high[2])
-        ax.set_box_aspect(high - low, zoom=1.2)
+        ax.set_box_aspect(high - low, zoom=1.1)
         ax.view_init(elev=18, azim=-60)
     else:
         ax.set_aspect("equal")

@@ -231,7 +231,7 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
         ConfigError: The folder holds a run already, and this one does not resume it.
     """
     there = folder / "config.yaml"
-    if there.exists() and not cfg.ckpt_path:
+    if (folder / "checkpoints" / "last.ckpt").exists() and not cfg.ckpt_path:
         raise ConfigError(f"run: {folder} holds a run; resume it with ckpt_path=last or name another")
     folder.mkdir(parents=True, exist_ok=True)
     there.write_text(OmegaConf.to_yaml(OmegaConf.create(plain(cfg))))

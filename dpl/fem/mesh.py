@@ -11,6 +11,7 @@ import skfem
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from skfem.io.meshio import from_meshio, to_meshio
 
 CELLS = {  # meshio's names of what can be solved, best first
     "hexahedron": (3, 8),
@@ -131,7 +132,7 @@ def _solid(raw: meshio.Mesh) -> skfem.Mesh:
         points = points[:, :2]
     used, cells = np.unique(cells, return_inverse=True)
     raw = meshio.Mesh(points[used], [(kinds[0], cells.reshape(-1, CELLS[kinds[0]][1]))])
-    return skfem.io.from_meshio(raw)
+    return from_meshio(raw)
 
 
 def check(mesh: skfem.Mesh) -> skfem.Mesh:
@@ -231,7 +232,7 @@ class Box:
 
 def save(path: Path, mesh: skfem.Mesh, fields: Mapping[str, NDArray[np.float64]]) -> None:
     """Write a mesh with fields at its vertices, (N,) or (N, D), in any format of meshio."""
-    flat = skfem.io.to_meshio(mesh)
+    flat = to_meshio(mesh)
     vertices = mesh.nvertices
     points = np.pad(flat.points, ((0, 0), (0, 3 - flat.points.shape[1])))
     data = {
