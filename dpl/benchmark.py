@@ -1,4 +1,4 @@
-"""Solvers against each other on the same loads, one load at a time: how wrong, how sure, how slow."""
+"""Solvers against each other on the same loads, one at a time: how wrong, how sure, how slow."""
 
 import json
 import time
@@ -114,7 +114,9 @@ def show(rows: Sequence[Row], title: str) -> None:
             f"{e['e_mean']:.1e}",
             f"{e['e_max']:.1e}",
             f"{e['SNR_min']:.1f}",
-            f"{e['rel_L2_median']:.2%}" if e["rel_L2_median"] > 1e-5 else f"{e['rel_L2_median']:.0e}",
+            f"{e['rel_L2_median']:.2%}"
+            if e["rel_L2_median"] > 1e-5
+            else f"{e['rel_L2_median']:.0e}",
             f"{e['rel_L2_worst']:.1%}" if e["rel_L2_worst"] > 1e-4 else f"{e['rel_L2_worst']:.0e}",
             f"{e['residual']:.1e}",
             f"{e['min_det_F']:.2f}",
@@ -146,7 +148,7 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
     """
     scene = surrogate.scene
     newton = replace(scene.solver, tol=tol)
-    solvers = {
+    solvers: dict[str, Solver] = {
         "linear": newton.rest,
         "network": Direct(surrogate.predict, scene.problem, tol),
         "hybrid Newton": Hybrid(surrogate.predict, newton),

@@ -20,8 +20,13 @@ if TYPE_CHECKING:
 FACETS = {
     "Tetrahedral": ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)),
     "Hexahedral": (
-        (0, 1, 4, 2), (0, 1, 5, 3), (0, 2, 6, 3), (1, 4, 7, 5), (2, 4, 7, 6), (3, 5, 7, 6),
-    ),  # fmt: skip
+        (0, 1, 4, 2),
+        (0, 1, 5, 3),
+        (0, 2, 6, 3),
+        (1, 4, 7, 5),
+        (2, 4, 7, 6),
+        (3, 5, 7, 6),
+    ),
 }
 
 
@@ -88,7 +93,7 @@ def deformed(
     return figure
 
 
-def _draw(ax: Any, polygons: NDArray[np.float64], **style: Any) -> None:
+def _draw(ax: Any, polygons: Any, **style: Any) -> None:
     from matplotlib.collections import PolyCollection
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -113,7 +118,7 @@ def _frame(ax: Any, points: NDArray[np.float64]) -> None:
 
 
 class DeformedShapes(L.Callback):
-    """Puts a picture of predicted against true shapes into TensorBoard, now and then and at the end."""
+    """Puts pictures of predicted against true shapes into TensorBoard."""
 
     def __init__(self, *, every: int = 20, loads: int = 3) -> None:
         """Choose how often and how much.

@@ -1,4 +1,4 @@
-"""Physics losses: callables (prediction, batch, physics) -> scalar that are Lightning callbacks too.
+"""Physics losses: callables (prediction, batch, physics) -> scalar, Lightning callbacks too.
 
 The module carries its loss into the trainer (`configure_callbacks`), so that a loss may anneal
 between epochs and log its own terms.
@@ -109,7 +109,9 @@ class LrPlus(Loss):
         """
         super().__init__()
         if weight < 0 or warmup_epochs < 0:
-            raise ValueError(f"weight = {weight}, warmup_epochs = {warmup_epochs} must be 0 or more")
+            raise ValueError(
+                f"weight = {weight}, warmup_epochs = {warmup_epochs} must be 0 or more"
+            )
         self._final, self._warmup = weight, warmup_epochs
         self.weight = weight if warmup_epochs == 0 else 0.0
 

@@ -44,7 +44,10 @@ class _PerLoad(Metric):
 
 
 class MeanError(_PerLoad):
-    """e_mean = 1/(N S) sum_s ||u_s - v_s||, N degrees of freedom; it shrinks like 1/sqrt(N) with the mesh."""
+    """e_mean = 1/(N S) sum_s ||u_s - v_s||, N degrees of freedom.
+
+    It shrinks like 1/sqrt(N) under refinement: never compare it across meshes.
+    """
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
         """See `_PerLoad`."""

@@ -76,13 +76,13 @@ class Surrogate(L.LightningModule):
         """Return what network and loss leave out, a line each."""
         return [*getattr(self.net, "plan", list)(), *self.loss.plan()]
 
-    def training_step(self, batch: Sample, _: int) -> Tensor:
+    def training_step(self, batch: Sample, batch_idx: int) -> Tensor:
         """Return the loss."""
         loss = self.loss(self.predict(batch.load), batch, self.physics)
         self.log("loss/train", loss, prog_bar=True, batch_size=len(batch.force))
         return loss
 
-    def validation_step(self, batch: Sample, _: int) -> None:
+    def validation_step(self, batch: Sample, batch_idx: int) -> None:
         """Update the metrics."""
         prediction = self.predict(batch.load)
         loss = self.loss(prediction, batch, self.physics)
@@ -90,7 +90,7 @@ class Surrogate(L.LightningModule):
         self.val_metrics.update(prediction, batch)
         self.log_dict(self.val_metrics, batch_size=len(batch.force))
 
-    def test_step(self, batch: Sample, _: int) -> None:
+    def test_step(self, batch: Sample, batch_idx: int) -> None:
         """Update the metrics."""
         self.test_metrics.update(self.predict(batch.load), batch)
         self.log_dict(self.test_metrics, batch_size=len(batch.force))

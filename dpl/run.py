@@ -93,11 +93,13 @@ def check(cfg: DictConfig, *, trust: bool = True) -> None:
 
 
 def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> None:
-    function = target.__init__ if inspect.isclass(target) else target  # type: ignore[misc]
+    function = typing.cast(Any, target).__init__ if inspect.isclass(target) else target
     parameters = inspect.signature(target).parameters
     if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
         parents = target.__mro__[1:] if inspect.isclass(target) else ()
-        known = set(parameters) | {n for c in parents for n in inspect.signature(c.__init__).parameters}
+        known = set(parameters) | {
+            n for c in parents for n in inspect.signature(c.__init__).parameters
+        }
     else:
         known = set(parameters)
     try:
@@ -109,7 +111,9 @@ def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> 
             continue
         if key not in known:
             named = ", ".join(sorted(known - {"self", "kwargs", "args"}))
-            raise ConfigError(f"{path}.{key}: {node['_target_']} has no such option; it has {named}")
+            raise ConfigError(
+                f"{path}.{key}: {node['_target_']} has no such option; it has {named}"
+            )
         if key in hints and not _fits(value, hints[key]):
             raise ConfigError(f"{path}.{key} = {value!r} must be {_words(hints[key])}")
 
@@ -143,7 +147,13 @@ def _words(hint: Any) -> str:
 
 
 def _leaves(node: Any, path: str) -> Iterator[tuple[str, Any]]:
-    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    items = (
+        node.items()
+        if isinstance(node, dict)
+        else enumerate(node)
+        if isinstance(node, list)
+        else ()
+    )
     for key, value in items:
         below = f"{path}.{key}" if path else str(key)
         if isinstance(value, dict | list):
@@ -155,7 +165,13 @@ def _leaves(node: Any, path: str) -> Iterator[tuple[str, Any]]:
 def _calls(node: Any, path: str) -> Iterator[tuple[str, dict[str, Any]]]:
     if isinstance(node, dict) and "_target_" in node:
         yield path, node
-    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    items = (
+        node.items()
+        if isinstance(node, dict)
+        else enumerate(node)
+        if isinstance(node, list)
+        else ()
+    )
     for key, value in items:
         yield from _calls(value, f"{path}.{key}" if path else str(key))
 
@@ -190,7 +206,9 @@ def build_scene(cfg: DictConfig) -> Scene:
     except ValueError as error:
         raise ConfigError(f"clamped, degree or mesh: {error}") from error
     if loose := problem.loose_modes():
-        raise ConfigError(f"clamped: {len(loose)} rigid modes are unconstrained: {', '.join(loose)}")
+        raise ConfigError(
+            f"clamped: {len(loose)} rigid modes are unconstrained: {', '.join(loose)}"
+        )
     solver = make(cfg, "solver", problem=problem)
     young = OmegaConf.to_container(cfg.young) if isinstance(cfg.young, ListConfig) else cfg.young
     if not _fits(young, float | Sequence[float]):
@@ -232,7 +250,9 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
     """
     there = folder / "config.yaml"
     if (folder / "checkpoints" / "last.ckpt").exists() and not cfg.ckpt_path:
-        raise ConfigError(f"run: {folder} holds a run; resume it with ckpt_path=last or name another")
+        raise ConfigError(
+            f"run: {folder} holds a run; resume it with ckpt_path=last or name another"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     there.write_text(OmegaConf.to_yaml(OmegaConf.create(plain(cfg))))
 

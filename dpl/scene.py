@@ -67,7 +67,9 @@ class Scene:
 
     def load_of(self, force: Tensor, young: Tensor) -> Load:
         """Return nodal forces (B, N, D) [N] (2D: [N/m]) on bodies of moduli (B,) [Pa] as a load."""
-        return Load(force.double() / (young.double()[:, None, None] * self.force_unit), young.double())
+        return Load(
+            force.double() / (young.double()[:, None, None] * self.force_unit), young.double()
+        )
 
     def identity(self) -> dict[str, object]:
         """Return everything that decides a sample, as plain data; arrays as their SHA-256.
@@ -119,9 +121,8 @@ class Scene:
         lines.append("K(0) factorised once for modes, linear answers and every first Newton step")
         lines.append("no factorisation for loads whose linear answer meets the tolerance")
         if loads.modes.values.shape[0] > loads.n_modes:
-            lines.append(
-                f"{loads.modes.values.shape[0]} modes instead of {loads.n_modes}: a family is kept whole"
-            )
+            count = len(loads.modes.values)
+            lines.append(f"{count} modes instead of {loads.n_modes}: a family is kept whole")
         return lines
 
 
@@ -134,7 +135,9 @@ def _name(function: Callable[..., object]) -> str:
 
 def _digest(array: np.ndarray) -> str:
     contiguous = np.ascontiguousarray(array)
-    return hashlib.sha256(f"{contiguous.dtype}{contiguous.shape}".encode() + contiguous.tobytes()).hexdigest()
+    return hashlib.sha256(
+        f"{contiguous.dtype}{contiguous.shape}".encode() + contiguous.tobytes()
+    ).hexdigest()
 
 
 def stack(samples: list[Sample]) -> Sample:

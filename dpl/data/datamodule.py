@@ -1,5 +1,7 @@
 """Lightning's door to the samples: from disk, or from workers that solve while it trains."""
 
+from typing import Any
+
 import lightning as L
 from torch.utils.data import DataLoader, Dataset
 from torch.utils.data.distributed import DistributedSampler
@@ -94,7 +96,7 @@ class OfflineData(L.LightningDataModule):
         return self._loaded[split]
 
     def train_dataloader(self) -> DataLoader | Replay:
-        """Return shuffled batches; the order is a function of (seed, epoch), so a run can resume."""
+        """Return shuffled batches, in an order that (shuffle, epoch) decides: a run can resume."""
         data = Samples(self.samples("train"))
         sampler: DistributedSampler = DistributedSampler(
             data, num_replicas=1, rank=0, shuffle=True, seed=self._shuffle
@@ -172,5 +174,5 @@ class OnlineData(OfflineData):
         self._produced = state_dict["produced"]
 
 
-def _same(batch: Sample) -> Sample:
+def _same(batch: Any) -> Any:
     return batch

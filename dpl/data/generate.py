@@ -24,8 +24,8 @@ HOPELESS = 12  # deaths in a row after which the fault is not in the loads
 class Job(NamedTuple):
     """A load to solve: which one of which stream."""
 
-    seed: tuple[int, ...]
-    index: int
+    seed: tuple[int, int]
+    number: int
 
 
 class Outcome(NamedTuple):
@@ -35,7 +35,7 @@ class Outcome(NamedTuple):
         job: Which load it is.
         force, displacement: (N, D) [-]; the displacement is an answer only if `accepted`.
         young: [Pa].
-        accepted: Whether the residual at `displacement` meets the tolerance and nothing is inverted.
+        accepted: Whether `displacement` meets the tolerance and inverts nothing.
         residual: ||R_free|| / ||f|| [-].
         volume_ratio: min det F [-].
         load_factor: Part of the load for which an equilibrium was found [-].
@@ -59,7 +59,7 @@ class Outcome(NamedTuple):
 
 def outcome(scene: Scene, job: Job) -> Outcome:
     """Return a load, solved."""
-    load = scene.loads.sample(job.seed, [job.index])
+    load = scene.loads.sample(job.seed, [job.number])
     start = time.perf_counter()
     solution = solve(scene.solver, Load(load.force, load.young))
     accepted = bool(solution.converged)
@@ -118,7 +118,7 @@ def outcomes(scene: Scene, jobs: Iterable[Job], *, workers: int) -> Iterator[Out
 
 def _lost(scene: Scene, job: Job) -> Outcome:
     """Return a load that killed its workers."""
-    load = scene.loads.sample(job.seed, [job.index])
+    load = scene.loads.sample(job.seed, [job.number])
     force = load.force[0].numpy()
     return Outcome(
         job, force, 0 * force, float(load.young), False, np.nan, np.nan, 0.0, 0, 0.0,

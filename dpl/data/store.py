@@ -3,7 +3,7 @@
     FOLDER/scene.json            fingerprint of the scene with its fields, seed, versions
     FOLDER/modes.safetensors     eigenvalues and eigenvectors that the loads are made of
     FOLDER/train-000000.safetensors, ...
-    FOLDER/manifest.jsonl        one line a shard: name, SHA-256, loads tried, loads rejected and why
+    FOLDER/manifest.jsonl        a line a shard: name, SHA-256, loads tried, rejects with reasons
 
 Files are written beside their place, synced and renamed; a shard that the manifest does not name
 does not exist. So an interrupted run loses the shard it was filling and nothing else.
@@ -119,10 +119,15 @@ class Store:
         card = self.folder / "scene.json"
         if not card.exists():
             if self.folder.exists() and any(self.folder.iterdir()):
-                raise DataSetError(f"{self.folder} is not empty and no data set; choose another data.folder")
+                raise DataSetError(
+                    f"{self.folder} is not empty and no data set; choose another data.folder"
+                )
             self.folder.mkdir(parents=True, exist_ok=True)
             modes = self.scene.loads.modes
-            _write(self.folder / "modes.safetensors", _packed(values=modes.values, vectors=modes.vectors))
+            _write(
+                self.folder / "modes.safetensors",
+                _packed(values=modes.values, vectors=modes.vectors),
+            )
             _write(card, json.dumps(self._card(), indent=1).encode())
         self._check(json.loads(card.read_text()))
         manifest = self.folder / "manifest.jsonl"
@@ -135,12 +140,18 @@ class Store:
             "fingerprint": self.scene.fingerprint,
             "scene": self.scene.identity(),
             "seed": self.seed,
-            "versions": {"dpl": dpl.__version__, "torch": torch.__version__, "numpy": np.__version__},
+            "versions": {
+                "dpl": dpl.__version__,
+                "torch": torch.__version__,
+                "numpy": np.__version__,
+            },
         }
 
     def _check(self, card: dict[str, Any]) -> None:
         if card.get("format") != FORMAT:
-            raise DataSetError(f"{self.folder} has format {card.get('format')}, this dpl reads {FORMAT}")
+            raise DataSetError(
+                f"{self.folder} has format {card.get('format')}, this dpl reads {FORMAT}"
+            )
         if card["fingerprint"] != self.scene.fingerprint:
             differing = [k for k, v in self.scene.identity().items() if card["scene"].get(k) != v]
             raise DataSetError(
@@ -190,11 +201,13 @@ class Store:
         """Write one shard, then its line of the manifest."""
         split = {self.stream(name): name for name in STREAMS}[tried[0].job.seed]
         kept = [one for one in tried if one.accepted]
-        name = f"{split}-{tried[0].job.index:06d}.safetensors"
+        name = f"{split}-{tried[0].job.number:06d}.safetensors"
         shape = (0, *self.scene.problem.shape)
         content = _packed(
-            index=torch.tensor([one.job.index for one in kept], dtype=torch.int64),
-            force=torch.from_numpy(np.stack([one.force for one in kept]) if kept else np.zeros(shape)),
+            index=torch.tensor([one.job.number for one in kept], dtype=torch.int64),
+            force=torch.from_numpy(
+                np.stack([one.force for one in kept]) if kept else np.zeros(shape)
+            ),
             displacement=torch.from_numpy(
                 np.stack([one.displacement for one in kept]) if kept else np.zeros(shape)
             ),
@@ -205,11 +218,11 @@ class Store:
             "file": name,
             "sha256": hashlib.sha256(content).hexdigest(),
             "split": split,
-            "first": tried[0].job.index,
+            "first": tried[0].job.number,
             "tried": len(tried),
             "accepted": len(kept),
             "rejected": [
-                {"index": one.job.index, "reason": one.reason, "load_factor": one.load_factor}
+                {"index": one.job.number, "reason": one.reason, "load_factor": one.load_factor}
                 for one in tried
                 if not one.accepted
             ],
@@ -232,8 +245,13 @@ class Store:
             if line["split"] != split or line["first"] >= count:
                 continue
             path = self.folder / line["file"]
-            if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != line["sha256"]:
-                raise DataSetError(f"{path} is damaged or missing; remove its line from manifest.jsonl")
+            if (
+                not path.is_file()
+                or hashlib.sha256(path.read_bytes()).hexdigest() != line["sha256"]
+            ):
+                raise DataSetError(
+                    f"{path} is damaged or missing; remove its line from manifest.jsonl"
+                )
             with safe_open(path, framework="pt") as shard:
                 sample = Sample(*(shard.get_tensor(name) for name in Sample._fields))
                 parts.append((shard.get_tensor("index"), sample))

@@ -26,7 +26,10 @@ class SingularMatrix(ArithmeticError):
 class Factor(Protocol):
     """A factorised matrix."""
 
-    negative_pivots: int
+    @property
+    def negative_pivots(self) -> int:
+        """Number of negative eigenvalues."""
+        ...
 
     def solve(self, right: Array) -> Array:
         """Return x, (n,), with K x = right."""

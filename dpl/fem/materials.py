@@ -31,7 +31,9 @@ class Material:
             ValueError: `poisson` lies outside (-1, 0.5) or is no finite number.
         """
         if not (math.isfinite(self.poisson) and -1.0 < self.poisson < 0.5):
-            raise ValueError(f"poisson = {self.poisson} must lie between -1 and 0.5 (both excluded)")
+            raise ValueError(
+                f"poisson = {self.poisson} must lie between -1 and 0.5 (both excluded)"
+            )
 
     @property
     def mu(self) -> float:
@@ -135,7 +137,7 @@ def green_lagrange(H: Tensor) -> Tensor:
 def volume_change(H: Tensor) -> Tensor:
     """Return det F - 1, (...,) [-], of H = F - I (..., 3, 3), to full relative precision.
 
-    The principal invariants of H and not `torch.linalg.det`, whose second derivative at F = I is NaN.
+    From the invariants of H and not by `torch.linalg.det`: its second derivative at F = I is NaN.
     """
     a, b, c = H.unbind(-2)
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = a.unbind(-1), b.unbind(-1), c.unbind(-1)

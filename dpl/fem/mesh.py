@@ -1,4 +1,4 @@
-"""Meshes (scikit-fem's own classes, in metres), regions that select their nodes, files in and out."""
+"""Meshes (scikit-fem's own classes, in metres), regions of their nodes, files in and out."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -112,7 +112,9 @@ def _solid(raw: meshio.Mesh) -> skfem.Mesh:
     found = {block.type for block in raw.cells if len(block.data)}
     kinds = [kind for kind in CELLS if kind in found]
     if not kinds:
-        raise ValueError(f"holds no cells that can be solved ({', '.join(sorted(found)) or 'none'})")
+        raise ValueError(
+            f"holds no cells that can be solved ({', '.join(sorted(found)) or 'none'})"
+        )
     dim = max(CELLS[kind][0] for kind in kinds)
     kinds = [kind for kind in kinds if CELLS[kind][0] == dim]
     if len(kinds) > 1:
@@ -124,7 +126,7 @@ def _solid(raw: meshio.Mesh) -> skfem.Mesh:
         raise ValueError(f"coordinates of node {bad[0]} are not finite ({len(bad)} such nodes)")
     if cells.min() < 0 or cells.max() >= len(points):
         raise ValueError(
-            f"cells name nodes {cells.min()} to {cells.max()}, the file holds 0 to {len(points) - 1}"
+            f"cells name nodes {cells.min()} to {cells.max()}, there are 0 to {len(points) - 1}"
         )
     if dim == 2 and points.shape[1] == 3:
         if np.ptp(points[:, 2]) > 1e-9 * np.ptp(points):
@@ -164,7 +166,9 @@ def check(mesh: skfem.Mesh) -> skfem.Mesh:
     pieces, member = connected_components(graph, directed=False)
     if pieces > 1:
         sizes = ", ".join(map(str, np.sort(np.bincount(member))[::-1]))
-        raise ValueError(f"the body is in {pieces} pieces (of {sizes} nodes); join or separate them")
+        raise ValueError(
+            f"the body is in {pieces} pieces (of {sizes} nodes); join or separate them"
+        )
     return mesh
 
 
@@ -177,7 +181,9 @@ def longest_side(points: NDArray[np.float64]) -> float:
     centred = points - points.mean(axis=0)
     principal = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
     boxes = [np.ptp(points, axis=0), np.ptp(principal, axis=0)]
-    return float(min(boxes, key=lambda sides: np.prod(sides) * (1 + 1e-9 * (sides is boxes[1]))).max())
+    return float(
+        min(boxes, key=lambda sides: np.prod(sides) * (1 + 1e-9 * (sides is boxes[1]))).max()
+    )
 
 
 @dataclass(frozen=True)

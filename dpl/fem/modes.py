@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -43,8 +44,8 @@ def eigenmodes(linear: Linear, count: int) -> Modes:
     """Return the lowest modes, those of the last family all: `count` or a few more.
 
     Shift-invert Lanczos around zero with the stored factor of K(0). The same problem gives the
-    same vectors: within an eigenspace the basis is the one that leans on the fields 1, x, y, z, x^2,
-    ... in turn, with positive sign.
+    same vectors: within an eigenspace the basis is the one that leans on the fields 1, x, y, z,
+    x^2, ... in turn, with positive sign.
 
     Args:
         linear: The body, held, with the factor of its K(0).
@@ -81,7 +82,7 @@ def _eigenspaces(values: Array) -> list[slice]:
     """Return the runs of eigenvalues that are one."""
     cuts = np.flatnonzero(np.diff(values) > SAME * values[1:]) + 1
     edges = [0, *cuts.tolist(), len(values)]
-    return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [slice(a, b) for a, b in pairwise(edges)]
 
 
 def _probes(problem: Problem) -> Array:
@@ -116,7 +117,7 @@ def uniform(rng: np.random.Generator, count: int) -> Array:
 
 
 def normal(rng: np.random.Generator, count: int) -> Array:
-    """Return `count` normal numbers of standard deviation 1/3, clipped to [-1, 1]: more small loads."""
+    """Return `count` normal numbers, deviation 1/3, clipped to [-1, 1]: more small loads."""
     return np.clip(rng.standard_normal(count) / 3, -1.0, 1.0)
 
 
@@ -126,7 +127,7 @@ class ModalLoads:
 
     Each mode's q is drawn by `distribution` times its largest value: for the softest mode the
     one whose linear answer moves some node by `deflection`, for the others that of equal energy.
-    The nodal force is then kept only on the boundary nodes within a random distance of a random one.
+    The nodal force is then kept on the boundary nodes within a random distance of a random one.
 
     Load i of a seed is a function of (seed, i) alone.
 
@@ -196,7 +197,9 @@ class ModalLoads:
         """Degrees of freedom that these loads can act on and that can move, (N, D)."""
         return self.problem.boundary[:, None] & self.problem.free
 
-    def sample(self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0) -> Load:
+    def sample(
+        self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0
+    ) -> Load:
         """Return loads.
 
         Args:
@@ -206,7 +209,9 @@ class ModalLoads:
         """
         drawn = [self._draw(seed, index) for index in indices]
         forces = torch.stack([force for force, _ in drawn])
-        return Load(amplitude * forces, torch.tensor([young for _, young in drawn], dtype=torch.float64))
+        return Load(
+            amplitude * forces, torch.tensor([young for _, young in drawn], dtype=torch.float64)
+        )
 
     def _draw(self, seed: int | Sequence[int], index: int) -> tuple[Tensor, float]:
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
@@ -214,7 +219,7 @@ class ModalLoads:
         points = self.problem.points
         loadable = self.reach.any(dim=1)
         centre = points[loadable][rng.integers(int(loadable.sum()))]
-        radius = rng.uniform(*self.patch)
+        radius = rng.uniform(self.patch[0], self.patch[1])
         inside = (points - centre).norm(dim=1) <= radius * (1 + 1e-9)
         force = torch.where(inside[:, None] & self.reach, self.modes.vectors @ q, 0.0)
         return force, rng.uniform(*self.young_range)

@@ -123,7 +123,8 @@ class Newton:
         while not self._balanced(state, force, self.tol):
             target = min(known + step, 1.0)
             tol = self.tol if target == 1.0 else self.loose
-            for state in self._correct(state, target * force, tol, count):
+            for iterate in self._correct(state, target * force, tol, count):
+                state = iterate
                 yield self._report(state, force, count, known)
             if self._balanced(state, target * force, tol):
                 base, known, step = state, target, 2 * step
@@ -154,16 +155,14 @@ class Newton:
             length = self._uninverted_length(state, update)
             if length == 0:
                 return
-            state = self._state(
-                state.displacement + length * update, (1 - length) * state.jump
-            )
+            state = self._state(state.displacement + length * update, (1 - length) * state.jump)
             yield state
             if self._balanced(state, force, tol):
                 return
 
     def _uninverted_length(self, state: "_State", update: Tensor) -> float:
-        """Return the longest of the steps 1, 1/2, 1/4, ... that inverts nothing; 0: there is none."""
-        floor = self.keep * min(state.volume_ratio, 1.0)
+        """Return the longest of the steps 1, 1/2, 1/4, ... that inverts nothing; 0: none does."""
+        floor = self.keep * min(float(state.volume_ratio), 1.0)
         for length in 0.5 ** np.arange(10):
             if self.problem.volume_ratio(state.displacement + length * update)[0] > floor:
                 return float(length)
@@ -197,9 +196,7 @@ class Newton:
         ratio = self.problem.imbalance(state.internal, force)
         return bool(ratio < tol and state.volume_ratio > 0 and not state.jump.any())
 
-    def _report(
-        self, state: "_State", force: Tensor, count: "_Count", known: float
-    ) -> Solution:
+    def _report(self, state: "_State", force: Tensor, count: "_Count", known: float) -> Solution:
         converged = torch.tensor([self._balanced(state, force, self.tol)])
         return Solution(
             displacement=state.displacement,
@@ -213,7 +210,7 @@ class Newton:
 
 
 class _State(NamedTuple):
-    """An iterate, evaluated once: u, f_int and min det F, and how far its supports have yet to move."""
+    """An iterate, evaluated once, and how far its supports have yet to move."""
 
     displacement: Tensor
     internal: Tensor

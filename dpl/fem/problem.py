@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import skfem
@@ -16,8 +16,8 @@ from dpl.fem.mesh import longest_side
 
 Region = Callable[[NDArray[np.float64]], NDArray[np.bool_]]  # points (N, D) [m] -> (N,)
 
-# shape of the cell, degree -> element, polynomial order that the quadrature integrates exactly. Full
-# quadrature: fewer points leave hourglass modes, more only cost time.
+# shape of the cell, degree -> element, polynomial order that the quadrature integrates exactly.
+# Full quadrature: fewer points leave hourglass modes, more only cost time.
 ELEMENTS = {
     ("Triangular", 1): (skfem.ElementTriP1, 0),
     ("Triangular", 2): (skfem.ElementTriP2, 2),
@@ -63,8 +63,8 @@ class Problem:
         length: L, longest side of the body [m].
         points: Nodes (N, D) [-]; for degree 2 those of edges, faces and cells too.
         cells: Nodes of each cell, (E, A).
-        dN: Gradients of the shape functions, (E, Q, A, D) [-]; (1, Q, A, D) where all cells are equal.
-        dV: Volumes of the quadrature points, (E, Q) [-]; (1, Q) where all cells are equal.
+        dN: Gradients of the shape functions, (E, Q, A, D) [-]; (1, Q, A, D) if all cells are equal.
+        dV: Volumes of the quadrature points, (E, Q) [-]; (1, Q) if all cells are equal.
         free: Degrees of freedom that may move, (N, D).
         prescribed: Displacement of the others at full load, (N, D) [-]; zero where free.
         boundary: Nodes on the boundary, (N,).
@@ -105,7 +105,7 @@ class Problem:
             length: L [m]; the longest side of the body if left out.
 
         Raises:
-            ValueError: `degree` is neither 1 nor 2, the cells cannot be solved, or `fixed` is empty.
+            ValueError: `degree` is neither 1 nor 2, no such cells, or `fixed` is empty.
         """
         if degree not in (1, 2):
             raise ValueError(f"degree = {degree} must be 1 or 2")
@@ -147,7 +147,7 @@ class Problem:
 
     def to(self, device: torch.device | str) -> Self:
         """Return the same problem with its tensors on a device."""
-        tensors = {
+        tensors: dict[str, Any] = {
             field.name: value.to(device)
             for field in fields(self)
             if isinstance(value := getattr(self, field.name), Tensor)

@@ -55,5 +55,9 @@ def _tested(problem: Problem, basis: skfem.Basis, values: NDArray[np.float64]) -
     force = np.zeros((basis.N, dim))
     for a, dofs in enumerate(basis.element_dofs):
         shape = basis.basis[a][0].value * basis.dx  # (E, Q)
-        np.add.at(force, dofs, np.einsum("deq,eq->ed", np.broadcast_to(values, (dim, *shape.shape)), shape))
+        np.add.at(
+            force,
+            dofs,
+            np.einsum("deq,eq->ed", np.broadcast_to(values, (dim, *shape.shape)), shape),
+        )
     return torch.from_numpy(force)

@@ -1,4 +1,4 @@
-"""Networks: nn.Modules from a scaled force field (B, N, D) to a scaled displacement field (B, N, D).
+"""Networks: nn.Modules from scaled forces (B, N, D) to scaled displacements (B, N, D).
 
 Each is built from a scene and its own options, and is float32 throughout.
 """

@@ -1,6 +1,7 @@
 """The paper's fully connected network."""
 
 import os
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +18,9 @@ class FCNN(nn.Module):
 
     Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.1.1.
     """
+
+    inputs: Tensor
+    outputs: Tensor
 
     def __init__(
         self,
@@ -52,12 +56,14 @@ class FCNN(nn.Module):
         hidden = width or ends[1]
         sizes = [ends[0], *[hidden] * (layers - 1), ends[1]]
         self.parameters_needed = _parameters(sizes)
-        self.parameters_saved = _parameters([everything.numel()] * (layers + 1)) - _parameters(sizes)
+        self.parameters_saved = _parameters([everything.numel()] * (layers + 1)) - _parameters(
+            sizes
+        )
         _refuse_beyond_memory(self.parameters_needed, memory_limit)
         self.register_buffer("inputs", inputs, persistent=False)
         self.register_buffer("outputs", outputs, persistent=False)
         stages: list[nn.Module] = [nn.Linear(sizes[0], sizes[1])]
-        for before, after in zip(sizes[1:-1], sizes[2:], strict=True):
+        for before, after in pairwise(sizes[1:]):
             stages += [nn.PReLU(before), nn.Linear(before, after)]
         self.stages = nn.Sequential(*stages)
 
@@ -80,7 +86,7 @@ class FCNN(nn.Module):
 
 def _parameters(sizes: list[int]) -> int:
     """Return weights, biases and slopes of linear layers between these sizes."""
-    linear = sum((before + 1) * after for before, after in zip(sizes[:-1], sizes[1:], strict=True))
+    linear = sum((before + 1) * after for before, after in pairwise(sizes))
     return linear + sum(sizes[1:-1])
 
 

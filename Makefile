@@ -1,0 +1,31 @@
+# make train: environment, installation and the main job on the small default scene.
+# make test:  installation and the checks that CI makes.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: setup train test lint slow clean
+
+setup: .venv/installed
+
+.venv/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
+	touch $@
+
+train: setup
+	$(BIN)/python scripts/train.py $(ARGS)
+
+test: lint
+	$(BIN)/python -m pytest -m 'not slow and not gpu'
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+slow: setup
+	$(BIN)/python -m pytest -m 'slow and not gpu' --timeout 1800
+
+clean:
+	rm -rf .venv build dist

@@ -1,0 +1,564 @@
+"""Laws of the discrete body: element matrices, consistency, invariance, supports."""
+
+import math
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.linalg
+import skfem
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from dpl.fem.linear import full_matrix
+from dpl.fem.materials import NeoHookean, SaintVenantKirchhoff
+from dpl.fem.mesh import Box, Plane, box, rectangle
+from dpl.fem.newton import Linear, Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, solve
+
+YOUNG, LENGTH = 4500.0, 100.0  # of the beam of VERIFICATION 1.8e [Pa], [m]
+NH = NeoHookean(0.3)
+CORNER = skfem.MeshTet(
+    np.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), np.arange(4)[:, None]
+)
+CUBE = box([1.0, 1.0, 1.0], [2, 2, 2])
+
+
+def stiffness(problem: Problem, displacement: Tensor | None = None) -> np.ndarray:
+    """Return K over the free degrees of freedom, at rest if no displacement is given."""
+    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    values = problem.tangent(rest if displacement is None else displacement)
+    return full_matrix(problem.pattern, values[0].numpy()).toarray()
+
+
+def rotation() -> Tensor:
+    """Return a rotation about no special axis."""
+    skew = torch.tensor([[0, -0.4, 0.9], [0.4, 0, -0.2], [-0.9, 0.2, 0]], dtype=torch.float64)
+    return torch.matrix_exp(skew)
+
+
+# VERIFICATION 1.7: mesh, degree, eigenvalues from below, number of them in all, largest, trace
+ELEMENTS = {
+    "hex8": (
+        *(CUBE, 1),
+        [0.064102564] * 2 + [0.117521368] * 3 + [0.192307692] * 3 + [0.256410256],
+        *(24, 1.25, 5.641025641),
+    ),
+    "tet4": (CORNER, 1, [0.128205128] * 2 + [0.212521895], 12, 1.005426823, 2.115384615),
+    "tet10": (
+        *(CORNER, 2),
+        [0.01232388] * 2 + [0.018478595] + [0.029921395] * 2,
+        *(30, 2.547414087, 9.730769231),
+    ),
+    "hex27": (
+        *(CUBE, 2),
+        [0.033427874] * 2 + [0.036130435] * 3 + [0.037893416],
+        *(81, 4.029073639, 40.615384615),
+    ),
+}
+
+
+@pytest.mark.parametrize("material", [SaintVenantKirchhoff, NeoHookean])
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_element_matrix_has_the_tabulated_eigenvalues(element, material):
+    """VERIFICATION 1.7."""
+    mesh, degree, smallest, count, largest, trace = ELEMENTS[element]
+    K = stiffness(Problem.build(mesh, material(0.3), degree=degree, length=1.0))
+    values = np.linalg.eigvalsh(K)
+    assert len(values) == count
+    assert np.abs(values[:6]).max() < 1e-14
+    assert values[6 : 6 + len(smallest)] == pytest.approx(smallest, abs=6e-10)
+    assert values[-1] == pytest.approx(largest, abs=6e-10)
+    assert np.trace(K) == pytest.approx(trace, abs=6e-10)
+
+
+def test_all_eigenvalues_of_the_hexahedron_are_tabulated():
+    """VERIFICATION 1.7, the upper part and the Frobenius norm; lambda_max = (3 lam + 2 mu) / 2."""
+    K = stiffness(Problem.build(CUBE, NH, length=1.0))
+    assert np.linalg.eigvalsh(K)[15:-1] == pytest.approx([0.384615385] * 8, abs=6e-10)
+    assert (K**2).sum() == pytest.approx(2.9722770107, abs=6e-11)
+    assert np.linalg.eigvalsh(K)[-1] == pytest.approx((3 * NH.lam + 2 * NH.mu) / 2, rel=1e-12)
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_homogeneous_strain_has_the_energy_of_hooke(element):
+    """VERIFICATION 1.7: u K u for u = x e1, X and y e1, times the volume."""
+    mesh, degree, *_ = ELEMENTS[element]
+    problem = Problem.build(mesh, NH, degree=degree, length=1.0)
+    volume = problem.dV.sum().item()
+    assert volume == pytest.approx(1 / 6 if mesh is CORNER else 1.0, rel=1e-14)
+    K, x = stiffness(problem), problem.points.numpy()
+    zero = np.zeros(len(x))
+    for u, printed in (
+        (np.stack([x[:, 0], zero, zero], axis=1), 1.3461538462),
+        (x, 7.5),
+        (np.stack([x[:, 1], zero, zero], axis=1), 0.3846153846),
+    ):
+        assert u.ravel() @ K @ u.ravel() / volume == pytest.approx(printed, abs=6e-11)
+
+
+def test_beam_has_the_tabulated_stiffness(law, beam):
+    """VERIFICATION 1.8e, eigenvalues of K in N/m on free degrees of freedom, tolerance 1e-6."""
+    values = np.linalg.eigvalsh(stiffness(beam(law))) * YOUNG * LENGTH
+    printed = (
+        [21.24835125] * 2 + [163.64340492] + [536.30691952] * 2 + [867.54630154, 1433.87488669]
+    )
+    assert values[:7] == pytest.approx(printed, rel=1e-9)
+
+
+def test_finer_beam_has_the_tabulated_stiffness(beam):
+    """VERIFICATION 1.8e."""
+    K = stiffness(beam(NH, 16, 4)) * YOUNG * LENGTH
+    values = scipy.linalg.eigvalsh(K, subset_by_index=[0, 5])
+    printed = [3.88134628] * 2 + [37.40358032] + [98.17128826] * 2 + [165.64636884]
+    assert values == pytest.approx(printed, rel=1e-8)
+
+
+@pytest.fixture(scope="module")
+def bent(beam, pull) -> tuple[Problem, Tensor, Tensor]:
+    """The beam of VERIFICATION 1.10 (hex8 8 x 2 x 2, NH-ln, q = 20), its load and its answer."""
+    problem = beam(NH)
+    force = pull(problem, 20.0)
+    load = Load(force, torch.tensor([YOUNG]))
+    answer = solve(Newton(problem, tol=1e-12, linear="superlu"), load)
+    assert answer.converged.all()
+    return problem, force, answer.displacement
+
+
+@pytest.fixture(scope="module")
+def direction(bent) -> Tensor:
+    """A random virtual displacement of the free degrees of freedom."""
+    problem, _, u = bent
+    random = torch.Generator().manual_seed(3)
+    return torch.where(
+        problem.free, torch.randn(u.shape, generator=random, dtype=torch.float64), 0.0
+    )
+
+
+def test_energy_is_expanded_by_force_and_tangent(bent, direction):
+    """VERIFICATION 1.10, Taylor test: remainders of order 2 and 3."""
+    problem, _, u = bent
+    steps = 3e-5 * 0.5 ** torch.arange(5, dtype=torch.float64)
+    change = problem.energy(u + steps[:, None, None] * direction) - problem.energy(u)
+    first = change - steps * (problem.internal_force(u) * direction).sum()
+    curvature = (problem.tangent_product(u, direction) * direction).sum()
+    second = first - steps**2 / 2 * curvature
+    assert (first[:-1] / first[1:]).log2().tolist() == pytest.approx([2.0] * 4, abs=0.05)
+    assert (second[:-1] / second[1:]).log2().tolist() == pytest.approx([3.0] * 4, abs=0.1)
+
+
+def test_differences_of_force_follow_the_tangent(bent, direction):
+    """VERIFICATION 1.10: the error falls by 100 as the step falls by 10, down to 1e-8."""
+    problem, _, u = bent
+    sparse = stiffness(problem, u) @ direction[problem.free[None]].numpy()
+    product = problem.tangent_product(u, direction)[problem.free[None]].numpy()
+    assert product == pytest.approx(sparse, rel=1e-11, abs=1e-13 * np.abs(sparse).max())
+    errors = []
+    for step in (1e-4, 1e-5, 1e-6):
+        ahead = problem.internal_force(u + step * direction)
+        behind = problem.internal_force(u - step * direction)
+        slope = ((ahead - behind) / (2 * step))[problem.free[None]].numpy()
+        errors.append(np.linalg.norm(slope - sparse) / np.linalg.norm(sparse))
+    assert errors[0] / errors[1] == pytest.approx(100, rel=0.05)
+    assert errors[1] / errors[2] == pytest.approx(100, rel=0.3)
+    assert errors[2] < 1e-8
+
+
+def test_moved_and_turned_body_feels_turned_forces(bent):
+    """VERIFICATION 1.10, objectivity, tolerance 1e-12."""
+    problem, _, u = bent
+    Q, X = rotation(), problem.points
+    moved = (X + u) @ Q.T + torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64) - X
+    force = problem.internal_force(u)
+    error = (problem.internal_force(moved) - force @ Q.T).norm() / force.norm()
+    assert error < 1e-12
+    assert_close(problem.energy(moved), problem.energy(u), rtol=1e-12, atol=0.0)
+    assert_close(problem.volume_ratio(moved), problem.volume_ratio(u), rtol=1e-12, atol=0.0)
+
+
+def test_turning_alone_needs_no_force(bent):
+    """VERIFICATION 1.10, objectivity."""
+    problem = bent[0]
+    turned = (problem.points @ (rotation() - torch.eye(3, dtype=torch.float64)).T)[None]
+    assert problem.internal_force(turned).norm() < 1e-14
+    assert problem.energy(turned).abs() < 1e-14
+
+
+def test_reactions_balance_the_load(bent):
+    """VERIFICATION 1.10: forces to 1e-10 of the load, moments about the deformed body to 1e-12."""
+    problem, force, u = bent
+    internal = problem.internal_force(u)
+    reactions = torch.where(problem.free, 0.0, internal)
+    assert (reactions + force).sum(dim=(0, 1)).abs().max() < 1e-10 * force.sum().abs()
+    moments = torch.linalg.cross(problem.points + u, internal)
+    assert moments.sum(dim=1).abs().max() < 1e-12 * moments.norm(dim=2).sum()
+
+
+def test_linear_answers_are_reciprocal(bent):
+    """VERIFICATION 1.10, Maxwell and Betti: u_a(f_b) = u_b(f_a)."""
+    problem = bent[0]
+    linear = Linear(problem, linear="superlu")
+    random = torch.Generator().manual_seed(5)
+    a, b = torch.randn(2, *problem.shape, generator=random, dtype=torch.float64)
+    work = (linear.respond(a) * b).sum()
+    assert_close(work, (linear.respond(b) * a).sum(), rtol=1e-12, atol=0.0)
+
+
+def test_free_body_has_exactly_the_rigid_zero_modes(bent):
+    """VERIFICATION 1.10: six eigenvalues below 1e-10 of the largest, at rest and turned."""
+    problem = Problem.build(box([4.0, 1.0, 1.0], [5, 2, 2]), NH)
+    turned = (problem.points @ (rotation() - torch.eye(3, dtype=torch.float64)).T)[None]
+    for state in (torch.zeros_like(turned), turned):
+        values = np.linalg.eigvalsh(stiffness(problem, state))
+        assert (np.abs(values) < 1e-10 * values[-1]).sum() == 6
+        assert values[6] > 1e-4 * values[-1]
+
+
+def path(problem: Problem, pull, loads: list[float]) -> tuple[Tensor, Tensor]:
+    """Return the strain energy [J] and the stroke f u / q [m3] at loads q [Pa]."""
+    force = torch.cat([pull(problem, q) for q in loads])
+    load = Load(force, torch.full((len(loads),), YOUNG))
+    answer = solve(Newton(problem, tol=1e-11, linear="superlu"), load)
+    assert answer.converged.all()
+    unit = pull(problem, 1.0) * YOUNG * LENGTH**3
+    scale = YOUNG * LENGTH**3
+    return problem.energy(answer.displacement) * scale, (unit * answer.displacement).sum((1, 2))
+
+
+def test_slope_of_the_total_energy_over_the_load_is_the_displacement(bent, pull):
+    """VERIFICATION 1.10, Hellmann-Feynman: d(U - q f u)/dq = -f u."""
+    errors = []
+    for step in (0.2, 0.1):
+        loads = torch.tensor([20 - step, 20, 20 + step], dtype=torch.float64)
+        energy, stroke = path(bent[0], pull, loads.tolist())
+        total = energy - loads * stroke
+        slope = (total[2] - total[0]).item() / (2 * step)
+        assert stroke[1].item() == pytest.approx(15003.700988, rel=1e-9)
+        errors.append(slope + stroke[1].item())
+    assert slope == pytest.approx(-15003.684431, rel=1e-9)  # at the step 0.1
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.01)
+
+
+def test_work_of_the_load_is_stored_as_strain_energy(bent, pull):
+    """VERIFICATION 1.10: integral of q d(f u) by Simpson in 40 steps = U."""
+    loads = np.linspace(0.0, 20.0, 41)
+    energy, stroke = path(bent[0], pull, loads.tolist())
+    weights = np.array([1] + [4, 2] * 19 + [4, 1]) * (loads[1] / 3)
+    work = 20 * stroke[-1].item() - weights @ stroke.numpy()  # by parts
+    assert energy[-1].item() == pytest.approx(145989.0724, rel=1e-9)
+    assert work == pytest.approx(145989.0722, rel=1e-8)
+
+
+@pytest.fixture
+def body(kind, law, grid) -> Problem:
+    """A body of each kind of element with unequal cells, held where x is small."""
+    cell, degree = kind
+    return Problem.build(
+        grid(cell, 2, 0.15), law, fixed=lambda points: points[:, 0] < 0.2, degree=degree, length=1.0
+    )
+
+
+def test_force_is_the_slope_of_the_energy(body, bend):
+    u = bend(body.points, 2).requires_grad_()
+    assert (body.volume_ratio(u) > 0.3).all()
+    (slope,) = torch.autograd.grad(body.energy(u).sum(), u)
+    assert_close(body.internal_force(u.detach()), slope, rtol=1e-11, atol=1e-13)
+
+
+def test_tangent_is_the_slope_of_the_force(body, bend):
+    assert not body.equal_cells
+    u, v = bend(body.points, 3), torch.where(body.free, bend(body.points, 3, seed=1), 0.0)
+    product = body.tangent_product(u, v)
+    for k, values in enumerate(body.tangent(u)):
+        K = full_matrix(body.pattern, values.numpy())
+        assert K @ v[k][body.free].numpy() == pytest.approx(
+            product[k][body.free].numpy(), rel=1e-10, abs=1e-13
+        )
+        assert abs(K - K.T).max() == 0
+
+
+def test_pattern_is_a_sorted_upper_triangle(body):
+    pattern = body.pattern
+    assert pattern.size == body.free.sum()
+    assert len(pattern.indptr) == pattern.size + 1
+    assert pattern.indptr[-1] == len(pattern.indices)
+    for row in range(pattern.size):
+        columns = pattern.indices[pattern.indptr[row] : pattern.indptr[row + 1]]
+        assert columns[0] == row
+        assert (np.diff(columns) > 0).all()
+
+
+def test_batch_answers_like_its_members(body, bend):
+    u, v = bend(body.points, 4), bend(body.points, 4, seed=1)
+    for method, batch in (
+        (body.energy, (u,)),
+        (body.internal_force, (u,)),
+        (body.tangent, (u,)),
+        (body.volume_ratio, (u,)),
+        (body.stress, (u,)),
+        (body.residual, (u, v)),
+        (body.residual_ratio, (u, v)),
+        (body.tangent_product, (u, v)),
+    ):
+        members = [method(*(x[k, None] for x in batch)) for k in range(4)]
+        assert_close(method(*batch), torch.cat(members), rtol=1e-12, atol=1e-14)
+
+
+def test_equal_cells_answer_like_unequal_ones(kind, law, grid, bend):
+    cell, degree = kind
+    if cell in ("triangle", "tetra"):  # cells of one orientation, so that they are equal
+        mesh = (
+            skfem.MeshTri(*one_corner(2)) if cell == "triangle" else skfem.MeshTet(*one_corner(3))
+        )
+    else:
+        mesh = grid(cell)
+    short = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
+    assert short.equal_cells
+    count = len(short.cells)
+    dN, dV = short.dN.expand(count, -1, -1, -1), short.dV.expand(count, -1)
+    long = replace(short, dN=dN.contiguous(), dV=dV.contiguous())
+    assert long.equal_cells == (count == 1)
+    u, v = bend(short.points, 2), bend(short.points, 2, seed=1)
+    for method in ("energy", "internal_force", "tangent", "volume_ratio", "stress"):
+        assert_close(getattr(short, method)(u), getattr(long, method)(u), rtol=1e-11, atol=1e-13)
+    assert_close(short.tangent_product(u, v), long.tangent_product(u, v), rtol=1e-11, atol=1e-13)
+
+
+def one_corner(dim: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return two equal simplices with one node in common: points and cells."""
+    corner = np.concatenate([np.zeros((1, dim)), np.eye(dim)])
+    points = np.concatenate([corner, corner[1:] + corner[1]])
+    cells = np.stack([np.arange(dim + 1), np.array([1, *range(dim + 1, 2 * dim + 1)])])
+    return points.T.copy(), cells.T.copy()
+
+
+def test_equal_cells_are_recognised(grid):
+    for cell in ("quad", "hexahedron"):
+        assert Problem.build(grid(cell, 3), NH).equal_cells
+        assert not Problem.build(grid(cell, 3, 1e-4), NH).equal_cells
+    for cell in ("triangle", "tetra"):
+        assert not Problem.build(grid(cell, 3), NH).equal_cells
+
+
+def test_homogeneous_deformation_has_one_stress_and_one_volume_ratio(body):
+    dim = body.shape[1]
+    random = torch.Generator().manual_seed(2)
+    H = torch.zeros(3, 3, dtype=torch.float64)
+    H[:dim, :dim] = torch.rand(dim, dim, generator=random, dtype=torch.float64) * 0.4 - 0.2
+    u = (body.points @ H[:dim, :dim].T)[None]
+    assert_close(
+        body.stress(u), body.material.stress(H).expand_as(body.stress(u)), rtol=1e-10, atol=1e-12
+    )
+    J = torch.linalg.det(H + torch.eye(3, dtype=torch.float64))
+    assert_close(body.volume_ratio(u), J[None], rtol=1e-12, atol=0.0)
+    volume = body.dV.expand(len(body.cells), -1).sum()
+    assert_close(body.energy(u), volume * body.material.energy(H)[None], rtol=1e-11, atol=0.0)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_plane_strain_is_a_slice_of_the_solid(law, bend, degree):
+    flat = Problem.build(rectangle([2.0, 1.0], [5, 3]), law, degree=degree, length=1.0)
+    solid = Problem.build(box([2.0, 1.0, 0.7], [5, 3, 2]), law, degree=degree, length=1.0)
+
+    def shape(points):
+        x, y = points[:, 0], points[:, 1]
+        return torch.stack([0.1 * x * y + 0.05 * x, 0.1 * x**2 - 0.1 * y], dim=1)[None]
+
+    in_space = torch.nn.functional.pad(shape(solid.points), (0, 1))
+    assert_close(
+        solid.energy(in_space), 0.7 * flat.energy(shape(flat.points)), rtol=1e-12, atol=0.0
+    )
+
+
+def test_inverted_body_is_seen(grid):
+    problem = Problem.build(grid("hexahedron"), NH)
+    mirrored = problem.points * torch.tensor([-2.0, 0, 0], dtype=torch.float64)
+    assert problem.volume_ratio(mirrored[None]).item() == pytest.approx(-1.0, rel=1e-12)
+    lost = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    lost[0, 3, 1] = math.nan
+    assert problem.volume_ratio(lost).item() == -math.inf
+
+
+def test_residual_lives_on_free_nodes_only(body, bend):
+    u, f = bend(body.points, 2), bend(body.points, 2, seed=1)
+    residual = body.residual(u, f)
+    assert not residual[:, ~body.free].any()
+    difference = body.internal_force(u) - f
+    assert_close(residual[:, body.free], difference[:, body.free], rtol=0, atol=0)
+    assert residual.abs().max() > 0
+
+
+def test_residual_ratio_is_relative_to_the_load(body, bend):
+    u, f = bend(body.points, 2), bend(body.points, 2, seed=1)
+    norm = body.residual(u, f).flatten(1).norm(dim=1)
+    assert not body.moved_supports
+    assert_close(body.residual_ratio(u, f), norm / f.flatten(1).norm(dim=1), rtol=1e-14, atol=0)
+    rest = torch.zeros_like(u)
+    ones = torch.where(body.free, 1.0, 0.0).expand_as(f).to(f)
+    assert_close(body.residual_ratio(rest, ones), torch.ones(2, dtype=torch.float64))
+
+
+def test_residual_of_no_load_is_absolute(body, bend):
+    u = bend(body.points)
+    none = torch.zeros_like(u)
+    assert_close(body.residual_ratio(u, none), body.residual(u, none).flatten(1).norm(dim=1))
+    assert body.residual_ratio(none, none) == 0
+
+
+def test_reactions_count_as_load_where_supports_move(grid, bend):
+    mesh = grid("hexahedron", 2, 0.1)
+    ends = (mesh.p[0] < 0.2) | (mesh.p[0] > 0.8)
+    given = np.where(mesh.p.T > 0.8, 0.1, 0.0)
+    problem = Problem.build(mesh, NH, fixed=ends, prescribed=given, length=1.0)
+    assert problem.moved_supports
+    assert not problem.prescribed[problem.free].any()
+    u = bend(problem.points)
+    internal, none = problem.internal_force(u), torch.zeros_like(u)
+    reaction = internal[:, ~problem.free].norm()
+    assert_close(
+        problem.residual_ratio(u, none), problem.residual(u, none).flatten(1).norm(dim=1) / reaction
+    )
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
+def test_boundary_nodes_are_those_on_the_surface(grid, cell, degree):
+    problem = Problem.build(grid(cell, 3), NH, degree=degree, length=1.0)
+    x = problem.points
+    assert torch.equal(problem.boundary, ((x < 1e-12) | (x > 1 - 1e-12)).any(dim=1))
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
+def test_nodes_lie_where_the_shape_functions_say(grid, cell, degree):
+    """A field linear in `points` has a constant gradient only where nodes and cells agree."""
+    problem = Problem.build(grid(cell, 3, 0.1), NH, degree=degree)
+    count = (3 * degree + 1) ** problem.shape[1]
+    assert problem.shape[0] == count
+    identity = torch.einsum("eai,eqaj->eqij", problem.points[problem.cells], problem.dN)
+    eye = torch.eye(problem.shape[1], dtype=torch.float64)
+    assert_close(identity, eye.expand_as(identity), rtol=0, atol=1e-12)
+
+
+def test_lengths_are_over_the_longest_side():
+    problem = Problem.build(box([2.0, 8.0, 4.0], [2, 5, 3]), NH, fixed=Plane(1, 8.0))
+    assert problem.length == pytest.approx(8.0)
+    assert problem.points.max(dim=0).values.tolist() == pytest.approx([0.25, 1.0, 0.5])
+    assert problem.dV.sum() * len(problem.cells) == pytest.approx(64.0 / 8.0**3)
+    held = ~problem.free.any(dim=1)
+    assert held.sum() == 6
+    assert (problem.points[held, 1] == 1).all()
+
+
+def test_support_may_be_a_region_or_nodes_or_components(grid):
+    mesh = grid("hexahedron")
+    by_region = Problem.build(mesh, NH, fixed=Plane(0, "min"))
+    by_nodes = Problem.build(mesh, NH, fixed=mesh.p[0] == 0)
+    by_component = np.zeros((27, 3), dtype=bool)
+    by_component[mesh.p[0] == 0, 1] = True
+    sliding = Problem.build(mesh, NH, fixed=by_component)
+    assert torch.equal(by_region.free, by_nodes.free)
+    assert (~by_region.free).sum() == 27
+    assert (~sliding.free).sum(dim=0).tolist() == [0, 9, 0]
+    assert Problem.build(mesh, NH).free.all()
+
+
+def test_quadratic_mesh_makes_a_quadratic_problem(grid):
+    straight = skfem.MeshTet2.from_mesh(grid("tetra"))
+    problem = Problem.build(straight, NH)
+    assert problem.degree == 2
+    assert problem.shape == (125, 3)
+
+
+def test_curved_cells_fill_the_curved_body():
+    """Isoparametric quadratic triangles: the error of a disc's area falls with the fourth power."""
+    errors = []
+    for refinements in (1, 2):
+        disc = skfem.MeshTri2.init_circle(refinements)
+        problem = Problem.build(disc, NH, length=1.0)
+        errors.append(abs(problem.dV.sum().item() - math.pi))
+    assert math.log2(errors[0] / errors[1]) > 3.5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"degree": 3}, "degree"), ({"degree": 0}, "degree"), ({"fixed": Plane(0, 0.3)}, "no node")],
+)
+def test_problem_that_cannot_be_built_is_an_error(grid, options, message):
+    with pytest.raises(ValueError, match=message):
+        Problem.build(grid("hexahedron"), NH, **options)
+
+
+def test_cells_without_an_element_are_an_error():
+    with pytest.raises(ValueError, match="cannot be solved"):
+        Problem.build(skfem.MeshWedge1(), NH)
+
+
+SPACE = {
+    "free": (None, 6),
+    "clamped": (Plane(0, "min"), 0),
+    "hinge": (Box([0, 0, 0], [0, 1, 0]), 1),
+    "ball": (Box([0, 0, 0], [0, 0, 0]), 3),
+}
+
+
+@pytest.mark.parametrize("support", SPACE)
+def test_motions_that_no_support_holds_are_named(grid, support):
+    """VERIFICATION 2.2 T13."""
+    fixed, count = SPACE[support]
+    names = Problem.build(grid("hexahedron", 3), NH, fixed=fixed).loose_modes()
+    assert len(names) == count
+    assert len(set(names)) == count
+
+
+def test_loose_motions_have_the_right_names(grid):
+    mesh = grid("hexahedron", 3)
+    assert Problem.build(mesh, NH).loose_modes() == [
+        *(f"translation along {axis}" for axis in "xyz"),
+        *(f"rotation about {axis}" for axis in "xyz"),
+    ]
+    rail = np.zeros((64, 3), dtype=bool)
+    rail[mesh.p[1] == 0] = [False, True, True]
+    assert Problem.build(mesh, NH, fixed=rail).loose_modes() == ["translation along x"]
+    table = np.zeros((64, 3), dtype=bool)
+    table[mesh.p[2] == 0, 2] = True
+    assert Problem.build(mesh, NH, fixed=table).loose_modes() == [
+        *("translation along x", "translation along y", "rotation about z"),
+    ]
+    hinge = Problem.build(mesh, NH, fixed=Box([0, 0, 0], [0, 1, 0]))
+    assert hinge.loose_modes() == ["rotation about y"]
+
+
+def test_loose_motions_of_a_plane_body_are_three(grid):
+    mesh = grid("quad", 3)
+    assert Problem.build(mesh, NH).loose_modes() == [
+        *("translation along x", "translation along y", "rotation about z"),
+    ]
+    assert Problem.build(mesh, NH, fixed=Plane(0, "min")).loose_modes() == []
+    pinned = Problem.build(mesh, NH, fixed=Box([0, 0], [0, 0]))
+    assert pinned.loose_modes() == ["rotation about z"]
+
+
+def test_loose_motions_are_the_zero_modes(grid):
+    """VERIFICATION 2.2 T13: as many as K has zero eigenvalues, for any support."""
+    random = np.random.default_rng(0)
+    mesh = grid("hexahedron", 2, 0.1)
+    for count in (1, 2, 3, 4, 5, 6, 7):
+        fixed = np.zeros((27, 3), dtype=bool)
+        fixed.ravel()[random.choice(81, count, replace=False)] = True
+        problem = Problem.build(mesh, NH, fixed=fixed)
+        values = np.linalg.eigvalsh(stiffness(problem))
+        assert (
+            len(problem.loose_modes()) == (values < 1e-10 * values[-1]).sum() == max(0, 6 - count)
+        )
+
+
+def test_copy_on_a_device_and_copy_by_pickle_are_the_same_problem(bent):
+    problem, force, u = bent
+    for copy in (problem.to("cpu"), pickle.loads(pickle.dumps(problem))):
+        assert torch.equal(copy.internal_force(u), problem.internal_force(u))
+        assert torch.equal(copy.residual_ratio(u, force), problem.residual_ratio(u, force))
+        assert copy.length == problem.length

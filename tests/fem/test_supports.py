@@ -1,0 +1,118 @@
+"""Laws of spread loads: they add up to what acts, wherever the nodes lie."""
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from dpl.fem.materials import NeoHookean
+from dpl.fem.mesh import Plane
+from dpl.fem.problem import Problem
+from dpl.fem.supports import body_force, traction
+
+
+@pytest.fixture(params=[1.0, 4.0])
+def body(request, kind, grid) -> Problem:
+    """A unit body of each kind of element, shaken inside, in units of a length."""
+    cell, degree = kind
+    mesh = grid(cell, 3, 0.15, inside=True)
+    return Problem.build(mesh, NeoHookean(0.3), degree=degree, length=request.param)
+
+
+def constant(vector):
+    """Return the field that is this vector everywhere."""
+    return lambda x: np.multiply.outer(np.asarray(vector, float), np.ones(x.shape[1:]))
+
+
+def moments(problem: Problem, force: torch.Tensor) -> torch.Tensor:
+    """Return the dipole sum of x_i f_j, (D, D)."""
+    return problem.points.T @ force
+
+
+def test_constant_traction_adds_up_to_stress_times_area(body):
+    dim, side = body.shape[1], 1 / body.length
+    stress = np.array([0.3, -2.0, 0.7])[:dim]
+    force = traction(body, Plane(0, "max"), constant(stress))
+    area = side ** (dim - 1)
+    assert_close(force.sum(dim=0), torch.from_numpy(stress * area), rtol=1e-12, atol=1e-14)
+    assert force[body.points[:, 0] < side - 1e-9].abs().max() < 1e-15
+
+
+def test_constant_traction_acts_at_the_middle_of_its_face(body):
+    dim, side = body.shape[1], 1 / body.length
+    stress = np.array([0.3, -2.0, 0.7])[:dim]
+    force = traction(body, Plane(0, "max"), constant(stress))
+    middle = np.array([side, side / 2, side / 2])[:dim]
+    expected = torch.from_numpy(np.outer(middle, stress) * side ** (dim - 1))
+    assert_close(moments(body, force), expected, rtol=1e-12, atol=1e-14)
+
+
+def test_linear_traction_adds_up_to_its_integral(body):
+    """The stress (y, 0, 0) on a face of side s: total s^2 / 2 times s^(D - 2)."""
+    dim, side = body.shape[1], 1 / body.length
+
+    def stress(x):
+        return np.stack([x[1], *[0 * x[1]] * (dim - 1)])
+
+    force = traction(body, Plane(0, "min"), stress).sum(dim=0)
+    assert force[0].item() == pytest.approx(side**2 / 2 * side ** (dim - 2), rel=1e-12)
+    assert not force[1:].any()
+
+
+def test_pressure_all_around_is_in_balance(body):
+    """Sum of n dA = 0 over a closed surface, each face in its own direction."""
+    dim, side = body.shape[1], 1 / body.length
+    total = torch.zeros(body.shape, dtype=torch.float64)
+    for axis in range(dim):
+        for end, sign in (("min", -1.0), ("max", 1.0)):
+            total += traction(body, Plane(axis, end), constant(sign * np.eye(dim)[axis]))
+    assert total.sum(dim=0).abs().max() < 1e-13
+    volume = side**dim
+    expected = volume * torch.eye(dim, dtype=torch.float64)
+    assert_close(moments(body, total), expected, rtol=1e-12, atol=1e-14)
+    assert total[~body.boundary].abs().sum() < 1e-14
+
+
+def test_constant_body_force_adds_up_to_density_times_volume(body):
+    dim, side = body.shape[1], 1 / body.length
+    density = np.array([0.3, -2.0, 0.7])[:dim]
+    force = body_force(body, constant(density))
+    assert_close(force.sum(dim=0), torch.from_numpy(density * side**dim), rtol=1e-12, atol=1e-14)
+
+
+def test_weight_acts_at_the_centre_of_gravity(kind, grid):
+    """Exact where the quadrature integrates x N: all elements but the triangles of degree 1."""
+    cell, degree = kind
+    problem = Problem.build(grid(cell, 3), NeoHookean(0.3), degree=degree, length=1.0)
+    dim = problem.shape[1]
+    density = np.arange(1.0, dim + 1)
+    expected = torch.from_numpy(np.outer(np.full(dim, 0.5), density))
+    force = body_force(problem, constant(density))
+    assert_close(moments(problem, force), expected, rtol=1e-12, atol=1e-14)
+
+
+def test_body_force_is_evaluated_where_it_acts(kind, grid):
+    """The total of the density (x, 0, 0) over a unit body is 1/2."""
+    cell, degree = kind
+    problem = Problem.build(grid(cell, 3), NeoHookean(0.3), degree=degree, length=1.0)
+
+    def density(x):
+        return np.stack([x[0], *[0 * x[0]] * (len(x) - 1)])
+
+    force = body_force(problem, density).sum(dim=0)
+    assert force[0].item() == pytest.approx(0.5, rel=1e-12)
+    assert not force[1:].any()
+
+
+def test_empty_region_of_a_traction_is_an_error(body):
+    for region in (Plane(0, 0.4321 / body.length), lambda points: np.zeros(len(points), bool)):
+        with pytest.raises(ValueError, match="no boundary facet"):
+            traction(body, region, constant(np.zeros(body.shape[1])))
+
+
+def test_single_node_is_no_facet(body):
+    corner = body.mesh.p.sum(axis=0).argmin()
+    with pytest.raises(ValueError, match="no boundary facet"):
+        traction(
+            body, lambda points: np.arange(len(points)) == corner, constant(np.ones(body.shape[1]))
+        )
