@@ -93,7 +93,7 @@ def check(cfg: DictConfig, *, trust: bool = True) -> None:
 
 
 def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> None:
-    function = typing.cast(Any, target).__init__ if inspect.isclass(target) else target
+    function = target.__init__ if inspect.isclass(target) else target  # type: ignore[misc]
     parameters = inspect.signature(target).parameters
     if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
         parents = target.__mro__[1:] if inspect.isclass(target) else ()

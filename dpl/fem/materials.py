@@ -60,6 +60,20 @@ class Material:
         return hessian(H.reshape(-1, 3, 3)).reshape(*H.shape, 3, 3)
 
 
+    def second_stress(self, E: Tensor) -> Tensor:
+        """Return the second Piola-Kirchhoff stress S over E_Young, (..., 3, 3) [-], of strains E."""
+        raise NotImplementedError(f"{type(self).__name__} has no stress as a function of strain")
+
+    def second_tangent(self, E: Tensor) -> Tensor:
+        """Return dS/dE over E_Young, (..., 3, 3, 3, 3) [-], of Green-Lagrange strains E."""
+        raise NotImplementedError(f"{type(self).__name__} has no stress as a function of strain")
+
+    @property
+    def has_second_stress(self) -> bool:
+        """Whether the law gives its stress as a function of strain, which mixed points need."""
+        return type(self).second_stress is not Material.second_stress
+
+
 @dataclass(frozen=True)
 class SaintVenantKirchhoff(Material):
     """Saint Venant-Kirchhoff solid: lambda/2 (tr E)^2 + mu E:E, E = (F^T F - I)/2.
@@ -74,22 +88,30 @@ class SaintVenantKirchhoff(Material):
 
     def stress(self, H: Tensor) -> Tensor:
         """Return P = F S, see `Material.stress`."""
-        S = self._second_stress(H)
+        S = self.second_stress(green_lagrange(H))
         return S + H @ S
 
     def tangent(self, H: Tensor) -> Tensor:
         """Return dP/dF, see `Material.tangent`."""
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        F, S = eye + H, self._second_stress(H)
+        F, S = eye + H, self.second_stress(green_lagrange(H))
         A = self.lam * torch.einsum("...ij,...kl->...ijkl", F, F)
         A += self.mu * torch.einsum("...il,...kj->...ijkl", F, F)
         A += self.mu * torch.einsum("...ik,jl->...ijkl", F @ F.mT, eye)
         return A + torch.einsum("ik,...jl->...ijkl", eye, S)
 
-    def _second_stress(self, H: Tensor) -> Tensor:
-        E = green_lagrange(H)
-        eye = torch.eye(3, dtype=H.dtype, device=H.device)
+    def second_stress(self, E: Tensor) -> Tensor:
+        """Return S = lambda tr E I + 2 mu E, see `Material.second_stress`."""
+        eye = torch.eye(3, dtype=E.dtype, device=E.device)
         return self.lam * trace(E)[..., None, None] * eye + 2 * self.mu * E
+
+    def second_tangent(self, E: Tensor) -> Tensor:
+        """Return Hooke's constant moduli, see `Material.second_tangent`."""
+        eye = torch.eye(3, dtype=E.dtype, device=E.device)
+        D = self.lam * torch.einsum("ij,kl->ijkl", eye, eye)
+        D += self.mu * torch.einsum("ik,jl->ijkl", eye, eye)
+        D += self.mu * torch.einsum("il,jk->ijkl", eye, eye)
+        return D.expand(*E.shape, 3, 3)
 
 
 @dataclass(frozen=True)
@@ -122,6 +144,26 @@ class NeoHookean(Material):
         A = torch.einsum("...il,...kj->...ijkl", shear * G, G)
         A += self.lam * torch.einsum("...ij,...kl->...ijkl", G, G)
         return A + self.mu * torch.einsum("ik,jl->ijkl", eye, eye)
+
+
+    def second_stress(self, E: Tensor) -> Tensor:
+        """Return S = (2 mu E + lambda ln J I) C^-1, C = I + 2 E, see `Material.second_stress`."""
+        inverse, log_J = self._inverse_and_log(E)
+        eye = torch.eye(3, dtype=E.dtype, device=E.device)
+        return (2 * self.mu * E + self.lam * log_J * eye) @ inverse
+
+    def second_tangent(self, E: Tensor) -> Tensor:
+        """Return dS/dE, see `Material.second_tangent`."""
+        inverse, log_J = self._inverse_and_log(E)
+        shear = (self.mu - self.lam * log_J) * inverse
+        D = self.lam * torch.einsum("...ij,...kl->...ijkl", inverse, inverse)
+        D += torch.einsum("...ik,...jl->...ijkl", shear, inverse)
+        return D + torch.einsum("...il,...jk->...ijkl", shear, inverse)
+
+    def _inverse_and_log(self, E: Tensor) -> tuple[Tensor, Tensor]:
+        """Return C^-1 and ln J (..., 1, 1)."""
+        change = volume_change(2 * E)  # of C, J^2 - 1
+        return inverse_transpose(2 * E, change), torch.log1p(change)[..., None, None] / 2
 
 
 def trace(H: Tensor) -> Tensor:

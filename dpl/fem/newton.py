@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.linear import Backend, Factor, SingularMatrix, backend
+from dpl.fem.materials import volume_change
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, in_step, judge
 
@@ -79,6 +80,7 @@ class Newton:
     loose: float = 1e-2
     keep: float = 0.2
     linear: str = "auto"
+    mixed: bool = True
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -143,22 +145,50 @@ class Newton:
         """Yield iterates under a fixed load until they balance it or cannot go on."""
         problem = self.problem
         for _ in range(self.max_iter):
-            right = force - state.internal
-            if problem.moved_supports:
-                right = right - problem.tangent_product(state.displacement, state.jump)
             try:
-                free = self._factor(state.displacement, count).solve(gather(right[0], problem))
+                update = self._update(state, force, count)
             except SingularMatrix:
                 return
             count.iterations += 1
-            update = scatter(free, problem)[None] + state.jump
             length = self._uninverted_length(state, update)
             if length == 0:
                 return
-            state = self._state(state.displacement + length * update, (1 - length) * state.jump)
+            strain = self._moved_strain(state, length, update)
+            end = state.displacement + length * update
+            state = self._state(end, (1 - length) * state.jump, strain)
             yield state
             if self._balanced(state, force, tol):
                 return
+
+    def _update(self, state: "_State", force: Tensor, count: "_Count") -> Tensor:
+        """Return the full Newton step (1, N, D) under a force, supports included.
+
+        Raises:
+            SingularMatrix: The tangent has no factor.
+        """
+        problem, u = self.problem, state.displacement
+        internal, factor = state.internal, self.rest.factor
+        if state.strain is not None:
+            internal, values = problem.mixed_system(u, state.strain)
+        elif u.any():
+            values = problem.tangent(u)
+        if u.any():
+            count.factorisations += 1
+            factor = self._backend.factorise(values[0].numpy())
+        right = force - internal
+        if problem.moved_supports:
+            right = right - problem.tangent_product(u, state.jump)
+        return scatter(factor.solve(gather(right[0], problem)), problem)[None] + state.jump
+
+    def _moved_strain(self, state: "_State", length: float, update: Tensor) -> Tensor | None:
+        """Return the strain that mixed points take with a step; None: plain Newton goes on."""
+        if not self.mixed:
+            return None
+        u = state.displacement
+        here = self.problem.strain(u)
+        before = here if state.strain is None else state.strain
+        strain = before + length * (here - before + self.problem.strain_change(u, update))
+        return strain if volume_change(2 * strain).min() > -1 + 1e-3 else None
 
     def _uninverted_length(self, state: "_State", update: Tensor) -> float:
         """Return the longest of the steps 1, 1/2, 1/4, ... that inverts nothing; 0: none does."""
@@ -167,13 +197,6 @@ class Newton:
             if self.problem.volume_ratio(state.displacement + length * update)[0] > floor:
                 return float(length)
         return 0.0
-
-    def _factor(self, displacement: Tensor, count: "_Count") -> Factor:
-        """Return the factor of K(u); that of the rest state is kept."""
-        if not displacement.any():
-            return self.rest.factor
-        count.factorisations += 1
-        return self._backend.factorise(self.problem.tangent(displacement)[0].numpy())
 
     @cached_property
     def rest(self) -> Linear:
@@ -188,9 +211,10 @@ class Newton:
         """Pickle without factors."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def _state(self, displacement: Tensor, jump: Tensor) -> "_State":
+    def _state(self, displacement: Tensor, jump: Tensor, strain: Tensor | None = None) -> "_State":
         internal = self.problem.internal_force(displacement)
-        return _State(displacement, internal, self.problem.volume_ratio(displacement), jump)
+        volume_ratio = self.problem.volume_ratio(displacement)
+        return _State(displacement, internal, volume_ratio, jump, strain)
 
     def _balanced(self, state: "_State", force: Tensor, tol: float) -> bool:
         ratio = self.problem.imbalance(state.internal, force)
@@ -216,6 +240,7 @@ class _State(NamedTuple):
     internal: Tensor
     volume_ratio: Tensor
     jump: Tensor
+    strain: Tensor | None
 
 
 @dataclass

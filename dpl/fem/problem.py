@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.materials import Material, volume_change
+from dpl.fem.materials import Material, green_lagrange, volume_change
 from dpl.fem.mesh import longest_side
 
 Region = Callable[[NDArray[np.float64]], NDArray[np.bool_]]  # points (N, D) [m] -> (N,)
@@ -27,6 +27,10 @@ ELEMENTS = {
     ("Tetrahedral", 2): (skfem.ElementTetP2, 2),
     ("Hexahedral", 1): (skfem.ElementHex1, 3),
     ("Hexahedral", 2): (skfem.ElementHex2, 5),
+}
+PAIRS = {  # axes of the independent components of a symmetric tensor, by dimension
+    2: ([0, 1, 0], [0, 1, 1]),
+    3: ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]),
 }
 QUADRATIC = {element for (_, degree), (element, _) in ELEMENTS.items() if degree == 2}
 
@@ -176,12 +180,7 @@ class Problem:
 
     def internal_force(self, displacement: Tensor) -> Tensor:
         """Return f_int, the slope of the energy, (B, N, D) [-]; on held nodes the reactions."""
-        dim = displacement.shape[-1]
-        stress = self.material.stress(self._gradient(displacement))[..., :dim, :dim]
-        weighted = (stress * self.dV[..., None, None]).transpose(-3, -2).flatten(-2)  # (B,E,D,QD)
-        per_cell = (weighted @ self._operator.mT).mT  # (B, E, A, D)
-        force = torch.zeros_like(displacement)
-        return force.index_add(1, self.cells.flatten(), per_cell.flatten(1, 2))
+        return self._spread(self.material.stress(self._gradient(displacement)))
 
     def residual(self, displacement: Tensor, force: Tensor) -> Tensor:
         """Return f_int - f where free and zero where held, (B, N, D) [-]."""
@@ -211,15 +210,82 @@ class Problem:
 
     def tangent(self, displacement: Tensor) -> Tensor:
         """Return the entries of K = d f_int / du on `pattern`, (B, nnz) [-]."""
-        samples, dim = displacement.shape[0], displacement.shape[-1]
-        A = self.material.tangent(self._gradient(displacement))[..., :dim, :dim, :dim, :dim]
-        A = (A * self.dV[..., None, None, None, None]).transpose(-4, -3)  # (B, E, Q, j, i, k, l)
+        return self._assembled(self.material.tangent(self._gradient(displacement)))
+
+    def strain(self, displacement: Tensor) -> Tensor:
+        """Return the Green-Lagrange strain at the quadrature points, (B, E, Q, 3, 3) [-]."""
+        return green_lagrange(self._gradient(displacement))
+
+    def strain_change(self, displacement: Tensor, update: Tensor) -> Tensor:
+        """Return B(u) du, the strain's linear change, (B, E, Q, 3, 3) [-]."""
+        H, dH = self._gradient(displacement), self._gradient(update)
+        change = dH + H.mT @ dH
+        return (change + change.mT) / 2
+
+    def mixed_system(self, displacement: Tensor, strain: Tensor) -> tuple[Tensor, Tensor]:
+        """Return force (B, N, D) and tangent (B, nnz) of Newton with mixed integration points.
+
+        The strain at the quadrature points, (B, E, Q, 3, 3), is an unknown of its own that each
+        point eliminates: stress and moduli are those of `strain`, moved to the strain of u by one
+        linear step. Where both strains agree these are `internal_force` and `tangent`.
+
+        Source: Magisano, Leonetti, Garcea (2017), CMAME 313, section 3.
+        """
+        dim, samples = self.shape[1], len(displacement)
+        H = self._gradient(displacement)
+        S, D = self.material.second_stress(strain), self.material.second_tangent(strain)
+        i, j = (torch.tensor(axes, device=H.device) for axes in PAIRS[dim])
+        D = D[..., i, j, :, :][..., i, j]  # (B, E, Q, P, P), P independent strains
+        slope = self._strain_slope(H)  # (B, E, Q, P, A i)
+        gap = (green_lagrange(H) - strain)[..., i, j] * (1.0 + (i != j))  # shear counts twice
+        moved = S[..., i, j] + (D @ gap[..., None])[..., 0]
+        weight = self.dV[..., None]
+        right = (D @ slope * weight[..., None]).flatten(-3, -2)  # (B, E, Q P, A i)
+        left = slope.flatten(-3, -2).mT
+        matrices = (left @ right).unflatten(-2, (-1, dim)).unflatten(-1, (-1, dim)).mT  # aikb
+        pull = (self.dN @ (S[..., :dim, :dim] * weight[..., None])).transpose(-3, -2).flatten(-2)
+        matrices.diagonal(dim1=-3, dim2=-2).add_((pull @ self._operator.mT)[..., None])
+        per_cell = (left @ (moved * weight).flatten(-2)[..., None]).unflatten(-2, (-1, dim))
+        return self._gathered(per_cell[..., 0]), self._entries(matrices.reshape(samples, -1))
+
+    def _strain_slope(self, H: Tensor) -> Tensor:
+        """Return B, the slope of the independent strains (shear doubled), (B, E, Q, P, A D)."""
+        dim = self.shape[1]
+        F = H[..., :dim, :dim] + torch.eye(dim, dtype=H.dtype, device=H.device)
+        # B[ij] at node a, direction k: F_ki dN_aj + F_kj dN_ai, half of it for i = j
+        i, j = (torch.tensor(axes, device=H.device) for axes in PAIRS[dim])
+        columns, gradients = F.mT[..., None, :], self.dN.mT[..., None]  # (i, 1, k), (j, a, 1)
+        slope = columns[..., i, :, :] * gradients[..., j, :, :]  # (B, E, Q, P, A, D)
+        slope = slope + columns[..., j, :, :] * gradients[..., i, :, :]
+        slope = slope * torch.where(i == j, 0.5, 1.0).to(H)[:, None, None]
+        return slope.flatten(-2)
+
+    def _spread(self, stress: Tensor) -> Tensor:
+        """Return the nodal forces (B, N, D) of first Piola-Kirchhoff stresses (B, E, Q, 3, 3)."""
+        dim = self.shape[1]
+        weighted = stress[..., :dim, :dim] * self.dV[..., None, None]
+        weighted = weighted.transpose(-3, -2).flatten(-2)  # (B, E, D, QD)
+        return self._gathered((weighted @ self._operator.mT).mT)
+
+    def _gathered(self, per_cell: Tensor) -> Tensor:
+        """Return the nodal sums (B, N, D) of what each cell has at its nodes (B, E, A, D)."""
+        force = per_cell.new_zeros(len(per_cell), *self.shape)
+        return force.index_add(1, self.cells.flatten(), per_cell.flatten(1, 2))
+
+    def _assembled(self, moduli: Tensor) -> Tensor:
+        """Return the tangent's entries (B, nnz) of dP/dF (B, E, Q, 3, 3, 3, 3)."""
+        samples, dim = len(moduli), self.shape[1]
+        A = moduli[..., :dim, :dim, :dim, :dim] * self.dV[..., None, None, None, None]
+        A = A.transpose(-4, -3)  # (B, E, Q, j, i, k, l)
         right = A.flatten(-4, -2) @ self.dN.mT  # (B, E, Q, jik, A)
         right = right.unflatten(-2, (dim, dim * dim)).flatten(-2).flatten(-3, -2)  # (B, E, Qj, ikA)
-        cell_matrices = self._operator @ right  # (B, E, A, ikA)
-        kept = cell_matrices.reshape(samples, -1)[:, self.pattern.source.to(displacement.device)]
-        values = kept.new_zeros(samples, len(self.pattern.indices))
-        return values.index_add(1, self.pattern.target.to(displacement.device), kept)
+        return self._entries((self._operator @ right).reshape(samples, -1))
+
+    def _entries(self, matrices: Tensor) -> Tensor:
+        """Return the tangent's entries (B, nnz) of cell matrices (B, E A D D A), laid out aikb."""
+        kept = matrices[:, self.pattern.source.to(matrices.device)]
+        values = kept.new_zeros(len(kept), len(self.pattern.indices))
+        return values.index_add(1, self.pattern.target.to(matrices.device), kept)
 
     def tangent_product(self, displacement: Tensor, direction: Tensor) -> Tensor:
         """Return K(u) v, (B, N, D) [-], on all degrees of freedom, without K."""

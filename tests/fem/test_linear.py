@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 
 from dpl.fem.linear import Backend, SingularMatrix, backend, full_matrix, installed
 from dpl.fem.materials import NeoHookean
-from dpl.fem.problem import Pattern, Problem
+from dpl.fem.problem import Pattern
 
 KNOWN = ["pardiso", "superlu"]
 

@@ -1,0 +1,208 @@
+"""A tiny scene with its data, and ways to run the scripts, that the tests share."""
+
+import os
+import runpy
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import hydra
+import matplotlib
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig
+
+from dpl import run
+from dpl.data.datamodule import OfflineData
+from dpl.fem.materials import NeoHookean
+from dpl.fem.mesh import Plane, box
+from dpl.fem.modes import ModalLoads
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.scene import Sample, Scene
+
+torch.set_num_threads(1)
+matplotlib.use("Agg")
+
+ROOT = Path(__file__).parents[1]
+CONF = ROOT / "conf"
+TINY = [
+    "mesh.nodes=[5,3,3]",
+    "loads.n_modes=3",
+    "+solver.linear=superlu",
+    "data.val=4",
+    "data.test=4",
+]  # of the scripts: 135 degrees of freedom
+TRAIN = [
+    "data.train=16",
+    "data.batch_size=8",
+    "data.workers=0",
+    "trainer.check_val_every_n_epoch=1",
+    "trainer.callbacks.3.every=1000",
+]
+
+
+def _tiny(
+    *,
+    size=(100.0, 25.0, 25.0),
+    nodes=(5, 3, 3),
+    cell="hexahedron",
+    law=NeoHookean,
+    poisson=0.3,
+    mesh=None,
+    fixed=None,
+    degree=1,
+    tol=1e-8,
+    linear="superlu",
+    newton=Newton,
+    young=4500.0,
+    n_modes=3,
+    **loads,
+) -> Scene:
+    mesh = box(size, nodes, cell) if mesh is None else mesh
+    held = Plane(0, "min") if fixed is None else fixed
+    problem = Problem.build(mesh, law(poisson), fixed=held, degree=degree)
+    solver = newton(problem, tol=tol, linear=linear)
+    loads = ModalLoads(solver.rest, n_modes=n_modes, young=young, **loads)
+    return Scene(problem, loads, solver)
+
+
+@pytest.fixture(scope="session")
+def make_scene() -> Callable[..., Scene]:
+    """Builds variants of the tiny scene."""
+    return _tiny
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    """A beam 100 x 25 x 25 m of 16 hexahedra, E = 4500 Pa, held at x = 0, three modes."""
+    return _tiny()
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory) -> Path:
+    """The folder of the tiny data set; read it, do not write there."""
+    return tmp_path_factory.mktemp("data") / "tiny"
+
+
+@pytest.fixture(scope="session")
+def _solved(scene, folder) -> Path:
+    OfflineData(
+        scene, folder=str(folder), train=12, val=4, test=4, workers=0
+    ).prepare_data()
+    return folder
+
+
+@pytest.fixture
+def data(scene, _solved) -> OfflineData:
+    """The tiny data set: 12, 4 and 4 loads, all solved."""
+    return OfflineData(
+        scene, folder=str(_solved), train=12, val=4, test=4, batch_size=4, workers=0
+    )
+
+
+@pytest.fixture(scope="session")
+def batch(scene, _solved) -> Sample:
+    """Twelve solved loads."""
+    return OfflineData(
+        scene, folder=str(_solved), train=12, val=4, test=4, workers=0
+    ).samples("train")
+
+
+@pytest.fixture
+def compose(monkeypatch, tmp_path) -> Iterator[Callable[..., DictConfig]]:
+    """Composes a command's configuration as its script does, in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+    def compose(*overrides: str, command: str = "generate") -> DictConfig:
+        GlobalHydra.instance().clear()
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            return hydra.compose(command, overrides=list(overrides))
+
+    yield compose
+    GlobalHydra.instance().clear()
+
+
+@pytest.fixture
+def scene_of(compose) -> Callable[..., Scene]:
+    """Checks and builds the scene of overrides of `conf/generate.yaml`."""
+
+    def scene_of(*overrides: str) -> Scene:
+        cfg = compose(*overrides)
+        run.check(cfg)
+        return run.build_scene(cfg)
+
+    return scene_of
+
+
+def _environment() -> dict[str, str]:
+    one = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    return {**os.environ, **one, "PYTHONPATH": path, "MPLBACKEND": "Agg", "COLUMNS": "200"}
+
+
+def _start(script: str, *arguments: str, cwd: Path) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / "scripts" / f"{script}.py"), *arguments],
+        cwd=cwd,
+        env=_environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+@pytest.fixture
+def start(tmp_path) -> Iterator[Callable[..., subprocess.Popen]]:
+    """Starts a script in a process group of its own; what is left of it is killed in the end."""
+    started: list[subprocess.Popen] = []
+
+    def start(script: str, *arguments: str, cwd: Path = tmp_path) -> subprocess.Popen:
+        started.append(_start(script, *arguments, cwd=cwd))
+        return started[-1]
+
+    yield start
+    for process in started:
+        for pid in members(process.pid):
+            os.kill(pid, signal.SIGKILL)
+        process.communicate()
+
+
+def members(group: int) -> list[int]:
+    """Return the living processes of a process group."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:  # it has just ended
+            continue
+        if int(fields[2]) == group and fields[0] != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
+@pytest.fixture
+def script(monkeypatch, capfd) -> Callable[..., SimpleNamespace]:
+    """Runs a script in this process, which saves its imports; returns status, out and err."""
+
+    def script(name: str, *arguments: str, cwd: Path) -> SimpleNamespace:
+        monkeypatch.chdir(cwd)
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
+        GlobalHydra.instance().clear()
+        capfd.readouterr()
+        status = 0
+        try:
+            runpy.run_path(str(ROOT / "scripts" / f"{name}.py"), run_name="__main__")
+        except SystemExit as end:
+            status = end.code
+        finally:
+            GlobalHydra.instance().clear()
+        return SimpleNamespace(status=status, **capfd.readouterr()._asdict())
+
+    return script

@@ -1,0 +1,485 @@
+"""Laws of the solver: right answers, honest failures, no inverted state, no wasted work."""
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from dpl.fem.linear import SuperLU, installed
+from dpl.fem.materials import NeoHookean, SaintVenantKirchhoff
+from dpl.fem.mesh import Plane, box
+from dpl.fem.newton import Linear, Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, Solution, judge, solve
+
+SVK, NH = SaintVenantKirchhoff(0.3), NeoHookean(0.3)
+LENGTH = 100.0  # of the beam of VERIFICATION 1.8e [m]
+
+
+def load_of(force: torch.Tensor) -> Load:
+    """Return a load of the beam's stiffness."""
+    return Load(force, torch.full((len(force),), 4500.0))
+
+
+def newton(problem: Problem, **options) -> Newton:
+    """Return the solver with the backend that every machine has."""
+    return Newton(problem, **{"linear": "superlu", **options})
+
+
+# VERIFICATION 1.8e: law, cells, cell, degree, q [Pa], u_z, u_x of the corner [m], iterations (1.10)
+BEAMS = [
+    (SVK, (4, 1), "hexahedron", 1, 5, -4.74016, None, None),
+    (SVK, (4, 1), "hexahedron", 1, 20, -18.7537, None, None),
+    (SVK, (4, 1), "hexahedron", 1, 40, -35.36415, None, None),
+    (NH, (4, 1), "hexahedron", 1, 40, -35.3999, None, None),
+    (SVK, (8, 2), "hexahedron", 1, 5, -6.3661, None, 4),
+    (SVK, (8, 2), "hexahedron", 1, 20, -24.79226, None, 6),
+    (SVK, (8, 2), "hexahedron", 1, 40, -44.77862, None, 7),
+    (NH, (8, 2), "hexahedron", 1, 40, -44.71446, None, 8),
+    (SVK, (16, 4), "hexahedron", 1, 5, -7.06306, None, 4),
+    (SVK, (16, 4), "hexahedron", 1, 20, -27.28787, None, 6),
+    (SVK, (16, 4), "hexahedron", 1, 40, -48.38715, None, 7),
+    (NH, (16, 4), "hexahedron", 1, 40, -48.34221, None, 7),
+    (SVK, (4, 1), "hexahedron", 2, 5, -7.20015, None, None),
+    (SVK, (4, 1), "hexahedron", 2, 20, -27.72827, None, None),
+    (SVK, (4, 1), "hexahedron", 2, 40, -48.8317, None, None),
+    (NH, (4, 1), "hexahedron", 2, 40, -48.76971, None, None),
+]
+FINE_BEAMS = [
+    (SVK, (39, 9), "hexahedron", 1, 5, -7.30886, None, 4),
+    (SVK, (39, 9), "hexahedron", 1, 20, -28.15840, None, 6),
+    (SVK, (39, 9), "hexahedron", 1, 40, -49.62752, -5.92339, 7),
+    (NH, (39, 9), "hexahedron", 1, 40, -49.59254, None, None),
+    (SVK, (8, 2), "hexahedron", 2, 20, -28.2134, None, None),
+    (NH, (8, 2), "hexahedron", 2, 40, -49.65505, None, None),
+    (SVK, (16, 4), "hexahedron", 2, 40, -49.88316, -6.03441, None),
+    (NH, (16, 4), "hexahedron", 2, 40, -49.8554, None, None),
+]
+
+
+@pytest.mark.parametrize(
+    ("law", "cells", "cell", "degree", "q", "z", "x", "count"),
+    BEAMS + [pytest.param(*beam, marks=pytest.mark.slow) for beam in FINE_BEAMS],
+)
+def test_beam_bends_as_tabulated(beam, pull, corner, law, cells, cell, degree, q, z, x, count):
+    """VERIFICATION 1.8e to 1e-6, and the iterations of 1.10."""
+    problem = beam(law, *cells, cell=cell, degree=degree)
+    backend = "auto" if cells[0] > 16 or degree == 2 else "superlu"
+    answer = solve(newton(problem, linear=backend), load_of(pull(problem, q)))
+    assert answer.converged.all()
+    end = corner(problem, answer.displacement) * LENGTH
+    assert end[2].item() == pytest.approx(z, rel=1e-6)
+    if x is not None:
+        assert end[0].item() == pytest.approx(x, rel=1e-6)
+    if count is not None:
+        assert answer.iterations.item() == count
+
+
+KUHN = [  # VERIFICATION 1.8e: cells, degree, SVK q = 5, 20, 40, NH-ln q = 40
+    ((39, 9), 1, [-6.99204, -27.03095, -48.04821, -48.11608]),
+    ((8, 2), 2, [-7.29293, -28.08539, -49.46152, -49.50036]),
+    ((16, 4), 2, [-7.35097, -28.3029, -49.81862, -49.8045]),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("cells", "degree", "printed"), KUHN)
+def test_beam_of_tetrahedra_bends_as_tabulated(beam, pull, corner, cells, degree, printed):
+    """VERIFICATION 1.8e; six Kuhn tetrahedra a cell, along another diagonal: within 0.5 %."""
+    for law, q, z in zip([SVK, SVK, SVK, NH], [5, 20, 40, 40], printed, strict=True):
+        problem = beam(law, *cells, cell="tetra", degree=degree)
+        answer = solve(newton(problem, linear="auto"), load_of(pull(problem, q)))
+        end = corner(problem, answer.displacement) * LENGTH
+        assert answer.converged.all()
+        assert end[2].item() == pytest.approx(z, rel=5e-3)
+
+
+@pytest.mark.parametrize(("law", "q"), [(SVK, 5), (SVK, 20), (NH, 5)])
+def test_error_falls_with_the_second_order(beam, pull, law, q):
+    """VERIFICATION 1.10: the last three residuals above rounding give an order of 1.9 or more."""
+    states = newton(beam(law), tol=1e-10).iterate(load_of(pull(beam(law), q)))
+    a, b, c = [s.residual.item() for s in states if s.residual > 1e-11][-3:]
+    assert math.log(c / b) / math.log(b / a) >= 1.9
+
+
+@pytest.mark.parametrize("q", [20, 40])
+@pytest.mark.parametrize("cells", [(8, 2), (16, 4)])
+def test_each_error_is_bounded_by_the_square_of_the_last(law, beam, pull, cells, q):
+    """An inexact tangent would let this quotient grow without bound."""
+    problem = beam(law, *cells)
+    states = newton(problem, tol=1e-10).iterate(load_of(pull(problem, q)))
+    residuals = [state.residual.item() for state in states]
+    quotients = [b / a**2 for a, b in zip(residuals[1:], residuals[2:], strict=False) if b > 1e-12]
+    assert len(quotients) >= 3
+    assert max(quotients) < 0.05
+
+
+@pytest.mark.parametrize("length", [1e-3, 1.0, 1e3, 100.0])
+@pytest.mark.parametrize(
+    ("law", "printed"),
+    [
+        (SVK, [8.023468838e-3, -2.392426382e-4, -0.2479226415]),
+        (NH, [1.024683172e-2, -2.397967447e-4, -0.2477360716]),
+    ],
+    ids=["svk", "neo-hookean"],
+)
+def test_answer_does_not_depend_on_the_size_of_the_body(pull, corner, law, printed, length):
+    """VERIFICATION 1.10, last: same u/L in six iterations at q/E = 20/4500."""
+    mesh = box([length, length / 4, length / 4], [9, 3, 3])
+    problem = Problem.build(mesh, law, fixed=Plane(0, "min"))
+    answer = solve(newton(problem), load_of(pull(problem, 20.0)))
+    assert problem.length == pytest.approx(length)
+    assert corner(problem, answer.displacement).tolist() == pytest.approx(printed, rel=1e-9)
+    assert answer.iterations.item() == 6
+
+
+def test_tiny_loads_converge_to_the_linear_answer(law, beam, pull, corner):
+    """VERIFICATION 2.2 T6: u / q is constant; the deviation is linear in q (1.8e)."""
+    problem, loads, deviations = beam(law), (1e-2, 1e-4, 1e-6), []
+    for q in loads:
+        load = load_of(pull(problem, q))
+        answer = solve(newton(problem), load)
+        linear = solve(Linear(problem, linear="superlu"), load)
+        assert answer.converged.all()
+        assert answer.iterations.item() <= 2
+        ratio = corner(problem, answer.displacement)[2] / corner(problem, linear.displacement)[2]
+        deviations.append(abs(ratio.item() - 1))
+    assert deviations[1] < 1e-6
+    assert deviations[0] / loads[0] == pytest.approx(deviations[1] / loads[1], rel=0.01)
+    assert deviations[1] / loads[1] == pytest.approx(deviations[2] / loads[2], rel=0.01)
+
+
+def test_no_load_costs_nothing(law, beam, monkeypatch):
+    """VERIFICATION 2.2 T6: zero load, u = 0, 0 iterations, no factor."""
+    problem = beam(law)
+    monkeypatch.setattr(SuperLU, "factorise", None)
+    states = list(newton(problem).iterate(load_of(torch.zeros(1, *problem.shape).double())))
+    assert len(states) == 1
+    assert not states[0].displacement.any()
+    assert states[0].converged.all()
+    assert states[0].iterations.item() == states[0].factorisations.item() == 0
+    assert states[0].load_factor.item() == 1
+
+
+@pytest.mark.parametrize(
+    ("law", "deepest", "volume"), [(SVK, None, 0.720), (NH, -0.7239, 0.804)], ids=["T1", "T3"]
+)
+def test_four_times_the_training_load_converges(beam, pull, law, deepest, volume):
+    """VERIFICATION 2.2 T1 and T3, q = 80 on hex8 16 x 4 x 4."""
+    problem = beam(law, 16, 4)
+    answer = solve(newton(problem), load_of(pull(problem, 80.0)))
+    assert answer.converged.all()
+    assert answer.volume_ratio.item() == pytest.approx(volume, abs=5e-4)
+    if deepest is not None:
+        assert answer.displacement[..., 2].min().item() == pytest.approx(deepest, abs=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("q", "deepest", "volume"),
+    [
+        (160.0, -0.9179, 0.723),
+        pytest.param(400.0, -1.1102, 0.590, marks=pytest.mark.slow),
+        pytest.param(1000.0, -1.3502, 0.443, marks=pytest.mark.slow),
+    ],
+)
+def test_neo_hookean_beam_answers_any_load(beam, pull, q, deepest, volume):
+    """VERIFICATION 2.2 T4."""
+    problem = beam(NH, 16, 4)
+    for state in newton(problem).iterate(load_of(pull(problem, q))):
+        assert state.volume_ratio.item() > 0
+    assert state.converged.all()
+    assert state.load_factor.item() == 1
+    assert state.displacement[..., 2].min().item() == pytest.approx(deepest, abs=1e-4)
+    assert state.volume_ratio.item() == pytest.approx(volume, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_slender_beam_needs_load_steps_and_gets_there(pull):
+    """VERIFICATION 2.2 T5: NH-ln 20 x 1 x 1, nu = 0, hex27, P L^2 / EI = 1: w / L = .302130893."""
+    mesh = box([20.0, 1.0, 1.0], [21, 2, 2])
+    problem = Problem.build(mesh, NeoHookean(0.0), fixed=Plane(0, "min"), degree=2)
+    answer = solve(newton(problem, linear="auto"), load_of(pull(problem, 4500.0 / 12 / 400)))
+    assert answer.converged.all()
+    end = problem.points[:, 0] == problem.points[:, 0].max()
+    force = pull(problem, 1.0)[0, end, 2]
+    sag = (answer.displacement[0, end, 2] * force).sum() / force.sum()  # mean over the section
+    assert -sag.item() == pytest.approx(0.302130893, rel=1e-3)
+
+
+def check_defeat(problem: Problem, solver: Newton, force: torch.Tensor) -> None:
+    """Assert that a load without an answer ends as VERIFICATION 2.2 T2 demands."""
+    for state in solver.iterate(load_of(force)):
+        assert state.volume_ratio.item() > 0
+        assert state.residual.isfinite().all()
+        assert not state.converged.any()
+    factor = state.load_factor.item()
+    assert 0 < factor < 1
+    rest = judge(problem, state.displacement, load_of(factor * force), solver.loose)
+    assert rest.converged.all()
+    assert state.residual.item() == problem.residual_ratio(state.displacement, force).item()
+
+
+@pytest.mark.parametrize("q", [400.0, 1000.0])
+def test_load_without_an_answer_is_reported_with_the_part_that_has_one(beam, pull, q):
+    """VERIFICATION 2.2 T2: SVK far beyond its limit."""
+    problem = beam(SVK)
+    check_defeat(problem, newton(problem, smallest_step=2.0**-6), pull(problem, q))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("q", [160.0, 400.0, 1000.0])
+def test_load_without_an_answer_on_the_finer_mesh_is_reported(beam, pull, q):
+    """VERIFICATION 2.2 T2 as printed there: hex8 16 x 4 x 4."""
+    problem = beam(SVK, 16, 4)
+    check_defeat(problem, newton(problem), pull(problem, q))
+
+
+def test_squeezed_block_fails_where_its_law_softens():
+    """VERIFICATION 1.11: an SVK bar under |P| > E / (3 sqrt 3) has no answer; below it has one."""
+    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
+    slides = mesh.p.T == 0  # each coordinate plane holds its own normal
+    problem = Problem.build(mesh, SVK, fixed=slides, length=1.0)
+    force = torch.zeros(1, 8, 3, dtype=torch.float64)
+    force[0, torch.from_numpy(mesh.p[0] == 1), 0] = -1 / 4
+    limit = 1 / (3 * math.sqrt(3))
+    below = solve(newton(problem), load_of(0.99 * limit * force))
+    assert below.converged.all()
+    assert below.displacement[0, :, 0].min().item() + 1 > 1 / math.sqrt(3)
+    above = solve(newton(problem), load_of(1.05 * limit * force))
+    assert not above.converged.any()
+    assert above.volume_ratio.item() > 0
+    assert above.load_factor.item() == pytest.approx(1 / 1.05, abs=0.02)
+
+
+def test_batch_solves_like_its_members(law, beam, pull):
+    """Members that need 0, 2, 4, 7 or no end of iterations do not disturb each other."""
+    problem = beam(law, 4, 1)
+    force = torch.cat([pull(problem, q) for q in (0.0, 1e-3, 5.0, 40.0, 2000.0)])
+    solver = newton(problem, smallest_step=2.0**-4)
+    batch = solve(solver, load_of(force))
+    for k, alone in enumerate(force):
+        member = solve(solver, load_of(alone[None]))
+        for field, value in zip(Solution._fields, member, strict=True):
+            assert torch.equal(getattr(batch, field)[k, None], value), field
+    assert len(set(batch.iterations.tolist())) == 5
+
+
+def test_states_are_yielded_from_the_start_one_by_one(law, beam, pull):
+    problem = beam(law)
+    states = list(newton(problem).iterate(load_of(pull(problem, 20.0))))
+    assert not states[0].displacement.any()
+    assert states[0].residual.item() == 1
+    assert [s.iterations.item() for s in states] == list(range(len(states)))
+    assert [s.converged.item() for s in states] == [False] * (len(states) - 1) + [True]
+    assert [s.load_factor.item() for s in states] == [0.0] * (len(states) - 1) + [1.0]
+    for state in states:
+        again = judge(problem, state.displacement, load_of(pull(problem, 20.0)), 1e-8)
+        assert torch.equal(again.residual, state.residual)
+        assert torch.equal(again.volume_ratio, state.volume_ratio)
+
+
+@pytest.fixture
+def wrong(law, beam, pull) -> tuple[Problem, Load, Solution]:
+    """A problem, its load and its answer from zero."""
+    problem = beam(law)
+    load = load_of(pull(problem, 20.0))
+    return problem, load, solve(newton(problem), load)
+
+
+@pytest.mark.parametrize("kind", ["nan", "one nan", "infinite", "inverted", "huge"])
+def test_bad_guess_changes_no_bit_of_the_answer(wrong, kind):
+    """VERIFICATION 2.2 T19."""
+    problem, load, answer = wrong
+    guess = torch.zeros_like(load.force)
+    if kind == "nan":
+        guess += math.nan
+    elif kind == "one nan":
+        guess[0, -1, 1] = math.nan
+    elif kind == "infinite":
+        guess += math.inf
+    elif kind == "inverted":
+        guess += problem.points * torch.tensor([-1.5, 0, 0], dtype=torch.float64)
+    else:
+        guess += 1e200 * torch.sin(1e3 * problem.points)
+    *_, again = newton(problem).iterate(load, guess=guess)
+    for field, value in zip(Solution._fields, answer, strict=True):
+        assert torch.equal(getattr(again, field), value), field
+
+
+def test_useless_but_uninverted_guess_still_ends_at_the_answer(wrong):
+    problem, load, answer = wrong
+    random = torch.Generator().manual_seed(0)
+    noise = 5e-3 * torch.randn(load.force.shape, generator=random, dtype=torch.float64)
+    assert problem.volume_ratio(noise).item() > 0
+    for guess in (noise, -answer.displacement, 0.5 * answer.displacement):
+        *_, end = newton(problem).iterate(load, guess=guess)
+        assert end.converged.all()
+        assert_close(end.displacement, answer.displacement, rtol=0, atol=1e-8)
+
+
+def test_exact_guess_costs_nothing(wrong, monkeypatch):
+    """VERIFICATION 2.3: 0 assemblies, 0 factorisations."""
+    problem, load, answer = wrong
+    monkeypatch.setattr(SuperLU, "factorise", None)
+    monkeypatch.setattr(Problem, "tangent", None)
+    states = list(newton(problem).iterate(load, guess=answer.displacement))
+    assert len(states) == 1
+    assert states[0].converged.all()
+    assert states[0].iterations.item() == states[0].factorisations.item() == 0
+    assert torch.equal(states[0].displacement, answer.displacement)
+
+
+def test_close_guess_saves_iterations(wrong):
+    problem, load, answer = wrong
+    *_, end = newton(problem).iterate(load, guess=1.0001 * answer.displacement)
+    assert end.converged.all()
+    assert 0 < end.iterations.item() < answer.iterations.item()
+
+
+def test_guess_of_the_held_nodes_is_not_believed(wrong):
+    problem, load, answer = wrong
+    guess = answer.displacement + torch.where(problem.free, 0.0, 0.1)
+    *_, end = newton(problem).iterate(load, guess=guess)
+    assert end.iterations.item() == 0
+    assert not end.displacement[:, ~problem.free].any()
+
+
+def test_members_use_their_own_guess(law, beam, pull):
+    problem = beam(law, 4, 1)
+    load = load_of(torch.cat([pull(problem, q) for q in (5.0, 20.0, 40.0)]))
+    answer = solve(newton(problem), load)
+    guess = answer.displacement.clone()
+    guess[1] = math.nan
+    *_, end = newton(problem).iterate(load, guess=guess)
+    assert end.converged.all()
+    assert end.iterations.tolist() == [0, answer.iterations[1].item(), 0]
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        *({name: value} for name in ("tol", "loose", "keep", "smallest_step") for value in (0, 1)),
+        *({"tol": -1e-8}, {"tol": math.nan}, {"max_iter": 0}, {"max_iter": -3}),
+    ],
+    ids=str,
+)
+def test_option_out_of_range_is_an_error_that_names_it(beam, option):
+    with pytest.raises(ValueError, match=next(iter(option))):
+        Newton(beam(NH, 4, 1), **option)
+
+
+def test_unknown_backend_is_an_error(beam, pull):
+    problem = beam(NH, 4, 1)
+    with pytest.raises(ValueError, match="backend"):
+        solve(newton(problem, linear="umfpack"), load_of(pull(problem, 1.0)))
+
+
+@pytest.fixture
+def counted(monkeypatch) -> list[int]:
+    """A list that grows by one with each factorisation."""
+    calls, factorise = [], SuperLU.factorise
+
+    def count(self, values):
+        calls.append(len(values))
+        return factorise(self, values)
+
+    monkeypatch.setattr(SuperLU, "factorise", count)
+    return calls
+
+
+def test_rest_state_is_factorised_once_for_all_loads(law, beam, pull, counted):
+    """VERIFICATION 2.3; the factor of the rest state is the scene's, not the load's."""
+    problem = beam(law)
+    solver, load = newton(problem), load_of(pull(problem, 20.0))
+    first = solve(solver, load)
+    assert first.factorisations.item() == first.iterations.item() - 1
+    assert len(counted) == first.iterations.item()
+    counted.clear()
+    second = solve(solver, load)
+    assert len(counted) == second.factorisations.item() == first.factorisations.item()
+    assert torch.equal(first.displacement, second.displacement)
+
+
+def test_load_whose_linear_answer_will_do_costs_no_factorisation(law, beam, pull, counted):
+    problem = beam(law)
+    solver = newton(problem)
+    for q in (1e-10, 2e-10, 3e-10):
+        answer = solve(solver, load_of(pull(problem, q)))
+        assert answer.converged.all()
+        assert answer.iterations.item() == 1
+        assert answer.factorisations.item() == 0
+    assert len(counted) == 1  # the rest state
+
+
+def test_linear_answer_is_the_first_iterate(law, beam, pull):
+    problem = beam(law)
+    load = load_of(pull(problem, 5.0))
+    states = list(newton(problem).iterate(load))
+    linear = solve(Linear(problem, linear="superlu"), load)
+    assert torch.equal(linear.displacement, states[1].displacement)
+    assert torch.equal(linear.residual, states[1].residual)
+    assert not linear.converged.any()
+    assert linear.iterations.item() == 1
+
+
+def test_backends_give_the_same_answer(law, beam, pull):
+    if len(installed()) < 2:
+        pytest.skip("one backend alone")
+    problem = beam(law)
+    load = load_of(pull(problem, 20.0))
+    first, second = (solve(newton(problem, linear=name), load) for name in installed())
+    assert first.iterations.item() == second.iterations.item()
+    assert_close(first.displacement, second.displacement, rtol=0, atol=1e-9)
+
+
+def test_solver_without_pardiso_solves_the_same(beam, pull, monkeypatch):
+    problem = beam(NH, 4, 1)
+    load = load_of(pull(problem, 20.0))
+    expected = solve(newton(problem), load)
+    monkeypatch.setattr("dpl.fem.linear.installed", lambda: ["superlu"])
+    assert torch.equal(solve(Newton(problem), load).displacement, expected.displacement)
+
+
+@pytest.mark.parametrize("kind", [Newton, Linear])
+def test_pickled_solver_answers_the_same(beam, pull, kind):
+    problem = beam(NH, 4, 1)
+    load = load_of(pull(problem, 5.0))
+    solver = kind(problem, tol=1e-9, linear="superlu")
+    answer = solve(solver, load)
+    copy = pickle.loads(pickle.dumps(solver))  # after factors have been made
+    assert copy.tol == 1e-9
+    assert torch.equal(solve(copy, load).displacement, answer.displacement)
+
+
+def test_moved_supports_pull_the_body_along(law):
+    """A bar stretched by its ends has the lateral stretch of VERIFICATION 1.2 at 1.5."""
+    mesh = box([1.0, 1.0, 1.0], [3, 3, 3])
+    held = mesh.p.T == 0
+    held[:, 0] |= mesh.p[0] == 1
+    given = np.where(mesh.p[0] == 1, 0.5, 0.0)[:, None] * np.array([1, 0, 0])
+    problem = Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0)
+    none = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    answer = solve(newton(problem, tol=1e-12), load_of(none))
+    assert answer.converged.all()
+    assert answer.load_factor.item() == 1
+    far = problem.points.sum(dim=1).argmax()
+    lateral = {SaintVenantKirchhoff: 0.79056942, NeoHookean: 0.88017459}[type(law)]
+    end = 1 + answer.displacement[0, far]
+    assert end.tolist() == pytest.approx([1.5, lateral, lateral], abs=6e-9)
+
+
+def test_judge_believes_nothing(law, beam, pull):
+    problem = beam(law, 4, 1)
+    load = load_of(torch.cat([pull(problem, 20.0)] * 3))
+    claims = torch.zeros_like(load.force)
+    claims[1] = solve(newton(problem), load_of(load.force[:1])).displacement[0]
+    claims[2] = math.nan
+    verdict = judge(problem, claims, load, 1e-8, iterations=3)
+    assert verdict.converged.tolist() == [False, True, False]
+    assert verdict.load_factor.tolist() == [0, 1, 0]
+    assert verdict.iterations.tolist() == [3, 3, 3]
+    assert verdict.residual[0].item() == pytest.approx(1.0, rel=1e-14)
+    assert verdict.volume_ratio[2].item() == -math.inf
