@@ -3,6 +3,7 @@
 The only file of the package that knows Hydra.
 """
 
+import contextlib
 import functools
 import importlib
 import inspect
@@ -17,9 +18,10 @@ from typing import Any
 
 import hydra
 import torch
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from dpl.data.store import DataSetError
 from dpl.scene import Scene
@@ -28,6 +30,12 @@ if typing.TYPE_CHECKING:
     from dpl.module import Surrogate
 
 TRUSTED = ("dpl.", "torch.optim.", "lightning.")  # what a run's folder may name without being asked
+
+KEYS = {  # what a configuration may hold at its top
+    *("mesh", "degree", "clamped", "material", "young", "loads", "solver"),
+    *("data", "model", "loss", "optimizer", "scheduler", "trainer"),
+    *("seed", "ckpt_path", "run", "folder", "tol"),
+}
 
 
 class ConfigError(ValueError):
@@ -44,12 +52,19 @@ def command(task: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
             task(cfg)
         except (ConfigError, DataSetError) as error:
             print(f"error: {error}", file=sys.stderr)
+            _drop_empty(Path(HydraConfig.get().runtime.output_dir))
             sys.exit(2)
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)
             sys.exit(130)
 
     return wrapped
+
+
+def _drop_empty(folder: Path) -> None:
+    """Remove the folder that Hydra made for a run that did not begin."""
+    with contextlib.suppress(OSError):  # not empty, or the current one
+        folder.rmdir()
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -62,6 +77,8 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
         return typing.cast(
             "dict[str, Any]", OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
         )
+    except MissingMandatoryValue as error:
+        raise ConfigError(f"{error.full_key} is missing; set it on the command line") from None
     except OmegaConfBaseException as error:
         raise ConfigError(f"{error.full_key or 'config'}: {error.msg or error}") from None
 
@@ -77,6 +94,8 @@ def check(cfg: DictConfig, *, trust: bool = True) -> None:
         ConfigError: A key that its object does not know, a value of another type, a number that is
             not finite, or an object that does not exist or is not trusted.
     """
+    if unknown := sorted(set(plain(cfg)) - KEYS):
+        raise ConfigError(f"{unknown[0]}: no such key; there are {', '.join(sorted(KEYS))}")
     for path, value in _leaves(plain(cfg), ""):
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{path} = {value} is not a finite number")
@@ -93,29 +112,33 @@ def check(cfg: DictConfig, *, trust: bool = True) -> None:
 
 
 def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> None:
-    function = target.__init__ if inspect.isclass(target) else target  # type: ignore[misc]
-    parameters = inspect.signature(target).parameters
-    if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
-        parents = target.__mro__[1:] if inspect.isclass(target) else ()
-        known = set(parameters) | {
-            n for c in parents for n in inspect.signature(c.__init__).parameters
-        }
-    else:
-        known = set(parameters)
-    try:
-        hints = typing.get_type_hints(function)
-    except (NameError, TypeError):
-        hints = {}
+    known, hints = _signature(target)
     for key, value in node.items():
         if key.startswith("_") and key.endswith("_"):
             continue
         if key not in known:
-            named = ", ".join(sorted(known - {"self", "kwargs", "args"}))
+            named = ", ".join(sorted(known))
             raise ConfigError(
                 f"{path}.{key}: {node['_target_']} has no such option; it has {named}"
             )
         if key in hints and not _fits(value, hints[key]):
             raise ConfigError(f"{path}.{key} = {value!r} must be {_words(hints[key])}")
+
+
+def _signature(target: Callable[..., Any]) -> tuple[set[str], dict[str, Any]]:
+    """Return the keywords of a call and their types; **kwargs stand for those of the parents."""
+    classes = inspect.getmro(target) if inspect.isclass(target) else ()
+    levels = [vars(c)["__init__"] for c in classes if "__init__" in vars(c)]
+    known: set[str] = set()
+    hints: dict[str, Any] = {}
+    for level in levels or [target]:
+        parameters = inspect.signature(level).parameters
+        known |= set(parameters)
+        with contextlib.suppress(NameError, TypeError):
+            hints = typing.get_type_hints(level) | hints
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+            break
+    return known - {"self", "args", "kwargs"}, hints
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -201,10 +224,12 @@ def build_scene(cfg: DictConfig) -> Scene:
     from dpl.fem.problem import Problem
 
     material, mesh, clamped = make(cfg, "material"), make(cfg, "mesh"), make(cfg, "clamped")
+    if cfg.degree not in (1, 2):
+        raise ConfigError(f"degree = {cfg.degree} must be 1 or 2")
     try:
         problem = Problem.build(mesh, material, fixed=clamped, degree=cfg.degree)
     except ValueError as error:
-        raise ConfigError(f"clamped, degree or mesh: {error}") from error
+        raise ConfigError(f"clamped: {error}") from error
     if loose := problem.loose_modes():
         raise ConfigError(
             f"clamped: {len(loose)} rigid modes are unconstrained: {', '.join(loose)}"

@@ -59,13 +59,12 @@ class Material:
         hessian = torch.func.vmap(torch.func.hessian(self.energy))
         return hessian(H.reshape(-1, 3, 3)).reshape(*H.shape, 3, 3)
 
-
     def second_stress(self, E: Tensor) -> Tensor:
-        """Return the second Piola-Kirchhoff stress S over E_Young, (..., 3, 3) [-], of strains E."""
+        """Return the second Piola-Kirchhoff stress S, (..., 3, 3) [-], of strains (..., 3, 3)."""
         raise NotImplementedError(f"{type(self).__name__} has no stress as a function of strain")
 
     def second_tangent(self, E: Tensor) -> Tensor:
-        """Return dS/dE over E_Young, (..., 3, 3, 3, 3) [-], of Green-Lagrange strains E."""
+        """Return dS/dE, (..., 3, 3, 3, 3) [-], of Green-Lagrange strains."""
         raise NotImplementedError(f"{type(self).__name__} has no stress as a function of strain")
 
     @property
@@ -144,7 +143,6 @@ class NeoHookean(Material):
         A = torch.einsum("...il,...kj->...ijkl", shear * G, G)
         A += self.lam * torch.einsum("...ij,...kl->...ijkl", G, G)
         return A + self.mu * torch.einsum("ik,jl->ijkl", eye, eye)
-
 
     def second_stress(self, E: Tensor) -> Tensor:
         """Return S = (2 mu E + lambda ln J I) C^-1, C = I + 2 E, see `Material.second_stress`."""

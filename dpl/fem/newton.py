@@ -71,6 +71,8 @@ class Newton:
         loose: Residual ratio at intermediate load factors [-].
         keep: Part of det F that one step may leave of the smallest one [-].
         linear: Backend of the sparse solves, see `dpl.fem.linear.backend`.
+        mixed: Let the strains at the quadrature points be unknowns of their own (Magisano,
+            Leonetti, Garcea 2017), for laws that can: fewer iterations, far larger steps.
     """
 
     problem: Problem
@@ -143,7 +145,6 @@ class Newton:
         self, state: "_State", force: Tensor, tol: float, count: "_Count"
     ) -> Iterator["_State"]:
         """Yield iterates under a fixed load until they balance it or cannot go on."""
-        problem = self.problem
         for _ in range(self.max_iter):
             try:
                 update = self._update(state, force, count)
@@ -182,7 +183,7 @@ class Newton:
 
     def _moved_strain(self, state: "_State", length: float, update: Tensor) -> Tensor | None:
         """Return the strain that mixed points take with a step; None: plain Newton goes on."""
-        if not self.mixed:
+        if not (self.mixed and self.problem.material.has_second_stress):
             return None
         u = state.displacement
         here = self.problem.strain(u)

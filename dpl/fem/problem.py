@@ -124,7 +124,7 @@ class Problem:
         else:
             where = fixed(points * length) if callable(fixed) else np.asarray(fixed)
             if not where.any():
-                raise ValueError(f"the fixed region {fixed} holds no node of the mesh")
+                raise ValueError(f"{fixed} holds no node of the mesh")
             held = np.broadcast_to(where[:, None] if where.ndim == 1 else where, (nodes, dim))
         gradients = np.stack([b[0].grad for b in basis.basis])  # (A, D, E, Q)
         dN, dV = gradients.transpose(2, 3, 0, 1), basis.dx
