@@ -30,20 +30,19 @@ matplotlib.use("Agg")
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
-TINY = [
-    "mesh.nodes=[5,3,3]",
-    "loads.n_modes=3",
-    "+solver.linear=superlu",
-    "data.val=4",
-    "data.test=4",
-]  # of the scripts: 135 degrees of freedom
-TRAIN = [
-    "data.train=16",
-    "data.batch_size=8",
-    "data.workers=0",
-    "trainer.check_val_every_n_epoch=1",
-    "trainer.callbacks.3.every=1000",
-]
+
+
+@pytest.fixture(scope="session")
+def tiny() -> list[str]:
+    """Overrides that make the tiny scene of any command."""
+    return ["mesh.nodes=[5,3,3]", "loads.n_modes=3", "+solver.linear=superlu"]
+
+
+@pytest.fixture(scope="session")
+def tiny_training(tiny) -> list[str]:
+    """Overrides that make a short training run, without worker processes."""
+    data = ["data.train=16", "data.val=4", "data.test=4", "data.batch_size=8", "data.workers=0"]
+    return [*tiny, *data, "trainer.check_val_every_n_epoch=1", "model.width=16"]
 
 
 def _tiny(
@@ -91,26 +90,22 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def _solved(scene, folder) -> Path:
-    OfflineData(
-        scene, folder=str(folder), train=12, val=4, test=4, workers=0
-    ).prepare_data()
+    OfflineData(scene, folder=str(folder), train=12, val=4, test=4, workers=0).prepare_data()
     return folder
 
 
 @pytest.fixture
 def data(scene, _solved) -> OfflineData:
     """The tiny data set: 12, 4 and 4 loads, all solved."""
-    return OfflineData(
-        scene, folder=str(_solved), train=12, val=4, test=4, batch_size=4, workers=0
-    )
+    return OfflineData(scene, folder=str(_solved), train=12, val=4, test=4, batch_size=4, workers=0)
 
 
 @pytest.fixture(scope="session")
 def batch(scene, _solved) -> Sample:
     """Twelve solved loads."""
-    return OfflineData(
-        scene, folder=str(_solved), train=12, val=4, test=4, workers=0
-    ).samples("train")
+    return OfflineData(scene, folder=str(_solved), train=12, val=4, test=4, workers=0).samples(
+        "train"
+    )
 
 
 @pytest.fixture
@@ -139,43 +134,27 @@ def scene_of(compose) -> Callable[..., Scene]:
     return scene_of
 
 
-def _environment() -> dict[str, str]:
-    one = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+@pytest.fixture(scope="session")
+def environment() -> Callable[..., dict[str, str]]:
+    """Environments of processes that can import `dpl` and use so many threads."""
+    return _environment
+
+
+def _environment(threads: int = 1) -> dict[str, str]:
+    one = dict.fromkeys(
+        ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads)
+    )
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     return {**os.environ, **one, "PYTHONPATH": path, "MPLBACKEND": "Agg", "COLUMNS": "200"}
 
 
-def _start(script: str, *arguments: str, cwd: Path) -> subprocess.Popen:
-    return subprocess.Popen(
-        [sys.executable, str(ROOT / "scripts" / f"{script}.py"), *arguments],
-        cwd=cwd,
-        env=_environment(),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+@pytest.fixture(scope="session")
+def members() -> Callable[[int], list[int]]:
+    """Lists the living processes of a process group."""
+    return _members
 
 
-@pytest.fixture
-def start(tmp_path) -> Iterator[Callable[..., subprocess.Popen]]:
-    """Starts a script in a process group of its own; what is left of it is killed in the end."""
-    started: list[subprocess.Popen] = []
-
-    def start(script: str, *arguments: str, cwd: Path = tmp_path) -> subprocess.Popen:
-        started.append(_start(script, *arguments, cwd=cwd))
-        return started[-1]
-
-    yield start
-    for process in started:
-        for pid in members(process.pid):
-            os.kill(pid, signal.SIGKILL)
-        process.communicate()
-
-
-def members(group: int) -> list[int]:
-    """Return the living processes of a process group."""
+def _members(group: int) -> list[int]:
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -185,6 +164,32 @@ def members(group: int) -> list[int]:
         if int(fields[2]) == group and fields[0] != "Z":
             found.append(int(stat.parent.name))
     return found
+
+
+@pytest.fixture(scope="session")
+def start() -> Iterator[Callable[..., subprocess.Popen]]:
+    """Starts a script in a process group of its own; what is left of it is killed in the end."""
+    started: list[subprocess.Popen] = []
+
+    def start(script: str, *arguments: str, cwd: Path) -> subprocess.Popen:
+        process = subprocess.Popen(
+            [sys.executable, str(ROOT / "scripts" / f"{script}.py"), *arguments],
+            cwd=cwd,
+            env=_environment(),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        for pid in _members(process.pid):
+            os.kill(pid, signal.SIGKILL)
+        process.communicate()
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ The symbolic work (ordering, structure) is done once per backend object, the num
 """
 
 import importlib.util
+import os
 import weakref
 from dataclasses import dataclass
 from functools import cached_property
@@ -175,9 +176,13 @@ class Pardiso:
             from pypardiso import PyPardisoSolver
 
             self._solver = PyPardisoSolver(mtype=-2)
+            # Found by a search through the whole environment, a second or more: once is enough.
+            os.environ.setdefault("PYPARDISO_MKL_RT", self._solver.libmkl._name)
             weakref.finalize(self, self._solver.free_memory, everything=True)
             self._call(11, matrix, np.zeros(pattern.size))
         self._call(22, matrix, np.zeros(pattern.size))
+        if self._solver.get_iparm(14):  # MKL replaces pivots it cannot use and says nothing
+            raise SingularMatrix(f"{self._solver.get_iparm(14)} pivots are zero to rounding")
         return PardisoFactor(self, matrix, int(self._solver.get_iparm(23)))
 
     def _call(self, phase: int, matrix: csr_array, right: Array) -> Array:

@@ -127,12 +127,18 @@ class NeoHookean(Material):
         return self.mu / 2 * (I1_minus_3 - 2 * log_J) + self.lam / 2 * log_J.square()
 
     def stress(self, H: Tensor) -> Tensor:
-        """Return P = (mu (F F^T - I) + lambda ln J I) F^-T, see `Material.stress`."""
-        change = volume_change(H)
+        """Return P = mu (F - F^-T) + lambda ln J F^-T, see `Material.stress`.
+
+        With F^-T = I - X / J and X = H^T + (J - 1 - tr H) I - cof H, so that nothing cancels for
+        small H.
+        """
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        kirchhoff = self.mu * (H + H.mT + H @ H.mT)
-        kirchhoff = kirchhoff + self.lam * torch.log1p(change)[..., None, None] * eye
-        return kirchhoff @ inverse_transpose(H, change)
+        cof, rest = cofactor(H)
+        change = trace(H) + rest
+        pressure = self.lam * torch.log1p(change)
+        X = H.mT - cof + rest[..., None, None] * eye
+        shear = (self.mu - pressure) / (1 + change)
+        return self.mu * H + shear[..., None, None] * X + pressure[..., None, None] * eye
 
     def tangent(self, H: Tensor) -> Tensor:
         """Return dP/dF, see `Material.tangent`."""
@@ -179,20 +185,26 @@ def volume_change(H: Tensor) -> Tensor:
 
     From the invariants of H and not by `torch.linalg.det`: its second derivative at F = I is NaN.
     """
-    a, b, c = H.unbind(-2)
-    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = a.unbind(-1), b.unbind(-1), c.unbind(-1)
-    second = ax * by - ay * bx + by * cz - bz * cy + ax * cz - az * cx
-    third = ax * (by * cz - bz * cy) - ay * (bx * cz - bz * cx) + az * (bx * cy - by * cx)
-    return ax + by + cz + second + third
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in H.unbind(-2))
+    third = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    return a + e + i + (a * e - b * d + e * i - f * h + a * i - c * g) + third
+
+
+def cofactor(H: Tensor) -> tuple[Tensor, Tensor]:
+    """Return cof H, (..., 3, 3), and det(I + H) - 1 - tr H, (...,) [-]."""
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in H.unbind(-2))
+    entries = [
+        *(e * i - f * h, f * g - d * i, d * h - e * g),
+        *(c * h - b * i, a * i - c * g, b * g - a * h),
+        *(b * f - c * e, c * d - a * f, a * e - b * d),
+    ]
+    # components first in memory, as `Problem` lays H out: elementwise work then runs along rows
+    cof = torch.stack(entries).unflatten(0, (3, 3)).movedim((0, 1), (-2, -1))
+    determinant = a * entries[0] + b * entries[1] + c * entries[2]
+    return cof, entries[0] + entries[4] + entries[8] + determinant
 
 
 def inverse_transpose(H: Tensor, change: Tensor) -> Tensor:
     """Return F^-T, (..., 3, 3) [-], of F = I + H with det F = 1 + change."""
-    a, b, c = (H + torch.eye(3, dtype=H.dtype, device=H.device)).unbind(-2)
-    cofactor = torch.stack([_cross(b, c), _cross(c, a), _cross(a, b)], dim=-2)
-    return cofactor / (1 + change)[..., None, None]
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
-    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=-1)
+    F = H + torch.eye(3, dtype=H.dtype, device=H.device)
+    return cofactor(F)[0] / (1 + change)[..., None, None]

@@ -97,10 +97,13 @@ def load(path: str | Path) -> skfem.Mesh:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such mesh file")
+    if path.suffix == ".vtu" and path.read_bytes().count(b"<Piece") > 1:
+        raise ValueError(f"{path}: holds several pieces, of which meshio keeps one; join them")
     try:
         raw = meshio.read(path)
     except (Exception, SystemExit) as error:  # meshio calls sys.exit on files it cannot read
-        reason = str(error).strip() or "meshio does not know this format"
+        known = isinstance(error, Exception) and str(error).strip()
+        reason = known or "meshio does not know this format"
         raise ValueError(f"{path}: cannot be read as a mesh: {reason}") from error
     try:
         return check(_solid(raw))
@@ -144,18 +147,22 @@ def check(mesh: skfem.Mesh) -> skfem.Mesh:
         ValueError: Inverted or flat cells, nodes in one place, or a body in several pieces.
     """
     vertices = mesh.p[:, : mesh.t.max() + 1]
-    volume = skfem.Basis(mesh, mesh.elem(), intorder=2).mapping.detDF(
-        skfem.quadrature.get_quadrature(mesh.elem.refdom, 2)[0]
-    )
+    X = skfem.quadrature.get_quadrature(mesh.elem.refdom, 2 * mesh.elem.maxdeg)[0]
+    # The sign tells only in which order nodes are listed. No detDF: it raises where it is zero.
+    volume = np.linalg.det(mesh.mapping().DF(X).transpose(2, 3, 0, 1))  # (E, Q)
+    volume = volume * np.sign(np.median(volume, axis=1, keepdims=True))
     diameter = np.ptp(vertices, axis=1).max()
-    for flaw, where in (
-        ("inverted", volume.min(axis=1) < 0),
-        ("of no volume", volume.min(axis=1) <= 1e-14 * diameter ** mesh.dim()),
-    ):
+    smallest, nothing = volume.min(axis=1), 1e-14 * diameter ** mesh.dim()
+    for flaw, where in (("inverted", smallest < -nothing), ("of no volume", smallest <= nothing)):
         bad = np.flatnonzero(where)
         if len(bad):
             named = ", ".join(map(str, bad[:5])) + (", ..." if len(bad) > 5 else "")
             raise ValueError(f"{len(bad)} cells are {flaw}: {named}")
+    boundary = skfem.FacetBasis(mesh, mesh.elem(), intorder=6)
+    flux = (boundary.normals * boundary.global_coordinates()).sum(axis=0) * boundary.dx
+    body = skfem.Basis(mesh, mesh.elem(), intorder=6).dx.sum()
+    if abs(flux.sum() / mesh.dim() - body) > 1e-9 * body:
+        raise ValueError("cells overlap: some are inverted or listed twice")
     rounded = np.round(vertices / (1e-9 * diameter)).T
     twins = len(rounded) - len(np.unique(rounded, axis=0))
     if twins:
@@ -239,7 +246,7 @@ class Box:
 def save(path: Path, mesh: skfem.Mesh, fields: Mapping[str, NDArray[np.float64]]) -> None:
     """Write a mesh with fields at its vertices, (N,) or (N, D), in any format of meshio."""
     flat = to_meshio(mesh)
-    vertices = mesh.nvertices
+    vertices = mesh.p.shape[1]
     points = np.pad(flat.points, ((0, 0), (0, 3 - flat.points.shape[1])))
     data = {
         name: np.pad(field[:vertices], ((0, 0), (0, 3 - field.shape[1])))

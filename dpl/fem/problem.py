@@ -357,8 +357,10 @@ class Problem:
     def _gradient(self, displacement: Tensor) -> Tensor:
         """Return H = du/dX, (B, E, Q, 3, 3) [-]; in 2D with zeros out of the plane."""
         dim = displacement.shape[-1]
-        at_cells = displacement[:, self.cells]  # (B, E, A, D)
-        gradient = (at_cells.mT @ self._operator).unflatten(-1, (-1, dim)).transpose(-3, -2)
+        at_cells = displacement[:, self.cells].mT  # (B, E, D, A)
+        gradient = (at_cells @ self._operator).unflatten(-1, (-1, dim))  # (B, E, D, Q, D)
+        # components first in memory: laws work on long rows, several times faster than on 3 x 3
+        gradient = gradient.permute(2, 4, 0, 1, 3).contiguous().permute(2, 3, 4, 0, 1)
         return gradient if dim == 3 else torch.nn.functional.pad(gradient, (0, 1, 0, 1))
 
 

@@ -24,7 +24,7 @@ def body_force(problem: Problem, density: Field) -> Tensor:
         density: Force density times L/E [-] at dimensionless points; (D, ...) to (D, ...).
     """
     basis = problem.basis
-    values = density(basis.global_coordinates().value)  # (D, E, Q)
+    values = density(basis.global_coordinates())  # (D, E, Q)
     return _tested(problem, basis, values)
 
 
@@ -46,7 +46,7 @@ def traction(problem: Problem, region: Field, stress: Field) -> Tensor:
     if not len(facets):
         raise ValueError("the region of a traction holds no boundary facet")
     basis = skfem.FacetBasis(mesh, problem.basis.elem, facets=facets, intorder=4)
-    return _tested(problem, basis, stress(basis.global_coordinates().value))
+    return _tested(problem, basis, stress(basis.global_coordinates()))
 
 
 def _tested(problem: Problem, basis: skfem.Basis, values: NDArray[np.float64]) -> Tensor:

@@ -3,6 +3,8 @@
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -116,7 +118,9 @@ def test_a_crew_closed_early_leaves_no_process_and_one_worker_finds_the_same_byt
 def test_a_load_that_kills_every_worker_is_given_up_with_a_reason(make_scene, here, monkeypatch):
     monkeypatch.setattr(generate, "TRIES", 2)
     scene = make_scene(distribution=dies_at_one)
-    found = {one.job.number: one for one in outcomes(scene, [Job(SEED, 1), Job(SEED, 0)], workers=1)}
+    found = {
+        one.job.number: one for one in outcomes(scene, [Job(SEED, 1), Job(SEED, 0)], workers=1)
+    }
     assert content(found[0]) == here[0]
     lost = found[1]
     assert not lost.accepted
@@ -127,7 +131,7 @@ def test_a_load_that_kills_every_worker_is_given_up_with_a_reason(make_scene, he
 
 
 def test_workers_that_all_die_end_the_run(make_scene, monkeypatch, capfd):
-    monkeypatch.setattr(generate, "HOPELESS", 2)
+    monkeypatch.setattr(generate, "HOPELESS", 1)
     scene = make_scene()
     scene.loads.modes  # noqa: B018 - found before the draws start to fail
     object.__setattr__(scene.loads, "distribution", raises)
@@ -170,3 +174,34 @@ def test_a_load_without_an_answer_is_rejected_with_the_part_that_has_one(make_sc
         if one.load_factor:
             assert scene.problem.residual_ratio(displacement, part) < scene.solver.loose
             assert scene.problem.volume_ratio(displacement) > 0
+
+
+def test_a_change_of_the_number_of_threads_between_loads_is_survived(tmp_path, environment):
+    """PARDISO reads past its plan where threads are limited between analysis and factorisation."""
+    pytest.importorskip("pypardiso")
+    code = """
+import torch
+from threadpoolctl import threadpool_limits
+from dpl.data.generate import Job, outcome
+from dpl.fem.materials import NeoHookean
+from dpl.fem.mesh import Plane, box
+from dpl.fem.modes import ModalLoads
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.scene import Scene
+
+torch.set_num_threads(2)
+mesh = box([4.0, 1.0, 1.0], [17, 5, 5])
+newton = Newton(Problem.build(mesh, NeoHookean(0.3), fixed=Plane(0, "min")), linear="pardiso")
+scene = Scene(newton.problem, ModalLoads(newton.rest, n_modes=3, deflection=0.01), newton)
+outcome(scene, Job((0, 0), 0))
+with threadpool_limits(1):
+    assert outcome(scene, Job((0, 0), 1)).accepted
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=environment(threads=2),
+        capture_output=True,
+    )
+    assert ended.returncode == 0, ended.stderr.decode()[-500:] or f"signal {-ended.returncode}"

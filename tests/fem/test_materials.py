@@ -8,7 +8,13 @@ from scipy.optimize import brentq
 from torch import Tensor
 from torch.testing import assert_close
 
-from dpl.fem.materials import Material, NeoHookean, SaintVenantKirchhoff, volume_change
+from dpl.fem.materials import (
+    Material,
+    NeoHookean,
+    SaintVenantKirchhoff,
+    green_lagrange,
+    volume_change,
+)
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookean(0.3)
 EYE = torch.eye(3, dtype=torch.float64)
@@ -329,6 +335,36 @@ def test_neo_hookean_is_infinite_at_zero_volume_and_undefined_below():
     flat = torch.diag(torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64))
     assert NH.energy(flat) == math.inf
     assert NH.energy(2 * flat).isnan()
+
+
+def test_second_stress_is_the_first_pulled_back(law, gradients):
+    """S = F^-1 P, as a function of the Green-Lagrange strain alone."""
+    S = law.second_stress(green_lagrange(gradients))
+    assert_close((EYE + gradients) @ S, law.stress(gradients), rtol=1e-11, atol=1e-13)
+    assert_close(S, S.mT, rtol=1e-12, atol=1e-13)
+
+
+def test_second_tangent_is_the_slope_of_the_second_stress(law, gradients):
+    """For symmetric changes of strain."""
+    E, change = green_lagrange(gradients), green_lagrange(gradients.flip(0))
+    slope = torch.func.jvp(law.second_stress, (E,), (change,))[1]
+    product = torch.einsum("nijkl,nkl->nij", law.second_tangent(E), change)
+    assert_close(product, slope, rtol=1e-11, atol=1e-13)
+
+
+def test_second_tangent_has_all_symmetries(law, gradients):
+    D = law.second_tangent(green_lagrange(gradients))
+    for order in ((0, 2, 1, 3, 4), (0, 1, 2, 4, 3), (0, 3, 4, 1, 2)):
+        assert_close(D, D.permute(order), rtol=1e-12, atol=1e-13)
+
+
+def test_law_without_second_stress_says_so():
+    assert SVK.has_second_stress
+    assert NH.has_second_stress
+    assert not Material(0.3).has_second_stress
+    for method in (Material(0.3).second_stress, Material(0.3).second_tangent):
+        with pytest.raises(NotImplementedError, match="Material"):
+            method(EYE)
 
 
 def test_law_without_energy_says_so():

@@ -1,0 +1,294 @@
+"""Patch tests, orders of accuracy and stored fields: answers against theory and other codes."""
+
+import math
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import skfem
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.testing import assert_close
+
+from dpl.fem.materials import Material, NeoHookean, SaintVenantKirchhoff
+from dpl.fem.mesh import Plane, box
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, Solution, solve
+from dpl.fem.supports import body_force, traction
+
+FIELDS = Path(__file__).parents[3] / "shared" / "reference" / "fields"
+SVK, NH = SaintVenantKirchhoff(0.25), NeoHookean(0.25)
+
+# VERIFICATION 1.6, MacNeal and Harder (1985): a cube in a cube
+OUTER = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
+INNER = [
+    *([0.249, 0.342, 0.192], [0.826, 0.288, 0.288], [0.850, 0.649, 0.263], [0.273, 0.750, 0.230]),
+    *([0.320, 0.186, 0.643], [0.677, 0.305, 0.683], [0.788, 0.693, 0.644], [0.165, 0.745, 0.702]),
+]
+FACES = [(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
+VOLUMES = [
+    *(0.0985582675, 0.1369742575, 0.1894968033, 0.1527662996),
+    *(0.1701827558, 0.1418706427, 0.1101509738),
+]
+LOCAL = [0, 4, 3, 1, 7, 5, 2, 6]  # scikit-fem's order of the corners OUTER
+# VERIFICATION 1.4, general F, and 1.6a
+GENERAL = [[0.2, 0.2, -0.1], [0.05, -0.05, 0.15], [-0.08, 0.12, 0.1]]
+SMALL = [[1e-3, 5e-4, 5e-4], [5e-4, 1e-3, 5e-4], [5e-4, 5e-4, 1e-3]]
+
+
+def cube_in_cube() -> skfem.MeshHex:
+    """Return the patch of seven hexahedra: the inner one and one on each of its faces."""
+    cells = [[8 + k for k in range(8)]] + [[*face, *(8 + k for k in face)] for face in FACES]
+    points = np.array(OUTER + INNER, dtype=float)
+    return skfem.MeshHex(points.T.copy(), np.array(cells)[:, LOCAL].T.copy())
+
+
+def stretched(mesh: skfem.Mesh, law: Material, H: list[list[float]], degree: int) -> Problem:
+    """Return the body whose boundary nodes are moved by H X."""
+    bare = Problem.build(mesh, law, degree=degree, length=1.0)
+    given = bare.points.numpy() @ np.array(H).T
+    return Problem.build(
+        mesh, law, fixed=bare.boundary.numpy(), prescribed=given, degree=degree, length=1.0
+    )
+
+
+def at_rest(problem: Problem, tol: float = 1e-12) -> Solution:
+    """Return the answer under no load but that of the supports."""
+    none = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    return solve(Newton(problem, tol=tol, linear="superlu"), Load(none, torch.ones(1)))
+
+
+def isotropic(normal: float, shear: float) -> Tensor:
+    """Return the tensor (3, 3) with equal entries on the diagonal and equal ones off it."""
+    eye = torch.eye(3, dtype=torch.float64)
+    return normal * eye + shear * (1 - eye)
+
+
+def test_patch_of_macneal_and_harder_has_the_printed_volumes():
+    """VERIFICATION 1.6."""
+    problem = Problem.build(cube_in_cube(), NH, length=1.0)
+    volumes = problem.dV.sum(dim=1).numpy()
+    assert np.sort(volumes) == pytest.approx(np.sort(VOLUMES), abs=1e-10)
+    assert volumes.sum() == pytest.approx(1.0, rel=1e-14)
+    assert problem.boundary.sum() == 8
+
+
+@pytest.mark.parametrize("material", [SaintVenantKirchhoff, NeoHookean])
+def test_linear_patch_has_the_printed_stress(material):
+    """VERIFICATION 1.6a: the linear field balances; stress 2000 and 400 at E = 1e6."""
+    problem = stretched(cube_in_cube(), material(0.25), SMALL, 1)
+    H = torch.tensor(SMALL, dtype=torch.float64)
+    field = (problem.points @ H.T)[None]
+    force = problem.tangent_product(torch.zeros_like(field), field)
+    assert force[0, 8:].abs().max() < 1e-15
+    assert force[0, :8].abs().max() > 1e-5
+    stress = 1e6 * torch.einsum("ijkl,kl->ij", problem.material.tangent(torch.zeros_like(H)), H)
+    assert_close(stress, isotropic(2000.0, 400.0), rtol=1e-12, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("law", "normal", "shear", "tolerance"),
+    [(NH, 1997.3048905, 398.9029931, 1e-10), (SVK, 2003.902, 402.1015, 5e-7)],
+    ids=["neo-hookean", "svk"],
+)
+def test_finite_patch_has_the_printed_stress(law, normal, shear, tolerance):
+    """VERIFICATION 1.6a in finite strain, E = 1e6."""
+    problem = stretched(cube_in_cube(), law, SMALL, 1)
+    answer = at_rest(problem)
+    assert answer.converged.all()
+    stress = 1e6 * problem.stress(answer.displacement)
+    assert_close(stress, isotropic(normal, shear).expand_as(stress), rtol=tolerance, atol=0.0)
+
+
+@pytest.mark.parametrize("law", [SVK, NH], ids=["svk", "neo-hookean"])
+@pytest.mark.parametrize("degree", [1, 2])
+def test_patch_passes_in_finite_strain(law, degree):
+    """VERIFICATION 1.6b: inner nodes exact, stress uniform, six or seven iterations."""
+    problem = stretched(cube_in_cube(), law, GENERAL, degree)
+    check_patch(problem, at_rest(problem))
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
+@pytest.mark.parametrize("law", [SVK, NH], ids=["svk", "neo-hookean"])
+def test_crooked_patch_of_any_element_passes(law, cell, degree, grid):
+    """VERIFICATION 1.6c: randomly shaken inner nodes."""
+    mesh = grid(cell, 3, 0.2, inside=True)
+    dim = mesh.dim()
+    problem = stretched(mesh, law, [row[:dim] for row in GENERAL[:dim]], degree)
+    assert not problem.equal_cells
+    check_patch(problem, at_rest(problem))
+
+
+def check_patch(problem: Problem, answer: Solution) -> None:
+    """Assert that the displacement is H X, the stress uniform and of few iterations."""
+    dim = problem.shape[1]
+    H = torch.zeros(3, 3, dtype=torch.float64)
+    H[:dim, :dim] = torch.tensor(GENERAL, dtype=torch.float64)[:dim, :dim]
+    assert answer.converged.all()
+    assert answer.load_factor.item() == 1
+    assert answer.iterations.item() <= 8
+    exact = problem.points @ H[:dim, :dim].T
+    assert problem.free.any()
+    assert (answer.displacement[0] - exact).abs().max() < 1e-13
+    stress = problem.stress(answer.displacement)
+    assert_close(stress, problem.material.stress(H).expand_as(stress), rtol=0.0, atol=1e-11)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["tetra", "hexahedron"])
+@pytest.mark.parametrize("law", [SVK, NH], ids=["svk", "neo-hookean"])
+def test_crooked_patch_passes_under_tractions(law, cell, degree, grid):
+    """VERIFICATION 1.6d: confined stretch 1.4 driven by P11 on x = 1, the other sides sliding."""
+    mesh = grid(cell, 2, 0.2, inside=True)
+    bare = Problem.build(mesh, law, degree=degree, length=1.0)
+    held = bare.points.numpy() < 1e-9
+    held[:, 1:] |= bare.points[:, 1:].numpy() > 1 - 1e-9
+    problem = Problem.build(mesh, law, fixed=held, degree=degree, length=1.0)
+    stretch = torch.diag(torch.tensor([0.4, 0, 0], dtype=torch.float64))
+    P11 = law.stress(stretch)[0, 0].item()
+    force = traction(
+        problem, Plane(0, "max"), lambda x: np.stack([0 * x[0] + P11, 0 * x[1], 0 * x[2]])
+    )
+    answer = solve(Newton(problem, tol=1e-12, linear="superlu"), Load(force[None], torch.ones(1)))
+    assert answer.converged.all()
+    assert (answer.displacement[0] - problem.points @ stretch).abs().max() < 1e-11
+
+
+def manufactured(x: Tensor, amplitude: float) -> Tensor:
+    """Return the displacement of VERIFICATION 1.9 at one point (3,)."""
+    X, Y, Z = math.pi * x
+    u = (X.sin() * (Y / 2).cos(), (Y / 2).cos() * Z.sin(), x[1] * (X / 2).sin() * Z.sin())
+    return amplitude * torch.stack(u)
+
+
+def errors(law: Material, amplitude: float, cell: str, degree: int, n: int) -> tuple[float, float]:
+    """Return the errors of the answer on n^3 cells, L2 and H1-seminorm."""
+
+    def exact(x: Tensor) -> Tensor:
+        return manufactured(x, amplitude)
+
+    gradient = torch.func.jacrev(exact)
+
+    def load(x: Tensor) -> Tensor:  # -Div P
+        return -torch.einsum(
+            "ijkl,klj->i", law.tangent(gradient(x)), torch.func.jacfwd(gradient)(x)
+        )
+
+    def at(field, x: np.ndarray) -> np.ndarray:
+        """Evaluate a field of one point at (3, E, Q); the derivatives come first."""
+        values = torch.func.vmap(field)(torch.from_numpy(x.reshape(3, -1).T.copy()))
+        return np.moveaxis(values.numpy(), 0, -1).reshape(*values.shape[1:], *x.shape[1:])
+
+    mesh = box([1.0] * 3, [n + 1] * 3, cell)
+    bare = Problem.build(mesh, law, degree=degree, length=1.0)
+    problem = Problem.build(
+        mesh,
+        law,
+        fixed=bare.boundary.numpy(),
+        prescribed=torch.func.vmap(exact)(bare.points).numpy(),
+        degree=degree,
+        length=1.0,
+    )
+    force = body_force(problem, lambda x: at(load, x))
+    backend = "auto" if problem.shape[0] > 3000 else "superlu"
+    answer = solve(Newton(problem, linear=backend), Load(force[None], torch.ones(1)))
+    assert answer.converged.all()
+    fine = skfem.Basis(mesh, problem.basis.elem, intorder=7)
+    x = np.asarray(fine.global_coordinates())
+    u, slope = at(exact, x), at(gradient, x)
+    found = [fine.interpolate(component) for component in answer.displacement[0].numpy().T]
+    off = sum((np.asarray(f) - u[i]) ** 2 for i, f in enumerate(found))
+    off_slope = sum(((f.grad - slope[i]) ** 2).sum(axis=0) for i, f in enumerate(found))
+    return math.sqrt((off * fine.dx).sum()), math.sqrt((off_slope * fine.dx).sum())
+
+
+# VERIFICATION 1.9, NH-ln, A = 0.1: number of cells a side, error in L2, error in the H1-seminorm
+MANUFACTURED = {
+    ("hexahedron", 1): (
+        [2, 4, 8, 16],
+        [1.7844e-2, 4.6365e-3, 1.1694e-3, 2.9296e-4],
+        [1.1184e-1, 5.6220e-2, 2.8064e-2, 1.4022e-2],
+    ),
+    ("hexahedron", 2): (
+        [1, 2, 4, 8],
+        [2.8187e-3, 1.6993e-3, 2.1432e-4, 2.6811e-5],
+        [3.3631e-2, 2.2007e-2, 5.5546e-3, 1.3900e-3],
+    ),
+    ("tetra", 1): (
+        [2, 4, 8, 16],
+        [2.1458e-2, 6.0357e-3, 1.6041e-3, 4.1073e-4],
+        [None, None, None, 2.0664e-2],
+    ),
+    ("tetra", 2): (
+        [1, 2, 4, 8],
+        [1.5808e-2, 2.6990e-3, 3.4504e-4, 4.2559e-5],
+        [None, None, None, 2.4995e-3],
+    ),
+}
+COARSE = [(cell, degree, level) for cell, degree in MANUFACTURED for level in (1, 2)]
+FINE = [pytest.param(*kind, 3, marks=pytest.mark.slow) for kind in MANUFACTURED]
+
+
+@pytest.fixture(scope="module")
+def measured() -> Callable[[type[Material], str, int, int], tuple[float, float]]:
+    """The errors of a law on the meshes of the table, each computed once."""
+
+    @cache
+    def measured(law: type[Material], cell: str, degree: int, level: int) -> tuple[float, float]:
+        amplitude = 0.1 if law is NeoHookean else 0.02  # VERIFICATION 1.9
+        count = MANUFACTURED[cell, degree][0][level]
+        return errors(law(0.3), amplitude, cell, degree, count)
+
+    return measured
+
+
+@pytest.mark.parametrize(("cell", "degree", "level"), COARSE + FINE)
+def test_manufactured_answer_has_the_printed_error(measured, cell, degree, level):
+    """VERIFICATION 1.9; tetrahedra lie along another diagonal there, so within 10 % for them."""
+    _, L2, H1 = MANUFACTURED[cell, degree]
+    error, slope_error = measured(NeoHookean, cell, degree, level)
+    tolerance = 5e-3 if cell == "hexahedron" else 0.1
+    assert error == pytest.approx(L2[level], rel=tolerance)
+    if H1[level] is not None:
+        assert slope_error == pytest.approx(H1[level], rel=tolerance)
+
+
+@pytest.mark.parametrize(("cell", "degree", "level"), [(*kind, 2) for kind in MANUFACTURED] + FINE)
+@pytest.mark.parametrize("law", [SaintVenantKirchhoff, NeoHookean])
+def test_error_falls_with_the_order_of_the_element(measured, law, cell, degree, level):
+    """VERIFICATION 1.9: p + 1 - 0.1 in L2, p - 0.05 in H1 on the last pair; twice that before."""
+    coarse, fine = measured(law, cell, degree, level - 1), measured(law, cell, degree, level)
+    slack = 1 if level == 3 else 2
+    assert math.log2(coarse[0] / fine[0]) > degree + 1 - 0.1 * slack
+    assert math.log2(coarse[1] / fine[1]) > degree - 0.05 * slack
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["S1s", "S1", "S2", "S3"])
+def test_beam_of_12000_degrees_of_freedom_has_the_stored_field(name):
+    """Fields of another code on the paper's mesh, to 1e-7; S1, S1s, S3 neo-Hookean, S2 SVK."""
+    path = FIELDS / f"ref_{name}.npz"
+    if not path.exists():
+        pytest.skip(f"{path.name} is not in {FIELDS.parent.name}/{FIELDS.name}")
+    field = np.load(path)
+    law = {"nh": NeoHookean, "svk": SaintVenantKirchhoff}[str(field["law"])]
+    size = field["L"]
+    mesh = box(size.tolist(), [40, 10, 10])
+    problem = Problem.build(mesh, law(float(field["nu"])), fixed=Plane(0, "min"))
+    assert problem.length == pytest.approx(size[0])
+    distance, order = cKDTree(field["X"] / size[0]).query(problem.points.numpy())
+    assert distance.max() < 1e-9
+    assert len(set(order)) == len(field["X"]) == problem.shape[0]
+    force = torch.from_numpy(field["f"][order] / (field["E"] * size[0] ** 2))  # equal at all nodes
+    assert force[:, 2].sum().item() == pytest.approx(-field["F"] / (field["E"] * size[0] ** 2))
+    answer = solve(Newton(problem, tol=1e-10), Load(force[None], torch.tensor([4500.0])))
+    assert answer.converged.all()
+    found, stored = answer.displacement[0].numpy() * size[0], field["u"][order]
+    assert np.abs(found - stored).max() < 1e-7 * np.abs(stored).max()
+    reactions = problem.internal_force(answer.displacement)[0].numpy() * field["E"] * size[0] ** 2
+    assert np.abs(reactions - field["fint"][order]).max() < 1e-7 * np.abs(field["fint"]).max()

@@ -1,0 +1,282 @@
+"""Laws of the network-started Newton: as exact as Newton's, and never worse led than the classic.
+
+The stubs and the pick rule are those of the verification dossier, T19, T20 and section 0.
+"""
+
+import pytest
+import torch
+
+from dpl.fem.linear import SuperLU
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, Solution, solve
+from dpl.hybrid import Direct, Hybrid, pick
+
+
+@pytest.fixture(scope="module")
+def loads(scene) -> Load:
+    """Four loads that need several iterations, the last one the largest."""
+    drawn = scene.loads.sample((9, 9), range(12))
+    largest = drawn.force.flatten(1).norm(dim=1).argsort()[-4:]
+    return Load(drawn.force[largest], drawn.young[largest])
+
+
+@pytest.fixture(scope="module")
+def truth(scene, loads):
+    """The displacements to far below any tolerance."""
+    return solve(Newton(scene.problem, tol=1e-12, linear="superlu"), loads).displacement
+
+
+def noise(truth, free, size):
+    random = torch.Generator().manual_seed(0)
+    return torch.where(
+        free, size * torch.randn(truth.shape, generator=random, dtype=torch.float64), 0.0
+    )
+
+
+@pytest.fixture(scope="module")
+def stubs(scene, loads, truth):
+    """Predictions (B, N, D) by name."""
+    free = scene.problem.free
+    one_nan = truth.clone()
+    one_nan[:, -1, 0] = torch.nan
+    inverted = torch.where(free, -1.5 * scene.problem.points, 0.0).expand_as(truth).clone()
+    return {
+        "nan": torch.full_like(truth, torch.nan),
+        "one nan": one_nan,
+        "inf": torch.where(free, torch.inf, torch.zeros_like(truth)),
+        "inverted": inverted,
+        "huge": 1e6 * truth,
+        "zero": torch.zeros_like(truth),
+        "exact": truth.clone(),
+        "half": 0.5 * truth,
+        "minus": -truth,
+        **{f"noise {e:g}": truth + noise(truth, free, e) for e in (1e-2, 1e-3, 1e-4, 1e-5)},
+    }
+
+
+USELESS = ["nan", "one nan", "inf", "inverted"]
+STUBS = [*USELESS, "huge", "zero", "exact", "half", "minus"]
+STUBS += [f"noise {e:g}" for e in (1e-2, 1e-3, 1e-4, 1e-5)]
+
+
+def hybrid(scene, loads, prediction):
+    """Return the hybrid whose network knows the answers to these loads."""
+
+    def predict(load):
+        same = (load.force[:, None] == loads.force[None]).flatten(2).all(dim=2)
+        return prediction[same.double().argmax(dim=1)]
+
+    return Hybrid(predict, scene.solver)
+
+
+def first_of(load):
+    return Load(load.force[-1:], load.young[-1:])
+
+
+def same(one: Solution, other: Solution):
+    pairs = zip(one, other, strict=True)
+    return all(torch.equal(torch.nan_to_num(a), torch.nan_to_num(b)) for a, b in pairs)
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Counts of assembled tangents and of factorisations."""
+    counts = {"tangent": 0, "factorise": 0}
+
+    def counting(owner, name, key):
+        original = getattr(owner, name)
+
+        def wrapped(*args, **kwargs):
+            counts[key] += 1
+            return original(*args, **kwargs)
+
+        monkeypatch.setattr(owner, name, wrapped)
+
+    counting(Problem, "tangent", "tangent")
+    counting(Problem, "mixed_system", "tangent")
+    counting(SuperLU, "factorise", "factorise")
+    return counts
+
+
+@pytest.mark.parametrize("name", STUBS)
+def test_whatever_is_predicted_the_answer_is_newtons(scene, loads, truth, stubs, name):
+    answer = solve(hybrid(scene, loads, stubs[name]), loads)
+    assert answer.converged.all()
+    assert (answer.residual < scene.solver.tol).all()
+    assert (answer.volume_ratio > 0).all()
+    assert torch.allclose(answer.displacement, truth, rtol=0, atol=1e-8)
+    assert not answer.displacement[:, ~scene.problem.free].any()
+
+
+@pytest.mark.parametrize("name", USELESS)
+def test_a_useless_prediction_leaves_the_classic_path_bit_for_bit(scene, loads, stubs, name):
+    load = first_of(loads)
+    _, *path = hybrid(scene, loads, stubs[name]).iterate(load)
+    _, *classic = scene.solver.iterate(load)
+    assert torch.equal(path[0].displacement, classic[0].displacement)
+    assert torch.equal(path[-1].displacement, classic[-1].displacement)
+    assert torch.equal(path[-1].residual, classic[-1].residual)
+    inner = [state.displacement.numpy().tobytes() for state in path]
+    assert list(dict.fromkeys(inner)) == [s.displacement.numpy().tobytes() for s in classic]
+
+
+@pytest.mark.parametrize("name", USELESS)
+def test_a_useless_prediction_costs_no_iteration(scene, loads, stubs, name):
+    """The classic step is taken once, not thrown away and taken again."""
+    load = first_of(loads)
+    ours, classic = solve(hybrid(scene, loads, stubs[name]), load), solve(scene.solver, load)
+    assert torch.equal(ours.iterations, classic.iterations)
+
+
+def test_an_exact_prediction_costs_no_iteration_no_tangent_and_no_factor(
+    scene, loads, stubs, counted
+):
+    states = list(hybrid(scene, loads, stubs["exact"]).iterate(loads))
+    assert counted == {"tangent": 0, "factorise": 0}
+    assert len(states) == 1
+    assert states[-1].converged.all()
+    assert not states[-1].iterations.any()
+    assert not states[-1].factorisations.any()
+    assert torch.equal(states[-1].displacement, stubs["exact"])
+
+
+def test_the_counters_see_what_newton_assembles(scene, loads, counted):
+    load = first_of(loads)
+    solve(hybrid(scene, loads, torch.zeros_like(loads.force)), load)
+    assert counted["factorise"] >= 2
+    assert counted["tangent"] >= counted["factorise"]
+
+
+@pytest.mark.parametrize("name", [name for name in STUBS if name != "exact"])
+def test_the_prediction_is_picked_exactly_where_its_residual_is_smaller(scene, loads, stubs, name):
+    load, problem = first_of(loads), scene.problem
+    guess = stubs[name][-1:]
+    predicted, first, *rest = hybrid(scene, loads, stubs[name]).iterate(load)
+    assert not predicted.converged
+    _, classic, *_ = scene.solver.iterate(load)
+    assert torch.equal(first.displacement, classic.displacement)
+    ratio_p = float(problem.residual_ratio(guess, load.force))
+    ratio_1 = float(problem.residual_ratio(classic.displacement, load.force))
+    upright = bool(problem.volume_ratio(guess) > 0)
+    picked = upright and ratio_p < ratio_1  # False where ratio_p is NaN
+    assert pick(predicted, first) == picked
+    start = guess if picked else classic.displacement
+    assert any(torch.equal(state.displacement, start) for state in (first, *rest))
+
+
+@pytest.mark.parametrize(
+    ("ratio_p", "ratio_1", "volume", "picked"),
+    [
+        (0.5, 1.0, 0.9, True),
+        (1.0, 1.0, 0.9, False),
+        (2.0, 1.0, 0.9, False),
+        (0.5, 1.0, 0.0, False),
+        (0.5, 1.0, -1.0, False),
+        (0.5, 1.0, -torch.inf, False),
+        (torch.nan, 1.0, 0.9, False),
+        (torch.inf, 1.0, 0.9, False),
+        (0.5, 1.0, torch.nan, False),
+    ],
+)
+def test_the_pick_rule_is_a_smaller_residual_with_nothing_inverted(
+    ratio_p, ratio_1, volume, picked
+):
+    def state(ratio, volume):
+        zero = torch.zeros(1, dtype=torch.int64)
+        numbers = (torch.tensor([ratio]), torch.tensor([volume]), torch.tensor([False]))
+        return Solution(torch.zeros(1, 2, 3), *numbers, zero, zero, torch.zeros(1))
+
+    assert pick(state(ratio_p, volume), state(ratio_1, 0.9)) is picked
+
+
+def test_a_zero_prediction_is_picked_though_it_knows_nothing(scene, loads, stubs):
+    """The rule measures residuals, not quality: the first Newton step of a soft bar overshoots."""
+    predicted, first, *_ = hybrid(scene, loads, stubs["zero"]).iterate(first_of(loads))
+    assert float(predicted.residual) == pytest.approx(1.0)
+    assert float(first.residual) > 1.0
+    assert pick(predicted, first)
+
+
+def test_smaller_noise_costs_fewer_iterations(scene, loads, stubs):
+    sizes = (1e-2, 1e-3, 1e-4, 1e-5)
+    counts = [
+        int(solve(hybrid(scene, loads, stubs[f"noise {e:g}"]), loads).iterations.sum())
+        for e in sizes
+    ]
+    classic = int(solve(scene.solver, loads).iterations.sum())
+    assert counts == sorted(counts, reverse=True)
+    assert counts[-1] < classic
+
+
+def test_the_discarded_classic_step_is_counted(scene, loads, stubs):
+    load = first_of(loads)
+    guess = stubs["noise 0.0001"][-1:]
+    predicted, first, *_ = hybrid(scene, loads, stubs["noise 0.0001"]).iterate(load)
+    assert pick(predicted, first)
+    from_guess = [*scene.solver.iterate(load, guess=guess)][-1]
+    answer = solve(hybrid(scene, loads, stubs["noise 0.0001"]), load)
+    assert int(answer.iterations) == int(from_guess.iterations) + 1
+
+
+def test_a_batch_is_its_members(scene, loads, stubs):
+    mixed = torch.stack(
+        [
+            stubs["nan"][0],
+            stubs["exact"][1],
+            stubs["noise 0.001"][2],
+            stubs["inverted"][3],
+        ]
+    )
+    whole = solve(hybrid(scene, loads, mixed), loads)
+    parts = [
+        solve(hybrid(scene, loads, mixed), Load(loads.force[k : k + 1], loads.young[k : k + 1]))
+        for k in range(4)
+    ]
+    assert same(whole, Solution(*(torch.cat(column) for column in zip(*parts, strict=True))))
+
+
+def test_no_load_costs_nothing(scene, counted):
+    rest = Load(torch.zeros(1, *scene.problem.shape, dtype=torch.float64), torch.ones(1))
+    zero = solve(Hybrid(lambda load: torch.zeros_like(load.force), scene.solver), rest)
+    assert zero.converged
+    assert not zero.displacement.any()
+    assert counted == {"tangent": 0, "factorise": 0}
+    bent = solve(Hybrid(lambda load: load.force + 0.01 * scene.problem.free, scene.solver), rest)
+    assert bent.converged
+    assert not bent.displacement.any(), "a body without load is at rest, whatever is predicted"
+
+
+def test_a_single_load_is_answered_with_one_call_of_the_network(scene, loads, stubs):
+    calls = []
+
+    def predict(load):
+        calls.append(len(load.force))
+        assert not torch.is_grad_enabled()
+        return stubs["half"]
+
+    solve(Hybrid(predict, scene.solver), loads)
+    assert calls == [4]
+
+
+@pytest.mark.parametrize("name", STUBS)
+def test_the_network_alone_is_judged_at_what_it_says(scene, loads, stubs, name, counted):
+    solver = Direct(lambda load: stubs[name], scene.problem)
+    (answer,) = solver.iterate(loads)
+    problem = scene.problem
+    assert torch.equal(torch.nan_to_num(answer.displacement), torch.nan_to_num(stubs[name]))
+    ratio = problem.residual_ratio(stubs[name], loads.force)
+    assert torch.equal(torch.nan_to_num(answer.residual), torch.nan_to_num(ratio))
+    assert torch.equal(answer.volume_ratio, problem.volume_ratio(stubs[name]))
+    assert answer.converged.all() == (name == "exact")
+    assert answer.converged.any() == (name == "exact")
+    assert not answer.iterations.any()
+    assert counted == {"tangent": 0, "factorise": 0}
+
+
+def test_the_network_alone_converges_where_its_own_tolerance_is_met(scene, loads, stubs):
+    guess = stubs["noise 1e-05"]
+    ratio = float(scene.problem.residual_ratio(guess, loads.force).max())
+    for tol, met in ((1.01 * ratio, True), (0.99 * ratio, False)):
+        answer = solve(Direct(lambda load: guess, scene.problem, tol), loads)
+        assert bool(answer.converged.all()) is met

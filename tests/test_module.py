@@ -1,0 +1,434 @@
+"""Laws of the surrogate: one border to SI units, exact resume, and records that tell all."""
+
+from pathlib import Path
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+from hydra.utils import instantiate
+from lightning.pytorch.callbacks import LearningRateMonitor
+from lightning.pytorch.loggers import TensorBoardLogger
+from omegaconf import OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch import nn
+
+from dpl.data.datamodule import OfflineData, OnlineData
+from dpl.fem.solution import Load
+from dpl.figures import DeformedShapes
+from dpl.losses import MSE, LrPlus, LrStar
+from dpl.models.fcnn import FCNN
+from dpl.module import Surrogate, WholeCheckpoints, scales, warmup_cosine
+
+CONF = Path(__file__).parents[1] / "conf"
+METRICS = {
+    "e_mean", "e_max", "SNR_min", "SNR_min_printed",
+    "rel_L2_median", "rel_L2_worst", "residual", "min_det_F",
+}  # fmt: skip
+
+
+def surrogate(scene, loss=None, *, seed=0, lr=1e-3, scheduler=warmup_cosine):
+    torch.manual_seed(seed)
+    return Surrogate(
+        FCNN(scene, width=16),
+        loss or MSE(),
+        scene,
+        optimizer=lambda parameters: torch.optim.AdamW(parameters, lr=lr),
+        scheduler=scheduler,
+    )
+
+
+def trainer(folder, *callbacks, **options):
+    defaults = {"accelerator": "cpu", "logger": False, "num_sanity_val_steps": 0}
+    quiet = {"enable_progress_bar": False, "enable_model_summary": False}
+    nodes = OmegaConf.load(CONF / "trainer" / "default.yaml").callbacks
+    checkpoints = [
+        instantiate(OmegaConf.merge(node, {"dirpath": str(folder)}))
+        for node in nodes
+        if node._target_.endswith("ModelCheckpoint")
+    ]
+    return L.Trainer(
+        callbacks=[*checkpoints, *callbacks],
+        plugins=[WholeCheckpoints()],
+        default_root_dir=folder,
+        **{**defaults, **quiet, **options},
+    )
+
+
+class StopAfter(L.Callback):
+    """Ends a run early, as a wall time would."""
+
+    def __init__(self, epochs):
+        self.epochs = epochs
+
+    def on_train_epoch_end(self, trainer, module):
+        trainer.should_stop |= trainer.current_epoch + 1 >= self.epochs
+
+
+def weights(module):
+    return {name: value.clone() for name, value in module.state_dict().items()}
+
+
+def identical(one, other):
+    return one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
+
+
+# ------------------------------------------------------------------ the border to SI units
+
+
+def test_answers_are_metres_from_newtons(scene, batch):
+    module = surrogate(scene).eval()
+    newtons = batch.force * (batch.young * scene.length**2)[:, None, None]
+    with torch.no_grad():
+        metres, ratio = module(newtons, batch.young), module.predict(batch.load)
+    assert torch.allclose(metres, scene.length * ratio, rtol=1e-6, atol=0)
+    assert float(metres.abs().max()) > 0
+
+
+def test_the_relative_answer_does_not_depend_on_size_and_stiffness(make_scene, scene, batch):
+    """u/L is a function of f/(E L^2), to the rounding of float32."""
+    steel = make_scene(size=(1.0, 0.25, 0.25), young=2e11)
+    module, twin = surrogate(scene).eval(), surrogate(steel).eval()
+    force = 4500.0 * 100.0**2 * batch.force
+    young = torch.full_like(batch.young, 4500.0)
+    with torch.no_grad():
+        soft = module(force, young) / 100.0
+        stiff = twin(2e11 * 1.0**2 * batch.force, torch.full_like(young, 2e11)) / 1.0
+    assert torch.allclose(soft, stiff, rtol=0, atol=1e-5 * float(soft.abs().max()))
+
+
+def test_a_stiffer_body_under_a_larger_force_moves_the_same(scene, batch):
+    module = surrogate(scene).eval()
+    force = batch.force * 4500.0 * scene.length**2
+    with torch.no_grad():
+        here = module(force, torch.full_like(batch.young, 4500.0))
+        there = module(1e6 * force, torch.full_like(batch.young, 4500.0e6))
+    assert torch.allclose(here, there, rtol=1e-5, atol=1e-6 * float(here.abs().max()))
+
+
+def test_held_degrees_of_freedom_do_not_move_at_all(scene, batch):
+    module = surrogate(scene).eval()
+    wild = Load(batch.force + 1.0, batch.young)  # forces where none can act, too
+    with torch.no_grad():
+        answer = module.predict(wild)
+    assert torch.equal(answer[:, ~scene.problem.free], torch.zeros(12, 27, dtype=torch.float64))
+    assert answer[:, scene.problem.free].abs().min() > 0
+
+
+def test_the_network_is_single_and_its_answer_double_precision(scene, batch):
+    seen = []
+
+    class Spy(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.weight = nn.Parameter(torch.ones(()))
+
+        def forward(self, force):
+            seen.append(force.dtype)
+            return self.weight * force
+
+    module = Surrogate(Spy(), MSE(), scene)
+    assert module.predict(batch.load).dtype == torch.float64
+    assert seen == [torch.float32]
+    assert all(p.dtype == torch.float32 for p in module.parameters())
+
+
+def test_scaled_forces_and_displacements_are_of_order_one(scene, batch):
+    force_scale, displacement_scale = scales(scene)
+    reach, free = scene.loads.reach, scene.problem.free
+    force = (batch.force / force_scale)[:, reach]
+    linear = torch.stack([scene.linear.respond(f) for f in batch.force]) / displacement_scale
+    assert 0.3 < float(force.square().mean().sqrt()) < 3
+    assert 0.3 < float(linear[:, free].square().mean().sqrt()) < 3
+
+
+def test_scales_are_one_where_nothing_acts_or_moves(scene):
+    force_scale, displacement_scale = scales(scene)
+    assert (force_scale[~scene.loads.reach] == 1).all()
+    assert (displacement_scale[~scene.problem.free] == 1).all()
+    assert (force_scale > 0).all()
+    assert (displacement_scale > 0).all()
+
+
+def test_scales_are_a_function_of_the_scene(make_scene, scene):
+    for ours, theirs in zip(scales(scene), scales(make_scene()), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_scales_know_no_load_of_the_data(scene, batch, monkeypatch):
+    asked = []
+    original = type(scene.loads).sample
+
+    def watched(loads, seed, indices, **options):
+        asked.append(tuple(seed))
+        return original(loads, seed, indices, **options)
+
+    monkeypatch.setattr(type(scene.loads), "sample", watched)
+    scales(scene)
+    assert asked
+    assert all(stream not in (0, 1, 2) for _, stream in asked)
+
+
+# ------------------------------------------------------------------ the schedule
+
+
+def schedule(total, **options):
+    optimizer = torch.optim.SGD([nn.Parameter(torch.zeros(1))], lr=1.0)
+    scheduler = warmup_cosine(optimizer, total_steps=total, **options)
+    rates = []
+    for _ in range(total):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        scheduler.step()
+    return np.array(rates), optimizer.param_groups[0]["lr"]
+
+
+def test_the_rate_rises_then_falls_to_zero():
+    rates, last = schedule(100, warmup=0.1)
+    assert rates.max() == pytest.approx(1.0)
+    assert rates.argmax() == 10
+    assert (np.diff(rates[:11]) > 0).all()
+    assert (np.diff(rates[10:]) < 0).all()
+    assert (rates > 0).all()
+    assert last == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("total", [1, 2, 5])
+def test_the_shortest_runs_have_a_rate(total):
+    rates, _ = schedule(total)
+    assert (rates > 0).all()
+    assert (rates <= 1).all()
+
+
+@pytest.mark.parametrize("warmup", [-0.1, 1.0, 2.0])
+def test_a_warmup_out_of_range_is_refused(warmup):
+    with pytest.raises(ValueError, match="warmup"):
+        schedule(10, warmup=warmup)
+
+
+# ------------------------------------------------------------------ training
+
+
+@pytest.mark.parametrize("loss", [MSE, LrStar, LrPlus])
+def test_training_lowers_its_loss(scene, data, tmp_path, loss):
+    module, train = surrogate(scene, loss(), lr=3e-3), data.samples("train")
+
+    def value():
+        with torch.no_grad():
+            return float(module.loss(module.predict(train.load), train, module.physics))
+
+    before = value()
+    trainer(tmp_path, max_epochs=30, check_val_every_n_epoch=30).fit(module, datamodule=data)
+    assert value() < 0.6 * before
+
+
+def test_metrics_losses_and_rates_are_logged(scene, data, tmp_path):
+    module = surrogate(scene, LrStar())
+    tutor = trainer(tmp_path, max_epochs=2)
+    tutor.fit(module, datamodule=data)
+    logged = {name for name in tutor.callback_metrics if name.startswith("val/")}
+    assert logged == {f"val/{name}" for name in METRICS}
+    assert {"loss/train", "loss/val", "loss/mse", "loss/residual"} <= set(tutor.callback_metrics)
+    assert all(torch.isfinite(value) for value in tutor.callback_metrics.values())
+
+
+def test_validation_metrics_are_those_of_the_predictions(scene, data, tmp_path):
+    module = surrogate(scene)
+    tutor = trainer(tmp_path, max_epochs=1)
+    tutor.fit(module, datamodule=data)
+    val = data.samples("val")
+    with torch.no_grad():
+        error = (module.predict(val.load) - val.displacement).flatten(1)
+    expected = error.norm(dim=1).mean() / error.shape[1]
+    assert float(tutor.callback_metrics["val/e_mean"]) == pytest.approx(float(expected), rel=1e-5)
+
+
+def test_metrics_do_not_pile_up_over_epochs(scene, data, tmp_path):
+    module = surrogate(scene, lr=0.0)  # nothing is learnt: every epoch has the same numbers
+    seen = []
+
+    class Watch(L.Callback):
+        def on_validation_end(self, trainer, module):
+            seen.append(float(trainer.callback_metrics["val/SNR_min"]))
+
+    trainer(tmp_path, Watch(), max_epochs=3).fit(module, datamodule=data)
+    assert len(seen) == 3
+    assert len(set(seen)) == 1
+
+
+def test_tests_are_logged_under_their_own_names(scene, data, tmp_path):
+    module = surrogate(scene)
+    (numbers,) = trainer(tmp_path).test(module, datamodule=data, verbose=False)
+    assert set(numbers) == {f"test/{name}" for name in METRICS}
+
+
+def test_tensorboard_shows_losses_metrics_rate_and_a_picture(scene, data, tmp_path):
+    module = surrogate(scene, LrStar())
+    logger = TensorBoardLogger(tmp_path, name="", version="", default_hp_metric=False)
+    shapes, rate = DeformedShapes(every=100, loads=1), LearningRateMonitor()
+    tutor = trainer(tmp_path, shapes, rate, logger=logger, max_epochs=2, log_every_n_steps=1)
+    tutor.fit(module, datamodule=data)
+    logger.finalize("success")
+    events = EventAccumulator(str(tmp_path), size_guidance={"images": 0, "scalars": 0})
+    events.Reload()
+    scalars = set(events.Tags()["scalars"])
+    wanted = {f"val/{name}" for name in METRICS}
+    wanted |= {"loss/train", "loss/val", "loss/mse", "loss/residual", "lr-AdamW"}
+    assert wanted <= scalars
+    assert events.Tags()["images"] == ["deformed shapes"]
+    assert len(events.Scalars("loss/train")) == 6  # 3 batches an epoch
+    assert len(events.Scalars("val/e_mean")) == 2
+    rates = [event.value for event in events.Scalars("lr-AdamW")]
+    assert len(set(rates)) > 1
+
+
+def test_pictures_come_every_so_many_validations_and_at_the_end(scene, data, tmp_path):
+    logger = TensorBoardLogger(tmp_path, name="", version="")
+    tutor = trainer(tmp_path, DeformedShapes(every=2, loads=1), logger=logger, max_epochs=3)
+    tutor.fit(surrogate(scene), datamodule=data)
+    logger.finalize("success")
+    events = EventAccumulator(str(tmp_path), size_guidance={"images": 0})
+    events.Reload()
+    assert [event.step for event in events.Images("deformed shapes")] == [6, 9]
+
+
+def test_validation_runs_no_backward(scene, data, tmp_path):
+    module = surrogate(scene, LrPlus())
+    trainer(tmp_path).validate(module, datamodule=data, verbose=False)
+    assert all(parameter.grad is None for parameter in module.parameters())
+
+
+# ------------------------------------------------------------------ resume
+
+
+def run(scene, folder, data, *, epochs=4, stop=None, resume=None, loss=LrPlus):
+    module = surrogate(scene, loss(), seed=0 if resume is None else 99)
+    callbacks = [StopAfter(stop)] if stop else []
+    tutor = trainer(folder, *callbacks, max_epochs=epochs)
+    tutor.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
+    return module, tutor
+
+
+@pytest.mark.parametrize("loss", [MSE, lambda: LrPlus(warmup_epochs=3)], ids=["mse", "annealed"])
+def test_a_resumed_run_ends_bit_for_bit_like_one_that_was_not_interrupted(
+    scene, folder, data, tmp_path, loss
+):
+    def fresh():
+        options = {"train": 12, "val": 4, "test": 4, "batch_size": 4, "workers": 0}
+        return OfflineData(scene, folder=str(folder), **options)
+
+    straight, whole = run(scene, tmp_path / "straight", fresh(), loss=loss)
+    half, part = run(scene, tmp_path / "parts", fresh(), stop=2, loss=loss)
+    assert (part.current_epoch, part.global_step) == (2, 6)
+    resumed, end = run(scene, tmp_path / "parts", fresh(), resume="last", loss=loss)
+    assert (end.current_epoch, end.global_step) == (4, 12)
+    assert not identical(weights(half), weights(straight))
+    assert identical(weights(resumed), weights(straight))
+    numbers = [
+        {name: float(value) for name, value in t.callback_metrics.items()} for t in (whole, end)
+    ]
+    assert numbers[0] == numbers[1]
+    best = [t.checkpoint_callback.best_model_score for t in (whole, end)]
+    assert best[0] == best[1]
+
+
+def test_the_seed_decides_the_weights(scene, data, tmp_path):
+    one = run(scene, tmp_path / "a", data, epochs=1)[0]
+    other = run(scene, tmp_path / "b", data, epochs=1)[0]
+    assert identical(weights(one), weights(other))
+
+
+def test_an_interrupted_stream_goes_on_with_new_loads(scene, folder, data, tmp_path):
+    def stream():
+        return OnlineData(
+            scene, folder=str(folder), val=4, test=4, workers=0, batch_size=4, batches=3,
+            fresh=4, reuse=1, capacity=16,
+        )  # fmt: skip
+
+    _, part = run(scene, tmp_path, stream(), stop=1)
+    assert part.datamodule.state_dict() == {"produced": 12}
+    _, end = run(scene, tmp_path, stream(), epochs=2, resume="last")
+    assert end.datamodule.state_dict() == {"produced": 24}
+
+
+def test_best_is_the_checkpoint_with_the_smallest_error(scene, data, tmp_path):
+    seen = []
+
+    class Watch(L.Callback):
+        def on_validation_end(self, trainer, module):
+            seen.append(float(trainer.callback_metrics["val/e_mean"]))
+
+    tutor = trainer(tmp_path, Watch(), max_epochs=4)
+    tutor.fit(surrogate(scene, lr=3e-2), datamodule=data)
+    assert sorted(path.name for path in tmp_path.glob("*.ckpt")) == ["best.ckpt", "last.ckpt"]
+    checkpoint = torch.load(tmp_path / "best.ckpt", weights_only=True)
+    assert checkpoint["epoch"] == int(np.argmin(seen))
+
+
+def test_last_is_the_checkpoint_of_the_last_epoch_also_where_nothing_improves(
+    scene, data, tmp_path
+):
+    trainer(tmp_path, max_epochs=3).fit(surrogate(scene, lr=0.0), datamodule=data)
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["epoch"] == 2
+
+
+# ------------------------------------------------------------------ checkpoints
+
+
+def test_a_checkpoint_holds_scales_and_the_normaliser_of_the_residual(scene, data, tmp_path):
+    run(scene, tmp_path, data, epochs=1)
+    checkpoint = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    assert checkpoint["scene"] == scene.fingerprint
+    state = checkpoint["state_dict"]
+    expected = float((scene.loads.modes.vectors @ scene.loads.q_max).norm())
+    assert float(state["largest_force"]) == pytest.approx(expected, rel=1e-12)
+    assert torch.equal(state["force_scale"], scales(scene)[0])
+    assert torch.equal(state["displacement_scale"], scales(scene)[1])
+
+
+def test_the_checkpoint_of_another_scene_is_refused_naming_both(scene, make_scene, data, tmp_path):
+    run(scene, tmp_path, data, epochs=1)
+    other = make_scene(poisson=0.25)
+    checkpoint = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    with pytest.raises(ValueError, match="scene") as refusal:
+        surrogate(other).on_load_checkpoint(checkpoint)
+    assert scene.fingerprint[:12] in str(refusal.value)
+    assert other.fingerprint[:12] in str(refusal.value)
+    surrogate(scene).on_load_checkpoint(checkpoint)
+
+
+def test_a_checkpoint_without_a_scene_is_refused(scene):
+    with pytest.raises(ValueError, match="unknown"):
+        surrogate(scene).on_load_checkpoint({"state_dict": {}})
+
+
+class Unwritable:
+    """An object whose pickling fails half way, as a full disk does."""
+
+    def __reduce__(self):
+        raise OSError("no space left on device")
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one(tmp_path):
+    path = tmp_path / "folder" / "last.ckpt"
+    files = WholeCheckpoints()
+    files.save_checkpoint({"epoch": 1}, path)
+    with pytest.raises(OSError, match="no space"):
+        files.save_checkpoint({"big": torch.zeros(10_000), "bad": Unwritable()}, path)
+    assert torch.load(path, weights_only=True) == {"epoch": 1}
+    assert [p.name for p in path.parent.iterdir()] == ["last.ckpt"]
+    files.save_checkpoint({"epoch": 2}, path)
+    assert torch.load(path, weights_only=True) == {"epoch": 2}
+
+
+def test_checkpoints_are_read_without_running_code(scene, data, tmp_path):
+    """weights_only accepts all that a run writes down."""
+    run(scene, tmp_path, data, epochs=1)
+    for path in tmp_path.glob("*.ckpt"):
+        assert torch.load(path, weights_only=True)["epoch"] == 0
+
+
+def test_the_plan_is_that_of_network_and_loss(scene):
+    module = surrogate(scene, MSE())
+    assert module.plan() == [*module.net.plan(), *module.loss.plan()]
+    assert Surrogate(nn.Identity(), LrPlus(), scene).plan() == []

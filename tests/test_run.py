@@ -1,0 +1,366 @@
+"""Laws of the composition root: what cannot work is refused by name before anything is computed."""
+
+import json
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import hydra
+import lightning as L
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from dpl import run
+from dpl.run import ConfigError
+
+ROOT = Path(__file__).parents[1]
+BAD = {  # override -> what the message must name
+    "material.poisson=0.7": r"poisson = 0\.7",
+    "material.poisson=-1": r"poisson = -1",
+    "material.poisson=nan": r"material\.poisson = nan",
+    "material.poisson=abc": r"material\.poisson = 'abc' must be a number",
+    "material.poisson=true": r"material\.poisson = True must be a number",
+    "material.poisson=null": r"material\.poisson = None must be a number",
+    "+material.e=1": r"material\.e: .* has no such option",
+    "material._target_=dpl.fem.materials.Rubber": r"material\._target_ = .*Rubber' does not exist",
+    "material._target_=nowhere.Rubber": r"material\._target_ = .*nowhere\.Rubber' does not exist",
+    "young=-1": r"young = -1",
+    "young=0": r"young = 0",
+    "young=nan": r"young = nan",
+    "young=inf": r"young = inf",
+    "young=1e400": r"young = inf",
+    "young=abc": r"young = 'abc'",
+    "young=[2e9,1e9]": r"young = \[2000000000\.0, 1000000000\.0\]",
+    "young=[1e9]": r"young = ",
+    "young=[1e9,2e9,3e9]": r"young = ",
+    "young=null": r"young = None",
+    "young=true": r"young = True",
+    "mesh.nodes=[5,3]": r"mesh: nodes = \[5, 3\]",
+    "mesh.nodes=[5,3,1]": r"mesh: nodes = \[5, 3, 1\]",
+    "mesh.nodes=[5,3,2.5]": r"mesh\.nodes = \[5, 3, 2\.5\] must be a list, each a whole number",
+    "mesh.size=[1,1,-1]": r"mesh: size = ",
+    "mesh.size=[1,1,nan]": r"mesh\.size\.2 = nan",
+    "mesh.size=1": r"mesh\.size = 1 must be a list, each a number",
+    "+mesh.cell=pyramid": r"mesh: cell = 'pyramid'",
+    "+mesh.colour=red": r"mesh\.colour: .* has no such option",
+    "mesh=file": r"mesh\.path",
+    "mesh=file mesh.path=nowhere.msh": r"mesh: nowhere\.msh: no such mesh file",
+    "mesh=file mesh.path=12": r"mesh\.path = 12 must be",
+    "clamped.at=7": r"clamped.*Plane\(axis=0, at=7\) holds no node",
+    "clamped.axis=3": r"clamped: axis = 3",
+    "clamped.at=middle": r"clamped: at = 'middle'",
+    "mesh=rectangle clamped.axis=2": r"clamped.*axis = 2 does not exist in 2D",
+    "clamped.at=null": r"clamped\.at = None must be a number or a text",
+    "degree=3": r"degree",
+    "degree=two": r"degree",
+    "solver.tol=0": r"solver: tol = 0",
+    "solver.tol=2": r"solver: tol = 2",
+    "solver.tol=small": r"solver\.tol = 'small' must be a number",
+    "+solver.max_iter=0": r"solver: max_iter = 0",
+    "+solver.linear=umfpack": r"umfpack",
+    "+solver.fast=true": r"solver\.fast: .* has no such option",
+    "loads.n_modes=0": r"loads: n_modes = 0",
+    "loads.n_modes=2.5": r"loads\.n_modes = 2\.5 must be a whole number",
+    "loads.n_modes=1000": r"n_modes = 1000",
+    "loads.deflection=-0.1": r"loads: deflection = -0\.1",
+    "loads.deflection=nan": r"loads\.deflection = nan",
+    "loads.patch=[0.5,0.1]": r"loads: patch = \[0\.5, 0\.1\]",
+    "loads.patch=[0.5]": r"loads: patch = \[0\.5\]",
+    "loads.distribution._target_=dpl.fem.modes.cauchy": r"loads\.distribution\._target_",
+}
+
+
+@pytest.mark.parametrize("override", BAD)
+def test_what_cannot_work_is_refused_by_its_key(compose, override, tmp_path):
+    cfg = compose("mesh.nodes=[5,3,3]", *override.split()) if "mesh" not in override else None
+    cfg = cfg or compose(*override.split())
+
+    def start():
+        run.check(cfg)
+        run.show_plan(run.build_scene(cfg))
+
+    with pytest.raises(ConfigError, match=BAD[override]) as refusal:
+        start()
+    assert "\n" not in str(refusal.value)
+    assert not list(tmp_path.iterdir()), "nothing is written before all is known to work"
+
+
+BAD_TRAINING = {
+    "data.batch_size=0": r"data: batch_size = 0",
+    "data.train=-5": r"data: train = -5",
+    "data.train=many": r"data\.train = 'many' must be a whole number",
+    "+data.vall=3": r"data\.vall: .* has no such option",
+    "model.layers=1": r"model: layers = 1",
+    "model.width=0": r"model: width = 0",
+    "model.width=wide": r"model\.width = 'wide' must be a whole number or null",
+    "+model.memory_limit=1e-6": r"model: .* parameters .* need .* GB, there are 0\.0 GB",
+    "loss=lr_plus loss.weight=-1": r"loss: weight = -1",
+    "loss=lr_plus loss.warmup_epochs=0.5": r"loss\.warmup_epochs = 0\.5 must be a whole number",
+    "+loss.weight=1": r"loss\.weight: .* has no such option",
+    "optimizer.lr=fast": r"optimizer\.lr = 'fast'",
+    "optimizer.lr=nan": r"optimizer\.lr = nan",
+    "+optimizer.speed=2": r"optimizer\.speed: .* has no such option",
+    "+scheduler.cooldown=2": r"scheduler\.cooldown: .* has no such option",
+    "trainer.max_epochs=ten": r"trainer\.max_epochs = 'ten'",
+    "+trainer.epochs=10": r"trainer\.epochs: .* has no such option",
+    "+trainer.callbacks.0.speed=1": r"trainer\.callbacks\.0\.speed: .* has no such option",
+    "seed=abc": r"(seed|shuffle) = 'abc'",
+    "data=online seed=abc": r"seed = 'abc'",
+    "data=online data.fresh=0": r"data: fresh = 0",
+    "data=online data.val=0": r"data: val = 0",
+    "data=online +data.trian=5": r"data\.trian: .* has no such option",
+}
+
+
+@pytest.mark.parametrize("override", BAD_TRAINING)
+def test_what_cannot_train_is_refused_by_its_key(compose, override, scene, tmp_path):
+    cfg = compose("folder=.", *override.split(), command="train")
+
+    def start():
+        run.check(cfg)
+        run.make(cfg, "data", scene=scene)
+        run.build_surrogate(cfg, scene)
+        run.make(cfg, "trainer")
+
+    with pytest.raises(ConfigError, match=BAD_TRAINING[override]):
+        start()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["young=1", "young=[1e9,2e11]", "mesh.size=[1,1,2]", "model.width=null", "+solver.max_iter=9"],
+)
+def test_what_works_is_not_refused(compose, override):
+    run.check(compose("folder=.", override, command="train"))
+
+
+def test_no_configuration_may_leave_the_body_loose(compose, tiny):
+    cfg = compose(*tiny)
+    cfg.clamped = {"_target_": "dpl.fem.mesh.Box", "lower": [0, 0, 0], "upper": [0, 0, 0]}
+    with pytest.raises(ConfigError, match="3 rigid modes are unconstrained: rotation"):
+        run.build_scene(cfg)
+
+
+def test_checking_calls_nothing(compose, monkeypatch):
+    def forbidden(path):
+        raise AssertionError("called")
+
+    monkeypatch.setattr("dpl.fem.mesh.load", forbidden)
+    cfg = compose("mesh=file", "mesh.path=part.msh")
+    cfg.mesh._target_ = "dpl.fem.mesh.load"
+    run.check(cfg)
+
+
+def test_a_range_of_moduli_reaches_the_loads(scene_of, tiny):
+    assert scene_of(*tiny, "young=[1e9,2e11]").loads.young_range == (1e9, 2e11)
+    assert scene_of(*tiny).loads.young_range == (4500.0, 4500.0)
+
+
+def test_the_configured_scene_is_the_one_built_by_hand(scene_of, tiny, scene):
+    assert scene_of(*tiny).fingerprint == scene.fingerprint
+
+
+# ------------------------------------------------------------------ commands
+
+
+@pytest.fixture(scope="module")
+def refusals(start, tmp_path_factory):
+    """Three real processes, at once: status, out, err and what they left behind."""
+    cases = {
+        "poisson": ("generate", "material.poisson=0.7"),
+        "young": ("generate", "young=-1"),
+        "unknown": ("train", "+material.e=1"),
+    }
+    started = {}
+    for name, (script, override) in cases.items():
+        folder = tmp_path_factory.mktemp(name)
+        started[name] = folder, start(script, override, cwd=folder)
+    ended = {}
+    for name, (folder, process) in started.items():
+        out, err = process.communicate(timeout=120)
+        left = sorted(p.name for p in folder.iterdir()) if folder.exists() else ["no folder"]
+        ended[name] = process.returncode, out, err, left
+    return ended
+
+
+@pytest.mark.parametrize("name", ["poisson", "young", "unknown"])
+def test_a_command_refuses_with_one_line_and_leaves_nothing(refusals, name):
+    status, out, err, left = refusals[name]
+    assert status == 2
+    lines = err.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    assert {"poisson": "poisson", "young": "young", "unknown": "material.e"}[name] in lines[0]
+    assert "Traceback" not in out + err
+    assert "plan:" not in out
+    assert left == []
+
+
+def test_an_interrupt_ends_a_command_with_130(capsys):
+    @run.command
+    def task(cfg):
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as end:
+        task(OmegaConf.create())
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_a_fault_of_ours_keeps_its_traceback():
+    @run.command
+    def task(cfg):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        task(OmegaConf.create())
+
+
+MECHANICS = textwrap.dedent(
+    """
+    import json, runpy, sys
+    script, *sys.argv[1:] = sys.argv[1:]
+    runpy.run_path(script, run_name="__main__")
+    print(json.dumps(sorted(name for name in sys.modules if "." not in name)))
+    """
+)
+
+
+def test_generation_imports_neither_lightning_nor_matplotlib(tmp_path, environment, tiny):
+    sizes = ["data.train=3", "data.val=1", "data.test=1", "data.workers=0"]
+    script = str(ROOT / "scripts" / "generate.py")
+    ended = subprocess.run(
+        [sys.executable, "-c", MECHANICS, script, *tiny, *sizes],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    modules = set(json.loads(ended.stdout.splitlines()[-1]))
+    heavy = {"lightning", "torchmetrics", "matplotlib", "tensorboard", "pytorch_lightning"}
+    assert not modules & heavy
+    assert {"torch", "skfem", "hydra"} <= modules
+    assert "train: 3 of 3 loads accepted" in ended.stdout
+
+
+# ------------------------------------------------------------------ runs
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_training, tmp_path_factory):
+    """A run of one epoch, as `train.py` leaves it."""
+    folder = tmp_path_factory.mktemp("run")
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        places = [f"data.folder={folder}/data", f"folder={folder}", "run=here"]
+        cfg = hydra.compose("train", overrides=[*tiny_training, *places])
+    kept = [node for node in cfg.trainer.callbacks if "ModelCheckpoint" in node._target_]
+    cfg.trainer.callbacks = kept
+    cfg.trainer.max_epochs = 1
+    scene = run.build_scene(cfg)
+    surrogate = run.build_surrogate(cfg, scene)
+    trainer: L.Trainer = run.make(cfg, "trainer")
+    run.save_config(cfg, folder)
+    trainer.fit(surrogate, datamodule=run.make(cfg, "data", scene=scene))
+    return folder, surrogate
+
+
+@pytest.fixture
+def copied(trained, tmp_path):
+    """The run in a folder that may be harmed."""
+    return shutil.copytree(trained[0], tmp_path / "copy")
+
+
+def test_a_run_comes_back_as_it_was(trained):
+    folder, surrogate = trained
+    cfg, again = run.load_run(folder)
+    assert again.scene.fingerprint == surrogate.scene.fingerprint
+    load = surrogate.scene.loads.sample((0, 2), range(4))
+    with torch.no_grad():
+        assert torch.equal(again.predict(load), surrogate.predict(load))
+    assert not again.training
+    assert cfg.mesh.nodes == [5, 3, 3]
+
+
+def test_a_run_keeps_its_resolved_configuration(trained):
+    text = (trained[0] / "config.yaml").read_text()
+    assert "${" not in text
+    assert "???" not in text
+
+
+def test_a_run_is_not_overwritten(trained, compose):
+    folder, _ = trained
+    before = (folder / "config.yaml").read_text()
+    cfg = compose("folder=.", "young=1", command="train")
+    with pytest.raises(ConfigError, match="resume it with ckpt_path=last"):
+        run.save_config(cfg, folder)
+    assert (folder / "config.yaml").read_text() == before
+
+
+def test_a_missing_run_is_refused_by_name(tmp_path):
+    with pytest.raises(ConfigError, match=r"nowhere has no config\.yaml"):
+        run.load_run(tmp_path / "nowhere")
+
+
+def test_a_run_without_a_checkpoint_is_refused(copied):
+    (copied / "checkpoints" / "best.ckpt").unlink()
+    with pytest.raises(ConfigError, match=r"checkpoints/best\.ckpt"):
+        run.load_run(copied)
+
+
+@pytest.mark.parametrize(
+    "path", ["mesh", "material", "loads.distribution", "model", "trainer.callbacks.0"]
+)
+def test_a_run_that_names_what_is_not_ours_is_not_called(copied, path, tmp_path):
+    cfg = OmegaConf.load(copied / "config.yaml")
+    OmegaConf.update(cfg, f"{path}._target_", "pathlib.Path.touch")
+    (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    with pytest.raises(ConfigError, match=r"names pathlib\.Path\.touch"):
+        run.load_run(copied)
+
+
+def test_a_run_cannot_reach_out_of_the_package_through_it(copied):
+    """dpl.run.sys.exit begins with `dpl.` and is not ours all the same."""
+    cfg = OmegaConf.load(copied / "config.yaml")
+    cfg.mesh = {"_target_": "dpl.run.importlib.import_module", "name": "antigravity"}
+    (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    with pytest.raises(ConfigError, match=r"dpl\.run\.importlib"):
+        run.load_run(copied)
+
+
+@pytest.mark.parametrize("harm", ["truncated", "text", "no weights"])
+def test_a_damaged_checkpoint_is_refused_by_name(copied, harm):
+    best = copied / "checkpoints" / "best.ckpt"
+    if harm == "truncated":
+        best.write_bytes(best.read_bytes()[:-1000])
+    elif harm == "text":
+        best.write_text("hello")
+    else:
+        state = torch.load(best, weights_only=True)
+        torch.save({**state, "state_dict": {}}, best)
+    with pytest.raises(ConfigError, match=r"best\.ckpt"):
+        run.load_run(copied)
+
+
+def test_the_run_of_another_scene_is_refused(copied):
+    cfg = OmegaConf.load(copied / "config.yaml")
+    cfg.material.poisson = 0.25
+    (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    with pytest.raises(ConfigError, match="the checkpoint is of scene"):
+        run.load_run(copied)
+
+
+def test_the_weights_are_a_function_of_the_seed(compose, scene):
+    def weights(seed):
+        cfg = compose("folder=.", f"seed={seed}", "model.width=8", command="train")
+        return run.build_surrogate(cfg, scene).state_dict()
+
+    one, same, other = weights(0), weights(0), weights(1)
+    assert all(torch.equal(one[name], same[name]) for name in one)
+    assert not all(torch.equal(one[name], other[name]) for name in one)

@@ -1,0 +1,308 @@
+"""The commands, end to end: what a user types, and what is there afterwards."""
+
+import json
+import os
+import signal
+import time
+
+import meshio
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+ROWS = ["linear", "network", "hybrid Newton", "Newton from zero"]
+
+
+def finish(process, timeout=240):
+    out, err = process.communicate(timeout=timeout)
+    return process.returncode, out, err
+
+
+def waited_for(condition, seconds=90):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.2)
+    return False
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """The folder in which a user works."""
+    return tmp_path_factory.mktemp("home")
+
+
+@pytest.fixture(scope="module")
+def trained(start, tiny_training, home):
+    """A training run in a process of its own: status, out, err."""
+    overrides = [*tiny_training, "trainer.max_epochs=2", "run=runs/first"]
+    return finish(start("train", *overrides, cwd=home))
+
+
+def test_training_ends_with_a_table_of_four_solvers(trained, home):
+    status, out, err = trained
+    assert status == 0, err[-2000:]
+    assert out.index("plan: skipped") < out.index("24 accepted, 0 rejected")
+    assert out.index("24 accepted, 0 rejected") < out.index("4 fresh loads")
+    rows = json.loads((home / "runs/first/evaluation.json").read_text())
+    assert [row["solver"] for row in rows] == ROWS
+    assert all(name in out for name in ROWS)
+    linear, network, hybrid, newton = rows
+    assert hybrid["converged"] == newton["converged"] == hybrid["loads"] == 4
+    assert network["iterations"] == 0
+    assert linear["iterations"] == 1
+    assert newton["errors"]["rel_L2_worst"] < 1e-6
+    assert hybrid["errors"]["rel_L2_worst"] < 1e-6
+
+
+def test_a_run_leaves_configuration_checkpoints_events_figure_and_case(trained, home):
+    left = {path.name for path in (home / "runs/first").iterdir()}
+    assert {"config.yaml", "checkpoints", "evaluation.json", "shapes.png", "worst.vtu"} <= left
+    names = sorted(path.name for path in (home / "runs/first/checkpoints").iterdir())
+    assert names == ["best.ckpt", "last.ckpt"]
+    (data,) = (home / "datasets").iterdir()
+    assert data.name.endswith("-seed0")
+    assert sorted(path.name for path in home.iterdir()) == ["datasets", "runs"]
+
+
+def test_tensorboard_has_hparams_with_the_final_metrics(trained, home):
+    scalars, plugins = {}, set()
+    for path in (home / "runs/first").glob("events*"):
+        events = EventAccumulator(str(path))
+        events.Reload()
+        scalars |= {tag: events.Scalars(tag)[-1].value for tag in events.Tags()["scalars"]}
+        plugins |= set(events.summary_metadata)
+    rows = json.loads((home / "runs/first/evaluation.json").read_text())
+    errors = next(row for row in rows if row["solver"] == "network")["errors"]
+    assert any("hparams" in name for name in plugins)
+    for name in ("e_mean", "rel_L2_median", "SNR_min"):
+        (tag,) = [tag for tag in scalars if tag.rpartition("/")[2] == name and "val" not in tag]
+        assert scalars[tag] == pytest.approx(errors[name], rel=1e-5)
+
+
+def test_evaluate_repeats_the_table_without_solving_again(trained, start, home):
+    first = json.loads((home / "runs/first/evaluation.json").read_text())
+    status, out, err = finish(start("evaluate", "run=runs/first", cwd=home))
+    assert status == 0, err[-2000:]
+    assert "solving" not in out
+    again = json.loads((home / "runs/first/evaluation.json").read_text())
+    for one, other in zip(first, again, strict=True):
+        assert one["solver"] == other["solver"]
+        assert one["converged"] == other["converged"]
+        assert one["iterations"] == other["iterations"]
+        assert one["errors"] == pytest.approx(other["errors"], rel=1e-4, abs=1e-8)
+
+
+def test_a_run_is_not_overwritten(trained, script, tiny_training, home):
+    before = {path: path.stat().st_mtime_ns for path in (home / "runs/first").rglob("*.ckpt")}
+    overrides = [*tiny_training, "trainer.max_epochs=3", "run=runs/first"]
+    ended = script("train", *overrides, cwd=home)
+    assert ended.status == 2
+    assert "holds a run" in ended.err
+    assert "ckpt_path=last" in ended.err
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert OmegaConf.load(home / "runs/first/config.yaml").trainer.max_epochs == 2
+
+
+def test_a_run_goes_on_where_it_was_left(trained, script, tiny_training, home):
+    overrides = [*tiny_training, "trainer.max_epochs=4", "run=runs/second"]
+    assert script("train", *overrides, "+trainer.max_steps=4", cwd=home).status == 0
+    ended = script("train", *overrides, "ckpt_path=last", cwd=home)
+    assert ended.status == 0, ended.err
+    assert "16 of 16" not in ended.out, "no load is solved again"
+    steps = []
+    for path in sorted((home / "runs/second").glob("events*")):
+        events = EventAccumulator(str(path))
+        events.Reload()
+        if "val/e_mean" in events.Tags()["scalars"]:
+            steps.append([event.step for event in events.Scalars("val/e_mean")])
+    assert steps[0][-1] < steps[-1][0], "the second part begins after the first one"
+    assert len(steps[0]) + len(steps[-1]) == 4
+
+
+def test_a_short_run_is_judged_also_where_no_epoch_is_validated(script, tiny_training, home):
+    """The default validates every fifth epoch."""
+    overrides = [o for o in tiny_training if "check_val" not in o]
+    ended = script("train", *overrides, "trainer.max_epochs=2", "run=runs/short", cwd=home)
+    assert ended.status == 0, ended.err.strip().splitlines()[-1]
+    assert (home / "runs/short/evaluation.json").exists()
+
+
+@pytest.mark.parametrize("missing", ["", "run=runs/nowhere"])
+def test_evaluate_without_a_run_says_so(script, tmp_path, missing):
+    ended = script("evaluate", *filter(None, [missing]), cwd=tmp_path)
+    assert ended.status == 2
+    assert ended.err.startswith("error: run")
+    assert tmp_path.exists(), "the folder in which a user works is not ours to remove"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_mesh_from_a_file_of_another_program_is_trained_on(script, tmp_path):
+    """Six tetrahedra a cube, written by meshio in Gmsh's format; nodes in no order."""
+    n, m = 7, 3
+    x, y, z = np.meshgrid(*(np.arange(k) for k in (n, m, m)), indexing="ij")
+    points = np.stack([x.ravel() * 0.5, y.ravel() * 0.5, z.ravel() * 0.5], axis=1)
+    shuffled = np.random.default_rng(0).permutation(len(points))
+    place = np.argsort(shuffled).reshape(n, m, m)
+    paths = ["xyz", "xzy", "yxz", "yzx", "zxy", "zyx"]
+    cells = []
+    for i, j, k in np.ndindex(n - 1, m - 1, m - 1):
+        for path in paths:
+            corner, tet = np.array([i, j, k]), [place[i, j, k]]
+            for axis in path:
+                corner = corner + np.eye(3, dtype=int)["xyz".index(axis)]
+                tet.append(place[tuple(corner)])
+            cells.append(tet)
+    cells = np.array(cells)
+    edges = points[shuffled][cells[:, 1:]] - points[shuffled][cells[:, :1]]
+    flipped = np.linalg.det(edges) < 0
+    cells[flipped] = cells[flipped][:, [0, 2, 1, 3]]
+    meshio.write(tmp_path / "part.msh", meshio.Mesh(points[shuffled], [("tetra", cells)]), "gmsh22")
+    sizes = ["data.train=6", "data.val=2", "data.test=2", "data.workers=0", "model.width=8"]
+    ended = script(
+        "train", "mesh=file", "mesh.path=part.msh", "loads.n_modes=2", "+solver.linear=superlu",
+        *sizes, "trainer.max_epochs=1", "trainer.check_val_every_n_epoch=1", "run=part",
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert ended.status == 0, ended.err[-2000:]
+    assert "one quadrature point for each of 144 cells" in ended.out
+    rows = json.loads((tmp_path / "part/evaluation.json").read_text())
+    assert next(row for row in rows if row["solver"] == "hybrid Newton")["converged"] == 2
+    case = meshio.read(tmp_path / "part/worst.vtu")
+    assert case.cells_dict["tetra"].shape == (144, 4)
+    assert np.ptp(case.points, axis=0) == pytest.approx([3.0, 1.0, 1.0])
+
+
+def test_generate_prints_what_it_made_and_reuses_it(script, tiny, tmp_path):
+    sizes = ["data.train=3", "data.val=1", "data.test=1", "data.workers=0"]
+    first = script("generate", *tiny, *sizes, cwd=tmp_path)
+    assert first.status == 0
+    assert "train: 3 of 3 loads accepted" in first.out
+    assert "5/5" in first.out
+    again = script("generate", *tiny, *sizes, cwd=tmp_path)
+    assert "train: 3 of 3 loads accepted" in again.out
+    assert "solving" not in again.out
+    assert [path.name for path in tmp_path.iterdir()] == ["datasets"]
+
+
+def test_a_data_set_of_another_scene_is_refused_with_both_fingerprints(
+    trained, script, tiny_training, home
+):
+    (data,) = (home / "datasets").iterdir()
+    overrides = [*tiny_training, "material.poisson=0.25", f"data.folder={data}", "run=runs/other"]
+    ended = script("train", *overrides, cwd=home)
+    assert ended.status == 2
+    assert data.name[:12] in ended.err
+    assert ended.err.count("\n") == 1
+    assert not (home / "runs/other/checkpoints").exists()
+
+
+# ------------------------------------------------------------------ processes
+
+
+def online(tiny_training, *more):
+    kept = [o for o in tiny_training if "data.train" not in o and "data.workers" not in o]
+    small = ["data.workers=2", "data.batches=4", "data.fresh=4", "data.reuse=8"]
+    return ["data=online", *kept, *small, *more]
+
+
+@pytest.mark.slow
+def test_training_on_a_stream_of_two_workers_ends_and_leaves_no_process(
+    start, members, tiny_training, tmp_path
+):
+    process = start("train", *online(tiny_training, "trainer.max_epochs=2", "run=r"), cwd=tmp_path)
+    status, out, err = finish(process)
+    assert status == 0, err[-2000:]
+    assert json.loads((tmp_path / "r/evaluation.json").read_text())
+    assert waited_for(lambda: not members(process.pid), 5)
+
+
+@pytest.fixture
+def streaming(start, members, tiny_training, tmp_path):
+    """A run on an endless stream, with its checkpoints there; and its two workers."""
+    overrides = online(tiny_training, "trainer.max_epochs=100000", "run=r")
+    process = start("train", *overrides, cwd=tmp_path)
+    there = waited_for(lambda: (tmp_path / "r/checkpoints/last.ckpt").exists() or process.poll())
+    assert there
+    assert process.poll() is None, process.communicate()[1][-2000:]
+
+    def workers():
+        found = []
+        for pid in members(process.pid):
+            try:
+                line = open(f"/proc/{pid}/cmdline").read()
+            except OSError:
+                continue
+            if "spawn_main" in line:
+                found.append(pid)
+        return found
+
+    assert len(workers()) == 2
+    return process, workers
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_training_with_130_and_leaves_no_process(streaming, members):
+    process, _ = streaming
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all of the group
+    status, out, err = finish(process, 60)
+    assert status == 130, err[-2000:]
+    assert waited_for(lambda: not members(process.pid), 5)
+    assert err.strip().endswith("interrupted")
+    assert "Traceback" not in err
+
+
+@pytest.mark.slow
+def test_a_killed_worker_ends_training_with_an_error_and_leaves_no_process(streaming, members):
+    process, workers = streaming
+    os.kill(workers()[0], signal.SIGKILL)
+    status, out, err = finish(process, 60)
+    assert status not in (0, 130)
+    assert "worker" in err
+    assert waited_for(lambda: not members(process.pid), 5)
+
+
+@pytest.mark.slow
+def test_a_killed_parent_leaves_no_process(streaming, members):
+    process, _ = streaming
+    process.kill()
+    assert waited_for(lambda: not members(process.pid), 15)
+
+
+@pytest.mark.slow
+def test_ctrl_c_while_generating_ends_with_130_and_keeps_whole_shards(
+    start, members, tiny, tmp_path
+):
+    sizes = ["data.train=100000", "data.val=0", "data.test=0", "data.workers=2"]
+    process = start("generate", *tiny, *sizes, cwd=tmp_path)
+    assert waited_for(lambda: list(tmp_path.glob("datasets/*/train-000000.safetensors")))
+    os.killpg(process.pid, signal.SIGINT)
+    status, out, err = finish(process, 60)
+    assert status == 130, err[-2000:]
+    assert waited_for(lambda: not members(process.pid), 5)
+    (folder,) = (tmp_path / "datasets").iterdir()
+    lines = (folder / "manifest.jsonl").read_text().splitlines()
+    assert len(lines) >= 1
+    assert all(json.loads(line)["tried"] == 64 for line in lines)
+    assert not list(folder.glob(".*.part"))
+
+
+@pytest.mark.slow
+def test_a_multirun_trains_each_combination_in_a_folder_of_its_own(start, tiny_training, tmp_path):
+    sweep = ["-m", "loss=mse,lr_star", "seed=0,1"]
+    process = start(
+        "train", *sweep, *tiny_training, "trainer.max_epochs=1", "run=sweep", cwd=tmp_path
+    )
+    status, out, err = finish(process)
+    assert status == 0, err[-2000:]
+    folders = [path for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
+    assert len(folders) == 4
+    seen = {
+        (cfg.loss._target_.rpartition(".")[2], cfg.seed)
+        for cfg in (OmegaConf.load(folder / "config.yaml") for folder in folders)
+    }
+    assert seen == {("MSE", 0), ("MSE", 1), ("LrStar", 0), ("LrStar", 1)}
+    assert all((folder / "evaluation.json").exists() for folder in folders)
+    assert len(list((tmp_path / "datasets").iterdir())) == 1, "they share the data set"
