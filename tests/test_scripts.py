@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import time
+from pathlib import Path
 
 import meshio
 import numpy as np
@@ -213,7 +214,7 @@ def test_training_on_a_stream_of_two_workers_ends_and_leaves_no_process(
     start, members, tiny_training, tmp_path
 ):
     process = start("train", *online(tiny_training, "trainer.max_epochs=2", "run=r"), cwd=tmp_path)
-    status, out, err = finish(process)
+    status, _, err = finish(process)
     assert status == 0, err[-2000:]
     assert json.loads((tmp_path / "r/evaluation.json").read_text())
     assert waited_for(lambda: not members(process.pid), 5)
@@ -232,7 +233,7 @@ def streaming(start, members, tiny_training, tmp_path):
         found = []
         for pid in members(process.pid):
             try:
-                line = open(f"/proc/{pid}/cmdline").read()
+                line = Path(f"/proc/{pid}/cmdline").read_text()
             except OSError:
                 continue
             if "spawn_main" in line:
@@ -247,7 +248,7 @@ def streaming(start, members, tiny_training, tmp_path):
 def test_ctrl_c_ends_training_with_130_and_leaves_no_process(streaming, members):
     process, _ = streaming
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all of the group
-    status, out, err = finish(process, 60)
+    status, _, err = finish(process, 60)
     assert status == 130, err[-2000:]
     assert waited_for(lambda: not members(process.pid), 5)
     assert err.strip().endswith("interrupted")
@@ -258,7 +259,7 @@ def test_ctrl_c_ends_training_with_130_and_leaves_no_process(streaming, members)
 def test_a_killed_worker_ends_training_with_an_error_and_leaves_no_process(streaming, members):
     process, workers = streaming
     os.kill(workers()[0], signal.SIGKILL)
-    status, out, err = finish(process, 60)
+    status, _, err = finish(process, 60)
     assert status not in (0, 130)
     assert "worker" in err
     assert waited_for(lambda: not members(process.pid), 5)
@@ -279,7 +280,7 @@ def test_ctrl_c_while_generating_ends_with_130_and_keeps_whole_shards(
     process = start("generate", *tiny, *sizes, cwd=tmp_path)
     assert waited_for(lambda: list(tmp_path.glob("datasets/*/train-000000.safetensors")))
     os.killpg(process.pid, signal.SIGINT)
-    status, out, err = finish(process, 60)
+    status, _, err = finish(process, 60)
     assert status == 130, err[-2000:]
     assert waited_for(lambda: not members(process.pid), 5)
     (folder,) = (tmp_path / "datasets").iterdir()
@@ -295,7 +296,7 @@ def test_a_multirun_trains_each_combination_in_a_folder_of_its_own(start, tiny_t
     process = start(
         "train", *sweep, *tiny_training, "trainer.max_epochs=1", "run=sweep", cwd=tmp_path
     )
-    status, out, err = finish(process)
+    status, _, err = finish(process)
     assert status == 0, err[-2000:]
     folders = [path for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
     assert len(folders) == 4

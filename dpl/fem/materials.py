@@ -6,9 +6,41 @@ the rounding of 1 + H, and with it the equilibrium of small loads.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+
+class Response(NamedTuple):
+    """Stress and moduli at a strain: dS/dE = a X x X + b (X_ik X_jl + X_il X_jk).
+
+    Attributes:
+        stress: Second Piola-Kirchhoff stress S over Young's modulus, (..., 3, 3) [-].
+        bulk: a, (..., 1, 1) [-].
+        shear: b, (..., 1, 1) [-].
+        metric: X, symmetric, (..., 3, 3) [-].
+    """
+
+    stress: Tensor
+    bulk: Tensor
+    shear: Tensor
+    metric: Tensor
+
+    def product(self, change: Tensor) -> Tensor:
+        """Return dS/dE : change, (..., 3, 3) [-], of a symmetric change of strain."""
+        X = self.metric
+        bulk = self.bulk * (X * change).sum((-2, -1), keepdim=True)
+        return bulk * X + 2 * self.shear * (X @ change @ X)
+
+    def tangent(self, H: Tensor) -> Tensor:
+        """Return dP/dF, (..., 3, 3, 3, 3) [-], indexed iJkL, of a body deformed by F = I + H."""
+        X, eye = self.metric, torch.eye(3, dtype=H.dtype, device=H.device)
+        Y = X + H @ X
+        A = torch.einsum("...ij,...kl->...ijkl", self.bulk * Y, Y)
+        A += torch.einsum("...il,...kj->...ijkl", self.shear * Y, Y)
+        A += torch.einsum("...ik,...jl->...ijkl", self.shear * (Y + Y @ H.mT), X)
+        return A + torch.einsum("ik,...jl->...ijkl", eye, self.stress)
 
 
 @dataclass(frozen=True)
@@ -16,7 +48,8 @@ class Material:
     """Isotropic hyperelastic law with Young's modulus 1.
 
     A law is its `energy`; `stress` and `tangent` follow by automatic differentiation. A subclass
-    may give them in closed form as well, for speed.
+    may give its `response` to strains as well: the two then follow from that, and Newton can take
+    strains as unknowns.
 
     Attributes:
         poisson: Poisson's ratio at rest [-], in (-1, 0.5).
@@ -49,28 +82,33 @@ class Material:
         """Return the energy density over E, (...,) [-], of H (..., 3, 3) [-]."""
         raise NotImplementedError(f"{type(self).__name__} has no energy")
 
+    def response(self, E: Tensor) -> Response:
+        """Return stress and moduli at Green-Lagrange strains E, (..., 3, 3) [-].
+
+        Raises:
+            NotImplementedError: The law is its energy alone, see `has_response`.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no stress as a function of strain")
+
+    @property
+    def has_response(self) -> bool:
+        """Whether the law gives its stress as a function of strain."""
+        return type(self).response is not Material.response
+
     def stress(self, H: Tensor) -> Tensor:
         """Return the first Piola-Kirchhoff stress P = dW/dF over E, (..., 3, 3) [-]."""
+        if self.has_response:
+            S = self.response(green_lagrange(H)).stress
+            return S + H @ S
         gradient = torch.func.vmap(torch.func.grad(self.energy))
         return gradient(H.reshape(-1, 3, 3)).reshape(H.shape)
 
     def tangent(self, H: Tensor) -> Tensor:
         """Return dP/dF over E, (..., 3, 3, 3, 3) [-], indexed iJkL."""
+        if self.has_response:
+            return self.response(green_lagrange(H)).tangent(H)
         hessian = torch.func.vmap(torch.func.hessian(self.energy))
         return hessian(H.reshape(-1, 3, 3)).reshape(*H.shape, 3, 3)
-
-    def second_stress(self, E: Tensor) -> Tensor:
-        """Return the second Piola-Kirchhoff stress S, (..., 3, 3) [-], of strains (..., 3, 3)."""
-        raise NotImplementedError(f"{type(self).__name__} has no stress as a function of strain")
-
-    def second_tangent(self, E: Tensor) -> Tensor:
-        """Return dS/dE, (..., 3, 3, 3, 3) [-], of Green-Lagrange strains."""
-        raise NotImplementedError(f"{type(self).__name__} has no stress as a function of strain")
-
-    @property
-    def has_second_stress(self) -> bool:
-        """Whether the law gives its stress as a function of strain, which mixed points need."""
-        return type(self).second_stress is not Material.second_stress
 
 
 @dataclass(frozen=True)
@@ -85,32 +123,12 @@ class SaintVenantKirchhoff(Material):
         E = green_lagrange(H)
         return self.lam / 2 * trace(E).square() + self.mu * E.square().sum((-2, -1))
 
-    def stress(self, H: Tensor) -> Tensor:
-        """Return P = F S, see `Material.stress`."""
-        S = self.second_stress(green_lagrange(H))
-        return S + H @ S
-
-    def tangent(self, H: Tensor) -> Tensor:
-        """Return dP/dF, see `Material.tangent`."""
-        eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        F, S = eye + H, self.second_stress(green_lagrange(H))
-        A = self.lam * torch.einsum("...ij,...kl->...ijkl", F, F)
-        A += self.mu * torch.einsum("...il,...kj->...ijkl", F, F)
-        A += self.mu * torch.einsum("...ik,jl->...ijkl", F @ F.mT, eye)
-        return A + torch.einsum("ik,...jl->...ijkl", eye, S)
-
-    def second_stress(self, E: Tensor) -> Tensor:
-        """Return S = lambda tr E I + 2 mu E, see `Material.second_stress`."""
-        eye = torch.eye(3, dtype=E.dtype, device=E.device)
-        return self.lam * trace(E)[..., None, None] * eye + 2 * self.mu * E
-
-    def second_tangent(self, E: Tensor) -> Tensor:
-        """Return Hooke's constant moduli, see `Material.second_tangent`."""
-        eye = torch.eye(3, dtype=E.dtype, device=E.device)
-        D = self.lam * torch.einsum("ij,kl->ijkl", eye, eye)
-        D += self.mu * torch.einsum("ik,jl->ijkl", eye, eye)
-        D += self.mu * torch.einsum("il,jk->ijkl", eye, eye)
-        return D.expand(*E.shape, 3, 3)
+    def response(self, E: Tensor) -> Response:
+        """Return S = lambda tr E I + 2 mu E with Hooke's moduli, see `Material.response`."""
+        eye = torch.eye(3, dtype=E.dtype, device=E.device).expand_as(E)
+        one = torch.ones_like(E[..., :1, :1])
+        S = self.lam * trace(E)[..., None, None] * eye + 2 * self.mu * E
+        return Response(S, self.lam * one, self.mu * one, eye)
 
 
 @dataclass(frozen=True)
@@ -140,34 +158,14 @@ class NeoHookean(Material):
         shear = (self.mu - pressure) / (1 + change)
         return self.mu * H + shear[..., None, None] * X + pressure[..., None, None] * eye
 
-    def tangent(self, H: Tensor) -> Tensor:
-        """Return dP/dF, see `Material.tangent`."""
-        change = volume_change(H)
-        eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        G = inverse_transpose(H, change)
-        shear = (self.mu - self.lam * torch.log1p(change))[..., None, None]
-        A = torch.einsum("...il,...kj->...ijkl", shear * G, G)
-        A += self.lam * torch.einsum("...ij,...kl->...ijkl", G, G)
-        return A + self.mu * torch.einsum("ik,jl->ijkl", eye, eye)
-
-    def second_stress(self, E: Tensor) -> Tensor:
-        """Return S = (2 mu E + lambda ln J I) C^-1, C = I + 2 E, see `Material.second_stress`."""
-        inverse, log_J = self._inverse_and_log(E)
-        eye = torch.eye(3, dtype=E.dtype, device=E.device)
-        return (2 * self.mu * E + self.lam * log_J * eye) @ inverse
-
-    def second_tangent(self, E: Tensor) -> Tensor:
-        """Return dS/dE, see `Material.second_tangent`."""
-        inverse, log_J = self._inverse_and_log(E)
-        shear = (self.mu - self.lam * log_J) * inverse
-        D = self.lam * torch.einsum("...ij,...kl->...ijkl", inverse, inverse)
-        D += torch.einsum("...ik,...jl->...ijkl", shear, inverse)
-        return D + torch.einsum("...il,...jk->...ijkl", shear, inverse)
-
-    def _inverse_and_log(self, E: Tensor) -> tuple[Tensor, Tensor]:
-        """Return C^-1 and ln J (..., 1, 1)."""
-        change = volume_change(2 * E)  # of C, J^2 - 1
-        return inverse_transpose(2 * E, change), torch.log1p(change)[..., None, None] / 2
+    def response(self, E: Tensor) -> Response:
+        """Return S = (2 mu E + lambda ln J I) C^-1, C = I + 2 E, see `Material.response`."""
+        change = volume_change(2 * E)  # det C - 1
+        inverse = inverse_transpose(2 * E, change)
+        pressure = self.lam / 2 * torch.log1p(change)[..., None, None]
+        one = torch.ones_like(pressure)
+        S = 2 * self.mu * E @ inverse + pressure * inverse
+        return Response(S, self.lam * one, self.mu - pressure, inverse)
 
 
 def trace(H: Tensor) -> Tensor:

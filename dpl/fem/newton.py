@@ -183,7 +183,7 @@ class Newton:
 
     def _moved_strain(self, state: "_State", length: float, update: Tensor) -> Tensor | None:
         """Return the strain that mixed points take with a step; None: plain Newton goes on."""
-        if not (self.mixed and self.problem.material.has_second_stress):
+        if not (self.mixed and self.problem.material.has_response):
             return None
         u = state.displacement
         here = self.problem.strain(u)

@@ -28,10 +28,6 @@ ELEMENTS = {
     ("Hexahedral", 1): (skfem.ElementHex1, 3),
     ("Hexahedral", 2): (skfem.ElementHex2, 5),
 }
-PAIRS = {  # axes of the independent components of a symmetric tensor, by dimension
-    2: ([0, 1, 0], [0, 1, 1]),
-    3: ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]),
-}
 QUADRATIC = {element for (_, degree), (element, _) in ELEMENTS.items() if degree == 2}
 
 
@@ -231,34 +227,10 @@ class Problem:
 
         Source: Magisano, Leonetti, Garcea (2017), CMAME 313, section 3.
         """
-        dim, samples = self.shape[1], len(displacement)
         H = self._gradient(displacement)
-        S, D = self.material.second_stress(strain), self.material.second_tangent(strain)
-        i, j = (torch.tensor(axes, device=H.device) for axes in PAIRS[dim])
-        D = D[..., i, j, :, :][..., i, j]  # (B, E, Q, P, P), P independent strains
-        slope = self._strain_slope(H)  # (B, E, Q, P, A i)
-        gap = (green_lagrange(H) - strain)[..., i, j] * (1.0 + (i != j))  # shear counts twice
-        moved = S[..., i, j] + (D @ gap[..., None])[..., 0]
-        weight = self.dV[..., None]
-        right = (D @ slope * weight[..., None]).flatten(-3, -2)  # (B, E, Q P, A i)
-        left = slope.flatten(-3, -2).mT
-        matrices = (left @ right).unflatten(-2, (-1, dim)).unflatten(-1, (-1, dim)).mT  # aikb
-        pull = (self.dN @ (S[..., :dim, :dim] * weight[..., None])).transpose(-3, -2).flatten(-2)
-        matrices.diagonal(dim1=-3, dim2=-2).add_((pull @ self._operator.mT)[..., None])
-        per_cell = (left @ (moved * weight).flatten(-2)[..., None]).unflatten(-2, (-1, dim))
-        return self._gathered(per_cell[..., 0]), self._entries(matrices.reshape(samples, -1))
-
-    def _strain_slope(self, H: Tensor) -> Tensor:
-        """Return B, the slope of the independent strains (shear doubled), (B, E, Q, P, A D)."""
-        dim = self.shape[1]
-        F = H[..., :dim, :dim] + torch.eye(dim, dtype=H.dtype, device=H.device)
-        # B[ij] at node a, direction k: F_ki dN_aj + F_kj dN_ai, half of it for i = j
-        i, j = (torch.tensor(axes, device=H.device) for axes in PAIRS[dim])
-        columns, gradients = F.mT[..., None, :], self.dN.mT[..., None]  # (i, 1, k), (j, a, 1)
-        slope = columns[..., i, :, :] * gradients[..., j, :, :]  # (B, E, Q, P, A, D)
-        slope = slope + columns[..., j, :, :] * gradients[..., i, :, :]
-        slope = slope * torch.where(i == j, 0.5, 1.0).to(H)[:, None, None]
-        return slope.flatten(-2)
+        response = self.material.response(strain)
+        stress = response.stress + response.product(green_lagrange(H) - strain)
+        return self._spread(stress + H @ stress), self._assembled(response.tangent(H))
 
     def _spread(self, stress: Tensor) -> Tensor:
         """Return the nodal forces (B, N, D) of first Piola-Kirchhoff stresses (B, E, Q, 3, 3)."""

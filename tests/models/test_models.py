@@ -1,0 +1,178 @@
+"""Laws of every network in conf/model, and the paper's counts for its own."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from dpl.fem.solution import Load
+from dpl.losses import MSE
+from dpl.models import fcnn
+from dpl.models.fcnn import FCNN
+from dpl.module import Surrogate
+
+MODELS = sorted((Path(__file__).parents[2] / "conf" / "model").glob("*.yaml"))
+
+
+@pytest.fixture(params=MODELS, ids=lambda path: path.stem)
+def build(request, scene):
+    """From a seed to the network, with the defaults of its file."""
+
+    def build(seed=0):
+        torch.manual_seed(seed)
+        return instantiate(OmegaConf.load(request.param), _convert_="all")(scene=scene)
+
+    return build
+
+
+def test_a_network_answers_fields_with_fields_in_single_precision(build, scene):
+    net = build()
+    for size in (1, 3):
+        force = torch.randn(size, *scene.problem.shape)
+        answer = net(force)
+        assert answer.shape == force.shape
+        assert answer.dtype == torch.float32
+    assert all(parameter.dtype == torch.float32 for parameter in net.parameters())
+
+
+def test_what_is_held_does_not_move(build, scene, batch):
+    surrogate = Surrogate(build(), MSE(), scene).eval()
+    with torch.no_grad():
+        answer = surrogate.predict(Load(batch.force + 1.0, batch.young))
+    held = ~scene.problem.free
+    assert torch.equal(answer[:, held], torch.zeros_like(answer[:, held]))
+    assert answer.abs().max() > 0
+
+
+def test_a_batch_is_its_members(build, scene):
+    net = build().eval()
+    force = torch.randn(4, *scene.problem.shape, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        whole = net(force)
+        parts = torch.cat([net(one[None]) for one in force])
+    assert torch.allclose(whole, parts, rtol=1e-4, atol=1e-5)
+
+
+def test_a_network_overfits_one_batch(build, scene, batch):
+    """A hundred times smaller error on four samples within 300 steps."""
+    surrogate = Surrogate(build(), MSE(), scene)
+    four = type(batch)(*(column[:4] for column in batch))
+    optimizer = torch.optim.Adam(surrogate.parameters(), lr=3e-3)
+    losses = []
+    for _ in range(300):
+        loss = surrogate.loss(surrogate.predict(four.load), four, surrogate.physics)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+        if losses[-1] < losses[0] / 100:
+            return
+    pytest.fail(f"the loss fell {losses[0] / min(losses):.0f} times only")
+
+
+def test_a_saved_network_is_the_same_network(build, scene, batch, tmp_path):
+    net, other = build(0).eval(), build(1).eval()
+    force = batch.force.float()
+    with torch.no_grad():
+        assert not torch.equal(net(force), other(force))
+        torch.save(net.state_dict(), tmp_path / "net.pt")
+        other.load_state_dict(torch.load(tmp_path / "net.pt", weights_only=True))
+        assert torch.equal(net(force), other(force))
+
+
+def test_weights_are_a_function_of_the_seed(build):
+    one, same, other = build(0), build(0), build(1)
+    assert all(torch.equal(a, b) for a, b in zip(one.parameters(), same.parameters(), strict=True))
+    assert any(
+        not torch.equal(a, b) for a, b in zip(one.parameters(), other.parameters(), strict=True)
+    )
+
+
+def test_every_parameter_learns(build, scene, batch):
+    surrogate = Surrogate(build(), MSE(), scene)
+    surrogate.loss(surrogate.predict(batch.load), batch, surrogate.physics).backward()
+    for name, parameter in surrogate.net.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.any(), name
+
+
+# ------------------------------------------------------------------ the paper's network
+
+
+def count(module):
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def test_the_papers_network_has_4_n2_plus_7_n_parameters(make_scene):
+    scene = make_scene(nodes=(9, 3, 3))  # 243 degrees of freedom
+    net = FCNN(scene, all_dofs=True)
+    assert count(net) == 4 * 243**2 + 7 * 243 == 237_897
+    assert net.parameters_needed == 237_897
+    assert net.plan() == []
+
+
+def test_the_papers_beam_has_576_million_parameters():
+    assert fcnn._parameters([12_000] * 5) == 4 * 12_000**2 + 7 * 12_000 == 576_084_000
+
+
+@pytest.mark.parametrize("options", [{}, {"width": 20}, {"layers": 2}, {"layers": 6, "width": 7}])
+def test_parameters_are_counted_before_they_are_made(scene, options):
+    net = FCNN(scene, **options)
+    assert net.parameters_needed == count(net)
+
+
+def test_inputs_are_where_loads_can_act_and_outputs_where_the_body_can_move(scene, batch):
+    torch.manual_seed(0)
+    net = FCNN(scene)
+    inputs, outputs = int(scene.loads.reach.sum()), int(scene.problem.free.sum())
+    assert net.stages[0].in_features == inputs < scene.problem.free.numel()
+    assert net.stages[-1].out_features == outputs
+    force = batch.force.float()
+    with torch.no_grad():
+        answer = net(force)
+        blind = net(force + torch.where(scene.loads.reach, 0.0, 1.0))
+    assert torch.equal(answer, blind)
+    assert not answer[:, ~scene.problem.free].any()
+
+
+def test_the_plan_counts_the_parameters_that_are_saved(scene):
+    net, whole = FCNN(scene), FCNN(scene, all_dofs=True)
+    (line,) = net.plan()
+    assert line.startswith(f"{count(whole) - count(net):,} of {count(whole):,} parameters")
+
+
+def test_each_unit_has_its_own_slope(scene):
+    net = FCNN(scene, width=20)
+    slopes = [stage for stage in net.stages if isinstance(stage, torch.nn.PReLU)]
+    assert [slope.num_parameters for slope in slopes] == [20, 20, 20]
+
+
+def test_a_network_beyond_memory_is_refused_with_the_numbers_before_it_is_made(scene, monkeypatch):
+    def forbidden(*_, **__):
+        raise AssertionError("allocated")
+
+    needed = FCNN(scene).parameters_needed
+    monkeypatch.setattr(torch.nn, "Linear", forbidden)
+    with pytest.raises(MemoryError) as refusal:
+        FCNN(scene, memory_limit=needed * 16 / 1e9 * 0.99)
+    assert f"{needed:,} parameters" in str(refusal.value)
+    assert f"{needed * 16 / 1e9:.1f} GB" in str(refusal.value)
+    with pytest.raises(AssertionError, match="allocated"):
+        FCNN(scene, memory_limit=needed * 16 / 1e9 * 1.01)
+
+
+def test_the_papers_beam_needs_nine_gigabytes():
+    with pytest.raises(
+        MemoryError, match=r"576,084,000 parameters .* need 9\.2 GB, there are 8\.0"
+    ):
+        fcnn._refuse_beyond_memory(576_084_000, 8.0)
+    fcnn._refuse_beyond_memory(576_084_000, 9.3)
+
+
+@pytest.mark.parametrize("options", [{"layers": 1}, {"width": 0}, {"layers": 0}])
+def test_options_out_of_range_are_refused_by_name(scene, options):
+    with pytest.raises(ValueError, match=f"{next(iter(options))} = "):
+        FCNN(scene, **options)

@@ -1,0 +1,188 @@
+"""Laws of the benchmark: rows that count right, and an evaluation that leaves what it promises."""
+
+import json
+import time
+
+import matplotlib.image
+import meshio
+import numpy as np
+import pytest
+import torch
+
+from dpl.benchmark import Row, clock, evaluate, save, show
+from dpl.fem.solution import Load, Solution, judge
+from dpl.losses import MSE
+from dpl.metrics import RelativeL2
+from dpl.models.fcnn import FCNN
+from dpl.module import Surrogate
+from dpl.scene import Sample
+
+
+@pytest.fixture(scope="module")
+def few(batch) -> Sample:
+    return Sample(*(column[:4] for column in batch))
+
+
+class Known:
+    """Knows the answers (B, N, D) to a batch of loads; counts and takes time as it is told."""
+
+    def __init__(self, problem, batch, answers, counts, seconds=0.0):
+        self.problem, self.batch, self.answers, self.counts = problem, batch, answers, counts
+        self.seconds, self.asked = seconds, []
+
+    def iterate(self, load):
+        assert len(load.force) == 1, "one load at a time"
+        (k,) = [k for k, force in enumerate(self.batch.force) if torch.equal(force, load.force[0])]
+        self.asked.append(k)
+        time.sleep(self.seconds)
+        yield judge(self.problem, torch.zeros_like(load.force), load, 1e-8)
+        answer = self.answers[k : k + 1]
+        yield judge(self.problem, answer, load, 1e-8, iterations=self.counts[k])
+
+
+def test_rows_count_what_the_solvers_did(scene, few):
+    wrong = few.displacement.clone()
+    wrong[2] *= 1.01
+    exact = Known(scene.problem, few, few.displacement, [3, 4, 5, 8])
+    poor = Known(scene.problem, few, wrong, [0, 0, 0, 0])
+    rows, answers = clock({"exact": exact, "poor": poor}, few, scene.problem)
+    assert [row.solver for row in rows] == ["exact", "poor"]
+    first, second = rows
+    assert (first.converged, first.loads) == (4, 4)
+    assert (second.converged, second.loads) == (3, 4)
+    assert (first.iterations, first.worst_iterations) == (5.0, 8)
+    assert (second.iterations, second.worst_iterations) == (0.0, 0)
+    assert first.errors["e_max"] == 0.0
+    assert second.errors["rel_L2_worst"] == pytest.approx(0.01, rel=1e-9)
+    assert second.errors["rel_L2_median"] == 0.0
+    assert torch.equal(answers["poor"], wrong)
+
+
+def test_every_solver_is_warmed_up_then_asked_each_load_in_turn(scene, few):
+    order = []
+
+    class Spy(Known):
+        def iterate(self, load):
+            order.append(self)
+            return super().iterate(load)
+
+    a, b = (Spy(scene.problem, few, few.displacement, [1] * 4) for _ in range(2))
+    clock({"a": a, "b": b}, few, scene.problem)
+    assert a.asked == b.asked == [0, 0, 1, 2, 3]
+    assert order == [a, b] + [a, b] * 4
+
+
+def test_the_clock_measures_the_solver(scene, few):
+    slow = Known(scene.problem, few, few.displacement, [1] * 4, seconds=0.02)
+    fast = Known(scene.problem, few, few.displacement, [1] * 4)
+    (first, second), _ = clock({"slow": slow, "fast": fast}, few, scene.problem)
+    assert first.milliseconds > 20
+    assert first.slowest >= first.milliseconds
+    assert second.milliseconds < first.milliseconds
+
+
+def test_a_solver_that_fails_is_a_row_and_no_crash(scene, few):
+    broken = Known(scene.problem, few, torch.full_like(few.displacement, torch.nan), [9] * 4)
+    (row,), _ = clock({"broken": broken}, few, scene.problem)
+    assert row.converged == 0
+    assert row.errors["residual"] == np.inf
+    show([row], "broken")
+
+
+def test_rows_come_back_from_json(scene, few, tmp_path):
+    rows, _ = clock(
+        {"exact": Known(scene.problem, few, few.displacement, [1] * 4)}, few, scene.problem
+    )
+    save(rows, tmp_path / "rows.json")
+    assert [Row(**row) for row in json.loads((tmp_path / "rows.json").read_text())] == rows
+
+
+# ------------------------------------------------------------------ evaluation
+
+
+@pytest.fixture(scope="module")
+def surrogate(scene):
+    torch.manual_seed(0)
+    return Surrogate(FCNN(scene, width=8), MSE(), scene).eval()
+
+
+@pytest.fixture(scope="module")
+def evaluated(surrogate, few, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("evaluated")
+    threads = torch.get_num_threads()
+    rows = evaluate(surrogate, few, folder)
+    assert torch.get_num_threads() == threads
+    return rows, folder
+
+
+def test_an_evaluation_has_four_rows_that_are_saved(evaluated):
+    rows, folder = evaluated
+    assert [row.solver for row in rows] == [
+        "linear",
+        "network",
+        "hybrid Newton",
+        "Newton from zero",
+    ]
+    saved = json.loads((folder / "evaluation.json").read_text())
+    assert [row["errors"]["e_mean"] for row in saved] == [row.errors["e_mean"] for row in rows]
+
+
+def test_hybrid_and_newton_answer_every_load(evaluated):
+    linear, network, hybrid, newton = evaluated[0]
+    assert hybrid.converged == newton.converged == 4
+    assert hybrid.errors["residual"] < 1e-8
+    assert hybrid.errors["rel_L2_worst"] < 1e-6
+    assert network.iterations == 0
+    assert linear.iterations == 1
+    assert newton.iterations >= 2
+
+
+def test_the_tolerance_of_an_evaluation_is_its_own(surrogate, few, tmp_path):
+    rows = evaluate(surrogate, few, tmp_path, tol=1e-2)
+    newton = rows[-1]
+    assert newton.converged == 4
+    assert 1e-8 < newton.errors["residual"] < 1e-2
+    assert surrogate.scene.solver.tol == 1e-8
+
+
+def test_the_table_prints_every_row(surrogate, few, tmp_path, capsys):
+    evaluate(surrogate, few, tmp_path)
+    out = capsys.readouterr().out
+    assert "4 fresh loads, one at a time, 1 thread, tol 1e-08" in out
+    for words in ("linear", "network", "hybrid Newton", "Newton from zero", "4/4"):
+        assert words in out
+
+
+def test_the_figure_is_a_picture(evaluated):
+    pixels = matplotlib.image.imread(evaluated[1] / "shapes.png")
+    assert pixels.shape[0] > 300
+    assert pixels.shape[1] > 600
+    assert pixels[..., :3].std() > 0.01
+
+
+def test_the_worst_case_is_written_in_si_units(evaluated, surrogate, scene, few):
+    case = meshio.read(evaluated[1] / "worst.vtu")
+    with torch.no_grad():
+        network = surrogate.predict(few.load)
+    worst = int(RelativeL2().measure(network, few).argmax())
+    length, fields = scene.length, case.point_data
+    assert np.ptp(case.points, axis=0) == pytest.approx([100.0, 25.0, 25.0])
+    assert case.cells_dict["hexahedron"].shape == (16, 8)
+    truth = length * few.displacement[worst].numpy()
+    assert fields["displacement [m]"] == pytest.approx(truth, abs=1e-9)
+    assert fields["network [m]"] == pytest.approx(length * network[worst].numpy(), abs=1e-5)
+    gap = np.linalg.norm(fields["network [m]"] - fields["displacement [m]"], axis=1)
+    assert fields["error [m]"] == pytest.approx(gap, abs=1e-9)
+    newtons = few.force[worst].numpy() * 4500.0 * length**2
+    assert fields["force [N]"] == pytest.approx(newtons, rel=1e-9, abs=1e-9)
+
+
+def test_the_written_case_is_in_equilibrium(evaluated, scene):
+    """Read back, newtons and metres still balance."""
+    case = meshio.read(evaluated[1] / "worst.vtu")
+    force = torch.from_numpy(case.point_data["force [N]"])[None]
+    metres = torch.from_numpy(case.point_data["displacement [m]"])[None]
+    load = scene.load_of(force, torch.tensor([4500.0]))
+    assert isinstance(load, Load)
+    answer: Solution = judge(scene.problem, metres / scene.length, load, 1e-7)
+    assert answer.converged

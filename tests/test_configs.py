@@ -1,0 +1,147 @@
+"""conf/ is the only registry: everything in it instantiates, composes and solves."""
+
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from dpl import run
+from dpl.data.generate import Job, outcome
+from dpl.fem.mesh import box
+from dpl.fem.solution import solve
+
+CONF = Path(__file__).parents[1] / "conf"
+
+
+def options(group):
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+MESHES = [
+    pytest.param(name, marks=pytest.mark.slow) if name == "paper_beam" else name
+    for name in options("mesh")
+]
+GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "experiment")
+
+
+@pytest.fixture
+def part(tmp_path):
+    """A mesh file that this package did not write."""
+    mesh = box([2.0, 0.5, 0.5], [7, 3, 3], "tetra")
+    path = tmp_path / "part.vtk"
+    meshio.write(path, meshio.Mesh(mesh.p.T, [("tetra", mesh.t.T)]))
+    return path
+
+
+@pytest.fixture
+def overrides(part):
+    """What an option of a group needs besides its name."""
+
+    def overrides(group, name):
+        return [f"{group}={name}", *([f"mesh.path={part}"] if name == "file" else [])]
+
+    return overrides
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_a_mesh_clamps_something_and_newton_answers_three_loads(scene_of, overrides, name):
+    scene = scene_of(*overrides("mesh", name), "+solver.linear=superlu")
+    free = scene.problem.free
+    assert 0 < int((~free).sum()) < free.numel()
+    assert scene.problem.loose_modes() == []
+    answer = solve(scene.solver, scene.loads.sample((0, 0), range(3)))
+    assert answer.converged.all()
+    assert (answer.volume_ratio > 0).all()
+
+
+SMALL = {
+    "beam": ["mesh=beam", "mesh.nodes=[5,3,3]"],
+    "tetra": ["mesh=beam", "mesh.nodes=[5,3,3]", "+mesh.cell=tetra"],
+    "quadratic": ["mesh=beam", "mesh.nodes=[3,2,2]", "degree=2"],
+    "rectangle": ["mesh=rectangle", "mesh.nodes=[9,3]"],
+    "triangle": ["mesh=rectangle", "mesh.nodes=[9,3]", "+mesh.cell=triangle"],
+}
+
+
+@pytest.mark.parametrize("mesh", SMALL)
+@pytest.mark.parametrize("material", options("material"))
+def test_every_law_answers_loads_on_every_kind_of_mesh(scene_of, material, mesh):
+    scene = scene_of(*SMALL[mesh], f"material={material}", "+solver.linear=superlu")
+    one = outcome(scene, Job((0, 0), 0))
+    assert one.accepted
+    assert one.displacement.any()
+
+
+@pytest.mark.parametrize("material", options("material"))
+def test_laws_share_young_and_poisson_at_rest(material):
+    law = instantiate(OmegaConf.load(CONF / "material" / f"{material}.yaml"))
+    tangent = law.tangent(torch.zeros(3, 3, dtype=torch.float64))
+    mu, lam = 1 / 2.6, 0.3 / (1.3 * 0.4)
+    assert float(tangent[0, 0, 0, 0]) == pytest.approx(lam + 2 * mu)
+    assert float(tangent[0, 0, 1, 1]) == pytest.approx(lam)
+    assert float(tangent[0, 1, 0, 1]) == pytest.approx(mu)
+
+
+@pytest.mark.parametrize("name", options("experiment"))
+def test_an_experiment_composes_and_passes_the_check(compose, name):
+    cfg = compose(f"experiment={name}", "folder=.", command="train")
+    run.check(cfg)
+
+
+@pytest.mark.parametrize(
+    ("group", "name"), [(group, name) for group in GROUPS for name in options(group)]
+)
+def test_every_option_composes_and_passes_the_check(compose, overrides, group, name):
+    run.check(compose(*overrides(group, name), "folder=.", command="train"))
+
+
+@pytest.mark.parametrize("command", ["generate", "train"])
+def test_commands_share_the_scene(compose, command):
+    cfg = compose(*(["folder=."] if command == "train" else []), command=command)
+    other = compose("folder=.", command="train")
+    for key in ("clamped", "degree", "young", "solver", "mesh", "material", "loads"):
+        assert cfg[key] == other[key], key
+
+
+def test_commands_share_the_sizes_of_the_data_set(compose):
+    """A data set from generate.py is the one that train.py looks for."""
+    one, other = compose(), compose("folder=.", command="train")
+    for key in ("folder", "seed", "train", "val", "test"):
+        assert one.data[key] == other.data[key], key
+
+
+def test_the_default_is_the_main_job(compose):
+    cfg = compose("folder=.", command="train")
+    assert cfg.mesh.nodes == [17, 5, 5]
+    assert cfg.material._target_.endswith("NeoHookean")
+    assert cfg.data.train == 1000
+    assert cfg.model._target_.endswith("FCNN")
+    assert cfg.loss._target_.endswith("LrStar")
+    assert cfg.data.test == 100
+
+
+def test_yaml_says_nothing_that_python_says_already_except_by_intent():
+    """Every file is a call of something that exists, or a command or a package-wide experiment."""
+    for path in CONF.glob("*/*.yaml"):
+        if path.parent.name in ("experiment", "young"):
+            continue
+        assert "_target_" in OmegaConf.load(path), path
+
+
+def test_loads_of_different_seeds_are_different_data(compose, scene, tmp_path):
+    folders = set()
+    for seed in (0, 1):
+        cfg = compose("folder=.", f"data.seed={seed}", command="train")
+        folders.add(run.make(cfg, "data", scene=scene).store.folder)
+    assert len(folders) == 2
+
+
+def test_the_seed_shuffles_batches_and_leaves_the_loads(compose):
+    cfg = compose("folder=.", "seed=5", command="train")
+    assert cfg.data.shuffle == 5
+    assert cfg.data.seed == 0
+    assert np.isfinite(cfg.optimizer.lr)

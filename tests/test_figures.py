@@ -1,0 +1,111 @@
+"""Laws of the figures: a closed skin of a body, and pictures of what is wrong where."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+import skfem
+import torch
+
+from dpl.fem.mesh import box, rectangle
+from dpl.figures import deformed, surface
+
+
+def edges(polygons):
+    """Return how many polygons share each edge."""
+    count = Counter()
+    for polygon in polygons:
+        for a, b in zip(polygon, np.roll(polygon, -1), strict=True):
+            count[frozenset((int(a), int(b)))] += 1
+    return count
+
+
+def area(points, polygons):
+    """Return the area of polygons (P, corners) that turn around their middle."""
+    corners = points[polygons]
+    middle = corners.mean(axis=1, keepdims=True)
+    spokes, following = corners - middle, np.roll(corners, -1, axis=1) - middle
+    return np.linalg.norm(np.cross(spokes, following), axis=-1).sum() / 2
+
+
+BODIES = {
+    "hexahedron": (box([4.0, 2.0, 1.0], [5, 3, 2]), 2 * (4 * 2 + 4 * 1 + 2 * 1), 4),
+    "tetra": (box([4.0, 2.0, 1.0], [5, 3, 2], "tetra"), 4 * (4 * 2 + 4 * 1 + 2 * 1), 3),
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_the_surface_of_a_body_is_closed(name):
+    mesh, facets, corners = BODIES[name]
+    polygons = surface(mesh)
+    assert polygons.shape == (facets, corners)
+    assert set(edges(polygons).values()) == {2}
+    assert len(mesh.boundary_facets()) == facets
+    assert set(polygons.ravel()) == set(mesh.boundary_nodes())
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_the_surface_has_the_area_of_the_body(name):
+    """Corners go around each facet: crossed quadrilaterals would have less."""
+    mesh, *_ = BODIES[name]
+    assert area(mesh.p.T, surface(mesh)) == pytest.approx(2 * (4 * 2 + 4 * 1 + 2 * 1))
+
+
+def test_the_surface_of_a_curved_body_is_that_of_its_vertices():
+    mesh = skfem.MeshTet2.from_mesh(box([1.0, 1.0, 1.0], [3, 3, 3], "tetra"))
+    polygons = surface(mesh)
+    assert polygons.shape == (48, 3)
+    assert area(mesh.p.T, polygons) == pytest.approx(6.0)
+
+
+@pytest.mark.parametrize(("cell", "count", "corners"), [("quad", 8, 4), ("triangle", 16, 3)])
+def test_a_plane_body_is_seen_as_its_cells(cell, count, corners):
+    mesh = rectangle([4.0, 2.0], [5, 3], cell)
+    polygons = surface(mesh)
+    assert polygons.shape == (count, corners)
+    flat = np.column_stack([mesh.p.T, np.zeros(mesh.p.shape[1])])
+    assert area(flat, polygons) == pytest.approx(8.0)
+
+
+@pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
+def test_a_figure_has_a_row_a_prediction_and_a_column_a_load(make_scene, cell):
+    plane = {"mesh": rectangle([8.0, 2.0], [5, 3], cell)} if cell in ("quad", "triangle") else {}
+    scene = make_scene(**(plane or {"cell": cell}), n_modes=2)
+    truth = 0.01 * torch.randn(2, *scene.problem.shape, dtype=torch.float64)
+    shown = [("network", truth * 0.9), ("linear", truth * 1.1), ("exact", truth)]
+    figure = deformed(scene.problem, truth, shown, names=["first", "second"])
+    axes = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
+    assert len(axes) == 6
+    titles = [ax.get_title() for ax in axes]
+    assert titles[0] == "first\nnetwork"
+    assert titles[1] == "second\nnetwork"
+    assert titles[-1] == "exact"
+    figure.canvas.draw()
+
+
+def test_an_exact_prediction_can_be_drawn(scene, batch):
+    truth = batch.displacement[:1]
+    deformed(scene.problem, truth, [("network", truth)]).canvas.draw()
+
+
+def test_a_prediction_that_is_no_number_can_be_drawn(scene, batch):
+    truth = batch.displacement[:1]
+    broken = torch.full_like(truth, torch.nan)
+    deformed(scene.problem, truth, [("network", broken), ("linear", truth)]).canvas.draw()
+
+
+def test_a_wrong_place_is_brighter(scene, batch):
+    """Colours grow with the distance from the true position."""
+    truth = batch.displacement[:1]
+    wrong = truth.clone()
+    points = scene.problem.points
+    end = points[:, 0] == points[:, 0].max()
+    wrong[:, end] += 0.1
+    figure = deformed(scene.problem, truth, [("network", wrong)])
+    shape = figure.axes[0].collections[0]
+    colours = np.asarray(shape.get_facecolor())
+    polygons = surface(scene.problem.mesh)
+    if len(colours) == len(polygons):
+        at_end = end.numpy()[polygons].all(axis=1)
+        brightness = colours[:, :3].sum(axis=1)
+        assert brightness[at_end].min() > brightness[~at_end].max() - 1e-9

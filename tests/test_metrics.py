@@ -1,0 +1,145 @@
+"""Laws of the metrics: the paper's formulas, written once more in numpy."""
+
+import numpy as np
+import pytest
+import torch
+
+from dpl.fem.problem import Problem
+from dpl.metrics import (
+    MaxError,
+    MeanError,
+    MinSNR,
+    MinVolumeRatio,
+    RelativeL2,
+    ResidualRatio,
+    metrics,
+)
+from dpl.scene import Sample
+
+
+@pytest.fixture(scope="module")
+def prediction(scene, batch):
+    random = torch.Generator().manual_seed(0)
+    noise = torch.randn(batch.force.shape, generator=random, dtype=torch.float64)
+    return batch.displacement + torch.where(scene.problem.free, 1e-3 * noise, 0.0)
+
+
+def by_hand(problem: Problem, prediction, batch):
+    """Return every number, load by load, without a line of `dpl.metrics`."""
+    u, v, f = (x.numpy() for x in (prediction, batch.displacement, batch.force))
+    loads, nodes, dim = u.shape
+    whole = [np.linalg.norm(u[s] - v[s]) for s in range(loads)]
+    ratio = [np.linalg.norm(u[s]) / whole[s] for s in range(loads)]
+    relative = sorted(whole[s] / np.linalg.norm(v[s]) for s in range(loads))
+    internal = problem.internal_force(prediction).numpy()
+    free = problem.free.numpy()
+    residual = sorted(
+        np.linalg.norm((internal[s] - f[s])[free]) / np.linalg.norm(f[s]) for s in range(loads)
+    )
+    F = problem._gradient(prediction).numpy() + np.eye(3)
+    return {
+        "e_mean": sum(whole) / (nodes * dim * loads),
+        "e_max": max(np.linalg.norm(u[s, i] - v[s, i]) for s in range(loads) for i in range(nodes)),
+        "SNR_min": 20 * np.log10(min(ratio)),
+        "SNR_min_printed": 10 * np.log10(min(ratio)),
+        "rel_L2_median": relative[(loads - 1) // 2],
+        "rel_L2_worst": relative[-1],
+        "residual": residual[(loads - 1) // 2],
+        "min_det_F": np.linalg.det(F).min(),
+    }
+
+
+def test_metrics_are_the_formulas(scene, prediction, batch):
+    found = metrics(scene.problem)
+    found.update(prediction, batch)
+    expected = by_hand(scene.problem, prediction, batch)
+    numbers = {name: float(value) for name, value in found.compute().items()}
+    assert numbers == pytest.approx(expected, rel=1e-9)
+
+
+def test_batches_accumulate_to_the_same_as_one(scene, prediction, batch):
+    whole, parts = metrics(scene.problem), metrics(scene.problem)
+    whole.update(prediction, batch)
+    for start, end in ((0, 5), (5, 6), (6, 12)):
+        parts.update(prediction[start:end], Sample(*(column[start:end] for column in batch)))
+    assert {k: float(v) for k, v in parts.compute().items()} == pytest.approx(
+        {k: float(v) for k, v in whole.compute().items()}, rel=1e-12
+    )
+
+
+def test_metrics_forget_on_reset(scene, prediction, batch):
+    found = metrics(scene.problem)
+    found.update(batch.displacement + 1.0, batch)
+    found.reset()
+    found.update(prediction, batch)
+    expected = by_hand(scene.problem, prediction, batch)
+    assert float(found.compute()["e_max"]) == pytest.approx(expected["e_max"])
+
+
+def test_single_precision_predictions_are_judged_in_double(scene, prediction, batch):
+    found = metrics(scene.problem)
+    found.update(prediction.float(), batch)
+    assert all(value.dtype == torch.float64 for value in found.compute().values())
+
+
+def test_noise_of_a_tenth_of_the_signal_is_20_dB_and_printed_as_10(batch):
+    """10 log10 of power is 20 log10 of amplitude; the paper's tables are the former."""
+    scaled = batch.displacement * 1.0
+    error = scaled.flip(0)
+    error *= (scaled.flatten(1).norm(dim=1) / error.flatten(1).norm(dim=1))[:, None, None] / 10
+    shifted = Sample(batch.force, scaled - error, batch.young)
+    for printed, decibels in ((False, 20.0), (True, 10.0)):
+        snr = MinSNR(printed=printed)
+        snr.update(scaled, shifted)
+        assert float(snr.compute()) == pytest.approx(decibels, abs=1e-9)
+
+
+def test_relative_l2_is_the_printed_power_of_the_snr(batch, prediction):
+    """PAPER.md: relative L2 = 10^(-SNR/20), where both refer to the same norm."""
+    snr = MinSNR().measure(prediction, batch)
+    size = prediction.flatten(1).norm(dim=1) / batch.displacement.flatten(1).norm(dim=1)
+    relative = RelativeL2().measure(prediction, batch)
+    assert torch.allclose(relative, size * 10 ** (-snr / 20), rtol=1e-10)
+
+
+def test_one_bad_node_of_one_load_is_the_largest_error(batch):
+    wrong = batch.displacement.clone()
+    wrong[3, 7] += torch.tensor([3.0, 0.0, 4.0])
+    largest = MaxError()
+    largest.update(wrong, batch)
+    assert float(largest.compute()) == pytest.approx(5.0)
+    mean = MeanError()
+    mean.update(wrong, batch)
+    assert float(mean.compute()) == pytest.approx(5.0 / (wrong[0].numel() * len(wrong)))
+
+
+def test_the_exact_answer_is_in_equilibrium_and_infinitely_clear(scene, batch):
+    found = metrics(scene.problem)
+    found.update(batch.displacement, batch)
+    numbers = found.compute()
+    assert float(numbers["e_mean"]) == float(numbers["e_max"]) == 0.0
+    assert float(numbers["SNR_min"]) == torch.inf
+    assert float(numbers["residual"]) < scene.solver.tol
+    assert float(numbers["min_det_F"]) > 0
+
+
+def test_an_inverted_prediction_is_seen(scene, batch):
+    problem = scene.problem
+    points = torch.where(problem.free, -1.5 * problem.points, 0.0).expand_as(batch.force)
+    volume = MinVolumeRatio(problem)
+    volume.update(points, batch)
+    assert float(volume.compute()) < 0
+    residual = ResidualRatio(problem)
+    residual.update(points, batch)
+    assert float(residual.compute()) > 1  # infinite, and not NaN
+
+
+def test_a_prediction_that_is_no_number_is_never_the_best(scene, batch):
+    broken = torch.full_like(batch.displacement, torch.nan)
+    found = metrics(scene.problem)
+    found.update(broken, batch)
+    numbers = {name: float(value) for name, value in found.compute().items()}
+    assert numbers["residual"] == torch.inf
+    assert numbers["min_det_F"] == -torch.inf
+    for name in ("e_mean", "e_max", "rel_L2_worst"):
+        assert not numbers[name] < 1e9

@@ -1,0 +1,204 @@
+"""Each line of the plan is true: what it says is skipped is counted and not there."""
+
+import pytest
+import torch
+
+from dpl.data.datamodule import OfflineData
+from dpl.data.generate import Job, outcome
+from dpl.fem.linear import SuperLU
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, solve
+from dpl.losses import MSE, LrPlus, LrStar
+from dpl.models.fcnn import FCNN
+from dpl.module import Surrogate
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """How often what is costly is done; counts begin anew with `calls.clear()`."""
+    counts = {}
+
+    def watch(owner, name, key):
+        original = getattr(owner, name)
+
+        def counted(*args, **kwargs):
+            counts[key] = counts.get(key, 0) + 1
+            return original(*args, **kwargs)
+
+        monkeypatch.setattr(owner, name, counted)
+
+    watch(SuperLU, "factorise", "factorise")
+    watch(Problem, "tangent", "tangent")
+    watch(Problem, "mixed_system", "tangent")
+    watch(Problem, "internal_force", "internal_force")
+    watch(Problem, "residual", "residual")
+    monkeypatch.setattr("dpl.fem.linear.splu", _counting_splu(counts))
+    return counts
+
+
+def _counting_splu(counts):
+    from scipy.sparse.linalg import splu
+
+    def counted(matrix, **options):
+        ordered = options.get("permc_spec") != "NATURAL"
+        counts["ordering"] = counts.get("ordering", 0) + ordered
+        return splu(matrix, **options)
+
+    return counted
+
+
+def says(scene, words):
+    return any(words in line for line in scene.plan())
+
+
+def small(scene, size):
+    """Loads so small that the linear answer meets the tolerance."""
+    load = scene.loads.sample((0, 0), range(3))
+    return Load(size * load.force, load.young)
+
+
+def test_rest_stiffness_is_factorised_once_for_modes_answers_and_first_steps(make_scene, calls):
+    scene = make_scene()
+    scene.loads.modes  # noqa: B018
+    assert calls["factorise"] == 1
+    load = scene.loads.sample((0, 0), range(3))
+    for force in load.force:
+        scene.linear.respond(force)
+    solve(scene.linear, load)
+    Surrogate(FCNN(scene, width=4), MSE(), scene)
+    assert calls["factorise"] == 1
+    for k in range(3):
+        states = scene.solver.iterate(Load(load.force[k : k + 1], load.young[k : k + 1]))
+        next(states)
+        next(states)  # the first step
+    assert calls["factorise"] == 1
+    assert says(scene, "K(0) factorised once for modes, linear answers and every first Newton step")
+
+
+def test_pattern_and_ordering_are_analysed_once(make_scene, calls, monkeypatch):
+    scene = make_scene()
+    analysed = []
+    original = Problem.pattern.func
+    monkeypatch.setattr(Problem.pattern, "func", lambda p: analysed.append(p) or original(p))
+    load = scene.loads.sample((0, 0), range(4))
+    solve(scene.solver, load)
+    solve(scene.solver, load)
+    assert calls["factorise"] > 6
+    assert len(analysed) == 1
+    backends = 2  # that of K(0) keeps its factor, that of Newton replaces it
+    assert calls["ordering"] <= backends
+    assert says(scene, "symmetric, pattern and ordering analysed once")
+
+
+def test_only_the_upper_half_of_the_tangent_is_computed(scene):
+    problem = scene.problem
+    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    rows = torch.repeat_interleave(
+        torch.arange(problem.pattern.size), torch.tensor(problem.pattern.indptr).diff()
+    )
+    assert problem.tangent(rest).shape[1] == len(problem.pattern.indices)
+    assert (torch.tensor(problem.pattern.indices) >= rows).all()
+
+
+def test_loads_whose_linear_answer_meets_the_tolerance_cost_no_factorisation(make_scene, calls):
+    scene = make_scene()
+    scene.linear.factor  # noqa: B018
+    calls.clear()
+    answer = solve(scene.solver, small(scene, 1e-12))
+    assert answer.converged.all()
+    assert (answer.iterations == 1).all()
+    assert "factorise" not in calls
+    assert "tangent" not in calls
+    assert says(scene, "no factorisation for loads whose linear answer meets the tolerance")
+
+
+def test_the_zero_load_costs_nothing(make_scene, calls):
+    scene = make_scene()
+    answer = solve(scene.solver, small(scene, 0.0))
+    assert answer.converged.all()
+    assert not answer.iterations.any()
+    assert not answer.displacement.any()
+    assert "factorise" not in calls
+    assert "tangent" not in calls
+
+
+def test_equal_cells_share_one_set_of_gradients(make_scene, scene):
+    assert len(scene.problem.dN) == len(scene.problem.dV) == 1
+    assert len(scene.problem.cells) == 16
+    assert says(scene, "one set of shape gradients for 16 equal cells")
+    tetrahedra = make_scene(cell="tetra")
+    assert len(tetrahedra.problem.dN) == 96
+    assert not says(tetrahedra, "equal cells")
+
+
+def test_constant_gradients_have_one_quadrature_point(make_scene, scene):
+    tetrahedra = make_scene(cell="tetra")
+    assert tetrahedra.problem.dN.shape[1] == 1
+    assert says(tetrahedra, "one quadrature point for each of 96 cells")
+    assert scene.problem.dN.shape[1] == 8
+
+
+def test_young_is_no_input_and_changes_no_answer(make_scene, scene):
+    one = outcome(scene, Job((0, 0), 0))
+    other = outcome(make_scene(young=[1e6, 2e11]), Job((0, 0), 0))
+    assert other.young != one.young
+    assert (one.force == other.force).all()
+    assert (one.displacement == other.displacement).all()
+    net = FCNN(scene)
+    assert net.stages[0].in_features == int(scene.loads.reach.sum())
+    assert says(scene, "no E input, no samples per E")
+
+
+@pytest.mark.parametrize(
+    ("loss", "evaluated"), [(MSE(), False), (LrStar(), True), (LrPlus(), True)]
+)
+def test_mse_trains_without_finite_elements(scene, batch, calls, loss, evaluated):
+    surrogate = Surrogate(FCNN(scene, width=4), loss, scene)
+    calls.clear()
+    loss(surrogate.predict(batch.load), batch, surrogate.physics).backward()
+    assert ("internal_force" in calls or "residual" in calls) is evaluated
+    assert any("no finite-element evaluation" in line for line in surrogate.plan()) != evaluated
+
+
+def test_lr_star_sends_no_gradient_through_the_residual(scene, batch, monkeypatch):
+    tracked = []
+    original = Problem.internal_force
+
+    def watched(problem, displacement):
+        tracked.append(torch.is_grad_enabled() and displacement.requires_grad)
+        return original(problem, displacement)
+
+    monkeypatch.setattr(Problem, "internal_force", watched)
+    prediction = (batch.displacement + 1e-3).requires_grad_()
+    surrogate = Surrogate(FCNN(scene, width=4), LrStar(), scene)
+    surrogate.loss(prediction, batch, surrogate.physics)
+    assert tracked == [False]
+    assert any("no backward pass through the residual" in line for line in surrogate.plan())
+    LrPlus()(prediction, batch, surrogate.physics)
+    assert tracked == [False, True]
+
+
+def test_a_data_set_that_is_there_is_not_solved_again(data, calls, monkeypatch):
+    solved = []
+    monkeypatch.setattr("dpl.data.generate.outcome", lambda *job: solved.append(job))
+    assert data.plan() == [f"20 of 20 loads not solved again: they are in {data.store.folder}"]
+    data.prepare_data()
+    assert solved == []
+    assert "factorise" not in calls
+
+
+def test_inputs_and_outputs_are_only_where_something_happens(scene):
+    net = FCNN(scene)
+    problem = scene.problem
+    assert net.stages[0].in_features == int((problem.boundary[:, None] & problem.free).sum())
+    assert net.stages[-1].out_features == int(problem.free.sum())
+    assert any("parameters" in line for line in net.plan())
+
+
+def test_a_plan_computes_no_sample(scene, tmp_path, calls):
+    module = OfflineData(scene, folder=str(tmp_path / "none"), workers=0)
+    scene.loads.modes  # noqa: B018
+    calls.clear()
+    assert scene.plan()
+    assert module.plan() == []
+    assert calls == {}

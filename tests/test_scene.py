@@ -1,0 +1,181 @@
+"""Laws of the scene: its identity, its border to SI units, and a plan that says what is skipped."""
+
+import subprocess
+import sys
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from dpl.fem.materials import SaintVenantKirchhoff
+from dpl.fem.mesh import Box, Plane, box, rectangle
+from dpl.fem.modes import normal, uniform
+from dpl.fem.solution import solve
+from dpl.scene import Sample, stack
+
+
+def mild(rng, count, *, factor):
+    return factor * uniform(rng, count)
+
+
+def test_the_fingerprint_knows_neither_size_nor_stiffness(make_scene, scene):
+    steel = make_scene(size=(1.0, 0.25, 0.25), young=2e11)
+    assert steel.fingerprint == scene.fingerprint
+    assert make_scene(young=[1e9, 2e11]).fingerprint == scene.fingerprint
+    assert make_scene(size=(0.3, 0.075, 0.075)).fingerprint == scene.fingerprint
+    assert make_scene(size=(1e3 / 3, 250 / 3, 250 / 3)).fingerprint == scene.fingerprint
+
+
+def test_the_fingerprint_knows_not_how_matrices_are_solved(make_scene, scene):
+    assert make_scene(linear="auto").fingerprint == scene.fingerprint
+
+
+def reordered(scene):
+    mesh = box((100.0, 25.0, 25.0), (5, 3, 3))
+    order = np.random.default_rng(0).permutation(mesh.p.shape[1])
+    place = np.argsort(order)
+    return type(mesh)(np.ascontiguousarray(mesh.p[:, order]), place[mesh.t])
+
+
+CHANGES = {
+    "poisson": {"poisson": 0.300001},
+    "law": {"law": SaintVenantKirchhoff},
+    "shape": {"size": (100.0, 25.0, 25.01)},
+    "nodes": {"nodes": (6, 3, 3)},
+    "cells": {"cell": "tetra"},
+    "degree": {"degree": 2},
+    "clamped end": {"fixed": Plane(0, "max")},
+    "clamped part": {"fixed": Box((0, 0, 0), (0, 25, 13))},
+    "tolerance": {"tol": 1e-6},
+    "modes": {"n_modes": 2},
+    "deflection": {"deflection": 0.41},
+    "patch": {"patch": (0.0, 0.5)},
+    "distribution": {"distribution": normal},
+    "argument of the distribution": {"distribution": partial(mild, factor=0.5)},
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_the_fingerprint_knows_what_decides_a_sample(make_scene, scene, name):
+    assert make_scene(**CHANGES[name]).fingerprint != scene.fingerprint
+
+
+def test_the_fingerprint_knows_the_order_of_the_nodes(make_scene, scene):
+    assert make_scene(mesh=reordered(scene)).fingerprint != scene.fingerprint
+
+
+def test_arguments_of_a_distribution_tell_scenes_apart(make_scene):
+    prints = {make_scene(distribution=partial(mild, factor=f)).fingerprint for f in (0.5, 0.6)}
+    assert len(prints) == 2
+
+
+def test_fingerprints_differ_from_each_other(make_scene):
+    prints = [make_scene(**change).fingerprint for change in CHANGES.values()]
+    assert len(set(prints)) == len(prints)
+
+
+def test_the_fingerprint_is_the_same_in_every_process(scene, environment, tmp_path):
+    code = """
+from dpl.fem.materials import NeoHookean
+from dpl.fem.mesh import Plane, box
+from dpl.fem.modes import ModalLoads
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.scene import Scene
+
+problem = Problem.build(box((1, 0.25, 0.25), (5, 3, 3)), NeoHookean(0.3), fixed=Plane(0, "min"))
+newton = Newton(problem)
+print(Scene(problem, ModalLoads(newton.rest, n_modes=3), newton).fingerprint)
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**environment(), "PYTHONHASHSEED": "7"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ended.stdout.strip() == scene.fingerprint
+
+
+def test_newtons_become_dimensionless_loads(scene):
+    """A force of E L^2 is 1."""
+    newtons = torch.full((2, *scene.problem.shape), 4500.0 * 100.0**2)
+    load = scene.load_of(newtons, torch.tensor([4500.0, 9000.0]))
+    assert load.force.dtype == load.young.dtype == torch.float64
+    assert torch.allclose(load.force[0], torch.ones((), dtype=torch.float64), rtol=1e-12)
+    assert torch.allclose(load.force[1], torch.full((), 0.5, dtype=torch.float64), rtol=1e-12)
+    assert load.young.tolist() == [4500.0, 9000.0]
+
+
+def test_forces_of_plane_bodies_are_per_thickness(make_scene):
+    plane = make_scene(mesh=rectangle([8.0, 2.0], [5, 3]), n_modes=2)
+    assert plane.force_unit == pytest.approx(8.0)
+    load = plane.load_of(torch.full((1, *plane.problem.shape), 3.0 * 8.0), torch.tensor([3.0]))
+    assert float(load.force[0, 0, 0]) == pytest.approx(1.0)
+
+
+def test_displacements_in_metres_do_not_depend_on_who_made_them_dimensionless(make_scene):
+    """The same body in other units: same newtons, same metres."""
+    metres, millimetres = make_scene(), make_scene(size=(1e5, 25e3, 25e3), young=4500e-6)
+    force = 0.02 * 4500.0 * 100.0**2 * metres.loads.sample((0, 0), [0]).force
+    one = solve(metres.solver, metres.load_of(force, torch.tensor([4500.0])))
+    other = solve(millimetres.solver, millimetres.load_of(force, torch.tensor([4500e-6])))
+    ours, theirs = metres.length * one.displacement, millimetres.length * other.displacement
+    assert torch.allclose(1e3 * ours, theirs, rtol=1e-6, atol=1e-9 * float(theirs.abs().max()))
+
+
+def test_a_scene_has_one_factor_of_its_rest_stiffness(scene):
+    assert scene.linear is scene.solver.rest is scene.loads.linear
+    assert scene.linear.factor is scene.linear.factor
+
+
+def test_stacked_samples_are_a_batch():
+    singles = [
+        Sample(torch.full((4, 3), k), torch.full((4, 3), -k), torch.tensor(k))
+        for k in (1.0, 2.0, 3.0)
+    ]
+    batch = stack(singles)
+    assert isinstance(batch, Sample)
+    assert batch.force.shape == (3, 4, 3)
+    assert batch.young.tolist() == [1.0, 2.0, 3.0]
+    assert batch.displacement[:, 0, 0].tolist() == [-1.0, -2.0, -3.0]
+    assert torch.equal(batch.load.force, batch.force)
+
+
+def lines_with(scene, words):
+    return [line for line in scene.plan() if words in line]
+
+
+def test_the_plan_names_one_modulus_or_the_range(make_scene, scene):
+    assert lines_with(scene, "no E input")[0].endswith("(E = 4500 Pa)")
+    ranged = make_scene(young=[1e9, 2e11])
+    assert lines_with(ranged, "no E input")[0].endswith("(E from 1e+09 to 2e+11 Pa)")
+
+
+def test_the_plan_shares_gradients_only_among_equal_cells(make_scene, scene):
+    assert lines_with(scene, "one set of shape gradients for 16 equal cells")
+    mesh = box((100.0, 25.0, 25.0), (5, 3, 3))
+    points = mesh.p.copy()
+    points[0, points[0] == 50.0] += 3.0
+    assert not lines_with(make_scene(mesh=type(mesh)(points, mesh.t)), "gradients for")
+
+
+def test_the_plan_has_one_point_only_where_gradients_are_constant(make_scene, scene):
+    assert not lines_with(scene, "one quadrature point")
+    assert lines_with(make_scene(cell="tetra"), "one quadrature point for each of 96 cells")
+    assert not lines_with(make_scene(cell="tetra", degree=2), "one quadrature point")
+
+
+def test_the_plan_counts_the_entries_that_symmetry_saves(scene):
+    problem = scene.problem
+    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    half = problem.tangent(rest).shape[1]
+    whole = 2 * half - int(problem.free.sum())
+    assert lines_with(scene, f"{half:,} tangent entries of {whole:,}")
+
+
+def test_the_plan_says_where_more_modes_are_excited(make_scene, scene):
+    assert not lines_with(scene, "a family is kept whole")
+    assert lines_with(make_scene(n_modes=1), "2 modes instead of 1: a family is kept whole")
