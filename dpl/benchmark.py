@@ -1,6 +1,7 @@
 """Solvers against each other on the same loads, one at a time: how wrong, how sure, how slow."""
 
 import json
+import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -126,7 +127,38 @@ def show(rows: Sequence[Row], title: str) -> None:
             f"{row.milliseconds:.1f}",
             f"{row.slowest:.1f}",
         )
-    Console(width=max(Console().width, 150)).print(table)
+    Console(width=max(Console().width, 160)).print(table)
+
+
+def compare(folder: Path) -> None:
+    """Print the network and the hybrid of every evaluated run below a folder, then medians.
+
+    Runs that differ in nothing but `seed` in their folder's name form a group.
+
+    Raises:
+        FileNotFoundError: No run below the folder has been evaluated.
+    """
+    found = sorted(folder.rglob("evaluation.json"))
+    if not found:
+        raise FileNotFoundError(f"{folder} holds no evaluated run")
+    table = Table(title=str(folder), title_justify="left")
+    names = ("e_mean", "e_max", "SNR_min", "rel_L2_median", "rel_L2_worst", "residual")
+    for column in ("run", *names, "hybrid iterations", "hybrid ms / Newton ms"):
+        table.add_column(column, justify="left" if column == "run" else "right")
+    groups: dict[str, list[list[float]]] = {}
+    for path in found:
+        rows = {row["solver"]: row for row in json.loads(path.read_text())}
+        network, hybrid = rows["network"]["errors"], rows["hybrid Newton"]
+        ratio = hybrid["milliseconds"] / rows["Newton from zero"]["milliseconds"]
+        numbers = [*(network[name] for name in names), hybrid["iterations"], ratio]
+        name = str(path.parent.relative_to(folder))
+        table.add_row(name, *(f"{number:.3g}" for number in numbers))
+        groups.setdefault(re.sub(r",?seed=\d+,?", "", name), []).append(numbers)
+    table.add_section()
+    for name, members in groups.items():
+        medians = torch.tensor(members).median(dim=0).values.tolist()
+        table.add_row(f"median of {len(members)}: {name}", *(f"{number:.3g}" for number in medians))
+    Console(width=max(Console().width, 160)).print(table)
 
 
 def save(rows: Sequence[Row], path: Path) -> None:

@@ -165,31 +165,12 @@ def warmup_cosine(
 def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:
     """Return the scales of forces and of displacements, (N, D) each, of the scene's loads.
 
-    Root mean squares over the first loads of a stream of their own, the displacements those of the
-    linear answers: no sample is needed, online and offline training share them, and what nothing
-    acts on or what never moves has the scale 1, not 0.
+    Root mean squares over the first loads of a stream of their own: of forces for each degree of
+    freedom, of displacements (linear answers) over all that move. No sample is needed, online and
+    offline training share the scales, and what nothing acts on has the scale 1, not 0.
     """
     force = scene.loads.sample((0, SCALES), range(count)).force
     displacement = torch.stack([scene.linear.respond(one) for one in force])
-    return _root_mean_square(force), _root_mean_square(displacement)
-
-
-def _root_mean_square(fields: Tensor) -> Tensor:
-    mean = fields.square().mean(dim=0).sqrt()
-    return torch.where(mean > 1e-9 * mean.max(), mean, 1.0)
-
-
-class WholeCheckpoints(TorchCheckpointIO):
-    """Checkpoints that are whole or not there.
-
-    Lightning's own go through the default temporary folder; where that is another file system, a
-    kill while writing leaves half a file under the final name.
-    """
-
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
-    ) -> None:
-        """Write a checkpoint."""
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(Path(path)) as file:
-            torch.save(checkpoint, file)
+    size = displacement[:, scene.problem.free].square().mean().sqrt()
+    each = force.square().mean(dim=0).sqrt()
+    return torch.where(each > 1e-9 * each.max(), each, 1.0), size.expand_as(each).clone()

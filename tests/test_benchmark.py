@@ -145,7 +145,8 @@ def test_the_tolerance_of_an_evaluation_is_its_own(surrogate, few, tmp_path):
     assert surrogate.scene.solver.tol == 1e-8
 
 
-def test_the_table_prints_every_row(surrogate, few, tmp_path, capsys):
+def test_the_table_prints_every_row(surrogate, few, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     evaluate(surrogate, few, tmp_path)
     out = capsys.readouterr().out
     assert "4 fresh loads, one at a time, 1 thread, tol 1e-08" in out
