@@ -174,3 +174,19 @@ def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:
     size = displacement[:, scene.problem.free].square().mean().sqrt()
     each = force.square().mean(dim=0).sqrt()
     return torch.where(each > 1e-9 * each.max(), each, 1.0), size.expand_as(each).clone()
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Checkpoints that are whole or not there.
+
+    Lightning's own go through the default temporary folder; where that is another file system, a
+    kill while writing leaves half a file under the final name.
+    """
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
+    ) -> None:
+        """Write a checkpoint."""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(Path(path)) as file:
+            torch.save(checkpoint, file)
