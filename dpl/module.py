@@ -163,17 +163,17 @@ def warmup_cosine(
 
 
 def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:
-    """Return the scales of forces and of displacements, (N, D) each, of the scene's loads.
+    """Return the scales of forces and of displacements of the scene's loads, scalars [-].
 
-    Root mean squares over the first loads of a stream of their own: of forces for each degree of
-    freedom, of displacements (linear answers) over all that move. No sample is needed, online and
-    offline training share the scales, and what nothing acts on has the scale 1, not 0.
+    Root mean squares over the first loads of a stream of their own, over the degrees of freedom
+    that loads can act on and over those that move; displacements are linear answers. So no sample
+    is needed, and online and offline training share the scales. One number each: scaling every
+    degree of freedom by its own trains worse (see README).
     """
     force = scene.loads.sample((0, SCALES), range(count)).force
     displacement = torch.stack([scene.linear.respond(one) for one in force])
-    size = displacement[:, scene.problem.free].square().mean().sqrt()
-    each = force.square().mean(dim=0).sqrt()
-    return torch.where(each > 1e-9 * each.max(), each, 1.0), size.expand_as(each).clone()
+    acting, moving = force[:, scene.loads.reach], displacement[:, scene.problem.free]
+    return acting.square().mean().sqrt(), moving.square().mean().sqrt()
 
 
 class WholeCheckpoints(TorchCheckpointIO):

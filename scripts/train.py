@@ -22,9 +22,12 @@ def main(cfg: DictConfig) -> None:
     trainer: L.Trainer = run.make(cfg, "trainer")
     run.show_plan(scene, data, surrogate)
     run.save_config(cfg, folder)
-    trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
-    if trainer.interrupted:
-        raise KeyboardInterrupt
+    try:
+        trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
+    except SystemExit as leaving:  # how Lightning passes Ctrl-C on
+        raise KeyboardInterrupt from leaving
+    finally:
+        data.teardown("fit")  # which Lightning leaves out on Ctrl-C
     _, best = run.load_run(folder, trust=True)
     rows = evaluate(best, data.samples("test"), folder)
     network = next(row for row in rows if row.solver == "network")

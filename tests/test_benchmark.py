@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import replace
 
 import matplotlib.image
 import meshio
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.benchmark import Row, clock, evaluate, save, show
+from dpl.benchmark import Row, clock, compare, evaluate, save, show
 from dpl.fem.solution import Load, Solution, judge
 from dpl.losses import MSE
 from dpl.metrics import RelativeL2
@@ -95,6 +96,27 @@ def test_rows_come_back_from_json(scene, few, tmp_path):
     )
     save(rows, tmp_path / "rows.json")
     assert [Row(**row) for row in json.loads((tmp_path / "rows.json").read_text())] == rows
+
+
+def test_runs_that_differ_in_their_seed_are_one_group(evaluated, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    rows, _ = evaluated
+    for k, name in enumerate(("loss=mse,seed=0", "loss=mse,seed=1", "loss=lr_star,seed=0")):
+        (tmp_path / name).mkdir()
+        network = replace(rows[1], errors={**rows[1].errors, "e_mean": 0.125 * (k + 1)})
+        save([rows[0], network, *rows[2:]], tmp_path / name / "evaluation.json")
+    compare(tmp_path)
+    lines = capsys.readouterr().out.splitlines()
+    (one,) = [line for line in lines if "median of 2: loss=mse" in line]
+    (other,) = [line for line in lines if "median of 1: loss=lr_star" in line]
+    assert "0.125" in one or "0.25" in one
+    assert "0.375" in other
+    assert sum("seed=" in line for line in lines) == 3
+
+
+def test_a_folder_without_evaluated_runs_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no evaluated run"):
+        compare(tmp_path)
 
 
 # ------------------------------------------------------------------ evaluation

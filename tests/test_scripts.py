@@ -131,6 +131,19 @@ def test_a_short_run_is_judged_also_where_no_epoch_is_validated(script, tiny_tra
     assert (home / "runs/short/evaluation.json").exists()
 
 
+def test_compare_prints_the_runs_below_a_folder(trained, script, home):
+    ended = script("compare", "run=runs", cwd=home)
+    assert ended.status == 0, ended.err
+    assert "first" in ended.out
+
+
+def test_compare_without_an_evaluated_run_says_so(script, tmp_path):
+    (tmp_path / "runs").mkdir()
+    ended = script("compare", "run=runs", cwd=tmp_path)
+    assert ended.status == 2
+    assert ended.err.startswith("error: ")
+
+
 @pytest.mark.parametrize("missing", ["", "run=runs/nowhere"])
 def test_evaluate_without_a_run_says_so(script, tmp_path, missing):
     ended = script("evaluate", *filter(None, [missing]), cwd=tmp_path)
