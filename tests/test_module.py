@@ -142,14 +142,11 @@ def test_scaled_forces_and_displacements_are_of_order_one(scene, batch):
     assert 0.3 < float(linear[:, free].square().mean().sqrt()) < 3
 
 
-def test_forces_have_a_scale_each_and_displacements_one_for_all(scene):
-    force_scale, displacement_scale = scales(scene)
-    reach = scene.loads.reach
-    assert force_scale.shape == displacement_scale.shape == scene.problem.shape
-    assert (force_scale[~reach] == 1).all()
-    assert 0 < float(force_scale[reach].min()) < float(force_scale[reach].max()) < 1
-    assert len(displacement_scale.unique()) == 1
-    assert float(displacement_scale.min()) > 0
+def test_scales_are_one_positive_number_for_each_field(scene):
+    """One number keeps the shape of a field: directions and places stay comparable."""
+    for scale in scales(scene):
+        assert len(scale.unique()) == 1
+        assert float(scale.min()) > 0
 
 
 def test_scales_are_a_function_of_the_scene(make_scene, scene):

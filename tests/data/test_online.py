@@ -73,14 +73,13 @@ def test_rejected_loads_do_not_enter_the_stream(scene, drawn, monkeypatch):
 
 def test_two_workers_solve_the_same_stream_and_end_when_it_is_closed(scene, drawn):
     before = {child.pid for child in multiprocessing.active_children()}
-    stream = replay(
-        OnlineSamples(scene, SEED), workers=2, fresh=4, batch_size=4, reuse=1, batches=4
-    )
-    seen = [keys(batch) for batch in stream]
+    options = {"fresh": 4, "batch_size": 256, "reuse": 64, "batches": 4}
+    stream = replay(OnlineSamples(scene, SEED), workers=2, **options)
+    seen = set().union(*[keys(batch) for batch in stream])
     crew = {child.pid for child in multiprocessing.active_children()} - before
     assert len(crew) == 2
     assert stream.produced == 16
-    assert set().union(*seen) <= set(drawn[:16])
+    assert seen == set(drawn[:16]), "no load is left out and none is solved by both"
     next(iter(stream))  # the next epoch goes on with the same workers
     assert {child.pid for child in multiprocessing.active_children()} - before == crew
     stream.close()
