@@ -10,12 +10,11 @@ from pathlib import Path
 import torch
 from rich.console import Console
 from rich.table import Table
-from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from dpl.fem.mesh import save as write_mesh
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, Solver, solve
+from dpl.fem.solution import Load, Solution, Solver, one_thread, solve
 from dpl.figures import deformed
 from dpl.hybrid import Direct, Hybrid
 from dpl.metrics import RelativeL2, metrics
@@ -186,13 +185,8 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
         "hybrid Newton": Hybrid(surrogate.predict, newton),
         "Newton from zero": newton,
     }
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1):
-            rows, answers = clock(solvers, test, scene.problem)
-    finally:
-        torch.set_num_threads(threads)
+    with one_thread():
+        rows, answers = clock(solvers, test, scene.problem)
     show(rows, f"{len(test.force)} fresh loads, one at a time, 1 thread, tol {tol:g}")
     save(rows, folder / "evaluation.json")
     _picture(surrogate, test, answers, folder)

@@ -76,8 +76,10 @@ class Hybrid:
         yield first
         if first.converged:
             return
-        start = guess if pick(predicted, first) else first.displacement
-        for state in self.newton.iterate(load, guess=start):
+        if not pick(predicted, first):
+            yield from classic
+            return
+        for state in self.newton.iterate(load, guess=guess):
             yield state._replace(
                 iterations=state.iterations + first.iterations,
                 factorisations=state.factorisations + first.factorisations,

@@ -141,9 +141,17 @@ def residual_norm(prediction: Tensor, batch: Sample, physics: Physics) -> Tensor
     Where elements are inverted so far that the law has no stress, the norm is not finite; such
     samples take the largest finite norm of the batch (1 if there is none) and no gradient.
     """
-    parts = zip(prediction.split(CHUNK), batch.force.split(CHUNK), strict=True)
-    residual = torch.cat([physics.problem.residual(*part) for part in parts]).flatten(1)
+    residual = _residual(prediction, batch, physics)
     sound = residual.isfinite().all(dim=1)
-    norm = torch.where(sound[:, None], residual, 0.0).norm(dim=1) / physics.largest_force
-    largest = norm.detach().max() if bool(sound.any()) else torch.ones_like(norm[0])
+    if not sound.all():  # evaluated again elsewhere: NaN passes through `where` backwards
+        elsewhere = torch.where(sound[:, None, None], prediction, batch.displacement)
+        residual = _residual(elsewhere, batch, physics)
+    norm = residual.norm(dim=1) / physics.largest_force
+    largest = norm[sound].detach().max() if sound.any() else torch.ones_like(norm[0])
     return torch.where(sound, norm, largest)
+
+
+def _residual(prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
+    """Return R where free, (B, N D) [-]."""
+    parts = zip(prediction.split(CHUNK), batch.force.split(CHUNK), strict=True)
+    return torch.cat([physics.problem.residual(*part) for part in parts]).flatten(1)

@@ -57,7 +57,9 @@ class Surrogate(L.LightningModule):
         force_scale, displacement_scale = scales(scene)
         self.register_buffer("force_scale", force_scale)
         self.register_buffer("displacement_scale", displacement_scale)
-        self.register_buffer("largest_force", torch.tensor(scene.loads.largest_force).double())
+        self.register_buffer(
+            "largest_force", torch.tensor(scene.loads.largest_force, dtype=torch.float64)
+        )
         self.physics = Physics(scene.problem, self.largest_force)
         self.val_metrics = metrics(scene.problem).clone(prefix="val/")
         self.test_metrics = metrics(scene.problem).clone(prefix="test/")

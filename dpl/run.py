@@ -14,6 +14,7 @@ import types
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import hydra
@@ -62,9 +63,12 @@ def command(task: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
 
 
 def _drop_empty(folder: Path) -> None:
-    """Remove the folder that Hydra made for a run that did not begin."""
-    with contextlib.suppress(OSError):  # not empty, or the current one
-        folder.rmdir()
+    """Remove the folders that Hydra made below this one for a run that did not begin."""
+    here = Path.cwd()
+    with contextlib.suppress(OSError):  # not empty
+        while here in folder.parents:
+            folder.rmdir()
+            folder = folder.parent
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -156,11 +160,16 @@ def _fits(value: Any, hint: Any) -> bool:
         return isinstance(value, hint)
     if origin is Sequence:
         return isinstance(value, list) and all(_fits(item, arguments[0]) for item in value)
+    if hint is Path:
+        return isinstance(value, str)
+    if isinstance(hint, type) and hint is not object:
+        return isinstance(value, hint)
     return True
 
 
 def _words(hint: Any) -> str:
     names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
+    names[Path] = "a path"
     arguments = typing.get_args(hint)
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
         return " or ".join(_words(argument) for argument in arguments)
@@ -239,6 +248,10 @@ def build_scene(cfg: DictConfig) -> Scene:
     if not _fits(young, float | Sequence[float]):
         raise ConfigError(f"young = {young!r} must be a modulus [Pa] or a range [low, high]")
     loads = make(cfg, "loads", linear=solver.rest, young=young)
+    try:
+        loads.modes  # noqa: B018  # which says whether there are so many
+    except ValueError as error:
+        raise ConfigError(f"loads: {error}") from error
     return Scene(problem, loads, solver)
 
 
@@ -294,16 +307,19 @@ def load_run(folder: str | Path, *, trust: bool = False) -> tuple[DictConfig, "S
         ConfigError: There is no finished run, or it names what is not trusted.
     """
     config, best = Path(folder) / "config.yaml", Path(folder) / "checkpoints" / "best.ckpt"
+    if not best.exists():  # a run too short to be validated
+        best = best.with_name("last.ckpt")
     for path in (config, best):
         if not path.is_file():
             raise ConfigError(f"run = {folder} has no {path.relative_to(folder)}; train it first")
     cfg = typing.cast(DictConfig, OmegaConf.load(config))
     check(cfg, trust=trust)
     surrogate = build_surrogate(cfg, build_scene(cfg))
-    checkpoint = torch.load(best, map_location="cpu", weights_only=True)
     try:
+        checkpoint = torch.load(best, map_location="cpu", weights_only=True)
         surrogate.on_load_checkpoint(checkpoint)
         surrogate.load_state_dict(checkpoint["state_dict"])
-    except (ValueError, KeyError, RuntimeError) as error:
-        raise ConfigError(f"{best}: {error}") from error
+    except (OSError, ValueError, KeyError, RuntimeError, EOFError, UnpicklingError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ConfigError(f"{best} cannot be used: {reason}") from error
     return cfg, surrogate.eval()

@@ -14,7 +14,10 @@ from dpl.benchmark import compare
 def main(cfg: DictConfig) -> None:
     """Print a table of all evaluated runs below a folder."""
     run.check(cfg)
-    compare(Path(cfg.run))
+    try:
+        compare(Path(cfg.run))
+    except FileNotFoundError as error:
+        raise run.ConfigError(f"run: {error}") from error
 
 
 if __name__ == "__main__":

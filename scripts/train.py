@@ -3,23 +3,26 @@
 from pathlib import Path
 
 import hydra
-import lightning as L
 from omegaconf import DictConfig
 
 from dpl import run
-from dpl.benchmark import evaluate
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="train")
 @run.command
 def main(cfg: DictConfig) -> None:
     """Train a surrogate and judge it."""
+    # here and not above: worker processes import this file, and need none of it
+    import lightning as L
+
+    from dpl.benchmark import evaluate
+
     run.check(cfg)
     folder = Path(cfg.folder)
     scene = run.build_scene(cfg)
     data = run.make(cfg, "data", scene=scene)
     surrogate = run.build_surrogate(cfg, scene)
-    trainer: L.Trainer = run.make(cfg, "trainer")
+    trainer = run.make(cfg, "trainer")
     run.show_plan(scene, data, surrogate)
     run.save_config(cfg, folder)
     try:

@@ -345,9 +345,9 @@ def test_an_interrupted_stream_goes_on_with_new_loads(scene, folder, data, tmp_p
         )  # fmt: skip
 
     _, part = run(scene, tmp_path, stream(), stop=1)
-    assert part.datamodule.state_dict() == {"produced": 12}
+    assert part.datamodule.state_dict() == {"produced": 12, "following": 12}
     _, end = run(scene, tmp_path, stream(), epochs=2, resume="last")
-    assert end.datamodule.state_dict() == {"produced": 24}
+    assert end.datamodule.state_dict() == {"produced": 24, "following": 24}
 
 
 def test_best_is_the_checkpoint_with_the_smallest_error(scene, data, tmp_path):

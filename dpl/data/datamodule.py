@@ -150,11 +150,11 @@ class OnlineData(OfflineData):
         super().__init__(scene, train=0, workers=workers, batch_size=batch_size, **kwargs)  # type: ignore[arg-type]
         self._options = {"batches": batches, "fresh": fresh, "reuse": reuse, "capacity": capacity}
         self._replay: Replay | None = None
-        self._produced = 0  # by earlier runs that this one resumes
+        self._produced = self._first = 0  # what earlier runs took that this one resumes
 
     def train_dataloader(self) -> Replay:
         """Return the stream, an epoch at a time."""
-        stream = OnlineSamples(self.scene, self.store.stream("train"), first=self._produced)
+        stream = OnlineSamples(self.scene, self.store.stream("train"), first=self._first)
         self._replay = Replay(
             stream, workers=self.workers, batch_size=self.batch_size, **self._options
         )
@@ -167,11 +167,15 @@ class OnlineData(OfflineData):
 
     def state_dict(self) -> dict[str, int]:
         """Return how far the stream has been used."""
-        return {"produced": self._produced + (self._replay.produced if self._replay else 0)}
+        produced, following = self._produced, self._first
+        if self._replay is not None:
+            produced += self._replay.produced
+            following = max(following, self._replay.following)
+        return {"produced": produced, "following": following}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
         """Go on where a stream was left: no load is drawn twice."""
-        self._produced = state_dict["produced"]
+        self._produced, self._first = state_dict["produced"], state_dict["following"]
 
 
 def _same(batch: Any) -> Any:

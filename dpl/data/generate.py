@@ -10,11 +10,9 @@ from multiprocessing.process import BaseProcess
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
-from dpl.fem.solution import Load, solve
+from dpl.fem.solution import Load, one_thread, solve
 from dpl.scene import Scene
 
 TRIES = 3  # of a load whose worker died, before it is given up
@@ -61,7 +59,8 @@ def outcome(scene: Scene, job: Job) -> Outcome:
     """Return a load, solved."""
     load = scene.loads.sample(job.seed, [job.number])
     start = time.perf_counter()
-    solution = solve(scene.solver, Load(load.force, load.young))
+    with one_thread():
+        solution = solve(scene.solver, Load(load.force, load.young))
     accepted = bool(solution.converged)
     return Outcome(
         job=job,
@@ -183,7 +182,6 @@ class _Crew:
 def _work(pipe: Connection, scene: Scene) -> None:
     """Solve what comes through the pipe until it closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    torch.set_num_threads(1)
-    with threadpool_limits(1), contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
             pipe.send(outcome(scene, pipe.recv()))

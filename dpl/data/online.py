@@ -2,14 +2,26 @@
 
 import itertools
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from threadpoolctl import threadpool_limits
+from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from dpl.data.generate import Job, outcome
 from dpl.scene import Sample, Scene, stack
+
+
+class Drawn(NamedTuple):
+    """A sample (or a batch of them) and its place in the stream.
+
+    Attributes:
+        sample: The load with its answer.
+        number: Which load of the stream, (B,).
+    """
+
+    sample: Sample
+    number: Tensor
 
 
 class OnlineSamples(IterableDataset):
@@ -25,19 +37,16 @@ class OnlineSamples(IterableDataset):
         """Keep the arguments, see the class."""
         self.scene, self.seed, self.first = scene, seed, first
 
-    def __iter__(self) -> Iterator[Sample]:
+    def __iter__(self) -> Iterator[Drawn]:
         """Yield samples (N, D), one at a time."""
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
-        torch.set_num_threads(1)  # one core per worker
-        with threadpool_limits(1):
-            for index in itertools.count(self.first + worker, workers):
-                one = outcome(self.scene, Job(self.seed, index))
-                if one.accepted:
-                    young = torch.tensor(one.young, dtype=torch.float64)
-                    yield Sample(
-                        torch.from_numpy(one.force), torch.from_numpy(one.displacement), young
-                    )
+        for index in itertools.count(self.first + worker, workers):
+            one = outcome(self.scene, Job(self.seed, index))
+            if one.accepted:
+                young = torch.tensor(one.young, dtype=torch.float64)
+                fields = torch.from_numpy(one.force), torch.from_numpy(one.displacement)
+                yield Drawn(Sample(*fields, young), torch.tensor(index))
 
 
 class Replay:
@@ -49,6 +58,7 @@ class Replay:
 
     Attributes:
         produced: Samples taken from the stream so far.
+        following: A number above all loads taken from the stream so far.
     """
 
     def __init__(
@@ -63,14 +73,14 @@ class Replay:
         capacity: int,
     ) -> None:
         """Keep the arguments, see the class; nothing starts before the first pass."""
-        self.produced = 0
+        self.produced = self.following = 0
         self._batches, self._batch_size = batches, batch_size
         self._fresh, self._reuse, self._capacity = fresh, reuse, capacity
         self._loader = DataLoader(
             stream,
             batch_size=fresh,
             num_workers=workers,
-            collate_fn=stack,
+            collate_fn=_batch,
             multiprocessing_context="spawn" if workers else None,
         )
         self._stream: Any = None
@@ -91,13 +101,14 @@ class Replay:
     def _draw(self) -> Iterator[Sample]:
         buffer: Sample | None = None
         owed = 0.0  # uses that the samples so far are still good for
-        for news in self._stream:
-            self.produced += len(news.force)
-            owed += len(news.force) * self._reuse
-            if buffer is not None:
-                pairs = zip(buffer, news, strict=True)
-                news = Sample(*(torch.cat(pair)[-self._capacity :] for pair in pairs))
-            buffer = news
+        for news, numbers in self._stream:
+            self.produced += len(numbers)
+            self.following = max(self.following, int(numbers.max()) + 1)
+            owed += len(numbers) * self._reuse
+            parts = [news] if buffer is None else [buffer, news]
+            buffer = Sample(
+                *(torch.cat(column)[-self._capacity :] for column in zip(*parts, strict=True))
+            )
             while owed >= self._batch_size:
                 owed -= self._batch_size
                 count = len(buffer.force)
@@ -107,3 +118,7 @@ class Replay:
     def close(self) -> None:
         """Stop the workers."""
         self._endless = self._stream = None
+
+
+def _batch(drawn: list[Drawn]) -> Drawn:
+    return Drawn(stack([one.sample for one in drawn]), torch.stack([one.number for one in drawn]))

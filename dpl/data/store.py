@@ -14,7 +14,7 @@ import json
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -131,8 +131,11 @@ class Store:
             _write(card, json.dumps(self._card(), indent=1).encode())
         self._check(json.loads(card.read_text()))
         manifest = self.folder / "manifest.jsonl"
-        lines = manifest.read_text().splitlines() if manifest.exists() else []
-        return [json.loads(line) for line in lines if line.endswith("}")]  # a torn line is none
+        shards = []
+        for line in manifest.read_text().splitlines() if manifest.exists() else ():
+            with suppress(json.JSONDecodeError):  # torn by a crash: its shard does not count
+                shards.append(json.loads(line))
+        return shards
 
     def _card(self) -> dict[str, Any]:
         return {
@@ -229,8 +232,10 @@ class Store:
             "iterations": sum(one.iterations for one in tried),
             "seconds": round(sum(one.seconds for one in tried), 3),
         }
-        with (self.folder / "manifest.jsonl").open("a") as manifest:
-            manifest.write(json.dumps(line) + "\n")
+        with (self.folder / "manifest.jsonl").open("a+") as manifest:
+            manifest.seek(0)
+            torn = not manifest.read().endswith("\n") and manifest.tell() > 0
+            manifest.write("\n" * torn + json.dumps(line) + "\n")
             manifest.flush()
             os.fsync(manifest.fileno())
 

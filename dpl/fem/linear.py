@@ -61,13 +61,21 @@ def backend(pattern: Pattern, name: str = "auto") -> Backend:
     Raises:
         ValueError: No such backend, or it is not installed.
     """
-    known: dict[str, type[Pardiso] | type[SuperLU]] = {"pardiso": Pardiso, "superlu": SuperLU}
+    return BACKENDS[chosen(name)](pattern)
+
+
+def chosen(name: str) -> str:
+    """Return the name of the backend that a name stands for.
+
+    Raises:
+        ValueError: No such backend, or it is not installed.
+    """
     choice = installed()[0] if name == "auto" else name
-    if choice not in known:
-        raise ValueError(f"backend = {name!r} must be auto, {', '.join(known)}")
+    if choice not in BACKENDS:
+        raise ValueError(f"linear = {name!r} must be auto, {' or '.join(BACKENDS)}")
     if choice not in installed():
-        raise ValueError(f"backend = {name!r} is not installed: pip install 'deepphysics[{name}]'")
-    return known[choice](pattern)
+        raise ValueError(f"linear = {name!r} is not installed: pip install 'deepphysics[{name}]'")
+    return choice
 
 
 def full_matrix(pattern: Pattern, values: Array) -> csr_array:
@@ -189,7 +197,15 @@ class Pardiso:
         from pypardiso.pardiso_wrapper import PyPardisoError
 
         self._solver.set_phase(phase)
+        # One thread: two are slower at these sizes, and MKL crashes if their number changes
+        # between analysis and factorisation.
+        before = self._solver.libmkl.MKL_Set_Num_Threads_Local(1)
         try:
             return self._solver._call_pardiso(matrix, right.reshape(-1, 1)).ravel()
         except PyPardisoError as error:
             raise SingularMatrix(str(error)) from error
+        finally:
+            self._solver.libmkl.MKL_Set_Num_Threads_Local(before)
+
+
+BACKENDS: dict[str, type[Pardiso] | type[SuperLU]] = {"superlu": SuperLU, "pardiso": Pardiso}

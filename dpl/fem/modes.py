@@ -160,9 +160,9 @@ class ModalLoads:
         low, high = self.patch if len(self.patch) == 2 else (1, 0)
         if not 0 <= low <= high < math.inf:
             raise ValueError(f"patch = {list(self.patch)} must be a smallest and a largest radius")
-        moduli = self.young_range
-        if not 0 < moduli[0] <= moduli[1] < math.inf:
-            raise ValueError(f"young = {self.young} must be a positive modulus [Pa] or a range")
+        moduli = [self.young] if isinstance(self.young, int | float) else list(self.young)
+        if len(moduli) not in (1, 2) or not 0 < moduli[0] <= moduli[-1] < math.inf:
+            raise ValueError(f"young = {self.young} must be a modulus above 0 [Pa] or [low, high]")
 
     @property
     def problem(self) -> Problem:
@@ -189,8 +189,8 @@ class ModalLoads:
     @property
     def young_range(self) -> tuple[float, float]:
         """Smallest and largest Young's modulus [Pa]."""
-        low, high = (self.young,) * 2 if isinstance(self.young, int | float) else self.young
-        return float(low), float(high)
+        moduli = [self.young] if isinstance(self.young, int | float) else self.young
+        return float(moduli[0]), float(moduli[-1])
 
     @property
     def reach(self) -> Tensor:

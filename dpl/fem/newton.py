@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.linear import Backend, Factor, SingularMatrix, backend
+from dpl.fem.linear import Backend, Factor, SingularMatrix, backend, chosen
 from dpl.fem.materials import volume_change
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, in_step, judge
@@ -88,13 +88,14 @@ class Newton:
         """Check the ranges.
 
         Raises:
-            ValueError: A tolerance, a step or a count is out of range.
+            ValueError: An attribute is out of range, or the backend is not there.
         """
         for name in ("tol", "loose", "keep", "smallest_step"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and 1")
         if self.max_iter < 1:
             raise ValueError(f"max_iter = {self.max_iter} must be 1 or more")
+        chosen(self.linear)
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
         """Yield the state before the first update and after each one.

@@ -1,9 +1,11 @@
 """What every solver takes and gives: Load, Solution, and the one sentence they all say."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple, Protocol
 
 import torch
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from dpl.fem.problem import Problem
@@ -49,6 +51,21 @@ class Solver(Protocol):
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield ever better answers; the last one is the answer."""
         ...
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep torch and BLAS to one thread; for more, use processes.
+
+    Inside one solve two threads are slower than one, and far slower where the other core is busy.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def solve(solver: Solver, load: Load) -> Solution:

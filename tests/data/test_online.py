@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import IterableDataset
 
 from dpl.data.generate import Job, outcome
-from dpl.data.online import OnlineSamples, Replay
+from dpl.data.online import Drawn, OnlineSamples, Replay
 from dpl.scene import Sample
 
 SEED = (0, 0)
@@ -24,7 +24,8 @@ class Numbers(IterableDataset):
     def __iter__(self):
         for place in itertools.count() if self.end is None else range(self.end):
             field = torch.full((2, 3), float(place), dtype=torch.float64)
-            yield Sample(field, -field, torch.tensor(float(place), dtype=torch.float64))
+            young = torch.tensor(float(place), dtype=torch.float64)
+            yield Drawn(Sample(field, -field, young), torch.tensor(place))
 
 
 def replay(stream=None, **options):
@@ -51,15 +52,16 @@ def drawn(scene):
 
 def test_the_stream_is_the_accepted_loads_in_order(scene, drawn):
     first = list(itertools.islice(OnlineSamples(scene, SEED), 6))
-    assert [one.force.numpy().tobytes() for one in first] == drawn[:6]
+    assert [one.sample.force.numpy().tobytes() for one in first] == drawn[:6]
+    assert [int(one.number) for one in first] == list(range(6))
     truth = outcome(scene, Job(SEED, 3))
-    assert torch.equal(first[3].displacement, torch.from_numpy(truth.displacement))
-    assert float(first[3].young) == truth.young
+    assert torch.equal(first[3].sample.displacement, torch.from_numpy(truth.displacement))
+    assert float(first[3].sample.young) == truth.young
 
 
 def test_the_stream_can_begin_anywhere(scene, drawn):
     first = next(iter(OnlineSamples(scene, SEED, first=9)))
-    assert first.force.numpy().tobytes() == drawn[9]
+    assert first.sample.force.numpy().tobytes() == drawn[9]
 
 
 def test_rejected_loads_do_not_enter_the_stream(scene, drawn, monkeypatch):
@@ -68,7 +70,7 @@ def test_rejected_loads_do_not_enter_the_stream(scene, drawn, monkeypatch):
 
     monkeypatch.setattr("dpl.data.online.outcome", choosy)
     first = itertools.islice(OnlineSamples(scene, SEED), 3)
-    assert [one.force.numpy().tobytes() for one in first] == [drawn[1], drawn[4], drawn[7]]
+    assert [one.sample.force.numpy().tobytes() for one in first] == [drawn[1], drawn[4], drawn[7]]
 
 
 def test_two_workers_solve_the_same_stream_and_end_when_it_is_closed(scene, drawn):
