@@ -103,6 +103,8 @@ def check(cfg: DictConfig, *, trust: bool = True) -> None:
     for path, value in _leaves(plain(cfg), ""):
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{path} = {value} is not a finite number")
+    if not _fits(cfg.get("seed", 0), int):
+        raise ConfigError(f"seed = {cfg.seed!r} must be a whole number")
     for path, node in _calls(plain(cfg), ""):
         name = node["_target_"]
         if not trust and not name.startswith(TRUSTED):

@@ -174,10 +174,11 @@ def test_lr_star_sends_no_gradient_through_the_residual(scene, batch, monkeypatc
     prediction = (batch.displacement + 1e-3).requires_grad_()
     surrogate = Surrogate(FCNN(scene, width=4), LrStar(), scene)
     surrogate.loss(prediction, batch, surrogate.physics)
-    assert tracked == [False]
+    assert tracked
+    assert not any(tracked)
     assert any("no backward pass through the residual" in line for line in surrogate.plan())
     LrPlus()(prediction, batch, surrogate.physics)
-    assert tracked == [False, True]
+    assert any(tracked)
 
 
 def test_a_data_set_that_is_there_is_not_solved_again(data, calls, monkeypatch):

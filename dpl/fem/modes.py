@@ -160,8 +160,8 @@ class ModalLoads:
         low, high = self.patch if len(self.patch) == 2 else (1, 0)
         if not 0 <= low <= high < math.inf:
             raise ValueError(f"patch = {list(self.patch)} must be a smallest and a largest radius")
-        moduli = [self.young] if isinstance(self.young, int | float) else list(self.young)
-        if len(moduli) not in (1, 2) or not 0 < moduli[0] <= moduli[-1] < math.inf:
+        moduli = [self.young] * 2 if isinstance(self.young, int | float) else list(self.young)
+        if len(moduli) != 2 or not 0 < moduli[0] <= moduli[1] < math.inf:
             raise ValueError(f"young = {self.young} must be a modulus above 0 [Pa] or [low, high]")
 
     @property

@@ -171,7 +171,7 @@ def test_backend_that_is_not_installed_is_an_error_that_says_how_to_get_it(monke
 
 
 def test_unknown_backend_is_an_error_that_names_the_known(stiffness):
-    with pytest.raises(ValueError, match=r"'umfpack' must be auto, pardiso, superlu"):
+    with pytest.raises(ValueError, match=r"linear = 'umfpack' must be auto, superlu or pardiso"):
         backend(stiffness[0], "umfpack")
 
 
