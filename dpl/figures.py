@@ -70,13 +70,14 @@ def deformed(
     right = truth.detach().cpu().numpy()
     fields = [(name, field.detach().cpu().numpy()) for name, field in predictions]
     columns, dim = len(right), points.shape[1]
-    figure = Figure(figsize=(3.6 * columns + 1.2, 2.6 * len(fields) + 0.4), layout="constrained")
+    figure = Figure(figsize=(3.6 * columns + 1.2, 2.2 * len(fields) + 0.4), layout="constrained")
     axes = figure.subplots(
         len(fields), columns, squeeze=False, subplot_kw={"projection": "3d"} if dim == 3 else {}
     )
     seen = np.concatenate([points[None] + right, points[None]])
     errors = [np.linalg.norm(field - right, axis=2) for _, field in fields]
-    top = max(1e-12, *(float(np.nanmax(error)) for error in errors))
+    finite = [error[np.isfinite(error)] for error in errors]
+    top = max(1e-12, *(float(error.max(initial=0.0)) for error in finite))
     scale = ScalarMappable(LogNorm(top * 1e-3, top), "viridis")
     for row, (name, field) in enumerate(fields):
         for column in range(columns):

@@ -36,6 +36,7 @@ def main(cfg: DictConfig) -> None:
     network = next(row for row in rows if row.solver == "network")
     if isinstance(trainer.logger, L.pytorch.loggers.TensorBoardLogger):
         trainer.logger.log_hyperparams(run.plain(cfg), network.errors)
+        trainer.logger.save()
         trainer.logger.finalize("success")
 
 
