@@ -169,8 +169,8 @@ def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:
 
     Root mean squares over the first loads of a stream of their own, over the degrees of freedom
     that loads can act on and over those that move; displacements are linear answers. So no sample
-    is needed, and online and offline training share the scales. One number each: scaling every
-    degree of freedom by its own trains worse (see README).
+    is needed, and online and offline training share the scales. One number each, so that forces
+    and displacements keep their proportions within the body.
     """
     force = scene.loads.sample((0, SCALES), range(count)).force
     displacement = torch.stack([scene.linear.respond(one) for one in force])
