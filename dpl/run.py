@@ -100,12 +100,14 @@ def check(cfg: DictConfig, *, trust: bool = True) -> None:
     """
     if unknown := sorted(set(plain(cfg)) - KEYS):
         raise ConfigError(f"{unknown[0]}: no such key; there are {', '.join(sorted(KEYS))}")
-    for path, value in _leaves(plain(cfg), ""):
+    for path, value in _walk(plain(cfg)):
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{path} = {value} is not a finite number")
     if not _fits(cfg.get("seed", 0), int):
         raise ConfigError(f"seed = {cfg.seed!r} must be a whole number")
-    for path, node in _calls(plain(cfg), ""):
+    for path, node in _walk(plain(cfg)):
+        if not isinstance(node, dict) or "_target_" not in node:
+            continue
         name = node["_target_"]
         if not trust and not name.startswith(TRUSTED):
             raise ConfigError(f"{path} names {name}, which is none of this package's; not called")
@@ -180,34 +182,16 @@ def _words(hint: Any) -> str:
     return names.get(hint, "null" if hint is types.NoneType else str(hint))
 
 
-def _leaves(node: Any, path: str) -> Iterator[tuple[str, Any]]:
-    items = (
-        node.items()
-        if isinstance(node, dict)
-        else enumerate(node)
-        if isinstance(node, list)
-        else ()
-    )
-    for key, value in items:
-        below = f"{path}.{key}" if path else str(key)
-        if isinstance(value, dict | list):
-            yield from _leaves(value, below)
-        else:
-            yield below, value
-
-
-def _calls(node: Any, path: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    if isinstance(node, dict) and "_target_" in node:
-        yield path, node
-    items = (
-        node.items()
-        if isinstance(node, dict)
-        else enumerate(node)
-        if isinstance(node, list)
-        else ()
-    )
-    for key, value in items:
-        yield from _calls(value, f"{path}.{key}" if path else str(key))
+def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield a node and all below it with their paths."""
+    yield path, node
+    entries: Any = ()
+    if isinstance(node, dict):
+        entries = node.items()
+    elif isinstance(node, list):
+        entries = enumerate(node)
+    for key, value in entries:
+        yield from _walk(value, f"{path}.{key}" if path else str(key))
 
 
 def make(cfg: DictConfig, key: str, /, **more: Any) -> Any:
