@@ -249,6 +249,10 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
     """
     from dpl.module import Surrogate
 
+    # both are tried on one number, so that their errors come before any solve
+    trial = make(cfg, "optimizer", params=[torch.nn.Parameter(torch.zeros(1))])
+    if cfg.scheduler:
+        make(cfg, "scheduler", optimizer=trial, total_steps=1)
     torch.manual_seed(cfg.seed)
     return Surrogate(
         make(cfg, "model", scene=scene),

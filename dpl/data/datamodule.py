@@ -1,8 +1,10 @@
 """Lightning's door to the samples: from disk, or from workers that solve while it trains."""
 
+import os
 from typing import Any
 
 import lightning as L
+import torch
 from torch.utils.data import DataLoader, Dataset
 from torch.utils.data.distributed import DistributedSampler
 
@@ -153,7 +155,9 @@ class OnlineData(OfflineData):
         self._produced = self._first = 0  # what earlier runs took that this one resumes
 
     def train_dataloader(self) -> Replay:
-        """Return the stream, an epoch at a time."""
+        """Return the stream, an epoch at a time; training keeps to the cores that are left."""
+        # threads of one operation wait for each other: none of them may wait for a solving worker
+        torch.set_num_threads(max(1, (os.cpu_count() or 1) - self.workers))
         stream = OnlineSamples(self.scene, self.store.stream("train"), first=self._first)
         self._replay = Replay(
             stream, workers=self.workers, batch_size=self.batch_size, **self._options
