@@ -49,6 +49,8 @@ def command(task: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
     @functools.wraps(task)
     def wrapped(cfg: DictConfig) -> None:
         logging.getLogger("skfem").setLevel(logging.WARNING)
+        for name in ("lightning.pytorch", "lightning.fabric"):  # they print for themselves
+            logging.getLogger(name).propagate = False
         try:
             task(cfg)
         except (ConfigError, DataSetError) as error:
