@@ -118,7 +118,8 @@ class Store:
         """
         card = self.folder / "scene.json"
         if not card.exists():
-            if self.folder.exists() and any(self.folder.iterdir()):
+            there = {path.name for path in self.folder.iterdir()} if self.folder.exists() else set()
+            if there - {"modes.safetensors"}:  # which is written first
                 raise DataSetError(
                     f"{self.folder} is not empty and no data set; choose another data.folder"
                 )
