@@ -35,7 +35,7 @@ CONF = ROOT / "conf"
 @pytest.fixture(scope="session")
 def tiny() -> list[str]:
     """Overrides that make the tiny scene of any command."""
-    return ["mesh.nodes=[5,3,3]", "loads.n_modes=3", "+solver.linear=superlu"]
+    return ["mesh.nodes=[5,3,3]", "loads.n_modes=3", "solver.linear=superlu"]
 
 
 @pytest.fixture(scope="session")

@@ -61,7 +61,7 @@ BAD = {  # override -> what the message must name
     "solver.tol=2": r"solver: tol = 2",
     "solver.tol=small": r"solver\.tol = 'small' must be a number",
     "+solver.max_iter=0": r"solver: max_iter = 0",
-    "+solver.linear=umfpack": r"umfpack",
+    "solver.linear=umfpack": r"umfpack",
     "+solver.fast=true": r"solver\.fast: .* has no such option",
     "loads.n_modes=0": r"loads: n_modes = 0",
     "loads.n_modes=2.5": r"loads\.n_modes = 2\.5 must be a whole number",
@@ -207,7 +207,7 @@ def test_a_command_refuses_with_one_line_and_leaves_nothing(refusals, name):
         ("generate", "loads.n_modes=1000", "n_modes = 1000"),
         ("train", "data.batch_size=0", "data: batch_size = 0"),
         ("train", "optimizer.lr=fast", "optimizer.lr = 'fast'"),
-        ("train", "+solver.linear=umfpack", "umfpack"),
+        ("train", "solver.linear=umfpack", "umfpack"),
     ],
 )
 def test_a_command_computes_nothing_before_all_is_known_to_work(
