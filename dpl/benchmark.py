@@ -178,7 +178,8 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
         tol: Residual ratio of Newton and the hybrid [-].
     """
     scene = surrogate.scene
-    newton = replace(scene.solver, tol=tol)
+    # the scene's own where it can be: its factor of K(0) is there already
+    newton = scene.solver if tol == scene.solver.tol else replace(scene.solver, tol=tol)
     solvers: dict[str, Solver] = {
         "linear": newton.rest,
         "network": Direct(surrogate.predict, scene.problem, tol),
@@ -200,7 +201,7 @@ def _picture(
     scene, network = surrogate.scene, answers["network"]
     error = RelativeL2().measure(network, test)
     order = error.argsort()
-    chosen = order[[0, len(order) // 2, -1]]
+    chosen = order[[0, (len(order) - 1) // 2, -1]]  # the median as torch takes it
     names = [
         f"{name} load: relative L2 {error[k]:.2%}"
         for name, k in zip(("best", "median", "worst"), chosen, strict=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 from dpl.fem.problem import Problem
 from dpl.scene import Sample
 
-CHUNK = 8  # samples whose stresses fit a processor's cache: twice as fast as a batch of 64 at once
+CHUNK = 8  # samples at once: few enough for their stresses to fit a processor's cache
 
 
 class Physics(NamedTuple):
