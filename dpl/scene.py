@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import NamedTuple
 
@@ -86,7 +86,7 @@ class Scene:
             "cells": _digest(self.problem.cells.numpy()),
             "free": _digest(self.problem.free.numpy()),
             "degree": self.problem.degree,
-            "law": {"name": type(law).__name__, **asdict(law)},
+            "law": {"name": type(law).__name__, **vars(law)},
             "loads": {
                 "name": type(loads).__name__,
                 "n_modes": loads.n_modes,

@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 from dpl import run
 from dpl.data.datamodule import OfflineData
-from dpl.fem.materials import NeoHookean
+from dpl.fem.materials import NeoHookeanLn
 from dpl.fem.mesh import Plane, box
 from dpl.fem.modes import ModalLoads
 from dpl.fem.newton import Newton
@@ -50,7 +50,7 @@ def _tiny(
     size=(100.0, 25.0, 25.0),
     nodes=(5, 3, 3),
     cell="hexahedron",
-    law=NeoHookean,
+    law=NeoHookeanLn,
     poisson=0.3,
     mesh=None,
     fixed=None,

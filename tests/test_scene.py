@@ -77,14 +77,14 @@ def test_fingerprints_differ_from_each_other(make_scene):
 
 def test_the_fingerprint_is_the_same_in_every_process(scene, environment, tmp_path):
     code = """
-from dpl.fem.materials import NeoHookean
+from dpl.fem.materials import NeoHookeanLn
 from dpl.fem.mesh import Plane, box
 from dpl.fem.modes import ModalLoads
 from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.scene import Scene
 
-problem = Problem.build(box((1, 0.25, 0.25), (5, 3, 3)), NeoHookean(0.3), fixed=Plane(0, "min"))
+problem = Problem.build(box((1, 0.25, 0.25), (5, 3, 3)), NeoHookeanLn(0.3), fixed=Plane(0, "min"))
 newton = Newton(problem)
 print(Scene(problem, ModalLoads(newton.rest, n_modes=3), newton).fingerprint)
 """

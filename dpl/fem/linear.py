@@ -1,4 +1,4 @@
-"""K x = r for the sparse symmetric tangents of a problem: direct backends behind one function.
+"""K x = r for the sparse symmetric tangents of a problem: several backends behind one function.
 
 The symbolic work (ordering, structure) is done once per backend object, the numbers per call.
 """
@@ -6,100 +6,120 @@ The symbolic work (ordering, structure) is done once per backend object, the num
 import importlib.util
 import os
 import weakref
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
+from threadpoolctl import threadpool_info
 
-from dpl.fem.problem import Pattern
+from dpl.fem.band import Band, Band32, band_layout
+from dpl.fem.krylov import CG, multigrid_installed, rigid_motions
+from dpl.fem.sparse import (
+    Array,
+    Backend,
+    Factor,
+    Pattern,
+    SingularMatrix,
+    full_matrix,
+    require_finite,
+    row_numbers,
+)
 
-Array = NDArray[np.float64]
-
-
-class SingularMatrix(ArithmeticError):
-    """The matrix has no usable factorisation."""
-
-
-class Factor(Protocol):
-    """A factorised matrix."""
-
-    @property
-    def negative_pivots(self) -> int:
-        """Number of negative eigenvalues."""
-        ...
-
-    def solve(self, right: Array) -> Array:
-        """Return x, (n,), with K x = right."""
-        ...
-
-
-class Backend(Protocol):
-    """Factorises matrices of one pattern."""
-
-    def factorise(self, values: Array) -> Factor:
-        """Return the factor of the matrix with entries values (nnz,) on the pattern.
-
-        Raises:
-            SingularMatrix: An exact zero pivot, or entries that are not finite.
-        """
-        ...
+__all__ = [
+    "BACKENDS",
+    "Backend",
+    "Factor",
+    "Pardiso",
+    "SingularMatrix",
+    "SuperLU",
+    "backend",
+    "chosen",
+    "full_matrix",
+    "installed",
+    "rigid_motions",
+    "slow_blas",
+]
 
 
 def installed() -> list[str]:
-    """Return the names of the backends that can be used here, the fastest first."""
-    pardiso = importlib.util.find_spec("pypardiso") is not None
-    return ["pardiso", "superlu"] if pardiso else ["superlu"]
+    """Return the names of the backends that can be used here."""
+    missing = set() if importlib.util.find_spec("pypardiso") else {"pardiso"}
+    return [name for name in BACKENDS if name not in missing]
 
 
-def backend(pattern: Pattern, name: str = "auto") -> Backend:
-    """Return the backend of that name ("auto": the fastest that is installed).
+def backend(pattern: Pattern, name: str = "auto", near_null: Array | None = None) -> Backend:
+    """Return a backend for matrices of a pattern.
+
+    Args:
+        pattern: Structure of the matrices.
+        name: "band", "band32", "pardiso", "superlu", "cg", or "auto", see `chosen`.
+        near_null: Fields that cost no energy, (n, k), see `rigid_motions`; "cg" wants them.
 
     Raises:
         ValueError: No such backend, or it is not installed.
     """
-    return BACKENDS[chosen(name)](pattern)
+    return BACKENDS[chosen(name, pattern, near_null)](pattern, near_null)
 
 
-def chosen(name: str) -> str:
+def chosen(name: str, pattern: Pattern | None = None, near_null: Array | None = None) -> str:
     """Return the name of the backend that a name stands for.
 
+    "auto" depends on the pattern and on what is installed, never on a clock: it stays "auto"
+    where no pattern is given.
+
     Raises:
         ValueError: No such backend, or it is not installed.
     """
-    choice = installed()[0] if name == "auto" else name
-    if choice not in BACKENDS:
-        raise ValueError(f"linear = {name!r} must be auto, {' or '.join(BACKENDS)}")
-    if choice not in installed():
+    if name not in (*BACKENDS, "auto"):
+        raise ValueError(f"linear = {name!r} must be auto, {', '.join(BACKENDS)}")
+    if name != "auto" and name not in installed():
         raise ValueError(f"linear = {name!r} is not installed: pip install 'deepphysics[{name}]'")
-    return choice
+    return name if name != "auto" or pattern is None else _automatic(pattern, near_null)
 
 
-def full_matrix(pattern: Pattern, values: Array) -> csr_array:
-    """Return the whole symmetric matrix (n, n) of upper-triangle entries (nnz,)."""
-    upper = csr_array((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
-    lower = upper.T.tocsr()
-    lower.setdiag(0)
-    lower.eliminate_zeros()
-    return (upper + lower).tocsr()
+# Measured on beams, cubes, stars, plates of 1,000 to 100,000 degrees of freedom: a band costs n b^2
+# operations, a sparse factor of a solid about n^2 slower ones, so b^2 / n decides.
+PAYS = {"pardiso": 30, "superlu": 100, "cg": 10}  # b^2 / n below which a band is faster
+LARGE = {"pardiso": 100_000, "superlu": 30_000}  # n from which on multigrid is faster
+WIDE = 250  # b from which on float32 saves more than the iterations on it cost
 
 
-@dataclass(frozen=True)
+def _automatic(pattern: Pattern, near_null: Array | None) -> str:
+    names = installed()
+    sparse = "pardiso" if "pardiso" in names else "superlu"
+    multigrid = "cg" in names and near_null is not None and multigrid_installed()
+    best = "cg" if multigrid and pattern.size > LARGE[sparse] else sparse
+    if "band" in names:
+        half = band_layout(pattern).half
+        if half**2 < PAYS[best] * pattern.size:
+            return "band32" if half >= WIDE else "band"
+    return best
+
+
+def _indefinite(pattern: Pattern) -> Backend:
+    """Return the best backend for matrices that are not positive definite."""
+    return Pardiso(pattern) if "pardiso" in installed() else SuperLU(pattern)
+
+
+@dataclass(frozen=True, eq=False)
 class SuperLUFactor:
     """LDL^T-like factor in a fill-reducing order."""
 
     lu: Any
     order: NDArray[np.int_]
 
-    @property
+    @cached_property
     def negative_pivots(self) -> int:
         """Number of negative eigenvalues (Sylvester's law of inertia; diagonal pivots only)."""
         return int((self.lu.U.diagonal() < 0).sum())
 
-    def solve(self, right: Array) -> Array:
+    def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right."""
         x = np.empty_like(right)
         x[self.order] = self.lu.solve(right[self.order])
@@ -116,8 +136,7 @@ class SuperLU:
     def _plan(self) -> tuple[NDArray[np.int_], csc_array, NDArray[np.int_]]:
         """Minimum-degree order, structure of the reordered matrix, where its entries come from."""
         n, count = self.pattern.size, len(self.pattern.indices)
-        rows = np.repeat(np.arange(n), np.diff(self.pattern.indptr))
-        columns = self.pattern.indices
+        rows, columns = row_numbers(self.pattern), self.pattern.indices
         model = np.where(rows == columns, 4.0 * count, -1.0)  # any positive definite values
         whole = full_matrix(self.pattern, model).tocsc()
         order = np.argsort(splu(whole, **_symmetric("MMD_AT_PLUS_A")).perm_c)
@@ -134,8 +153,7 @@ class SuperLU:
 
     def factorise(self, values: Array) -> SuperLUFactor:
         """Return the factor, see `Backend.factorise`."""
-        if not np.isfinite(values).all():
-            raise SingularMatrix("the matrix has entries that are not finite")
+        require_finite(values)
         order, structure, source = self._plan
         matrix = csc_array((values[source], structure.indices, structure.indptr), structure.shape)
         try:
@@ -149,26 +167,27 @@ def _symmetric(order: str) -> dict[str, Any]:
     return {"permc_spec": order, "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PardisoFactor:
-    """LDL^T factor inside MKL; valid until its backend factorises the next matrix."""
+    """LDL^T factor inside MKL, which holds one at a time: an older one is made anew when asked."""
 
     parent: "Pardiso"
     matrix: csr_array
     negative_pivots: int
 
-    def solve(self, right: Array) -> Array:
+    def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right."""
-        return self.parent._call(33, self.matrix, right)
+        return self.parent.solve(self.matrix, right)
 
 
 class Pardiso:
-    """MKL PARDISO (Schenk, Gaertner 2004), symmetric indefinite: the fastest, where installed."""
+    """MKL PARDISO (Schenk, Gaertner 2004), symmetric indefinite, where installed."""
 
     def __init__(self, pattern: Pattern) -> None:
         """Prepare; the analysis runs with the first matrix."""
         self.pattern = pattern
         self._solver: Any = None
+        self._held: csr_array | None = None  # the matrix whose factor MKL holds
 
     def __reduce__(self) -> tuple[type["Pardiso"], tuple[Pattern]]:
         """Pickle without MKL's handle."""
@@ -176,10 +195,21 @@ class Pardiso:
 
     def factorise(self, values: Array) -> PardisoFactor:
         """Return the factor, see `Backend.factorise`."""
-        if not np.isfinite(values).all():
-            raise SingularMatrix("the matrix has entries that are not finite")
+        require_finite(values)
         pattern = self.pattern
-        matrix = csr_array((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
+        entries = values.copy(), pattern.indices, pattern.indptr
+        matrix = csr_array(entries, shape=(pattern.size,) * 2)
+        self._factorise(matrix)
+        return PardisoFactor(self, matrix, int(self._solver.get_iparm(23)))
+
+    def solve(self, matrix: csr_array, right: Array) -> Array:
+        """Return x, (n,), with K x = right, for a matrix that has been factorised before."""
+        if self._held is not matrix:
+            self._factorise(matrix)
+        return self._call(33, matrix, right)
+
+    def _factorise(self, matrix: csr_array) -> None:
+        self._held = None
         if self._solver is None:
             from pypardiso import PyPardisoSolver
 
@@ -187,11 +217,11 @@ class Pardiso:
             # Found by a search through the whole environment, a second or more: once is enough.
             os.environ.setdefault("PYPARDISO_MKL_RT", self._solver.libmkl._name)
             weakref.finalize(self, self._solver.free_memory, everything=True)
-            self._call(11, matrix, np.zeros(pattern.size))
-        self._call(22, matrix, np.zeros(pattern.size))
+            self._call(11, matrix, np.zeros(self.pattern.size))
+        self._call(22, matrix, np.zeros(self.pattern.size))
         if self._solver.get_iparm(14):  # MKL replaces pivots it cannot use and says nothing
             raise SingularMatrix(f"{self._solver.get_iparm(14)} pivots are zero to rounding")
-        return PardisoFactor(self, matrix, int(self._solver.get_iparm(23)))
+        self._held = matrix
 
     def _call(self, phase: int, matrix: csr_array, right: Array) -> Array:
         from pypardiso.pardiso_wrapper import PyPardisoError
@@ -208,4 +238,32 @@ class Pardiso:
             self._solver.libmkl.MKL_Set_Num_Threads_Local(before)
 
 
-BACKENDS: dict[str, type[Pardiso] | type[SuperLU]] = {"superlu": SuperLU, "pardiso": Pardiso}
+BACKENDS: dict[str, Callable[[Pattern, Array | None], Backend]] = {
+    "band": lambda pattern, near_null: Band(pattern, _indefinite),
+    "band32": lambda pattern, near_null: Band32(pattern, _indefinite),
+    "pardiso": lambda pattern, near_null: Pardiso(pattern),
+    "superlu": lambda pattern, near_null: SuperLU(pattern),
+    "cg": CG,
+}
+
+# flag of the CPU -> its OpenBLAS kernels, best first; those that OpenBLAS takes for unknown CPUs
+KERNELS = {"avx512dq": "SkylakeX", "avx2": "Haswell"}
+CPUINFO = Path("/proc/cpuinfo")
+OLD_KERNELS = {"generic", "prescott", "core2", "penryn", "dunnington", "atom", "nehalem"}
+
+
+def slow_blas() -> str | None:
+    """Return one line of advice if OpenBLAS has not recognised this CPU, else None."""
+    if "OPENBLAS_CORETYPE" in os.environ or not CPUINFO.exists():
+        return None
+    lines = CPUINFO.read_text().splitlines()
+    flags = next((line.split() for line in lines if line.startswith("flags")), [])
+    best = next((kernels for flag, kernels in KERNELS.items() if flag in flags), None)
+    for library in threadpool_info():
+        kernels = str(library.get("architecture", ""))
+        if library["internal_api"] == "openblas" and best and kernels.lower() in OLD_KERNELS:
+            return (
+                f"OpenBLAS runs its {kernels} kernels on a CPU that can do more: "
+                f"set OPENBLAS_CORETYPE={best} before Python starts"
+            )
+    return None

@@ -1,9 +1,10 @@
 """Newton-Raphson on the nodal equilibrium f_int(u) = f, and the linear answer it starts with."""
 
+import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,9 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.linear import Backend, Factor, SingularMatrix, backend, chosen
-from dpl.fem.materials import volume_change
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, in_step, judge
+from dpl.fem.solution import Load, Solution, Status, in_step, judge
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +34,15 @@ class Linear:
     def factor(self) -> Factor:
         """Factor of K(0)."""
         rest = torch.zeros(1, *self.problem.shape, dtype=torch.float64)
-        values = self.problem.tangent(rest)[0].numpy()
-        return backend(self.problem.pattern, self.linear).factorise(values)
+        values = self.problem.linearise(rest).tangent[0].numpy()
+        return _backend_of(self.problem, self.linear).factorise(values)
 
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield the linear answer."""
+        start = time.perf_counter()
         answer = torch.stack([self.respond(force) for force in load.force])
-        yield judge(self.problem, answer, load, self.tol, iterations=1)
+        seconds = (time.perf_counter() - start) / len(answer)
+        yield judge(self.problem, answer, load, self.tol, iterations=1, seconds=seconds)
 
     def respond(self, force: Tensor) -> Tensor:
         """Return K(0)^-1 f, (N, D) [-], for f (N, D) [-]; zero where held."""
@@ -61,12 +63,16 @@ class Newton:
     converge, the load is applied in steps, each half the one that failed, twice the one that
     succeeded; intermediate states need only `loose`.
 
+    An answer whose tangent has negative pivots is in balance but no minimum of the energy, a
+    straight column beyond its critical load, for one: its status says so.
+
     Source: Wriggers (2008), Nonlinear Finite Element Methods, sections 5.1 and 5.3.
 
     Attributes:
         problem: The body.
         tol: Residual ratio ||R_free|| / ||f|| of an answer [-].
         max_iter: Iterations per load step before it is halved.
+        budget: Iterations in all before a load is given up.
         smallest_step: Load step, as a part of the load, below which to give up [-].
         loose: Residual ratio at intermediate load factors [-].
         keep: Part of det F that one step may leave of the smallest one [-].
@@ -78,6 +84,7 @@ class Newton:
     problem: Problem
     tol: float = 1e-8
     max_iter: int = 15
+    budget: int = 400
     smallest_step: float = 2.0**-10
     loose: float = 1e-2
     keep: float = 0.2
@@ -93,8 +100,9 @@ class Newton:
         for name in ("tol", "loose", "keep", "smallest_step"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and 1")
-        if self.max_iter < 1:
-            raise ValueError(f"max_iter = {self.max_iter} must be 1 or more")
+        for name in ("max_iter", "budget"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} = {getattr(self, name)} must be 1 or more")
         chosen(self.linear)
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
@@ -123,46 +131,61 @@ class Newton:
             held = torch.where(problem.free, guess, problem.prescribed)
             start = self._state(held, torch.zeros_like(force))
             state, guessed = (start, True) if start.volume_ratio > 0 else (base, False)
-        known, step = 0.0, 1.0
-        yield self._report(state, force, count, known)
+        count.known, step = 0.0, 1.0
+        yield self._report(state, force, count)
         while not self._balanced(state, force, self.tol):
-            target = min(known + step, 1.0)
+            target = min(count.known + step, 1.0)
             tol = self.tol if target == 1.0 else self.loose
             for iterate in self._correct(state, target * force, tol, count):
                 state = iterate
-                yield self._report(state, force, count, known)
+                yield self._report(state, force, count)
             if self._balanced(state, target * force, tol):
-                base, known, step = state, target, 2 * step
+                base, count.known, step = state, target, 2 * step
             else:  # a guess that failed costs no load step
-                step, guessed = (step, False) if guessed else ((target - known) / 2, False)
+                step, guessed = (step, False) if guessed else ((target - count.known) / 2, False)
                 state = base
-            if step < self.smallest_step:
-                yield self._report(base, force, count, known)
+            lost = step < self.smallest_step
+            if lost or count.iterations >= self.budget:
+                end = Status.NO_VALID_EQUILIBRIUM if lost else Status.NOT_CONVERGED
+                yield self._report(base, force, count, end)
                 return
-            ahead = min(known + step, 1.0) - known
+            ahead = min(count.known + step, 1.0) - count.known
             state = state._replace(jump=ahead * problem.prescribed[None])
 
     def _correct(
         self, state: "_State", force: Tensor, tol: float, count: "_Count"
     ) -> Iterator["_State"]:
         """Yield iterates under a fixed load until they balance it or cannot go on."""
+        before = float("nan")
         for _ in range(self.max_iter):
+            ratio = float(self.problem.imbalance(state.internal, force))
             try:
-                update = self._update(state, force, count)
+                update = self._update(state, force, count, self._forcing(ratio, before))
             except SingularMatrix:
                 return
             count.iterations += 1
-            length = self._uninverted_length(state, update)
-            if length == 0:
+            stepped = self._stepped(state, update)
+            if stepped is None:
                 return
-            strain = self._moved_strain(state, length, update)
-            end = state.displacement + length * update
-            state = self._state(end, (1 - length) * state.jump, strain)
+            state = stepped
             yield state
-            if self._balanced(state, force, tol):
+            if self._balanced(state, force, tol) or count.iterations >= self.budget:
                 return
+            before = ratio
 
-    def _update(self, state: "_State", force: Tensor, count: "_Count") -> Tensor:
+    def _forcing(self, ratio: float, before: float) -> float:
+        """Return the relative residual that a linear solve may leave.
+
+        As much as does not slow Newton down; `before` is the residual ratio an iteration ago, NaN
+        in the first one.
+
+        Source: Eisenstat, Walker (1996), SIAM J. Sci. Comput. 17, choice 2.
+        """
+        enough = 0.1 * self.tol / ratio if ratio > 0 else 0.0
+        earned = 0.01 * (ratio / before) ** 2 if before > 0 else 0.0
+        return max(1e-12, enough, min(1e-3, earned))
+
+    def _update(self, state: "_State", force: Tensor, count: "_Count", rtol: float) -> Tensor:
         """Return the full Newton step (1, N, D) under a force, supports included.
 
         Raises:
@@ -170,35 +193,31 @@ class Newton:
         """
         problem, u = self.problem, state.displacement
         internal, factor = state.internal, self.rest.factor
-        if state.strain is not None:
-            internal, values = problem.mixed_system(u, state.strain)
-        elif u.any():
-            values = problem.tangent(u)
         if u.any():
+            system = problem.linearise(u, state.gap)
+            if not system.valid:
+                system = problem.linearise(u)
+            internal = system.force
             count.factorisations += 1
-            factor = self._backend.factorise(values[0].numpy())
+            factor = self._backend.factorise(system.tangent[0].numpy())
         right = force - internal
-        if problem.moved_supports:
+        if state.jump.any():
             right = right - problem.tangent_product(u, state.jump)
-        return scatter(factor.solve(gather(right[0], problem)), problem)[None] + state.jump
+        step = factor.solve(gather(right[0], problem), rtol)
+        count.negative_pivots = factor.negative_pivots
+        return scatter(step, problem)[None] + state.jump
 
-    def _moved_strain(self, state: "_State", length: float, update: Tensor) -> Tensor | None:
-        """Return the strain that mixed points take with a step; None: plain Newton goes on."""
-        if not (self.mixed and self.problem.material.has_response):
-            return None
-        u = state.displacement
-        here = self.problem.strain(u)
-        before = here if state.strain is None else state.strain
-        strain = before + length * (here - before + self.problem.strain_change(u, update))
-        return strain if volume_change(2 * strain).min() > -1 + 1e-3 else None
-
-    def _uninverted_length(self, state: "_State", update: Tensor) -> float:
-        """Return the longest of the steps 1, 1/2, 1/4, ... that inverts nothing; 0: none does."""
+    def _stepped(self, state: "_State", update: Tensor) -> "_State | None":
+        """Return the state after the longest of the steps 1, 1/2, 1/4, ... that inverts nothing."""
         floor = self.keep * min(float(state.volume_ratio), 1.0)
-        for length in 0.5 ** np.arange(10):
-            if self.problem.volume_ratio(state.displacement + length * update)[0] > floor:
-                return float(length)
-        return 0.0
+        for length in (0.5 ** np.arange(10)).tolist():
+            jump = (1 - length) * state.jump
+            end = self._state(state.displacement + length * update, jump)
+            if end.volume_ratio > floor:
+                if self.mixed and self.problem.mixes:
+                    return end._replace(gap=self.problem.widened(state.gap, length, update))
+                return end
+        return None
 
     @cached_property
     def rest(self) -> Linear:
@@ -207,32 +226,50 @@ class Newton:
 
     @cached_property
     def _backend(self) -> Backend:
-        return backend(self.problem.pattern, self.linear)
+        return _backend_of(self.problem, self.linear)
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle without factors."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {f.name: getattr(self, f.name) for f in fields(self)}
 
-    def _state(self, displacement: Tensor, jump: Tensor, strain: Tensor | None = None) -> "_State":
-        internal = self.problem.internal_force(displacement)
-        volume_ratio = self.problem.volume_ratio(displacement)
-        return _State(displacement, internal, volume_ratio, jump, strain)
+    def _state(self, displacement: Tensor, jump: Tensor, gap: Any = None) -> "_State":
+        return _State(displacement, *self.problem.evaluate(displacement), jump, gap)
 
     def _balanced(self, state: "_State", force: Tensor, tol: float) -> bool:
-        ratio = self.problem.imbalance(state.internal, force)
-        return bool(ratio < tol and state.volume_ratio > 0 and not state.jump.any())
+        balanced = self.problem.balanced(state.displacement, state.internal, force, tol)
+        return bool(balanced and state.volume_ratio > 0 and not state.jump.any())
 
-    def _report(self, state: "_State", force: Tensor, count: "_Count", known: float) -> Solution:
-        converged = torch.tensor([self._balanced(state, force, self.tol)])
+    def _report(
+        self, state: "_State", force: Tensor, count: "_Count", end: Status | None = None
+    ) -> Solution:
+        balanced = end is None and self._balanced(state, force, self.tol)
+        if balanced:
+            end = Status.UNSTABLE if self._negative_pivots(state, count) > 0 else Status.CONVERGED
+        elif end is None:
+            end = Status.NOT_CONVERGED
+        factor = 1.0 if balanced else count.known
         return Solution(
             displacement=state.displacement,
             residual=self.problem.imbalance(state.internal, force),
             volume_ratio=state.volume_ratio,
-            converged=converged,
+            status=torch.tensor([int(end)]),
+            negative_pivots=torch.tensor([count.negative_pivots]),
             iterations=torch.tensor([count.iterations]),
             factorisations=torch.tensor([count.factorisations]),
-            load_factor=torch.where(converged, 1.0, torch.tensor([known], dtype=force.dtype)),
+            load_factor=torch.tensor([factor], dtype=force.dtype),
+            seconds=torch.tensor([time.perf_counter() - count.start], dtype=torch.float64),
         )
+
+    def _negative_pivots(self, state: "_State", count: "_Count") -> int:
+        """Return those of the tangent at an answer; factorised only if the last one had some."""
+        if count.negative_pivots > 0:
+            count.factorisations += 1
+            tangent = self.problem.linearise(state.displacement).tangent
+            try:
+                count.negative_pivots = self._backend.factorise(tangent[0].numpy()).negative_pivots
+            except SingularMatrix:  # at the critical load itself
+                count.negative_pivots = 1
+        return count.negative_pivots
 
 
 class _State(NamedTuple):
@@ -242,15 +279,24 @@ class _State(NamedTuple):
     internal: Tensor
     volume_ratio: Tensor
     jump: Tensor
-    strain: Tensor | None
+    gap: Any
 
 
 @dataclass
 class _Count:
-    """What one load has cost so far."""
+    """What one load has cost so far, and what is known of it."""
 
     iterations: int = 0
     factorisations: int = 0
+    negative_pivots: int = -1
+    known: float = 0.0
+    start: float = field(default_factory=time.perf_counter)
+
+
+def _backend_of(problem: Problem, name: str) -> Backend:
+    """Return the backend for a problem's tangents."""
+    motions = problem.rigid_motions()[0][problem.free].numpy()
+    return backend(problem.pattern, name, motions)
 
 
 def gather(field: Tensor, problem: Problem) -> NDArray[np.float64]:

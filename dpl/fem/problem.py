@@ -1,9 +1,10 @@
 """Problem = mesh + law + supports: energy, internal force, residual and tangent, batched."""
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import skfem
@@ -11,10 +12,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.materials import Material, green_lagrange, volume_change
-from dpl.fem.mesh import longest_side
-
-Region = Callable[[NDArray[np.float64]], NDArray[np.bool_]]  # points (N, D) [m] -> (N,)
+from dpl.fem.kernels import Kernels
+from dpl.fem.materials import (
+    Isotropic,
+    Material,
+    green_lagrange,
+    inverse_transpose,
+    volume_change,
+)
+from dpl.fem.mesh import aspect_ratio, longest_side
+from dpl.fem.pattern import Pattern
+from dpl.fem.regions import Region, nodes_in
+from dpl.fem.supports import Displacement, Spring, Springs, Support, joined
 
 # shape of the cell, degree -> element, polynomial order that the quadrature integrates exactly.
 # Full quadrature: fewer points leave hourglass modes, more only cost time.
@@ -31,22 +40,30 @@ ELEMENTS = {
 QUADRATIC = {element for (_, degree), (element, _) in ELEMENTS.items() if degree == 2}
 
 
-@dataclass(frozen=True)
-class Pattern:
-    """Where the tangent has entries: upper triangle over the free degrees of freedom, in CSR.
+class Evaluation(NamedTuple):
+    """What a displacement is judged by.
 
     Attributes:
-        size: n, the number of free degrees of freedom.
-        indptr, indices: CSR structure, columns sorted, (n + 1,) and (nnz,).
-        source: For each kept entry of all cell matrices its place in them.
-        target: For each kept entry its place among the nnz.
+        internal: f_int, (B, N, D) [-].
+        volume_ratio: min det F over the quadrature points, (B,) [-].
     """
 
-    size: int
-    indptr: NDArray[np.int32]
-    indices: NDArray[np.int32]
-    source: Tensor
-    target: Tensor
+    internal: Tensor
+    volume_ratio: Tensor
+
+
+class System(NamedTuple):
+    """A linearised equilibrium K du = f - force.
+
+    Attributes:
+        force: (B, N, D) [-].
+        tangent: Entries of K on the pattern, (B, nnz) [-].
+        valid: Whether the strains that it was made at are those of some deformation, (B,).
+    """
+
+    force: Tensor
+    tangent: Tensor
+    valid: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +71,9 @@ class Problem:
     """Static equilibrium of one hyperelastic body; build it with `Problem.build`.
 
     All quantities are dimensionless. Methods take displacements (B, N, D) in float64 and return
-    values on the same device; none of them loops over cells in Python.
+    values on the same device; none of them loops over cells in Python. `energy`, `internal_force`
+    and `tangent` are tensor operations, differentiable, on any device; `evaluate` and `linearise`
+    say the same without derivatives, by compiled loops where body and law have them.
 
     Attributes:
         mesh: Geometry, coordinates over `length`.
@@ -68,6 +87,8 @@ class Problem:
         free: Degrees of freedom that may move, (N, D).
         prescribed: Displacement of the others at full load, (N, D) [-]; zero where free.
         boundary: Nodes on the boundary, (N,).
+        springs: Robin conditions; None if there are none.
+        mean_dilatation: Whether a cell's points share its mean volume ratio.
     """
 
     mesh: skfem.Mesh
@@ -81,6 +102,8 @@ class Problem:
     free: Tensor
     prescribed: Tensor
     boundary: Tensor
+    springs: Springs | None = None
+    mean_dilatation: bool = False
 
     @classmethod
     def build(
@@ -90,7 +113,9 @@ class Problem:
         *,
         fixed: Region | NDArray[np.bool_] | None = None,
         prescribed: NDArray[np.float64] | None = None,
+        supports: Sequence[Support] = (),
         degree: int = 1,
+        mean_dilatation: bool = False,
         length: float | None = None,
     ) -> Self:
         """Return the problem of a body.
@@ -101,11 +126,19 @@ class Problem:
             fixed: What is held: a region (all components of its nodes), or nodes (N,), or
                 degrees of freedom (N, D).
             prescribed: Displacement over `length` where fixed, (N, D); zero if left out.
+            supports: Prescribed displacements and springs besides; of two on one degree of freedom
+                the later counts.
             degree: 1 or 2.
+            mean_dilatation: Let the points of a cell share its mean volume ratio, so that nearly
+                incompressible bodies of linear quadrilaterals and hexahedra do not lock.
             length: L [m]; the longest side of the body if left out.
 
         Raises:
-            ValueError: `degree` is neither 1 nor 2, no such cells, or `fixed` is empty.
+            ValueError: `degree` is neither 1 nor 2, no such cells, a region is empty, or
+                `mean_dilatation` is asked of cells that it does nothing for.
+
+        Warns:
+            UserWarning: Linear elements will lock: see `advice`.
         """
         if degree not in (1, 2):
             raise ValueError(f"degree = {degree} must be 1 or 2")
@@ -114,14 +147,24 @@ class Problem:
         mesh = mesh.scaled(1.0 / length)
         basis = _basis(mesh, degree)
         nodes, dim = basis.N, mesh.dim()
+        if mean_dilatation and (degree == 2 or basis.dx.shape[1] == 1):
+            raise ValueError(
+                "mean_dilatation: is for linear quadrilaterals and hexahedra; "
+                "set degree=2 instead, quadratic elements hardly lock"
+            )
         points = basis.doflocs.T
-        if fixed is None:
-            held = np.zeros((nodes, dim), dtype=bool)
-        else:
-            where = fixed(points * length) if callable(fixed) else np.asarray(fixed)
+        given = np.full((nodes, dim), np.nan)
+        if fixed is not None:
+            where = fixed if isinstance(fixed, np.ndarray) else nodes_in(fixed, basis, length)
             if not where.any():
                 raise ValueError(f"{fixed} holds no node of the mesh")
             held = np.broadcast_to(where[:, None] if where.ndim == 1 else where, (nodes, dim))
+            given = np.where(held, 0.0 if prescribed is None else prescribed, np.nan)
+        for support in supports:
+            if isinstance(support, Displacement):
+                value = support.on(basis, length)
+                given = np.where(np.isnan(value), given, value)
+        beds = [s.on(basis, length) for s in supports if isinstance(s, Spring)]
         gradients = np.stack([b[0].grad for b in basis.basis])  # (A, D, E, Q)
         dN, dV = gradients.transpose(2, 3, 0, 1), basis.dx
         if np.allclose(dN, dN[:1], rtol=0, atol=1e-11 * np.abs(dN).max()) and np.allclose(
@@ -130,20 +173,40 @@ class Problem:
             dN, dV = dN[:1], dV[:1]
         boundary = np.zeros(nodes, dtype=bool)
         boundary[basis.get_dofs(mesh.boundary_facets()).all()] = True
-        given = np.zeros((nodes, dim)) if prescribed is None else np.where(held, prescribed, 0.0)
-        return cls(
+        problem = cls(
             mesh=mesh,
             degree=degree,
             material=material,
             length=length,
             points=torch.from_numpy(np.ascontiguousarray(points)),
-            cells=torch.from_numpy(basis.element_dofs.T.astype(np.int64)),
+            cells=torch.from_numpy(np.ascontiguousarray(basis.element_dofs.T.astype(np.int64))),
             dN=torch.from_numpy(np.ascontiguousarray(dN)),
             dV=torch.from_numpy(np.ascontiguousarray(dV)),
-            free=torch.from_numpy(~held),
-            prescribed=torch.from_numpy(given),
+            free=torch.from_numpy(np.isnan(given)),
+            prescribed=torch.from_numpy(np.nan_to_num(given)),
             boundary=torch.from_numpy(boundary),
+            springs=joined(beds),
+            mean_dilatation=mean_dilatation,
         )
+        for line in problem.advice():
+            warnings.warn(line, stacklevel=2)
+        return problem
+
+    def advice(self) -> list[str]:
+        """Return where linear elements will be far too stiff, a line each."""
+        lines, shape = [], self.mesh.elem.refdom.name.lower()
+        constant = self.dV.shape[1] == 1
+        nu = self.material.poisson_ratio
+        if self.degree == 1 and nu >= 0.45 and not self.mean_dilatation:
+            remedy = "degree=2" if constant else "degree=2 or mean_dilatation=true"
+            lines.append(f"linear {shape} elements lock at Poisson's ratio {nu:.4g}: set {remedy}")
+        aspect = float(aspect_ratio(self.mesh).max()) if self.degree == 1 else 0.0
+        if aspect > 20:
+            lines.append(
+                f"linear {shape} elements of aspect ratio {aspect:.0f} lock in bending: "
+                "set degree=2"
+            )
+        return lines
 
     def to(self, device: torch.device | str) -> Self:
         """Return the same problem with its tensors on a device."""
@@ -152,7 +215,13 @@ class Problem:
             for field in fields(self)
             if isinstance(value := getattr(self, field.name), Tensor)
         }
+        if self.springs is not None:
+            tensors["springs"] = Springs(*(part.to(device) for part in self.springs))
         return replace(self, **tensors)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Pickle without what is computed from the rest."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
     def basis(self) -> skfem.Basis:
@@ -169,22 +238,48 @@ class Problem:
         """Whether all cells share one set of gradients."""
         return len(self.dN) == 1
 
+    @property
+    def mixes(self) -> bool:
+        """Whether the strains of its points can be unknowns of their own, see `linearise`."""
+        return self.material.has_response and not self.mean_dilatation
+
     def energy(self, displacement: Tensor) -> Tensor:
-        """Return the strain energy over E L^D, (B,) [-]."""
-        density = self.material.energy(self._gradient(displacement))
-        return (density * self.dV).sum((-2, -1))
+        """Return the strain energy over E L^D, that of springs included, (B,) [-]."""
+        H = self._gradient(displacement)
+        if self.mean_dilatation:
+            H = self._dilated(H)[0]
+        energy = (self.material.energy(H) * self.dV).sum((-2, -1))
+        if self.springs is not None:
+            pull = self.springs.force(displacement)
+            energy = energy + (pull * displacement).sum((-2, -1)) / 2
+        return energy
 
     def internal_force(self, displacement: Tensor) -> Tensor:
         """Return f_int, the slope of the energy, (B, N, D) [-]; on held nodes the reactions."""
-        return self._spread(self.material.stress(self._gradient(displacement)))
+        stress = self._effective_stress(self._gradient(displacement))
+        return self._with_springs(self._spread(stress), displacement)
 
     def residual(self, displacement: Tensor, force: Tensor) -> Tensor:
         """Return f_int - f where free and zero where held, (B, N, D) [-]."""
         return torch.where(self.free, self.internal_force(displacement) - force, 0.0)
 
+    def evaluate(self, displacement: Tensor) -> Evaluation:
+        """Return internal force and min det F, without derivatives."""
+        if (kernels := self._kernels(displacement)) is None:
+            with torch.no_grad():
+                internal = self.internal_force(displacement)
+                return Evaluation(internal, self.volume_ratio(displacement))
+        internal = torch.zeros_like(displacement)
+        lowest = [
+            kernels.force(u.numpy(), out.numpy())
+            for u, out in zip(displacement.contiguous(), internal, strict=True)
+        ]
+        internal = self._with_springs(internal, displacement)
+        return Evaluation(internal, torch.tensor(lowest, dtype=torch.float64))
+
     def residual_ratio(self, displacement: Tensor, force: Tensor) -> Tensor:
         """Return ||R_free|| / ||f||, (B,) [-], see `imbalance`."""
-        return self.imbalance(self.internal_force(displacement), force)
+        return self.imbalance(self.evaluate(displacement).internal, force)
 
     def imbalance(self, internal: Tensor, force: Tensor) -> Tensor:
         """Return ||R_free|| / ||f||, (B,) [-]: the one criterion by which answers are judged.
@@ -199,6 +294,31 @@ class Problem:
             scale = torch.maximum(scale, reaction)
         return residual / torch.where(scale > 0, scale, 1.0)
 
+    def balanced(self, displacement: Tensor, internal: Tensor, force: Tensor, tol: float) -> Tensor:
+        """Return whether `imbalance` is below tol, or as small as rounding lets it be, (B,)."""
+        residual = torch.where(self.free, internal - force, 0.0).flatten(1).norm(dim=1)
+        ratio = self.imbalance(internal, force)
+        return (ratio < tol) | ((ratio < 1e-4) & (residual <= self.rounding(displacement)))
+
+    def rounding(self, displacement: Tensor) -> Tensor:
+        """Return what rounding alone can make of ||R_free||, (B,) [-].
+
+        A bound from magnitudes: every nodal force is a sum of products of displacement, gradient,
+        modulus and gradient. On slivers it exceeds any tolerance.
+        """
+        return self._rounding * displacement.abs().amax(dim=(1, 2))
+
+    @cached_property
+    def _rounding(self) -> float:
+        size = self.dN.norm(dim=-1)  # (E or 1, Q, A)
+        moduli = self.material.lam + 2 * self.material.mu
+        terms = moduli * (self.dV[..., None] * size * size.sum(-1, keepdim=True)).sum(1)
+        terms = terms.expand(len(self.cells), -1)[None, ..., None]
+        held = ~self.free.any(dim=1)
+        summed = self._gathered(terms.expand(-1, -1, -1, self.shape[1]))[0, :, 0]
+        summed = torch.where(held, 0.0, summed)
+        return torch.finfo(torch.float64).eps * float(summed.norm())
+
     @cached_property
     def moved_supports(self) -> bool:
         """Whether some prescribed displacement is not zero."""
@@ -206,43 +326,162 @@ class Problem:
 
     def tangent(self, displacement: Tensor) -> Tensor:
         """Return the entries of K = d f_int / du on `pattern`, (B, nnz) [-]."""
-        return self._assembled(self.material.tangent(self._gradient(displacement)))
+        if self.mean_dilatation:
+            return self._with_spring_entries(self._entries(self._cell_tangents(displacement)))
+        moduli = self.material.tangent(self._gradient(displacement))
+        return self._with_spring_entries(self._assembled(moduli))
 
     def strain(self, displacement: Tensor) -> Tensor:
         """Return the Green-Lagrange strain at the quadrature points, (B, E, Q, 3, 3) [-]."""
         return green_lagrange(self._gradient(displacement))
 
-    def strain_change(self, displacement: Tensor, update: Tensor) -> Tensor:
-        """Return B(u) du, the strain's linear change, (B, E, Q, 3, 3) [-]."""
-        H, dH = self._gradient(displacement), self._gradient(update)
-        change = dH + H.mT @ dH
-        return (change + change.mT) / 2
-
-    def mixed_system(self, displacement: Tensor, strain: Tensor) -> tuple[Tensor, Tensor]:
+    def mixed_system(self, displacement: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
         """Return force (B, N, D) and tangent (B, nnz) of Newton with mixed integration points.
 
-        The strain at the quadrature points, (B, E, Q, 3, 3), is an unknown of its own that each
-        point eliminates: stress and moduli are those of `strain`, moved to the strain of u by one
-        linear step. Where both strains agree these are `internal_force` and `tangent`.
+        The strain at the quadrature points is an unknown of its own that each point eliminates:
+        stress and moduli are those at the strain of u less `gap`, (B, E, Q, 3, 3), moved to the
+        strain of u by one linear step. Without a gap these are `internal_force` and `tangent`.
 
         Source: Magisano, Leonetti, Garcea (2017), CMAME 313, section 3.
         """
         H = self._gradient(displacement)
-        response = self.material.response(strain)
-        stress = response.stress + response.product(green_lagrange(H) - strain)
-        return self._spread(stress + H @ stress), self._assembled(response.tangent(H))
+        response = self.material.response(green_lagrange(H) - gap)
+        stress = response.stress + response.product(gap)
+        force = self._with_springs(self._spread(stress + H @ stress), displacement)
+        return force, self._with_spring_entries(self._assembled(response.tangent(H)))
+
+    def linearise(self, displacement: Tensor, gap: Any = None) -> System:
+        """Return the linearised equilibrium at (1, N, D), without derivatives.
+
+        Args:
+            displacement: u.
+            gap: What `widened` returned; None for plain Newton.
+        """
+        if (kernels := self._kernels(displacement)) is None:
+            return self._reference_system(displacement, gap)
+        force = np.zeros(self.shape)
+        values = np.zeros(len(self.pattern.indices) + 1)
+        lowest = kernels.system(displacement[0].contiguous().numpy(), gap, force, values)
+        internal = self._with_springs(torch.from_numpy(force)[None], displacement)
+        tangent = self._with_spring_entries(torch.from_numpy(values[:-1])[None])
+        return System(internal, tangent, torch.tensor([lowest > 1e-3]))
+
+    @torch.no_grad()
+    def _reference_system(self, displacement: Tensor, gap: Tensor | None) -> System:
+        if gap is None:
+            force, tangent = self.internal_force(displacement), self.tangent(displacement)
+            return System(force, tangent, torch.ones(len(force), dtype=torch.bool))
+        lowest = 1 + volume_change(2 * (self.strain(displacement) - gap)).flatten(1).amin(1)
+        return System(*self.mixed_system(displacement, gap), lowest > 1e-3)
+
+    def widened(self, gap: Any, length: float, update: Tensor) -> Any:
+        """Return the gap between the strain of u and that of mixed points after a step.
+
+        Points move with the strain's linear change along length * update and close as much of the
+        gap that there was; what the change is short of is the gap.
+
+        Args:
+            gap: Before the step; None: none.
+            length: Part of the step that is taken.
+            update: The full step, (1, N, D) [-].
+        """
+        if (kernels := self._kernels(update)) is not None:
+            return kernels.widened(gap, length, update[0].contiguous().numpy())
+        dH = self._gradient(update)
+        return (0.0 if gap is None else (1 - length) * gap) + length**2 / 2 * dH.mT @ dH
+
+    def _kernels(self, displacement: Tensor) -> Kernels | None:
+        """Return the compiled loops, None where there are none."""
+        return self._compiled if displacement.device.type == "cpu" else None
+
+    @cached_property
+    def _compiled(self) -> Kernels | None:
+        law = self.material
+        if self.mean_dilatation or not isinstance(law, Isotropic):
+            return None
+        arrays = (self.cells.numpy(), self.dN.numpy(), self.dV.numpy())
+        places = self.pattern.places
+        return Kernels(law, *arrays, places.reshape(len(places), -1))
 
     def _spread(self, stress: Tensor) -> Tensor:
         """Return the nodal forces (B, N, D) of first Piola-Kirchhoff stresses (B, E, Q, 3, 3)."""
+        return self._gathered(self._cell_forces(stress))
+
+    def _cell_forces(self, stress: Tensor) -> Tensor:
+        """Return what each cell has at its nodes, (B, E, A, D), of stresses (B, E, Q, 3, 3)."""
         dim = self.shape[1]
         weighted = stress[..., :dim, :dim] * self.dV[..., None, None]
         weighted = weighted.transpose(-3, -2).flatten(-2)  # (B, E, D, QD)
-        return self._gathered((weighted @ self._operator.mT).mT)
+        return (weighted @ self._operator.mT).mT
 
     def _gathered(self, per_cell: Tensor) -> Tensor:
         """Return the nodal sums (B, N, D) of what each cell has at its nodes (B, E, A, D)."""
         force = per_cell.new_zeros(len(per_cell), *self.shape)
         return force.index_add(1, self.cells.flatten(), per_cell.flatten(1, 2))
+
+    def _with_springs(self, internal: Tensor, displacement: Tensor) -> Tensor:
+        """Return forces (B, N, D) with those of the springs."""
+        if self.springs is None:
+            return internal
+        return internal + self.springs.force(displacement)
+
+    def _with_spring_entries(self, tangent: Tensor) -> Tensor:
+        """Return a tangent's entries (B, nnz) with those of the springs."""
+        if self.springs is None:
+            return tangent
+        rows, columns, stiffness = (part.cpu().numpy() for part in self.springs)
+        places = self.pattern.between(rows, columns)
+        added = np.bincount(places.ravel(), stiffness.ravel(), len(self.pattern.indices) + 1)
+        return tangent + torch.from_numpy(added[:-1]).to(tangent.device)
+
+    def _effective_stress(self, H: Tensor) -> Tensor:
+        """Return the stress that does work on H, (B, E, Q, 3, 3) [-]."""
+        if not self.mean_dilatation:
+            return self.material.stress(H)
+        dilated, ratio, plane = self._dilated(H)
+        dim, change = self.shape[1], volume_change(H)
+        stress = self.material.stress(dilated)
+        F = dilated + torch.eye(3, dtype=H.dtype, device=H.device)
+        work = (stress * F * plane).sum((-2, -1))  # by a change of all stretches, (B, E, Q)
+        total = (work * self.dV).sum(-1, keepdim=True)
+        shared = total * (1 + change) / ((1 + change) * self.dV).sum(-1, keepdim=True)
+        turned = inverse_transpose(H, change) * plane
+        return (
+            ratio[..., None, None] * stress * plane
+            + ((shared - work) / dim)[..., None, None] * turned
+        )
+
+    def _dilated(self, H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the gradient with the cell's mean det F, the factor on F, and what it acts on.
+
+        F -> (mean J / J)^(1/D) F, in the plane for plane strain.
+
+        Source: Nagtegaal, Parks, Rice (1974); Simo, Taylor, Pister (1985), CMAME 51, section 3.
+        """
+        dim = self.shape[1]
+        plane = torch.zeros(3, 3, dtype=H.dtype, device=H.device)
+        plane[:dim, :dim] = 1.0
+        change = volume_change(H)
+        mean = (change * self.dV).sum(-1, keepdim=True) / self.dV.sum(-1, keepdim=True)
+        growth = torch.expm1((torch.log1p(mean) - torch.log1p(change)) / dim)
+        F = (H + torch.eye(3, dtype=H.dtype, device=H.device)) * plane
+        return H + growth[..., None, None] * F, 1 + growth, plane
+
+    def _cell_tangents(self, displacement: Tensor) -> Tensor:
+        """Return the cell matrices (B, E A D D A), laid out aikb, by derivatives of cell forces."""
+        at_cells = displacement[:, self.cells]  # (B, E, A, D)
+        nodes, dim = at_cells.shape[-2:]
+
+        def forces(local: Tensor) -> Tensor:
+            return self._cell_forces(self._effective_stress(self._cell_gradient(local.mT)))
+
+        def along(direction: Tensor) -> Tensor:
+            return torch.func.jvp(forces, (at_cells,), (direction.expand_as(at_cells),))[1]
+
+        directions = torch.eye(nodes * dim, dtype=displacement.dtype, device=displacement.device)
+        columns = torch.func.vmap(along)(directions.view(-1, nodes, dim))  # (bk, B, E, A, D)
+        columns = columns.unflatten(0, (nodes, dim))
+        return columns.permute(2, 3, 4, 5, 1, 0).flatten(1)
 
     def _assembled(self, moduli: Tensor) -> Tensor:
         """Return the tangent's entries (B, nnz) of dP/dF (B, E, Q, 3, 3, 3, 3)."""
@@ -270,55 +509,43 @@ class Problem:
 
     def stress(self, displacement: Tensor) -> Tensor:
         """Return the first Piola-Kirchhoff stress over E at the quadrature points, (B,E,Q,3,3)."""
-        return self.material.stress(self._gradient(displacement))
+        H = self._gradient(displacement)
+        return self.material.stress(self._dilated(H)[0] if self.mean_dilatation else H)
 
     @cached_property
     def pattern(self) -> Pattern:
         """The tangent's sparsity, analysed once."""
-        nodes, dim = self.shape
-        free = self.free.cpu().numpy()
-        number = np.full(nodes * dim, -1, dtype=np.int64)
-        number[free.ravel()] = np.arange(free.sum())
-        cells = self.cells.cpu().numpy()
-        dofs = number.reshape(nodes, dim)[cells]  # (E, A, D)
-        rows = dofs[:, :, :, None, None]  # laid out as the cell matrices: (E, A, i, k, A)
-        columns = dofs.transpose(0, 2, 1)[:, None, None]
-        kept = np.flatnonzero((rows >= 0) & (rows <= columns))
-        shape = (*dofs.shape, dim, dofs.shape[1])
-        rows, columns = (np.broadcast_to(d, shape).ravel()[kept] for d in (rows, columns))
-        size = int(free.sum())
-        codes, target = np.unique(rows * size + columns, return_inverse=True)
-        indptr = np.searchsorted(codes // size, np.arange(size + 1))
-        return Pattern(
-            size=size,
-            indptr=indptr.astype(np.int32),
-            indices=(codes % size).astype(np.int32),
-            source=torch.from_numpy(kept),
-            target=torch.from_numpy(target.ravel()),
-        )
+        return Pattern.build(self.cells.cpu().numpy(), self.free.cpu().numpy())
 
-    def loose_modes(self) -> list[str]:
-        """Return the rigid motions that the supports leave free, named; none of them if held."""
-        points = self.points.cpu().numpy() - self.points.cpu().numpy().mean(axis=0)
-        nodes, dim = points.shape
+    def rigid_motions(self) -> tuple[Tensor, list[str]]:
+        """Return the rigid motions (N, D, 3 in 2D or 6) about the centre, and their names."""
+        points = self.points - self.points.mean(dim=0)
+        dim = points.shape[1]
         motions, names = [], []
         for axis in range(dim):
-            motions.append(np.tile(np.eye(dim)[axis], (nodes, 1)))
+            motions.append(torch.eye(dim, dtype=points.dtype)[axis].expand_as(points))
             names.append(f"translation along {'xyz'[axis]}")
         for i, j in [(1, 2), (0, 2), (0, 1)] if dim == 3 else [(0, 1)]:
-            turn = np.zeros((nodes, dim))
+            turn = torch.zeros_like(points)
             turn[:, i], turn[:, j] = -points[:, j], points[:, i]
             motions.append(turn)
             names.append(f"rotation about {'xyz'[3 - i - j]}")
-        held = ~self.free.cpu().numpy()
-        grip = np.stack([motion[held] for motion in motions], axis=1)  # (held, motions)
-        if not len(grip):
+        return torch.stack(motions, dim=-1), names
+
+    def loose_modes(self) -> list[str]:
+        """Return the rigid motions that the supports leave free, named; none of them if held."""
+        motions, names = self.rigid_motions()
+        grip = motions[~self.free].numpy()  # (held, motions)
+        held = grip.T @ grip
+        if self.springs is not None:
+            pull = self.springs.force(motions.movedim(-1, 0)).flatten(1)
+            springs = (pull @ motions.flatten(0, 1)).numpy()
+            held = held + springs / max(float(self.springs.stiffness.max()), 1e-300)
+        if not held.any():
             return names
-        rank = np.linalg.matrix_rank(grip, tol=1e-8 * max(1.0, np.abs(grip).max()))
-        if rank == len(names):
-            return []
-        null = np.linalg.svd(grip)[2][rank:]
-        return [names[k] for k in np.unique(np.abs(null).argmax(axis=1))]
+        values, vectors = np.linalg.eigh(held)
+        null = vectors[:, values < 1e-14 * max(1.0, values.max())]
+        return [names[k] for k in np.unique(np.abs(null).argmax(axis=0))]
 
     @cached_property
     def _operator(self) -> Tensor:
@@ -328,8 +555,11 @@ class Problem:
 
     def _gradient(self, displacement: Tensor) -> Tensor:
         """Return H = du/dX, (B, E, Q, 3, 3) [-]; in 2D with zeros out of the plane."""
-        dim = displacement.shape[-1]
-        at_cells = displacement[:, self.cells].mT  # (B, E, D, A)
+        return self._cell_gradient(displacement[:, self.cells].mT)
+
+    def _cell_gradient(self, at_cells: Tensor) -> Tensor:
+        """Return H, (B, E, Q, 3, 3) [-], of the displacements of each cell's nodes (B, E, D, A)."""
+        dim = self.shape[1]
         gradient = (at_cells @ self._operator).unflatten(-1, (-1, dim))  # (B, E, D, Q, D)
         # components first in memory: laws work on long rows and not on 3 x 3
         gradient = gradient.permute(2, 4, 0, 1, 3).contiguous().permute(2, 3, 4, 0, 1)

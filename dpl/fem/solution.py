@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from enum import IntEnum
 from typing import NamedTuple, Protocol
 
 import torch
@@ -23,6 +24,19 @@ class Load(NamedTuple):
     young: Tensor
 
 
+class Status(IntEnum):
+    """What is known of an answer."""
+
+    CONVERGED = 0  # in balance, nothing inverted, and stable as far as it was examined
+    UNSTABLE = 1  # in balance, but not a minimum of the energy: the tangent has negative pivots
+    NO_VALID_EQUILIBRIUM = 2  # the path of equilibria from rest ends below the whole load
+    NOT_CONVERGED = 3  # iterations ran out, or go on
+
+    def __str__(self) -> str:
+        """Return it in words."""
+        return self.name.lower().replace("_", " ")
+
+
 class Solution(NamedTuple):
     """Displacements under a load, with what is known of them.
 
@@ -30,19 +44,33 @@ class Solution(NamedTuple):
         displacement: Over L, (B, N, D) [-].
         residual: ||R_free|| / ||f|| at `displacement` under the whole load, (B,) [-].
         volume_ratio: min det F at `displacement`, (B,) [-].
-        converged: Whether `residual` is below the solver's tolerance and nothing is inverted, (B,).
+        status: `Status` as a number, (B,).
+        negative_pivots: Negative eigenvalues of the tangent there, (B,); -1: not examined.
         iterations: Linear solves with a tangent so far, (B,).
         factorisations: Tangents factorised so far, (B,); that of the rest state is the scene's.
         load_factor: Part of the load for which an equilibrium is known, (B,) [-].
+        seconds: Time so far, (B,) [s].
     """
 
     displacement: Tensor
     residual: Tensor
     volume_ratio: Tensor
-    converged: Tensor
+    status: Tensor
+    negative_pivots: Tensor
     iterations: Tensor
     factorisations: Tensor
     load_factor: Tensor
+    seconds: Tensor
+
+    @property
+    def converged(self) -> Tensor:
+        """Whether it is in balance to the solver's tolerance and nothing is inverted, (B,)."""
+        return self.status <= Status.UNSTABLE
+
+    @property
+    def stable(self) -> Tensor:
+        """Whether it is in balance and not known to be unstable, (B,)."""
+        return self.status == Status.CONVERGED
 
 
 class Solver(Protocol):
@@ -86,19 +114,26 @@ def in_step(members: Sequence[Iterator[Solution]]) -> Iterator[Solution]:
 
 
 def judge(
-    problem: Problem, displacement: Tensor, load: Load, tol: float, *, iterations: int = 0
+    problem: Problem,
+    displacement: Tensor,
+    load: Load,
+    tol: float,
+    *,
+    iterations: int = 0,
+    seconds: float = 0.0,
 ) -> Solution:
     """Return a displacement (B, N, D) as the solution it is: evaluated, nothing believed."""
-    residual = problem.residual_ratio(displacement, load.force)
-    volume = problem.volume_ratio(displacement)
-    converged = (residual < tol) & (volume > 0)
-    count = torch.full_like(residual, iterations, dtype=torch.int64)
+    internal, volume = problem.evaluate(displacement)
+    balanced = problem.balanced(displacement, internal, load.force, tol) & (volume > 0)
+    count = torch.full_like(volume, iterations, dtype=torch.int64)
     return Solution(
         displacement=displacement,
-        residual=residual,
+        residual=problem.imbalance(internal, load.force),
         volume_ratio=volume,
-        converged=converged,
+        status=torch.where(balanced, int(Status.CONVERGED), int(Status.NOT_CONVERGED)),
+        negative_pivots=torch.full_like(count, -1),
         iterations=count,
         factorisations=torch.zeros_like(count),
-        load_factor=converged.to(residual.dtype),
+        load_factor=balanced.to(volume.dtype),
+        seconds=torch.full_like(volume, seconds),
     )

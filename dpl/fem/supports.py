@@ -1,9 +1,9 @@
-"""Loads spread over a body or its boundary, as consistent nodal forces.
+"""What holds a body: prescribed displacements and springs, each on a region."""
 
-What holds the body (clamped regions) belongs to `dpl.fem.problem.Problem` itself.
-"""
-
-from collections.abc import Callable
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import skfem
@@ -11,53 +11,98 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.problem import Problem
-
-Field = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # (D, ...) -> (D, ...)
+from dpl.fem.regions import Region, facets_in, nodes_in
 
 
-def body_force(problem: Problem, density: Field) -> Tensor:
-    """Return the nodal forces (N, D) [-] of a force per rest volume.
+@dataclass(frozen=True)
+class Displacement:
+    """Dirichlet condition u = g, ramped with the load.
 
-    Args:
-        problem: Where it acts.
-        density: Force density times L/E [-] at dimensionless points; (D, ...) to (D, ...).
+    Attributes:
+        region: Which nodes.
+        value: g per component [m]; None leaves the component free. All 0 if left out: a clamp.
     """
-    basis = problem.basis
-    values = density(basis.global_coordinates())  # (D, E, Q)
-    return _tested(problem, basis, values)
+
+    region: Region
+    value: Sequence[float | None] | None = None
+
+    def on(self, basis: skfem.Basis, scale: float) -> NDArray[np.float64]:
+        """Return g over `scale`, (N, D) [-], NaN where it leaves a component free.
+
+        Args:
+            basis: Scalar basis of a body whose coordinates are over `scale`.
+            scale: L [m].
+
+        Raises:
+            ValueError: The region holds no node, or `value` has not D entries, one of them given.
+        """
+        dim = basis.mesh.dim()
+        value = [0.0] * dim if self.value is None else list(self.value)
+        given = [math.nan if g is None else float(g) / scale for g in value]
+        if len(given) != dim or all(map(math.isnan, given)) or any(map(math.isinf, given)):
+            raise ValueError(f"value = {value} must be {dim} lengths [m], null where free")
+        where = nodes_in(self.region, basis, scale)
+        return np.where(where[:, None], np.array(given), math.nan)
 
 
-def traction(problem: Problem, region: Field, stress: Field) -> Tensor:
-    """Return the nodal forces (N, D) [-] of a dead traction on a part of the boundary.
+@dataclass(frozen=True)
+class Spring:
+    """Robin condition: a bed of springs that pulls with the traction -alpha u.
 
-    Args:
-        problem: Where it acts.
-        region: Points (N, D) [-] to bool (N,); facets with all their vertices inside are loaded.
-        stress: Traction over E [-] at dimensionless points; (D, ...) to (D, ...).
-
-    Raises:
-        ValueError: The region holds no boundary facet.
+    Attributes:
+        region: Which boundary facets.
+        stiffness: alpha over Young's modulus [1/m], a number or one per direction. A spring whose
+            alpha is fixed [Pa/m] thus stands for one Young's modulus only.
     """
-    mesh = problem.mesh
-    inside = region(mesh.p.T)
-    facets = mesh.boundary_facets()
-    facets = facets[inside[mesh.facets[:, facets]].all(axis=0)]
-    if not len(facets):
-        raise ValueError("the region of a traction holds no boundary facet")
-    basis = skfem.FacetBasis(mesh, problem.basis.elem, facets=facets, intorder=4)
-    return _tested(problem, basis, stress(basis.global_coordinates()))
 
+    region: Region
+    stiffness: float | Sequence[float]
 
-def _tested(problem: Problem, basis: skfem.Basis, values: NDArray[np.float64]) -> Tensor:
-    """Return the integral of values (D, E, Q) against each shape function, (N, D)."""
-    dim = problem.points.shape[1]
-    force = np.zeros((basis.N, dim))
-    for a, dofs in enumerate(basis.element_dofs):
-        shape = basis.basis[a][0].value * basis.dx  # (E, Q)
-        np.add.at(
-            force,
-            dofs,
-            np.einsum("deq,eq->ed", np.broadcast_to(values, (dim, *shape.shape)), shape),
+    def on(self, basis: skfem.Basis, scale: float) -> "Springs":
+        """Return the springs' matrix over E L^(D - 2), see `Displacement.on`.
+
+        Raises:
+            ValueError: The region holds no boundary facet, or `stiffness` is out of range.
+        """
+        dim = basis.mesh.dim()
+        one = isinstance(self.stiffness, int | float)
+        stiffness = np.array([self.stiffness] * dim if one else self.stiffness, dtype=np.float64)
+        if stiffness.shape != (dim,) or not (stiffness >= 0).all() or not stiffness.any():
+            raise ValueError(
+                f"stiffness = {self.stiffness} must be a number above 0 [1/m], or {dim} of them"
+            )
+        facets = facets_in(self.region, basis.mesh, scale)
+        boundary = skfem.FacetBasis(basis.mesh, basis.elem, facets=facets, intorder=4)
+        mass = skfem.BilinearForm(lambda u, v, _: u * v).assemble(boundary).tocoo()
+        linked = np.abs(mass.data) > 1e-14 * np.abs(mass.data).max()
+        return Springs(
+            torch.from_numpy(mass.row[linked].astype(np.int64)),
+            torch.from_numpy(mass.col[linked].astype(np.int64)),
+            torch.from_numpy(np.outer(mass.data[linked], stiffness * scale)),
         )
-    return torch.from_numpy(force)
+
+
+class Springs(NamedTuple):
+    """Matrix of springs: one between each two linked nodes, per direction.
+
+    Attributes:
+        rows, columns: The nodes, (S,).
+        stiffness: Over E L^(D - 2), (S, D) [-].
+    """
+
+    rows: Tensor
+    columns: Tensor
+    stiffness: Tensor
+
+    def force(self, displacement: Tensor) -> Tensor:
+        """Return the forces (B, N, D) that hold the springs at displacements (B, N, D)."""
+        pull = self.stiffness * displacement[:, self.columns]
+        return torch.zeros_like(displacement).index_add(1, self.rows, pull)
+
+
+Support = Displacement | Spring
+
+
+def joined(springs: Sequence[Springs]) -> Springs | None:
+    """Return several beds as one, None if there are none."""
+    return Springs(*map(torch.cat, zip(*springs, strict=True))) if springs else None

@@ -183,7 +183,7 @@ def test_a_change_of_the_number_of_threads_between_loads_is_survived(tmp_path, e
 import torch
 from threadpoolctl import threadpool_limits
 from dpl.data.generate import Job, outcome
-from dpl.fem.materials import NeoHookean
+from dpl.fem.materials import NeoHookeanLn
 from dpl.fem.mesh import Plane, box
 from dpl.fem.modes import ModalLoads
 from dpl.fem.newton import Newton
@@ -192,7 +192,7 @@ from dpl.scene import Scene
 
 torch.set_num_threads(2)
 mesh = box([4.0, 1.0, 1.0], [17, 5, 5])
-newton = Newton(Problem.build(mesh, NeoHookean(0.3), fixed=Plane(0, "min")), linear="pardiso")
+newton = Newton(Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min")), linear="pardiso")
 scene = Scene(newton.problem, ModalLoads(newton.rest, n_modes=3, deflection=0.01), newton)
 outcome(scene, Job((0, 0), 0))
 with threadpool_limits(1):

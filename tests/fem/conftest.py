@@ -8,10 +8,10 @@ import skfem
 import torch
 from torch import Tensor
 
-from dpl.fem.materials import Material, NeoHookean, SaintVenantKirchhoff
+from dpl.fem.forces import traction
+from dpl.fem.materials import Material, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box, rectangle
 from dpl.fem.problem import Problem
-from dpl.fem.supports import traction
 
 torch.set_num_threads(1)
 
@@ -19,7 +19,7 @@ YOUNG, LENGTH = 4500.0, 100.0  # of the beam of VERIFICATION 1.8e [Pa], [m]
 KINDS = [(cell, d) for cell in ("triangle", "quad", "tetra", "hexahedron") for d in (1, 2)]
 
 
-@pytest.fixture(params=[SaintVenantKirchhoff, NeoHookean], ids=["svk", "neo-hookean"])
+@pytest.fixture(params=[SaintVenantKirchhoff, NeoHookeanLn], ids=["svk", "neo-hookean"])
 def law(request) -> Material:
     """Both laws, at a Poisson ratio of 0.3."""
     return request.param(0.3)

@@ -2,42 +2,127 @@
 
 import importlib.util
 import pickle
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from scipy.sparse import csr_array
 
-from dpl.fem.linear import Backend, SingularMatrix, backend, full_matrix, installed
-from dpl.fem.materials import NeoHookean
-from dpl.fem.problem import Pattern
+from dpl.fem import linear
+from dpl.fem.band import Band32Factor, band_layout
+from dpl.fem.krylov import conjugate_gradients
+from dpl.fem.linear import (
+    BACKENDS,
+    Backend,
+    SingularMatrix,
+    backend,
+    chosen,
+    full_matrix,
+    installed,
+    rigid_motions,
+    slow_blas,
+)
+from dpl.fem.materials import NeoHookeanLn
+from dpl.fem.mesh import Plane, box
+from dpl.fem.problem import Problem
+from dpl.fem.sparse import Pattern, SymmetricProduct
 
-KNOWN = ["pardiso", "superlu"]
+KNOWN = ["band", "band32", "pardiso", "superlu", "cg"]
+DIRECT = ["band", "band32", "pardiso", "superlu"]  # those that solve indefinite matrices too
+System = tuple[Pattern, np.ndarray]
+
+
+class Structure(NamedTuple):
+    """All that a backend wants to know of a pattern."""
+
+    size: int
+    indptr: np.ndarray
+    indices: np.ndarray
+
+
+def need(name: str) -> str:
+    if name not in installed():
+        pytest.skip(f"{name} is not installed")
+    return name
 
 
 @pytest.fixture(params=KNOWN)
 def name(request) -> str:
     """Each backend that is installed here."""
-    if request.param not in installed():
-        pytest.skip(f"{request.param} is not installed")
-    return request.param
+    return need(request.param)
 
 
-@pytest.fixture(scope="module")
-def stiffness(beam) -> tuple[Pattern, np.ndarray]:
-    """The tangent of the beam at rest: positive definite."""
-    problem = beam(NeoHookean(0.3), 6, 2)
+@pytest.fixture(params=DIRECT)
+def direct(request) -> str:
+    """Each backend that is installed here and solves any matrix that is not singular."""
+    return need(request.param)
+
+
+@pytest.fixture
+def hide(monkeypatch) -> Callable[..., None]:
+    """Makes packages look as if they were not installed."""
+    find = importlib.util.find_spec
+
+    def hide(*packages: str) -> None:
+        monkeypatch.setattr(
+            importlib.util, "find_spec", lambda name, *_: None if name in packages else find(name)
+        )
+
+    return hide
+
+
+def system(problem: Problem) -> System:
+    """Return the tangent of a body at rest."""
     rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
     return problem.pattern, problem.tangent(rest)[0].numpy()
 
 
-def dense(matrix: np.ndarray) -> tuple[Pattern, np.ndarray]:
+def motions(problem: Problem) -> np.ndarray:
+    return rigid_motions(problem.points.numpy(), problem.free.numpy())
+
+
+@pytest.fixture(scope="module")
+def body(beam) -> Problem:
+    """A beam of 162 degrees of freedom."""
+    return beam(NeoHookeanLn(0.3), 6, 2)
+
+
+@pytest.fixture(scope="module")
+def stiffness(body) -> System:
+    """The tangent of the beam at rest: positive definite."""
+    return system(body)
+
+
+@pytest.fixture(scope="module")
+def shuffled() -> Problem:
+    """A beam whose nodes are numbered at random."""
+    mesh = box([100.0, 25.0, 25.0], [21, 5, 5])
+    order = np.random.default_rng(0).permutation(mesh.p.shape[1])
+    mesh = type(mesh)(mesh.p[:, order], np.argsort(order)[mesh.t])
+    return Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"))
+
+
+def dense(matrix: np.ndarray) -> System:
     """Return a full symmetric matrix as a pattern and its entries."""
     n = len(matrix)
     rows, columns = np.triu_indices(n)
     indptr = np.searchsorted(rows, np.arange(n + 1)).astype(np.int32)
-    none = torch.zeros(0, dtype=torch.int64)
-    return Pattern(n, indptr, columns.astype(np.int32), none, none), matrix[rows, columns]
+    return Structure(n, indptr, columns.astype(np.int32)), matrix[rows, columns]
+
+
+def of_eigenvalues(values: np.ndarray) -> System:
+    """Return a full matrix with these eigenvalues."""
+    basis = np.linalg.qr(np.random.default_rng(5).normal(size=(len(values),) * 2))[0]
+    return dense(basis * values @ basis.T)
+
+
+def of_band(size: int, half: int) -> Structure:
+    """Return the pattern of a full band."""
+    columns = np.arange(size)[:, None] + np.arange(half + 1)
+    indptr = np.cumsum([0, *(columns < size).sum(axis=1)]).astype(np.int32)
+    return Structure(size, indptr, columns[columns < size].astype(np.int32))
 
 
 def shifted(pattern: Pattern, values: np.ndarray, shift: float) -> np.ndarray:
@@ -54,6 +139,12 @@ def error(solver: Backend, pattern: Pattern, values: np.ndarray) -> float:
     return float(np.linalg.norm(found - answer) / np.linalg.norm(answer))
 
 
+def residual(pattern: Pattern, values: np.ndarray, x: np.ndarray, right: np.ndarray) -> float:
+    """Return ||right - K x|| / ||right||."""
+    rest = right - full_matrix(pattern, values) @ x
+    return float(np.linalg.norm(rest) / np.linalg.norm(right))
+
+
 def test_positive_definite_matrix_is_solved_to_rounding(name, stiffness):
     pattern, values = stiffness
     solver = backend(pattern, name)
@@ -61,11 +152,11 @@ def test_positive_definite_matrix_is_solved_to_rounding(name, stiffness):
     assert solver.factorise(values).negative_pivots == 0
 
 
-def test_indefinite_matrix_is_solved_and_its_negative_eigenvalues_are_counted(name, stiffness):
+def test_indefinite_matrix_is_solved_and_its_negative_eigenvalues_are_counted(direct, stiffness):
     """Sylvester's law of inertia, against the eigenvalues."""
     pattern, values = stiffness
     eigenvalues = np.linalg.eigvalsh(full_matrix(pattern, values).toarray())
-    solver = backend(pattern, name)
+    solver = backend(pattern, direct)
     for count in (1, 2, 5, 20):
         shift = eigenvalues[count - 1 : count + 1].mean()
         if eigenvalues[count] - eigenvalues[count - 1] < 1e-6 * shift:
@@ -84,6 +175,30 @@ def test_backend_serves_matrix_after_matrix(name, stiffness):
         assert error(solver, pattern, scale * values) < 1e-10
 
 
+def test_factor_outlives_the_next_factorisation_and_its_entries(name, stiffness):
+    pattern, values = stiffness
+    solver, right = backend(pattern, name), np.ones(pattern.size)
+    entries = values.copy()
+    first = solver.factorise(entries)
+    expected = first.solve(right)
+    second = solver.factorise(2 * values)
+    entries[:] = np.nan
+    assert np.array_equal(first.solve(right), expected)
+    assert second.solve(right) == pytest.approx(expected / 2, rel=1e-9)
+    assert np.array_equal(first.solve(right), expected)
+
+
+def test_storage_of_a_dead_factor_is_used_again(stiffness):
+    pattern, values = stiffness
+    solver = backend(pattern, "band")
+    first = solver.factorise(values)
+    second = solver.factorise(values)
+    assert not np.shares_memory(first.storage, second.storage)
+    storage = second.storage
+    del second
+    assert np.shares_memory(solver.factorise(values).storage, storage)
+
+
 def test_right_hand_side_stays_as_it_is(name, stiffness):
     pattern, values = stiffness
     right = np.ones(pattern.size)
@@ -93,6 +208,11 @@ def test_right_hand_side_stays_as_it_is(name, stiffness):
     assert (right == 1).all()
     assert np.array_equal(values, kept)
     assert np.array_equal(first, second)
+
+
+def test_no_load_has_no_answer_but_zero(name, stiffness):
+    pattern, values = stiffness
+    assert not backend(pattern, name).factorise(values).solve(np.zeros(pattern.size)).any()
 
 
 @pytest.mark.parametrize("entry", [np.nan, np.inf])
@@ -113,10 +233,17 @@ SINGULAR = {
 
 
 @pytest.mark.parametrize("kind", SINGULAR)
-def test_singular_matrix_is_an_error(name, kind):
+def test_singular_matrix_is_an_error(direct, kind):
     pattern, values = dense(SINGULAR[kind])
     with pytest.raises(SingularMatrix):
-        backend(pattern, name).factorise(values)
+        backend(pattern, direct).factorise(values)
+
+
+@pytest.mark.parametrize("kind", SINGULAR)
+def test_singular_matrix_is_an_error_of_conjugate_gradients_when_it_is_solved(kind):
+    pattern, values = dense(SINGULAR[kind])
+    with pytest.raises(SingularMatrix):
+        backend(pattern, "cg").factorise(values).solve(np.ones(6))
 
 
 def test_backend_recovers_from_a_matrix_it_refused(name, stiffness):
@@ -138,46 +265,243 @@ def test_backend_survives_pickling(name, stiffness, used):
     assert error(pickle.loads(pickle.dumps(solver)), pattern, values) < 1e-10
 
 
-def test_backends_agree(stiffness):
-    if len(installed()) < 2:
-        pytest.skip("one backend alone")
-    pattern, values = stiffness
+def test_backends_agree(name, shuffled):
+    pattern, values = system(shuffled)
     right = np.random.default_rng(2).normal(size=pattern.size)
-    first, second = (backend(pattern, name).factorise(values).solve(right) for name in KNOWN)
-    assert first == pytest.approx(second, rel=1e-9, abs=1e-12 * np.abs(first).max())
+    expected = backend(pattern, "superlu").factorise(values).solve(right)
+    found = backend(pattern, name, motions(shuffled)).factorise(values).solve(right)
+    assert np.linalg.norm(found - expected) < 1e-10 * np.linalg.norm(expected)
 
 
-def hide_pardiso(monkeypatch) -> None:
-    """Make pypardiso look like a package that is not installed."""
-    find = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *_: None if name == "pypardiso" else find(name)
-    )
+# ---- bands
 
 
-def test_superlu_stands_in_where_pardiso_is_not_installed(monkeypatch, stiffness):
+@pytest.mark.parametrize("name", ["band", "band32"])
+def test_band_of_a_shuffled_mesh_is_found_again(name, shuffled):
+    pattern, values = system(shuffled)
+    layout = band_layout(pattern)
+    own = (pattern.indices - np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))).max()
+    assert sorted(layout.order) == list(range(pattern.size))
+    assert layout.half < own / 4
+    assert layout.half <= 3 * 2 * 25  # two layers of nodes
+    assert error(backend(pattern, name), pattern, values) < 1e-10
+
+
+def test_numbering_that_is_narrow_is_kept(stiffness):
+    pattern, _ = stiffness
+    layout = band_layout(pattern)
+    assert layout.order is None
+    assert layout.half == 3 * (9 + 3 + 1) + 2  # a node's farthest neighbour, its last component
+
+
+def test_float32_factor_answers_in_float64_without_another(stiffness):
     pattern, values = stiffness
-    hide_pardiso(monkeypatch)
-    assert installed() == ["superlu"]
-    solver = backend(pattern)
-    assert type(solver).__name__ == "SuperLU"
-    assert error(solver, pattern, values) < 1e-10
+    factor = backend(pattern, "band32").factorise(values)
+    answer = np.random.default_rng(0).normal(size=pattern.size)
+    found = factor.solve(full_matrix(pattern, values) @ answer)
+    assert isinstance(factor, Band32Factor)
+    assert factor.exact is None
+    assert np.linalg.norm(found - answer) < 1e-10 * np.linalg.norm(answer)
 
 
-def test_backend_that_is_not_installed_is_an_error_that_says_how_to_get_it(monkeypatch, stiffness):
-    hide_pardiso(monkeypatch)
+def test_stiff_and_soft_unknowns_fit_into_float32(stiffness):
+    """Demmel (1989): diagonal scaling changes nothing in the rounding of Cholesky."""
+    pattern, values = stiffness
+    scale = 10 ** np.random.default_rng(4).uniform(-12, 12, pattern.size)
+    rows = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+    scaled = values * scale[rows] * scale[pattern.indices]
+    factor = backend(pattern, "band32").factorise(scaled)
+    right = scale * np.random.default_rng(0).normal(size=pattern.size)
+    assert residual(pattern, scaled, factor.solve(right), right) < 1e-11
+    assert isinstance(factor, Band32Factor)
+    assert factor.exact is None
+
+
+@pytest.mark.parametrize("smallest", [1e-6, 1e-9, -1e-9, 1e-12])
+def test_matrix_too_delicate_for_float32_is_solved_in_float64(smallest):
+    pattern, values = of_eigenvalues(np.array([smallest, *np.linspace(1, 2, 40)]))
+    right = np.random.default_rng(0).normal(size=pattern.size)
+    factor = backend(pattern, "band32").factorise(values)
+    x = factor.solve(right)
+    exact = np.linalg.solve(full_matrix(pattern, values).toarray(), right)
+    assert np.linalg.norm(x - exact) < 1e-15 / abs(smallest) * 100 * np.linalg.norm(exact)
+    assert factor.negative_pivots == (smallest < 0)
+
+
+def test_float64_factor_stays_for_the_solves_after_the_one_that_needed_it(stiffness):
+    pattern, values = stiffness
+    factor = backend(pattern, "band32").factorise(values)
+    right = np.ones(pattern.size)
+    expected = factor.solve(right)
+    factor.MAX_ITER = 1
+    assert factor.solve(right, rtol=1e-13) == pytest.approx(expected, rel=1e-9)
+    assert factor.exact is not None
+    assert factor.solve(right) == pytest.approx(expected, rel=1e-9)
+
+
+# ---- iterations
+
+
+@pytest.mark.parametrize("name", ["band32", "cg"])
+def test_iteration_stops_where_it_is_told_to(name, shuffled, monkeypatch):
+    pattern, values = system(shuffled)
+    factor = backend(pattern, name, motions(shuffled)).factorise(values)
+    products, multiply = [], SymmetricProduct.__call__
+
+    def counted(self, x):
+        products.append(1)
+        return multiply(self, x)
+
+    monkeypatch.setattr(SymmetricProduct, "__call__", counted)
+    right, costs = np.random.default_rng(0).normal(size=pattern.size), []
+    for rtol in (1e-1, 1e-5, 1e-11):
+        products.clear()
+        x = factor.solve(right, rtol=rtol)
+        costs.append(len(products))
+        assert residual(pattern, values, x, right) <= 1.01 * rtol
+    assert costs == sorted(costs)
+    assert costs[0] < costs[-1]
+
+
+def test_product_needs_the_upper_triangle_alone(stiffness):
+    pattern, values = stiffness
+    x = np.random.default_rng(0).normal(size=pattern.size)
+    expected = full_matrix(pattern, values) @ x
+    assert SymmetricProduct(pattern, values)(x) == pytest.approx(expected, rel=1e-12)
+
+
+def test_negative_curvature_is_an_error(body):
+    pattern, values = system(body)
+    smallest = np.linalg.eigvalsh(full_matrix(pattern, values).toarray())[0]
+    moved = shifted(pattern, values, 2 * smallest)
+    for near_null in (None, motions(body)):
+        with pytest.raises(SingularMatrix, match="not positive definite"):
+            backend(pattern, "cg", near_null).factorise(moved).solve(np.ones(pattern.size))
+
+
+def test_iteration_that_does_not_end_is_an_error(stiffness):
+    product = SymmetricProduct(*stiffness)
+    right = np.ones(len(product.diagonal))
+    with pytest.raises(SingularMatrix, match="no convergence to 1e-12 in 3"):
+        conjugate_gradients(product, lambda r: r, right, 1e-12, 3)
+
+
+def test_rigid_motions_cost_no_energy(body):
+    """On a body that nothing holds."""
+    free = Problem.build(box([100.0, 25.0, 25.0], [5, 3, 3]), NeoHookeanLn(0.3))
+    pattern, values = system(free)
+    fields = motions(free)
+    assert np.linalg.matrix_rank(fields) == fields.shape[1] == 6
+    forces = full_matrix(pattern, values) @ fields
+    assert np.abs(forces).max() < 1e-12 * np.abs(values).max()
+    assert motions(body).shape == (system(body)[0].size, 6)
+
+
+def test_multigrid_needs_hardly_more_steps_for_larger_bodies(beam):
+    """Smoothed aggregation, Vanek, Mandel, Brezina (1996)."""
+    pytest.importorskip("pyamg")
+    steps = []
+    for cells in (12, 36):
+        problem = beam(NeoHookeanLn(0.3), cells, cells // 4)
+        pattern, values = system(problem)
+        factor = backend(pattern, "cg", motions(problem)).factorise(values)
+        right, count = np.random.default_rng(0).normal(size=pattern.size), []
+        x = conjugate_gradients(
+            lambda v, f=factor, c=count: c.append(1) or f.product(v),
+            factor.precondition,
+            right,
+            1e-8,
+            100,
+        )
+        assert residual(pattern, values, x, right) < 1e-7
+        steps.append(len(count))
+    assert steps[1] < 30
+
+
+def test_multigrid_serves_bodies_that_slide():
+    """Supports that hold single components: nodes have different numbers of unknowns."""
+    pytest.importorskip("pyamg")
+    mesh = box([1.0, 1.0, 1.0], [6, 6, 6])
+    held = mesh.p.T == 0  # each side slides on its plane
+    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=held)
+    pattern, values = system(problem)
+    assert error(backend(pattern, "cg", motions(problem)), pattern, values) < 1e-10
+
+
+def test_multigrid_leaves_numpys_random_numbers_alone(body):
+    """And so gives the same answer each time."""
+    pytest.importorskip("pyamg")
+    pattern, values = system(body)
+    np.random.seed(3)  # noqa: NPY002  the global state is what must stay
+    expected = np.random.random()  # noqa: NPY002
+    np.random.seed(3)  # noqa: NPY002
+    right = np.ones(pattern.size)
+    first, second = (
+        backend(pattern, "cg", motions(body)).factorise(values).solve(right) for _ in range(2)
+    )
+    assert np.random.random() == expected  # noqa: NPY002
+    assert np.array_equal(first, second)
+
+
+# ---- the choice
+
+
+def test_slender_body_gets_a_band(hide):
+    assert chosen("auto", of_band(2000, 20)) == "band"
+    assert chosen("auto", of_band(8000, 300)) == "band32"
+    hide("pypardiso", "pyamg")
+    assert chosen("auto", of_band(8000, 300)) == "band32"
+
+
+def test_compact_body_gets_a_sparse_factor(hide):
+    wide = of_band(800, 400)
+    if "pardiso" in installed():
+        assert chosen("auto", wide) == "pardiso"
+    hide("pypardiso")
+    assert chosen("auto", wide) == "superlu"
+
+
+def test_very_large_body_gets_multigrid_where_its_rigid_motions_are_known(monkeypatch, hide):
+    pytest.importorskip("pyamg")
+    wide, fields = of_band(800, 400), np.ones((800, 6))
+    monkeypatch.setattr(linear, "LARGE", {"pardiso": 799, "superlu": 799})
+    assert chosen("auto", wide, fields) == "cg"
+    assert chosen("auto", wide) != "cg"
+    assert chosen("auto", of_band(800, 40), fields) == "band"
+    hide("pyamg")
+    assert chosen("auto", wide, fields) != "cg"
+
+
+def test_choice_is_between_the_backends_that_are_installed(monkeypatch):
+    monkeypatch.setattr(linear, "installed", lambda: ["superlu"])
+    assert chosen("auto", of_band(200, 5)) == "superlu"
+    assert type(backend(of_band(200, 5))).__name__ == "SuperLU"
+
+
+def test_choice_waits_for_the_pattern():
+    assert chosen("auto") == "auto"
+    assert [chosen(name) for name in installed()] == installed()
+
+
+def test_superlu_stands_in_where_pardiso_is_not_installed(hide, stiffness):
+    pattern, values = stiffness
+    hide("pypardiso")
+    assert installed() == [name for name in BACKENDS if name != "pardiso"]
+    moved = shifted(pattern, values, 2 * np.abs(values).max())
+    factor = backend(pattern, "band").factorise(moved)
+    assert type(factor).__name__ == "SuperLUFactor"
+    assert factor.negative_pivots > 0
+
+
+def test_backend_that_is_not_installed_is_an_error_that_says_how_to_get_it(hide, stiffness):
+    hide("pypardiso")
     with pytest.raises(ValueError, match=r"not installed: pip install 'deepphysics\[pardiso\]'"):
         backend(stiffness[0], "pardiso")
 
 
 def test_unknown_backend_is_an_error_that_names_the_known(stiffness):
-    with pytest.raises(ValueError, match=r"linear = 'umfpack' must be auto, superlu or pardiso"):
+    with pytest.raises(ValueError, match=r"linear = 'umfpack' must be auto, band, band32, pardiso"):
         backend(stiffness[0], "umfpack")
-
-
-def test_fastest_backend_comes_first():
-    found = [name for name in KNOWN if name == "superlu" or importlib.util.find_spec("pypardiso")]
-    assert installed() == found
 
 
 def test_full_matrix_mirrors_the_upper_triangle(stiffness):
@@ -189,3 +513,27 @@ def test_full_matrix_mirrors_the_upper_triangle(stiffness):
     random = np.random.default_rng(3).normal(size=(5, 5))
     symmetric = random + random.T
     assert np.array_equal(full_matrix(*dense(symmetric)).toarray(), symmetric)
+
+
+# ---- the library below
+
+
+@pytest.mark.parametrize(
+    ("flags", "kernels", "advice"),
+    [
+        ("sse avx avx2", "Prescott", "OPENBLAS_CORETYPE=Haswell"),
+        ("sse avx avx2 avx512dq", "Nehalem", "OPENBLAS_CORETYPE=SkylakeX"),
+        ("sse avx avx2", "Haswell", None),
+        ("sse", "Prescott", None),
+    ],
+)
+def test_slow_kernels_on_a_fast_cpu_are_pointed_out(monkeypatch, tmp_path, flags, kernels, advice):
+    (tmp_path / "cpuinfo").write_text(f"processor : 0\nflags : {flags}\n")
+    library = {"internal_api": "openblas", "architecture": kernels}
+    monkeypatch.delenv("OPENBLAS_CORETYPE", raising=False)
+    monkeypatch.setattr(linear, "CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(linear, "threadpool_info", lambda: [{"internal_api": "mkl"}, library])
+    said = slow_blas()
+    assert said is None if advice is None else advice in said
+    monkeypatch.setenv("OPENBLAS_CORETYPE", "Prescott")  # what the user has set is meant
+    assert slow_blas() is None

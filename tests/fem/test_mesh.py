@@ -1,6 +1,7 @@
-"""Laws of meshes: grids, regions, what a file may hold, and what it gives back."""
+"""Laws of meshes: grids, the propeller, what a file may hold, and what it gives back."""
 
 import math
+import time
 from pathlib import Path
 
 import meshio
@@ -8,7 +9,19 @@ import numpy as np
 import pytest
 import skfem
 
-from dpl.fem.mesh import Box, Plane, box, check, load, longest_side, rectangle, save
+from dpl.fem.mesh import (
+    Cylinder,
+    Tag,
+    aspect_ratio,
+    box,
+    check,
+    load,
+    longest_side,
+    nodes_in,
+    propeller,
+    rectangle,
+    save,
+)
 
 CORNERS = np.array(  # of a hexahedron, in the order of files (VTK, Gmsh)
     [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], float
@@ -111,42 +124,139 @@ def test_longest_side_of_a_cube_is_its_side(nodes):
     assert longest_side(rectangle([2.0] * 2, [nodes] * 2).p.T) == pytest.approx(2.0, rel=1e-12)
 
 
+def scaled_jacobian(mesh: skfem.MeshHex) -> np.ndarray:
+    """Return the smallest determinant of unit edges over the corners of each hexahedron, (E,)."""
+    corners = mesh.elem.refdom.p.T.astype(int)
+    smallest = np.full(mesh.nelements, np.inf)
+    for v, corner in enumerate(corners):
+        edges = []
+        for axis in range(3):
+            other = corner.copy()
+            other[axis] = 1 - other[axis]
+            w = int(np.flatnonzero((corners == other).all(axis=1))[0])
+            edge = (mesh.p[:, mesh.t[w]] - mesh.p[:, mesh.t[v]]) * (1 - 2 * corner[axis])
+            edges.append(edge / np.linalg.norm(edge, axis=0))
+        smallest = np.minimum(smallest, np.linalg.det(np.stack(edges).transpose(2, 0, 1)))
+    return smallest
+
+
+def test_propeller_has_the_size_of_the_papers():
+    """4,025 nodes, 12,075 degrees of freedom; a metre long; held at 525 of them."""
+    mesh = propeller()
+    assert mesh.p.shape == (3, 4025)
+    assert mesh.t.shape == (8, 2550)
+    assert longest_side(mesh.p.T) == pytest.approx(1.0, rel=0.03)
+    radius = np.hypot(mesh.p[1], mesh.p[2])
+    assert radius.max() == pytest.approx(0.5, rel=1e-12)
+    assert radius.min() == pytest.approx(0.05, rel=1e-12)
+    bore = nodes_in(Tag("bore"), skfem.Basis(mesh, skfem.ElementHex1()))
+    assert bore.sum() == 175
+    assert np.array_equal(bore, Cylinder(0, 0.05)(mesh.p.T))
+    assert {name: len(cells) for name, cells in mesh.subdomains.items()} == {
+        "hub": 300,
+        "blades": 2250,
+    }
+
+
+@pytest.mark.parametrize("options", [{}, {"blades": 3, "cells": [2, 4, 1, 4, 9]}, {"blades": 2}])
+def test_propeller_counts_by_its_formula_and_its_cells_are_sound(options):
+    mesh = propeller(**options)
+    blades, (t, g, w, c, s) = options.get("blades", 5), options.get("cells", (3, 2, 2, 6, 25))
+    nodes = blades * (t + g) * (w + 1) * (c + 1) + blades * (t + 1) * (c + 1) * s
+    assert mesh.p.shape == (3, nodes)
+    X = skfem.quadrature.get_quadrature(mesh.elem.refdom, 5)[0]
+    assert (mesh.mapping().detDF(X) > 0).all()
+    assert scaled_jacobian(mesh).min() > 0.69
+    assert check(mesh) is mesh
+    assert aspect_ratio(mesh).max() < 20
+
+
+@pytest.mark.parametrize("blades", [2, 5, 6])
+def test_propeller_turned_by_a_blade_is_the_same(blades):
+    p = propeller(blades=blades).p.T
+    c, s = math.cos(2 * math.pi / blades), math.sin(2 * math.pi / blades)
+    turned = p @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
+    assert np.array_equal(*(np.unique(np.round(q, 9) + 0.0, axis=0) for q in (p, turned)))
+
+
+def test_blades_of_a_propeller_twist_and_taper():
+    """Measured on the first blade: direction and length of its sections' chords."""
+    mesh = propeller(blades=5)
+    radius, angle = np.hypot(mesh.p[1], mesh.p[2]), np.arctan2(mesh.p[2], mesh.p[1])
+    pitch, chord = [], []
+    for r in np.linspace(0.116, 0.5, 25):
+        on = np.isclose(radius, r) & (np.abs(angle) < math.pi / 5)
+        assert on.sum() == 28
+        section = np.stack([mesh.p[0, on], r * angle[on]], axis=1)
+        along = np.linalg.svd(section - section.mean(axis=0))[2][0]
+        pitch.append(math.degrees(math.atan2(abs(along[0]), abs(along[1]))))
+        chord.append(np.ptp(section @ along))
+    assert np.all(np.diff(pitch) < 0)
+    assert pitch[-1] == pytest.approx(25.0, abs=0.1)
+    assert chord[-1] == pytest.approx(0.1, rel=0.01)
+    assert max(chord) > 2 * chord[-1]
+
+
+def test_cells_of_the_propeller_know_only_near_numbers():
+    """Reverse Cuthill-McKee: a ring of all blades, not the whole of one."""
+    assert np.ptp(propeller().t, axis=0).max() < 250
+
+
 @pytest.mark.parametrize(
-    ("region", "count"),
+    ("options", "message"),
     [
-        (Plane(0, "min"), 6),
-        (Plane(0, "max"), 6),
-        (Plane(0, 2.0), 6),
-        (Plane(1, 0.0), 15),
-        (Plane(2, "max"), 10),
-        (Plane(0, 2.5), 0),
-        (Box([1, 0, 0], [3, 1, 2]), 18),
-        (Box([0, 0, 0], [0, 0, 0]), 1),
-        (Box([0, 0, 1], [4, 1, 1]), 10),
-        (Box([5, 0, 0], [6, 1, 1]), 0),
+        ({"diameter": -1.0}, "diameter = -1.0"),
+        ({"diameter": math.nan}, "diameter = nan"),
+        ({"hub_diameter": 1.0}, "hub_diameter = 1.0 must be less than diameter"),
+        ({"bore_diameter": 0.2}, "bore_diameter = 0.2 must be less than hub_diameter"),
+        ({"bore_diameter": 0.0}, "bore_diameter = 0.0"),
+        ({"hub_length": math.inf}, "hub_length = inf"),
+        ({"blades": 1}, "blades = 1"),
+        ({"blades": 2.5}, "blades = 2.5"),
+        ({"pitch_angle": [60.0]}, "pitch_angle"),
+        ({"pitch_angle": [60.0, 90.0]}, "pitch_angle"),
+        ({"pitch_angle": [math.nan, 20.0]}, "pitch_angle"),
+        ({"chord": [0.2, 0.0]}, "chord"),
+        ({"chord": [0.02, 0.02]}, "chord or thickness fold the blades"),
+        ({"thickness": [0.05]}, "thickness"),
+        ({"thickness": [0.2, 0.01]}, "no room between 5 blades"),
+        ({"blades": 20}, "no room between 20 blades"),
+        ({"cells": [3, 2, 2, 6]}, "cells"),
+        ({"cells": [3, 2, 2, 6, 0]}, "cells"),
+        ({"cells": [3, 2, 2, 6, 2.5]}, "cells"),
     ],
 )
-def test_region_selects_its_nodes(region, count):
-    points = box([4.0, 1.0, 2.0], [5, 2, 3]).p.T
-    inside = region(points)
-    assert inside.shape == (30,)
-    assert inside.sum() == count
+def test_propeller_out_of_range_is_an_error_of_one_line(options, message):
+    with pytest.raises(ValueError, match=message) as error:
+        propeller(**options)
+    assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test_regions_forgive_rounding_at_every_scale(scale):
-    points = scale * box([0.3, 0.1, 0.1], [4, 2, 2]).p.T
-    assert Plane(0, 0.1 * scale)(points).sum() == 4
-    assert Box([0, 0, 0], [0.2 * scale, 0.1 * scale, 0.1 * scale])(points).sum() == 12
+@pytest.mark.parametrize(
+    ("mesh", "ratio"),
+    [
+        (box([2.0, 2.0, 2.0], [2, 2, 2]), 1.0),
+        (box([5.0, 1.0, 2.0], [2, 2, 2]), 5.0),
+        (box([1.0, 1.0, 0.01], [5, 5, 2]), 25.0),
+        (rectangle([3.0, 1.0], [2, 2]), 3.0),
+        (rectangle([1.0, 1.0], [2, 2], "triangle"), math.sqrt(3)),
+        (box([1.0, 1.0, 1.0], [3, 3, 3], "tetra"), 1 + math.sqrt(2)),
+        (skfem.MeshHex2.from_mesh(box([5.0, 1.0, 2.0], [2, 2, 2])), 5.0),
+        (skfem.MeshTri(np.array([[0, 1, 0.5], [0, 0, 0.75**0.5]]), np.array([[0], [1], [2]])), 1.0),
+    ],
+)
+def test_aspect_ratio_is_longest_over_shortest(mesh, ratio):
+    assert aspect_ratio(mesh) == pytest.approx(np.full(mesh.nelements, ratio), rel=1e-9)
 
 
-def test_region_that_cannot_be_is_an_error():
-    with pytest.raises(ValueError, match="axis"):
-        Plane(3, "min")
-    with pytest.raises(ValueError, match="at"):
-        Plane(0, "middle")
-    with pytest.raises(ValueError, match="2D"):
-        Plane(2, "min")(np.zeros((4, 2)))
+def test_aspect_ratio_of_a_tetrahedron_ignores_order_place_and_size():
+    points = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
+    cell = np.arange(4)[:, None]
+    assert aspect_ratio(skfem.MeshTet(points.T.copy(), cell)) == pytest.approx(1.0, rel=1e-12)
+    flat = points * [1, 1, 0.01]
+    for order in ([0, 1, 2, 3], [3, 1, 0, 2], [1, 2, 3, 0]):
+        moved = turned(flat[order] * 7, 0.7) + 3
+        assert aspect_ratio(skfem.MeshTet(moved.T.copy(), cell)) == pytest.approx(100, rel=1e-9)
 
 
 @pytest.mark.parametrize("suffix", [".msh", ".vtu", ".vtk"])
@@ -271,19 +381,39 @@ NEXT = TWO_CUBES + np.array([2, 0, 0])
 BAD = {
     "not a number": ("not finite", with_node(TWO_CUBES, 3, np.nan), {"hexahedron": TWO_HEXES}),
     "infinite": ("not finite", with_node(TWO_CUBES, 3, np.inf), {"hexahedron": TWO_HEXES}),
-    "index from one": ("nodes 1 to 12", TWO_CUBES, {"hexahedron": TWO_HEXES + 1}),
+    "index from one": ("does the numbering start at 1?", TWO_CUBES, {"hexahedron": TWO_HEXES + 1}),
     "index too large": (
         "to 99",
         TWO_CUBES,
         {"hexahedron": np.where(TWO_HEXES > 10, 99, TWO_HEXES)},
     ),
     "index below zero": ("nodes -1", TWO_CUBES, {"hexahedron": TWO_HEXES - 1}),
+    "node listed twice": (
+        "1 cells list a node twice: 0",
+        TWO_CUBES,
+        {"hexahedron": np.where(TWO_HEXES == 9, 10, TWO_HEXES)},
+    ),
+    "cell listed twice": (
+        "1 cells are listed twice: 1 and 5",
+        CORNERS,
+        {"tetra": np.concatenate([TETS, TETS[1:2, [1, 2, 3, 0]]])},
+    ),
+    "side of three": (
+        "a side is shared by three or more cells: 0, 1, 2",
+        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1], [0, 0, 1], [0.3, 0.3, -1]]),
+        {"tetra": np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 2, 5]])},
+    ),
     "inverted hexahedron": (
         "inverted",
         with_node(TWO_CUBES, 8, [0.2, -0.2, 0.8]),
         {"hexahedron": TWO_HEXES},
     ),
     "inverted tetrahedron": ("inverted", with_node(CORNERS, 0, [2, 2, 2]), {"tetra": TETS}),
+    "folded tetrahedra": (
+        "2 cells are inverted, folded over their neighbours: 0, 1",
+        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1], [0.2, 0.2, 1]]),
+        {"tetra": np.array([[0, 1, 2, 3], [0, 1, 2, 4]])},
+    ),
     "inverted triangle": ("inverted", with_node(PATCH, 4, [1.5, 0.5, 0]), {"triangle": FAN}),
     "flat hexahedra": ("no volume", TWO_CUBES * [1, 1, 0], {"hexahedron": TWO_HEXES}),
     "one flat hexahedron": (
@@ -298,7 +428,7 @@ BAD = {
     ),
     "flat triangle": ("no volume", with_node(PATCH, 4, [0.5, 0, 0]), {"triangle": FAN}),
     "crack": (
-        "4 nodes coincide",
+        "4 nodes coincide with others: 2 and 12, 5 and 15, 8 and 18, 11 and 21; merge them",
         np.concatenate([TWO_CUBES, NEXT]),
         {"hexahedron": np.concatenate([TWO_HEXES, TWO_HEXES + 12])},
     ),
@@ -306,6 +436,12 @@ BAD = {
         "2 pieces (of 12, 12 nodes)",
         np.concatenate([TWO_CUBES, FAR]),
         {"hexahedron": np.concatenate([TWO_HEXES, TWO_HEXES + 12])},
+    ),
+    "hanging nodes": (
+        "1 nodes lie inside a side of a cell that does not have them as vertices "
+        "(hanging nodes): 4",
+        np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [1, 2, 0], [0, 3, 0], [2, 3, 0]]),
+        {"triangle": np.array([[0, 1, 2], [0, 2, 3], [3, 4, 5], [4, 6, 5], [4, 2, 6]])},
     ),
     "two kinds": (
         "mixes hexahedron and tetra",
@@ -326,10 +462,154 @@ BAD = {
 @pytest.mark.parametrize("flaw", BAD)
 def test_mesh_that_cannot_be_solved_is_an_error_that_says_why(tmp_path, flaw):
     message, points, cells = BAD[flaw]
-    path = write(tmp_path / "bad.vtu", points, **cells)
+    path = write(tmp_path / "bad.vtu", np.asarray(points, float), **cells)
     with pytest.raises(ValueError, match=r"bad\.vtu") as error:
         load(path)
     assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("flaw", ["crack", "hanging nodes", "not a number", "surface in space"])
+def test_errors_number_nodes_as_the_file_does(tmp_path, flaw):
+    """Nodes that no cell uses are dropped, and nobody needs to know: here every second one."""
+    _, points, cells = BAD[flaw]
+    loose = np.repeat(points, 2, axis=0).astype(float)
+    loose[::2] += np.nan  # not even that counts
+    errors = []
+    for name, nodes, factor in (("tight", points, 1), ("loose", loose, 2)):
+        shifted = {kind: factor * np.asarray(t) + factor - 1 for kind, t in cells.items()}
+        with pytest.raises(ValueError, match=name) as error:
+            load(write(tmp_path / f"{name}.vtu", np.asarray(nodes, float), **shifted))
+        text = str(error.value).split(name)[1]
+        errors.append([int(n) for part in text.split(":")[2:] for n in numbers(part)])
+    assert errors[0]
+    assert errors[1] == [2 * n + 1 for n in errors[0]]
+
+
+def numbers(text: str) -> list[str]:
+    """Return the whole numbers of a text."""
+    return "".join(c if c.isdigit() else " " for c in text).split()
+
+
+def joined(first: skfem.Mesh, second: skfem.Mesh) -> skfem.Mesh:
+    """Return two meshes as one, nodes in one place merged."""
+    p = np.concatenate([first.p, second.p], axis=1)
+    _, one, all_of_them = np.unique(
+        np.round(p, 9) + 0.0, axis=1, return_index=True, return_inverse=True
+    )
+    t = np.concatenate([first.t, second.t + first.p.shape[1]], axis=1)
+    return type(first)(p[:, one], all_of_them.ravel()[t])
+
+
+def warped(mesh: skfem.Mesh, size: float) -> skfem.Mesh:
+    """Return the mesh with twisted planes, or inclined lines."""
+    p = mesh.p.copy()
+    p[0] += size * p[1] * (p[2] if len(p) == 3 else 1)
+    return type(mesh)(p, mesh.t)
+
+
+@pytest.mark.parametrize("warp", [0.0, 0.2])
+@pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
+@pytest.mark.parametrize(("coarse", "fine"), [(1, 2), (2, 3), (1, 4)])
+def test_fine_cells_on_coarse_ones_are_an_error(cell, warp, coarse, fine):
+    """All nodes that the other side lacks hang; on a warped plane tetrahedra have edges there."""
+    grid, dim = (rectangle, 2) if cell in ("quad", "triangle") else (box, 3)
+    second = grid([1.0] * dim, [fine + 1] * dim, cell)
+    first = grid([1.0] * dim, [coarse + 1] * dim, cell)
+    mesh = joined(first, type(second)(second.p + np.eye(dim)[:, :1], second.t))
+    shared = (coarse * math.gcd(coarse, fine) // coarse + 1) ** (dim - 1)
+    lacking = (fine + 1) ** (dim - 1) + (coarse + 1) ** (dim - 1) - 2 * shared
+    with pytest.raises(ValueError, match="hanging nodes") as error:
+        check(warped(mesh, warp))
+    hanging = int(str(error.value).split()[0])
+    assert hanging == lacking or (cell == "tetra" and warp and 0 < hanging < lacking)
+
+
+def test_sides_cut_along_the_other_diagonal_are_an_error():
+    first = box([1.0, 1.0, 1.0], [2, 2, 2], "tetra")
+    fits = type(first)(np.stack([2 - first.p[0], first.p[1], first.p[2]]), first.t)
+    check(joined(first, fits))
+    crossed = type(first)(np.stack([2 - first.p[0], 1 - first.p[1], first.p[2]]), first.t)
+    with pytest.raises(ValueError, match="overlap without being the same"):
+        check(joined(first, crossed))
+
+
+@pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
+@pytest.mark.parametrize("thin", [1e-2, 1e-4, 1e-6, 1e-8])
+@pytest.mark.parametrize("at", [50.0, 87.5])
+def test_a_layer_of_slivers_is_no_flaw(cell, thin, at):
+    """VERIFICATION T11; inside of the beam and at its end."""
+    mesh = box([100.0, 25.0, 25.0], [9, 3, 3], cell)
+    p = mesh.p.copy()
+    p[0, p[0] == at] = 37.5 + 12.5 * thin if at == 50.0 else 100 - 12.5 * thin
+    check(type(mesh)(p, mesh.t))
+
+
+@pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
+def test_shaken_thin_and_distant_meshes_are_sound(cell, grid):
+    mesh = grid(cell, 4, shaken=0.15)
+    flat = np.where(np.arange(mesh.dim()) == mesh.dim() - 1, 1e-3, 1.0)[:, None]
+    for p in (mesh.p, mesh.p + 1e4, mesh.p * 1e-6, mesh.p * 1e6, mesh.p * flat, -mesh.p):
+        check(type(mesh)(p, mesh.t))
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("cell", ["tetra", "triangle"])
+def test_simplices_are_folded_where_they_do_not_fill_what_their_boundary_encloses(cell, seed, grid):
+    """The volume that the boundary encloses is the flux of x / D through it."""
+    mesh = grid(cell, 4)
+    random = np.random.default_rng(seed)
+    p = mesh.p + 0.25 * random.uniform(-1, 1, mesh.p.shape) * (random.random(mesh.nvertices) < 0.1)
+    mesh = type(mesh)(p, mesh.t)
+    boundary = skfem.FacetBasis(mesh, mesh.elem(), intorder=4)
+    flux = (boundary.normals * boundary.global_coordinates()).sum(axis=0) * boundary.dx
+    if abs(flux.sum() / mesh.dim() / volumes(mesh).sum() - 1) > 1e-9:
+        with pytest.raises(ValueError, match="inverted, folded over"):
+            check(mesh)
+    else:
+        check(mesh)
+
+
+def test_a_mesh_built_by_hand_may_not_have_nodes_without_a_cell():
+    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
+    with pytest.raises(ValueError, match="1 nodes belong to no cell: 0"):
+        check(skfem.MeshHex(np.concatenate([[[9], [9], [9]], mesh.p], axis=1), mesh.t + 1))
+
+
+@pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
+def test_a_hundred_thousand_nodes_are_checked_in_seconds(cell):
+    mesh = box([1.0, 1.0, 1.0], [47, 47, 47], cell)
+    start = time.process_time()
+    check(mesh)
+    assert time.process_time() - start < 6  # measured: 2.1 and 2.7 s
+
+
+def test_vtu_of_several_pieces_is_an_error(tmp_path):
+    """Meshio would keep the cells of the last one (its issue 1444)."""
+    path = write(tmp_path / "bar.vtu", TWO_CUBES, hexahedron=TWO_HEXES)
+    text = path.read_text()
+    start, end = text.index("<Piece"), text.index("</Piece>") + len("</Piece>")
+    path.write_text(text[:end] + text[start:end] + text[end:])
+    with pytest.raises(ValueError, match="several pieces"):
+        load(path)
+
+
+@pytest.mark.parametrize("kind", ["gmsh", "gmsh22", "vtu", "vtk", "vtk42", "abaqus"])
+def test_a_file_that_ends_too_early_is_an_error_and_meshio_keeps_silent(tmp_path, kind, capfd):
+    """Cut anywhere; the last bytes of some formats mean nothing."""
+    mesh = box([1.0, 1.0, 1.0], [4, 3, 3], "tetra")
+    suffix = {"gmsh": "msh", "gmsh22": "msh", "abaqus": "inp"}.get(kind, kind[:3])
+    path = tmp_path / f"whole.{suffix}"
+    binary = {} if kind in ("abaqus", "vtu") else {"binary": False}
+    meshio.write(path, meshio.Mesh(mesh.p.T, [("tetra", mesh.t.T)]), file_format=kind, **binary)
+    capfd.readouterr()
+    text = path.read_bytes()
+    for part in np.linspace(0.0, 0.97, 30):
+        path.write_bytes(text[: int(part * len(text))])
+        with pytest.raises(ValueError, match=r"whole\.") as error:
+            load(path)
+        assert "\n" not in str(error.value)
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(

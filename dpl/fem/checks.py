@@ -1,0 +1,249 @@
+"""The front door: what makes a mesh unsolvable, in one line with the numbers of the culprits."""
+
+import numpy as np
+import skfem
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+# Degree that the quadrature integrates exactly; no problem here puts its points more densely.
+ORDERS = {"Triangular": 4, "Quadrilateral": 5, "Tetrahedral": 4, "Hexahedral": 5}
+
+Numbers = NDArray[np.int_]
+
+
+def check(mesh: skfem.Mesh, *, numbers: Numbers | None = None) -> skfem.Mesh:
+    """Return the mesh as it is, if it can be solved.
+
+    Args:
+        mesh: The body; its cells may list their nodes in either sense.
+        numbers: What errors call its vertices, (N,); their place if left out. Cells are counted
+            from 0.
+
+    Raises:
+        ValueError: The first of these flaws, with the cells or nodes that have it: coordinates that
+            are not finite, nodes without a cell, cells that list a node twice, cells listed twice,
+            inverted or flat cells, sides shared by three cells, cells folded over their neighbours,
+            nodes in one place, hanging nodes, sides that overlap without being the same, a body
+            in several pieces.
+    """
+    numbers = np.arange(mesh.p.shape[1]) if numbers is None else numbers
+    _check_nodes(mesh, numbers)
+    _check_lists(mesh)
+    orientation = _check_volumes(mesh)
+    _check_sides(mesh, orientation)
+    _check_places(mesh, numbers)
+    _check_contacts(mesh, numbers)
+    _check_pieces(mesh)
+    return mesh
+
+
+def listed(numbers: Numbers, most: int = 5) -> str:
+    """Return numbers as a text, the first few of them."""
+    return ", ".join(map(str, numbers[:most])) + (", ..." if len(numbers) > most else "")
+
+
+def _check_nodes(mesh: skfem.Mesh, numbers: Numbers) -> None:
+    bad = np.flatnonzero(~np.isfinite(mesh.p).all(axis=0))
+    if len(bad):
+        raise ValueError(f"coordinates of {len(bad)} nodes are not finite: {_nodes(bad, numbers)}")
+    bad = np.flatnonzero(np.bincount(mesh.t.ravel(), minlength=mesh.nvertices) == 0)
+    if len(bad):
+        raise ValueError(f"{len(bad)} nodes belong to no cell: {_nodes(bad, numbers)}")
+
+
+def _check_lists(mesh: skfem.Mesh) -> None:
+    ordered = np.sort(mesh.t, axis=0)
+    bad = np.flatnonzero((np.diff(ordered, axis=0) == 0).any(axis=0))
+    if len(bad):
+        raise ValueError(f"{len(bad)} cells list a node twice: {listed(bad)}")
+    order = np.lexsort(ordered)
+    same = (ordered[:, order[1:]] == ordered[:, order[:-1]]).all(axis=0)
+    if same.any():
+        pairs = np.sort([order[:-1][same], order[1:][same]], axis=0)
+        raise ValueError(f"{same.sum()} cells are listed twice: {_pairs(pairs)}")
+
+
+def _check_volumes(mesh: skfem.Mesh) -> NDArray[np.float64]:
+    """Return in which sense each cell lists its nodes, (E,): 1 or -1."""
+    shape = mesh.elem.refdom
+    X = skfem.quadrature.get_quadrature(shape, 0 if mesh.affine else ORDERS[shape.name])[0]
+    J = _determinant(mesh.mapping().DF(X))  # (E, Q). No detDF: it raises where it is zero
+    sense = np.sign(np.median(J, axis=1))
+    smallest = (J * sense[:, None]).min(axis=1)
+    size = np.ptp(mesh.p[:, mesh.t], axis=1).max(axis=0)  # (E,)
+    # what rounding makes of nothing: of the cell's own size, and of its distance from the origin
+    nothing = (1e-12 * size + 1e-15 * np.abs(mesh.p).max()) * size ** (mesh.dim() - 1)
+    for flaw, where in (("inverted", smallest < -nothing), ("of no volume", smallest <= nothing)):
+        bad = np.flatnonzero(where)
+        if len(bad):
+            raise ValueError(f"{len(bad)} cells are {flaw}: {listed(bad)}")
+    return sense
+
+
+def _determinant(J: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return det J of (D, D, ...); for many small matrices much faster than numpy's."""
+    if len(J) == 2:
+        return J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
+    return sum(
+        J[0, i] * (J[1, j] * J[2, k] - J[1, k] * J[2, j])
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+    )
+
+
+def _check_sides(mesh: skfem.Mesh, sense: NDArray[np.float64]) -> None:
+    """Hold each side to two cells, and these to its two faces."""
+    shared = np.bincount(mesh.t2f.ravel())
+    crowded = np.flatnonzero((shared > 2)[mesh.t2f].any(axis=0))
+    if len(crowded):
+        raise ValueError(f"a side is shared by three or more cells: {listed(crowded, 8)}")
+    signs = np.stack([_outward(mesh, side) for side in mesh.elem.refdom.facets]) * sense
+    total = np.bincount(mesh.t2f.ravel(), weights=signs.ravel())
+    folded = (shared == 2) & (np.abs(total) > 1)  # both cells lie on the same side of it
+    if folded.any():
+        all_of_them = (folded | (shared == 1))[mesh.t2f].all(axis=0) & folded[mesh.t2f].any(axis=0)
+        bad = np.flatnonzero(all_of_them if any(all_of_them) else folded[mesh.t2f].any(axis=0))
+        raise ValueError(
+            f"{len(bad)} cells are inverted, folded over their neighbours: {listed(bad)}"
+        )
+
+
+def _outward(mesh: skfem.Mesh, side: list[int]) -> NDArray[np.int_]:
+    """Return for a side of all cells, (E,), on which face of it each cell lies: 1 or -1.
+
+    The face is told by the sense in which the side's vertices go round, seen from outside the cell
+    and starting from the vertex of the lowest number: the two cells of a side must disagree.
+    """
+    p = mesh.elem.refdom.p[:, side]  # (D, corners)
+    along, away = p[:, 1] - p[:, 0], p.mean(axis=1) - mesh.elem.refdom.p.mean(axis=1)
+    normal = np.array([along[1], -along[0]]) if len(p) == 2 else np.cross(along, p[:, -1] - p[:, 0])
+    t = mesh.t[side]
+    first, cells = t.argmin(axis=0), np.arange(t.shape[1])
+    if len(p) == 2:
+        turn = np.where(first == 0, 1, -1)
+    else:
+        after, before = t[(first + 1) % len(t), cells], t[(first - 1) % len(t), cells]
+        turn = np.where(after > before, 1, -1)
+    return turn * int(np.sign(normal @ away))
+
+
+def _check_places(mesh: skfem.Mesh, numbers: Numbers) -> None:
+    """Hold all nodes, those of quadratic edges too, to places of their own."""
+    close = 1e-9 * np.ptp(mesh.p, axis=1).max()
+    twins = cKDTree(mesh.p.T).query_pairs(close, output_type="ndarray")
+    if len(twins):
+        known = twins[(twins < len(numbers)).all(axis=1)]
+        where = f": {_pairs(numbers[known[np.lexsort(known.T[::-1])]].T)}" if len(known) else ""
+        raise ValueError(
+            f"{len(np.unique(twins[:, 1]))} nodes coincide with others{where}; merge them, "
+            "or the body is cracked"
+        )
+
+
+def _check_contacts(mesh: skfem.Mesh, numbers: Numbers) -> None:
+    """Hold the boundary to touching itself nowhere but in its own vertices.
+
+    A side that should join two cells and does not is a side of the boundary to both of them. Then a
+    vertex of one lies inside the other (a hanging node). Triangles can fail without: as two ways of
+    cutting one quadrilateral, which share two vertices and most inner points.
+    """
+    facets = mesh.boundary_facets()
+    around = _around(mesh, facets)  # (corners, F)
+    sides = mesh.p[:, around]  # (D, corners, F)
+    vertices = np.unique(around)
+    hanging = np.unique(vertices[_contacts(sides, mesh.p[:, vertices], -1e-6)[1]])
+    if len(hanging):
+        raise ValueError(
+            f"{len(hanging)} nodes lie inside a side of a cell that does not have them as vertices "
+            f"(hanging nodes): {_nodes(hanging, numbers)}"
+        )
+    if mesh.elem.refdom.name == "Tetrahedral":
+        inner = sides[:, 0] * 0.45 + sides[:, 1] * 0.33 + sides[:, 2] * 0.22  # on no diagonal
+        pair = np.stack(_contacts(sides, inner, 0.01))
+        common = (around[:, None, pair[0]] == around[None, :, pair[1]]).sum(axis=(0, 1))
+        cells = mesh.f2t[0, facets[pair[:, common == 2]]]
+        if cells.size:
+            raise ValueError(
+                "sides of cells overlap without being the same, their vertices differ: "
+                + _pairs(np.unique(np.sort(cells, axis=0), axis=1))
+            )
+
+
+def _around(mesh: skfem.Mesh, facets: Numbers) -> Numbers:
+    """Return the vertices of facets on the boundary in turn around each, (corners, F)."""
+    cells = mesh.f2t[0, facets]
+    local = (mesh.t2f[:, cells] == facets).argmax(axis=0)
+    return mesh.t[np.array(mesh.elem.refdom.facets).T[:, local], cells]
+
+
+def _contacts(
+    sides: NDArray[np.float64], points: NDArray[np.float64], margin: float
+) -> tuple[Numbers, Numbers]:
+    """Return which of sides (D, corners, F) hold which of points (D, P): pairs of their places.
+
+    A side holds what lies on it, further than `margin` (a part of its size) from its edges, and is
+    none of its corners.
+    """
+    middle = sides.mean(axis=1)
+    radius = np.sqrt(((sides - middle[:, None]) ** 2).sum(axis=0).max(axis=0))
+    near = cKDTree(points.T).query_ball_point(middle.T, radius * (1 + 1e-9))
+    side = np.repeat(np.arange(len(near)), [len(found) for found in near])
+    point = np.concatenate(near).astype(np.int64)
+    corners = sides[:, :, side] - points[:, None, point]
+    clear = np.sqrt((corners**2).sum(axis=0)).min(axis=0) > 1e-3 * radius[side]
+    side, point = side[clear], point[clear]
+    on = _distance(sides[:, :, side], points[:, point], margin) <= 1e-5 * radius[side]
+    return side[on], point[on]
+
+
+def _distance(
+    sides: NDArray[np.float64], points: NDArray[np.float64], margin: float
+) -> NDArray[np.float64]:
+    """Return how far points (D, P) are from segments, triangles or bilinear quads (D, corners, P).
+
+    It is infinite if the parameters of the nearest place are not within the margin. For warped
+    quads they are found by Gauss-Newton; for the others its first step is exact.
+    """
+    corners = sides.shape[1]
+    a, b = sides[:, 0], sides[:, 1]
+    d = sides[:, -1] if corners > 2 else a
+    twist = a - b + sides[:, 2] - d if corners == 4 else np.zeros_like(a)
+    s = t = np.full(points.shape[1], 0.5 if corners == 4 else 0.0)
+    for _ in range(6 if corners == 4 else 1):
+        ds, dt = b - a + t * twist, d - a + s * twist
+        gap = points - (a + s * (b - a) + t * (d - a) + s * t * twist)
+        ss, st, tt = (ds * ds).sum(axis=0), (ds * dt).sum(axis=0), (dt * dt).sum(axis=0)
+        fs, ft = (ds * gap).sum(axis=0), (dt * gap).sum(axis=0)
+        if corners == 2:
+            s = s + fs / ss
+        else:
+            area = ss * tt - st * st
+            s, t = s + (tt * fs - st * ft) / area, t + (ss * ft - st * fs) / area
+    gap = points - (a + s * (b - a) + t * (d - a) + s * t * twist)
+    within = (s >= margin) & (s <= 1 - margin)
+    if corners > 2:
+        within &= (t >= margin) & ((t if corners == 4 else s + t) <= 1 - margin)
+    return np.where(within, np.sqrt((gap**2).sum(axis=0)), np.inf)
+
+
+def _check_pieces(mesh: skfem.Mesh) -> None:
+    links = np.ones(mesh.t[1:].size)
+    graph = coo_array((links, (np.tile(mesh.t[0], len(mesh.t) - 1), mesh.t[1:].ravel())))
+    graph.resize((mesh.nvertices,) * 2)
+    pieces, member = connected_components(graph, directed=False)
+    if pieces > 1:
+        sizes = listed(np.sort(np.bincount(member))[::-1], 8)
+        raise ValueError(
+            f"the body is in {pieces} pieces (of {sizes} nodes); join or separate them"
+        )
+
+
+def _nodes(vertices: Numbers, numbers: Numbers) -> str:
+    return listed(numbers[vertices[vertices < len(numbers)]])
+
+
+def _pairs(pairs: NDArray[np.int_], most: int = 4) -> str:
+    """Return pairs (2, n) as a text, the first few of them."""
+    named = ", ".join(f"{a} and {b}" for a, b in pairs.T[:most])
+    return named + (", ..." if pairs.shape[1] > most else "")

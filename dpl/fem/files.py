@@ -1,0 +1,293 @@
+"""Mesh files in and out, with the names that they give to parts of the body."""
+
+import contextlib
+import io
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import meshio
+import numpy as np
+import skfem
+from numpy.typing import NDArray
+from skfem.io.meshio import from_meshio, to_meshio
+
+from dpl.fem.checks import check, listed
+
+CELLS = {  # meshio's names of what can be solved, best first: dimension, nodes
+    "hexahedron": (3, 8),
+    "hexahedron27": (3, 27),
+    "tetra": (3, 4),
+    "tetra10": (3, 10),
+    "quad": (2, 4),
+    "quad9": (2, 9),
+    "triangle": (2, 3),
+    "triangle6": (2, 6),
+}
+SIDES = {  # of these cells: corners, which meshio lists first
+    "line": 2,
+    "line3": 2,
+    "triangle": 3,
+    "triangle6": 3,
+    "triangle7": 3,
+    "quad": 4,
+    "quad8": 4,
+    "quad9": 4,
+}
+MOST_VALUES = 1000  # of a field that tells parts apart; with more it counts something else
+
+Numbers = NDArray[np.int_]
+
+
+def load(path: str | Path) -> skfem.Mesh:
+    """Return the mesh of any file that meshio reads, checked.
+
+    The cells of the highest dimension are kept in their order, nodes that no cell uses are dropped,
+    and a planar mesh with a third coordinate of zero becomes a 2D one.
+
+    The file's names for parts are kept as scikit-fem's `mesh.boundaries` (facets) and
+    `mesh.subdomains` (cells), where `dpl.fem.regions.Tag` finds them:
+
+    - Gmsh's physical groups, by name; by number ("7") if they have none;
+    - sets of cells or nodes (.inp and others), by name;
+    - whole-numbered fields on cells or nodes, as "field=value"; where such a field is only 0 or 1,
+      "field" stands for the ones too.
+
+    Sets of nodes become the facets that have all their vertices in it, inner ones too. Groups of
+    single points or, in 3D, of curves are not kept.
+
+    Args:
+        path: A file (.msh, .vtu, .vtk, .inp, ...), coordinates in metres.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file cannot be read, or its mesh cannot be solved; the message says why.
+            Nodes have the place in which the file lists them, from 0; so have cells among those
+            that are kept.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such mesh file")
+    if path.suffix.lower() == ".vtu" and path.read_bytes().count(b"<Piece") > 1:
+        raise ValueError(f"{path}: holds several pieces, of which meshio keeps one; join them")
+    raw = _read(path)
+    try:
+        return _body(raw)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _read(path: Path) -> meshio.Mesh:
+    """Return what meshio reads; what it prints and how it exits become part of the error."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            raw = meshio.read(path)
+    except (Exception, SystemExit) as error:  # meshio calls sys.exit on files it cannot read
+        known = isinstance(error, (SystemExit, meshio.ReadError, ImportError))
+        text = said.getvalue().split("Error:")[0] if isinstance(error, SystemExit) else str(error)
+        reason = " ".join(text.split())
+        if "'gmsh:physical'" in reason:
+            reason = "only some of its cells are in physical groups; give each part one"
+        elif not (known and reason):
+            reason = f"it is damaged or ends too early{f' ({reason})' if reason else ''}"
+        raise ValueError(f"{path}: cannot be read as a mesh: {reason}") from error
+    promised = (
+        re.search(rb"CELL_TYPES\s+(\d+)", path.read_bytes()) if path.suffix == ".vtk" else None
+    )
+    missing = promised and int(promised[1]) != sum(len(block.data) for block in raw.cells)
+    if missing or "not closed" in said.getvalue():
+        raise ValueError(f"{path}: cannot be read as a mesh: it ends too early")
+    return raw
+
+
+def _body(raw: meshio.Mesh) -> skfem.Mesh:
+    found = {block.type for block in raw.cells if len(block.data)}
+    kinds = [kind for kind in CELLS if kind in found]
+    if not kinds:
+        raise ValueError(
+            f"holds no cells that can be solved ({', '.join(sorted(found)) or 'none'})"
+        )
+    dim = max(CELLS[kind][0] for kind in kinds)
+    kinds = [kind for kind in kinds if CELLS[kind][0] == dim]
+    if len(kinds) > 1:
+        raise ValueError(f"mixes {' and '.join(kinds)} cells; convert them to one kind")
+    if any(np.ndim(block.data) != 2 for block in raw.cells):
+        raise ValueError("lists cells with too few nodes; does it end too early?")
+    points = np.asarray(raw.points, dtype=np.float64)
+    cells = np.concatenate([block.data for block in raw.cells if block.type == kinds[0]])
+    cells = cells.astype(np.int64)
+    if points.shape[1] < dim:
+        raise ValueError(f"{kinds[0]} cells need nodes of {dim} coordinates")
+    _check_range(cells, len(points))
+    used, compact = np.unique(cells, return_inverse=True)
+    compact = compact.reshape(-1, CELLS[kinds[0]][1])
+    points = _flat(points, used) if dim == 2 else points[used]
+    mesh = from_meshio(meshio.Mesh(points, [(kinds[0], compact)]))
+    corners = np.unique(cells[:, : len(mesh.t)])  # vertex k is node corners[k] of the file
+    return _tagged(check(mesh, numbers=corners), raw, kinds[0], corners)
+
+
+def _check_range(cells: Numbers, nodes: int) -> None:
+    low, high = cells.min(), cells.max()
+    if low < 0 or high >= nodes:
+        guess = "; does the numbering start at 1?" if (low, high) == (1, nodes) else ""
+        bad = np.flatnonzero(((cells < 0) | (cells >= nodes)).any(axis=1))
+        raise ValueError(
+            f"cells name nodes {low} to {high}, there are 0 to {nodes - 1}{guess} "
+            f"({len(bad)} such cells: {listed(bad)})"
+        )
+
+
+def _flat(points: NDArray[np.float64], used: Numbers) -> NDArray[np.float64]:
+    """Return the used points without their third coordinate, if it is zero.
+
+    Raises:
+        ValueError: It is not, at a node that is named.
+    """
+    points = points[used]
+    if points.shape[1] == 3:
+        away = np.abs(points[:, 2] - points[0, 2])
+        bad = np.flatnonzero(away > 1e-9 * np.ptp(points, axis=0).max())
+        if len(bad):
+            raise ValueError(
+                "is a surface in space, no body; a 2D mesh must lie in the plane z = 0 "
+                f"({len(bad)} nodes leave it: {listed(used[bad])})"
+            )
+    return points[:, :2]
+
+
+def _tagged(mesh: skfem.Mesh, raw: meshio.Mesh, kind: str, corners: Numbers) -> skfem.Mesh:
+    """Return the mesh with the names of the file; vertex k is node corners[k] of it."""
+    vertex = np.full(len(raw.points), -1)
+    vertex[corners] = np.arange(len(corners))
+    cells: dict[str, list[Numbers]] = {}
+    facets: dict[str, list[Numbers]] = {}
+    places: list[Numbers | None] = []  # of each block's cells among those of the mesh
+    known: list[Numbers | None] = []  # of each block's cells among the facets of the mesh
+    count, width = 0, len(mesh.facets)
+    for block in raw.cells:
+        kept = block.type == kind
+        places.append(count + np.arange(len(block.data)) if kept else None)
+        count += len(block.data) if kept else 0
+        fits = not kept and SIDES.get(block.type) == width
+        known.append(_find(mesh, vertex[block.data[:, :width]]) if fits else None)
+    for name, b, members in _cell_sets(raw):
+        if (own := places[b]) is not None:
+            cells.setdefault(name, []).append(own[members])
+        elif (side := known[b]) is not None:
+            found = side[members]
+            facets.setdefault(name, []).append(found[found >= 0])
+    for name, b, bits in _saved_facets(raw):
+        if (own := places[b]) is not None:
+            local, which = np.nonzero(bits >> np.arange(len(mesh.t2f))[:, None] & 1)
+            facets.setdefault(name, []).append(mesh.t2f[local, own[which]])
+    for name, inside in _node_sets(raw):
+        full = inside[corners][mesh.facets].all(axis=0)
+        facets.setdefault(name, []).append(np.flatnonzero(full))
+    boundaries, subdomains = (
+        {name: np.unique(np.concatenate(parts)).astype(np.int32) for name, parts in found.items()}
+        for found in (facets, cells)
+    )
+    return mesh.with_boundaries(boundaries).with_subdomains(subdomains)
+
+
+def _find(mesh: skfem.Mesh, sides: Numbers) -> Numbers:
+    """Return which facet of the mesh has the vertices of each side (n, corners), or -1."""
+    both = np.sort(np.concatenate([mesh.facets.T, sides]), axis=1)
+    both = both[:, : mesh.dim()]  # three corners tell faces apart
+    order = np.lexsort(both.T)  # stable: a facet comes before the sides that are like it
+    new = np.ones(len(both), dtype=bool)
+    new[1:] = (np.diff(both[order], axis=0) != 0).any(axis=1)
+    first = order[new][np.cumsum(new) - 1]
+    found = np.empty(len(both), dtype=np.int64)
+    found[order] = np.where(first < mesh.facets.shape[1], first, -1)
+    return found[mesh.facets.shape[1] :]
+
+
+def _cell_sets(raw: meshio.Mesh) -> Iterator[tuple[str, int, Numbers]]:
+    """Yield all named sets of cells: name, block, places in the block."""
+    for name, blocks in raw.cell_sets.items():
+        if name and not name.startswith("gmsh:"):
+            for b, members in enumerate(blocks):
+                if np.size(members):
+                    yield name, b, np.asarray(members, dtype=np.int64)
+    groups = {tuple(key): name for name, key in raw.field_data.items() if np.size(key) == 2}
+    for field, blocks in raw.cell_data.items():
+        if field.startswith("skfem:"):
+            if field.startswith("skfem:s:"):
+                for b, mask in enumerate(blocks):
+                    yield field.removeprefix("skfem:s:"), b, np.flatnonzero(mask)
+            continue
+        for b, number, members in _values(blocks):
+            if field != "gmsh:physical":
+                yield f"{field}={number}", b, members
+            elif number:  # 0 stands for none
+                yield groups.get((number, raw.cells[b].dim), str(number)), b, members
+        if _is_mask(blocks):
+            for b, mask in enumerate(blocks):
+                yield field, b, np.flatnonzero(mask)
+
+
+def _saved_facets(raw: meshio.Mesh) -> Iterator[tuple[str, int, Numbers]]:
+    """Yield sets of facets as scikit-fem writes them: name, block, a bit per side of each cell."""
+    for field, blocks in raw.cell_data.items():
+        if field.startswith("skfem:b:"):
+            for b, bits in enumerate(blocks):
+                yield field.removeprefix("skfem:b:"), b, np.asarray(bits).astype(np.int64)
+
+
+def _node_sets(raw: meshio.Mesh) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Yield all named sets of nodes: name, which nodes."""
+    inside = np.zeros(len(raw.points), dtype=bool)
+    sets = [(name, np.asarray(members)) for name, members in raw.point_sets.items()]
+    for field, data in raw.point_data.items():
+        sets += [(f"{field}={number}", members) for _, number, members in _values([data])]
+        sets += [(field, np.flatnonzero(data))] if _is_mask([data]) else []
+    for name, members in sets:
+        inside[:] = False
+        inside[members] = True
+        yield name, inside
+
+
+def _values(blocks: list) -> Iterator[tuple[int, int, Numbers]]:
+    """Yield block, value, places for each value of a whole-numbered field of one component."""
+    if not _is_whole(blocks):
+        return
+    found = [np.unique(block, return_inverse=True) for block in blocks]
+    if len({int(v) for values, _ in found for v in values}) > MOST_VALUES:
+        return
+    for b, (values, which) in enumerate(found):
+        order = np.argsort(which, kind="stable")
+        ends = np.cumsum(np.bincount(which, minlength=len(values)))[:-1]
+        for value, members in zip(values, np.split(order, ends), strict=True):
+            yield b, int(value), members
+
+
+def _is_whole(blocks: list) -> bool:
+    return all(np.ndim(block) == 1 and np.asarray(block).dtype.kind in "iub" for block in blocks)
+
+
+def _is_mask(blocks: list) -> bool:
+    return _is_whole(blocks) and {int(v) for block in blocks for v in np.unique(block)} == {0, 1}
+
+
+def save(path: Path, mesh: skfem.Mesh, fields: Mapping[str, NDArray[np.float64]]) -> None:
+    """Write a mesh, its tags and fields at its nodes, in any format of meshio.
+
+    Args:
+        path: A file; its folder is made if there is none. Tags need cell data (.vtu, .vtk).
+        mesh: The body.
+        fields: By name, (N,) or (N, D); of N nodes those of the mesh come first.
+    """
+    flat = to_meshio(mesh)
+    nodes = mesh.p.shape[1]
+    points = np.pad(flat.points, ((0, 0), (0, 3 - flat.points.shape[1])))
+    data = {
+        name: np.pad(field[:nodes], ((0, 0), (0, 3 - field.shape[1])))
+        if field.ndim == 2
+        else field[:nodes]
+        for name, field in fields.items()
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    meshio.write(path, meshio.Mesh(points, flat.cells, point_data=data, cell_data=flat.cell_data))

@@ -1,0 +1,482 @@
+"""Compiled element loops: force, tangent and det F of a body under an isotropic law.
+
+WIDTH cells are worked on at once, one in each lane of the processor's vectors. The loops say the
+same as `Problem`'s tensor methods, which stay the reference; tests hold the two together.
+
+In here strains and stresses are 6 numbers, 11 22 33 12 23 13, strains as e = 2 E.
+"""
+
+import hashlib
+import inspect
+import math
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit, types
+from numba.extending import (
+    NativeValue,
+    models,
+    overload,
+    register_model,
+    typeof_impl,
+    unbox,
+)
+from numpy.typing import NDArray
+
+from dpl.fem import lanes
+from dpl.fem.lanes import WIDTH, load, sqrt, store
+from dpl.fem.materials import Isotropic
+
+Array = NDArray[np.float64]
+
+VOIGT = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2]])
+FIRST = np.array([0, 1, 2, 0, 1, 0])  # the two indices of each of the 6
+SECOND = np.array([0, 1, 2, 1, 2, 2])
+
+
+class _LawType(types.Type):
+    """numba's type of a law: its name holds a digest of all code that a kernel is made of.
+
+    So a kernel is compiled once per law, and one compiled from other sources is never taken from
+    numba's cache on disk.
+    """
+
+
+_SLOPES: dict[str, Any] = {}  # name of the type -> compiled slopes
+_SOURCES = "".join(inspect.getsource(m) for m in (lanes, sys.modules[__name__]))
+
+
+@dataclass(frozen=True)
+class _Law:
+    """A law as an argument of a kernel."""
+
+    material: type[Isotropic]
+
+    @property
+    def kind(self) -> _LawType:
+        """Numba's type."""
+        name = self.material.__qualname__
+        functions = [self.material.slopes, *_helpers(self.material.slopes)]
+        source = "".join(inspect.getsource(f) for f in functions)
+        name += hashlib.sha256((source + _SOURCES).encode()).hexdigest()[:16]
+        if name not in _SLOPES:
+            _SLOPES[name] = _jitted(self.material.slopes)
+        return _LawType(name)
+
+
+def _needs(material: Isotropic) -> int:
+    """Return what a law's slopes read: 0 nothing of C^-1, 1 no ln J, 2 ln J, 3 J^(-2/3) too."""
+
+    def read(**values: float) -> tuple[float, ...]:
+        arguments = dict.fromkeys(("i1", "i2", "j", "log_j", "m1"), 0.0) | values
+        return material.slopes(material.constants, **arguments)
+
+    if np.isnan(read(m1=np.nan)).any():
+        return 3
+    if np.isnan(read(log_j=np.nan)).any():
+        return 2
+    everything = read(i1=np.nan, i2=np.nan, j=np.nan)
+    return 0 if everything[2] == 0 and not np.any(everything[6:]) else 1
+
+
+def _helpers(function: Any) -> list[Any]:
+    """Return the functions of its own module that a function names."""
+    named = (function.__globals__.get(name) for name in function.__code__.co_names)
+    return [f for f in named if inspect.isfunction(f)]
+
+
+def _jitted(function: Any) -> Any:
+    """Return a plain arithmetic function compiled, with the functions that it calls."""
+    compiled = {f.__name__: njit(f) for f in _helpers(function)}
+    scope = {**function.__globals__, **compiled}
+    return njit(type(function)(function.__code__, scope, function.__name__))
+
+
+@register_model(_LawType)
+class _LawModel(models.OpaqueModel):
+    pass
+
+
+@typeof_impl.register(_Law)
+def _typeof_law(law: _Law, context: Any) -> _LawType:
+    return law.kind
+
+
+@unbox(_LawType)
+def _unbox_law(kind: Any, value: Any, context: Any) -> NativeValue:
+    return NativeValue(context.context.get_dummy_value())
+
+
+def _slopes(law, c, i1, i2, j, log_j, m1):
+    raise NotImplementedError
+
+
+@overload(_slopes)
+def _slopes_of(law, c, i1, i2, j, log_j, m1):
+    function = _SLOPES[law.name]
+    return lambda law, c, i1, i2, j, log_j, m1: function(c, i1, i2, j, log_j, m1)
+
+
+@njit
+def _gather(field, cells, start, count, out):
+    """Copy a nodal field (N, D) to rows 3 a + i of `out`, a cell in each lane."""
+    for lane in range(WIDTH):
+        cell = start + min(lane, count - 1)
+        for a in range(cells.shape[1]):
+            for i in range(field.shape[1]):
+                out[3 * a + i, lane] = field[cells[cell, a], i]
+
+
+@njit
+def _shape(dN, dV, start, count, q, g, weight):
+    """Copy gradients to rows 3 a + j of `g` and volumes to `weight`, zero past the last cell."""
+    several = dN.shape[0] > 1
+    for lane in range(WIDTH):
+        cell = start + min(lane, count - 1) if several else 0
+        weight[0, lane] = dV[cell, q] if lane < count else 0.0
+        for a in range(dN.shape[2]):
+            for j in range(dN.shape[3]):
+                g[3 * a + j, lane] = dN[cell, q, a, j]
+
+
+@njit
+def _gradient(ue, g, H):
+    """Set H (rows 3 i + j) to sum_a u_a g_a^T."""
+    for r in range(9):
+        store(H, r, 0.0)
+    for a in range(g.shape[0] // 3):
+        g0, g1, g2 = load(g, 3 * a), load(g, 3 * a + 1), load(g, 3 * a + 2)
+        for i in range(3):
+            u = load(ue, 3 * a + i)
+            store(H, 3 * i, load(H, 3 * i) + u * g0)
+            store(H, 3 * i + 1, load(H, 3 * i + 1) + u * g1)
+            store(H, 3 * i + 2, load(H, 3 * i + 2) + u * g2)
+
+
+@njit
+def _quadratic(H, scale, e):
+    """Add scale * H^T H to e."""
+    for v in range(6):
+        i, j = FIRST[v], SECOND[v]
+        square = (
+            load(H, i) * load(H, j)
+            + load(H, 3 + i) * load(H, 3 + j)
+            + load(H, 6 + i) * load(H, 6 + j)
+        )
+        store(e, v, load(e, v) + scale * square)
+
+
+@njit
+def _strain(H, finite, e):
+    """Set e to 2 E = H + H^T + H^T H, without the last term where `finite` is 0."""
+    for v in range(6):
+        store(e, v, load(H, 3 * FIRST[v] + SECOND[v]) + load(H, 3 * SECOND[v] + FIRST[v]))
+    _quadratic(H, finite, e)
+
+
+@njit
+def _volume_change(H):
+    """Return det(I + H) - 1."""
+    a, b, c = load(H, 0), load(H, 1), load(H, 2)
+    d, e, f = load(H, 3), load(H, 4), load(H, 5)
+    g, h, i = load(H, 6), load(H, 7), load(H, 8)
+    minors = a * e - b * d + e * i - f * h + a * i - c * g
+    return a + e + i + minors + a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
+@njit
+def _stress(law, c, needs, e, X, S, scratch, D, moduli):
+    """Set S and X = C^-1, and with `moduli` D = dS/dE (rows 6 I + J), at e; return det C - 1."""
+    e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
+    e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
+    i1 = e0 + e1 + e2
+    m0, m1, m2 = e1 * e2 - e4 * e4, e0 * e2 - e5 * e5, e0 * e1 - e3 * e3
+    second = m0 + m1 + m2
+    square = i1 + second + e0 * m0 - e3 * (e3 * e2 - e4 * e5) + e5 * (e3 * e4 - e1 * e5)
+    if needs > 0:
+        inverse = 1.0 / (1.0 + square)
+        store(X, 0, (1.0 + e1 + e2 + m0) * inverse)
+        store(X, 1, (1.0 + e0 + e2 + m1) * inverse)
+        store(X, 2, (1.0 + e0 + e1 + m2) * inverse)
+        store(X, 3, (e4 * e5 - e3 - e3 * e2) * inverse)
+        store(X, 4, (e3 * e5 - e4 - e0 * e4) * inverse)
+        store(X, 5, (e3 * e4 - e5 - e1 * e5) * inverse)
+    store(scratch, 0, square)
+    if needs > 1:
+        for lane in range(WIDTH):
+            scratch[0, lane] = 0.5 * math.log1p(scratch[0, lane])
+            if needs > 2:
+                scratch[1, lane] = math.expm1(-2 / 3 * scratch[0, lane])
+    j = square / (1.0 + sqrt(1.0 + square))
+    i2 = 2.0 * i1 + second
+    slopes = _slopes(law, c, i1, i2, j, load(scratch, 0), load(scratch, 1))
+    rest, W2, p, W11, W12, W22, W1J, W2J, pJ = slopes
+    pressure = rest + 2.0 * W2 * i1
+    for v in range(6):
+        stress = -2.0 * W2 * load(e, v)
+        if v < 3:
+            stress = stress + pressure
+        if needs > 0:  # - p e X
+            i, k = 3 * FIRST[v], SECOND[v]
+            turned = 0.0 * i1
+            for n in range(3):
+                turned = turned + load(e, VOIGT[FIRST[v], n]) * load(X, VOIGT[n, k])
+            stress = stress - p * turned
+        store(S, v, stress)
+    if moduli:
+        for v in range(6):
+            normal = 2.0 if v < 3 else 0.0
+            t2 = normal * (2.0 + i1) - 2.0 * load(e, v)
+            x = load(X, v)
+            store(scratch, 2 + v, t2)
+            store(scratch, 8 + v, W11 * normal + W12 * t2 + W1J * x)
+            store(scratch, 14 + v, W12 * normal + W22 * t2 + W2J * x)
+            store(scratch, 20 + v, W1J * normal + W2J * t2 + pJ * x)
+        for v in range(6):
+            i, k = FIRST[v], SECOND[v]
+            for w in range(v, 6):
+                m, n = FIRST[w], SECOND[w]
+                d = load(scratch, 8 + v) * (2.0 if w < 3 else 0.0)
+                d = d + load(scratch, 14 + v) * load(scratch, 2 + w)
+                d = d + load(scratch, 20 + v) * load(X, w)
+                d = d - p * (
+                    load(X, VOIGT[i, m]) * load(X, VOIGT[k, n])
+                    + load(X, VOIGT[i, n]) * load(X, VOIGT[k, m])
+                )
+                if v == w and v > 2:
+                    d = d - 2.0 * W2
+                if v != w and w < 3:
+                    d = d + 4.0 * W2
+                store(D, 6 * v + w, d)
+                store(D, 6 * w + v, d)
+    return square
+
+
+@njit
+def _spread(F, S, weight, g, P, fe):
+    """Add the nodal forces of stress F S at a point of volume `weight` to fe (rows 3 a + i)."""
+    for i in range(3):
+        for j in range(3):
+            stress = load(F, 3 * i) * load(S, VOIGT[0, j])
+            stress = stress + load(F, 3 * i + 1) * load(S, VOIGT[1, j])
+            stress = stress + load(F, 3 * i + 2) * load(S, VOIGT[2, j])
+            store(P, 3 * i + j, weight * stress)
+    for a in range(g.shape[0] // 3):
+        g0, g1, g2 = load(g, 3 * a), load(g, 3 * a + 1), load(g, 3 * a + 2)
+        for i in range(3):
+            force = load(P, 3 * i) * g0 + load(P, 3 * i + 1) * g1 + load(P, 3 * i + 2) * g2
+            store(fe, 3 * a + i, load(fe, 3 * a + i) + force)
+
+
+@njit
+def _push_forward(F, D, S, weight, finite, T, A):
+    """Set A (rows ((i 3 + k) 3 + J) 3 + L) to dP_iJ/dF_kL times the volume of the point."""
+    for J in range(3):
+        d0, d1, d2 = 6 * VOIGT[0, J], 6 * VOIGT[1, J], 6 * VOIGT[2, J]
+        for i in range(3):
+            f0, f1, f2 = load(F, 3 * i), load(F, 3 * i + 1), load(F, 3 * i + 2)
+            for v in range(6):
+                t = f0 * load(D, d0 + v) + f1 * load(D, d1 + v) + f2 * load(D, d2 + v)
+                store(T, v, weight * t)
+            for k in range(3):
+                f0, f1, f2 = load(F, 3 * k), load(F, 3 * k + 1), load(F, 3 * k + 2)
+                for L in range(3):
+                    a = load(T, VOIGT[0, L]) * f0
+                    a = a + load(T, VOIGT[1, L]) * f1
+                    a = a + load(T, VOIGT[2, L]) * f2
+                    if i == k:
+                        a = a + finite * weight * load(S, VOIGT[J, L])
+                    store(A, ((3 * i + k) * 3 + J) * 3 + L, a)
+
+
+@njit
+def _stiffness(A, g, dim, C, K):
+    """Add g_a A g_b to K for all pairs of nodes a <= b, rows (pair, i, k)."""
+    first = 0
+    for b in range(g.shape[0] // 3):
+        g0, g1, g2 = load(g, 3 * b), load(g, 3 * b + 1), load(g, 3 * b + 2)
+        for r in range(27):
+            store(C, r, load(A, 3 * r) * g0 + load(A, 3 * r + 1) * g1 + load(A, 3 * r + 2) * g2)
+        for i in range(dim):
+            for k in range(dim):
+                r = 3 * (3 * i + k)
+                c0, c1, c2 = load(C, r), load(C, r + 1), load(C, r + 2)
+                for a in range(b + 1):
+                    at = first + (a * dim + i) * dim + k
+                    value = load(g, 3 * a) * c0 + load(g, 3 * a + 1) * c1
+                    value = value + load(g, 3 * a + 2) * c2
+                    store(K, at, load(K, at) + value)
+        first += (b + 1) * dim * dim
+
+
+@njit
+def _lowest(values, count, low):
+    """Return the smallest of `low` and `count` values; what is no number counts as -inf."""
+    for lane in range(count):
+        value = values[0, lane]
+        low = min(low, value if value == value else -np.inf)
+    return low
+
+
+@njit
+def _scatter(fe, cells, start, count, force):
+    for lane in range(count):
+        for a in range(cells.shape[1]):
+            for i in range(force.shape[1]):
+                force[cells[start + lane, a], i] += fe[3 * a + i, lane]
+
+
+@njit(error_model="numpy", cache=True)
+def _force(law, c, needs, finite, u, cells, dN, dV, force):
+    """Add the internal force of displacements u (N, D) to force (N, D); return min det F - 1."""
+    rows = 3 * cells.shape[1]
+    ue, fe, g = np.zeros((rows, WIDTH)), np.zeros((rows, WIDTH)), np.zeros((rows, WIDTH))
+    H, P, D = np.zeros((9, WIDTH)), np.zeros((9, WIDTH)), np.zeros((36, WIDTH))
+    e, X, S = np.zeros((6, WIDTH)), np.zeros((6, WIDTH)), np.zeros((6, WIDTH))
+    weight, scratch, low = np.zeros((1, WIDTH)), np.zeros((26, WIDTH)), np.inf
+    for start in range(0, len(cells), WIDTH):
+        count = min(WIDTH, len(cells) - start)
+        _gather(u, cells, start, count, ue)
+        fe[:] = 0.0
+        for q in range(dN.shape[1]):
+            _shape(dN, dV, start, count, q, g, weight)
+            _gradient(ue, g, H)
+            store(scratch, 0, _volume_change(H))
+            low = _lowest(scratch, count, low)
+            _strain(H, finite, e)
+            _stress(law, c, needs, e, X, S, scratch, D, False)
+            for r in range(9):
+                store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
+            _spread(H, S, load(weight, 0), g, P, fe)
+        _scatter(fe, cells, start, count, force)
+    return low
+
+
+@njit(error_model="numpy", cache=True)
+def _system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values):
+    """Add force (N, D) and tangent (nnz + 1,) at displacements u (N, D).
+
+    With `gap` (blocks, Q, 6, WIDTH) the stress is that at the strain of u less the gap, moved to
+    the strain of u by the moduli there. Returns the smallest det C - 1 of the strains used.
+    """
+    n, Q, dim = cells.shape[1], dN.shape[1], dN.shape[3]
+    ue, fe, g = np.zeros((3 * n, WIDTH)), np.zeros((3 * n, WIDTH)), np.zeros((3 * n, WIDTH))
+    H, P, D = np.zeros((9, WIDTH)), np.zeros((9, WIDTH)), np.zeros((36, WIDTH))
+    e, X, S, T = (
+        np.zeros((6, WIDTH)),
+        np.zeros((6, WIDTH)),
+        np.zeros((6, WIDTH)),
+        np.zeros((6, WIDTH)),
+    )
+    A, C, K = np.zeros((81, WIDTH)), np.zeros((27, WIDTH)), np.zeros((places.shape[1], WIDTH))
+    weight, scratch, low = np.zeros((1, WIDTH)), np.zeros((26, WIDTH)), np.inf
+    for start in range(0, len(cells), WIDTH):
+        block, count = start // WIDTH, min(WIDTH, len(cells) - start)
+        _gather(u, cells, start, count, ue)
+        fe[:] = 0.0
+        K[:] = 0.0
+        for q in range(Q):
+            _shape(dN, dV, start, count, q, g, weight)
+            _gradient(ue, g, H)
+            _strain(H, finite, e)
+            mixed = len(gap) > 0
+            if mixed:
+                for v in range(6):
+                    store(e, v, load(e, v) - load(gap[block, q], v))
+            store(scratch, 0, _stress(law, c, needs, e, X, S, scratch, D, True))
+            low = _lowest(scratch, count, low)
+            for r in range(9):
+                store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
+            _push_forward(H, D, S, load(weight, 0), finite, T, A)
+            if mixed:
+                for v in range(6):
+                    stress = load(S, v)
+                    for w in range(6):
+                        half = 0.5 if w < 3 else 1.0
+                        stress = stress + half * load(D, 6 * v + w) * load(gap[block, q], w)
+                    store(S, v, stress)
+            _spread(H, S, load(weight, 0), g, P, fe)
+            _stiffness(A, g, dim, C, K)
+        _scatter(fe, cells, start, count, force)
+        for r in range(places.shape[1]):
+            for lane in range(count):
+                values[places[block, r, lane]] += K[r, lane]
+    return low
+
+
+@njit(error_model="numpy", cache=True)
+def _widen(law, gap, length, update, cells, dN, dV):
+    """Return (1 - length) gap + length^2 dH^T dH, (blocks, Q, 6, WIDTH), of a step (N, D)."""
+    rows, Q = 3 * cells.shape[1], dN.shape[1]
+    wider = np.zeros((-(-len(cells) // WIDTH), Q, 6, WIDTH))
+    ue, g = np.zeros((rows, WIDTH)), np.zeros((rows, WIDTH))
+    H, weight = np.zeros((9, WIDTH)), np.zeros((1, WIDTH))
+    for start in range(0, len(cells), WIDTH):
+        block, count = start // WIDTH, min(WIDTH, len(cells) - start)
+        _gather(update, cells, start, count, ue)
+        for q in range(Q):
+            _shape(dN, dV, start, count, q, g, weight)
+            _gradient(ue, g, H)
+            if len(gap) > 0:
+                for v in range(6):
+                    store(wider[block, q], v, (1.0 - length) * load(gap[block, q], v))
+            _quadratic(H, length * length, wider[block, q])
+    return wider
+
+
+class Kernels:
+    """The compiled loops of one body.
+
+    Attributes:
+        material: The law.
+        cells: (E, A).
+        dN: (E or 1, Q, A, D).
+        dV: (E or 1, Q).
+        places: Where each entry of a cell's matrix goes among the nnz + 1 values (the last one for
+            entries that are not kept), (blocks, A (A + 1)/2 D^2, WIDTH).
+    """
+
+    def __init__(
+        self,
+        material: Isotropic,
+        cells: NDArray[np.int64],
+        dN: Array,
+        dV: Array,
+        places: NDArray[np.int32],
+    ) -> None:
+        """Keep the arrays; compilation happens at the first call and is kept on disk."""
+        self.cells, self.dN, self.dV = cells, dN, dV
+        self.places = _in_blocks(places)
+        self.law = _Law(type(material))
+        self._law_arguments = (
+            self.law,
+            np.array(material.constants),
+            _needs(material),
+            float(material.finite),
+        )
+        self._nothing = np.zeros((0, 0, 0, WIDTH))
+
+    def force(self, u: Array, out: Array) -> float:
+        """Add the internal force (N, D) of u (N, D) to `out`; return min det F."""
+        return 1 + _force(*self._law_arguments, u, self.cells, self.dN, self.dV, out)
+
+    def system(self, u: Array, gap: Array | None, out: Array, values: Array) -> float:
+        """Add force and tangent (nnz + 1,) at u; return the smallest det C of the strains used."""
+        gap = self._nothing if gap is None else gap
+        arrays = (self.cells, self.dN, self.dV, self.places)
+        return 1 + _system(*self._law_arguments, u, gap, *arrays, out, values)
+
+    def widened(self, gap: Array | None, length: float, update: Array) -> Array:
+        """Return the gap between the strain of u and that of mixed points after a step."""
+        gap = self._nothing if gap is None else gap
+        return _widen(self.law, gap, length, update, self.cells, self.dN, self.dV)
+
+
+def _in_blocks(places: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return (E, entries) as (blocks, entries, WIDTH)."""
+    blocks = -(-len(places) // WIDTH)
+    padded = np.zeros((blocks * WIDTH, places.shape[1]), dtype=np.int32)
+    padded[: len(places)] = places
+    return np.ascontiguousarray(padded.reshape(blocks, WIDTH, -1).transpose(0, 2, 1))

@@ -1,0 +1,167 @@
+"""Conjugate gradients, alone or with algebraic multigrid: little memory, for very large bodies."""
+
+import importlib
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+
+from dpl.fem.sparse import (
+    Array,
+    Pattern,
+    SingularMatrix,
+    SymmetricProduct,
+    full_matrix,
+    require_finite,
+    row_numbers,
+)
+
+Map = Callable[[Array], Array]  # (n,) -> (n,)
+
+
+def conjugate_gradients(
+    product: Map, precondition: Map, right: Array, rtol: float, max_iter: int
+) -> Array:
+    """Return x, (n,), with ||right - K x|| <= rtol ||right||.
+
+    Source: Hestenes, Stiefel (1952); Saad (2003), Iterative Methods, algorithm 9.1. The residual
+    is the one that the recursion carries: the true one ends where rounding ends it.
+
+    Args:
+        product: x -> K x.
+        precondition: r -> approximately K^-1 r, symmetric positive definite.
+        right: Right-hand side, (n,).
+        rtol: Where to stop [-].
+        max_iter: Products to spend at most.
+
+    Raises:
+        SingularMatrix: K is not positive definite, or `max_iter` is not enough.
+    """
+    x = np.zeros_like(right)
+    enough = rtol * np.linalg.norm(right)
+    if enough == 0:
+        return x
+    residual = right.copy()
+    z = precondition(residual)
+    direction, rz = z.copy(), residual @ z
+    for _ in range(max_iter):
+        image = product(direction)
+        curvature = direction @ image
+        if not (curvature > 0 and rz > 0):
+            raise SingularMatrix("the matrix is not positive definite: negative curvature")
+        length = rz / curvature
+        x += length * direction
+        residual -= length * image
+        if np.linalg.norm(residual) <= enough:
+            return x
+        z = precondition(residual)
+        rz, before = residual @ z, rz
+        direction *= rz / before
+        direction += z
+    raise SingularMatrix(f"no convergence to {rtol:g} in {max_iter} conjugate gradient steps")
+
+
+def rigid_motions(points: Array, free: NDArray[np.bool_]) -> Array:
+    """Return the translations and linear rotations of nodes, (n, 6), in 2D (n, 3).
+
+    Args:
+        points: Nodes, (N, D) [-].
+        free: Degrees of freedom that may move, (N, D), n of them.
+    """
+    dim = points.shape[1]
+    x = points - points.mean(axis=0)
+    motions = [np.broadcast_to(axis, x.shape)[free] for axis in np.eye(dim)]
+    for i, j in [(1, 2), (0, 2), (0, 1)] if dim == 3 else [(0, 1)]:
+        turn = np.zeros_like(x)
+        turn[:, i], turn[:, j] = -x[:, j], x[:, i]
+        motions.append(turn[free])
+    return np.stack(motions, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class CGFactor:
+    """A matrix and its preconditioner.
+
+    Attributes:
+        product: x -> K x.
+        precondition: r -> approximately K^-1 r.
+        max_iter: Conjugate gradient steps a solve may take.
+        negative_pivots: 0; a solve that meets negative curvature raises.
+    """
+
+    product: SymmetricProduct
+    precondition: Map
+    max_iter: int
+    negative_pivots: int = 0
+
+    def solve(self, right: Array, rtol: float = 1e-12) -> Array:
+        """Return x, (n,), see `Factor.solve`."""
+        try:
+            return conjugate_gradients(self.product, self.precondition, right, rtol, self.max_iter)
+        except np.linalg.LinAlgError as error:  # from the coarsest grid's Cholesky
+            raise SingularMatrix(f"the matrix is not positive definite: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class CG:
+    """Conjugate gradients for positive definite matrices; others raise, in `solve` if not before.
+
+    With the near-nullspace and pyamg: preconditioned by smoothed aggregation (Vanek, Mandel,
+    Brezina 1996), whose steps hardly grow with the body. Otherwise by the diagonal.
+
+    Attributes:
+        pattern: Structure of the matrices.
+        near_null: Fields that cost no energy, (n, k), see `rigid_motions`.
+    """
+
+    pattern: Pattern
+    near_null: Array | None = None
+
+    def factorise(self, values: Array) -> CGFactor:
+        """Return the factor, see `Backend.factorise`."""
+        require_finite(values)
+        product = SymmetricProduct(self.pattern, values.copy())
+        if not (product.diagonal > 0).all():
+            raise SingularMatrix("the matrix is not positive definite: its diagonal is not")
+        if self.near_null is not None and multigrid_installed():
+            return CGFactor(product, self._multigrid(values, self.near_null), max_iter=300)
+        inverse = 1 / product.diagonal
+        return CGFactor(product, lambda residual: inverse * residual, max_iter=5000)
+
+    def _multigrid(self, values: Array, near_null: Array) -> Map:
+        pyamg: Any = importlib.import_module("pyamg")
+        whole = csr_matrix(full_matrix(self.pattern, values))  # pyamg wants SciPy's older classes
+        hierarchy = pyamg.smoothed_aggregation_solver(
+            whole.tobsr((self._block, self._block)),
+            B=near_null,
+            symmetry="symmetric",
+            strength=("symmetric", {"theta": 0.0}),
+            smooth=("jacobi", {"weighting": "local"}),  # other weightings draw random numbers
+            presmoother=("gauss_seidel", {"sweep": "forward"}),
+            postsmoother=("gauss_seidel", {"sweep": "backward"}),
+            improve_candidates=None,
+            max_coarse=300,
+            coarse_solver="cholesky",
+        )
+        return hierarchy.aspreconditioner().matvec
+
+    @cached_property
+    def _block(self) -> int:
+        """D where all nodes have D degrees of freedom that couple in full, else 1."""
+        n, nnz = self.pattern.size, len(self.pattern.indices)
+        dim = {6: 3, 3: 2}.get(0 if self.near_null is None else self.near_null.shape[1], 1)
+        if n % dim:
+            return 1
+        blocks = row_numbers(self.pattern).astype(np.int64) // dim * n + self.pattern.indices // dim
+        filled = len(np.unique(blocks)) * dim**2 - n // dim * (dim * (dim - 1) // 2)
+        return dim if filled == nnz else 1
+
+
+def multigrid_installed() -> bool:
+    """Return whether pyamg is there."""
+    return importlib.util.find_spec("pyamg") is not None

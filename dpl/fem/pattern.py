@@ -1,0 +1,120 @@
+"""Where the tangent has entries: analysed once per body, from its cells and its supports."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Upper triangle over the free degrees of freedom, in CSR with sorted columns.
+
+    Attributes:
+        size: n, the number of free degrees of freedom.
+        indptr, indices: CSR structure, (n + 1,) and (nnz,).
+        places: For pairs of a cell's nodes a <= b, b slowest, and their components i, k: where the
+            entry goes among the nnz; nnz where it is not kept, (E, A (A + 1)/2, D, D).
+        number: Number of each degree of freedom among the free ones, -1 where held, (N, D).
+    """
+
+    size: int
+    indptr: NDArray[np.int32]
+    indices: NDArray[np.int32]
+    places: NDArray[np.int32]
+    number: Integers
+
+    @classmethod
+    def build(cls, cells: Integers, free: NDArray[np.bool_]) -> "Pattern":
+        """Return the pattern of cells (E, A) whose degrees of freedom `free` (N, D) may move."""
+        nodes = len(free)
+        a, b = _pairs(cells.shape[1])
+        p, q = cells[:, a], cells[:, b]
+        codes, entry = np.unique(np.minimum(p, q) * nodes + np.maximum(p, q), return_inverse=True)
+        place, indptr, indices = _places(codes // nodes, codes % nodes, free)
+        places = place[entry.reshape(p.shape)]
+        turned = (p > q)[..., None, None]
+        places = np.where(turned, places.swapaxes(-1, -2), places)
+        return cls(
+            size=int(free.sum()),
+            indptr=indptr.astype(np.int32),
+            indices=indices.astype(np.int32),
+            places=places.astype(np.int32),
+            number=_numbered(free),
+        )
+
+    def between(self, rows: Integers, columns: Integers) -> NDArray[np.int64]:
+        """Return the places of equal components of linked nodes, (S, D) of (S,) and (S,)."""
+        row, column = self.number[rows], self.number[columns]
+        kept = (row >= 0) & (column >= row)
+        owner = np.repeat(np.arange(self.size), np.diff(self.indptr))
+        codes = owner * self.size + self.indices
+        found = np.searchsorted(codes, row * self.size + column)
+        return np.where(kept, found, len(codes))
+
+    @cached_property
+    def source(self) -> Tensor:
+        """For each kept entry of all cell matrices, laid out (E, A, i, k, A), its place in them."""
+        return torch.from_numpy(self._kept[0])
+
+    @cached_property
+    def target(self) -> Tensor:
+        """For each kept entry of all cell matrices its place among the nnz."""
+        return torch.from_numpy(self._kept[1])
+
+    @cached_property
+    def _kept(self) -> tuple[Integers, Integers]:
+        cells, pairs, dim, _ = self.places.shape
+        count = int((8 * pairs + 1) ** 0.5) // 2  # pairs = A (A + 1)/2
+        a, b = _pairs(count)
+        i, k = np.indices((dim, dim))
+        local = ((a[:, None, None] * dim + i) * dim + k) * count + b[:, None, None]
+        source = np.arange(cells)[:, None, None, None] * (count * dim) ** 2 + local
+        kept = self.places < len(self.indices)
+        return source[kept], self.places[kept].astype(np.int64)
+
+
+def _numbered(free: NDArray[np.bool_]) -> Integers:
+    """Return the number of each free degree of freedom, -1 where held, (N, D)."""
+    number = np.full(free.shape, -1)
+    number[free] = np.arange(free.sum())
+    return number
+
+
+def _pairs(count: int) -> tuple[Integers, Integers]:
+    """Return the pairs a <= b < count, b slowest."""
+    b, a = np.tril_indices(count)
+    return a, b
+
+
+def _places(
+    low: Integers, high: Integers, free: NDArray[np.bool_]
+) -> tuple[Integers, Integers, Integers]:
+    """Return places (T, D, D) of the T pairs of linked nodes low <= high, indptr and indices.
+
+    The pairs are sorted, and each node is linked with itself.
+    """
+    nodes, dim = free.shape
+    width = free.sum(axis=1)  # free components of a node
+    rank = free.cumsum(axis=1) - free  # how many of them come before each
+    number = _numbered(free)
+    same = low == high
+    before = np.concatenate([[0], np.cumsum(width[high])])
+    row_start = before[np.searchsorted(low, np.arange(nodes + 1))]
+    lengths = np.diff(row_start)[:, None] - rank  # of the rows of each node
+    indptr = np.concatenate([[0], np.cumsum(lengths[free])])
+    first = np.zeros(free.shape, dtype=np.int64)
+    first[free] = indptr[:-1]
+    offset = before[:-1] - row_start[low]  # of each pair in its node's first row
+    place = (first - rank)[low][:, :, None] + offset[:, None, None] + rank[high][:, None, :]
+    kept = free[low][:, :, None] & free[high][:, None, :]
+    kept &= ~(same[:, None, None] & np.tri(dim, k=-1, dtype=bool))
+    indices = np.empty(indptr[-1], dtype=np.int64)
+    columns = np.broadcast_to(number[high][:, None, :], place.shape)
+    indices[place[kept]] = columns[kept]
+    return np.where(kept, place, len(indices)), indptr, indices

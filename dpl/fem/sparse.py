@@ -1,0 +1,114 @@
+"""What all linear backends share: their interface, their error, the product with a half matrix."""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+Array = NDArray[np.float64]
+
+
+class Pattern(Protocol):
+    """Where a symmetric matrix has entries: the upper triangle in CSR, each row from its diagonal.
+
+    Every row has its diagonal entry, and columns are sorted.
+    """
+
+    @property
+    def size(self) -> int:
+        """n, the number of rows."""
+        ...
+
+    @property
+    def indptr(self) -> NDArray[np.int32]:
+        """Start of each row among the entries, (n + 1,)."""
+        ...
+
+    @property
+    def indices(self) -> NDArray[np.int32]:
+        """Column of each entry, (nnz,)."""
+        ...
+
+
+class SingularMatrix(ArithmeticError):
+    """The matrix has no usable factorisation, or an iteration on it does not end."""
+
+
+class Factor(Protocol):
+    """A factorised matrix, or what stands for it in an iterative backend."""
+
+    @property
+    def negative_pivots(self) -> int:
+        """Number of negative eigenvalues; iterative backends count 0 until they meet one."""
+        ...
+
+    def solve(self, right: Array, rtol: float = 1e-12) -> Array:
+        """Return x, (n,), with K x = right.
+
+        Args:
+            right: Right-hand side, (n,).
+            rtol: ||right - K x|| / ||right|| where iterative backends stop [-]; direct ones go
+                to rounding.
+
+        Raises:
+            SingularMatrix: An iterative backend met negative curvature or did not converge.
+        """
+        ...
+
+
+class Backend(Protocol):
+    """Factorises matrices of one pattern, on one thread; can be pickled, without its factors."""
+
+    def factorise(self, values: Array) -> Factor:
+        """Return the factor of the matrix with entries values (nnz,) on the pattern.
+
+        It serves as long as it lives, whatever the backend factorises next and whatever becomes
+        of `values`.
+
+        Raises:
+            SingularMatrix: An exact zero pivot, or entries that are not finite.
+        """
+        ...
+
+
+class SymmetricProduct:
+    """x -> K x from the upper triangle of K alone."""
+
+    def __init__(self, pattern: Pattern, values: Array) -> None:
+        """Take entries (nnz,); they are not copied."""
+        shape = (pattern.size, pattern.size)
+        self.upper = csr_array((values, pattern.indices, pattern.indptr), shape=shape)
+        self.lower = self.upper.T  # a view
+        self.diagonal = values[pattern.indptr[:-1]]
+
+    def __call__(self, x: Array) -> Array:
+        """Return K x, (n,)."""
+        product = self.upper @ x
+        product += self.lower @ x
+        product -= self.diagonal * x
+        return product
+
+
+def full_matrix(pattern: Pattern, values: Array) -> csr_array:
+    """Return the whole symmetric matrix (n, n) of upper-triangle entries (nnz,)."""
+    upper = csr_array((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
+    lower = upper.T.tocsr()
+    lower.setdiag(0)
+    lower.eliminate_zeros()
+    return (upper + lower).tocsr()
+
+
+def row_numbers(pattern: Pattern) -> NDArray[np.int32]:
+    """Return the row of each entry, (nnz,)."""
+    return np.repeat(np.arange(pattern.size, dtype=np.int32), np.diff(pattern.indptr))
+
+
+def require_finite(values: Array) -> None:
+    """Refuse entries that are not finite.
+
+    Raises:
+        SingularMatrix: There is one.
+    """
+    if not np.isfinite(values).all():
+        raise SingularMatrix("the matrix has entries that are not finite")

@@ -1,0 +1,412 @@
+"""Laws of regions: what they select of points, nodes and facets, and what files call parts."""
+
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+import skfem
+from skfem.io.meshio import to_meshio
+
+from dpl.fem.mesh import (
+    Box,
+    Cylinder,
+    Plane,
+    Sphere,
+    Tag,
+    box,
+    facets_in,
+    load,
+    nodes_in,
+    propeller,
+    rectangle,
+    save,
+)
+
+BAR = ([4.0, 1.0, 2.0], [5, 2, 3])
+ELEMENTS = {
+    ("hexahedron", 1): skfem.ElementHex1,
+    ("hexahedron", 2): skfem.ElementHex2,
+    ("tetra", 1): skfem.ElementTetP1,
+    ("tetra", 2): skfem.ElementTetP2,
+    ("quad", 1): skfem.ElementQuad1,
+    ("quad", 2): skfem.ElementQuad2,
+    ("triangle", 1): skfem.ElementTriP1,
+    ("triangle", 2): skfem.ElementTriP2,
+}
+
+
+@pytest.mark.parametrize(
+    ("region", "count"),
+    [
+        (Plane(0, "min"), 6),
+        (Plane(0, "max"), 6),
+        (Plane(0, 2.0), 6),
+        (Plane(1, 0.0), 15),
+        (Plane(2, "max"), 10),
+        (Plane(0, 2.5), 0),
+        (Box([1, 0, 0], [3, 1, 2]), 18),
+        (Box([0, 0, 0], [0, 0, 0]), 1),
+        (Box([0, 0, 1], [4, 1, 1]), 10),
+        (Box([5, 0, 0], [6, 1, 1]), 0),
+        (Sphere([0, 0, 0], 1.0), 4),
+        (Sphere([2, 0.5, 1], 0.5), 2),
+        (Sphere([2, 0.5, 1], 0.4), 0),
+        (Sphere([2, 0.5, 1], 100.0), 30),
+        (Cylinder(0, 1.0), 15),
+        (Cylinder(0, 0.5, [9, 0.5, 1]), 10),
+        (Cylinder(1, 1.0, [1, 7, 1]), 10),
+        (Cylinder(2, 1.0, [4, 1, 0]), 9),
+        (Cylinder(2, 0.5, [2, 0.5, 0]), 6),
+        (Cylinder(2, 0.4, [2, 0.5, 0]), 0),
+    ],
+)
+def test_region_selects_its_nodes(region, count):
+    points = box(*BAR).p.T
+    inside = region(points)
+    assert inside.shape == (30,)
+    assert inside.sum() == count
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_regions_forgive_rounding_at_every_scale(scale):
+    points = scale * box([0.3, 0.1, 0.1], [4, 2, 2]).p.T
+    side = 0.1 * scale
+    assert Plane(0, side)(points).sum() == 4
+    assert Box([0, 0, 0], [2 * side, side, side])(points).sum() == 12
+    assert Sphere([0, 0, 0], 3 * side)(points).sum() == 13
+    assert Cylinder(0, side)(points).sum() == 12
+
+
+def test_cylinder_about_z_is_a_disc_in_2d():
+    points = rectangle([2.0, 2.0], [3, 3]).p.T
+    assert Cylinder(2, 1.0, [1, 1])(points).sum() == 5
+    assert np.array_equal(Cylinder(2, 1.0, [1, 1])(points), Sphere([1, 1], 1.0)(points))
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Plane(3, "min"), "axis = 3"),
+        (lambda: Plane(0, "middle"), "at = 'middle'"),
+        (lambda: Plane(2, "min")(np.zeros((4, 2))), "axis = 2 does not exist in 2D"),
+        (lambda: Box([0, 0, 1], [1, 1, 0]), "lower"),
+        (lambda: Box([0, 0], [1, 1, 1]), "lower"),
+        (lambda: Box([0, 0, float("nan")], [1, 1, 1]), "lower"),
+        (lambda: Box([0, 0], [1, 1])(np.zeros((4, 3))), "must have 3 coordinates"),
+        (lambda: Sphere([0, 0, 0], 0.0), "radius = 0.0"),
+        (lambda: Sphere([0, float("inf"), 0], 1.0), "centre"),
+        (lambda: Sphere([0, 0], 1.0)(np.zeros((4, 3))), "must have 3 coordinates"),
+        (lambda: Cylinder(3, 1.0), "axis = 3"),
+        (lambda: Cylinder(0, float("nan")), "radius = nan"),
+        (lambda: Cylinder(0, -1.0), "radius = -1.0"),
+        (lambda: Cylinder(0, 1.0, [0, 0])(np.zeros((4, 3))), "must have 3 coordinates"),
+        (lambda: Tag(7), "in quotes"),
+        (lambda: Tag(""), "must be a text"),
+    ],
+)
+def test_region_that_cannot_be_is_an_error(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+def tagged(cell: str) -> skfem.Mesh:
+    """Return a bar or strip of length 4 with tags: facets "end", cells "half" (x < 2)."""
+    grid, dim = (box, 3) if cell in ("hexahedron", "tetra") else (rectangle, 2)
+    mesh = grid([4.0, 1.0, 2.0][:dim], [5, 2, 3][:dim], cell)
+    half = mesh.p[0, mesh.t].max(axis=0) <= 2.0
+    return mesh.with_boundaries({"end": lambda x: x[0] == 4.0}).with_subdomains(
+        {"half": np.flatnonzero(half)}
+    )
+
+
+@pytest.mark.parametrize(("cell", "degree"), ELEMENTS)
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 40.0])
+def test_a_tag_holds_the_nodes_of_its_facets_or_cells_whatever_the_degree(cell, degree, scale):
+    """A dimensionless mesh: its points times `scale` are metres."""
+    mesh = tagged(cell).scaled(1 / scale)
+    basis = skfem.Basis(mesh, ELEMENTS[cell, degree]())
+    for tag, region in (("end", Plane(0, "max")), ("half", lambda x: x[:, 0] <= 2 + 1e-9)):
+        inside = nodes_in(Tag(tag), basis, scale)
+        assert inside.shape == (basis.N,)
+        assert np.array_equal(inside, nodes_in(region, basis, scale))
+    assert nodes_in(Plane(0, 4.0), basis, scale).sum() == nodes_in(Tag("end"), basis, scale).sum()
+
+
+@pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 40.0])
+def test_facets_are_in_a_region_with_all_their_vertices(cell, scale):
+    mesh = tagged(cell).scaled(1 / scale)
+    dim = mesh.dim()
+    end = facets_in(Plane(0, 4.0), mesh, scale)
+    assert np.array_equal(end, np.sort(mesh.boundaries["end"]))
+    assert np.array_equal(facets_in(Tag("end"), mesh, scale), end)
+    half = facets_in(Tag("half"), mesh, scale)
+    lower = Box([0.0] * dim, [2.0, 1.0, 2.0][:dim])
+    assert np.array_equal(half, facets_in(lower, mesh, scale))
+    assert np.isin(half, mesh.boundary_facets()).all()
+    everything = facets_in(lambda x: np.ones(len(x), dtype=bool), mesh, scale)
+    assert np.array_equal(everything, mesh.boundary_facets())
+
+
+def test_a_region_that_selects_nothing_is_an_error_that_names_it():
+    mesh = tagged("hexahedron").with_boundaries(
+        {"none": np.array([], int), "inner": np.flatnonzero(box(*BAR).f2t[1] >= 0)}
+    )
+    basis = skfem.Basis(mesh, skfem.ElementHex1())
+    for region, name in (
+        (Plane(0, 0.3), r"Plane\(axis=0, at=0.3\)"),
+        (Tag("none"), r"Tag\(name='none'\)"),
+        (lambda x: np.zeros(len(x), dtype=bool), "lambda"),
+    ):
+        with pytest.raises(ValueError, match=f"{name}.* holds no node of the mesh"):
+            nodes_in(region, basis)
+        with pytest.raises(ValueError, match=f"{name}.* holds no facet of the boundary"):
+            facets_in(region, mesh)
+    assert nodes_in(Tag("inner"), basis).any()
+    with pytest.raises(ValueError, match=r"'inner'.* holds no facet of the boundary"):
+        facets_in(Tag("inner"), mesh)
+    with pytest.raises(ValueError, match="holds no facet of the boundary"):
+        facets_in(Box([0, 0, 0], [4, 0, 0]), mesh)  # an edge: nodes, but no facet
+
+
+def test_a_tag_that_does_not_exist_says_which_there_are():
+    mesh = tagged("quad")
+    with pytest.raises(ValueError, match=r"Tag\(name='ends'\): the mesh has 'end', 'half'$"):
+        nodes_in(Tag("ends"), skfem.Basis(mesh, skfem.ElementQuad1()))
+    with pytest.raises(ValueError, match="the mesh has no tags at all"):
+        facets_in(Tag("ends"), rectangle([1, 1], [2, 2]))
+
+
+@pytest.mark.parametrize(
+    "answer", [lambda x: x[:, 0], lambda x: x > 0, lambda x: np.array([True]), lambda x: None]
+)
+def test_a_region_answers_with_one_truth_value_per_point(answer):
+    mesh = rectangle([1, 1], [3, 3])
+    with pytest.raises(ValueError, match="not one truth value each"):
+        nodes_in(answer, skfem.Basis(mesh, skfem.ElementQuad1()))
+    with pytest.raises(ValueError, match="not one truth value each"):
+        facets_in(answer, mesh)
+
+
+def test_bore_of_the_propeller_is_a_cylinder_and_a_tag():
+    mesh = propeller()
+    for element in (skfem.ElementHex1(), skfem.ElementHex2()):
+        basis = skfem.Basis(mesh, element, intorder=1)
+        inside = nodes_in(Cylinder(0, 0.05), basis)
+        assert np.array_equal(nodes_in(Tag("bore"), basis), inside)
+    assert np.array_equal(facets_in(Cylinder(0, 0.05), mesh), facets_in(Tag("bore"), mesh))
+    assert len(facets_in(Tag("bore"), mesh)) == 25 * 6
+
+
+GMSH_41 = """$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$PhysicalNames
+3
+2 1 "held end"
+3 1 "body"
+3 2 "far cell"
+$EndPhysicalNames
+$Entities
+0 0 2 2
+1 0 0 0 0 1 1 1 1 0
+2 1 0 0 1 1 1 1 7 0
+1 0 0 0 1 1 1 1 1 0
+2 1 0 0 2 1 1 2 1 2 0
+$EndEntities
+$Nodes
+1 13 5 20
+3 1 0 13
+20
+5
+6
+7
+8
+9
+10
+11
+12
+13
+14
+15
+16
+9 9 9
+0 0 0
+1 0 0
+2 0 0
+0 1 0
+1 1 0
+2 1 0
+0 0 1
+1 0 1
+2 0 1
+0 1 1
+1 1 1
+2 1 1
+$EndNodes
+$Elements
+4 4 1 4
+2 1 3 1
+1 5 11 14 8
+2 2 3 1
+2 6 9 15 12
+3 1 5 1
+3 5 6 9 8 11 12 15 14
+3 2 5 1
+4 6 7 10 9 12 13 16 15
+$EndElements
+"""
+
+
+def test_physical_groups_of_gmsh_are_tags_by_name_or_by_number(tmp_path):
+    """MSH 4.1 as Gmsh writes it, with a node that no cell uses: two cubes, x from 0 to 2."""
+    (tmp_path / "bar.msh").write_text(GMSH_41)
+    mesh = load(tmp_path / "bar.msh")
+    assert mesh.p.shape == (3, 12)
+    assert mesh.p[0, mesh.facets[:, facets_in(Tag("held end"), mesh)]].tolist() == [[0]] * 4
+    (between,) = mesh.boundaries["7"]
+    assert mesh.p[0, mesh.facets[:, between]].tolist() == [1] * 4
+    assert {name: list(cells) for name, cells in mesh.subdomains.items() if "=" not in name} == {
+        "body": [0, 1],
+        "far cell": [1],
+    }
+
+
+def side_blocks(mesh: skfem.Mesh, facets) -> tuple[str, np.ndarray]:
+    """Return the facets as cells of a file, listed in turn."""
+    kind = {(3, 4): "quad", (3, 3): "triangle", (2, 2): "line"}[mesh.dim(), len(mesh.facets)]
+    t = mesh.facets[:, facets]
+    return kind, (t[[0, 1, 3, 2]] if kind == "quad" else t).T
+
+
+@pytest.mark.parametrize("named", [True, False])
+@pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
+def test_physical_groups_of_msh_2_are_tags_too(tmp_path, cell, named):
+    """The third coordinate, the order of blocks and nodes without cells do not confuse them."""
+    mesh = tagged(cell)
+    flat = to_meshio(mesh)
+    kind = flat.cells[0].type
+    half = np.isin(np.arange(mesh.nelements), mesh.subdomains["half"])
+    body = flat.cells[0].data + 1
+    side, ends = side_blocks(mesh, mesh.boundaries["end"])
+    blocks = [(kind, body[half]), (side, ends + 1), (kind, body[~half])]
+    numbers = [np.full(len(data), n) for (_, data), n in zip(blocks, (5, 5, 6), strict=True)]
+    points = np.pad(mesh.p.T, ((1, 0), (0, 3 - mesh.dim())))
+    dim = mesh.dim()
+    names = {"half": [5, dim], "end": [5, dim - 1]} if named else {}
+    file = meshio.Mesh(
+        points,
+        blocks,
+        cell_data={"gmsh:physical": numbers, "gmsh:geometrical": numbers},
+        field_data={name: np.array(key) for name, key in names.items()},
+    )
+    meshio.write(tmp_path / "bar.msh", file, file_format="gmsh22")
+    again = load(tmp_path / "bar.msh")
+    assert again.p.shape == mesh.p.shape
+    end = again.boundaries["end" if named else "5"]
+    assert len(end) == len(ends)
+    assert (again.p[0, again.facets[:, end]] == 4.0).all()
+    first = again.subdomains["half" if named else "5"]
+    assert len(first) == half.sum()
+    assert again.p[0, again.t[:, first]].max() == 2.0
+    assert np.isin(np.arange(mesh.nelements), again.subdomains["6"]).sum() == (~half).sum()
+
+
+def test_sets_of_cells_and_nodes_are_tags(tmp_path):
+    """Abaqus: ELSET and NSET; a set of nodes stands for the facets that it fills."""
+    mesh = tagged("hexahedron")
+    flat = to_meshio(mesh)
+    sets = {
+        "end": np.flatnonzero(mesh.p[0] == 4.0),
+        "corner": np.array([0]),
+        "low": np.flatnonzero(mesh.p[0] <= 1.0),
+    }
+    file = meshio.Mesh(
+        flat.points, flat.cells, point_sets=sets, cell_sets={"half": [mesh.subdomains["half"]]}
+    )
+    meshio.write(tmp_path / "bar.inp", file)
+    again = load(tmp_path / "bar.inp")
+    basis = skfem.Basis(again, skfem.ElementHex1())
+    assert np.array_equal(again.subdomains["half"], mesh.subdomains["half"])
+    assert np.array_equal(nodes_in(Tag("end"), basis), nodes_in(Plane(0, "max"), basis))
+    assert np.array_equal(facets_in(Tag("end"), again), facets_in(Plane(0, "max"), again))
+    assert nodes_in(Tag("low"), basis).sum() == 12
+    with pytest.raises(ValueError, match=r"'corner'.* holds no node"):
+        nodes_in(Tag("corner"), basis)
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk"])
+@pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
+def test_whole_numbered_fields_are_tags(tmp_path, cell, suffix):
+    mesh = tagged(cell)
+    flat = to_meshio(mesh)
+    half = np.isin(np.arange(mesh.nelements), mesh.subdomains["half"]).astype(np.int64)
+    x = np.pad(mesh.p.T, ((0, 0), (0, 3 - mesh.dim())))
+    file = meshio.Mesh(
+        x,
+        [(flat.cells[0].type, flat.cells[0].data)],
+        cell_data={
+            "half": [half],
+            "material": [np.where(half == 1, 3, 8)],
+            "density": [half.astype(float)],
+        },
+        point_data={
+            "plane": mesh.p[0].astype(np.int64),
+            "end": (mesh.p[0] == 4.0).astype(np.int64),
+            "heat": mesh.p[0],
+            "normal": x.astype(np.int64),
+        },
+    )
+    meshio.write(tmp_path / f"bar{suffix}", file)
+    again = load(tmp_path / f"bar{suffix}")
+    assert set(again.subdomains) == {"half", "half=0", "half=1", "material=3", "material=8"}
+    assert set(again.boundaries) == {"end", "end=0", "end=1", *(f"plane={k}" for k in range(5))}
+    for name in ("half", "half=1", "material=3"):
+        assert np.array_equal(again.subdomains[name], mesh.subdomains["half"])
+    end = np.sort(mesh.boundaries["end"])
+    for name in ("end", "end=1", "plane=4"):
+        assert np.array_equal(facets_in(Tag(name), again), end)
+    assert len(again.boundaries["plane=2"]) == len(end)  # inner facets
+    with pytest.raises(ValueError, match="holds no facet of the boundary"):
+        facets_in(Tag("plane=2"), again)
+
+
+def test_numbers_of_cells_and_nodes_are_no_tags(tmp_path):
+    mesh = box([1.0, 1.0, 1.0], [12, 11, 11])
+    flat = to_meshio(mesh)
+    file = meshio.Mesh(
+        flat.points,
+        flat.cells,
+        cell_data={"id": [np.arange(mesh.nelements)]},
+        point_data={"id": np.arange(mesh.nvertices)},
+    )
+    meshio.write(tmp_path / "cube.vtu", file)
+    again = load(tmp_path / "cube.vtu")
+    assert not again.boundaries
+    assert not again.subdomains
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk"])
+@pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
+@pytest.mark.parametrize("quadratic", [False, True])
+def test_tags_survive_save_and_load(tmp_path, cell, suffix, quadratic):
+    mesh = tagged(cell).with_boundaries({"a:b=1": np.array([0, 3]), "none": np.array([], int)})
+    if quadratic:
+        kinds = {"hexahedron": skfem.MeshHex2, "tetra": skfem.MeshTet2}
+        kind = {**kinds, "quad": skfem.MeshQuad2, "triangle": skfem.MeshTri2}[cell]
+        mesh = (
+            kind.from_mesh(mesh).with_boundaries(mesh.boundaries).with_subdomains(mesh.subdomains)
+        )
+    path = Path(tmp_path / f"bar{suffix}")
+    save(path, mesh, {"x": mesh.p[0]})
+    again = load(path)
+    for old, new in ((mesh.boundaries, again.boundaries), (mesh.subdomains, again.subdomains)):
+        assert set(old) == set(new)
+        for name in old:
+            assert np.array_equal(np.sort(old[name]), new[name])
+    small = again.scaled(0.25)
+    assert {name: list(f) for name, f in small.boundaries.items()} == {
+        name: list(f) for name, f in again.boundaries.items()
+    }
+    assert set(small.subdomains) == set(again.subdomains)
