@@ -83,6 +83,7 @@ class Hybrid:
             yield state._replace(
                 iterations=state.iterations + first.iterations,
                 factorisations=state.factorisations + first.factorisations,
+                seconds=state.seconds + first.seconds,
             )
 
 

@@ -12,6 +12,7 @@ import math
 import sys
 import types
 import typing
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from pickle import UnpicklingError
@@ -25,17 +26,21 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from dpl.data.store import DataSetError
+from dpl.fem.linear import slow_blas
 from dpl.scene import Scene
 
 if typing.TYPE_CHECKING:
+    from dpl.fem.problem import Problem
     from dpl.module import Surrogate
 
 TRUSTED = ("dpl.", "torch.optim.", "lightning.")  # what a run's folder may name without being asked
 
 KEYS = {  # what a configuration may hold at its top
-    *("mesh", "degree", "clamped", "material", "young", "loads", "solver"),
+    *("mesh", "degree", "mean_dilatation", "clamped", "supports", "forces"),
+    *("material", "young", "loads", "solver"),
     *("data", "model", "loss", "optimizer", "scheduler", "trainer"),
     *("seed", "ckpt_path", "run", "folder", "tol"),
+    *("parts", "linear", "repeats", "count", "workers", "peers"),
 }
 
 
@@ -223,10 +228,26 @@ def build_scene(cfg: DictConfig) -> Scene:
     material, mesh, clamped = make(cfg, "material"), make(cfg, "mesh"), make(cfg, "clamped")
     if cfg.degree not in (1, 2):
         raise ConfigError(f"degree = {cfg.degree} must be 1 or 2")
-    try:
-        problem = Problem.build(mesh, material, fixed=clamped, degree=cfg.degree)
-    except ValueError as error:
-        raise ConfigError(f"clamped: {error}") from error
+    if not isinstance(cfg.mean_dilatation, bool):
+        raise ConfigError(f"mean_dilatation = {cfg.mean_dilatation!r} must be true or false")
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always", UserWarning)
+        try:
+            problem = Problem.build(
+                mesh,
+                material,
+                fixed=clamped,
+                supports=_parts(cfg, "supports"),
+                degree=cfg.degree,
+                mean_dilatation=cfg.mean_dilatation,
+            )
+        except ValueError as error:
+            key = "clamped or supports" if cfg.supports else "clamped"
+            told = str(error)
+            key = "mean_dilatation" if told.startswith("mean_dilatation") else key
+            raise ConfigError(f"{key}: {told.removeprefix('mean_dilatation: ')}") from error
+    for line in {str(w.message): None for w in warned if w.category is UserWarning}:
+        print(f"warning: {line}", file=sys.stderr)
     if loose := problem.loose_modes():
         raise ConfigError(
             f"clamped: {len(loose)} rigid modes are unconstrained: {', '.join(loose)}"
@@ -235,12 +256,31 @@ def build_scene(cfg: DictConfig) -> Scene:
     young = OmegaConf.to_container(cfg.young) if isinstance(cfg.young, ListConfig) else cfg.young
     if not _fits(young, float | Sequence[float]):
         raise ConfigError(f"young = {young!r} must be a modulus [Pa] or a range [low, high]")
-    loads = make(cfg, "loads", linear=solver.rest, young=young)
+    loads = make(cfg, "loads", linear=solver.rest, young=young, always=_always(cfg, problem))
     try:
         loads.modes  # noqa: B018  # which says whether there are so many
     except ValueError as error:
         raise ConfigError(f"loads: {error}") from error
     return Scene(problem, loads, solver)
+
+
+def _parts(cfg: DictConfig, key: str) -> list[Any]:
+    """Return the objects of a node that names several, {} or null for none."""
+    node = cfg[key]
+    if node is None:
+        return []
+    if not isinstance(node, DictConfig):
+        raise ConfigError(f"{key} = {node!r} must name its parts: {key}: {{name: {{...}}}}")
+    return [make(node, name) for name in node if node[name] is not None]
+
+
+def _always(cfg: DictConfig, problem: "Problem") -> torch.Tensor | None:
+    """Return the force that every load holds, (N, D) [-]; None if there is none."""
+    try:
+        forces = [part.on(problem) for part in _parts(cfg, "forces")]
+    except ValueError as error:
+        raise ConfigError(f"forces: {error}") from error
+    return torch.stack(forces).sum(dim=0) if forces else None
 
 
 def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
@@ -270,6 +310,8 @@ def show_plan(*parts: Any) -> None:
     lines = [line for part in parts for line in part.plan()]
     print("plan: skipped, because this scene does not need it")
     print("\n".join(f"  - {line}" for line in lines), flush=True)
+    if advice := slow_blas():
+        print(f"warning: {advice}", file=sys.stderr)
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:

@@ -86,6 +86,9 @@ class Scene:
             "cells": _digest(self.problem.cells.numpy()),
             "free": _digest(self.problem.free.numpy()),
             "degree": self.problem.degree,
+            "mean_dilatation": self.problem.mean_dilatation,
+            "prescribed": _digest(self.problem.prescribed.numpy()),
+            "springs": [_digest(part.numpy()) for part in self.problem.springs or ()],
             "law": {"name": type(law).__name__, **vars(law)},
             "loads": {
                 "name": type(loads).__name__,
@@ -93,6 +96,7 @@ class Scene:
                 "deflection": loads.deflection,
                 "patch": [float(radius) for radius in loads.patch],
                 "distribution": _name(loads.distribution),
+                "always": None if loads.always is None else _digest(loads.always.numpy()),
             },
             "tol": self.solver.tol,
         }
@@ -109,6 +113,10 @@ class Scene:
         low, high = loads.young_range
         young = f"E = {low:.4g} Pa" if low == high else f"E from {low:.4g} to {high:.4g} Pa"
         lines = [f"no E input, no samples per E: u/L depends on f/(E L^2) only ({young})"]
+        if problem.springs is None:
+            lines.append("no springs, nothing of theirs assembled")
+        elif low < high:
+            lines.append("springs are alpha / E: those of this scene grow with E, see its supports")
         if problem.equal_cells:
             lines.append(f"one set of shape gradients for {cells} equal cells")
         if points == 1:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dpl.fem.solution import Load, one_thread, solve
+from dpl.fem.solution import Load, Status, one_thread, solve
 from dpl.scene import Scene
 
 TRIES = 3  # of a load whose worker died, before it is given up
@@ -61,7 +61,7 @@ def outcome(scene: Scene, job: Job) -> Outcome:
     start = time.perf_counter()
     with one_thread():
         solution = solve(scene.solver, Load(load.force, load.young))
-    accepted = bool(solution.converged)
+    accepted = bool(solution.stable)
     return Outcome(
         job=job,
         force=load.force[0].numpy(),
@@ -73,7 +73,7 @@ def outcome(scene: Scene, job: Job) -> Outcome:
         load_factor=float(solution.load_factor),
         iterations=int(solution.iterations),
         seconds=time.perf_counter() - start,
-        reason="" if accepted else "not converged",
+        reason="" if accepted else str(Status(int(solution.status))),
     )
 
 

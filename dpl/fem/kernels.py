@@ -11,6 +11,7 @@ import inspect
 import math
 import sys
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ SECOND = np.array([0, 1, 2, 1, 2, 2])
 
 
 class _LawType(types.Type):
-    """numba's type of a law: its name holds a digest of all code that a kernel is made of.
+    """Type of a law in numba: its name holds a digest of all code that a kernel is made of.
 
     So a kernel is compiled once per law, and one compiled from other sources is never taken from
     numba's cache on disk.
@@ -54,9 +55,9 @@ class _Law:
 
     material: type[Isotropic]
 
-    @property
+    @cached_property
     def kind(self) -> _LawType:
-        """Numba's type."""
+        """The law's type in numba."""
         name = self.material.__qualname__
         functions = [self.material.slopes, *_helpers(self.material.slopes)]
         source = "".join(inspect.getsource(f) for f in functions)
@@ -130,29 +131,37 @@ def _gather(field, cells, start, count, out):
 
 
 @njit
-def _shape(dN, dV, start, count, q, g, weight):
-    """Copy gradients to rows 3 a + j of `g` and volumes to `weight`, zero past the last cell."""
+def _shape(dN, dV, start, count, g, weight):
+    """Copy gradients to g (Q, 3 a + j, lane) and volumes to weight, zero past the last cell.
+
+    Equal cells share one set, which is copied for the first block and for one that is not full.
+    """
     several = dN.shape[0] > 1
-    for lane in range(WIDTH):
-        cell = start + min(lane, count - 1) if several else 0
-        weight[0, lane] = dV[cell, q] if lane < count else 0.0
-        for a in range(dN.shape[2]):
-            for j in range(dN.shape[3]):
-                g[3 * a + j, lane] = dN[cell, q, a, j]
+    if not several and start > 0 and count == WIDTH:
+        return
+    for q in range(dN.shape[1]):
+        for lane in range(WIDTH):
+            cell = start + min(lane, count - 1) if several else 0
+            weight[q, lane] = dV[cell, q] if lane < count else 0.0
+            for a in range(dN.shape[2]):
+                for j in range(dN.shape[3]):
+                    g[q, 3 * a + j, lane] = dN[cell, q, a, j]
 
 
 @njit
 def _gradient(ue, g, H):
     """Set H (rows 3 i + j) to sum_a u_a g_a^T."""
-    for r in range(9):
-        store(H, r, 0.0)
-    for a in range(g.shape[0] // 3):
-        g0, g1, g2 = load(g, 3 * a), load(g, 3 * a + 1), load(g, 3 * a + 2)
-        for i in range(3):
-            u = load(ue, 3 * a + i)
-            store(H, 3 * i, load(H, 3 * i) + u * g0)
-            store(H, 3 * i + 1, load(H, 3 * i + 1) + u * g1)
-            store(H, 3 * i + 2, load(H, 3 * i + 2) + u * g2)
+    for i in range(3):
+        u = load(ue, i)
+        h0, h1, h2 = u * load(g, 0), u * load(g, 1), u * load(g, 2)
+        for r in range(3, g.shape[0], 3):
+            u = load(ue, r + i)
+            h0 = h0 + u * load(g, r)
+            h1 = h1 + u * load(g, r + 1)
+            h2 = h2 + u * load(g, r + 2)
+        store(H, 3 * i, h0)
+        store(H, 3 * i + 1, h1)
+        store(H, 3 * i + 2, h2)
 
 
 @njit
@@ -300,14 +309,17 @@ def _stiffness(A, g, dim, C, K):
         for r in range(27):
             store(C, r, load(A, 3 * r) * g0 + load(A, 3 * r + 1) * g1 + load(A, 3 * r + 2) * g2)
         for i in range(dim):
-            for k in range(dim):
-                r = 3 * (3 * i + k)
-                c0, c1, c2 = load(C, r), load(C, r + 1), load(C, r + 2)
-                for a in range(b + 1):
-                    at = first + (a * dim + i) * dim + k
-                    value = load(g, 3 * a) * c0 + load(g, 3 * a + 1) * c1
-                    value = value + load(g, 3 * a + 2) * c2
-                    store(K, at, load(K, at) + value)
+            r = 9 * i
+            c0, c1, c2 = load(C, r), load(C, r + 1), load(C, r + 2)
+            d0, d1, d2 = load(C, r + 3), load(C, r + 4), load(C, r + 5)
+            e0, e1, e2 = load(C, r + 6), load(C, r + 7), load(C, r + 8)
+            for a in range(b + 1):
+                g0, g1, g2 = load(g, 3 * a), load(g, 3 * a + 1), load(g, 3 * a + 2)
+                at = first + (a * dim + i) * dim
+                store(K, at, load(K, at) + g0 * c0 + g1 * c1 + g2 * c2)
+                store(K, at + 1, load(K, at + 1) + g0 * d0 + g1 * d1 + g2 * d2)
+                if dim == 3:
+                    store(K, at + 2, load(K, at + 2) + g0 * e0 + g1 * e1 + g2 * e2)
         first += (b + 1) * dim * dim
 
 
@@ -331,25 +343,25 @@ def _scatter(fe, cells, start, count, force):
 @njit(error_model="numpy", cache=True)
 def _force(law, c, needs, finite, u, cells, dN, dV, force):
     """Add the internal force of displacements u (N, D) to force (N, D); return min det F - 1."""
-    rows = 3 * cells.shape[1]
-    ue, fe, g = np.zeros((rows, WIDTH)), np.zeros((rows, WIDTH)), np.zeros((rows, WIDTH))
+    rows, Q = 3 * cells.shape[1], dN.shape[1]
+    ue, fe, g = np.zeros((rows, WIDTH)), np.zeros((rows, WIDTH)), np.zeros((Q, rows, WIDTH))
     H, P, D = np.zeros((9, WIDTH)), np.zeros((9, WIDTH)), np.zeros((36, WIDTH))
     e, X, S = np.zeros((6, WIDTH)), np.zeros((6, WIDTH)), np.zeros((6, WIDTH))
-    weight, scratch, low = np.zeros((1, WIDTH)), np.zeros((26, WIDTH)), np.inf
+    weight, scratch, low = np.zeros((Q, WIDTH)), np.zeros((26, WIDTH)), np.inf
     for start in range(0, len(cells), WIDTH):
         count = min(WIDTH, len(cells) - start)
         _gather(u, cells, start, count, ue)
+        _shape(dN, dV, start, count, g, weight)
         fe[:] = 0.0
-        for q in range(dN.shape[1]):
-            _shape(dN, dV, start, count, q, g, weight)
-            _gradient(ue, g, H)
+        for q in range(Q):
+            _gradient(ue, g[q], H)
             store(scratch, 0, _volume_change(H))
             low = _lowest(scratch, count, low)
             _strain(H, finite, e)
             _stress(law, c, needs, e, X, S, scratch, D, False)
             for r in range(9):
                 store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
-            _spread(H, S, load(weight, 0), g, P, fe)
+            _spread(H, S, load(weight, q), g[q], P, fe)
         _scatter(fe, cells, start, count, force)
     return low
 
@@ -362,7 +374,7 @@ def _system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values)
     the strain of u by the moduli there. Returns the smallest det C - 1 of the strains used.
     """
     n, Q, dim = cells.shape[1], dN.shape[1], dN.shape[3]
-    ue, fe, g = np.zeros((3 * n, WIDTH)), np.zeros((3 * n, WIDTH)), np.zeros((3 * n, WIDTH))
+    ue, fe, g = np.zeros((3 * n, WIDTH)), np.zeros((3 * n, WIDTH)), np.zeros((Q, 3 * n, WIDTH))
     H, P, D = np.zeros((9, WIDTH)), np.zeros((9, WIDTH)), np.zeros((36, WIDTH))
     e, X, S, T = (
         np.zeros((6, WIDTH)),
@@ -371,15 +383,15 @@ def _system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values)
         np.zeros((6, WIDTH)),
     )
     A, C, K = np.zeros((81, WIDTH)), np.zeros((27, WIDTH)), np.zeros((places.shape[1], WIDTH))
-    weight, scratch, low = np.zeros((1, WIDTH)), np.zeros((26, WIDTH)), np.inf
+    weight, scratch, low = np.zeros((Q, WIDTH)), np.zeros((26, WIDTH)), np.inf
     for start in range(0, len(cells), WIDTH):
         block, count = start // WIDTH, min(WIDTH, len(cells) - start)
         _gather(u, cells, start, count, ue)
+        _shape(dN, dV, start, count, g, weight)
         fe[:] = 0.0
         K[:] = 0.0
         for q in range(Q):
-            _shape(dN, dV, start, count, q, g, weight)
-            _gradient(ue, g, H)
+            _gradient(ue, g[q], H)
             _strain(H, finite, e)
             mixed = len(gap) > 0
             if mixed:
@@ -389,7 +401,7 @@ def _system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values)
             low = _lowest(scratch, count, low)
             for r in range(9):
                 store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
-            _push_forward(H, D, S, load(weight, 0), finite, T, A)
+            _push_forward(H, D, S, load(weight, q), finite, T, A)
             if mixed:
                 for v in range(6):
                     stress = load(S, v)
@@ -397,8 +409,8 @@ def _system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values)
                         half = 0.5 if w < 3 else 1.0
                         stress = stress + half * load(D, 6 * v + w) * load(gap[block, q], w)
                     store(S, v, stress)
-            _spread(H, S, load(weight, 0), g, P, fe)
-            _stiffness(A, g, dim, C, K)
+            _spread(H, S, load(weight, q), g[q], P, fe)
+            _stiffness(A, g[q], dim, C, K)
         _scatter(fe, cells, start, count, force)
         for r in range(places.shape[1]):
             for lane in range(count):
@@ -411,14 +423,14 @@ def _widen(law, gap, length, update, cells, dN, dV):
     """Return (1 - length) gap + length^2 dH^T dH, (blocks, Q, 6, WIDTH), of a step (N, D)."""
     rows, Q = 3 * cells.shape[1], dN.shape[1]
     wider = np.zeros((-(-len(cells) // WIDTH), Q, 6, WIDTH))
-    ue, g = np.zeros((rows, WIDTH)), np.zeros((rows, WIDTH))
-    H, weight = np.zeros((9, WIDTH)), np.zeros((1, WIDTH))
+    ue, g = np.zeros((rows, WIDTH)), np.zeros((Q, rows, WIDTH))
+    H, weight = np.zeros((9, WIDTH)), np.zeros((Q, WIDTH))
     for start in range(0, len(cells), WIDTH):
         block, count = start // WIDTH, min(WIDTH, len(cells) - start)
         _gather(update, cells, start, count, ue)
+        _shape(dN, dV, start, count, g, weight)
         for q in range(Q):
-            _shape(dN, dV, start, count, q, g, weight)
-            _gradient(ue, g, H)
+            _gradient(ue, g[q], H)
             if len(gap) > 0:
                 for v in range(6):
                     store(wider[block, q], v, (1.0 - length) * load(gap[block, q], v))

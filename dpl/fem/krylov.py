@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from dpl.fem.sparse import (
@@ -66,23 +65,6 @@ def conjugate_gradients(
     raise SingularMatrix(f"no convergence to {rtol:g} in {max_iter} conjugate gradient steps")
 
 
-def rigid_motions(points: Array, free: NDArray[np.bool_]) -> Array:
-    """Return the translations and linear rotations of nodes, (n, 6), in 2D (n, 3).
-
-    Args:
-        points: Nodes, (N, D) [-].
-        free: Degrees of freedom that may move, (N, D), n of them.
-    """
-    dim = points.shape[1]
-    x = points - points.mean(axis=0)
-    motions = [np.broadcast_to(axis, x.shape)[free] for axis in np.eye(dim)]
-    for i, j in [(1, 2), (0, 2), (0, 1)] if dim == 3 else [(0, 1)]:
-        turn = np.zeros_like(x)
-        turn[:, i], turn[:, j] = -x[:, j], x[:, i]
-        motions.append(turn[free])
-    return np.stack(motions, axis=1)
-
-
 @dataclass(frozen=True, eq=False)
 class CGFactor:
     """A matrix and its preconditioner.
@@ -116,7 +98,7 @@ class CG:
 
     Attributes:
         pattern: Structure of the matrices.
-        near_null: Fields that cost no energy, (n, k), see `rigid_motions`.
+        near_null: Fields that cost no energy, (n, k), see `Problem.rigid_motions`.
     """
 
     pattern: Pattern

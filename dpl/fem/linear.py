@@ -19,7 +19,7 @@ from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_info
 
 from dpl.fem.band import Band, Band32, band_layout
-from dpl.fem.krylov import CG, multigrid_installed, rigid_motions
+from dpl.fem.krylov import CG, multigrid_installed
 from dpl.fem.sparse import (
     Array,
     Backend,
@@ -42,7 +42,6 @@ __all__ = [
     "chosen",
     "full_matrix",
     "installed",
-    "rigid_motions",
     "slow_blas",
 ]
 
@@ -59,7 +58,7 @@ def backend(pattern: Pattern, name: str = "auto", near_null: Array | None = None
     Args:
         pattern: Structure of the matrices.
         name: "band", "band32", "pardiso", "superlu", "cg", or "auto", see `chosen`.
-        near_null: Fields that cost no energy, (n, k), see `rigid_motions`; "cg" wants them.
+        near_null: Fields that cost no energy, (n, k), see `Problem.rigid_motions`; "cg" wants them.
 
     Raises:
         ValueError: No such backend, or it is not installed.
@@ -85,7 +84,7 @@ def chosen(name: str, pattern: Pattern | None = None, near_null: Array | None = 
 
 # Measured on beams, cubes, stars, plates of 1,000 to 100,000 degrees of freedom: a band costs n b^2
 # operations, a sparse factor of a solid about n^2 slower ones, so b^2 / n decides.
-PAYS = {"pardiso": 30, "superlu": 100, "cg": 10}  # b^2 / n below which a band is faster
+PAYS = {"pardiso": 25, "superlu": 100, "cg": 10}  # b^2 / n below which a band is faster
 LARGE = {"pardiso": 100_000, "superlu": 30_000}  # n from which on multigrid is faster
 WIDE = 250  # b from which on float32 saves more than the iterations on it cost
 

@@ -536,7 +536,7 @@ class OgdenK2(Material):
         """
         if len(self.shear) != len(self.exponents) or not all(self.exponents):
             raise ValueError(
-                f"exponents = {list(self.exponents)} must be {len(self.shear)} numbers, none of them 0"
+                f"exponents = {list(self.exponents)} must be {len(self.shear)} numbers other than 0"
             )
         _check_moduli("sum of shear", sum(self.shear), self.bulk)
 

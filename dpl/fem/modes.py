@@ -62,7 +62,7 @@ def eigenmodes(linear: Linear, count: int) -> Modes:
     if loose := problem.loose_modes():
         raise ValueError(f"{len(loose)} rigid modes are unconstrained: {', '.join(loose)}")
     rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    stiffness = full_matrix(problem.pattern, problem.tangent(rest)[0].numpy())
+    stiffness = full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())
     inverse = LinearOperator((size, size), matvec=linear.factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(size)
     asked = min(count + 8, size - 2)
@@ -138,6 +138,7 @@ class ModalLoads:
         patch: Smallest and largest radius of the area over L [-].
         distribution: Draws q over its largest value, per mode.
         young: Young's modulus [Pa], or a range of which each load draws its own.
+        always: Force that every load holds besides, (N, D) [-]; none if left out.
     """
 
     linear: Linear
@@ -146,6 +147,7 @@ class ModalLoads:
     patch: Sequence[float] = (0.0, 1.0)
     distribution: Distribution = uniform
     young: float | Sequence[float] = 1.0
+    always: Tensor | None = None
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -222,6 +224,8 @@ class ModalLoads:
         radius = rng.uniform(self.patch[0], self.patch[1])
         inside = (points - centre).norm(dim=1) <= radius * (1 + 1e-9)
         force = torch.where(inside[:, None] & self.reach, self.modes.vectors @ q, 0.0)
+        if self.always is not None:
+            force = force + self.always
         return force, rng.uniform(*self.young_range)
 
     def __getstate__(self) -> dict[str, object]:

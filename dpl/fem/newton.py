@@ -133,13 +133,13 @@ class Newton:
             state, guessed = (start, True) if start.volume_ratio > 0 else (base, False)
         count.known, step = 0.0, 1.0
         yield self._report(state, force, count)
-        while not self._balanced(state, force, self.tol):
+        while not self._balanced(state, force, 1.0, self.tol):
             target = min(count.known + step, 1.0)
             tol = self.tol if target == 1.0 else self.loose
-            for iterate in self._correct(state, target * force, tol, count):
+            for iterate in self._correct(state, force, target, tol, count):
                 state = iterate
                 yield self._report(state, force, count)
-            if self._balanced(state, target * force, tol):
+            if self._balanced(state, force, target, tol):
                 base, count.known, step = state, target, 2 * step
             else:  # a guess that failed costs no load step
                 step, guessed = (step, False) if guessed else ((target - count.known) / 2, False)
@@ -153,14 +153,14 @@ class Newton:
             state = state._replace(jump=ahead * problem.prescribed[None])
 
     def _correct(
-        self, state: "_State", force: Tensor, tol: float, count: "_Count"
+        self, state: "_State", force: Tensor, target: float, tol: float, count: "_Count"
     ) -> Iterator["_State"]:
-        """Yield iterates under a fixed load until they balance it or cannot go on."""
+        """Yield iterates under `target` times a load until they balance it or cannot go on."""
         before = float("nan")
         for _ in range(self.max_iter):
-            ratio = float(self.problem.imbalance(state.internal, force))
+            ratio = self._ratio(state, force, target)
             try:
-                update = self._update(state, force, count, self._forcing(ratio, before))
+                update = self._update(state, target * force, count, self._forcing(ratio, before))
             except SingularMatrix:
                 return
             count.iterations += 1
@@ -169,7 +169,7 @@ class Newton:
                 return
             state = stepped
             yield state
-            if self._balanced(state, force, tol) or count.iterations >= self.budget:
+            if self._balanced(state, force, target, tol) or count.iterations >= self.budget:
                 return
             before = ratio
 
@@ -233,16 +233,27 @@ class Newton:
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def _state(self, displacement: Tensor, jump: Tensor, gap: Any = None) -> "_State":
-        return _State(displacement, *self.problem.evaluate(displacement), jump, gap)
+        return _State(displacement, *self.problem.evaluate(displacement), jump, gap, {})
 
-    def _balanced(self, state: "_State", force: Tensor, tol: float) -> bool:
-        balanced = self.problem.balanced(state.displacement, state.internal, force, tol)
-        return bool(balanced and state.volume_ratio > 0 and not state.jump.any())
+    def _ratio(self, state: "_State", force: Tensor, target: float) -> float:
+        """Return ||R_free|| / ||f|| under `target` times a load, evaluated once."""
+        if target not in state.ratios:
+            ratio = self.problem.imbalance(state.internal, target * force)
+            state.ratios[target] = float(ratio)
+        return state.ratios[target]
+
+    def _balanced(self, state: "_State", force: Tensor, target: float, tol: float) -> bool:
+        if not state.volume_ratio > 0 or state.jump.any():
+            return False
+        if (ratio := self._ratio(state, force, target)) < tol:
+            return True
+        u, internal = state.displacement, state.internal
+        return ratio < 1e-4 and bool(self.problem.balanced(u, internal, target * force, tol))
 
     def _report(
         self, state: "_State", force: Tensor, count: "_Count", end: Status | None = None
     ) -> Solution:
-        balanced = end is None and self._balanced(state, force, self.tol)
+        balanced = end is None and self._balanced(state, force, 1.0, self.tol)
         if balanced:
             end = Status.UNSTABLE if self._negative_pivots(state, count) > 0 else Status.CONVERGED
         elif end is None:
@@ -250,7 +261,7 @@ class Newton:
         factor = 1.0 if balanced else count.known
         return Solution(
             displacement=state.displacement,
-            residual=self.problem.imbalance(state.internal, force),
+            residual=torch.tensor([self._ratio(state, force, 1.0)], dtype=force.dtype),
             volume_ratio=state.volume_ratio,
             status=torch.tensor([int(end)]),
             negative_pivots=torch.tensor([count.negative_pivots]),
@@ -280,6 +291,7 @@ class _State(NamedTuple):
     volume_ratio: Tensor
     jump: Tensor
     gap: Any
+    ratios: dict[float, float]
 
 
 @dataclass

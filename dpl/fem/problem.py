@@ -335,6 +335,11 @@ class Problem:
         """Return the Green-Lagrange strain at the quadrature points, (B, E, Q, 3, 3) [-]."""
         return green_lagrange(self._gradient(displacement))
 
+    def bending(self, update: Tensor) -> Tensor:
+        """Return what a step's strain is beyond linear, dH^T dH / 2, (B, E, Q, 3, 3) [-]."""
+        dH = self._gradient(update)
+        return dH.mT @ dH / 2
+
     def mixed_system(self, displacement: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
         """Return force (B, N, D) and tangent (B, nnz) of Newton with mixed integration points.
 
@@ -387,8 +392,8 @@ class Problem:
         """
         if (kernels := self._kernels(update)) is not None:
             return kernels.widened(gap, length, update[0].contiguous().numpy())
-        dH = self._gradient(update)
-        return (0.0 if gap is None else (1 - length) * gap) + length**2 / 2 * dH.mT @ dH
+        wider = length**2 * self.bending(update)
+        return wider if gap is None else (1 - length) * gap + wider
 
     def _kernels(self, displacement: Tensor) -> Kernels | None:
         """Return the compiled loops, None where there are none."""

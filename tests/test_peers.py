@@ -1,0 +1,82 @@
+"""The benchmark of the mechanics times answers that are right."""
+
+import json
+import math
+import sys
+import textwrap
+
+import pytest
+
+from dpl import peers
+from dpl.fem.solution import solve
+
+
+def test_cases_are_the_fields_scenes():
+    problem, load = peers.CASES["S1"].build()
+    assert problem.shape == (4000, 3)
+    assert len(problem.cells) == 39 * 9 * 9
+    newtons = load.force.sum(dim=(0, 1)) * 4500.0 * problem.length**2
+    assert newtons.tolist() == pytest.approx([0, 0, -20100.0])
+
+
+@pytest.mark.parametrize("name", ["S1s", "S2"])
+def test_answer_of_a_case_is_the_one_that_the_codes_agree_on(name):
+    case = peers.CASES[name]
+    problem, load = case.build()
+    answer = solve(peers.Newton(problem), load)
+    assert case.error(problem, answer) < 1e-8
+
+
+def test_median_leaves_the_first_call_out():
+    calls = []
+    assert peers.median(lambda: calls.append(1), 3) >= 0
+    assert len(calls) == 4
+
+
+def test_peer_is_another_program_that_reads_cases_and_writes_times(tmp_path):
+    program = tmp_path / "other_beam.py"
+    program.write_text(
+        textwrap.dedent("""
+        import json, sys
+        cases = json.load(sys.stdin)
+        print("noise")
+        print(json.dumps({n: {"seconds": c["force"], "iterations": 7} for n, c in cases.items()}))
+        """)
+    )
+    times = peers.measured_peer(sys.executable, program, 1)
+    assert set(times) == set(peers.CASES)
+    assert times["S1"].seconds == 20100.0
+    assert times["S1"].iterations == 7
+
+
+def test_peer_that_fails_says_why(tmp_path):
+    program = tmp_path / "broken_beam.py"
+    program.write_text("raise SystemExit('no such library')\n")
+    with pytest.raises(OSError, match="no such library"):
+        peers.measured_peer(sys.executable, program, 1)
+
+
+def test_random_loads_are_counted(scene):
+    results = peers.robustness({"beam": lambda: scene}, 4, 0)
+    row = results["beam"]
+    assert row["loads"] == row["in one step"] == row["with load steps"] == 4
+    assert row["iterations"] >= 1
+    assert 0 < row["min det F"] <= 1
+
+
+def test_benchmark_script_refuses_unknown_parts(script, tmp_path):
+    done = script("benchmark", "parts=[nonsense]", cwd=tmp_path)
+    assert done.status == 2
+    assert "parts" in done.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_benchmark_script_writes_what_it_prints(script, tmp_path):
+    done = script(
+        "benchmark", "parts=[scenes,propeller]", "repeats=1", "linear=[auto]", cwd=tmp_path
+    )
+    assert done.status == 0, done.err
+    written = json.loads((tmp_path / "runs/benchmark/scenes.json").read_text())
+    assert math.isfinite(written["scenes"][0]["S1"]["seconds"])
+    assert "dolfinx" in done.out
