@@ -6,12 +6,15 @@ same as `Problem`'s tensor methods, which stay the reference; tests hold the two
 In here strains and stresses are 6 numbers, 11 22 33 12 23 13, strains as e = 2 E.
 """
 
+import contextlib
 import hashlib
 import inspect
 import math
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -461,9 +464,8 @@ class Kernels:
         """Keep the arrays; compilation happens at the first call and is kept on disk."""
         self.cells, self.dN, self.dV = cells, dN, dV
         self.places = _in_blocks(places)
-        self.law = _Law(type(material))
-        self._law_arguments = (
-            self.law,
+        self._law = (
+            _Law(type(material)),
             np.array(material.constants),
             _needs(material),
             float(material.finite),
@@ -472,18 +474,52 @@ class Kernels:
 
     def force(self, u: Array, out: Array) -> float:
         """Add the internal force (N, D) of u (N, D) to `out`; return min det F."""
-        return 1 + _force(*self._law_arguments, u, self.cells, self.dN, self.dV, out)
+        return 1 + self._call(_force, *self._law, u, self.cells, self.dN, self.dV, out)
 
     def system(self, u: Array, gap: Array | None, out: Array, values: Array) -> float:
         """Add force and tangent (nnz + 1,) at u; return the smallest det C of the strains used."""
         gap = self._nothing if gap is None else gap
         arrays = (self.cells, self.dN, self.dV, self.places)
-        return 1 + _system(*self._law_arguments, u, gap, *arrays, out, values)
+        return 1 + self._call(_system, *self._law, u, gap, *arrays, out, values)
 
     def widened(self, gap: Array | None, length: float, update: Array) -> Array:
         """Return the gap between the strain of u and that of mixed points after a step."""
         gap = self._nothing if gap is None else gap
-        return _widen(self.law, gap, length, update, self.cells, self.dN, self.dV)
+        law, *_ = self._law
+        return self._call(_widen, law, gap, length, update, self.cells, self.dN, self.dV)
+
+    def _call(self, kernel: Any, *arguments: Any) -> Any:
+        """Return what a kernel returns, compiled or found on disk at its first call."""
+        first = (kernel, arguments[0].kind.name)
+        if first in _READY:
+            return kernel(*arguments)
+        with _alone(Path(kernel.stats.cache_path)):
+            result = kernel(*arguments)
+        _READY.add(first)
+        return result
+
+
+_READY: set[tuple[Any, str]] = set()  # kernels and laws that this process has compiled or loaded
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Keep other processes from numba's cache meanwhile.
+
+    Two that save kernels of different laws at the same time would give their files one name, and a
+    law would be answered by the code of another. The second one of the same law finds it compiled.
+    """
+    try:
+        import fcntl
+
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / "kernels.lock").open("w")
+    except (ImportError, OSError):  # no such locks here, or a folder that numba cannot write either
+        yield
+        return
+    with lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 def _in_blocks(places: NDArray[np.int32]) -> NDArray[np.int32]:

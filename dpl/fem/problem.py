@@ -10,6 +10,7 @@ import numpy as np
 import skfem
 import torch
 from numpy.typing import NDArray
+from scipy.linalg import qr
 from torch import Tensor
 
 from dpl.fem.kernels import Kernels
@@ -404,7 +405,8 @@ class Problem:
         law = self.material
         if self.mean_dilatation or not isinstance(law, Isotropic):
             return None
-        arrays = (self.cells.numpy(), self.dN.numpy(), self.dV.numpy())
+        # Copies: sending a problem to a worker process moves the memory of its tensors.
+        arrays = [tensor.numpy().copy() for tensor in (self.cells, self.dN, self.dV)]
         places = self.pattern.places
         return Kernels(law, *arrays, places.reshape(len(places), -1))
 
@@ -550,7 +552,10 @@ class Problem:
             return names
         values, vectors = np.linalg.eigh(held)
         null = vectors[:, values < 1e-14 * max(1.0, values.max())]
-        return [names[k] for k in np.unique(np.abs(null).argmax(axis=0))]
+        if not null.size:
+            return []
+        _, pivots = qr(null.T, mode="r", pivoting=True)  # motions that span what is loose
+        return [names[k] for k in np.sort(pivots[: null.shape[1]])]
 
     @cached_property
     def _operator(self) -> Tensor:

@@ -1,0 +1,132 @@
+"""Figures of one style: black is the reference, colour is dpl; readable without colour."""
+
+import io
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dpl.fem.problem import Problem
+from dpl.verification.bodies import lattice
+
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+MARKS = "osD^vP"
+STYLE = {
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "axes.axisbelow": True,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "legend.handlelength": 1.8,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+}
+
+
+@contextmanager
+def picture(path: Path, height: float = 3.1) -> Iterator[Any]:
+    """Lend an empty figure as wide as a page, written to a file at the end."""
+    import matplotlib
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7.4, height), layout="constrained")
+        figure.get_layout_engine().set(w_pad=0.06, wspace=0.05)
+        yield figure
+        drawn = io.BytesIO()
+        figure.savefig(drawn, dpi=150)
+    palette = Image.open(drawn).convert("RGB").quantize(128)  # a third of the bytes
+    palette.save(path, optimize=True)
+
+
+def panel(figure: Any, place: int, x: str, y: str, title: str = "", **options: Any) -> Any:
+    """Return one of a figure's axes, labelled."""
+    ax = figure.add_subplot(1, options.pop("columns", 2), place)
+    ax.set(xlabel=x, ylabel=y, **options)
+    ax.set_title(title, loc="left")
+    ax.grid(True)
+    return ax
+
+
+def measured(ax: Any, x: Any, y: Any, k: int, label: str | None = None, **style: Any) -> None:
+    """Draw measured values, the k-th series."""
+    how = {"color": COLOURS[k], "marker": MARKS[k], "markersize": 3.8, "linewidth": 1.0}
+    ax.plot(x, y, **{**how, "label": label, **style})
+
+
+def reference(ax: Any, x: Any, y: Any, label: str | None = None) -> None:
+    """Draw printed values: open circles, measured ones show inside."""
+    ax.plot(
+        *(x, y, "o"),
+        **{"markersize": 6.5, "markerfacecolor": "none", "markeredgecolor": "black"},
+        **{"markeredgewidth": 0.8, "label": label, "zorder": 5},
+    )
+
+
+def triangle(ax: Any, x: float, y: float, order: int, *, rise: float = 2.0) -> None:
+    """Draw a triangle of a given order into a logarithmic plot, its right angle lower right."""
+    left, low = x / rise, y / rise**order
+    ax.fill([left, x, x], [low, low, y], facecolor="none", edgecolor="black", linewidth=0.7)
+    ax.annotate(
+        f"{order}", (x, math.sqrt(low * y)), (3, 0), textcoords="offset points", va="center"
+    )
+
+
+def side(ax: Any, problem: Problem, displacement: Tensor, colour: str, axes: Any = (0, 1)) -> None:
+    """Draw the cells of a grid, seen along the axis that is left out, deformed."""
+    from matplotlib.collections import LineCollection
+
+    points = problem.points.numpy()
+    nodes = lattice(points if len(axes) == points.shape[1] else points)
+    if points.shape[1] == 3:
+        nodes = nodes[:, 0]
+    seen = (points + displacement.numpy())[:, list(axes)][nodes]
+    k = problem.degree
+    outline = np.concatenate([seen[:, 0], seen[-1], seen[::-1, -1], seen[::-1][-1][::-1]])
+    ax.fill(*outline.T, facecolor=colour, alpha=0.25, linewidth=0)
+    lines = [*seen[::k], *seen.swapaxes(0, 1)[::k]]
+    ax.add_collection(LineCollection(lines, colors=colour, linewidths=0.6))
+
+
+def solid(ax: Any, problem: Problem, displacement: Tensor, colour: str) -> None:
+    """Draw the faces of a block of a grid, deformed, its cells outlined."""
+    from matplotlib.colors import LightSource, to_rgb
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+    nodes = lattice(problem.points.numpy())
+    places = (problem.points + displacement).numpy()
+    k, quads, lines = problem.degree, [], []
+    for axis in range(3):
+        for end in (0, -1):
+            face = np.moveaxis(nodes, axis, 0)[end]
+            quad = np.stack([face[:-1, :-1], face[1:, :-1], face[1:, 1:], face[:-1, 1:]], axis=-1)
+            quads.append(places[quad.reshape(-1, 4)])
+            lines += [places[row] for row in (*face[::k], *face.T[::k])]
+    ax.add_collection3d(
+        Poly3DCollection(
+            np.concatenate(quads),
+            facecolors=to_rgb(colour),
+            edgecolors="none",
+            shade=True,
+            lightsource=LightSource(225, 35),
+        )
+    )
+    ax.add_collection3d(Line3DCollection(lines, colors="black", linewidths=0.25, alpha=0.6))
+    low, high = places.min(axis=0), places.max(axis=0)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    ax.set_box_aspect(high - low, zoom=1.3)
+    ax.view_init(elev=14, azim=-60)
+    ax.set_axis_off()

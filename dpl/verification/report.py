@@ -1,0 +1,141 @@
+"""What a case returns, and the page that is made of it."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Row:
+    """A quantity, what it should be and what it is.
+
+    Attributes:
+        quantity: In words.
+        reference: As its source prints it; "< 1e-10" or "> 0.94" is a bound.
+        value: What was measured.
+        within: Relative difference allowed; None: one unit of the last digit printed.
+    """
+
+    quantity: str
+    reference: str
+    value: float
+    within: float | None = None
+
+    @property
+    def difference(self) -> float:
+        """Relative difference; NaN from a bound."""
+        if self.reference[0] in "<>":
+            return math.nan
+        known = float(self.reference)
+        return (self.value - known) / abs(known) if known else self.value
+
+    @property
+    def holds(self) -> bool:
+        """Whether the value is where it should be."""
+        if self.reference[0] in "<>":
+            bound = float(self.reference[1:])
+            return self.value < bound if self.reference[0] == "<" else self.value > bound
+        if self.within is not None:
+            return abs(self.difference) <= self.within
+        exponent = Decimal(self.reference).as_tuple().exponent
+        return abs(self.value - float(self.reference)) <= 1.000001 * 10.0 ** int(exponent)
+
+    def cells(self) -> tuple[str, ...]:
+        """Return the row of a table: two digits more than the source prints, misses in bold."""
+        if self.reference[0] in "<>":
+            shown, difference = f"{self.value:.4g}", "holds"
+        else:
+            digits = len(Decimal(self.reference).as_tuple().digits)
+            shown = f"{self.value:.{min(digits + 2, 12)}g}"
+            off = self.difference
+            difference = f"{100 * off:+.2f} %" if abs(off) >= 1e-3 else f"{off:+.1e}"
+        if not self.holds:
+            difference = f"**{difference if difference != 'holds' else 'misses'}**"
+        return self.quantity, self.reference, shown, difference
+
+
+@dataclass(frozen=True)
+class Section:
+    """What a case measured.
+
+    Attributes:
+        title: Of the section.
+        text: What is solved, and where the references are from.
+        rows: Of its table.
+        figures: File names with captions.
+        notes: What else was seen.
+        seconds: It took [s].
+    """
+
+    title: str
+    text: str
+    rows: list[Row]
+    figures: list[tuple[str, str]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+def measure(name: str, folder: Path) -> Section:
+    """Return a case's section; its figures and its numbers are written into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # some of these bodies lock on purpose
+        section = CASES[name](folder)
+    section = replace(section, seconds=time.perf_counter() - start)
+    (folder / f"{name}.json").write_text(json.dumps(asdict(section), indent=1) + "\n")
+    return section
+
+
+def page(folder: Path) -> str:
+    """Return the page of all sections whose numbers lie in a folder, in Markdown."""
+    sections = {}
+    for name in CASES:
+        if (path := folder / f"{name}.json").is_file():
+            data = json.loads(path.read_text())
+            data["rows"] = [Row(**row) for row in data["rows"]]
+            sections[name] = Section(**data)
+    lines = [
+        "# Verification",
+        "",
+        "Written by `python scripts/verify.py`; every number in the columns *dpl* and *difference*",
+        "is measured by that run, in float64 on one thread. The references are typed in as their",
+        "sources print them. A difference is relative and must lie within one unit of the last",
+        "digit printed or, where a section says so, within the tolerance given there; what does",
+        "not is set in **bold** and explained below its table. *An independent code* is a small",
+        "finite-element program written in NumPy for these references; it shares nothing with dpl.",
+        "In the figures, black is the reference and colour is dpl.",
+        "",
+        *_table(
+            ("case", "values", "as they should be", "largest relative difference", "seconds"),
+            [_summary(k, s) for k, s in enumerate(sections.values(), 1)],
+        ),
+    ]
+    for k, section in enumerate(sections.values(), 1):
+        lines += ["", f"## {k}. {section.title}", "", section.text]
+        for file, caption in section.figures:
+            lines += ["", f"![{caption}](verification/{file})", "", f"*{caption}*"]
+        header = ("quantity", "reference", "dpl", "difference")
+        lines += ["", *_table(header, [row.cells() for row in section.rows])]
+        for note in section.notes:
+            lines += ["", note]
+    return "\n".join(lines) + "\n"
+
+
+def _summary(number: int, section: Section) -> tuple[str, ...]:
+    off = [abs(r.difference) for r in section.rows if not math.isnan(r.difference)]
+    good = sum(row.holds for row in section.rows)
+    anchor = f"{number}-" + "".join(
+        c if c.isalnum() or c == "-" else "-" if c == " " else "" for c in section.title.lower()
+    )
+    counts = (str(len(section.rows)), str(good) if good == len(section.rows) else f"**{good}**")
+    largest = f"{max(off):.1e}" if off else ""
+    return (f"[{number}. {section.title}](#{anchor})", *counts, largest, f"{section.seconds:.0f}")
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    lines = [header, ["---"] * len(header), *rows]
+    return [f"| {' | '.join(cells)} |" for cells in lines]
