@@ -153,5 +153,8 @@ def residual_norm(prediction: Tensor, batch: Sample, physics: Physics) -> Tensor
 
 def _residual(prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
     """Return R where free, (B, N D) [-]."""
+    if not torch.is_grad_enabled():
+        internal = physics.problem.evaluate(prediction).internal
+        return torch.where(physics.problem.free, internal - batch.force, 0.0).flatten(1)
     parts = zip(prediction.split(CHUNK), batch.force.split(CHUNK), strict=True)
     return torch.cat([physics.problem.residual(*part) for part in parts]).flatten(1)

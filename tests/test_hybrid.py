@@ -9,7 +9,7 @@ import torch
 from dpl.fem.linear import SuperLU
 from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, solve
+from dpl.fem.solution import Load, Solution, Status, solve
 from dpl.hybrid import Direct, Hybrid, pick
 
 
@@ -75,7 +75,8 @@ def first_of(load):
 
 
 def same(one: Solution, other: Solution):
-    pairs = zip(one, other, strict=True)
+    """Whether two solutions agree to the last bit in all but the time that they took."""
+    pairs = zip(one._replace(seconds=other.seconds), other, strict=True)
     return all(torch.equal(torch.nan_to_num(a), torch.nan_to_num(b)) for a, b in pairs)
 
 
@@ -93,8 +94,7 @@ def counted(monkeypatch):
 
         monkeypatch.setattr(owner, name, wrapped)
 
-    counting(Problem, "tangent", "tangent")
-    counting(Problem, "mixed_system", "tangent")
+    counting(Problem, "linearise", "tangent")
     counting(SuperLU, "factorise", "factorise")
     return counts
 
@@ -184,8 +184,17 @@ def test_the_pick_rule_is_a_smaller_residual_with_nothing_inverted(
 ):
     def state(ratio, volume):
         zero = torch.zeros(1, dtype=torch.int64)
-        numbers = (torch.tensor([ratio]), torch.tensor([volume]), torch.tensor([False]))
-        return Solution(torch.zeros(1, 2, 3), *numbers, zero, zero, torch.zeros(1))
+        return Solution(
+            displacement=torch.zeros(1, 2, 3),
+            residual=torch.tensor([ratio]),
+            volume_ratio=torch.tensor([volume]),
+            status=torch.tensor([int(Status.NOT_CONVERGED)]),
+            negative_pivots=zero,
+            iterations=zero,
+            factorisations=zero,
+            load_factor=torch.zeros(1),
+            seconds=torch.zeros(1),
+        )
 
     assert pick(state(ratio_p, volume), state(ratio_1, 0.9)) is picked
 
@@ -267,7 +276,7 @@ def test_the_network_alone_is_judged_at_what_it_says(scene, loads, stubs, name, 
     assert torch.equal(torch.nan_to_num(answer.displacement), torch.nan_to_num(stubs[name]))
     ratio = problem.residual_ratio(stubs[name], loads.force)
     assert torch.equal(torch.nan_to_num(answer.residual), torch.nan_to_num(ratio))
-    assert torch.equal(answer.volume_ratio, problem.volume_ratio(stubs[name]))
+    assert torch.equal(answer.volume_ratio, problem.evaluate(stubs[name]).volume_ratio)
     assert answer.converged.all() == (name == "exact")
     assert answer.converged.any() == (name == "exact")
     assert not answer.iterations.any()

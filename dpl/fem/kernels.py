@@ -199,29 +199,40 @@ def _volume_change(H):
 
 
 @njit
-def _stress(law, c, needs, e, X, S, scratch, D, moduli):
-    """Set S and X = C^-1, and with `moduli` D = dS/dE (rows 6 I + J), at e; return det C - 1."""
+def _square(e):
+    """Return det C - 1 of C = I + e."""
+    e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
+    e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
+    m0, m1, m2 = e1 * e2 - e4 * e4, e0 * e2 - e5 * e5, e0 * e1 - e3 * e3
+    third = e0 * m0 - e3 * (e3 * e2 - e4 * e5) + e5 * (e3 * e4 - e1 * e5)
+    return e0 + e1 + e2 + m0 + m1 + m2 + third
+
+
+@njit
+def _stress(law, c, needs, e, j, X, S, scratch, D, moduli):
+    """Set S and X = C^-1, and with `moduli` D = dS/dE (rows 6 I + J), at e with det F = 1 + j.
+
+    Where det F is negative a law of ln J has no stress (NaN).
+    """
     e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
     e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
     i1 = e0 + e1 + e2
     m0, m1, m2 = e1 * e2 - e4 * e4, e0 * e2 - e5 * e5, e0 * e1 - e3 * e3
     second = m0 + m1 + m2
-    square = i1 + second + e0 * m0 - e3 * (e3 * e2 - e4 * e5) + e5 * (e3 * e4 - e1 * e5)
     if needs > 0:
-        inverse = 1.0 / (1.0 + square)
+        inverse = 1.0 / (1.0 + _square(e))
         store(X, 0, (1.0 + e1 + e2 + m0) * inverse)
         store(X, 1, (1.0 + e0 + e2 + m1) * inverse)
         store(X, 2, (1.0 + e0 + e1 + m2) * inverse)
         store(X, 3, (e4 * e5 - e3 - e3 * e2) * inverse)
         store(X, 4, (e3 * e5 - e4 - e0 * e4) * inverse)
         store(X, 5, (e3 * e4 - e5 - e1 * e5) * inverse)
-    store(scratch, 0, square)
+    store(scratch, 0, j)
     if needs > 1:
         for lane in range(WIDTH):
-            scratch[0, lane] = 0.5 * math.log1p(scratch[0, lane])
+            scratch[0, lane] = math.log1p(scratch[0, lane])
             if needs > 2:
                 scratch[1, lane] = math.expm1(-2 / 3 * scratch[0, lane])
-    j = square / (1.0 + sqrt(1.0 + square))
     i2 = 2.0 * i1 + second
     slopes = _slopes(law, c, i1, i2, j, load(scratch, 0), load(scratch, 1))
     rest, W2, p, W11, W12, W22, W1J, W2J, pJ = slopes
@@ -263,7 +274,6 @@ def _stress(law, c, needs, e, X, S, scratch, D, moduli):
                     d = d + 4.0 * W2
                 store(D, 6 * v + w, d)
                 store(D, 6 * w + v, d)
-    return square
 
 
 @njit
@@ -358,10 +368,11 @@ def _force(law, c, needs, finite, u, cells, dN, dV, force):
         fe[:] = 0.0
         for q in range(Q):
             _gradient(ue, g[q], H)
-            store(scratch, 0, _volume_change(H))
+            j = _volume_change(H)
+            store(scratch, 0, j)
             low = _lowest(scratch, count, low)
             _strain(H, finite, e)
-            _stress(law, c, needs, e, X, S, scratch, D, False)
+            _stress(law, c, needs, e, j, X, S, scratch, D, False)
             for r in range(9):
                 store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
             _spread(H, S, load(weight, q), g[q], P, fe)
@@ -374,7 +385,8 @@ def _system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values)
     """Add force (N, D) and tangent (nnz + 1,) at displacements u (N, D).
 
     With `gap` (blocks, Q, 6, WIDTH) the stress is that at the strain of u less the gap, moved to
-    the strain of u by the moduli there. Returns the smallest det C - 1 of the strains used.
+    the strain of u by the moduli there. Returns the smallest det C - 1 of such strains, infinity
+    without a gap.
     """
     n, Q, dim = cells.shape[1], dN.shape[1], dN.shape[3]
     ue, fe, g = np.zeros((3 * n, WIDTH)), np.zeros((3 * n, WIDTH)), np.zeros((Q, 3 * n, WIDTH))
@@ -397,11 +409,15 @@ def _system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values)
             _gradient(ue, g[q], H)
             _strain(H, finite, e)
             mixed = len(gap) > 0
+            j = _volume_change(H)
             if mixed:
                 for v in range(6):
                     store(e, v, load(e, v) - load(gap[block, q], v))
-            store(scratch, 0, _stress(law, c, needs, e, X, S, scratch, D, True))
-            low = _lowest(scratch, count, low)
+                square = _square(e)
+                store(scratch, 0, square)
+                low = _lowest(scratch, count, low)
+                j = square / (1.0 + sqrt(1.0 + square))
+            _stress(law, c, needs, e, j, X, S, scratch, D, True)
             for r in range(9):
                 store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
             _push_forward(H, D, S, load(weight, q), finite, T, A)
@@ -477,7 +493,7 @@ class Kernels:
         return 1 + self._call(_force, *self._law, u, self.cells, self.dN, self.dV, out)
 
     def system(self, u: Array, gap: Array | None, out: Array, values: Array) -> float:
-        """Add force and tangent (nnz + 1,) at u; return the smallest det C of the strains used."""
+        """Add force and tangent (nnz + 1,) at u; return the smallest det C of mixed points."""
         gap = self._nothing if gap is None else gap
         arrays = (self.cells, self.dN, self.dV, self.places)
         return 1 + self._call(_system, *self._law, u, gap, *arrays, out, values)

@@ -30,6 +30,14 @@ def balanced(newton: Newton, force: Tensor | None = None, guess: Tensor | None =
     return last
 
 
+NAMES = {
+    ("hexahedron", 1): "hex8",
+    ("hexahedron", 2): "hex27",
+    ("tetra", 1): "tet4",
+    ("tetra", 2): "tet10",
+}
+
+
 def paper_beam(
     law: Material, cells: Sequence[int], cell: str = "hexahedron", degree: int = 1
 ) -> Problem:

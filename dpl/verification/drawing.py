@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.problem import Problem
-from dpl.verification.bodies import lattice
+from dpl.verification.bodies import Array, lattice
 
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -85,19 +84,22 @@ def triangle(ax: Any, x: float, y: float, order: int, *, rise: float = 2.0) -> N
     )
 
 
-def side(ax: Any, problem: Problem, displacement: Tensor, colour: str, axes: Any = (0, 1)) -> None:
-    """Draw the cells of a grid, seen along the axis that is left out, deformed."""
+def side(ax: Any, places: Array, nodes: NDArray[np.int_], colour: str, step: int = 1) -> None:
+    """Draw a grid in a plane.
+
+    Args:
+        ax: Where.
+        places: Of the nodes, (N, 2).
+        nodes: By their places in the grid, see `lattice`, (n1, n2).
+        colour: Of cells and edges.
+        step: Nodes from one cell to the next, the degree of the displacement.
+    """
     from matplotlib.collections import LineCollection
 
-    points = problem.points.numpy()
-    nodes = lattice(points if len(axes) == points.shape[1] else points)
-    if points.shape[1] == 3:
-        nodes = nodes[:, 0]
-    seen = (points + displacement.numpy())[:, list(axes)][nodes]
-    k = problem.degree
-    outline = np.concatenate([seen[:, 0], seen[-1], seen[::-1, -1], seen[::-1][-1][::-1]])
-    ax.fill(*outline.T, facecolor=colour, alpha=0.25, linewidth=0)
-    lines = [*seen[::k], *seen.swapaxes(0, 1)[::k]]
+    seen = places[nodes]
+    outline = np.concatenate([seen[:, 0], seen[-1], seen[::-1, -1], seen[0, ::-1]])
+    ax.fill(*outline.T, facecolor=colour, alpha=0.3, linewidth=0)
+    lines = [*seen[::step], *seen.swapaxes(0, 1)[::step]]
     ax.add_collection(LineCollection(lines, colors=colour, linewidths=0.6))
 
 
@@ -130,3 +132,8 @@ def solid(ax: Any, problem: Problem, displacement: Tensor, colour: str) -> None:
     ax.set_box_aspect(high - low, zoom=1.3)
     ax.view_init(elev=14, azim=-60)
     ax.set_axis_off()
+
+
+def curve(ax: Any, x: Any, y: Any, label: str | None = None, linestyle: str = "-") -> None:
+    """Draw a known curve."""
+    ax.plot(x, y, color="black", linewidth=0.8, linestyle=linestyle, label=label, zorder=4)

@@ -34,12 +34,6 @@ ERRORS: dict[tuple[str, int], tuple[list[int], str, str]] = {
     ("tetra", 1): ([2, 4, 8, 16], "2.1458e-2 6.0357e-3 1.6041e-3 4.1073e-4", "2.0664e-2"),
     ("tetra", 2): ([1, 2, 4, 8], "1.5808e-2 2.6990e-3 3.4504e-4 4.2559e-5", "2.4995e-3"),
 }
-NAMES = {
-    ("hexahedron", 1): "hex8",
-    ("hexahedron", 2): "hex27",
-    ("tetra", 1): "tet4",
-    ("tetra", 2): "tet10",
-}
 
 
 def manufactured(x: Tensor) -> Tensor:
@@ -174,6 +168,7 @@ def cook(folder: Path) -> Section:
                 rows.append(Row(f"{what}, independent code", known, found[degree, n]))
             if (degree, n) == (2, 8):
                 shown, corner = (problem, u), _at(problem, u, 48, 60)
+                tip = _at(problem, u, 48, 52)
     rows += [
         Row("Q2, 8 × 8: u_x(48, 60) [mm]", "-13.8264", float(corner[0])),
         Row("Q2, 8 × 8: u_y(48, 60) [mm]", "13.7505", float(corner[1])),
@@ -198,14 +193,15 @@ def cook(folder: Path) -> Section:
         ax.legend(loc="lower right")
         ax = panel(figure, 2, "x [mm]", "y [mm]", "(b) Q2, 8 × 8 cells", aspect="equal")
         problem, u = shown
-        scale = problem.length
-        side(ax, problem, torch.zeros_like(u), "0.6")
-        side(ax, problem, u / scale, COLOURS[1])
-        ticks = np.arange(0, 80, 15)
-        ax.set_xticks(ticks[:5] / scale, ticks[:5])
-        ax.set_yticks(ticks / scale, ticks)
-        ax.plot(48 / scale, 52 / scale, "k.", (48 + u[0, 0] * 0) / scale, 52 / scale, "k.")
-        ax.annotate("(48, 52)", (48 / scale, 52 / scale), (4, -3), textcoords="offset points")
+        X = problem.points.numpy() * problem.length
+        x, y = X.T / 48
+        nodes = lattice(np.stack([x, (y * 48 - 44 * x) / (44 - 28 * x)], axis=1))
+        side(ax, X, nodes, "0.6", 2)
+        side(ax, X + u.numpy(), nodes, COLOURS[1], 2)
+        for place, text in (((48, 52), "(48, 52)"), (np.array([48, 52]) + tip.numpy(), "")):
+            ax.plot(*place, "k.", markersize=5)
+            ax.annotate(text, place, (4, -3), textcoords="offset points")
+        ax.set(xticks=range(0, 61, 15), yticks=range(0, 76, 15), xlim=(-3, 63), ylim=(-3, 78))
     return Section(
         "Cook's membrane",
         "A tapered panel (corners (0, 0), (48, 44), (48, 60), (0, 44) mm), clamped on the left, "

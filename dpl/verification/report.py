@@ -78,54 +78,7 @@ class Section:
     seconds: float = 0.0
 
 
-def measure(name: str, folder: Path) -> Section:
-    """Return a case's section; its figures and its numbers are written into a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
-    start = time.perf_counter()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # some of these bodies lock on purpose
-        section = CASES[name](folder)
-    section = replace(section, seconds=time.perf_counter() - start)
-    (folder / f"{name}.json").write_text(json.dumps(asdict(section), indent=1) + "\n")
-    return section
-
-
-def page(folder: Path) -> str:
-    """Return the page of all sections whose numbers lie in a folder, in Markdown."""
-    sections = {}
-    for name in CASES:
-        if (path := folder / f"{name}.json").is_file():
-            data = json.loads(path.read_text())
-            data["rows"] = [Row(**row) for row in data["rows"]]
-            sections[name] = Section(**data)
-    lines = [
-        "# Verification",
-        "",
-        "Written by `python scripts/verify.py`; every number in the columns *dpl* and *difference*",
-        "is measured by that run, in float64 on one thread. The references are typed in as their",
-        "sources print them. A difference is relative and must lie within one unit of the last",
-        "digit printed or, where a section says so, within the tolerance given there; what does",
-        "not is set in **bold** and explained below its table. *An independent code* is a small",
-        "finite-element program written in NumPy for these references; it shares nothing with dpl.",
-        "In the figures, black is the reference and colour is dpl.",
-        "",
-        *_table(
-            ("case", "values", "as they should be", "largest relative difference", "seconds"),
-            [_summary(k, s) for k, s in enumerate(sections.values(), 1)],
-        ),
-    ]
-    for k, section in enumerate(sections.values(), 1):
-        lines += ["", f"## {k}. {section.title}", "", section.text]
-        for file, caption in section.figures:
-            lines += ["", f"![{caption}](verification/{file})", "", f"*{caption}*"]
-        header = ("quantity", "reference", "dpl", "difference")
-        lines += ["", *_table(header, [row.cells() for row in section.rows])]
-        for note in section.notes:
-            lines += ["", note]
-    return "\n".join(lines) + "\n"
-
-
-def _summary(number: int, section: Section) -> tuple[str, ...]:
+def summary(number: int, section: Section) -> tuple[str, ...]:
     off = [abs(r.difference) for r in section.rows if not math.isnan(r.difference)]
     good = sum(row.holds for row in section.rows)
     anchor = f"{number}-" + "".join(
@@ -136,6 +89,6 @@ def _summary(number: int, section: Section) -> tuple[str, ...]:
     return (f"[{number}. {section.title}](#{anchor})", *counts, largest, f"{section.seconds:.0f}")
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     lines = [header, ["---"] * len(header), *rows]
     return [f"| {' | '.join(cells)} |" for cells in lines]

@@ -9,20 +9,54 @@ import torch
 from torch import Tensor
 
 from dpl.fem.forces import traction
-from dpl.fem.materials import Material, NeoHookeanLn, SaintVenantKirchhoff
+from dpl.fem.materials import (
+    LinearElastic,
+    Material,
+    MooneyRivlinK2,
+    NeoHookeanIsoK2,
+    NeoHookeanIsoK4,
+    NeoHookeanLn,
+    OgdenK2,
+    SaintVenantKirchhoff,
+    StableNeoHookean,
+    YeohK2,
+)
 from dpl.fem.mesh import Plane, box, rectangle
 from dpl.fem.problem import Problem
 
 torch.set_num_threads(1)
 
 YOUNG, LENGTH = 4500.0, 100.0  # of the beam of VERIFICATION 1.8e [Pa], [m]
+LAWS = {  # VERIFICATION 1.1 with its constants
+    "linear": LinearElastic(0.3),
+    "SVK": SaintVenantKirchhoff(0.3),
+    "NH-ln": NeoHookeanLn(0.3),
+    "NHiso-k2": NeoHookeanIsoK2(0.3),
+    "NHiso-k4": NeoHookeanIsoK4(0.3),
+    "SNH": StableNeoHookean(0.3),
+    "MR": MooneyRivlinK2(0.15, 0.05, 2.0),
+    "Yeoh": YeohK2(0.2, -0.02, 0.005, 2.0),
+    "Ogden3": OgdenK2((0.3, 0.1, 0.02), (1.3, 5.0, -2.0), 2.0),
+}
 KINDS = [(cell, d) for cell in ("triangle", "quad", "tetra", "hexahedron") for d in (1, 2)]
 
 
 @pytest.fixture(params=[SaintVenantKirchhoff, NeoHookeanLn], ids=["svk", "neo-hookean"])
 def law(request) -> Material:
-    """Both laws, at a Poisson ratio of 0.3."""
+    """The two laws of the tables for bodies, at a Poisson ratio of 0.3."""
     return request.param(0.3)
+
+
+@pytest.fixture(scope="session")
+def laws() -> dict[str, Material]:
+    """All laws by the names of VERIFICATION 1.1."""
+    return LAWS
+
+
+@pytest.fixture(params=LAWS)
+def any_law(request) -> Material:
+    """Each of all laws."""
+    return LAWS[request.param]
 
 
 @pytest.fixture(params=KINDS, ids=lambda kind: f"{kind[0]}{kind[1]}")
@@ -44,6 +78,25 @@ def grid() -> Callable[..., skfem.Mesh]:
         return type(mesh)(mesh.p + shift, mesh.t)
 
     return grid
+
+
+@pytest.fixture(scope="session")
+def chain() -> Callable[..., skfem.Mesh]:
+    """Rows of `count` equal cells of unit size along x, neighbours with nodes in common."""
+
+    def chain(cell: str, count: int) -> skfem.Mesh:
+        dim = 3 if cell in ("tetra", "hexahedron") else 2
+        if cell in ("quad", "hexahedron"):
+            build = box if dim == 3 else rectangle
+            return build([count, *[1.0] * (dim - 1)], [count + 1, *[2] * (dim - 1)], cell)
+        spine = np.pad(np.arange(count + 1.0)[:, None], ((0, 0), (0, dim - 1)))
+        tips = [spine[:-1] + axis for axis in np.eye(dim)[1:]]
+        numbers = np.arange(count)
+        corners = [numbers, numbers + 1, *(numbers + 1 + count * k for k in range(1, dim))]
+        build = skfem.MeshTet if dim == 3 else skfem.MeshTri
+        return build(np.concatenate([spine, *tips]).T.copy(), np.stack(corners))
+
+    return chain
 
 
 @pytest.fixture(scope="session")

@@ -1,13 +1,16 @@
 """Laws of spread loads: they add up to what acts, wherever the nodes lie."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.fem.forces import body_force, traction
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import Plane
+from dpl.fem.forces import BodyForce, Traction, body_force, traction
+from dpl.fem.materials import LinearElastic, NeoHookeanLn
+from dpl.fem.mesh import Plane, box, rectangle
+from dpl.fem.newton import Linear
 from dpl.fem.problem import Problem
 
 
@@ -116,3 +119,67 @@ def test_single_node_is_no_facet(body):
         traction(
             body, lambda points: np.arange(len(points)) == corner, constant(np.ones(body.shape[1]))
         )
+
+
+@pytest.fixture(params=[0.5, 3.0])
+def sized(request, kind, grid) -> Problem:
+    """A body of each kind of element with sides of so many metres, lengths over that."""
+    mesh = grid(kind[0], 3, 0.15, inside=True).scaled(request.param)
+    problem = Problem.build(mesh, NeoHookeanLn(0.3), degree=kind[1])
+    assert problem.length == pytest.approx(request.param)
+    return problem
+
+
+def test_traction_is_a_stress_over_young(sized):
+    """Force over E L^2 of the value on a face of side L: the value itself, whatever L."""
+    value = [0.3, -2.0, 0.7][: sized.shape[1]]
+    force = Traction(Plane(0, "max"), value).on(sized)
+    assert force.sum(dim=0).tolist() == pytest.approx(value, rel=1e-12)
+    assert force[sized.points[:, 0] < 1 - 1e-9].abs().max() < 1e-15
+
+
+def test_body_force_is_a_weight_per_volume_over_young(sized):
+    """Force over E L^2 of a density [1/m] on a volume L^3: the value times L."""
+    value = [0.3, -2.0, 0.7][: sized.shape[1]]
+    force = BodyForce(value).on(sized)
+    expected = [sized.length * density for density in value]
+    assert force.sum(dim=0).tolist() == pytest.approx(expected, rel=1e-12)
+
+
+def test_region_of_a_traction_is_in_metres(sized):
+    far = sized.length
+    force = Traction(Plane(1, far), [1.0] * sized.shape[1]).on(sized)
+    assert force.sum(dim=0).tolist() == pytest.approx([1.0] * sized.shape[1], rel=1e-12)
+    with pytest.raises(ValueError, match="no facet of the boundary"):
+        Traction(Plane(1, 1.234 * far), [1.0] * sized.shape[1]).on(sized)
+
+
+@pytest.mark.parametrize("value", [[], [1.0], [1.0] * 4, [1.0, math.nan, 0.0], [math.inf] * 3])
+def test_load_of_the_wrong_length_is_an_error(grid, value):
+    problem = Problem.build(grid("hexahedron"), NeoHookeanLn(0.3))
+    for load in (Traction(Plane(0, "max"), value), BodyForce(value)):
+        with pytest.raises(ValueError, match="must be 3 finite numbers"):
+            load.on(problem)
+
+
+def test_load_for_space_is_an_error_in_the_plane(grid):
+    problem = Problem.build(grid("quad"), NeoHookeanLn(0.3))
+    with pytest.raises(ValueError, match="must be 2 finite numbers"):
+        BodyForce([0.0, 0.0, -1.0]).on(problem)
+
+
+def test_bar_hanging_in_its_own_weight_stretches_quadratically(kind):
+    """With nu = 0 its end moves along by rho h^2 / 2, exactly at the nodes of bars in a row."""
+    cell, degree = kind
+    if degree == 1 and cell in ("triangle", "tetra"):
+        pytest.skip("cells that are no bars")
+    dim = 3 if cell in ("tetra", "hexahedron") else 2
+    build = box if dim == 3 else rectangle
+    mesh = build([4.0, *[1.0] * (dim - 1)], [5, *[2] * (dim - 1)], cell)
+    problem = Problem.build(mesh, LinearElastic(0.0), fixed=Plane(0, "min"), degree=degree)
+    force = BodyForce([1e-3, *[0.0] * (dim - 1)]).on(problem)
+    u = Linear(problem, linear="superlu").respond(force) * problem.length
+    x = problem.points[:, 0] * problem.length
+    expected = 1e-3 * x * (8 - x) / 2
+    assert_close(u[:, 0], expected, rtol=0, atol=1e-13)
+    assert u[:, 1:].abs().max() < 1e-13

@@ -21,7 +21,6 @@ from dpl.fem.linear import (
     chosen,
     full_matrix,
     installed,
-    rigid_motions,
     slow_blas,
 )
 from dpl.fem.materials import NeoHookeanLn
@@ -80,7 +79,7 @@ def system(problem: Problem) -> System:
 
 
 def motions(problem: Problem) -> np.ndarray:
-    return rigid_motions(problem.points.numpy(), problem.free.numpy())
+    return problem.rigid_motions()[0][problem.free].numpy()
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,9 @@
 
 import math
 import pickle
+import warnings
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -13,8 +15,9 @@ from scipy.sparse.linalg import eigsh
 from torch import Tensor
 from torch.testing import assert_close
 
+from dpl.fem.forces import Traction
 from dpl.fem.linear import full_matrix
-from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
+from dpl.fem.materials import MooneyRivlinK2, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Box, Plane, box, rectangle
 from dpl.fem.newton import Linear, Newton
 from dpl.fem.problem import Problem
@@ -33,6 +36,13 @@ def stiffness(problem: Problem, displacement: Tensor | None = None) -> np.ndarra
     rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
     values = problem.tangent(rest if displacement is None else displacement)
     return full_matrix(problem.pattern, values[0].numpy()).toarray()
+
+
+class Reference(Problem):
+    """A problem without compiled loops."""
+
+    def _kernels(self, displacement):
+        return None
 
 
 def rotation() -> Tensor:
@@ -283,36 +293,46 @@ def test_tangent_is_the_slope_of_the_force(body, bend):
 
 def test_mixed_points_in_agreement_give_force_and_tangent(body, bend):
     u = bend(body.points, 3)
-    force, tangent = body.mixed_system(u, body.strain(u))
+    force, tangent = body.mixed_system(u, torch.zeros_like(body.strain(u)))
     assert_close(force, body.internal_force(u), rtol=1e-11, atol=1e-14)
     assert_close(tangent, body.tangent(u), rtol=1e-10, atol=1e-13)
 
 
-def test_mixed_system_is_that_of_saint_venant_whatever_the_strain(kind, grid, bend):
+def test_mixed_system_is_that_of_saint_venant_whatever_the_gap(kind, grid, bend):
     """A linear stress is moved to the strain of u exactly: only the tangent sees the mixed one."""
     mesh = grid(kind[0], 2, 0.15)
     body = Problem.build(mesh, SaintVenantKirchhoff(0.3), degree=kind[1], length=1.0)
-    u, other = bend(body.points, 2), bend(body.points, 2, seed=1)
-    force, tangent = body.mixed_system(u, body.strain(other))
+    u, gap = bend(body.points, 2), body.strain(bend(body.points, 2, seed=1))
+    force, tangent = body.mixed_system(u, gap)
     assert_close(force, body.internal_force(u), rtol=1e-11, atol=1e-14)
     assert (tangent - body.tangent(u)).abs().max() > 1e-4
 
 
-def test_strain_change_is_the_slope_of_the_strain(body, bend):
-    u, v = bend(body.points, 2), bend(body.points, 2, seed=1)
+def test_stress_of_mixed_points_is_moved_to_the_strain_by_the_moduli_there(body, bend):
+    """To first order in the gap the force does not see it."""
+    u, gap = bend(body.points), body.strain(bend(body.points, seed=1))
+    plain = body.internal_force(u)
+    errors = [(body.mixed_system(u, h * gap)[0] - plain).norm().item() for h in (4e-3, 2e-3, 1e-3)]
+    if isinstance(body.material, SaintVenantKirchhoff):
+        assert max(errors) < 1e-14
+    else:
+        assert [math.log2(a / b) for a, b in pairwise(errors)] == pytest.approx([2.0] * 2, abs=0.05)
+
+
+@pytest.mark.parametrize("length", [1.0, 0.25])
+def test_gap_is_what_the_linear_change_of_strain_falls_short_of(kind, law, grid, bend, length):
+    """Points close the part of the gap that the step takes and follow the slope of the strain."""
+    body = Reference.build(grid(kind[0], 2, 0.15), law, degree=kind[1], length=1.0)
+    u, v = bend(body.points), bend(body.points, seed=1)
+    gap = body.strain(bend(body.points, seed=2))
     slope = torch.func.jvp(body.strain, (u,), (v,))[1]
-    assert_close(body.strain_change(u, v), slope, rtol=1e-12, atol=1e-14)
-
-
-def test_pattern_is_a_sorted_upper_triangle(body):
-    pattern = body.pattern
-    assert pattern.size == body.free.sum()
-    assert len(pattern.indptr) == pattern.size + 1
-    assert pattern.indptr[-1] == len(pattern.indices)
-    for row in range(pattern.size):
-        columns = pattern.indices[pattern.indptr[row] : pattern.indptr[row + 1]]
-        assert columns[0] == row
-        assert (np.diff(columns) > 0).all()
+    for before, found in (
+        (torch.zeros_like(gap), body.widened(None, length, v)),
+        (gap, body.widened(gap, length, v)),
+    ):
+        mixed = body.strain(u) - before
+        moved = mixed + length * (slope + before)
+        assert_close(found, body.strain(u + length * v) - moved, rtol=1e-11, atol=1e-14)
 
 
 def test_batch_answers_like_its_members(body, bend):
@@ -331,32 +351,18 @@ def test_batch_answers_like_its_members(body, bend):
         assert_close(method(*batch), torch.cat(members), rtol=1e-12, atol=1e-14)
 
 
-def test_equal_cells_answer_like_unequal_ones(kind, law, grid, bend):
+def test_equal_cells_answer_like_unequal_ones(kind, law, chain, bend):
     cell, degree = kind
-    if cell in ("triangle", "tetra"):  # cells of one orientation, so that they are equal
-        mesh = (
-            skfem.MeshTri(*one_corner(2)) if cell == "triangle" else skfem.MeshTet(*one_corner(3))
-        )
-    else:
-        mesh = grid(cell)
-    short = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
+    short = Problem.build(chain(cell, 3), law, fixed=Plane(0, "min"), degree=degree)
     assert short.equal_cells
     count = len(short.cells)
     dN, dV = short.dN.expand(count, -1, -1, -1), short.dV.expand(count, -1)
     long = replace(short, dN=dN.contiguous(), dV=dV.contiguous())
-    assert long.equal_cells == (count == 1)
+    assert not long.equal_cells
     u, v = bend(short.points, 2), bend(short.points, 2, seed=1)
     for method in ("energy", "internal_force", "tangent", "volume_ratio", "stress"):
         assert_close(getattr(short, method)(u), getattr(long, method)(u), rtol=1e-11, atol=1e-13)
     assert_close(short.tangent_product(u, v), long.tangent_product(u, v), rtol=1e-11, atol=1e-13)
-
-
-def one_corner(dim: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return two equal simplices with one node in common: points and cells."""
-    corner = np.concatenate([np.zeros((1, dim)), np.eye(dim)])
-    points = np.concatenate([corner, corner[1:] + corner[1]])
-    cells = np.stack([np.arange(dim + 1), np.array([1, *range(dim + 1, 2 * dim + 1)])])
-    return points.T.copy(), cells.T.copy()
 
 
 def test_equal_cells_are_recognised(grid):
@@ -586,3 +592,222 @@ def test_copy_on_a_device_and_copy_by_pickle_are_the_same_problem(bent):
         assert torch.equal(copy.internal_force(u), problem.internal_force(u))
         assert torch.equal(copy.residual_ratio(u, force), problem.residual_ratio(u, force))
         assert copy.length == problem.length
+
+
+def test_evaluation_is_force_and_smallest_volume_ratio(body, bend):
+    u, f = bend(body.points, 3), bend(body.points, 3, seed=1)
+    internal, volume = body.evaluate(u)
+    assert_close(internal, body.internal_force(u), rtol=1e-11, atol=1e-14)
+    assert_close(volume, body.volume_ratio(u), rtol=1e-13, atol=0)
+    ratio = body.residual(u, f).flatten(1).norm(dim=1) / f.flatten(1).norm(dim=1)
+    assert_close(body.imbalance(internal, f), ratio, rtol=1e-11, atol=0)
+
+
+def test_linearised_equilibrium_is_force_and_tangent(body, bend):
+    u = bend(body.points)
+    system = body.linearise(u)
+    assert_close(system.force, body.internal_force(u), rtol=1e-11, atol=1e-14)
+    assert_close(system.tangent, body.tangent(u), rtol=1e-10, atol=1e-13)
+    assert system.valid.tolist() == [True]
+
+
+def test_strain_of_no_deformation_is_not_valid(kind, law, grid):
+    """Det C of the strain of u less the gap must be above zero: here it is 0.2 - 1 < 0."""
+    build = {"compiled": Problem, "reference": Reference}
+    for owner in build.values():
+        body = owner.build(grid(kind[0]), law, degree=kind[1], length=1.0)
+        squeezed = -0.6 * body.points[None] * torch.eye(body.shape[1], dtype=torch.float64)[0]
+        gap = body.widened(None, 1.0, squeezed)  # 0.36/2 along x
+        for length, valid in ((1.0, True), (4.0, False)):
+            wide = body.widened(gap, 0.0, squeezed) if length == 1.0 else length * gap
+            found = body.linearise(torch.zeros_like(squeezed), wide).valid
+            assert found.tolist() == [valid]
+
+
+@pytest.fixture(params=["quad", "hexahedron"])
+def dilated(request, any_law, grid) -> Problem:
+    """Bodies of unequal linear cells whose points share their cell's mean volume ratio."""
+    mesh = grid(request.param, 2, 0.15)
+    held = mesh.p[0] < 0.2
+    return Problem.build(mesh, any_law, fixed=held, length=1.0, mean_dilatation=True)
+
+
+def standard(problem: Problem) -> Problem:
+    """Return the same body whose points keep their own volume ratio."""
+    return replace(problem, mean_dilatation=False)
+
+
+def test_force_of_mean_dilatation_is_the_slope_of_its_energy(dilated, bend):
+    u = bend(dilated.points, 2).requires_grad_()
+    assert (dilated.volume_ratio(u) > 0.3).all()
+    (slope,) = torch.autograd.grad(dilated.energy(u).sum(), u)
+    assert_close(dilated.internal_force(u.detach()), slope, rtol=1e-9, atol=1e-13)
+    assert (slope - standard(dilated).internal_force(u.detach())).abs().max() > 1e-4
+
+
+def test_tangent_of_mean_dilatation_is_the_slope_of_its_force(dilated, bend):
+    u, v = bend(dilated.points), bend(dilated.points, seed=1) * dilated.free
+    ahead, behind = (dilated.internal_force(u + h * v) for h in (1e-6, -1e-6))
+    slope = ((ahead - behind) / 2e-6)[0][dilated.free].numpy()
+    K = full_matrix(dilated.pattern, dilated.tangent(u)[0].numpy())
+    assert K @ v[0][dilated.free].numpy() == pytest.approx(slope, rel=1e-6, abs=1e-8)
+    product = dilated.tangent_product(u, v)[0][dilated.free].numpy()
+    assert K @ v[0][dilated.free].numpy() == pytest.approx(product, rel=1e-10, abs=1e-13)
+
+
+def test_tangent_of_mean_dilatation_is_symmetric(dilated, bend):
+    """Variational, unlike the F-bar of de Souza Neto (1996)."""
+    u, v, w = (bend(dilated.points, seed=seed) for seed in range(3))
+    one = (dilated.tangent_product(u, v) * w).sum()
+    assert_close(one, (dilated.tangent_product(u, w) * v).sum(), rtol=1e-11, atol=0)
+
+
+def test_mean_dilatation_changes_no_homogeneous_deformation(dilated):
+    dim = dilated.shape[1]
+    random = torch.Generator().manual_seed(2)
+    H = torch.rand(dim, dim, generator=random, dtype=torch.float64) * 0.4 - 0.2
+    u, plain = (dilated.points @ H.T)[None], standard(dilated)
+    for method in ("energy", "internal_force", "stress", "volume_ratio"):
+        found, expected = getattr(dilated, method)(u), getattr(plain, method)(u)
+        assert_close(found, expected, rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("cell", ["quad", "hexahedron"])
+def test_mean_dilatation_passes_the_patch_test(cell, any_law, grid):
+    """VERIFICATION 1.6: the boundary is moved linearly, the inner nodes follow exactly."""
+    mesh = grid(cell, 3, 0.2, inside=True)
+    dim = len(mesh.p)
+    H = np.array([[0.2, 0.2, -0.1], [0.05, -0.05, 0.15], [-0.08, 0.12, 0.1]])[:dim, :dim]
+    outside = np.zeros(mesh.p.shape[1], dtype=bool)
+    outside[mesh.boundary_nodes()] = True
+    problem = Problem.build(
+        mesh, any_law, fixed=outside, prescribed=mesh.p.T @ H.T, length=1.0, mean_dilatation=True
+    )
+    load = Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
+    answer = solve(Newton(problem, tol=1e-12, linear="superlu"), load)
+    assert answer.converged.all()
+    expected = problem.points @ torch.from_numpy(H).T
+    assert_close(answer.displacement[0], expected, rtol=0, atol=1e-11)
+    stress = problem.stress(answer.displacement)
+    assert_close(stress, stress[:, :1, :1].expand_as(stress), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("cell", ["quad", "hexahedron"])
+def test_mean_dilatation_does_not_lock(cell):
+    """VERIFICATION 2.2 T8: at nu = 0.4999 within 6 % of quadratic cells, which hardly lock."""
+    size, nodes = ([10.0, 2.0], [21, 5]) if cell == "quad" else ([10.0, 2.0, 2.0], [21, 5, 3])
+    build = rectangle if cell == "quad" else box
+    law, sags = NeoHookeanLn(0.4999), {}
+    options = {"locked": {}, "dilated": {"mean_dilatation": True}, "quadratic": {"degree": 2}}
+    for name, option in options.items():
+        mesh = build(size, nodes, cell)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            problem = Problem.build(mesh, law, fixed=Plane(0, "min"), **option)
+        value = [0.0, -1e-6, 0.0][: len(size)]
+        force = Traction(Plane(0, "max"), value).on(problem)
+        sags[name] = (Linear(problem, linear="superlu").respond(force) * force).sum().item()
+    assert sags["locked"] < 0.5 * sags["quadratic"]
+    assert sags["dilated"] == pytest.approx(sags["quadratic"], rel=0.06)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
+def test_mean_dilatation_is_refused_of_quadratic_cells(grid, cell):
+    with pytest.raises(ValueError, match="mean_dilatation"):
+        Problem.build(grid(cell), NH, degree=2, mean_dilatation=True)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "tetra"])
+def test_mean_dilatation_is_refused_of_cells_of_one_strain(grid, cell):
+    with pytest.raises(ValueError, match="mean_dilatation"):
+        Problem.build(grid(cell), NH, mean_dilatation=True)
+
+
+def test_mean_dilatation_is_refused_for_a_mesh_that_is_quadratic(grid):
+    with pytest.raises(ValueError, match="mean_dilatation"):
+        Problem.build(skfem.MeshHex2.from_mesh(grid("hexahedron")), NH, mean_dilatation=True)
+
+
+@pytest.mark.parametrize(
+    ("cell", "remedy"),
+    [(cell, "set degree=2$") for cell in ("triangle", "tetra")]
+    + [(cell, "or mean_dilatation=true$") for cell in ("quad", "hexahedron")],
+)
+def test_linear_cells_that_will_lock_are_warned_of(grid, cell, remedy):
+    """VERIFICATION 2.2 T8, from a Poisson ratio of 0.45 on."""
+    with pytest.warns(UserWarning, match=f"lock at Poisson's ratio 0.45: .*{remedy}"):
+        Problem.build(grid(cell), NeoHookeanLn(0.45))
+    assert Problem.build(grid(cell), NeoHookeanLn(0.449)).advice() == []
+    assert Problem.build(grid(cell), NeoHookeanLn(0.49), degree=2).advice() == []
+
+
+def test_what_mean_dilatation_has_cured_is_not_warned_of(grid):
+    for cell in ("quad", "hexahedron"):
+        assert Problem.build(grid(cell), NeoHookeanLn(0.49), mean_dilatation=True).advice() == []
+
+
+def test_locking_of_a_law_without_poisson_ratio_is_seen_too(grid):
+    """Its moduli at rest say it: shear 0.4, bulk 20 is a ratio of 0.4901."""
+    with pytest.warns(UserWarning, match="ratio 0.4901"):
+        Problem.build(grid("hexahedron"), MooneyRivlinK2(0.15, 0.05, 20.0))
+
+
+def test_thin_linear_cells_are_warned_of():
+    """VERIFICATION 2.2 T10: aspect ratios above 20."""
+    for thickness, lines in ((1.001 / 20, 0), (0.999 / 20, 1)):
+        mesh = rectangle([4.0, 4 * thickness], [5, 5])
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            problem = Problem.build(mesh, NH)
+        advice = [str(one.message) for one in caught if one.category is UserWarning]
+        assert advice == problem.advice()
+        assert len(advice) == lines
+        assert all("aspect ratio 20 lock in bending: set degree=2" in line for line in advice)
+        assert Problem.build(mesh, NH, degree=2).advice() == []
+
+
+def test_residual_at_the_level_of_rounding_is_balance(bent):
+    problem, force, u = bent
+    internal, room = problem.internal_force(u), problem.rounding(u)
+    assert room.shape == (1,)
+    spot = torch.zeros_like(u)
+    spot[0, problem.free.any(dim=1).nonzero()[0, 0], 0] = 1.0
+    target = torch.where(problem.free, force, internal)
+    for part, balanced in ((0.99, True), (1.01, False)):
+        off = target + part * room * spot
+        assert problem.balanced(u, off, force, 1e-30).item() is balanced
+
+
+def test_residual_above_rounding_needs_the_tolerance(bent):
+    problem, force, u = bent
+    internal, tol = problem.internal_force(u), 1e-8
+    assert problem.rounding(u) < 0.1 * tol * force.norm()  # no excuse on an ordinary body
+    free = torch.where(problem.free, force, 0.0)
+    target = torch.where(problem.free, force, internal)
+    scale = tol * force.norm() / free.norm()
+    for part, balanced in ((0.99, True), (1.01, False)):
+        off = target + part * scale * free
+        assert problem.balanced(u, off, force, tol).item() is balanced
+
+
+def test_rounding_excuses_no_imbalance_that_matters(grid):
+    """However large the bound, a ratio of 1e-4 is no rounding."""
+    problem = Problem.build(grid("hexahedron"), NH, fixed=Plane(0, "min"))
+    u = 1e12 * problem.points[None]
+    force = torch.where(problem.free, 1e-3, 0.0).to(u)[None]
+    assert problem.rounding(u) > 1e-3 * force.norm()
+    for ratio, balanced in ((0.99e-4, True), (1.01e-4, False)):
+        assert problem.balanced(u, (1 + ratio) * force, force, 1e-8).item() is balanced
+
+
+def test_rounding_bounds_what_rounding_does(body, bend):
+    """The residual of an answer as exact as can be, in another order of summation."""
+    problem = Problem.build(body.mesh, body.material, fixed=lambda x: x[:, 0] < 0.2, length=1.0)
+    u = 1e-3 * bend(problem.points, 5)
+    order = torch.randperm(len(problem.cells), generator=torch.Generator().manual_seed(0))
+    parts = {name: getattr(problem, name)[order] for name in ("cells", "dN", "dV")}
+    shuffled = replace(problem, **parts)
+    noise = torch.where(problem.free, shuffled.internal_force(u) - problem.internal_force(u), 0.0)
+    room = problem.rounding(u)
+    assert noise.any()
+    assert (noise.flatten(1).norm(dim=1) < room).all()
