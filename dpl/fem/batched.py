@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.materials import volume_change
 from dpl.fem.newton import Linear
 from dpl.fem.problem import Evaluation, Problem
 from dpl.fem.solution import Load, Solution, Status
+from dpl.fem.tensors import volume_change
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,31 +7,21 @@ In here strains and stresses are 6 numbers, 11 22 33 12 23 13, strains as e = 2 
 """
 
 import contextlib
-import hashlib
 import inspect
 import math
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit, types
-from numba.extending import (
-    NativeValue,
-    models,
-    overload,
-    register_model,
-    typeof_impl,
-    unbox,
-)
+from numba import njit
 from numpy.typing import NDArray
 
-from dpl.fem import lanes
+from dpl.fem import lanes, slopes
 from dpl.fem.lanes import WIDTH, load, sqrt, store
-from dpl.fem.materials import Isotropic
+from dpl.fem.law import Isotropic
+from dpl.fem.slopes import Law, needed, slopes_of
 
 Array = NDArray[np.float64]
 
@@ -40,87 +30,7 @@ FIRST = np.array([0, 1, 2, 0, 1, 0])  # the two indices of each of the 6
 SECOND = np.array([0, 1, 2, 1, 2, 2])
 
 
-class _LawType(types.Type):
-    """Type of a law in numba: its name holds a digest of all code that a kernel is made of.
-
-    So a kernel is compiled once per law, and one compiled from other sources is never taken from
-    numba's cache on disk.
-    """
-
-
-_SLOPES: dict[str, Any] = {}  # name of the type -> compiled slopes
-_SOURCES = "".join(inspect.getsource(m) for m in (lanes, sys.modules[__name__]))
-
-
-@dataclass(frozen=True)
-class _Law:
-    """A law as an argument of a kernel."""
-
-    material: type[Isotropic]
-
-    @cached_property
-    def kind(self) -> _LawType:
-        """The law's type in numba."""
-        name = self.material.__qualname__
-        functions = [self.material.slopes, *_helpers(self.material.slopes)]
-        source = "".join(inspect.getsource(f) for f in functions)
-        name += hashlib.sha256((source + _SOURCES).encode()).hexdigest()[:16]
-        if name not in _SLOPES:
-            _SLOPES[name] = _jitted(self.material.slopes)
-        return _LawType(name)
-
-
-def _needs(material: Isotropic) -> int:
-    """Return what a law's slopes read: 0 nothing of C^-1, 1 no ln J, 2 ln J, 3 J^(-2/3) too."""
-
-    def read(**values: float) -> tuple[float, ...]:
-        arguments = dict.fromkeys(("i1", "i2", "j", "log_j", "m1"), 0.0) | values
-        return material.slopes(material.constants, **arguments)
-
-    if np.isnan(read(m1=np.nan)).any():
-        return 3
-    if np.isnan(read(log_j=np.nan)).any():
-        return 2
-    everything = read(i1=np.nan, i2=np.nan, j=np.nan)
-    return 0 if everything[2] == 0 and not np.any(everything[6:]) else 1
-
-
-def _helpers(function: Any) -> list[Any]:
-    """Return the functions of its own module that a function names."""
-    named = (function.__globals__.get(name) for name in function.__code__.co_names)
-    return [f for f in named if inspect.isfunction(f)]
-
-
-def _jitted(function: Any) -> Any:
-    """Return a plain arithmetic function compiled, with the functions that it calls."""
-    compiled = {f.__name__: njit(f) for f in _helpers(function)}
-    scope = {**function.__globals__, **compiled}
-    return njit(type(function)(function.__code__, scope, function.__name__))
-
-
-@register_model(_LawType)
-class _LawModel(models.OpaqueModel):
-    pass
-
-
-@typeof_impl.register(_Law)
-def _typeof_law(law: _Law, context: Any) -> _LawType:
-    return law.kind
-
-
-@unbox(_LawType)
-def _unbox_law(kind: Any, value: Any, context: Any) -> NativeValue:
-    return NativeValue(context.context.get_dummy_value())
-
-
-def _slopes(law, c, i1, i2, j, log_j, m1):
-    raise NotImplementedError
-
-
-@overload(_slopes)
-def _slopes_of(law, c, i1, i2, j, log_j, m1):
-    function = _SLOPES[law.name]
-    return lambda law, c, i1, i2, j, log_j, m1: function(c, i1, i2, j, log_j, m1)
+_SOURCES = "".join(inspect.getsource(m) for m in (lanes, slopes, sys.modules[__name__]))
 
 
 @njit
@@ -234,7 +144,7 @@ def _stress(law, c, needs, e, j, X, S, scratch, D, moduli):
             if needs > 2:
                 scratch[1, lane] = math.expm1(-2 / 3 * scratch[0, lane])
     i2 = 2.0 * i1 + second
-    slopes = _slopes(law, c, i1, i2, j, load(scratch, 0), load(scratch, 1))
+    slopes = slopes_of(law, c, i1, i2, j, load(scratch, 0), load(scratch, 1))
     rest, W2, p, W11, W12, W22, W1J, W2J, pJ = slopes
     pressure = rest + 2.0 * W2 * i1
     for v in range(6):
@@ -481,9 +391,9 @@ class Kernels:
         self.cells, self.dN, self.dV = cells, dN, dV
         self.places = _in_blocks(places)
         self._law = (
-            _Law(type(material)),
+            Law(type(material), _SOURCES),
             np.array(material.constants),
-            _needs(material),
+            needed(material),
             float(material.finite),
         )
         self._nothing = np.zeros((0, 0, 0, WIDTH))

@@ -1,233 +1,37 @@
-"""Hyperelastic laws: one class = one energy density of the displacement gradient.
+"""The laws, their moduli over Young's modulus; names say the volumetric term."""
 
-Laws take the displacement gradient H = F - I and not F: for |H| near 1e-10 the strain is lost in
-the rounding of 1 + H, and with it the equilibrium of small loads. For the same reason no law forms
-its stress as a difference of terms that cancel at rest.
-"""
-
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from dpl.fem.law import Hookean, Isotropic, Material, Response, check_moduli
+from dpl.fem.ogden import OgdenK2
+from dpl.fem.tensors import (
+    dyad,
+    green_lagrange,
+    invariants,
+    symmetric_product,
+    trace,
+    volume_change,
+)
 
-class Response(NamedTuple):
-    """Stress and moduli at a strain.
-
-    Attributes:
-        stress: Second Piola-Kirchhoff stress S over Young's modulus, (..., 3, 3) [-].
-        moduli: dS/dE, (..., 3, 3, 3, 3) [-], with minor and major symmetry.
-    """
-
-    stress: Tensor
-    moduli: Tensor
-
-    def product(self, change: Tensor) -> Tensor:
-        """Return dS/dE : change, (..., 3, 3) [-], of a symmetric change of strain."""
-        return torch.einsum("...ijkl,...kl->...ij", self.moduli, change)
-
-    def tangent(self, H: Tensor) -> Tensor:
-        """Return dP/dF, (..., 3, 3, 3, 3) [-], indexed iJkL, of a body deformed by F = I + H."""
-        eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        F = H + eye
-        A = torch.einsum("...iM,...MJNL,...kN->...iJkL", F, self.moduli, F)
-        return A + torch.einsum("ik,...JL->...iJkL", eye, self.stress)
-
-
-class Material:
-    """Isotropic hyperelastic law, its moduli over Young's modulus E.
-
-    A law is its `energy`; `stress` and `tangent` follow by automatic differentiation. A subclass
-    may give its `response` to strains as well: the two then follow from that, and Newton can take
-    strains as unknowns. A law of the invariants (`Isotropic`) is compiled too.
-    """
-
-    def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density over E, (...,) [-], of H (..., 3, 3) [-]."""
-        raise NotImplementedError(f"{type(self).__name__} has no energy")
-
-    def response(self, E: Tensor) -> Response:
-        """Return stress and moduli at Green-Lagrange strains E, (..., 3, 3) [-].
-
-        Raises:
-            NotImplementedError: The law is its energy alone, see `has_response`.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has no stress as a function of strain")
-
-    @property
-    def has_response(self) -> bool:
-        """Whether the law gives its stress as a function of strain."""
-        return type(self).response is not Material.response
-
-    def stress(self, H: Tensor) -> Tensor:
-        """Return the first Piola-Kirchhoff stress P = dW/dF over E, (..., 3, 3) [-]."""
-        if self.has_response:
-            S = self.response(green_lagrange(H)).stress
-            return S + H @ S
-        gradient = torch.func.vmap(torch.func.grad(self.energy))
-        return gradient(H.reshape(-1, 3, 3)).reshape(H.shape)
-
-    def tangent(self, H: Tensor) -> Tensor:
-        """Return dP/dF over E, (..., 3, 3, 3, 3) [-], indexed iJkL."""
-        if self.has_response:
-            return self.response(green_lagrange(H)).tangent(H)
-        hessian = torch.func.vmap(torch.func.hessian(self.energy))
-        return hessian(H.reshape(-1, 3, 3)).reshape(*H.shape, 3, 3)
-
-    @property
-    def mu(self) -> float:
-        """Shear modulus at rest over Young's modulus [-]."""
-        return float(self._at_rest[0, 1, 0, 1])
-
-    @property
-    def lam(self) -> float:
-        """First Lame parameter at rest over Young's modulus [-]."""
-        return float(self._at_rest[0, 0, 1, 1])
-
-    @property
-    def poisson_ratio(self) -> float:
-        """Poisson's ratio at rest [-]."""
-        return self.lam / (2 * (self.lam + self.mu))
-
-    @property
-    def _at_rest(self) -> Tensor:
-        return self.tangent(torch.zeros(1, 3, 3, dtype=torch.float64))[0]
-
-
-@dataclass(frozen=True)
-class Hookean(Material):
-    """Law that at rest is Hooke's, with Young's modulus 1: such laws can be swapped fairly.
-
-    Attributes:
-        poisson: Poisson's ratio at rest [-], in (-1, 0.5).
-    """
-
-    poisson: float
-
-    def __post_init__(self) -> None:
-        """Check the range.
-
-        Raises:
-            ValueError: `poisson` lies outside (-1, 0.5) or is no finite number.
-        """
-        if not (math.isfinite(self.poisson) and -1.0 < self.poisson < 0.5):
-            raise ValueError(
-                f"poisson = {self.poisson} must lie between -1 and 0.5 (both excluded)"
-            )
-
-    @property
-    def mu(self) -> float:
-        """Shear modulus over Young's modulus [-]."""
-        return 1.0 / (2.0 * (1.0 + self.poisson))
-
-    @property
-    def lam(self) -> float:
-        """First Lame parameter over Young's modulus [-]."""
-        return self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
-
-    @property
-    def bulk(self) -> float:
-        """Bulk modulus over Young's modulus [-]."""
-        return self.lam + 2 / 3 * self.mu
-
-
-class Isotropic(Material):
-    """Law of the invariants, W(I1, I2, J) of C = F^T F, given by its `slopes` as well.
-
-    The slopes are plain arithmetic on numbers of any kind: tensors here, lanes of a processor in
-    `dpl.fem.kernels`. With X = C^-1, the stress they stand for is
-
-        S = (rest + 2 W2 i1) I - 4 W2 E - p (I - X),   I - X = 2 E X,
-
-    in which nothing cancels at rest.
-
-    Attributes:
-        finite: False for the one law whose strain is the symmetric part of H.
-    """
-
-    finite: ClassVar[bool] = True
-
-    @property
-    def constants(self) -> tuple[float, ...]:
-        """Moduli that the slopes take."""
-        raise NotImplementedError
-
-    @staticmethod
-    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
-        """Return (rest, W2, p, W11, W12, W22, J W1J, J W2J, J p_J).
-
-        Indices are derivatives, p = J W_J, and rest = p + 2 W1 + 4 W2, which is zero at rest and
-        must be given in a form that is small there.
-
-        Args:
-            c: `constants`.
-            i1, i2, j: I1 - 3, I2 - 3, J - 1.
-            log_j: ln J.
-            m1: J^(-2/3) - 1.
-        """
-        raise NotImplementedError
-
-    def response(self, E: Tensor) -> Response:
-        """Return stress and moduli, see `Material.response`."""
-        e = 2 * E
-        i1, second, square = invariants(e)
-        j = square / (1 + (1 + square).sqrt())
-        eye = torch.eye(3, dtype=E.dtype, device=E.device)
-        X = inverse_transpose(e, square)
-        slopes = self._slopes(i1, 2 * i1 + second, j)
-        S = _stress(e, square, i1, slopes)
-        _, W2, p, *curvatures = (
-            s[..., None, None, None, None] if isinstance(s, Tensor) else s for s in slopes
-        )
-        W11, W12, W22, W1J, W2J, pJ = curvatures
-        T1, T2 = 2 * eye.expand_as(e), 2 * ((2 + i1)[..., None, None] * eye - e)
-        D = W11 * _dyad(T1, T1) + W22 * _dyad(T2, T2) + pJ * _dyad(X, X)
-        for factor, A, B in ((W12, T1, T2), (W1J, T1, X), (W2J, T2, X)):
-            D = D + factor * (_dyad(A, B) + _dyad(B, A))
-        D = D + 4 * W2 * (_dyad(eye, eye) - _symmetric_product(eye)) - 2 * p * _symmetric_product(X)
-        return Response(S, D)
-
-    def stress(self, H: Tensor) -> Tensor:
-        """Return the first Piola-Kirchhoff stress, see `Material.stress`.
-
-        J is that of H, with its sign: inverted, a law with ln J has no stress (NaN).
-        """
-        e = 2 * green_lagrange(H)
-        i1, second, square = invariants(e)
-        slopes = self._slopes(i1, 2 * i1 + second, volume_change(H))
-        S = _stress(e, square, i1, slopes)
-        return S + H @ S
-
-    def _slopes(self, i1: Tensor, i2: Tensor, j: Tensor) -> tuple[Tensor | float, ...]:
-        log_j = torch.log1p(j)
-        m1 = torch.expm1(-2 / 3 * log_j)
-        return self.slopes(self.constants, i1, i2, j, log_j, m1)
-
-
-def _stress(e: Tensor, square: Tensor, i1: Tensor, slopes: tuple[Tensor | float, ...]) -> Tensor:
-    """Return S (..., 3, 3) of `Isotropic` at e = 2 E = C - I with det C = 1 + square."""
-    rest, W2, p = (s[..., None, None] if isinstance(s, Tensor) else s for s in slopes[:3])
-    eye = torch.eye(3, dtype=e.dtype, device=e.device)
-    S = (rest + 2 * W2 * i1[..., None, None]) * eye
-    if isinstance(W2, Tensor) or W2:
-        S = S - 2 * W2 * e
-    if isinstance(p, Tensor) or p:  # else a collapsed body, C singular, has a stress too
-        S = S - p * (e @ inverse_transpose(e, square))
-    return S
-
-
-def _dyad(A: Tensor, B: Tensor) -> Tensor:
-    """Return A_ij B_kl, (..., 3, 3, 3, 3)."""
-    return A[..., :, :, None, None] * B[..., None, None, :, :]
-
-
-def _symmetric_product(A: Tensor) -> Tensor:
-    """Return (A_ik A_jl + A_il A_jk)/2, (..., 3, 3, 3, 3)."""
-    product = A[..., :, None, :, None] * A[..., None, :, None, :]
-    return (product + product.transpose(-1, -2)) / 2
+__all__ = [
+    "Hookean",
+    "Isotropic",
+    "LinearElastic",
+    "Material",
+    "MooneyRivlinK2",
+    "NeoHookeanIsoK2",
+    "NeoHookeanIsoK4",
+    "NeoHookeanLn",
+    "OgdenK2",
+    "Response",
+    "SaintVenantKirchhoff",
+    "StableNeoHookean",
+    "YeohK2",
+]
 
 
 @dataclass(frozen=True)
@@ -277,7 +81,7 @@ class LinearElastic(SaintVenantKirchhoff):
     def tangent(self, H: Tensor) -> Tensor:
         """Return Hooke's moduli, see `Material.tangent`."""
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        hooke = self.lam * _dyad(eye, eye) + 2 * self.mu * _symmetric_product(eye)
+        hooke = self.lam * dyad(eye, eye) + 2 * self.mu * symmetric_product(eye)
         return hooke.expand(*H.shape, 3, 3)
 
     @property
@@ -408,7 +212,7 @@ class MooneyRivlinK2(Isotropic):
         Raises:
             ValueError: The body would not resist shear or compression.
         """
-        _check_moduli("2 (c10 + c01)", 2 * (self.c10 + self.c01), self.bulk)
+        check_moduli("2 (c10 + c01)", 2 * (self.c10 + self.c01), self.bulk)
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
@@ -447,7 +251,7 @@ class YeohK2(Isotropic):
         Raises:
             ValueError: The body would not resist shear or compression.
         """
-        _check_moduli("2 c10", 2 * self.c10, self.bulk)
+        check_moduli("2 c10", 2 * self.c10, self.bulk)
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
@@ -497,173 +301,3 @@ def _isochoric(H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         n * i2 + 3 * torch.expm1(-4 / 3 * log_j),
         j,
     )
-
-
-def _check_moduli(name: str, shear: float, bulk: float) -> None:
-    """Raise ValueError if a shear modulus, called `name`, or a bulk modulus is not above 0."""
-    if not 0 < shear < math.inf:
-        raise ValueError(f"{name} = {shear} must be above 0: it is the shear modulus at rest")
-    if not 0 < bulk < math.inf:
-        raise ValueError(f"bulk = {bulk} must be above 0")
-
-
-@dataclass(frozen=True)
-class OgdenK2(Material):
-    """Ogden's solid: sum 2 mu_i/alpha_i^2 (lb1^alpha_i + lb2^alpha_i + lb3^alpha_i - 3)
-    + bulk/2 (J - 1)^2, lb = J^(-1/3) lambda the isochoric principal stretches.
-
-    The shear modulus at rest is sum mu_i, as Abaqus defines them; in Ogden's own paper it is
-    sum mu_i alpha_i / 2.
-
-    Source: Ogden (1972), Proc. R. Soc. A 326; moduli by Simo, Taylor (1991), CMAME 85, section 2.
-
-    Attributes:
-        shear: mu_i over E [-].
-        exponents: alpha_i [-], as many.
-        bulk: Over E [-].
-    """
-
-    shear: Sequence[float]
-    exponents: Sequence[float]
-    bulk: float
-
-    def __post_init__(self) -> None:
-        """Check the range.
-
-        Raises:
-            ValueError: Not as many exponents as moduli, an exponent of 0, or a body that would not
-                resist shear or compression.
-        """
-        if len(self.shear) != len(self.exponents) or not all(self.exponents):
-            raise ValueError(
-                f"exponents = {list(self.exponents)} must be {len(self.shear)} numbers other than 0"
-            )
-        _check_moduli("sum of shear", sum(self.shear), self.bulk)
-
-    def energy(self, H: Tensor) -> Tensor:
-        """Return the energy density, see `Material.energy`."""
-        j = volume_change(H)
-        logs = torch.log1p(2 * torch.linalg.eigvalsh(green_lagrange(H))) / 2
-        logs = logs - torch.log1p(j)[..., None] / 3
-        terms = [
-            2 * mu / a**2 * torch.expm1(a * logs).sum(-1)
-            for mu, a in zip(self.shear, self.exponents, strict=True)
-        ]
-        return sum(terms) + self.bulk / 2 * j.square()
-
-    def stress(self, H: Tensor) -> Tensor:
-        """Return the first Piola-Kirchhoff stress, see `Material.stress`; NaN where inverted."""
-        S = _SpectralStress.apply(green_lagrange(H), self)
-        S = torch.where((volume_change(H) > -1)[..., None, None], S, torch.nan)
-        return S + H @ S
-
-    def response(self, E: Tensor) -> Response:
-        """Return stress and moduli, see `Material.response`."""
-        strain, axes = torch.linalg.eigh(E)
-        stress, slopes = self._principal(strain)
-        gap = strain[..., :, None] - strain[..., None, :]
-        same = gap.abs() < 1e-6  # there the quotient is its limit, to within as much
-        limit = slopes.diagonal(dim1=-2, dim2=-1)
-        limit = (limit[..., :, None] + limit[..., None, :]) / 2 - slopes
-        quotient = (stress[..., :, None] - stress[..., None, :]) / torch.where(same, 1.0, gap)
-        shear = torch.where(same, limit, quotient)
-        shear = shear - torch.diag_embed(shear.diagonal(dim1=-2, dim2=-1))
-        S = (axes * stress[..., None, :]) @ axes.mT
-        normal = axes[..., :, None, :] * axes[..., None, :, :]  # (..., i, j, a)
-        D = torch.einsum("...ija,...ab,...klb->...ijkl", normal, slopes, normal)
-        pair = torch.einsum("...ia,...jb->...ijab", axes, axes)
-        pair = (pair + pair.transpose(-4, -3)) / 2
-        return Response(S, D + torch.einsum("...ijab,...ab,...klab->...ijkl", pair, shear, pair))
-
-    def _principal(self, strain: Tensor) -> tuple[Tensor, Tensor]:
-        """Return principal stresses S_a (..., 3) and dS_a/dE_b (..., 3, 3) at principal strains."""
-        logs = torch.log1p(2 * strain) / 2
-        log_J = logs.sum(-1, keepdim=True)
-        j = torch.expm1(log_J)
-        eye = torch.eye(3, dtype=strain.dtype, device=strain.device)
-        T = self.bulk * (1 + j) * j + torch.zeros_like(logs)
-        dT = (self.bulk * (1 + j) * (1 + 2 * j))[..., None] + torch.zeros_like(eye)
-        for mu, a in zip(self.shear, self.exponents, strict=True):
-            grown = torch.expm1(a * (logs - log_J / 3))  # lb^a - 1
-            mean = grown.mean(-1, keepdim=True)
-            T = T + 2 * mu / a * (grown - mean)
-            power, third = 1 + grown, (1 + mean) / 3
-            dT = dT + 2 * mu * (
-                power[..., :, None] * eye
-                - (power[..., :, None] + power[..., None, :]) / 3
-                + third[..., None]
-            )
-        stretch = 1 + 2 * strain
-        slopes = (dT - 2 * T[..., :, None] * eye) / (stretch[..., :, None] * stretch[..., None, :])
-        return T / stretch, slopes
-
-
-class _SpectralStress(torch.autograd.Function):
-    """S(E) of a law, differentiated by its moduli: those of eigenvectors are infinite at rest."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(E: Tensor, law: OgdenK2) -> Tensor:
-        return law.response(E).stress
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, OgdenK2], output: Tensor) -> None:
-        E, law = inputs
-        ctx.law = law
-        ctx.save_for_backward(E)
-        ctx.save_for_forward(E)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        (E,) = ctx.saved_tensors
-        return ctx.law.response(E).product((gradient + gradient.mT) / 2), None
-
-    @staticmethod
-    def jvp(ctx: Any, change: Tensor, _: None) -> Tensor:
-        (E,) = ctx.saved_tensors
-        return ctx.law.response(E).product(change)
-
-
-def trace(H: Tensor) -> Tensor:
-    """Return tr H, (...,), of H (..., 3, 3)."""
-    return H.diagonal(dim1=-2, dim2=-1).sum(-1)
-
-
-def green_lagrange(H: Tensor) -> Tensor:
-    """Return the Green-Lagrange strain (H + H^T + H^T H)/2, (..., 3, 3) [-]."""
-    return (H + H.mT + H.mT @ H) / 2
-
-
-def invariants(e: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return tr e, its sum of principal minors and det(I + e) - 1, (...,), of e (..., 3, 3)."""
-    (a, b, c), (d, f, g), (h, i, k) = (row.unbind(-1) for row in e.unbind(-2))
-    first, second = a + f + k, a * f - b * d + f * k - g * i + a * k - c * h
-    third = a * (f * k - g * i) - b * (d * k - g * h) + c * (d * i - f * h)
-    return first, second, first + second + third
-
-
-def volume_change(H: Tensor) -> Tensor:
-    """Return det F - 1, (...,) [-], of H = F - I (..., 3, 3), to full relative precision.
-
-    From the invariants of H and not by `torch.linalg.det`: its second derivative at F = I is NaN.
-    """
-    return invariants(H)[2]
-
-
-def cofactor(F: Tensor) -> Tensor:
-    """Return cof F, (..., 3, 3)."""
-    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in F.unbind(-2))
-    entries = [
-        *(e * i - f * h, f * g - d * i, d * h - e * g),
-        *(c * h - b * i, a * i - c * g, b * g - a * h),
-        *(b * f - c * e, c * d - a * f, a * e - b * d),
-    ]
-    # components first in memory, as `Problem` lays H out: elementwise work then runs along rows
-    return torch.stack(entries).unflatten(0, (3, 3)).movedim((0, 1), (-2, -1))
-
-
-def inverse_transpose(H: Tensor, change: Tensor) -> Tensor:
-    """Return F^-T, (..., 3, 3) [-], of F = I + H with det F = 1 + change."""
-    F = H + torch.eye(3, dtype=H.dtype, device=H.device)
-    return cofactor(F) / (1 + change)[..., None, None]

@@ -13,18 +13,14 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 from torch import Tensor
 
+from dpl.fem.dilatation import dilated, dilated_stress
 from dpl.fem.kernels import Kernels
-from dpl.fem.materials import (
-    Isotropic,
-    Material,
-    green_lagrange,
-    inverse_transpose,
-    volume_change,
-)
+from dpl.fem.law import Isotropic, Material
 from dpl.fem.mesh import aspect_ratio, longest_side
 from dpl.fem.pattern import Pattern
 from dpl.fem.regions import Region, nodes_in
 from dpl.fem.supports import Displacement, Spring, Springs, Support, joined
+from dpl.fem.tensors import green_lagrange, volume_change
 
 # shape of the cell, degree -> element, polynomial order that the quadrature integrates exactly.
 # Full quadrature: fewer points leave hourglass modes, more only cost time.
@@ -248,7 +244,7 @@ class Problem:
         """Return the strain energy over E L^D, that of springs included, (B,) [-]."""
         H = self._gradient(displacement)
         if self.mean_dilatation:
-            H = self._dilated(H)[0]
+            H = dilated(H, self.dV, self.shape[1])[0]
         energy = (self.material.energy(H) * self.dV).sum((-2, -1))
         if self.springs is not None:
             pull = self.springs.force(displacement)
@@ -406,9 +402,9 @@ class Problem:
         if self.mean_dilatation or not isinstance(law, Isotropic):
             return None
         # Copies: sending a problem to a worker process moves the memory of its tensors.
-        arrays = [tensor.numpy().copy() for tensor in (self.cells, self.dN, self.dV)]
+        cells, dN, dV = (tensor.numpy().copy() for tensor in (self.cells, self.dN, self.dV))
         places = self.pattern.places
-        return Kernels(law, *arrays, places.reshape(len(places), -1))
+        return Kernels(law, cells, dN, dV, places.reshape(len(places), -1))
 
     def _spread(self, stress: Tensor) -> Tensor:
         """Return the nodal forces (B, N, D) of first Piola-Kirchhoff stresses (B, E, Q, 3, 3)."""
@@ -445,34 +441,7 @@ class Problem:
         """Return the stress that does work on H, (B, E, Q, 3, 3) [-]."""
         if not self.mean_dilatation:
             return self.material.stress(H)
-        dilated, ratio, plane = self._dilated(H)
-        dim, change = self.shape[1], volume_change(H)
-        stress = self.material.stress(dilated)
-        F = dilated + torch.eye(3, dtype=H.dtype, device=H.device)
-        work = (stress * F * plane).sum((-2, -1))  # by a change of all stretches, (B, E, Q)
-        total = (work * self.dV).sum(-1, keepdim=True)
-        shared = total * (1 + change) / ((1 + change) * self.dV).sum(-1, keepdim=True)
-        turned = inverse_transpose(H, change) * plane
-        return (
-            ratio[..., None, None] * stress * plane
-            + ((shared - work) / dim)[..., None, None] * turned
-        )
-
-    def _dilated(self, H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the gradient with the cell's mean det F, the factor on F, and what it acts on.
-
-        F -> (mean J / J)^(1/D) F, in the plane for plane strain.
-
-        Source: Nagtegaal, Parks, Rice (1974); Simo, Taylor, Pister (1985), CMAME 51, section 3.
-        """
-        dim = self.shape[1]
-        plane = torch.zeros(3, 3, dtype=H.dtype, device=H.device)
-        plane[:dim, :dim] = 1.0
-        change = volume_change(H)
-        mean = (change * self.dV).sum(-1, keepdim=True) / self.dV.sum(-1, keepdim=True)
-        growth = torch.expm1((torch.log1p(mean) - torch.log1p(change)) / dim)
-        F = (H + torch.eye(3, dtype=H.dtype, device=H.device)) * plane
-        return H + growth[..., None, None] * F, 1 + growth, plane
+        return dilated_stress(self.material, H, self.dV, self.shape[1])
 
     def _cell_tangents(self, displacement: Tensor) -> Tensor:
         """Return the cell matrices (B, E A D D A), laid out aikb, by derivatives of cell forces."""
@@ -517,7 +486,9 @@ class Problem:
     def stress(self, displacement: Tensor) -> Tensor:
         """Return the first Piola-Kirchhoff stress over E at the quadrature points, (B,E,Q,3,3)."""
         H = self._gradient(displacement)
-        return self.material.stress(self._dilated(H)[0] if self.mean_dilatation else H)
+        if self.mean_dilatation:
+            H = dilated(H, self.dV, self.shape[1])[0]
+        return self.material.stress(H)
 
     @cached_property
     def pattern(self) -> Pattern:

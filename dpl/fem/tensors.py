@@ -1,0 +1,59 @@
+"""Small tensor algebra on (..., 3, 3), exact where F is close to I."""
+
+import torch
+from torch import Tensor
+
+
+def trace(H: Tensor) -> Tensor:
+    """Return tr H, (...,), of H (..., 3, 3)."""
+    return H.diagonal(dim1=-2, dim2=-1).sum(-1)
+
+
+def green_lagrange(H: Tensor) -> Tensor:
+    """Return the Green-Lagrange strain (H + H^T + H^T H)/2, (..., 3, 3) [-]."""
+    return (H + H.mT + H.mT @ H) / 2
+
+
+def invariants(e: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return tr e, its sum of principal minors and det(I + e) - 1, (...,), of e (..., 3, 3)."""
+    (a, b, c), (d, f, g), (h, i, k) = (row.unbind(-1) for row in e.unbind(-2))
+    first, second = a + f + k, a * f - b * d + f * k - g * i + a * k - c * h
+    third = a * (f * k - g * i) - b * (d * k - g * h) + c * (d * i - f * h)
+    return first, second, first + second + third
+
+
+def volume_change(H: Tensor) -> Tensor:
+    """Return det F - 1, (...,) [-], of H = F - I (..., 3, 3), to full relative precision.
+
+    From the invariants of H and not by `torch.linalg.det`: its second derivative at F = I is NaN.
+    """
+    return invariants(H)[2]
+
+
+def cofactor(F: Tensor) -> Tensor:
+    """Return cof F, (..., 3, 3)."""
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in F.unbind(-2))
+    entries = [
+        *(e * i - f * h, f * g - d * i, d * h - e * g),
+        *(c * h - b * i, a * i - c * g, b * g - a * h),
+        *(b * f - c * e, c * d - a * f, a * e - b * d),
+    ]
+    # components first in memory, as `Problem` lays H out: elementwise work then runs along rows
+    return torch.stack(entries).unflatten(0, (3, 3)).movedim((0, 1), (-2, -1))
+
+
+def inverse_transpose(H: Tensor, change: Tensor) -> Tensor:
+    """Return F^-T, (..., 3, 3) [-], of F = I + H with det F = 1 + change."""
+    F = H + torch.eye(3, dtype=H.dtype, device=H.device)
+    return cofactor(F) / (1 + change)[..., None, None]
+
+
+def dyad(A: Tensor, B: Tensor) -> Tensor:
+    """Return A_ij B_kl, (..., 3, 3, 3, 3)."""
+    return A[..., :, :, None, None] * B[..., None, None, :, :]
+
+
+def symmetric_product(A: Tensor) -> Tensor:
+    """Return (A_ik A_jl + A_il A_jk)/2, (..., 3, 3, 3, 3)."""
+    product = A[..., :, None, :, None] * A[..., None, :, None, :]
+    return (product + product.transpose(-1, -2)) / 2
