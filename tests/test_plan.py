@@ -29,9 +29,9 @@ def calls(monkeypatch):
 
     watch(SuperLU, "factorise", "factorise")
     watch(Problem, "tangent", "tangent")
-    watch(Problem, "mixed_system", "tangent")
-    watch(Problem, "internal_force", "internal_force")
-    watch(Problem, "residual", "residual")
+    watch(Problem, "linearise", "tangent")
+    for name in ("internal_force", "residual", "evaluate"):
+        watch(Problem, name, "residual")
     monkeypatch.setattr("dpl.fem.linear.splu", _counting_splu(counts))
     return counts
 
@@ -158,19 +158,22 @@ def test_mse_trains_without_finite_elements(scene, batch, calls, loss, evaluated
     surrogate = Surrogate(FCNN(scene, width=4), loss, scene)
     calls.clear()
     loss(surrogate.predict(batch.load), batch, surrogate.physics).backward()
-    assert ("internal_force" in calls or "residual" in calls) is evaluated
+    assert ("residual" in calls) is evaluated
     assert any("no finite-element evaluation" in line for line in surrogate.plan()) != evaluated
 
 
 def test_lr_star_sends_no_gradient_through_the_residual(scene, batch, monkeypatch):
     tracked = []
-    original = Problem.internal_force
 
-    def watched(problem, displacement):
-        tracked.append(torch.is_grad_enabled() and displacement.requires_grad)
-        return original(problem, displacement)
+    def watch(original):
+        def watched(problem, displacement):
+            tracked.append(torch.is_grad_enabled() and displacement.requires_grad)
+            return original(problem, displacement)
 
-    monkeypatch.setattr(Problem, "internal_force", watched)
+        return watched
+
+    for name in ("internal_force", "evaluate"):
+        monkeypatch.setattr(Problem, name, watch(getattr(Problem, name)))
     prediction = (batch.displacement + 1e-3).requires_grad_()
     surrogate = Surrogate(FCNN(scene, width=4), LrStar(), scene)
     surrogate.loss(prediction, batch, surrogate.physics)

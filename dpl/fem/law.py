@@ -6,6 +6,7 @@ its stress as a difference of terms that cancel at rest.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -180,9 +181,17 @@ class Isotropic(Material):
 
     def response(self, E: Tensor) -> Response:
         """Return stress and moduli, see `Material.response`."""
+        square = invariants(2 * E)[2]
+        return self._response(E, square / (1 + (1 + square).sqrt()))
+
+    def tangent(self, H: Tensor) -> Tensor:
+        """Return dP/dF, see `Material.tangent`; J is that of H, with its sign."""
+        return self._response(green_lagrange(H), volume_change(H)).tangent(H)
+
+    def _response(self, E: Tensor, j: Tensor) -> Response:
+        """Return stress and moduli at strains E where J = 1 + j."""
         e = 2 * E
         i1, second, square = invariants(e)
-        j = square / (1 + (1 + square).sqrt())
         eye = torch.eye(3, dtype=E.dtype, device=E.device)
         X = inverse_transpose(e, square)
         slopes = self._slopes(i1, 2 * i1 + second, j)
@@ -227,9 +236,16 @@ def _stress(e: Tensor, square: Tensor, i1: Tensor, slopes: tuple[Tensor | float,
     return S
 
 
-def check_moduli(name: str, shear: float, bulk: float) -> None:
-    """Raise ValueError if a shear modulus, called `name`, or a bulk modulus is not above 0."""
+def check_moduli(name: str, shear: float, bulk: float, constants: Iterable[float]) -> None:
+    """Check the constants of a law, and the moduli at rest that follow.
+
+    Raises:
+        ValueError: A constant is no finite number, or the shear modulus, called `name`, or the bulk
+            modulus is not above 0.
+    """
     if not 0 < shear < math.inf:
         raise ValueError(f"{name} = {shear} must be above 0: it is the shear modulus at rest")
     if not 0 < bulk < math.inf:
         raise ValueError(f"bulk = {bulk} must be above 0")
+    if not all(math.isfinite(constant) for constant in constants):
+        raise ValueError(f"moduli = {list(constants)} must be finite numbers")

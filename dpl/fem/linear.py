@@ -213,6 +213,8 @@ class Pardiso:
             from pypardiso import PyPardisoSolver
 
             self._solver = PyPardisoSolver(mtype=-2)
+            for place, setting in SETTINGS.items():
+                self._solver.set_iparm(place, setting)
             # Found by a search through the whole environment, a second or more: once is enough.
             os.environ.setdefault("PYPARDISO_MKL_RT", self._solver.libmkl._name)
             weakref.finalize(self, self._solver.free_memory, everything=True)
@@ -236,6 +238,17 @@ class Pardiso:
         finally:
             self._solver.libmkl.MKL_Set_Num_Threads_Local(before)
 
+
+# MKL's iparm, counted from 1; by default it gives up pivots below 1e-8 ||A||, which slender bodies
+# have that are far from singular.
+SETTINGS = {
+    1: 1,  # these settings, not the defaults
+    2: 2,  # nested dissection
+    8: 2,  # refinement steps at most
+    10: 13,  # pivots below 1e-13 ||A|| are zero
+    11: 0,
+    13: 0,
+}
 
 BACKENDS: dict[str, Callable[[Pattern, Array | None], Backend]] = {
     "band": lambda pattern, near_null: Band(pattern, _indefinite),

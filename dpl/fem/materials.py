@@ -160,8 +160,9 @@ class NeoHookeanIsoK4(NeoHookeanIsoK2):
 class StableNeoHookean(Hookean, Isotropic):
     """Stable neo-Hookean solid: m/2 (I1 - 3) + l/2 (J - a)^2 - m/2 ln(I1 + 1).
 
-    With m = 4 mu/3, l = lambda + 5 mu/6 and a = 1 + 3 m/(4 l). Finite for any F, inverted or not:
-    a body may rest inverted. The energy at rest is not zero.
+    With m = 4 mu/3, l = lambda + 5 mu/6 and a = 1 + 3 m/(4 l). The energy is finite for any F,
+    inverted or not (a body may rest inverted), the stress for any F that is not singular. The
+    energy at rest is not zero.
 
     Source: Smith, de Goes, Kim (2018), ACM TOG 37(2), eq. 14.
     """
@@ -212,7 +213,7 @@ class MooneyRivlinK2(Isotropic):
         Raises:
             ValueError: The body would not resist shear or compression.
         """
-        check_moduli("2 (c10 + c01)", 2 * (self.c10 + self.c01), self.bulk)
+        check_moduli("2 (c10 + c01)", 2 * (self.c10 + self.c01), self.bulk, vars(self).values())
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
@@ -251,7 +252,7 @@ class YeohK2(Isotropic):
         Raises:
             ValueError: The body would not resist shear or compression.
         """
-        check_moduli("2 c10", 2 * self.c10, self.bulk)
+        check_moduli("2 c10", 2 * self.c10, self.bulk, vars(self).values())
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""

@@ -64,7 +64,9 @@ class Newton:
     succeeded; intermediate states need only `loose`.
 
     An answer whose tangent has negative pivots is in balance but no minimum of the energy, a
-    straight column beyond its critical load, for one: its status says so.
+    straight column beyond its critical load, for one: its status says so. The tangent at the
+    answer is factorised only if the last one on the way had some, so that an answer within 1e-4 of
+    a critical load may pass.
 
     Source: Wriggers (2008), Nonlinear Finite Element Methods, sections 5.1 and 5.3.
 
@@ -145,7 +147,8 @@ class Newton:
                 step, guessed = (step, False) if guessed else ((target - count.known) / 2, False)
                 state = base
             lost = step < self.smallest_step
-            if lost or count.iterations >= self.budget:
+            spent = count.iterations >= self.budget
+            if lost or (spent and not self._balanced(state, force, 1.0, self.tol)):
                 end = Status.NO_VALID_EQUILIBRIUM if lost else Status.NOT_CONVERGED
                 yield self._report(base, force, count, end)
                 return

@@ -42,7 +42,8 @@ class OgdenK2(Material):
             raise ValueError(
                 f"exponents = {list(self.exponents)} must be {len(self.shear)} numbers other than 0"
             )
-        check_moduli("sum of shear", sum(self.shear), self.bulk)
+        constants = [*self.shear, *self.exponents, self.bulk]
+        check_moduli("sum of shear", sum(self.shear), self.bulk, constants)
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""

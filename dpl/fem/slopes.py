@@ -46,12 +46,12 @@ class Law:
     @cached_property
     def kind(self) -> _LawType:
         """The law's type in numba."""
-        name = self.material.__qualname__
-        functions = [self.material.slopes, *_helpers(self.material.slopes)]
-        source = "".join(inspect.getsource(f) for f in functions)
-        name += hashlib.sha256((source + self.sources).encode()).hexdigest()[:16]
+        slopes = self.material.slopes
+        code = repr(_read(slopes)) + self.sources
+        digest = hashlib.sha256(code.encode()).hexdigest()[:16]
+        name = f"{self.material.__qualname__}{digest}"
         if name not in _SLOPES:
-            _SLOPES[name] = _jitted(self.material.slopes)
+            _SLOPES[name] = _jitted(slopes)
         return _LawType(name)
 
 
@@ -70,16 +70,28 @@ def needed(material: Isotropic) -> int:
     return 0 if everything[2] == 0 and not np.any(everything[6:]) else 1
 
 
-def _helpers(function: Any) -> list[Any]:
-    """Return the functions of its own module that a function names."""
-    named = (function.__globals__.get(name) for name in function.__code__.co_names)
-    return [f for f in named if inspect.isfunction(f)]
+def _globals(function: Any) -> dict[str, Any]:
+    """Return what a function reads of its module, by name."""
+    scope = function.__globals__
+    return {name: scope[name] for name in function.__code__.co_names if name in scope}
+
+
+def _read(function: Any) -> tuple[Any, ...]:
+    """Return all that decides what a function returns: its code, and what it reads, in depth."""
+    code = function.__code__
+    parts = [
+        (name, _read(value) if inspect.isfunction(value) else repr(value))
+        for name, value in sorted(_globals(function).items())
+    ]
+    return code.co_code, code.co_consts, code.co_names, parts
 
 
 def _jitted(function: Any) -> Any:
     """Return a plain arithmetic function compiled, with the functions that it calls."""
-    compiled = {f.__name__: njit(f) for f in _helpers(function)}
-    scope = {**function.__globals__, **compiled}
+    scope = dict(function.__globals__)
+    for name, value in _globals(function).items():
+        if inspect.isfunction(value):
+            scope[name] = _jitted(value)
     return njit(type(function)(function.__code__, scope, function.__name__))
 
 

@@ -46,7 +46,9 @@ def paper_beam(
     return Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
 
 
-def slender(law: Material, cells: Sequence[int], cell: str = "hexahedron", degree: int = 2) -> Any:
+def slender(
+    law: Material, cells: Sequence[int], cell: str = "hexahedron", degree: int = 2
+) -> Problem:
     """Return a beam of cross-section 1 x 1, as long as it has cells over those across, clamped."""
     mesh = box([cells[0] / cells[1], 1.0, 1.0], [n + 1 for n in cells], cell)
     return Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)

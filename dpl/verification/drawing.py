@@ -2,7 +2,7 @@
 
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ from torch import Tensor
 
 from dpl.fem.problem import Problem
 from dpl.verification.bodies import Array, lattice
-
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKS = "osD^vP"
@@ -42,8 +41,8 @@ def picture(path: Path, height: float = 3.1) -> Iterator[Any]:
     from PIL import Image
 
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(7.4, height), layout="constrained")
-        figure.get_layout_engine().set(w_pad=0.06, wspace=0.05)
+        figure = Figure(figsize=(7.4, height))
+        figure.set_layout_engine("constrained", w_pad=0.06, wspace=0.05)
         yield figure
         drawn = io.BytesIO()
         figure.savefig(drawn, dpi=150)
@@ -104,33 +103,32 @@ def side(ax: Any, places: Array, nodes: NDArray[np.int_], colour: str, step: int
 
 
 def solid(ax: Any, problem: Problem, displacement: Tensor, colour: str) -> None:
-    """Draw the faces of a block of a grid, deformed, its cells outlined."""
-    from matplotlib.colors import LightSource, to_rgb
+    """Draw the faces of a block of a grid, deformed and lit, its cells outlined."""
+    from matplotlib.colors import to_rgb
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     nodes = lattice(problem.points.numpy())
     places = (problem.points + displacement).numpy()
-    k, quads, lines = problem.degree, [], []
+    light = np.array([-0.3, -0.85, 0.45])
     for axis in range(3):
-        for end in (0, -1):
+        for end, outward in ((0, -1), (-1, 1)):
             face = np.moveaxis(nodes, axis, 0)[end]
             quad = np.stack([face[:-1, :-1], face[1:, :-1], face[1:, 1:], face[:-1, 1:]], axis=-1)
-            quads.append(places[quad.reshape(-1, 4)])
-            lines += [places[row] for row in (*face[::k], *face.T[::k])]
-    ax.add_collection3d(
-        Poly3DCollection(
-            np.concatenate(quads),
-            facecolors=to_rgb(colour),
-            edgecolors="none",
-            shade=True,
-            lightsource=LightSource(225, 35),
-        )
-    )
-    ax.add_collection3d(Line3DCollection(lines, colors="black", linewidths=0.25, alpha=0.6))
+            quads = places[quad.reshape(-1, 4)]
+            normals = np.cross(quads[:, 1] - quads[:, 0], quads[:, 3] - quads[:, 0])
+            normals *= outward * (1 if axis != 1 else -1) / np.linalg.norm(normals, axis=1)[:, None]
+            shade = 0.45 + 0.55 * np.maximum(normals @ light, 0.0)
+            colours = shade[:, None] * to_rgb(colour)
+            ax.add_collection3d(
+                Poly3DCollection(quads, facecolors=colours, edgecolors=colours, clip_on=False)
+            )
+            lines = [places[row] for row in (*face[:: problem.degree], *face.T[:: problem.degree])]
+            style = {"colors": "black", "linewidths": 0.25, "clip_on": False}
+            ax.add_collection3d(Line3DCollection(lines, **style))
     low, high = places.min(axis=0), places.max(axis=0)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    ax.set_box_aspect(high - low, zoom=1.3)
-    ax.view_init(elev=14, azim=-60)
+    ax.set_box_aspect(high - low, zoom=1.45)
+    ax.view_init(elev=18, azim=-65)
     ax.set_axis_off()
 
 

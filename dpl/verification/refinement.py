@@ -18,7 +18,6 @@ from dpl.verification.bodies import NAMES, Array, balanced, lattice
 from dpl.verification.drawing import COLOURS, measured, panel, picture, reference, side, triangle
 from dpl.verification.report import Row, Section
 
-
 # cell, degree: cells a side, error in L2, error in the H1-seminorm; NH-ln, A = 0.1
 ERRORS: dict[tuple[str, int], tuple[list[int], str, str]] = {
     ("hexahedron", 1): (
@@ -89,27 +88,7 @@ def order(folder: Path) -> Section:
             Row(f"{name}, order in L2, last pair", f"> {degree + 0.9}", rates[0]),
             Row(f"{name}, order in H1, last pair", f"> {degree - 0.05:.2f}", rates[1]),
         ]
-    with picture(folder / "order.png", 3.4) as figure:
-        log = {"xscale": "log", "yscale": "log"}
-        for place, what in ((1, "L2 error of u [-]"), (2, "H1 error of u (seminorm) [-]")):
-            ax = panel(figure, place, "cell size h/L [-]", what, f"({'ab'[place - 1]})", **log)
-            for k, (kind, (counts, *printed)) in enumerate(ERRORS.items()):
-                h, known = 1 / np.array(counts), printed[place - 1].split()
-                measured(ax, h, found[kind][:, place - 1], k, NAMES[kind])
-                reference(
-                    ax, h[-len(known) :], [float(e) for e in known], "reference" if k == 3 else None
-                )
-            ticks = [1, 1 / 2, 1 / 4, 1 / 8, 1 / 16]
-            ax.set_xticks(ticks, ["1", "1/2", "1/4", "1/8", "1/16"])
-            ax.minorticks_off()
-            low = (
-                [(0.125, 5.5e-4, 2), (0.25, 7e-5, 3)]
-                if place == 1
-                else [(0.14, 9e-3, 1), (0.3, 2e-3, 2)]
-            )
-            for x, y, p in low:
-                triangle(ax, x, y, p)
-        ax.legend(loc="lower right")
+    _draw_errors(folder / "order.png", found)
     return Section(
         "Order of accuracy",
         "Manufactured solution on the unit cube (NH-ln, ν = 0.3): u₁ = A sin πx cos πy/2, "
@@ -122,19 +101,40 @@ def order(folder: Path) -> Section:
     )
 
 
-COOK = {  # degree: cells a side, displacement u_y at (48, 52) [mm]
-    1: ([2, 4, 8, 16, 32, 64], "8.638 12.07 13.86 14.49 14.67 14.72"),
-    2: ([2, 4, 8, 16, 32, 64], "14.30 14.65 14.71 14.73 14.74 14.74"),
+def _draw_errors(path: Path, found: dict[tuple[str, int], Array]) -> None:
+    panels = (
+        ("L2 error of u [-]", ((0.125, 5.5e-4, 2), (0.21, 4.2e-5, 3))),
+        ("H1 error of u (seminorm) [-]", ((0.14, 9e-3, 1), (0.3, 2e-3, 2))),
+    )
+    sizes = {"1": 1, "1/2": 1 / 2, "1/4": 1 / 4, "1/8": 1 / 8, "1/16": 1 / 16}
+    log = {"xscale": "log", "yscale": "log"}
+    with picture(path, 3.4) as figure:
+        for place, (what, triangles) in enumerate(panels):
+            ax = panel(figure, place + 1, "cell size h/L [-]", what, f"({'ab'[place]})", **log)
+            for k, (kind, (counts, *printed)) in enumerate(ERRORS.items()):
+                h, values = 1 / np.array(counts), [float(text) for text in printed[place].split()]
+                measured(ax, h, found[kind][:, place], k, NAMES[kind])
+                label = "independent code" if k == 3 else None
+                reference(ax, h[-len(values) :], values, label)
+            for x, y, power in triangles:
+                triangle(ax, x, y, power)
+            ax.set_xticks([*sizes.values()], [*sizes])
+            ax.minorticks_off()
+            if place == 0:
+                ax.legend(loc="lower right")
+
+
+SIDES = (2, 4, 8, 16, 32, 64)
+COOK = {  # displacement u_y at (48, 52) [mm] on SIDES cells a side: deal.II
+    1: "8.638 12.07 13.86 14.49 14.67 14.72",
+    2: "14.30 14.65 14.71 14.73 14.74 14.74",
 }
-FINER = {  # degree, cells a side: the same by an independent code
-    (1, 2): "8.6384",
-    (1, 4): "12.0712",
-    (1, 8): "13.8632",
-    (1, 16): "14.4853",
-    (2, 2): "14.3018",
-    (2, 4): "14.6494",
-    (2, 8): "14.7139",
-}
+FINER = {1: "8.6384 12.0712 13.8632 14.4853", 2: "14.3018 14.6494 14.7139"}  # independent code
+OTHERS: list[tuple[str, Material, int, str]] = [  # 8 x 8 cells, independent code
+    ("NH-ln", NeoHookeanLn(0.3), 1, "13.700585"),
+    ("NH-ln", NeoHookeanLn(0.3), 2, "14.4831"),
+    ("SVK", SaintVenantKirchhoff(0.3), 2, "13.6261"),
+]
 
 
 def membrane(law: Material, n: int, degree: int) -> tuple[Problem, Tensor]:
@@ -148,60 +148,29 @@ def membrane(law: Material, n: int, degree: int) -> tuple[Problem, Tensor]:
     return problem, balanced(Newton(problem), force).displacement[0] * problem.length
 
 
-def _at(problem: Problem, field: Tensor, *place: float) -> Tensor:
-    """Return a nodal field at the node nearest a place [of the unit of `length`]."""
+def at(problem: Problem, field: Tensor, place: Sequence[float]) -> tuple[float, ...]:
+    """Return a nodal field (N, D) at the node nearest a place [of the unit of `length`]."""
     away = problem.points * problem.length - torch.tensor(place, dtype=torch.float64)
-    return field[int(away.norm(dim=1).argmin())]
+    return tuple(field[int(away.norm(dim=1).argmin())].tolist())
 
 
 def cook(folder: Path) -> Section:
     """Refine Cook's membrane."""
-    law, rows, found = NeoHookeanIsoK4(0.3), [], {}
-    for degree, (counts, printed) in COOK.items():
-        for n, known in zip(counts, printed.split(), strict=True):
-            problem, u = membrane(law, n, degree)
-            found[degree, n] = float(_at(problem, u, 48, 52)[1])
-            what = f"Q{degree}, {n} × {n}: u_y(48, 52) [mm]"
-            rows.append(Row(f"{what}, deal.II", known, found[degree, n]))
-            if (degree, n) in FINER:
-                known = FINER[degree, n]
-                rows.append(Row(f"{what}, independent code", known, found[degree, n]))
-            if (degree, n) == (2, 8):
-                shown, corner = (problem, u), _at(problem, u, 48, 60)
-                tip = _at(problem, u, 48, 52)
-    rows += [
-        Row("Q2, 8 × 8: u_x(48, 60) [mm]", "-13.8264", float(corner[0])),
-        Row("Q2, 8 × 8: u_y(48, 60) [mm]", "13.7505", float(corner[1])),
-    ]
-    others = (
-        ("NH-ln, Q1, 8 × 8", NeoHookeanLn(0.3), 1, "13.700585"),
-        ("NH-ln, Q2, 8 × 8", NeoHookeanLn(0.3), 2, "14.4831"),
-        ("SVK, Q2, 8 × 8", SaintVenantKirchhoff(0.3), 2, "13.6261"),
-    )
-    for what, other, degree, known in others:
-        value = float(_at(*membrane(other, 8, degree), 48, 52)[1])
-        rows.append(Row(f"{what}: u_y(48, 52) [mm]", known, value))
-    with picture(folder / "cook.png") as figure:
-        ax = panel(figure, 1, "cells a side [-]", "u$_y$ at (48, 52) [mm]", "(a)", xscale="log")
-        for k, (degree, (counts, printed)) in enumerate(COOK.items()):
-            reference(
-                ax, counts, [float(text) for text in printed.split()], "deal.II" if k else None
-            )
-            measured(ax, counts, [found[degree, n] for n in counts], k, f"Q{degree}")
-        ax.set_xticks(counts, [str(n) for n in counts])
-        ax.minorticks_off()
-        ax.legend(loc="lower right")
-        ax = panel(figure, 2, "x [mm]", "y [mm]", "(b) Q2, 8 × 8 cells", aspect="equal")
-        problem, u = shown
-        X = problem.points.numpy() * problem.length
-        x, y = X.T / 48
-        nodes = lattice(np.stack([x, (y * 48 - 44 * x) / (44 - 28 * x)], axis=1))
-        side(ax, X, nodes, "0.6", 2)
-        side(ax, X + u.numpy(), nodes, COLOURS[1], 2)
-        for place, text in (((48, 52), "(48, 52)"), (np.array([48, 52]) + tip.numpy(), "")):
-            ax.plot(*place, "k.", markersize=5)
-            ax.annotate(text, place, (4, -3), textcoords="offset points")
-        ax.set(xticks=range(0, 61, 15), yticks=range(0, 76, 15), xlim=(-3, 63), ylim=(-3, 78))
+    found = {(d, n): membrane(NeoHookeanIsoK4(0.3), n, d) for d in COOK for n in SIDES}
+    tips = {case: at(*body, (48, 52))[1] for case, body in found.items()}
+    rows = []
+    for source, table in (("deal.II", COOK), ("independent code", FINER)):
+        for degree, printed in table.items():
+            for n, text in zip(SIDES, printed.split(), strict=False):
+                name = f"Q{degree}, {n} × {n}: u_y(48, 52) [mm], {source}"
+                rows.append(Row(name, text, tips[degree, n]))
+    for k, text in enumerate(("-13.8264", "13.7505")):
+        name = f"Q2, 8 × 8: u_{'xy'[k]}(48, 60) [mm], independent code"
+        rows.append(Row(name, text, at(*found[2, 8], (48, 60))[k]))
+    for law_name, law, degree, text in OTHERS:
+        name = f"{law_name}, Q{degree}, 8 × 8: u_y(48, 52) [mm], independent code"
+        rows.append(Row(name, text, at(*membrane(law, 8, degree), (48, 52))[1]))
+    _draw_membrane(folder / "cook.png", tips, *found[2, 8])
     return Section(
         "Cook's membrane",
         "A tapered panel (corners (0, 0), (48, 44), (48, 60), (0, 44) mm), clamped on the left, "
@@ -215,12 +184,39 @@ def cook(folder: Path) -> Section:
     )
 
 
+def _draw_membrane(
+    path: Path, tips: dict[tuple[int, int], float], problem: Problem, u: Tensor
+) -> None:
+    with picture(path, 3.3) as figure:
+        ax = panel(figure, 1, "cells a side [-]", "u$_y$ at (48, 52) [mm]", "(a)", xscale="log")
+        for k, (degree, printed) in enumerate(COOK.items()):
+            measured(ax, SIDES, [tips[degree, n] for n in SIDES], k, f"Q{degree}")
+            known = [float(text) for text in printed.split()]
+            reference(ax, SIDES, known, "deal.II" if k else None)
+        ax.set_xticks(SIDES, map(str, SIDES))
+        ax.minorticks_off()
+        ax.legend(loc="lower right")
+        ax = panel(figure, 2, "x [mm]", "y [mm]", "(b) Q2, 8 × 8 cells", aspect="equal")
+        ax.grid(False)
+        X = problem.points.numpy() * problem.length
+        x, y = X.T
+        nodes = lattice(np.stack([x / 48, (y - 44 / 48 * x) / (44 - 28 / 48 * x)], axis=1))
+        side(ax, X, nodes, "0.6", 2)
+        side(ax, X + u.numpy(), nodes, COLOURS[1], 2)
+        tip = np.array([48.0, 52.0])
+        ends = np.stack([tip, tip + at(problem, u, (48, 52))])
+        ax.plot(*ends.T, "k.-", markersize=5, linewidth=0.8, zorder=5)
+        ax.annotate("(48, 52)", ends[0], (5, -3), textcoords="offset points")
+        ax.set(xticks=range(0, 61, 15), yticks=range(0, 76, 15), xlim=(-3, 66), ylim=(-3, 78))
+
+
 POISSON = (0.3, 0.45, 0.49, 0.499, 0.4999)
 LOCKING = {  # compliance over that of hex27, 16 x 4 x 4: cells, cell, degree, values
     "hex8, 16 × 4 × 4": ((16, 4, 4), "hexahedron", 1, ".960 .901 .753 .467 .209"),
     "tet4, 16 × 4 × 4": ((16, 4, 4), "tetra", 1, ".795 .615 .323 .103 .067"),
     "tet10, 8 × 2 × 2": ((8, 2, 2), "tetra", 2, ".991 .973 .957 .947 .945"),
     "hex27, 8 × 2 × 2": ((8, 2, 2), "hexahedron", 2, ".996 .981 .963 .954 .952"),
+    "hex8 with mean dilatation, 16 × 4 × 4": ((16, 4, 4), "hexahedron", 1, ""),
 }
 
 
@@ -238,36 +234,17 @@ def compliance(
 def locking(folder: Path) -> Section:
     """Approach incompressibility with every element."""
     best = [compliance(nu, (16, 4, 4), "hexahedron", 2) for nu in POISSON]
-    rows, found = [], {}
+    found, rows = {}, []
     for name, (cells, cell, degree, printed) in LOCKING.items():
-        values = [
-            compliance(nu, cells, cell, degree) / b for nu, b in zip(POISSON, best, strict=True)
+        mean = not printed
+        values = [compliance(nu, cells, cell, degree, mean) for nu in POISSON]
+        found[name] = [value / right for value, right in zip(values, best, strict=True)]
+        texts = printed.split() or ["> 0.94"] * len(POISSON)
+        rows += [
+            Row(f"{name}, ν = {nu}", text, value)
+            for nu, text, value in zip(POISSON, texts, found[name], strict=True)
         ]
-        found[name] = values
-        for nu, known, value in zip(POISSON, printed.split(), values, strict=True):
-            if nu in (0.3, 0.49, 0.4999):
-                rows.append(Row(f"{name}, ν = {nu}", known, value))
-    name = "hex8 with mean dilatation, 16 × 4 × 4"
-    found[name] = [
-        compliance(nu, (16, 4, 4), "hexahedron", 1, True) / b
-        for nu, b in zip(POISSON, best, strict=True)
-    ]
-    for nu, value in zip(POISSON, found[name], strict=True):
-        rows.append(Row(f"{name}, ν = {nu}", "> 0.94", value))
-    with picture(folder / "locking.png") as figure:
-        ax = panel(figure, 1, "½ − ν [-]", "compliance / that of hex27, 16 × 4 × 4 [-]", columns=1)
-        away = 0.5 - np.array(POISSON)
-        for k, (name, values) in enumerate(found.items()):
-            measured(ax, away, values, k, name)
-            if name in LOCKING:
-                known = [float(text) for text in LOCKING[name][3].split()]
-                reference(ax, away, known, "independent code" if k == 3 else None)
-        ax.set_xscale("log")
-        ax.invert_xaxis()
-        ax.set_xticks(away, [f"{a:.4g}\n(ν = {nu})" for a, nu in zip(away, POISSON, strict=True)])
-        ax.minorticks_off()
-        ax.set(ylim=(0, 1.08))
-        ax.legend(loc="upper left", bbox_to_anchor=(1, 1))
+    _draw_locking(folder / "locking.png", found)
     return Section(
         "Nearly incompressible bodies",
         "Compliance f·u of the paper's beam (4 × 1 × 1) under a small load across its end, over "
@@ -281,3 +258,27 @@ def locking(folder: Path) -> Section:
             "than the hex27 that it is compared with, which is not exact either."
         ],
     )
+
+
+def _draw_locking(path: Path, found: dict[str, list[float]]) -> None:
+    with picture(path, 2.9) as figure:
+        what = "compliance / that of fine hex27 [-]"
+        ax = panel(
+            figure,
+            1,
+            "Poisson's ratio ν [-], its distance from ½ in logarithmic scale",
+            what,
+            columns=1,
+            xscale="log",
+        )
+        away = 0.5 - np.array(POISSON)
+        for k, (name, values) in enumerate(found.items()):
+            measured(ax, away, values, k, name)
+            if known := [float(text) for text in LOCKING[name][3].split()]:
+                reference(ax, away, known)
+        reference(ax, [], [], "independent code")
+        ax.set_xticks(away, map(str, POISSON))
+        ax.minorticks_off()
+        ax.invert_xaxis()
+        ax.set(ylim=(0, 1.08))
+        ax.legend(loc="upper left", bbox_to_anchor=(1, 1))

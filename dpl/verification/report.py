@@ -1,11 +1,9 @@
 """What a case returns, and the page that is made of it."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
-from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -51,10 +49,14 @@ class Row:
             digits = len(Decimal(self.reference).as_tuple().digits)
             shown = f"{self.value:.{min(digits + 2, 12)}g}"
             off = self.difference
-            difference = f"{100 * off:+.2f} %" if abs(off) >= 1e-3 else f"{off:+.1e}"
+            difference = (
+                f"{100 * off:+.2f} %" if abs(off) >= 1e-3 else f"{off:+.1e}" if off else "0"
+            )
         if not self.holds:
             difference = f"**{difference if difference != 'holds' else 'misses'}**"
-        return self.quantity, self.reference, shown, difference
+        printed = self.reference.removeprefix(".")
+        printed = printed if printed == self.reference else f"0.{printed}"
+        return self.quantity, printed, shown, difference
 
 
 @dataclass(frozen=True)

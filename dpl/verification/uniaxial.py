@@ -27,7 +27,6 @@ from dpl.verification.bodies import Array, balanced
 from dpl.verification.drawing import measured, panel, picture, reference
 from dpl.verification.report import Row, Section
 
-
 LAWS = {
     "linear": LinearElastic(0.3),
     "SVK": SaintVenantKirchhoff(0.3),
@@ -149,7 +148,10 @@ def _draw_laws(panels: Sequence[Any], grid: Array, curves: dict[str, Any]) -> No
     for k, (name, curve) in enumerate(curves.items()):
         P = np.array([stress for stress, _ in curve])
         known = np.array([float(text) for text in UNIAXIAL[name][0].split()])
-        style = {"markevery": slice(k % 5, None, 5), "linestyle": "-" if k % 2 else "--"}
+        style: dict[str, Any] = {
+            "markevery": slice(k % 5, None, 5),
+            "linestyle": "-" if k % 2 else "--",
+        }
         ax, k = (stressed, k) if k < 6 else (rubber, k - 6)
         label = "reference" if k in (2, 5) else None
         measured(ax, grid, P, k, name, **style)

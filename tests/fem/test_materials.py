@@ -23,9 +23,8 @@ from dpl.fem.materials import (
     SaintVenantKirchhoff,
     StableNeoHookean,
     YeohK2,
-    green_lagrange,
-    volume_change,
 )
+from dpl.fem.tensors import green_lagrange, volume_change
 
 SVK, NH, SNH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3), StableNeoHookean(0.3)
 HOOKEAN = [

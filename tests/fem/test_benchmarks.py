@@ -1,0 +1,335 @@
+"""Benchmarks of VERIFICATION 1.8 a to f: beams, Cook's membrane, a twisted column, the elastica."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dpl.fem.forces import Traction
+from dpl.fem.materials import Material, NeoHookeanIsoK4, NeoHookeanLn, SaintVenantKirchhoff
+from dpl.fem.mesh import Plane, box, rectangle
+from dpl.fem.modes import eigenmodes
+from dpl.fem.newton import Linear, Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, Solution, Status, solve
+
+# these benchmarks are about elements that lock
+pytestmark = pytest.mark.filterwarnings("ignore:linear .* lock")
+
+SVK, NH, K4 = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3), NeoHookeanIsoK4(0.3)
+
+
+def load_of(force: Tensor) -> Load:
+    """Return nodal forces (N, D) [-] as a load of one member; no answer depends on its modulus."""
+    return Load(force[None], torch.ones(1, dtype=torch.float64))
+
+
+def resumed(problem: Problem, force: Tensor, guess: Tensor | None, **options) -> Solution:
+    """Return the answer that Newton reaches from a guess."""
+    *_, last = Newton(problem, **options).iterate(load_of(force), guess=guess)
+    return last
+
+
+def node_at(problem: Problem, *place: float) -> int:
+    """Return the number of the node at a place [m], one coordinate for each of the first axes."""
+    given = torch.tensor(place, dtype=torch.float64) / problem.length
+    distance = (problem.points[:, : len(place)] - given).norm(dim=1)
+    assert distance.min() < 1e-9
+    return int(distance.argmin())
+
+
+# VERIFICATION 1.8a: R_k / R_1 of the load steps 1 to 5, R_1 the residual after one iteration
+CARIBOU = [
+    [4.802014100e-3, 3.457785824e-4, 6.4178e-8],
+    [4.700052322e-3, 3.771851553e-4, 1.289757639e-5, 2.12504e-8],
+    [4.416064536e-3, 4.703733157e-4, 3.659722934e-5, 7.7915e-8],
+    [4.003458215e-3, 6.263051714e-4, 4.996976075e-5, 1.42207e-7],
+    [3.526942204e-3, 8.307813177e-4, 4.667215114e-5, 1.64673e-7],
+]
+
+
+def caribou(degree: int) -> tuple[Problem, Tensor]:
+    """Return the beam 15 x 15 x 80 along z of Caribou's regression test, and its whole load."""
+    mesh = box([15.0, 15.0, 80.0], [3, 3, 9])
+    law = SaintVenantKirchhoff(0.499)
+    problem = Problem.build(mesh, law, fixed=Plane(2, "min"), degree=degree)
+    return problem, Traction(Plane(2, "max"), [0.0, -30 / 3000, 0.0]).on(problem)
+
+
+def load_steps(problem: Problem, force: Tensor) -> Iterator[tuple[list[float], Tensor]]:
+    """Yield R_k / R_1 and the last displacement of each of five load steps of plain Newton.
+
+    A step ends where R_k / R_1 < 1e-5, as in Caribou.
+    """
+    state = None
+    for step in range(1, 6):
+        part = step / 5 * force
+        solver = Newton(problem, tol=1e-15, mixed=False, linear="superlu")
+        norms = []
+        for iterate in solver.iterate(load_of(part), guess=state):
+            state = iterate.displacement
+            norms.append(problem.residual(state, part).norm().item())
+            if len(norms) > 2 and norms[-1] < 1e-5 * norms[1]:
+                break
+        yield [norm / norms[1] for norm in norms[2:]], state
+
+
+def end_face(problem: Problem, state: Tensor) -> list[float]:
+    """Return where the centre of the end face comes to lie, from the beam's axis [m]."""
+    centre = node_at(problem, 7.5, 7.5, 80.0)
+    return (80 * (problem.points + state[0])[centre] - torch.tensor([7.5, 7.5, 0.0])).tolist()
+
+
+def test_beam_of_caribou_has_its_residuals_and_its_end():
+    """VERIFICATION 1.8a: 19 ratios to 1e-10, the end face's centre to all digits."""
+    problem, force = caribou(1)
+    steps = list(load_steps(problem, force))
+    for (ratios, _), printed in zip(steps, CARIBOU, strict=True):
+        assert ratios == pytest.approx(printed, rel=0, abs=1e-10)
+    state = steps[-1][1]
+    assert end_face(problem, state) == pytest.approx([0, -21.0164, 76.1898], abs=1e-4)
+    answer = solve(Newton(problem), load_of(force))
+    assert end_face(problem, answer.displacement) == pytest.approx([0, -21.0164, 76.1898], abs=1e-3)
+
+
+def test_beam_of_caribou_in_quadratic_elements_bends_twice_as_far():
+    """VERIFICATION 1.8a: the printed place is one where Caribou stops, 7e-4 out of balance."""
+    problem, force = caribou(2)
+    *_, (_, state) = load_steps(problem, force)
+    printed = [0, -49.22035, 58.16711]
+    assert end_face(problem, state) == pytest.approx(printed, abs=1e-5)
+    assert problem.residual_ratio(state, force[None]).item() == pytest.approx(7.4e-4, rel=0.02)
+    answer = solve(Newton(problem), load_of(force))
+    assert answer.status.item() == Status.CONVERGED
+    assert end_face(problem, answer.displacement) == pytest.approx(printed, abs=1e-3)
+
+
+# VERIFICATION 1.8b: law, degree, cells a side, place, displacement [mm], digits of it
+COOK = [
+    *((K4, 1, n, (48, 52), u, 5e-5) for n, u in ((2, 8.6384), (4, 12.0712), (8, 13.8632))),
+    (K4, 1, 16, (48, 52), 14.4853, 5e-5),
+    *((K4, 2, n, (48, 52), u, 5e-5) for n, u in ((2, 14.3018), (4, 14.6494), (8, 14.7139))),
+    (K4, 2, 8, (48, 60), 13.7505, 5e-5),
+    (NH, 1, 8, (48, 52), 13.700585, 5e-7),
+    (NH, 2, 8, (48, 52), 14.4831, 5.1e-5),
+    (SVK, 2, 8, (48, 52), 13.6261, 5e-5),
+]
+COOK_OF_DEAL = {1: [8.638, 12.07, 13.86, 14.49, 14.67, 14.72], 2: [14.30, 14.65, 14.71, 14.73]}
+SIDES = [2, 4, 8, 16, 32, 64]
+
+
+def cook(law: Material, degree: int, count: int, *, solid: bool = False) -> tuple[Problem, Tensor]:
+    """Return Cook's membrane [mm] and its load, in plane strain or one element thick with u_z = 0.
+
+    The modulus is 2 mu (1 + nu) with mu = 0.4225 N/mm^2, the shear traction 1/16 N/mm^2.
+    """
+    sides, cells = [1.0] * (2 + solid), [count + 1] * 2 + [2] * solid
+    mesh = (box if solid else rectangle)(sides, cells)
+    x, y = mesh.p[:2]
+    mesh = type(mesh)(np.stack([48 * x, 44 * x + y * (44 - 28 * x), *mesh.p[2:]]), mesh.t)
+    points = Problem.build(mesh, law, degree=degree).points.numpy()
+    held = np.zeros(points.shape, dtype=bool)
+    held[:, 2:] = True
+    held[points[:, 0] < 1e-9] = True
+    problem = Problem.build(mesh, law, fixed=held, degree=degree)
+    value = [0.0, 1 / 16 / (2 * 0.4225 * 1.3), 0.0][: 2 + solid]
+    return problem, Traction(Plane(0, "max"), value).on(problem)
+
+
+@pytest.mark.parametrize("solid", [False, True], ids=["plane", "solid"])
+@pytest.mark.parametrize(("law", "degree", "count", "place", "printed", "digits"), COOK)
+def test_membrane_of_cook_rises_as_tabulated(solid, law, degree, count, place, printed, digits):
+    """VERIFICATION 1.8b: plane strain and a slice of the solid say the same."""
+    problem, force = cook(law, degree, count, solid=solid)
+    answer = solve(Newton(problem), load_of(force))
+    assert answer.status.item() == Status.CONVERGED
+    found = problem.length * answer.displacement[0, node_at(problem, *place)]
+    assert found[1].item() == pytest.approx(printed, abs=digits)
+    if place == (48, 60):
+        assert found[0].item() == pytest.approx(-13.8264, abs=5e-5)
+
+
+FINE_COOK = [(1, n) for n in range(4)] + [(2, n) for n in range(3)]
+SLOW_COOK = [(1, 4), (1, 5), (2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("degree", "level"), FINE_COOK + [pytest.param(*c, marks=pytest.mark.slow) for c in SLOW_COOK]
+)
+def test_membrane_of_cook_rises_as_printed_by_deal_ii(degree, level):
+    """VERIFICATION 1.8b: the four digits of the gallery's table, 0.5 % at the finest meshes."""
+    problem, force = cook(K4, degree, SIDES[level])
+    answer = solve(Newton(problem), load_of(force))
+    rise = problem.length * answer.displacement[0, node_at(problem, 48, 52), 1].item()
+    assert float(f"{rise:.4g}") == COOK_OF_DEAL[degree][level]
+    assert level < 3 or rise == pytest.approx(14.74, rel=0.02 if degree == 1 else 5e-3)
+
+
+# VERIFICATION 1.8c: degree, n -> displacement of (20, 1, 1) [m], iterations of plain Newton
+DOLFINX = {
+    (2, 1): (-0.456847, -1.8e-5, -4.554805),
+    (2, 3): (-3.152621, -7.2e-5, -10.444325),
+    (2, 5): (-5.562813, -1.25e-4, -13.189922),
+    (2, 9): (-8.573525, -2.21e-4, -15.511486),
+    (1, 1): (None, None, -3.341340),
+    (1, 9): (None, None, -14.300877),
+}
+DOLFINX_ITERATIONS = [7, 8, 9, 8, 7, 6, 6, 5, 5]
+
+
+@pytest.mark.parametrize("degree", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])
+def test_beam_of_the_dolfinx_tutorial_bends_as_computed(degree, mixed):
+    """VERIFICATION 1.8c: nine loads, each from the answer before, no load step."""
+    mesh = box([20.0, 1.0, 1.0], [21, 6, 6])
+    problem = Problem.build(mesh, NH, fixed=Plane(0, "min"), degree=degree)
+    unit = Traction(Plane(0, "max"), [0.0, 0.0, -1.5 / 1e4]).on(problem)
+    corner, state = node_at(problem, 20, 1, 1), None
+    for n, count in enumerate(DOLFINX_ITERATIONS, 1):
+        answer = resumed(problem, n * unit, state, tol=1e-9, mixed=mixed)
+        assert answer.status.item() == Status.CONVERGED
+        assert answer.iterations.item() <= count + (degree == 1)
+        state = answer.displacement
+        for found, printed in zip(
+            20 * state[0, corner], DOLFINX.get((degree, n), [None] * 3), strict=True
+        ):
+            assert printed is None or found.item() == pytest.approx(printed, abs=5.1e-7)
+    if degree == 2:
+        energy = problem.energy(state).item() * 1e4 * 20**3
+        assert energy == pytest.approx(56.966619, abs=5e-7)
+
+
+# VERIFICATION 1.8d: degree, cells -> torque [N m], axial force [N], energy [J]
+TWISTED = {
+    (1, (4, 4, 20)): (18024.62786229, -800.53818109, 14151.84978085),
+    (2, (2, 2, 10)): (17404.618354, -479.767061, 13664.649365),
+    (2, (4, 4, 20)): (17150.398827, -355.321678, 13462.158844),
+}
+
+
+@pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])
+@pytest.mark.parametrize(
+    ("degree", "cells"),
+    [pytest.param(*c, marks=pytest.mark.slow if c[1][0] * c[0] > 4 else []) for c in TWISTED],
+)
+def test_column_follows_the_rotation_of_its_end(degree, cells, mixed):
+    """VERIFICATION 1.8d: 90 degrees in nine steps, each from the answer before."""
+    mesh = box([1.0, 1.0, 5.0], [n + 1 for n in cells])
+    points = 5 * Problem.build(mesh, NH, degree=degree).points
+    centred = points - torch.tensor([0.5, 0.5, 0.0])
+    top, state = points[:, 2] > 5 - 1e-9, None
+    held = (top | (points[:, 2] < 1e-9)).numpy()
+    for step in range(1, 10):
+        a = math.radians(10 * step)
+        turn = torch.tensor(
+            [[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]],
+            dtype=torch.float64,
+        )
+        given = torch.where(top[:, None], centred @ turn.T - centred, 0.0).numpy() / 5
+        problem = Problem.build(mesh, NH, fixed=held, prescribed=given, degree=degree)
+        none = torch.zeros(problem.shape, dtype=torch.float64)
+        answer = resumed(problem, none, state, tol=1e-10, mixed=mixed)
+        assert answer.status.item() == Status.CONVERGED
+        assert answer.iterations.item() <= 6
+        state = answer.displacement
+    reaction = 1e6 * 25 * problem.internal_force(state)[0]
+    torque, axial, energy = TWISTED[degree, cells]
+    moment = torch.linalg.cross(centred + 5 * state[0], reaction)[top].sum(dim=0)
+    assert moment[2].item() == pytest.approx(torque, rel=1e-9)
+    assert reaction[top, 2].sum().item() == pytest.approx(axial, rel=2e-9)
+    assert problem.energy(state).item() * 1e6 * 125 == pytest.approx(energy, rel=1e-10)
+    assert moment[:2].abs().max() < 1e-6 * torque
+
+
+# VERIFICATION 1.8e, rows of quadratic elements: cells, q -> u_z of the corner [m]
+BEAMS = {
+    ((8, 2), 5): -7.32678,
+    ((8, 2), 40): -49.67143,
+    ((16, 4), 5): -7.36089,
+    ((16, 4), 20): -28.3413,
+}
+
+
+def sag(beam, pull, corner, law: Material, cells: tuple[int, int], q: float) -> float:
+    """Return u_z of the corner [m] of the beam of VERIFICATION 1.8e in hex27."""
+    problem = beam(law, *cells, degree=2)
+    answer = solve(Newton(problem, tol=1e-10), load_of(pull(problem, q)[0]))
+    assert answer.status.item() == Status.CONVERGED
+    return 100 * corner(problem, answer.displacement)[2].item()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("cells", "q"), BEAMS)
+def test_beam_of_quadratic_elements_bends_as_tabulated(beam, pull, corner, cells, q):
+    """VERIFICATION 1.8e; the other rows are in test_newton."""
+    assert sag(beam, pull, corner, SVK, cells, q) == pytest.approx(BEAMS[cells, q], abs=5.1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("q", "limit", "within"), [(20, -28.387, 0.02), (40, -49.955, 0.03)])
+def test_beams_of_quadratic_elements_tend_to_the_tabulated_limit(
+    beam, pull, corner, q, limit, within
+):
+    """VERIFICATION 1.8e: Richardson's limit of 4, 8 and 16 cells."""
+    a, b, c = (sag(beam, pull, corner, SVK, n, q) for n in ((4, 1), (8, 2), (16, 4)))
+    rate = (b - a) / (c - b)
+    assert rate > 2
+    assert c + (c - b) / (rate - 1) == pytest.approx(limit, abs=within / 10)
+
+
+@pytest.mark.slow
+def test_finest_beam_has_the_tabulated_eigenvalues(beam):
+    """VERIFICATION 1.8e: those of K(0) in N/m at 12 000 degrees of freedom, tolerance 1e-6."""
+    printed = [0.41357726] * 2 + [4.69213513] + [10.51183774] * 2 + [17.59484223]
+    values = eigenmodes(Linear(beam(NH, 39, 9)), len(printed)).values[: len(printed)]
+    assert (4500 * 100 * values).tolist() == pytest.approx(printed, rel=1e-6)
+
+
+# VERIFICATION 1.8f: P L^2 / EI -> w / L and u / L of the elastica
+ELASTICA = {
+    1: (0.30172077, 0.056433236),
+    4: (0.66996418, 0.32894124),
+    10: (0.81060902, 0.5549956),
+}
+SLENDER = {"hex27": ("hexahedron", 2, 1), "tet10": ("tetra", 2, 1), "hex8": ("hexahedron", 1, 2)}
+SLENDER["tet4"] = ("tetra", 1, 2)
+
+
+def tip(element: str, alpha: float) -> tuple[float, float]:
+    """Return w / L and u / L of the end section of a bar 20 x 1 x 1 of SVK, nu = 0."""
+    cell, degree, fine = SLENDER[element]
+    mesh = box([20.0, 1.0, 1.0], [20 * fine + 1, fine + 1, fine + 1], cell)
+    law = SaintVenantKirchhoff(0.0)
+    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
+    force = Traction(Plane(0, "max"), [0.0, 0.0, -alpha / 12 / 400]).on(problem)
+    answer = solve(Newton(problem), load_of(force))
+    assert answer.status.item() == Status.CONVERGED
+    mean = force[:, 2] @ answer.displacement[0] / force[:, 2].sum()  # over the section
+    return -mean[2].item(), -mean[0].item()
+
+
+@pytest.mark.parametrize("alpha", ELASTICA)
+@pytest.mark.parametrize("element", ["hex27", "tet10"])
+def test_slender_bar_of_quadratic_elements_is_the_elastica(element, alpha):
+    """VERIFICATION 1.8f, Bisshopp and Drucker (1945): within 0.6 %."""
+    assert tip(element, alpha) == pytest.approx(ELASTICA[alpha], rel=6e-3)
+
+
+@pytest.mark.parametrize(
+    ("element", "alpha", "printed"),
+    [("hex27", 1, 0.30216), ("hex27", 4, 0.67157), ("hex27", 10, 0.81379)],
+)
+def test_slender_bar_has_the_tabulated_tip(element, alpha, printed):
+    """VERIFICATION 1.8f."""
+    assert tip(element, alpha)[0] == pytest.approx(printed, abs=5.1e-6)
+
+
+@pytest.mark.parametrize(
+    ("element", "short", "digits"), [("hex8", 0.093, 5e-4), ("tet4", 0.41, 5e-3)]
+)
+def test_slender_bar_of_linear_elements_locks_as_tabulated(element, short, digits):
+    """VERIFICATION 1.8f: 9.3 % and 41 % short of the elastica at P L^2 / EI = 1."""
+    assert 1 - tip(element, 1)[0] / ELASTICA[1][0] == pytest.approx(short, abs=digits)

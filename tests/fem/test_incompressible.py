@@ -1,0 +1,294 @@
+"""Bodies that keep their volume, nearly: closed forms of VERIFICATION 1.5 in elements for them."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import skfem
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from dpl.fem.forces import Traction, traction
+from dpl.fem.linear import full_matrix
+from dpl.fem.materials import (
+    LinearElastic,
+    Material,
+    MooneyRivlinK2,
+    NeoHookeanIsoK2,
+    NeoHookeanIsoK4,
+    NeoHookeanLn,
+    StableNeoHookean,
+    YeohK2,
+)
+from dpl.fem.mesh import Plane
+from dpl.fem.newton import Linear, Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, Solution, Status, solve
+
+
+def poisson(ratio: float) -> float:
+    """Return Poisson's ratio where the bulk modulus is so many shear moduli."""
+    return (3 * ratio - 2) / (6 * ratio + 2)
+
+
+NU = poisson(1e5)
+FORMULATIONS = {"mean dilatation": {"mean_dilatation": True}, "quadratic": {"degree": 2}}
+
+
+@pytest.fixture(params=FORMULATIONS)
+def formulation(request) -> dict:
+    """What hexahedra need in order not to lock: options of `Problem.build`."""
+    return FORMULATIONS[request.param]
+
+
+def without_load(problem: Problem, guess: Tensor | None = None, **options) -> Solution:
+    """Return the answer (N, D) to the supports alone."""
+    none = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    load = Load(none, torch.ones(1, dtype=torch.float64))
+    *_, last = Newton(problem, **options).iterate(load, guess=guess)
+    return last
+
+
+def slopes(law: Material) -> Callable[[float, float], tuple[float, float]]:
+    """Return dW/dI1 and dW/dI2 at J = 1 as functions of I1 and I2."""
+    if isinstance(law, MooneyRivlinK2):
+        return lambda i1, i2: (law.c10, law.c01)
+    if isinstance(law, YeohK2):
+        return lambda i1, i2: (law.c10 + 2 * law.c20 * (i1 - 3) + 3 * law.c30 * (i1 - 3) ** 2, 0.0)
+    if isinstance(law, StableNeoHookean):  # m/2 (I1 - 3) - m/2 ln(I1 + 1), m = 4 mu/3
+        return lambda i1, i2: (2 / 3 * law.mu * (1 - 1 / (i1 + 1)), 0.0)
+    return lambda i1, i2: (law.mu / 2, 0.0)
+
+
+RUBBERS = {
+    "NH-ln": NeoHookeanLn(NU),
+    "NHiso-k2": NeoHookeanIsoK2(NU),
+    "NHiso-k4": NeoHookeanIsoK4(NU),
+    "SNH": StableNeoHookean(NU),
+    "MR": MooneyRivlinK2(0.15, 0.05, 4e4),
+    "Yeoh": YeohK2(0.2, -0.02, 0.005, 4e4),
+}
+EXTRA = {"NHiso-k2", "NHiso-k4", "SNH"}  # for which, but for one mode, there is little time
+MODES = {  # stretch -> principal stretches, the directions that are pulled, P11 of W1 and W2
+    "uniaxial": (lambda s: (s, s**-0.5, s**-0.5), 1, lambda s: (s - s**-2, 1 / s)),
+    "equibiaxial": (lambda s: (s, s, s**-2), 2, lambda s: (s - s**-5, s**2)),
+    "pure shear": (lambda s: (s, 1.0, 1 / s), 2, lambda s: (s - s**-3, 1.0)),
+}
+
+
+CASES = [
+    pytest.param(name, mode, marks=[pytest.mark.slow] if name in EXTRA and k else [])
+    for name in RUBBERS
+    for k, mode in enumerate(MODES)
+]
+
+
+@pytest.mark.parametrize(("name", "mode"), CASES)
+def test_stretched_rubber_has_the_stress_of_the_incompressible_limit(formulation, grid, name, mode):
+    """VERIFICATION 1.5: P11 on a crooked mesh, bulk over shear modulus 1e5, tolerance 1e-3."""
+    law = RUBBERS[name]
+    stretches, pulled, factors = MODES[mode]
+    mesh = grid("hexahedron", 2, 0.2, inside=True)
+    points = Problem.build(mesh, law, length=1.0, **formulation).points.numpy()
+    far, held = points > 1 - 1e-9, points < 1e-9
+    held[:, :pulled] |= far[:, :pulled]
+    for stretch in (0.7, 2.0):
+        principal = np.array(stretches(stretch))
+        given = np.where(far, principal - 1, 0.0)
+        problem = Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0, **formulation)
+        answer = without_load(problem)
+        assert answer.converged.all()
+        pull = problem.internal_force(answer.displacement)[0, far[:, 0], 0].sum().item()
+        W1, W2 = slopes(law)((principal**2).sum(), (principal**-2.0).sum())
+        first, second = factors(stretch)
+        assert pull == pytest.approx(2 * first * (W1 + second * W2), rel=1e-3), stretch
+
+
+def octant(cells: int, layers: int, inner: float, outer: float) -> skfem.MeshHex2:
+    """Return an eighth of a thick sphere: three blocks of curved hex27, a cube's faces blown up."""
+    sides, radii = np.linspace(0, 1, cells + 1), np.linspace(inner, outer, layers + 1)
+    block = skfem.MeshHex.init_tensor(sides, sides, radii)
+    x, y, radius = block.p
+    face = np.stack([radius, radius * x, radius * y])
+    points = np.concatenate([np.roll(face, axis, axis=0) for axis in range(3)], axis=1)
+    corners = np.concatenate([block.t + k * face.shape[1] for k in range(3)], axis=1)
+    _, first, merged = np.unique(
+        np.round(points, 9), axis=1, return_index=True, return_inverse=True
+    )
+    flat = skfem.MeshHex2.from_mesh(skfem.MeshHex(points[:, first], merged.reshape(-1)[corners]))
+    radius = flat.doflocs.max(axis=0)
+    direction = np.tan(np.pi / 4 * flat.doflocs / radius)
+    return skfem.MeshHex2(radius * direction / np.linalg.norm(direction, axis=0), flat.t)
+
+
+def blown_up(mesh: skfem.MeshHex2, law: Material, stretch: float) -> tuple[Problem, Solution]:
+    """Return an eighth of a sphere whose inner radius 1 has grown, and its answer."""
+    points = Problem.build(mesh, law, length=1.0).points
+    radius = points.norm(dim=1)
+    inside = radius < 1 + 1e-9
+    held = (points < 1e-9) | inside[:, None]
+    given = torch.where(inside[:, None], (stretch - 1) * points, 0.0)
+    problem = Problem.build(
+        mesh, law, fixed=held.numpy(), prescribed=given.numpy(), degree=2, length=1.0
+    )
+    grown = (radius**3 + stretch**3 - 1) ** (1 / 3)  # as an incompressible body does
+    guess = ((grown / radius - 1)[:, None] * points)[None]
+    return problem, without_load(problem, guess)
+
+
+def pressure_inside(problem: Problem, answer: Solution, stretch: float) -> float:
+    """Return the pressure in the hole of an octant: work per change of its volume.
+
+    The hole is blown up by its displacement: so the pressure, which in nature follows the surface
+    and its normal, need not be applied as a load, and its limit point is passed.
+    """
+    inside = problem.points.norm(dim=1) < 1 + 1e-9
+    reaction = problem.internal_force(answer.displacement)[0, inside]
+    return (reaction * problem.points[inside]).sum().item() / (math.pi / 2 * stretch**2)
+
+
+SPHERES = [(1.1, 0.2871548459), (1.5, 0.7554331187), (2.0, 0.8069266031), (3.0, 0.6345066752)]
+
+
+@pytest.mark.parametrize(("stretch", "printed"), SPHERES)
+def test_thick_sphere_holds_the_printed_pressure(stretch, printed):
+    """VERIFICATION 1.5: p / mu at 1e4 mu = bulk modulus, radii 1 and 2, tolerance 1e-3."""
+    law = NeoHookeanIsoK2(poisson(1e4))
+    problem, answer = blown_up(octant(2, 32, 1.0, 2.0), law, stretch)
+    assert answer.status.item() == Status.CONVERGED
+    pressure = pressure_inside(problem, answer, stretch)
+    assert pressure / law.mu == pytest.approx(printed, rel=1e-3)
+
+
+def test_balloon_has_its_largest_pressure_at_the_sixth_root_of_seven():
+    """VERIFICATION 1.5: p R / (2 mu H) = .6197314512 at 7^(1/6); here H / R = 1e-3."""
+    law, peak = NeoHookeanIsoK2(poisson(1e4)), 7 ** (1 / 6)
+    mesh, found = octant(4, 1, 1.0, 1.001), {}
+    for stretch in (0.97 * peak, peak, 1.03 * peak):
+        problem, answer = blown_up(mesh, law, stretch)
+        assert answer.converged.all()
+        found[stretch] = pressure_inside(problem, answer, stretch) / (2 * law.mu * 1e-3)
+    assert found[peak] == pytest.approx(0.6197314512, rel=2e-3)
+    assert found[peak] > max(found[0.97 * peak], found[1.03 * peak])
+
+
+CYLINDER = {0.3: 4.5825e-3, 0.49: 5.039925e-3, 0.499: 5.06024925e-3, 0.4999: 5.062274992e-3}
+
+
+def bore(nu: float, cells: tuple[int, int], **options) -> float:
+    """Return u_r at the bore of the thick cylinder of MacNeal and Harder, p = 1, E = 1000.
+
+    It is the linear answer: mean dilatation is for laws of finite strain, whose K(0) is Hooke's.
+    """
+    law = NeoHookeanLn(nu) if options.get("mean_dilatation") else LinearElastic(nu)
+    polar = skfem.MeshQuad.init_tensor(
+        np.linspace(3, 9, cells[0] + 1), np.linspace(0, np.pi / 2, cells[1] + 1)
+    )
+    if options.get("degree") == 2:
+        polar = skfem.MeshQuad2.from_mesh(polar)
+    radius, angle = polar.doflocs
+    mesh = type(polar)(np.stack([radius * np.cos(angle), radius * np.sin(angle)]), polar.t)
+    points = Problem.build(mesh, law, length=1.0, **options).points.numpy()
+    fixed = np.abs(points) < 1e-9
+    problem = Problem.build(mesh, law, fixed=fixed, length=1.0, **options)
+    force = traction(
+        problem,
+        lambda x: np.linalg.norm(x, axis=1) < 3 + 1e-6,
+        lambda x: x / np.linalg.norm(x, axis=0) / 1000,
+    )
+    answer = solve(Linear(problem), Load(force[None], torch.ones(1)))
+    return answer.displacement[0, np.abs(points - [3, 0]).sum(axis=1).argmin(), 0].item()
+
+
+@pytest.mark.parametrize("nu", CYLINDER)
+def test_thick_cylinder_of_macneal_and_harder_widens_as_printed(nu):
+    """VERIFICATION 1.5: mean dilatation, within 1e-3 whatever Poisson's ratio, of second order."""
+    coarse, fine = (bore(nu, (n, n - 4), mean_dilatation=True) / CYLINDER[nu] for n in (20, 40))
+    assert coarse == pytest.approx(1.0, abs=1e-3)
+    assert math.log2((coarse - 1) / (fine - 1)) > 1.9
+
+
+@pytest.mark.parametrize(("nu", "within"), [(0.3, 2e-6), (0.49, 3e-5), (0.499, 3e-4)])
+def test_thick_cylinder_of_quadratic_elements_widens_as_printed(nu, within):
+    """VERIFICATION 1.5: what remains grows with the bulk modulus, 2.3e-3 at nu = .4999."""
+    assert bore(nu, (20, 16), degree=2) == pytest.approx(CYLINDER[nu], rel=within)
+
+
+@pytest.mark.filterwarnings("ignore:linear .* lock")
+@pytest.mark.parametrize(("nu", "short"), [(0.49, 0.086), (0.499, 0.477), (0.4999, 0.901)])
+def test_thick_cylinder_of_plain_linear_elements_locks(nu, short):
+    """VERIFICATION 1.5 as a warning: 10 x 8 cells."""
+    assert 1 - bore(nu, (10, 8)) / CYLINDER[nu] == pytest.approx(short, abs=1e-3)
+
+
+@pytest.fixture(scope="module", params=["quad", "hexahedron"])
+def shaken(request, grid) -> Problem:
+    """A crooked body of cells that share their mean volume ratio, nearly incompressible."""
+    mesh = grid(request.param, 2, 0.15)
+    return Problem.build(mesh, NeoHookeanLn(0.49), fixed=Plane(0, "min"), mean_dilatation=True)
+
+
+def test_force_of_mean_dilatation_is_the_slope_of_its_energy(shaken, bend):
+    """VERIFICATION 1.10 for the elements that do not lock."""
+    u = bend(shaken.points, 2).requires_grad_()
+    (slope,) = torch.autograd.grad(shaken.energy(u).sum(), u)
+    assert_close(shaken.internal_force(u.detach()), slope, rtol=1e-10, atol=1e-12)
+
+
+def test_tangent_of_mean_dilatation_is_the_slope_of_its_force(shaken, bend):
+    """VERIFICATION 1.10: differences to 1e-8, and symmetry."""
+    u = bend(shaken.points)
+    v = torch.where(shaken.free, bend(shaken.points, seed=1), 0.0)
+    K = full_matrix(shaken.pattern, shaken.tangent(u)[0].numpy())
+    product, free = K @ v[0][shaken.free].numpy(), shaken.free[None]
+    step = 1e-5
+    ahead, behind = (shaken.internal_force(u + s * v)[free] for s in (step, -step))
+    slope = ((ahead - behind) / (2 * step)).numpy()
+    assert np.linalg.norm(product - slope) < 1e-8 * np.linalg.norm(slope)
+    assert_close(shaken.tangent_product(u, v)[free].numpy(), product, rtol=1e-9, atol=1e-11)
+
+
+def test_moved_and_turned_body_of_mean_dilatation_feels_turned_forces(shaken, bend):
+    """VERIFICATION 1.10, objectivity, tolerance 1e-12 of the stiff volume."""
+    dim, u = shaken.shape[1], bend(shaken.points)
+    skew = torch.tensor([[0, -0.4, 0.9], [0.4, 0, -0.2], [-0.9, 0.2, 0]], dtype=torch.float64)
+    turn = torch.matrix_exp(skew[:dim, :dim])
+    force = shaken.internal_force(u)
+    moved = (shaken.points + u) @ turn.T + 0.3 - shaken.points
+    assert (shaken.internal_force(moved) - force @ turn.T).norm() < 1e-12 * force.norm()
+
+
+def test_mean_dilatation_is_refused_to_the_linear_law(beam):
+    """The mean is taken of det F, which is not linear in u: a linear answer would take iterations."""
+    with pytest.raises(ValueError, match="mean_dilatation: is for laws of finite strain"):
+        beam(LinearElastic(0.3), mean_dilatation=True)
+
+
+def test_beam_of_mean_dilatation_keeps_its_volume(beam, pull):
+    """The volume ratio of each cell tends to 1 as nu tends to 1/2, that of its points need not."""
+    problem = beam(NeoHookeanLn(0.4999), 4, 2, mean_dilatation=True)
+    force = pull(problem, 20.0)
+    answer = solve(Newton(problem), Load(force, torch.ones(1)))
+    assert answer.status.item() == Status.CONVERGED
+    F = torch.einsum("eai,eqaj->eqij", answer.displacement[0][problem.cells], problem.dN)
+    J = torch.linalg.det(F + torch.eye(3, dtype=torch.float64))
+    weight = problem.dV / problem.dV.sum(dim=1, keepdim=True)
+    assert ((J * weight).sum(dim=1) - 1).abs().max() < 1e-3
+    assert (J - 1).abs().max() > 1e-2
+
+
+def test_pull_on_rubber_of_mean_dilatation_is_that_of_plain_elements_where_it_is_uniform(grid):
+    """Homogeneous states know no mean: the same answer on any mesh, with and without."""
+    law = NeoHookeanIsoK4(0.4)
+    mesh = grid("hexahedron", 2, 0.2, inside=True)
+    held = np.abs(mesh.p.T) < 1e-9
+    ends = []
+    for mean_dilatation in (False, True):
+        problem = Problem.build(mesh, law, fixed=held, length=1.0, mean_dilatation=mean_dilatation)
+        force = Traction(Plane(0, "max"), [0.3, 0.0, 0.0]).on(problem)
+        answer = solve(Newton(problem, tol=1e-12), Load(force[None], torch.ones(1)))
+        assert answer.converged.all()
+        ends.append(answer.displacement)
+    assert_close(ends[0], ends[1], rtol=0, atol=1e-10)

@@ -1,0 +1,308 @@
+"""Where equilibria end or lose stability: VERIFICATION 1.8 g to i and the bodies of 1.11."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dpl.fem.forces import Traction
+from dpl.fem.linear import SuperLU
+from dpl.fem.materials import (
+    Material,
+    NeoHookeanIsoK2,
+    NeoHookeanLn,
+    SaintVenantKirchhoff,
+    YeohK2,
+)
+from dpl.fem.mesh import Plane, box
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, Solution, Status, judge, solve
+
+# a cell that is uniformly strained does not lock
+pytestmark = pytest.mark.filterwarnings("ignore:linear .* lock")
+
+SVK, NH = SaintVenantKirchhoff(0.0), NeoHookeanLn(0.0)
+EYE = torch.eye(3, dtype=torch.float64)
+
+
+def load_of(force: Tensor) -> Load:
+    """Return nodal forces (N, D) [-] as a load of one member; no answer depends on its modulus."""
+    return Load(force[None], torch.ones(1, dtype=torch.float64))
+
+
+def inertia(problem: Problem, displacement: Tensor) -> int:
+    """Return the number of negative eigenvalues of K at a displacement (1, N, D)."""
+    tangent = problem.linearise(displacement).tangent[0].numpy()
+    return SuperLU(problem.pattern).factorise(tangent).negative_pivots
+
+
+def bisected(loses, stable: float, unstable: float) -> float:
+    """Return where a truth value changes from false at `stable` to true at `unstable`."""
+    assert not loses(stable)
+    assert loses(unstable)
+    while abs(unstable - stable) > 1e-9:
+        middle = (stable + unstable) / 2
+        stable, unstable = (stable, middle) if loses(middle) else (middle, unstable)
+    return (stable + unstable) / 2
+
+
+@cache
+def column(law: Material, cells: tuple[int, int, int]) -> tuple[Problem, Tensor]:
+    """Return the column 10 x 1 x 1 in hex27, E = 1000, nu = 0, and the axial load P = 1."""
+    mesh = box([10.0, 1.0, 1.0], [n + 1 for n in cells])
+    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=2)
+    return problem, Traction(Plane(0, "max"), [-1 / 1000, 0.0, 0.0]).on(problem)
+
+
+def squeezed(problem: Problem, force: Tensor, P: float, **options) -> Solution:
+    """Return the answer to an axial load, from rest or from a guess."""
+    guess = options.pop("guess", None)
+    solver = Newton(problem, tol=1e-10, linear="superlu", **options)
+    *_, last = solver.iterate(load_of(P * force), guess=guess)
+    return last
+
+
+# VERIFICATION 1.8g: law, cells, P at which K is singular; Euler's load is 2.056168
+CRITICAL = [
+    (SVK, (10, 1, 1), 2.039763),
+    pytest.param(SVK, (20, 2, 2), 2.037811, marks=pytest.mark.slow),
+    (NH, (10, 1, 1), 2.056558),
+]
+
+
+@pytest.mark.parametrize(("law", "cells", "printed"), CRITICAL)
+def test_column_loses_its_stability_at_the_critical_load(law, cells, printed):
+    """VERIFICATION 1.8g, by bisection on the inertia of the tangent at the straight answer."""
+    problem, force = column(law, cells)
+
+    def buckles(P: float) -> bool:
+        answer = squeezed(problem, force, P)
+        assert answer.converged.all()
+        return inertia(problem, answer.displacement) > 0
+
+    critical = bisected(buckles, 1.9, 2.2)
+    assert critical == pytest.approx(printed, abs=5.1e-7)
+    for part, status, negative in ((0.9999, Status.CONVERGED, 0), (1.0001, Status.UNSTABLE, 2)):
+        answer = squeezed(problem, force, part * critical)
+        assert answer.status.item() == status
+        assert answer.negative_pivots.item() == negative
+
+
+def bowed(problem: Problem, angle: float, side: float = 1.0) -> Tensor:
+    """Return the column bent to a quarter sine of section angles, `angle` at its end, (1, N, 3)."""
+    along = torch.linspace(0, 1, 2001, dtype=torch.float64)
+    turn = angle * (np.pi / 2 * along).sin()
+    x, y, z = problem.points.T
+    height = z - z.max() / 2
+
+    def at(values: Tensor) -> Tensor:
+        return torch.from_numpy(np.interp(x.numpy(), along.numpy(), values.numpy()))
+
+    line = [torch.cumulative_trapezoid(f, along) for f in (turn.cos(), turn.sin())]
+    axis, rise = (at(torch.nn.functional.pad(f, (1, 0))) for f in line)
+    t = at(turn)
+    bent = [axis - side * height * t.sin(), y, side * rise + height * t.cos() + z.max() / 2]
+    return (torch.stack(bent, dim=1) - problem.points)[None]
+
+
+# VERIFICATION 1.8g, beyond buckling: P, angle of the guess, w / L and u / L of the end's centre,
+# the same of the elastica
+BUCKLED = [(2.5, 1.2, (0.6873, 0.3885), (0.66363, 0.34682))]
+BUCKLED += [(4.0, 2.0, (0.7925, 0.9731), (0.80022, 0.90518))]
+
+
+@pytest.mark.parametrize(("P", "angle", "printed", "elastica"), BUCKLED)
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])
+def test_buckled_column_is_found_from_a_bent_guess(mixed, side, P, angle, printed, elastica):
+    """VERIFICATION 1.8g: a stable answer to either side, mirror images of each other."""
+    problem, force = column(SVK, (20, 2, 2))
+    answer = squeezed(problem, force, P, guess=bowed(problem, angle, side), mixed=mixed)
+    assert answer.status.item() == Status.CONVERGED
+    assert inertia(problem, answer.displacement) == 0
+    centre = torch.tensor([1.0, 0.05, 0.05], dtype=torch.float64)
+    end = answer.displacement[0, (problem.points - centre).norm(dim=1).argmin()] * side
+    assert (end[2].item(), -side * end[0].item()) == pytest.approx(printed, abs=5.1e-5)
+    assert end[2].item() == pytest.approx(elastica[0], rel=0.04)  # shear makes it softer
+    assert abs(end[1].item()) < 1e-9
+
+
+RUBBER = YeohK2(0.5, -0.25, 0.025, 1e6)  # VERIFICATION 1.8h; its bulk modulus stands for infinity
+
+
+def pulled(stretch: float | None = None) -> tuple[Problem, Tensor]:
+    """Return a cube of one cell that slides on three planes, and its unit load along x.
+
+    With a stretch its end is moved instead.
+    """
+    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
+    held, given = mesh.p.T == 0, np.zeros((8, 3))
+    if stretch is not None:
+        held[:, 0], given[:, 0] = True, (stretch - 1) * mesh.p[0]
+    problem = Problem.build(mesh, RUBBER, fixed=held, prescribed=given, length=1.0)
+    return problem, Traction(Plane(0, "max"), [1.0, 0.0, 0.0]).on(problem)
+
+
+def uniform(problem: Problem, stretch: float) -> Tensor:
+    """Return the uniaxial stretch that keeps the volume, (1, N, 3)."""
+    sides = torch.tensor([stretch, stretch**-0.5, stretch**-0.5], dtype=torch.float64)
+    return (problem.points * (sides - 1))[None]
+
+
+@pytest.mark.parametrize("off", [0.0, -0.01, 0.01])
+@pytest.mark.parametrize(
+    ("stretch", "printed", "sign"),
+    [(1.364017197, 0.5696673896, -1), (2.398502327, -1.461699953, 1)],
+    ids=["peak", "trough"],
+)
+def test_pull_on_yeohs_rubber_has_the_tabulated_extremes(stretch, printed, sign, off):
+    """VERIFICATION 1.8h, its end moved: beside the peak it pulls less, beside the trough more.
+
+    The bulk modulus leaves 3e-6 of it.
+    """
+    problem, _ = pulled(stretch + off)
+    none = torch.zeros(problem.shape, dtype=torch.float64)
+    solver = Newton(problem, tol=1e-11, linear="superlu")
+    *_, answer = solver.iterate(load_of(none), guess=uniform(problem, stretch + off))
+    assert answer.converged.all()
+    far = problem.points[:, 0] == 1
+    pull = problem.internal_force(answer.displacement)[0, far, 0].sum().item()
+    if off:
+        assert sign * (pull - printed) > 1e-5
+    else:
+        assert pull == pytest.approx(printed, rel=5e-6)
+
+
+def test_load_beyond_the_peak_is_reported_with_the_part_below_it():
+    """VERIFICATION 1.8h: load control ends at P = .5696673896; the rest is no path from rest."""
+    problem, unit = pulled()
+    solver = Newton(problem, linear="superlu", loose=1e-9, smallest_step=2.0**-17, budget=2000)
+    answer = solve(solver, load_of(0.57 * unit))
+    assert answer.status.item() == Status.NO_VALID_EQUILIBRIUM
+    assert 0.57 * answer.load_factor.item() == pytest.approx(0.5696673896, abs=2e-5)
+    assert 1 + answer.displacement[..., 0].max().item() == pytest.approx(1.364017197, abs=0.02)
+
+
+def test_rubber_beyond_the_peak_has_snapped_through():
+    """VERIFICATION 1.8h: at P = .57 the stretch is 2.836546, where a guess beyond the gap leads."""
+    problem, unit = pulled()
+    solver = Newton(problem, tol=1e-10, linear="superlu")
+    *_, answer = solver.iterate(load_of(0.57 * unit), guess=uniform(problem, 2.8))
+    assert answer.status.item() == Status.CONVERGED
+    assert answer.load_factor.item() == 1
+    stretch = 1 + answer.displacement[..., 0].max().item()
+    assert stretch == pytest.approx(2.836546, abs=5e-6)
+
+
+def rivlin(law: Material) -> tuple[Problem, Tensor]:
+    """Return a cube of one cell that slides on three planes, pulled on the others by T = 1."""
+    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
+    problem = Problem.build(mesh, law, fixed=mesh.p.T == 0, length=1.0)
+    sides = [Traction(Plane(i, "max"), EYE[i].tolist()).on(problem) for i in range(3)]
+    return problem, sum(sides)
+
+
+def swollen(problem: Problem, stretch: float) -> tuple[Tensor, float]:
+    """Return the symmetric state (1, N, 3) of Rivlin's cube, and the load T on its sides."""
+    T = problem.material.stress((stretch - 1) * EYE)[0, 0].item()
+    return ((stretch - 1) * problem.points)[None], T
+
+
+@pytest.mark.parametrize(
+    ("poisson", "stretch", "load"),
+    [(0.45, 1.083880948, 0.7475041023), (0.49, 1.013891353, 0.6804639956)],
+)
+def test_cube_of_rivlin_loses_its_symmetry_at_the_tabulated_load(poisson, stretch, load):
+    """VERIFICATION 1.8i, NH-ln: the inertia changes by two; beyond, the answer says so."""
+    problem, unit = rivlin(NeoHookeanLn(poisson))
+    critical = bisected(lambda s: inertia(problem, swollen(problem, s)[0]) > 0, 1.0, 1.1)
+    assert critical == pytest.approx(stretch, abs=1.5e-9)
+    assert swollen(problem, critical)[1] == pytest.approx(load, abs=1e-7)
+    assert inertia(problem, swollen(problem, critical + 1e-6)[0]) == 2
+    for part, status, negative in ((0.99, Status.CONVERGED, 0), (1.01, Status.UNSTABLE, 2)):
+        state, T = swollen(problem, 1 + part * (critical - 1))
+        answer = solve(Newton(problem, linear="superlu"), load_of(T * unit))
+        assert answer.status.item() == status
+        assert answer.negative_pivots.item() == negative
+        assert (answer.displacement - state).abs().max() < 1e-7
+
+
+def test_compressible_cube_of_rivlin_keeps_its_symmetry():
+    """VERIFICATION 1.8i: NH-ln with nu = .3 has no such load."""
+    problem, _ = rivlin(NeoHookeanLn(0.3))
+    for stretch in np.linspace(1.0, 4.0, 61):
+        assert inertia(problem, swollen(problem, stretch)[0]) == 0
+
+
+def test_cube_of_rivlin_loses_its_symmetry_at_two_shear_moduli_in_the_limit():
+    """VERIFICATION 1.8i: T / mu = 2 for incompressible bodies."""
+    excess = []
+    for poisson in (0.499, 0.4999):
+        law = NeoHookeanLn(poisson)
+        problem, _ = rivlin(law)
+        critical = bisected(lambda s: inertia(problem, swollen(problem, s)[0]) > 0, 1.0, 1.1)  # noqa: B023
+        excess.append(swollen(problem, critical)[1] / law.mu - 2)
+    assert excess[1] == pytest.approx(0, abs=1e-3)
+    assert excess[0] / excess[1] == pytest.approx(10, rel=0.05)
+
+
+def bar(law: Material) -> tuple[Problem, Tensor]:
+    """Return a cube of 2 x 2 x 2 cells that slides on three planes, and the load P = 1 along x."""
+    mesh = box([1.0, 1.0, 1.0], [3, 3, 3])
+    problem = Problem.build(mesh, law, fixed=mesh.p.T == 0, length=1.0)
+    return problem, Traction(Plane(0, "max"), [1.0, 0.0, 0.0]).on(problem)
+
+
+@pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])
+@pytest.mark.parametrize(
+    ("P", "stretch"), [(-1, 0.4835138104), (-10, 0.1073321638), (1, 2.780359487), (10, 26.00274671)]
+)
+def test_neo_hookean_bar_answers_every_load(mixed, P, stretch):
+    """VERIFICATION 1.11: its barrier holds; solved from rest, whatever steps it takes."""
+    problem, unit = bar(NeoHookeanLn(0.3))
+    answer = solve(Newton(problem, tol=1e-11, linear="superlu", mixed=mixed), load_of(P * unit))
+    assert answer.converged.all()
+    found = 1 + answer.displacement[0, problem.points[:, 0] == 1, 0]
+    assert found.tolist() == pytest.approx([stretch] * 9, rel=1e-8)
+
+
+@pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])
+def test_quadratic_volume_term_is_no_barrier_under_pressure(mixed):
+    """VERIFICATION 1.11: NHiso-k2 holds kappa s^2 (1 - s^3) at most, s^3 = 2/5; NH-ln any load."""
+    law = NeoHookeanIsoK2(0.3)
+    problem, unit = rivlin(law)
+    limit = law.bulk * 0.4 ** (2 / 3) * 0.6
+    for part, status in ((0.99, Status.CONVERGED), (1.02, Status.NO_VALID_EQUILIBRIUM)):
+        solver = Newton(problem, linear="superlu", mixed=mixed)
+        answer = solve(solver, load_of(-part * limit * unit))
+        assert answer.status.item() == status
+        assert answer.volume_ratio.item() > 0
+    assert answer.load_factor.item() == pytest.approx(1 / 1.02, abs=0.02)
+    problem, unit = rivlin(NeoHookeanLn(0.3))
+    answer = solve(Newton(problem, linear="superlu", mixed=mixed), load_of(-3 * limit * unit))
+    assert answer.converged.all()
+
+
+def test_mirror_image_of_a_body_at_rest_is_no_answer():
+    """VERIFICATION 1.11: SVK is blind to reflection, so forces alone would accept it."""
+    problem, _ = bar(SaintVenantKirchhoff(0.3))
+    mirrored = (problem.points * torch.tensor([-2.0, 0.0, 0.0]))[None]
+    assert problem.internal_force(mirrored).abs().max() < 1e-15
+    verdict = judge(problem, mirrored, load_of(torch.zeros(problem.shape).double()), 1e-8)
+    assert verdict.volume_ratio.item() == pytest.approx(-1.0)
+    assert verdict.status.item() == Status.NOT_CONVERGED
+
+
+def test_longest_load_of_a_saint_venant_bar_is_the_tabulated_one():
+    """VERIFICATION 1.11: max |P| = E / (3 sqrt 3) = .1924500897 at a stretch of .57735."""
+    problem, unit = bar(SaintVenantKirchhoff(0.3))
+    solver = Newton(problem, linear="superlu", loose=1e-9, smallest_step=2.0**-17, budget=2000)
+    answer = solve(solver, load_of(-0.2 * unit))
+    assert answer.status.item() == Status.NO_VALID_EQUILIBRIUM
+    assert 0.2 * answer.load_factor.item() == pytest.approx(0.1924500897, abs=1e-5)
+    stretch = 1 + answer.displacement[..., 0].min().item()
+    assert stretch == pytest.approx(1 / math.sqrt(3), abs=0.01)

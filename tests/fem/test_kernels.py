@@ -1,0 +1,397 @@
+"""Laws of the compiled element loops: they say what the tensor operations say."""
+
+import importlib.util
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from multiprocessing.reduction import ForkingPickler
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from numba import njit
+from torch import Tensor
+
+from dpl.fem.lanes import WIDTH, load, sqrt, store
+from dpl.fem.materials import Hookean, Isotropic, NeoHookeanLn
+from dpl.fem.mesh import Plane
+from dpl.fem.problem import Problem
+from dpl.fem.slopes import Law
+from dpl.fem.supports import Spring
+from dpl.fem.tensors import green_lagrange, invariants, trace
+
+CLOSE = 1e-13  # of the largest entry
+LAWS = ["linear", "SVK", "NH-ln", "NHiso-k2", "NHiso-k4", "SNH", "MR", "Yeoh"]
+FEW = ["SVK", "NH-ln"]
+
+
+def cubed(x):
+    """Return x^3, of numbers of any kind."""
+    return x * x * x
+
+
+@dataclass(frozen=True)
+class Coupled(Hookean, Isotropic):
+    """NH-ln + (I1 - 3)^3 / 50 + (I1 - 3)(I2 - 3) / 20 + (I2 - 3)^2 / 40: all slopes of I1, I2."""
+
+    def energy(self, H):
+        """Return the energy density."""
+        i1, second, _ = invariants(2 * green_lagrange(H))
+        i2 = 2 * i1 + second
+        more = i1**3 / 50 + i1 * i2 / 20 + i2**2 / 40
+        return NeoHookeanLn(self.poisson).energy(H) + more
+
+    @property
+    def constants(self):
+        """Return lambda, mu and the factors of the three terms."""
+        return self.lam, self.mu, 1 / 50, 1 / 20, 1 / 40
+
+    @staticmethod
+    def slopes(c, i1, i2, j, log_j, m1):
+        """Return the slopes."""
+        rest, p = c[0] * log_j, c[0] * log_j - c[1]
+        W1 = c[2] * 3 * (cubed(i1) - (i1 - 1) * i1 * i1) + c[3] * i2  # of what NH-ln has not
+        W2 = c[3] * i1 + 2 * c[4] * i2
+        rest = rest + 2 * W1 + 4 * W2
+        return rest, W2, p, 6 * c[2] * i1, c[3], 2 * c[4], 0.0, 0.0, c[0]
+
+
+@pytest.fixture(params=[*LAWS, "own"])
+def law(request, laws) -> Isotropic:
+    """Each law of invariants, and one that is written here."""
+    return Coupled(0.3) if request.param == "own" else laws[request.param]
+
+
+@pytest.fixture(params=["equal", "unequal"])
+def body(request, law, kind, grid, chain) -> Problem:
+    """Bodies of each kind of element, of a number of cells that fills no whole block of lanes."""
+    cell, degree = kind
+    mesh = chain(cell, 2 * WIDTH + 3) if request.param == "equal" else grid(cell, 3, 0.12)
+    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
+    assert problem.equal_cells == (request.param == "equal")
+    assert len(problem.cells) % WIDTH
+    return problem
+
+
+class Reference(Problem):
+    """A problem without compiled loops."""
+
+    def _kernels(self, displacement):
+        return None
+
+
+def reference(problem: Problem) -> Reference:
+    """Return the same body without compiled loops."""
+    return Reference(**problem.__getstate__())
+
+
+def check_equal(found: Tensor, expected: Tensor) -> None:
+    """Assert that arrays agree to rounding, relative to the largest entry."""
+    assert found.shape == expected.shape
+    assert (found - expected).abs().max() < CLOSE * expected.abs().max()
+
+
+def as_tensor(gap: np.ndarray, cells: int) -> Tensor:
+    """Return strains E (1, cells, Q, 3, 3) of the kernels' 2 E (blocks, Q, 6, WIDTH)."""
+    rows = torch.from_numpy(gap).permute(0, 3, 1, 2).flatten(0, 1)[:cells]  # (E, Q, 6)
+    return rows[..., [[0, 3, 5], [3, 1, 4], [5, 4, 2]]][None] / 2
+
+
+def test_law_written_here_is_what_its_slopes_say(bend):
+    """So that the kernels below can be held against it: stress and energy agree."""
+    law = Coupled(0.3)
+    random = torch.Generator().manual_seed(0)
+    H = torch.rand(20, 3, 3, generator=random, dtype=torch.float64) * 0.5 - 0.25
+    slope = torch.func.vmap(torch.func.grad(law.energy))(H)
+    assert (law.stress(H) - slope).abs().max() < 1e-12
+    curvature = torch.func.vmap(torch.func.hessian(law.energy))(H)
+    assert (law.tangent(H) - curvature).abs().max() < 1e-11
+
+
+def test_force_and_volume_ratio_are_those_of_the_tensors(body, bend):
+    u = bend(body.points, 2)
+    assert body._compiled is not None
+    found, expected = body.evaluate(u), reference(body).evaluate(u)
+    check_equal(found.internal, expected.internal)
+    check_equal(found.volume_ratio, expected.volume_ratio)
+
+
+def test_force_and_tangent_are_those_of_the_tensors(body, bend):
+    u = bend(body.points)
+    found, expected = body.linearise(u), reference(body).linearise(u)
+    check_equal(found.force, expected.force)
+    check_equal(found.tangent, expected.tangent)
+    assert torch.equal(found.valid, expected.valid)
+
+
+def test_system_of_mixed_points_is_that_of_the_tensors(body, bend):
+    """Two steps of points, and the system at the strains where they end."""
+    if not body.mixes:
+        pytest.skip("strains are no unknowns of the linear law")
+    u, v, w = (0.7 * bend(body.points, seed=seed) for seed in range(3))
+    gap = body.widened(body.widened(None, 1.0, v), 0.25, w)
+    plain = reference(body)
+    wide = plain.widened(plain.widened(None, 1.0, v), 0.25, w)
+    check_equal(as_tensor(gap, len(body.cells)), wide)
+    assert wide.abs().max() > 1e-3
+    found, expected = body.linearise(u, gap), plain.linearise(u, wide)
+    check_equal(found.force, expected.force)
+    check_equal(found.tangent, expected.tangent)
+    assert found.valid.item()
+    assert expected.valid.item()
+
+
+@pytest.mark.parametrize("law", FEW, indirect=True)
+def test_body_at_rest_feels_no_force(body):
+    internal, volume = body.evaluate(torch.zeros(1, *body.shape, dtype=torch.float64))
+    assert not internal.any()
+    assert volume.item() == 1
+
+
+@pytest.mark.parametrize("law", FEW, indirect=True)
+def test_tiny_displacements_keep_their_digits(body, bend):
+    """At |u|/L = 1e-12 the strain would be lost in the rounding of F."""
+    u = bend(body.points)
+    tiny = 1e-12 * u
+    slope = body.tangent_product(torch.zeros_like(u), u)
+    assert (1e12 * body.evaluate(tiny).internal - slope).abs().max() < 1e-10 * slope.abs().max()
+
+
+@pytest.mark.parametrize("law", FEW, indirect=True)
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_displacement_that_is_no_number_has_no_volume(law, kind, grid, bad):
+    """In any cell, the last one of a block that is not full among them."""
+    problem = Problem.build(grid(kind[0], 3, 0.12), law, degree=kind[1])
+    for node in (0, problem.shape[0] // 2, problem.shape[0] - 1):
+        u = torch.zeros(1, *problem.shape, dtype=torch.float64)
+        u[0, node, 0] = bad
+        assert problem.evaluate(u).volume_ratio.item() == -math.inf
+
+
+def test_inverted_body_has_the_force_of_the_tensors(body, bend):
+    """A law that is defined there feels it; one with ln J has no force in either."""
+    mirror = torch.eye(body.shape[1], dtype=torch.float64)
+    mirror[0, 0] = -1
+    u = (body.points + 0.5 * bend(body.points)) @ mirror - body.points
+    found, expected = body.evaluate(u), reference(body).evaluate(u)
+    assert found.volume_ratio < 0
+    check_equal(found.volume_ratio, expected.volume_ratio)
+    assert torch.equal(found.internal.isnan(), expected.internal.isnan())
+    assert (found.internal - expected.internal).nan_to_num().abs().max() < 1e-14
+
+
+@pytest.mark.parametrize("law", FEW, indirect=True)
+def test_inverted_body_is_seen(body):
+    mirrored = body.points * (-2.0 * torch.eye(body.shape[1], dtype=torch.float64)[0])
+    volume = body.evaluate(mirrored[None]).volume_ratio
+    assert volume.item() == pytest.approx(-1.0, rel=1e-12)
+    flat = 0.5 * mirrored[None]
+    assert body.evaluate(flat).volume_ratio.item() == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("count", range(1, 2 * WIDTH + 2))
+def test_number_of_cells_does_not_matter(chain, bend, count):
+    """Blocks of lanes that are full, almost full, almost empty; equal cells and unequal ones."""
+    body = Problem.build(chain("quad", count), NeoHookeanLn(0.3), length=1.0)
+    several = replace(body, dN=body.dN.repeat(count, 1, 1, 1), dV=body.dV.repeat(count, 1))
+    u = bend(body.points / count)
+    for problem in (body, several):
+        plain = reference(problem)
+        check_equal(problem.evaluate(u).internal, plain.evaluate(u).internal)
+        check_equal(problem.linearise(u).tangent, plain.linearise(u).tangent)
+        gap = as_tensor(problem.widened(None, 1.0, u), count)
+        check_equal(gap, plain.widened(None, 1.0, u))
+
+
+def test_order_of_axes_in_memory_does_not_matter(grid, bend):
+    """Displacements from a network or a transposed file are not contiguous."""
+    body = Problem.build(grid("hexahedron"), NeoHookeanLn(0.3))
+    u = bend(body.points, 2)
+    strided = u.permute(2, 1, 0).contiguous().permute(2, 1, 0)
+    assert not strided.is_contiguous()
+    assert torch.equal(body.evaluate(strided).internal, body.evaluate(u).internal)
+    first = body.linearise(strided[:1]).tangent
+    assert torch.equal(first, body.linearise(u[:1]).tangent)
+
+
+def test_springs_pull_in_compiled_and_tensor_loops_alike(kind, grid, bend):
+    spring = Spring(Plane(0, "max"), 0.7)
+    body = Problem.build(grid(kind[0]), NeoHookeanLn(0.3), supports=[spring], degree=kind[1])
+    u, plain = bend(body.points), reference(body)
+    check_equal(body.evaluate(u).internal, plain.evaluate(u).internal)
+    check_equal(body.linearise(u).tangent, plain.linearise(u).tangent)
+    free = replace(body, springs=None).evaluate(u).internal
+    assert (body.evaluate(u).internal - free).abs().max() > 1e-3
+
+
+def test_law_without_slopes_is_not_compiled(grid, laws, bend):
+    body = Problem.build(grid("hexahedron"), laws["Ogden3"])
+    assert body._compiled is None
+    u = bend(body.points)
+    assert torch.equal(body.evaluate(u).internal, body.internal_force(u))
+    assert torch.equal(body.linearise(u).tangent, body.tangent(u))
+
+
+def test_problem_sent_to_another_process_keeps_its_arrays(grid, bend):
+    """Torch moves the memory of tensors that it sends; arrays made of them must not dangle."""
+    body = Problem.build(grid("hexahedron"), NeoHookeanLn(0.3))
+    u = bend(body.points)
+    before = body.evaluate(u).internal
+    ForkingPickler.dumps(body)
+    kernels = body._compiled
+    for name in ("cells", "dN", "dV"):
+        array, tensor = getattr(kernels, name), getattr(body, name)
+        assert array.flags.owndata or array.ctypes.data == tensor.data_ptr(), name
+    assert torch.equal(body.evaluate(u).internal, before)
+
+
+LAW = """
+from dataclasses import dataclass
+
+from dpl.fem.materials import Hookean, Isotropic
+
+FACTOR = {factor}
+
+def inner(x):
+    return {inner} * x
+
+def outer(x):
+    return {outer} * x
+
+@dataclass(frozen=True)
+class Mine(Hookean, Isotropic):
+    @property
+    def constants(self):
+        return (self.mu,)
+
+    @staticmethod
+    def slopes(c, i1, i2, j, log_j, m1):
+        return outer(c[0] * i1), {slope}, 0.0, c[0], 0.0, 0.0, 0.0, 0.0, 0.0
+"""
+
+
+@pytest.fixture
+def written(tmp_path, monkeypatch) -> Callable[..., ModuleType]:
+    """Writes modules with a law in them and imports these."""
+
+    def written(name: str, **parts: str) -> ModuleType:
+        path = tmp_path / f"{name}.py"
+        given = {"factor": "0.5", "inner": "4", "outer": "2 * FACTOR", "slope": "-c[0] / 2"}
+        path.write_text(LAW.format(**given | parts))
+        spec = importlib.util.spec_from_file_location(name, path)
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, name, module)
+        spec.loader.exec_module(module)
+        return module
+
+    return written
+
+
+PARTS = {
+    "slopes": {"slope": "-c[0] / 4"},
+    "helper": {"outer": "3 * FACTOR"},
+    "number of the module": {"factor": "0.7"},
+    "helper of a helper": {"outer": "inner(0.7)"},
+}
+
+
+def name_of(module: ModuleType) -> str:
+    """Return the name of the type of a module's law, by which its machine code is found."""
+    return Law(module.Mine, "code of the loops").kind.name
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_type_of_a_law_changes_with_the_source_of_its_slopes(written, part):
+    """So that no machine code of another law is taken from the disk."""
+    first, again = name_of(written("first")), name_of(written("again"))
+    assert first == again
+    assert first.startswith("Mine")
+    assert name_of(written("other", **PARTS[part])) != first
+
+
+def test_type_of_a_law_changes_with_the_code_of_the_loops():
+    first, other = (Law(NeoHookeanLn, code).kind.name for code in ("one", "another"))
+    assert first != other
+
+
+@pytest.mark.parametrize("part", [None, *PARTS])
+def test_laws_of_one_name_are_not_confused(written, grid, bend, part):
+    body = Problem.build(grid("quad"), written("module", **PARTS.get(part, {})).Mine(0.3))
+    u = bend(body.points)
+    check_equal(body.evaluate(u).internal, reference(body).evaluate(u).internal)
+
+
+@njit
+def _arithmetic(a, b, out):
+    x, y = load(a, 0), load(b, 0)
+    results = (
+        *(x + y, x - y, x * y, x / y, -x, sqrt(y)),
+        *(x + 2.0, 2.0 + x, x - 2.0, 2.0 - x, x * 3.0, 3.0 * x, x / 4.0, 4.0 / x),
+        *(x + 2, 2 + x, x - 2, 2 - x, x * 3, 3 * x, x / 4, 4 / x),
+    )
+    row = 0
+    for value in results:
+        store(out, row, value)
+        row += 1
+    store(out, row, 7.5)
+    store(out, row + 1, load(a, 1))
+
+
+def test_lanes_add_multiply_and_divide_like_numbers():
+    random = np.random.default_rng(0)
+    a, b = random.uniform(0.5, 2.0, (2, 2, WIDTH))
+    a[:, ::2] *= -1
+    out = np.full((24, WIDTH), np.nan)
+    _arithmetic(a, b, out)
+    x, y = a[0], b[0]
+    expected = [
+        *(x + y, x - y, x * y, x / y, -x, np.sqrt(y)),
+        *(x + 2, 2 + x, x - 2, 2 - x, x * 3, 3 * x, x / 4, 4 / x) * 2,
+        *(np.full(WIDTH, 7.5), a[1]),
+    ]
+    assert out == pytest.approx(np.array(expected), rel=1e-15)
+
+
+@njit
+def _copy(rows, out):
+    for row in range(len(rows)):
+        store(out, len(rows) - 1 - row, load(rows, row))
+
+
+def test_rows_are_loaded_and_stored_where_they_are():
+    rows = np.arange(5.0 * WIDTH).reshape(5, WIDTH)
+    out = np.zeros((7, WIDTH))
+    _copy(rows, out[1:6])
+    assert np.array_equal(out[1:6], rows[::-1])
+    assert not out[[0, 6]].any()
+
+
+@njit
+def _quotients(a, b, out):
+    store(out, 0, load(a, 0) / load(b, 0))
+    store(out, 1, sqrt(load(a, 0)))
+    store(out, 2, load(a, 0) - load(a, 0))
+
+
+def test_lanes_know_infinity_and_nan():
+    """Inverted cells are found by them."""
+    a, b, out = np.full((1, WIDTH), -1.0), np.zeros((1, WIDTH)), np.zeros((3, WIDTH))
+    a[0, 0], a[0, 1] = math.nan, math.inf
+    _quotients(a, b, out)
+    assert np.isnan(out[0, 0])
+    assert out[0, 1] == math.inf
+    assert (out[0, 2:] == -math.inf).all()
+    assert np.isnan(out[1, 2:]).all()
+    assert np.isnan(out[2, :2]).all()
+
+
+def test_trace_of_a_gap_is_that_of_its_six_numbers(grid, bend):
+    """Strains in the kernels are 2 E: 11 22 33 12 23 13."""
+    body = Problem.build(grid("hexahedron"), NeoHookeanLn(0.3), length=1.0)
+    stretch = 0.2 * body.points[None] * torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    gap = body.widened(None, 1.0, stretch)
+    assert gap[0, 0, :, 0] == pytest.approx([0.04, 0.16, 0.36, 0, 0, 0], abs=1e-14)
+    E = as_tensor(gap, len(body.cells))
+    assert trace(E) == pytest.approx(torch.full_like(trace(E), 0.28), abs=1e-14)

@@ -1,0 +1,363 @@
+"""Laws of what holds a body: prescribed displacements and springs."""
+
+import math
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from dpl.fem.forces import Traction
+from dpl.fem.linear import full_matrix
+from dpl.fem.materials import LinearElastic, NeoHookeanLn, SaintVenantKirchhoff
+from dpl.fem.mesh import Box, Plane, box, rectangle
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, solve
+from dpl.fem.supports import Displacement, Spring
+
+NH = NeoHookeanLn(0.3)
+LEFT, RIGHT = Plane(0, "min"), Plane(0, "max")
+NOTHING = Plane(0, 0.4321)
+
+
+@pytest.fixture
+def dim(kind) -> int:
+    """Dimension of each kind of element."""
+    return 3 if kind[0] in ("tetra", "hexahedron") else 2
+
+
+@pytest.fixture
+def held(kind, grid):
+    """Builds unit bodies, lengths over 4 m, of each kind of element, with supports."""
+
+    def held(*supports, **options) -> Problem:
+        mesh = grid(kind[0], 2, 0.12, inside=True).scaled(4.0)
+        return Problem.build(mesh, NH, supports=supports, degree=kind[1], **options)
+
+    return held
+
+
+def answer_of(problem: Problem, force: torch.Tensor | None = None, **options):
+    """Return the solution under a load, none if left out."""
+    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    load = Load(rest if force is None else force[None], torch.ones(1))
+    return solve(Newton(problem, linear="superlu", **options), load)
+
+
+def test_clamp_holds_all_components_of_its_nodes(held):
+    """The default value, the same as `fixed`."""
+    clamped, fixed = held(Displacement(LEFT)), held(fixed=LEFT)
+    assert torch.equal(clamped.free, fixed.free)
+    assert (~clamped.free).sum() > 0
+    assert not clamped.prescribed.any()
+    assert not clamped.moved_supports
+
+
+def test_component_without_a_value_stays_free(held, dim):
+    for axis in range(dim):
+        value = [None] * dim
+        value[axis] = 0.0
+        problem = held(Displacement(LEFT, value))
+        on_plane = problem.points[:, 0] < 1e-9
+        expected = torch.zeros(dim, dtype=torch.bool)
+        expected[axis] = True
+        assert torch.equal(~problem.free, on_plane[:, None] & expected)
+
+
+def test_value_is_a_length_in_metres(held, dim):
+    value = [0.4, None, -0.2][:dim]
+    problem = held(Displacement(RIGHT, value))
+    right = problem.points[:, 0] > 1 - 1e-9
+    assert problem.length == pytest.approx(4.0)
+    assert problem.moved_supports
+    found = problem.prescribed[right]
+    assert_close(found[:, 0], torch.full_like(found[:, 0], 0.1), rtol=1e-14, atol=0)
+    assert not found[:, 1].any()
+    assert problem.free[right][:, 1].all()
+    assert not problem.prescribed[~right].any()
+    if dim == 3:
+        assert_close(found[:, 2], torch.full_like(found[:, 2], -0.05), rtol=1e-14, atol=0)
+
+
+def test_whole_number_of_metres_is_a_value_too(held, dim):
+    problem = held(Displacement(RIGHT, [2, *[None] * (dim - 1)]))
+    assert problem.prescribed.max().item() == pytest.approx(0.5, rel=1e-14)
+
+
+def test_of_two_values_for_one_component_the_later_counts(held, dim):
+    first = Displacement(LEFT, [0.4] * dim)
+    second = Displacement(LEFT, [-0.8, *[None] * (dim - 1)])
+    left = held().points[:, 0] < 1e-9
+    for supports, value in (((first, second), -0.2), ((second, first), 0.1)):
+        problem = held(*supports)
+        assert_close(problem.prescribed[left][:, 0].unique(), torch.tensor([value]).double())
+        assert_close(problem.prescribed[left][:, 1].unique(), torch.tensor([0.1]).double())
+
+
+def test_support_counts_more_than_what_is_fixed(held, dim):
+    problem = held(Displacement(LEFT, [0.4, *[None] * (dim - 1)]), fixed=LEFT)
+    left = problem.points[:, 0] < 1e-9
+    assert not problem.free[left].any()
+    assert_close(problem.prescribed[left][:, 0].unique(), torch.tensor([0.1]).double())
+    assert not problem.prescribed[left][:, 1:].any()
+
+
+def test_support_that_leaves_a_component_free_does_not_free_what_is_fixed(held, dim):
+    problem = held(Displacement(LEFT, [*[None] * (dim - 1), 0.0]), fixed=LEFT)
+    assert torch.equal(problem.free, held(fixed=LEFT).free)
+
+
+def test_supports_on_different_regions_add_up(held):
+    both = held(Displacement(LEFT), Displacement(RIGHT))
+    assert torch.equal(both.free, held(fixed=LEFT).free & held(fixed=RIGHT).free)
+
+
+@pytest.mark.parametrize(
+    "value", [[], [0.0], [0.0] * 4, [None] * 3, [0.0, math.inf, 0.0], [math.nan] * 3], ids=str
+)
+def test_value_of_the_wrong_length_is_an_error(grid, value):
+    with pytest.raises(ValueError, match="must be 3 lengths"):
+        Problem.build(grid("hexahedron"), NH, supports=[Displacement(LEFT, value)])
+
+
+def test_value_for_space_is_an_error_in_the_plane(grid):
+    with pytest.raises(ValueError, match="must be 2 lengths"):
+        Problem.build(grid("quad"), NH, supports=[Displacement(LEFT, [0.0, 0.0, 0.0])])
+
+
+@pytest.mark.parametrize(
+    ("support", "what"),
+    [(Displacement(NOTHING), "no node"), (Spring(NOTHING, 1.0), "no facet of the boundary")],
+)
+def test_empty_region_is_an_error(held, support, what):
+    with pytest.raises(ValueError, match=what):
+        held(support)
+
+
+@pytest.mark.parametrize(
+    "stiffness",
+    [0.0, -1.0, math.nan, [0.0] * 3, [1.0, -1.0, 1.0], [1.0, 1.0], [1.0] * 4, [math.nan, 1.0, 1.0]],
+    ids=str,
+)
+def test_stiffness_out_of_range_is_an_error(grid, stiffness):
+    with pytest.raises(ValueError, match="stiffness"):
+        Problem.build(grid("hexahedron"), NH, supports=[Spring(LEFT, stiffness)])
+
+
+def test_moved_supports_pull_the_body_along():
+    """A bar stretched by 50 % of its length has the lateral stretch of VERIFICATION 1.2."""
+    mesh = box([2.0, 2.0, 2.0], [3, 3, 3])
+    rails = [
+        Displacement(Plane(axis, "min"), [0.0 if k == axis else None for k in range(3)])
+        for axis in range(3)
+    ]
+    pulled = Displacement(RIGHT, [1.0, None, None])
+    for law, lateral in ((SaintVenantKirchhoff(0.3), 0.79056942), (NH, 0.88017459)):
+        problem = Problem.build(mesh, law, supports=[*rails, pulled])
+        answer = answer_of(problem, tol=1e-12)
+        assert answer.converged.all()
+        end = 1 + answer.displacement[0, problem.points.sum(dim=1).argmax()]
+        assert end.tolist() == pytest.approx([1.5, lateral, lateral], abs=6e-9)
+
+
+def test_supports_move_with_the_load():
+    """An equilibrium under half the load has half the displacement at the supports."""
+    mesh = rectangle([4.0, 1.0], [9, 3])
+    ends = [Displacement(LEFT), Displacement(RIGHT, [4.0, 1.0])]
+    problem = Problem.build(mesh, NH, supports=ends)
+    right = problem.points[:, 0] > 1 - 1e-9
+    for budget, factor in ((10, 0.5), (30, 1.0)):  # three iterations are too few for the whole
+        answer = answer_of(problem, max_iter=3, budget=budget, mixed=False)
+        assert answer.load_factor.item() == factor
+        assert answer.converged.item() == (factor == 1.0)
+        moved = answer.displacement[0, right]
+        expected = factor * torch.tensor([1.0, 0.25], dtype=torch.float64)
+        assert_close(moved, expected.expand_as(moved), rtol=1e-14, atol=0)
+
+
+# VERIFICATION 1.6e: t = 0.1 on x = 4, alpha = 0.5 on x = 0, nu = 0, SVK
+STRETCH, START, END = 1.0880339146912892, 0.2, 0.5521356587651567
+
+
+def bar(kind, count: int, stiffness) -> Problem:
+    """Return the bar of VERIFICATION 1.6e on springs, in space or in the plane."""
+    cell, degree = kind
+    dim = 3 if cell in ("tetra", "hexahedron") else 2
+    build = box if dim == 3 else rectangle
+    mesh = build([4.0, *[1.0] * (dim - 1)], [count + 1, *[2] * (dim - 1)], cell)
+    shift = np.random.default_rng(0).uniform(-0.1, 0.1, mesh.p.shape) / count
+    shift[:, mesh.boundary_nodes()] = 0.0
+    shift[0, (mesh.p[0] > 0) & (mesh.p[0] < 4)] = 0.3 / count  # cells of two lengths
+    mesh = type(mesh)(mesh.p + shift, mesh.t)
+    law = SaintVenantKirchhoff(0.0)
+    return Problem.build(mesh, law, supports=[Spring(LEFT, stiffness)], degree=degree)
+
+
+def check_bar(problem: Problem) -> None:
+    force = Traction(RIGHT, [0.1, *[0.0] * (problem.shape[1] - 1)]).on(problem)
+    answer = answer_of(problem, force, tol=1e-13)
+    assert answer.converged.all()
+    x, u = problem.points[:, 0] * problem.length, answer.displacement[0] * problem.length
+    assert_close(u[:, 0], START + (STRETCH - 1) * x, rtol=0, atol=1e-10)
+    assert u[:, 1:].abs().max() < 1e-10
+    ends = [u[x < 1e-9, 0], u[x > 4 - 1e-9, 0]]
+    for end, expected in zip(ends, (START, END), strict=True):
+        assert end.tolist() == [pytest.approx(expected, abs=1e-10)] * len(end)
+
+
+def test_closed_form_of_the_robin_bar_is_consistent():
+    assert pytest.approx(0.2, rel=1e-14) == STRETCH**3 - STRETCH
+    assert pytest.approx(END, rel=1e-15) == START + 4 * (STRETCH - 1)
+
+
+@pytest.mark.parametrize("count", [1, 3, 8])
+def test_bar_on_springs_is_exact_on_every_mesh(kind, count):
+    """VERIFICATION 1.6e, tolerance 1e-10."""
+    problem = bar(kind, count, 0.5)
+    assert problem.loose_modes() == []
+    check_bar(problem)
+
+
+def test_bar_on_springs_does_not_care_for_the_unit_of_length(kind):
+    """The stiffness [1/m] and the displacement [m] of a bar of 0.004 m: alpha = 500/m."""
+    problem = bar(kind, 3, 0.5)
+    mesh = problem.mesh.scaled(0.004)
+    small = Problem.build(
+        mesh, problem.material, supports=[Spring(LEFT, 500.0)], degree=problem.degree
+    )
+    assert small.length == pytest.approx(0.004)
+    assert_close(small.springs.stiffness, problem.springs.stiffness, rtol=1e-12, atol=1e-15)
+
+
+def test_stiffness_may_differ_from_direction_to_direction(kind, dim):
+    """The pull along x does not feel the other two; those in plane must hold the body."""
+    check_bar(bar(kind, 3, [0.5, 2.0, 7.0][:dim]))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_springs_in_one_direction_leave_the_others_free(kind, dim, axis):
+    if axis >= dim:
+        pytest.skip("no such axis")
+    stiffness = [0.0] * dim
+    stiffness[axis] = 0.5
+    problem = bar(kind, 2, stiffness)
+    names = problem.loose_modes()
+    assert f"translation along {'xyz'[axis]}" not in names
+    others = [f"translation along {'xyz'[k]}" for k in range(dim) if k != axis]
+    assert set(others) <= set(names)
+    turns = {2: {0: 0, 1: 1}, 3: {0: 1, 1: 2, 2: 2}}[dim]  # about lines in the springs' face
+    assert len(names) == dim - 1 + turns[axis]
+
+
+def test_loose_motions_on_springs_are_the_zero_modes(kind, dim):
+    for axis in range(dim):
+        stiffness = [0.0] * dim
+        stiffness[axis] = 0.5
+        problem = bar(kind, 1, stiffness)
+        rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
+        K = full_matrix(problem.pattern, problem.tangent(rest)[0].numpy()).toarray()
+        values = np.linalg.eigvalsh(K)
+        assert (values < 1e-10 * values[-1]).sum() == len(problem.loose_modes())
+
+
+def test_springs_and_clamps_hold_together(held, dim):
+    """A hinge line or point leaves rotations; springs at the other end take them."""
+    corner = Box([0.0] * dim, [0.0] * dim)
+    pinned = held(Displacement(corner))
+    assert len(pinned.loose_modes()) == {2: 1, 3: 3}[dim]
+    assert held(Displacement(corner), Spring(RIGHT, 1e-3)).loose_modes() == []
+
+
+def test_soft_springs_hold_as_well_as_stiff_ones(kind):
+    for stiffness in (1e-9, 1.0, 1e9):
+        assert bar(kind, 2, stiffness).loose_modes() == []
+
+
+@pytest.fixture
+def sprung(held, dim) -> Problem:
+    """Unequal cells, held in part, two beds of springs on neighbouring faces."""
+    return held(
+        Displacement(Box([0.0] * dim, [4.0, *[0.0] * (dim - 1)]), [None, 0.0, None][:dim]),
+        Spring(LEFT, [0.3, 0.1, 0.7][:dim]),
+        Spring(Plane(1, "max"), 0.2),
+    )
+
+
+def test_force_on_springs_is_the_slope_of_the_energy(sprung, bend):
+    u = bend(sprung.points, 2).requires_grad_()
+    (slope,) = torch.autograd.grad(sprung.energy(u).sum(), u)
+    assert_close(sprung.internal_force(u.detach()), slope, rtol=1e-11, atol=1e-13)
+    assert_close(sprung.evaluate(u.detach()).internal, slope, rtol=1e-11, atol=1e-13)
+
+
+def test_tangent_on_springs_is_the_slope_of_the_force(sprung, bend):
+    u = bend(sprung.points)
+    v = torch.where(sprung.free, bend(sprung.points, seed=1), 0.0)
+    product = sprung.tangent_product(u, v)[0][sprung.free].numpy()
+    for values in (sprung.tangent(u), sprung.linearise(u).tangent):
+        K = full_matrix(sprung.pattern, values[0].numpy())
+        found = K @ v[0][sprung.free].numpy()
+        assert found == pytest.approx(product, rel=1e-10, abs=1e-13)
+
+
+def test_mixed_points_on_springs_see_the_springs(sprung, bend):
+    u = bend(sprung.points)
+    force, tangent = sprung.mixed_system(u, torch.zeros_like(sprung.strain(u)))
+    assert_close(force, sprung.internal_force(u), rtol=1e-11, atol=1e-14)
+    assert_close(tangent, sprung.tangent(u), rtol=1e-11, atol=1e-13)
+
+
+def test_springs_pull_with_stiffness_times_displacement_times_area(held, dim):
+    """A body moved as a whole: the pull is -alpha u, on an area of 4 m by 4 m."""
+    stiffness = np.array([0.3, 0.1, 0.7][:dim])
+    problem = held(Spring(LEFT, stiffness.tolist()))
+    shift = torch.tensor([0.05, -0.02, 0.01][:dim], dtype=torch.float64)
+    u = shift.expand(1, *problem.shape)
+    total = problem.internal_force(u).sum(dim=1)[0]
+    expected = torch.from_numpy(stiffness * 4.0) * shift  # times L; the face's area is 1
+    assert_close(total, expected, rtol=1e-12, atol=1e-15)
+    assert_close(problem.energy(u), (expected * shift).sum()[None] / 2, rtol=1e-12, atol=0)
+
+
+def test_beds_of_springs_on_one_face_add_up(held, bend):
+    one, two = held(Spring(LEFT, 0.3), Spring(LEFT, 0.2)), held(Spring(LEFT, 0.5))
+    u = bend(one.points)
+    assert_close(one.internal_force(u), two.internal_force(u), rtol=1e-12, atol=1e-15)
+    assert_close(one.tangent(u), two.tangent(u), rtol=1e-12, atol=1e-15)
+
+
+def test_body_without_springs_has_none(held):
+    assert held(Displacement(LEFT)).springs is None
+
+
+def test_very_stiff_springs_clamp(kind):
+    """The difference falls with the stiffness, by 10 where it is ten times as large."""
+    cell, degree = kind
+    build = box if cell in ("tetra", "hexahedron") else rectangle
+    dim = 3 if build is box else 2
+    mesh = build([4.0, *[1.0] * (dim - 1)], [5, *[2] * (dim - 1)], cell)
+    law, value = LinearElastic(0.3), [0.0, 1e-4, 0.0][:dim]
+
+    def sag(**supports):
+        problem = Problem.build(mesh, law, degree=degree, **supports)
+        force = Traction(RIGHT, value).on(problem)
+        answer = answer_of(problem, force)
+        assert answer.converged.all()
+        return (answer.displacement[0] * force).sum().item()
+
+    clamped = sag(fixed=LEFT)
+    softer, stiffer = (sag(supports=[Spring(LEFT, a)]) / clamped - 1 for a in (1e3, 1e4))
+    assert 0 < stiffer < 1e-2
+    assert softer / stiffer == pytest.approx(10, rel=0.05)
+
+
+def test_copy_on_a_device_and_copy_by_pickle_keep_their_springs(sprung, bend):
+    u = bend(sprung.points)
+    for copy in (sprung.to("cpu"), pickle.loads(pickle.dumps(sprung))):
+        assert torch.equal(copy.internal_force(u), sprung.internal_force(u))
+        assert torch.equal(copy.linearise(u).tangent, sprung.linearise(u).tangent)
+    bare = replace(sprung, springs=None)
+    assert (bare.internal_force(u) - sprung.internal_force(u)).abs().max() > 1e-4
