@@ -183,7 +183,6 @@ def _draw_side(ax: Any, problem: Problem, u: Tensor, colour: str, at: float | No
     side(ax, places if at is None else places[:, ::-1] + [at, 0.0], nodes, colour, problem.degree)
 
 
-BACKEND = "auto"  # counts pivots, however small those of a slender column are
 EULER = math.pi**2 / 4  # P L^2 / EI at which a column, clamped below, free above, buckles
 NEWTON = 100 / (1000 / 12)  # P L^2 / EI of 1 N on the column 10 x 1 x 1 m, E = 1000 Pa
 CRITICAL: list[tuple[Material, tuple[int, int, int], str]] = [  # [N]
@@ -205,8 +204,8 @@ def pushed(problem: Problem, P: float) -> Tensor:
 def critical(law: Material, cells: Sequence[int]) -> float:
     """Return the load P [N] at which the tangent of a straight column becomes singular."""
     problem = slender(law, cells)
-    newton, unit = Newton(problem, tol=1e-10, linear=BACKEND), pushed(problem, 1.0)
-    tangents, low, high = backend(problem.pattern, BACKEND), 2.0, 2.1
+    newton, unit = Newton(problem, tol=1e-10), pushed(problem, 1.0)
+    tangents, low, high = backend(problem.pattern), 2.0, 2.1
     while high - low > 2e-7:
         middle = (low + high) / 2
         u = balanced(newton, middle * unit).displacement
@@ -221,7 +220,7 @@ def bent_branch(cells: Sequence[int], lowest: float) -> dict[float, tuple[Proble
     The first answer is reached by a guess, the elastica's shape; each of the others by the last.
     """
     problem = slender(SVK, cells)
-    newton, unit = Newton(problem, linear=BACKEND), pushed(problem, 1.0)
+    newton, unit = Newton(problem), pushed(problem, 1.0)
     _, line, slopes = at_load(buckled_line, LOADS[0] * NEWTON / EULER)
     X = problem.points.numpy()
     x, z, slope = (np.interp(X[:, 0], np.linspace(0, 1, 200), v) for v in (*line.T, slopes))
@@ -264,7 +263,7 @@ def buckling(folder: Path) -> Section:
                 name = f"L/h = {ratio}, bent, P = {P:g} N: {what}/L, {source}"
                 rows.append(Row(name, tip[k], branches[ratio][P][2][k], within))
     problem = slender(SVK, (20, 2, 2))
-    newton, unit = Newton(problem, linear=BACKEND), pushed(problem, 1.0)
+    newton, unit = Newton(problem), pushed(problem, 1.0)
     straight = {P: balanced(newton, P * unit) for P in np.arange(0.5, 4.1, 0.25).tolist()}
     _draw_buckled(folder / "buckling.png", problem, straight, branches)
     flagged = [P for P, answer in straight.items() if answer.status == Status.UNSTABLE]
@@ -274,7 +273,7 @@ def buckling(folder: Path) -> Section:
         "A column 10 × 1 × 1 m (E = 1000 Pa, ν = 0, hex27), clamped below, under an axial dead "
         "load P on its top; one with L/h = 40 under loads of the same PL²/EI. A critical load is "
         "where the tangent of the straight column becomes singular, by bisection on its negative "
-        "pivots (SuperLU). The bent branch is reached by a guess, the elastica's shape at P = 4 N, "
+        "pivots. The bent branch is reached by a guess, the elastica's shape at P = 4 N, "
         "and followed down. References: *same mesh*, an independent code (critical loads to 2e-6); "
         "Euler's critical load, to 0.2 %; the elastica by elliptic integrals, to 1 %.",
         rows,

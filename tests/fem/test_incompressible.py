@@ -261,7 +261,7 @@ def test_moved_and_turned_body_of_mean_dilatation_feels_turned_forces(shaken, be
 
 
 def test_mean_dilatation_is_refused_to_the_linear_law(beam):
-    """The mean is taken of det F, which is not linear in u: a linear answer would take iterations."""
+    """The mean is taken of det F, which is not linear in u: a load would take iterations."""
     with pytest.raises(ValueError, match="mean_dilatation: is for laws of finite strain"):
         beam(LinearElastic(0.3), mean_dilatation=True)
 
