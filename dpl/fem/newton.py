@@ -1,6 +1,7 @@
 """Newton-Raphson on the nodal equilibrium f_int(u) = f, and the linear answer it starts with."""
 
 import time
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -51,6 +52,9 @@ class Linear:
     def __getstate__(self) -> dict[str, object]:
         """Pickle without the factor."""
         return {"problem": self.problem, "tol": self.tol, "linear": self.linear}
+
+
+CAREFUL = 2.0**-4  # load step from which on the end of the path may be near: full accuracy
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +141,8 @@ class Newton:
         yield self._report(state, force, count)
         while not self._balanced(state, force, 1.0, self.tol):
             target = min(count.known + step, 1.0)
-            tol = self.tol if target == 1.0 else self.loose
+            whole = target == 1.0
+            tol = self.tol if whole or step < CAREFUL else self.loose
             for iterate in self._correct(state, force, target, tol, count):
                 state = iterate
                 yield self._report(state, force, count)
@@ -258,16 +263,23 @@ class Newton:
     ) -> Solution:
         balanced = end is None and self._balanced(state, force, 1.0, self.tol)
         if balanced:
+            if (ratio := self._ratio(state, force, 1.0)) >= self.tol:
+                warnings.warn(
+                    f"||R||/||f|| = {ratio:.1e} and not {self.tol:g}: rounding allows no less on "
+                    "this body (very thin cells, moduli far apart?)",
+                    stacklevel=2,
+                )
             end = Status.UNSTABLE if self._negative_pivots(state, count) > 0 else Status.CONVERGED
         elif end is None:
             end = Status.NOT_CONVERGED
         factor = 1.0 if balanced else count.known
+        pivots = count.negative_pivots if balanced else -1
         return Solution(
             displacement=state.displacement,
             residual=torch.tensor([self._ratio(state, force, 1.0)], dtype=force.dtype),
             volume_ratio=state.volume_ratio,
             status=torch.tensor([int(end)]),
-            negative_pivots=torch.tensor([count.negative_pivots]),
+            negative_pivots=torch.tensor([pivots]),
             iterations=torch.tensor([count.iterations]),
             factorisations=torch.tensor([count.factorisations]),
             load_factor=torch.tensor([factor], dtype=force.dtype),

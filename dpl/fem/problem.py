@@ -244,7 +244,7 @@ class Problem:
         """Return the strain energy over E L^D, that of springs included, (B,) [-]."""
         H = self._gradient(displacement)
         if self.mean_dilatation:
-            H = dilated(H, self.dV, self.shape[1])[0]
+            H = dilated(self.material, H, self.dV, self.shape[1])
         energy = (self.material.energy(H) * self.dV).sum((-2, -1))
         if self.springs is not None:
             pull = self.springs.force(displacement)
@@ -266,10 +266,11 @@ class Problem:
             with torch.no_grad():
                 internal = self.internal_force(displacement)
                 return Evaluation(internal, self.volume_ratio(displacement))
-        internal = torch.zeros_like(displacement)
+        displacement = displacement.detach().contiguous()
+        internal = torch.zeros(displacement.shape, dtype=torch.float64)
         lowest = [
             kernels.force(u.numpy(), out.numpy())
-            for u, out in zip(displacement.contiguous(), internal, strict=True)
+            for u, out in zip(displacement, internal, strict=True)
         ]
         internal = self._with_springs(internal, displacement)
         return Evaluation(internal, torch.tensor(lowest, dtype=torch.float64))
@@ -487,7 +488,7 @@ class Problem:
         """Return the first Piola-Kirchhoff stress over E at the quadrature points, (B,E,Q,3,3)."""
         H = self._gradient(displacement)
         if self.mean_dilatation:
-            H = dilated(H, self.dV, self.shape[1])[0]
+            H = dilated(self.material, H, self.dV, self.shape[1])
         return self.material.stress(H)
 
     @cached_property

@@ -98,7 +98,8 @@ def test_stretched_rubber_has_the_stress_of_the_incompressible_limit(formulation
         principal = np.array(stretches(stretch))
         given = np.where(far, principal - 1, 0.0)
         problem = Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0, **formulation)
-        answer = without_load(problem)
+        guess = problem.points * torch.from_numpy(principal - 1)
+        answer = without_load(problem, guess[None])
         assert answer.converged.all()
         pull = problem.internal_force(answer.displacement)[0, far[:, 0], 0].sum().item()
         W1, W2 = slopes(law)((principal**2).sum(), (principal**-2.0).sum())
@@ -162,6 +163,7 @@ def test_thick_sphere_holds_the_printed_pressure(stretch, printed):
     assert pressure / law.mu == pytest.approx(printed, rel=1e-3)
 
 
+@pytest.mark.filterwarnings("ignore:.*rounding allows no less")
 def test_balloon_has_its_largest_pressure_at_the_sixth_root_of_seven():
     """VERIFICATION 1.5: p R / (2 mu H) = .6197314512 at 7^(1/6); here H / R = 1e-3."""
     law, peak = NeoHookeanIsoK2(poisson(1e4)), 7 ** (1 / 6)
@@ -260,7 +262,6 @@ def test_moved_and_turned_body_of_mean_dilatation_feels_turned_forces(shaken, be
     assert (shaken.internal_force(moved) - force @ turn.T).norm() < 1e-12 * force.norm()
 
 
-@pytest.mark.xfail(strict=True, reason="the mean is taken of det F, which is not linear in u")
 def test_linear_law_of_mean_dilatation_is_linear(beam, pull):
     """VERIFICATION 0: a linear problem converges in exactly one iteration."""
     problem = beam(LinearElastic(0.3), mean_dilatation=True)

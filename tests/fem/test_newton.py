@@ -2,6 +2,7 @@
 
 import math
 import pickle
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -618,6 +619,10 @@ def test_slivers_end_where_rounding_ends_them(pull, corner, part, deepest):
     points[0, points[0] == 50.0] = 37.5 + 12.5 * part
     with pytest.warns(UserWarning, match="aspect ratio"):
         problem = Problem.build(type(mesh)(points, mesh.t), SVK, fixed=Plane(0, "min"))
-    answer = solve(newton(problem), load_of(pull(problem, 20.0)))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        answer = solve(newton(problem), load_of(pull(problem, 20.0)))
+    told = any("rounding allows no less" in str(w.message) for w in caught)
+    assert told == bool(answer.residual > 1e-8) == (part == 1e-8)
     assert answer.converged.all()
     assert corner(problem, answer.displacement)[2].item() == pytest.approx(deepest, abs=6e-8)

@@ -240,6 +240,7 @@ def test_flat_linear_cells_are_warned_of(slenderness, warned):
 SLIVERS = {1e-2: -0.2388289, 1e-4: -0.2386176, 1e-6: -0.2386155, 1e-8: -0.2386155}
 
 
+@pytest.mark.filterwarnings("ignore:.*rounding allows no less")
 @pytest.mark.parametrize("part", SLIVERS)
 @pytest.mark.parametrize("name", DIRECT)
 def test_slivers_are_warned_of_and_change_nothing(pull, name, mixed, part):
