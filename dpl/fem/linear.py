@@ -84,7 +84,7 @@ def chosen(name: str, pattern: Pattern | None = None, near_null: Array | None = 
 
 # Measured on beams, cubes, stars, plates of 1,000 to 100,000 degrees of freedom: a band costs n b^2
 # operations, a sparse factor of a solid about n^2 slower ones, so b^2 / n decides.
-PAYS = {"pardiso": 25, "superlu": 100, "cg": 10}  # b^2 / n below which a band is faster
+PAYS = {"pardiso": 22, "superlu": 100, "cg": 10}  # b^2 / n below which a band is faster
 LARGE = {"pardiso": 100_000, "superlu": 30_000}  # n from which on multigrid is faster
 WIDE = 250  # b from which on float32 saves more than the iterations on it cost
 
