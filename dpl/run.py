@@ -225,7 +225,8 @@ def build_scene(cfg: DictConfig) -> Scene:
     """
     from dpl.fem.problem import Problem
 
-    material, mesh, clamped = make(cfg, "material"), make(cfg, "mesh"), make(cfg, "clamped")
+    material, mesh = make(cfg, "material"), make(cfg, "mesh")
+    clamped = make(cfg, "clamped") if cfg.get("clamped") is not None else None
     if cfg.degree not in (1, 2):
         raise ConfigError(f"degree = {cfg.degree} must be 1 or 2")
     if not isinstance(cfg.mean_dilatation, bool):

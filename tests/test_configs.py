@@ -43,7 +43,12 @@ def overrides(part):
     """What an option of a group needs besides its name."""
 
     def overrides(group, name):
-        return [f"{group}={name}", *([f"mesh.path={part}"] if name == "file" else [])]
+        needed = {
+            "file": [f"mesh.path={part}"],
+            "tag": ["clamped.name=bore"],
+            "cylinder": ["clamped.radius=0.05"],
+        }
+        return [f"{group}={name}", *needed.get(name, [])]
 
     return overrides
 
@@ -149,3 +154,11 @@ def test_the_seed_shuffles_batches_and_leaves_the_loads(compose):
     assert cfg.data.shuffle == 5
     assert cfg.data.seed == 0
     assert np.isfinite(cfg.optimizer.lr)
+
+
+@pytest.mark.parametrize(
+    "clamped", [["clamped=tag", "clamped.name=bore"], ["clamped=cylinder", "clamped.radius=0.05"]]
+)
+def test_propeller_is_held_at_its_bore_by_name_or_by_place(scene_of, clamped):
+    scene = scene_of("mesh=propeller", *clamped)
+    assert int((~scene.problem.free).all(dim=1).sum()) == 175
