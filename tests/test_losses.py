@@ -50,15 +50,20 @@ def inverted(scene, few):
 
 @pytest.fixture
 def evaluations(monkeypatch):
-    """Counts of evaluated internal forces."""
+    """Counts of evaluated internal forces, by tensors and by compiled loops."""
     counts = []
-    original = Problem.internal_force
 
-    def counted(problem, displacement):
-        counts.append(len(displacement))
-        return original(problem, displacement)
+    def count(name):
+        original = getattr(Problem, name)
 
-    monkeypatch.setattr(Problem, "internal_force", counted)
+        def counted(problem, displacement):
+            counts.append(len(displacement))
+            return original(problem, displacement)
+
+        monkeypatch.setattr(Problem, name, counted)
+
+    count("internal_force")
+    count("evaluate")
     return counts
 
 

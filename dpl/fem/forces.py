@@ -102,7 +102,7 @@ def _tested(problem: Problem, basis: skfem.Basis, values: NDArray[np.float64]) -
     dim = problem.points.shape[1]
     force = np.zeros((basis.N, dim))
     for a, dofs in enumerate(basis.element_dofs):
-        shape = basis.basis[a][0].value * basis.dx  # (E, Q)
+        shape = np.asarray(basis.basis[a][0]) * basis.dx  # (E, Q)
         np.add.at(
             force,
             dofs,
