@@ -175,7 +175,7 @@ class Newton:
             stepped = self._stepped(state, update)
             if stepped is None:
                 return
-            state = stepped
+            state = stepped._replace(before=ratio)
             yield state
             if self._balanced(state, force, target, tol) or count.iterations >= self.budget:
                 return
@@ -256,7 +256,8 @@ class Newton:
         if (ratio := self._ratio(state, force, target)) < tol:
             return True
         u, internal = state.displacement, state.internal
-        return ratio < 1e-4 and bool(self.problem.balanced(u, internal, target * force, tol))
+        stuck = 0.1 * state.before < ratio < 1e-4
+        return stuck and bool(self.problem.balanced(u, internal, target * force, tol))
 
     def _report(
         self, state: "_State", force: Tensor, count: "_Count", end: Status | None = None
@@ -307,6 +308,7 @@ class _State(NamedTuple):
     jump: Tensor
     gap: Any
     ratios: dict[float, float]
+    before: float = 0.0  # residual ratio that the step came from
 
 
 @dataclass

@@ -191,7 +191,7 @@ def test_beam_of_the_dolfinx_tutorial_bends_as_computed(degree, mixed):
     for n, count in enumerate(DOLFINX_ITERATIONS, 1):
         answer = resumed(problem, n * unit, state, tol=1e-9, mixed=mixed)
         assert answer.status.item() == Status.CONVERGED
-        assert answer.iterations.item() <= count + (degree == 1)
+        assert answer.iterations.item() <= count + 1  # theirs is over the first residual
         state = answer.displacement
         for found, printed in zip(
             20 * state[0, corner], DOLFINX.get((degree, n), [None] * 3), strict=True
