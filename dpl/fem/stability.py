@@ -71,13 +71,13 @@ def branches(
     for sign in (1.0, -1.0):
         bent = newton.problem.prescribed[None]
         for part in np.linspace(0.1, 1.0, 10):
-            bent = _end(newton, Load(part * (load.force + sign * push), load.young), bent)
-        *_, last = newton.iterate(load, guess=bent)
-        answers.append(last)
+            pushed = Load(part * (load.force + sign * push), load.young)
+            bent = _end(newton, pushed, bent).displacement
+        answers.append(_end(newton, load, bent))
     return answers
 
 
-def _end(newton: Newton, load: Load, guess: Tensor) -> Tensor:
+def _end(newton: Newton, load: Load, guess: Tensor) -> Solution:
     """Return where Newton ends, from a guess."""
     *_, last = newton.iterate(load, guess=guess)
-    return last.displacement
+    return last
