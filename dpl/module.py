@@ -1,16 +1,18 @@
 """Surrogate: a network with its scales and its loss, trained by Lightning."""
 
 import math
+import random
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import lightning as L
+import numpy as np
 import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from torch import Tensor, nn
 
-from dpl.data.store import whole_file
+from dpl.data.durable import whole_file
 from dpl.fem.solution import Load
 from dpl.losses import Loss, Physics
 from dpl.metrics import metrics
@@ -30,6 +32,7 @@ class Surrogate(L.LightningModule):
         net: Scaled force (B, N, D) to scaled displacement (B, N, D).
         scene: What it answers for.
         loss: What it is trained with.
+        batch_errors: Relative L2 errors on the last training batch, (B,); None before the first.
     """
 
     def __init__(
@@ -53,6 +56,8 @@ class Surrogate(L.LightningModule):
         """
         super().__init__()
         self.net, self.loss, self.scene = net, loss, scene
+        self.batch_errors: Tensor | None = None
+        self._random_states: dict[str, Any] | None = None  # of the run that this one resumes
         self._optimizer, self._scheduler = optimizer, scheduler
         force_scale, displacement_scale = scales(scene)
         self.register_buffer("force_scale", force_scale)
@@ -80,7 +85,10 @@ class Surrogate(L.LightningModule):
 
     def training_step(self, batch: Sample, batch_idx: int) -> Tensor:
         """Return the loss."""
-        loss = self.loss(self.predict(batch.load), batch, self.physics)
+        prediction = self.predict(batch.load)
+        loss = self.loss(prediction, batch, self.physics)
+        error = (prediction.detach() - batch.displacement).flatten(1).norm(dim=1)
+        self.batch_errors = error / batch.displacement.flatten(1).norm(dim=1).clamp(min=1e-12)
         self.log("loss/train", loss, prog_bar=True, batch_size=len(batch.force))
         return loss
 
@@ -125,8 +133,9 @@ class Surrogate(L.LightningModule):
         }
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Write down whose surrogate this is."""
+        """Write down whose surrogate this is, and where random numbers are."""
         checkpoint["scene"] = self.scene.fingerprint
+        checkpoint["random"] = random_states()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse the checkpoint of another scene.
@@ -137,6 +146,12 @@ class Surrogate(L.LightningModule):
         theirs, ours = checkpoint.get("scene", "unknown"), self.scene.fingerprint
         if theirs != ours:
             raise ValueError(f"the checkpoint is of scene {theirs[:12]}, this scene is {ours[:12]}")
+        self._random_states = checkpoint.get("random")
+
+    def on_train_start(self) -> None:
+        """Go on with the random numbers of the run that this one resumes."""
+        if self._random_states is not None:
+            set_random_states(self._random_states)
 
 
 def warmup_cosine(
@@ -176,6 +191,28 @@ def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:
     displacement = torch.stack([scene.linear.respond(one) for one in force])
     acting, moving = force[:, scene.loads.reach], displacement[:, scene.problem.free]
     return acting.square().mean().sqrt(), moving.square().mean().sqrt()
+
+
+def random_states() -> dict[str, Any]:
+    """Return the states of all random number generators of this process, as plain data."""
+    kind, keys, *rest = np.random.get_state()  # noqa: NPY002 - the global one, of others' code
+    return {
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        "numpy": [kind, torch.from_numpy(np.asarray(keys).astype(np.int64)), *rest],
+        "python": random.getstate(),
+    }
+
+
+def set_random_states(states: dict[str, Any]) -> None:
+    """Put random number generators where `random_states` found them."""
+    kind, keys, *rest = states["numpy"]
+    torch.set_rng_state(states["torch"].cpu())
+    if states["cuda"] and torch.cuda.device_count() == len(states["cuda"]):
+        torch.cuda.set_rng_state_all([state.cpu() for state in states["cuda"]])
+    np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))  # noqa: NPY002
+    version, numbers, gauss = states["python"]
+    random.setstate((version, tuple(numbers), gauss))
 
 
 class WholeCheckpoints(TorchCheckpointIO):

@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dpl.data.generate import Job, outcomes
+from dpl.data.crew import outcomes
+from dpl.data.outcome import Job
 from dpl.fem.linear import backend, chosen
 from dpl.fem.materials import Material, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, Tag, box, propeller

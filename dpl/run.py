@@ -4,6 +4,7 @@ The only file of the package that knows Hydra.
 """
 
 import contextlib
+import errno
 import functools
 import importlib
 import inspect
@@ -22,10 +23,11 @@ import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
+from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from dpl.data.store import DataSetError
+from dpl.data.durable import DataSetError
 from dpl.fem.linear import slow_blas
 from dpl.scene import Scene
 
@@ -33,6 +35,7 @@ if typing.TYPE_CHECKING:
     from dpl.fem.problem import Problem
     from dpl.module import Surrogate
 
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
 TRUSTED = ("dpl.", "torch.optim.", "lightning.")  # what a run's folder may name without being asked
 
 KEYS = {  # what a configuration may hold at its top
@@ -40,6 +43,7 @@ KEYS = {  # what a configuration may hold at its top
     *("material", "young", "loads", "solver"),
     *("data", "model", "loss", "optimizer", "scheduler", "trainer"),
     *("seed", "ckpt_path", "run", "folder", "tol"),
+    *("action", "shard", "shards"),
     *("parts", "linear", "repeats", "count", "workers", "peers"),
 }
 
@@ -61,6 +65,16 @@ def command(task: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
         except (ConfigError, DataSetError) as error:
             print(f"error: {error}", file=sys.stderr)
             _drop_empty(Path(HydraConfig.get().runtime.output_dir))
+            sys.exit(2)
+        except OSError as error:
+            if error.errno not in FULL:
+                raise
+            where = f" for {error.filename}" if error.filename else ""
+            print(
+                f"error: no space left{where}; what was written before is whole: make room and "
+                "run the same command again",
+                file=sys.stderr,
+            )
             sys.exit(2)
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)
@@ -306,6 +320,24 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
     )
 
 
+def check_processes(trainer: Any) -> None:
+    """Refuse the sweep whose training starts further processes: each would start the sweep again.
+
+    Raises:
+        ConfigError: It is one.
+    """
+    from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
+
+    sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+    launcher = getattr(trainer.strategy, "launcher", None)
+    if sweep and trainer.world_size > 1 and isinstance(launcher, _SubprocessScriptLauncher):
+        raise ConfigError(
+            "trainer.strategy: with -m, each process that DDP starts would run the whole sweep "
+            "again; set trainer.strategy=ddp_spawn, or start each run by torchrun or on a cluster "
+            "(hydra/launcher=submitit_slurm)"
+        )
+
+
 def show_plan(*parts: Any) -> None:
     """Print what the parts of a run do not need and skip."""
     lines = [line for part in parts for line in part.plan()]
@@ -330,11 +362,14 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
     there.write_text(OmegaConf.to_yaml(OmegaConf.create(plain(cfg))))
 
 
-def load_run(folder: str | Path, *, trust: bool = False) -> tuple[DictConfig, "Surrogate"]:
+def load_run(
+    folder: str | Path, *, trust: bool = False, scene: Scene | None = None
+) -> tuple[DictConfig, "Surrogate"]:
     """Return the configuration and the best surrogate of a training run.
 
     Args:
         folder: The run's.
+        scene: Its scene, where that is there already; built anew if left out.
         trust: Whether its configuration may name objects outside this package, such as your own
             law: they are imported and called.
 
@@ -349,7 +384,7 @@ def load_run(folder: str | Path, *, trust: bool = False) -> tuple[DictConfig, "S
             raise ConfigError(f"run = {folder} has no {path.relative_to(folder)}; train it first")
     cfg = typing.cast(DictConfig, OmegaConf.load(config))
     check(cfg, trust=trust)
-    surrogate = build_surrogate(cfg, build_scene(cfg))
+    surrogate = build_surrogate(cfg, build_scene(cfg) if scene is None else scene)
     try:
         checkpoint = torch.load(best, map_location="cpu", weights_only=True)
         surrogate.on_load_checkpoint(checkpoint)

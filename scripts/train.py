@@ -1,5 +1,6 @@
 """Data set, training, evaluation: python scripts/train.py model=fcnn loss=lr_star."""
 
+import signal
 from pathlib import Path
 
 import hydra
@@ -23,15 +24,20 @@ def main(cfg: DictConfig) -> None:
     data = run.make(cfg, "data", scene=scene)
     surrogate = run.build_surrogate(cfg, scene)
     trainer = run.make(cfg, "trainer")
+    run.check_processes(trainer)
     run.show_plan(scene, data, surrogate)
     run.save_config(cfg, folder)
     try:
         trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
     except SystemExit as leaving:  # how Lightning passes Ctrl-C on
+        if leaving.code == 128 + signal.SIGTERM:
+            raise
         raise KeyboardInterrupt from leaving
     finally:
         data.teardown("fit")  # which Lightning leaves out on Ctrl-C
-    _, best = run.load_run(folder, trust=True)
+    if not trainer.is_global_zero:
+        return
+    _, best = run.load_run(folder, trust=True, scene=scene)
     rows = evaluate(best, data.samples("test"), folder)
     network = next(row for row in rows if row.solver == "network")
     if isinstance(trainer.logger, L.pytorch.loggers.TensorBoardLogger):

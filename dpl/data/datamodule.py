@@ -1,40 +1,52 @@
 """Lightning's door to the samples: from disk, or from workers that solve while it trains."""
 
 import os
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import lightning as L
 import torch
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 from torch.utils.data.distributed import DistributedSampler
 
-from dpl.data.online import OnlineSamples, Replay
-from dpl.data.store import generate, store_of
+from dpl.data.generate import DataSet
+from dpl.data.online import OnlineSamples, Rates, Replay, Worst
+from dpl.fem.symmetry import Symmetry, symmetries
 from dpl.scene import Sample, Scene
 
 
 class Samples(Dataset):
-    """Samples in memory, fetched a batch at a time."""
+    """Samples in memory with their images under symmetries, fetched a batch at a time."""
 
-    def __init__(self, samples: Sample) -> None:
-        """Keep the samples, (B, ...)."""
-        self.samples = samples
+    def __init__(self, samples: Sample, group: Sequence[Symmetry] = ()) -> None:
+        """Keep the samples, (B, ...), and the symmetries of their body, identity first."""
+        self.samples, self.group = samples, group
 
     def __len__(self) -> int:
-        """Return B."""
-        return len(self.samples.force)
+        """Return B times the number of symmetries."""
+        return len(self.samples.force) * max(1, len(self.group))
 
     def __getitems__(self, indices: list[int]) -> Sample:
         """Return a batch."""
-        return Sample(*(column[indices] for column in self.samples))
+        count = len(self.samples.force)
+        batch = Sample(*(column[[i % count for i in indices]] for column in self.samples))
+        motions = torch.tensor([i // count for i in indices])
+        for k, symmetry in enumerate(self.group[1:], 1):
+            mine = motions == k
+            if mine.any():
+                for field in (batch.force, batch.displacement):
+                    field[mine] = symmetry.image(field[mine])
+        return batch
 
 
 class OfflineData(L.LightningDataModule):
     """A data set on disk, generated where it is missing.
 
     Attributes:
-        store: The data set.
-        sizes: Loads tried in each split: train, val, test.
+        wanted: The data set.
+        store: Where it is kept.
     """
 
     def __init__(
@@ -48,7 +60,9 @@ class OfflineData(L.LightningDataModule):
         val: int = 100,
         test: int = 100,
         batch_size: int = 64,
+        symmetry: bool = False,
         workers: int = 2,
+        timeout: float | None = 600.0,
     ) -> None:
         """Nothing is read or solved before `prepare_data`.
 
@@ -61,47 +75,62 @@ class OfflineData(L.LightningDataModule):
             val: Loads to validate on.
             test: Loads to test on.
             batch_size: Samples in a batch.
+            symmetry: Train on the images of each sample under the symmetries of the body too.
             workers: Processes that solve; 0: this one.
+            timeout: Longest time for one load [s]; None: no limit.
 
         Raises:
             ValueError: A number is out of range.
         """
         super().__init__()
-        self.sizes = {"train": train, "val": val, "test": test}
         for name, number in {"val": val, "test": test, "batch_size": batch_size}.items():
             if number < 1:
                 raise ValueError(f"{name} = {number} must be 1 or more")
-        for name, number in {"train": train, "seed": seed, "workers": workers}.items():
-            if number < 0:
-                raise ValueError(f"{name} = {number} must be 0 or more")
+        self.wanted = DataSet(
+            scene, folder, seed, train, val, test, workers=workers, timeout=timeout
+        )
         self.scene, self.batch_size, self.workers = scene, batch_size, workers
-        self.store = store_of(scene, folder, seed)
+        self.store, self.symmetry = self.wanted.store, symmetry
         self._shuffle = shuffle
         self._loaded: dict[str, Sample] = {}
 
+    @cached_property
+    def group(self) -> list[Symmetry]:
+        """The symmetries that make images of the training samples; none if they are not wanted."""
+        if not self.symmetry:
+            return []
+        always = self.scene.loads.always
+        return symmetries(self.scene.problem, also=[] if always is None else [always])
+
     def plan(self) -> list[str]:
-        """Return what of the data set is there already, a line."""
-        wanted = sum(self.sizes.values())
-        there = wanted - sum(len(self.store.missing(*split)) for split in self.sizes.items())
-        where = self.store.folder
-        return [f"{there} of {wanted} loads not solved again: they are in {where}"] if there else []
+        """Return what of the data set need not be solved, a line each."""
+        lines = self.wanted.plan()
+        if self.symmetry:
+            lines.append(f"{len(self.group)} samples of each load solved: symmetries of the body")
+        return lines
 
     def prepare_data(self) -> None:
         """Solve what is missing on disk."""
-        folder, seed = str(self.store.folder), self.store.seed
-        generate(self.scene, folder=folder, seed=seed, workers=self.workers, **self.sizes)
+        self.wanted.fill()
 
     def samples(self, split: str) -> Sample:
         """Return a split, read once, (B, ...) in float64."""
         if split not in self._loaded:
-            self._loaded[split] = self.store.load(split, self.sizes[split])
+            self._loaded[split] = self.store.load(split, self.wanted.sizes[split])
         return self._loaded[split]
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """Which training process this is, of how many."""
+        trainer = self.trainer
+        return (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
 
     def train_dataloader(self) -> DataLoader | Replay:
         """Return shuffled batches, in an order that (shuffle, epoch) decides: a run can resume."""
-        data = Samples(self.samples("train"))
+        data = Samples(self.samples("train"), self.group)
+        rank, processes = self.place
         sampler: DistributedSampler = DistributedSampler(
-            data, num_replicas=1, rank=0, shuffle=True, seed=self._shuffle
+            data, num_replicas=processes, rank=rank, shuffle=True, seed=self._shuffle
         )
         return DataLoader(data, self.batch_size, sampler=sampler, collate_fn=_same)
 
@@ -125,6 +154,8 @@ class OnlineData(OfflineData):
         fresh: int = 8,
         reuse: int = 50,
         capacity: int = 4096,
+        worst: float = 0.0,
+        save: bool = False,
         workers: int = 2,
         batch_size: int = 64,
         **kwargs: object,
@@ -135,34 +166,87 @@ class OnlineData(OfflineData):
             scene: What is simulated.
             batches: Batches in an epoch.
             fresh: New samples after which batches are drawn again.
-            reuse: How often a sample is used on average.
+            reuse: How often a sample is used at most.
             capacity: Samples kept.
+            worst: Part of the new loads that are drawn near those on which the surrogate is worst.
+            save: Keep what is solved in the data set, and read what it has instead of solving it.
             workers: Processes that solve; 0: this one, between the steps.
             batch_size: Samples in a batch.
-            kwargs: folder, seed, val, test of `OfflineData`.
+            kwargs: folder, seed, val, test, timeout of `OfflineData`.
 
         Raises:
-            ValueError: A number is out of range.
+            ValueError: A number is out of range, or options exclude each other.
         """
         for name, number in (("batches", batches), ("fresh", fresh), ("reuse", reuse)):
             if number < 1:
                 raise ValueError(f"{name} = {number} must be 1 or more")
         if capacity < fresh:
             raise ValueError(f"capacity = {capacity} must be fresh = {fresh} or more")
+        if not 0 <= worst <= 1:
+            raise ValueError(f"worst = {worst} must lie between 0 and 1")
+        if save and worst:
+            raise ValueError(
+                "save = true keeps the loads that the seed names, and worst > 0 draws others; "
+                "choose one of the two"
+            )
         super().__init__(scene, train=0, workers=workers, batch_size=batch_size, **kwargs)  # type: ignore[arg-type]
         self._options = {"batches": batches, "fresh": fresh, "reuse": reuse, "capacity": capacity}
+        self._save, self._worst = save, worst
         self._replay: Replay | None = None
         self._produced = self._first = 0  # what earlier runs took that this one resumes
+
+    def plan(self) -> list[str]:
+        """Return what need not be solved, a line each."""
+        lines = super().plan()
+        known = sum(line["tried"] for line in self.store.shards() if line["split"] == "train")
+        if self._save and known:
+            lines.append(f"{known} loads of the stream not solved again: they are there")
+        return lines
 
     def train_dataloader(self) -> Replay:
         """Return the stream, an epoch at a time; training keeps to the cores that are left."""
         # threads of one operation wait for each other: none of them may wait for a solving worker
         torch.set_num_threads(max(1, (os.cpu_count() or 1) - self.workers))
-        stream = OnlineSamples(self.scene, self.store.stream("train"), first=self._first)
+        rank, processes = self.place
+        stream = OnlineSamples(
+            self.scene,
+            self.store.stream("train"),
+            first=self._first,
+            lane=rank,
+            lanes=processes,
+            store=self.store if self._save else None,
+            worst=Worst(self.scene.loads.dimension) if self._worst else None,
+            near=self._worst,
+            timeout=self.wanted.timeout,
+        )
         self._replay = Replay(
-            stream, workers=self.workers, batch_size=self.batch_size, **self._options
+            stream,
+            workers=self.workers,
+            batch_size=self.batch_size,
+            errors=self._errors,
+            report=self._report,
+            **self._options,
         )
         return self._replay
+
+    def _errors(self) -> Tensor | None:
+        """Return the surrogate's errors on the last batch, (B,)."""
+        module = self.trainer.lightning_module if self.trainer is not None else None
+        return getattr(module, "batch_errors", None)
+
+    def _report(self, rates: Rates) -> None:
+        """Log an epoch's rates; write what makes whole shards."""
+        if self.trainer is not None and self.trainer.logger is not None:
+            named = {f"online/{name}": value for name, value in rates._asdict().items()}
+            self.trainer.logger.log_metrics(named, step=self.trainer.global_step)
+        if self._save and self.place[0] == 0:
+            self.store.collect("train")
+
+    def prepare_data(self) -> None:
+        """Solve what is missing of validation and test."""
+        super().prepare_data()
+        if self._save:
+            self.store.create()
 
     def teardown(self, stage: str) -> None:
         """Stop the workers."""

@@ -1,187 +1,186 @@
-"""Draws loads and solves them, in parallel."""
+"""What is wanted of a data set, and the long work of filling it: progress, interruption, report."""
 
-import contextlib
-import signal
+import os
+import platform
+import socket
+import sys
 import time
-from collections.abc import Iterable, Iterator
-from multiprocessing import connection, get_context
-from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
-from typing import NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dpl.fem.solution import Load, Status, one_thread, solve
+import dpl
+from dpl.data import balance
+from dpl.data.crew import Stop
+from dpl.data.durable import append_line
+from dpl.data.store import Store
 from dpl.scene import Scene
 
-TRIES = 3  # of a load whose worker died, before it is given up
-HOPELESS = 12  # deaths in a row after which the fault is not in the loads
 
-
-class Job(NamedTuple):
-    """A load to solve: which one of which stream."""
-
-    seed: tuple[int, int]
-    number: int
-
-
-class Outcome(NamedTuple):
-    """One load, solved or not; arrays and numbers only, to cross between processes.
+@dataclass(frozen=True)
+class DataSet:
+    """A data set as it is wanted, there or not.
 
     Attributes:
-        job: Which load it is.
-        force, displacement: (N, D) [-]; the displacement is an answer only if `accepted`.
-        young: [Pa].
-        accepted: Whether `displacement` meets the tolerance and inverts nothing.
-        residual: ||R_free|| / ||f|| [-].
-        volume_ratio: min det F [-].
-        load_factor: Part of the load for which an equilibrium was found [-].
-        iterations: Newton iterations.
-        seconds: Wall time of the solve.
-        reason: Why it is rejected; empty if accepted.
-    """
-
-    job: Job
-    force: NDArray[np.float64]
-    displacement: NDArray[np.float64]
-    young: float
-    accepted: bool
-    residual: float
-    volume_ratio: float
-    load_factor: float
-    iterations: int
-    seconds: float
-    reason: str
-
-
-def outcome(scene: Scene, job: Job) -> Outcome:
-    """Return a load, solved."""
-    load = scene.loads.sample(job.seed, [job.number])
-    start = time.perf_counter()
-    with one_thread():
-        solution = solve(scene.solver, Load(load.force, load.young))
-    accepted = bool(solution.stable)
-    return Outcome(
-        job=job,
-        force=load.force[0].numpy(),
-        displacement=solution.displacement[0].numpy(),
-        young=float(load.young),
-        accepted=accepted,
-        residual=float(solution.residual),
-        volume_ratio=float(solution.volume_ratio),
-        load_factor=float(solution.load_factor),
-        iterations=int(solution.iterations),
-        seconds=time.perf_counter() - start,
-        reason="" if accepted else str(Status(int(solution.status))),
-    )
-
-
-def outcomes(scene: Scene, jobs: Iterable[Job], *, workers: int) -> Iterator[Outcome]:
-    """Yield loads solved, in the order in which they are finished.
-
-    Each worker is a process of its own on one core. One that dies is replaced, its load tried
-    again, and given up after three deaths; none outlives this generator.
-
-    Args:
         scene: What is simulated.
-        jobs: Which loads.
-        workers: Processes; 0 solves in this one.
-
-    Raises:
-        RuntimeError: Workers die one after the other.
+        folder: Where it is; named after the scene's fingerprint and the seed if left out.
+        seed: Names the loads.
+        train: Loads to train on.
+        val: Loads to validate on.
+        test: Loads to test on.
+        workers: Processes that solve, one core each; 0: this one.
+        timeout: Longest time for one load [s]; null: no limit.
+        shard: Which part of the files to make, from 0, of
+        shards: so many parts, each made by a process of its own.
     """
-    todo = list(jobs)[::-1]
-    if workers == 0:
-        while todo:
-            yield outcome(scene, todo.pop())
-        return
-    with _Crew(scene, min(workers, len(todo))) as crew:
-        deaths: dict[Job, int] = {}
-        in_a_row = 0
-        while todo or crew.busy:
-            while todo and crew.idle:
-                crew.give(todo.pop())
-            done, dead = crew.wait()
-            yield from done
-            in_a_row = 0 if done else in_a_row + len(dead)
-            if in_a_row >= HOPELESS:
-                raise RuntimeError(f"{in_a_row} workers died one after the other; see above why")
-            for job in dead:
-                deaths[job] = deaths.get(job, 0) + 1
-                if deaths[job] < TRIES:
-                    todo.append(job)
-                else:
-                    yield _lost(scene, job)
 
+    scene: Scene
+    folder: str | None = None
+    seed: int = 0
+    train: int = 1000
+    val: int = 100
+    test: int = 100
+    workers: int = 2
+    timeout: float | None = 600.0
+    shard: int = 0
+    shards: int = 1
 
-def _lost(scene: Scene, job: Job) -> Outcome:
-    """Return a load that killed its workers."""
-    load = scene.loads.sample(job.seed, [job.number])
-    force = load.force[0].numpy()
-    return Outcome(
-        job, force, 0 * force, float(load.young), False, np.nan, np.nan, 0.0, 0, 0.0,
-        f"its worker died {TRIES} times",
-    )  # fmt: skip
+    def __post_init__(self) -> None:
+        """Check the ranges.
 
+        Raises:
+            ValueError: A number is out of range.
+        """
+        for name in ("seed", "train", "val", "test", "workers"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} = {getattr(self, name)} must be 0 or more")
+        if self.timeout is not None and not self.timeout > 0:
+            raise ValueError(f"timeout = {self.timeout} must be above 0 [s], or null")
+        if not 0 <= self.shard < self.shards:
+            raise ValueError(
+                f"shard = {self.shard} must be one of 0 to shards - 1 = {self.shards - 1}"
+            )
 
-class _Crew:
-    """Worker processes, each with a pipe; a context that leaves none of them behind."""
+    @cached_property
+    def store(self) -> Store:
+        """Where it is kept."""
+        name = f"datasets/{self.scene.fingerprint[:12]}-seed{self.seed}"
+        return Store(Path(self.folder or name), self.scene, self.seed)
 
-    def __init__(self, scene: Scene, size: int) -> None:
-        self._context = get_context("spawn")  # forking a process with BLAS threads can hang it
-        self._scene, self._size = scene, size
-        self._members: dict[Connection, BaseProcess] = {}
-        self.idle: list[Connection] = []
-        self.busy: dict[Connection, Job] = {}
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Loads wanted in each split."""
+        return {"train": self.train, "val": self.val, "test": self.test}
 
-    def __enter__(self) -> "_Crew":
-        for _ in range(self._size):
-            self._hire()
-        return self
+    def missing(self) -> dict[str, list[int]]:
+        """Return the loads of this part that have not been tried, by split."""
+        return {
+            split: self.store.missing(split, size, self.shard, self.shards)
+            for split, size in self.sizes.items()
+        }
 
-    def __exit__(self, *_: object) -> None:
-        for process in self._members.values():
-            process.terminate()
-        for pipe, process in self._members.items():
-            process.join()
-            pipe.close()
+    def plan(self) -> list[str]:
+        """Return what need not be solved, a line each."""
+        wanted = sum(self.sizes.values())
+        there = wanted - sum(len(self.store.missing(*split)) for split in self.sizes.items())
+        lines = [
+            "one data set for every size and Young's modulus of this body: "
+            f"{self.store.folder}, of scene {self.scene.fingerprint[:12]}"
+        ]
+        if there:
+            lines.append(f"{there} of {wanted} loads not solved again: they are there")
+        return lines
 
-    def _hire(self) -> None:
-        ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_work, args=(theirs, self._scene), daemon=True)
-        process.start()
-        theirs.close()
-        self._members[ours] = process
-        self.idle.append(ours)
+    def fill(self) -> Store:
+        """Return the data set; what is missing is solved under a progress bar.
 
-    def give(self, job: Job) -> None:
-        """Hand a load to an idle worker."""
-        pipe = self.idle.pop()
-        self.busy[pipe] = job
-        with contextlib.suppress(BrokenPipeError):  # it died idle: `wait` will see
-            pipe.send(job)
+        Ctrl-C and SIGTERM once finish the loads at work. What is solved is kept in any case.
 
-    def wait(self) -> tuple[list[Outcome], list[Job]]:
-        """Return what was finished, and the loads whose workers died, once there is any."""
-        done, dead = [], []
-        for pipe in connection.wait(list(self.busy)):
-            assert isinstance(pipe, Connection)
-            job = self.busy.pop(pipe)
+        Raises:
+            DataSetError: The folder holds something else, or another process writes there.
+            KeyboardInterrupt: Stopped.
+        """
+        missing = self.missing()
+        if not any(missing.values()):
+            return self.store
+        columns = (
+            TextColumn("solving {task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[news]}"),
+            TimeRemainingColumn(),
+        )
+        total = sum(map(len, missing.values()))
+        found = sum(
+            job.number in numbers
+            for split, numbers in missing.items()
+            for job in self.store.spooled()
+            if job.seed == self.store.stream(split)
+        )
+        done = _Session(workers=self.workers)
+        with Stop() as stop, Progress(*columns) as progress:
+            bar = progress.add_task("loads", total=total, completed=found, news="")
             try:
-                done.append(pipe.recv())
-                self.idle.append(pipe)
-            except (EOFError, ConnectionResetError):
-                self._members.pop(pipe).join()
-                pipe.close()
-                dead.append(job)
-                self._hire()
-        return done, dead
+                for one in self.store.fill(
+                    missing,
+                    workers=self.workers,
+                    timeout=self.timeout,
+                    stop=stop,
+                    shard=self.shard,
+                    shards=self.shards,
+                ):
+                    news = done.count(one.accepted, one.seconds)
+                    progress.update(bar, advance=1, news=news)
+            finally:
+                done.write(self.store.folder)
+            stop.leave()
+        if told := balance.warning(self.store.acceptance()):
+            print(f"warning: {told}", file=sys.stderr)
+        return self.store
+
+    def verify(self) -> Iterator[str]:
+        """Yield what is wrong with the data set, a line for each damaged file."""
+        for line, flaw in self.store.verify():
+            if flaw:
+                yield f"{self.store.folder / line['file']} {flaw}"
+
+    def repair(self) -> Store:
+        """Return the data set, its damaged files made again."""
+        for name in self.store.repair():
+            print(f"making {name} again")
+        return self.fill()
 
 
-def _work(pipe: Connection, scene: Scene) -> None:
-    """Solve what comes through the pipe until it closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        while True:
-            pipe.send(outcome(scene, pipe.recv()))
+class _Session:
+    """What one run of the generator has done, for the progress bar and the journal."""
+
+    def __init__(self, workers: int) -> None:
+        self.workers, self.loads, self.accepted, self.core_seconds = workers, 0, 0, 0.0
+        self.started, self.begin = time.strftime("%Y-%m-%d %H:%M:%S"), time.perf_counter()
+
+    def count(self, accepted: bool, seconds: float) -> str:
+        """Count a load; return the news."""
+        self.loads += 1
+        self.accepted += accepted
+        self.core_seconds += seconds
+        rate = self.loads / (time.perf_counter() - self.begin)
+        return f"{self.accepted} accepted, {self.loads - self.accepted} rejected, {rate:.1f}/s"
+
+    def write(self, folder: Path) -> None:
+        """Add a line to the journal."""
+        if self.loads and folder.is_dir():
+            line = {
+                "started": self.started,
+                "machine": socket.gethostname(),
+                "process": os.getpid(),
+                "python": platform.python_version(),
+                "dpl": dpl.__version__,
+                "workers": self.workers,
+                "loads": self.loads,
+                "seconds": round(time.perf_counter() - self.begin, 3),
+                "core_seconds": round(self.core_seconds, 3),
+            }
+            append_line(folder / "journal.jsonl", line)

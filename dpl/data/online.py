@@ -1,15 +1,23 @@
 """An endless stream of fresh samples, drawn and solved while the network trains."""
 
 import itertools
-from collections.abc import Iterator
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from dpl.data.generate import Job, outcome
+from dpl.data.crew import HOPELESS, TRIES, die_with_parent
+from dpl.data.outcome import Job, Outcome, lost, outcome
+from dpl.data.store import Store
 from dpl.scene import Sample, Scene, stack
+
+NEAR = 0.05  # deviation from a bad load, in the unit cube, of the loads that are drawn near it
 
 
 class Drawn(NamedTuple):
@@ -18,10 +26,40 @@ class Drawn(NamedTuple):
     Attributes:
         sample: The load with its answer.
         number: Which load of the stream, (B,).
+        point: Point of the unit cube that the load stands for, (B, d).
     """
 
     sample: Sample
     number: Tensor
+    point: Tensor
+
+
+class Worst:
+    """Where the surrogate is worst at present: written by the trainer, read by all workers.
+
+    Attributes:
+        points: Points of the unit cube, of which the first `count` count, (H, d), shared.
+        count: How many there are, (1,), shared.
+    """
+
+    def __init__(self, dimension: int, size: int = 64) -> None:
+        """Begin with none."""
+        self.points = torch.zeros(size, dimension, dtype=torch.float64).share_memory_()
+        self.count = torch.zeros(1, dtype=torch.int64).share_memory_()
+
+    def put(self, points: Tensor) -> None:
+        """Put new points, the worst first, in the place of the old ones."""
+        count = min(len(points), len(self.points))
+        self.points[:count] = points[:count]
+        self.count.fill_(count)
+
+    def near(self, rng: np.random.Generator) -> Tensor | None:
+        """Return a point near one of them, (d,); None while there are none."""
+        if not (count := int(self.count)):
+            return None
+        centre = self.points[int(rng.integers(count))].numpy()
+        moved = np.abs(centre + NEAR * rng.standard_normal(len(centre))) % 2  # folded back at 0
+        return torch.from_numpy(np.minimum(moved, 2 - moved).clip(0, 1 - 2.0**-53))  # and at 1
 
 
 class OnlineSamples(IterableDataset):
@@ -31,34 +69,111 @@ class OnlineSamples(IterableDataset):
         scene: What is simulated.
         seed: Names the stream.
         first: Index of the first load.
+        lane, lanes: Which training process this is, of how many; they share the stream.
+        store: Keeps what is solved and gives what it has; none if left out.
+        worst: Where the surrogate is worst; none if left out.
+        near: Part of the loads that are drawn near those.
+        timeout: Longest time for a load in a worker [s]; None: no limit.
     """
 
-    def __init__(self, scene: Scene, seed: tuple[int, int], first: int = 0) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        seed: tuple[int, int],
+        first: int = 0,
+        *,
+        lane: int = 0,
+        lanes: int = 1,
+        store: Store | None = None,
+        worst: Worst | None = None,
+        near: float = 0.0,
+        timeout: float | None = None,
+    ) -> None:
         """Keep the arguments, see the class."""
         self.scene, self.seed, self.first = scene, seed, first
+        self.lane, self.lanes = lane, lanes
+        self.store, self.worst, self.near, self.timeout = store, worst, near, timeout
 
     def __iter__(self) -> Iterator[Drawn]:
         """Yield samples (N, D), one at a time."""
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
-        for index in itertools.count(self.first + worker, workers):
-            one = outcome(self.scene, Job(self.seed, index))
+        first = self.first + self.lane * workers + worker
+        known = self.store.reader("train") if self.store else None
+        for index in itertools.count(first, workers * self.lanes):
+            one = known(index) if known else None
+            if one is None:
+                one = self._solved(index, alone=info is not None)
+                if self.store:
+                    self.store.keep(one)
             if one.accepted:
-                young = torch.tensor(one.young, dtype=torch.float64)
+                point = torch.from_numpy(one.point)
+                young = self.scene.loads.young_at(point[None])[0]
                 fields = torch.from_numpy(one.force), torch.from_numpy(one.displacement)
-                yield Drawn(Sample(*fields, young), torch.tensor(index))
+                yield Drawn(Sample(*fields, young), torch.tensor(index), point)
+
+    def _solved(self, index: int, alone: bool) -> Outcome:
+        """Return a load, solved; `alone`: in a process of its own, where it can be timed out."""
+        job, point = Job(self.seed, index), None
+        if self.worst is not None:
+            rng = np.random.default_rng(np.random.SeedSequence((*self.seed, 1), spawn_key=(index,)))
+            point = self.worst.near(rng) if rng.random() < self.near else None
+        try:
+            with _within(self.timeout if alone else None):
+                return outcome(self.scene, job, point=point)
+        except TimeoutError as error:
+            return lost(self.scene, job, str(error))
+
+
+@contextmanager
+def _within(seconds: float | None) -> Iterator[None]:
+    """Raise TimeoutError if the body takes longer; in the main thread of a process only."""
+    if seconds is None:
+        yield
+        return
+
+    def end(*_: object) -> None:
+        raise TimeoutError(f"timed out after {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+class Rates(NamedTuple):
+    """How fast an epoch's samples were made and used.
+
+    Attributes:
+        produced, consumed: Samples a second.
+        waiting: Part of the time in which the optimiser had nothing to do.
+        uses: How often the samples made so far have been used, on average.
+    """
+
+    produced: float
+    consumed: float
+    waiting: float
+    uses: float
 
 
 class Replay:
     """Batches from a stream and from what it has given so far: a slow solver, a busy optimiser.
 
-    Every `fresh` new samples enter a buffer (the oldest leave), and as many batches are drawn from
-    it as make each sample count `reuse` times on average. One pass is an epoch of `batches`; the
-    stream goes on from epoch to epoch.
+    Every `fresh` new samples enter a buffer (the oldest leave a full one), and batches are drawn
+    from those in it that have been used less than `reuse` times: once it is full, as many batches
+    as use each sample `reuse` times on average; while it fills, half as many. So no sample is used
+    more than `reuse` times, and batches do not depend on who was faster. One pass is an epoch of
+    `batches`; the stream goes on from epoch to epoch.
+
+    A worker that dies is replaced; what it was solving is drawn anew.
 
     Attributes:
         produced: Samples taken from the stream so far.
         following: A number above all loads taken from the stream so far.
+        rates: Of the last epoch.
     """
 
     def __init__(
@@ -71,21 +186,34 @@ class Replay:
         fresh: int,
         reuse: int,
         capacity: int,
+        errors: Callable[[], Tensor | None] = lambda: None,
+        report: Callable[[Rates], None] = lambda rates: None,
     ) -> None:
-        """Keep the arguments, see the class; nothing starts before the first pass."""
+        """Keep the arguments, see the class; nothing starts before the first pass.
+
+        Args:
+            stream: What to draw from.
+            workers: Processes that solve; 0: this one, between the steps.
+            batch_size: Samples in a batch.
+            batches: Batches in a pass.
+            fresh: New samples after which batches are drawn again.
+            reuse: How often a sample is used at most.
+            capacity: Samples kept.
+            errors: Gives the errors on the last batch, (B,), if the stream wants to know where the
+                surrogate is worst.
+            report: Is told the rates at the end of each pass.
+        """
         self.produced = self.following = 0
+        self.rates: Rates | None = None
+        self._source, self._workers = stream, workers
         self._batches, self._batch_size = batches, batch_size
-        self._fresh, self._reuse, self._capacity = fresh, reuse, capacity
-        self._loader = DataLoader(
-            stream,
-            batch_size=fresh,
-            num_workers=workers,
-            collate_fn=_batch,
-            multiprocessing_context="spawn" if workers else None,
-        )
+        self._fresh, self._reuse = fresh, reuse
+        self._errors, self._report = errors, report
+        self._buffer = _Buffer(capacity, reuse)
         self._stream: Any = None
         self._endless: Iterator[Sample] | None = None
         self._generator = torch.Generator().manual_seed(0)
+        self._used, self._waited, self._restarts = 0, 0.0, 0
 
     def __len__(self) -> int:
         """Return the number of batches in an epoch."""
@@ -94,31 +222,134 @@ class Replay:
     def __iter__(self) -> Iterator[Sample]:
         """Yield one epoch."""
         if self._endless is None:
-            self._stream = iter(self._loader)
+            self._start(self._source.first)
             self._endless = self._draw()
-        return itertools.islice(self._endless, self._batches)
+        begin, produced, used, waited = time.monotonic(), self.produced, self._used, self._waited
+        yield from itertools.islice(self._endless, self._batches)
+        seconds = max(time.monotonic() - begin, 1e-9)
+        self.rates = Rates(
+            produced=(self.produced - produced) / seconds,
+            consumed=(self._used - used) / seconds,
+            waiting=(self._waited - waited) / seconds,
+            uses=self._used / max(self.produced, 1),
+        )
+        self._report(self.rates)
+
+    def _start(self, first: int) -> None:
+        self._source.first = first
+        self._stream = iter(
+            DataLoader(
+                self._source,
+                batch_size=self._fresh,
+                num_workers=self._workers,
+                collate_fn=_batch,
+                multiprocessing_context="spawn" if self._workers else None,
+                worker_init_fn=_begin,
+            )
+        )
 
     def _draw(self) -> Iterator[Sample]:
-        buffer: Sample | None = None
-        owed = 0.0  # uses that the samples so far are still good for
-        for news, numbers in self._stream:
-            self.produced += len(numbers)
-            self.following = max(self.following, int(numbers.max()) + 1)
-            owed += len(numbers) * self._reuse
-            parts = [news] if buffer is None else [buffer, news]
-            buffer = Sample(
-                *(torch.cat(column)[-self._capacity :] for column in zip(*parts, strict=True))
-            )
-            while owed >= self._batch_size:
+        owed = 0.0  # uses that the samples so far are good for
+        while (news := self._next()) is not None:
+            self.produced += len(news.number)
+            self.following = max(self.following, int(news.number.max()) + 1)
+            uses = self._reuse if self._buffer.full else max(1.0, self._reuse / 2)
+            owed += len(news.number) * uses
+            self._buffer.put(news)
+            while owed >= self._batch_size and self._buffer.left >= self._batch_size:
                 owed -= self._batch_size
-                count = len(buffer.force)
-                chosen = torch.randint(count, (self._batch_size,), generator=self._generator)
-                yield Sample(*(column[chosen] for column in buffer))
+                chosen = self._buffer.choose(self._batch_size, self._generator)
+                self._used += self._batch_size
+                yield Sample(*(column[chosen] for column in self._buffer.sample))
+                if self._source.worst is not None:
+                    self._buffer.note(chosen, self._errors())
+                    self._source.worst.put(self._buffer.worst())
+
+    def _next(self) -> Drawn | None:
+        """Return new samples; None at the end of a stream that has one."""
+        start = time.monotonic()
+        try:
+            news = next(self._stream, None)
+            self._restarts = 0
+            return news
+        except RuntimeError as error:
+            self._restarts += 1
+            if "DataLoader worker" not in str(error) or self._restarts > HOPELESS:
+                raise
+            # a load that kills worker after worker is left out
+            skipped = self._workers * self._source.lanes * (self._restarts // TRIES)
+            self._start(max(self.following, self._source.first) + skipped)
+            return self._next()
+        finally:
+            self._waited += time.monotonic() - start
 
     def close(self) -> None:
         """Stop the workers."""
         self._endless = self._stream = None
 
 
+class _Buffer:
+    """The last samples of a stream, with how often each may still be used, and its last error."""
+
+    def __init__(self, capacity: int, reuse: int) -> None:
+        self._capacity, self._reuse, self._count = capacity, reuse, 0
+        self._left = torch.zeros(capacity, dtype=torch.int64)
+        self._error = torch.zeros(capacity, dtype=torch.float64)
+        self._point = torch.zeros(capacity, 0, dtype=torch.float64)
+        self.sample = Sample(*(torch.zeros(0) for _ in Sample._fields))
+
+    @property
+    def full(self) -> bool:
+        """Whether the oldest sample leaves for the next one."""
+        return self._count >= self._capacity
+
+    @property
+    def left(self) -> int:
+        """Uses that are left in all."""
+        return int(self._left.sum())
+
+    def put(self, news: Drawn) -> None:
+        """Put samples in the place of the oldest ones."""
+        if not self._count:  # memory is taken as it is written to
+            self.sample = Sample(*(c.new_empty(self._capacity, *c.shape[1:]) for c in news.sample))
+            self._point = news.point.new_zeros(self._capacity, news.point.shape[1])
+        place = torch.arange(self._count, self._count + len(news.number)) % self._capacity
+        for column, new in zip(self.sample, news.sample, strict=True):
+            column[place] = new
+        self._left[place], self._error[place] = self._reuse, 0.0
+        self._point[place] = news.point
+        self._count += len(news.number)
+
+    def choose(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return the places of samples for a batch, none twice if there are enough, (B,)."""
+        live = self._left.nonzero()[:, 0]
+        if len(live) < count:
+            live = torch.repeat_interleave(live, self._left[live])
+        chosen = live[torch.randperm(len(live), generator=generator)[:count]]
+        self._left -= torch.bincount(chosen, minlength=self._capacity)
+        return chosen
+
+    def note(self, chosen: Tensor, errors: Tensor | None) -> None:
+        """Write down the surrogate's errors on a batch."""
+        if errors is not None and len(errors) == len(chosen):
+            self._error[chosen] = errors.double().cpu()
+
+    def worst(self, part: float = 0.1) -> Tensor:
+        """Return the points on which it was worst, a part of the buffer, worst first, (H, d)."""
+        seen = int(self._error.count_nonzero())
+        order = self._error.argsort(descending=True)[: int(np.ceil(part * seen))]
+        return self._point[order]
+
+
+def _begin(worker: int) -> None:
+    """Make a worker process leave Ctrl-C to its parent and die with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    die_with_parent()
+
+
 def _batch(drawn: list[Drawn]) -> Drawn:
-    return Drawn(stack([one.sample for one in drawn]), torch.stack([one.number for one in drawn]))
+    return Drawn(
+        stack([one.sample for one in drawn]),
+        torch.stack([one.number for one in drawn]),
+        torch.stack([one.point for one in drawn]),
+    )

@@ -4,96 +4,49 @@
     FOLDER/modes.safetensors     eigenvalues and eigenvectors that the loads are made of
     FOLDER/train-000000.safetensors, ...
     FOLDER/manifest.jsonl        a line a shard: name, SHA-256, loads tried, rejects with reasons
+    FOLDER/manifest-1-of-4.jsonl the same of one writer of several
+    FOLDER/journal.jsonl         a line a session: when, where, how long
+    FOLDER/spool/                loads solved whose shard is not complete
 
-Files are written beside their place, synced and renamed; a shard that the manifest does not name
-does not exist. So an interrupted run loses the shard it was filling and nothing else.
+Files are written beside their place, synced and renamed; a shard that no manifest names does not
+exist. The manifest holds nothing that depends on a clock: interrupted and resumed, by one worker or
+by eight, the same loads give the same bytes.
 """
 
 import hashlib
 import json
-import os
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors import safe_open
+from safetensors.torch import load as unpacked
 from safetensors.torch import save
 from torch import Tensor
 
 import dpl
-from dpl.data.generate import Job, Outcome, outcomes
+from dpl.data import balance
+from dpl.data.crew import Stop, outcomes
+from dpl.data.durable import (
+    DataSetError,
+    append_line,
+    read_lines,
+    sole_writer,
+    sync_folder,
+    whole_file,
+)
+from dpl.data.outcome import Job, Outcome
 from dpl.fem.modes import Modes
 from dpl.scene import Sample, Scene
 
-FORMAT = 1
+FORMAT = 2
 SHARD = 64  # loads in one file
 STREAMS = {"train": 0, "val": 1, "test": 2}  # disjoint streams of one seed
-
-
-class DataSetError(ValueError):
-    """A data set that cannot be used, and what to do about it."""
-
-
-def store_of(scene: Scene, folder: str | None, seed: int) -> "Store":
-    """Return the data set in a folder; left out, one named after the scene and the seed."""
-    return Store(Path(folder or f"datasets/{scene.fingerprint[:12]}-seed{seed}"), scene, seed)
-
-
-def generate(
-    scene: Scene,
-    *,
-    folder: str | None = None,
-    seed: int = 0,
-    train: int = 1000,
-    val: int = 100,
-    test: int = 100,
-    workers: int = 2,
-) -> "Store":
-    """Return a data set with so many loads tried; what is missing is solved under a progress bar.
-
-    Args:
-        scene: What is simulated.
-        folder: Where the data set is; named after the scene's fingerprint if left out.
-        seed: Names the loads.
-        train: Loads to train on.
-        val: Loads to validate on.
-        test: Loads to test on.
-        workers: Processes that solve; 0: this one.
-
-    Raises:
-        ValueError: A number is out of range.
-        DataSetError: The folder holds something else.
-    """
-    sizes = {"train": train, "val": val, "test": test}
-    for name, number in {"seed": seed, **sizes, "workers": workers}.items():
-        if number < 0:
-            raise ValueError(f"{name} = {number} must be 0 or more")
-    store = store_of(scene, folder, seed)
-    missing = {split: store.missing(split, size) for split, size in sizes.items()}
-    if not any(missing.values()):
-        return store
-    columns = (
-        TextColumn("solving {task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[news]}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns) as progress:
-        bar = progress.add_task("loads", total=sum(map(len, missing.values())), news="")
-        accepted, start = 0, time.perf_counter()
-        for count, one in enumerate(store.fill(missing, workers=workers), 1):
-            accepted += one.accepted
-            rate = count / (time.perf_counter() - start)
-            news = f"{accepted} accepted, {count - accepted} rejected, {rate:.1f}/s"
-            progress.update(bar, advance=1, news=news)
-    return store
+MACHINE = ("timed out", "its worker died")  # reasons that lie with the machine: `repair` retries
 
 
 @dataclass(frozen=True)
@@ -110,8 +63,10 @@ class Store:
     scene: Scene
     seed: int
 
-    def open(self) -> list[dict[str, Any]]:
-        """Return the manifest, after creating the data set or checking that it is the scene's.
+    # ------------------------------------------------------------------ reading
+
+    def shards(self) -> list[dict[str, Any]]:
+        """Return the lines of all manifests by first load; none if there is no data set yet.
 
         Raises:
             DataSetError: The folder holds something else.
@@ -119,42 +74,26 @@ class Store:
         card = self.folder / "scene.json"
         if not card.exists():
             there = {path.name for path in self.folder.iterdir()} if self.folder.exists() else set()
-            if there - {"modes.safetensors"}:  # which is written first
+            if not {name for name in there if name[0] != "."} <= {"modes.safetensors"}:
                 raise DataSetError(
                     f"{self.folder} is not empty and no data set; choose another data.folder"
                 )
-            self.folder.mkdir(parents=True, exist_ok=True)
-            modes = self.scene.loads.modes
-            _write(
-                self.folder / "modes.safetensors",
-                _packed(values=modes.values, vectors=modes.vectors),
-            )
-            _write(card, json.dumps(self._card(), indent=1).encode())
-        self._check(json.loads(card.read_text()))
-        manifest = self.folder / "manifest.jsonl"
-        shards = []
-        for line in manifest.read_text().splitlines() if manifest.exists() else ():
-            with suppress(json.JSONDecodeError):  # torn by a crash: its shard does not count
-                shards.append(json.loads(line))
-        return shards
+            return []
+        try:
+            self._check(json.loads(card.read_text()))
+        except (json.JSONDecodeError, UnicodeDecodeError, TypeError, AttributeError) as error:
+            raise DataSetError(f"{card} is damaged: {error}") from None
+        lines = [line for path in self._manifests() for line in read_lines(path)]
+        return sorted(lines, key=lambda line: (line["split"], line["first"]))
 
-    def _card(self) -> dict[str, Any]:
-        return {
-            "format": FORMAT,
-            "fingerprint": self.scene.fingerprint,
-            "scene": self.scene.identity(),
-            "seed": self.seed,
-            "versions": {
-                "dpl": dpl.__version__,
-                "torch": torch.__version__,
-                "numpy": np.__version__,
-            },
-        }
+    def _manifests(self) -> list[Path]:
+        return sorted(self.folder.glob("manifest*.jsonl"))
 
     def _check(self, card: dict[str, Any]) -> None:
         if card.get("format") != FORMAT:
             raise DataSetError(
-                f"{self.folder} has format {card.get('format')}, this dpl reads {FORMAT}"
+                f"{self.folder} has format {card.get('format')}, this dpl reads {FORMAT}; "
+                "choose another data.folder"
             )
         if card["fingerprint"] != self.scene.fingerprint:
             differing = [k for k, v in self.scene.identity().items() if card["scene"].get(k) != v]
@@ -169,76 +108,21 @@ class Store:
                 "choose another data.folder or data.seed"
             )
 
-    def missing(self, split: str, count: int) -> list[int]:
-        """Return which of the first `count` loads of a split have not been tried."""
+    def missing(self, split: str, count: int, shard: int = 0, shards: int = 1) -> list[int]:
+        """Return which of the first `count` loads of a split have not been tried.
+
+        Args:
+            split: train, val or test.
+            count: So many loads are wanted.
+            shard: Of these the ones that fall to this writer, of
+            shards: so many, who take files in turn.
+        """
         tried: set[int] = set()
-        for line in self.open() if self.folder.exists() else ():
+        for line in self.shards():
             if line["split"] == split:
                 tried.update(range(line["first"], line["first"] + line["tried"]))
-        return [index for index in range(count) if index not in tried]
-
-    def fill(self, missing: Mapping[str, Sequence[int]], *, workers: int) -> Iterator[Outcome]:
-        """Solve loads that are missing, by split; yield each as it is done.
-
-        Raises:
-            DataSetError: The folder holds something else.
-        """
-        self.open()
-        shards = [
-            [Job(self.stream(split), index) for index in run]
-            for split, indices in missing.items()
-            for run in _runs(indices)
-        ]
-        waiting: dict[Job, Outcome] = {}
-        jobs = [job for shard in shards for job in shard]
-        for one in outcomes(self.scene, jobs, workers=workers):
-            waiting[one.job] = one
-            yield one
-            while shards and all(job in waiting for job in shards[0]):
-                self._append([waiting.pop(job) for job in shards.pop(0)])
-
-    def stream(self, split: str) -> tuple[int, int]:
-        """Return the seed of a split's loads."""
-        return self.seed, STREAMS[split]
-
-    def _append(self, tried: Sequence[Outcome]) -> None:
-        """Write one shard, then its line of the manifest."""
-        split = {self.stream(name): name for name in STREAMS}[tried[0].job.seed]
-        kept = [one for one in tried if one.accepted]
-        name = f"{split}-{tried[0].job.number:06d}.safetensors"
-        shape = (0, *self.scene.problem.shape)
-        content = _packed(
-            index=torch.tensor([one.job.number for one in kept], dtype=torch.int64),
-            force=torch.from_numpy(
-                np.stack([one.force for one in kept]) if kept else np.zeros(shape)
-            ),
-            displacement=torch.from_numpy(
-                np.stack([one.displacement for one in kept]) if kept else np.zeros(shape)
-            ),
-            young=torch.tensor([one.young for one in kept], dtype=torch.float64),
-        )
-        _write(self.folder / name, content)
-        line = {
-            "file": name,
-            "sha256": hashlib.sha256(content).hexdigest(),
-            "split": split,
-            "first": tried[0].job.number,
-            "tried": len(tried),
-            "accepted": len(kept),
-            "rejected": [
-                {"index": one.job.number, "reason": one.reason, "load_factor": one.load_factor}
-                for one in tried
-                if not one.accepted
-            ],
-            "iterations": sum(one.iterations for one in tried),
-            "seconds": round(sum(one.seconds for one in tried), 3),
-        }
-        with (self.folder / "manifest.jsonl").open("a+") as manifest:
-            manifest.seek(0)
-            torn = not manifest.read().endswith("\n") and manifest.tell() > 0
-            manifest.write("\n" * torn + json.dumps(line) + "\n")
-            manifest.flush()
-            os.fsync(manifest.fileno())
+        mine = (index for index in range(count) if index // SHARD % shards == shard)
+        return [index for index in mine if index not in tried]
 
     def load(self, split: str, count: int) -> Sample:
         """Return the accepted ones of the first `count` loads of a split, in order.
@@ -246,46 +130,332 @@ class Store:
         Raises:
             DataSetError: A shard is damaged, or there are no samples.
         """
-        parts: list[tuple[Tensor, Sample]] = []
-        for line in sorted(self.open(), key=lambda line: line["first"]):
-            if line["split"] != split or line["first"] >= count:
-                continue
-            path = self.folder / line["file"]
-            if (
-                not path.is_file()
-                or hashlib.sha256(path.read_bytes()).hexdigest() != line["sha256"]
-            ):
-                raise DataSetError(
-                    f"{path} is damaged or missing; remove its line from manifest.jsonl"
-                )
-            with safe_open(path, framework="pt") as shard:
-                sample = Sample(*(shard.get_tensor(name) for name in Sample._fields))
-                parts.append((shard.get_tensor("index"), sample))
-        if not parts or not sum(len(index) for index, _ in parts):
+        parts = []
+        for line in self.shards():
+            if line["split"] == split and line["first"] < count:
+                parts.append(self._read(line))
+        index = torch.cat([part["index"] for part in parts]) if parts else torch.zeros(0)
+        keep = np.unique(index.numpy(), return_index=True)[1]  # two writers may have had one load
+        keep = keep[index.numpy()[keep] < count]
+        if not len(keep):
             raise DataSetError(f"{self.folder} holds no {split} samples")
-        chosen = torch.cat([index for index, _ in parts]) < count
-        columns = zip(*(sample for _, sample in parts), strict=True)
-        return Sample(*(torch.cat(column)[chosen] for column in columns))
+        force, displacement, point = (
+            torch.cat([part[name] for part in parts])[keep]
+            for name in ("force", "displacement", "point")
+        )
+        return Sample(force, displacement, self.scene.loads.young_at(point))
 
-    def summary(self) -> str:
-        """Return how many loads were tried and accepted, a line a split."""
-        lines = [str(self.folder)]
-        for split in STREAMS:
-            shards = [line for line in self.open() if line["split"] == split]
-            tried, accepted = (sum(line[key] for line in shards) for key in ("tried", "accepted"))
-            seconds = sum(line["seconds"] for line in shards)
-            if tried:
-                mean = sum(line["iterations"] for line in shards) / tried
-                lines.append(
-                    f"  {split}: {accepted} of {tried} loads accepted, {mean:.1f} Newton "
-                    f"iterations and {seconds / tried:.3f} s each on one core"
-                )
-        return "\n".join(lines)
+    def _read(self, line: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return what a shard holds, forces as fields (B, N, D).
+
+        Raises:
+            DataSetError: It is damaged.
+        """
+        try:
+            return self._sound(line)
+        except ValueError as error:
+            raise DataSetError(
+                f"{self.folder / line['file']} {error}; scripts/generate.py action=repair with the "
+                "same scene solves its loads again"
+            ) from None
+
+    def _sound(self, line: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Return what a shard holds.
+
+        Raises:
+            ValueError: It is damaged; the message goes on after its name.
+        """
+        path = self.folder / line["file"]
+        if path.parent != self.folder or not path.is_file():
+            raise ValueError("is missing")
+        content = path.read_bytes()
+        if hashlib.sha256(content).hexdigest() != line["sha256"]:
+            raise ValueError("is damaged: its SHA-256 is not the manifest's")
+        shard = unpacked(content)
+        shard["force"] = _spread(shard, self.scene.problem.shape)
+        return shard
+
+    def reader(self, split: str) -> Callable[[int], Outcome | None]:
+        """Return what gives a split's loads one at a time, None for those not in a shard."""
+        lines = {
+            index: line
+            for line in self.shards()
+            if line["split"] == split
+            for index in range(line["first"], line["first"] + line["tried"])
+        }
+        shard: dict[str, Tensor] = {}
+        name = ""
+
+        def read(index: int) -> Outcome | None:
+            nonlocal shard, name
+            if (line := lines.get(index)) is None:
+                return None
+            if name != line["file"]:
+                shard, name = self._read(line), line["file"]
+            return _taken(shard, Job(self.stream(split), index), line)
+
+        return read
+
+    def digest(self, split: str, count: int) -> str:
+        """Return the SHA-256 of a split's samples in order, however they came into their shards."""
+        found = hashlib.sha256()
+        for column in self.load(split, count)[:2]:
+            found.update(column.contiguous().numpy().tobytes())
+        return found.hexdigest()
 
     def modes(self) -> Modes:
         """Return the modes that the data set's loads are made of."""
         with safe_open(self.folder / "modes.safetensors", framework="pt") as file:
             return Modes(file.get_tensor("values"), file.get_tensor("vectors"))
+
+    def acceptance(self) -> list[balance.Bin]:
+        """Return how many loads of each amplitude were accepted, all splits together."""
+        amplitudes: list[float] = []
+        accepted: list[bool] = []
+        for line in self.shards():
+            rejected = {one["index"] for one in line["rejected"]}
+            amplitudes += line["amplitudes"]
+            accepted += [line["first"] + k not in rejected for k in range(line["tried"])]
+        return balance.bins(amplitudes, accepted)
+
+    def summary(self) -> str:
+        """Return how many loads were tried and accepted, by split and by amplitude."""
+        lines = [str(self.folder)]
+        for split in STREAMS:
+            shards = [line for line in self.shards() if line["split"] == split]
+            tried, accepted = (sum(line[key] for line in shards) for key in ("tried", "accepted"))
+            if tried:
+                mean = sum(line["iterations"] for line in shards) / tried
+                lines.append(
+                    f"  {split}: {accepted} of {tried} loads accepted, {mean:.1f} Newton iterations"
+                )
+        lines += [f"  {row}" for row in balance.table(self.acceptance())]
+        sessions = read_lines(self.folder / "journal.jsonl")
+        if loads := sum(one["loads"] for one in sessions):
+            core = sum(one["core_seconds"] for one in sessions) / loads
+            wall = sum(one["seconds"] for one in sessions)
+            size = sum(path.stat().st_size for path in self.folder.glob("*.safetensors")) / 1e6
+            lines.append(
+                f"  {core:.3f} s a load on one core; {wall:.0f} s in all, "
+                f"{loads / max(wall, 1e-9):.1f} loads a second; {size:.0f} MB"
+            )
+        return "\n".join(lines)
+
+    # ------------------------------------------------------------------ writing
+
+    def create(self) -> None:
+        """Write down whose data set this is, if it is not there yet.
+
+        Raises:
+            DataSetError: The folder holds something else.
+        """
+        self.shards()
+        if (self.folder / "scene.json").exists():
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        modes = self.scene.loads.modes
+        _write(self.folder / "modes.safetensors", save(modes._asdict()))
+        card = {
+            "format": FORMAT,
+            "fingerprint": self.scene.fingerprint,
+            "scene": self.scene.identity(),
+            "seed": self.seed,
+            "versions": {
+                "dpl": dpl.__version__,
+                "torch": torch.__version__,
+                "numpy": np.__version__,
+            },
+        }
+        _write(self.folder / "scene.json", json.dumps(card, indent=1).encode())
+
+    def stream(self, split: str) -> tuple[int, int]:
+        """Return the seed of a split's loads."""
+        return self.seed, STREAMS[split]
+
+    def fill(
+        self,
+        missing: Mapping[str, Sequence[int]],
+        *,
+        workers: int,
+        timeout: float | None = None,
+        stop: Stop | None = None,
+        shard: int = 0,
+        shards: int = 1,
+    ) -> Iterator[Outcome]:
+        """Solve loads that are missing, by split; yield each as it is done.
+
+        Each is kept in the spool as soon as it is solved; a shard is written when it is complete,
+        in order. Loads that were spooled before an interruption are not solved again.
+
+        Args:
+            missing: Numbers of the loads, by split.
+            workers: Processes that solve; 0: this one.
+            timeout: Longest time for a load [s].
+            stop: Asked whether to begin no more.
+            shard: Which files to write, of
+            shards: so many writers.
+
+        Raises:
+            DataSetError: The folder holds something else, or another process writes there.
+        """
+        self.create()
+        with sole_writer(self.folder, shard, shards):
+            manifest = "manifest.jsonl" if shards == 1 else f"manifest-{shard}-of-{shards}.jsonl"
+            files = [
+                [Job(self.stream(split), index) for index in run]
+                for split, indices in missing.items()
+                for run in _runs(indices)
+            ]
+            spooled = self.spooled()
+            jobs = [job for file in files for job in file if job not in spooled]
+            self._flush(files, spooled, manifest)
+            for one in outcomes(self.scene, jobs, workers=workers, timeout=timeout, stop=stop):
+                spooled[one.job] = self.keep(one)
+                yield one
+                self._flush(files, spooled, manifest)
+            with suppress(OSError):  # not empty, or never made
+                (self.folder / "spool").rmdir()
+
+    def keep(self, one: Outcome) -> Path:
+        """Write one load into the spool; return its file."""
+        spool = self.folder / "spool"
+        spool.mkdir(exist_ok=True)
+        content = _packed(one)
+        split = self._split(one.job)
+        digest = hashlib.sha256(content).hexdigest()[:16]
+        path = spool / f"{split}-{one.job.number:06d}-{digest}.safetensors"
+        # not synced: a crash of the machine costs what its name would tell to be damaged
+        with whole_file(path, sync=False) as file:
+            file.write(content)
+        return path
+
+    def _split(self, job: Job) -> str:
+        return {self.stream(name): name for name in STREAMS}[job.seed]
+
+    def spooled(self) -> dict[Job, Path]:
+        """Return the loads that are solved and wait for their shard; damaged ones are removed."""
+        found = {}
+        for path in sorted((self.folder / "spool").glob("*-*-*.safetensors")):
+            split, number, digest = path.stem.split("-")
+            if hashlib.sha256(path.read_bytes()).hexdigest()[:16] != digest:
+                path.unlink()
+            else:
+                found[Job(self.stream(split), int(number))] = path
+        return found
+
+    def _flush(self, files: list[list[Job]], spooled: dict[Job, Path], manifest: str) -> None:
+        """Write the first shards that are complete; take them off both lists."""
+        while files and all(job in spooled for job in files[0]):
+            jobs = files.pop(0)
+            paths = [spooled.pop(job) for job in jobs]
+            self._append([_unpacked(path) for path in paths], manifest)
+            for path in paths:
+                path.unlink()
+
+    def collect(self, split: str) -> None:
+        """Write those spooled loads of a split that make whole shards.
+
+        Raises:
+            DataSetError: Another process writes there.
+        """
+        with sole_writer(self.folder):
+            spooled = self.spooled()
+            mine = {job for job in spooled if job.seed == self.stream(split)}
+            count = max((job.number for job in mine), default=-1) + 1
+            runs = [run for run in _runs(self.missing(split, count)) if len(run) == SHARD]
+            files = [[Job(self.stream(split), index) for index in run] for run in runs]
+            whole = [file for file in files if mine.issuperset(file)]
+            self._flush(whole, spooled, "manifest.jsonl")
+
+    def _append(self, tried: Sequence[Outcome], manifest: str) -> None:
+        """Write one shard, then its line of the manifest."""
+        split, first = self._split(tried[0].job), tried[0].job.number
+        kept = [one for one in tried if one.accepted]
+        name = f"{split}-{first:06d}.safetensors"
+        content = save(_joined(kept, self.scene.problem.shape, self.scene.loads.dimension))
+        _write(self.folder / name, content)
+        line = {
+            "file": name,
+            "sha256": hashlib.sha256(content).hexdigest(),
+            "split": split,
+            "first": first,
+            "tried": len(tried),
+            "accepted": len(kept),
+            "iterations": sum(one.iterations for one in tried),
+            "amplitudes": [round(one.amplitude, 6) for one in tried],
+            "rejected": [
+                {"index": one.job.number, "reason": one.reason, "load_factor": one.load_factor}
+                for one in tried
+                if not one.accepted
+            ],
+        }
+        append_line(self.folder / manifest, line)
+
+    # ------------------------------------------------------------------ trust
+
+    def verify(self) -> Iterator[tuple[dict[str, Any], str]]:
+        """Yield each shard's line with what is wrong with it; empty if nothing is.
+
+        A shard is sound if its bytes are those that were written, its loads those that the scene
+        draws, and each displacement balances its load to the tolerance, evaluated again, with
+        nothing inverted.
+        """
+        for line in self.shards():
+            try:
+                yield line, self._flaw(line, self._sound(line))
+            except ValueError as error:
+                yield line, str(error)
+
+    def _flaw(self, line: Mapping[str, Any], shard: Mapping[str, Tensor]) -> str:
+        problem, loads = self.scene.problem, self.scene.loads
+        rejected = {one["index"] for one in line["rejected"]}
+        numbers = range(line["first"], line["first"] + line["tried"])
+        if shard["index"].tolist() != [i for i in numbers if i not in rejected]:
+            return "holds other loads than the manifest says"
+        if not len(shard["index"]):
+            return ""
+        load = loads.sample(self.stream(line["split"]), shard["index"].tolist())
+        if not torch.allclose(
+            shard["force"], load.force, rtol=1e-6, atol=1e-9 * loads.largest_force
+        ):
+            return "holds loads that this scene does not draw"
+        for k, (u, force) in enumerate(zip(shard["displacement"], shard["force"], strict=True)):
+            internal, volume = problem.evaluate(u[None])
+            if not (
+                bool(volume > 0)
+                and bool(problem.balanced(u[None], internal, force[None], self.scene.solver.tol))
+            ):
+                return f"holds an answer out of balance: load {int(shard['index'][k])}"
+        return ""
+
+    def repair(self) -> list[str]:
+        """Forget damaged shards, and those with loads that the machine lost; return their names.
+
+        Their loads count as missing from then on. Files that no manifest names are removed.
+
+        Raises:
+            DataSetError: Another process writes there.
+        """
+        if not (self.folder / "scene.json").exists():
+            return []
+        with sole_writer(self.folder):
+            poor = {
+                line["file"]
+                for line, flaw in self.verify()
+                if flaw or any(one["reason"].startswith(MACHINE) for one in line["rejected"])
+            }
+            named = {"modes.safetensors"}
+            for manifest in self._manifests():
+                lines = [line for line in read_lines(manifest) if line["file"] not in poor]
+                named |= {line["file"] for line in lines}
+                text = "".join(json.dumps(line) + "\n" for line in lines)
+                if text.encode() != manifest.read_bytes():
+                    _write(manifest, text.encode())
+            for path in [*self.folder.glob("*.safetensors"), *self.folder.glob(".*.part")]:
+                if path.name not in named:
+                    path.unlink()
+            sync_folder(self.folder)
+        return sorted(poor)
 
 
 def _runs(indices: Sequence[int]) -> Iterator[list[int]]:
@@ -300,29 +470,99 @@ def _runs(indices: Sequence[int]) -> Iterator[list[int]]:
         yield run
 
 
-def _packed(**tensors: Tensor) -> bytes:
-    return save({name: tensor.contiguous() for name, tensor in tensors.items()})
-
-
 def _write(path: Path, content: bytes) -> None:
     with whole_file(path) as file:
         file.write(content)
 
 
-@contextmanager
-def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a file to write that will be there whole or not at all, also after a crash."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+def _packed(one: Outcome) -> bytes:
+    """Return a load as a file of the spool."""
+    fields = one._asdict()
+    plain = {k: v for k, v in fields.items() if not isinstance(v, np.ndarray)}
+    arrays = {k: v for k, v in fields.items() if isinstance(v, np.ndarray)}
+    force = torch.from_numpy(arrays.pop("force"))
+    tensors = {name: torch.from_numpy(array).contiguous() for name, array in arrays.items()}
+    tensors |= _compact(force[None])
+    return save(tensors, metadata={"outcome": json.dumps(plain), "nodes": str(len(force))})
+
+
+def _unpacked(path: Path) -> Outcome:
+    """Return a load from the spool."""
+    with safe_open(path, framework="pt") as file:
+        plain = json.loads(file.metadata()["outcome"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    displacement = tensors["displacement"]
+    force = _spread(tensors, tuple(displacement.shape))[0]
+    seed, number = plain.pop("job")
+    return Outcome(
+        job=Job((seed[0], seed[1]), number),
+        point=tensors["point"].numpy(),
+        force=force.numpy(),
+        displacement=displacement.numpy(),
+        **plain,
+    )
+
+
+def _taken(shard: Mapping[str, Tensor], job: Job, line: Mapping[str, Any]) -> Outcome:
+    """Return a load from a shard that has tried it."""
+    amplitude = line["amplitudes"][job.number - line["first"]]
+    found = (shard["index"] == job.number).nonzero()
+    if not len(found):
+        (why,) = (one for one in line["rejected"] if one["index"] == job.number)
+        none = np.zeros(0)
+        return Outcome(
+            job, none, none, none, amplitude, False, np.nan, np.nan, why["load_factor"], 0, 0.0,
+            why["reason"],
+        )  # fmt: skip
+    k = int(found[0])
+    return Outcome(
+        job=job,
+        point=shard["point"][k].numpy(),
+        force=shard["force"][k].numpy(),
+        displacement=shard["displacement"][k].numpy(),
+        amplitude=amplitude,
+        accepted=True,
+        residual=float(shard["residual"][k]),
+        volume_ratio=float(shard["volume_ratio"][k]),
+        load_factor=1.0,
+        iterations=int(shard["iterations"][k]),
+        seconds=0.0,
+        reason="",
+    )
+
+
+def _joined(kept: Sequence[Outcome], shape: tuple[int, ...], dimension: int) -> dict[str, Tensor]:
+    """Return accepted loads as the tensors of a shard."""
+
+    def column(name: str, *empty: int) -> Tensor:
+        values = [getattr(one, name) for one in kept]
+        return torch.from_numpy(np.stack(values) if values else np.zeros((0, *empty)))
+
+    return {
+        "index": torch.tensor([one.job.number for one in kept], dtype=torch.int64),
+        "point": column("point", dimension),
+        **_compact(column("force", *shape)),
+        "displacement": column("displacement", *shape),
+        "residual": torch.tensor([one.residual for one in kept], dtype=torch.float64),
+        "volume_ratio": torch.tensor([one.volume_ratio for one in kept], dtype=torch.float64),
+        "iterations": torch.tensor([one.iterations for one in kept], dtype=torch.int64),
+    }
+
+
+def _compact(force: Tensor) -> dict[str, Tensor]:
+    """Return forces (B, N, D) as those of the nodes that carry any: they live on small areas."""
+    carries = force.ne(0).any(dim=-1)
+    return {
+        "carried": carries.sum(dim=1),
+        "node": carries.nonzero()[:, 1].to(torch.int32),
+        "nodal_force": force[carries],
+    }
+
+
+def _spread(compact: Mapping[str, Tensor], shape: tuple[int, ...]) -> Tensor:
+    """Return forces (B, N, D) from their compact form."""
+    count = compact["carried"]
+    force = torch.zeros(len(count), *shape, dtype=torch.float64)
+    sample = torch.repeat_interleave(torch.arange(len(count)), count)
+    force[sample, compact["node"].long()] = compact["nodal_force"]
+    return force

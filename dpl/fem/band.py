@@ -109,6 +109,10 @@ class Cholesky:
         x[slice(None) if self.order is None else self.order] = answer
         return x
 
+    def apply(self, right: Array) -> Array:
+        """Return `solve`."""
+        return self.solve(right)
+
 
 class Band:
     """Banded Cholesky in float64; a matrix that is not positive definite goes to another backend.
@@ -222,15 +226,14 @@ class Band32Factor:
         """Return x, (n,), see `Factor.solve`."""
         if self.exact is None:
             try:
-                return conjugate_gradients(
-                    self.product, self._precondition, right, rtol, self.MAX_ITER
-                )
+                return conjugate_gradients(self.product, self.apply, right, rtol, self.MAX_ITER)
             except SingularMatrix:
                 self.exact = self.parent.other.factorise(self.values)
         return self.exact.solve(right)
 
-    def _precondition(self, residual: Array) -> Array:
-        size = np.abs(residual).max()  # of order one, so that float32 holds it
-        return self.rough.solve((residual / size).astype(np.float32)).astype(np.float64) * (
+    def apply(self, right: Array) -> Array:
+        """Return K^-1 right, (n,), to float32, see `Factor.apply`."""
+        size = np.abs(right).max() or 1.0  # of order one, so that float32 holds it
+        return self.rough.solve((right / size).astype(np.float32)).astype(np.float64) * (
             size / self.scale
         )

@@ -81,6 +81,10 @@ class CGFactor:
     max_iter: int
     negative_pivots: int = 0
 
+    def apply(self, right: Array) -> Array:
+        """Return the preconditioner's answer, (n,)."""
+        return self.precondition(right)
+
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), see `Factor.solve`."""
         try:

@@ -124,6 +124,10 @@ class SuperLUFactor:
         x[self.order] = self.lu.solve(right[self.order])
         return x
 
+    def apply(self, right: Array) -> Array:
+        """Return `solve`."""
+        return self.solve(right)
+
 
 @dataclass(frozen=True, eq=False)
 class SuperLU:
@@ -177,6 +181,10 @@ class PardisoFactor:
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right."""
         return self.parent.solve(self.matrix, right)
+
+    def apply(self, right: Array) -> Array:
+        """Return `solve`."""
+        return self.solve(right)
 
 
 class Pardiso:
@@ -244,7 +252,7 @@ class Pardiso:
 SETTINGS = {
     1: 1,  # these settings, not the defaults
     2: 2,  # nested dissection
-    8: 2,  # refinement steps at most
+    8: 0,  # no refinement: Newton refines, and a step would cost as much as two solves
     10: 13,  # pivots below 1e-13 ||A|| are zero
     11: 0,
     13: 0,

@@ -5,7 +5,7 @@ random areas of the boundary.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -20,10 +20,10 @@ from torch import Tensor
 from dpl.fem.linear import full_matrix
 from dpl.fem.newton import Linear, gather, scatter
 from dpl.fem.problem import Problem
+from dpl.fem.sampling import SAMPLINGS, Quantile, even, one, uniform
 from dpl.fem.solution import Load
 
 Array = NDArray[np.float64]
-Distribution = Callable[[np.random.Generator, int], Array]  # generator, M -> (M,) in [-1, 1]
 SAME = 1e-6  # eigenvalues closer than this, relatively, are one eigenspace
 CLUSTER = 0.05  # eigenvalues closer than this belong to one family and are excited together
 
@@ -111,32 +111,28 @@ def _leaning(basis: Array, probes: Array) -> Array:
     return basis @ chosen
 
 
-def uniform(rng: np.random.Generator, count: int) -> Array:
-    """Return `count` numbers uniform in [-1, 1]: the paper's sampling."""
-    return rng.uniform(-1.0, 1.0, count)
-
-
-def normal(rng: np.random.Generator, count: int) -> Array:
-    """Return `count` normal numbers, deviation 1/3, clipped to [-1, 1]: more small loads."""
-    return np.clip(rng.standard_normal(count) / 3, -1.0, 1.0)
-
-
 @dataclass(frozen=True, eq=False)
 class ModalLoads:
     """Random loads f = Phi q on random areas of the boundary.
 
     Each mode's q is drawn by `distribution` times its largest value: for the softest mode the
-    one whose linear answer moves some node by `deflection`, for the others that of equal energy.
-    The nodal force is then kept on the boundary nodes within a random distance of a random one.
+    one whose linear answer moves some node by `deflection`, for the others that of equal energy
+    (`spectrum` 0.5). All of it is multiplied by the amplitude, then kept on the boundary nodes
+    within a random distance of a random one.
 
-    Load i of a seed is a function of (seed, i) alone.
+    A load is a function of a point of the unit cube, and that of (seed, index) alone.
 
     Attributes:
         linear: The body, with the factor of its K(0).
         n_modes: Modes at least; the last family of neighbouring eigenvalues is taken whole.
         deflection: Largest linear deflection of the softest mode over L [-].
         patch: Smallest and largest radius of the area over L [-].
-        distribution: Draws q over its largest value, per mode.
+        distribution: Quantiles of q over its largest value, per mode, in [-1, 1].
+        spectrum: Largest q of a mode as a power of its eigenvalue: 0.5 for equal energies, 1 for
+            equal deflections, 0 for equal forces.
+        radius: Quantiles of the radius, from 0 (the smallest) to 1 (the largest).
+        amplitude: Quantiles of a factor on the whole load, in [0, 1].
+        sampling: How loads fill the cube: "independent" points or a "sobol" sequence.
         young: Young's modulus [Pa], or a range of which each load draws its own.
         always: Force that every load holds besides, (N, D) [-]; none if left out.
     """
@@ -145,7 +141,11 @@ class ModalLoads:
     n_modes: int = 5
     deflection: float = 0.4
     patch: Sequence[float] = (0.0, 1.0)
-    distribution: Distribution = uniform
+    distribution: Quantile = uniform
+    spectrum: float = 0.5
+    radius: Quantile = even
+    amplitude: Quantile = one
+    sampling: str = "independent"
     young: float | Sequence[float] = 1.0
     always: Tensor | None = None
 
@@ -162,9 +162,18 @@ class ModalLoads:
         low, high = self.patch if len(self.patch) == 2 else (1, 0)
         if not 0 <= low <= high < math.inf:
             raise ValueError(f"patch = {list(self.patch)} must be a smallest and a largest radius")
+        if not -1 <= self.spectrum <= 2:
+            raise ValueError(f"spectrum = {self.spectrum} must lie between -1 and 2")
+        if self.sampling not in SAMPLINGS:
+            named = " or ".join(SAMPLINGS)
+            raise ValueError(f"sampling = {self.sampling!r} must be {named}")
         moduli = [self.young] * 2 if isinstance(self.young, int | float) else list(self.young)
         if len(moduli) != 2 or not 0 < moduli[0] <= moduli[1] < math.inf:
             raise ValueError(f"young = {self.young} must be a modulus above 0 [Pa] or [low, high]")
+        for name, low in (("distribution", -1.0), ("radius", 0.0), ("amplitude", 0.0)):
+            drawn = getattr(self, name)(np.linspace(0.0, 1 - 2.0**-53, 1001))
+            if not ((drawn >= low) & (drawn <= 1)).all():
+                raise ValueError(f"{name} draws numbers outside [{low:g}, 1]")
 
     @property
     def problem(self) -> Problem:
@@ -181,7 +190,7 @@ class ModalLoads:
         """Largest modal loads, (M,) [-]."""
         values, vectors = self.modes
         softest = self.deflection * values[0] / vectors[..., 0].norm(dim=1).max()
-        return softest * (values / values[0]).sqrt()
+        return softest * (values / values[0]) ** self.spectrum
 
     @property
     def largest_force(self) -> float:
@@ -199,6 +208,26 @@ class ModalLoads:
         """Degrees of freedom that these loads can act on and that can move, (N, D)."""
         return self.problem.boundary[:, None] & self.problem.free
 
+    @property
+    def dimension(self) -> int:
+        """d, numbers that a load is made of: M for q, then centre, radius, amplitude, modulus."""
+        return len(self.q_max) + 4
+
+    def points(self, seed: int | Sequence[int], indices: Sequence[int]) -> Tensor:
+        """Return the points of the unit cube that loads stand for, (B, d)."""
+        drawn = [SAMPLINGS[self.sampling](seed, index, self.dimension) for index in indices]
+        return torch.from_numpy(np.stack(drawn))
+
+    def at(self, points: Tensor) -> Load:
+        """Return the loads of points of the unit cube, (B, d)."""
+        forces = torch.stack([self._force(point.numpy()) for point in points])
+        return Load(forces, self.young_at(points))
+
+    def young_at(self, points: Tensor) -> Tensor:
+        """Return the Young's moduli of points, (B,) [Pa]."""
+        low, high = self.young_range
+        return low + (high - low) * points[:, -1]
+
     def sample(
         self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0
     ) -> Load:
@@ -209,24 +238,22 @@ class ModalLoads:
             indices: Which loads of the stream, B of them.
             amplitude: Factor on all forces [-].
         """
-        drawn = [self._draw(seed, index) for index in indices]
-        forces = torch.stack([force for force, _ in drawn])
-        return Load(
-            amplitude * forces, torch.tensor([young for _, young in drawn], dtype=torch.float64)
-        )
+        load = self.at(self.points(seed, indices))
+        return load._replace(force=amplitude * load.force)
 
-    def _draw(self, seed: int | Sequence[int], index: int) -> tuple[Tensor, float]:
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
-        q = self.q_max * torch.from_numpy(self.distribution(rng, len(self.q_max)))
+    def _force(self, point: Array) -> Tensor:
+        """Return the force (N, D) of a point (d,)."""
+        centre, radius, amplitude, _ = point[-4:]
+        q = self.q_max * torch.from_numpy(self.distribution(point[:-4]))
+        q = float(self.amplitude(np.asarray(amplitude))) * q
         points = self.problem.points
-        loadable = self.reach.any(dim=1)
-        centre = points[loadable][rng.integers(int(loadable.sum()))]
-        radius = rng.uniform(self.patch[0], self.patch[1])
-        inside = (points - centre).norm(dim=1) <= radius * (1 + 1e-9)
+        places = points[self.reach.any(dim=1)]
+        low, high = self.patch
+        distance = low + (high - low) * float(self.radius(np.asarray(radius)))
+        middle = places[int(centre * len(places))]
+        inside = (points - middle).norm(dim=1) <= distance * (1 + 1e-9)
         force = torch.where(inside[:, None] & self.reach, self.modes.vectors @ q, 0.0)
-        if self.always is not None:
-            force = force + self.always
-        return force, rng.uniform(*self.young_range)
+        return force if self.always is None else force + self.always
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle with the modes, so that workers need not find them again."""

@@ -1,8 +1,10 @@
 """Newton-Raphson on the nodal equilibrium f_int(u) = f, and the linear answer it starts with."""
 
+import math
 import time
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -12,9 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dpl.fem.krylov import conjugate_gradients
 from dpl.fem.linear import Backend, Factor, SingularMatrix, backend, chosen
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, Status, in_step, judge
+from dpl.fem.sparse import SymmetricProduct
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +58,7 @@ class Linear:
         return {"problem": self.problem, "tol": self.tol, "linear": self.linear}
 
 
+PATIENCE = 8  # conjugate gradient steps with the factor of another tangent, then its own
 CAREFUL = 2.0**-4  # load step from which on the end of the path may be near: full accuracy
 
 
@@ -69,7 +74,7 @@ class Newton:
 
     An answer whose tangent has negative pivots is in balance but no minimum of the energy, a
     straight column beyond its critical load, for one: its status says so. The tangent at the
-    answer is factorised only if the last one on the way had some, so that an answer within 1e-4 of
+    answer is factorised only if the last one on the way had some, so that an answer within 1e-3 of
     a critical load may pass.
 
     Source: Wriggers (2008), Nonlinear Finite Element Methods, sections 5.1 and 5.3.
@@ -85,6 +90,8 @@ class Newton:
         linear: Backend of the sparse solves, see `dpl.fem.linear.backend`.
         mixed: Let the strains at the quadrature points be unknowns of their own (Magisano,
             Leonetti, Garcea 2017), for laws that can: fewer iterations, far larger steps.
+        reuse: Residual ratio below which the last factor, as preconditioner of conjugate gradients
+            on the new tangent, stands for a new one [-]; 0: a factor for every tangent.
     """
 
     problem: Problem
@@ -96,6 +103,7 @@ class Newton:
     keep: float = 0.2
     linear: str = "auto"
     mixed: bool = True
+    reuse: float = 0.1
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -106,6 +114,8 @@ class Newton:
         for name in ("tol", "loose", "keep", "smallest_step"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and 1")
+        if not 0 <= self.reuse < math.inf:
+            raise ValueError(f"reuse = {self.reuse} must be 0 or more")
         for name in ("max_iter", "budget"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)} must be 1 or more")
@@ -165,10 +175,13 @@ class Newton:
     ) -> Iterator["_State"]:
         """Yield iterates under `target` times a load until they balance it or cannot go on."""
         before = float("nan")
+        kept: Factor | None = None
         for _ in range(self.max_iter):
             ratio = self._ratio(state, force, target)
+            rtol = self._forcing(ratio, before)
+            near = kept if ratio < self.reuse else None
             try:
-                update = self._update(state, target * force, count, self._forcing(ratio, before))
+                update, kept = self._update(state, target * force, count, rtol, near)
             except SingularMatrix:
                 return
             count.iterations += 1
@@ -193,27 +206,44 @@ class Newton:
         earned = 0.01 * (ratio / before) ** 2 if before > 0 else 0.0
         return max(1e-12, enough, min(1e-3, earned))
 
-    def _update(self, state: "_State", force: Tensor, count: "_Count", rtol: float) -> Tensor:
-        """Return the full Newton step (1, N, D) under a force, supports included.
+    def _update(
+        self, state: "_State", force: Tensor, count: "_Count", rtol: float, near: Factor | None
+    ) -> tuple[Tensor, Factor | None]:
+        """Return the full Newton step (1, N, D) under a force, supports included; and its factor.
+
+        `near` is the factor of a tangent nearby, if there is one worth trying. The factor that
+        comes back is None for the rest state's, which is near no other.
 
         Raises:
             SingularMatrix: The tangent has no factor.
         """
         problem, u = self.problem, state.displacement
-        internal, factor = state.internal, self.rest.factor
-        if u.any():
-            system = problem.linearise(u, state.gap)
-            if not system.valid:
-                system = problem.linearise(u)
-            internal = system.force
+        if not u.any():
+            right = self._right(state, force, state.internal)
+            count.negative_pivots = self.rest.factor.negative_pivots
+            return scatter(self.rest.factor.solve(right, rtol), problem)[None] + state.jump, None
+        system = problem.linearise(u, state.gap)
+        if not system.valid:
+            system = problem.linearise(u)
+        right, values = self._right(state, force, system.force), system.tangent[0].numpy()
+        step = None
+        if near is not None and near.negative_pivots == 0:
+            with suppress(SingularMatrix):
+                product = SymmetricProduct(problem.pattern, values)
+                step = conjugate_gradients(product, near.apply, right, rtol, PATIENCE)
+        if step is None:
             count.factorisations += 1
-            factor = self._backend.factorise(system.tangent[0].numpy())
+            near = self._backend.factorise(values)
+            step = near.solve(right, rtol)
+            count.negative_pivots = near.negative_pivots
+        return scatter(step, problem)[None] + state.jump, near
+
+    def _right(self, state: "_State", force: Tensor, internal: Tensor) -> NDArray[np.float64]:
+        """Return what the step has to balance, (n,)."""
         right = force - internal
         if state.jump.any():
-            right = right - problem.tangent_product(u, state.jump)
-        step = factor.solve(gather(right[0], problem), rtol)
-        count.negative_pivots = factor.negative_pivots
-        return scatter(step, problem)[None] + state.jump
+            right = right - self.problem.tangent_product(state.displacement, state.jump)
+        return gather(right[0], self.problem)
 
     def _stepped(self, state: "_State", update: Tensor) -> "_State | None":
         """Return the state after the longest of the steps 1, 1/2, 1/4, ... that inverts nothing."""

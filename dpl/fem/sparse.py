@@ -43,6 +43,10 @@ class Factor(Protocol):
         """Number of negative eigenvalues; iterative backends count 0 until they meet one."""
         ...
 
+    def apply(self, right: Array) -> Array:
+        """Return roughly K^-1 right, (n,): a fixed symmetric map, a preconditioner."""
+        ...
+
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right.
 

@@ -67,7 +67,7 @@ def load_steps(problem: Problem, force: Tensor) -> Iterator[tuple[list[float], T
     state = None
     for step in range(1, 6):
         part = step / 5 * force
-        solver = Newton(problem, tol=1e-15, mixed=False, linear="superlu")
+        solver = Newton(problem, tol=1e-15, mixed=False, linear="superlu", reuse=0.0)
         norms = []
         for iterate in solver.iterate(load_of(part), guess=state):
             state = iterate.displacement

@@ -1,0 +1,113 @@
+"""Files that are whole or not there, and folders that one process at a time writes to."""
+
+import fcntl
+import json
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+
+class DataSetError(ValueError):
+    """A data set that cannot be used, and what to do about it."""
+
+
+@contextmanager
+def whole_file(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
+    """Open a file to write that will be there whole or not at all.
+
+    Args:
+        path: Where it will be.
+        sync: Whether it must survive a crash of the machine too, and not of this process only.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with part.open("wb") as file:
+            yield file
+            file.flush()
+            if sync:
+                os.fsync(file.fileno())
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+    if sync:
+        sync_folder(path.parent)
+
+
+def sync_folder(path: Path) -> None:
+    """Make what was renamed or removed in a folder survive a crash of the machine."""
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def append_line(path: Path, line: dict[str, Any]) -> None:
+    """Add a line of JSON, synced; after a line that a crash has torn, on a line of its own."""
+    with path.open("ab+") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - 1))
+        torn = size > 0 and file.read(1) != b"\n"
+        try:
+            file.write(b"\n" * torn + json.dumps(line).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        except OSError:  # no space: the half of a line is taken back
+            with suppress(OSError):
+                file.truncate(size)
+            raise
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Return the lines of JSON in a file, those left out that a crash has torn."""
+    lines = []
+    for line in path.read_bytes().splitlines() if path.exists() else ():
+        with suppress(ValueError):
+            lines.append(json.loads(line))
+    return [line for line in lines if isinstance(line, dict)]
+
+
+@contextmanager
+def sole_writer(folder: Path, shard: int = 0, shards: int = 1) -> Iterator[None]:
+    """Be the only writer of shard `shard` of `shards` of a folder; a dead writer does not count.
+
+    The kernel keeps the locks (flock), so none outlives its process.
+
+    Raises:
+        DataSetError: Another process writes some of the same; its number and machine are named.
+    """
+    with ExitStack() as held:
+        with (folder / ".writers").open("a") as gate:
+            fcntl.flock(gate, fcntl.LOCK_EX)
+            for other in folder.glob(".writer-*"):
+                _, k, n = other.name.split("-")
+                if (int(n) == shards and int(k) != shard) or not (holder := _holder(other)):
+                    continue
+                raise DataSetError(
+                    f"{folder} is being written by {holder}; wait for it, stop it, or choose "
+                    "another data.folder"
+                )
+            mine = folder / f".writer-{shard}-{shards}"
+            file = held.enter_context(mine.open("w"))
+            fcntl.flock(file, fcntl.LOCK_EX)
+            since = time.strftime("%Y-%m-%d %H:%M:%S")
+            file.write(f"process {os.getpid()} on {socket.gethostname()} since {since}")
+            file.flush()
+            held.callback(mine.unlink, missing_ok=True)
+        yield
+
+
+def _holder(path: Path) -> str:
+    """Return who holds a lock; empty if nobody does."""
+    try:
+        with path.open("r+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return ""
+    except BlockingIOError:
+        return path.read_text() or "another process"
+    return ""

@@ -1,0 +1,86 @@
+"""Random numbers that are functions of their place in a stream, and the distributions made of them.
+
+A distribution is its quantile function: it maps numbers uniform in [0, 1) to what is drawn, so that
+every distribution goes with every way to fill the unit cube.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+Array = NDArray[np.float64]
+Quantile = Callable[[Array], Array]  # uniform in [0, 1) -> what is drawn, of the same shape
+
+
+def independent(seed: int | Sequence[int], index: int, count: int) -> Array:
+    """Return point `index` of a stream of independent points, (count,), uniform in [0, 1)."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,))).random(count)
+
+
+def sobol(seed: int | Sequence[int], index: int, count: int) -> Array:
+    """Return point `index` of a scrambled Sobol sequence, (count,), in [0, 1).
+
+    It fills the cube more evenly than independent points; the stream decides how it is scrambled.
+
+    Source: Sobol (1967); Owen (1998), J. Complexity 14; Joe, Kuo (2008).
+    """
+    key = (seed,) if isinstance(seed, int) else tuple(seed)
+    sequence = _sobol(key, count)
+    sequence.reset()
+    if index:
+        sequence.fast_forward(index)
+    return sequence.random(1)[0]
+
+
+@lru_cache(maxsize=8)
+def _sobol(seed: tuple[int, ...], count: int) -> qmc.Sobol:
+    return qmc.Sobol(count, scramble=True, rng=np.random.default_rng(list(seed)))
+
+
+SAMPLINGS = {"independent": independent, "sobol": sobol}
+
+
+def uniform(t: Array) -> Array:
+    """Return numbers uniform in [-1, 1]: the paper's modal loads."""
+    return 2 * t - 1
+
+
+def normal(t: Array) -> Array:
+    """Return normal numbers, deviation 1/3, clipped to [-1, 1]: more small modal loads."""
+    return np.clip(ndtri(t) / 3, -1.0, 1.0)
+
+
+def even(t: Array) -> Array:
+    """Return numbers uniform in [0, 1)."""
+    return t
+
+
+def one(t: Array) -> Array:
+    """Return 1."""
+    return np.ones_like(t)
+
+
+def logarithmic(t: Array, low: float = 1e-2) -> Array:
+    """Return numbers in [low, 1) of which every decade holds as many.
+
+    Raises:
+        ValueError: `low` lies outside (0, 1).
+    """
+    if not 0 < low < 1:
+        raise ValueError(f"low = {low} must lie between 0 and 1")
+    return low ** (1 - t)
+
+
+def tail(t: Array, part: float = 0.25, low: float = 1e-3) -> Array:
+    """Return 1, but for a part of the draws that is logarithmic in [low, 1): small loads.
+
+    Raises:
+        ValueError: `part` or `low` lies outside (0, 1).
+    """
+    if not 0 < part < 1:
+        raise ValueError(f"part = {part} must lie between 0 and 1")
+    return np.where(t < part, logarithmic(t / part, low), 1.0)
