@@ -44,7 +44,7 @@ KEYS = {  # what a configuration may hold at its top
     *("data", "model", "loss", "optimizer", "scheduler", "trainer"),
     *("seed", "ckpt_path", "run", "folder", "tol"),
     *("action", "shard", "shards"),
-    *("parts", "linear", "repeats", "count", "workers", "peers"),
+    *("parts", "linear", "repeats", "count", "workers", "peers", "samples"),
 }
 
 

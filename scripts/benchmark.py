@@ -1,6 +1,7 @@
 """The mechanics against public codes: python scripts/benchmark.py.
 
-Long parts on demand: parts=[large] (run alone, it reports its memory), parts=[robustness].
+Long parts on demand: parts=[large] (run alone, it reports its memory), parts=[robustness],
+parts=[generation].
 """
 
 import json
@@ -13,13 +14,13 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from dpl import peers, run
+from dpl import peers, run, throughput
 from dpl.fem.linear import installed
 from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.solution import one_thread
 
 CONSOLE = Console(width=150)
-PARTS = ("scenes", "pieces", "propeller", "large", "robustness")
+PARTS = ("scenes", "pieces", "propeller", "large", "robustness", "generation")
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="benchmark")
@@ -91,6 +92,28 @@ def robustness(cfg: DictConfig, backends: list[str]) -> dict[str, dict[str, floa
     for name, row in results.items():
         table.add_row(name, *(f"{value:.4g}" for value in row.values()))
     CONSOLE.print(table)
+    return results
+
+
+def generation(cfg: DictConfig, backends: list[str]) -> dict[str, list[throughput.Cost]]:
+    """Return what a sample costs on one core, with and without what makes it faster."""
+    scenes = {
+        "paper's beam, NH-ln": peers.beam_scene(NeoHookeanLn(0.3)),
+        "paper's propeller, NH-ln": peers.propeller_scene(),
+    }
+    guess = None
+    if cfg.run is not None:
+        surrogate = run.load_run(cfg.run)[1]
+        scenes, guess = {cfg.run: surrogate.scene}, surrogate.predict
+    results = {}
+    for name, scene in scenes.items():
+        rows = results[name] = throughput.costs(scene, cfg.samples, surrogate=guess)
+        table = Table(name, "ms", "samples/s on a core", "iterations", "factors", "accepted")
+        for row in rows:
+            count = f"{row.iterations:.2f}", f"{row.factorisations:.2f}"
+            done = f"{row.accepted}/{cfg.samples}"
+            table.add_row(row.way, f"{1e3 * row.seconds:.1f}", f"{row.rate:.2f}", *count, done)
+        CONSOLE.print(table)
     return results
 
 

@@ -25,8 +25,9 @@ def main(cfg: DictConfig) -> None:
     surrogate = run.build_surrogate(cfg, scene)
     trainer = run.make(cfg, "trainer")
     run.check_processes(trainer)
-    run.show_plan(scene, data, surrogate)
-    run.save_config(cfg, folder)
+    if trainer.is_global_zero:
+        run.show_plan(scene, data, surrogate)
+        run.save_config(cfg, folder)
     try:
         trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
     except SystemExit as leaving:  # how Lightning passes Ctrl-C on

@@ -10,7 +10,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from dpl import run
-from dpl.data.generate import Job, outcome
+from dpl.data.outcome import Job, outcome
 from dpl.fem.materials import Hookean
 from dpl.fem.mesh import box
 from dpl.fem.solution import solve
@@ -154,6 +154,34 @@ def test_the_seed_shuffles_batches_and_leaves_the_loads(compose):
     assert cfg.data.shuffle == 5
     assert cfg.data.seed == 0
     assert np.isfinite(cfg.optimizer.lr)
+
+
+def test_small_loads_are_small_in_force_and_in_area(scene_of):
+    scene = scene_of("loads=modal_small", *SMALL["beam"], "solver.linear=superlu")
+    loads = scene.loads
+    assert loads.sampling == "sobol"
+    drawn = loads.sample((0, 0), range(64))
+    size = drawn.force.flatten(1).norm(dim=1) / loads.largest_force
+    assert 0 < float(size.min()) < 1e-3
+    assert int((drawn.force.any(dim=2).sum(dim=1) == 1).sum()) > 20
+    for number in range(3):
+        assert outcome(scene, Job((0, 0), number)).accepted
+
+
+def test_options_of_the_loads_can_be_changed_one_by_one(scene_of):
+    usual = scene_of(*SMALL["beam"])
+    changes = ["spectrum=1", "sampling=sobol", "radius._target_=dpl.fem.sampling.one"]
+    for change in [*changes, "distribution._target_=dpl.fem.sampling.normal"]:
+        assert scene_of(*SMALL["beam"], f"loads.{change}").fingerprint != usual.fingerprint
+
+
+def test_paper_young_shares_its_data_with_paper_beam(scene_of):
+    """The same body in units of L and E, whatever its size and modulus."""
+    beam, young = (scene_of(f"experiment=paper_{name}") for name in ("beam", "young"))
+    assert young.fingerprint == beam.fingerprint
+    assert young.loads.young_range == (1e9, 2.03e11)
+    assert beam.loads.young_range[0] == beam.loads.young_range[1]
+    assert (young.length, beam.length) == pytest.approx((1.0, 100.0))
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,14 @@ import torch
 
 from dpl.fem.materials import SaintVenantKirchhoff
 from dpl.fem.mesh import Box, Plane, box, rectangle
-from dpl.fem.modes import normal, uniform
+from dpl.fem.newton import Newton
+from dpl.fem.sampling import even, logarithmic, normal, tail, uniform
 from dpl.fem.solution import solve
 from dpl.scene import Sample, stack
 
 
-def mild(rng, count, *, factor):
-    return factor * uniform(rng, count)
+def mild(t, *, factor):
+    return factor * uniform(t)
 
 
 def test_the_fingerprint_knows_neither_size_nor_stiffness(make_scene, scene):
@@ -53,6 +54,14 @@ CHANGES = {
     "patch": {"patch": (0.0, 0.5)},
     "distribution": {"distribution": normal},
     "argument of the distribution": {"distribution": partial(mild, factor=0.5)},
+    "spectrum": {"spectrum": 1.0},
+    "radius": {"radius": logarithmic},
+    "argument of the radius": {"radius": partial(logarithmic, low=1e-4)},
+    "amplitude": {"amplitude": tail},
+    "argument of the amplitude": {"amplitude": partial(tail, part=0.5)},
+    "amplitude as the radius": {"amplitude": even},
+    "sampling": {"sampling": "sobol"},
+    "always": {"always": torch.ones(45, 3, dtype=torch.float64)},
 }
 
 
@@ -68,6 +77,22 @@ def test_the_fingerprint_knows_the_order_of_the_nodes(make_scene, scene):
 def test_arguments_of_a_distribution_tell_scenes_apart(make_scene):
     prints = {make_scene(distribution=partial(mild, factor=f)).fingerprint for f in (0.5, 0.6)}
     assert len(prints) == 2
+
+
+def test_the_identity_names_the_options_of_the_loads_and_no_other(make_scene, scene):
+    """Nor does it name what decides no sample: how Newton gets there."""
+    assert set(scene.identity()["loads"]) == {
+        *("name", "n_modes", "deflection", "patch", "distribution", "spectrum", "radius"),
+        *("amplitude", "sampling", "always"),
+    }
+    for options in ({"newton": partial(Newton, reuse=0.0)}, {"newton": partial(Newton, budget=9)}):
+        assert make_scene(**options).fingerprint == scene.fingerprint
+
+
+def test_the_order_of_arguments_tells_no_scenes_apart(make_scene):
+    one, other = {"part": 0.5, "low": 1e-2}, {"low": 1e-2, "part": 0.5}
+    prints = {make_scene(amplitude=partial(tail, **given)).fingerprint for given in (one, other)}
+    assert len(prints) == 1
 
 
 def test_fingerprints_differ_from_each_other(make_scene):

@@ -7,13 +7,14 @@ process, no worker outlives it.
 
 import contextlib
 import ctypes
+import multiprocessing
 import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from multiprocessing import connection, get_context, parent_process
+from multiprocessing import connection, parent_process
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from types import FrameType
@@ -120,7 +121,7 @@ class _Crew:
     """Worker processes, each with a pipe; a context that leaves none of them behind."""
 
     def __init__(self, scene: Scene, size: int, timeout: float | None) -> None:
-        self._context = get_context("spawn")  # forking a process with BLAS threads can hang it
+        self._context = spawning()
         self._scene, self._size, self._timeout = scene, size, timeout
         self._members: dict[Connection, BaseProcess] = {}
         self._deadlines: dict[Connection, float] = {}
@@ -188,6 +189,16 @@ class _Crew:
         now = time.monotonic()
         late = [pipe for pipe in self.busy if self._deadlines.get(pipe, now) < now]
         return done, dead, [self._replace(pipe) for pipe in late]
+
+
+def spawning() -> multiprocessing.context.SpawnContext:
+    """Return the way to start workers: forking a process with BLAS threads can hang it.
+
+    A process of joblib's has a way of its own, which those that it spawns do not know by name.
+    """
+    if multiprocessing.get_start_method() not in multiprocessing.get_all_start_methods():
+        multiprocessing.set_start_method("spawn", force=True)
+    return multiprocessing.get_context("spawn")
 
 
 def _work(pipe: Connection, scene: Scene) -> None:

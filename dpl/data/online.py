@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from dpl.data.crew import HOPELESS, TRIES, die_with_parent
+from dpl.data.crew import HOPELESS, TRIES, die_with_parent, spawning
 from dpl.data.outcome import Job, Outcome, lost, outcome
 from dpl.data.store import Store
 from dpl.scene import Sample, Scene, stack
@@ -243,7 +243,7 @@ class Replay:
                 batch_size=self._fresh,
                 num_workers=self._workers,
                 collate_fn=_batch,
-                multiprocessing_context="spawn" if self._workers else None,
+                multiprocessing_context=spawning() if self._workers else None,
                 worker_init_fn=_begin,
             )
         )

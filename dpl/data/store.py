@@ -236,8 +236,8 @@ class Store:
             wall = sum(one["seconds"] for one in sessions)
             size = sum(path.stat().st_size for path in self.folder.glob("*.safetensors")) / 1e6
             lines.append(
-                f"  {core:.3f} s a load on one core; {wall:.0f} s in all, "
-                f"{loads / max(wall, 1e-9):.1f} loads a second; {size:.0f} MB"
+                f"  {core:.3f} s a load on one core, {wall:.0f} s of wall time in {len(sessions)} "
+                f"sessions, {size:.0f} MB"
             )
         return "\n".join(lines)
 

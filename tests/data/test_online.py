@@ -1,47 +1,101 @@
-"""Laws of the endless stream: whoever solves it, every load once, and no process left behind."""
+"""Laws of the endless stream: whoever solves it, every load once, used boundedly, nobody left."""
 
+import hashlib
 import itertools
+import json
 import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
-from torch.utils.data import IterableDataset
+from torch.utils.data import IterableDataset, get_worker_info
 
-from dpl.data.generate import Job, outcome
-from dpl.data.online import Drawn, OnlineSamples, Replay
+from dpl.data.online import NEAR, Drawn, OnlineSamples, Rates, Replay, Worst
+from dpl.data.outcome import Job, outcome
+from dpl.fem.newton import Newton
 from dpl.scene import Sample
 
 SEED = (0, 0)
 
 
 class Numbers(IterableDataset):
-    """Samples whose modulus is their place in the stream."""
+    """A stream like `OnlineSamples`, without mechanics: the modulus is the place in it.
 
-    def __init__(self, end=None):
-        self.end = end
+    Attributes:
+        end: Where it ends; never if left out.
+        deadly: The place that always kills its worker.
+        pause: Seconds that each worker takes for a sample.
+    """
+
+    def __init__(self, end=None, *, deadly=None, pause=(), shape=(2, 3)):
+        self.first, self.lane, self.lanes, self.worst = 0, 0, 1, None
+        self.end, self.deadly, self.pause, self.shape = end, deadly, pause, shape
 
     def __iter__(self):
-        for place in itertools.count() if self.end is None else range(self.end):
-            field = torch.full((2, 3), float(place), dtype=torch.float64)
-            young = torch.tensor(float(place), dtype=torch.float64)
-            yield Drawn(Sample(field, -field, young), torch.tensor(place))
+        info = get_worker_info()
+        worker, workers = (info.id, info.num_workers) if info else (0, 1)
+        first = self.first + self.lane * workers + worker
+        for place in itertools.count(first, workers * self.lanes):
+            if self.end is not None and place >= self.end:
+                return
+            if place == self.deadly:
+                os.kill(os.getpid(), signal.SIGKILL)
+            if self.pause:
+                time.sleep(self.pause[worker])
+            yield self.drawn(place)
+
+    def drawn(self, place):
+        field = torch.full(self.shape, float(place), dtype=torch.float64)
+        young = torch.tensor(float(place), dtype=torch.float64)
+        point = torch.tensor([place / 1e6], dtype=torch.float64)
+        return Drawn(Sample(field, -field, young), torch.tensor(place), point)
 
 
-def replay(stream=None, **options):
-    defaults = {
-        "workers": 0,
-        "batch_size": 8,
-        "batches": 10,
-        "fresh": 4,
-        "reuse": 6,
-        "capacity": 100,
-    }
-    return Replay(stream or Numbers(), **{**defaults, **options})
+@pytest.fixture
+def replay():
+    """Builds replays, closed in the end."""
+    made = []
+
+    def replay(stream=None, **options):
+        defaults = {
+            "workers": 0,
+            "batch_size": 8,
+            "batches": 10,
+            "fresh": 4,
+            "reuse": 6,
+            "capacity": 100,
+        }
+        made.append(Replay(stream or Numbers(), **{**defaults, **options}))
+        return made[-1]
+
+    yield replay
+    for one in made:
+        one.close()
+
+
+def crew():
+    return {child.pid for child in multiprocessing.active_children()}
 
 
 def keys(batch):
     return {force.numpy().tobytes() for force in batch.force}
+
+
+def places(batch):
+    return batch.young.long().tolist()
+
+
+def numbers(stream, count):
+    return [int(one.number) for one in itertools.islice(stream, count)]
 
 
 @pytest.fixture(scope="module")
@@ -50,13 +104,23 @@ def drawn(scene):
     return [f.numpy().tobytes() for f in scene.loads.sample(SEED, range(32)).force]
 
 
+# ------------------------------------------------------------------ the stream
+
+
 def test_the_stream_is_the_accepted_loads_in_order(scene, drawn):
     first = list(itertools.islice(OnlineSamples(scene, SEED), 6))
     assert [one.sample.force.numpy().tobytes() for one in first] == drawn[:6]
     assert [int(one.number) for one in first] == list(range(6))
     truth = outcome(scene, Job(SEED, 3))
     assert torch.equal(first[3].sample.displacement, torch.from_numpy(truth.displacement))
-    assert float(first[3].sample.young) == truth.young
+    assert torch.equal(first[3].point, torch.from_numpy(truth.point))
+
+
+def test_the_stream_draws_its_own_moduli(make_scene):
+    stream = OnlineSamples(make_scene(young=[1e6, 2e11]), SEED)
+    young = torch.stack([one.sample.young for one in itertools.islice(stream, 6)])
+    assert torch.equal(young, stream.scene.loads.sample(SEED, range(6)).young)
+    assert len(young.unique()) == 6
 
 
 def test_the_stream_can_begin_anywhere(scene, drawn):
@@ -65,70 +129,144 @@ def test_the_stream_can_begin_anywhere(scene, drawn):
 
 
 def test_rejected_loads_do_not_enter_the_stream(scene, drawn, monkeypatch):
-    def choosy(scene, job):
-        return outcome(scene, job)._replace(accepted=job.number % 3 == 1)
+    def choosy(scene, job, **options):
+        return outcome(scene, job, **options)._replace(accepted=job.number % 3 == 1)
 
     monkeypatch.setattr("dpl.data.online.outcome", choosy)
     first = itertools.islice(OnlineSamples(scene, SEED), 3)
     assert [one.sample.force.numpy().tobytes() for one in first] == [drawn[1], drawn[4], drawn[7]]
 
 
-def test_two_workers_solve_the_same_stream_and_end_when_it_is_closed(scene, drawn):
-    before = {child.pid for child in multiprocessing.active_children()}
-    options = {"fresh": 4, "batch_size": 256, "reuse": 64, "batches": 4}
+@pytest.mark.parametrize("lanes", [2, 3])
+def test_the_lanes_of_training_processes_are_disjoint_and_together_all(scene, lanes):
+    seen = [
+        numbers(OnlineSamples(scene, SEED, first=4, lane=k, lanes=lanes), 4) for k in range(lanes)
+    ]
+    assert sorted(itertools.chain(*seen)) == list(range(4, 4 + 4 * lanes))
+
+
+def test_two_workers_solve_the_same_stream_and_end_when_it_is_closed(scene, drawn, replay):
+    before = crew()
+    options = {"fresh": 4, "batch_size": 256, "reuse": 128, "batches": 4}
     stream = replay(OnlineSamples(scene, SEED), workers=2, **options)
     seen = set().union(*[keys(batch) for batch in stream])
-    crew = {child.pid for child in multiprocessing.active_children()} - before
-    assert len(crew) == 2
+    started = crew() - before
+    assert len(started) == 2
     assert stream.produced == 16
     assert seen == set(drawn[:16]), "no load is left out and none is solved by both"
     next(iter(stream))  # the next epoch goes on with the same workers
-    assert {child.pid for child in multiprocessing.active_children()} - before == crew
+    assert crew() - before == started
     stream.close()
-    assert not crew & {child.pid for child in multiprocessing.active_children()}
-    assert not any(Path(f"/proc/{pid}").exists() for pid in crew)
+    assert not started & crew()
+    assert not any(Path(f"/proc/{pid}").exists() for pid in started)
 
 
-def test_batches_are_samples_with_a_leading_batch_axis():
+# ------------------------------------------------------------------ epochs
+
+
+def test_batches_are_samples_with_a_leading_batch_axis(replay):
     batch = next(iter(replay()))
     assert isinstance(batch, Sample)
     assert batch.force.shape == batch.displacement.shape == (8, 2, 3)
     assert batch.young.shape == (8,)
     assert torch.equal(batch.force[:, 0, 0], batch.young), "columns are drawn together"
+    assert torch.equal(batch.displacement, -batch.force)
 
 
-def test_an_epoch_has_its_number_of_batches_for_ever():
+def test_nothing_starts_before_the_first_batch(replay):
+    class Never(Numbers):
+        def __iter__(self):
+            raise AssertionError("started")
+
+    stream = replay(Never())
+    assert len(stream) == 10
+    assert stream.produced == 0
+
+
+def test_an_epoch_has_its_number_of_batches_for_ever(replay):
     stream = replay(batches=7)
     assert len(stream) == 7
     for _ in range(5):
         assert sum(1 for _ in stream) == 7
 
 
-def test_epochs_go_on_with_the_stream():
+def test_epochs_go_on_with_the_stream(replay):
     stream = replay(batches=6, reuse=2, fresh=4, batch_size=8)
     newest = [max(float(batch.young.max()) for batch in stream) for _ in range(4)]
-    assert stream.produced == 4 * 6 * 8 // 2
     assert newest == sorted(newest)
     assert newest[-1] > 3 * newest[0]
 
 
-@pytest.mark.parametrize("reuse", [1, 5, 50])
-def test_samples_are_used_as_often_as_promised_on_average(reuse):
-    stream = replay(reuse=reuse, batches=1, fresh=4, batch_size=8)
+def test_a_stream_that_ends_ends_the_epoch(replay):
+    stream = replay(Numbers(end=20), reuse=2, batches=100, capacity=8)
+    used = sum(len(batch.young) for batch in stream)
+    assert stream.produced == 20
+    assert 20 - 8 <= used <= 40
+
+
+# ------------------------------------------------------------------ how often a sample is used
+
+
+def counted(stream, batches):
+    """Return how often each place was used in so many batches."""
+    used = [place for _ in range(batches) for place in places(next(iter(stream)))]
+    return torch.bincount(torch.tensor(used), minlength=stream.produced)
+
+
+@pytest.mark.parametrize("reuse", [1, 2, 6, 50])
+@pytest.mark.parametrize(("fresh", "capacity"), [(4, 16), (8, 8), (3, 1000), (5, 12)])
+def test_no_sample_is_used_more_often_than_promised(replay, reuse, fresh, capacity):
+    stream = replay(reuse=reuse, batches=1, fresh=fresh, capacity=capacity)
+    assert counted(stream, 300).max() <= reuse
+
+
+@pytest.mark.parametrize("reuse", [2, 6, 50])
+def test_samples_are_used_half_as_often_while_the_buffer_fills(replay, reuse):
+    stream = replay(reuse=reuse, batches=1, capacity=10_000)
     for drawn in range(1, 200):
         next(iter(stream))
-        assert drawn * 8 <= stream.produced * reuse, "no more uses than the samples are good for"
-        assert (stream.produced - 4) * reuse < drawn * 8, "no sample is taken before it is needed"
+        assert drawn * 8 <= stream.produced * reuse / 2, "no more than they are good for"
+        assert (stream.produced - 4) * reuse / 2 < drawn * 8, "none is taken before it is needed"
 
 
-def test_training_starts_with_the_first_samples():
+def test_samples_that_are_used_once_are_used_once_while_the_buffer_fills_too(replay):
+    used = counted(replay(reuse=1, batches=1, capacity=10_000), 100)
+    assert (used[:-4] == 1).all()
+
+
+@pytest.mark.parametrize("reuse", [2, 6, 50])
+def test_samples_are_used_as_often_as_promised_on_average_once_the_buffer_is_full(replay, reuse):
+    stream = replay(reuse=reuse, batches=1, capacity=64)
+    while stream.produced <= 64:
+        next(iter(stream))
+    produced, used = stream.produced, 0
+    for _ in range(100 * reuse):
+        used += len(next(iter(stream)).young)
+    assert used == pytest.approx((stream.produced - produced) * reuse, abs=4 * reuse + 8)
+
+
+def test_training_starts_with_the_first_samples(replay):
     stream = replay(reuse=50, fresh=4)
     batch = next(iter(stream))
     assert stream.produced == 4
-    assert set(batch.young.tolist()) <= {0.0, 1.0, 2.0, 3.0}
+    assert set(places(batch)) <= {0, 1, 2, 3}
 
 
-def test_the_oldest_samples_leave_a_full_buffer():
+def test_no_sample_is_twice_in_a_batch_if_there_are_enough(replay):
+    stream = replay(batches=1, fresh=8, reuse=4, capacity=64, batch_size=8)
+    for _ in range(300):
+        assert len(set(places(next(iter(stream))))) == 8
+
+
+def test_a_batch_larger_than_the_buffer_holds_samples_more_than_once(replay):
+    stream = replay(batches=1, fresh=4, reuse=12, capacity=4, batch_size=16)
+    for _ in range(30):
+        batch = next(iter(stream))
+        assert len(batch.young) == 16
+        assert len(set(places(batch))) <= 4
+
+
+def test_the_oldest_samples_leave_a_full_buffer(replay):
     stream = replay(capacity=12, fresh=4, reuse=2, batches=1)
     for _ in range(50):
         batch = next(iter(stream))
@@ -136,20 +274,501 @@ def test_the_oldest_samples_leave_a_full_buffer():
         assert batch.young.max() < stream.produced
 
 
-def test_all_samples_of_the_buffer_are_drawn():
+def test_a_number_of_fresh_samples_that_does_not_divide_the_buffer_loses_none(replay):
+    used = counted(replay(capacity=42, fresh=5, reuse=1, batches=1), 60)
+    assert (used[:-5] == 1).all()
+
+
+def test_all_samples_of_the_buffer_are_drawn(replay):
     stream = replay(capacity=16, fresh=16, reuse=100, batch_size=100, batches=8)
     counts = torch.bincount(torch.cat([batch.young for batch in stream]).long(), minlength=16)
     assert counts.min() > 20  # 800 draws from 16
 
 
-def test_two_streams_give_the_same_batches():
-    one, other = replay(), replay()
+@pytest.mark.parametrize("reuse", [4, 50])
+def test_batches_stay_mixed_however_long_it_runs(replay, reuse):
+    """Old and new samples meet in a batch: not the newest alone, each several times."""
+    stream = replay(capacity=256, fresh=8, reuse=reuse, batch_size=32, batches=1)
+    for _ in range(60 * reuse):
+        batch = next(iter(stream))
+    ages = []
+    for _ in range(40):
+        batch = next(iter(stream))
+        assert len(set(places(batch))) == 32
+        ages.append(stream.produced - batch.young)
+    assert torch.cat(ages).mean() > 256 / 8
+    assert torch.cat(ages).max() > 256 / 2
+
+
+def test_two_streams_give_the_same_batches(replay):
+    one, other = replay(), replay(Numbers(pause=[0.001]))
     for a, b in itertools.islice(zip(one, other, strict=True), 10):
         assert torch.equal(a.young, b.young)
 
 
-def test_a_closed_stream_can_be_closed_again():
+@pytest.mark.slow
+def test_batches_do_not_depend_on_which_worker_is_faster(replay):
+    streams = [replay(Numbers(pause=pause), workers=2) for pause in ([0.02, 0.0], [0.0, 0.02])]
+    for _ in range(3):
+        one, other = (torch.stack([batch.young for batch in stream]) for stream in streams)
+        assert torch.equal(one, other)
+
+
+def test_memory_is_that_of_the_buffer(replay):
+    shape = (100, 3)  # 5 kB a sample: 64 chunks of 64 are 20 MB
+    stream = replay(Numbers(shape=shape), fresh=64, capacity=128, reuse=2, batch_size=64, batches=2)
+
+    def resident():
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    for _ in stream:
+        pass
+    columns = [column.data_ptr() for column in stream._buffer.sample]
+    for _ in range(20):
+        list(stream)
+    before = resident()
+    for _ in range(100):
+        for _ in stream:
+            pass
+    assert stream.produced > 6000
+    assert resident() - before < 8, "MB; all that went through is 30 MB"
+    assert [column.data_ptr() for column in stream._buffer.sample] == columns
+
+
+def test_what_enters_the_buffer_later_does_not_change_batches_handed_out(replay):
+    stream = replay(capacity=8, fresh=8, reuse=1, batches=1)
+    batch = next(iter(stream))
+    before = batch.force.clone()
+    for _ in range(5):
+        next(iter(stream))
+    assert torch.equal(batch.force, before)
+
+
+# ------------------------------------------------------------------ rates
+
+
+def test_the_rates_of_each_epoch_are_reported(replay):
+    told = []
+    stream = replay(Numbers(pause=[0.005]), batches=5, reuse=4, capacity=1000, report=told.append)
+    for epoch in range(3):
+        for _ in stream:
+            pass
+        assert len(told) == epoch + 1
+    assert all(isinstance(rates, Rates) for rates in told)
+    assert stream.rates is told[-1]
+    for rates in told:
+        assert 0 < rates.produced <= 1 / 0.005
+        assert 1.5 * rates.produced < rates.consumed < 2.7 * rates.produced  # reuse / 2
+        assert 0.9 < rates.waiting <= 1, "this loop has nothing else to do"
+    assert told[-1].uses == pytest.approx(2, rel=0.1)
+
+
+def test_an_optimiser_that_is_the_slower_one_does_not_wait(replay):
+    stream = replay(batches=5)
+    for _ in stream:
+        time.sleep(0.01)
+    assert stream.rates.waiting < 0.2
+    assert stream.rates.consumed < 8 / 0.01
+
+
+def test_an_epoch_left_early_reports_nothing_false(replay):
+    stream = replay(batches=5)
+    next(iter(stream))
+    assert stream.rates is None
+
+
+# ------------------------------------------------------------------ where the surrogate is worst
+
+
+def test_points_near_the_worst_lie_in_the_unit_cube():
+    worst, rng = Worst(3), np.random.default_rng(0)
+    corners = torch.tensor(list(itertools.product([0.0, 1 - 2.0**-53], repeat=3)))
+    worst.put(corners.double())
+    points = torch.stack([worst.near(rng) for _ in range(2000)])
+    assert points.dtype == torch.float64
+    assert (points >= 0).all()
+    assert (points < 1).all()
+    distance = torch.cdist(points, corners.double()).amin(dim=1)
+    assert 0.5 * NEAR < distance.mean() < 3 * NEAR
+    assert not ((points == 0) | (points >= 1 - 2.0**-50)).any(), "folded back, not piled up"
+
+
+def test_nothing_is_near_the_worst_while_there_is_none():
+    worst = Worst(3)
+    assert worst.near(np.random.default_rng(0)) is None
+    worst.put(torch.rand(5, 3, dtype=torch.float64))
+    assert worst.near(np.random.default_rng(0)) is not None
+    worst.put(torch.zeros(0, 3, dtype=torch.float64))
+    assert worst.near(np.random.default_rng(0)) is None
+
+
+def test_more_points_than_there_is_room_for_leave_the_worst_ones():
+    worst = Worst(1, size=4)
+    worst.put(torch.arange(10, dtype=torch.float64)[:, None] / 10)
+    near = {round(float(worst.near(np.random.default_rng(k))) / 0.1) for k in range(200)}
+    assert near <= set(range(6))
+    assert int(worst.count) == 4
+    assert worst.points[:, 0].tolist() == [0.0, 0.1, 0.2, 0.3]
+
+
+def test_new_loads_are_drawn_near_the_worst_ones_as_often_as_asked(scene):
+    worst = Worst(scene.loads.dimension)
+    centre = torch.full((1, scene.loads.dimension), 0.5, dtype=torch.float64)
+    worst.put(centre)
+    for part in (0.0, 0.5, 1.0):
+        stream = OnlineSamples(scene, SEED, worst=worst, near=part)
+        points = torch.stack([one.point for one in itertools.islice(stream, 40)])
+        near = ((points - centre).abs().amax(dim=1) < 6 * NEAR).double().mean()
+        assert near == pytest.approx(part, abs=0.25 if part < 1 else 0.0)
+
+
+def test_a_load_drawn_near_the_worst_is_an_answer_to_its_own_point(scene):
+    worst = Worst(scene.loads.dimension)
+    worst.put(torch.full((1, scene.loads.dimension), 0.5, dtype=torch.float64))
+    one = next(iter(OnlineSamples(scene, SEED, worst=worst, near=1.0)))
+    load = scene.loads.at(one.point[None])
+    assert torch.equal(one.sample.force, load.force[0])
+    assert torch.equal(one.sample.young, load.young[0])
+    internal, volume = scene.problem.evaluate(one.sample.displacement[None])
+    assert bool(volume > 0)
+    assert float(scene.problem.imbalance(internal, load.force)) < 1e-8
+
+
+@pytest.fixture
+def unsolved(monkeypatch):
+    """Loads without mechanics: points alone."""
+
+    def fake(scene, job, *, point=None):
+        if point is None:
+            point = torch.from_numpy(np.random.default_rng([*job.seed, job.number]).random(2))
+        none = np.zeros((1, 1))
+        return SimpleNamespace(
+            job=job, point=point.numpy(), force=none, displacement=none, accepted=True
+        )
+
+    monkeypatch.setattr("dpl.data.online.outcome", fake)
+    return SimpleNamespace(loads=SimpleNamespace(young_at=lambda points: points[:, -1]))
+
+
+def test_new_loads_concentrate_where_the_errors_are_largest(unsolved, replay):
+    """A surrogate that is bad in one corner of the square sees ever more of it."""
+    corner, last = torch.ones(2, dtype=torch.float64), {}
+
+    def errors():
+        return torch.exp(-8 * (last["points"] - corner).norm(dim=1))
+
+    stream = OnlineSamples(unsolved, SEED, worst=Worst(2), near=0.5)
+    stream.scene.loads.young_at = lambda points: points[:, 0] + 10 * (points[:, 1] * 1e6).round()
+    told = replay(stream, errors=errors, batches=1, fresh=16, reuse=4, capacity=256, batch_size=16)
+    buffer = told._buffer
+
+    def share():
+        points = buffer._point[: min(buffer._count, 256)]
+        return float(((points - corner).norm(dim=1) < 0.3).double().mean())
+
+    original = buffer.choose
+
+    def choose(count, generator):
+        chosen = original(count, generator)
+        last["points"] = buffer._point[chosen]
+        return chosen
+
+    buffer.choose = choose
+    for _ in range(4):
+        next(iter(told))
+    early = share()
+    for _ in range(400):
+        next(iter(told))
+    assert early < 0.25, "of the square it is 0.07"
+    assert share() > 0.35
+
+
+def test_errors_are_those_of_the_batch_before(replay):
+    """The largest errors name their points, of those that have been seen alone."""
+
+    class Watched(Worst):
+        puts: list = []
+
+        def put(self, points):
+            self.puts.append(points)
+
+    source, last = Numbers(), {}
+    source.worst = Watched(1)
+
+    def errors():
+        return last["batch"].young + 1
+
+    stream = replay(source, errors=errors, batches=1, fresh=8, reuse=2, capacity=64)
+    seen = set()
+    for _ in range(30):
+        before = set(seen)
+        last["batch"] = batch = next(iter(stream))
+        if source.worst.puts:
+            named = (source.worst.puts[-1][:, 0] * 1e6).round().long().tolist()
+            assert named == sorted(named, reverse=True)
+            assert named[0] == max(before)
+            assert set(named) <= before
+        seen |= set(places(batch))
+    assert len(source.worst.puts) == 29
+
+
+def test_without_worst_no_error_is_asked_for(replay):
+    def forbidden():
+        raise AssertionError("asked")
+
+    assert sum(1 for _ in replay(errors=forbidden)) == 10
+
+
+class Watching(Numbers):
+    """A stream whose samples say how many bad points their worker knows."""
+
+    def drawn(self, place):
+        one = super().drawn(place)
+        told = torch.cat([self.worst.count.double(), self.worst.points[0]])
+        return one._replace(sample=one.sample._replace(force=told.expand(2, 3)))
+
+
+def test_spawned_workers_see_where_the_surrogate_is_worst_at_once(replay):
+    stream = Watching(pause=[0.01])
+    stream.worst = Worst(2)
+    told = replay(stream, workers=1, fresh=1, reuse=1, batch_size=1, batches=1, capacity=8)
+    assert next(iter(told)).force[0, 0].tolist() == [0.0, 0.0, 0.0]
+    stream.worst.put(torch.tensor([[0.25, 0.75]], dtype=torch.float64))
+    stream.worst.put = lambda points: None  # the replay's own: it has no errors to tell
+    for _ in range(4):  # those on their way do not know
+        last = next(iter(told)).force[0, 0].tolist()
+    assert last == [1.0, 0.25, 0.75]
+
+
+# ------------------------------------------------------------------ loads that hang
+
+
+@dataclass(frozen=True)
+class Hanging(Newton):
+    """Newton that never comes back on some loads."""
+
+    def iterate(self, load, **options):
+        if hangs(load.force[0]):
+            time.sleep(1000)
+        return super().iterate(load, **options)
+
+
+def hangs(force):
+    return hashlib.sha256(force.numpy().tobytes()).digest()[0] % 4 == 0
+
+
+@pytest.fixture(scope="module")
+def hanging(make_scene):
+    return make_scene(newton=Hanging)
+
+
+@pytest.fixture(scope="module")
+def good(scene):
+    """The places of the loads that do not hang."""
+    return [k for k, f in enumerate(scene.loads.sample(SEED, range(32)).force) if not hangs(f)]
+
+
+def test_a_load_that_hangs_is_timed_out_in_a_worker_and_left_out(
+    hanging, good, monkeypatch, tmp_path
+):
+    """In this process, that says it is a worker."""
+    monkeypatch.setattr(
+        "dpl.data.online.get_worker_info", lambda: SimpleNamespace(id=0, num_workers=1)
+    )
+    before = signal.getsignal(signal.SIGALRM)
+    kept = []
+    store = SimpleNamespace(reader=lambda split: lambda index: None, keep=kept.append)
+    assert good[:6] != list(range(6)), "one of the first hangs"
+    assert numbers(OnlineSamples(hanging, SEED, store=store, timeout=0.3), 6) == good[:6]
+    lost = [one for one in kept if not one.accepted]
+    assert lost
+    assert {one.reason for one in lost} == {"timed out after 0.3 s"}
+    assert signal.getsignal(signal.SIGALRM) is before
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+@pytest.mark.slow
+def test_a_load_that_hangs_is_timed_out_in_a_real_worker(hanging, good, replay):
+    options = {"workers": 1, "fresh": 2, "batch_size": 2, "reuse": 1, "batches": 4}
+    stream = replay(OnlineSamples(hanging, SEED, timeout=5.0), **options)
+    seen = set().union(*[keys(batch) for batch in stream])
+    forces = hanging.loads.sample(SEED, good[:8]).force
+    assert seen == {force.numpy().tobytes() for force in forces}
+
+
+# ------------------------------------------------------------------ workers that die
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_replaced_and_the_stream_goes_on(replay):
+    before = crew()
+    stream = replay(Numbers(pause=[0.05, 0.05]), workers=2, reuse=1, fresh=2, batches=2)
+    seen = [place for batch in stream for place in places(batch)]
+    started = crew() - before
+    for victim in sorted(started)[:1]:
+        os.kill(victim, signal.SIGKILL)
+    seen += [place for _ in range(4) for batch in stream for place in places(batch)]
+    assert len(seen) == len(set(seen)) == 5 * 16, "none twice, none missing in a batch"
+    assert len(crew() - before) == 2
+    assert not (crew() - before) & started
+
+
+@pytest.mark.slow
+def test_no_load_is_left_out_where_a_worker_was_killed(replay):
+    """What it was solving is drawn anew."""
+    before = crew()
+    stream = replay(Numbers(pause=[0.05, 0.05]), workers=2, reuse=1, fresh=2, batches=2)
+    seen = [place for batch in stream for place in places(batch)]
+    os.kill(min(crew() - before), signal.SIGKILL)
+    seen += [place for _ in range(4) for batch in stream for place in places(batch)]
+    assert sorted(seen)[:64] == list(range(64))
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_while_the_optimiser_works_is_replaced_too(replay):
+    """Training is not in the stream's hands then: nothing may come up in the middle of a step."""
+    before = crew()
+    stream = replay(Numbers(), workers=2, reuse=1, fresh=2, batches=2)
+    seen = [place for batch in stream for place in places(batch)]
+    os.kill(min(crew() - before), signal.SIGKILL)
+    end = time.monotonic() + 1
+    while time.monotonic() < end:  # a step
+        torch.randn(50, 50) @ torch.randn(50, 50)
+    seen += [place for batch in stream for place in places(batch)]
+    assert len(seen) == len(set(seen))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("deadly", [1, 5])
+def test_a_load_that_always_kills_its_worker_is_left_out_in_the_end(replay, deadly):
+    stream = replay(Numbers(deadly=deadly), workers=1, reuse=1, fresh=8, batches=4)
+    seen = [place for batch in stream for place in places(batch)]
+    assert len(seen) == len(set(seen)) == 32
+    assert deadly not in seen
+
+
+@pytest.mark.slow
+def test_workers_that_all_die_end_training_with_an_error(replay):
+    class_of_all = Deadly()
+    with pytest.raises(RuntimeError, match="worker"):
+        next(iter(replay(class_of_all, workers=1)))
+
+
+class Deadly(Numbers):
+    """No load of it can be solved."""
+
+    def drawn(self, place):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_replaced_worker_keeps_to_the_lane_of_its_training_process(replay):
+    """Lane 0 of 2 has the even loads, whatever happened."""
+    source = Numbers()
+    source.lanes = 2
+    stream = replay(source, reuse=1, fresh=3, batch_size=3, batches=2)
+    seen = [place for batch in stream for place in places(batch)]
+
+    def dead():
+        raise RuntimeError("DataLoader worker (pid 1) is killed by signal: Killed.")
+        yield
+
+    stream._stream = dead()
+    seen += [place for batch in stream for place in places(batch)]
+    assert [place % 2 for place in seen] == [0] * 12
+
+
+def test_an_error_in_a_stream_that_is_no_death_is_raised(replay):
+    class Faulty(Numbers):
+        def drawn(self, place):
+            raise RuntimeError("a fault of ours")
+
+    with pytest.raises(RuntimeError, match="a fault of ours"):
+        next(iter(replay(Faulty())))
+
+
+def test_a_closed_stream_can_be_closed_again(replay):
     stream = replay()
     next(iter(stream))
     stream.close()
     stream.close()
+
+
+# ------------------------------------------------------------------ nobody outlives the parent
+
+PARENT = textwrap.dedent(
+    """
+    import json, multiprocessing, sys, time
+    sys.path.insert(0, sys.argv[1])
+    from test_online import Busy
+    from dpl.data.online import Replay
+
+    if __name__ == "__main__":
+        stream = Replay(
+            Busy(), workers=2, batch_size=2, batches=9, fresh=2, reuse=1, capacity=64
+        )
+        batches = iter(stream)
+        next(batches), next(batches)
+        print(json.dumps([child.pid for child in multiprocessing.active_children()]), flush=True)
+        sys.stdin.readline()
+        print(len(next(batches).young), flush=True)
+        time.sleep(1000)
+    """
+)
+
+
+class Busy(Numbers):
+    """A stream that works, without a pause in which somebody could be asked, from load 8 on."""
+
+    def drawn(self, place):
+        end = time.monotonic() + (1000 if place >= 20 else 0)
+        while time.monotonic() < end:
+            torch.randn(300, 300) @ torch.randn(300, 300)
+        return super().drawn(place)
+
+
+def alive(pids):
+    found = []
+    for pid in pids:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            continue
+        if state != "Z":
+            found.append(pid)
+    return found
+
+
+@pytest.mark.slow
+def test_workers_ignore_ctrl_c_and_die_with_their_parent(environment, tmp_path):
+    (tmp_path / "parent.py").write_text(PARENT)
+    parent = subprocess.Popen(
+        [sys.executable, "parent.py", str(Path(__file__).parent)],
+        cwd=tmp_path,
+        env=environment(),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        line = parent.stdout.readline()
+        assert line, parent.stderr.read()
+        workers = json.loads(line)
+        assert len(workers) == 2
+        for pid in workers:
+            os.kill(pid, signal.SIGINT)
+        time.sleep(0.5)
+        assert alive(workers) == workers
+        parent.stdin.write("\n")
+        parent.stdin.flush()
+        assert parent.stdout.readline() == "2\n", "the stream goes on"
+        parent.kill()
+        parent.wait()
+        end = time.monotonic() + 2
+        while alive(workers) and time.monotonic() < end:
+            time.sleep(0.05)
+        assert not alive(workers)
+    finally:
+        parent.kill()
+        parent.communicate()

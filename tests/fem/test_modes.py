@@ -1,5 +1,8 @@
 """Laws of the modes and of the loads made of them: reproducible, bounded, where they may act."""
 
+import multiprocessing
+import pickle
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -11,9 +14,10 @@ from dpl.fem import modes as modes_module
 from dpl.fem.linear import full_matrix
 from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import box, rectangle
-from dpl.fem.modes import ModalLoads, eigenmodes, normal, uniform
+from dpl.fem.modes import ModalLoads, eigenmodes
 from dpl.fem.newton import Linear, Newton
 from dpl.fem.problem import Problem
+from dpl.fem.sampling import SAMPLINGS, even, logarithmic, normal, one, tail
 from dpl.fem.solution import Load, solve
 
 YOUNG, LENGTH = 4500.0, 100.0
@@ -32,6 +36,12 @@ def linear(beam):
 @pytest.fixture(scope="module")
 def loads(linear):
     return ModalLoads(linear, n_modes=5)
+
+
+@pytest.fixture(params=SAMPLINGS)
+def sampling(request):
+    """Each way to fill the unit cube."""
+    return request.param
 
 
 def stiffness(problem):
@@ -160,19 +170,108 @@ def test_largest_modal_loads_have_equal_energy(linear, loads):
     )
 
 
-def test_a_load_is_a_function_of_its_seed_and_index(linear, loads):
-    whole = loads.sample((3, 0), range(6)).force
-    assert torch.equal(loads.sample((3, 0), [4, 1]).force, whole[[4, 1]])
-    assert torch.equal(loads.sample((3, 0), [5]).force[0], whole[5])
-    fresh = ModalLoads(Linear(linear.problem, linear="superlu"), n_modes=5)
-    assert torch.equal(fresh.sample((3, 0), range(6)).force, whole)
+def test_a_load_is_a_function_of_its_seed_and_index(linear, sampling):
+    loads = ModalLoads(linear, n_modes=5, sampling=sampling, young=[1.0, 2.0])
+    whole = loads.sample((3, 0), range(6))
+    mixed = loads.sample((3, 0), [4, 1, 4])
+    assert torch.equal(mixed.force, whole.force[[4, 1, 4]])
+    assert torch.equal(mixed.young, whole.young[[4, 1, 4]])
+    loads.sample((3, 1), range(9))
+    assert torch.equal(loads.sample((3, 0), [5]).force[0], whole.force[5])
+    fresh = Linear(linear.problem, linear="superlu")
+    again = ModalLoads(fresh, n_modes=5, sampling=sampling, young=[1.0, 2.0])
+    assert torch.equal(again.sample((3, 0), range(6)).force, whole.force)
 
 
-def test_streams_and_indices_give_different_loads(loads):
+def test_a_load_is_the_same_in_every_process(linear, sampling):
+    """And its modes travel along: workers do not find them again."""
+    loads = ModalLoads(linear, n_modes=3, sampling=sampling, radius=partial(logarithmic, low=0.1))
+    copy = pickle.loads(pickle.dumps(loads))
+    assert "modes" in copy.__dict__
+    assert "factor" not in copy.linear.__dict__
+    expected = loads.sample((3, 0), range(6))
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        theirs = pool.submit(copy.sample, (3, 0), list(range(6))).result()
+    for here in (theirs, copy.sample((3, 0), range(6))):
+        assert torch.equal(here.force, expected.force)
+        assert torch.equal(here.young, expected.young)
+    assert "factor" not in copy.linear.__dict__
+
+
+def test_streams_and_indices_give_different_loads(linear, sampling):
+    loads = ModalLoads(linear, n_modes=5, sampling=sampling)
     drawn = torch.cat([loads.sample(seed, range(5)).force for seed in ((0, 0), (0, 1), (1, 0))])
     distance = torch.cdist(drawn.flatten(1), drawn.flatten(1))
     distance.fill_diagonal_(1.0)
     assert distance.min() > 1e-9
+
+
+def test_samplings_are_different_streams(linear):
+    one_, other = (ModalLoads(linear, sampling=name).sample(0, [3]) for name in SAMPLINGS)
+    assert not torch.equal(one_.force, other.force)
+
+
+def test_samples_are_the_loads_of_points(linear, sampling):
+    loads = ModalLoads(linear, n_modes=3, sampling=sampling, young=[1.0, 2.0])
+    points = loads.points((3, 0), [2, 5])
+    assert points.shape == (2, loads.dimension)
+    assert points.dtype == torch.float64
+    assert loads.dimension == len(loads.modes.values) + 4
+    direct = SAMPLINGS[sampling]((3, 0), 5, loads.dimension)
+    assert np.array_equal(points[1].numpy(), direct)
+    at, sample = loads.at(points), loads.sample((3, 0), [2, 5])
+    assert torch.equal(at.force, sample.force)
+    assert torch.equal(at.young, sample.young)
+    assert torch.equal(at.young, loads.young_at(points))
+
+
+def point_of(loads, *q, centre=0.0, radius=0.0, amplitude=0.0, young=0.0):
+    """Return a point of the unit cube (1, d); the modal loads left out are 0."""
+    q = [*q, *[0.5] * (loads.dimension - 4 - len(q))]
+    return torch.tensor([[*q, centre, radius, amplitude, young]], dtype=torch.float64)
+
+
+def test_coordinates_of_a_point_are_the_modal_loads_in_their_order(linear):
+    loads = ModalLoads(linear, n_modes=5, patch=(2.0, 2.0))
+    for k in range(5):
+        for t, share in ((0.0, -1.0), (0.5, 0.0), (0.75, 0.5)):
+            force = loads.at(point_of(loads, *[0.5] * k, t)).force[0]
+            expected = share * loads.q_max[k] * loads.modes.vectors[..., k]
+            expected = torch.where(loads.reach, expected, 0.0)
+            assert torch.allclose(force, expected, rtol=1e-14, atol=0)
+
+
+def test_coordinates_besides_are_centre_radius_amplitude_and_modulus(linear):
+    """Each of them changes what it is for, and nothing else."""
+    loads = ModalLoads(
+        linear, n_modes=2, patch=(0.1, 1.0), amplitude=even, young=[1.0, 3.0], distribution=one
+    )
+    middle = {"centre": 0.5, "radius": 0.3, "amplitude": 0.5, "young": 0.5}
+    usual = loads.at(point_of(loads, **middle))
+    loaded = usual.force[0].any(dim=1)
+
+    def changed(**options):
+        return loads.at(point_of(loads, **{**middle, **options}))
+
+    assert changed(young=0.75).young.item() == 2.5
+    assert torch.equal(changed(young=0.75).force, usual.force)
+    half = changed(amplitude=0.25)
+    assert torch.allclose(half.force, usual.force / 2, rtol=1e-14, atol=0)
+    larger = changed(radius=0.9).force[0]
+    assert int(larger.any(dim=1).sum()) > int(loaded.sum())
+    assert torch.equal(larger[loaded], usual.force[0][loaded])
+    moved = changed(centre=0.05).force[0].any(dim=1)
+    assert not torch.equal(moved, loaded)
+
+
+def test_every_point_of_the_closed_cube_below_one_has_a_load(linear):
+    last = 1 - 2.0**-53
+    loads = ModalLoads(linear, n_modes=2, young=[1.0, 3.0], distribution=normal, radius=logarithmic)
+    for value in (0.0, last):
+        load = loads.at(torch.full((1, loads.dimension), value, dtype=torch.float64))
+        assert load.force.isfinite().all()
+        assert load.force.any()
+        assert 1.0 <= load.young.item() <= 3.0
 
 
 def test_forces_act_on_free_boundary_nodes_within_the_patch_only(loads):
@@ -209,8 +308,8 @@ def test_a_patch_over_the_whole_body_keeps_the_modal_force(linear):
     assert (np.abs(q) <= loads.q_max.numpy() * (1 + 1e-9)).all()
 
 
-def test_modal_loads_are_uniform_up_to_their_largest(linear):
-    loads = ModalLoads(linear, n_modes=2, patch=(2.0, 2.0))
+def test_modal_loads_are_uniform_up_to_their_largest(linear, sampling):
+    loads = ModalLoads(linear, n_modes=2, patch=(2.0, 2.0), sampling=sampling)
     reach = loads.reach
     basis = np.linalg.pinv(loads.modes.vectors[reach].numpy())
     drawn = loads.sample((0, 0), range(400)).force[:, reach].numpy() @ basis.T
@@ -227,28 +326,16 @@ def test_radii_and_centres_vary(loads):
 
 
 def test_other_distributions_can_be_plugged_in(linear):
-    def largest(rng, count):
-        return np.ones(count)
-
-    loads = ModalLoads(linear, n_modes=3, patch=(2.0, 2.0), distribution=largest)
+    loads = ModalLoads(linear, n_modes=3, patch=(2.0, 2.0), distribution=one)
     force = loads.sample((0, 0), [0]).force[0]
     expected = torch.where(loads.reach, loads.modes.vectors @ loads.q_max, 0.0)
     assert torch.allclose(force, expected, rtol=1e-12, atol=0)
 
-    def scaled(rng, count, *, factor):
-        return factor * np.ones(count)
+    def scaled(t, *, factor):
+        return factor * np.ones_like(t)
 
     half = ModalLoads(linear, n_modes=3, patch=(2.0, 2.0), distribution=partial(scaled, factor=0.5))
     assert torch.allclose(half.sample((0, 0), [0]).force[0], expected / 2, rtol=1e-12, atol=0)
-
-
-@pytest.mark.parametrize("distribution", [uniform, normal])
-def test_distributions_stay_within_one(distribution):
-    drawn = distribution(np.random.default_rng(0), 10_000)
-    assert drawn.shape == (10_000,)
-    assert np.abs(drawn).max() <= 1
-    assert drawn.mean() == pytest.approx(0.0, abs=0.02)
-    assert drawn.std() == pytest.approx({uniform: 3**-0.5, normal: 1 / 3}[distribution], abs=0.01)
 
 
 def test_a_range_of_moduli_is_drawn_from_and_changes_no_force(linear, loads):
@@ -262,6 +349,29 @@ def test_a_range_of_moduli_is_drawn_from_and_changes_no_force(linear, loads):
     assert torch.equal(drawn.force[:5], loads.sample((0, 0), range(5)).force)
 
 
+@pytest.mark.parametrize("young", [[1e9, 2e11], [0.1, 0.3], [1e-3, 1e12], [5.0, 5.0]])
+def test_moduli_stay_in_their_range(linear, young):
+    loads = ModalLoads(linear, n_modes=2, young=young)
+    ends = torch.tensor([[0.0] * loads.dimension, [1 - 2.0**-53] * loads.dimension])
+    drawn = loads.young_at(torch.cat([ends.double(), loads.points(0, range(200))]))
+    assert drawn.min() == young[0]
+    assert drawn.max() <= young[1]
+    assert drawn.max() == pytest.approx(young[1], rel=1e-12)
+
+
+def test_positions_of_loads_know_nothing_of_their_moduli(linear, sampling):
+    """So that a data set serves every range of moduli."""
+    kinds = [4500.0, [1e9, 2e11], [1.0, 1.0]]
+    points = [ModalLoads(linear, young=y, sampling=sampling).points(0, range(5)) for y in kinds]
+    assert torch.equal(points[0], points[1])
+    assert torch.equal(points[0], points[2])
+    moved = points[0].clone()
+    moved[:, -1] = 0.123
+    loads = ModalLoads(linear, young=kinds[1], sampling=sampling)
+    assert torch.equal(loads.at(moved).force, loads.at(points[0]).force)
+    assert not torch.equal(loads.at(moved).young, loads.at(points[0]).young)
+
+
 def test_one_modulus_is_that_of_every_load(linear):
     loads = ModalLoads(linear, n_modes=2, young=4500.0)
     assert (loads.sample((0, 0), range(5)).young == 4500.0).all()
@@ -271,6 +381,93 @@ def test_the_amplitude_is_a_factor_on_the_forces(loads):
     one, twice = (loads.sample((0, 0), range(4), amplitude=a) for a in (1.0, 2.0))
     assert torch.equal(twice.force, 2 * one.force)
     assert torch.equal(twice.young, one.young)
+
+
+def test_spectrum_says_how_large_stiffer_modes_become(linear):
+    """1/2: equal energies; 1: equal displacements; 0: equal forces."""
+
+    def work(loads):
+        vectors = loads.modes.vectors
+        forces = [q * vectors[..., k] for k, q in enumerate(loads.q_max)]
+        answers = [linear.respond(force) for force in forces]
+        pairs = list(zip(forces, answers, strict=True))
+        return [
+            [float((f * u).sum()) for f, u in pairs],
+            [float(u.norm()) for _, u in pairs],
+            [float(f.norm()) for f, _ in pairs],
+        ]
+
+    for equal, spectrum in enumerate((0.5, 1.0, 0.0)):
+        loads = ModalLoads(linear, n_modes=5, spectrum=spectrum)
+        found = work(loads)
+        for kind, values in enumerate(found):
+            spread = max(values) / min(values) - 1
+            assert (spread < 1e-8) == (kind == equal)
+        reached = linear.respond(loads.q_max[0] * loads.modes.vectors[..., 0])
+        assert float(reached.norm(dim=1).max()) == pytest.approx(0.4, rel=1e-8)
+
+
+def test_radius_makes_areas_small_down_to_one_node(linear):
+    """Half of the logarithmic radii from .01 L to L are below .1 L, which here is one node."""
+    points = linear.problem.points
+    places = points[linear.problem.boundary & linear.problem.free.any(dim=1)]
+    counts = {}
+    for name, radius in {"even": even, "log": logarithmic}.items():
+        loads = ModalLoads(linear, n_modes=2, radius=radius, sampling="sobol")
+        sizes = loads.sample(0, range(128)).force.any(dim=2).sum(dim=1)
+        assert sizes.min() == 1
+        counts[name] = int((sizes == 1).sum())
+    assert counts["even"] < 25
+    assert 55 < counts["log"] < 80
+    loads = ModalLoads(linear, n_modes=2, patch=(0.0, 2.0), radius=logarithmic, distribution=one)
+    for t in (0.0, 0.3, 0.6, 0.9):
+        force = loads.at(point_of(loads, centre=0.7, radius=t)).force[0]
+        middle = places[int(0.7 * len(places))]
+        reach = (points - middle).norm(dim=1) <= 2 * 1e-2 ** (1 - t)
+        inside = reach[:, None] & loads.reach
+        assert torch.equal(force != 0, inside & (loads.modes.vectors @ loads.q_max != 0))
+
+
+def test_amplitude_is_one_factor_on_a_whole_load(linear):
+    plain, scaled = (ModalLoads(linear, n_modes=3, amplitude=a) for a in (one, tail))
+    points = plain.points((0, 0), range(64))
+    factors = torch.from_numpy(tail(points[:, -2].numpy()))
+    expected = factors[:, None, None] * plain.at(points).force
+    assert torch.allclose(scaled.at(points).force, expected, rtol=1e-14, atol=0)
+    assert 5 < int((factors < 1).sum()) < 30
+
+
+def test_tail_of_the_amplitude_makes_small_loads(linear):
+    """A quarter of the loads is smaller than the others ever are, down to a thousandth."""
+    loads = ModalLoads(
+        linear, n_modes=2, patch=(2.0, 2.0), distribution=one, amplitude=tail, sampling="sobol"
+    )
+    largest = torch.where(loads.reach, loads.modes.vectors @ loads.q_max, 0.0).norm()
+    share = loads.sample(0, range(256)).force.flatten(1).norm(dim=1) / largest
+    assert int((share < 1 - 1e-9).sum()) == pytest.approx(64, abs=2)
+    assert int((share < 10**-1.5).sum()) == pytest.approx(32, abs=2)
+    assert 1e-3 <= float(share.min()) < 2e-3
+
+
+def test_what_always_acts_has_no_amplitude(linear):
+    weight = torch.full((linear.problem.shape), -1e-3, dtype=torch.float64)
+    none = ModalLoads(linear, n_modes=2, amplitude=tail)
+    loads = ModalLoads(linear, n_modes=2, amplitude=tail, always=weight)
+    with_, without = (kind.sample(0, range(20)).force for kind in (loads, none))
+    assert torch.allclose(with_ - weight, without, rtol=0, atol=1e-16)
+    nothing = ModalLoads(linear, n_modes=2, amplitude=np.zeros_like, always=weight)
+    assert torch.equal(nothing.sample(0, [3]).force[0], weight)
+
+
+def test_sobol_loads_cover_what_few_independent_ones_leave_out(linear):
+    """32 centres of a sequence are spread over the nodes; 32 of any others are not."""
+    spread = {}
+    for name in SAMPLINGS:
+        loads = ModalLoads(linear, patch=(0.0, 0.0), distribution=one, sampling=name)
+        forces = loads.sample(1, range(32)).force.any(dim=2)
+        spread[name] = len({int(row.nonzero()) for row in forces})
+    assert spread["sobol"] == 32
+    assert spread["independent"] < 29
 
 
 def test_plane_bodies_have_modal_loads_too():
@@ -299,6 +496,19 @@ def test_plane_bodies_have_modal_loads_too():
         ({"young": float("inf")}, "young = inf"),
         ({"young": float("nan")}, "young = nan"),
         ({"young": [2.0, 1.0]}, "young = "),
+        ({"spectrum": -1.1}, r"spectrum = -1\.1"),
+        ({"spectrum": 2.1}, r"spectrum = 2\.1"),
+        ({"spectrum": float("nan")}, "spectrum = nan"),
+        ({"sampling": "halton"}, "sampling = 'halton' must be independent or sobol"),
+        ({"sampling": None}, "sampling = None"),
+        ({"distribution": lambda t: 2 * t}, r"distribution draws numbers outside \[-1, 1\]"),
+        ({"distribution": lambda t: np.nan * t}, "distribution draws"),
+        ({"radius": normal}, r"radius draws numbers outside \[0, 1\]"),
+        ({"radius": lambda t: 1 + t}, "radius draws"),
+        ({"amplitude": normal}, r"amplitude draws numbers outside \[0, 1\]"),
+        ({"amplitude": lambda t: 1 + t}, "amplitude draws"),
+        ({"amplitude": partial(tail, part=1.5)}, r"part = 1\.5"),
+        ({"radius": partial(logarithmic, low=0.0)}, r"low = 0\.0"),
     ],
 )
 def test_options_out_of_range_are_refused_by_name(linear, options, named):

@@ -1,0 +1,203 @@
+"""Laws of `dpl.data.durable`: files are whole or not there, and a folder has one writer."""
+
+import errno
+import fcntl
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import contextmanager
+
+import pytest
+
+from dpl.data import durable
+from dpl.data.durable import DataSetError, append_line, read_lines, sole_writer, whole_file
+
+WRITER = """
+import sys, time
+from pathlib import Path
+from dpl.data.durable import sole_writer
+with sole_writer(Path(sys.argv[1])):
+    print("writing", flush=True)
+    time.sleep(600)
+"""
+
+
+@contextmanager
+def largest_file(size):
+    """Let no file of this process grow beyond so many bytes, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+# ------------------------------------------------------------------ whole files
+
+
+@pytest.mark.parametrize("sync", [True, False])
+def test_a_file_is_written_whole_or_not_at_all(tmp_path, sync):
+    path = tmp_path / "file"
+    path.write_bytes(b"old")
+
+    def write_and_fail():
+        with whole_file(path, sync=sync) as file:
+            file.write(b"new")
+            file.flush()
+            assert path.read_bytes() == b"old"
+            raise OSError("no space left")
+
+    with pytest.raises(OSError, match="no space"):
+        write_and_fail()
+    assert path.read_bytes() == b"old"
+    assert names(tmp_path) == ["file"]
+    with whole_file(path, sync=sync) as file:
+        file.write(b"new")
+    assert path.read_bytes() == b"new"
+    assert names(tmp_path) == ["file"]
+
+
+def test_a_file_for_which_there_is_no_space_leaves_nothing(tmp_path):
+    with largest_file(1000), pytest.raises(OSError, match="too large") as full:
+        with whole_file(tmp_path / "file") as file:
+            file.write(bytes(5000))
+    assert full.value.errno == errno.EFBIG
+    assert names(tmp_path) == []
+
+
+# ------------------------------------------------------------------ lines
+
+
+def test_lines_come_back_in_the_order_in_which_they_were_added(tmp_path):
+    path = tmp_path / "lines"
+    assert read_lines(path) == []
+    for k in range(3):
+        append_line(path, {"k": k})
+    assert path.read_bytes() == b'{"k": 0}\n{"k": 1}\n{"k": 2}\n'
+    assert read_lines(path) == [{"k": 0}, {"k": 1}, {"k": 2}]
+
+
+@pytest.mark.parametrize("torn", [b'{"k": 1, "l', b'{"k"', b"{", b'{"name": "\xc3', b"\x00\x00"])
+def test_a_torn_line_is_left_out_and_does_not_spoil_the_next(tmp_path, torn):
+    path = tmp_path / "lines"
+    append_line(path, {"k": 0})
+    with path.open("ab") as file:
+        file.write(torn)
+    assert read_lines(path) == [{"k": 0}]
+    append_line(path, {"k": 2})
+    append_line(path, {"k": 3})
+    assert read_lines(path) == [{"k": 0}, {"k": 2}, {"k": 3}]
+
+
+def test_a_line_torn_to_something_shorter_that_is_json_too_is_left_out(tmp_path):
+    path = tmp_path / "lines"
+    path.write_bytes(b'{"k": 0}\n1\n[]\nnull\n"text"\n')
+    assert read_lines(path) == [{"k": 0}]
+
+
+def test_a_line_for_which_there_is_no_space_is_taken_back_whole(tmp_path):
+    path = tmp_path / "lines"
+    append_line(path, {"k": 0})
+    before = path.read_bytes()
+    with largest_file(len(before) + 20), pytest.raises(OSError, match="too large"):
+        append_line(path, {"text": 100 * "x"})
+    assert path.read_bytes() == before
+    append_line(path, {"k": 1})
+    assert path.read_bytes() == before + b'{"k": 1}\n'
+
+
+# ------------------------------------------------------------------ one writer
+
+
+def held(folder, *part):
+    """Return whether somebody else may not write such a part now."""
+    try:
+        with sole_writer(folder, *part):
+            return False
+    except DataSetError:
+        return True
+
+
+def test_a_second_writer_is_refused_naming_process_and_machine(tmp_path):
+    with sole_writer(tmp_path), pytest.raises(DataSetError) as refusal, sole_writer(tmp_path):
+        pass
+    told = str(refusal.value)
+    assert f"process {os.getpid()} on {socket.gethostname()}" in told
+    assert str(tmp_path) in told
+    assert "\n" not in told
+
+
+def test_a_folder_is_free_again_after_its_writer_however_it_ended(tmp_path):
+    with sole_writer(tmp_path):
+        assert held(tmp_path)
+    assert not held(tmp_path)
+    with pytest.raises(RuntimeError), sole_writer(tmp_path):
+        raise RuntimeError
+    assert not held(tmp_path)
+    assert not list(tmp_path.glob(".writer-*"))
+
+
+def test_a_refusal_does_not_free_the_folder(tmp_path):
+    with sole_writer(tmp_path):
+        assert held(tmp_path)
+        assert held(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("mine", "other", "refused"),
+    [
+        ((0, 2), (1, 2), False),
+        ((0, 2), (0, 2), True),
+        ((1, 4), (3, 4), False),
+        ((0, 1), (1, 2), True),
+        ((1, 2), (0, 1), True),
+        ((0, 2), (1, 3), True),
+    ],
+)
+def test_parts_have_a_writer_each_if_they_are_parts_of_the_same_division(
+    tmp_path, mine, other, refused
+):
+    with sole_writer(tmp_path, *mine):
+        assert held(tmp_path, *other) == refused
+    assert not held(tmp_path, *other)
+
+
+def test_a_killed_writer_does_not_count(tmp_path, environment):
+    writer = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE, env=environment()
+    )
+    try:
+        assert writer.stdout.readline() == b"writing\n"
+        with pytest.raises(DataSetError, match=f"process {writer.pid} on "), sole_writer(tmp_path):
+            pass
+    finally:
+        writer.send_signal(signal.SIGKILL)
+        writer.communicate()
+    assert list(tmp_path.glob(".writer-*")), "a killed process removes nothing"
+    assert not held(tmp_path)
+    assert not held(tmp_path, 1, 2)
+
+
+def test_a_writer_that_ends_while_it_is_asked_for_its_name_is_no_crash(tmp_path, monkeypatch):
+    path = tmp_path / ".writer-0-1"
+    real = fcntl.flock
+
+    def flock(file, how):
+        try:
+            real(file, how)
+        except BlockingIOError:
+            path.unlink()  # which its holder does first, then it lets go
+            raise
+
+    with path.open("w") as holder:
+        real(holder, fcntl.LOCK_EX)
+        monkeypatch.setattr(durable.fcntl, "flock", flock)
+        assert held(tmp_path) in (True, False)

@@ -1,0 +1,153 @@
+"""Laws of `dpl.data.outcome`: a load solved is a function of scene, stream and number."""
+
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from dpl.data.outcome import Job, lost, outcome
+from dpl.fem.materials import SaintVenantKirchhoff
+
+SEED = (5, 0)
+CLOCK = "seconds"
+
+
+def content(one):
+    """Return all of an outcome that may not depend on a clock, as comparable values."""
+    fields = {name: value for name, value in one._asdict().items() if name != CLOCK}
+    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in fields.items()}
+
+
+@pytest.fixture(scope="module")
+def jobs():
+    return [Job(SEED, index) for index in range(8)]
+
+
+@pytest.fixture(scope="module")
+def hard(make_scene):
+    """Loads of ten times L on a law that does not bear them all."""
+    return make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch=(2.0, 2.0))
+
+
+def test_an_outcome_does_not_depend_on_what_was_solved_before(scene, jobs):
+    forwards = [content(outcome(scene, job)) for job in jobs]
+    backwards = [content(outcome(scene, job)) for job in jobs[::-1]]
+    assert backwards[::-1] == forwards
+
+
+def test_an_outcome_does_not_depend_on_the_scene_object_its_size_and_stiffness(
+    scene, make_scene, jobs
+):
+    twin = make_scene(size=(1.0, 0.25, 0.25), young=2e11)
+    assert content(outcome(make_scene(), jobs[3])) == content(outcome(scene, jobs[3]))
+    assert content(outcome(twin, jobs[3]))["force"] == content(outcome(scene, jobs[3]))["force"]
+
+
+def test_streams_and_numbers_name_different_loads(scene):
+    forces = {
+        outcome(scene, Job((seed, stream), number)).force.tobytes()
+        for seed in (0, 1)
+        for stream in (0, 1)
+        for number in (0, 1)
+    }
+    assert len(forces) == 8
+
+
+def test_an_outcome_is_judged_at_the_state_that_it_holds(scene, jobs):
+    for job in jobs:
+        one = outcome(scene, job)
+        force, displacement = torch.from_numpy(one.force), torch.from_numpy(one.displacement)
+        ratio = scene.problem.residual_ratio(displacement[None], force[None])
+        assert one.job == job
+        assert one.accepted
+        assert float(ratio) == pytest.approx(one.residual, rel=1e-6, abs=1e-14)
+        assert one.residual < scene.solver.tol
+        assert one.volume_ratio > 0
+        assert one.load_factor == 1
+        assert one.iterations > 0
+        assert one.seconds > 0
+        assert one.reason == ""
+
+
+def test_an_outcome_holds_the_load_of_its_point_and_its_size(scene, jobs):
+    one = outcome(scene, jobs[2])
+    load = scene.loads.sample(SEED, [2])
+    assert torch.equal(torch.from_numpy(one.force), load.force[0])
+    assert torch.equal(torch.from_numpy(one.point), scene.loads.points(SEED, [2])[0])
+    assert one.amplitude == pytest.approx(float(load.force.norm()) / scene.loads.largest_force)
+    assert 0 < one.amplitude <= 1
+
+
+def test_a_point_that_is_given_takes_the_place_of_the_streams_own(scene, jobs):
+    point = scene.loads.points(SEED, [7])[0]
+    given, drawn = outcome(scene, jobs[0], point=point), outcome(scene, jobs[7])
+    assert given.job == jobs[0]
+    assert content(given) | {"job": jobs[7]} == content(drawn)
+
+
+def test_a_load_without_an_answer_is_rejected_with_the_part_that_has_one(hard):
+    found = [outcome(hard, Job(SEED, index)) for index in range(6)]
+    rejected = [one for one in found if not one.accepted]
+    assert rejected, "SVK bears six loads of ten times L: choose harder ones"
+    for one in rejected:
+        assert one.reason
+        assert 0 <= one.load_factor < 1
+        displacement = torch.from_numpy(one.displacement)[None]
+        part = one.load_factor * torch.from_numpy(one.force)[None]
+        if one.load_factor:
+            assert hard.problem.residual_ratio(displacement, part) < hard.solver.loose
+            assert hard.problem.volume_ratio(displacement) > 0
+
+
+def test_a_load_that_the_machine_lost_is_the_load_without_an_answer(scene, jobs):
+    one, solved = lost(scene, jobs[1], "the lights went out", seconds=3.0), outcome(scene, jobs[1])
+    assert one.job == jobs[1]
+    assert one.reason == "the lights went out"
+    assert one.seconds == 3.0
+    assert not one.accepted
+    assert one.load_factor == 0
+    assert not one.displacement.any()
+    assert one.displacement.shape == solved.displacement.shape
+    for name in ("force", "point", "amplitude"):
+        assert np.array_equal(getattr(one, name), getattr(solved, name))
+
+
+def test_outcomes_cross_between_processes_without_tensors(scene, jobs):
+    for one in (outcome(scene, jobs[0]), lost(scene, jobs[0], "gone")):
+        for value in one:
+            assert isinstance(value, Job | np.ndarray | float | int | str)
+        assert content(pickle.loads(pickle.dumps(one))) == content(one)
+
+
+def test_a_change_of_the_number_of_threads_between_loads_is_survived(tmp_path, environment):
+    """PARDISO reads past its plan where threads are limited between analysis and factorisation."""
+    pytest.importorskip("pypardiso")
+    code = """
+import torch
+from threadpoolctl import threadpool_limits
+from dpl.data.outcome import Job, outcome
+from dpl.fem.materials import NeoHookeanLn
+from dpl.fem.mesh import Plane, box
+from dpl.fem.modes import ModalLoads
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.scene import Scene
+
+torch.set_num_threads(2)
+mesh = box([4.0, 1.0, 1.0], [17, 5, 5])
+newton = Newton(Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min")), linear="pardiso")
+scene = Scene(newton.problem, ModalLoads(newton.rest, n_modes=3, deflection=0.01), newton)
+outcome(scene, Job((0, 0), 0))
+with threadpool_limits(1):
+    assert outcome(scene, Job((0, 0), 1)).accepted
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=environment(threads=2),
+        capture_output=True,
+    )
+    assert ended.returncode == 0, ended.stderr.decode()[-500:] or f"signal {-ended.returncode}"

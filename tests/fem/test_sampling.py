@@ -1,0 +1,249 @@
+"""Laws of random numbers: functions of their place, and distributed as they claim."""
+
+import warnings
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.stats import qmc
+
+from dpl.fem import sampling
+from dpl.fem.sampling import (
+    SAMPLINGS,
+    even,
+    independent,
+    logarithmic,
+    normal,
+    one,
+    sobol,
+    tail,
+    uniform,
+)
+
+GRID = (np.arange(10_000) + 0.5) / 10_000  # of the unit interval
+LAST = 1 - 2.0**-53  # the largest number below 1
+
+
+@pytest.fixture(params=SAMPLINGS)
+def drawn(request):
+    """Each way to fill the unit cube: seed, index, count -> (count,)."""
+    return SAMPLINGS[request.param]
+
+
+def stream(draw, seed, size, count=3):
+    """Return the first points of a stream, (size, count)."""
+    return np.stack([draw(seed, index, count) for index in range(size)])
+
+
+# ---- distributions
+
+
+def mixed(x, part=0.25, low=1e-3):
+    """Return the part of the draws of `tail` that lie below x < 1."""
+    return part * stats.loguniform(low, 1).cdf(x)
+
+
+LAWS = {  # quantiles, cumulative distribution, smallest, largest
+    "uniform": (uniform, stats.uniform(-1, 2).cdf, -1, 1),
+    "normal": (normal, stats.norm(0, 1 / 3).cdf, -1, 1),
+    "even": (even, stats.uniform(0, 1).cdf, 0, 1),
+    "logarithmic": (logarithmic, stats.loguniform(1e-2, 1).cdf, 1e-2, 1),
+    "four decades": (partial(logarithmic, low=1e-4), stats.loguniform(1e-4, 1).cdf, 1e-4, 1),
+    "tail": (tail, mixed, 1e-3, 1),
+    "long tail": (partial(tail, part=0.6, low=1e-5), partial(mixed, part=0.6, low=1e-5), 1e-5, 1),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_quantiles_invert_the_distribution_that_is_claimed(name):
+    quantile, cumulative, low, high = LAWS[name]
+    values = quantile(GRID)
+    inside = (values > low) & (values < high)  # elsewhere many draws share one value
+    assert inside.sum() > 0.2 * len(GRID)
+    assert cumulative(values[inside]) == pytest.approx(GRID[inside], abs=1e-12)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_draws_have_the_distribution_that_is_claimed(drawn, name):
+    """Kolmogorov, Smirnov: of 512 draws, less than 1 in 1000 by chance; normal: clipped at 3."""
+    quantile, cumulative, _, high = LAWS[name]
+    values = quantile(stream(drawn, 4, 512))[:, 1]
+    below = values[values < high]
+    share = len(below) / len(values)
+    expected = float(cumulative(np.nextafter(high, 0)))
+    assert share == pytest.approx(expected, abs=3.3 * (expected * (1 - expected) / 512) ** 0.5 + 1e-2)
+    assert stats.kstest(below, lambda x: cumulative(x) / expected).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_quantiles_rise_and_stay_in_range(name):
+    quantile, _, low, high = LAWS[name]
+    values = quantile(np.array([0.0, 1e-300, *GRID, LAST]))
+    assert (np.diff(values) >= 0).all()
+    assert values[0] == low
+    assert values[-1] == pytest.approx(high, rel=1e-15)
+    assert values[-1] <= high
+
+
+@pytest.mark.parametrize(
+    ("name", "mean", "deviation"),
+    [
+        ("uniform", 0, 3**-0.5),
+        ("normal", 0, 1 / 3),
+        ("even", 0.5, 12**-0.5),
+        ("logarithmic", 0.99 / np.log(100), (0.9999 / 2 / np.log(100) - 0.0462169) ** 0.5),
+        ("tail", 0.75 + 0.25 * 0.999 / np.log(1000), None),
+    ],
+)
+def test_draws_have_the_moments_that_are_claimed(name, mean, deviation):
+    values = LAWS[name][0](GRID)
+    assert values.mean() == pytest.approx(mean, abs=2e-4)
+    if deviation is not None:
+        assert values.std() == pytest.approx(deviation, rel=5e-3)
+
+
+@pytest.mark.parametrize("low", [1e-2, 1e-4, 1e-6])
+def test_every_decade_holds_as_many_logarithmic_numbers(low):
+    decades = round(-np.log10(low))
+    counts, _ = np.histogram(np.log10(logarithmic(GRID, low)), decades, (-decades, 0))
+    assert counts.tolist() == pytest.approx([len(GRID) / decades] * decades, abs=2)
+
+
+@pytest.mark.parametrize("part", [0.1, 0.25, 0.9])
+def test_tail_makes_that_part_of_the_draws_small(part):
+    values = tail(GRID, part, 1e-3)
+    assert (values < 1).mean() == pytest.approx(part, abs=2e-4)
+    assert (values < 1e-3 * 1e3**0.5).mean() == pytest.approx(part / 2, abs=2e-4)
+
+
+def test_one_is_one():
+    assert np.array_equal(one(GRID), np.ones(len(GRID)))
+
+
+@pytest.mark.parametrize("name", [*LAWS, "one"])
+@pytest.mark.parametrize("shape", [(), (1,), (0,), (3, 4)])
+def test_quantiles_keep_the_shape(name, shape):
+    quantile = LAWS[name][0] if name in LAWS else one
+    t = np.full(shape, 0.3)
+    assert np.shape(quantile(t)) == shape
+    assert np.array_equal(t, np.full(shape, 0.3))
+
+
+def test_a_small_part_with_a_long_tail_is_no_overflow():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert (tail(GRID, 1e-3, 1e-3) <= 1).all()
+
+
+@pytest.mark.parametrize("low", [0.0, 1.0, -0.1, 2.0, float("nan")])
+@pytest.mark.parametrize("quantile", [logarithmic, tail])
+def test_low_out_of_range_is_refused_by_name(quantile, low):
+    with pytest.raises(ValueError, match=f"low = {low} must lie between 0 and 1"):
+        quantile(GRID, low=low)
+
+
+@pytest.mark.parametrize("part", [0.0, 1.0, -0.1, float("nan")])
+def test_part_out_of_range_is_refused_by_name(part):
+    with pytest.raises(ValueError, match=f"part = {part} must lie between 0 and 1"):
+        tail(GRID, part=part)
+
+
+# ---- points
+
+
+def test_points_lie_in_the_half_open_cube(drawn):
+    points = stream(drawn, 0, 512)
+    assert points.shape == (512, 3)
+    assert points.dtype == np.float64
+    assert (points >= 0).all()
+    assert (points < 1).all()
+
+
+def test_points_are_functions_of_seed_and_index(drawn):
+    """In any order, among other streams, more of them than are remembered."""
+    points = stream(drawn, (3, 1), 40)
+    for index in (39, 0, 7, 7, 23, 0):
+        for other in range(10):
+            drawn((other, 0), index + other, 3)
+        drawn((3, 1), index + 1, 4)
+        assert np.array_equal(drawn((3, 1), index, 3), points[index])
+
+
+def test_a_point_can_be_changed_without_changing_the_stream(drawn):
+    for index in (1, 0):
+        point = drawn(11, index, 3)
+        kept = point.copy()
+        point[:] = -1
+        again = drawn(11, index, 3)
+        sampling._sobol.cache_clear()
+        assert np.array_equal(again, kept)
+
+
+def test_seeds_and_indices_give_different_points(drawn):
+    streams = [stream(drawn, seed, 16) for seed in (0, 1, (0, 1), (1, 0), (0, 2))]
+    points = np.concatenate(streams)
+    assert len(np.unique(points, axis=0)) == len(points)
+    assert len(np.unique(points)) == points.size  # no coordinate is that of another
+
+
+def test_a_number_is_a_stream_of_one_number(drawn):
+    assert np.array_equal(drawn(5, 3, 4), drawn((5,), 3, 4))
+    assert np.array_equal(drawn(5, 3, 4), drawn([5], 3, 4))
+
+
+def test_streams_do_not_know_of_each_other(drawn):
+    """Each coordinate of a stream is uncorrelated with each of another."""
+    one, other = stream(drawn, (0, 0), 512), stream(drawn, (0, 1), 512)
+    assert np.abs(np.corrcoef(one.T, other.T)[:3, 3:]).max() < 0.15
+    assert np.abs(np.corrcoef(one.T) - np.eye(3)).max() < 0.15
+
+
+def test_no_point_is_drawn_with_a_warning(drawn):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for index in (0, 1, 2, 3, 1000, 12_345):
+            drawn((0, 0), index, 9)
+
+
+def test_points_far_out_in_the_stream_are_there(drawn):
+    point = drawn((0, 0), 2**20 + 1, 9)
+    assert point.shape == (9,)
+    assert not np.array_equal(point, drawn((0, 0), 2**20, 9))
+
+
+def test_random_access_to_a_sobol_sequence_equals_its_order():
+    engine = qmc.Sobol(5, scramble=True, rng=np.random.default_rng([7, 2]))
+    assert np.array_equal(stream(sobol, (7, 2), 64, 5), engine.random(64))
+
+
+@pytest.mark.parametrize("size", [16, 64, 256])
+def test_every_interval_holds_one_coordinate_of_a_sobol_sequence(size):
+    """Sobol (1967): each coordinate is a (0, 1)-sequence in base 2, scrambled or not."""
+    cells = np.sort(np.floor(stream(sobol, 2, size, 9) * size), axis=0)
+    assert np.array_equal(cells, np.repeat(np.arange(size)[:, None], 9, axis=1))
+
+
+def test_independent_points_do_not_avoid_each_other():
+    cells = np.sort(np.floor(stream(independent, 2, 64, 9) * 64), axis=0)
+    assert all(len(np.unique(column)) < 55 for column in cells.T)  # 64 (1 - 1/e) = 40
+
+
+@pytest.mark.parametrize(("size", "count"), [(64, 2), (128, 5), (256, 9), (100, 9)])
+def test_sobol_points_fill_the_cube_more_evenly_than_independent_ones(size, count):
+    """By centred discrepancy, for each of five seeds."""
+    for seed in range(5):
+        even_, rough = (
+            qmc.discrepancy(stream(draw, seed, size, count)) for draw in (sobol, independent)
+        )
+        assert even_ < 0.5 * rough
+
+
+def test_sobol_means_are_closer_than_independent_ones():
+    """Owen (1998): the mean of a smooth function, here of a product."""
+
+    def error(draw, seed):
+        return abs(np.prod(1 + stream(draw, seed, 256, 5) - 0.5, axis=1).mean() - 1)
+
+    ours, theirs = (np.mean([error(d, s) for s in range(8)]) for d in (sobol, independent))
+    assert ours < 0.2 * theirs
