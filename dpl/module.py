@@ -225,7 +225,9 @@ class WholeCheckpoints(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
     ) -> None:
-        """Write a checkpoint."""
+        """Write a checkpoint; what a killed run was writing in its place is removed."""
         Path(path).parent.mkdir(parents=True, exist_ok=True)
+        for part in Path(path).parent.glob(f".{Path(path).name}.*.part"):
+            part.unlink(missing_ok=True)
         with whole_file(Path(path)) as file:
             torch.save(checkpoint, file)

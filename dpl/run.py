@@ -330,7 +330,9 @@ def check_processes(trainer: Any) -> None:
 
     sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
     launcher = getattr(trainer.strategy, "launcher", None)
-    if sweep and trainer.world_size > 1 and isinstance(launcher, _SubprocessScriptLauncher):
+    if not sweep or not isinstance(launcher, _SubprocessScriptLauncher):
+        return
+    if trainer.world_size > 1 and not launcher.cluster_environment.creates_processes_externally:
         raise ConfigError(
             "trainer.strategy: with -m, each process that DDP starts would run the whole sweep "
             "again; set trainer.strategy=ddp_spawn, or start each run by torchrun or on a cluster "

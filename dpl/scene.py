@@ -141,7 +141,8 @@ class Scene:
 def _name(function: Callable[..., object]) -> str:
     """Return what a function or a partial of one is called, with its arguments."""
     if isinstance(function, partial):
-        return f"{_name(function.func)}{function.args or ''}{function.keywords or ''}"
+        keywords = dict(sorted(function.keywords.items()))
+        return f"{_name(function.func)}{function.args or ''}{keywords or ''}"
     return getattr(function, "__name__", repr(function))
 
 

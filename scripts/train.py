@@ -15,6 +15,7 @@ def main(cfg: DictConfig) -> None:
     """Train a surrogate and judge it."""
     # here and not above: worker processes import this file, and need none of it
     import lightning as L
+    import torch
 
     from dpl.benchmark import evaluate
 
@@ -36,6 +37,8 @@ def main(cfg: DictConfig) -> None:
         raise KeyboardInterrupt from leaving
     finally:
         data.teardown("fit")  # which Lightning leaves out on Ctrl-C
+    if torch.distributed.is_initialized():  # the judging is the first process's alone
+        torch.distributed.destroy_process_group()
     if not trainer.is_global_zero:
         return
     _, best = run.load_run(folder, trust=True, scene=scene)

@@ -1,5 +1,6 @@
 """Laws of the surrogate: one border to SI units, exact resume, and records that tell all."""
 
+import random
 from pathlib import Path
 
 import lightning as L
@@ -18,7 +19,14 @@ from dpl.fem.solution import Load
 from dpl.figures import DeformedShapes
 from dpl.losses import MSE, LrPlus, LrStar
 from dpl.models.fcnn import FCNN
-from dpl.module import Surrogate, WholeCheckpoints, scales, warmup_cosine
+from dpl.module import (
+    Surrogate,
+    WholeCheckpoints,
+    random_states,
+    scales,
+    set_random_states,
+    warmup_cosine,
+)
 
 CONF = Path(__file__).parents[1] / "conf"
 METRICS = {
@@ -217,7 +225,8 @@ def test_training_lowers_its_loss(scene, data, tmp_path, loss):
             return float(module.loss(module.predict(train.load), train, module.physics))
 
     before = value()
-    trainer(tmp_path, max_epochs=30, check_val_every_n_epoch=30).fit(module, datamodule=data)
+    tutor = trainer(tmp_path, max_epochs=60, check_val_every_n_epoch=60)
+    tutor.fit(module, datamodule=data)  # residuals rise at first, with rotations
     assert value() < 0.6 * before
 
 
@@ -329,6 +338,119 @@ def test_a_resumed_run_ends_bit_for_bit_like_one_that_was_not_interrupted(
     assert numbers[0] == numbers[1]
     best = [t.checkpoint_callback.best_model_score for t in (whole, end)]
     assert best[0] == best[1]
+
+
+class Noisy(nn.Module):
+    """A network whose training draws from every generator there is."""
+
+    def __init__(self, scene):
+        super().__init__()
+        size = scene.problem.points.numel()
+        self.dropout, self.linear = nn.Dropout(0.3), nn.Linear(size, size)
+
+    def forward(self, force):
+        x = self.dropout(force.flatten(1))
+        if self.training:
+            noise = random.gauss(0, 1) + np.random.standard_normal()  # noqa: NPY002
+            x = x * (1 + 0.1 * noise)
+        return self.linear(x).view_as(force)
+
+
+LOADER = "each `iter` of a DataLoader without a generator draws from torch's, outside the states"
+
+
+@pytest.mark.xfail(strict=True, reason=LOADER)
+def test_a_resumed_run_of_a_network_that_draws_goes_on_with_the_same_numbers(
+    scene, folder, data, tmp_path
+):
+    def noisy(name, *callbacks, resume=None):
+        torch.manual_seed(0 if resume is None else 99)
+        random.seed(0 if resume is None else 99)
+        np.random.seed(0 if resume is None else 99)  # noqa: NPY002
+        options = {"train": 12, "val": 4, "test": 4, "batch_size": 4, "workers": 0}
+        module = Surrogate(Noisy(scene), MSE(), scene, scheduler=warmup_cosine)
+        trainer(tmp_path / name, *callbacks, max_epochs=4).fit(
+            module,
+            datamodule=OfflineData(scene, folder=str(folder), **options),
+            ckpt_path=resume,
+            weights_only=True,
+        )
+        return weights(module)
+
+    straight = noisy("straight")
+    assert identical(noisy("again"), straight), "else there is nothing to compare with"
+    assert not identical(noisy("parts", StopAfter(2)), straight)
+    assert identical(noisy("parts", resume="last"), straight)
+
+
+def draws():
+    """Numbers of every generator."""
+    numbers = np.random.standard_normal(3).tolist()  # noqa: NPY002
+    return [torch.rand(3).tolist(), numbers, [random.random(), random.gauss(0, 1)]]
+
+
+@pytest.fixture
+def generators():
+    """Gives the tests that follow their random numbers back."""
+    before = random_states()
+    yield
+    set_random_states(before)
+
+
+@pytest.mark.parametrize("ahead", [0, 1, 700])
+def test_random_numbers_go_on_where_their_states_were_taken(generators, ahead):
+    for _ in range(ahead):
+        torch.rand(1), np.random.standard_normal(), random.gauss(0, 1)  # noqa: NPY002
+    states = random_states()
+    first, second = draws(), draws()
+    assert first != second
+    set_random_states(states)
+    assert [draws(), draws()] == [first, second]
+
+
+def test_random_states_survive_a_file_that_runs_no_code(generators, tmp_path):
+    np.random.standard_normal(), random.gauss(0, 1)  # noqa: NPY002  # half of a pair is kept
+    torch.save({"random": random_states()}, tmp_path / "states")
+    expected = draws()
+    draws()
+    set_random_states(torch.load(tmp_path / "states", weights_only=True)["random"])
+    assert draws() == expected
+
+
+def test_random_states_are_a_copy(generators):
+    states = random_states()
+    expected = draws()
+    draws()
+    set_random_states(states)
+    assert draws() == expected
+    set_random_states(states)
+    assert draws() == expected
+
+
+def test_a_checkpoint_of_many_devices_is_resumed_on_one(generators):
+    """The states of devices that are not there are left out."""
+    set_random_states({**random_states(), "cuda": [torch.zeros(16, dtype=torch.uint8)] * 2})
+
+
+def test_a_checkpoint_without_random_states_is_resumed(scene, generators):
+    module = surrogate(scene)
+    module.on_load_checkpoint({"scene": scene.fingerprint, "state_dict": {}})
+    state = torch.get_rng_state()
+    module.on_train_start()
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_loading_for_an_evaluation_leaves_random_numbers_alone(scene, generators):
+    """They are put back where training begins, not where a checkpoint is read."""
+    checkpoint = {"scene": scene.fingerprint, "random": random_states()}
+    draws()
+    state = torch.get_rng_state()
+    module = surrogate(scene)
+    torch.set_rng_state(state)
+    module.on_load_checkpoint(checkpoint)
+    assert torch.equal(torch.get_rng_state(), state)
+    module.on_train_start()
+    assert torch.equal(torch.get_rng_state(), checkpoint["random"]["torch"])
 
 
 def test_the_seed_decides_the_weights(scene, data, tmp_path):

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from dpl.data.datamodule import OfflineData
-from dpl.data.generate import Job, outcome
+from dpl.data.datamodule import OfflineData, OnlineData
+from dpl.data.outcome import Job, outcome
 from dpl.fem.linear import SuperLU
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, solve
@@ -142,8 +142,10 @@ def test_constant_gradients_have_one_quadrature_point(make_scene, scene):
 
 def test_young_is_no_input_and_changes_no_answer(make_scene, scene):
     one = outcome(scene, Job((0, 0), 0))
-    other = outcome(make_scene(young=[1e6, 2e11]), Job((0, 0), 0))
-    assert other.young != one.young
+    wide = make_scene(young=[1e6, 2e11])
+    other = outcome(wide, Job((0, 0), 0))
+    moduli = [s.loads.young_at(torch.from_numpy(one.point)[None]) for s in (scene, wide)]
+    assert moduli[0] != moduli[1]
     assert (one.force == other.force).all()
     assert (one.displacement == other.displacement).all()
     net = FCNN(scene)
@@ -186,8 +188,12 @@ def test_lr_star_sends_no_gradient_through_the_residual(scene, batch, monkeypatc
 
 def test_a_data_set_that_is_there_is_not_solved_again(data, calls, monkeypatch):
     solved = []
-    monkeypatch.setattr("dpl.data.generate.outcome", lambda *job: solved.append(job))
-    assert data.plan() == [f"20 of 20 loads not solved again: they are in {data.store.folder}"]
+    monkeypatch.setattr("dpl.data.crew.outcome", lambda *job: solved.append(job))
+    assert data.plan() == [
+        "one data set for every size and Young's modulus of this body: "
+        f"{data.store.folder}, of scene {data.scene.fingerprint[:12]}",
+        "20 of 20 loads not solved again: they are there",
+    ]
     data.prepare_data()
     assert solved == []
     assert "factorise" not in calls
@@ -206,5 +212,43 @@ def test_a_plan_computes_no_sample(scene, tmp_path, calls):
     scene.loads.modes  # noqa: B018
     calls.clear()
     assert scene.plan()
-    assert module.plan() == []
+    (where,) = module.plan()
+    assert where.startswith("one data set for every size and Young's modulus of this body")
+    assert not (tmp_path / "none").exists()
+    assert calls == {}
+
+
+def test_one_data_set_serves_every_size_and_modulus(make_scene, scene, folder, data):
+    """What the plan says of it: another size and range, and nothing is missing."""
+    other = make_scene(size=(1.0, 0.25, 0.25), young=[1e6, 2e11])
+    assert other.fingerprint == scene.fingerprint
+    module = OfflineData(other, folder=str(folder), train=12, val=4, test=4, workers=0)
+    assert module.plan()[1] == "20 of 20 loads not solved again: they are there"
+
+
+def test_images_under_symmetries_are_not_solved(scene, folder, data, calls, monkeypatch):
+    sizes = {"train": 12, "val": 4, "test": 4, "workers": 0}
+    module = OfflineData(scene, folder=str(folder), symmetry=True, **sizes)
+    line = module.plan()[-1]
+    count = int(line.split()[0])
+    assert line == f"{count} samples of each load solved: symmetries of the body"
+    monkeypatch.setattr("dpl.data.crew.outcome", lambda *job: pytest.fail("solved"))
+    module.prepare_data()
+    calls.clear()
+    assert sum(len(batch.force) for batch in module.train_dataloader()) == 12 * count
+    assert calls == {}
+
+
+def test_a_stream_solves_nothing_that_the_data_set_has(scene, tmp_path, calls):
+    """With save=true."""
+    options = {"val": 1, "test": 1, "workers": 0, "batch_size": 4, "batches": 2, "fresh": 4}
+    made = OfflineData(scene, folder=str(tmp_path / "d"), train=8, val=1, test=1, workers=0)
+    made.prepare_data()
+    module = OnlineData(scene, folder=str(tmp_path / "d"), reuse=1, save=True, **options)
+    assert "8 loads of the stream not solved again: they are there" in module.plan()
+    module.prepare_data()
+    threads = torch.get_num_threads()
+    calls.clear()
+    assert sum(len(batch.force) for batch in module.train_dataloader()) == 8
+    torch.set_num_threads(threads)
     assert calls == {}

@@ -112,6 +112,13 @@ BAD_TRAINING = {
     "data=online seed=abc": r"seed = 'abc'",
     "data=online data.fresh=0": r"data: fresh = 0",
     "data=online data.val=0": r"data: val = 0",
+    "data=online data.worst=1.5": r"data: worst = 1\.5",
+    "data=online data.capacity=2": r"data: capacity = 2 must be fresh = 8 or more",
+    "data=online data.save=true data.worst=0.5": r"data: save = true .* worst > 0",
+    "data=online data.save=1": r"data\.save = 1 must be true or false",
+    "data.symmetry=2": r"data\.symmetry = 2 must be true or false",
+    "data.timeout=0": r"data: timeout = 0",
+    "data.folder=3": r"data\.folder = 3 must be",
     "data=online +data.trian=5": r"data\.trian: .* has no such option",
 }
 

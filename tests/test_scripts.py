@@ -264,17 +264,25 @@ def test_ctrl_c_ends_training_with_130_and_leaves_no_process(streaming, members)
     status, _, err = finish(process, 60)
     assert status == 130, err[-2000:]
     assert waited_for(lambda: not members(process.pid), 5)
-    assert err.strip().endswith("interrupted")
-    assert "Traceback" not in err
+    assert err.strip().endswith("interrupted"), err[-4000:]
+    assert "Traceback" not in err, err[-4000:]
 
 
 @pytest.mark.slow
-def test_a_killed_worker_ends_training_with_an_error_and_leaves_no_process(streaming, members):
+@pytest.mark.xfail(strict=True, reason="torch's SIGCHLD handler raises wherever the program is")
+def test_a_killed_worker_is_replaced_and_training_goes_on(streaming, members, tmp_path):
     process, workers = streaming
-    os.kill(workers()[0], signal.SIGKILL)
-    status, _, err = finish(process, 60)
-    assert status not in (0, 130)
-    assert "worker" in err
+    checkpoint = tmp_path / "r/checkpoints/last.ckpt"
+    for _ in range(4):  # some are killed while it waits, some while it learns
+        before = workers()
+        os.kill(before[0], signal.SIGKILL)
+        waited_for(lambda b=before: len(set(workers()) - set(b)) == 2 or process.poll() is not None)
+        killed = time.time()
+        waited_for(lambda t=killed: checkpoint.stat().st_mtime > t or process.poll() is not None)
+        assert process.poll() is None, process.communicate()[1][-2000:]
+        time.sleep(0.3)
+    os.killpg(process.pid, signal.SIGINT)
+    assert finish(process, 60)[0] == 130
     assert waited_for(lambda: not members(process.pid), 5)
 
 
@@ -282,25 +290,32 @@ def test_a_killed_worker_ends_training_with_an_error_and_leaves_no_process(strea
 def test_a_killed_parent_leaves_no_process(streaming, members):
     process, _ = streaming
     process.kill()
-    assert waited_for(lambda: not members(process.pid), 15)
+    assert waited_for(lambda: not members(process.pid), 2)
 
 
 @pytest.mark.slow
-def test_ctrl_c_while_generating_ends_with_130_and_keeps_whole_shards(
+@pytest.mark.xfail(
+    strict=True, reason="`stop or Stop()`: a Stop that nobody has asked yet is false"
+)
+def test_ctrl_c_while_generating_ends_with_130_and_keeps_all_that_was_solved(
     start, members, tiny, tmp_path
 ):
     sizes = ["data.train=100000", "data.val=0", "data.test=0", "data.workers=2"]
     process = start("generate", *tiny, *sizes, cwd=tmp_path)
     assert waited_for(lambda: list(tmp_path.glob("datasets/*/train-000000.safetensors")))
     os.killpg(process.pid, signal.SIGINT)
-    status, _, err = finish(process, 60)
+    status, _, err = finish(process, 20)
     assert status == 130, err[-2000:]
     assert waited_for(lambda: not members(process.pid), 5)
     (folder,) = (tmp_path / "datasets").iterdir()
     lines = (folder / "manifest.jsonl").read_text().splitlines()
     assert len(lines) >= 1
     assert all(json.loads(line)["tried"] == 64 for line in lines)
-    assert not list(folder.glob(".*.part"))
+    assert not list(folder.rglob(".*.part"))
+    assert "Traceback" not in err, err[-4000:]
+    (session,) = map(json.loads, (folder / "journal.jsonl").read_text().splitlines())
+    spooled = len(list(folder.glob("spool/*.load")))
+    assert session["loads"] == 64 * len(lines) + spooled
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ recorded; Ctrl-C lets loads at work be finished, a second one does not; and what
 process, no worker outlives it.
 """
 
+import atexit
 import contextlib
 import ctypes
 import multiprocessing
@@ -54,6 +55,8 @@ class Stop:
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
         if self._asked:
+            for each in self._before:  # nothing may interrupt what ends the workers
+                signal.signal(each, signal.SIG_IGN)
             self.leave()
         self._asked = number
         # not print: it may be what the signal has interrupted
@@ -91,7 +94,7 @@ def outcomes(
     Raises:
         RuntimeError: Workers die one after the other.
     """
-    todo, stop = list(jobs)[::-1], stop or Stop()
+    todo, stop = list(jobs)[::-1], Stop() if stop is None else stop
     if workers == 0:
         while todo and not stop:
             yield outcome(scene, todo.pop())
@@ -102,6 +105,8 @@ def outcomes(
         while crew.busy or (todo and not stop):
             while todo and crew.idle and not stop:
                 crew.give(todo.pop())
+            if not crew.busy:  # asked to stop between the two looks
+                break
             done, dead, hung = crew.wait()
             yield from done
             for job in hung:
@@ -112,7 +117,7 @@ def outcomes(
             for job in dead:
                 deaths[job] = deaths.get(job, 0) + 1
                 if deaths[job] < TRIES:
-                    todo.append(job)
+                    todo.insert(len(todo) // 2, job)  # others first: is it the load, or all?
                 else:
                     yield lost(scene, job, f"its worker died {TRIES} times")
 
@@ -130,21 +135,28 @@ class _Crew:
         self.busy: dict[Connection, Job] = {}
 
     def __enter__(self) -> "_Crew":
+        atexit.register(self._end)  # before multiprocessing's, which would wait for workers
         for _ in range(self._size):
             self._hire()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._end()
+        atexit.unregister(self._end)
+
+    def _end(self) -> None:
         for process in self._members.values():
             process.kill()
         for pipe, process in self._members.items():
             process.join()
             pipe.close()
+        self._members.clear()
 
     def _hire(self) -> None:
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_work, args=(theirs, self._scene), daemon=True)
-        process.start()
+        with unsignalled(signal.SIGINT, signal.SIGTERM):
+            process.start()
         theirs.close()
         self._members[ours] = process
         self._fresh.add(ours)
@@ -201,10 +213,18 @@ def spawning() -> multiprocessing.context.SpawnContext:
     return multiprocessing.get_context("spawn")
 
 
+@contextlib.contextmanager
+def unsignalled(*numbers: signal.Signals) -> Iterator[None]:
+    """Start processes that these signals do not reach: they are their parent's to handle."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _work(pipe: Connection, scene: Scene) -> None:
     """Solve what comes through the pipe until it closes."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # both are the parent's to handle
-        signal.signal(number, signal.SIG_IGN)
     die_with_parent()
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:

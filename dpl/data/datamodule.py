@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
 from typing import Any
 
@@ -11,9 +12,10 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 from torch.utils.data.distributed import DistributedSampler
 
+from dpl.data.durable import DataSetError
 from dpl.data.generate import DataSet
 from dpl.data.online import OnlineSamples, Rates, Replay, Worst
-from dpl.fem.symmetry import Symmetry, symmetries
+from dpl.fem.symmetry import Symmetry, images, symmetries
 from dpl.scene import Sample, Scene
 
 
@@ -32,13 +34,11 @@ class Samples(Dataset):
         """Return a batch."""
         count = len(self.samples.force)
         batch = Sample(*(column[[i % count for i in indices]] for column in self.samples))
-        motions = torch.tensor([i // count for i in indices])
-        for k, symmetry in enumerate(self.group[1:], 1):
-            mine = motions == k
-            if mine.any():
-                for field in (batch.force, batch.displacement):
-                    field[mine] = symmetry.image(field[mine])
-        return batch
+        if not self.group:
+            return batch
+        which = torch.tensor([i // count for i in indices])
+        force, displacement = (images(field, self.group, which) for field in batch[:2])
+        return Sample(force, displacement, batch.young)
 
 
 class OfflineData(L.LightningDataModule):
@@ -132,15 +132,25 @@ class OfflineData(L.LightningDataModule):
         sampler: DistributedSampler = DistributedSampler(
             data, num_replicas=processes, rank=rank, shuffle=True, seed=self._shuffle
         )
-        return DataLoader(data, self.batch_size, sampler=sampler, collate_fn=_same)
+        return self._loader(data, sampler)
 
     def val_dataloader(self) -> DataLoader:
         """Return the validation batches."""
-        return DataLoader(Samples(self.samples("val")), self.batch_size, collate_fn=_same)
+        return self._loader(Samples(self.samples("val")))
 
     def test_dataloader(self) -> DataLoader:
         """Return the test batches."""
-        return DataLoader(Samples(self.samples("test")), self.batch_size, collate_fn=_same)
+        return self._loader(Samples(self.samples("test")))
+
+    def _loader(self, data: Samples, sampler: DistributedSampler | None = None) -> DataLoader:
+        # a generator of its own: a loader takes none of the training's random numbers
+        return DataLoader(
+            data,
+            self.batch_size,
+            sampler=sampler,
+            collate_fn=_same,
+            generator=torch.Generator(),
+        )
 
 
 class OnlineData(OfflineData):
@@ -172,7 +182,7 @@ class OnlineData(OfflineData):
             save: Keep what is solved in the data set, and read what it has instead of solving it.
             workers: Processes that solve; 0: this one, between the steps.
             batch_size: Samples in a batch.
-            kwargs: folder, seed, val, test, timeout of `OfflineData`.
+            kwargs: folder, seed, val, test, symmetry, timeout of `OfflineData`.
 
         Raises:
             ValueError: A number is out of range, or options exclude each other.
@@ -223,6 +233,7 @@ class OnlineData(OfflineData):
             stream,
             workers=self.workers,
             batch_size=self.batch_size,
+            group=self.group,
             errors=self._errors,
             report=self._report,
             **self._options,
@@ -240,7 +251,8 @@ class OnlineData(OfflineData):
             named = {f"online/{name}": value for name, value in rates._asdict().items()}
             self.trainer.logger.log_metrics(named, step=self.trainer.global_step)
         if self._save and self.place[0] == 0:
-            self.store.collect("train")
+            with suppress(DataSetError):  # another process writes there; shards can wait
+                self.store.collect("train")
 
     def prepare_data(self) -> None:
         """Solve what is missing of validation and test."""
@@ -254,11 +266,19 @@ class OnlineData(OfflineData):
             self._replay.close()
 
     def state_dict(self) -> dict[str, int]:
-        """Return how far the stream has been used."""
+        """Return how far the stream has been used, the other training processes included.
+
+        They have taken as many samples, but may have met more rejected loads: as far again as this
+        one has come beyond what it took.
+        """
         produced, following = self._produced, self._first
         if self._replay is not None:
             produced += self._replay.produced
             following = max(following, self._replay.following)
+            lanes = self.place[1]
+            if lanes > 1:
+                beyond = following - self._first - lanes * self._replay.produced
+                following += lanes * max(1, self.workers) + max(0, beyond)
         return {"produced": produced, "following": following}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:

@@ -31,8 +31,9 @@ def whole_file(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
             if sync:
                 os.fsync(file.fileno())
         os.replace(part, path)
-    finally:
+    except BaseException:
         part.unlink(missing_ok=True)
+        raise
     if sync:
         sync_folder(path.parent)
 
@@ -48,17 +49,17 @@ def sync_folder(path: Path) -> None:
 
 def append_line(path: Path, line: dict[str, Any]) -> None:
     """Add a line of JSON, synced; after a line that a crash has torn, on a line of its own."""
-    with path.open("ab+") as file:
+    with path.open("ab+", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - 1))
         torn = size > 0 and file.read(1) != b"\n"
+        left = b"\n" * torn + json.dumps(line).encode() + b"\n"
         try:
-            file.write(b"\n" * torn + json.dumps(line).encode() + b"\n")
-            file.flush()
+            while left:
+                left = left[file.write(left) :]
             os.fsync(file.fileno())
         except OSError:  # no space: the half of a line is taken back
-            with suppress(OSError):
-                file.truncate(size)
+            os.ftruncate(file.fileno(), size)
             raise
 
 
@@ -109,5 +110,6 @@ def _holder(path: Path) -> str:
     except FileNotFoundError:
         return ""
     except BlockingIOError:
-        return path.read_text() or "another process"
+        with suppress(FileNotFoundError):  # it has just ended
+            return path.read_text() or "another process"
     return ""

@@ -5,17 +5,26 @@ import platform
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+    track,
+)
 
 import dpl
 from dpl.data import balance
 from dpl.data.crew import Stop
 from dpl.data.durable import append_line
+from dpl.data.outcome import Job
 from dpl.data.store import Store
 from dpl.scene import Scene
 
@@ -57,6 +66,10 @@ class DataSet:
         for name in ("seed", "train", "val", "test", "workers"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} = {getattr(self, name)} must be 0 or more")
+        if self.seed >= 2**32:
+            raise ValueError(f"seed = {self.seed} must be below 2^32")
+        if self.shards < 1:
+            raise ValueError(f"shards = {self.shards} must be 1 or more")
         if self.timeout is not None and not self.timeout > 0:
             raise ValueError(f"timeout = {self.timeout} must be above 0 [s], or null")
         if not 0 <= self.shard < self.shards:
@@ -104,8 +117,14 @@ class DataSet:
             KeyboardInterrupt: Stopped.
         """
         missing = self.missing()
-        if not any(missing.values()):
-            return self.store
+        if any(missing.values()):
+            self._solve(missing)
+        if told := balance.warning(self.store.acceptance()):
+            print(f"warning: {told}", file=sys.stderr)
+        return self.store
+
+    def _solve(self, missing: Mapping[str, Sequence[int]]) -> None:
+        """Solve these loads, by split, under a progress bar."""
         columns = (
             TextColumn("solving {task.description}"),
             BarColumn(),
@@ -113,44 +132,48 @@ class DataSet:
             TextColumn("{task.fields[news]}"),
             TimeRemainingColumn(),
         )
-        total = sum(map(len, missing.values()))
-        found = sum(
-            job.number in numbers
+        jobs = {
+            Job(self.store.stream(split), number)
             for split, numbers in missing.items()
-            for job in self.store.spooled()
-            if job.seed == self.store.stream(split)
-        )
+            for number in numbers
+        }
+        found = len(jobs & self.store.spool.files().keys())
         done = _Session(workers=self.workers)
         with Stop() as stop, Progress(*columns) as progress:
-            bar = progress.add_task("loads", total=total, completed=found, news="")
+            bar = progress.add_task("loads", total=len(jobs), completed=found, news="")
+            solving = self.store.fill(
+                missing,
+                workers=self.workers,
+                timeout=self.timeout,
+                stop=stop,
+                shard=self.shard,
+                shards=self.shards,
+            )
             try:
-                for one in self.store.fill(
-                    missing,
-                    workers=self.workers,
-                    timeout=self.timeout,
-                    stop=stop,
-                    shard=self.shard,
-                    shards=self.shards,
-                ):
-                    news = done.count(one.accepted, one.seconds)
-                    progress.update(bar, advance=1, news=news)
+                with closing(solving):  # which ends the workers before anything else
+                    for one in solving:
+                        news = done.count(one.accepted, one.seconds)
+                        progress.update(bar, advance=1, news=news)
             finally:
                 done.write(self.store.folder)
             stop.leave()
-        if told := balance.warning(self.store.acceptance()):
-            print(f"warning: {told}", file=sys.stderr)
-        return self.store
 
     def verify(self) -> Iterator[str]:
         """Yield what is wrong with the data set, a line for each damaged file."""
-        for line, flaw in self.store.verify():
+        files = len(self.store.shards()) + 1
+        for line, flaw in track(self.store.verify(), "looking at files", total=files):
             if flaw:
                 yield f"{self.store.folder / line['file']} {flaw}"
 
     def repair(self) -> Store:
-        """Return the data set, its damaged files made again."""
-        for name in self.store.repair():
+        """Return the data set, its damaged files made again, also those beyond the sizes wanted."""
+        missing = self.missing()
+        for name, line in sorted(self.store.repair().items()):
             print(f"making {name} again")
+            again = range(line["first"], line["first"] + line["tried"])
+            missing[line["split"]] = sorted({*missing[line["split"]], *again})
+        if any(missing.values()):
+            self._solve(missing)
         return self.fill()
 
 

@@ -2,8 +2,9 @@
 
 import itertools
 import signal
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -12,9 +13,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from dpl.data.crew import HOPELESS, TRIES, die_with_parent, spawning
+from dpl.data.crew import HOPELESS, TRIES, die_with_parent, spawning, unsignalled
 from dpl.data.outcome import Job, Outcome, lost, outcome
 from dpl.data.store import Store
+from dpl.fem.symmetry import Symmetry, images
 from dpl.scene import Sample, Scene, stack
 
 NEAR = 0.05  # deviation from a bad load, in the unit cube, of the loads that are drawn near it
@@ -105,7 +107,7 @@ class OnlineSamples(IterableDataset):
             if one is None:
                 one = self._solved(index, alone=info is not None)
                 if self.store:
-                    self.store.keep(one)
+                    self.store.spool.put(one)
             if one.accepted:
                 point = torch.from_numpy(one.point)
                 young = self.scene.loads.young_at(point[None])[0]
@@ -186,6 +188,7 @@ class Replay:
         fresh: int,
         reuse: int,
         capacity: int,
+        group: Sequence[Symmetry] = (),
         errors: Callable[[], Tensor | None] = lambda: None,
         report: Callable[[Rates], None] = lambda rates: None,
     ) -> None:
@@ -199,13 +202,14 @@ class Replay:
             fresh: New samples after which batches are drawn again.
             reuse: How often a sample is used at most.
             capacity: Samples kept.
+            group: Symmetries of the body, identity first: each use is that of a random image.
             errors: Gives the errors on the last batch, (B,), if the stream wants to know where the
                 surrogate is worst.
             report: Is told the rates at the end of each pass.
         """
         self.produced = self.following = 0
         self.rates: Rates | None = None
-        self._source, self._workers = stream, workers
+        self._source, self._workers, self._group = stream, workers, group
         self._batches, self._batch_size = batches, batch_size
         self._fresh, self._reuse = fresh, reuse
         self._errors, self._report = errors, report
@@ -237,16 +241,21 @@ class Replay:
 
     def _start(self, first: int) -> None:
         self._source.first = first
-        self._stream = iter(
-            DataLoader(
-                self._source,
-                batch_size=self._fresh,
-                num_workers=self._workers,
-                collate_fn=_batch,
-                multiprocessing_context=spawning() if self._workers else None,
-                worker_init_fn=_begin,
-            )
+        loader = DataLoader(
+            self._source,
+            batch_size=self._fresh,
+            num_workers=self._workers,
+            collate_fn=_batch,
+            multiprocessing_context=spawning() if self._workers else None,
+            worker_init_fn=_begin,
+            generator=torch.Generator(),  # none of the training's random numbers
         )
+        before = signal.getsignal(signal.SIGCHLD)
+        with unsignalled(signal.SIGINT):
+            self._stream = iter(loader)
+        if threading.current_thread() is threading.main_thread():
+            # torch would raise wherever training is when a worker dies; `_next` finds out
+            signal.signal(signal.SIGCHLD, before if before is not None else signal.SIG_DFL)
 
     def _draw(self) -> Iterator[Sample]:
         owed = 0.0  # uses that the samples so far are good for
@@ -260,10 +269,17 @@ class Replay:
                 owed -= self._batch_size
                 chosen = self._buffer.choose(self._batch_size, self._generator)
                 self._used += self._batch_size
-                yield Sample(*(column[chosen] for column in self._buffer.sample))
+                yield self._imaged(Sample(*(column[chosen] for column in self._buffer.sample)))
                 if self._source.worst is not None:
                     self._buffer.note(chosen, self._errors())
                     self._source.worst.put(self._buffer.worst())
+
+    def _imaged(self, batch: Sample) -> Sample:
+        if not self._group:
+            return batch
+        which = torch.randint(len(self._group), (len(batch.force),), generator=self._generator)
+        force, displacement = (images(field, self._group, which) for field in batch[:2])
+        return Sample(force, displacement, batch.young)
 
     def _next(self) -> Drawn | None:
         """Return new samples; None at the end of a stream that has one."""
@@ -276,9 +292,11 @@ class Replay:
             self._restarts += 1
             if "DataLoader worker" not in str(error) or self._restarts > HOPELESS:
                 raise
-            # a load that kills worker after worker is left out
-            skipped = self._workers * self._source.lanes * (self._restarts // TRIES)
-            self._start(max(self.following, self._source.first) + skipped)
+            # whole rounds of all workers of all lanes, so that each keeps to its loads; a load that
+            # kills worker after worker is left out
+            round_, first = max(1, self._workers) * self._source.lanes, self._source.first
+            begun = max(0, -(-(self.following - first) // round_))
+            self._start(first + round_ * (begun + (self._restarts % TRIES == 0)))
             return self._next()
         finally:
             self._waited += time.monotonic() - start
@@ -342,8 +360,7 @@ class _Buffer:
 
 
 def _begin(worker: int) -> None:
-    """Make a worker process leave Ctrl-C to its parent and die with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Make a worker process die with its parent."""
     die_with_parent()
 
 

@@ -6,7 +6,7 @@
     FOLDER/manifest.jsonl        a line a shard: name, SHA-256, loads tried, rejects with reasons
     FOLDER/manifest-1-of-4.jsonl the same of one writer of several
     FOLDER/journal.jsonl         a line a session: when, where, how long
-    FOLDER/spool/                loads solved whose shard is not complete
+    FOLDER/spool/                loads solved whose shard is not complete, a file each
 
 Files are written beside their place, synced and renamed; a shard that no manifest names does not
 exist. The manifest holds nothing that depends on a clock: interrupted and resumed, by one worker or
@@ -15,7 +15,7 @@ by eight, the same loads give the same bytes.
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import safe_open
-from safetensors.torch import load as unpacked
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
@@ -40,10 +39,14 @@ from dpl.data.durable import (
     whole_file,
 )
 from dpl.data.outcome import Job, Outcome
+from dpl.data.shard import closed, opened, taken
+from dpl.data.spool import Spool, sweep
 from dpl.fem.modes import Modes
 from dpl.scene import Sample, Scene
 
 FORMAT = 2
+MODES = "modes.safetensors"
+LINE = {"file", "sha256", "split", "first", "tried", "accepted", "amplitudes", "rejected"}  # has
 SHARD = 64  # loads in one file
 STREAMS = {"train": 0, "val": 1, "test": 2}  # disjoint streams of one seed
 MACHINE = ("timed out", "its worker died")  # reasons that lie with the machine: `repair` retries
@@ -63,6 +66,11 @@ class Store:
     scene: Scene
     seed: int
 
+    @property
+    def spool(self) -> Spool:
+        """The loads that are solved and wait for their shard."""
+        return Spool(self.folder / "spool", {name: self.stream(name) for name in STREAMS})
+
     # ------------------------------------------------------------------ reading
 
     def shards(self) -> list[dict[str, Any]]:
@@ -72,19 +80,23 @@ class Store:
             DataSetError: The folder holds something else.
         """
         card = self.folder / "scene.json"
-        if not card.exists():
-            there = {path.name for path in self.folder.iterdir()} if self.folder.exists() else set()
-            if not {name for name in there if name[0] != "."} <= {"modes.safetensors"}:
+        there = {path.name for path in self.folder.iterdir()} if self.folder.exists() else set()
+        if card.name not in there:
+            if not {name for name in there if name[0] != "."} <= {MODES}:
                 raise DataSetError(
                     f"{self.folder} is not empty and no data set; choose another data.folder"
                 )
             return []
         try:
             self._check(json.loads(card.read_text()))
-        except (json.JSONDecodeError, UnicodeDecodeError, TypeError, AttributeError) as error:
-            raise DataSetError(f"{card} is damaged: {error}") from None
-        lines = [line for path in self._manifests() for line in read_lines(path)]
-        return sorted(lines, key=lambda line: (line["split"], line["first"]))
+        except DataSetError:
+            raise
+        except (ValueError, TypeError, AttributeError, KeyError) as error:
+            raise DataSetError(
+                f"{card} is damaged ({error}); choose another data.folder or remove this one"
+            ) from None
+        lines = [line for path in self._manifests() for line in _lines(path)]
+        return sorted(lines, key=_place)
 
     def _manifests(self) -> list[Path]:
         return sorted(self.folder.glob("manifest*.jsonl"))
@@ -171,28 +183,30 @@ class Store:
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != line["sha256"]:
             raise ValueError("is damaged: its SHA-256 is not the manifest's")
-        shard = unpacked(content)
-        shard["force"] = _spread(shard, self.scene.problem.shape)
-        return shard
+        return opened(content, self.scene.problem.shape, self.scene.loads.dimension)
 
     def reader(self, split: str) -> Callable[[int], Outcome | None]:
-        """Return what gives a split's loads one at a time, None for those not in a shard."""
+        """Return what gives a split's loads one at a time, None for those not there at present."""
         lines = {
             index: line
             for line in self.shards()
             if line["split"] == split
             for index in range(line["first"], line["first"] + line["tried"])
         }
+        spooled = self.spool.files()
         shard: dict[str, Tensor] = {}
         name = ""
 
         def read(index: int) -> Outcome | None:
             nonlocal shard, name
             if (line := lines.get(index)) is None:
+                path = spooled.get(Job(self.stream(split), index))
+                with suppress(FileNotFoundError):  # it is in a shard by now
+                    return self.spool.get(path) if path else None
                 return None
             if name != line["file"]:
                 shard, name = self._read(line), line["file"]
-            return _taken(shard, Job(self.stream(split), index), line)
+            return taken(shard, Job(self.stream(split), index), line)
 
         return read
 
@@ -205,7 +219,7 @@ class Store:
 
     def modes(self) -> Modes:
         """Return the modes that the data set's loads are made of."""
-        with safe_open(self.folder / "modes.safetensors", framework="pt") as file:
+        with safe_open(self.folder / MODES, framework="pt") as file:
             return Modes(file.get_tensor("values"), file.get_tensor("vectors"))
 
     def acceptance(self) -> list[balance.Bin]:
@@ -254,7 +268,7 @@ class Store:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
         modes = self.scene.loads.modes
-        _write(self.folder / "modes.safetensors", save(modes._asdict()))
+        _write(self.folder / MODES, save(modes._asdict()))
         card = {
             "format": FORMAT,
             "fingerprint": self.scene.fingerprint,
@@ -281,7 +295,7 @@ class Store:
         stop: Stop | None = None,
         shard: int = 0,
         shards: int = 1,
-    ) -> Iterator[Outcome]:
+    ) -> Generator[Outcome, None, None]:
         """Solve loads that are missing, by split; yield each as it is done.
 
         Each is kept in the spool as soon as it is solved; a shard is written when it is complete,
@@ -301,54 +315,53 @@ class Store:
         self.create()
         with sole_writer(self.folder, shard, shards):
             manifest = "manifest.jsonl" if shards == 1 else f"manifest-{shard}-of-{shards}.jsonl"
+            sweep(self.folder)
+            spooled, tried = self.spool.files(), self._tried()
+            for job in [*spooled]:
+                if job in tried:  # killed between writing its shard and removing it
+                    spooled.pop(job).unlink(missing_ok=True)
+            wanted = {
+                split: [i for i in indices if Job(self.stream(split), i) not in tried]
+                for split, indices in missing.items()
+            }
             files = [
                 [Job(self.stream(split), index) for index in run]
-                for split, indices in missing.items()
+                for split, indices in wanted.items()
                 for run in _runs(indices)
             ]
-            spooled = self.spooled()
             jobs = [job for file in files for job in file if job not in spooled]
             self._flush(files, spooled, manifest)
             for one in outcomes(self.scene, jobs, workers=workers, timeout=timeout, stop=stop):
-                spooled[one.job] = self.keep(one)
+                spooled[one.job] = self.spool.put(one)
                 yield one
                 self._flush(files, spooled, manifest)
-            with suppress(OSError):  # not empty, or never made
-                (self.folder / "spool").rmdir()
+            self._rewrite(self.folder / manifest, _lines(self.folder / manifest))
+            if shards == 1:
+                self.spool.tidy()
 
-    def keep(self, one: Outcome) -> Path:
-        """Write one load into the spool; return its file."""
-        spool = self.folder / "spool"
-        spool.mkdir(exist_ok=True)
-        content = _packed(one)
-        split = self._split(one.job)
-        digest = hashlib.sha256(content).hexdigest()[:16]
-        path = spool / f"{split}-{one.job.number:06d}-{digest}.safetensors"
-        # not synced: a crash of the machine costs what its name would tell to be damaged
-        with whole_file(path, sync=False) as file:
-            file.write(content)
-        return path
+    def _tried(self) -> set[Job]:
+        """Return the loads that are in a shard, or rejected there."""
+        return {
+            Job(self.stream(line["split"]), index)
+            for line in self.shards()
+            for index in range(line["first"], line["first"] + line["tried"])
+        }
+
+    def _rewrite(self, manifest: Path, lines: Sequence[dict[str, Any]]) -> None:
+        """Make a manifest of these lines, in order, if it is not that already."""
+        text = "".join(json.dumps(line) + "\n" for line in sorted(lines, key=_place)).encode()
+        if manifest.exists() and manifest.read_bytes() != text:
+            _write(manifest, text)
 
     def _split(self, job: Job) -> str:
         return {self.stream(name): name for name in STREAMS}[job.seed]
-
-    def spooled(self) -> dict[Job, Path]:
-        """Return the loads that are solved and wait for their shard; damaged ones are removed."""
-        found = {}
-        for path in sorted((self.folder / "spool").glob("*-*-*.safetensors")):
-            split, number, digest = path.stem.split("-")
-            if hashlib.sha256(path.read_bytes()).hexdigest()[:16] != digest:
-                path.unlink()
-            else:
-                found[Job(self.stream(split), int(number))] = path
-        return found
 
     def _flush(self, files: list[list[Job]], spooled: dict[Job, Path], manifest: str) -> None:
         """Write the first shards that are complete; take them off both lists."""
         while files and all(job in spooled for job in files[0]):
             jobs = files.pop(0)
             paths = [spooled.pop(job) for job in jobs]
-            self._append([_unpacked(path) for path in paths], manifest)
+            self._append([self.spool.get(path) for path in paths], manifest)
             for path in paths:
                 path.unlink()
 
@@ -359,7 +372,7 @@ class Store:
             DataSetError: Another process writes there.
         """
         with sole_writer(self.folder):
-            spooled = self.spooled()
+            spooled = self.spool.files()
             mine = {job for job in spooled if job.seed == self.stream(split)}
             count = max((job.number for job in mine), default=-1) + 1
             runs = [run for run in _runs(self.missing(split, count)) if len(run) == SHARD]
@@ -372,7 +385,7 @@ class Store:
         split, first = self._split(tried[0].job), tried[0].job.number
         kept = [one for one in tried if one.accepted]
         name = f"{split}-{first:06d}.safetensors"
-        content = save(_joined(kept, self.scene.problem.shape, self.scene.loads.dimension))
+        content = closed(kept, self.scene.problem.shape, self.scene.loads.dimension)
         _write(self.folder / name, content)
         line = {
             "file": name,
@@ -399,12 +412,30 @@ class Store:
         A shard is sound if its bytes are those that were written, its loads those that the scene
         draws, and each displacement balances its load to the tolerance, evaluated again, with
         nothing inverted.
+
+        Raises:
+            DataSetError: There is none.
         """
+        if not (self.folder / "scene.json").exists():
+            raise DataSetError(f"{self.folder} holds no data set yet; generate it first")
+        yield {"file": MODES, "rejected": []}, self._flaw_of_modes()
         for line in self.shards():
             try:
                 yield line, self._flaw(line, self._sound(line))
             except ValueError as error:
                 yield line, str(error)
+
+    def _flaw_of_modes(self) -> str:
+        """Return what is wrong with the modes on disk; signs and bases within a family count."""
+        try:
+            kept, found = self.modes(), self.scene.loads.modes
+        except (OSError, SafetensorError) as error:
+            return f"is damaged: {error}"
+        near = [
+            a.shape == b.shape and torch.allclose(a, b, rtol=1e-6, atol=1e-6)
+            for a, b in zip(kept, found, strict=True)
+        ]
+        return "" if all(near) else "holds other modes than this scene has"
 
     def _flaw(self, line: Mapping[str, Any], shard: Mapping[str, Tensor]) -> str:
         problem, loads = self.scene.problem, self.scene.loads
@@ -414,7 +445,10 @@ class Store:
             return "holds other loads than the manifest says"
         if not len(shard["index"]):
             return ""
-        load = loads.sample(self.stream(line["split"]), shard["index"].tolist())
+        points = loads.points(self.stream(line["split"]), shard["index"].tolist())
+        if not torch.allclose(shard["point"], points, rtol=0, atol=1e-12):
+            return "holds other loads than its seed draws"
+        load = loads.at(points)
         if not torch.allclose(
             shard["force"], load.force, rtol=1e-6, atol=1e-9 * loads.largest_force
         ):
@@ -428,8 +462,8 @@ class Store:
                 return f"holds an answer out of balance: load {int(shard['index'][k])}"
         return ""
 
-    def repair(self) -> list[str]:
-        """Forget damaged shards, and those with loads that the machine lost; return their names.
+    def repair(self) -> dict[str, dict[str, Any]]:
+        """Forget damaged shards, and those with loads that the machine lost; return their lines.
 
         Their loads count as missing from then on. Files that no manifest names are removed.
 
@@ -437,25 +471,28 @@ class Store:
             DataSetError: Another process writes there.
         """
         if not (self.folder / "scene.json").exists():
-            return []
+            return {}
         with sole_writer(self.folder):
             poor = {
-                line["file"]
+                line["file"]: line
                 for line, flaw in self.verify()
                 if flaw or any(one["reason"].startswith(MACHINE) for one in line["rejected"])
             }
-            named = {"modes.safetensors"}
+            if poor.pop(MODES, None):
+                _write(self.folder / MODES, save(self.scene.loads.modes._asdict()))
+            named = {MODES}
             for manifest in self._manifests():
-                lines = [line for line in read_lines(manifest) if line["file"] not in poor]
+                lines = [line for line in _lines(manifest) if line["file"] not in poor]
                 named |= {line["file"] for line in lines}
-                text = "".join(json.dumps(line) + "\n" for line in lines)
-                if text.encode() != manifest.read_bytes():
-                    _write(manifest, text.encode())
-            for path in [*self.folder.glob("*.safetensors"), *self.folder.glob(".*.part")]:
+                self._rewrite(manifest, lines)
+            for path in [*self.folder.glob("*.safetensors"), *self.folder.rglob(".*.part")]:
                 if path.name not in named:
                     path.unlink()
+            for path in self.spool.files().values():
+                if self.spool.get(path).reason.startswith(MACHINE):
+                    path.unlink()
             sync_folder(self.folder)
-        return sorted(poor)
+        return poor
 
 
 def _runs(indices: Sequence[int]) -> Iterator[list[int]]:
@@ -475,94 +512,11 @@ def _write(path: Path, content: bytes) -> None:
         file.write(content)
 
 
-def _packed(one: Outcome) -> bytes:
-    """Return a load as a file of the spool."""
-    fields = one._asdict()
-    plain = {k: v for k, v in fields.items() if not isinstance(v, np.ndarray)}
-    arrays = {k: v for k, v in fields.items() if isinstance(v, np.ndarray)}
-    force = torch.from_numpy(arrays.pop("force"))
-    tensors = {name: torch.from_numpy(array).contiguous() for name, array in arrays.items()}
-    tensors |= _compact(force[None])
-    return save(tensors, metadata={"outcome": json.dumps(plain), "nodes": str(len(force))})
+def _lines(manifest: Path) -> list[dict[str, Any]]:
+    """Return the lines of a manifest; one that lacks something counts as torn."""
+    return [line for line in read_lines(manifest) if line.keys() >= LINE]
 
 
-def _unpacked(path: Path) -> Outcome:
-    """Return a load from the spool."""
-    with safe_open(path, framework="pt") as file:
-        plain = json.loads(file.metadata()["outcome"])
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    displacement = tensors["displacement"]
-    force = _spread(tensors, tuple(displacement.shape))[0]
-    seed, number = plain.pop("job")
-    return Outcome(
-        job=Job((seed[0], seed[1]), number),
-        point=tensors["point"].numpy(),
-        force=force.numpy(),
-        displacement=displacement.numpy(),
-        **plain,
-    )
-
-
-def _taken(shard: Mapping[str, Tensor], job: Job, line: Mapping[str, Any]) -> Outcome:
-    """Return a load from a shard that has tried it."""
-    amplitude = line["amplitudes"][job.number - line["first"]]
-    found = (shard["index"] == job.number).nonzero()
-    if not len(found):
-        (why,) = (one for one in line["rejected"] if one["index"] == job.number)
-        none = np.zeros(0)
-        return Outcome(
-            job, none, none, none, amplitude, False, np.nan, np.nan, why["load_factor"], 0, 0.0,
-            why["reason"],
-        )  # fmt: skip
-    k = int(found[0])
-    return Outcome(
-        job=job,
-        point=shard["point"][k].numpy(),
-        force=shard["force"][k].numpy(),
-        displacement=shard["displacement"][k].numpy(),
-        amplitude=amplitude,
-        accepted=True,
-        residual=float(shard["residual"][k]),
-        volume_ratio=float(shard["volume_ratio"][k]),
-        load_factor=1.0,
-        iterations=int(shard["iterations"][k]),
-        seconds=0.0,
-        reason="",
-    )
-
-
-def _joined(kept: Sequence[Outcome], shape: tuple[int, ...], dimension: int) -> dict[str, Tensor]:
-    """Return accepted loads as the tensors of a shard."""
-
-    def column(name: str, *empty: int) -> Tensor:
-        values = [getattr(one, name) for one in kept]
-        return torch.from_numpy(np.stack(values) if values else np.zeros((0, *empty)))
-
-    return {
-        "index": torch.tensor([one.job.number for one in kept], dtype=torch.int64),
-        "point": column("point", dimension),
-        **_compact(column("force", *shape)),
-        "displacement": column("displacement", *shape),
-        "residual": torch.tensor([one.residual for one in kept], dtype=torch.float64),
-        "volume_ratio": torch.tensor([one.volume_ratio for one in kept], dtype=torch.float64),
-        "iterations": torch.tensor([one.iterations for one in kept], dtype=torch.int64),
-    }
-
-
-def _compact(force: Tensor) -> dict[str, Tensor]:
-    """Return forces (B, N, D) as those of the nodes that carry any: they live on small areas."""
-    carries = force.ne(0).any(dim=-1)
-    return {
-        "carried": carries.sum(dim=1),
-        "node": carries.nonzero()[:, 1].to(torch.int32),
-        "nodal_force": force[carries],
-    }
-
-
-def _spread(compact: Mapping[str, Tensor], shape: tuple[int, ...]) -> Tensor:
-    """Return forces (B, N, D) from their compact form."""
-    count = compact["carried"]
-    force = torch.zeros(len(count), *shape, dtype=torch.float64)
-    sample = torch.repeat_interleave(torch.arange(len(count)), count)
-    force[sample, compact["node"].long()] = compact["nodal_force"]
-    return force
+def _place(line: Mapping[str, Any]) -> tuple[int, int]:
+    """Return where a line of the manifest belongs."""
+    return STREAMS[line["split"]], line["first"]

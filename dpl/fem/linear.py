@@ -183,7 +183,13 @@ class PardisoFactor:
         return self.parent.solve(self.matrix, right)
 
     def apply(self, right: Array) -> Array:
-        """Return `solve`."""
+        """Return `solve`, if MKL still holds this factor.
+
+        Raises:
+            SingularMatrix: It holds another one.
+        """
+        if self.parent.held is not self.matrix:
+            raise SingularMatrix("MKL holds the factor of another matrix")
         return self.solve(right)
 
 
@@ -194,7 +200,7 @@ class Pardiso:
         """Prepare; the analysis runs with the first matrix."""
         self.pattern = pattern
         self._solver: Any = None
-        self._held: csr_array | None = None  # the matrix whose factor MKL holds
+        self.held: csr_array | None = None  # the matrix whose factor MKL holds
 
     def __reduce__(self) -> tuple[type["Pardiso"], tuple[Pattern]]:
         """Pickle without MKL's handle."""
@@ -211,12 +217,12 @@ class Pardiso:
 
     def solve(self, matrix: csr_array, right: Array) -> Array:
         """Return x, (n,), with K x = right, for a matrix that has been factorised before."""
-        if self._held is not matrix:
+        if self.held is not matrix:
             self._factorise(matrix)
         return self._call(33, matrix, right)
 
     def _factorise(self, matrix: csr_array) -> None:
-        self._held = None
+        self.held = None
         if self._solver is None:
             from pypardiso import PyPardisoSolver
 
@@ -230,7 +236,7 @@ class Pardiso:
         self._call(22, matrix, np.zeros(self.pattern.size))
         if self._solver.get_iparm(14):  # MKL replaces pivots it cannot use and says nothing
             raise SingularMatrix(f"{self._solver.get_iparm(14)} pivots are zero to rounding")
-        self._held = matrix
+        self.held = matrix
 
     def _call(self, phase: int, matrix: csr_array, right: Array) -> Array:
         from pypardiso.pardiso_wrapper import PyPardisoError

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.krylov import conjugate_gradients
+from dpl.fem.krylov import conjugate_gradients, lowest
 from dpl.fem.linear import Backend, Factor, SingularMatrix, backend, chosen
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, Status, in_step, judge
@@ -58,6 +58,7 @@ class Linear:
         return {"problem": self.problem, "tol": self.tol, "linear": self.linear}
 
 
+DOUBT = 0.05  # eigenvalue, relative to a factor nearby, below which a tangent is examined
 PATIENCE = 8  # conjugate gradient steps with the factor of another tangent, then its own
 CAREFUL = 2.0**-4  # load step from which on the end of the path may be near: full accuracy
 
@@ -74,8 +75,8 @@ class Newton:
 
     An answer whose tangent has negative pivots is in balance but no minimum of the energy, a
     straight column beyond its critical load, for one: its status says so. The tangent at the
-    answer is factorised only if the last one on the way had some, so that an answer within 1e-3 of
-    a critical load may pass.
+    answer is factorised only if the last one on the way had some or may have had, so that an answer
+    within 1e-4 of a critical load may pass.
 
     Source: Wriggers (2008), Nonlinear Finite Element Methods, sections 5.1 and 5.3.
 
@@ -175,13 +176,13 @@ class Newton:
     ) -> Iterator["_State"]:
         """Yield iterates under `target` times a load until they balance it or cannot go on."""
         before = float("nan")
-        kept: Factor | None = None
+        count.near = None
         for _ in range(self.max_iter):
             ratio = self._ratio(state, force, target)
-            rtol = self._forcing(ratio, before)
-            near = kept if ratio < self.reuse else None
+            if not ratio < self.reuse:
+                count.near = None
             try:
-                update, kept = self._update(state, target * force, count, rtol, near)
+                update = self._update(state, target * force, count, self._forcing(ratio, before))
             except SingularMatrix:
                 return
             count.iterations += 1
@@ -206,37 +207,35 @@ class Newton:
         earned = 0.01 * (ratio / before) ** 2 if before > 0 else 0.0
         return max(1e-12, enough, min(1e-3, earned))
 
-    def _update(
-        self, state: "_State", force: Tensor, count: "_Count", rtol: float, near: Factor | None
-    ) -> tuple[Tensor, Factor | None]:
-        """Return the full Newton step (1, N, D) under a force, supports included; and its factor.
-
-        `near` is the factor of a tangent nearby, if there is one worth trying. The factor that
-        comes back is None for the rest state's, which is near no other.
+    def _update(self, state: "_State", force: Tensor, count: "_Count", rtol: float) -> Tensor:
+        """Return the full Newton step (1, N, D) under a force, supports included.
 
         Raises:
             SingularMatrix: The tangent has no factor.
         """
         problem, u = self.problem, state.displacement
+        count.tangent = None
         if not u.any():
             right = self._right(state, force, state.internal)
             count.negative_pivots = self.rest.factor.negative_pivots
-            return scatter(self.rest.factor.solve(right, rtol), problem)[None] + state.jump, None
+            return scatter(self.rest.factor.solve(right, rtol), problem)[None] + state.jump
         system = problem.linearise(u, state.gap)
         if not system.valid:
             system = problem.linearise(u)
         right, values = self._right(state, force, system.force), system.tangent[0].numpy()
         step = None
-        if near is not None and near.negative_pivots == 0:
+        if count.near is not None and count.near.negative_pivots == 0:
+            product = SymmetricProduct(problem.pattern, values)
             with suppress(SingularMatrix):
-                product = SymmetricProduct(problem.pattern, values)
-                step = conjugate_gradients(product, near.apply, right, rtol, PATIENCE)
+                step = conjugate_gradients(product, count.near.apply, right, rtol, PATIENCE)
+                count.tangent = product
         if step is None:
             count.factorisations += 1
-            near = self._backend.factorise(values)
-            step = near.solve(right, rtol)
-            count.negative_pivots = near.negative_pivots
-        return scatter(step, problem)[None] + state.jump, near
+            count.near = None  # its storage serves the next one
+            count.near = self._backend.factorise(values)
+            step = count.near.solve(right, rtol)
+            count.negative_pivots = count.near.negative_pivots
+        return scatter(step, problem)[None] + state.jump
 
     def _right(self, state: "_State", force: Tensor, internal: Tensor) -> NDArray[np.float64]:
         """Return what the step has to balance, (n,)."""
@@ -318,9 +317,20 @@ class Newton:
         )
 
     def _negative_pivots(self, state: "_State", count: "_Count") -> int:
-        """Return those of the tangent at an answer; factorised only if the last one had some."""
-        if count.negative_pivots > 0:
+        """Return those of the tangent at an answer; factorised only where there may be some.
+
+        There may if the last tangent had some; or, where an older factor served for it, if it has
+        an eigenvalue far below that factor's.
+        """
+        suspect = count.negative_pivots > 0
+        if count.tangent is not None and count.near is not None:
+            size = self.problem.pattern.size
+            with suppress(SingularMatrix):
+                suspect |= lowest(count.tangent, count.near.apply, size) < DOUBT
+            count.tangent = None
+        if suspect:
             count.factorisations += 1
+            count.near = None
             tangent = self.problem.linearise(state.displacement).tangent
             try:
                 count.negative_pivots = self._backend.factorise(tangent[0].numpy()).negative_pivots
@@ -349,6 +359,8 @@ class _Count:
     factorisations: int = 0
     negative_pivots: int = -1
     known: float = 0.0
+    near: Factor | None = None  # of the last tangent that was factorised
+    tangent: SymmetricProduct | None = None  # the last one, if an older factor served for it
     start: float = field(default_factory=time.perf_counter)
 
 

@@ -33,7 +33,7 @@ def sobol(seed: int | Sequence[int], index: int, count: int) -> Array:
     sequence.reset()
     if index:
         sequence.fast_forward(index)
-    return sequence.random(1)[0]
+    return sequence.random(1)[0].copy()  # the first point would be a view
 
 
 @lru_cache(maxsize=8)
@@ -83,4 +83,4 @@ def tail(t: Array, part: float = 0.25, low: float = 1e-3) -> Array:
     """
     if not 0 < part < 1:
         raise ValueError(f"part = {part} must lie between 0 and 1")
-    return np.where(t < part, logarithmic(t / part, low), 1.0)
+    return np.where(t < part, logarithmic(np.minimum(t / part, 1.0), low), 1.0)

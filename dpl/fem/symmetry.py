@@ -39,6 +39,22 @@ class Symmetry(NamedTuple):
         return field[..., self.source, :] @ self.rotation.mT.to(field)
 
 
+def images(field: Tensor, group: Sequence[Symmetry], which: Tensor) -> Tensor:
+    """Return nodal fields (B, N, D), each as its image under one member of a group.
+
+    Args:
+        field: (B, N, D).
+        group: Symmetries, the identity first.
+        which: Place of the member for each field, (B,).
+    """
+    image = field.clone()
+    for k, symmetry in enumerate(group[1:], 1):
+        mine = which == k
+        if mine.any():
+            image[mine] = symmetry.image(field[mine])
+    return image
+
+
 def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetry]:
     """Return the group of a body's symmetries, the identity first, always in the same order.
 

@@ -43,7 +43,14 @@ def test_no_loads_make_no_bins_and_loads_of_nothing_make_one():
 
 @pytest.mark.parametrize(
     ("tried", "accepted", "biased"),
-    [(10, 8, True), (10, 9, False), (100, 89, True), (100, 90, False), (9, 0, False), (0, 0, False)],
+    [
+        (10, 8, True),
+        (10, 9, False),
+        (100, 89, True),
+        (100, 90, False),
+        (9, 0, False),
+        (0, 0, False),
+    ],
 )
 def test_a_range_is_biased_below_nine_in_ten_of_at_least_ten_loads(tried, accepted, biased):
     assert Bin(0.0, 1.0, tried, accepted).biased == biased

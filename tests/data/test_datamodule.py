@@ -1,14 +1,39 @@
 """Laws of the data modules: what they hand to Lightning, in which order, and from where."""
 
 import itertools
+import json
 import multiprocessing
+from types import SimpleNamespace
 
+import lightning as L
+import numpy as np
 import pytest
 import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from dpl.data.datamodule import OfflineData, OnlineData
-from dpl.data.generate import outcome
+from dpl.data.datamodule import OfflineData, OnlineData, Samples
+from dpl.data.durable import sole_writer
+from dpl.data.generate import DataSet
+from dpl.data.online import Rates
+from dpl.data.outcome import Job, outcome
+from dpl.data.store import SHARD
+from dpl.fem.symmetry import symmetries
+from dpl.losses import MSE
+from dpl.models.fcnn import FCNN
+from dpl.module import Surrogate
 from dpl.scene import Sample
+
+SIZES = {"val": 4, "test": 4, "workers": 0, "batch_size": 4}
+STREAM = {"batches": 3, "fresh": 4, "reuse": 1, "capacity": 64}
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    """The stream sets the threads of this process: not those of the tests that follow."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture
@@ -16,30 +41,45 @@ def offline(scene, folder, data):
     """Builds data modules on the tiny data set."""
 
     def offline(**options):
-        defaults = {"train": 12, "val": 4, "test": 4, "batch_size": 4, "workers": 0}
-        return OfflineData(scene, folder=str(folder), **{**defaults, **options})
+        return OfflineData(scene, folder=str(folder), **{"train": 12, **SIZES, **options})
 
     return offline
 
 
 @pytest.fixture
 def online(scene, folder, data):
-    """Builds streams that validate on the tiny data set."""
+    """Builds streams that validate on the tiny data set; closed in the end."""
+    made = []
 
     def online(**options):
-        defaults = {
-            "val": 4,
-            "test": 4,
-            "workers": 0,
-            "batch_size": 4,
-            "batches": 3,
-            "fresh": 4,
-            "reuse": 1,
-            "capacity": 64,
-        }
-        return OnlineData(scene, folder=str(folder), **{**defaults, **options})
+        made.append(OnlineData(scene, folder=str(folder), **{**SIZES, **STREAM, **options}))
+        return made[-1]
 
-    return online
+    yield online
+    for one in made:
+        one.teardown("fit")
+
+
+@pytest.fixture
+def saving(scene, tmp_path):
+    """Builds streams that keep what they solve in a data set of their own, with its folder."""
+    made = []
+
+    def saving(**options):
+        options = {**SIZES, "val": 1, "test": 1, **STREAM, "save": True, **options}
+        made.append(OnlineData(options.pop("scene", scene), folder=str(tmp_path / "d"), **options))
+        made[-1].prepare_data()
+        return made[-1]
+
+    yield saving
+    for one in made:
+        one.teardown("fit")
+
+
+def placed(module, rank, processes):
+    """Return a data module that is one of several training processes."""
+    module.trainer = SimpleNamespace(global_rank=rank, world_size=processes, logger=None)
+    return module
 
 
 def order(module, epoch):
@@ -50,6 +90,13 @@ def order(module, epoch):
 
 def forces(batches):
     return [force.numpy().tobytes() for batch in batches for force in batch.force]
+
+
+def drawn(scene, count):
+    return forces([scene.loads.sample((0, 0), range(count))])
+
+
+# ------------------------------------------------------------------ from disk
 
 
 def test_an_epoch_holds_every_sample_once(offline):
@@ -65,6 +112,17 @@ def test_batches_are_a_function_of_shuffle_and_epoch(offline):
     assert order(offline(shuffle=3), epoch=2) == first
     assert order(offline(shuffle=3), epoch=3) != first
     assert order(offline(shuffle=4), epoch=2) != first
+
+
+def test_forces_and_displacements_stay_together(offline):
+    module = offline(symmetry=True)
+    truth = module.samples("train")
+    pairs = dict(zip(forces([truth]), truth.displacement, strict=True))
+    for batch in module.train_dataloader():
+        for force, displacement in zip(batch.force, batch.displacement, strict=True):
+            if (key := force.numpy().tobytes()) in pairs:
+                assert torch.equal(pairs.pop(key), displacement)
+    assert not pairs
 
 
 def test_validation_and_test_keep_their_order(offline):
@@ -85,36 +143,200 @@ def test_batches_keep_double_precision(offline):
     assert all(column.dtype == torch.float64 for column in batch)
 
 
-def test_the_plan_counts_what_is_there(offline, scene, tmp_path):
-    (line,) = offline().plan()
+def test_a_batch_is_a_copy(offline):
+    """What a training step does to its batch, the next epoch does not see."""
+    module = offline(symmetry=True)
+    before = module.samples("train").force.clone()
+    for batch in module.train_dataloader():
+        batch.force.zero_()
+    assert torch.equal(module.samples("train").force, before)
+
+
+def test_the_plan_counts_what_is_there(offline, scene, folder, tmp_path):
+    where, line = offline().plan()
+    assert str(folder) in where
+    assert scene.fingerprint[:12] in where
     assert line.startswith("20 of 20 loads not solved again")
-    (line,) = offline(train=30).plan()
-    assert line.startswith("20 of 38 loads not solved again")
-    assert OfflineData(scene, folder=str(tmp_path / "new"), workers=0).plan() == []
+    assert offline(train=30).plan()[1].startswith("20 of 38 loads not solved again")
+    (where,) = OfflineData(scene, folder=str(tmp_path / "new"), workers=0).plan()
+    assert str(tmp_path / "new") in where
     assert not (tmp_path / "new").exists(), "a plan computes nothing and writes nothing"
 
 
 def test_preparing_twice_solves_nothing(offline, monkeypatch):
-    def forbidden(*_):
+    def forbidden(*_, **__):
         raise AssertionError("solved again")
 
-    monkeypatch.setattr("dpl.data.generate.outcome", forbidden)
+    monkeypatch.setattr("dpl.data.crew.outcome", forbidden)
     offline().prepare_data()
 
 
 @pytest.mark.parametrize(
     "options",
-    [{"train": -1}, {"val": 0}, {"test": 0}, {"batch_size": 0}, {"workers": -1}, {"seed": -1}],
+    [
+        {"train": -1}, {"val": 0}, {"test": 0}, {"batch_size": 0}, {"workers": -1}, {"seed": -1},
+        {"timeout": 0.0},
+    ],
     ids=lambda options: next(iter(options)),
-)
+)  # fmt: skip
 def test_options_out_of_range_are_refused_by_name(offline, options):
     with pytest.raises(ValueError, match=f"{next(iter(options))} = "):
         offline(**options)
 
 
+# ------------------------------------------------------------------ young: one data set for all
+
+
+def test_the_moduli_are_those_of_this_scene_whatever_the_store_was_made_with(
+    scene, make_scene, offline, folder
+):
+    """u/L depends on f/(E L^2) alone: one data set serves every range, and every size."""
+    wide = make_scene(young=[1e6, 2e11], size=(1.0, 0.25, 0.25))
+    module = OfflineData(wide, folder=str(folder), train=12, **SIZES)
+    here, there = offline().samples("train"), module.samples("train")
+    assert torch.equal(here.force, there.force)
+    assert torch.equal(here.displacement, there.displacement)
+    assert (here.young == 4500.0).all()
+    assert torch.equal(there.young, wide.loads.sample((0, 0), range(12)).young)
+    assert len(there.young.unique()) == 12
+    assert torch.equal(next(iter(module.val_dataloader())).young, module.samples("val").young)
+
+
+# ------------------------------------------------------------------ symmetry
+
+
+def test_an_epoch_holds_the_images_of_every_sample_once(scene, offline):
+    module, group = offline(symmetry=True, batch_size=5), symmetries(scene.problem)
+    assert len(group) > 1
+    seen = forces(module.train_dataloader())
+    samples = module.samples("train")
+    images = [forces([samples._replace(force=one.image(samples.force))]) for one in group]
+    assert len(seen) == 12 * len(group)
+    assert sorted(seen) == sorted(itertools.chain(*images))
+
+
+def test_images_balance_as_well_as_their_samples(scene, offline):
+    worst = 0.0
+    for batch in offline(symmetry=True).train_dataloader():
+        internal, volume = scene.problem.evaluate(batch.displacement)
+        assert (volume > 0).all()
+        worst = max(worst, float(scene.problem.imbalance(internal, batch.force).max()))
+    assert 0 < worst < 1e-8
+
+
+def test_images_keep_the_modulus_of_their_sample(make_scene, folder, data):
+    """Which image is which sample's is seen by the norm of the force."""
+    scene = make_scene(young=[1e6, 2e11])
+    module = OfflineData(scene, folder=str(folder), train=12, symmetry=True, **SIZES)
+    samples = module.samples("train")
+    norms = samples.force.flatten(1).norm(dim=1)
+    for batch in module.train_dataloader():
+        found = (batch.force.flatten(1).norm(dim=1)[:, None] - norms).abs().argmin(dim=1)
+        assert torch.equal(batch.young, samples.young[found])
+
+
+def test_validation_and_test_have_no_images(offline):
+    module = offline(symmetry=True)
+    assert forces(module.val_dataloader()) == forces([module.samples("val")])
+    assert forces(module.test_dataloader()) == forces([module.samples("test")])
+
+
+def test_the_order_of_images_is_a_function_of_shuffle_and_epoch(offline):
+    first = order(offline(symmetry=True, shuffle=3), epoch=2)
+    assert order(offline(symmetry=True, shuffle=3), epoch=2) == first
+    assert order(offline(symmetry=True, shuffle=3), epoch=3) != first
+    assert order(offline(symmetry=True, shuffle=4), epoch=2) != first
+    assert sorted(order(offline(symmetry=True, shuffle=4), epoch=0)) == sorted(first)
+
+
+def test_images_of_a_sample_are_spread_over_the_epoch(offline):
+    """They are shuffled as samples of their own, not one batch after the other."""
+    module = offline(symmetry=True, batch_size=12)
+    norms = [batch.force.flatten(1).norm(dim=1) for batch in module.train_dataloader()]
+    assert any(len((n / n.max()).mul(1e9).round().unique()) < 12 for n in norms)
+
+
+def test_the_plan_says_how_many_samples_a_load_makes(scene, offline):
+    count = len(symmetries(scene.problem))
+    line = f"{count} samples of each load solved: symmetries of the body"
+    assert line in offline(symmetry=True).plan()
+    assert not any("symmetr" in line for line in offline().plan())
+
+
+def test_a_force_in_every_load_breaks_the_symmetries_that_turn_it(make_scene, tmp_path):
+    scene = make_scene()
+    down = torch.zeros(scene.problem.shape, dtype=torch.float64)
+    down[:, 2] = torch.where(scene.loads.reach[:, 2], -1e-7, 0.0)
+    weighted = make_scene(always=down)
+    free = OfflineData(scene, folder=str(tmp_path), symmetry=True, **SIZES)
+    held = OfflineData(weighted, folder=str(tmp_path), symmetry=True, **SIZES)
+    assert 1 < len(held.group) < len(free.group)
+    assert all(torch.equal(one.image(down), down) for one in held.group)
+
+
+def test_samples_without_symmetries_are_handed_out_as_they_are(batch):
+    plain = Samples(batch)
+    assert len(plain) == 12
+    assert torch.equal(plain.__getitems__([3, 1]).force, batch.force[[3, 1]])
+
+
+@pytest.mark.xfail(strict=True, reason="**kwargs takes `symmetry`, nothing is done with it")
+def test_a_stream_makes_images_or_refuses_to(online):
+    """The plan must not promise what does not happen."""
+    try:
+        module = online(symmetry=True, batch_size=12, fresh=12, batches=4, capacity=1000)
+    except (TypeError, ValueError):
+        return
+    told = [line for line in module.plan() if "samples of each load" in line]
+    count = len(set(forces(module.train_dataloader())))
+    replay = module._replay
+    assert not told or count > replay.produced
+
+
+# ------------------------------------------------------------------ several training processes
+
+
+def test_two_processes_see_disjoint_halves_that_together_are_everything(offline):
+    for epoch in (0, 1):
+        halves = [order(placed(offline(shuffle=1), k, 2), epoch) for k in (0, 1)]
+        assert [len(half) for half in halves] == [6, 6]
+        assert not set(halves[0]) & set(halves[1])
+        assert sorted(halves[0] + halves[1]) == sorted(forces([offline().samples("train")]))
+
+
+def test_two_processes_share_the_images(scene, offline):
+    count = 12 * len(symmetries(scene.problem))
+    halves = [set(order(placed(offline(symmetry=True), k, 2), 0)) for k in (0, 1)]
+    assert not halves[0] & halves[1]
+    assert len(halves[0] | halves[1]) == count
+
+
+def test_the_streams_of_two_processes_are_disjoint_and_together_everything(scene, online):
+    options = {"batches": 2, "fresh": 4, "batch_size": 4}
+    halves = [set(forces(placed(online(**options), k, 2).train_dataloader())) for k in (0, 1)]
+    assert [len(half) for half in halves] == [8, 8]
+    assert halves[0] | halves[1] == set(drawn(scene, 16))
+
+
+@pytest.mark.xfail(strict=True, reason="only rank 0's `following` is in the checkpoint")
+def test_resumed_streams_of_two_processes_draw_no_load_twice(scene, online):
+    """A checkpoint holds what rank 0 has taken; the others may be ahead of it."""
+    first = [placed(online(), k, 2) for k in (0, 1)]
+    seen = set().union(*[forces(module.train_dataloader()) for module in first])
+    resumed = [placed(online(), k, 2) for k in (0, 1)]
+    for module in resumed:
+        module.load_state_dict(first[0].state_dict())
+    again = [set(forces(module.train_dataloader())) for module in resumed]
+    assert not again[0] & again[1]
+    assert not seen & (again[0] | again[1])
+
+
+# ------------------------------------------------------------------ online
+
+
 @pytest.mark.parametrize(
     "options",
-    [{"batches": 0}, {"fresh": 0}, {"reuse": 0}, {"capacity": 3}],
+    [{"batches": 0}, {"fresh": 0}, {"reuse": 0}, {"capacity": 3}, {"worst": -0.1}, {"worst": 1.1}],
     ids=lambda options: next(iter(options)),
 )
 def test_options_of_the_stream_out_of_range_are_refused_by_name(online, options):
@@ -122,8 +344,17 @@ def test_options_of_the_stream_out_of_range_are_refused_by_name(online, options)
         online(**options)
 
 
+def test_keeping_loads_and_drawing_others_than_the_seed_names_exclude_each_other(online):
+    with pytest.raises(ValueError, match=r"save = true .* worst > 0") as refusal:
+        online(save=True, worst=0.1)
+    assert "\n" not in str(refusal.value)
+    online(save=True, worst=0.0)
+    online(save=False, worst=1.0)
+
+
 def test_the_stream_solves_the_loads_that_the_data_set_would_hold(online, offline):
-    batches = list(online(batches=10, batch_size=12, fresh=12, reuse=10).train_dataloader())
+    options = {"batches": 10, "batch_size": 12, "fresh": 12, "reuse": 20}
+    batches = list(online(**options).train_dataloader())
     assert set(forces(batches)) == set(forces([offline().samples("train")]))
 
 
@@ -132,34 +363,69 @@ def test_the_stream_validates_on_the_data_set(online, offline):
     assert forces(online().test_dataloader()) == forces(offline().test_dataloader())
 
 
-def test_preparing_a_stream_solves_no_training_load(online, scene, tmp_path, monkeypatch):
+def test_preparing_a_stream_solves_no_training_load(scene, tmp_path, monkeypatch):
     seen = []
 
     def counted(scene, job):
         seen.append(job.seed)
         return outcome(scene, job)
 
-    monkeypatch.setattr("dpl.data.generate.outcome", counted)
+    monkeypatch.setattr("dpl.data.crew.outcome", counted)
     module = OnlineData(scene, folder=str(tmp_path / "d"), val=2, test=3, workers=0)
     module.prepare_data()
     assert sorted(seen) == [(0, 1)] * 2 + [(0, 2)] * 3
+    module.train_dataloader()
+    assert len(seen) == 5
+
+
+def test_a_stream_without_worst_has_nothing_of_it(online, monkeypatch):
+    def forbidden(*_, **__):
+        raise AssertionError("made")
+
+    monkeypatch.setattr("dpl.data.datamodule.Worst", forbidden)
+    monkeypatch.setattr(OnlineData, "_errors", forbidden)
+    assert len(list(online().train_dataloader())) == 3
+    with pytest.raises(AssertionError, match="made"):
+        online(worst=0.5).train_dataloader()
+
+
+def test_errors_of_the_surrogate_decide_where_new_loads_are(scene, online):
+    """Not before it has told any; then near the one that it answers worst."""
+    module = online(worst=1.0, batch_size=4, fresh=4, batches=1, capacity=64)
+    told = SimpleNamespace(batch_errors=None)
+    module.trainer = SimpleNamespace(
+        lightning_module=told, logger=None, global_rank=0, world_size=1
+    )
+    stream = module.train_dataloader()
+    first = next(iter(stream))
+    told.batch_errors = torch.arange(4.0)
+    assert sorted(forces([first])) == sorted(drawn(scene, 4))
+    next(iter(stream))
+    worst = module._replay._source.worst
+    assert int(worst.count) == 1
+    load = scene.loads.at(worst.points[:1])
+    assert torch.equal(load.force[0], first.force[3])
+
+
+# ------------------------------------------------------------------ resumed streams
 
 
 def test_a_resumed_stream_goes_on_where_it_was_left(online):
     module = online()
     first = set(forces(module.train_dataloader()))
     state = module.state_dict()
-    assert state["produced"] == 12
+    assert state == {"produced": 12, "following": 12}
     resumed = online()
     resumed.load_state_dict(state)
+    assert resumed.state_dict() == state
     second = set(forces(resumed.train_dataloader()))
     assert not first & second
-    assert resumed.state_dict()["produced"] == 24
+    assert resumed.state_dict() == {"produced": 24, "following": 24}
 
 
 def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, monkeypatch):
-    def choosy(scene, job):
-        return outcome(scene, job)._replace(accepted=job.number % 3 == 1)
+    def choosy(scene, job, **options):
+        return outcome(scene, job, **options)._replace(accepted=job.number % 3 == 1)
 
     monkeypatch.setattr("dpl.data.online.outcome", choosy)
     module = online()
@@ -170,11 +436,277 @@ def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, mo
 
 
 def test_a_resumed_stream_of_two_workers_draws_no_load_twice(online):
-    module = online(workers=2, batches=3, fresh=4, batch_size=64, reuse=16)
+    module = online(workers=2, batches=3, fresh=4, batch_size=64, reuse=32, capacity=64)
     first = set(forces(itertools.islice(module.train_dataloader(), 3)))
     state = module.state_dict()
     module.teardown("fit")
     assert not multiprocessing.active_children()
-    resumed = online(batches=3, fresh=4, batch_size=64, reuse=16)
+    resumed = online()
     resumed.load_state_dict(state)
     assert not first & set(forces(resumed.train_dataloader()))
+
+
+# ------------------------------------------------------------------ what is solved is kept
+
+
+def names(folder):
+    return sorted(path.name for path in folder.glob("train-*.safetensors"))
+
+
+def test_what_was_produced_is_in_the_data_set_whole_shards_and_a_spool(scene, saving, tmp_path):
+    module = saving(batches=20)  # 80 loads
+    seen = forces(module.train_dataloader())
+    folder = tmp_path / "d"
+    assert names(folder) == ["train-000000.safetensors"]
+    assert sorted(seen) == sorted(drawn(scene, 80))
+    assert sorted(forces([module.store.load("train", SHARD)])) == sorted(drawn(scene, SHARD))
+    spooled = sorted(path.name for path in (folder / "spool").iterdir())
+    assert [name[:13] for name in spooled] == [f"train-{k:06d}." for k in range(SHARD, 80)]
+    assert module.store.missing("train", 80) == list(range(SHARD, 80))
+
+
+def test_a_data_set_begun_online_is_completed_to_the_one_made_offline(scene, saving, tmp_path):
+    """Manifest and bytes: whoever has solved them, and when."""
+    module = saving(batches=20)
+    list(module.train_dataloader())
+    module.teardown("fit")
+    sizes = {"train": 100, "val": 1, "test": 1, "workers": 0}
+    one = DataSet(scene, str(tmp_path / "d"), **sizes)
+    solved = []
+    for got in one.store.fill(one.missing(), workers=0):
+        solved.append(got.job.number)
+    assert solved == list(range(80, 100)), "no load is solved again"
+    other = DataSet(scene, str(tmp_path / "offline"), **sizes)
+    other.fill()
+
+    def manifest(data):
+        lines = (data.store.folder / "manifest.jsonl").read_text().splitlines()
+        return sorted(json.loads(line)["file"] + line for line in lines)
+
+    assert manifest(one) == manifest(other)
+    assert one.store.digest("train", 100) == other.store.digest("train", 100)
+    assert all(not flaw for _, flaw in one.store.verify())
+    assert not (tmp_path / "d" / "spool").exists()
+
+
+def test_what_the_data_set_has_is_read_and_not_solved(scene, saving, tmp_path, monkeypatch):
+    DataSet(scene, str(tmp_path / "d"), train=20, val=1, test=1, workers=0).fill()
+    solved = []
+
+    def counted(scene, job, **options):
+        solved.append(job.number)
+        return outcome(scene, job, **options)
+
+    monkeypatch.setattr("dpl.data.online.outcome", counted)
+    module = saving(batches=6)
+    assert "20 loads of the stream not solved again: they are there" in module.plan()
+    batches = list(module.train_dataloader())
+    assert solved == [20, 21, 22, 23]
+    assert sorted(forces(batches)) == sorted(drawn(scene, 24))
+    truth = module.store.load("train", 20)
+    pairs = dict(zip(forces([truth]), truth.displacement, strict=True))
+    for batch in batches:
+        for force, displacement in zip(batch.force, batch.displacement, strict=True):
+            if (key := force.numpy().tobytes()) in pairs:
+                assert torch.equal(pairs.pop(key), displacement)
+    assert not pairs
+
+
+def test_read_loads_have_the_moduli_of_this_scene(make_scene, saving, scene, tmp_path):
+    DataSet(scene, str(tmp_path / "d"), train=4, val=1, test=1, workers=0).fill()
+    wide = make_scene(young=[1e6, 2e11])
+    (batch,) = saving(scene=wide, batches=1).train_dataloader()
+    assert torch.equal(batch.young.sort()[0], wide.loads.sample((0, 0), range(4)).young.sort()[0])
+
+
+@pytest.mark.xfail(strict=True, reason="`Store.reader` knows shards alone, not the spool")
+def test_what_waits_in_the_spool_is_not_solved_again(saving, monkeypatch, tmp_path):
+    """A run that was stopped leaves up to 63 loads there, and a resumed one begins below."""
+    list(saving(batches=6).train_dataloader())
+    spooled = sorted((tmp_path / "d" / "spool").iterdir())
+    assert len(spooled) == 24
+
+    def forbidden(*_, **__):
+        raise AssertionError("solved again")
+
+    monkeypatch.setattr("dpl.data.online.outcome", forbidden)
+    list(saving(batches=6).train_dataloader())
+    assert sorted((tmp_path / "d" / "spool").iterdir()) == spooled
+
+
+@pytest.mark.xfail(strict=True, reason="a load's file is named by its bytes, that hold its seconds")
+def test_a_load_solved_twice_leaves_nothing_in_the_spool(scene, saving, tmp_path):
+    for _ in range(2):
+        list(saving(batches=6).train_dataloader())
+    DataSet(scene, str(tmp_path / "d"), train=24, val=1, test=1, workers=0).fill()
+    assert not (tmp_path / "d" / "spool").exists()
+
+
+def test_rejected_loads_are_kept_as_rejected(scene, saving, tmp_path, monkeypatch):
+    def choosy(scene, job, **options):
+        one = outcome(scene, job, **options)
+        return one._replace(accepted=False, reason="a whim") if job.number % 3 == 0 else one
+
+    monkeypatch.setattr("dpl.data.online.outcome", choosy)
+    monkeypatch.setattr("dpl.data.crew.outcome", choosy)
+    module = saving(batches=12)  # 48 accepted of 71 or 72
+    seen = forces(module.train_dataloader())
+    loads = drawn(scene, 72)
+    assert sorted(seen) == sorted(load for k, load in enumerate(loads) if k % 3)
+    (line,) = (line for line in module.store.shards() if line["split"] == "train")
+    assert line["tried"] == SHARD
+    assert [one["index"] for one in line["rejected"]] == list(range(0, SHARD, 3))
+    assert {one["reason"] for one in line["rejected"]} == {"a whim"}
+    again = saving(batches=10)
+    solved = []
+    monkeypatch.setattr(
+        "dpl.data.online.outcome", lambda *a, **k: solved.append(1) or choosy(*a, **k)
+    )
+    first = forces(again.train_dataloader())
+    assert not set(first) & {load for k, load in enumerate(loads) if not k % 3}
+    assert not solved, "neither what was accepted nor what was rejected"
+
+
+def test_a_data_set_without_a_rejected_point_gives_samples_of_finite_numbers(saving, monkeypatch):
+    """What a rejected load leaves, NaN, does not reach training."""
+
+    def choosy(scene, job, **options):
+        one = outcome(scene, job, **options)
+        bad = one._replace(accepted=False, reason="x", displacement=np.nan * one.displacement)
+        return bad if job.number % 2 else one
+
+    monkeypatch.setattr("dpl.data.online.outcome", choosy)
+    for batch in saving(batches=20).train_dataloader():
+        assert all(torch.isfinite(column).all() for column in batch)
+
+
+def test_a_stream_that_does_not_save_writes_nothing(scene, tmp_path):
+    options = {**SIZES, **STREAM, "val": 1, "test": 1}
+    module = OnlineData(scene, folder=str(tmp_path / "d"), **options)
+    module.prepare_data()
+    before = sorted(path.name for path in (tmp_path / "d").rglob("*"))
+    list(module.train_dataloader())
+    assert sorted(path.name for path in (tmp_path / "d").rglob("*")) == before
+
+
+def test_only_the_first_of_several_processes_writes_shards(saving, tmp_path):
+    modules = [placed(saving(batches=16), k, 2) for k in (1, 0)]
+    list(modules[0].train_dataloader())
+    assert not names(tmp_path / "d")
+    assert len(list((tmp_path / "d" / "spool").iterdir())) == 64
+    list(modules[1].train_dataloader())
+    assert names(tmp_path / "d") == ["train-000000.safetensors", "train-000064.safetensors"]
+
+
+@pytest.mark.xfail(strict=True, reason="`_report` lets DataSetError out, in the midst of training")
+def test_another_writer_does_not_end_a_training_run(saving, tmp_path):
+    """Shards can wait for the next epoch; hours of training cannot be had again."""
+    stream = saving(batches=16).train_dataloader()
+    with sole_writer(tmp_path / "d"):
+        list(stream)
+    assert len(list((tmp_path / "d" / "spool").iterdir())) == 64
+    list(stream)
+    assert len(names(tmp_path / "d")) == 2
+
+
+@pytest.mark.slow
+def test_two_workers_keep_what_they_solve(scene, saving, tmp_path):
+    module = saving(workers=2, batches=24, fresh=4)
+    seen = forces(module.train_dataloader())
+    module.teardown("fit")
+    store = DataSet(scene, str(tmp_path / "d"), train=80, val=1, test=1, workers=0).fill()
+    assert all(not flaw for _, flaw in store.verify())
+    assert names(tmp_path / "d")[0] == "train-000000.safetensors"
+    assert set(seen) <= set(drawn(scene, 128))
+    assert module.store.missing("train", SHARD) == []
+
+
+# ------------------------------------------------------------------ within a trainer
+
+
+@pytest.fixture
+def fitted(scene, tmp_path):
+    """Trains on a stream for some epochs; returns the trainer."""
+
+    def fitted(module, epochs=2):
+        torch.manual_seed(0)
+        logger = TensorBoardLogger(tmp_path / "log", name="", version="")
+        trainer = L.Trainer(
+            accelerator="cpu", max_epochs=epochs, logger=logger, num_sanity_val_steps=0,
+            enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
+            log_every_n_steps=1,
+        )  # fmt: skip
+        trainer.fit(Surrogate(FCNN(scene, width=4), MSE(), scene), datamodule=module)
+        logger.finalize("success")
+        return trainer
+
+    return fitted
+
+
+def scalars(folder):
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+    return {tag: events.Scalars(tag) for tag in events.Tags()["scalars"]}
+
+
+def test_the_rates_of_the_stream_are_handed_to_the_logger(online):
+    module, logged = online(reuse=2), []
+    logger = SimpleNamespace(log_metrics=lambda numbers, step: logged.append((step, numbers)))
+    module.trainer = SimpleNamespace(logger=logger, global_step=7, global_rank=0, world_size=1)
+    list(module.train_dataloader())
+    ((step, numbers),) = logged
+    assert step == 7
+    assert set(numbers) == {f"online/{name}" for name in Rates._fields}
+    assert numbers["online/uses"] == pytest.approx(12 / 12)
+
+
+REPORT = "Lightning asks for `len` batches and no more: what follows `yield from` never runs"
+
+
+@pytest.mark.xfail(strict=True, reason=REPORT)
+def test_tensorboard_shows_the_rates_of_each_epoch(online, fitted, tmp_path):
+    fitted(online(), epochs=3)
+    found = scalars(tmp_path / "log")
+    for name in Rates._fields:
+        first, second, third = (event.step for event in found[f"online/{name}"])
+        assert 0 < first <= 3 < second <= 6 < third <= 9
+
+
+@pytest.mark.xfail(strict=True, reason=REPORT)
+def test_a_trained_stream_leaves_whole_shards(saving, fitted, tmp_path):
+    fitted(saving(batches=16), epochs=2)
+    assert names(tmp_path / "d") == ["train-000000.safetensors", "train-000064.safetensors"]
+
+
+def test_a_trained_stream_takes_no_more_than_it_uses(online, fitted):
+    module = online()
+    trainer = fitted(module, epochs=2)
+    assert trainer.global_step == 6
+    assert module.state_dict() == {"produced": 24, "following": 24}
+
+
+def test_loads_near_the_worst_answers_are_drawn_while_it_trains(online, fitted):
+    module = online(worst=0.5, batches=8, reuse=2, fresh=4)
+    fitted(module, epochs=2)
+    worst = module._replay._source.worst
+    assert int(worst.count) > 0
+    assert ((worst.points[: int(worst.count)] >= 0) & (worst.points[: int(worst.count)] < 1)).all()
+
+
+@pytest.mark.xfail(strict=True, reason="it sets what the machine has, not what the user gave")
+def test_a_stream_does_not_take_more_threads_than_it_was_given(online):
+    """OMP_NUM_THREADS=1 on a shared machine means one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    online().train_dataloader()
+    after = torch.get_num_threads()
+    torch.set_num_threads(before)
+    assert after == 1
+
+
+def test_the_job_of_a_stream_is_that_of_the_training_split(online):
+    stream = online().train_dataloader()._source
+    assert stream.seed == (0, 0)
+    truth = outcome(stream.scene, Job((0, 0), 0))
+    one = next(iter(stream))
+    assert torch.equal(one.sample.displacement, torch.from_numpy(truth.displacement))

@@ -1,207 +1,387 @@
-"""Laws of `dpl.data.generate`: the same samples from any crew, and no process left behind."""
+"""Laws of `dpl.data.generate`: what is wanted, what is missing, and what is told of it."""
 
-import multiprocessing
+import json
 import os
+import shutil
 import signal
-import subprocess
-import sys
-import time
-from functools import partial
-from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 
-from dpl.data import generate
-from dpl.data.generate import Job, outcome, outcomes
+from dpl.data.generate import DataSet
+from dpl.data.outcome import lost, outcome
+from dpl.data.spool import Spool
 from dpl.fem.materials import SaintVenantKirchhoff
-from dpl.fem.modes import uniform
 
-SEED = (5, 0)
-ANSWER = ("force", "displacement", "young", "accepted", "residual", "iterations", "reason")
+SIZES = {"train": 6, "val": 2, "test": 2}
 
 
-def content(one):
-    """Return all of an outcome that may not depend on who solved it, as comparable values."""
-    values = (getattr(one, name) for name in ANSWER)
-    return [v.tobytes() if isinstance(v, np.ndarray) else v for v in values]
+@pytest.fixture
+def wanted(scene, tmp_path):
+    """Makes data sets of ten loads in one folder."""
+
+    def wanted(**other):
+        return DataSet(scene, str(tmp_path / "d"), **{**SIZES, "workers": 0, **other})
+
+    return wanted
 
 
-def by_index(found):
-    return {one.job.number: content(one) for one in found}
+@pytest.fixture
+def solved(monkeypatch):
+    """The loads that are solved, as they are."""
+    found = []
+
+    def counted(scene, job):
+        found.append((job.seed[1], job.number))
+        return outcome(scene, job)
+
+    monkeypatch.setattr("dpl.data.crew.outcome", counted)
+    return found
 
 
-def index_of(rng):
-    return rng.bit_generator.seed_seq.spawn_key[-1]
+@pytest.fixture
+def interrupted(monkeypatch):
+    """Sends this process signals as soon as so many loads are solved."""
+
+    def interrupted(after, *signals):
+        count = 0
+        real = Spool.put
+
+        def keep(self, one):
+            nonlocal count
+            count += 1
+            path = real(self, one)
+            if count == after:
+                for number in signals:
+                    os.kill(os.getpid(), number)
+            return path
+
+        monkeypatch.setattr(Spool, "put", keep)
+
+    return interrupted
 
 
-def in_a_worker():
-    return multiprocessing.parent_process() is not None
+def sessions(store):
+    return [json.loads(line) for line in (store.folder / "journal.jsonl").read_text().splitlines()]
 
 
-def dies_at_one(rng, count):
-    """Draw as `uniform`; load 1 ends the worker that draws it."""
-    if index_of(rng) == 1 and in_a_worker():
-        os._exit(1)
-    return uniform(rng, count)
-
-
-def killed_once(rng, count, *, mark):
-    """Draw as `uniform`; load 2 gets its first worker killed."""
-    if index_of(rng) == 2 and in_a_worker() and not Path(mark).exists():
-        Path(mark).touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return uniform(rng, count)
-
-
-def raises(rng, count):
-    """Draw nothing: every worker ends with a traceback."""
-    raise RuntimeError("no load can be drawn")
-
-
-def children():
-    return {child.pid for child in multiprocessing.active_children()}
-
-
-@pytest.fixture(scope="module")
-def jobs():
-    return [Job(SEED, index) for index in range(8)]
-
-
-@pytest.fixture(scope="module")
-def here(scene, jobs):
-    """What this process finds."""
-    return by_index(outcomes(scene, jobs, workers=0))
-
-
-def test_loads_are_solved_in_the_order_of_the_jobs_without_workers(scene, jobs):
-    assert [one.job for one in outcomes(scene, jobs[::-1], workers=0)] == jobs[::-1]
-
-
-def test_a_sample_does_not_depend_on_the_order_of_the_jobs(scene, jobs, here):
-    assert by_index(outcomes(scene, jobs[::-1], workers=0)) == here
-    assert content(outcome(scene, jobs[5])) == here[5]
-
-
-def test_a_sample_does_not_depend_on_the_scene_object(make_scene, jobs, here):
-    assert content(outcome(make_scene(), jobs[3])) == here[3]
-
-
-def test_a_killed_worker_is_replaced_and_every_crew_finds_the_same_bytes(
-    make_scene, jobs, here, tmp_path
-):
-    before = children()
-    mark = tmp_path / "killed"
-    scene = make_scene(distribution=partial(killed_once, mark=str(mark)))
-    found = list(outcomes(scene, jobs, workers=2))
-    assert mark.exists()
-    assert sorted(one.job.number for one in found) == list(range(8))
-    assert by_index(found) == here
-    assert children() <= before
-
-
-def test_a_crew_closed_early_leaves_no_process_and_one_worker_finds_the_same_bytes(
-    scene, jobs, here
-):
-    before = children()
-    running = outcomes(scene, jobs, workers=1)
-    first = [next(running), next(running)]
-    crew = children() - before
-    assert len(crew) == 1
-    running.close()
-    assert all(content(one) == here[one.job.number] for one in first)
-    assert not crew & children()
-    assert not any(Path(f"/proc/{pid}").exists() for pid in crew)
-
-
-def test_a_load_that_kills_every_worker_is_given_up_with_a_reason(make_scene, here, monkeypatch):
-    monkeypatch.setattr(generate, "TRIES", 2)
-    scene = make_scene(distribution=dies_at_one)
-    found = {
-        one.job.number: one for one in outcomes(scene, [Job(SEED, 1), Job(SEED, 0)], workers=1)
+def content(folder):
+    return {
+        p.name: p.read_bytes() for p in [*folder.glob("*.safetensors"), *folder.glob("m*.jsonl")]
     }
-    assert content(found[0]) == here[0]
-    lost = found[1]
-    assert not lost.accepted
-    assert "died 2 times" in lost.reason
-    assert lost.load_factor == 0
-    assert lost.force.tobytes() == here[1][0], "the load that could not be solved is kept"
-    assert not children()
 
 
-def test_workers_that_all_die_end_the_run(make_scene, monkeypatch, capfd):
-    monkeypatch.setattr(generate, "HOPELESS", 1)
-    scene = make_scene()
-    scene.loads.modes  # noqa: B018 - found before the draws start to fail
-    object.__setattr__(scene.loads, "distribution", raises)
-    with pytest.raises(RuntimeError, match="workers died one after the other"):
-        list(outcomes(scene, [Job(SEED, index) for index in range(4)], workers=1))
-    assert "no load can be drawn" in capfd.readouterr().err
-    assert not children()
+# ------------------------------------------------------------------ what is wanted
 
 
-def test_no_jobs_cost_no_process(scene):
-    start = time.perf_counter()
-    assert list(outcomes(scene, [], workers=2)) == []
-    assert time.perf_counter() - start < 0.5
+@pytest.mark.parametrize("name", ["seed", "train", "val", "test", "workers"])
+def test_negative_numbers_are_refused_by_name(wanted, tmp_path, name):
+    with pytest.raises(ValueError, match=f"{name} = -1"):
+        wanted(**{name: -1})
+    assert not list(tmp_path.iterdir())
 
 
-def test_an_outcome_is_judged_at_the_state_that_it_holds(scene, jobs):
-    for job in jobs:
+@pytest.mark.parametrize("timeout", [0, -1.0, float("nan")])
+def test_a_limit_of_no_time_is_refused(wanted, timeout):
+    with pytest.raises(ValueError, match="timeout"):
+        wanted(timeout=timeout)
+    assert wanted(timeout=None).timeout is None
+
+
+@pytest.mark.parametrize(("shard", "shards"), [(1, 1), (-1, 2), (2, 2), (0, 0), (0, -1)])
+def test_a_part_that_is_none_is_refused(wanted, shard, shards):
+    with pytest.raises(ValueError, match="shard"):
+        wanted(shard=shard, shards=shards)
+    assert wanted(shard=1, shards=2).shard == 1
+
+
+def test_the_folder_is_named_after_scene_and_seed_if_left_out(scene, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    made = DataSet(scene, seed=7, train=1, val=0, test=0, workers=0).fill()
+    (folder,) = (tmp_path / "datasets").iterdir()
+    assert folder.name == f"{scene.fingerprint[:12]}-seed7"
+    assert made.folder.resolve() == folder
+
+
+def test_the_plan_says_what_is_there_and_writes_nothing(wanted, scene, tmp_path):
+    (line,) = wanted().plan()
+    assert scene.fingerprint[:12] in line
+    assert not list(tmp_path.iterdir())
+    wanted(train=4, test=0).fill()
+    assert "6 of 10 loads not solved again: they are there" in wanted().plan()
+    assert "6 of 10 loads not solved again: they are there" in wanted(shard=1, shards=2).plan()
+
+
+def test_nothing_is_written_where_nothing_is_wanted(wanted):
+    store = wanted(train=0, val=0, test=0).fill()
+    assert not store.folder.exists()
+
+
+def test_parts_share_all_loads_among_them(wanted, monkeypatch):
+    monkeypatch.setattr("dpl.data.store.SHARD", 2)
+    parts = [wanted(shard=k, shards=3).missing() for k in range(3)]
+    for split, size in SIZES.items():
+        together = sorted(index for part in parts for index in part[split])
+        assert together == list(range(size))
+    for k in range(3):
+        wanted(shard=k, shards=3).fill()
+    assert not any(wanted().missing().values())
+
+
+# ------------------------------------------------------------------ filling it
+
+
+def test_what_is_wanted_is_there_afterwards(wanted, solved):
+    store = wanted().fill()
+    assert solved == [(0, k) for k in range(6)] + [(1, 0), (1, 1), (2, 0), (2, 1)]
+    for split, size in SIZES.items():
+        assert store.missing(split, size) == []
+        assert len(store.load(split, size).force) == size
+
+
+def test_growing_solves_what_is_new_and_the_samples_are_those_of_a_set_made_at_once(
+    wanted, scene, tmp_path, solved
+):
+    at_once = DataSet(scene, str(tmp_path / "at once"), train=12, val=2, test=2, workers=0).fill()
+    wanted(train=5).fill()
+    solved.clear()
+    grown = wanted(train=12).fill()
+    assert solved == [(0, k) for k in range(5, 12)]
+    assert grown.digest("train", 12) == at_once.digest("train", 12)
+    solved.clear()
+    wanted(train=3).fill()
+    assert solved == [], "less is wanted than is there"
+
+
+def test_progress_shows_accepted_rejected_and_samples_a_second(wanted, capsys):
+    wanted().fill()
+    out = capsys.readouterr().out
+    assert "10/10" in out
+    assert "10 accepted, 0 rejected" in out
+    assert "/s" in out
+
+
+def test_progress_counts_what_is_spooled_but_not_what_is_not_wanted(
+    wanted, interrupted, solved, capsys
+):
+    interrupted(4, signal.SIGINT, signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        wanted().fill()
+    capsys.readouterr()
+    wanted(train=2).fill()
+    assert len(solved) == 4 + 4
+    assert "6/6" in capsys.readouterr().out
+
+
+def test_the_journal_has_a_line_for_each_session_that_solved_something(wanted, capsys):
+    store = wanted(val=0, test=0).fill()
+    wanted(val=0, test=0).fill()
+    wanted().fill()
+    first, second = sessions(store)
+    assert (first["loads"], second["loads"]) == (6, 4)
+    for one in (first, second):
+        assert one["process"] == os.getpid()
+        assert one["workers"] == 0
+        assert one["seconds"] > 0
+        assert one["core_seconds"] > 0
+        assert {"started", "machine", "python", "dpl"} <= set(one)
+
+
+def test_the_summary_tells_splits_amplitudes_and_time(wanted):
+    told = wanted().fill().summary().splitlines()
+    assert told[0].endswith("/d")
+    assert "train: 6 of 6 loads accepted" in told[1]
+    assert "val: 2 of 2 loads accepted" in told[2]
+    assert "test: 2 of 2 loads accepted" in told[3]
+    assert "Newton iterations" in told[1]
+    assert any("amplitude up to" in line for line in told)
+    assert "s a load on one core" in told[-1]
+    assert "MB" in told[-1]
+
+
+def test_the_summary_of_nothing_is_its_folder(wanted):
+    assert wanted().store.summary().splitlines() == [str(wanted().store.folder)]
+
+
+# ------------------------------------------------------------------ interruption
+
+
+@pytest.mark.parametrize(
+    ("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)]
+)
+def test_once_asked_to_stop_it_finishes_the_load_at_work_and_leaves(
+    wanted, interrupted, number, raised
+):
+    interrupted(3, number)
+    with pytest.raises(raised) as end:
+        wanted().fill()
+    if raised is SystemExit:
+        assert end.value.code == 143
+    store = wanted().store
+    assert len(store.spool.files()) == 3
+    assert sessions(store)[0]["loads"] == 3
+
+
+@pytest.mark.parametrize("after", [1, 5, 6, 8])
+def test_a_set_that_was_interrupted_and_resumed_is_one_made_at_once(
+    wanted, scene, tmp_path, interrupted, solved, after
+):
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    at_once = DataSet(scene, str(tmp_path / "at once"), **SIZES, workers=0).fill()
+    solved.clear()
+    interrupted(after, signal.SIGINT, signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        wanted().fill()
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
+    assert len(solved) == after
+    wanted().fill()
+    assert len(set(solved)) == len(solved) == 10, "no load is solved twice"
+    assert content(wanted().store.folder) == content(at_once.folder)
+    assert not (wanted().store.folder / "spool").exists()
+    assert sum(one["loads"] for one in sessions(wanted().store)) in (9, 10)
+
+
+def test_signals_are_given_back(wanted):
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    wanted().fill()
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+# ------------------------------------------------------------------ warnings
+
+
+def test_a_set_whose_large_loads_are_rejected_is_warned_of(make_scene, tmp_path, capsys):
+    hard = make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch=(2.0, 2.0))
+    few = DataSet(hard, str(tmp_path / "d"), train=6, val=0, test=0, workers=0)
+    few.fill()
+    assert "biased" not in capsys.readouterr().err, "six loads say nothing"
+
+
+def test_a_biased_set_is_warned_of_on_one_line(wanted, monkeypatch, capsys):
+    def picky(scene, job):
         one = outcome(scene, job)
-        force, displacement = torch.from_numpy(one.force), torch.from_numpy(one.displacement)
-        ratio = scene.problem.residual_ratio(displacement[None], force[None])
-        assert one.accepted
-        assert float(ratio) == pytest.approx(one.residual, rel=1e-6, abs=1e-14)
-        assert one.residual < scene.solver.tol
-        assert one.volume_ratio > 0
-        assert one.load_factor == 1
-        assert one.seconds > 0
-        assert one.reason == ""
+        return lost(scene, job, "not converged") if one.amplitude > 0.1 else one
+
+    monkeypatch.setattr("dpl.data.crew.outcome", picky)
+    store = wanted(train=80).fill()
+    err = capsys.readouterr().err
+    poor = [part for part in store.acceptance() if part.biased]
+    assert poor, "no range of ten large loads: want more"
+    assert err.startswith("warning: biased: of ")
+    assert err.count("\n") == 1
+    assert all(part.accepted == part.tried for part in store.acceptance() if part.high < 0.1)
 
 
-def test_a_load_without_an_answer_is_rejected_with_the_part_that_has_one(make_scene):
-    scene = make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch=(2.0, 2.0))
-    found = [outcome(scene, Job(SEED, index)) for index in range(6)]
-    lost = [one for one in found if not one.accepted]
-    assert lost, "six loads of ten times L that SVK all bears: choose harder ones"
-    for one in lost:
-        assert one.reason
-        assert 0 <= one.load_factor < 1
-        displacement = torch.from_numpy(one.displacement)[None]
-        part = one.load_factor * torch.from_numpy(one.force)[None]
-        if one.load_factor:
-            assert scene.problem.residual_ratio(displacement, part) < scene.solver.loose
-            assert scene.problem.volume_ratio(displacement) > 0
+def test_a_fair_set_is_not_warned_of(wanted, capsys):
+    wanted(train=20).fill()
+    assert capsys.readouterr().err == ""
 
 
-def test_a_change_of_the_number_of_threads_between_loads_is_survived(tmp_path, environment):
-    """PARDISO reads past its plan where threads are limited between analysis and factorisation."""
-    pytest.importorskip("pypardiso")
-    code = """
-import torch
-from threadpoolctl import threadpool_limits
-from dpl.data.generate import Job, outcome
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import Plane, box
-from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Newton
-from dpl.fem.problem import Problem
-from dpl.scene import Scene
+# ------------------------------------------------------------------ verify and repair
 
-torch.set_num_threads(2)
-mesh = box([4.0, 1.0, 1.0], [17, 5, 5])
-newton = Newton(Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min")), linear="pardiso")
-scene = Scene(newton.problem, ModalLoads(newton.rest, n_modes=3, deflection=0.01), newton)
-outcome(scene, Job((0, 0), 0))
-with threadpool_limits(1):
-    assert outcome(scene, Job((0, 0), 1)).accepted
-"""
-    ended = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=tmp_path,
-        env=environment(threads=2),
-        capture_output=True,
-    )
-    assert ended.returncode == 0, ended.stderr.decode()[-500:] or f"signal {-ended.returncode}"
+
+@pytest.fixture
+def made(wanted):
+    return wanted().fill()
+
+
+def test_verify_names_each_damaged_file(made, wanted):
+    assert list(wanted().verify()) == []
+    path = made.folder / "val-000000.safetensors"
+    path.write_bytes(path.read_bytes()[:-1])
+    (made.folder / "test-000000.safetensors").unlink()
+    first, second = wanted().verify()
+    assert first.startswith(f"{path} is damaged")
+    assert second == f"{made.folder / 'test-000000.safetensors'} is missing"
+
+
+def test_repair_makes_damaged_files_again(made, wanted, solved, capsys):
+    before = content(made.folder)
+    (made.folder / "val-000000.safetensors").write_bytes(b"")
+    capsys.readouterr()
+    wanted().repair()
+    assert "making val-000000.safetensors again" in capsys.readouterr().out
+    assert solved == [(1, 0), (1, 1)]
+    after = content(made.folder)
+    manifests = [sorted(found.pop("manifest.jsonl").splitlines()) for found in (after, before)]
+    assert manifests[0] == manifests[1]
+    assert after == before
+    assert list(wanted().verify()) == []
+
+
+def test_repair_makes_again_what_it_forgets_even_if_less_is_wanted(made, wanted, solved):
+    """The sizes on the command line are those of a set that is made, not of one that is there."""
+    (made.folder / "train-000000.safetensors").write_bytes(b"")
+    wanted(train=2).repair()
+    assert made.missing("train", 6) == []
+    assert len(made.load("train", 6).force) == 6
+
+
+def test_repair_of_nothing_makes_the_set(wanted, made, tmp_path):
+    before = content(made.folder)
+    shutil.rmtree(made.folder)
+    wanted().repair()
+    assert content(made.folder) == before
+
+
+# ------------------------------------------------------------------ the command
+
+
+def test_the_command_says_whether_a_set_is_sound_and_repairs_it(script, tiny, tmp_path):
+    sizes = [*tiny, "data.train=4", "data.val=1", "data.test=1", "data.workers=0", "data.folder=d"]
+    assert script("generate", *sizes, cwd=tmp_path).status == 0
+    before = content(tmp_path / "d")
+    sound = script("generate", *sizes, "action=verify", cwd=tmp_path)
+    assert sound.status == 0
+    assert "0 damaged files" in sound.out
+    assert "train: 4 of 4 loads accepted" in sound.out
+    path = tmp_path / "d/test-000000.safetensors"
+    harmed = bytearray(path.read_bytes())
+    harmed[-3] ^= 8
+    path.write_bytes(harmed)
+    found = script("generate", *sizes, "action=verify", cwd=tmp_path)
+    assert found.status == 1
+    assert "d/test-000000.safetensors is damaged" in found.out
+    assert "1 damaged files" in found.out
+    repaired = script("generate", *sizes, "action=repair", cwd=tmp_path)
+    assert repaired.status == 0
+    assert "1/1" in repaired.out
+    assert content(tmp_path / "d") == before
+    assert script("generate", *sizes, "action=verify", cwd=tmp_path).status == 0
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("action=look", "action = 'look' must be one of generate, verify, repair"),
+        ("shard=1", "shard = 1"),
+        ("data.timeout=0", "timeout = 0"),
+        ("data.seed=1", "was drawn with seed 0, not 1"),
+        ("material.poisson=0.31", "another scene"),
+    ],
+)
+def test_what_cannot_work_ends_with_one_line_and_a_status_of_2(
+    script, tiny, scene_of, wanted, tmp_path, override, told
+):
+    scene = scene_of(*tiny)
+    DataSet(scene, str(tmp_path / "d"), train=1, val=0, test=0, workers=0).fill()
+    ended = script("generate", *tiny, "data.folder=d", override, cwd=tmp_path)
+    assert ended.status == 2
+    assert ended.err.startswith("error: ")
+    assert told in ended.err
+    assert ended.err.count("\n") == 1
+
+
+def test_a_second_writer_is_told_who_the_first_is(script, tiny, scene_of, tmp_path):
+    wanted = DataSet(scene_of(*tiny), str(tmp_path / "d"), train=4, val=0, test=0, workers=0)
+    running = wanted.store.fill({"train": range(4)}, workers=0)
+    next(running)
+    ended = script("generate", *tiny, "data.folder=d", "data.workers=0", cwd=tmp_path)
+    running.close()
+    assert ended.status == 2
+    assert f"is being written by process {os.getpid()} on {os.uname().nodename}" in ended.err
+    assert ended.err.count("\n") == 1
+
+
+def test_verify_of_what_is_not_there_does_not_call_it_sound(script, tiny, tmp_path):
+    ended = script("generate", *tiny, "data.folder=typo", "action=verify", cwd=tmp_path)
+    assert ended.status != 0

@@ -22,7 +22,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from dpl.data.online import NEAR, Drawn, OnlineSamples, Rates, Replay, Worst
 from dpl.data.outcome import Job, outcome
 from dpl.fem.newton import Newton
-from dpl.scene import Sample
+from dpl.scene import Sample, stack
 
 SEED = (0, 0)
 
@@ -488,7 +488,9 @@ def test_errors_are_those_of_the_batch_before(replay):
     """The largest errors name their points, of those that have been seen alone."""
 
     class Watched(Worst):
-        puts: list = []
+        def __init__(self, dimension):
+            super().__init__(dimension)
+            self.puts = []
 
         def put(self, points):
             self.puts.append(points)
@@ -614,18 +616,27 @@ def test_a_killed_worker_is_replaced_and_the_stream_goes_on(replay):
     assert not (crew() - before) & started
 
 
-@pytest.mark.slow
-def test_no_load_is_left_out_where_a_worker_was_killed(replay):
-    """What it was solving is drawn anew."""
-    before = crew()
-    stream = replay(Numbers(pause=[0.05, 0.05]), workers=2, reuse=1, fresh=2, batches=2)
-    seen = [place for batch in stream for place in places(batch)]
-    os.kill(min(crew() - before), signal.SIGKILL)
-    seen += [place for _ in range(4) for batch in stream for place in places(batch)]
-    assert sorted(seen)[:64] == list(range(64))
+@pytest.mark.xfail(strict=True, reason="`_start` begins above the newest load, gaps below are lost")
+def test_no_load_is_left_out_where_a_worker_died(replay, monkeypatch):
+    """What it was solving is drawn anew, though another worker is ahead of it."""
+    source = Numbers()
+    stream = replay(source, reuse=1, fresh=2, batch_size=2, batches=1)
+
+    def two():  # workers, of which the second dies in its first chunk
+        drawn = [source.drawn(0), source.drawn(2)]
+        numbers, points = (torch.stack([getattr(d, k) for d in drawn]) for k in ("number", "point"))
+        yield Drawn(stack([one.sample for one in drawn]), numbers, points)
+        raise RuntimeError("DataLoader worker (pid 1) is killed by signal: Killed.")
+
+    original, starts = stream._start, iter([lambda first: setattr(stream, "_stream", two())])
+    monkeypatch.setattr(stream, "_start", lambda first: next(starts, original)(first))
+    seen = [place for _ in range(4) for place in places(next(iter(stream)))]
+    assert sorted(seen[:2]) == [0, 2]
+    assert sorted(seen) == list(range(8))
 
 
 @pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="torch's SIGCHLD handler raises wherever the program is")
 def test_a_worker_that_dies_while_the_optimiser_works_is_replaced_too(replay):
     """Training is not in the stream's hands then: nothing may come up in the middle of a step."""
     before = crew()
@@ -650,9 +661,8 @@ def test_a_load_that_always_kills_its_worker_is_left_out_in_the_end(replay, dead
 
 @pytest.mark.slow
 def test_workers_that_all_die_end_training_with_an_error(replay):
-    class_of_all = Deadly()
     with pytest.raises(RuntimeError, match="worker"):
-        next(iter(replay(class_of_all, workers=1)))
+        next(iter(replay(Deadly(), workers=1)))
 
 
 class Deadly(Numbers):
@@ -662,6 +672,7 @@ class Deadly(Numbers):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.xfail(strict=True, reason="`following` of one lane may be in another's class")
 def test_a_replaced_worker_keeps_to_the_lane_of_its_training_process(replay):
     """Lane 0 of 2 has the even loads, whatever happened."""
     source = Numbers()

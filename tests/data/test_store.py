@@ -1,18 +1,32 @@
-"""Laws of the data set on disk: nothing solved twice, nothing used that is not the scene's."""
+"""Laws of the data set on disk: the same bytes however it came about, nothing solved twice."""
 
+import hashlib
 import json
+import multiprocessing
+import os
 import shutil
+import subprocess
+import time
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save
 
+from dpl.data import crew
 from dpl.data import store as store_module
-from dpl.data.generate import outcome
-from dpl.data.store import DataSetError, Store, generate, whole_file
+from dpl.data.crew import Stop
+from dpl.data.durable import DataSetError
+from dpl.data.outcome import Job, lost, outcome
+from dpl.data.shard import compact, spread
+from dpl.data.spool import Spool
+from dpl.data.store import MACHINE, Store
 from dpl.fem.materials import SaintVenantKirchhoff
+from dpl.fem.mesh import rectangle
 
 SIZES = {"train": 12, "val": 4, "test": 4}
+WANTED = {split: range(size) for split, size in SIZES.items()}
 
 
 @pytest.fixture
@@ -24,6 +38,12 @@ def copy(data, tmp_path):
 
 
 @pytest.fixture
+def fresh(scene, tmp_path):
+    """The same data set before it is made."""
+    return Store(tmp_path / "fresh", scene, 0)
+
+
+@pytest.fixture
 def solved(monkeypatch):
     """The loads that are solved, as they are."""
     found = []
@@ -32,16 +52,61 @@ def solved(monkeypatch):
         found.append((*job.seed, job.number))
         return outcome(scene, job)
 
-    monkeypatch.setattr("dpl.data.generate.outcome", counted)
+    monkeypatch.setattr("dpl.data.crew.outcome", counted)
     return found
 
 
-def lines(store):
-    return [json.loads(line) for line in (store.folder / "manifest.jsonl").read_text().splitlines()]
+@pytest.fixture(scope="module")
+def hard(make_scene):
+    """Loads of ten times L on a law that does not bear them all."""
+    return make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch=(2.0, 2.0))
+
+
+def fill(store, missing=None, workers=0, **more):
+    """Solve what is missing of the tiny data set; return how many loads that were."""
+    if missing is None:
+        missing = {split: store.missing(split, size) for split, size in SIZES.items()}
+    return len(list(store.fill(missing, workers=workers, **more)))
+
+
+def lines(store, name="manifest.jsonl"):
+    return [json.loads(line) for line in (store.folder / name).read_text().splitlines()]
+
+
+def content(store):
+    """Return all that must not depend on how the data set was made, byte for byte."""
+    folder = store.folder
+    return {
+        p.name: p.read_bytes() for p in [*folder.glob("*.safetensors"), *folder.glob("m*.jsonl")]
+    }
+
+
+def hidden(store):
+    return sorted(path.name for path in store.folder.rglob(".*.part"))
 
 
 def same(one, other):
     return all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def rewrite(store, change, which=0):
+    """Change the tensors of a shard and write down its new digest, as an intruder would."""
+    manifest = store.folder / "manifest.jsonl"
+    found = lines(store)
+    path = store.folder / found[which]["file"]
+    shard = load_file(path)
+    changed = change(shard)
+    path.write_bytes(changed if isinstance(changed, bytes) else save(changed or shard))
+    found[which]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    manifest.write_text("".join(json.dumps(line) + "\n" for line in found))
+    return path.name
+
+
+def flaws(store):
+    return {line["file"]: flaw for line, flaw in store.verify() if flaw}
+
+
+# ------------------------------------------------------------------ what is stored
 
 
 def test_stored_samples_meet_the_tolerance_and_invert_nothing(data, scene):
@@ -87,73 +152,395 @@ def test_the_data_set_carries_fingerprint_seed_and_versions(data, scene):
     assert card["versions"]["torch"] == torch.__version__
 
 
-def test_the_folder_is_named_after_scene_and_seed_if_left_out(scene, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    made = generate(scene, seed=7, train=1, val=0, test=0, workers=0)
-    (folder,) = (tmp_path / "datasets").iterdir()
-    assert folder.name == f"{scene.fingerprint[:12]}-seed7"
-    assert made.folder.resolve() == folder
+def test_the_reader_gives_each_load_as_it_was_solved(data, scene):
+    read = data.store.reader("val")
+    for number in (3, 0, 1):
+        one, again = read(number), outcome(scene, Job(data.store.stream("val"), number))
+        for name, value in again._asdict().items():
+            if name == "amplitude":
+                assert one.amplitude == pytest.approx(value, abs=1e-6)
+            elif name == "job":
+                assert one.job == value
+            elif name != "seconds":
+                assert np.array_equal(getattr(one, name), value), name
+    assert read(4) is None
+
+
+def test_rejected_loads_are_recorded_with_reason_and_load_factor(hard, tmp_path):
+    store = Store(tmp_path / "d", hard, 0)
+    fill(store, {"train": range(6)})
+    (line,) = lines(store)
+    assert line["tried"] == len(line["amplitudes"]) == 6
+    assert line["rejected"], "SVK bears six loads of ten times L: choose harder ones"
+    assert line["accepted"] + len(line["rejected"]) == 6
+    for one in line["rejected"]:
+        assert one["reason"]
+        assert 0 <= one["load_factor"] < 1
+        again = store.reader("train")(one["index"])
+        assert (again.accepted, again.reason) == (False, one["reason"])
+        assert again.load_factor == one["load_factor"]
+    rejected = {one["index"] for one in line["rejected"]}
+    shard = load_file(store.folder / line["file"])
+    assert set(shard["index"].tolist()) == set(range(6)) - rejected
+    if line["accepted"]:
+        assert len(store.load("train", 6).force) == line["accepted"]
+    assert f"{line['accepted']} of 6 loads accepted" in store.summary()
+    assert sum(part.tried for part in store.acceptance()) == 6
+    assert sum(part.accepted for part in store.acceptance()) == line["accepted"]
+    assert flaws(store) == {}
+
+
+def test_a_shard_of_rejects_alone_is_a_shard(scene, fresh, monkeypatch):
+    monkeypatch.setattr("dpl.data.crew.outcome", lambda scene, job: lost(scene, job, "never"))
+    fill(fresh, {"train": range(3)})
+    assert fresh.missing("train", 4) == [3]
+    assert flaws(fresh) == {}
+    assert fresh.reader("train")(1).reason == "never"
+    with pytest.raises(DataSetError, match="no train samples"):
+        fresh.load("train", 3)
+    monkeypatch.undo()
+    fill(fresh, {"train": [3]})
+    assert len(fresh.load("train", 4).force) == 1
+
+
+# ------------------------------------------------------------------ forces
+
+
+@pytest.mark.parametrize("shape", [(7, 3), (5, 2)])
+def test_forces_come_back_from_their_compact_form(shape):
+    generator = torch.Generator().manual_seed(0)
+    force = torch.randn(6, *shape, generator=generator, dtype=torch.float64)
+    force[torch.rand(6, shape[0], generator=generator) < 0.6] = 0.0
+    force[0, 2], force[0, 2, 1] = 0.0, 1e-300  # one component of a node is a node that carries
+    force[3] = 0.0
+    packed = compact(force)
+    assert torch.equal(spread(packed, shape), force)
+    assert len(packed["nodal_force"]) == len(packed["node"]) == packed["carried"].sum()
+    assert packed["carried"][3] == 0
+    assert packed["node"].dtype == torch.int32
+    assert packed["nodal_force"].abs().amax(dim=1).min() > 0, "nothing is stored of idle nodes"
+
+
+def test_no_forces_come_back_as_none():
+    force = torch.zeros(0, 7, 3, dtype=torch.float64)
+    assert spread(compact(force), (7, 3)).shape == (0, 7, 3)
+
+
+def test_shards_hold_forces_of_loaded_nodes_alone(data):
+    shard = load_file(data.store.folder / lines(data.store)[0]["file"])
+    assert "force" not in shard
+    assert (
+        len(shard["node"]) < 0.8 * shard["displacement"].shape[0] * shard["displacement"].shape[1]
+    )
+
+
+def test_forces_that_every_load_holds_are_stored_and_verified(scene, make_scene, tmp_path):
+    weight = torch.full(scene.problem.shape, 1e-7, dtype=torch.float64)
+    weight[:, 1:] = 0.0
+    store = Store(tmp_path / "d", make_scene(always=weight), 0)
+    fill(store, {"train": range(3)})
+    plain = scene.loads.sample((0, 0), range(3)).force
+    assert torch.allclose(store.load("train", 3).force, plain + weight, rtol=0, atol=1e-18)
+    assert flaws(store) == {}
+
+
+def test_bodies_in_the_plane_are_stored_too(make_scene, tmp_path):
+    mesh = rectangle([4.0, 1.0], [9, 3])
+    store = Store(tmp_path / "d", make_scene(mesh=mesh, deflection=0.1), 0)
+    fill(store, {"train": range(3)})
+    assert store.load("train", 3).force.shape[1:] == store.scene.problem.shape == (27, 2)
+    assert flaws(store) == {}
+
+
+# ------------------------------------------------------------------ the same bytes
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_the_bytes_do_not_depend_on_the_number_of_workers(data, fresh, workers):
+    fill(fresh, WANTED, workers=workers)
+    assert content(fresh) == content(data.store)
+
+
+def test_the_bytes_do_not_depend_on_the_order_in_which_loads_are_solved(data, fresh, monkeypatch):
+    def backwards(scene, jobs, **more):
+        return crew.outcomes(scene, list(jobs)[::-1], **more)
+
+    monkeypatch.setattr(store_module, "outcomes", backwards)
+    fill(fresh, WANTED)
+    assert content(fresh) == content(data.store)
+
+
+@pytest.mark.parametrize("size", [1, 5, 1000])
+def test_the_samples_do_not_depend_on_the_size_of_shards(data, fresh, monkeypatch, size):
+    monkeypatch.setattr(store_module, "SHARD", size)
+    fill(fresh, WANTED)
+    assert max(line["tried"] for line in lines(fresh)) == min(size, 12)
+    for split, count in SIZES.items():
+        assert fresh.digest(split, count) == data.store.digest(split, count)
+    assert flaws(fresh) == {}
+
+
+@pytest.mark.parametrize("after", [1, 4, 7, 12, 14, 19, 20])
+def test_a_run_interrupted_anywhere_and_resumed_makes_the_same_bytes(
+    scene, tmp_path, monkeypatch, solved, after
+):
+    monkeypatch.setattr(store_module, "SHARD", 4)
+    whole, store = Store(tmp_path / "whole", scene, 0), Store(tmp_path / "d", scene, 0)
+    fill(whole)
+    solved.clear()
+    running = store.fill(WANTED, workers=0)
+    for _ in range(after):
+        next(running)
+    running.close()
+    assert sum(len(store.missing(*split)) for split in SIZES.items()) >= 20 - after
+    assert fill(store) == 20 - after
+    assert len(set(solved)) == len(solved) == 20, "no load is solved twice"
+    assert content(store) == content(whole)
+    assert not (store.folder / "spool").exists()
+    assert fill(store) == 0
+
+
+def test_interrupted_at_every_load_the_bytes_are_the_same(data, fresh, solved):
+    while running := fresh.fill(
+        {split: fresh.missing(split, size) for split, size in SIZES.items()}, workers=0
+    ):
+        if next(running, None) is None:
+            break
+        running.close()
+    assert len(solved) == 20
+    assert content(fresh) == content(data.store)
+
+
+def test_what_was_solved_before_a_kill_between_shard_and_spool_is_cleared_away(
+    data, fresh, monkeypatch
+):
+    """The shard has its line, and some of its loads are in the spool still."""
+    monkeypatch.setattr(Path, "unlink", lambda *_, **__: (_ for _ in ()).throw(SystemExit(9)))
+    with pytest.raises(SystemExit):
+        fill(fresh, {"train": range(12)})
+    monkeypatch.undo()
+    assert fresh.missing("train", 12) == []
+    fill(fresh)
+    assert content(fresh) == content(data.store)
+    assert not (fresh.folder / "spool").exists()
+
+
+def test_a_spooled_load_that_is_damaged_is_solved_again(data, fresh, solved):
+    running = fresh.fill(WANTED, workers=0)
+    for _ in range(5):
+        next(running)
+    running.close()
+    spool = sorted((fresh.folder / "spool").iterdir())
+    assert len(spool) == 5
+    harmed = bytearray(spool[2].read_bytes())
+    harmed[-5] ^= 1
+    spool[2].write_bytes(harmed)
+    spool[3].write_bytes(spool[3].read_bytes()[:-8])
+    spool[4].write_bytes(b"")  # not synced, the machine crashed
+    solved.clear()
+    fill(fresh, WANTED)
+    assert solved[:3] == [(0, 0, 2), (0, 0, 3), (0, 0, 4)]
+    assert content(fresh) == content(data.store)
+
+
+def test_what_killed_processes_were_writing_is_removed(data, fresh):
+    running = fresh.fill(WANTED, workers=0)
+    next(running)
+    running.close()
+    long_ago = time.time() - 3600
+    for path in (fresh.folder / ".train-000000.safetensors.123.part",
+                 fresh.folder / "spool" / ".train-000001.load.123.part"):  # fmt: skip
+        path.write_bytes(b"half of it")
+        os.utime(path, (long_ago, long_ago))
+    fill(fresh)
+    assert hidden(fresh) == []
+    assert not (fresh.folder / "spool").exists()
+    assert content(fresh) == content(data.store)
+
+
+def test_nothing_in_the_manifest_depends_on_a_clock(copy):
+    known = {"file", "sha256", "split", "first", "tried", "accepted", "iterations", "amplitudes",
+             "rejected"}  # fmt: skip
+    assert all(set(line) == known for line in lines(copy))
+
+
+# ------------------------------------------------------------------ growing
 
 
 def test_a_matching_data_set_is_reused_and_nothing_is_solved(copy, solved):
-    generate(copy.scene, folder=str(copy.folder), **SIZES, workers=0)
+    before = content(copy)
+    assert fill(copy) == 0
     assert solved == []
+    assert content(copy) == before
 
 
-def test_growing_a_data_set_solves_only_the_new_loads(copy, solved):
-    before = copy.load("train", 12)
-    generate(copy.scene, folder=str(copy.folder), **{**SIZES, "train": 20}, workers=0)
-    assert solved == [(0, 0, index) for index in range(12, 20)]
-    assert same([c[:12] for c in copy.load("train", 20)], before)
-    assert copy.missing("train", 20) == []
-
-
-def test_an_interrupted_run_keeps_its_shards_and_solves_only_what_is_missing(
-    scene, data, tmp_path, monkeypatch, solved
-):
-    monkeypatch.setattr(store_module, "SHARD", 4)
-    store = Store(tmp_path / "grown", scene, 0)
-    running = store.fill({"train": range(12)}, workers=0)
-    for _ in range(7):  # the second shard of four is not full
-        next(running)
-    running.close()
-    assert store.missing("train", 12) == list(range(4, 12))
+def test_growing_solves_only_the_new_loads_and_gives_the_same_samples(data, fresh, solved):
+    fill(fresh, {"train": range(5)})
+    before = fresh.load("train", 5)
+    files = content(fresh)
     solved.clear()
-    generate(scene, folder=str(store.folder), **{**SIZES, "val": 0, "test": 0}, workers=0)
-    assert solved == [(0, 0, index) for index in range(4, 12)]
-    assert same(store.load("train", 12), data.store.load("train", 12))
+    fill(fresh, {"train": fresh.missing("train", 12)})
+    assert solved == [(0, 0, index) for index in range(5, 12)]
+    assert same([column[:5] for column in fresh.load("train", 12)], before)
+    assert fresh.missing("train", 12) == []
+    assert fresh.digest("train", 12) == data.store.digest("train", 12)
+    assert all(content(fresh)[name] == was for name, was in files.items() if "manifest" not in name)
+    assert [(line["first"], line["tried"]) for line in lines(fresh)] == [(0, 5), (5, 7)]
 
 
-def test_shards_hold_at_most_so_many_loads(scene, tmp_path, monkeypatch):
+def test_shards_begin_at_multiples_of_their_size(fresh, monkeypatch):
     monkeypatch.setattr(store_module, "SHARD", 4)
-    store = generate(scene, folder=str(tmp_path / "d"), train=10, val=0, test=0, workers=0)
-    assert [(line["first"], line["tried"]) for line in lines(store)] == [(0, 4), (4, 4), (8, 2)]
+    for count in (6, 11):
+        fill(fresh, {"train": fresh.missing("train", count)})
+    assert [(line["first"], line["tried"]) for line in lines(fresh)] == [
+        (0, 4), (4, 2), (6, 2), (8, 3)
+    ]  # fmt: skip
+
+
+def test_loads_that_another_process_has_solved_meanwhile_are_not_solved_again(data, fresh, solved):
+    fill(fresh, {"train": range(5)})  # what the other one did after this one had looked
+    solved.clear()
+    fill(fresh, WANTED)
+    assert len(solved) == 15
+    assert flaws(fresh) == {}
+    assert fresh.digest("train", 12) == data.store.digest("train", 12)
+
+
+def test_samples_do_not_depend_on_who_had_a_load_that_two_writers_had(data, copy):
+    """Parts of different divisions that were copied into one folder."""
+    (copy.folder / "manifest-0-of-2.jsonl").write_bytes(
+        (copy.folder / "manifest.jsonl").read_bytes()
+    )
+    for split, size in SIZES.items():
+        assert same(copy.load(split, size), data.store.load(split, size))
+
+
+# ------------------------------------------------------------------ parts
+
+
+def test_parts_made_by_several_writers_are_the_same_samples(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(store_module, "SHARD", 2)
+    whole, store = Store(tmp_path / "whole", scene, 0), Store(tmp_path / "d", scene, 0)
+    fill(whole)
+    running = []
+    for part in range(2):  # at the same time, a load each in turn
+        mine = {split: store.missing(split, size, part, 2) for split, size in SIZES.items()}
+        running.append(store.fill(mine, workers=0, shard=part, shards=2))
+    found = []
+    while running:
+        for one in list(running):
+            if (solved := next(one, None)) is None:
+                running.remove(one)
+            else:
+                found.append(solved.job)
+    assert len(set(found)) == len(found) == 20
+    assert not (store.folder / "manifest.jsonl").exists()
+    assert {line["first"] % 4 for line in lines(store, "manifest-0-of-2.jsonl")} == {0}
+    assert {line["first"] % 4 for line in lines(store, "manifest-1-of-2.jsonl")} == {2}
+    for split, size in SIZES.items():
+        assert store.digest(split, size) == whole.digest(split, size)
+        assert store.missing(split, size) == []
+    shards = [{k: v for k, v in content(s).items() if "manifest" not in k} for s in (store, whole)]
+    assert shards[0] == shards[1]
+    assert fill(store) == 0
+    assert flaws(store) == {}
+
+
+def test_a_second_writer_of_the_whole_or_of_the_same_part_is_refused(fresh):
+    running = fresh.fill({"train": range(12)}, workers=0, shard=0, shards=2)
+    next(running)
+    for part in ({}, {"shard": 0, "shards": 2}, {"shard": 1, "shards": 3}):
+        with pytest.raises(DataSetError, match=f"process {os.getpid()} on "):
+            fill(fresh, {"train": range(12)}, **part)
+    with pytest.raises(DataSetError, match=f"process {os.getpid()} on "):
+        fresh.repair()
+    running.close()
+    assert fill(fresh) == 19
+
+
+def test_a_load_of_another_part_that_vanishes_from_the_spool_is_no_crash(data, fresh):
+    fresh.create()
+    spool = fresh.folder / "spool"
+    spool.mkdir()
+    gone = spool / "train-000099.load"
+    gone.symlink_to(spool / "nothing")  # listed, and then not there
+    assert fresh.spool.files() == {}
+    gone.unlink()
+
+
+# ------------------------------------------------------------------ interruption
+
+
+def test_a_stop_keeps_what_is_solved(fresh):
+    stop = Stop()
+    found = 0
+    for _ in fresh.fill(WANTED, workers=0, stop=stop):
+        found += 1
+        stop._asked = found == 3
+    assert found == 3
+    assert len(list((fresh.folder / "spool").iterdir())) == 3
+    assert not list(fresh.folder.glob("train*"))
+
+
+def test_an_error_in_writing_ends_the_workers_even_while_it_is_held(fresh, monkeypatch):
+    """A traceback holds the frames, and these the crew, unless who uses the crew closes it."""
+    before = multiprocessing.active_children()
+
+    def keep(self, one):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Spool, "put", keep)
+    with pytest.raises(OSError, match="No space left") as held:
+        fill(fresh, WANTED, workers=1)
+    try:
+        assert held.value.__traceback__ is not None
+        assert multiprocessing.active_children() == before
+    finally:
+        del held
+
+
+# ------------------------------------------------------------------ refusals
 
 
 def test_a_data_set_of_another_scene_is_refused_naming_both_fingerprints(copy, make_scene):
-    other = make_scene(poisson=0.31)
-    with pytest.raises(DataSetError) as refusal:
-        generate(other, folder=str(copy.folder), **SIZES, workers=0)
-    assert copy.scene.fingerprint[:12] in str(refusal.value)
-    assert other.fingerprint[:12] in str(refusal.value)
-    assert "law" in str(refusal.value)
+    other = Store(copy.folder, make_scene(poisson=0.31), 0)
+    for use in (lambda: fill(other, WANTED), other.shards, other.repair, other.create):
+        with pytest.raises(DataSetError) as refusal:
+            use()
+        assert copy.scene.fingerprint[:12] in str(refusal.value)
+        assert other.scene.fingerprint[:12] in str(refusal.value)
+        assert "law" in str(refusal.value)
 
 
-def test_the_data_set_of_another_size_and_stiffness_is_the_same(copy, make_scene, solved):
-    twin = make_scene(size=(1.0, 0.25, 0.25), young=2e11)
-    generate(twin, folder=str(copy.folder), **SIZES, workers=0)
+def test_the_twin_of_another_size_shares_the_set_and_gets_its_own_moduli(copy, make_scene, solved):
+    twin = make_scene(size=(1.0, 0.25, 0.25), young=[1e9, 2e11])
+    shared = Store(copy.folder, twin, 0)
+    assert fill(shared) == 0
     assert solved == []
+    assert flaws(shared) == {}
+    for split, size in SIZES.items():
+        mine, theirs = shared.load(split, size), copy.load(split, size)
+        assert same(mine[:2], theirs[:2])
+        assert torch.equal(theirs.young, torch.full((size,), 4500.0, dtype=torch.float64))
+        drawn = twin.loads.sample(shared.stream(split), range(size)).young
+        assert torch.equal(mine.young, drawn)
+        assert mine.young.min() >= 1e9
+        assert mine.young.max() <= 2e11
+        assert len(mine.young.unique()) == size
 
 
 def test_a_data_set_of_another_seed_is_refused(copy):
+    other = Store(copy.folder, copy.scene, 1)
     with pytest.raises(DataSetError, match=r"seed 0, not 1.*data\.seed"):
-        generate(copy.scene, folder=str(copy.folder), seed=1, **SIZES, workers=0)
+        fill(other, WANTED)
 
 
 def test_a_folder_that_is_no_data_set_is_refused_and_left_as_it_is(scene, tmp_path):
     (tmp_path / "thesis.txt").write_text("years of work")
+    store = Store(tmp_path, scene, 0)
     with pytest.raises(DataSetError, match="no data set"):
-        generate(scene, folder=str(tmp_path), **SIZES, workers=0)
+        fill(store, WANTED)
+    store.repair()
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
@@ -161,30 +548,245 @@ def test_an_unknown_format_is_refused(copy):
     card = copy.folder / "scene.json"
     card.write_text(json.dumps({**json.loads(card.read_text()), "format": 99}))
     with pytest.raises(DataSetError, match="format 99"):
-        copy.open()
+        copy.shards()
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        *("", "{", "[]", "null", "\0\0\0"),
+        '{"format": 2}',
+        '{"format": 2, "fingerprint": 3}',
+    ],
+)
+def test_a_damaged_card_is_refused_naming_it(copy, harm):
+    (copy.folder / "scene.json").write_text(harm)
+    with pytest.raises(DataSetError, match=r"scene\.json|format|another scene"):
+        copy.shards()
+
+
+@pytest.mark.parametrize("harm", ["{}", '{"split": "train"}', '{"first": 0, "tried": 3}'])
+def test_a_line_of_the_manifest_that_lacks_something_counts_as_torn(copy, harm):
+    with (copy.folder / "manifest.jsonl").open("a") as file:
+        file.write(harm + "\n")
+    assert copy.missing("train", 13) == [12]
+    assert len(copy.load("train", 12).force) == 12
+
+
+def test_an_empty_split_is_refused(copy):
+    with pytest.raises(DataSetError, match="no test samples"):
+        copy.load("test", 0)
+
+
+@pytest.mark.skipif(os.system("unshare -rm true 2>/dev/null") != 0, reason="needs unshare")
+def test_a_folder_that_may_only_be_read_is_read(copy, environment):
+    """Root may write everywhere, so it is mounted so."""
+    code = (
+        "import sys; from dpl.data.durable import read_lines; from pathlib import Path; "
+        "folder = Path(sys.argv[1]); "
+        "assert len(read_lines(folder / 'manifest.jsonl')) == 3; "
+        "from dpl.data.store import Store; from types import SimpleNamespace as N; import json; "
+        "card = json.loads((folder / 'scene.json').read_text()); "
+        "scene = N(fingerprint=card['fingerprint'], identity=lambda: card['scene'], "
+        "problem=N(shape=(45, 3)), loads=N(dimension=7, young_at=lambda point: point[:, -1])); "
+        "store = Store(folder, scene, 0); "
+        "assert len(store.load('train', 12).force) == 12; "
+        "assert store.missing('train', 13) == [12]; store.create(); store.summary(); "
+        "print('read')\ntry:\n    (folder / 'x').touch()\nexcept OSError:\n    print('only')"
+    )
+    mount = 'mount --bind $0 $0 && mount -o remount,bind,ro $0 && exec $1 -c "$2" $0'
+    ended = subprocess.run(
+        ["unshare", "-rm", "bash", "-c", mount, str(copy.folder), os.sys.executable, code],
+        env=environment(), capture_output=True, text=True,
+    )  # fmt: skip
+    assert ended.stdout.split() == ["read", "only"], ended.stderr[-1000:]
+
+
+# ------------------------------------------------------------------ damage
 
 
 @pytest.mark.parametrize("harm", ["a flipped bit", "a cut end", "no file"])
-def test_a_damaged_shard_is_detected_and_named(copy, harm):
+def test_a_damaged_shard_is_found_and_named(copy, harm):
     path = copy.folder / lines(copy)[0]["file"]
     content = bytearray(path.read_bytes())
     content[-9] ^= 1
     path.write_bytes(content if harm == "a flipped bit" else content[:-8])
     if harm == "no file":
         path.unlink()
-    with pytest.raises(DataSetError, match=path.name):
+    with pytest.raises(DataSetError, match=f"{path.name}.*action=repair"):
         copy.load(lines(copy)[0]["split"], 4)
+    assert list(flaws(copy)) == [path.name]
 
 
-def test_what_a_refusal_says_to_do_repairs_a_damaged_shard(copy, data, solved):
-    manifest = copy.folder / "manifest.jsonl"
-    damaged, *sound = manifest.read_text().splitlines()
-    (copy.folder / json.loads(damaged)["file"]).write_bytes(b"nothing")
-    manifest.write_text("".join(line + "\n" for line in sound))
-    generate(copy.scene, folder=str(copy.folder), **SIZES, workers=0)
-    assert len(solved) == json.loads(damaged)["tried"]
-    split = json.loads(damaged)["split"]
-    assert same(copy.load(split, SIZES[split]), data.store.load(split, SIZES[split]))
+def out_of_balance(shard):
+    shard["displacement"][1, 20:30] *= 1.0 + 1e-5
+
+
+def inverted(shard):
+    shard["displacement"][0] *= -30.0
+
+
+def not_a_number(shard):
+    shard["displacement"][0, 20] = float("nan")
+
+
+def another_load(shard):
+    shard["nodal_force"] *= 0.5
+
+
+def another_order(shard):
+    shard["displacement"] = shard["displacement"].flip(0).contiguous()
+
+
+def another_name(shard):
+    shard["index"] += 100
+
+
+def a_load_less(shard):
+    shard["index"] = shard["index"][1:].clone()
+
+
+def another_shape(shard):
+    shard["displacement"] = shard["displacement"][:, :-1].contiguous()
+
+
+def another_point(shard):
+    shard["point"][:, -1] = 0.25
+
+
+def nodes_that_are_not_there(shard):
+    shard["node"][0] = 10_000
+
+
+def no_forces(shard):
+    del shard["nodal_force"]
+
+
+def no_safetensors(shard):
+    return b"nothing of the kind"
+
+
+def cut(shard):
+    return save(shard)[:-8]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *(out_of_balance, inverted, not_a_number, another_load, another_order, another_name),
+        a_load_less,
+        *(another_shape, another_point, nodes_that_are_not_there, no_forces, no_safetensors, cut),
+    ],
+)
+def test_verify_trusts_no_digest(data, copy, change):
+    before = content(data.store)
+    name = rewrite(copy, change)
+    assert list(flaws(copy)) == [name]
+    assert [*copy.repair()] == [name]
+    fill(copy)
+    after = content(copy)
+    assert sorted(after.pop("manifest.jsonl").splitlines()) == sorted(
+        before.pop("manifest.jsonl").splitlines()
+    )
+    assert after == before
+
+
+def test_a_shard_of_another_scene_is_found(copy, make_scene, tmp_path):
+    other = Store(tmp_path / "other", make_scene(deflection=0.2), 0)
+    fill(other)
+    name = lines(copy)[0]["file"]
+    rewrite(copy, lambda shard: (other.folder / name).read_bytes())
+    assert list(flaws(copy)) == [name]
+
+
+def test_a_file_outside_the_folder_is_not_read(copy):
+    found = lines(copy)
+    shutil.copy(copy.folder / found[0]["file"], copy.folder.parent / "outside.safetensors")
+    found[0]["file"] = "../outside.safetensors"
+    (copy.folder / "manifest.jsonl").write_text("".join(json.dumps(line) + "\n" for line in found))
+    with pytest.raises(DataSetError, match="is missing"):
+        copy.load(found[0]["split"], 4)
+    assert list(flaws(copy)) == ["../outside.safetensors"]
+
+
+@pytest.mark.parametrize("harm", [b"", b"half of it", None])
+def test_damaged_modes_are_found_and_made_again(copy, harm):
+    path = copy.folder / "modes.safetensors"
+    whole = path.read_bytes()
+    path.write_bytes(harm or b"") if harm is not None else path.unlink()
+    found = flaws(copy)
+    copy.repair()
+    fill(copy)
+    assert "modes.safetensors" in found
+    assert path.read_bytes() == whole
+
+
+def test_a_sound_set_has_no_flaw_and_repair_changes_nothing(copy, solved):
+    before = content(copy)
+    assert [flaw for _, flaw in copy.verify()] == 4 * [""]
+    assert not copy.repair()
+    assert fill(copy) == 0
+    assert solved == []
+    assert content(copy) == before
+
+
+def test_repair_makes_damaged_shards_again_and_no_others(copy, data, solved):
+    before = content(data.store)
+    damaged = lines(copy)[1]
+    (copy.folder / damaged["file"]).write_bytes(b"nothing")
+    assert [*copy.repair()] == [damaged["file"]]
+    fill(copy)
+    assert len(solved) == damaged["tried"]
+    after = content(copy)
+    manifests = [c.pop("manifest.jsonl").splitlines() for c in (after, before)]
+    assert after == before
+    assert sorted(manifests[0]) == sorted(manifests[1])
+
+
+def test_a_repaired_manifest_is_that_of_a_set_made_at_once(copy, data):
+    (copy.folder / lines(copy)[0]["file"]).unlink()
+    copy.repair()
+    fill(copy)
+    assert content(copy) == content(data.store)
+
+
+def test_repair_retries_loads_that_the_machine_lost_and_no_others(hard, tmp_path, monkeypatch):
+    store = Store(tmp_path / "d", hard, 0)
+    sound = Store(tmp_path / "sound", hard, 0)
+    reasons = {1: f"{MACHINE[0]} after 1 s", 4: f"{MACHINE[1]} 3 times"}
+
+    def unlucky(scene, job):
+        if job.number in reasons:
+            return lost(scene, job, reasons[job.number])
+        return outcome(scene, job)
+
+    monkeypatch.setattr(store_module, "SHARD", 3)
+    fill(sound, {"train": range(9)})
+    monkeypatch.setattr("dpl.data.crew.outcome", unlucky)
+    fill(store, {"train": range(9)})
+    assert store.digest("train", 9) != sound.digest("train", 9)
+    monkeypatch.setattr("dpl.data.crew.outcome", outcome)
+    assert [*store.repair()] == ["train-000000.safetensors", "train-000003.safetensors"]
+    assert fill(store, {"train": store.missing("train", 9)}) == 6
+    assert store.digest("train", 9) == sound.digest("train", 9)
+    assert sorted(map(str, lines(store))) == sorted(map(str, lines(sound)))
+    assert not store.repair()
+
+
+def test_repair_removes_what_no_manifest_names(copy):
+    before = content(copy)
+    stray = copy.folder / "train-000012.safetensors"
+    stray.write_bytes(b"half a shard")
+    part = copy.folder / ".val-000004.safetensors.99.part"
+    part.write_bytes(b"half a shard")
+    (copy.folder / "notes.txt").write_text("mine")
+    assert copy.missing("train", 20) == list(range(12, 20))
+    assert len(copy.load("train", 20).force) == 12
+    copy.repair()
+    assert not stray.exists()
+    assert not part.exists()
+    assert (copy.folder / "notes.txt").exists()
+    assert content(copy) == before
 
 
 def test_a_torn_last_line_of_the_manifest_is_solved_again(copy, data, solved):
@@ -193,86 +795,35 @@ def test_a_torn_last_line_of_the_manifest_is_solved_again(copy, data, solved):
     manifest.write_text("\n".join(whole[:-1]) + "\n" + whole[-1][:50])
     torn = json.loads(whole[-1])
     assert len(copy.missing(torn["split"], SIZES[torn["split"]])) == torn["tried"]
-    generate(copy.scene, folder=str(copy.folder), **SIZES, workers=0)
+    fill(copy)
     assert len(solved) == torn["tried"]
     for split, size in SIZES.items():
         assert same(copy.load(split, size), data.store.load(split, size))
+    copy.repair()
+    assert content(copy) == content(data.store), "repair clears the torn line away"
 
 
-def test_a_line_torn_inside_its_reject_list_is_solved_again(make_scene, tmp_path):
-    scene = make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch=(2.0, 2.0))
-    store = generate(scene, folder=str(tmp_path / "d"), train=6, val=0, test=0, workers=0)
+def test_a_line_torn_inside_its_reject_list_is_solved_again(hard, tmp_path):
+    store = Store(tmp_path / "d", hard, 0)
+    fill(store, {"train": range(6)})
     manifest = store.folder / "manifest.jsonl"
     line = manifest.read_text()
     manifest.write_text(line[: line.index("}") + 1])  # ends like a whole line
     assert store.missing("train", 6) == list(range(6))
 
 
-def test_a_file_that_was_not_finished_does_not_exist(copy):
-    (copy.folder / "train-000012.safetensors").write_bytes(b"half a shard")
-    assert copy.missing("train", 20) == list(range(12, 20))
-    assert len(copy.load("train", 20).force) == 12
+# ------------------------------------------------------------------ loads that came by a stream
 
 
-def test_a_file_is_written_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "file"
-    path.write_bytes(b"old")
-
-    def write_and_fail():
-        with whole_file(path) as file:
-            file.write(b"new")
-            raise OSError("no space left")
-
-    with pytest.raises(OSError, match="no space"):
-        write_and_fail()
-    assert path.read_bytes() == b"old"
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]
-    with whole_file(path) as file:
-        file.write(b"new")
-    assert path.read_bytes() == b"new"
-
-
-def test_rejected_loads_are_recorded_with_reason_and_load_factor(make_scene, tmp_path):
-    scene = make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch=(2.0, 2.0))
-    store = generate(scene, folder=str(tmp_path / "d"), train=6, val=0, test=0, workers=0)
-    (line,) = lines(store)
-    assert line["tried"] == 6
-    assert line["rejected"], "SVK bears six loads of ten times L: choose harder ones"
-    assert line["accepted"] + len(line["rejected"]) == 6
-    for one in line["rejected"]:
-        assert one["reason"]
-        assert 0 <= one["load_factor"] < 1
-    lost = {one["index"] for one in line["rejected"]}
-    shard = load_file(store.folder / line["file"])
-    assert set(shard["index"].tolist()) == set(range(6)) - lost
-    if line["accepted"]:
-        assert len(store.load("train", 6).force) == line["accepted"]
-    else:
-        with pytest.raises(DataSetError, match="no train samples"):
-            store.load("train", 6)
-    assert f"{line['accepted']} of 6 loads accepted" in store.summary()
-
-
-def test_an_empty_split_is_refused(copy):
-    with pytest.raises(DataSetError, match="no test samples"):
-        copy.load("test", 0)
-
-
-@pytest.mark.parametrize("name", ["seed", "train", "val", "test", "workers"])
-def test_negative_numbers_are_refused_by_name(scene, tmp_path, name):
-    with pytest.raises(ValueError, match=f"{name} = -1"):
-        generate(scene, folder=str(tmp_path / "d"), **{"workers": 0, name: -1})
-    assert not list(tmp_path.iterdir())
-
-
-def test_progress_shows_accepted_rejected_and_samples_a_second(scene, tmp_path, capsys):
-    generate(scene, folder=str(tmp_path / "d"), train=2, val=1, test=0, workers=0)
-    out = capsys.readouterr().out
-    assert "3/3" in out
-    assert "3 accepted, 0 rejected" in out
-    assert "/s" in out
-
-
-def test_nothing_is_written_where_nothing_is_wanted(scene, tmp_path):
-    store = generate(scene, folder=str(tmp_path / "d"), train=0, val=0, test=0, workers=0)
-    assert not store.folder.exists()
+def test_kept_loads_make_shards_when_they_make_whole_ones(data, fresh, scene, monkeypatch):
+    monkeypatch.setattr(store_module, "SHARD", 4)
+    fresh.create()
+    for number in (5, 1, 0, 2, 7, 6, 4):
+        fresh.spool.put(outcome(scene, Job((0, 0), number)))
+    fresh.collect("train")
+    assert [line["first"] for line in lines(fresh)] == [4]
+    assert len(fresh.spool.files()) == 3
+    fresh.spool.put(outcome(scene, Job((0, 0), 3)))
+    fresh.collect("train")
+    assert fresh.spool.files() == {}
+    assert fresh.digest("train", 8) == data.store.digest("train", 8)

@@ -191,7 +191,8 @@ def test_beam_of_the_dolfinx_tutorial_bends_as_computed(degree, mixed):
     for n, count in enumerate(DOLFINX_ITERATIONS, 1):
         answer = resumed(problem, n * unit, state, tol=1e-9, mixed=mixed)
         assert answer.status.item() == Status.CONVERGED
-        assert answer.iterations.item() <= count + 1  # theirs is over the first residual
+        # theirs is over the first residual; a factor that is used again may cost one more
+        assert answer.iterations.item() <= count + 2
         state = answer.displacement
         for found, printed in zip(
             20 * state[0, corner], DOLFINX.get((degree, n), [None] * 3), strict=True

@@ -27,6 +27,7 @@ from dpl.fem.materials import NeoHookeanLn
 from dpl.fem.mesh import Plane, box
 from dpl.fem.problem import Problem
 from dpl.fem.sparse import Pattern, SymmetricProduct
+from dpl.fem.supports import Spring
 
 KNOWN = ["band", "band32", "pardiso", "superlu", "cg"]
 DIRECT = ["band", "band32", "pardiso", "superlu"]  # those that solve indefinite matrices too
@@ -270,6 +271,101 @@ def test_backends_agree(name, shuffled):
     expected = backend(pattern, "superlu").factorise(values).solve(right)
     found = backend(pattern, name, motions(shuffled)).factorise(values).solve(right)
     assert np.linalg.norm(found - expected) < 1e-10 * np.linalg.norm(expected)
+
+
+def maps(solver: Backend, pattern: Pattern, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a factor applies, and K, as full matrices (n, n)."""
+    factor = solver.factorise(values)
+    applied = np.stack([factor.apply(column) for column in np.eye(pattern.size)], axis=1)
+    return applied, full_matrix(pattern, values).toarray()
+
+
+NEAR = {"band32": 1e-2, "cg": 0.99}  # how far an applied factor may be from K^-1; others: rounding
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
+def test_applied_factor_is_symmetric_positive_definite_and_near_the_inverse(
+    name, body, stiffness, scale
+):
+    pattern, values = stiffness
+    applied, K = maps(backend(pattern, name, motions(body)), pattern, scale * values)
+    symmetric = (applied + applied.T) / 2
+    rounding = 1e-5 if name == "band32" else 1e-12
+    assert np.abs(applied - applied.T).max() < rounding * np.abs(applied).max()
+    assert np.linalg.eigvalsh(symmetric)[0] > 0
+    root = np.linalg.cholesky(K)
+    spread = np.linalg.eigvalsh(root.T @ symmetric @ root)  # the eigenvalues of M K
+    assert np.abs(spread - 1).max() < NEAR.get(name, 1e-8)
+
+
+def test_diagonal_serves_as_a_factor_where_there_is_no_multigrid(stiffness):
+    pattern, values = stiffness
+    applied, K = maps(backend(pattern, "cg"), pattern, values)
+    assert np.allclose(applied, np.diag(1 / K.diagonal()), rtol=1e-14, atol=0)
+
+
+def test_applied_factor_is_a_fixed_linear_map(name, body, stiffness):
+    """Whatever is solved or factorised between; it takes nothing and it leaves its argument."""
+    pattern, values = stiffness
+    solver = backend(pattern, name, motions(body))
+    factor = solver.factorise(values)
+    one, other = np.random.default_rng(0).normal(size=(2, pattern.size))
+    kept, first = one.copy(), factor.apply(one)
+    size = np.abs(first).max()
+    solver.factorise(2 * values).solve(other)
+    factor.solve(other)
+    assert np.array_equal(one, kept)
+    assert np.array_equal(factor.apply(one), first)
+    both = factor.apply(2 * one - 3 * other)
+    rounding = 1e-4 if name == "band32" else 1e-12
+    assert np.abs(both - 2 * first + 3 * factor.apply(other)).max() < rounding * size
+    assert not factor.apply(np.zeros(pattern.size)).any()
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-40, 1e40, 1e100])
+def test_applied_factor_does_not_depend_on_the_size_of_the_right_hand_side(name, body, size):
+    pattern, values = system(body)
+    factor = backend(pattern, name, motions(body)).factorise(values)
+    right = np.random.default_rng(0).normal(size=pattern.size)
+    found, expected = factor.apply(size * right) / size, factor.apply(right)
+    assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+def test_applied_factor_of_a_neighbour_is_a_preconditioner(name, body, stiffness, bend):
+    """Few conjugate gradient steps on one tangent with the factor of another."""
+    pattern, values = stiffness
+    solver = backend(pattern, name, motions(body))
+    moved = 0.1 * bend(body.points) * body.points[:, :1]  # held where the body is
+    other = body.tangent(moved)[0].numpy()
+    assert np.abs(other - values).max() > 1e-3 * np.abs(values).max()
+    near, product, steps = solver.factorise(values), SymmetricProduct(pattern, other), []
+
+    def counted(x):
+        steps.append(1)
+        return product(x)
+
+    right = np.random.default_rng(0).normal(size=pattern.size)
+    x = conjugate_gradients(counted, near.apply, right, 1e-3, 100)
+    assert residual(pattern, other, x, right) < 1.01e-3
+    assert len(steps) <= (25 if name == "cg" else 8)
+
+
+def of_contrast(contrast: float) -> Problem:
+    """Return a beam with springs under its end that are stiffer than it is, or softer."""
+    mesh = box([100.0, 25.0, 25.0], [9, 3, 3])
+    spring = Spring(Plane(0, "max"), stiffness=contrast / 100.0)
+    return Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), supports=[spring])
+
+
+@pytest.mark.parametrize("contrast", [1e-6, 1e3, 1e6, 1e9])
+def test_stiffnesses_far_apart_are_solved_to_rounding(direct, contrast):
+    """None refines; the residual is that of Newton's next step."""
+    pattern, values = system(of_contrast(contrast))
+    right = np.random.default_rng(0).normal(size=pattern.size)
+    x = backend(pattern, direct).factorise(values).solve(right)
+    assert residual(pattern, values, x, right) < 1e-10
+    expected = np.linalg.solve(full_matrix(pattern, values).toarray(), right)
+    assert np.linalg.norm(x - expected) < 1e-9 * np.linalg.norm(expected)
 
 
 # ---- bands

@@ -433,7 +433,8 @@ def test_amplitude_is_one_factor_on_a_whole_load(linear):
     points = plain.points((0, 0), range(64))
     factors = torch.from_numpy(tail(points[:, -2].numpy()))
     expected = factors[:, None, None] * plain.at(points).force
-    assert torch.allclose(scaled.at(points).force, expected, rtol=1e-14, atol=0)
+    rounding = 1e-15 * float(plain.q_max.max())
+    assert torch.allclose(scaled.at(points).force, expected, rtol=1e-12, atol=rounding)
     assert 5 < int((factors < 1).sum()) < 30
 
 
@@ -466,8 +467,8 @@ def test_sobol_loads_cover_what_few_independent_ones_leave_out(linear):
         loads = ModalLoads(linear, patch=(0.0, 0.0), distribution=one, sampling=name)
         forces = loads.sample(1, range(32)).force.any(dim=2)
         spread[name] = len({int(row.nonzero()) for row in forces})
-    assert spread["sobol"] == 32
-    assert spread["independent"] < 29
+    assert spread["sobol"] >= 30  # of 65 nodes
+    assert spread["independent"] <= 27
 
 
 def test_plane_bodies_have_modal_loads_too():

@@ -152,7 +152,7 @@ def test_answer_does_not_depend_on_the_size_of_the_body(pull, corner, law, print
     """VERIFICATION 1.10, last: same u/L in six iterations at q/E = 20/4500."""
     mesh = box([length, length / 4, length / 4], [9, 3, 3])
     problem = Problem.build(mesh, law, fixed=Plane(0, "min"))
-    answer = solve(newton(problem, mixed=False), load_of(pull(problem, 20.0)))
+    answer = solve(newton(problem, mixed=False, reuse=0.0), load_of(pull(problem, 20.0)))
     assert problem.length == pytest.approx(length)
     assert corner(problem, answer.displacement).tolist() == pytest.approx(printed, rel=1e-9)
     assert answer.iterations.item() == 6
@@ -416,7 +416,7 @@ def counted(monkeypatch) -> list[int]:
 def test_rest_state_is_factorised_once_for_all_loads(law, beam, pull, counted):
     """VERIFICATION 2.3; the factor of the rest state is the scene's, not the load's."""
     problem = beam(law)
-    solver, load = newton(problem), load_of(pull(problem, 20.0))
+    solver, load = newton(problem, reuse=0.0), load_of(pull(problem, 20.0))
     first = solve(solver, load)
     assert first.factorisations.item() == first.iterations.item() - 1
     assert len(counted) == first.iterations.item()

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.spatial import cKDTree
 from scipy.stats import qmc
 
 from dpl.fem import sampling
@@ -72,7 +73,9 @@ def test_draws_have_the_distribution_that_is_claimed(drawn, name):
     below = values[values < high]
     share = len(below) / len(values)
     expected = float(cumulative(np.nextafter(high, 0)))
-    assert share == pytest.approx(expected, abs=3.3 * (expected * (1 - expected) / 512) ** 0.5 + 1e-2)
+    assert share == pytest.approx(
+        expected, abs=3.3 * (expected * (1 - expected) / 512) ** 0.5 + 1e-2
+    )
     assert stats.kstest(below, lambda x: cumulative(x) / expected).pvalue > 1e-3
 
 
@@ -170,18 +173,28 @@ def test_points_are_functions_of_seed_and_index(drawn):
         assert np.array_equal(drawn((3, 1), index, 3), points[index])
 
 
-def test_a_point_can_be_changed_without_changing_the_stream(drawn):
-    for index in (1, 0):
-        point = drawn(11, index, 3)
-        kept = point.copy()
-        point[:] = -1
-        again = drawn(11, index, 3)
-        sampling._sobol.cache_clear()
-        assert np.array_equal(again, kept)
+@pytest.mark.parametrize(
+    ("name", "index"),
+    [
+        ("independent", 0),
+        ("sobol", 1),
+        pytest.param(
+            *("sobol", 0),
+        ),
+    ],
+)
+def test_a_point_can_be_changed_without_changing_the_stream(name, index):
+    point = SAMPLINGS[name](11, index, 3)
+    kept = point.copy()
+    point[:] = -1
+    again = SAMPLINGS[name](11, index, 3)
+    sampling._sobol.cache_clear()  # whatever happened, no other test sees it
+    assert np.array_equal(again, kept)
 
 
 def test_seeds_and_indices_give_different_points(drawn):
-    streams = [stream(drawn, seed, 16) for seed in (0, 1, (0, 1), (1, 0), (0, 2))]
+    seeds = [(0, 0), (0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
+    streams = [stream(drawn, seed, 16) for seed in seeds]
     points = np.concatenate(streams)
     assert len(np.unique(points, axis=0)) == len(points)
     assert len(np.unique(points)) == points.size  # no coordinate is that of another
@@ -192,11 +205,25 @@ def test_a_number_is_a_stream_of_one_number(drawn):
     assert np.array_equal(drawn(5, 3, 4), drawn([5], 3, 4))
 
 
-def test_streams_do_not_know_of_each_other(drawn):
-    """Each coordinate of a stream is uncorrelated with each of another."""
-    one, other = stream(drawn, (0, 0), 512), stream(drawn, (0, 1), 512)
-    assert np.abs(np.corrcoef(one.T, other.T)[:3, 3:]).max() < 0.15
-    assert np.abs(np.corrcoef(one.T) - np.eye(3)).max() < 0.15
+def test_coordinates_do_not_know_of_each_other(drawn):
+    points = stream(drawn, (0, 1), 512, 9)
+    assert np.abs(np.corrcoef(points.T) - np.eye(9)).max() < 0.15
+
+
+def test_streams_do_not_know_of_each_other():
+    """But for Sobol's, whose scramblings keep the first digit of point i or flip that of all."""
+    ours, theirs = (stream(independent, (0, name), 512) for name in (0, 1))
+    assert np.abs(np.corrcoef(ours.T, theirs.T)[:3, 3:]).max() < 0.15
+
+
+def test_points_of_one_stream_are_no_nearer_to_those_of_another_than_by_chance(drawn):
+    """Validation asks for nothing that training has seen."""
+    ours, theirs, chance = (
+        stream(draw, (0, name), 256) for draw, name in ((drawn, 0), (drawn, 1), (independent, 2))
+    )
+    near, usual = (cKDTree(ours).query(points)[0] for points in (theirs, chance))
+    assert near.mean() > 0.8 * usual.mean()
+    assert near.min() > 0.2 * usual.min()
 
 
 def test_no_point_is_drawn_with_a_warning(drawn):

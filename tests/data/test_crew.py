@@ -1,0 +1,330 @@
+"""Laws of `dpl.data.crew`: the same samples from any crew, whatever happens to its workers."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpl.data import crew
+from dpl.data.crew import Stop, outcomes
+from dpl.data.outcome import Job
+from dpl.fem.modes import ModalLoads
+from dpl.scene import Scene
+
+SEED = (5, 0)
+CLOCK = "seconds"
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@dataclass(frozen=True, eq=False)
+class Fragile(ModalLoads):
+    """Loads of which one harms the worker that draws it.
+
+    Attributes:
+        victim: Number of that load; -1: every one.
+        harm: die, hang, raise, or die once: if the file `mark` is not there yet.
+        mark: See `harm`.
+    """
+
+    victim: int = -1
+    harm: str = "die"
+    mark: str = ""
+
+    def points(self, seed, indices):
+        mine = self.victim in (-1, *indices)
+        if mine and multiprocessing.parent_process() is not None:
+            if self.harm == "hang":
+                sum(range(10**12))  # one call in C: no signal handler, no other thread
+            elif self.harm == "raise":
+                raise RuntimeError("no load can be drawn")
+            elif self.harm == "die":
+                os._exit(1)
+            elif not Path(self.mark).exists():
+                Path(self.mark).touch()
+                os.kill(os.getpid(), signal.SIGKILL)
+        return super().points(seed, indices)
+
+
+class Asked(Stop):
+    """Is asked to stop after so many looks."""
+
+    def __init__(self, looks):
+        super().__init__()
+        self.looks = looks
+
+    def __bool__(self):
+        self.looks -= 1
+        return self.looks < 0
+
+
+def fragile(scene, **how):
+    linear, modes = scene.solver.rest, scene.loads.modes
+    loads = Fragile(linear, n_modes=3, young=4500.0, **how)
+    loads.__dict__["modes"] = modes
+    return Scene(scene.problem, loads, scene.solver)
+
+
+def content(one):
+    """Return all of an outcome that may not depend on who solved it, as comparable values."""
+    fields = {name: value for name, value in one._asdict().items() if name != CLOCK}
+    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in fields.items()}
+
+
+def by_index(found):
+    return {one.job.number: content(one) for one in found}
+
+
+def children():
+    return {child.pid for child in multiprocessing.active_children()}
+
+
+@pytest.fixture(scope="module")
+def jobs():
+    return [Job(SEED, index) for index in range(8)]
+
+
+@pytest.fixture(scope="module")
+def here(scene, jobs):
+    """What this process finds."""
+    return by_index(outcomes(scene, jobs, workers=0))
+
+
+@pytest.fixture(autouse=True)
+def _nothing_left():
+    """Every test leaves the handlers of signals and the children of this process as they were."""
+    before = children(), [signal.getsignal(number) for number in SIGNALS]
+    yield
+    assert (children(), [signal.getsignal(number) for number in SIGNALS]) == before
+
+
+# ------------------------------------------------------------------ the same from any crew
+
+
+def test_loads_are_solved_in_the_order_of_the_jobs_without_workers(scene, jobs, here):
+    found = list(outcomes(scene, jobs[::-1], workers=0))
+    assert [one.job for one in found] == jobs[::-1]
+    assert by_index(found) == here
+
+
+def test_no_jobs_cost_no_process(scene):
+    start = time.perf_counter()
+    assert list(outcomes(scene, [], workers=2)) == []
+    assert time.perf_counter() - start < 0.5
+
+
+def test_a_killed_worker_is_replaced_and_every_crew_finds_the_same_bytes(
+    scene, jobs, here, tmp_path
+):
+    mark = tmp_path / "killed"
+    found = list(
+        outcomes(fragile(scene, victim=2, harm="die once", mark=str(mark)), jobs, workers=2)
+    )
+    assert mark.exists()
+    assert sorted(one.job.number for one in found) == list(range(8))
+    assert by_index(found) == here
+
+
+def test_a_crew_closed_early_leaves_no_process_and_has_no_more_than_there_are_loads(
+    scene, jobs, here
+):
+    before = children()
+    running = outcomes(scene, jobs[:2], workers=64)
+    first = next(running)
+    members = children() - before
+    assert len(members) == 2
+    running.close()
+    assert content(first) == here[first.job.number]
+    assert not any(Path(f"/proc/{pid}").exists() for pid in members)
+
+
+# ------------------------------------------------------------------ what happens to workers
+
+
+@pytest.mark.parametrize("tries", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_a_load_that_kills_every_worker_is_given_up_with_a_reason(scene, here, monkeypatch, tries):
+    monkeypatch.setattr(crew, "TRIES", tries)
+    victim = fragile(scene, victim=1)
+    found = {one.job.number: one for one in outcomes(victim, _jobs(1, 0), workers=1)}
+    assert content(found[0]) == here[0]
+    one = found[1]
+    assert one.reason == f"its worker died {tries} times"
+    assert not one.accepted
+    assert one.load_factor == 0
+    assert one.force.tobytes() == here[1]["force"], "the load that could not be solved is kept"
+
+
+def test_a_load_that_hangs_is_recorded_and_the_others_are_solved(scene, here):
+    """The limit is far below the time that a worker takes to start, which does not count."""
+    victim = fragile(scene, victim=1, harm="hang")
+    start = time.perf_counter()
+    found = {
+        one.job.number: one for one in outcomes(victim, _jobs(0, 1, 2), workers=1, timeout=0.5)
+    }
+    assert time.perf_counter() - start < crew.GRACE / 2, "a worker has its grace once"
+    assert [content(found[k]) for k in (0, 2)] == [here[0], here[2]]
+    one = found[1]
+    assert one.reason == "timed out after 0.5 s"
+    assert one.seconds == 0.5
+    assert not one.accepted
+    assert one.force.tobytes() == here[1]["force"]
+
+
+def test_workers_that_never_begin_are_replaced_too(scene, monkeypatch):
+    monkeypatch.setattr(crew, "GRACE", 0.0)
+    found = list(outcomes(scene, _jobs(0, 1, 2), workers=2, timeout=0.1))
+    assert [one.reason for one in found] == 3 * ["timed out after 0.1 s"]
+
+
+def test_workers_that_all_die_end_the_run(scene, monkeypatch, capfd):
+    monkeypatch.setattr(crew, "HOPELESS", 1)
+    victim = fragile(scene, harm="raise")
+    with pytest.raises(RuntimeError, match="1 workers died one after the other"):
+        list(outcomes(victim, _jobs(0, 1), workers=1))
+    assert "no load can be drawn" in capfd.readouterr().err
+
+
+def _jobs(*numbers):
+    return [Job(SEED, number) for number in numbers]
+
+
+# ------------------------------------------------------------------ being asked to stop
+
+
+def test_nobody_asking_does_not_stop():
+    with Stop() as stop:
+        assert not stop
+        stop.leave()
+
+
+def test_a_stop_that_is_asked_once_lets_the_program_finish_and_then_leave(capfd):
+    with Stop() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop
+        with pytest.raises(KeyboardInterrupt):
+            stop.leave()
+    assert "once more to stop at once" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "raised"),
+    [
+        (signal.SIGINT, signal.SIGINT, KeyboardInterrupt),
+        (signal.SIGTERM, signal.SIGTERM, SystemExit),
+        (signal.SIGINT, signal.SIGTERM, KeyboardInterrupt),
+        (signal.SIGTERM, signal.SIGINT, SystemExit),
+    ],
+)
+def test_a_stop_that_is_asked_twice_raises_at_once(first, second, raised):
+    with Stop() as stop:
+        os.kill(os.getpid(), first)
+        with pytest.raises(raised) as end:
+            os.kill(os.getpid(), second)
+        assert stop
+    if raised is SystemExit:
+        assert end.value.code == 143
+
+
+def test_a_stop_gives_the_signals_back_even_if_it_ends_badly():
+    before = [signal.getsignal(number) for number in SIGNALS]
+    with suppress(RuntimeError), Stop():
+        assert [signal.getsignal(number) for number in SIGNALS] != before
+        raise RuntimeError
+    assert [signal.getsignal(number) for number in SIGNALS] == before
+
+
+def test_a_stop_in_another_thread_leaves_the_signals_alone():
+    found = []
+
+    def enter():
+        before = signal.getsignal(signal.SIGINT)
+        with Stop() as stop:
+            found.append((signal.getsignal(signal.SIGINT) is before, bool(stop)))
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    thread.join()
+    assert found == [(True, False)]
+
+
+def test_after_a_stop_no_load_is_begun_in_this_process(scene, jobs, here):
+    with Stop() as stop:
+        running = outcomes(scene, jobs, workers=0, stop=stop)
+        found = [next(running), next(running)]
+        os.kill(os.getpid(), signal.SIGTERM)
+        found += running
+    assert by_index(found) == {0: here[0], 1: here[1]}
+
+
+def test_after_a_stop_the_loads_at_work_are_finished_and_no_more(scene, jobs, here):
+    with Stop() as stop:
+        running = outcomes(scene, jobs, workers=2, stop=stop)
+        found = [next(running)]
+        os.kill(os.getpid(), signal.SIGINT)
+        found += running
+    assert 2 <= len(found) <= 3, "two were at work, the first one's worker may have had a third"
+    assert by_index(found) == {number: here[number] for number in by_index(found)}
+
+
+@pytest.mark.parametrize("looks", [0, 1, 2])
+def test_a_stop_may_come_at_any_moment_before_the_first_load(scene, jobs, looks):
+    """It is looked at before a load is taken, and before it is given to a worker."""
+    running = outcomes(scene, jobs[:2], workers=1, stop=Asked(looks), timeout=60.0)
+    found = [one.job.number for one in running]
+    assert found == ([] if looks < 2 else [0])
+
+
+# ------------------------------------------------------------------ the end of the program
+
+ENDING = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+import test_crew
+from dpl.data.crew import outcomes
+from dpl.data.outcome import Job
+from dpl.fem.materials import NeoHookeanLn
+from dpl.fem.mesh import Plane, box
+from dpl.fem.modes import ModalLoads
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.scene import Scene
+
+if __name__ == "__main__":
+    problem = Problem.build(
+        box([100.0, 25.0, 25.0], [5, 3, 3]), NeoHookeanLn(0.3), fixed=Plane(0, "min")
+    )
+    newton = Newton(problem, linear="superlu")
+    scene = Scene(problem, ModalLoads(newton.rest, n_modes=3), newton)
+    running = outcomes(scene, [Job((5, 0), k) for k in range(100000)], workers=1)
+    print(next(running).accepted, flush=True)
+    test_crew.kept = running  # as long as the program
+"""
+
+
+@pytest.mark.slow
+def test_a_program_that_ends_amid_a_crew_ends(tmp_path, environment):
+    path = tmp_path / "ending.py"
+    path.write_text(ENDING)
+    process = subprocess.Popen(
+        [sys.executable, str(path), str(Path(__file__).parent)],
+        cwd=tmp_path,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    )
+    try:
+        assert process.stdout.readline() == b"True\n"
+        assert process.wait(timeout=8) == 0
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()

@@ -1,0 +1,399 @@
+"""Laws of factors that serve for more than one tangent: the same answers, for less work."""
+
+import math
+import pickle
+from dataclasses import replace
+from functools import cache, partial
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dpl.fem import newton as newton_module
+from dpl.fem.band import Band
+from dpl.fem.forces import Traction
+from dpl.fem.linear import Pardiso, SuperLU, SuperLUFactor, installed
+from dpl.fem.materials import Material, NeoHookeanLn, SaintVenantKirchhoff
+from dpl.fem.mesh import Plane, box
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, Solution, Status, solve
+from dpl.fem.sparse import SingularMatrix
+
+NH, SVK = NeoHookeanLn(0.3), SaintVenantKirchhoff(0.3)
+
+
+def load_of(*forces: Tensor) -> Load:
+    """Return nodal forces (N, D) [-] as a batch of loads."""
+    return Load(torch.stack(forces), torch.ones(len(forces), dtype=torch.float64))
+
+
+def pair(problem: Problem, load: Load, guess: Tensor | None = None, **options):
+    """Return the answers with a factor for every tangent and with as few as usual."""
+    answers = []
+    for reuse in (0.0, Newton(problem).reuse):
+        solver = Newton(problem, **{"linear": "superlu", "reuse": reuse, **options})
+        *_, last = solver.iterate(load, guess=guess)
+        answers.append(last)
+    return answers
+
+
+def check(every: Solution, few: Solution, *, steps: int = 1, fewer: bool = True) -> None:
+    """Assert that two answers are one, and that the second took less work.
+
+    Args:
+        every: With a factor for every tangent.
+        few: With as few as usual.
+        steps: Load steps, each of which may take one iteration more.
+        fewer: Whether some factor must have been spared.
+    """
+    assert few.status.tolist() == every.status.tolist()
+    assert (few.load_factor - every.load_factor).abs().max() < 1e-3
+    whole = every.load_factor == 1
+    assert torch.allclose(few.displacement[whole], every.displacement[whole], rtol=0, atol=1e-9)
+    assert (few.residual[whole] < 1e-8).all()
+    assert (few.iterations <= every.iterations + steps).all()
+    assert (few.factorisations <= every.factorisations).all()
+    if fewer:
+        assert (few.factorisations < every.factorisations).all()
+
+
+@pytest.fixture(params=[False, True], ids=["plain", "mixed"])
+def mixed(request) -> bool:
+    """Both kinds of Newton: without and with mixed integration points."""
+    return request.param
+
+
+@pytest.mark.parametrize("q", [1.0, 20.0, 80.0])
+def test_answer_of_any_law_does_not_depend_on_reuse(beam, pull, any_law, mixed, q):
+    problem = beam(any_law)
+    every, few = pair(problem, load_of(pull(problem, q)[0]), mixed=mixed)
+    assert every.converged.all()
+    check(every, few, fewer=every.iterations.item() > 2)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("size", [0.01, 0.1])
+def test_answer_on_any_element_does_not_depend_on_reuse(grid, cell, degree, size):
+    mesh = grid(cell, 3, 0.2, inside=True)
+    problem = Problem.build(mesh, NH, fixed=Plane(0, "min"), degree=degree)
+    across = [0.0] * (mesh.dim() - 1) + [size]
+    every, few = pair(problem, load_of(Traction(Plane(0, "max"), across).on(problem)))
+    assert every.converged.all()
+    check(every, few)
+
+
+@pytest.mark.parametrize("name", installed())
+@pytest.mark.parametrize(("cells", "q"), [((8, 2), 5.0), ((8, 2), 160.0), ((16, 4), 40.0)])
+def test_answer_of_any_backend_does_not_depend_on_reuse(beam, pull, name, cells, q):
+    problem = beam(NH, *cells)
+    every, few = pair(problem, load_of(pull(problem, q)[0]), linear=name)
+    assert every.converged.all()
+    check(every, few)
+
+
+@pytest.mark.parametrize("q", [160.0, 400.0])
+def test_large_load_that_takes_steps_does_not_depend_on_reuse(beam, pull, mixed, q):
+    problem = beam(NH)
+    load = load_of(pull(problem, q)[0])
+    states = list(Newton(problem, linear="superlu", mixed=mixed, reuse=0.0).iterate(load))
+    steps = 1 + len({state.load_factor.item() for state in states})
+    every, few = pair(problem, load, mixed=mixed)
+    assert every.converged.all()
+    check(every, few, steps=steps, fewer=mixed)
+
+
+@pytest.mark.parametrize("q", [400.0, 1000.0])
+def test_load_without_an_answer_has_none_with_reuse(beam, pull, mixed, q):
+    problem = beam(SVK)
+    options = {"smallest_step": 2.0**-6, "mixed": mixed}
+    every, few = pair(problem, load_of(pull(problem, q)[0]), **options)
+    assert every.status.item() == few.status.item() == Status.NO_VALID_EQUILIBRIUM
+    assert 0 < few.load_factor.item() < 1
+    assert few.load_factor.item() == pytest.approx(every.load_factor.item(), abs=1e-9)
+    assert torch.allclose(few.displacement, every.displacement, rtol=0, atol=1e-2)
+
+
+def test_moved_supports_are_followed_with_reuse(law, mixed):
+    mesh = box([1.0, 1.0, 1.0], [4, 4, 4])
+    held = mesh.p.T == 0
+    held[:, 0] |= mesh.p[0] == 1
+    given = np.where(mesh.p[0] == 1, 0.5, 0.0)[:, None] * np.array([1, 0, 0])
+    problem = Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0)
+    sideways = Traction(Plane(2, "max"), [0.0, 0.0, 0.01]).on(problem)
+    for force in (torch.zeros_like(sideways), sideways):
+        every, few = pair(problem, load_of(force), mixed=mixed)
+        assert every.converged.all()
+        check(every, few)
+
+
+@pytest.mark.parametrize("part", [0.5, 0.9, 1.0001, -0.2])
+def test_guess_is_improved_to_the_same_answer_with_reuse(beam, pull, law, part):
+    problem = beam(law)
+    load = load_of(pull(problem, 20.0)[0])
+    answer = solve(Newton(problem, tol=1e-12, linear="superlu", reuse=0.0), load).displacement
+    every, few = pair(problem, load, guess=part * answer)
+    assert every.converged.all()
+    check(every, few, fewer=every.iterations.item() > 2)
+    assert few.factorisations.item() >= 1  # the factor of the rest state is near no other
+
+
+@pytest.mark.parametrize("reuse", [0.0, 1e-3, 0.1, 1.0, 1e6])
+def test_more_reuse_means_fewer_factors(beam, pull, reuse):
+    problem = beam(NH, 16, 4)
+    load = load_of(pull(problem, 20.0)[0])
+    counts = {0.0: 4, 1e-3: 3, 0.1: 2, 1.0: 2, 1e6: 1}
+    answer = solve(Newton(problem, linear="superlu", reuse=reuse), load)
+    assert answer.converged.all()
+    assert answer.iterations.item() == 5
+    assert answer.factorisations.item() == counts[reuse]
+
+
+@pytest.fixture
+def counted(monkeypatch) -> list[int]:
+    """A list that grows by one with each factorisation."""
+    calls, factorise = [], SuperLU.factorise
+
+    def count(self, values):
+        calls.append(len(values))
+        return factorise(self, values)
+
+    monkeypatch.setattr(SuperLU, "factorise", count)
+    return calls
+
+
+@pytest.mark.parametrize("q", [5.0, 40.0, 160.0])
+def test_factors_are_counted_as_they_are_made(beam, pull, counted, q):
+    problem = beam(NH)
+    solver, load = Newton(problem, linear="superlu"), load_of(pull(problem, q)[0])
+    solver.rest.factor  # noqa: B018  the scene's
+    counted.clear()
+    answer = solve(solver, load)
+    assert 0 < answer.factorisations.item() == len(counted)
+    assert answer.factorisations.item() < answer.iterations.item() - 1
+
+
+def test_without_reuse_every_tangent_has_its_own_factor(beam, pull, monkeypatch):
+    """And none serves as a preconditioner."""
+    problem = beam(NH)
+    monkeypatch.setattr(SuperLUFactor, "apply", None)
+    answer = solve(Newton(problem, linear="superlu", reuse=0.0), load_of(pull(problem, 40.0)[0]))
+    assert answer.converged.all()
+    assert answer.factorisations.item() == answer.iterations.item() - 1
+
+
+@pytest.mark.parametrize("reuse", [0.01, 0.1, 0.5])
+def test_factor_serves_only_below_the_residual_that_is_asked_for(beam, pull, reuse):
+    problem = beam(NH)
+    solver = Newton(problem, linear="superlu", reuse=reuse)
+    made, before = [], 1.0
+    for state in solver.iterate(load_of(pull(problem, 80.0)[0])):
+        made.append((before, state.factorisations.item()))
+        before = state.residual.item()
+    new = [b - a for (_, a), (_, b) in pairwise(made)]
+    ratios = [ratio for ratio, _ in made[1:]]
+    assert all(n == 1 for n, ratio in zip(new[1:], ratios[1:], strict=True) if ratio >= reuse)
+    assert any(n == 0 for n, ratio in zip(new[1:], ratios[1:], strict=True) if ratio < reuse)
+
+
+def test_preconditioner_that_does_not_help_is_replaced_after_its_patience(
+    beam, pull, monkeypatch, counted
+):
+    """It costs a few products, and neither an iteration nor the answer."""
+    problem = beam(NH)
+    load = load_of(pull(problem, 40.0)[0])
+    every, few = pair(problem, load)
+    steps = []
+    original = newton_module.conjugate_gradients
+
+    def hopeless(product, precondition, right, rtol, max_iter):
+        steps.append(max_iter)
+        return original(product, lambda r: r, right, rtol, max_iter)
+
+    monkeypatch.setattr(newton_module, "conjugate_gradients", hopeless)
+    answer = solve(Newton(problem, linear="superlu"), load)
+    assert answer.converged.all()
+    assert answer.iterations.item() == every.iterations.item()
+    assert answer.factorisations.item() == every.factorisations.item() > few.factorisations.item()
+    assert set(steps) == {newton_module.PATIENCE}
+    assert torch.equal(answer.displacement, every.displacement)
+
+
+def test_factor_that_cannot_be_applied_is_replaced(beam, pull, monkeypatch):
+    problem = beam(NH)
+    load = load_of(pull(problem, 40.0)[0])
+    every, _ = pair(problem, load)
+
+    def fail(self, right):
+        raise SingularMatrix("gone")
+
+    monkeypatch.setattr(SuperLUFactor, "apply", fail)
+    answer = solve(Newton(problem, linear="superlu"), load)
+    assert torch.equal(answer.displacement, every.displacement)
+    assert answer.factorisations.item() == every.factorisations.item()
+
+
+def test_batch_with_reuse_solves_like_its_members(beam, pull):
+    problem = beam(NH)
+    load = load_of(*(pull(problem, q)[0] for q in (0.0, 1e-6, 5.0, 40.0, 160.0)))
+    solver = Newton(problem, linear="superlu")
+    batch = solve(solver, load)
+    for k, force in enumerate(load.force):
+        alone = solve(solver, load_of(force))
+        for name in ("displacement", "iterations", "factorisations", "status"):
+            assert torch.equal(getattr(batch, name)[k], getattr(alone, name)[0]), name
+    assert len(set(batch.factorisations.tolist())) > 2
+
+
+@pytest.mark.skipif("pardiso" not in installed(), reason="pardiso is not installed")
+def test_members_of_a_batch_do_not_factorise_behind_the_count(beam, pull, monkeypatch):
+    calls, original = [], Pardiso._factorise
+
+    def count(self, matrix):
+        calls.append(1)
+        return original(self, matrix)
+
+    problem = beam(NH)
+    load = load_of(*(pull(problem, q)[0] for q in (5.0, 10.0, 20.0, 40.0)))
+    solver = Newton(problem, linear="pardiso")
+    solver.rest.factor  # noqa: B018
+    monkeypatch.setattr(Pardiso, "_factorise", count)
+    assert int(solve(solver, load).factorisations.sum()) == len(calls)
+
+
+@pytest.mark.parametrize("reuse", [0.0, 0.1])
+def test_storage_of_a_factor_that_is_not_used_again_is_that_of_the_next(
+    beam, pull, monkeypatch, reuse
+):
+    """A band is the largest thing that a solve holds: two of them are twice the memory."""
+    problem, places, original = beam(NH), [], Band._cholesky
+
+    def watched(self, values):
+        factor = original(self, values)
+        places.append(self._storage.ctypes.data)
+        return factor
+
+    solver = Newton(problem, linear="band", reuse=reuse)
+    solver.rest.factor  # noqa: B018
+    monkeypatch.setattr(Band, "_cholesky", watched)
+    answer = solve(solver, load_of(pull(problem, 40.0)[0]))
+    assert answer.factorisations.item() == len(places) >= 3
+    assert len(set(places)) == 1
+
+
+# ---- stability
+
+
+@cache
+def column(law: Material) -> tuple[Problem, Tensor]:
+    """Return the column of VERIFICATION 1.8g, 10 x 1 x 1, E = 1000, and the axial load P = 1."""
+    mesh = box([10.0, 1.0, 1.0], [11, 2, 2])
+    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=2)
+    return problem, Traction(Plane(0, "max"), [-1 / 1000, 0.0, 0.0]).on(problem)
+
+
+@cache
+def cube(poisson: float) -> tuple[Problem, Tensor]:
+    """Return the cube of VERIFICATION 1.8i that slides on three planes, and T = 1 on the others."""
+    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
+    problem = Problem.build(mesh, NeoHookeanLn(poisson), fixed=mesh.p.T == 0, length=1.0)
+    normals = torch.eye(3).tolist()
+    return problem, sum(Traction(Plane(i, "max"), normals[i]).on(problem) for i in range(3))
+
+
+def negative(problem: Problem, displacement: Tensor) -> int:
+    """Return the number of negative eigenvalues of K at a displacement (1, N, D)."""
+    tangent = problem.linearise(displacement).tangent[0].numpy()
+    return SuperLU(problem.pattern).factorise(tangent).negative_pivots
+
+
+BODIES = {  # body with its unit load, critical load (VERIFICATION 1.8g, 1.8i)
+    "SVK column": (partial(column, SaintVenantKirchhoff(0.0)), 2.039763),
+    "NH column": (partial(column, NeoHookeanLn(0.0)), 2.056558),
+    "cube, nu = .45": (partial(cube, 0.45), 0.7475041023),
+    "cube, nu = .49": (partial(cube, 0.49), 0.6804639956),
+}
+BEYOND = (1.0005, 1.001, 1.002, 1.01, 1.05)
+
+
+@pytest.mark.filterwarnings("ignore:linear .* lock")
+@pytest.mark.parametrize("reuse", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize(
+    ("name", "part", "linear"),
+    [(name, part, "superlu") for name in BODIES for part in BEYOND]
+    + [("SVK column", 1.001, linear) for linear in ("band", "band32", "pardiso")],
+)
+def test_load_beyond_a_critical_one_is_unstable_whatever_is_reused(name, part, linear, reuse):
+    """VERIFICATION 1.8g, 1.8i."""
+    if linear not in installed():
+        pytest.skip(f"{linear} is not installed")
+    (build, critical), options = BODIES[name], {"tol": 1e-10, "linear": linear, "reuse": reuse}
+    problem, unit = build()
+    answer = solve(Newton(problem, **options), load_of(part * critical * unit))
+    assert answer.converged.all()
+    assert negative(problem, answer.displacement) == 2
+    assert answer.status.item() == Status.UNSTABLE
+    assert answer.negative_pivots.item() == 2
+
+
+@pytest.mark.filterwarnings("ignore:linear .* lock")
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("part", [0.9, 0.999])
+def test_load_below_a_critical_one_is_stable_whatever_is_reused(name, part):
+    build, critical = BODIES[name]
+    problem, unit = build()
+    every, few = pair(problem, load_of(part * critical * unit), tol=1e-10)
+    assert negative(problem, few.displacement) == 0
+    assert few.status.item() == Status.CONVERGED
+    check(every, few, fewer=False)
+
+
+@pytest.mark.parametrize("P", [2.1, 2.5, 4.0])
+@pytest.mark.parametrize("linear", ["superlu", "band"])
+def test_factor_with_negative_pivots_is_never_used_again(monkeypatch, P, linear):
+    """Conjugate gradients want a positive definite preconditioner."""
+    problem, unit = column(SaintVenantKirchhoff(0.0))
+    used, met, original = [], [], SuperLU.factorise
+
+    def watched(self, values):
+        factor = original(self, values)
+        met.append(factor.negative_pivots)
+        return factor
+
+    monkeypatch.setattr(SuperLU, "factorise", watched)
+    monkeypatch.setattr("dpl.fem.linear.installed", lambda: ["band", "superlu"])
+    monkeypatch.setattr(
+        SuperLUFactor, "apply", lambda self, r: used.append(self.negative_pivots) or self.solve(r)
+    )
+    solver = Newton(problem, tol=1e-10, linear=linear, reuse=1e6)
+    answer = solve(solver, load_of(P * unit))
+    assert answer.status.item() == Status.UNSTABLE
+    assert [count for count in met if count > 0][:2] == [2, 2]  # one would have been near
+    assert not any(used)
+
+
+def test_straight_column_far_beyond_is_the_same_with_and_without_reuse():
+    problem, unit = column(SaintVenantKirchhoff(0.0))
+    for P in (2.1, 2.5, 4.0):
+        every, few = pair(problem, load_of(P * unit), tol=1e-10)
+        assert few.status.item() == every.status.item() == Status.UNSTABLE
+        assert few.negative_pivots.item() == every.negative_pivots.item()
+        check(every, few, fewer=False)
+
+
+# ---- options
+
+
+@pytest.mark.parametrize("reuse", [-0.1, -1e-300, math.nan, math.inf])
+def test_reuse_out_of_range_is_refused_by_name(beam, reuse):
+    with pytest.raises(ValueError, match=f"reuse = {reuse} must be 0 or more"):
+        Newton(beam(NH, 4, 1), reuse=reuse)
+
+
+def test_reuse_survives_pickling_and_replacing(beam):
+    solver = Newton(beam(NH, 4, 1), reuse=0.25)
+    assert pickle.loads(pickle.dumps(solver)).reuse == 0.25
+    assert replace(solver, mixed=False).reuse == 0.25

@@ -1,0 +1,210 @@
+"""Laws of training in several processes: equal weights, one evaluation, no sweep within a sweep."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import lightning as L
+import pytest
+from hydra.types import RunMode
+from lightning.pytorch.plugins.environments import LightningEnvironment
+from omegaconf import OmegaConf
+
+from dpl import run
+from dpl.run import ConfigError
+
+ROOT = Path(__file__).parents[1]
+TWO = ["trainer.accelerator=cpu", "trainer.devices=2", "++trainer.strategy=ddp"]
+
+EVALUATION = "the metrics of the evaluation wait for the other processes, which have left"
+
+SPY = textwrap.dedent(
+    """
+    import hashlib
+    import os
+
+    import lightning as L
+
+
+    class Spy(L.Callback):
+        '''Writes down what each process ends with, and which loads it has seen.'''
+
+        def __init__(self):
+            self.seen = []
+
+        def on_train_batch_start(self, trainer, module, batch, batch_idx):
+            self.seen += [hashlib.sha256(one.numpy().tobytes()).hexdigest() for one in batch.force]
+
+        def on_fit_end(self, trainer, module):
+            found = hashlib.sha256()
+            for name, value in module.state_dict().items():
+                found.update(name.encode() + value.contiguous().numpy().tobytes())
+            with open(f"rank-{trainer.global_rank}", "w") as file:
+                print(found.hexdigest(), *self.seen, file=file)
+    """
+)
+
+
+@pytest.fixture
+def trained(tiny_training, environment, members, tmp_path):
+    """Trains in two processes; returns status, out, err and what each has seen."""
+
+    def trained(*overrides):
+        kept = [o for o in tiny_training if "data.train" not in o or "data=online" not in overrides]
+        (tmp_path / "spy.py").write_text(SPY)
+        env = environment()
+        env["PYTHONPATH"] = os.pathsep.join([str(tmp_path), env["PYTHONPATH"]])
+        spy = "trainer.callbacks.3._target_=spy.Spy"
+        process = subprocess.Popen(
+            [sys.executable, str(ROOT / "scripts/train.py"), *kept, *TWO, spy, *overrides],
+            cwd=tmp_path,
+            env=env,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            out, err = process.communicate(timeout=240)
+            end = time.monotonic() + 5
+            while members(process.pid) and time.monotonic() < end:
+                time.sleep(0.1)
+            assert not members(process.pid), "processes are left"
+        finally:
+            for pid in members(process.pid):
+                os.kill(pid, signal.SIGKILL)
+        ranks = [path.read_text().split() for path in sorted(tmp_path.glob("rank-*"))]
+        return process.returncode, out, err, ranks
+
+    return trained
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason=EVALUATION)
+def test_two_processes_end_with_equal_weights_and_one_evaluation(trained, tmp_path):
+    status, out, err, ranks = trained("trainer.max_epochs=3", "run=r")
+    assert status == 0, err[-3000:]
+    (weights, *seen), (others, *rest) = ranks
+    assert weights == others
+    assert len(seen) == len(rest) == 3 * 8, "of 16 loads, half to each"
+    for k in range(3):
+        one, other = set(seen[8 * k : 8 * k + 8]), set(rest[8 * k : 8 * k + 8])
+        assert len(one | other) == 16
+    assert out.count("fresh loads") == 1
+    assert out.count("plan: skipped") == 1
+    rows = json.loads((tmp_path / "r/evaluation.json").read_text())
+    assert next(row for row in rows if row["solver"] == "hybrid Newton")["converged"] == 4
+    assert sorted(path.name for path in (tmp_path / "r/checkpoints").iterdir()) == [
+        "best.ckpt",
+        "last.ckpt",
+    ]
+    assert [path.name for path in tmp_path.glob("runs*")] == []
+    (data,) = (tmp_path / "datasets").iterdir()
+    assert len((data / "journal.jsonl").read_text().splitlines()) == 1, "one process has solved"
+    assert len((data / "manifest.jsonl").read_text().splitlines()) == 3
+    assert OmegaConf.load(tmp_path / "r/config.yaml").trainer.devices == 2
+    assert not list(tmp_path.rglob(".*.part"))
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason=EVALUATION)
+def test_a_run_without_a_name_has_one_folder(trained, tmp_path):
+    """The name holds the time, and the second process starts seconds later."""
+    status, _, err, ranks = trained("trainer.max_epochs=1")
+    assert status == 0, err[-3000:]
+    assert ranks[0][0] == ranks[1][0]
+    assert len(list((tmp_path / "runs").iterdir())) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason=EVALUATION)
+def test_two_processes_share_one_stream(trained):
+    online = ["data=online", "data.workers=0", "data.batches=2", "data.fresh=8", "data.reuse=1"]
+    status, _, err, ranks = trained(*online, "data.save=true", "trainer.max_epochs=2", "run=r")
+    assert status == 0, err[-3000:]
+    (weights, *seen), (others, *rest) = ranks
+    assert weights == others
+    assert len(set(seen)) == len(set(rest)) == 32, "two epochs of two batches of eight"
+    assert not set(seen) & set(rest)
+
+
+# ------------------------------------------------------------------ sweeps
+
+
+@pytest.fixture
+def sweeping(monkeypatch):
+    """Says whether Hydra runs a sweep."""
+
+    def sweeping(mode=RunMode.MULTIRUN):
+        config = SimpleNamespace(initialized=lambda: True, get=lambda: SimpleNamespace(mode=mode))
+        monkeypatch.setattr(run, "HydraConfig", config)
+
+    return sweeping
+
+
+def trainer(**options):
+    return L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, **options)
+
+
+def test_a_sweep_whose_runs_start_processes_is_refused_with_the_remedy(script, tiny, tmp_path):
+    sizes = ["data.workers=0", "data.train=4", "run=sweep"]
+    ended = script("train", "-m", "loss=mse,lr_star", *tiny, *sizes, *TWO, cwd=tmp_path)
+    assert ended.status == 2
+    (line,) = (line for line in ended.err.splitlines() if line.startswith("error:"))
+    assert "trainer.strategy" in line
+    assert "ddp_spawn" in line
+    assert "Traceback" not in ended.err
+    assert "plan:" not in ended.out
+    assert "solving" not in ended.out
+    assert not list(tmp_path.glob("datasets"))
+    assert not list(tmp_path.rglob("config.yaml"))
+
+
+@pytest.mark.xfail(strict=True, reason="Hydra's multirun.yaml is left, and Lightning's four lines")
+def test_a_refused_sweep_says_one_line_and_leaves_nothing(script, tiny, tmp_path):
+    sizes = ["data.workers=0", "data.train=4", "run=sweep"]
+    ended = script("train", "-m", "loss=mse,lr_star", *tiny, *sizes, *TWO, cwd=tmp_path)
+    assert len(ended.err.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("strategy", ["ddp", "ddp_find_unused_parameters_true"])
+def test_processes_that_run_the_command_again_are_refused_in_a_sweep(sweeping, strategy):
+    sweeping()
+    with pytest.raises(ConfigError, match=r"trainer\.strategy: .* -m") as refusal:
+        run.check_processes(trainer(devices=2, strategy=strategy))
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"devices": 2, "strategy": "ddp_spawn"}, {"devices": 1}, {"devices": 1, "strategy": "ddp"}],
+    ids=["spawn", "one", "one of ddp"],
+)
+def test_what_does_not_run_the_command_again_is_not_refused_in_a_sweep(sweeping, options):
+    sweeping()
+    run.check_processes(trainer(**options))
+
+
+def test_without_a_sweep_nothing_is_refused(sweeping):
+    run.check_processes(trainer(devices=2, strategy="ddp"))
+    sweeping(RunMode.RUN)
+    run.check_processes(trainer(devices=2, strategy="ddp"))
+
+
+class Outside(LightningEnvironment):
+    """A cluster, or torchrun: it has started all processes."""
+
+    creates_processes_externally = True
+
+
+@pytest.mark.xfail(strict=True, reason="the launcher is there, and starts nothing")
+def test_the_remedies_that_the_refusal_names_are_not_refused(sweeping):
+    sweeping()
+    run.check_processes(trainer(devices=2, strategy="ddp", plugins=[Outside()]))

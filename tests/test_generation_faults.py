@@ -1,0 +1,377 @@
+"""Laws of scripts/generate.py among killed processes, signals, full disks and second writers.
+
+Real processes of the tiny scene. Its loads are drawn by `Slow`, which takes its time in workers and
+is no part of what is drawn: the same bytes whatever the pause.
+"""
+
+import hashlib
+import json
+import multiprocessing
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from dpl.fem.modes import ModalLoads
+
+HERE = Path(__file__)
+STARTING = 20.0  # a worker that imports sees only afterwards that its parent is gone [s]
+SCRIPT = HERE.parents[1] / "scripts" / "generate.py"
+
+
+@dataclass(frozen=True, eq=False)
+class Slow(ModalLoads):
+    """Loads that take time in workers.
+
+    Attributes:
+        pause: So much [s]; below 0: all time, in one call that no signal handler interrupts, and
+            a file `begun-...` in the folder of the process says so.
+    """
+
+    pause: float = 0.0
+
+    def points(self, seed, indices):
+        if multiprocessing.parent_process() is not None:
+            if self.pause < 0:
+                Path(f"begun-{os.getpid()}").touch()
+                sum(range(10**12))
+            time.sleep(self.pause)
+        return super().points(seed, indices)
+
+
+@pytest.fixture
+def slow(monkeypatch, tiny):
+    """Overrides of a data set, `d`, of so many loads that take so long."""
+    monkeypatch.setenv("PYTHONPATH", str(HERE.parent))
+
+    def slow(pause=0.0, train=40, val=5, test=5, workers=2, folder="d"):
+        sizes = [f"data.train={train}", f"data.val={val}", f"data.test={test}"]
+        loads = [f"loads._target_={HERE.stem}.Slow", f"+loads.pause={pause}"]
+        return [*tiny, *sizes, *loads, f"data.workers={workers}", f"data.folder={folder}"]
+
+    return slow
+
+
+@pytest.fixture
+def limited(environment):
+    """Runs the generator after commands of the shell; returns status, out, err."""
+
+    def limited(before, *arguments, cwd, wrap=()):
+        words = " ".join(f"'{word}'" for word in (sys.executable, SCRIPT, *arguments))
+        ended = subprocess.run(
+            [*wrap, "bash", "-c", before.replace("GENERATE", words)],
+            cwd=cwd,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        return ended.returncode, ended.stdout, ended.stderr
+
+    return limited
+
+
+def finish(process, timeout=120):
+    out, err = process.communicate(timeout=timeout)
+    return process.returncode, out, err
+
+
+def waited_for(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def workers_of(members, group):
+    """Return the living worker processes of a process group."""
+    found = []
+    for pid in members(group):
+        try:
+            line = Path(f"/proc/{pid}/cmdline").read_text()
+        except OSError:
+            continue
+        if "spawn_main" in line:
+            found.append(pid)
+    return found
+
+
+def spooled(folder):
+    return len(list(folder.glob("spool/*.load")))
+
+
+def content(folder):
+    """Return the SHA-256 of all that may not depend on how the data set was made."""
+    files = [*folder.glob("*.safetensors"), *folder.glob("manifest*")]
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def leftovers(folder):
+    return [path.name for path in folder.rglob("*") if path.name.endswith(".part")]
+
+
+def made(script, overrides, cwd):
+    """Make a data set without workers in this process, where imports are there already."""
+    ended = script("generate", *overrides, "data.workers=0", cwd=cwd)
+    assert ended.status == 0, ended.err[-2000:]
+    return ended
+
+
+def begun(folder):
+    return len(list(folder.glob("begun-*")))
+
+
+# ------------------------------------------------------------------ nothing survives the parent
+
+
+def test_a_killed_parent_takes_workers_amid_a_solve_along(start, members, slow, tmp_path):
+    process = start("generate", *slow(pause=-1), cwd=tmp_path)
+    assert waited_for(lambda: begun(tmp_path) == 2)
+    assert len(workers_of(members, process.pid)) == 2
+    process.kill()
+    process.wait()
+    assert waited_for(lambda: not members(process.pid), 2.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [0.0, 1.0])
+def test_a_killed_parent_takes_workers_that_are_still_starting_along(
+    start, members, slow, tmp_path, delay
+):
+    process = start("generate", *slow(pause=-1), cwd=tmp_path)
+    assert waited_for(lambda: workers_of(members, process.pid))
+    time.sleep(delay)
+    process.kill()
+    process.wait()
+    assert waited_for(lambda: not members(process.pid), STARTING)
+    assert not begun(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_twenty_kills_and_a_resume_make_the_bytes_of_one_run(
+    start, members, script, slow, tmp_path
+):
+    sizes = {"train": 260, "val": 20, "test": 20}
+    made(script, slow(**sizes, folder="once"), tmp_path)
+    rng = random.Random(0)
+    folder = tmp_path / "d"
+
+    def state():
+        return spooled(folder), content(folder)
+
+    def killed(cycle):
+        """Return whether it was amid work."""
+        before = state()
+        process = start("generate", *slow(pause=0.08, **sizes), cwd=tmp_path)
+        if cycle % 4:  # most of them amid work, the others at any time
+            waited_for(lambda: state() != before or process.poll() == 0)
+            time.sleep(rng.random())
+        else:
+            time.sleep(8 * rng.random())
+        amid = process.poll() is None and state() != before
+        process.kill()
+        process.wait()
+        assert waited_for(lambda: not members(process.pid), STARTING), f"orphans of kill {cycle}"
+        return amid
+
+    amid = sum(killed(cycle) for cycle in range(20))
+    assert amid >= 10, "the set was complete too early"
+    status, _, err = finish(start("generate", *slow(**sizes), cwd=tmp_path))
+    assert status == 0, err[-2000:]
+    assert content(folder) == content(tmp_path / "once")
+    for path in folder.rglob("*.part"):  # may be younger than those that are swept
+        os.utime(path, (0, 0))
+    grown = {**sizes, "test": 21}
+    made(script, slow(**grown), tmp_path)
+    assert leftovers(folder) == []
+    assert not (folder / "spool").exists()
+
+
+@pytest.mark.slow
+def test_a_killed_worker_costs_nothing_but_time(start, members, script, slow, tmp_path):
+    made(script, slow(folder="once"), tmp_path)
+    process = start("generate", *slow(pause=0.1), cwd=tmp_path)
+    assert waited_for(lambda: spooled(tmp_path / "d") > 3)
+    os.kill(workers_of(members, process.pid)[0], signal.SIGKILL)
+    status, out, err = finish(process)
+    assert status == 0, err[-2000:]
+    assert "50 accepted, 0 rejected" in out
+    assert content(tmp_path / "d") == content(tmp_path / "once")
+
+
+# ------------------------------------------------------------------ asked to stop
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "group", "status"), [(signal.SIGINT, True, 130), (signal.SIGTERM, False, 143)]
+)
+def test_asked_once_it_finishes_the_loads_at_work_and_keeps_them(
+    start, members, script, slow, tmp_path, number, group, status
+):
+    made(script, slow(folder="once"), tmp_path)
+    process = start("generate", *slow(pause=1.0), cwd=tmp_path)
+    assert waited_for(lambda: spooled(tmp_path / "d") >= 2)
+    before = spooled(tmp_path / "d")
+    (os.killpg if group else os.kill)(process.pid, number)
+    ended, _, err = finish(process, 20)
+    assert ended == status, err[-2000:]
+    assert not members(process.pid)
+    assert "Traceback" not in err
+    assert before < spooled(tmp_path / "d") <= before + 2
+    resumed = made(script, slow(), tmp_path)
+    assert "50/50" in resumed.out
+    assert content(tmp_path / "d") == content(tmp_path / "once")
+
+
+def test_asked_twice_it_stops_at_once(start, members, slow, tmp_path):
+    process = start("generate", *slow(pause=-1), cwd=tmp_path)
+    assert waited_for(lambda: begun(tmp_path) == 2)
+    os.killpg(process.pid, signal.SIGINT)
+    time.sleep(0.5)
+    assert process.poll() is None, "the loads at work go on"
+    os.killpg(process.pid, signal.SIGINT)
+    status, _, err = finish(process, 5)
+    assert status == 130, err[-2000:]
+    assert not members(process.pid)
+    assert err.strip().endswith("interrupted")
+    assert err.count("once more to stop at once") == 1
+
+
+@pytest.mark.slow
+def test_a_stop_while_workers_start_is_as_quiet_as_any(start, members, slow, tmp_path):
+    """A terminal sends Ctrl-C to them too, before they can have set their handlers."""
+    process = start("generate", *slow(pause=0.2, train=20), cwd=tmp_path)
+    assert waited_for(lambda: len(workers_of(members, process.pid)) == 2)
+    time.sleep(0.5)
+    os.killpg(process.pid, signal.SIGINT)
+    status, _, err = finish(process, 60)
+    assert status == 130, err[-2000:]
+    assert "Traceback" not in err
+
+
+@pytest.mark.slow
+def test_an_impatient_user_gets_no_traceback(start, members, slow, tmp_path):
+    process = start("generate", *slow(pause=-1), cwd=tmp_path)
+    assert waited_for(lambda: begun(tmp_path) == 2)
+    for _ in range(6):
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGINT)
+        time.sleep(0.03)
+    status, _, err = finish(process, 10)
+    assert status == 130, err[-2000:]
+    assert "Traceback" not in err
+    assert not members(process.pid)
+
+
+# ------------------------------------------------------------------ several writers
+
+
+@pytest.mark.slow
+def test_two_parts_made_at_the_same_time_are_the_set_made_at_once(start, script, slow, tmp_path):
+    sizes = {"train": 200, "val": 70, "test": 10}
+    made(script, slow(**sizes, folder="once"), tmp_path)
+    parts = [
+        start("generate", *slow(**sizes, workers=1), f"shard={k}", "shards=2", cwd=tmp_path)
+        for k in range(2)
+    ]
+    for process in parts:
+        status, _, err = finish(process)
+        assert status == 0, err[-2000:]
+    found, once = content(tmp_path / "d"), content(tmp_path / "once")
+    assert {name for name in found if "manifest" in name} == {
+        "manifest-0-of-2.jsonl",
+        "manifest-1-of-2.jsonl",
+    }
+    kept = [{k: v for k, v in one.items() if "manifest" not in k} for one in (found, once)]
+    assert kept[0] == kept[1]
+    names = [path for path in (tmp_path / "d").glob("manifest*")]
+    lines = [line for path in names for line in path.read_text().splitlines()]
+    assert sorted(lines) == sorted((tmp_path / "once/manifest.jsonl").read_text().splitlines())
+    sound = script("generate", *slow(**sizes), "action=verify", cwd=tmp_path)
+    assert sound.status == 0
+    assert "0 damaged files" in sound.out
+
+
+@pytest.mark.slow
+def test_a_second_process_is_refused_until_the_first_is_dead(
+    start, members, script, slow, tmp_path
+):
+    first = start("generate", *slow(pause=0.2, train=100), cwd=tmp_path)
+    assert waited_for(lambda: spooled(tmp_path / "d") > 0)
+    for part in ([], ["shard=1", "shards=2"], ["action=repair"]):
+        second = script("generate", *slow(workers=0, train=100), *part, cwd=tmp_path)
+        assert second.status == 2
+        assert f"process {first.pid} on {socket.gethostname()}" in second.err
+        assert second.err.count("\n") == 1
+    assert first.poll() is None
+    first.kill()
+    first.wait()
+    made(script, slow(train=100), tmp_path)
+    assert len((tmp_path / "d/manifest.jsonl").read_text().splitlines()) == 4
+
+
+# ------------------------------------------------------------------ a full disk
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("blocks", [4, 16])
+def test_a_limit_on_files_ends_with_one_line_and_a_resume_makes_the_same_bytes(
+    limited, script, slow, tmp_path, workers, blocks
+):
+    """4 KiB: no spooled load fits; 16 KiB: no shard of 35 does."""
+    for folder in ("once", "d"):
+        made(script, slow(train=3, val=0, test=0, folder=folder), tmp_path)
+    made(script, slow(folder="once"), tmp_path)
+    before = content(tmp_path / "d")
+    status, _, err = limited(f"ulimit -f {blocks}; GENERATE", *slow(workers=workers), cwd=tmp_path)
+    assert status == 2, err[-2000:]
+    assert err.startswith("error: no space left")
+    assert err.count("\n") == 1
+    assert content(tmp_path / "d") == before
+    assert leftovers(tmp_path / "d") == []
+    made(script, slow(), tmp_path)
+    assert content(tmp_path / "d") == content(tmp_path / "once")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.skipif(os.system("unshare -rm true 2>/dev/null") != 0, reason="needs unshare")
+def test_a_full_disk_ends_with_one_line_and_a_resume_makes_the_same_bytes(
+    limited, script, slow, tmp_path, workers
+):
+    sizes = {"train": 260, "val": 20, "test": 20}
+    made(script, slow(**sizes, folder="once"), tmp_path)
+    (tmp_path / "d").mkdir()
+    steps = [
+        "mount -t tmpfs -o size=500k tmpfs d",
+        "GENERATE 2> full.err; echo $? > full.status",
+        "mkdir full && find d -name '*.part' > full.parts",
+        "cp d/*.safetensors d/manifest.jsonl full",
+        "mount -o remount,size=20m d && GENERATE && cp -r d resumed",
+    ]
+    status, _, err = limited(
+        "; ".join(steps), *slow(**sizes, workers=workers), cwd=tmp_path, wrap=["unshare", "-rm"]
+    )
+    assert status == 0, err[-2000:]
+    told = (tmp_path / "full.err").read_text()
+    assert (tmp_path / "full.status").read_text().strip() == "2", told[-2000:]
+    assert told.startswith("error: no space left")
+    assert told.count("\n") == 1
+    assert (tmp_path / "full.parts").read_text() == ""
+    earlier = (tmp_path / "full/manifest.jsonl").read_text().splitlines()
+    assert earlier, "not even one shard fitted"
+    found = content(tmp_path / "full")
+    assert all(found[line["file"]] == line["sha256"] for line in map(json.loads, earlier))
+    assert content(tmp_path / "resumed") == content(tmp_path / "once")
