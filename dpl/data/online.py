@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from dpl.data.crew import HOPELESS, TRIES, die_with_parent, spawning, unsignalled
+from dpl.data.crew import GRACE, HOPELESS, TRIES, die_with_parent, spawning, unsignalled
 from dpl.data.outcome import Job, Outcome, lost, outcome
 from dpl.data.store import Store
 from dpl.fem.symmetry import Symmetry, images
@@ -71,6 +71,8 @@ class OnlineSamples(IterableDataset):
         scene: What is simulated.
         seed: Names the stream.
         first: Index of the first load.
+        starts: Index of the first load of some places, each the turn of one worker of one lane;
+            the others begin at `first`.
         lane, lanes: Which training process this is, of how many; they share the stream.
         store: Keeps what is solved and gives what it has; none if left out.
         worst: Where the surrogate is worst; none if left out.
@@ -93,6 +95,7 @@ class OnlineSamples(IterableDataset):
     ) -> None:
         """Keep the arguments, see the class."""
         self.scene, self.seed, self.first = scene, seed, first
+        self.starts: dict[int, int] = {}
         self.lane, self.lanes = lane, lanes
         self.store, self.worst, self.near, self.timeout = store, worst, near, timeout
 
@@ -100,12 +103,15 @@ class OnlineSamples(IterableDataset):
         """Yield samples (N, D), one at a time."""
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
-        first = self.first + self.lane * workers + worker
+        place = self.lane * workers + worker
+        first = self.starts.get(place, self.first + place)
         known = self.store.reader("train") if self.store else None
+        grace = GRACE
         for index in itertools.count(first, workers * self.lanes):
             one = known(index) if known else None
             if one is None:
-                one = self._solved(index, alone=info is not None)
+                limit = self.timeout + grace if self.timeout and info is not None else None
+                one, grace = self._solved(index, limit), 0.0
                 if self.store:
                     self.store.spool.put(one)
             if one.accepted:
@@ -114,14 +120,14 @@ class OnlineSamples(IterableDataset):
                 fields = torch.from_numpy(one.force), torch.from_numpy(one.displacement)
                 yield Drawn(Sample(*fields, young), torch.tensor(index), point)
 
-    def _solved(self, index: int, alone: bool) -> Outcome:
-        """Return a load, solved; `alone`: in a process of its own, where it can be timed out."""
+    def _solved(self, index: int, limit: float | None) -> Outcome:
+        """Return a load, solved within so many seconds, or recorded as lost."""
         job, point = Job(self.seed, index), None
         if self.worst is not None:
             rng = np.random.default_rng(np.random.SeedSequence((*self.seed, 1), spawn_key=(index,)))
             point = self.worst.near(rng) if rng.random() < self.near else None
         try:
-            with _within(self.timeout if alone else None):
+            with _within(limit):
                 return outcome(self.scene, job, point=point)
         except TimeoutError as error:
             return lost(self.scene, job, str(error))
@@ -226,21 +232,23 @@ class Replay:
     def __iter__(self) -> Iterator[Sample]:
         """Yield one epoch."""
         if self._endless is None:
-            self._start(self._source.first)
+            self._start()
             self._endless = self._draw()
         begin, produced, used, waited = time.monotonic(), self.produced, self._used, self._waited
-        yield from itertools.islice(self._endless, self._batches)
-        seconds = max(time.monotonic() - begin, 1e-9)
-        self.rates = Rates(
-            produced=(self.produced - produced) / seconds,
-            consumed=(self._used - used) / seconds,
-            waiting=(self._waited - waited) / seconds,
-            uses=self._used / max(self.produced, 1),
-        )
-        self._report(self.rates)
+        for k, batch in enumerate(itertools.islice(self._endless, self._batches), 1):
+            if k == self._batches:  # before the last batch: nobody may ask for one more
+                used += self._batch_size if k > 1 else 0  # which is not used yet
+                seconds = max(time.monotonic() - begin, 1e-9)
+                self.rates = Rates(
+                    produced=(self.produced - produced) / seconds,
+                    consumed=(self._used - used) / seconds,
+                    waiting=(self._waited - waited) / seconds,
+                    uses=self._used / max(self.produced, 1),
+                )
+                self._report(self.rates)
+            yield batch
 
-    def _start(self, first: int) -> None:
-        self._source.first = first
+    def _start(self) -> None:
         loader = DataLoader(
             self._source,
             batch_size=self._fresh,
@@ -258,10 +266,13 @@ class Replay:
             signal.signal(signal.SIGCHLD, before if before is not None else signal.SIG_DFL)
 
     def _draw(self) -> Iterator[Sample]:
+        first, turns = self._source.first, self._turns
         owed = 0.0  # uses that the samples so far are good for
         while (news := self._next()) is not None:
             self.produced += len(news.number)
             self.following = max(self.following, int(news.number.max()) + 1)
+            for number in news.number.tolist():
+                self._source.starts[(number - first) % turns] = number + turns
             uses = self._reuse if self._buffer.full else max(1.0, self._reuse / 2)
             owed += len(news.number) * uses
             self._buffer.put(news)
@@ -273,6 +284,11 @@ class Replay:
                 if self._source.worst is not None:
                     self._buffer.note(chosen, self._errors())
                     self._source.worst.put(self._buffer.worst())
+
+    @property
+    def _turns(self) -> int:
+        """How many workers of all training processes take turns on the stream."""
+        return max(1, self._workers) * self._source.lanes
 
     def _imaged(self, batch: Sample) -> Sample:
         if not self._group:
@@ -288,15 +304,18 @@ class Replay:
             news = next(self._stream, None)
             self._restarts = 0
             return news
-        except RuntimeError as error:
+        except (RuntimeError, OSError, EOFError) as error:  # what a dead worker leaves behind
             self._restarts += 1
-            if "DataLoader worker" not in str(error) or self._restarts > HOPELESS:
+            died = "DataLoader worker" in str(error)
+            died |= bool(self._workers) and not isinstance(error, RuntimeError)
+            if not died or self._restarts > HOPELESS:
                 raise
-            # whole rounds of all workers of all lanes, so that each keeps to its loads; a load that
-            # kills worker after worker is left out
-            round_, first = max(1, self._workers) * self._source.lanes, self._source.first
-            begun = max(0, -(-(self.following - first) // round_))
-            self._start(first + round_ * (begun + (self._restarts % TRIES == 0)))
+            if self._restarts % TRIES == 0:  # some load kills worker after worker
+                lane, first = self._source.lane * self._workers, self._source.first
+                for place in range(lane, lane + self._workers):
+                    following = self._source.starts.get(place, first + place)
+                    self._source.starts[place] = following + self._turns
+            self._start()
             return self._next()
         finally:
             self._waited += time.monotonic() - start
