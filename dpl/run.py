@@ -36,6 +36,7 @@ if typing.TYPE_CHECKING:
     from dpl.module import Surrogate
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
+FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 TRUSTED = ("dpl.", "torch.optim.", "lightning.")  # what a run's folder may name without being asked
 
 KEYS = {  # what a configuration may hold at its top
@@ -67,12 +68,14 @@ def command(task: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
             _drop_empty(Path(HydraConfig.get().runtime.output_dir))
             sys.exit(2)
         except OSError as error:
-            if error.errno not in FULL:
+            if error.errno not in (*FULL, *FORBIDDEN):
                 raise
             where = f" for {error.filename}" if error.filename else ""
+            full = error.errno in FULL
+            told = f"no space left{where}" if full else f"no permission to write{where}"
+            do = "make room" if full else "choose another folder or change its rights"
             print(
-                f"error: no space left{where}; what was written before is whole: make room and "
-                "run the same command again",
+                f"error: {told}; what was there is whole: {do} and run the same command again",
                 file=sys.stderr,
             )
             sys.exit(2)

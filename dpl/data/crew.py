@@ -117,7 +117,7 @@ def outcomes(
             for job in dead:
                 deaths[job] = deaths.get(job, 0) + 1
                 if deaths[job] < TRIES:
-                    todo.insert(len(todo) // 2, job)  # others first: is it the load, or all?
+                    todo.insert(max(0, len(todo) - 8), job)  # after others: is it the load?
                 else:
                     yield lost(scene, job, f"its worker died {TRIES} times")
 

@@ -139,7 +139,7 @@ class DataSet:
         }
         found = len(jobs & self.store.spool.files().keys())
         done = _Session(workers=self.workers)
-        with Stop() as stop, Progress(*columns) as progress:
+        with Stop() as stop, Progress(*columns, refresh_per_second=2) as progress:
             bar = progress.add_task("loads", total=len(jobs), completed=found, news="")
             solving = self.store.fill(
                 missing,
