@@ -79,10 +79,7 @@ CRITICAL = [
 
 @pytest.mark.parametrize(("law", "cells", "printed"), CRITICAL)
 def test_column_loses_its_stability_at_the_critical_load(law, cells, printed):
-    """VERIFICATION 1.8g, by bisection on the inertia of the tangent at the straight answer.
-
-    How the status depends on factors that are used again is in test_reuse.py.
-    """
+    """VERIFICATION 1.8g, by bisection on the inertia of the tangent at the straight answer."""
     problem, force = column(law, cells)
 
     def buckles(P: float) -> bool:
@@ -93,7 +90,7 @@ def test_column_loses_its_stability_at_the_critical_load(law, cells, printed):
     critical = bisected(buckles, 1.9, 2.2)
     assert critical == pytest.approx(printed, abs=5.1e-7)
     for part, status, negative in ((0.9999, Status.CONVERGED, 0), (1.0001, Status.UNSTABLE, 2)):
-        answer = squeezed(problem, force, part * critical, reuse=0.0)
+        answer = squeezed(problem, force, part * critical)
         assert answer.status.item() == status
         assert answer.negative_pivots.item() == negative
 
@@ -231,7 +228,7 @@ def test_cube_of_rivlin_loses_its_symmetry_at_the_tabulated_load(poisson, stretc
     assert inertia(problem, swollen(problem, critical + 1e-6)[0]) == 2
     for part, status, negative in ((0.99, Status.CONVERGED, 0), (1.01, Status.UNSTABLE, 2)):
         state, T = swollen(problem, 1 + part * (critical - 1))
-        answer = solve(Newton(problem, linear="superlu", reuse=0.0), load_of(T * unit))
+        answer = solve(Newton(problem, linear="superlu"), load_of(T * unit))
         assert answer.status.item() == status
         assert answer.negative_pivots.item() == negative
         assert (answer.displacement - state).abs().max() < 1e-7
