@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from multiprocessing import connection, parent_process
+from multiprocessing import connection, parent_process, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from types import FrameType
@@ -216,6 +216,7 @@ def spawning() -> multiprocessing.context.SpawnContext:
 @contextlib.contextmanager
 def unsignalled(*numbers: signal.Signals) -> Iterator[None]:
     """Start processes that these signals do not reach: they are their parent's to handle."""
+    resource_tracker.ensure_running()  # which would unblock them
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
@@ -225,6 +226,8 @@ def unsignalled(*numbers: signal.Signals) -> Iterator[None]:
 
 def _work(pipe: Connection, scene: Scene) -> None:
     """Solve what comes through the pipe until it closes."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # whatever has unblocked them here
+        signal.signal(number, signal.SIG_IGN)
     die_with_parent()
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:

@@ -251,7 +251,8 @@ class Replay:
     def _start(self) -> None:
         loader = DataLoader(
             self._source,
-            batch_size=self._fresh,
+            # once a worker has died, one by one: none is lost with those that come after it
+            batch_size=1 if self._restarts else self._fresh,
             num_workers=self._workers,
             collate_fn=_batch,
             multiprocessing_context=spawning() if self._workers else None,
@@ -379,7 +380,8 @@ class _Buffer:
 
 
 def _begin(worker: int) -> None:
-    """Make a worker process die with its parent."""
+    """Make a worker process leave Ctrl-C to its parent and die with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     die_with_parent()
 
 

@@ -29,6 +29,7 @@ from torch import Tensor
 
 import dpl
 from dpl.data import balance
+from dpl.data.audit import flaw_of_modes, flaw_of_shard
 from dpl.data.crew import Stop, outcomes
 from dpl.data.durable import (
     DataSetError,
@@ -418,49 +419,17 @@ class Store:
         """
         if not (self.folder / "scene.json").exists():
             raise DataSetError(f"{self.folder} holds no data set yet; generate it first")
-        yield {"file": MODES, "rejected": []}, self._flaw_of_modes()
+        try:
+            flaw = flaw_of_modes(self.scene, self.modes())
+        except (OSError, SafetensorError) as error:
+            flaw = f"is damaged: {error}"
+        yield {"file": MODES, "rejected": []}, flaw
         for line in self.shards():
             try:
-                yield line, self._flaw(line, self._sound(line))
+                shard = self._sound(line)
+                yield line, flaw_of_shard(self.scene, self.stream(line["split"]), line, shard)
             except ValueError as error:
                 yield line, str(error)
-
-    def _flaw_of_modes(self) -> str:
-        """Return what is wrong with the modes on disk; signs and bases within a family count."""
-        try:
-            kept, found = self.modes(), self.scene.loads.modes
-        except (OSError, SafetensorError) as error:
-            return f"is damaged: {error}"
-        near = [
-            a.shape == b.shape and torch.allclose(a, b, rtol=1e-6, atol=1e-6)
-            for a, b in zip(kept, found, strict=True)
-        ]
-        return "" if all(near) else "holds other modes than this scene has"
-
-    def _flaw(self, line: Mapping[str, Any], shard: Mapping[str, Tensor]) -> str:
-        problem, loads = self.scene.problem, self.scene.loads
-        rejected = {one["index"] for one in line["rejected"]}
-        numbers = range(line["first"], line["first"] + line["tried"])
-        if shard["index"].tolist() != [i for i in numbers if i not in rejected]:
-            return "holds other loads than the manifest says"
-        if not len(shard["index"]):
-            return ""
-        points = loads.points(self.stream(line["split"]), shard["index"].tolist())
-        if not torch.allclose(shard["point"], points, rtol=0, atol=1e-12):
-            return "holds other loads than its seed draws"
-        load = loads.at(points)
-        if not torch.allclose(
-            shard["force"], load.force, rtol=1e-6, atol=1e-9 * loads.largest_force
-        ):
-            return "holds loads that this scene does not draw"
-        for k, (u, force) in enumerate(zip(shard["displacement"], shard["force"], strict=True)):
-            internal, volume = problem.evaluate(u[None])
-            if not (
-                bool(volume > 0)
-                and bool(problem.balanced(u[None], internal, force[None], self.scene.solver.tol))
-            ):
-                return f"holds an answer out of balance: load {int(shard['index'][k])}"
-        return ""
 
     def repair(self) -> dict[str, dict[str, Any]]:
         """Forget damaged shards, and those with loads that the machine lost; return their lines.

@@ -394,7 +394,14 @@ class Problem:
         return wider if gap is None else (1 - length) * gap + wider
 
     def _kernels(self, displacement: Tensor) -> Kernels | None:
-        """Return the compiled loops, None where there are none."""
+        """Return the compiled loops, None where there are none.
+
+        Raises:
+            ValueError: The displacement is that of another body: the loops would run past its end.
+        """
+        if tuple(displacement.shape[1:]) != tuple(self.shape):
+            found, wanted = tuple(displacement.shape), ("B", *self.shape)
+            raise ValueError(f"a displacement of shape {found} must have {wanted}")
         return self._compiled if displacement.device.type == "cpu" else None
 
     @cached_property

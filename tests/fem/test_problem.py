@@ -811,3 +811,12 @@ def test_rounding_bounds_what_rounding_does(body, bend):
     room = problem.rounding(u)
     assert noise.any()
     assert (noise.flatten(1).norm(dim=1) < room).all()
+
+
+def test_a_displacement_of_another_body_is_refused_and_not_read_past_its_end(beam):
+    problem = beam(NeoHookeanLn(0.3))
+    short = torch.zeros(1, problem.shape[0] - 1, problem.shape[1], dtype=torch.float64)
+    with pytest.raises(ValueError, match="must have"):
+        problem.evaluate(short)
+    with pytest.raises(ValueError, match="must have"):
+        problem.linearise(short)

@@ -14,6 +14,7 @@ from torch import Tensor
 from dpl.fem import newton as newton_module
 from dpl.fem.band import Band
 from dpl.fem.forces import Traction
+from dpl.fem.krylov import multigrid_installed
 from dpl.fem.linear import Pardiso, SuperLU, SuperLUFactor, installed
 from dpl.fem.materials import Material, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box
@@ -92,7 +93,7 @@ def test_answer_of_any_backend_does_not_depend_on_reuse(beam, pull, name, cells,
     problem = beam(NH, *cells)
     every, few = pair(problem, load_of(pull(problem, q)[0]), linear=name)
     assert every.converged.all()
-    check(every, few)
+    check(every, few, fewer=name != "cg" or multigrid_installed())  # the diagonal spares none
 
 
 @pytest.mark.parametrize("q", [160.0, 400.0])
