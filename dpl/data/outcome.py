@@ -57,14 +57,14 @@ def outcome(scene: Scene, job: Job, *, point: Tensor | None = None) -> Outcome:
         job: Which load.
         point: What it stands for, (d,), if it is not the stream's own.
     """
-    load, points = _drawn(scene, job, point)
+    load, where = _drawn(scene, job, point)
     start = time.perf_counter()
     with one_thread():
         solution = solve(scene.solver, load)
     accepted = bool(solution.stable)
     return Outcome(
         job=job,
-        point=points,
+        point=where,
         force=load.force[0].numpy(),
         displacement=solution.displacement[0].numpy(),
         amplitude=float(load.force.norm()) / scene.loads.largest_force,
@@ -80,11 +80,11 @@ def outcome(scene: Scene, job: Job, *, point: Tensor | None = None) -> Outcome:
 
 def lost(scene: Scene, job: Job, reason: str, seconds: float = 0.0) -> Outcome:
     """Return a load that the machine, and not mechanics, has left without an answer."""
-    load, point = _drawn(scene, job, None)
+    load, where = _drawn(scene, job, None)
     force = load.force[0].numpy()
     amplitude = float(load.force.norm()) / scene.loads.largest_force
     return Outcome(
-        job, point, force, 0 * force, amplitude, False, np.nan, np.nan, 0.0, 0, seconds, reason
+        job, where, force, 0 * force, amplitude, False, np.nan, np.nan, 0.0, 0, seconds, reason
     )
 
 
