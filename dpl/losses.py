@@ -1,21 +1,32 @@
 """Physics losses: callables (prediction, batch, physics) -> scalar, Lightning callbacks too.
 
 The module carries its loss into the trainer (`configure_callbacks`), so that a loss may anneal
-between epochs and log its own terms.
+between epochs and log its own terms. Where mechanics enters, slopes come from the compiled forces
+of `Problem.evaluate` and not from automatic differentiation, which takes 3 to 17 times as long.
 
-Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.3.
+Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.3, for the first three.
 """
 
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import lightning as L
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from dpl.fem.linear import full_matrix
+from dpl.fem.newton import Linear, gather
 from dpl.fem.problem import Problem
 from dpl.scene import Sample
 
-CHUNK = 8  # samples at once: few enough for their stresses to fit a processor's cache
+ENTRIES = 16_000  # numbers of a displacement at once: few enough for their strains to fit a cache
+REMEMBERED = 1_000_000  # loads whose scale is kept
+TINY = 1e-24  # square of an error below which a norm has no slope [-]
+STEP = 1e-5  # of the displacement gradient, where differences of forces stand for the tangent [-]
 
 
 class Physics(NamedTuple):
@@ -53,13 +64,49 @@ class Loss(L.Callback):
 class MSE(Loss):
     """Mean squared error of u/L over all degrees of freedom."""
 
+    def __init__(self, *, relative: float = 0.0, floor: float = 1e-2) -> None:
+        """Choose the weighting.
+
+        Args:
+            relative: Power of the mean square of its own displacement that each sample's error is
+                divided by: at 1 small loads count as much as large ones, at 0 by their size.
+            floor: See `floored`; only where `relative` is above 0.
+
+        Raises:
+            ValueError: A number is out of range.
+        """
+        super().__init__()
+        if not 0 <= relative <= 1:
+            raise ValueError(f"relative = {relative} must lie between 0 and 1")
+        self.relative, self.floor = relative, _checked(floor)
+
     def __call__(self, prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
         """See `Loss`."""
-        return squared_error(prediction, batch).mean()
+        size = batch.displacement.square().mean(dim=(1, 2))
+        return self.of_squares(squared_error(prediction, batch), size)
+
+    def of_squares(self, error: Tensor, size: Tensor) -> Tensor:
+        """Return the loss of mean squared errors (B,) of displacements of mean squares (B,)."""
+        if self.relative:
+            error = error / floored(size, self.floor) ** self.relative
+        return error.mean()
 
     def plan(self) -> list[str]:
         """See `Loss`."""
         return ["no finite-element evaluation in training: the loss knows no residual"]
+
+
+class MeanNorm(MSE):
+    """Mean over samples of the root mean square error of u/L: e_mean, but for a factor.
+
+    Its slope does not fade as the error falls, and no sample with a large error outweighs a batch.
+    """
+
+    def of_squares(self, error: Tensor, size: Tensor) -> Tensor:
+        """See `MSE`."""
+        if self.relative:
+            error = error / floored(size, self.floor) ** self.relative
+        return (error + TINY).sqrt().mean()
 
 
 class LrStar(Loss):
@@ -81,9 +128,8 @@ class LrStar(Loss):
     def __call__(self, prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
         """See `Loss`."""
         error = squared_error(prediction, batch)
-        with torch.no_grad():
-            weight = residual_norm(prediction, batch, physics)
-            weight = weight if self.per_sample else weight.mean()
+        weight = residual_norm(prediction.detach(), batch, physics)
+        weight = weight if self.per_sample else weight.mean()
         self.terms = {"mse": error.mean(), "residual": weight.mean()}
         return (error * weight).mean()
 
@@ -130,31 +176,313 @@ class LrPlus(Loss):
         return error + self.weight * residual
 
 
+class Stiffness(Loss):
+    """Squared energy norm of the error with the rest stiffness: e^T K(0) e / v^T K(0) v, e = u - v.
+
+    The squared relative error of strains rather than of displacements: a rough error, harmless to
+    the eye and in the MSE, is stiff and costs Newton its first steps; here it weighs what it costs.
+    One sparse product with a matrix that is assembled once, and no finite element in training.
+    """
+
+    def __init__(self, *, relative: bool = True, floor: float = 1e-2) -> None:
+        """Choose the weighting.
+
+        Args:
+            relative: Divide each sample's error by the energy of its own displacement; otherwise
+                all by the mean energy of the batch.
+            floor: See `floored`; only where `relative`.
+
+        Raises:
+            ValueError: `floor` is out of range.
+        """
+        super().__init__()
+        self.relative, self.floor = relative, _checked(floor)
+        self._rest: Rest | None = None
+
+    def __call__(self, prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
+        """See `Loss`."""
+        self._rest = rest = Rest.of(physics.problem, self._rest)
+        with torch.no_grad():
+            fields = torch.cat([prediction - batch.displacement, batch.displacement])
+            images = rest.product(fields)
+            error, size = (fields * images).sum(dim=(1, 2)).chunk(2)
+            size = floored(size, self.floor if self.relative else torch.inf)
+            slope = 2 * images[: len(prediction)] / size[:, None, None]
+        return _Known.apply(prediction, error / size, slope).mean()
+
+    def plan(self) -> list[str]:
+        """See `Loss`."""
+        return ["no finite-element evaluation in training: K(0) is assembled once"]
+
+
+class Energy(Loss):
+    """Total potential energy (W(u) - W(0) - f.u) / (f.K(0)^-1 f / 2): equilibria without answers.
+
+    Displacements of the batch are not read: stable equilibria are the minima. The scale is the work
+    of the linear answer, so that every load counts alike, a light one or one on a single node (a
+    scale of ||f||^2 would hardly see that one: nearly all of its norm lies in stiff modes). Near
+    rest the loss is -1 + the squared relative energy norm of the error. Its conditioning is that of
+    K(0): outputs in modes over the roots of their eigenvalues learn fast, free nodal values slowly,
+    as their noise is stiff; those begin better with another loss, see `Annealed`.
+
+    Where elements are inverted the energy is no number or leads to a body inside out. Such a sample
+    takes u^T K(0) u / 2 on the same scale instead, without its load: positive, and downhill to
+    rest, rough strains first, where nothing is inverted. (With the load it would lead to the linear
+    answer, which may be inverted itself.)
+
+    Source: Samaniego, Anitescu, Goswami et al. (2020), CMAME 362, for energies as losses.
+    """
+
+    def __init__(self, *, floor: float = 1e-2) -> None:
+        """Choose the weighting.
+
+        Args:
+            floor: See `floored`.
+
+        Raises:
+            ValueError: `floor` is out of range.
+        """
+        super().__init__()
+        self.floor = _checked(floor)
+        self._rest: Rest | None = None
+
+    def __call__(self, prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
+        """See `Loss`."""
+        self._rest = rest = Rest.of(physics.problem, self._rest)
+        with torch.no_grad():
+            scale = floored(rest.work(batch.force), self.floor)
+            energy, slope, sound = potential(prediction, batch.force, physics.problem, rest)
+            if not sound.all():
+                image = rest.product(prediction)
+                energy = torch.where(sound, energy, (prediction * image).sum(dim=(1, 2)) / 2)
+                slope = torch.where(sound[:, None, None], slope, image)
+            self.terms = {"inverted": 1 - sound.double().mean()}
+        return _Known.apply(prediction, energy / scale, slope / scale[:, None, None]).mean()
+
+    def plan(self) -> list[str]:
+        """See `Loss`."""
+        return ["no displacement of the data set in the loss: it is the energy itself"]
+
+
+class Annealed(Loss):
+    """One loss that turns into another: (1 - weight) first + weight second.
+
+    Attributes:
+        weight: Part of the second loss at present [-].
+    """
+
+    def __init__(self, first: Loss, second: Loss, *, epochs: int, start: int = 0) -> None:
+        """Choose from what to what, and when.
+
+        Args:
+            first: The loss up to `start`.
+            second: The loss from `start + epochs` on; best of the same size as the first one.
+            epochs: Epochs in which the weight rises linearly from 0 to 1.
+            start: Epoch in which it begins to.
+
+        Raises:
+            ValueError: A number is out of range.
+        """
+        super().__init__()
+        if epochs < 1 or start < 0:
+            raise ValueError(f"epochs = {epochs} must be 1 or more, start = {start} 0 or more")
+        self.first, self.second = first, second
+        self._epochs, self._start = epochs, start
+        self.weight = 0.0
+
+    def on_train_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Anneal the weight, and those of the parts."""
+        passed = (trainer.current_epoch - self._start) / self._epochs
+        self.weight = min(1.0, max(0.0, passed))
+        for loss in (self.first, self.second):
+            loss.on_train_epoch_start(trainer, module)
+
+    def __call__(self, prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
+        """See `Loss`; a part of weight 0 is not evaluated."""
+        total = prediction.new_zeros(())
+        self.terms = {"weight": total + self.weight}
+        parts = {"first": (1 - self.weight, self.first), "second": (self.weight, self.second)}
+        for name, (share, loss) in parts.items():
+            if share > 0:
+                value = loss(prediction, batch, physics)
+                total = total + share * value
+                self.terms |= {name: value}
+                self.terms |= {f"{name}/{term}": what for term, what in loss.terms.items()}
+        return total
+
+    def plan(self) -> list[str]:
+        """Return what both leave out."""
+        return [line for line in self.first.plan() if line in self.second.plan()]
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """A body at rest, made once, when first asked for.
+
+    Attributes:
+        problem: The body.
+    """
+
+    problem: Problem
+
+    @classmethod
+    def of(cls, problem: Problem, known: "Rest | None") -> "Rest":
+        """Return the rest of a body: the known one if that is its."""
+        return known if known is not None and known.problem is problem else cls(problem)
+
+    def product(self, field: Tensor) -> Tensor:
+        """Return K(0) v, (B, N, D) [-], of v (B, N, D); zero where held."""
+        free, image = self.problem.free, torch.zeros_like(field)
+        columns = field.detach()[:, free].T
+        if field.device.type == "cpu":
+            image[:, free] = torch.from_numpy(self._matrix @ columns.numpy()).T
+        else:
+            image[:, free] = (self._on_device @ columns).T
+        return image
+
+    def work(self, force: Tensor) -> Tensor:
+        """Return f.K(0)^-1 f / 2, the work of f (B, N, D) on its linear answer, (B,) [-].
+
+        To about 1e-3: it is a scale. One solve with a stored factor, on the processor, for a force
+        that is new; those of a data set come again every epoch and are remembered by their hash.
+        """
+        problem, found = self._linear.problem, []
+        for one in force.cpu():
+            right = gather(one, problem)
+            key = hash(right.tobytes())
+            if key not in self._works:
+                if len(self._works) >= REMEMBERED:
+                    self._works.clear()
+                self._works[key] = float(right @ self._linear.factor.solve(right, 1e-3)) / 2
+            found.append(self._works[key])
+        return torch.tensor(found, dtype=force.dtype, device=force.device)
+
+    @cached_property
+    def _works(self) -> dict[int, float]:
+        return {}
+
+    @cached_property
+    def energy(self) -> Tensor:
+        """W(0), (1,) [-], which is not zero for every law."""
+        return self.problem.energy(self.problem.points.new_zeros(1, *self.problem.shape))
+
+    @cached_property
+    def _linear(self) -> Linear:
+        here = self.problem.points.device.type == "cpu"
+        return Linear(self.problem if here else self.problem.to("cpu"))
+
+    @cached_property
+    def _matrix(self) -> csr_array:
+        problem = self._linear.problem
+        rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
+        return full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())
+
+    @cached_property
+    def _on_device(self) -> Tensor:
+        whole, device = self._matrix, self.problem.points.device
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch calls its sparse matrices a beta
+            return torch.sparse_csr_tensor(
+                torch.from_numpy(whole.indptr),
+                torch.from_numpy(whole.indices),
+                torch.from_numpy(whole.data),
+                whole.shape,
+                device=device,
+            )
+
+    def __getstate__(self) -> dict[str, object]:
+        """Pickle without matrix and factor."""
+        return {"problem": self.problem}
+
+
+class _Known(torch.autograd.Function):
+    """Values (B,) of displacements (B, N, D), their slope (B, N, D) found by other means."""
+
+    @staticmethod
+    def forward(ctx: Any, displacement: Tensor, value: Tensor, slope: Tensor) -> Tensor:
+        ctx.save_for_backward(slope)
+        return value.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        (slope,) = ctx.saved_tensors
+        return gradient[:, None, None] * slope, None, None
+
+
 def squared_error(prediction: Tensor, batch: Sample) -> Tensor:
     """Return the mean square of (u - v)/L over degrees of freedom, (B,) [-]."""
     return (prediction - batch.displacement).square().mean(dim=(1, 2))
 
 
+def floored(sizes: Tensor, floor: float) -> Tensor:
+    """Return what to divide samples by: their own sizes (B,), but no less than a part of the mean.
+
+    Without a floor a load near zero, which no network answers to many digits, outweighs a batch.
+
+    Args:
+        sizes: Squares or energies, 0 or more.
+        floor: Part of their mean; 1e-2 is a tenth of the usual displacement. Infinity: all take
+            the mean.
+    """
+    mean = sizes.mean()
+    sizes = mean.expand_as(sizes) if floor == torch.inf else torch.maximum(sizes, floor * mean)
+    return torch.where(sizes > 0, sizes, 1.0)
+
+
 def residual_norm(prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
     """Return ||R_free(u)|| / ||Phi q_max||, (B,) [-].
 
-    Where elements are inverted so far that the law has no stress, the norm is not finite; such
-    samples take the largest finite norm of the batch (1 if there is none) and no gradient.
+    Its slope K R / ||R|| takes two more evaluations, see `tangent_product`. Where elements are
+    inverted so far that the law has no stress, the norm is not finite; such samples take the
+    largest finite norm of the batch (1 if there is none) and no gradient.
     """
-    residual = _residual(prediction, batch, physics)
-    sound = residual.isfinite().all(dim=1)
-    if not sound.all():  # evaluated again elsewhere: NaN passes through `where` backwards
-        elsewhere = torch.where(sound[:, None, None], prediction, batch.displacement)
-        residual = _residual(elsewhere, batch, physics)
-    norm = residual.norm(dim=1) / physics.largest_force
-    largest = norm[sound].detach().max() if sound.any() else torch.ones_like(norm[0])
-    return torch.where(sound, norm, largest)
+    problem = physics.problem
+    residual = torch.where(problem.free, problem.evaluate(prediction).internal - batch.force, 0.0)
+    length = residual.flatten(1).norm(dim=1)
+    norm, sound = length / physics.largest_force, length.isfinite()
+    largest = norm[sound].max() if sound.any() else torch.ones_like(norm[0])
+    norm = torch.where(sound, norm, largest)
+    if not (prediction.requires_grad and torch.is_grad_enabled()):
+        return norm
+    unit = residual / length.clamp(min=torch.finfo(length.dtype).tiny)[:, None, None]
+    slope = tangent_product(problem, prediction.detach(), unit) / physics.largest_force
+    slope = torch.where(slope.isfinite() & sound[:, None, None], slope, 0.0)
+    return _Known.apply(prediction, norm, slope)
 
 
-def _residual(prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
-    """Return R where free, (B, N D) [-]."""
-    if not torch.is_grad_enabled():
-        internal = physics.problem.evaluate(prediction).internal
-        return torch.where(physics.problem.free, internal - batch.force, 0.0).flatten(1)
-    parts = zip(prediction.split(CHUNK), batch.force.split(CHUNK), strict=True)
-    return torch.cat([physics.problem.residual(*part) for part in parts]).flatten(1)
+def tangent_product(problem: Problem, displacement: Tensor, direction: Tensor) -> Tensor:
+    """Return K(u) v on free degrees of freedom, (B, N, D) [-], by a central difference of forces.
+
+    Two evaluations, by compiled loops a quarter as long as the tangent and a thirtieth as long as a
+    derivative of tensors; to about 1e-8 of |K| |v|.
+    """
+    steepness = problem.dN.abs().max() * direction.abs().amax(dim=(1, 2))
+    length = (STEP / steepness.clamp(min=torch.finfo(steepness.dtype).tiny))[:, None, None]
+    ahead = problem.evaluate(displacement + length * direction).internal
+    behind = problem.evaluate(displacement - length * direction).internal
+    return torch.where(problem.free, (ahead - behind) / (2 * length), 0.0)
+
+
+def potential(
+    displacement: Tensor, force: Tensor, problem: Problem, rest: Rest
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return W(u) - W(0) - f.u, (B,) [-], its slope (B, N, D), and whether all det F > 0, (B,)."""
+    internal, volume = problem.evaluate(displacement)
+    slope = torch.where(problem.free, internal - force, 0.0)
+    parts = displacement.split(max(1, ENTRIES // displacement[0].numel()))
+    strain = torch.cat([problem.energy(part) for part in parts]) - rest.energy
+    energy = strain - (force * displacement).sum(dim=(1, 2))
+    sound = (volume > 0) & energy.isfinite() & slope.flatten(1).isfinite().all(dim=1)
+    return energy, slope, sound
+
+
+def _checked(floor: float) -> float:
+    """Return a floor.
+
+    Raises:
+        ValueError: It lies outside [0, 1].
+    """
+    if not 0 <= floor <= 1:
+        raise ValueError(f"floor = {floor} must lie between 0 and 1")
+    return floor

@@ -4,7 +4,7 @@ import math
 import random
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import lightning as L
 import numpy as np
@@ -14,8 +14,10 @@ from torch import Tensor, nn
 
 from dpl.data.durable import whole_file
 from dpl.fem.solution import Load
-from dpl.losses import Loss, Physics
+from dpl.losses import MSE, Loss, Physics
 from dpl.metrics import metrics
+from dpl.models.coordinates import Coordinates, CoordinateSamples
+from dpl.models.pod import PODNet
 from dpl.scene import Sample, Scene
 
 SCALES = 3  # the stream of the loads that give the scales; those of samples are below
@@ -76,21 +78,58 @@ class Surrogate(L.LightningModule):
     def predict(self, load: Load) -> Tensor:
         """Return displacements over L, (B, N, D), float64."""
         scaled = (load.force / self.force_scale).to(self.dtype)
-        answer = self.net(scaled).double() * self.displacement_scale
+        more = (load.young,) if getattr(self.net, "takes_young", False) else ()
+        answer = self.net(scaled, *more).double() * self.displacement_scale
         return torch.where(self.physics.problem.free, answer, 0.0)
 
     def plan(self) -> list[str]:
         """Return what network and loss leave out, a line each."""
-        return [*getattr(self.net, "plan", list)(), *self.loss.plan()]
+        lines = [*getattr(self.net, "plan", list)(), *self.loss.plan()]
+        if isinstance(self.net, PODNet) and isinstance(self.loss, MSE):
+            lines.append("no field in training: squared errors are those of coordinates")
+        return lines
 
-    def training_step(self, batch: Sample, batch_idx: int) -> Tensor:
+    def training_step(self, batch: Sample | Coordinates, batch_idx: int) -> Tensor:
         """Return the loss."""
-        prediction = self.predict(batch.load)
-        loss = self.loss(prediction, batch, self.physics)
-        error = (prediction.detach() - batch.displacement).flatten(1).norm(dim=1)
-        self.batch_errors = error / batch.displacement.flatten(1).norm(dim=1).clamp(min=1e-12)
-        self.log("loss/train", loss, prog_bar=True, batch_size=len(batch.force))
+        if isinstance(batch, Coordinates):
+            loss = self._loss_of_coordinates(batch)
+        else:
+            prediction = self.predict(batch.load)
+            loss = self.loss(prediction, batch, self.physics)
+            error = (prediction.detach() - batch.displacement).flatten(1).norm(dim=1)
+            size = batch.displacement.flatten(1).norm(dim=1)
+            self.batch_errors = error / size.clamp(min=1e-12)
+        self.log("loss/train", loss, prog_bar=True, batch_size=len(batch[0]))
         return loss
+
+    def _loss_of_coordinates(self, batch: Coordinates) -> Tensor:
+        """Return the loss of a batch in coordinates: of its mean squared errors alone."""
+        net = cast(PODNet, self.net)
+        missed = (net.network(batch.inputs) - batch.targets).square().sum(dim=1) + batch.rest
+        square = self.displacement_scale**2
+        error = square * missed / self.scene.problem.free.numel()
+        return cast(MSE, self.loss).of_squares(error, square * batch.size)
+
+    def encode(self, samples: Sample) -> CoordinateSamples | None:
+        """Return training samples (S, N, D) in the coordinates of the network; None if it has none.
+
+        In an orthonormal basis the squared error of a displacement is that of its coordinates: a
+        loss that is a function of squared errors needs no field.
+        """
+        if not (isinstance(self.net, PODNet) and isinstance(self.loss, MSE)):
+            return None
+        return self.net.encode(self._scaled(samples))
+
+    def _scaled(self, samples: Sample) -> Sample:
+        return samples._replace(
+            force=samples.force / self.force_scale.cpu(),
+            displacement=samples.displacement / self.displacement_scale.cpu(),
+        )
+
+    def prepare(self, samples: Sample) -> None:
+        """Let the network make its bases from training samples (S, N, D)."""
+        unit = float(self.force_scale / self.displacement_scale)
+        cast(PODNet, self.net).prepare(self._scaled(samples), unit)
 
     def validation_step(self, batch: Sample, batch_idx: int) -> None:
         """Update the metrics."""
@@ -106,11 +145,14 @@ class Surrogate(L.LightningModule):
         self.log_dict(self.test_metrics, batch_size=len(batch.force))
 
     def setup(self, stage: str) -> None:
-        """Bring the physics to the device of the network."""
+        """Bring the physics to the device of the network; let the network see the samples."""
         problem = self.scene.problem
         if problem.points.device != self.device:
             problem = problem.to(self.device)
         self.physics = Physics(problem, self.largest_force)
+        wanting = isinstance(self.net, PODNet) and not self.net.prepared
+        if stage == "fit" and wanting and not self.trainer.ckpt_path:  # a resumed one brings them
+            self.prepare(self.trainer.datamodule.snapshots())
         for collection in (self.val_metrics, self.test_metrics):
             for metric in collection.values():
                 if hasattr(metric, "problem"):

@@ -1,16 +1,37 @@
-"""Laws of every loss in conf/loss, and the paper's formulas."""
+"""Laws of every loss in conf/loss, and the formulas of each."""
 
+import pickle
 from pathlib import Path
 from types import SimpleNamespace
 
+import lightning as L
 import pytest
 import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from dpl.fem.materials import SaintVenantKirchhoff, StableNeoHookean
+from dpl.fem.mesh import Plane, box
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
-from dpl.fem.solution import solve
-from dpl.losses import MSE, Loss, LrPlus, LrStar, Physics, residual_norm
+from dpl.fem.solution import Load, solve
+from dpl.fem.supports import Spring
+from dpl.losses import (
+    MSE,
+    Annealed,
+    Energy,
+    Loss,
+    LrPlus,
+    LrStar,
+    Physics,
+    Rest,
+    Stiffness,
+    floored,
+    residual_norm,
+    tangent_product,
+)
+from dpl.models.fcnn import FCNN
+from dpl.module import Surrogate
 from dpl.scene import Sample
 
 LOSSES = sorted((Path(__file__).parents[1] / "conf" / "loss").glob("*.yaml"))
@@ -50,7 +71,7 @@ def inverted(scene, few):
 
 @pytest.fixture
 def evaluations(monkeypatch):
-    """Counts of evaluated internal forces, by tensors and by compiled loops."""
+    """Counts of evaluated forces, by tensors and by compiled loops, and of energies."""
     counts = []
 
     def count(name):
@@ -64,7 +85,18 @@ def evaluations(monkeypatch):
 
     count("internal_force")
     count("evaluate")
+    count("energy")
     return counts
+
+
+@pytest.fixture(scope="module")
+def unanswered(few) -> Sample:
+    """Loads whose displacements nobody knows."""
+    return few._replace(displacement=torch.full_like(few.displacement, torch.nan))
+
+
+def singles(batch) -> list[Sample]:
+    return [Sample(*(column[k : k + 1] for column in batch)) for k in range(len(batch.force))]
 
 
 def gradient(loss, prediction, batch, physics):
@@ -73,7 +105,22 @@ def gradient(loss, prediction, batch, physics):
     return slope
 
 
-def test_a_loss_vanishes_at_the_exact_answer(loss, few, physics, near):
+def slopes_along(loss, prediction, batch, physics, step=1e-6):
+    """Pairs of a loss's slope along random directions, from differences and from its gradient."""
+    slope = gradient(loss, prediction, batch, physics)
+    random, free = torch.Generator().manual_seed(1), physics.problem.free
+    for _ in range(3):
+        way = torch.randn(prediction.shape, generator=random, dtype=torch.float64)
+        way = torch.where(free, way / way.norm(), 0.0)
+        up, down = (float(loss(prediction + s * way, batch, physics)) for s in (step, -step))
+        yield (up - down) / (2 * step), float((slope * way).sum())
+
+
+def test_a_loss_is_least_at_the_exact_answer(loss, few, physics, near):
+    if isinstance(loss, Energy):  # least, but not zero
+        exact, off = (loss(u, few, physics) for u in (few.displacement, near))
+        assert exact < off
+        return
     exact = float(loss(few.displacement, few, physics))
     assert 0 <= exact < 1e-5 * float(loss(near, few, physics))
     assert exact < 1e-6
@@ -83,7 +130,7 @@ def test_a_loss_is_a_positive_scalar_in_double_precision(loss, few, physics, nea
     value = loss(near, few, physics)
     assert value.shape == ()
     assert value.dtype == torch.float64
-    assert float(value) > 0
+    assert float(value) > 0 or isinstance(loss, Energy)
 
 
 def test_a_loss_has_a_finite_gradient_that_leads_downhill(loss, few, physics, near):
@@ -115,9 +162,9 @@ def test_a_loss_logs_what_it_is_made_of(loss, few, physics, near):
 
 
 def test_a_batch_is_the_mean_of_its_members_unless_the_residual_weighs_it(few, physics, near):
-    singles = [Sample(*(column[k : k + 1] for column in few)) for k in range(4)]
-    for loss in (MSE(), LrPlus(), LrStar(per_sample=True)):
-        parts = [loss(near[k : k + 1], single, physics) for k, single in enumerate(singles)]
+    relative = MSE(relative=True, floor=0.0), Stiffness(floor=0.0), Energy(floor=0.0)
+    for loss in (MSE(), LrPlus(), LrStar(per_sample=True), *relative):
+        parts = [loss(near[k : k + 1], one, physics) for k, one in enumerate(singles(few))]
         whole = loss(near, few, physics)
         assert float(whole) == pytest.approx(float(torch.stack(parts).mean()), rel=1e-12)
 
@@ -134,10 +181,19 @@ def test_mse_evaluates_no_finite_element(few, physics, near, evaluations):
 
 
 def test_residual_losses_evaluate_finite_elements_once_a_batch(few, physics, near, evaluations):
-    for loss in (LrStar(), LrStar(per_sample=True), LrPlus()):
+    for loss in (LrStar(), LrStar(per_sample=True)):
         evaluations.clear()
         gradient(loss, near, few, physics)
         assert evaluations == [4]
+
+
+def test_the_slope_of_a_residual_takes_two_evaluations_more(few, physics, near, evaluations):
+    gradient(LrPlus(), near, few, physics)
+    assert evaluations == [4, 4, 4]
+    evaluations.clear()
+    with torch.no_grad():
+        LrPlus()(near, few, physics)
+    assert evaluations == [4]
 
 
 def test_the_residual_is_over_the_largest_modal_force(scene, few, physics, near):
@@ -182,16 +238,20 @@ def test_lr_plus_is_mse_plus_the_weighted_residual(few, physics, near):
         assert value == pytest.approx(error + weight * norm, rel=1e-12)
 
 
-def test_the_gradient_of_lr_plus_is_that_of_finite_differences(scene, few, physics, near):
-    loss = LrPlus()
-    slope = gradient(loss, near, few, physics)
-    random = torch.Generator().manual_seed(1)
-    for _ in range(3):
-        way = torch.randn(near.shape, generator=random, dtype=torch.float64)
-        way = torch.where(scene.problem.free, way / way.norm(), 0.0)
-        step = 1e-6
-        up, down = (float(loss(near + s * way, few, physics)) for s in (step, -step))
-        assert (up - down) / (2 * step) == pytest.approx(float((slope * way).sum()), rel=1e-5)
+def test_the_gradient_of_lr_plus_is_that_of_finite_differences(few, physics, near):
+    for expected, found in slopes_along(LrPlus(), near, few, physics):
+        assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_product_with_the_tangent_is_that_of_tensors(scene, few):
+    problem, u = scene.problem, few.displacement
+    way = torch.randn(u.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    way = torch.where(problem.free, way, 0.0)
+    way[0] = 0.0
+    expected = torch.where(problem.free, problem.tangent_product(u, way), 0.0)
+    found = tangent_product(problem, u, way)
+    assert torch.allclose(found, expected, rtol=0, atol=1e-8 * float(expected.abs().max()))
+    assert not found[0].any()
 
 
 def test_lr_plus_at_the_answer_has_the_slope_of_no_kink(scene, few, physics):
@@ -220,3 +280,279 @@ def test_without_a_warmup_the_weight_stays():
 def test_negative_options_are_refused_by_name(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         LrPlus(**options)
+
+
+# ------------------------------------------------------------------ the energy norm of the error
+
+
+def test_stiffness_is_the_squared_energy_norm_of_the_error(scene, few, physics, near):
+    problem, rest = scene.problem, torch.zeros_like(near)
+
+    def work(field):
+        return (field * problem.tangent_product(rest, field)).sum(dim=(1, 2))
+
+    error, size = work(near - few.displacement), work(few.displacement)
+    expected = float((error / size).mean())
+    assert float(Stiffness(floor=0.0)(near, few, physics)) == pytest.approx(expected, rel=1e-9)
+    expected = float(error.mean() / size.mean())
+    found = float(Stiffness(relative=False)(near, few, physics))
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_the_gradient_of_stiffness_is_that_of_finite_differences(few, physics, near, relative):
+    for expected, found in slopes_along(Stiffness(relative=relative), near, few, physics):
+        assert found == pytest.approx(expected, rel=1e-6)
+
+
+def test_stiffness_evaluates_one_tangent_and_no_other_finite_element(
+    few, physics, near, evaluations, monkeypatch
+):
+    made = []
+    linearise = Problem.linearise
+    monkeypatch.setattr(Problem, "linearise", lambda *a: made.append(1) or linearise(*a))
+    loss = Stiffness()
+    for _ in range(3):
+        gradient(loss, near, few, physics)
+    assert evaluations == []
+    assert len(made) == 1
+
+
+def test_a_loss_forgets_the_stiffness_of_another_body(few, physics, near, make_scene):
+    used, other = Stiffness(), make_scene(poisson=0.45)
+    used(near, few, physics)
+    there = Physics(other.problem, physics.largest_force)
+    assert float(used(near, few, there)) == float(Stiffness()(near, few, there))
+    assert float(used(near, few, there)) != float(used(near, few, physics))
+
+
+def test_products_with_the_rest_stiffness_are_those_of_any_device(scene, few):
+    """Other devices take torch's sparse matrices, which the processor has as well."""
+    rest, free = Rest(scene.problem), scene.problem.free
+    image = rest._on_device @ few.displacement[:, free].T
+    assert torch.allclose(rest.product(few.displacement)[:, free], image.T, rtol=1e-12, atol=1e-18)
+
+
+@pytest.mark.parametrize("loss", [Stiffness(), Energy()])
+def test_a_loss_is_pickled_without_its_matrices(loss, few, physics, near):
+    value = loss(near, few, physics)
+    twin = pickle.loads(pickle.dumps(loss))
+    assert set(vars(twin._rest)) == {"problem"}
+    assert float(twin(near, few, physics)) == pytest.approx(float(value), rel=1e-12)
+
+
+def test_relative_losses_weigh_a_load_by_its_own_size(few, physics, near):
+    """A hundredth of a load, answered as badly, counts as much."""
+    factor = torch.tensor([1e-2, 1.0, 1.0, 1.0], dtype=torch.float64)[:, None, None]
+    small = few._replace(displacement=factor * few.displacement)
+    for loss in (MSE(relative=True, floor=0.0), Stiffness(floor=0.0)):
+        value = float(loss(factor * near, small, physics))
+        assert value == pytest.approx(float(loss(near, few, physics)), rel=1e-9)
+
+
+def test_sizes_have_a_floor():
+    sizes = torch.tensor([0.0, 1.0, 3.0, 4.0], dtype=torch.float64)
+    assert floored(sizes, 0.0).tolist() == [1.0, 1.0, 3.0, 4.0]  # nothing to divide by: 1
+    assert floored(sizes, 0.1).tolist() == pytest.approx([0.2, 1.0, 3.0, 4.0])
+    assert floored(sizes, torch.inf).tolist() == [2.0] * 4
+    assert floored(0 * sizes, 0.1).tolist() == [1.0] * 4
+
+
+@pytest.mark.parametrize("kind", [MSE, Stiffness, Energy])
+@pytest.mark.parametrize("floor", [-0.1, 1.1, float("nan")])
+def test_a_floor_out_of_range_is_refused(kind, floor):
+    with pytest.raises(ValueError, match="floor"):
+        kind(floor=floor)
+
+
+# ------------------------------------------------------------------ the energy, without answers
+
+
+def test_the_energy_reads_no_answer(few, unanswered, physics, near):
+    value = Energy()(near, unanswered, physics)
+    assert value == Energy()(near, few, physics)
+    assert gradient(Energy(), near, unanswered, physics).isfinite().all()
+
+
+def test_the_energy_is_the_potential_over_the_work_of_the_linear_answer(scene, few, physics, near):
+    problem = scene.problem
+    total = problem.energy(near) - (few.force * near).sum(dim=(1, 2))
+    linear = torch.stack([scene.linear.respond(force) for force in few.force])
+    work = (few.force * linear).sum(dim=(1, 2)) / 2
+    found = float(Energy(floor=0.0)(near, few, physics))
+    assert found == pytest.approx(float((total / work).mean()), rel=1e-9)
+
+
+def test_the_energy_is_stationary_at_the_exact_answer(scene, few, unanswered, physics, near):
+    exact = solve(scene.solver, few.load).displacement
+    there, off = (gradient(Energy(), u, unanswered, physics).norm() for u in (exact, near))
+    assert there < 1e-6 * off
+
+
+def test_the_gradient_of_the_energy_is_that_of_finite_differences(unanswered, physics, near):
+    for expected, found in slopes_along(Energy(), near, unanswered, physics):
+        assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_light_loads_count_as_much_as_heavy_ones(scene, few, physics):
+    """Near rest the energy is -1 + the squared relative energy norm of the error, at any size."""
+    energy, stiffness = Energy(floor=0.0), Stiffness(floor=0.0)
+    for amplitude in (1e-3, 1e-5):
+        force = amplitude * few.force
+        linear = torch.stack([scene.linear.respond(one) for one in force])
+        light = Sample(force, linear, few.young)
+        for u in (linear, 0.9 * linear, 0.5 * linear):
+            expected = -1 + float(stiffness(u, light, physics))
+            assert float(energy(u, light, physics)) == pytest.approx(expected, abs=1e-3)
+
+
+def test_zero_loads_are_no_trouble(few, physics, near):
+    still = Sample(0 * few.force, 0 * few.displacement, few.young)
+    for loss in (Energy(), Stiffness(), MSE(relative=True), LrPlus(), LrStar()):
+        for u in (near, 0 * near):
+            assert loss(u, still, physics).isfinite()
+            assert gradient(loss, u, still, physics).isfinite().all()
+
+
+def test_inverted_samples_lead_to_where_nothing_is_inverted(scene, unanswered, physics, inverted):
+    u, problem, loss = inverted.clone().requires_grad_(), scene.problem, Energy()
+    assert loss(u, unanswered, physics) > 0
+    assert float(loss.terms["inverted"]) == 1
+    optimizer = torch.optim.Adam([u], lr=0.02)
+    for _ in range(200):
+        optimizer.zero_grad()
+        loss(u, unanswered, physics).backward()
+        optimizer.step()
+    u = u.detach()
+    assert (problem.volume_ratio(u) > 0).all()
+    loss(u, unanswered, physics)
+    assert float(loss.terms["inverted"]) == 0
+
+
+def test_an_inverted_sample_leaves_the_others_as_they_are(unanswered, physics, near, inverted):
+    mixed = torch.cat([near[:3], inverted[3:]])
+    slope = gradient(Energy(), mixed, unanswered, physics)
+    assert torch.equal(slope[:3], gradient(Energy(), near, unanswered, physics)[:3])
+    assert slope[3].isfinite().all()
+    assert (slope[3] * inverted[3]).sum() > 0  # downhill is towards rest
+
+
+def test_laws_that_are_finite_inside_out_have_no_minimum_there(few, make_scene):
+    scene = make_scene(law=SaintVenantKirchhoff)
+    physics = Physics(scene.problem, torch.tensor(1.0, dtype=torch.float64))
+    mirrored = torch.zeros_like(few.displacement)
+    mirrored[:] = -2 * scene.problem.points * torch.tensor([1.0, 0.0, 0.0])  # no strain at all
+    still = few._replace(force=0 * few.force)
+    assert float(scene.problem.energy(mirrored).abs().max()) < 1e-12
+    assert float(Energy()(mirrored, still, physics)) > 0.01
+
+
+def test_energies_count_from_rest(few, make_scene):
+    scene = make_scene(law=StableNeoHookean)
+    physics = Physics(scene.problem, torch.tensor(1.0, dtype=torch.float64))
+    assert float(scene.problem.energy(0 * few.force)[0].abs()) > 0.01
+    assert float(Energy()(0 * few.force, few, physics)) == pytest.approx(0, abs=1e-9)
+
+
+def test_springs_are_part_of_the_energy(few):
+    mesh, bed = box([100.0, 25.0, 25.0], [5, 3, 3]), Spring(Plane(2, "min"), 1e-3)
+    law = SaintVenantKirchhoff(0.3)
+    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), supports=[bed])
+    physics = Physics(problem, torch.tensor(1.0, dtype=torch.float64))
+    exact = solve(Newton(problem, linear="superlu"), Load(few.force, few.young)).displacement
+    off = exact + torch.where(problem.free, 1e-3, 0.0)
+    slopes = [gradient(Energy(), u, few, physics).norm() for u in (exact, off)]
+    assert slopes[0] < 1e-6 * slopes[1]
+    for expected, found in slopes_along(Energy(), off, few, physics):
+        assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_descent_on_the_energy_ends_at_newtons_answers(scene, few, unanswered, physics):
+    """In coordinates y with K(0) = L L^T, u = L^-T y, where stiff and soft are alike."""
+    loss, free = Energy(floor=0.0), scene.problem.free
+    root = torch.linalg.cholesky(torch.from_numpy(Rest(scene.problem)._matrix.toarray()))
+    size = Rest(scene.problem).work(few.force).sqrt()[:, None]
+    y = torch.zeros(len(few.force), len(root), dtype=torch.float64, requires_grad=True)
+
+    def displacement():
+        moved = torch.linalg.solve_triangular(root.mT, (size * y).mT, upper=True).mT
+        return torch.zeros_like(few.force).masked_scatter(free.expand_as(few.force), moved)
+
+    options = {"max_iter": 200, "history_size": 50, "tolerance_change": 1e-14}
+    search = torch.optim.LBFGS([y], line_search_fn="strong_wolfe", **options)
+
+    def energy():
+        search.zero_grad()
+        value = loss(displacement(), unanswered, physics)
+        value.backward()
+        return value
+
+    search.step(energy)
+    error = (displacement() - few.displacement).flatten(1).norm(dim=1)
+    assert (error < 1e-5 * few.displacement.flatten(1).norm(dim=1)).all()
+
+
+# ------------------------------------------------------------------ from one loss to another
+
+
+def test_an_annealed_loss_blends_its_parts(few, physics, near):
+    first, second = MSE(relative=True), Stiffness()
+    loss = Annealed(first, second, epochs=4, start=2)
+    seen = []
+    for epoch in range(8):
+        loss.on_train_epoch_start(SimpleNamespace(current_epoch=epoch), None)
+        seen.append(loss.weight)
+        parts = [float(part(near, few, physics)) for part in (first, second)]
+        expected = (1 - loss.weight) * parts[0] + loss.weight * parts[1]
+        assert float(loss(near, few, physics)) == pytest.approx(expected, rel=1e-12)
+        assert float(loss.terms["weight"]) == loss.weight
+    assert seen == [0, 0, 0, 0.25, 0.5, 0.75, 1, 1]
+
+
+def test_what_has_no_weight_is_not_evaluated(few, physics, near, evaluations):
+    loss = Annealed(MSE(), LrStar(), epochs=2)
+    loss(near, few, physics)
+    assert evaluations == []
+    assert set(loss.terms) == {"weight", "first"}
+    loss.on_train_epoch_start(SimpleNamespace(current_epoch=2), None)
+    loss(near, few, physics)
+    assert evaluations == [4]
+    assert set(loss.terms) == {"weight", "second", "second/mse", "second/residual"}
+
+
+def test_the_parts_of_an_annealed_loss_anneal_too():
+    loss = Annealed(MSE(), LrPlus(weight=2.0, warmup_epochs=4), epochs=2)
+    loss.on_train_epoch_start(SimpleNamespace(current_epoch=3), None)
+    assert loss.second.weight == 1.5
+
+
+def test_an_annealed_loss_leaves_out_what_both_do():
+    assert Annealed(MSE(), LrStar(), epochs=1).plan() == []
+    assert Annealed(MSE(), MSE(relative=True), epochs=1).plan() == MSE().plan()
+
+
+@pytest.mark.parametrize("options", [{"epochs": 0}, {"epochs": 1, "start": -1}])
+def test_a_schedule_out_of_range_is_refused(options):
+    with pytest.raises(ValueError, match="epochs"):
+        Annealed(MSE(), Stiffness(), **options)
+
+
+def test_a_trainer_anneals_and_logs_the_weight(scene, data, tmp_path):
+    torch.manual_seed(0)
+    module = Surrogate(FCNN(scene, width=8), Annealed(MSE(), Energy(), epochs=2), scene)
+    seen = []
+
+    class Watch(L.Callback):
+        def on_train_epoch_end(self, trainer, module):
+            seen.append(float(trainer.callback_metrics["loss/weight"]))
+
+    quiet = {"enable_progress_bar": False, "enable_model_summary": False, "logger": False}
+    L.Trainer(
+        accelerator="cpu",
+        max_epochs=4,
+        callbacks=[Watch()],
+        enable_checkpointing=False,
+        default_root_dir=tmp_path,
+        **quiet,
+    ).fit(module, datamodule=data)
+    assert seen == [0.0, 0.5, 1.0, 1.0]

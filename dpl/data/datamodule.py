@@ -119,6 +119,10 @@ class OfflineData(L.LightningDataModule):
             self._loaded[split] = self.store.load(split, self.wanted.sizes[split])
         return self._loaded[split]
 
+    def snapshots(self) -> Sample:
+        """Return samples to make a basis from, (B, ...): those of training, or of validation."""
+        return self.samples("train" if self.wanted.sizes["train"] else "val")
+
     @property
     def place(self) -> tuple[int, int]:
         """Which training process this is, of how many."""
@@ -126,8 +130,15 @@ class OfflineData(L.LightningDataModule):
         return (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
 
     def train_dataloader(self) -> DataLoader | Replay:
-        """Return shuffled batches, in an order that (shuffle, epoch) decides: a run can resume."""
-        data = Samples(self.samples("train"), self.group)
+        """Return shuffled batches, in an order that (shuffle, epoch) decides: a run can resume.
+
+        Batches of samples and their images, or of what the module encodes them as.
+        """
+        module = self.trainer.lightning_module if self.trainer is not None else None
+        encode = getattr(module, "encode", lambda samples: None)
+        data = encode(self.samples("train"))
+        if data is None:
+            data = Samples(self.samples("train"), self.group)
         rank, processes = self.place
         sampler: DistributedSampler = DistributedSampler(
             data, num_replicas=processes, rank=rank, shuffle=True, seed=self._shuffle
@@ -142,7 +153,7 @@ class OfflineData(L.LightningDataModule):
         """Return the test batches."""
         return self._loader(Samples(self.samples("test")))
 
-    def _loader(self, data: Samples, sampler: DistributedSampler | None = None) -> DataLoader:
+    def _loader(self, data: Dataset, sampler: DistributedSampler | None = None) -> DataLoader:
         # a generator of its own: a loader takes none of the training's random numbers
         return DataLoader(
             data,

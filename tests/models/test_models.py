@@ -11,18 +11,23 @@ from dpl.fem.solution import Load
 from dpl.losses import MSE
 from dpl.models import fcnn
 from dpl.models.fcnn import FCNN
+from dpl.models.pod import PODNet
 from dpl.module import Surrogate
 
 MODELS = sorted((Path(__file__).parents[2] / "conf" / "model").glob("*.yaml"))
 
 
 @pytest.fixture(params=MODELS, ids=lambda path: path.stem)
-def build(request, scene):
-    """From a seed to the network, with the defaults of its file."""
+def build(request, scene, batch):
+    """From a seed to the network, with the defaults of its file, shown a batch if it wants one."""
+    node = OmegaConf.load(request.param)
 
     def build(seed=0):
         torch.manual_seed(seed)
-        return instantiate(OmegaConf.load(request.param), _convert_="all")(scene=scene)
+        net = instantiate(node.get("model", node), _convert_="all")(scene=scene)
+        if isinstance(net, PODNet):
+            Surrogate(net, MSE(), scene).prepare(batch)
+        return net
 
     return build
 

@@ -1,0 +1,52 @@
+"""Samples as a network sees them that works on few coordinates: small enough to stay in a cache."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+
+class Coordinates(NamedTuple):
+    """Samples in coordinates; a batch is the same with a leading B.
+
+    Attributes:
+        inputs: Of the load, (B, M) [-].
+        targets: Of the displacement that is to be learnt, in an orthonormal basis, (B, R) [-].
+        rest: Square of what the basis does not reach, (B,) [-].
+        size: Mean square of the whole displacement over degrees of freedom, (B,) [-].
+    """
+
+    inputs: Tensor
+    targets: Tensor
+    rest: Tensor
+    size: Tensor
+
+
+class CoordinateSamples(Dataset):
+    """Samples in coordinates with their images under symmetries, fetched a batch at a time."""
+
+    def __init__(self, samples: Coordinates, inputs: Tensor, targets: Tensor) -> None:
+        """Make the images.
+
+        Args:
+            samples: S of them.
+            inputs: What each symmetry does to the inputs, x -> x T, (G, M, M); identity first.
+            targets: What it does to the targets, (G, R, R).
+        """
+        images = len(inputs)
+        self.samples = Coordinates(
+            inputs=(samples.inputs @ inputs).flatten(0, 1),
+            targets=(samples.targets @ targets).flatten(0, 1),
+            rest=samples.rest.repeat(images),
+            size=samples.size.repeat(images),
+        )
+
+    def __len__(self) -> int:
+        """Return S times the number of symmetries."""
+        return len(self.samples.rest)
+
+    def __getitems__(self, indices: list[int]) -> Coordinates:
+        """Return a batch."""
+        chosen = torch.tensor(indices)
+        return Coordinates(*(column[chosen] for column in self.samples))

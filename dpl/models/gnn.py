@@ -1,0 +1,418 @@
+"""Message passing on the nodes of the mesh and on coarser and coarser clusters of them."""
+
+import math
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import gelu
+
+from dpl.fem.problem import Problem
+from dpl.scene import Scene
+
+COARSEST = 24  # clusters of the last level, which all hear each other
+WIDEST = 4  # largest width of a level over that of the nodes
+CACHE = 2**17  # numbers of a block of messages that stay in a processor's cache
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+
+class Graph(NamedTuple):
+    """Nodes, or clusters of them, and who hears whom.
+
+    Attributes:
+        points: Places, (K, D) [-].
+        receiver: Who hears, (P,), ascending.
+        sender: Whom, (P,); with (i, j) there is (j, i).
+        whole: Whether all hear all, themselves too.
+    """
+
+    points: Floats
+    receiver: Integers
+    sender: Integers
+    whole: bool
+
+    @property
+    def spacing(self) -> float:
+        """Mean distance of those that hear each other [-]."""
+        way = np.linalg.norm(self.points[self.sender] - self.points[self.receiver], axis=1)
+        return float(way[way > 0].mean()) if way.any() else 1.0
+
+    def features(self) -> Floats:
+        """Return ways from receiver to sender and their lengths over the spacing, (P, D + 1)."""
+        way = (self.points[self.sender] - self.points[self.receiver]) / self.spacing
+        return np.column_stack([way, np.linalg.norm(way, axis=1)])
+
+
+def mesh_graph(problem: Problem) -> Graph:
+    """Return the graph of a mesh: nodes of a cell that are closest together hear each other.
+
+    Closest in the regular cell (square, cube, equilateral triangle, regular tetrahedron), whatever
+    the cell's shape: along the cell's edges, in halves where it is quadratic. In a mesh of at most
+    `COARSEST` nodes all hear all.
+    """
+    points = problem.points.numpy()
+    if len(points) <= COARSEST:
+        return _whole(points)
+    element = problem.basis.elem
+    places = np.asarray(element.doflocs)  # (A, D)
+    if element.refdom.name in ("Triangular", "Tetrahedral"):
+        places = places @ np.linalg.cholesky((np.eye(places.shape[1]) + 1) / 2)
+    apart = np.linalg.norm(places[:, None] - places, axis=-1)
+    apart[np.diag_indices_from(apart)] = np.inf
+    one, other = np.nonzero(apart < apart.min() * 1.01)
+    cells = problem.cells.numpy()
+    return _joined(points, cells[:, one].ravel(), cells[:, other].ravel())
+
+
+def coarser(graph: Graph, count: int) -> tuple[Graph, Integers]:
+    """Return the graph of so many clusters of nodes, and the cluster of each node, (K,).
+
+    Centres are chosen one by one, each farthest from those before; nodes belong to the nearest.
+    Distances are numbers of edges and ties go to the first, so that rounding, of a body moved far
+    away, say, does not change clusters. Each separate part of a body has a cluster at least, even
+    where that makes more than `count`. Clusters hear each other where members do, and all of them
+    where they are `COARSEST` or fewer.
+
+    Source: Gonzalez (1985), Clustering to minimize the maximum intercluster distance.
+    """
+    nodes = len(graph.points)
+    start = np.searchsorted(graph.receiver, np.arange(nodes + 1)).tolist()
+    sender = graph.sender.tolist()
+    distance = np.full(nodes, nodes, dtype=np.int64)
+    cluster = np.zeros(nodes, dtype=np.int64)
+    chosen = 0
+    while chosen < min(count, nodes) or distance.max() == nodes:
+        ring, reach = [int(distance.argmax())], 0
+        while ring:
+            distance[ring], cluster[ring] = reach, chosen
+            reach += 1
+            heard = {k for i in ring for k in sender[start[i] : start[i + 1]]}
+            ring = sorted(k for k in heard if distance[k] > reach)
+        chosen += 1
+    members = np.bincount(cluster)
+    points = np.column_stack([np.bincount(cluster, axis) / members for axis in graph.points.T])
+    if chosen <= COARSEST:
+        return _whole(points), cluster
+    return _joined(points, cluster[graph.receiver], cluster[graph.sender]), cluster
+
+
+def hierarchy(problem: Problem, levels: int | None = None) -> tuple[list[Graph], list[Integers]]:
+    """Return the graphs of all levels, nodes first, and the clusters that lead to each next one.
+
+    Sizes fall by one factor from level to level, down to `COARSEST`. Without `levels` there are as
+    many as keep that factor at 2^D or less, where clusters become twice as wide.
+    """
+    nodes, dim = problem.shape
+    needed = math.ceil(max(0.0, math.log(nodes / COARSEST, 2**dim)))
+    steps = min(needed if levels is None else levels - 1, nodes - 1 if needed else 0)
+    graphs, clusters = [mesh_graph(problem)], []
+    for step in range(1, steps + 1):
+        count = round(nodes * (COARSEST / nodes) ** (step / steps))
+        graph, cluster = coarser(graphs[-1], count)
+        graphs.append(graph)
+        clusters.append(cluster)
+    return graphs, clusters
+
+
+def _whole(points: Floats) -> Graph:
+    return Graph(points, *np.divmod(np.arange(len(points) ** 2), len(points)), whole=True)
+
+
+def _joined(points: Floats, receiver: Integers, sender: Integers) -> Graph:
+    apart = receiver != sender
+    pairs = np.unique(receiver[apart] * len(points) + sender[apart])
+    return Graph(points, *np.divmod(pairs, len(points)), whole=False)
+
+
+class GNN(nn.Module):
+    """Encode, process on several levels of the mesh, decode.
+
+    The levels are the nodes and clusters of clusters of them, down to few that all hear each other.
+    Each level sees the loads on its clusters, the parts of them that are held and that are
+    boundary, and relative positions, never positions: moving the body changes nothing. A pass
+    goes down the levels and up again, so that what happens at one end of the body is known at
+    the other after one pass. Coarser levels have more channels, and most of the work is there.
+
+    Sources: Pfaff, Fortunato, Sanchez-Gonzalez, Battaglia (2021), MeshGraphNets: encode, process,
+    decode, and relative positions on edges; Fortunato et al. (2022), MultiScale MeshGraphNets:
+    levels; Schuett et al. (2017), SchNet: filters as functions of relative positions, see
+    `Messages`. Unlike in the first, messages are no networks of their own, edges have no state,
+    and nothing is normalised.
+    """
+
+    def __init__(
+        self, scene: Scene, *, width: int = 32, levels: int | None = None, passes: int = 1
+    ) -> None:
+        """Build the network.
+
+        Args:
+            scene: What it is to answer.
+            width: Channels of the nodes; each coarser level has twice as many, `WIDEST` times
+                `width` at most.
+            levels: Of which the first is the nodes; 1 means that information goes from node to
+                node only. Left out, as many as make clusters twice as wide from level to level.
+            passes: Ways down the levels and up again.
+
+        Raises:
+            ValueError: `width`, `levels` or `passes` is out of range.
+        """
+        super().__init__()
+        if width < 1:
+            raise ValueError(f"width = {width} must be 1 or more")
+        if levels is not None and levels < 1:
+            raise ValueError(f"levels = {levels} must be 1 or more")
+        if passes < 1:
+            raise ValueError(f"passes = {passes} must be 1 or more")
+        problem = scene.problem
+        nodes, dim = problem.shape
+        graphs, clusters = hierarchy(problem, levels)
+        widths = [width * min(2**k, WIDEST) for k in range(len(graphs))]
+        flags = np.column_stack([problem.free.numpy(), problem.boundary.numpy()]).astype(float)
+        self.levels = nn.ModuleList()
+        for k, graph in enumerate(graphs):
+            self.levels.append(Level(graph, flags, nodes, widths[k], first=k == 0))
+            if k < len(clusters):
+                flags = _means(flags, clusters[k])
+        self.steps = nn.ModuleList(
+            Step(fine, coarse, cluster)
+            for (fine, coarse), cluster in zip(pairwise(graphs), clusters, strict=True)
+        )
+        self.sizes = [len(graph.points) for graph in graphs]
+        self.whole = graphs[-1].whole
+        self.passes = nn.ModuleList(Pass(dim, widths) for _ in range(passes))
+        self.decode = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, dim))
+
+    def forward(self, force: Tensor) -> Tensor:
+        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32."""
+        states = [
+            level(*load) for level, load in zip(self.levels, self.resultants(force), strict=True)
+        ]
+        for one in self.passes:
+            states = one(states, self.levels, self.steps)
+        return self.decode(states[0]).transpose(0, 1)
+
+    def resultants(self, force: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return what a force (B, N, D) is on the clusters of each level, as sums over nodes.
+
+        Forces (K, B, D) and their first moments about the cluster's centre, (K, B, D D): the sums
+        of (x - centre) f^T [-], without which a cluster would not know how it is twisted.
+        """
+        force = force.transpose(0, 1).contiguous()
+        moment = force.new_zeros(*force.shape[:2], force.shape[2] ** 2)
+        loads = [(force, moment)]
+        for step in self.steps:
+            loads.append(step(*loads[-1]))
+        return loads
+
+    def plan(self) -> list[str]:
+        """Return what the network leaves out, a line each."""
+        lines = ["no positions, only relative ones: the answer moves with the body"]
+        if len(self.sizes) > 1:
+            nodes, *clusters = map(str, self.sizes)
+            lines.append(f"no long ways over {nodes} nodes: clusters, {' then '.join(clusters)}")
+        elif self.whole:
+            lines.append(f"no clusters: {self.sizes[0]} nodes all hear each other")
+        else:
+            lines.append(f"no clusters: {self.sizes[0]} nodes hear their neighbours only")
+        return lines
+
+
+class Level(nn.Module):
+    """A graph as tensors, and the encoder of what is known there."""
+
+    receiver: Tensor
+    sender: Tensor
+    features: Tensor
+    flags: Tensor
+
+    def __init__(self, graph: Graph, flags: Floats, nodes: int, width: int, *, first: bool) -> None:
+        """Take a graph, the flags of its members (K, D + 1) and the number of nodes of the mesh."""
+        super().__init__()
+        count, dim = graph.points.shape
+        self.register_buffer("receiver", torch.from_numpy(graph.receiver))
+        self.register_buffer("sender", torch.from_numpy(graph.sender))
+        self.register_buffer("features", torch.from_numpy(graph.features()).float())
+        self.register_buffer("flags", torch.from_numpy(flags).float())
+        self.whole, self.first, self.spacing = graph.whole, first, graph.spacing
+        self.mean_degree = len(graph.sender) / count
+        # half-way between the load on a node and that on all of a cluster's
+        self.load_scale = math.sqrt(count / nodes)
+        self.load = nn.Linear(dim if first else dim + dim * dim, width, bias=False)
+        self.place = nn.Sequential(nn.Linear(dim + 1, width), nn.GELU(), nn.Linear(width, width))
+
+    def forward(self, force: Tensor, moment: Tensor) -> Tensor:
+        """Return the state (K, B, width) under forces (K, B, D) and moments (K, B, D D)."""
+        if not self.first:
+            force = torch.cat([force, moment / self.spacing], dim=-1)
+        return self.load(force * self.load_scale) + self.place(self.flags)[:, None]
+
+
+class Step(nn.Module):
+    """Which cluster of the next level each member of a level belongs to."""
+
+    cluster: Tensor
+    arm: Tensor
+    share: Tensor
+
+    def __init__(self, fine: Graph, coarse: Graph, cluster: Integers) -> None:
+        """Take two graphs and the cluster of each member of the first, (K,)."""
+        super().__init__()
+        arm = fine.points - coarse.points[cluster]
+        self.clusters, self.spacing = len(coarse.points), coarse.spacing
+        self.register_buffer("cluster", torch.from_numpy(cluster))
+        self.register_buffer("arm", torch.from_numpy(arm / coarse.spacing).float())
+        self.register_buffer("share", torch.from_numpy(1 / np.bincount(cluster)).float())
+
+    def sum(self, values: Tensor) -> Tensor:
+        """Return the sums over members (K, B, ...) of each cluster."""
+        total = values.new_zeros(self.clusters, *values.shape[1:])
+        return total.index_add(0, self.cluster, values)
+
+    def forward(self, force: Tensor, moment: Tensor) -> tuple[Tensor, Tensor]:
+        """Return forces (K, B, D) and moments (K, B, D D) of the clusters."""
+        lever = self.spacing * self.arm[:, None, :, None] * force[:, :, None, :]
+        return self.sum(force), self.sum(moment + lever.flatten(-2))
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Return the means over members (K, B, ...) of each cluster."""
+        return self.sum(values) * self.share[:, None, None]
+
+
+class Pass(nn.Module):
+    """One way down the levels and up again, a V-cycle."""
+
+    def __init__(self, dim: int, widths: list[int]) -> None:
+        """Take the space dimension and the width of each level."""
+        super().__init__()
+        pairs = list(pairwise(widths))
+        # none on the nodes before the first way down: the most expensive place
+        self.down = nn.ModuleList(Messages(dim, width) for width in widths[1:-1])
+        self.bottom = nn.ModuleList(Messages(dim, widths[-1]) for _ in range(2))
+        self.up = nn.ModuleList(Messages(dim, width) for width in widths[:-1])
+        self.restrict = nn.ModuleList(Restrict(dim, *pair) for pair in pairs)
+        self.prolong = nn.ModuleList(Prolong(dim, *pair) for pair in pairs)
+
+    def forward(
+        self, states: list[Tensor], levels: nn.ModuleList, steps: nn.ModuleList
+    ) -> list[Tensor]:
+        """Return the states (K, B, width) of all levels after the pass."""
+        states = list(states)
+        for k, (step, restrict) in enumerate(zip(steps, self.restrict, strict=True)):
+            if k > 0:
+                states[k] = self.down[k - 1](levels[k], states[k])
+            states[k + 1] = states[k + 1] + restrict(step, states[k])
+        for messages in self.bottom:
+            states[-1] = messages(levels[-1], states[-1])
+        for k in reversed(range(len(steps))):
+            states[k] = states[k] + self.prolong[k](steps[k], states[k], states[k + 1])
+            states[k] = self.up[k](levels[k], states[k])
+        return states
+
+
+class Messages(nn.Module):
+    """Each member hears its neighbours: a sum of their states, filtered by where they are.
+
+    The filter, a number per channel, is a small network of the relative position, the same for all
+    loads; so a message is one product and not a network of its own, and what is not linear in
+    the states happens at the receiver. Where all hear all the sum is a matrix product.
+    """
+
+    def __init__(self, dim: int, width: int) -> None:
+        """Take the space dimension and the width."""
+        super().__init__()
+        self.filter = nn.Sequential(nn.Linear(dim + 1, width), nn.GELU(), nn.Linear(width, width))
+        self.enter = nn.Linear(width, 2 * width)
+        self.hear = nn.Linear(width, width, bias=False)
+        self.leave = nn.Linear(width, width)
+
+    def forward(self, level: Level, state: Tensor) -> Tensor:
+        """Return the state (K, B, width) after hearing."""
+        weight = self.filter(level.features) / level.mean_degree  # (P, width)
+        said, own = self.enter(state).chunk(2, dim=-1)
+        if level.whole:
+            matrix = weight.unflatten(0, (len(said), len(said))).permute(2, 0, 1)
+            heard = (matrix @ said.permute(2, 0, 1)).permute(1, 2, 0)
+        elif torch.compiler.is_compiling():  # which sees through one sum, and not through blocks
+            messages = said.index_select(0, level.sender) * weight[:, None]
+            heard = torch.zeros_like(said).index_add(0, level.receiver, messages)
+        else:
+            heard = Filtered.apply(said.contiguous(), weight, level.receiver, level.sender)
+        return state + self.leave(gelu(own + self.hear(heard)))
+
+
+class Filtered(torch.autograd.Function):
+    """Sums over neighbours j of i of w_ij x_j, a block of messages at a time.
+
+    All messages at once are the largest tensor of the network, several times over; blocks stay in
+    the cache and are not kept for the way back.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, said: Tensor, weight: Tensor, receiver: Tensor, sender: Tensor) -> Tensor:
+        """Return (K, B, width) from states (K, B, width) and weights (P, width)."""
+        ctx.save_for_backward(said, weight, receiver, sender)
+        heard = torch.zeros_like(said)
+        for i, j, w in _blocks(said, receiver, sender, weight):
+            heard.index_add_(0, i, said.index_select(0, j).mul_(w[:, None]))
+        return heard
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        """Return the slopes with respect to states and weights."""
+        said, weight, receiver, sender = ctx.saved_tensors
+        of_said, of_weight = torch.zeros_like(said), torch.empty_like(weight)
+        slope = slope.contiguous()
+        for i, j, w, out in _blocks(said, receiver, sender, weight, of_weight):
+            heard = slope.index_select(0, i)
+            torch.sum(said.index_select(0, j).mul_(heard), dim=1, out=out)
+            of_said.index_add_(0, j, heard.mul_(w[:, None]))
+        return of_said, of_weight, None, None
+
+
+def _blocks(states: Tensor, *columns: Tensor) -> Any:
+    """Return rows of the columns (P, ...), as many at a time as stay in the cache."""
+    rows = CACHE // states[0].numel() if states.device.type == "cpu" else len(columns[0])
+    return zip(*(column.split(max(1, rows)) for column in columns), strict=True)
+
+
+class Restrict(nn.Module):
+    """What clusters learn from their members: a mean."""
+
+    def __init__(self, dim: int, fine: int, coarse: int) -> None:
+        """Take the space dimension and the widths of two levels."""
+        super().__init__()
+        self.state, self.arm = nn.Linear(fine, fine), nn.Linear(dim, fine, bias=False)
+        self.leave = nn.Linear(fine, coarse)
+
+    def forward(self, step: Step, fine: Tensor) -> Tensor:
+        """Return what is added to clusters, (K', B, coarse), from members (K, B, fine)."""
+        return self.leave(step.mean(gelu(self.state(fine) + self.arm(step.arm)[:, None])))
+
+
+class Prolong(nn.Module):
+    """What members learn from their cluster, by where in it they are."""
+
+    def __init__(self, dim: int, fine: int, coarse: int) -> None:
+        """Take the space dimension and the widths of two levels."""
+        super().__init__()
+        self.own, self.arm = nn.Linear(fine, fine), nn.Linear(dim, fine, bias=False)
+        self.cluster = nn.Linear(coarse, fine, bias=False)
+        self.leave = nn.Linear(fine, fine)
+
+    def forward(self, step: Step, fine: Tensor, coarse: Tensor) -> Tensor:
+        """Return what is added to members, (K, B, fine)."""
+        above = self.cluster(coarse).index_select(0, step.cluster)
+        return self.leave(gelu(self.own(fine) + above + self.arm(step.arm)[:, None]))
+
+
+def _means(values: Floats, cluster: Integers) -> Floats:
+    """Return the means of values (K, ...) over the members of each cluster."""
+    members = np.bincount(cluster)
+    return np.column_stack([np.bincount(cluster, column) / members for column in values.T])

@@ -1,0 +1,170 @@
+"""The linear answer, and a network for what is nonlinear: the flagship."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from dpl.fem.newton import Linear
+from dpl.models.pod import PODNet, evened, root_mean_square
+from dpl.scene import Sample, Scene
+
+
+class Latent(PODNet):
+    """K(0)^-1 f plus what a network learns of u - K(0)^-1 f, in one basis.
+
+    Its error vanishes quadratically with the load: the linear part is the exact one, projected on
+    the basis, and the network's output is held to zero as |x|^2 where its inputs x, coordinates of
+    the linear answer, are small. The basis holds linear answers and nonlinear rests of the training
+    samples. Loads on few degrees of freedom, whose near field no global basis sees, take their
+    linear part from the factor of K(0) itself.
+
+    Attributes:
+        unit: What scaled linear answers are multiples of, ().
+    """
+
+    unit: Tensor
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        rank: int = 160,
+        coordinates: int = 60,
+        width: int = 256,
+        blocks: int = 4,
+        symmetry: bool = True,
+        near: int = 300,
+    ) -> None:
+        """Build the network; see `PODNet`, besides.
+
+        Args:
+            scene: What it is to answer.
+            rank: Modes of the displacement, R.
+            coordinates: Inputs of the network, M.
+            width: Units in the hidden layers.
+            blocks: Residual blocks of two layers.
+            symmetry: Find the symmetries of the body and respect them.
+            near: Loads on no more degrees of freedom than this are answered with the factor of
+                K(0); 0: none.
+
+        Raises:
+            ValueError: A number is out of range.
+        """
+        if near < 0:
+            raise ValueError(f"near = {near} must be 0 or more")
+        super().__init__(
+            scene,
+            rank=rank,
+            coordinates=coordinates,
+            width=width,
+            blocks=blocks,
+            symmetry=symmetry,
+        )
+        self.near = near
+        self.register_buffer("unit", torch.tensor(0.0, dtype=torch.float64))
+        self._answers: tuple[Tensor, Tensor] | None = None
+
+    def _reading(self, rank: int, coordinates: int) -> int:
+        return rank
+
+    def forward(self, force: Tensor) -> Tensor:
+        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32."""
+        acting = force[:, self.acting]
+        linear = acting @ self.read
+        learnt = self.learnt(linear @ self.scaled)
+        few = (acting != 0).sum(dim=1) <= self.near
+        if not few.any():
+            moved = (linear + learnt) @ self.basis
+        else:
+            moved = torch.where(few[:, None], learnt, linear + learnt) @ self.basis
+            exact = _Respond.apply(acting[few].double(), self)
+            moved = moved.index_add(0, few.nonzero()[:, 0], exact.to(moved.dtype))
+        displacement = torch.zeros_like(force)
+        displacement[:, self.moving] = moved
+        return displacement
+
+    def network(self, inputs: Tensor) -> Tensor:
+        """Return coordinates (B, R) of the nonlinear part from inputs (B, M), without symmetry."""
+        square = inputs.square().sum(dim=1, keepdim=True)
+        return square / (1 + square) * super().network(inputs)
+
+    def plan(self) -> list[str]:
+        """Return what the network leaves out, a line each."""
+        lines = super().plan()
+        lines.append("nothing linear learnt: K(0)^-1 f is exact to the rank of the basis")
+        if self.near:
+            lines.append(
+                f"no rank for near fields: forces on up to {self.near} degrees of freedom are "
+                "answered with the factor of K(0)"
+            )
+        return lines
+
+    def prepare(self, samples: Sample, unit: float) -> None:
+        """Make the basis; see `PODNet.prepare`."""
+        self.unit.fill_(unit)
+        force, displacement = self._columns(samples)
+        linear = self._known(force)
+        size = displacement.norm(dim=1)
+        weight = torch.where(size > 0, size.clamp(min=1e-12) ** -0.5, 0.0)
+        parts = [weight[:, None] * linear, weight[:, None] * (displacement - linear)]
+        basis = self._modes(torch.cat(parts), self.moving, len(self.basis))
+        # its coordinates in the order of what they have of the rests
+        rests = parts[1] @ basis
+        basis = basis @ torch.linalg.eigh(rests.T @ rests)[1].flip(1)
+        self.basis.copy_(basis.T)
+        responses = self._respond_all(basis.T)
+        self.read.copy_(responses[:, self.acting[self.moving]].T)
+        motions = self._motions(basis, self.moving)
+        self._scale(linear @ basis, (displacement - linear) @ basis, weight, motions)
+        self._turn(motions, motions)
+        self.prepared.fill_(True)
+
+    def _scale(self, read: Tensor, targets: Tensor, weight: Tensor, motions: Tensor) -> None:
+        weighted = weight[:, None] * read
+        spread = (motions.mT @ (weighted.T @ weighted) @ motions).mean(dim=0)  # over all images
+        axes = torch.linalg.eigh(spread)[1].flip(1)[:, : self.scaled.shape[1]]
+        size = ((axes.T @ spread) * axes.T).sum(dim=1).clamp(min=0).sqrt()
+        self.scaled.copy_(axes / evened(size))
+        size = root_mean_square(targets)
+        self.spread.copy_((size * size.max()).sqrt())
+
+    def _known(self, force: Tensor) -> Tensor:
+        """Return linear answers (S, outputs) of forces on the inputs (S, inputs), scaled."""
+        if self._answers is None or self._answers[0].data_ptr() != force.data_ptr():
+            self._answers = force, self.respond(force)
+        return self._answers[1]
+
+    def respond(self, acting: Tensor) -> Tensor:
+        """Return K(0)^-1 f, scaled: (B, outputs) of forces on the inputs (B, inputs), float64."""
+        every = acting.new_zeros(len(acting), int(self.moving.sum()))
+        every[:, self.acting[self.moving]] = acting
+        return self._respond_all(every)
+
+    def _respond_all(self, forces: Tensor) -> Tensor:
+        """Return K(0)^-1 f, scaled, (B, outputs) of forces on all that moves, (B, outputs)."""
+        factor = self._linear.factor
+        answers = [torch.from_numpy(factor.solve(one.numpy())) for one in forces.cpu()]
+        return float(self.unit) * torch.stack(answers).to(forces.device)
+
+    @property
+    def _linear(self) -> Linear:
+        return self.scene.linear
+
+
+class _Respond(torch.autograd.Function):
+    """K(0)^-1 f, scaled; K is symmetric, so the slope is the same solve."""
+
+    @staticmethod
+    def forward(ctx: Any, acting: Tensor, net: Latent) -> Tensor:
+        """Return (B, outputs) of (B, inputs)."""
+        ctx.net = net
+        return net.respond(acting)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None]:
+        """Return the slope with respect to forces."""
+        net = ctx.net
+        return net._respond_all(slope)[:, net.acting[net.moving]], None

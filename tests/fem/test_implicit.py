@@ -1,0 +1,218 @@
+"""Laws of the differentiable equilibrium: its slopes are those of whole solves."""
+
+import pickle
+
+import pytest
+import torch
+
+from dpl.fem.implicit import Equilibrium
+from dpl.fem.linear import SingularMatrix, SuperLU
+from dpl.fem.materials import LinearElastic, NeoHookeanLn
+from dpl.fem.mesh import Plane, box
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, Status, solve
+from dpl.fem.supports import Displacement, Spring
+
+YOUNG, LENGTH = 4500.0, 100.0
+
+
+@pytest.fixture(scope="module")
+def problem(beam):
+    return beam(NeoHookeanLn(0.3), n=4, m=1)
+
+
+@pytest.fixture(scope="module")
+def equilibrium(problem):
+    return Equilibrium(Newton(problem, tol=1e-12, linear="superlu"))
+
+
+@pytest.fixture(scope="module")
+def force(problem, pull):
+    """Two loads that bend the beam by a tenth and by a third of its length."""
+    return torch.cat([pull(problem, 2.0), pull(problem, 10.0)])
+
+
+@pytest.fixture(scope="module")
+def way(problem):
+    """A direction of forces, of no symmetry, on held nodes too."""
+    return noise(2, *problem.shape, seed=1)
+
+
+def noise(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def loaded(force):
+    return Load(force, torch.ones(len(force), dtype=torch.float64))
+
+
+def seen(displacement):
+    """Some smooth number of each answer, (B,)."""
+    weight = noise(*displacement.shape[1:], seed=2)
+    return (displacement * weight).sum(dim=(1, 2)) + displacement.square().sum(dim=(1, 2))
+
+
+def slope_of(function, step):
+    return (function(step) - function(-step)) / (2 * step)
+
+
+def test_the_answer_is_that_of_newton(equilibrium, force):
+    answer = equilibrium(loaded(force))
+    assert torch.equal(answer, solve(equilibrium.newton, loaded(force)).displacement)
+    assert answer.dtype == torch.float64
+    assert not answer.requires_grad
+
+
+def test_the_gradient_by_forces_is_that_of_whole_solves(equilibrium, force, way):
+    inner = force.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(seen(equilibrium(loaded(inner))).sum(), inner)
+    size = float(force[0].norm() / way[0].norm())
+
+    def along(step):
+        return seen(equilibrium(loaded(force + step * size * way)))
+
+    found = (slope * way).sum(dim=(1, 2)) * size
+    expected = slope_of(along, 1e-4)
+    assert expected.abs().min() > 1e-3
+    assert torch.allclose(found, expected, rtol=1e-5, atol=0)
+
+
+def test_forces_on_held_nodes_change_nothing(problem, equilibrium, force):
+    inner = force.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(seen(equilibrium(loaded(inner))).sum(), inner)
+    assert (slope[:, ~problem.free] == 0).all()
+    assert (slope[:, problem.free] != 0).any()
+
+
+def test_the_gradient_by_young_and_by_newtons_is_that_of_whole_solves(scene, batch):
+    """Through `Scene.load_of`: u/L depends on f/(E L^2) alone, so f df + E dE = 0 as well."""
+    equilibrium = Equilibrium(Newton(scene.problem, tol=1e-12, linear="superlu"))
+    young = torch.tensor([4500.0, 9000.0], dtype=torch.float64)
+    newtons = batch.force[:2] * (young * scene.force_unit)[:, None, None]
+
+    def metres(newtons, young):
+        return scene.length * equilibrium(scene.load_of(newtons, young))
+
+    inner = newtons.clone().requires_grad_(), young.clone().requires_grad_()
+    by_force, by_young = torch.autograd.grad(seen(metres(*inner)).sum(), inner)
+    expected = slope_of(lambda step: seen(metres(newtons, young * (1 + step))), 1e-4) / young
+    assert torch.allclose(by_young, expected, rtol=1e-5, atol=0)
+    expected = slope_of(lambda step: seen(metres(newtons * (1 + step), young)), 1e-4)
+    assert torch.allclose((by_force * newtons).sum(dim=(1, 2)), expected, rtol=1e-5, atol=0)
+    assert torch.allclose((by_force * newtons).sum(dim=(1, 2)), -by_young * young, rtol=1e-8)
+
+
+def test_a_batch_has_the_gradients_of_its_members(equilibrium, force):
+    inner = force.clone().requires_grad_()
+    (whole,) = torch.autograd.grad(seen(equilibrium(loaded(inner))).sum(), inner)
+    for k in range(2):
+        one = force[k : k + 1].clone().requires_grad_()
+        (slope,) = torch.autograd.grad(seen(equilibrium(loaded(one))).sum(), one)
+        assert torch.allclose(whole[k], slope[0], rtol=1e-9, atol=1e-12 * float(slope.abs().max()))
+
+
+def test_a_gradient_costs_one_factor_however_often_it_is_asked_for(equilibrium, force, monkeypatch):
+    answer = equilibrium(loaded(force.clone().requires_grad_()))
+    made = []
+    factorise = SuperLU.factorise
+    monkeypatch.setattr(SuperLU, "factorise", lambda *given: made.append(1) or factorise(*given))
+    for component in answer[:, -1].sum(dim=0):
+        component.backward(retain_graph=True)
+    assert len(made) == 2  # of two loads
+
+
+def test_linear_bodies_have_the_same_gradient_everywhere(beam, pull):
+    problem = beam(LinearElastic(0.3), n=4, m=1)
+    equilibrium = Equilibrium(Newton(problem, linear="superlu"))
+    force = torch.cat([pull(problem, 0.01), pull(problem, 1.0)]).requires_grad_()
+    weight = noise(*problem.shape)
+    (slope,) = torch.autograd.grad((equilibrium(loaded(force)) * weight).sum(), force)
+    adjoint = equilibrium.newton.rest.respond(weight)
+    assert torch.allclose(slope[0], adjoint, rtol=1e-8, atol=1e-10)
+    assert torch.allclose(slope[1], adjoint, rtol=1e-8, atol=1e-10)
+
+
+def test_moved_supports_and_springs_take_part(pull):
+    ends = [
+        Displacement(Plane(0, "max"), [5.0, None, None]),
+        Spring(Plane(2, "min"), 1e-4),
+    ]
+    mesh = box([LENGTH, 25.0, 25.0], [5, 2, 2])
+    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), supports=ends)
+    equilibrium = Equilibrium(Newton(problem, tol=1e-12, linear="superlu"))
+    force, way = pull(problem, 5.0), noise(1, *problem.shape, seed=3)
+    inner = force.clone().requires_grad_()
+    answer = equilibrium(loaded(inner))
+    assert torch.equal(answer[0][~problem.free], problem.prescribed[~problem.free])
+    (slope,) = torch.autograd.grad(seen(answer).sum(), inner)
+    size = 0.1 * float(force.norm() / way.norm())
+    expected = slope_of(lambda step: seen(equilibrium(loaded(force + step * size * way))), 1e-3)
+    assert float((slope * way).sum()) * size == pytest.approx(float(expected), rel=1e-5)
+
+
+def test_a_balanced_column_beyond_its_critical_load_has_a_gradient(beam):
+    """Its tangent is indefinite, and yet the way in which it answers is a matter of one solve."""
+    problem = beam(NeoHookeanLn(0.3), n=8, m=1)
+    equilibrium = Equilibrium(Newton(problem, tol=1e-12, linear="superlu"))
+    tip = (problem.points[:, 0] == problem.points[:, 0].max()).double()
+    axial = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    axial[0, :, 0] = -tip / tip.sum()
+
+    def shortened(load):
+        return -equilibrium(loaded(load * axial))[0, :, 0].min()
+
+    load = torch.tensor(0.006, dtype=torch.float64, requires_grad=True)
+    answer = equilibrium.solution(loaded(load.detach() * axial))
+    assert answer.status.tolist() == [Status.UNSTABLE]
+    assert int(answer.negative_pivots) > 0
+    (slope,) = torch.autograd.grad(shortened(load), load)
+    with torch.no_grad():
+        expected = slope_of(lambda step: shortened(load + step), 1e-5)
+    assert float(slope) == pytest.approx(float(expected), rel=1e-5)
+
+
+def test_a_guess_shortens_the_solve_and_changes_neither_answer_nor_gradient(equilibrium, force):
+    cold = loaded(force.clone().requires_grad_())
+    warm = loaded(force.clone().requires_grad_())
+    first = equilibrium(cold)
+    again = equilibrium(warm, guess=first)
+    assert torch.allclose(first, again, rtol=0, atol=1e-10)
+    assert (equilibrium.solution(warm, guess=first.detach()).iterations <= 1).all()
+    slopes = [
+        torch.autograd.grad(seen(u).sum(), load.force)[0]
+        for u, load in ((first, cold), (again, warm))
+    ]
+    assert torch.allclose(*slopes, rtol=1e-7, atol=1e-9)
+
+
+def test_loads_without_an_answer_are_refused_by_number(problem, force):
+    equilibrium = Equilibrium(Newton(problem, linear="superlu", budget=2))
+    hopeless = torch.cat([0 * force[:1], 100 * force[1:]]).requires_grad_()
+    with pytest.raises(ValueError, match="of 2 loads, load 1: not converged"):
+        equilibrium(loaded(hopeless))
+    assert equilibrium.solution(loaded(hopeless)).converged.tolist() == [True, False]
+
+
+def test_a_critical_load_has_no_gradient_and_says_so(equilibrium, force, monkeypatch):
+    def critical(backend, values):
+        raise SingularMatrix("a pivot is zero")
+
+    answer = equilibrium(loaded(force.clone().requires_grad_()))
+    monkeypatch.setattr(SuperLU, "factorise", critical)
+    with pytest.raises(SingularMatrix):
+        answer.sum().backward()
+
+
+def test_forces_of_single_precision_get_gradients_of_theirs(equilibrium, force):
+    single = force.float().requires_grad_()
+    answer = equilibrium(loaded(single))
+    assert answer.dtype == torch.float64
+    answer.sum().backward()
+    assert single.grad.dtype == torch.float32
+
+
+def test_it_can_be_pickled(equilibrium, force):
+    equilibrium(loaded(force.clone().requires_grad_())).sum().backward()
+    twin = pickle.loads(pickle.dumps(equilibrium))
+    assert torch.equal(twin(loaded(force)), equilibrium(loaded(force)))

@@ -1,0 +1,316 @@
+"""Laws of the convolutional network and of the grid that immerses the body."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from dpl.fem.mesh import rectangle
+from dpl.fem.solution import solve
+from dpl.hybrid import Direct, Hybrid
+from dpl.losses import MSE
+from dpl.models import cnn
+from dpl.models.cnn import CNN, Immersion, Permutation, filling, own_grid
+from dpl.module import Surrogate
+
+
+def shaken(mesh, size=0.1):
+    """The mesh with its inner nodes moved by so many shortest edges: no longer a grid."""
+    moved = mesh.p.copy()
+    inner = mesh.interior_nodes()
+    noise = torch.rand(mesh.dim(), len(inner), generator=torch.Generator().manual_seed(0))
+    moved[:, inner] += size * mesh.param() * (noise.numpy() - 0.5)
+    return type(mesh)(moved, mesh.t)
+
+
+@pytest.fixture(scope="module")
+def plate(make_scene):
+    """A beam in plane strain, 9 x 4 nodes."""
+    return make_scene(mesh=rectangle([100.0, 25.0], [9, 4]))
+
+
+@pytest.fixture(scope="module")
+def unstructured(make_scene, scene):
+    """The tiny beam of tetrahedra whose inner nodes are shaken."""
+    mesh = make_scene(nodes=(7, 4, 4), cell="tetra").problem.mesh
+    return make_scene(mesh=shaken(mesh.scaled(100.0)))
+
+
+@pytest.fixture(scope="module")
+def ring(make_scene):
+    """A square with a square hole, in plane strain: not a grid, not all of its bounding box."""
+    mesh = rectangle([1.0, 1.0], [10, 10])
+    x, y = mesh.p[:, mesh.t].mean(axis=1) - 0.5
+    return make_scene(mesh=mesh.remove_elements(np.flatnonzero((abs(x) < 0.3) & (abs(y) < 0.3))))
+
+
+@pytest.fixture(params=["scene", "plate", "unstructured", "ring"])
+def body(request):
+    return request.getfixturevalue(request.param)
+
+
+def network(scene, seed=0, **options):
+    torch.manual_seed(seed)
+    return CNN(scene, **{"channels": 4, **options})
+
+
+def field(scene, batch=3, seed=0):
+    return torch.randn(batch, *scene.problem.shape, generator=torch.Generator().manual_seed(seed))
+
+
+# ------------------------------------------------------------------ the grid
+
+
+def test_nodes_of_a_box_are_its_grid_whatever_their_order(scene, make_scene):
+    for body, shape in ((scene, (5, 3, 3)), (make_scene(cell="tetra"), (5, 3, 3))):
+        net = network(body)
+        assert own_grid(body.problem.points) == shape
+        assert isinstance(net.immersion, Permutation)
+        values = field(body)
+        assert torch.equal(net.immersion.read(net.immersion.spread(values)), values)
+    shuffled = scene.problem.points[torch.randperm(45, generator=torch.Generator().manual_seed(0))]
+    immersion = Permutation(shuffled, (5, 3, 3))
+    x, y, z = immersion.spread(shuffled[None])[0]
+    assert (x.diff(dim=0) > 0).all()
+    assert (y.diff(dim=1) > 0).all()
+    assert (z.diff(dim=2) > 0).all()
+
+
+def test_quadratic_hexahedra_make_a_grid_of_half_the_spacing(make_scene):
+    assert own_grid(make_scene(nodes=(3, 2, 2), degree=2).problem.points) == (5, 3, 3)
+
+
+def test_what_only_looks_like_a_grid_is_none(unstructured, ring, scene):
+    points = scene.problem.points
+    assert own_grid(unstructured.problem.points) is None
+    assert own_grid(ring.problem.points) is None
+    assert own_grid(points.square()) is None  # graded
+    assert own_grid(torch.cat([points[:-1], points[:1]])) is None  # one twice, one never
+    assert own_grid(points.float().double() @ torch.eye(3).double().roll(1, 0)) == (3, 3, 5)
+
+
+def test_a_permutation_is_what_interpolation_would_be(scene):
+    points, values = scene.problem.points, field(scene)
+    one, other = Permutation(points, (5, 3, 3)), Immersion(points, (5, 3, 3))
+    grid = one.spread(values)
+    assert torch.allclose(grid, other.spread(values), atol=1e-5)
+    assert torch.allclose(one.read(grid), other.read(grid), atol=1e-5)
+
+
+def test_spreading_keeps_the_total_force_and_its_moment(body):
+    """The moment too: multilinear weights reproduce linear fields."""
+    points = body.problem.points
+    shape = tuple(3 + axis for axis in range(points.shape[1]))
+    force = field(body)
+    spread = Immersion(points, shape).spread(force)
+    assert spread.shape == (3, points.shape[1], *shape)
+    assert torch.allclose(spread.flatten(2).sum(2), force.sum(1), atol=1e-4)
+    place = coordinates(points, shape).flatten(1).float()
+    first = torch.einsum("bip,jp->bij", spread.flatten(2), place)
+    assert torch.allclose(first, torch.einsum("bni,nj->bij", force, points.float()), atol=1e-4)
+
+
+def coordinates(points, shape):
+    low, high = points.amin(0), points.amax(0)
+    sides = [torch.linspace(a, b, n).double() for a, b, n in zip(low, high, shape, strict=True)]
+    return torch.stack(torch.meshgrid(*sides, indexing="ij"))
+
+
+def test_interpolation_reproduces_linear_fields(body):
+    points = body.problem.points
+    shape = tuple(4 - axis for axis in range(points.shape[1]))
+    slope = torch.randn(5, points.shape[1], generator=torch.Generator().manual_seed(0)).double()
+    grid = torch.einsum("ci,i...->c...", slope, coordinates(points, shape)) + 0.5
+    read = Immersion(points, shape).read(grid[None].float())[0]
+    assert torch.allclose(read, (points @ slope.T + 0.5).float(), atol=1e-5)
+
+
+def test_spreading_is_the_adjoint_of_interpolation(body):
+    immersion = Immersion(body.problem.points, (4, 3, 5)[: body.problem.shape[1]])
+    force = field(body)
+    grid = torch.randn(3, force.shape[2], *immersion.shape)
+    left = (immersion.spread(force) * grid).sum()
+    assert torch.allclose(left, (force * immersion.read(grid)).sum(), rtol=1e-4, atol=1e-3)
+
+
+def test_filling_is_the_volume_of_the_body(body):
+    problem = body.problem
+    sides = problem.points.amax(0) - problem.points.amin(0)
+    for shape in ((5, 3, 4), (11, 8, 9)):
+        shape = shape[: len(sides)]
+        voxel = torch.ones(()).double()
+        for n in shape:
+            width = torch.tensor([0.5, *[1.0] * (n - 2), 0.5]).double() / (n - 1)
+            voxel = voxel[..., None] * width
+        filled = filling(problem, shape)
+        volume = problem.dV.expand(len(problem.cells), -1).sum()
+        assert torch.isclose((filled * voxel).sum() * sides.prod(), volume)
+        assert filled.min() >= 0
+        assert filled.max() < 1.2
+
+
+def test_a_hole_is_empty_and_only_bodies_with_one_are_told_so(ring, unstructured):
+    net = network(ring)
+    held, filled = net.constant
+    middle = [n // 2 for n in filled.shape]
+    assert filled[*middle] == 0
+    assert filled[0].min() > 0.5
+    assert held.max() > 0.5
+    assert held.min() == 0
+    assert len(network(unstructured).constant) == 1
+    assert any("all of the grid" in line for line in network(unstructured).plan())
+    assert net.plan() == []
+
+
+def test_a_cell_left_out_of_a_grid_of_nodes_is_seen(make_scene):
+    net = network(make_scene(mesh=rectangle([1.0, 1.0], [5, 5]).remove_elements(np.array([5]))))
+    assert isinstance(net.immersion, Permutation)
+    _, filled = net.constant
+    assert sorted(filled.unique().tolist()) == [0.75, 1.0]
+    assert len(net.plan()) == 1
+
+
+def test_held_nodes_are_a_channel_for_each_component_that_differs(make_scene, scene):
+    (held,) = network(scene).constant
+    assert torch.equal(held, (torch.arange(5) == 0).float()[:, None, None].expand(5, 3, 3))
+    free = scene.problem.free.clone()
+    free[scene.problem.points[:, 0] == scene.problem.points[:, 0].max(), 2] = False
+    sliding = make_scene(fixed=(~free).numpy())
+    assert len(network(sliding).constant) == 3
+
+
+def test_a_grid_has_about_as_many_points_as_the_mesh_and_cubic_cells(ring, unstructured):
+    for body in (ring, unstructured):
+        points = body.problem.points
+        shape = network(body).immersion.shape
+        assert 0.4 * len(points) < math.prod(shape) <= len(points)
+        spacing = (points.amax(0) - points.amin(0)) / (torch.tensor(shape) - 1)
+        assert spacing.max() < 1.6 * spacing.min()
+
+
+def test_another_grid_can_be_asked_for(scene):
+    assert network(scene, grid=9).immersion.shape == (9, 3, 3)
+    assert isinstance(network(scene, grid=9).immersion, Immersion)
+    assert isinstance(network(scene, grid=5).immersion, Permutation)
+    assert network(scene, grid=2).immersion.shape == (2, 2, 2)
+
+
+def test_the_plan_says_what_is_left_out(scene):
+    assert network(scene).plan() == [
+        "no interpolation: the nodes are the points of a grid, 5 x 3 x 3",
+        "no input for what lies inside the body: all of the grid does",
+    ]
+
+
+# ------------------------------------------------------------------ the network
+
+
+def test_fields_go_in_and_out_in_two_and_three_dimensions(body):
+    force = field(body)
+    answer = network(body)(force)
+    assert answer.shape == force.shape
+    assert answer.dtype == torch.float32
+
+
+@pytest.mark.parametrize("shape", [(17, 5, 5), (40, 10, 10), (7, 2), (2, 13), (31, 6, 3)])
+def test_any_number_of_points_goes_down_and_up(shape):
+    sizes = cnn._sizes(shape, None)
+    assert max(sizes[-1]) <= 3
+    assert min(min(size) for size in sizes) == min(min(shape), 2)
+    net = cnn.UNet(2, 3, sizes, [2] * len(sizes))
+    assert net(torch.randn(1, 2, *shape)).shape == (1, 3, *shape)
+
+
+@pytest.mark.parametrize("shape", [(17, 5, 5), (33, 9)])
+def test_every_point_feels_every_other(shape):
+    """The gradient at one end with respect to the input at the other is not zero."""
+    torch.manual_seed(0)
+    sizes = cnn._sizes(shape, None)
+    net = cnn.UNet(1, 1, sizes, [4 * 2**level for level in range(len(sizes))])
+    force = torch.zeros(1, 1, *shape, requires_grad=True)
+    net(force)[(0, 0, *[-1] * len(shape))].backward()
+    assert (force.grad != 0).all()
+
+
+def test_a_batch_is_its_members_on_every_mesh(body):
+    net, force = network(body).eval(), field(body, 4)
+    with torch.no_grad():
+        parts = torch.cat([net(one[None]) for one in force])
+        assert torch.allclose(net(force), parts, rtol=1e-4, atol=1e-5)
+
+
+def test_a_saved_network_is_the_same_network_on_every_mesh(body, tmp_path):
+    net, other, force = network(body, 0), network(body, 1), field(body)
+    with torch.no_grad():
+        assert not torch.equal(net(force), other(force))
+        torch.save(net.state_dict(), tmp_path / "net.pt")
+        other.load_state_dict(torch.load(tmp_path / "net.pt", weights_only=True))
+        assert torch.equal(net(force), other(force))
+
+
+def test_moving_the_network_moves_its_grid(unstructured):
+    net = network(unstructured).to("meta")
+    assert all(tensor.is_meta for tensor in (*net.buffers(), *net.parameters()))
+
+
+@pytest.mark.parametrize("name", ["plate", "unstructured"])
+def test_it_overfits_a_batch_on_plane_and_on_unstructured_bodies(request, name):
+    """A fifty times smaller error on four samples within 300 steps."""
+    scene = request.getfixturevalue(name)
+    load = scene.loads.sample((0, 0), range(4))
+    scale = 1 / load.force.std()
+    force = (load.force * scale).float()
+    truth = torch.stack([scene.linear.respond(one) for one in load.force]).float()
+    truth = truth / truth.std()
+    net = network(scene, channels=8)
+    optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
+    first = None
+    for _ in range(300):
+        loss = (net(force) - truth)[:, scene.problem.free].square().mean()
+        first = first or float(loss.detach())
+        if loss < first / 50:
+            return
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    pytest.fail(f"the loss fell {first / float(loss):.0f} times only")
+
+
+def test_newton_started_by_it_is_as_exact_as_newton(body):
+    surrogate = Surrogate(network(body), MSE(), body).eval()
+    load = body.loads.sample((0, 0), range(2))
+    direct = solve(Direct(surrogate.predict, body.problem), load)
+    assert direct.displacement[:, body.problem.free].any()
+    assert not direct.displacement[:, ~body.problem.free].any()
+    exact, hybrid = (solve(s, load) for s in (body.solver, Hybrid(surrogate.predict, body.solver)))
+    assert hybrid.converged.all()
+    assert torch.allclose(hybrid.displacement, exact.displacement, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"channels": 0}, "channels = 0 must be 1 or more"),
+        ({"steps": -1}, "steps = -1 must be 0 or more"),
+        ({"grid": 1}, "grid = 1 must be 2 or more"),
+        ({"steps": 3}, "steps = 3 must be 2 or less: after them the grid of 5 x 3 x 3 points"),
+    ],
+)
+def test_options_out_of_range_are_refused_with_what_would_do(scene, options, message):
+    with pytest.raises(ValueError, match=message):
+        CNN(scene, **options)
+    CNN(scene, steps=2, channels=1)
+    CNN(scene, steps=0, channels=1)
+
+
+@pytest.mark.parametrize("options", [{"grid": 10**6}, {"channels": 10**6}])
+def test_what_no_memory_can_hold_is_refused_before_it_is_made(scene, options):
+    with pytest.raises(MemoryError, match=r"parameters and a grid of .* GB; take a smaller model"):
+        CNN(scene, **options)
+
+
+def test_the_memory_limit_is_kept(scene):
+    CNN(scene, channels=4, memory_limit=0.01)
+    with pytest.raises(MemoryError, match=r"there are 0\.0 GB"):
+        CNN(scene, channels=4, memory_limit=1e-6)

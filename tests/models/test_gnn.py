@@ -1,0 +1,237 @@
+"""Laws of message passing: what crosses the body, what is conserved, what does not matter."""
+
+import numpy as np
+import pytest
+import torch
+
+from dpl.fem.materials import NeoHookeanLn
+from dpl.fem.mesh import box, rectangle
+from dpl.fem.problem import Problem
+from dpl.losses import MSE
+from dpl.models import gnn
+from dpl.models.gnn import GNN, Filtered, coarser, mesh_graph
+from dpl.module import Surrogate
+
+BODIES = {
+    "hexahedra": {"nodes": (9, 4, 4)},
+    "tetrahedra": {"nodes": (7, 3, 3), "cell": "tetra"},
+    "quadratic hexahedra": {"nodes": (4, 2, 2), "degree": 2},
+    "quadratic tetrahedra": {"nodes": (4, 2, 2), "cell": "tetra", "degree": 2},
+    "quadrilaterals": {"mesh": rectangle((4.0, 1.0), (13, 4))},
+    "triangles": {"mesh": rectangle((4.0, 1.0), (13, 4), "triangle")},
+    "few nodes": {"nodes": (4, 2, 2)},
+}
+
+
+@pytest.fixture(scope="module", params=BODIES)
+def body(request, make_scene):
+    return make_scene(**BODIES[request.param])
+
+
+@pytest.fixture(scope="module")
+def bar(make_scene):
+    return make_scene(nodes=(17, 4, 4))
+
+
+def build(scene, seed=0, **options):
+    torch.manual_seed(seed)
+    return GNN(scene, **{"width": 8, **options})
+
+
+def forces(scene, count=3):
+    return torch.randn(count, *scene.problem.shape, generator=torch.Generator().manual_seed(1))
+
+
+# ------------------------------------------------------------------ answers
+
+
+@pytest.mark.parametrize("options", [{}, {"levels": 1}, {"levels": 4}, {"passes": 2}])
+def test_it_answers_on_every_kind_of_mesh(body, options):
+    net, force = build(body, **options), forces(body)
+    answer = net(force)
+    assert answer.shape == force.shape
+    assert answer.dtype == torch.float32
+    assert answer.isfinite().all()
+    assert answer.any()
+    answer.square().mean().backward()
+    for name, parameter in net.named_parameters():
+        assert parameter.grad.any(), name
+
+
+def test_information_crosses_the_body_in_one_pass(body):
+    """Every node's force moves every node, the farthest too."""
+    net, force = build(body), forces(body, 1).requires_grad_()
+    far = body.problem.points[:, 0].argmax()
+    (slope,) = torch.autograd.grad(net(force)[0, far].sum(), force)
+    assert slope.any(dim=2).all()
+
+
+def test_without_clusters_it_does_not_cross(bar):
+    net, force = build(bar, levels=1), forces(bar, 1).requires_grad_()
+    x = bar.problem.points[:, 0]
+    (slope,) = torch.autograd.grad(net(force)[0, x.argmax()].sum(), force)
+    assert not slope[0, x.argmin()].any()
+
+
+def test_a_batch_is_its_members(body):
+    net, force = build(body), forces(body)
+    with torch.no_grad():
+        parts = torch.cat([net(one[None]) for one in force])
+        assert torch.allclose(net(force), parts, rtol=1e-4, atol=1e-6)
+
+
+def test_the_body_may_be_anywhere(make_scene):
+    here, there = box((4.0, 1.0, 1.0), (9, 4, 4)), box((4.0, 1.0, 1.0), (9, 4, 4))
+    there = there.translated((1000.3, -77.7, 0.1))
+    one, other = make_scene(mesh=here), make_scene(mesh=there)
+    assert not torch.allclose(one.problem.points, other.problem.points)
+    force = forces(one)
+    with torch.no_grad():
+        assert torch.allclose(build(one)(force), build(other)(force), rtol=1e-4, atol=1e-5)
+
+
+def test_it_overfits_one_batch_of_tetrahedra(make_scene):
+    """A hundred times smaller error on four linear answers within 300 steps."""
+    scene = make_scene(**BODIES["tetrahedra"])
+    load = scene.loads.sample((0, 0), range(4))
+    truth = torch.stack([scene.linear.respond(force) for force in load.force])
+    surrogate = Surrogate(build(scene, width=16), MSE(), scene)
+    truth, scale = truth.float(), float(surrogate.displacement_scale)
+    optimizer = torch.optim.Adam(surrogate.parameters(), lr=3e-3)
+    losses = []
+    for _ in range(300):
+        loss = ((surrogate.predict(load) - truth) / scale).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+        if losses[-1] < losses[0] / 100:
+            return
+    pytest.fail(f"the loss fell {losses[0] / min(losses):.0f} times only")
+
+
+def test_a_saved_network_is_the_same_network_with_its_graph(body, tmp_path):
+    net, other = build(body), build(body, seed=1)
+    force = forces(body)
+    with torch.no_grad():
+        assert not torch.equal(net(force), other(force))
+        torch.save(net.state_dict(), tmp_path / "net.pt")
+        other.load_state_dict(torch.load(tmp_path / "net.pt", weights_only=True))
+        assert torch.equal(net(force), other(force))
+    assert any(name.endswith("cluster") for name in net.state_dict()) == (len(net.sizes) > 1)
+
+
+# ------------------------------------------------------------------ levels
+
+
+def test_force_and_moment_are_the_same_on_every_level(body):
+    """Sums over clusters lose no load, and no moment of it about the origin."""
+    net, force = build(body).double(), forces(body).double()
+    places = body.problem.points
+    graph, total, moment = (
+        mesh_graph(body.problem),
+        force.sum(1),
+        torch.einsum("nd,bne->bde", places, force),
+    )
+    levels = net.resultants(force)
+    assert [len(level[0]) for level in levels] == net.sizes
+    for k, (on_cluster, about_centre) in enumerate(levels):
+        assert torch.allclose(on_cluster.sum(0), total)
+        arms = torch.einsum("kd,kbe->bde", torch.from_numpy(graph.points), on_cluster)
+        own = about_centre.sum(0).reshape(moment.shape)
+        assert torch.allclose(arms + own, moment, atol=1e-6)  # arms are kept in float32
+        if k + 1 < len(levels):
+            graph, _ = coarser(graph, net.sizes[k + 1])
+
+
+def test_levels_end_with_few_clusters_that_all_hear_each_other(bar):
+    net = build(bar)
+    assert net.sizes[0] == len(bar.problem.points)
+    assert net.sizes[-1] == gnn.COARSEST
+    assert net.sizes == sorted(net.sizes, reverse=True)
+    assert net.levels[-1].whole
+    assert build(bar, levels=4).sizes[3] == gnn.COARSEST
+    assert len(build(bar, levels=1).sizes) == 1
+
+
+def test_a_mesh_hears_along_the_edges_of_its_cells(make_scene):
+    grid = mesh_graph(make_scene(nodes=(9, 4, 4)).problem)
+    assert len(grid.sender) == 2 * (8 * 16 + 2 * 9 * 3 * 4)
+    plane = mesh_graph(make_scene(mesh=rectangle((4.0, 1.0), (13, 4), "triangle")).problem)
+    assert len(plane.sender) == 2 * (12 * 4 + 13 * 3 + 12 * 3)
+    fine = mesh_graph(make_scene(nodes=(4, 2, 2), degree=2).problem)
+    assert len(fine.sender) == 2 * (6 * 9 + 2 * 7 * 2 * 3)  # the edges of 7 x 3 x 3 nodes
+
+
+def test_whom_one_hears_hears_one(body):
+    graph = mesh_graph(body.problem)
+    for count in (30, 10):
+        pairs = set(zip(graph.receiver.tolist(), graph.sender.tolist(), strict=True))
+        assert {(j, i) for i, j in pairs} == pairs
+        assert (np.diff(graph.receiver) >= 0).all()
+        graph, cluster = coarser(graph, count)
+        assert sorted(set(cluster.tolist())) == list(range(len(graph.points)))
+
+
+def test_clusters_are_in_one_piece(bar):
+    graph = mesh_graph(bar.problem)
+    _, cluster = coarser(graph, 40)
+    for k in range(40):
+        members = set(np.flatnonzero(cluster == k).tolist())
+        found = new = {min(members)}
+        while new:
+            heard = graph.sender[np.isin(graph.receiver, list(new))]
+            new = (set(heard.tolist()) & members) - found
+            found = found | new
+        assert found == members
+
+
+def test_each_part_of_a_body_has_a_cluster():
+    cube = box((1.0, 1.0, 1.0), (4, 4, 4))
+    two = Problem.build(cube + cube.translated((9.0, 0.0, 0.0)), NeoHookeanLn(0.3))
+    coarse, cluster = coarser(mesh_graph(two), 1)
+    assert np.bincount(cluster).tolist() == [64, 64]
+    assert coarse.whole
+
+
+def test_it_can_be_exported_for_batches_of_any_size(bar):
+    net, force = build(bar).eval(), forces(bar, 5)
+    exported = torch.export.export(
+        net, (force[:2],), dynamic_shapes=({0: torch.export.Dim("batch", min=1, max=64)},)
+    ).module()
+    with torch.no_grad():
+        assert torch.allclose(exported(force), net(force), rtol=1e-4, atol=1e-6)
+
+
+def test_blocks_of_messages_have_the_right_slopes(bar, monkeypatch):
+    graph = mesh_graph(bar.problem)
+    pairs = torch.from_numpy(graph.receiver), torch.from_numpy(graph.sender)
+    state = torch.randn(len(graph.points), 2, 3, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(len(graph.sender), 3, dtype=torch.float64, requires_grad=True)
+    probe = torch.randn_like(state)
+    plain = torch.zeros_like(state).index_add(0, pairs[0], state[pairs[1]] * weight[:, None])
+    expected = torch.autograd.grad((plain * probe).sum(), (state, weight))
+    for cache in (1, 1000, gnn.CACHE):
+        monkeypatch.setattr(gnn, "CACHE", cache)
+        heard = Filtered.apply(state, weight, *pairs)
+        assert torch.allclose(heard, plain)
+        for slope, right in zip(
+            torch.autograd.grad((heard * probe).sum(), (state, weight)), expected, strict=True
+        ):
+            assert torch.allclose(slope, right)
+
+
+# ------------------------------------------------------------------ what it says
+
+
+def test_the_plan_says_what_is_left_out(make_scene, bar):
+    assert build(bar).plan()[1].startswith("no long ways over 272 nodes: clusters, ")
+    assert build(bar, levels=1).plan()[1] == "no clusters: 272 nodes hear their neighbours only"
+    few = make_scene(**BODIES["few nodes"])
+    assert build(few).plan()[1] == "no clusters: 16 nodes all hear each other"
+
+
+@pytest.mark.parametrize("options", [{"width": 0}, {"levels": 0}, {"passes": 0}])
+def test_options_out_of_range_are_refused_by_name(scene, options):
+    with pytest.raises(ValueError, match=f"{next(iter(options))} = 0 must be 1 or more"):
+        GNN(scene, **options)
