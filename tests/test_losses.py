@@ -10,6 +10,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from dpl.fem.energy import Rest, tangent_product
 from dpl.fem.materials import SaintVenantKirchhoff, StableNeoHookean
 from dpl.fem.mesh import Plane, box
 from dpl.fem.newton import Newton
@@ -23,12 +24,11 @@ from dpl.losses import (
     Loss,
     LrPlus,
     LrStar,
+    MeanNorm,
     Physics,
-    Rest,
     Stiffness,
     floored,
     residual_norm,
-    tangent_product,
 )
 from dpl.models.fcnn import FCNN
 from dpl.module import Surrogate
@@ -178,6 +178,107 @@ def test_mse_evaluates_no_finite_element(few, physics, near, evaluations):
     gradient(MSE(), near, few, physics)
     assert evaluations == []
     assert MSE().plan() == ["no finite-element evaluation in training: the loss knows no residual"]
+
+
+@pytest.mark.parametrize("relative", [0.0, 0.5, 0.8, 1.0])
+def test_the_power_of_a_relative_mse_is_that_of_a_samples_size(few, physics, near, relative):
+    error = (near - few.displacement).square().mean(dim=(1, 2))
+    size = few.displacement.square().mean(dim=(1, 2))
+    found = float(MSE(relative=relative, floor=0.0)(near, few, physics))
+    assert found == pytest.approx(float((error / size**relative).mean()), rel=1e-12)
+
+
+def scaled_by_sample(near, few):
+    """Return errors and samples, each sample a tenth of the one before."""
+    factor = 10.0 ** -torch.arange(4.0, dtype=torch.float64)[:, None, None]
+    return factor * near, few._replace(displacement=factor * few.displacement)
+
+
+@pytest.mark.parametrize("kind", [MSE, MeanNorm])
+def test_small_loads_count_as_much_as_large_ones_at_power_one_only(few, physics, near, kind):
+    tiny, samples = scaled_by_sample(near, few)
+    whole, plain = kind(relative=1.0, floor=0.0), kind()
+    assert float(whole(tiny, samples, physics)) == pytest.approx(
+        float(whole(near, few, physics)), rel=1e-5
+    )
+    assert plain(tiny, samples, physics) < 0.9 * plain(near, few, physics)
+
+
+@pytest.mark.parametrize("kind", [MSE, MeanNorm])
+def test_a_floor_keeps_loads_near_zero_from_outweighing_a_batch(few, physics, near, kind):
+    """The error of the last sample stays as its displacement vanishes."""
+    shrunk = few.displacement.clone()
+    shrunk[-1] *= 1e-6
+    samples = few._replace(displacement=shrunk)
+    off = torch.cat([near[:-1], shrunk[-1:] + (near - few.displacement)[-1:]])
+    bare, floored_ = (kind(relative=1.0, floor=f)(off, samples, physics) for f in (0.0, 1e-2))
+    assert bare > 1e3 * floored_
+    nothing = few._replace(displacement=torch.zeros_like(shrunk))
+    assert kind(relative=1.0)(near, nothing, physics).isfinite()
+
+
+def test_mean_norm_is_the_mean_of_root_mean_squares(few, physics, near):
+    """e_mean but for the root of the number of degrees of freedom."""
+    norms = (near - few.displacement).flatten(1).norm(dim=1)
+    expected = float(norms.mean()) / near[0].numel() ** 0.5
+    assert float(MeanNorm()(near, few, physics)) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("relative", [0.0, 0.8])
+def test_a_batch_in_mean_norm_is_the_mean_of_its_members(few, physics, near, relative):
+    loss = MeanNorm(relative=relative, floor=0.0)
+    parts = [loss(near[k : k + 1], one, physics) for k, one in enumerate(singles(few))]
+    mean = float(torch.stack(parts).mean())
+    assert float(loss(near, few, physics)) == pytest.approx(mean, rel=1e-12)
+
+
+def test_the_slope_of_mean_norm_does_not_fade_with_the_error(few, physics, near):
+    error = near - few.displacement
+    sizes = {}
+    for kind in (MeanNorm, MSE):
+        large, small = (
+            gradient(kind(), few.displacement + s * error, few, physics).norm() for s in (1, 1e-4)
+        )
+        sizes[kind] = float(small / large)
+    assert sizes[MeanNorm] == pytest.approx(1.0, rel=1e-3)
+    assert sizes[MSE] == pytest.approx(1e-4, rel=1e-3)
+
+
+def test_every_sample_has_the_same_slope_in_mean_norm_however_large_its_error(few, physics, near):
+    factor = 10.0 ** torch.arange(4.0, dtype=torch.float64)[:, None, None]
+    off = few.displacement + factor * (near - few.displacement)
+    slopes = gradient(MeanNorm(), off, few, physics).flatten(1).norm(dim=1)
+    assert torch.allclose(slopes, slopes[:1].expand(4), rtol=1e-6)
+
+
+def test_mean_norm_has_no_slope_at_the_exact_answer_and_no_nan(few, physics):
+    slope = gradient(MeanNorm(relative=0.8), few.displacement, few, physics)
+    assert not slope.any()
+    assert slope.isfinite().all()
+
+
+def test_the_gradient_of_mean_norm_is_that_of_finite_differences(few, physics, near):
+    for expected, found in slopes_along(MeanNorm(relative=0.8), near, few, physics):
+        assert found == pytest.approx(expected, rel=1e-5)
+
+
+def test_losses_of_squared_errors_need_no_field(few, physics, near):
+    error = (near - few.displacement).square().mean(dim=(1, 2))
+    size = few.displacement.square().mean(dim=(1, 2))
+    for loss in (MSE(), MSE(relative=0.5), MeanNorm(), MeanNorm(relative=0.8, floor=1e-4)):
+        assert float(loss.of_squares(error, size)) == pytest.approx(
+            float(loss(near, few, physics)), rel=1e-12
+        )
+
+
+@pytest.mark.parametrize("kind", [MSE, MeanNorm])
+@pytest.mark.parametrize(
+    "options", [{"relative": -0.1}, {"relative": 1.1}, {"floor": -1.0}, {"floor": 2.0}]
+)
+def test_weights_of_squared_errors_out_of_range_are_refused_by_name(kind, options):
+    ((name, number),) = options.items()
+    with pytest.raises(ValueError, match=f"{name} = {number} must lie between 0 and 1"):
+        kind(**options)
 
 
 def test_residual_losses_evaluate_finite_elements_once_a_batch(few, physics, near, evaluations):

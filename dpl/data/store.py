@@ -256,6 +256,12 @@ class Store:
             )
         return "\n".join(lines)
 
+    def seconds_a_load(self) -> float | None:
+        """Return the wall time of a load in all sessions so far [s]; None before the first."""
+        sessions = read_lines(self.folder / "journal.jsonl")
+        loads = sum(one["loads"] for one in sessions)
+        return sum(one["seconds"] for one in sessions) / loads if loads else None
+
     # ------------------------------------------------------------------ writing
 
     def create(self) -> None:

@@ -1,16 +1,16 @@
 """A convolutional network on the grid that immerses the body: U-Mesh."""
 
 import math
-import os
-from itertools import pairwise, product
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
 from dpl.fem.problem import Problem
+from dpl.models.grid import Immersion, Permutation, cubic_grid, filling, own_grid
+from dpl.models.memory import refuse_beyond
 from dpl.scene import Scene
 
-SAME = 1e-4  # nodes this close to a grid point, in spacings, are at it; files in float32 are
 COARSE = 3  # grid points along a side across which two convolutions carry everything
 LEAK = 0.25  # slope of negative values: near enough to linear that training does not stall
 CONVOLUTION: dict[int, type[nn.Module]] = {2: nn.Conv2d, 3: nn.Conv3d}
@@ -66,7 +66,7 @@ class CNN(nn.Module):
         problem = scene.problem
         points, dim = problem.points, problem.shape[1]
         own = own_grid(points)
-        shape = own if own and grid in (None, max(own)) else _shape(points, grid)
+        shape = own if own and grid in (None, max(own)) else cubic_grid(points, grid)
         sizes = _sizes(shape, steps)
         widths = [channels * 2**level for level in range(len(sizes))]
         _refuse_beyond_memory(sizes, widths, memory_limit)
@@ -103,65 +103,6 @@ class CNN(nn.Module):
         if self.full:
             lines.append("no input for what lies inside the body: all of the grid does")
         return lines
-
-
-class Permutation(nn.Module):
-    """Nodes that are the points of a regular grid, and back; the counterpart of `Immersion`.
-
-    Attributes:
-        shape: Grid points along each side.
-    """
-
-    nodes: Tensor
-    places: Tensor
-
-    def __init__(self, points: Tensor, shape: tuple[int, ...]) -> None:
-        """Number nodes (N, D) as the points of their grid."""
-        super().__init__()
-        self.shape = shape
-        places = _ravel(_in_spacings(points, points, shape).round().long(), shape)
-        self.register_buffer("places", places, persistent=False)
-        self.register_buffer("nodes", places.argsort(), persistent=False)
-
-    def spread(self, values: Tensor) -> Tensor:
-        """Return nodal values (B, N, C) on the grid, (B, C, *shape)."""
-        return values[:, self.nodes].mT.unflatten(2, self.shape)
-
-    def read(self, field: Tensor) -> Tensor:
-        """Return the values of a field (B, C, *shape) at the nodes, (B, N, C)."""
-        return field.flatten(2)[:, :, self.places].mT
-
-
-class Immersion(nn.Module):
-    """Multilinear interpolation from a regular grid to nodes, and its adjoint.
-
-    Attributes:
-        shape: Grid points along each side of the nodes' bounding box, which the grid fills.
-        corners: Grid points of the cell that a node lies in, (N, 2^D).
-        weights: Of these, (N, 2^D) [-], float32; they sum to 1.
-    """
-
-    corners: Tensor
-    weights: Tensor
-
-    def __init__(self, points: Tensor, shape: tuple[int, ...]) -> None:
-        """Find the cells that nodes (N, D) lie in."""
-        super().__init__()
-        self.shape = shape
-        corners, weights = _stencil(_in_spacings(points, points, shape), shape)
-        self.register_buffer("corners", corners, persistent=False)
-        self.register_buffer("weights", weights.float(), persistent=False)
-
-    def spread(self, values: Tensor) -> Tensor:
-        """Return nodal values (B, N, C) shared out to the grid, (B, C, *shape): sums are kept."""
-        shares = (values[:, :, None] * self.weights[..., None]).flatten(1, 2)
-        field = values.new_zeros(len(values), math.prod(self.shape), values.shape[2])
-        return field.index_add(1, self.corners.flatten(), shares).mT.unflatten(2, self.shape)
-
-    def read(self, field: Tensor) -> Tensor:
-        """Return the values of a field (B, C, *shape) at the nodes, (B, N, C)."""
-        around = field.flatten(2).mT.index_select(1, self.corners.flatten())
-        return (around.unflatten(1, self.corners.shape) * self.weights[..., None]).sum(2)
 
 
 class UNet(nn.Module):
@@ -206,98 +147,6 @@ class UNet(nn.Module):
         for ascent, decoder in zip(reversed(self.ascents), reversed(self.decoders), strict=True):
             field = decoder(torch.cat([passed.pop(), ascent(field)], dim=1))
         return self.last(field)
-
-
-def own_grid(points: Tensor) -> tuple[int, ...] | None:
-    """Return the sides of the regular grid that nodes (N, D) are all points of, or None."""
-    shape = []
-    for coordinate in points.mT:
-        ordered = coordinate.sort().values
-        apart = ordered.diff() > 1e-6 * (ordered[-1] - ordered[0])
-        shape.append(int(apart.sum()) + 1)
-    if math.prod(shape) != len(points):
-        return None
-    place = _in_spacings(points, points, shape)
-    regular = (place - place.round()).abs().max() < SAME
-    every = len(_ravel(place.round().long(), shape).unique()) == len(points)
-    return tuple(shape) if regular and every else None
-
-
-def filling(problem: Problem, shape: tuple[int, ...]) -> Tensor:
-    """Return what part of each grid point's voxel the body fills, (*shape) [-].
-
-    The volume of small parts of cells, spread with multilinear weights: it sums to the body's.
-    """
-    points, mapping, cell = problem.points, problem.basis.mapping, problem.mesh.elem.refdom
-    simplex = cell.name in ("Triangular", "Tetrahedral")
-    at_cells = _in_spacings(points, points, shape)[problem.cells]
-    extent = (at_cells.amax(1) - at_cells.amin(1)).amax(1)  # (E,), in spacings
-    parts = 2 ** ((4 if simplex else 2) * extent).clamp(min=1).log2().ceil().long()  # along a side
-    cell_volume = problem.dV.expand(len(problem.cells), -1).sum(1, keepdim=True)
-    volume = points.new_zeros(math.prod(shape))
-    for count in parts.unique():
-        local, weight = _lattice(int(count), points.shape[1], simplex=simplex)
-        for some in (parts == count).nonzero()[:, 0].split(max(1, 500_000 // len(local))):
-            cells, X = some.numpy(), local.mT.numpy()
-            where = torch.from_numpy(mapping.F(X, tind=cells)).flatten(1).mT
-            shares = torch.from_numpy(mapping.detDF(X, tind=cells)).abs() * weight
-            shares = cell_volume[some] * shares / shares.sum(1, keepdim=True)
-            index, part = _stencil(_in_spacings(where, points, shape), shape)
-            volume.index_add_(0, index.flatten(), (part * shares.flatten()[:, None]).flatten())
-    voxel = points.new_ones(())
-    for side, count in zip((points.amax(0) - points.amin(0)).tolist(), shape, strict=True):
-        width = torch.full((count,), side / (count - 1), dtype=points.dtype)
-        width[[0, -1]] /= 2
-        voxel = voxel[..., None] * width
-    return volume.view(shape) / voxel
-
-
-def _lattice(count: int, dim: int, *, simplex: bool) -> tuple[Tensor, Tensor]:
-    """Return even points (P, D) of the reference cube or simplex and their weights (P,)."""
-    side = (torch.arange(count, dtype=torch.float64) + 0.5) / count
-    points = torch.cartesian_prod(*[side] * dim)
-    if not simplex:
-        return points, side.new_ones(len(points))
-    # the cube folded onto one of its Kuhn simplices, and that one sheared onto the reference
-    folded, copies = points.sort(dim=1).values.unique(dim=0, return_counts=True)
-    return folded.diff(dim=1, prepend=folded.new_zeros(len(folded), 1)), copies.double()
-
-
-def _in_spacings(where: Tensor, points: Tensor, shape: tuple[int, ...] | list[int]) -> Tensor:
-    """Return places (P, D) in spacings of the grid on the bounding box of nodes (N, D)."""
-    low, high = points.amin(0), points.amax(0)
-    return (where - low) / (high - low) * (torch.tensor(shape) - 1)
-
-
-def _ravel(place: Tensor, shape: tuple[int, ...] | list[int]) -> Tensor:
-    """Return the numbers of grid points (..., D)."""
-    strides = [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
-    return (place * torch.tensor(strides)).sum(-1)
-
-
-def _stencil(place: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """Return the corners of the cells that places (P, D) lie in and their weights, (P, 2^D)."""
-    last = torch.tensor(shape) - 1
-    low = place.floor().clamp(min=torch.zeros_like(last), max=last - 1)
-    part = (place - low).clamp(0, 1)[:, None]
-    corner = torch.tensor(list(product([0, 1], repeat=len(shape))))
-    weight = torch.where(corner == 1, part, 1 - part).prod(-1)
-    return _ravel(low.long()[:, None] + corner, shape), weight
-
-
-def _shape(points: Tensor, grid: int | None) -> tuple[int, ...]:
-    """Return the sides of a grid of nearly cubic cells on the bounding box of nodes (N, D)."""
-    sides = (points.amax(0) - points.amin(0)).tolist()
-
-    def shape(cells: float) -> tuple[int, ...]:
-        return tuple(max(1, round(side / max(sides) * cells)) + 1 for side in sides)
-
-    if grid is not None:
-        return shape(grid - 1)
-    cells = 1
-    while math.prod(shape(cells + 1)) <= len(points):
-        cells += 1
-    return shape(cells)
 
 
 def _sizes(shape: tuple[int, ...], steps: int | None) -> list[tuple[int, ...]]:
@@ -346,15 +195,8 @@ def _refuse_beyond_memory(
     # a level: 2 convolutions down and 2 up, of twice the width, its stride and that one's transpose
     parameters = sum(9 * kernel * width**2 for width in widths)
     fields = sum(10 * width * math.prod(size) for size, width in zip(sizes, widths, strict=True))
-    if limit is None:
-        if torch.cuda.is_available():
-            limit = torch.cuda.mem_get_info()[1] / 1e9
-        else:
-            limit = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     needed = (parameters * 4 * 4 + fields * 4) / 1e9  # as many gradients and two moments; 4 bytes
-    if needed > limit:
-        raise MemoryError(
-            f"about {parameters:,} parameters and a grid of {' x '.join(map(str, sizes[0]))} "
-            f"points need {needed:.1f} GB, there are {limit:.1f} GB; "
-            "take a smaller model.grid, model.channels or model.steps"
-        )
+    points = " x ".join(map(str, sizes[0]))
+    what = f"about {parameters:,} parameters and a grid of {points} points"
+    remedy = "take a smaller model.grid, model.channels or model.steps"
+    refuse_beyond(needed, limit, what, remedy)

@@ -1,11 +1,11 @@
 """The paper's fully connected network."""
 
-import os
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
+from dpl.models.memory import refuse_beyond
 from dpl.scene import Scene
 
 
@@ -29,6 +29,7 @@ class FCNN(nn.Module):
         layers: int = 4,
         width: int | None = None,
         all_dofs: bool = False,
+        young: bool = False,
         memory_limit: float | None = None,
     ) -> None:
         """Build the network.
@@ -38,6 +39,8 @@ class FCNN(nn.Module):
             layers: Linear layers, 2 or more.
             width: Units in the hidden layers; as many as outputs if left out.
             all_dofs: Let every degree of freedom in and out, as the paper does.
+            young: Let forces in as newtons are, and Young's modulus besides, as the paper does for
+                a range of moduli; u/L depends on f/(E L^2) alone, so that nothing is gained.
             memory_limit: Memory that training may take [GB]; what the machine has if left out.
 
         Raises:
@@ -52,7 +55,9 @@ class FCNN(nn.Module):
         everything = torch.ones(scene.problem.shape, dtype=torch.bool)
         inputs = everything if all_dofs else scene.loads.reach
         outputs = everything if all_dofs else scene.problem.free
-        ends = int(inputs.sum()), int(outputs.sum())
+        self.takes_young, (low, high) = young, scene.loads.young_range
+        self.middle, self.spread = (low + high) / 2, max((high - low) / 2, 1e-12 * high)
+        ends = int(inputs.sum()) + young, int(outputs.sum())
         hidden = width or ends[1]
         sizes = [ends[0], *[hidden] * (layers - 1), ends[1]]
         self.parameters_needed = _parameters(sizes)
@@ -67,10 +72,25 @@ class FCNN(nn.Module):
             stages += [nn.PReLU(before), nn.Linear(before, after)]
         self.stages = nn.Sequential(*stages)
 
-    def forward(self, force: Tensor) -> Tensor:
-        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32."""
+    def forward(self, force: Tensor, young: Tensor | None = None) -> Tensor:
+        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
+
+        Args:
+            force: Over E L^2, scaled.
+            young: E, (B,) [Pa]; wanted where it is an input, ignored elsewhere.
+
+        Raises:
+            ValueError: It is wanted and not there.
+        """
+        entering = force[:, self.inputs]
+        if self.takes_young:
+            if young is None:
+                raise ValueError("young is an input of this network: give E, (B,) [Pa]")
+            size = (young / (self.middle + self.spread)).to(force.dtype)[:, None]
+            place = ((young - self.middle) / self.spread).to(force.dtype)[:, None]
+            entering = torch.cat([size * entering, place], dim=1)
         displacement = torch.zeros_like(force)
-        displacement[:, self.outputs] = self.stages(force[:, self.inputs])
+        displacement[:, self.outputs] = self.stages(entering)
         return displacement
 
     def plan(self) -> list[str]:
@@ -93,13 +113,5 @@ def _parameters(sizes: list[int]) -> int:
 def _refuse_beyond_memory(parameters: int, limit: float | None) -> None:
     """Raise where training in float32 would not fit."""
     needed = parameters * 4 * 4 / 1e9  # parameters, gradients, two moments, 4 bytes each
-    if limit is None:
-        if torch.cuda.is_available():
-            limit = torch.cuda.mem_get_info()[1] / 1e9
-        else:
-            limit = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
-    if needed > limit:
-        raise MemoryError(
-            f"{parameters:,} parameters with gradients and Adam's moments need {needed:.1f} GB, "
-            f"there are {limit:.1f} GB; take a coarser mesh, model.width or another model"
-        )
+    what = f"{parameters:,} parameters with gradients and Adam's moments"
+    refuse_beyond(needed, limit, what, "take a coarser mesh, model.width or another model")

@@ -3,12 +3,14 @@
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from dpl.fem.newton import Linear
 from dpl.models.pod import PODNet, evened, root_mean_square
 from dpl.scene import Sample, Scene
+
+SAME = 1e-4  # eigenvalues closer than this, relatively, belong to one family
 
 
 class Latent(PODNet):
@@ -124,7 +126,12 @@ class Latent(PODNet):
     def _scale(self, read: Tensor, targets: Tensor, weight: Tensor, motions: Tensor) -> None:
         weighted = weight[:, None] * read
         spread = (motions.mT @ (weighted.T @ weighted) @ motions).mean(dim=0)  # over all images
-        axes = torch.linalg.eigh(spread)[1].flip(1)[:, : self.scaled.shape[1]]
+        values, axes = (found.flip(-1) for found in torch.linalg.eigh(spread))
+        count = self.scaled.shape[1]
+        gaps = -values.diff()
+        while 0 < count < len(values) and gaps[count - 1] < SAME * values[count - 1]:
+            count -= 1  # a family is kept whole or not at all
+        axes = nn.functional.pad(axes[:, :count], (0, self.scaled.shape[1] - count))
         size = ((axes.T @ spread) * axes.T).sum(dim=1).clamp(min=0).sqrt()
         self.scaled.copy_(axes / evened(size))
         size = root_mean_square(targets)

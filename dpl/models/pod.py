@@ -8,13 +8,12 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from dpl.fem.rom import pod
+from dpl.fem.pod import LARGE, pod
 from dpl.fem.symmetry import images, symmetries
 from dpl.models.coordinates import Coordinates, CoordinateSamples
 from dpl.scene import Sample, Scene
 
 SNAPSHOTS = 16_000  # images of samples that make a basis, at most
-LARGE = 2000  # size of a Gram matrix from which on sketches are faster
 
 
 class Block(nn.Module):
@@ -207,9 +206,22 @@ class PODNet(nn.Module):
         some = snapshots[::stride]
         some = some.float() if members * len(some) > LARGE else some
         every = torch.cat([self._image(some, where, k) for k in range(members)])
-        count = min(rank, *every.shape)
-        found = randomised(every, count) if min(every.shape) > LARGE else pod(every, count).vectors
+        found = self._invariant(pod(every, min(rank, *every.shape)).vectors.double(), where)
         return nn.functional.pad(found, (0, rank - found.shape[1]))
+
+    def _invariant(self, modes: Tensor, where: Tensor) -> Tensor:
+        """Return a basis (n, r) of what symmetries map onto itself of the span of modes (n, rank).
+
+        Where the last modes are some of a family whose others were cut off, they go too.
+        """
+        members = len(self.group)
+        if members < 2:
+            return modes
+        every = torch.cat([self._image(modes.T, where, k) for k in range(members)]).T
+        q, r = torch.linalg.qr(every)
+        shares, vectors = torch.linalg.eigh(r @ r.T / members)  # of images in each direction
+        kept = vectors[:, shares > 3 / 4].flip(1)[:, : modes.shape[1]]
+        return q @ kept
 
     def _image(self, columns: Tensor, where: Tensor, k: int) -> Tensor:
         """Return fields (S, n) on some degrees of freedom as their images under a symmetry."""
@@ -241,17 +253,6 @@ class PODNet(nn.Module):
     def _known(self, force: Tensor) -> Tensor:
         """Return the part of the displacement that is not learnt, (S, outputs)."""
         return force.new_zeros(len(force), int(self.moving.sum()))
-
-
-def randomised(snapshots: Tensor, rank: int) -> Tensor:
-    """Return POD modes (n, rank) of many snapshots (S, n), from sketches in single precision.
-
-    Source: Halko, Martinsson, Tropp (2011), SIAM Rev. 53, algorithm 4.4.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        found = torch.svd_lowrank(snapshots.float(), q=rank + 32, niter=3)[2]
-    return torch.linalg.qr(found[:, :rank].double())[0]
 
 
 def evened(size: Tensor) -> Tensor:

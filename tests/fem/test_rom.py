@@ -9,12 +9,14 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from dpl.fem.cubature import Cubature, nonnegative
 from dpl.fem.materials import LinearElastic, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box
 from dpl.fem.modes import ModalLoads
 from dpl.fem.newton import Linear, Newton
+from dpl.fem.pod import pod
 from dpl.fem.problem import Problem
-from dpl.fem.rom import Cubature, PODGalerkin, nonnegative, pod
+from dpl.fem.rom import PODGalerkin
 from dpl.fem.solution import Load, Status, solve
 from dpl.fem.supports import Displacement, Spring
 
@@ -110,9 +112,31 @@ def test_rank_out_of_range_is_refused(rank):
         pod(noise(7, 40), rank)
 
 
-def test_snapshots_that_are_not_finite_are_refused():
+@pytest.mark.parametrize("large", [5, 2000], ids=["sketched", "exact"])
+def test_snapshots_that_are_not_finite_are_refused(monkeypatch, large):
+    monkeypatch.setattr("dpl.fem.pod.LARGE", large)
     with pytest.raises(ValueError, match="finite"):
-        pod(noise(7, 40).log(), 2)
+        pod(noise(150, 400).log(), 2)
+
+
+@pytest.mark.parametrize("shape", [(160, 400), (400, 160)], ids=str)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
+def test_sketches_leave_hardly_more_than_the_best_basis(monkeypatch, shape, dtype):
+    fields = (noise(*shape) @ torch.diag(0.8 ** torch.arange(shape[1]).double())).to(dtype)
+    best = pod(fields, 6)
+    monkeypatch.setattr("dpl.fem.pod.LARGE", 100)
+    before = torch.get_rng_state()
+    vectors, values = pod(fields, 6)
+    assert torch.equal(before, torch.get_rng_state())
+    assert vectors.dtype == values.dtype == torch.float64
+    assert_close(vectors.T @ vectors, torch.eye(6).double(), rtol=0, atol=1e-13)
+    assert_close(values, best.values[:6], rtol=1e-5, atol=0)
+    assert_close(vectors, best.vectors, rtol=0, atol=1e-3)  # of the same signs
+    left, least = (
+        (fields.double() - fields.double() @ v @ v.T).norm() for v in (vectors, best.vectors)
+    )
+    assert left < least * (1 + 1e-5)
+    assert torch.equal(pod(fields, 6).vectors, vectors)
 
 
 def test_sparse_weights_reproduce_the_sum():

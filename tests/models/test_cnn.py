@@ -11,7 +11,8 @@ from dpl.fem.solution import solve
 from dpl.hybrid import Direct, Hybrid
 from dpl.losses import MSE
 from dpl.models import cnn
-from dpl.models.cnn import CNN, Immersion, Permutation, filling, own_grid
+from dpl.models.cnn import CNN
+from dpl.models.grid import Immersion, Permutation, filling, own_grid
 from dpl.module import Surrogate
 
 

@@ -9,7 +9,8 @@ from dpl.fem.mesh import box, rectangle
 from dpl.fem.problem import Problem
 from dpl.losses import MSE
 from dpl.models import gnn
-from dpl.models.gnn import GNN, Filtered, coarser, mesh_graph
+from dpl.models.gnn import GNN, Filtered
+from dpl.models.graph import COARSEST, coarser, mesh_graph
 from dpl.module import Surrogate
 
 BODIES = {
@@ -147,10 +148,10 @@ def test_force_and_moment_are_the_same_on_every_level(body):
 def test_levels_end_with_few_clusters_that_all_hear_each_other(bar):
     net = build(bar)
     assert net.sizes[0] == len(bar.problem.points)
-    assert net.sizes[-1] == gnn.COARSEST
+    assert net.sizes[-1] == COARSEST
     assert net.sizes == sorted(net.sizes, reverse=True)
     assert net.levels[-1].whole
-    assert build(bar, levels=4).sizes[3] == gnn.COARSEST
+    assert build(bar, levels=4).sizes[3] == COARSEST
     assert len(build(bar, levels=1).sizes) == 1
 
 

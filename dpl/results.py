@@ -1,0 +1,300 @@
+"""All methods on one scene side by side: how wrong on three sets of loads, how slow, how large."""
+
+import csv
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from dpl.fem.newton import Newton
+from dpl.fem.rom import PODGalerkin
+from dpl.fem.solution import Load, Status, one_thread, solve
+from dpl.metrics import RelativeL2, metrics
+from dpl.module import Surrogate
+from dpl.scene import Sample, Scene
+
+Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]
+
+# Odot, Haferssas, Cotin (2022), tables 1 to 3: e_mean, e_max, SNR_min [dB], samples
+PAPER = {
+    "beam_svk": (8.0e-6, 0.03, 8.4, 4095),
+    "propeller_nh": (2.7e-6, 0.01, 18.9, 4095),
+    "beam_nh_loss": (7.7e-6, 0.03, 2.7, 4095),
+    "beam_young": (4.6e-5, 0.09, -2.6, 10650),
+    "beam_young_wide": (1e-4, None, None, None),
+}
+STREAMS = {"twice": 4, "small": 5}  # of loads; those of samples and scales are below
+
+
+@dataclass(frozen=True)
+class Result:
+    """One method on one set of loads.
+
+    Attributes:
+        method: Its name.
+        loads: Name of the set: "in range", "twice" (one to two times the amplitude) or "small" (1
+            to 10 % of it).
+        count: Loads in the set.
+        samples: Solved loads that it learnt from.
+        generation_minutes: Wall time in which those were solved.
+        training_minutes: Wall time of the training, or of the making of a basis.
+        parameters: Numbers that were trained.
+        e_mean, e_max, SNR_min, rel_L2_median, rel_L2_worst, residual, min_det_F: See `dpl.metrics`.
+        ms: Median wall time of a prediction, batch 1, one thread [ms].
+        ms_p99: 99th percentile of the same [ms].
+        newton_iterations: Mean iterations of Newton from it to the scene's tolerance.
+    """
+
+    method: str
+    loads: str
+    count: int
+    samples: int | None = None
+    generation_minutes: float | None = None
+    training_minutes: float | None = None
+    parameters: int | None = None
+    e_mean: float | None = None
+    e_max: float | None = None
+    SNR_min: float | None = None
+    rel_L2_median: float | None = None
+    rel_L2_worst: float | None = None
+    residual: float | None = None
+    min_det_F: float | None = None
+    ms: float | None = None
+    ms_p99: float | None = None
+    newton_iterations: float | None = None
+
+
+@dataclass(frozen=True)
+class Method:
+    """Something that predicts, and what it has cost to make.
+
+    Attributes:
+        predict: From a load to displacements.
+        samples: Solved loads that it learnt from.
+        training_minutes: Wall time of its making.
+        parameters: Numbers that were trained.
+    """
+
+    predict: Predict
+    samples: int | None = None
+    training_minutes: float | None = None
+    parameters: int | None = None
+
+
+def load_sets(scene: Scene, test: Sample, count: int = 50) -> dict[str, Sample]:
+    """Return the test loads in range, and more of them outside, solved here.
+
+    Loads that have no stable answer are left out.
+
+    Args:
+        scene: What is simulated.
+        test: Loads in range with the truth.
+        count: Loads of each other set.
+    """
+    sets = {"in range": test}
+    part = torch.linspace(0, 1, count, dtype=torch.float64)
+    factors = {"twice": 1 + part, "small": 10.0 ** (part - 2)}
+    for name, factor in factors.items():
+        drawn = scene.loads.sample((0, STREAMS[name]), range(count))
+        load = drawn._replace(force=factor[:, None, None] * drawn.force)
+        answer = solve(scene.solver, load)
+        sound = answer.status == int(Status.CONVERGED)
+        sample = Sample(load.force, answer.displacement, load.young)
+        sets[name] = Sample(*(column[sound] for column in sample))
+    return sets
+
+
+def measure(
+    methods: Mapping[str, Method],
+    sets: Mapping[str, Sample],
+    newton: Newton,
+    *,
+    generation_minutes: float | None = None,
+    repeats: int = 3,
+) -> Iterator[tuple[Result, Tensor]]:
+    """Yield a row and the relative L2 errors of the loads (S,), for each method and set of loads.
+
+    Every load is asked alone, on one thread; the methods take turns on each load.
+
+    Args:
+        methods: Named.
+        sets: Loads with the truth, named.
+        newton: What goes on from each prediction.
+        generation_minutes: Wall time of the samples.
+        repeats: Times that each load is asked.
+    """
+    for title, batch in sets.items():
+        singles = [Load(f[None], e[None]) for f, e in zip(batch.force, batch.young, strict=True)]
+        answers: dict[str, list[Tensor]] = {name: [] for name in methods}
+        seconds: dict[str, list[float]] = {name: [] for name in methods}
+        with one_thread(), torch.no_grad():
+            for method in methods.values():
+                method.predict(singles[0])
+            for name, method in methods.items():  # each in its own turn: caches stay its own
+                for turn in range(repeats):
+                    for load in singles:
+                        start = time.perf_counter()
+                        answer = method.predict(load)
+                        seconds[name].append(time.perf_counter() - start)
+                        if turn == 0:
+                            answers[name].append(answer)
+            for name, method in methods.items():
+                answer = torch.cat(answers[name])
+                iterations = [
+                    float(_last(newton, load, guess[None]))
+                    for load, guess in zip(singles, answer, strict=True)
+                ]
+                errors = metrics(newton.problem)
+                errors.update(answer, batch)
+                known = {field.name for field in fields(Result)}
+                numbers = {k: float(v) for k, v in errors.compute().items() if k in known}
+                taken = torch.tensor(seconds[name], dtype=torch.float64)
+                row = Result(
+                    method=name,
+                    loads=title,
+                    count=len(singles),
+                    samples=method.samples,
+                    generation_minutes=generation_minutes if method.samples else None,
+                    training_minutes=method.training_minutes,
+                    parameters=method.parameters,
+                    ms=1e3 * float(taken.median()),
+                    ms_p99=1e3 * float(taken.quantile(0.99)),
+                    newton_iterations=sum(iterations) / len(iterations),
+                    **numbers,
+                )
+                yield row, RelativeL2().measure(answer, batch)
+
+
+def _last(newton: Newton, load: Load, guess: Tensor) -> Tensor:
+    *_, last = newton.iterate(load, guess=guess)
+    return last.iterations[0]
+
+
+def linear(scene: Scene) -> Method:
+    """Return K(0)^-1 f."""
+
+    def predict(load: Load) -> Tensor:
+        return torch.stack([scene.linear.respond(force) for force in load.force])
+
+    return Method(predict)
+
+
+def pod_galerkin(
+    scene: Scene, train: Sample, rank: int, tolerance: float
+) -> tuple[Method, PODGalerkin]:
+    """Return the hyper-reduced model of the training samples, on the linear answer."""
+    start = time.perf_counter()
+    solver = PODGalerkin.fit(
+        scene.problem, train.displacement, rank, tolerance=tolerance, lift=scene.linear
+    )
+    minutes = (time.perf_counter() - start) / 60
+
+    def predict(load: Load) -> Tensor:
+        return torch.stack([solver.reduced(force).displacement for force in load.force])
+
+    return Method(predict, len(train.force), minutes), solver
+
+
+def network(surrogate: Surrogate, folder: Path, samples: int) -> Method:
+    """Return the network of a run's folder."""
+    return Method(
+        surrogate.predict,
+        samples,
+        training_minutes(folder),
+        sum(p.numel() for p in surrogate.net.parameters()),
+    )
+
+
+def corrected(surrogate: Surrogate, solver: PODGalerkin, method: Method, steps: int) -> Method:
+    """Return a network whose answers are corrected by steps in a subspace."""
+
+    def predict(load: Load) -> Tensor:
+        guess = surrogate.predict(load)
+        pairs = zip(load.force, guess, strict=True)
+        return torch.stack([solver.correct(f, u, steps=steps) for f, u in pairs])
+
+    return Method(predict, method.samples, method.training_minutes, method.parameters)
+
+
+def training_minutes(folder: Path) -> float | None:
+    """Return the wall time of a run's training, all its sessions together; None if not known."""
+    path = folder / "training.jsonl"
+    if not path.is_file():
+        return None
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    return sum(float(line["seconds"]) for line in lines) / 60
+
+
+def paper(experiment: str) -> Result | None:
+    """Return the paper's row of an experiment; None if it has none."""
+    if experiment not in PAPER:
+        return None
+    e_mean, e_max, snr, samples = PAPER[experiment]
+    worst = None if snr is None else 10 ** (-snr / 20)
+    return Result(
+        "paper", "in range", 100, samples, e_mean=e_mean, e_max=e_max, SNR_min=snr,
+        rel_L2_worst=worst,
+    )  # fmt: skip
+
+
+def show(rows: Sequence[Result], title: str) -> None:
+    """Print rows as a table."""
+    table = Table(title=title, title_justify="left")
+    for field in fields(Result):
+        table.add_column(field.name.replace("_", " "))
+    for row in rows:
+        table.add_row(*(_text(value) for value in asdict(row).values()))
+    Console(width=max(Console().width, 200)).print(table)
+
+
+def _text(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return "" if value is None else str(value)
+
+
+def save(
+    rows: Sequence[Result], errors: Mapping[tuple[str, str], Tensor], machine: str, stem: Path
+) -> None:
+    """Write rows as CSV, the machine as JSON, and a figure of the errors of all loads as PNG."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    with stem.with_suffix(".csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Result)])
+        writer.writeheader()
+        for row in rows:
+            numbers = asdict(row).items()
+            writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in numbers})
+    stem.with_suffix(".json").write_text(json.dumps({"machine": machine, "threads": 1}) + "\n")
+    draw(errors, stem.with_suffix(".png"))
+
+
+def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
+    """Draw the relative errors of all loads, sorted, a panel for each set of loads.
+
+    Args:
+        errors: Relative L2 errors (S,) by method and set.
+        path: Of the picture.
+    """
+    from matplotlib.figure import Figure
+
+    sets = list(dict.fromkeys(title for _, title in errors))
+    figure = Figure(figsize=(4 * len(sets), 3.8), layout="constrained")
+    axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
+    for ax, title in zip(axes, sets, strict=True):
+        for (method, of), values in errors.items():
+            if of == title:
+                part = torch.linspace(0, 100, len(values))
+                ax.semilogy(part, values.sort().values.clamp(min=1e-9), label=method)
+        ax.axhline(10 ** (-(50 if title == "small" else 60) / 20), color="0.7", ls=":")
+        ax.set_title(f"{title} loads", fontsize=10)
+        ax.set_xlabel("part of the loads [%]")
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("relative L2 error, no more than")
+    axes[-1].legend(fontsize=8)
+    figure.savefig(path, dpi=130)

@@ -1,0 +1,54 @@
+"""All methods on one experiment side by side: python scripts/results.py name=beam_svk."""
+
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+
+from dpl import run
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="results")
+@run.command
+def main(cfg: DictConfig) -> None:
+    """Measure every run of an experiment; write rows, machine and figure."""
+    from dpl import peers, results
+    from dpl.models.pod import PODNet
+
+    run.check(cfg)
+    folders = sorted(path.parent for path in Path(cfg.run).glob("*/config.yaml"))
+    if not folders:
+        raise run.ConfigError(f"run: {cfg.run} holds no runs; train some with run={cfg.run}/NAME")
+    methods: dict[str, results.Method] = {}
+    scene = galerkin = None
+    for folder in folders:
+        trained, surrogate = run.load_run(folder, scene=scene)
+        if scene is None:
+            scene = surrogate.scene
+            data = run.make(trained, "data", scene=scene)
+            data.prepare_data()
+            train = data.samples("train")
+            methods["linear"] = results.linear(scene)
+            if cfg.tolerance:
+                methods["POD-Galerkin"], galerkin = results.pod_galerkin(
+                    scene, train, cfg.rank, cfg.tolerance
+                )
+        methods[folder.name] = results.network(surrogate, folder, trained.data.train)
+        if galerkin is not None and isinstance(surrogate.net, PODNet):
+            name = f"{folder.name} corrected"
+            methods[name] = results.corrected(surrogate, galerkin, methods[folder.name], cfg.steps)
+    sets = results.load_sets(scene, data.samples("test"), cfg.count)
+    first = results.paper(cfg.name)
+    rows = [] if first is None else [first]
+    errors = {}
+    a_load = data.store.seconds_a_load()
+    minutes = None if a_load is None else a_load * sum(data.wanted.sizes.values()) / 60
+    for row, error in results.measure(methods, sets, scene.solver, generation_minutes=minutes):
+        rows.append(row)
+        errors[row.method, row.loads] = error
+    results.show(rows, f"{cfg.name}, one load at a time, 1 thread")
+    results.save(rows, errors, peers.machine(), Path(cfg.folder) / cfg.name)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,437 @@
+"""Laws of the networks between few coordinates: the POD network's, and what the latent one shares.
+
+Where laws are exact but for rounding they are tested in double precision.
+"""
+
+import pytest
+import torch
+
+from dpl.fem.materials import NeoHookeanLn
+from dpl.fem.mesh import Plane, box, rectangle
+from dpl.fem.modes import ModalLoads
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import solve
+from dpl.fem.supports import Displacement
+from dpl.losses import MSE
+from dpl.models.latent import Latent
+from dpl.models.pod import PODNet
+from dpl.module import Surrogate
+from dpl.scene import Sample, Scene
+
+SMALL = {"width": 16, "blocks": 1}
+WHOLE = {"rank": 1000, "coordinates": 1000, **SMALL}  # no mode is left out
+CUT = "a rank or a number of coordinates may cut a family of modes that symmetries mix"
+FILLED = "modes beyond the rank of the snapshots are made of rounding, and not zero as promised"
+NETWORKS = pytest.mark.parametrize("kind", [PODNet, Latent])
+
+
+def prepared(kind, scene, samples, *, seed=0, **options):
+    """Return a surrogate in evaluation, random weights, bases made."""
+    torch.manual_seed(seed)
+    module = Surrogate(kind(scene, **{**SMALL, **options}), MSE(), scene)
+    module.prepare(samples)
+    return module.eval()
+
+
+def exact(module):
+    """Return the network in double precision."""
+    return module.double().net
+
+
+def solved(scene, count):
+    load = scene.loads.sample((0, 0), range(count))
+    answer = solve(scene.solver, load)
+    assert answer.converged.all()
+    return Sample(load.force, answer.displacement, load.young)
+
+
+def some(batch, count):
+    return Sample(*(column[:count] for column in batch))
+
+
+@pytest.fixture(scope="module")
+def bar(make_scene):
+    """A beam of 48 degrees of freedom, that loads all reach, with as many modes in its loads."""
+    scene = make_scene(nodes=(5, 2, 2))
+    assert torch.equal(scene.loads.reach, scene.problem.free)
+    return scene, solved(scene, 16)
+
+
+def noise(scene, count=4, seed=0):
+    """Return forces (count, N, D) of no symmetry, on all that loads can act on."""
+    random = torch.Generator().manual_seed(seed)
+    force = torch.randn(count, *scene.problem.shape, generator=random, dtype=torch.float64)
+    return torch.where(scene.loads.reach, force, 0.0)
+
+
+def asymmetry(net, force):
+    """Return the largest relative distance of images of answers from answers to images."""
+    with torch.no_grad():
+        answer = net(force)
+        far = [(s.image(answer) - net(s.image(force))).norm() / answer.norm() for s in net.group]
+    return float(max(far))
+
+
+def eye(size):
+    return torch.eye(size, dtype=torch.float64)
+
+
+def left_over(basis, net, where):
+    """Return the largest part of an image of a mode (R, n) that the modes do not reach."""
+    basis = basis.double()
+    images = torch.cat([net._image(basis, where, k) for k in range(len(net.group))])
+    return float((images - images @ basis.T @ basis).norm(dim=1).max())
+
+
+# ------------------------------------------------------------------ bases
+
+
+@NETWORKS
+def test_a_basis_is_orthonormal(kind, scene, batch):
+    net = prepared(kind, scene, batch, rank=30).net
+    assert net.basis.shape == (30, int(scene.problem.free.sum()))
+    basis = net.basis.double()
+    assert torch.allclose(basis @ basis.T, eye(30), rtol=0, atol=1e-6)
+
+
+@NETWORKS
+def test_a_basis_of_all_modes_holds_every_training_sample(kind, scene, batch):
+    net = prepared(kind, scene, batch, **WHOLE).net
+    basis = net.basis.double()
+    moved = batch.displacement[:, scene.problem.free]
+    error = (moved - moved @ basis.T @ basis).norm(dim=1) / moved.norm(dim=1)
+    assert float(error.max()) < 1e-5
+
+
+@NETWORKS
+def test_more_modes_hold_more_of_the_samples(kind, scene, batch):
+    moved = batch.displacement[:, scene.problem.free]
+    left = []
+    for rank in (4, 12, 40):
+        basis = prepared(kind, scene, batch, rank=rank).net.basis.double()
+        left.append(float((moved - moved @ basis.T @ basis).norm() / moved.norm()))
+    assert left[0] > 3 * left[1] > 9 * left[2] > 0
+
+
+@NETWORKS
+def test_whole_families_of_modes_are_invariant_under_the_symmetries(kind, bar):
+    """The first four: bending to both sides, stretching, twisting."""
+    scene, samples = bar
+    net = prepared(kind, scene, samples, rank=4).net
+    assert len(net.group) == 8
+    assert left_over(net.basis, net, net.moving) < 1e-5
+
+
+@pytest.mark.xfail(strict=True, reason=FILLED)
+def test_all_modes_of_few_samples_are_invariant_under_the_symmetries(scene, batch):
+    net = prepared(Latent, scene, some(batch, 2), **WHOLE).net
+    assert left_over(net.basis, net, net.moving) < 1e-5
+
+
+@pytest.mark.xfail(strict=True, reason=FILLED)
+def test_all_modes_of_few_loads_are_invariant_under_the_symmetries(scene, batch):
+    net = prepared(PODNet, scene, some(batch, 2), **WHOLE).net
+    kept = net.read[:, net.read.any(dim=0)].T.double()
+    assert left_over(kept, net, net.acting) < 1e-5
+
+
+@pytest.mark.xfail(strict=True, reason=CUT)
+@NETWORKS
+def test_a_basis_of_any_rank_is_invariant_under_the_symmetries(kind, scene, batch):
+    for rank in range(1, 13):
+        net = prepared(kind, scene, batch, rank=rank).net
+        assert left_over(net.basis, net, net.moving) < 1e-5, rank
+
+
+def test_the_basis_of_loads_is_orthonormal_and_holds_them(scene, batch):
+    read = prepared(PODNet, scene, batch, **WHOLE).net.read.double()
+    kept = read[:, read.any(dim=0)]
+    assert torch.allclose(kept.T @ kept, eye(kept.shape[1]), rtol=0, atol=1e-6)
+    force = batch.force[:, scene.loads.reach]
+    assert float((force - force @ kept @ kept.T).norm() / force.norm()) < 1e-5
+
+
+@NETWORKS
+def test_bases_are_a_function_of_the_samples(kind, scene, batch):
+    one, same, other = (
+        prepared(kind, scene, samples, seed=seed).net
+        for seed, samples in enumerate([batch, batch, some(batch, 8)])
+    )
+    for name, buffer in one.named_buffers():
+        assert torch.equal(buffer, dict(same.named_buffers())[name]), name
+    assert not torch.equal(one.basis, other.basis)
+
+
+@NETWORKS
+def test_more_samples_than_snapshots_are_thinned_out(kind, scene, batch, monkeypatch):
+    """Every third of twelve makes the basis that these four make."""
+    monkeypatch.setattr("dpl.models.pod.SNAPSHOTS", 8 * 4)
+    seen = []
+    original = PODNet._image
+    monkeypatch.setattr(
+        PODNet, "_image", lambda net, c, *more: seen.append(len(c)) or original(net, c, *more)
+    )
+    net = prepared(kind, scene, batch, rank=20).net
+    assert 0 < seen[0] <= 4
+    basis = net.basis.double()
+    assert torch.allclose(basis @ basis.T, eye(20), rtol=0, atol=1e-5)
+
+
+# ------------------------------------------------------------------ symmetries
+
+
+@NETWORKS
+def test_turns_and_returns_are_a_representation(kind, bar):
+    """The product of two members is a member; returns are orthogonal."""
+    net = exact(prepared(kind, *bar, **WHOLE))
+    order = len(net.group)
+    assert order == 8
+    for motion in (net.turns[0], net.returns[0], *(net.returns.mT @ net.returns)):
+        assert torch.allclose(motion, eye(48), rtol=0, atol=1e-5)
+    for motions in (net.turns, net.returns.mT):
+        for one in motions:
+            far = (motions @ one)[:, None] - motions  # (G, G, r, r)
+            nearest = far.flatten(2).norm(dim=2).min(dim=1)
+            assert float(nearest.values.max()) < 1e-4 * float(motions.norm(dim=(1, 2)).max())
+            assert len(nearest.indices.unique()) == order
+
+
+@NETWORKS
+@pytest.mark.parametrize("seed", [0, 1])
+def test_answers_have_the_symmetries_exactly(kind, bar, seed):
+    scene, samples = bar
+    module = prepared(kind, scene, samples, seed=seed, **WHOLE)
+    force = noise(scene)
+    assert asymmetry(module.net, force.float()) < 1e-4
+    with torch.no_grad():
+        for parameter in module.net.parameters():
+            parameter.normal_(0, 0.1)
+    assert asymmetry(module.net, force.float()) < 1e-4
+    assert asymmetry(exact(module), force) < 1e-6
+
+
+@NETWORKS
+def test_in_training_it_is_the_network_alone(kind, bar):
+    scene, samples = bar
+    net = exact(prepared(kind, scene, samples, **WHOLE)).train()
+    assert asymmetry(net, noise(scene)) > 1e-4
+
+
+@pytest.mark.xfail(strict=True, reason=CUT)
+@NETWORKS
+def test_answers_have_the_symmetries_for_any_rank(kind, scene, batch):
+    for rank in range(1, 13):
+        net = exact(prepared(kind, scene, batch, rank=rank, coordinates=4))
+        assert asymmetry(net, noise(scene)) < 1e-4, rank
+
+
+@pytest.mark.xfail(strict=True, reason=CUT)
+@NETWORKS
+def test_answers_have_the_symmetries_for_any_number_of_coordinates(kind, scene, batch):
+    for coordinates in range(1, 13):
+        net = exact(prepared(kind, scene, batch, rank=12, coordinates=coordinates))
+        assert asymmetry(net, noise(scene)) < 1e-4, coordinates
+
+
+@pytest.mark.xfail(strict=True, reason=CUT)
+def test_answers_of_the_defaults_have_the_symmetries(scene, batch):
+    """Sixty coordinates of the load, a hundred modes: conf/model/pod.yaml."""
+    assert asymmetry(exact(prepared(PODNet, scene, batch)), noise(scene)) < 1e-4
+
+
+@NETWORKS
+def test_symmetry_false_respects_none(kind, bar):
+    scene, samples = bar
+    net = exact(prepared(kind, scene, samples, symmetry=False, **WHOLE))
+    assert net.group == []
+    assert net.turns.shape[0] == net.returns.shape[0] == 1
+    force, group = noise(scene), kind(scene, **SMALL).group
+    with torch.no_grad():
+        answer = net(force)
+        assert torch.equal(answer, net.train()(force))
+        far = group[3].image(answer) - net(group[3].image(force))
+    assert float(far.norm() / answer.norm()) > 1e-4
+    assert len(net.plan()) == len(kind(scene, **SMALL).plan()) - 1
+
+
+@NETWORKS
+def test_the_plan_counts_coordinates_and_symmetries(kind, scene):
+    lines = kind(scene, rank=20, **SMALL).plan()
+    assert lines[0] == f"20 coordinates learnt instead of {int(scene.problem.free.sum())} " + (
+        "displacements"
+    )
+    assert lines[1].startswith("nothing learnt 8 times")
+
+
+# ------------------------------------------------------------------ bodies
+
+
+@pytest.fixture(scope="module")
+def plane(make_scene):
+    """A cantilever in plane strain, with twenty solved loads."""
+    scene = make_scene(mesh=rectangle([100.0, 25.0], [7, 2]))
+    return scene, solved(scene, 20)
+
+
+@pytest.fixture(scope="module")
+def skew(make_scene):
+    """A body whose cells have no symmetry, with five solved loads."""
+    mesh = box([100.0, 30.0, 25.0], [4, 3, 2], "tetra")
+    scene = make_scene(mesh=mesh)
+    return scene, solved(scene, 5)
+
+
+@NETWORKS
+def test_a_body_in_the_plane_is_answered_with_its_mirror_image(kind, plane):
+    scene, samples = plane
+    net = exact(prepared(kind, scene, samples, **WHOLE))
+    assert len(net.group) == 2
+    force = noise(scene)
+    assert net(force).shape == force.shape == (4, 14, 2)
+    assert net(force).abs().max() > 0
+    assert asymmetry(net, force) < 1e-6
+    assert asymmetry(net.train(), force) > 1e-4
+
+
+@NETWORKS
+def test_a_body_without_symmetry_is_answered(kind, skew):
+    scene, samples = skew
+    net = exact(prepared(kind, scene, samples, rank=5, coordinates=4))
+    assert len(net.group) == 1
+    assert net.turns.shape == (1, 4, 4)
+    assert len(net.plan()) == (1 if kind is PODNet else 3)
+    basis = net.basis
+    assert torch.allclose(basis @ basis.T, eye(5), rtol=0, atol=1e-6)
+    with torch.no_grad():
+        answer = net(noise(scene))
+        assert torch.equal(answer, net.train()(noise(scene)))
+    assert answer.isfinite().all()
+    assert answer.any()
+
+
+@NETWORKS
+def test_a_body_that_is_held_in_some_directions_only_is_answered(kind):
+    """Rails: a node moves in some directions and not in others."""
+    ends = [(0, [0.0, None, None]), (1, [None, 0.0, None]), (2, [None, None, 0.0])]
+    rails = [Displacement(Plane(axis, "min"), value) for axis, value in ends]
+    mesh = box([100.0, 25.0, 25.0], [5, 2, 2])
+    problem = Problem.build(mesh, NeoHookeanLn(0.3), supports=rails)
+    solver = Newton(problem, linear="superlu")
+    scene = Scene(problem, ModalLoads(solver.rest, n_modes=3, young=4500.0), solver)
+    assert (problem.free.any(dim=1) & ~problem.free.all(dim=1)).any()
+    module = prepared(kind, scene, solved(scene, 30), **WHOLE)
+    answer = exact(module)(noise(scene))
+    assert answer.any()
+    assert not answer[:, ~problem.free].any()
+    assert len(module.net.group) == 2
+    assert asymmetry(module.net, noise(scene)) < 1e-5
+
+
+# ------------------------------------------------------------------ samples
+
+
+@NETWORKS
+@pytest.mark.parametrize("count", [1, 2])
+def test_fewer_snapshots_than_modes_are_enough(kind, scene, batch, count):
+    module = prepared(kind, scene, some(batch, count), rank=100, symmetry=False)
+    for name, buffer in module.net.named_buffers():
+        assert buffer.isfinite().all(), name
+    force = noise(scene).float().requires_grad_()
+    answer = module.net(force)
+    answer.square().sum().backward()
+    assert answer.isfinite().all()
+    assert force.grad.isfinite().all()
+    for name, parameter in module.net.named_parameters():
+        assert parameter.grad.isfinite().all(), name
+
+
+@NETWORKS
+def test_a_sample_that_does_not_move_changes_nothing(kind, scene, batch):
+    """No size, no weight: neither a NaN nor a mode of its own."""
+    still = Sample(*(torch.cat([column, column[:1]]) for column in some(batch, 4)))
+    still.force[-1], still.displacement[-1] = 0.0, 0.0
+    net = prepared(kind, scene, still, rank=12).net
+    usual = prepared(kind, scene, some(batch, 4), rank=12).net
+    for name, buffer in net.named_buffers():
+        assert buffer.isfinite().all(), name
+    projectors = [one.basis.double().T @ one.basis.double() for one in (net, usual)]
+    assert torch.allclose(*projectors, rtol=0, atol=1e-5)
+
+
+@NETWORKS
+def test_ranks_beyond_what_moves_and_acts_are_cut(kind, scene, batch):
+    net = prepared(kind, scene, batch, **WHOLE).net
+    outputs, inputs = int(scene.problem.free.sum()), int(scene.loads.reach.sum())
+    assert net.basis.shape == (outputs, outputs)
+    assert net.leave.out_features == outputs
+    assert net.enter.in_features == inputs
+
+
+def test_a_latent_network_reads_no_more_coordinates_than_it_has_modes(scene):
+    assert Latent(scene, rank=7, coordinates=60, **SMALL).enter.in_features == 7
+    assert PODNet(scene, rank=7, coordinates=60, **SMALL).enter.in_features == 60
+
+
+@NETWORKS
+def test_no_bases_no_answer_and_they_are_told_apart(kind, scene, batch):
+    net = kind(scene, **SMALL)
+    assert not net.prepared
+    assert not net(noise(scene).float()).any() or kind is Latent
+    assert prepared(kind, scene, batch).net.prepared
+
+
+@NETWORKS
+def test_a_batch_is_its_members(kind, scene, batch):
+    net = exact(prepared(kind, scene, batch))
+    force = noise(scene, 5)
+    with torch.no_grad():
+        parts = torch.cat([net(one[None]) for one in force])
+        assert torch.allclose(net(force), parts, rtol=1e-9, atol=1e-12)
+
+
+@NETWORKS
+def test_slopes_with_respect_to_forces_are_those_of_differences(kind, scene, batch):
+    net = exact(prepared(kind, scene, batch, rank=40))
+    force, way = noise(scene).requires_grad_(), noise(scene, seed=1)
+    weight = noise(scene, seed=2)
+    (slope,) = torch.autograd.grad((weight * net(force)).sum(), force)
+    step = 1e-5
+    with torch.no_grad():
+        ends = [float((weight * net(force + s * step * way)).sum()) for s in (1, -1)]
+    found = float((slope * way).sum())
+    assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(found, rel=1e-6)
+    assert found != 0
+    assert not slope[:, ~scene.loads.reach].any()
+
+
+# ------------------------------------------------------------------ options
+
+
+@NETWORKS
+@pytest.mark.parametrize(
+    "options", [{"rank": 0}, {"coordinates": 0}, {"width": 0}, {"blocks": -1}, {"rank": -3}]
+)
+def test_options_out_of_range_are_refused_by_name(kind, scene, options):
+    (name, number) = next(iter(options.items()))
+    with pytest.raises(ValueError, match=f"{name} = {number} must be"):
+        kind(scene, **options)
+
+
+@NETWORKS
+def test_no_blocks_at_all_are_a_network_too(kind, scene, batch):
+    net = prepared(kind, scene, batch, blocks=0).net
+    assert len(net.blocks) == 0
+    assert net(noise(scene).float()).any()
+
+
+def test_more_width_and_blocks_are_more_parameters(scene):
+    def count(**options):
+        return sum(
+            p.numel() for p in PODNet(scene, rank=10, coordinates=20, **options).parameters()
+        )
+
+    for width, blocks in ((16, 0), (16, 3), (24, 2)):
+        inner = blocks * 2 * (width * width + width)
+        expected = (20 * width + width) + inner + (10 * width + 10)
+        assert count(width=width, blocks=blocks) == expected
