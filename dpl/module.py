@@ -87,7 +87,7 @@ class Surrogate(L.LightningModule):
         """Return what network and loss leave out, a line each."""
         lines = [*getattr(self.net, "plan", list)(), *self.loss.plan()]
         if isinstance(self.net, PODNet) and isinstance(self.loss, MSE):
-            lines.append("no field in training: squared errors are those of coordinates")
+            lines.append("no field in training from disk: squared errors are those of coordinates")
         return lines
 
     def training_step(self, batch: Sample | Coordinates, batch_idx: int) -> Tensor:
@@ -111,13 +111,17 @@ class Surrogate(L.LightningModule):
         error = square * missed / self.scene.problem.free.numel()
         return cast(MSE, self.loss).of_squares(error, square * batch.size)
 
-    def encode(self, samples: Sample) -> CoordinateSamples | None:
+    def encode(self, samples: Sample, *, images: bool = False) -> CoordinateSamples | None:
         """Return training samples (S, N, D) in the coordinates of the network; None if it has none.
+
+        With their images if the network knows the symmetries; None if only the caller does.
 
         In an orthonormal basis the squared error of a displacement is that of its coordinates: a
         loss that is a function of squared errors needs no field.
         """
         if not (isinstance(self.net, PODNet) and isinstance(self.loss, MSE)):
+            return None
+        if images and not self.net.group:
             return None
         return self.net.encode(self._scaled(samples))
 
@@ -151,8 +155,8 @@ class Surrogate(L.LightningModule):
         if problem.points.device != self.device:
             problem = problem.to(self.device)
         self.physics = Physics(problem, self.largest_force)
-        wanting = isinstance(self.net, PODNet) and not self.net.prepared
-        if stage == "fit" and wanting and not self.trainer.ckpt_path:  # a resumed one brings them
+        # here: schedules ask for the batches, which want the bases, before any later hook
+        if stage == "fit" and isinstance(self.net, PODNet) and not self.net.prepared:
             self.prepare(self.trainer.datamodule.snapshots())
         for collection in (self.val_metrics, self.test_metrics):
             for metric in collection.values():

@@ -181,11 +181,13 @@ def test_mse_evaluates_no_finite_element(few, physics, near, evaluations):
 
 
 @pytest.mark.parametrize("relative", [0.0, 0.5, 0.8, 1.0])
-def test_the_power_of_a_relative_mse_is_that_of_a_samples_size(few, physics, near, relative):
+def test_the_power_of_a_relative_loss_is_that_of_a_samples_size(few, physics, near, relative):
     error = (near - few.displacement).square().mean(dim=(1, 2))
     size = few.displacement.square().mean(dim=(1, 2))
     found = float(MSE(relative=relative, floor=0.0)(near, few, physics))
     assert found == pytest.approx(float((error / size**relative).mean()), rel=1e-12)
+    found = float(MeanNorm(relative=relative, floor=0.0)(near, few, physics))
+    assert found == pytest.approx(float((error / size**relative).sqrt().mean()), rel=1e-9)
 
 
 def scaled_by_sample(near, few):

@@ -66,14 +66,13 @@ class Latent(PODNet):
         )
         self.near = near
         self.register_buffer("unit", torch.tensor(0.0, dtype=torch.float64))
-        self._answers: tuple[Tensor, Tensor] | None = None
 
     def _reading(self, rank: int, coordinates: int) -> int:
         return rank
 
     def forward(self, force: Tensor) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32."""
-        acting = force[:, self.acting]
+        acting = self.entering(force)
         linear = acting @ self.read
         learnt = self.learnt(linear @ self.scaled)
         few = (acting != 0).sum(dim=1) <= self.near
@@ -83,9 +82,7 @@ class Latent(PODNet):
             moved = torch.where(few[:, None], learnt, linear + learnt) @ self.basis
             exact = _Respond.apply(acting[few].double(), self)
             moved = moved.index_add(0, few.nonzero()[:, 0], exact.to(moved.dtype))
-        displacement = torch.zeros_like(force)
-        displacement[:, self.moving] = moved
-        return displacement
+        return self.leaving(moved, force)
 
     def network(self, inputs: Tensor) -> Tensor:
         """Return coordinates (B, R) of the nonlinear part from inputs (B, M), without symmetry."""
@@ -107,7 +104,7 @@ class Latent(PODNet):
         """Make the basis; see `PODNet.prepare`."""
         self.unit.fill_(unit)
         force, displacement = self._columns(samples)
-        linear = self._known(force)
+        linear = self.respond(force)
         size = displacement.norm(dim=1)
         weight = torch.where(size > 0, size.clamp(min=1e-12) ** -0.5, 0.0)
         parts = [weight[:, None] * linear, weight[:, None] * (displacement - linear)]
@@ -117,36 +114,43 @@ class Latent(PODNet):
         basis = basis @ torch.linalg.eigh(rests.T @ rests)[1].flip(1)
         self.basis.copy_(basis.T)
         responses = self._respond_all(basis.T)
-        self.read.copy_(responses[:, self.acting[self.moving]].T)
+        self.read.copy_(responses[:, self.acting.cpu()[self.moving.cpu()]].T)
         motions = self._motions(basis, self.moving)
         self._scale(linear @ basis, (displacement - linear) @ basis, weight, motions)
         self._turn(motions, motions)
         self.prepared.fill_(True)
 
     def _scale(self, read: Tensor, targets: Tensor, weight: Tensor, motions: Tensor) -> None:
-        weighted = weight[:, None] * read
-        spread = (motions.mT @ (weighted.T @ weighted) @ motions).mean(dim=0)  # over all images
-        values, axes = (found.flip(-1) for found in torch.linalg.eigh(spread))
+        def spread(columns: Tensor) -> Tensor:
+            """Return mean products of coordinates (S, C) over all images, (C, C)."""
+            return (motions.mT @ (columns.T @ columns / len(columns)) @ motions).mean(dim=0)
+
+        values, axes = (
+            found.flip(-1) for found in torch.linalg.eigh(spread(weight[:, None] * read))
+        )
         count = self.scaled.shape[1]
         gaps = -values.diff()
         while 0 < count < len(values) and gaps[count - 1] < SAME * values[count - 1]:
             count -= 1  # a family is kept whole or not at all
         axes = nn.functional.pad(axes[:, :count], (0, self.scaled.shape[1] - count))
-        size = ((axes.T @ spread) * axes.T).sum(dim=1).clamp(min=0).sqrt()
+        size = ((axes.T @ spread(read)) * axes.T).sum(dim=1).clamp(min=0).sqrt()
         self.scaled.copy_(axes / evened(size))
         size = root_mean_square(targets)
         self.spread.copy_((size * size.max()).sqrt())
 
     def _known(self, force: Tensor) -> Tensor:
-        """Return linear answers (S, outputs) of forces on the inputs (S, inputs), scaled."""
-        if self._answers is None or self._answers[0].data_ptr() != force.data_ptr():
-            self._answers = force, self.respond(force)
-        return self._answers[1]
+        """Return linear answers (S, outputs) of forces on the inputs (S, inputs), scaled.
+
+        Those that the basis has of them for all but forces on few degrees of freedom.
+        """
+        linear, basis = self.respond(force), self.basis.cpu().double()
+        few = (force != 0).sum(dim=1) <= self.near
+        return torch.where(few[:, None], linear, (linear @ basis.T) @ basis)
 
     def respond(self, acting: Tensor) -> Tensor:
         """Return K(0)^-1 f, scaled: (B, outputs) of forces on the inputs (B, inputs), float64."""
-        every = acting.new_zeros(len(acting), int(self.moving.sum()))
-        every[:, self.acting[self.moving]] = acting
+        every = acting.new_zeros(len(acting), len(self.moving_places))
+        every[:, self.acting[self.moving].to(acting.device)] = acting
         return self._respond_all(every)
 
     def _respond_all(self, forces: Tensor) -> Tensor:

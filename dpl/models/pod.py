@@ -52,6 +52,8 @@ class PODNet(nn.Module):
 
     acting: Tensor
     moving: Tensor
+    acting_places: Tensor
+    moving_places: Tensor
     basis: Tensor
     read: Tensor
     scaled: Tensor
@@ -95,7 +97,10 @@ class PODNet(nn.Module):
         self.group = symmetries(scene.problem, also=also) if symmetry else []
         self.register_buffer("acting", scene.loads.reach, persistent=False)
         self.register_buffer("moving", scene.problem.free, persistent=False)
-        inputs, outputs = int(self.acting.sum()), int(self.moving.sum())
+        for name, where in {"acting": self.acting, "moving": self.moving}.items():
+            places = where.flatten().nonzero()[:, 0]  # faster than a mask
+            self.register_buffer(f"{name}_places", places, persistent=False)
+        inputs, outputs = len(self.acting_places), len(self.moving_places)
         rank, coordinates = min(rank, outputs), min(coordinates, inputs)
         members = max(1, len(self.group))
         width_of_reading = self._reading(rank, coordinates)
@@ -120,10 +125,17 @@ class PODNet(nn.Module):
 
     def forward(self, force: Tensor) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32."""
-        read = force[:, self.acting] @ self.read
-        displacement = torch.zeros_like(force)
-        displacement[:, self.moving] = self.learnt(read @ self.scaled) @ self.basis
-        return displacement
+        read = self.entering(force) @ self.read
+        return self.leaving(self.learnt(read @ self.scaled) @ self.basis, force)
+
+    def entering(self, force: Tensor) -> Tensor:
+        """Return the forces on the inputs, (B, inputs), of (B, N, D)."""
+        return force.flatten(1).index_select(1, self.acting_places)
+
+    def leaving(self, moved: Tensor, force: Tensor) -> Tensor:
+        """Return displacements (B, outputs) as a field like the force, (B, N, D)."""
+        field = moved.new_zeros(len(force), force[0].numel())
+        return field.index_copy(1, self.moving_places, moved).view_as(force)
 
     def learnt(self, inputs: Tensor) -> Tensor:
         """Return coordinates (B, R) of the displacement from inputs (B, M).
@@ -188,13 +200,13 @@ class PODNet(nn.Module):
 
     def _turn(self, loads: Tensor, basis: Tensor) -> None:
         """Set what symmetries do to inputs and outputs, from what they do to coordinates."""
-        scaled = self.scaled.double()
+        scaled = self.scaled.cpu().double()
         self.turns.copy_(torch.linalg.pinv(scaled) @ loads @ scaled)
         self.returns.copy_(basis.mT)
 
     def _columns(self, samples: Sample) -> tuple[Tensor, Tensor]:
         """Return forces on the inputs (S, inputs) and displacements (S, outputs)."""
-        return samples.force[:, self.acting], samples.displacement[:, self.moving]
+        return samples.force[:, self.acting.cpu()], samples.displacement[:, self.moving.cpu()]
 
     def _modes(self, snapshots: Tensor, where: Tensor, rank: int) -> Tensor:
         """Return POD modes (n, rank), zero beyond the rank of the snapshots (S, n).
@@ -207,6 +219,8 @@ class PODNet(nn.Module):
         some = some.float() if members * len(some) > LARGE else some
         every = torch.cat([self._image(some, where, k) for k in range(members)])
         found = self._invariant(pod(every, min(rank, *every.shape)).vectors.double(), where)
+        seen = every @ found.to(every.dtype)
+        found = found @ torch.linalg.eigh((seen.T @ seen).double())[1].flip(1)  # largest first
         return nn.functional.pad(found, (0, rank - found.shape[1]))
 
     def _invariant(self, modes: Tensor, where: Tensor) -> Tensor:
@@ -221,12 +235,18 @@ class PODNet(nn.Module):
         q, r = torch.linalg.qr(every)
         shares, vectors = torch.linalg.eigh(r @ r.T / members)  # of images in each direction
         kept = vectors[:, shares > 3 / 4].flip(1)[:, : modes.shape[1]]
+        if not kept.shape[1]:
+            raise ValueError(
+                f"{modes.shape[1]} modes end amid a family that the body's symmetries mix; take a "
+                "larger rank and more coordinates, or symmetry=false"
+            )
         return q @ kept
 
     def _image(self, columns: Tensor, where: Tensor, k: int) -> Tensor:
         """Return fields (S, n) on some degrees of freedom as their images under a symmetry."""
         if k == 0:
             return columns
+        where = where.cpu()
         field = columns.new_zeros(len(columns), *where.shape)
         field[:, where] = columns
         return images(field, self.group, torch.full((len(field),), k))[:, where]
@@ -239,20 +259,20 @@ class PODNet(nn.Module):
     def encode(self, samples: Sample) -> CoordinateSamples:
         """Return scaled samples (S, N, D), float64, in coordinates."""
         force, displacement = self._columns(samples)
+        basis, reading, scaled = (b.cpu().double() for b in (self.basis, self.read, self.scaled))
         target = displacement - self._known(force)
-        targets = target @ self.basis.double().T
-        read = force @ self.read.double()
+        targets = target @ basis.T
         coordinates = Coordinates(
-            inputs=(read @ self.scaled.double()).float(),
+            inputs=(force @ reading @ scaled).float(),
             targets=targets.float(),
             rest=(target.square().sum(1) - targets.square().sum(1)).clamp(min=0),
             size=displacement.square().sum(1) / self.acting.numel(),
         )
-        return CoordinateSamples(coordinates, self.turns, self.returns.mT.contiguous())
+        return CoordinateSamples(coordinates, self.turns.cpu(), self.returns.mT.cpu())
 
     def _known(self, force: Tensor) -> Tensor:
         """Return the part of the displacement that is not learnt, (S, outputs)."""
-        return force.new_zeros(len(force), int(self.moving.sum()))
+        return force.new_zeros(len(force), len(self.moving_places))
 
 
 def evened(size: Tensor) -> Tensor:

@@ -1,5 +1,7 @@
 """Training in coordinates is training in fields: squared errors, images, gradients."""
 
+import functools
+
 import pytest
 import torch
 
@@ -9,7 +11,7 @@ from dpl.models.coordinates import Coordinates, CoordinateSamples
 from dpl.models.fcnn import FCNN
 from dpl.models.latent import Latent
 from dpl.models.pod import PODNet
-from dpl.module import Surrogate
+from dpl.module import Surrogate, scales
 from dpl.scene import Sample
 
 SMALL = {"width": 16, "blocks": 1}
@@ -29,6 +31,14 @@ def cases(*, without_near):
     known = [pytest.param(*case, id=name) for name, case in KINDS.items()]
     far = [pytest.param(*case, id=name, marks=marks) for name, case in UNSEEN.items()]
     return pytest.mark.parametrize(("kind", "options"), [*known, *far])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def scales_of_a_scene_once():
+    """They are a function of the scene and take longer than all the rest."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dpl.module.scales", functools.cache(scales))
+        yield
 
 
 @pytest.fixture

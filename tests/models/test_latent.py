@@ -1,5 +1,6 @@
 """Laws of the flagship: exact linear answers, and a network for the rest alone."""
 
+import functools
 import json
 import shutil
 
@@ -11,9 +12,17 @@ from dpl.data.datamodule import OnlineData
 from dpl.fem.solution import Load, solve
 from dpl.losses import MSE
 from dpl.models.latent import Latent
-from dpl.module import Surrogate
+from dpl.module import Surrogate, scales
 
 SMALL = {"width": 16, "blocks": 1}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def scales_of_a_scene_once():
+    """They are a function of the scene and take longer than all the rest."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dpl.module.scales", functools.cache(scales))
+        yield
 
 
 def prepared(scene, samples, *, seed=0, **options):
@@ -260,8 +269,7 @@ def overrides(tiny_training):
 
     def overrides(name, *more):
         small = ["model=latent", "model.blocks=1", "model.coordinates=8", "data.folder=data"]
-        bare = "trainer.callbacks.4._target_=lightning.pytorch.callbacks.ModelSummary"
-        return [*tiny_training, *small, bare, "trainer.max_epochs=4", f"run={name}", *more]
+        return [*tiny_training, *small, "trainer.max_epochs=4", f"run={name}", *more]
 
     return overrides
 
