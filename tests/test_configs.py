@@ -192,7 +192,6 @@ def test_what_is_asked_for_wins_over_what_a_network_brings(compose):
     run.check(cfg)
 
 
-@pytest.mark.xfail(strict=True, reason="model=latent sets optimizer.lr whatever the optimiser is")
 def test_a_network_leaves_a_rate_alone_that_is_meant_for_its_own_optimiser_only(compose):
     """2e-2 is Muon's; AdamW asked for instead keeps the rate of its file."""
     usual = compose("folder=.", command="train").optimizer.lr

@@ -20,17 +20,9 @@ KINDS = {
     "pod, few modes": (PODNet, {"rank": 4, "coordinates": 4}),
     "latent": (Latent, {}),
     "latent, few modes": (Latent, {"rank": 4, "coordinates": 4}),
+    "latent, without near": (Latent, {"rank": 4, "coordinates": 4, "near": 0}),
 }
-FAR = "rest leaves out what the basis misses of the linear answer, which only near loads get whole"
-UNSEEN = {"latent, without near": (Latent, {"rank": 4, "coordinates": 4, "near": 0})}
-
-
-def cases(*, without_near):
-    """Return parameters for all networks; where `near` is off the squared error is known wrong."""
-    marks = [pytest.mark.xfail(strict=True, reason=FAR)] if without_near == "fails" else []
-    known = [pytest.param(*case, id=name) for name, case in KINDS.items()]
-    far = [pytest.param(*case, id=name, marks=marks) for name, case in UNSEEN.items()]
-    return pytest.mark.parametrize(("kind", "options"), [*known, *far])
+CASES = pytest.mark.parametrize(("kind", "options"), KINDS.values(), ids=KINDS)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -71,7 +63,7 @@ def gradients(module, batch):
 # ------------------------------------------------------------------ squared errors
 
 
-@cases(without_near="fails")
+@CASES
 def test_errors_of_coordinates_and_the_rest_are_those_of_the_field(build, batch, kind, options):
     """Parseval: the basis is orthonormal."""
     module = build(kind, options)
@@ -83,7 +75,7 @@ def test_errors_of_coordinates_and_the_rest_are_those_of_the_field(build, batch,
     assert torch.allclose(found, field.square().sum(dim=(1, 2)), rtol=1e-4)
 
 
-@cases(without_near="works")
+@CASES
 def test_sizes_are_mean_squares_of_whole_displacements(build, batch, kind, options):
     module = build(kind, options)
     size = encoded(module, batch).size * module.displacement_scale**2
@@ -117,7 +109,7 @@ def test_squared_errors_are_right_with_fewer_snapshots_than_modes(build, scene, 
 # ------------------------------------------------------------------ training
 
 
-@cases(without_near="fails")
+@CASES
 @pytest.mark.parametrize("loss", [MSE(), MSE(relative=0.5), MeanNorm(relative=0.8, floor=1e-4)])
 def test_the_loss_of_coordinates_is_that_of_fields(build, batch, kind, options, loss):
     module = build(kind, options, loss)
@@ -126,7 +118,7 @@ def test_the_loss_of_coordinates_is_that_of_fields(build, batch, kind, options, 
         assert found == pytest.approx(float(module.training_step(batch, 0)), rel=1e-4)
 
 
-@cases(without_near="works")
+@CASES
 def test_the_gradient_of_coordinates_is_that_of_fields(build, batch, kind, options):
     """Of the squared error, whatever the basis misses: it has no slope."""
     module = build(kind, options, MSE(relative=0.5))
@@ -136,7 +128,7 @@ def test_the_gradient_of_coordinates_is_that_of_fields(build, batch, kind, optio
     assert float((found - expected).norm() / expected.norm()) < 1e-3
 
 
-@cases(without_near="fails")
+@CASES
 def test_the_gradient_of_a_norm_is_that_of_fields_too(build, batch, kind, options):
     module = build(kind, options, MeanNorm())
     (_, found), (_, expected) = (
@@ -164,7 +156,7 @@ def test_only_losses_of_squared_errors_are_found_in_coordinates(build, scene, ba
 
 
 def test_the_plan_tells_of_coordinates_where_they_are_used(build):
-    told = "no field in training: squared errors are those of coordinates"
+    told = "no field in training from disk: squared errors are those of coordinates"
     assert told in build(PODNet, {}).plan()
     assert told in build(Latent, {}, MeanNorm()).plan()
     assert told not in build(Latent, {}, LrStar()).plan()
@@ -226,7 +218,6 @@ def test_batches_are_fetched_in_any_order():
     assert batch.size.tolist() == [5.0, 3.0, 3.0]
 
 
-@pytest.mark.xfail(strict=True, reason="training in coordinates does not see data.symmetry")
 def test_images_that_the_data_want_are_made_where_the_network_has_no_symmetry(
     build, scene, data, batch
 ):

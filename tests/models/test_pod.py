@@ -24,10 +24,6 @@ from dpl.scene import Sample, Scene
 
 SMALL = {"width": 16, "blocks": 1}
 WHOLE = {"rank": 1000, "coordinates": 1000, **SMALL}  # no mode is left out
-MIXED = (
-    "what symmetries leave of the modes comes in no order, mixed: sizes of coordinates tell nothing"
-)
-NONE = "a rank of one where the first modes are a family leaves no mode at all, and nobody says so"
 NETWORKS = pytest.mark.parametrize("kind", [PODNet, Latent])
 
 
@@ -124,7 +120,6 @@ def test_modes_of_a_body_without_symmetry_come_in_the_order_of_their_size(scene,
     assert_ordered(net, batch)
 
 
-@pytest.mark.xfail(strict=True, reason=MIXED)
 def test_modes_come_in_the_order_of_their_size(scene, batch):
     """Uncorrelated too: scales of single coordinates are those of single modes."""
     assert_ordered(prepared(PODNet, scene, batch, rank=12).net, batch)
@@ -182,7 +177,7 @@ def test_all_modes_of_few_loads_are_invariant_under_the_symmetries(scene, batch)
 
 @NETWORKS
 def test_a_basis_of_any_rank_is_invariant_under_the_symmetries(kind, scene, batch):
-    for rank in (1, 2, 3, 5, 6, 8, 11):
+    for rank in (2, 3, 5, 6, 8, 11):
         net = prepared(kind, scene, batch, rank=rank).net
         assert left_over(net.basis, net, net.moving) < 1e-5, rank
 
@@ -275,7 +270,6 @@ def test_answers_have_the_symmetries_for_any_number_of_coordinates(kind, scene, 
         assert asymmetry(net, noise(scene)) < 1e-4, coordinates
 
 
-@pytest.mark.xfail(strict=True, reason=NONE)
 def test_a_rank_that_leaves_no_mode_is_told(scene, batch):
     """Of twins, bending to both sides, one is none: refused by name, or not left out."""
     module = Surrogate(PODNet(scene, rank=1, **SMALL), MSE(), scene)
