@@ -134,7 +134,7 @@ class OfflineData(L.LightningDataModule):
 
         Batches of samples and their images, or of what the module encodes them as.
         """
-        module = self.trainer.lightning_module if self.trainer is not None else None
+        module = getattr(self.trainer, "lightning_module", None)
         encode = getattr(module, "encode", lambda samples, images: None)
         data = encode(self.samples("train"), images=len(self.group) > 1)
         if data is None:
