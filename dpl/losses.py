@@ -79,9 +79,10 @@ class MSE(Loss):
 
     def of_squares(self, error: Tensor, size: Tensor) -> Tensor:
         """Return the loss of mean squared errors (B,) of displacements of mean squares (B,)."""
-        if self.relative:
-            error = error / floored(size, self.floor) ** self.relative
-        return error.mean()
+        return self._weighted(error, size).mean()
+
+    def _weighted(self, error: Tensor, size: Tensor) -> Tensor:
+        return error / floored(size, self.floor) ** self.relative if self.relative else error
 
     def plan(self) -> list[str]:
         """See `Loss`."""
@@ -96,9 +97,7 @@ class MeanNorm(MSE):
 
     def of_squares(self, error: Tensor, size: Tensor) -> Tensor:
         """See `MSE`."""
-        if self.relative:
-            error = error / floored(size, self.floor) ** self.relative
-        return (error + TINY).sqrt().mean()
+        return (self._weighted(error, size) + TINY).sqrt().mean()
 
 
 class LrStar(Loss):

@@ -120,7 +120,8 @@ def measure(
 ) -> Iterator[tuple[Result, Tensor]]:
     """Yield a row and the relative L2 errors of the loads (S,), for each method and set of loads.
 
-    Every load is asked alone, on one thread; the methods take turns on each load.
+    Every load is asked alone, on one thread; each method has all loads of a set in a row, as in
+    use, so that its weights stay in the cache.
 
     Args:
         methods: Named.
@@ -136,7 +137,7 @@ def measure(
         with one_thread(), torch.no_grad():
             for method in methods.values():
                 method.predict(singles[0])
-            for name, method in methods.items():  # each in its own turn: caches stay its own
+            for name, method in methods.items():
                 for turn in range(repeats):
                     for load in singles:
                         start = time.perf_counter()

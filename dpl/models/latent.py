@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from dpl.fem.newton import Linear
 from dpl.models.pod import PODNet, evened, root_mean_square
 from dpl.scene import Sample, Scene
 
@@ -155,13 +154,9 @@ class Latent(PODNet):
 
     def _respond_all(self, forces: Tensor) -> Tensor:
         """Return K(0)^-1 f, scaled, (B, outputs) of forces on all that moves, (B, outputs)."""
-        factor = self._linear.factor
+        factor = self.scene.linear.factor
         answers = [torch.from_numpy(factor.solve(one.numpy())) for one in forces.cpu()]
         return float(self.unit) * torch.stack(answers).to(forces.device)
-
-    @property
-    def _linear(self) -> Linear:
-        return self.scene.linear
 
 
 class _Respond(torch.autograd.Function):

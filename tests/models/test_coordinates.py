@@ -82,7 +82,7 @@ def test_sizes_are_mean_squares_of_whole_displacements(build, batch, kind, optio
     assert torch.allclose(size, batch.displacement.square().mean(dim=(1, 2)), rtol=1e-9)
 
 
-@pytest.mark.parametrize(("kind", "options"), KINDS.values(), ids=KINDS)
+@CASES
 def test_targets_are_the_best_coordinates(build, batch, kind, options):
     """No other coordinates are nearer to the field; with all modes nothing is left."""
     module = build(kind, options)
