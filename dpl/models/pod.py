@@ -259,20 +259,30 @@ class PODNet(nn.Module):
     def encode(self, samples: Sample) -> CoordinateSamples:
         """Return scaled samples (S, N, D), float64, in coordinates."""
         force, displacement = self._columns(samples)
-        basis, reading, scaled = (b.cpu().double() for b in (self.basis, self.read, self.scaled))
-        target = displacement - self._known(force)
-        targets = target @ basis.T
+        read, targets, missed = self._split(force, displacement)
         coordinates = Coordinates(
-            inputs=(force @ reading @ scaled).float(),
+            inputs=(read @ self.scaled.cpu().double()).float(),
             targets=targets.float(),
-            rest=(target.square().sum(1) - targets.square().sum(1)).clamp(min=0),
+            rest=missed.clamp(min=0),
             size=displacement.square().sum(1) / self.acting.numel(),
         )
         return CoordinateSamples(coordinates, self.turns.cpu(), self.returns.mT.cpu())
 
-    def _known(self, force: Tensor) -> Tensor:
-        """Return the part of the displacement that is not learnt, (S, outputs)."""
-        return force.new_zeros(len(force), len(self.moving_places))
+    def _split(self, force: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what of samples is read, to be learnt, and out of reach.
+
+        Args:
+            force: On the inputs, (S, inputs), float64.
+            displacement: (S, outputs), float64.
+
+        Returns:
+            Coordinates of the loads (S, C), of what the network is to answer (S, R), and squares of
+            what the basis misses (S,).
+        """
+        basis, reading = self.basis.cpu().double(), self.read.cpu().double()
+        targets = displacement @ basis.T
+        missed = displacement.square().sum(dim=1) - targets.square().sum(dim=1)
+        return force @ reading, targets, missed
 
 
 def evened(size: Tensor) -> Tensor:

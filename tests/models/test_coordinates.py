@@ -20,7 +20,7 @@ KINDS = {
     "pod, few modes": (PODNet, {"rank": 4, "coordinates": 4}),
     "latent": (Latent, {}),
     "latent, few modes": (Latent, {"rank": 4, "coordinates": 4}),
-    "latent, without near": (Latent, {"rank": 4, "coordinates": 4, "near": 0}),
+    "latent, never solved": (Latent, {"rank": 4, "coordinates": 4, "linear_tol": torch.inf}),
 }
 CASES = pytest.mark.parametrize(("kind", "options"), KINDS.values(), ids=KINDS)
 
