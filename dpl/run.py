@@ -46,7 +46,7 @@ KEYS = {  # what a configuration may hold at its top
     *("seed", "ckpt_path", "run", "folder", "tol"),
     *("action", "shard", "shards"),
     *("parts", "linear", "repeats", "count", "workers", "peers", "samples"),
-    *("name", "rank", "tolerance", "steps"),
+    *("name", "galerkin", "corrected"),
 }
 
 

@@ -20,7 +20,7 @@ def main(cfg: DictConfig) -> None:
     if not folders:
         raise run.ConfigError(f"run: {cfg.run} holds no runs; train some with run={cfg.run}/NAME")
     methods: dict[str, results.Method] = {}
-    scene = galerkin = None
+    scene = None
     for folder in folders:
         trained, surrogate = run.load_run(folder, scene=scene)
         if scene is None:
@@ -29,18 +29,14 @@ def main(cfg: DictConfig) -> None:
             data.prepare_data()
             train = data.samples("train")
             methods["linear"] = results.linear(scene)
-            if cfg.tolerance:
-                methods["POD-Galerkin"], galerkin = results.pod_galerkin(
-                    scene, train, cfg.rank, cfg.tolerance
-                )
+            if cfg.galerkin:
+                methods["POD-Galerkin"] = run.make(cfg, "galerkin")(scene, train)
         methods[folder.name] = results.network(surrogate, folder, trained.data.train)
-        if galerkin is not None and isinstance(surrogate.net, PODNet):
-            name = f"{folder.name} corrected"
-            methods[name] = results.corrected(surrogate, galerkin, methods[folder.name], cfg.steps)
+        if cfg.corrected and isinstance(surrogate.net, PODNet):
+            tier = run.make(cfg, "corrected")(surrogate, methods[folder.name], train)
+            methods[f"{folder.name} corrected"] = tier
     sets = results.load_sets(scene, data.samples("test"), cfg.count)
-    first = results.paper(cfg.name)
-    rows = [] if first is None else [first]
-    errors = {}
+    rows, errors = results.paper(cfg.name), {}
     a_load = data.store.seconds_a_load()
     minutes = None if a_load is None else a_load * sum(data.wanted.sizes.values()) / 60
     for row, error in results.measure(methods, sets, scene.solver, generation_minutes=minutes):

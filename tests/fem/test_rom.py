@@ -402,3 +402,62 @@ def test_option_out_of_range_is_an_error_that_names_it(newton, snapshots, option
 def test_basis_of_another_body_is_refused(newton, beam, snapshots):
     with pytest.raises(ValueError, match="vectors of shape"):
         PODGalerkin(beam(NH, 4, 1), snapshots[:4].movedim(0, -1))
+
+
+# ------------------------------------------------------------------ corrections
+
+
+@pytest.fixture(scope="module")
+def corrector(newton, snapshots) -> PODGalerkin:
+    """A solver whose cells are chosen roughly."""
+    return PODGalerkin.fit(newton.problem, snapshots, 12, tolerance=1e-2)
+
+
+def astray(solver: PODGalerkin, truth: torch.Tensor, size: float) -> torch.Tensor:
+    """Return answers with errors in the subspace, each of a size relative to the largest answer."""
+    way = solver.vectors @ noise(solver.vectors.shape[2], len(truth))
+    way = way.movedim(2, 0)
+    way = way / way.flatten(1).norm(dim=1)[:, None, None]
+    return truth + size * truth.flatten(1).norm(dim=1)[:, None, None] * way
+
+
+def test_a_correction_finds_what_the_subspace_holds_of_an_error(newton, unseen, truth):
+    """With all modes it is Newton's answer, whatever the guess."""
+    solver = PODGalerkin(newton.problem, everything(newton.problem))
+    for force, u, guess in zip(unseen.force, truth, astray(solver, truth, 0.02), strict=True):
+        assert_close(solver.correct(force, guess), u, rtol=0, atol=1e-4 * float(u.abs().max()))
+
+
+def test_each_correction_by_few_cells_leaves_a_small_part_of_the_error(corrector, unseen, truth):
+    assert len(corrector.cubature.cells) < len(corrector.problem.cells) / 2
+    guess = astray(corrector, truth, 0.02)
+    found = [errors(guess, truth)]
+    for steps in (1, 2, 3):
+        pairs = zip(unseen.force, guess, strict=True)
+        answer = torch.stack([corrector.correct(f, u, steps=steps) for f, u in pairs])
+        found.append(errors(answer, truth))
+    for before, after in pairwise(found[:3]):
+        assert float((after / before).median()) < 0.15
+    assert float(found[3].max()) < 1e-2 * float(found[0].min())
+
+
+def test_the_exact_answer_is_not_corrected(corrector, unseen, truth):
+    for force, u in zip(unseen.force, truth, strict=True):
+        assert_close(corrector.correct(force, u, steps=3), u, rtol=0, atol=1e-8)
+
+
+def test_what_the_subspace_does_not_hold_stays(corrector, unseen, truth):
+    free, basis = corrector.problem.free, corrector.vectors[corrector.problem.free]
+    guess = truth[0].clone()
+    guess[free] += 1e-3 * noise(int(free.sum()))
+    found = corrector.correct(unseen.force[0], guess, steps=2)
+    change = (found - guess)[free]
+    assert change.any()
+    assert_close(basis @ (basis.T @ change), change, rtol=0, atol=1e-12)
+    assert not (found - guess)[~free].any()
+
+
+def test_an_inverted_guess_is_handed_back(corrector, unseen, truth):
+    guess = torch.where(corrector.problem.free, 0.5 * noise(*truth[0].shape), 0.0)
+    assert not corrector.problem.evaluate(guess[None])[1] > 0
+    assert torch.equal(corrector.correct(unseen.force[0], guess), guess)

@@ -1,0 +1,215 @@
+"""Laws of the tables of results: what is measured is what was asked, and nothing is made up."""
+
+import csv
+import json
+
+import pytest
+import torch
+
+from dpl import results
+from dpl.fem.solution import solve
+from dpl.losses import MSE
+from dpl.metrics import metrics
+from dpl.models.latent import Latent
+from dpl.models.pod import PODNet
+from dpl.module import Surrogate
+
+SMALL = {"width": 16, "blocks": 1}
+
+
+@pytest.fixture(scope="module")
+def sets(scene, batch):
+    return results.load_sets(scene, batch, 6)
+
+
+@pytest.fixture(scope="module")
+def rows(scene, batch, sets):
+    """Rows and errors of the linear answer and of the truth itself, by method and set."""
+    known = {
+        tuple(f.flatten().tolist()): u for s in sets.values() for f, u in zip(*s[:2], strict=True)
+    }
+
+    def cheat(load):
+        return torch.stack([known[tuple(f.flatten().tolist())] for f in load.force])
+
+    methods = {"linear": results.linear(scene), "truth": results.Method(cheat, 12, 1.5, 7)}
+    found = results.measure(methods, sets, scene.solver, generation_minutes=3.0, repeats=1)
+    return {(row.method, row.loads): (row, errors) for row, errors in found}
+
+
+def sizes(field):
+    return field.flatten(1).norm(dim=1)
+
+
+def test_sets_are_in_range_beyond_it_and_far_below(scene, batch, sets):
+    assert list(sets) == ["in range", "twice", "small"]
+    assert sets["in range"] is batch
+    drawn = {k: scene.loads.sample((0, s), range(6)).force for k, s in results.STREAMS.items()}
+    for name, (low, high) in {"twice": (1, 2), "small": (0.01, 0.1)}.items():
+        factor = sizes(sets[name].force) / sizes(drawn[name])
+        assert float(factor[0]) == pytest.approx(low)
+        assert float(factor[-1]) == pytest.approx(high)
+        assert (factor.diff() > 0).all()
+
+
+def test_truth_is_in_balance(scene, sets):
+    for sample in sets.values():
+        (answer,) = [a for a in [solve(scene.solver, sample.load)]]
+        assert answer.converged.all()
+        far = sizes(answer.displacement - sample.displacement) / sizes(sample.displacement)
+        assert float(far.max()) < 1e-6
+
+
+def test_loads_without_an_answer_are_left_out(scene, batch, monkeypatch):
+    def fails(solver, load):
+        answer = solve(solver, load)
+        answer.status[1] = 2
+        return answer
+
+    monkeypatch.setattr(results, "solve", fails)
+    found = results.load_sets(scene, batch, 4)
+    assert [len(found[name].force) for name in ("twice", "small")] == [3, 3]
+
+
+def test_every_method_is_measured_on_every_set(rows, sets):
+    assert set(rows) == {(m, s) for m in ("linear", "truth") for s in sets}
+    for (_, name), (row, errors) in rows.items():
+        assert row.count == len(errors) == len(sets[name].force)
+        assert 0 < row.ms <= row.ms_p99
+
+
+def test_errors_are_those_of_the_metrics(scene, rows, sets):
+    for name, sample in sets.items():
+        answer = torch.stack([scene.linear.respond(f) for f in sample.force])
+        expected = metrics(scene.problem)
+        expected.update(answer, sample)
+        row, errors = rows["linear", name]
+        for key in ("e_mean", "e_max", "SNR_min", "rel_L2_worst", "residual", "min_det_F"):
+            assert getattr(row, key) == pytest.approx(float(expected.compute()[key]), rel=1e-9)
+        relative = sizes(answer - sample.displacement) / sizes(sample.displacement)
+        assert torch.allclose(errors, relative)
+    assert rows["truth", "in range"][0].e_mean == 0
+
+
+def test_newton_goes_on_from_what_was_predicted(rows):
+    linear, truth = (rows[method, "in range"][0] for method in ("linear", "truth"))
+    assert truth.newton_iterations == 0
+    assert 1 < linear.newton_iterations < 10
+    assert rows["linear", "twice"][0].newton_iterations is None
+
+
+def test_only_what_has_learnt_costs_samples(rows):
+    linear, truth = (rows[method, "in range"][0] for method in ("linear", "truth"))
+    assert (linear.samples, linear.generation_minutes, linear.parameters) == (None, None, None)
+    assert (truth.samples, truth.generation_minutes, truth.training_minutes) == (12, 3.0, 1.5)
+    assert truth.parameters == 7
+
+
+@pytest.mark.parametrize("kind", [PODNet, Latent])
+def test_corrections_bring_answers_nearer_and_leave_the_network_alone(scene, batch, kind):
+    torch.manual_seed(0)
+    module = Surrogate(kind(scene, **SMALL), MSE(), scene).eval()
+    module.prepare(batch)
+    with torch.no_grad():
+        for parameter in module.net.parameters():
+            parameter.mul_(0.3)
+    plain = results.Method(module.predict, len(batch.force), 2.0, 5)
+    tier = results.corrected(module, plain, batch, rank=20, tolerance=1e-4, steps=2)
+    with torch.no_grad():
+        first, after, again = (m.predict(batch.load) for m in (plain, tier, plain))
+    before, after = sizes(first - batch.displacement), sizes(after - batch.displacement)
+    assert float(after.median()) < 0.1 * float(before.median())
+    assert (after <= before * (1 + 1e-9)).all()
+    assert torch.equal(first, again)
+    assert getattr(module.net, "linear_tol", 5e-4) == 5e-4
+    assert (tier.samples, tier.parameters) == (plain.samples, 5)
+    assert tier.training_minutes > 2
+
+
+def test_the_rom_comes_near_the_truth(scene, batch):
+    found = results.pod_galerkin(scene, batch, rank=10, tolerance=1e-4)
+    far = sizes(found.predict(batch.load) - batch.displacement) / sizes(batch.displacement)
+    assert float(far.max()) < 1e-2
+    assert found.samples == len(batch.force)
+
+
+def test_minutes_are_summed_over_sessions(tmp_path):
+    assert results.training_minutes(tmp_path) is None
+    (tmp_path / "training.jsonl").write_text('{"seconds": 30.0}\n{"seconds": 90.0}\n')
+    assert results.training_minutes(tmp_path) == 2.0
+
+
+def test_rows_of_the_paper_are_marked_as_such():
+    (row,) = results.paper("beam_svk")
+    assert (row.method, row.e_mean, row.SNR_min, row.ms) == ("paper", 8e-6, 8.4, None)
+    assert row.rel_L2_worst == pytest.approx(0.38, abs=0.005), "the paper's text: 38 %"
+    assert [row.method for row in results.paper("beam_young")] == ["paper", "paper, 3b"]
+    assert results.paper("mine") == []
+
+
+# ------------------------------------------------------------------ the command
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    return tmp_path_factory.mktemp("results")
+
+
+@pytest.fixture
+def trained(script, tiny_training, home):
+    """A folder with a run of the paper's network and one of the flagship."""
+    if not (home / "runs").exists():
+        for name, more in {"fcnn": [], "latent": ["model.blocks=1"]}.items():
+            common = ["data.folder=data", "trainer.max_epochs=1", f"run=runs/tiny/{name}"]
+            ended = script("train", *tiny_training, *common, f"model={name}", *more, cwd=home)
+            assert ended.status == 0, ended.err
+    return home
+
+
+QUICK = ["name=tiny", "count=3", "galerkin.rank=5", "corrected.rank=8"]
+
+
+def test_one_command_writes_rows_machine_and_figure(trained, script):
+    ended = script("results", *QUICK, cwd=trained)
+    assert ended.status == 0, ended.err
+    with (trained / "results" / "tiny.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    names = ["linear", "POD-Galerkin", "fcnn", "latent", "latent corrected"]
+    assert [row["method"] for row in rows] == names * 3
+    assert [row["loads"] for row in rows] == [
+        s for s in ("in range", "twice", "small") for _ in names
+    ]
+    told = {row["method"]: row for row in rows if row["loads"] == "in range"}
+    assert (told["fcnn"]["samples"], told["linear"]["samples"]) == ("16", "")
+    assert float(told["latent"]["training_minutes"]) > 0
+    assert float(told["latent"]["e_mean"]) < float(told["linear"]["e_mean"])
+    machine = json.loads((trained / "results" / "tiny.json").read_text())
+    assert machine["threads"] == 1
+    assert (trained / "results" / "tiny.png").read_bytes().startswith(b"\x89PNG")
+    rows = json.loads((trained / "runs" / "tiny" / "fcnn" / "evaluation.json").read_text())
+    (network,) = (row for row in rows if row["solver"] == "network")
+    assert float(told["fcnn"]["e_mean"]) == pytest.approx(network["errors"]["e_mean"], rel=1e-3)
+
+
+def test_reduced_models_may_be_left_out(trained, script):
+    ended = script(
+        "results", *QUICK[:2], "galerkin=null", "corrected=null", "folder=no", cwd=trained
+    )
+    assert ended.status == 0, ended.err
+    with (trained / "no" / "tiny.csv").open() as file:
+        assert {row["method"] for row in csv.DictReader(file)} == {"linear", "fcnn", "latent"}
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["name=none"], "run: runs/none holds no runs"),
+        (["name=tiny", "galerkin.rank=many"], "galerkin.rank = 'many' must be"),
+        (["name=tiny", "corrected.depth=2"], "corrected.depth"),
+    ],
+)
+def test_a_wrong_word_ends_with_one_line(trained, script, more, said):
+    ended = script("results", *more, cwd=trained)
+    assert ended.status != 0
+    assert said in ended.err
+    assert "Traceback" not in ended.err
