@@ -171,7 +171,7 @@ def test_a_network_may_bring_an_optimiser_and_a_loss_of_its_own(compose, name):
     cfg = compose(f"model={name}", "folder=.", command="train")
     run.check(cfg)
     assert cfg.optimizer._target_.endswith("Muon")
-    assert cfg.optimizer.lr == 2e-2
+    assert cfg.optimizer.lr == 5e-3
     assert cfg.optimizer.momentum == 0.95, "the rest is that of conf/optimizer"
     assert cfg.loss._target_.endswith("MeanNorm")
     assert cfg.data.batch_size == 1024
@@ -193,7 +193,7 @@ def test_what_is_asked_for_wins_over_what_a_network_brings(compose):
 
 
 def test_a_network_leaves_a_rate_alone_that_is_meant_for_its_own_optimiser_only(compose):
-    """2e-2 is Muon's; AdamW asked for instead keeps the rate of its file."""
+    """5e-3 is Muon's; AdamW asked for instead keeps the rate of its file."""
     usual = compose("folder=.", command="train").optimizer.lr
     cfg = compose("model=latent", "optimizer=adamw", "folder=.", command="train")
     assert cfg.optimizer.lr == usual
