@@ -35,6 +35,8 @@ if typing.TYPE_CHECKING:
     from dpl.fem.problem import Problem
     from dpl.module import Surrogate
 
+R = typing.TypeVar("R")
+
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 TRUSTED = ("dpl.", "torch.optim.", "lightning.")  # what a run's folder may name without being asked
@@ -49,21 +51,26 @@ KEYS = {  # what a configuration may hold at its top
     *("name", "galerkin", "corrected"),
 }
 
+ASIDE = {  # where a run lies and how it is watched, not what it is
+    *("run", "folder", "ckpt_path", "data.folder"),
+    *("trainer.callbacks", "trainer.logger", "trainer.plugins"),
+}
+
 
 class ConfigError(ValueError):
     """A configuration that cannot work: which key, what is wrong, what to do."""
 
 
-def command(task: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+def command(task: Callable[[DictConfig], R]) -> Callable[[DictConfig], R]:
     """Return a task that ends bad input with one line and a status of 2, Ctrl-C with 130."""
 
     @functools.wraps(task)
-    def wrapped(cfg: DictConfig) -> None:
+    def wrapped(cfg: DictConfig) -> R:
         logging.getLogger("skfem").setLevel(logging.WARNING)
         for name in ("lightning.pytorch", "lightning.fabric"):  # they print for themselves
             logging.getLogger(name).propagate = False
         try:
-            task(cfg)
+            return task(cfg)
         except (ConfigError, DataSetError) as error:
             print(f"error: {error}", file=sys.stderr)
             _drop_empty(Path(HydraConfig.get().runtime.output_dir))
@@ -110,6 +117,31 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
         raise ConfigError(f"{error.full_key} is missing; set it on the command line") from None
     except OmegaConfBaseException as error:
         raise ConfigError(f"{error.full_key or 'config'}: {error.msg or error}") from None
+
+
+def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
+    """Return what makes one run differ from another, flat: numbers, truth values and texts.
+
+    Under the keys of the command line (`model.width`). A call stands under its own key by the name
+    of what it calls (`model`: FCNN). Left out are null and `ASIDE`.
+
+    Raises:
+        ConfigError: A value is missing.
+    """
+    return dict(_columns(plain(cfg)))
+
+
+def _columns(node: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in node.items():
+        place = f"{path}.{key}" if path else key
+        if value is None or place in ASIDE:
+            continue
+        if isinstance(value, dict):
+            yield from _columns(value, place)
+        elif key == "_target_":
+            yield path, value.rpartition(".")[2]
+        elif not key.startswith("_"):
+            yield place, str(value) if isinstance(value, list) else value
 
 
 def check(cfg: DictConfig, *, trust: bool = True) -> None:
@@ -342,6 +374,46 @@ def check_processes(trainer: Any) -> None:
             "again; set trainer.strategy=ddp_spawn, or start each run by torchrun or on a cluster "
             "(hydra/launcher=submitit_slurm)"
         )
+
+
+def check_sweep(arguments: Sequence[str]) -> None:
+    """End a command that asks for Optuna where it cannot be used, with one line and a status of 2.
+
+    Hydra itself would list the sweepers that it has, and not say how to get this one.
+
+    Args:
+        arguments: Of the command.
+    """
+    wanted = ("sweep=", "+sweep=", "hydra/sweeper=optuna")
+    if not any(argument.startswith(wanted) for argument in arguments):
+        return
+    try:
+        importlib.import_module("hydra_plugins.hydra_optuna_sweeper._impl")
+    except ImportError as error:
+        do = "pip install -c constraints.txt -e '.[sweep]'"
+        print(f"error: sweep: Optuna cannot be used ({error}): {do}", file=sys.stderr)
+        sys.exit(2)
+
+
+def best_error(trainer: Any) -> float | None:
+    """Return the smallest validation e_mean of a training [-], which a sweep minimises.
+
+    Infinite where the training diverged before its first validation, None without validation.
+
+    Raises:
+        ConfigError: There is no validation, in a sweep that needs one.
+    """
+    for kept in trainer.checkpoint_callbacks:
+        score = getattr(kept, "best_model_score", None)
+        if getattr(kept, "monitor", None) == "val/e_mean" and score is not None:
+            return float(score) if math.isfinite(score) else math.inf
+    hydra_now = HydraConfig.get()
+    if hydra_now.mode == RunMode.MULTIRUN and "direction" in hydra_now.sweeper:
+        raise ConfigError(
+            "trainer.check_val_every_n_epoch: no epoch was validated, so that there is nothing to "
+            "minimise; validate more often or train longer"
+        )
+    return None
 
 
 def show_plan(*parts: Any) -> None:

@@ -6,6 +6,7 @@ import meshio
 import numpy as np
 import pytest
 import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 
@@ -26,7 +27,8 @@ MESHES = [
     pytest.param(name, marks=pytest.mark.slow) if name == "paper_beam" else name
     for name in options("mesh")
 ]
-GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "experiment")
+WHOLE = ("experiment", "sweep")  # groups of whole commands, not of one part
+GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name not in WHOLE)
 
 
 @pytest.fixture
@@ -101,6 +103,29 @@ def test_an_experiment_composes_and_passes_the_check(compose, name):
     run.check(cfg)
 
 
+@pytest.mark.parametrize("experiment", [None, "beam_svk"])
+@pytest.mark.parametrize("name", options("sweep"))
+def test_a_sweep_composes_passes_the_check_and_searches_among_what_there_is(
+    compose, name, experiment
+):
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    choices = [f"sweep={name}", *([f"experiment={experiment}"] if experiment else []), "folder=."]
+    run.check(compose(*choices, command="train"))
+    search = OmegaConf.load(CONF / "sweep" / f"{name}.yaml").hydra.sweeper.params
+    spaces = OverridesParser.create().parse_overrides(
+        [f"{k}={space}" for k, space in search.items()]
+    )
+    for end in (0, -1):
+        values = {}
+        for one in spaces:
+            space = one.value()
+            among = space.list if one.is_choice_sweep() else (space.start, space.end)
+            values[one.key_or_group] = among[end]
+        cfg = compose(*choices, *(f"{k}={v}" for k, v in values.items()), command="train")
+        assert {key: OmegaConf.select(cfg, key) for key in values} == values
+        run.check(cfg)
+
+
 @pytest.mark.parametrize(
     ("group", "name"), [(group, name) for group in GROUPS for name in options(group)]
 )
@@ -159,7 +184,7 @@ def call_of(path):
 def test_yaml_says_nothing_that_python_says_already_except_by_intent():
     """Every file is a call of something that exists, or a command or a package-wide experiment."""
     for path in CONF.glob("*/*.yaml"):
-        if path.parent.name in ("experiment", "young"):
+        if path.parent.name in WHOLE:
             continue
         node = call_of(path)
         assert "_target_" in node, path

@@ -12,6 +12,7 @@ import lightning as L
 import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
+from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import OmegaConf
 
 from dpl import run
@@ -277,17 +278,49 @@ def test_generation_imports_neither_lightning_nor_matplotlib(tmp_path, environme
     assert "train: 3 of 3 loads accepted" in ended.stdout
 
 
+@pytest.mark.parametrize("argument", ["sweep=latent", "+sweep=latent", "hydra/sweeper=optuna"])
+def test_a_sweep_without_optuna_says_in_one_line_what_to_install(
+    script, monkeypatch, argument, tmp_path
+):
+    monkeypatch.setitem(sys.modules, "hydra_plugins.hydra_optuna_sweeper._impl", None)
+    ended = script("train", argument, cwd=tmp_path)
+    assert ended.status == 2
+    assert ended.err.startswith("error: sweep: ")
+    assert ended.err.count("\n") == 1
+    assert "pip install -c constraints.txt -e '.[sweep]'" in ended.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_hyperparameters_are_flat_and_a_call_goes_by_its_name(compose):
+    cfg = compose("folder=.", "model=latent", "young=[1e6,2e11]", command="train")
+    flat = run.hyperparameters(cfg)
+    assert flat["model"] == "Latent"
+    assert (flat["model.width"], flat["optimizer.lr"], flat["loss"]) == (256, 2e-2, "MeanNorm")
+    assert flat["young"] == "[1000000.0, 200000000000.0]"
+    assert all(isinstance(value, bool | int | float | str) for value in flat.values())
+    noise = ("run", "folder", "ckpt_path", "trainer.callbacks", "trainer.logger")
+    assert not [key for key in flat if key.startswith(noise) or "_target_" in key]
+
+
+@pytest.mark.parametrize(
+    ("score", "told"), [(2e-3, 2e-3), (float("nan"), float("inf")), (float("inf"), float("inf"))]
+)
+def test_the_best_error_is_the_score_of_the_checkpoint_that_is_kept_for_it(score, told):
+    best, last = ModelCheckpoint(monitor="val/e_mean"), ModelCheckpoint()
+    best.best_model_score, last.best_model_score = torch.tensor(score), torch.tensor(1e-9)
+    trainer = L.Trainer(logger=False, callbacks=[last, best], accelerator="cpu")
+    assert run.best_error(trainer) == pytest.approx(told)
+
+
 # ------------------------------------------------------------------ runs
 
 
-@pytest.fixture(scope="module")
-def trained(tiny_training, tmp_path_factory):
-    """A run of one epoch, as `train.py` leaves it."""
-    folder = tmp_path_factory.mktemp("run")
+def _trained(folder, *overrides):
+    """Train for one epoch, as `train.py` does; return the surrogate as it is in memory."""
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         places = [f"data.folder={folder}/data", f"folder={folder}", "run=here"]
-        cfg = hydra.compose("train", overrides=[*tiny_training, *places])
+        cfg = hydra.compose("train", overrides=[*overrides, *places])
     kept = [node for node in cfg.trainer.callbacks if "ModelCheckpoint" in node._target_]
     cfg.trainer.callbacks = kept
     cfg.trainer.max_epochs = 1
@@ -296,7 +329,14 @@ def trained(tiny_training, tmp_path_factory):
     trainer: L.Trainer = run.make(cfg, "trainer")
     run.save_config(cfg, folder)
     trainer.fit(surrogate, datamodule=run.make(cfg, "data", scene=scene))
-    return folder, surrogate
+    return surrogate
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_training, tmp_path_factory):
+    """A run of one epoch and its surrogate."""
+    folder = tmp_path_factory.mktemp("run")
+    return folder, _trained(folder, *tiny_training)
 
 
 @pytest.fixture
@@ -314,6 +354,21 @@ def test_a_run_comes_back_as_it_was(trained):
         assert torch.equal(again.predict(load), surrogate.predict(load))
     assert not again.training
     assert cfg.mesh.nodes == [5, 3, 3]
+
+
+def test_a_run_over_a_range_of_moduli_with_e_as_an_input_comes_back_as_it_was(
+    tiny_training, tmp_path
+):
+    wide = ["young=[1e6,2.03e11]", "model.young=true"]
+    surrogate = _trained(tmp_path, *tiny_training, *wide)
+    _, again = run.load_run(tmp_path)
+    load = surrogate.scene.loads.sample((0, 2), range(4))
+    assert load.young.max() > 2 * load.young.min()
+    with torch.no_grad():
+        answer = again.predict(load)
+        assert torch.equal(answer, surrogate.predict(load))
+        assert not torch.allclose(answer, again.predict(load._replace(young=load.young.flip(0))))
+    assert answer.isfinite().all()
 
 
 def test_a_run_keeps_its_resolved_configuration(trained):

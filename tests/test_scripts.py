@@ -10,7 +10,13 @@ import meshio
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
+from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
+from tensorboard.context import RequestContext
+from tensorboard.plugins.base_plugin import TBContext
+from tensorboard.plugins.hparams import api_pb2, get_experiment, list_session_groups
+from tensorboard.plugins.hparams.backend_context import Context
 
 ROWS = ["linear", "network", "hybrid Newton", "Newton from zero"]
 
@@ -331,3 +337,171 @@ def test_a_multirun_trains_each_combination_in_a_folder_of_its_own(start, tiny_t
     assert seen == {("MSE", 0), ("MSE", 1), ("LrStar", 0), ("LrStar", 1)}
     assert all((folder / "evaluation.json").exists() for folder in folders)
     assert len(list((tmp_path / "datasets").iterdir())) == 1, "they share the data set"
+
+
+# ------------------------------------------------------------------ sweeps
+
+
+def configurations(folder):
+    """Return those of the runs below a folder, by the last names of network, loss and optimiser."""
+    seen = {}
+    for path in folder.glob("*/config.yaml"):
+        cfg = OmegaConf.load(path)
+        parts = (cfg.model, cfg.loss, cfg.optimizer)
+        seen[tuple(part._target_.rpartition(".")[2] for part in parts)] = path.parent
+    return seen
+
+
+@pytest.fixture(scope="module")
+def swept(start, tiny_training, tmp_path_factory):
+    """Where a sweep over networks and losses ran, one of which brings an optimiser and a loss."""
+    home = tmp_path_factory.mktemp("swept")
+    sweep = ["-m", "model=fcnn,latent", "loss=mse,lr_star"]
+    process = start("train", *sweep, *tiny_training, "trainer.max_epochs=1", "run=sweep", cwd=home)
+    status, _, err = finish(process)
+    assert status == 0, err[-2000:]
+    return home
+
+
+def test_a_sweep_over_networks_gives_each_the_loss_that_is_asked_for_and_a_folder(swept):
+    runs = configurations(swept / "sweep")
+    assert set(runs) == {
+        ("FCNN", "MSE", "AdamW"),
+        ("FCNN", "LrStar", "AdamW"),
+        ("Latent", "MSE", "Muon"),
+        ("Latent", "LrStar", "Muon"),
+    }
+    judged = {json.loads((folder / "evaluation.json").read_text())[1]["errors"]["e_mean"]
+              for folder in runs.values()}  # fmt: skip
+    assert len(judged) == 4, "each run is another one"
+    assert len(list((swept / "datasets").iterdir())) == 1, "they share the data set"
+    (journal,) = (swept / "datasets").glob("*/journal.jsonl")
+    assert len(journal.read_text().splitlines()) == 1, "which is solved once"
+
+
+def test_the_hparams_tab_shows_the_runs_of_a_sweep_side_by_side(swept):
+    """What TensorBoard's own reader hands to the tab: columns, then a line for each run."""
+    runs = EventMultiplexer()
+    runs.AddRunsFromDirectory(str(swept / "sweep"))
+    runs.Reload()
+    provider = MultiplexerDataProvider(runs, str(swept / "sweep"))
+    backend = Context(TBContext(data_provider=provider))
+    asked = RequestContext(), backend, ""
+    columns = get_experiment.Handler(*asked, api_pb2.GetExperimentRequest()).run()
+    request = api_pb2.ListSessionGroupsRequest(
+        start_index=0,
+        slice_size=10,
+        allowed_statuses=[api_pb2.STATUS_SUCCESS],
+        col_params=[
+            *({"hparam": info.name} for info in columns.hparam_infos),
+            *({"metric": info.name} for info in columns.metric_infos),
+        ],
+    )
+    lines = list_session_groups.Handler(*asked, request).run().session_groups
+
+    names = {info.name for info in columns.hparam_infos}
+    assert {"model", "loss", "optimizer.lr", "model.layers", "model.rank", "young"} <= names
+    assert not [name for name in names if "_" in (name[0], name[-1]) or "callbacks" in name]
+    metrics = {info.name.tag for info in columns.metric_infos}
+    assert {"e_mean", "e_max", "SNR_min", "rel_L2_median", "residual"} <= metrics
+
+    assert len(lines) == 4
+    folders = configurations(swept / "sweep")
+    for line in lines:
+        shown = {name: value.string_value for name, value in line.hparams.items()}
+        errors = {value.name.tag: value.value for value in line.metric_values}
+        rows = json.loads(
+            (
+                folders[shown["model"], shown["loss"], shown["optimizer"]] / "evaluation.json"
+            ).read_text()
+        )
+        assert errors["e_mean"] == pytest.approx(rows[1]["errors"]["e_mean"], rel=1e-5)
+        width, wanted = line.hparams["model.width"].number_value, 16
+        assert width == wanted
+        assert ("model.rank" in line.hparams) == (shown["model"] == "Latent")
+        assert ("model.layers" in line.hparams) == (shown["model"] == "FCNN")
+
+
+@pytest.mark.slow
+def test_every_network_trains_with_either_loss_in_one_command(start, tiny_training, tmp_path):
+    """As it stands in the README, but for the size; networks have the widths of their files."""
+    sizes = [o for o in tiny_training if not o.startswith("model.")]
+    process = start(
+        "train", "-m", "model=fcnn,cnn,gnn,pod,latent", "loss=mse,lr_star", *sizes,
+        "trainer.max_epochs=1", "run=all", cwd=tmp_path,
+    )  # fmt: skip
+    status, _, err = finish(process)
+    assert status == 0, err[-2000:]
+    runs = configurations(tmp_path / "all")
+    owners = {"FCNN": "AdamW", "CNN": "AdamW", "GNN": "AdamW", "PODNet": "Muon", "Latent": "Muon"}
+    assert set(runs) == {(m, loss, o) for m, o in owners.items() for loss in ("MSE", "LrStar")}
+    for folder in runs.values():
+        rows = json.loads((folder / "evaluation.json").read_text())
+        assert np.isfinite(rows[1]["errors"]["e_mean"])
+        assert (folder / "checkpoints/best.ckpt").exists()
+    assert len(list((tmp_path / "datasets").iterdir())) == 1
+
+
+@pytest.fixture
+def search(script, tiny_training, tmp_path):
+    """Searches for the flagship's numbers on the tiny scene; returns what ended, and the folder."""
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+
+    def search(*overrides):
+        sizes = [o for o in tiny_training if not o.startswith("data.batch_size")]
+        ended = script(
+            "train",
+            "sweep=latent",
+            *sizes,
+            "trainer.max_epochs=1",
+            "run=s",
+            *overrides,
+            cwd=tmp_path,
+        )
+        return ended, tmp_path / "s"
+
+    return search
+
+
+def validated(folder):
+    """Return the validation e_mean of a run of one epoch."""
+    for path in folder.glob("events*"):
+        events = EventAccumulator(str(path))
+        events.Reload()
+        if "val/e_mean" in events.Tags()["scalars"]:
+            return events.Scalars("val/e_mean")[-1].value
+    raise AssertionError(f"{folder} was not validated")
+
+
+def test_a_search_keeps_the_trial_with_the_smallest_validation_error(search):
+    ended, folder = search("hydra.sweeper.n_trials=2")
+    assert ended.status == 0, ended.err[-2000:]
+    found = OmegaConf.load(folder / "optimization_results.yaml")
+    errors = [validated(folder / number) for number in ("0", "1")]
+    assert errors[0] != errors[1]
+    assert found.best_value == pytest.approx(min(errors), rel=1e-5)
+    best = OmegaConf.load(folder / str(int(np.argmin(errors))) / "config.yaml")
+    searched = {"model.blocks", "model.rank", "optimizer.lr", "data.batch_size", "loss.relative"}
+    assert set(found.best_params) == searched, "the width is given on the command line"
+    for key, value in found.best_params.items():
+        assert OmegaConf.select(best, key) == pytest.approx(value)
+    assert best.model.width == 16
+
+
+def test_a_search_goes_on_after_a_trial_that_diverges(search):
+    ended, folder = search("hydra.sweeper.n_trials=4", "optimizer.lr=choice(1e30,1e-2)")
+    assert ended.status == 0, ended.err[-2000:]
+    rates = [OmegaConf.load(path).optimizer.lr for path in sorted(folder.glob("*/config.yaml"))]
+    assert len(rates) == 4
+    assert set(rates[:-1]) == {1e30, 1e-2}, "both are tried, and something after the first"
+    assert not np.isfinite(validated(folder / str(rates.index(1e30))))
+    found = OmegaConf.load(folder / "optimization_results.yaml")
+    assert found.best_params["optimizer.lr"] == 1e-2
+    assert np.isfinite(found.best_value)
+
+
+def test_a_search_without_validation_ends_with_one_line(search):
+    ended, folder = search("hydra.sweeper.n_trials=2", "trainer.check_val_every_n_epoch=5")
+    assert ended.status == 2
+    assert "error: trainer.check_val_every_n_epoch: no epoch was validated" in ended.err
+    assert len(list(folder.glob("*/config.yaml"))) == 1, "the first trial tells"

@@ -56,7 +56,8 @@ class FCNN(nn.Module):
         inputs = everything if all_dofs else scene.loads.reach
         outputs = everything if all_dofs else scene.problem.free
         self.takes_young, (low, high) = young, scene.loads.young_range
-        self.middle, self.spread = (low + high) / 2, max((high - low) / 2, 1e-12 * high)
+        self.largest, self.middle = high, (low + high) / 2  # [Pa]
+        self.spread = (high - low) / 2 or high  # of one modulus, itself: others are not far away
         ends = int(inputs.sum()) + young, int(outputs.sum())
         hidden = width or ends[1]
         sizes = [ends[0], *[hidden] * (layers - 1), ends[1]]
@@ -86,7 +87,7 @@ class FCNN(nn.Module):
         if self.takes_young:
             if young is None:
                 raise ValueError("young is an input of this network: give E, (B,) [Pa]")
-            size = (young / (self.middle + self.spread)).to(force.dtype)[:, None]
+            size = (young / self.largest).to(force.dtype)[:, None]
             place = ((young - self.middle) / self.spread).to(force.dtype)[:, None]
             entering = torch.cat([size * entering, place], dim=1)
         displacement = torch.zeros_like(force)

@@ -177,6 +177,72 @@ def test_the_papers_beam_needs_nine_gigabytes():
     fcnn._refuse_beyond_memory(576_084_000, 9.3)
 
 
+@pytest.fixture
+def over_moduli(make_scene):
+    """A network with E as an input, over the paper's widest range; and four loads of its scene."""
+    scene = make_scene(young=[1e6, 2.03e11])
+    torch.manual_seed(0)
+    return Surrogate(FCNN(scene, young=True), MSE(), scene), scene.loads.sample((0, 0), range(4))
+
+
+def test_youngs_modulus_matters_where_it_is_an_input_and_only_there(over_moduli):
+    surrogate, load = over_moduli
+    plain = Surrogate(FCNN(surrogate.scene), MSE(), surrogate.scene)
+    soft, stiff = (load._replace(young=torch.full_like(load.young, e)) for e in (1e6, 2.03e11))
+    with torch.no_grad():
+        apart = (surrogate.predict(soft) - surrogate.predict(stiff)).flatten(1).norm(dim=1)
+        size = surrogate.predict(stiff).flatten(1).norm(dim=1)
+        assert (apart > 0.01 * size).all()
+        assert torch.equal(plain.predict(soft), plain.predict(stiff))
+
+
+def test_an_answer_has_a_slope_with_respect_to_youngs_modulus(over_moduli):
+    """That of the input itself, against a difference quotient."""
+    surrogate, load = over_moduli
+    surrogate.double()
+    young = load.young.clone().requires_grad_()
+    surrogate.predict(load._replace(young=young)).sum().backward()
+    step = 1e-4 * 2.03e11
+    with torch.no_grad():
+        ends = [surrogate.predict(load._replace(young=load.young + h)) for h in (step, -step)]
+    quotient = (ends[0] - ends[1]).flatten(1).sum(dim=1) / (2 * step)
+    assert young.grad.abs().min() > 0
+    assert torch.allclose(young.grad, quotient, rtol=1e-2)
+
+
+def test_youngs_modulus_enters_between_minus_one_and_one_and_forces_as_newtons_are(over_moduli):
+    surrogate, load = over_moduli
+    entered = []
+    surrogate.net.stages[0].register_forward_hook(lambda _, given, __: entered.append(given[0]))
+    moduli = torch.tensor([1e6, 1e9, 1.015005e11, 2.03e11], dtype=torch.float64)
+    force = load.force[:1].expand(4, -1, -1)
+    surrogate.predict(load._replace(force=force, young=moduli))
+    (inputs,) = entered
+    assert inputs[:, -1].tolist() == pytest.approx([-1.0, -0.99015, 0.0, 1.0], abs=1e-4)
+    newtons = inputs[:, :-1].norm(dim=1) / moduli
+    assert torch.allclose(newtons, newtons[:1].expand(4))
+    scaled = (force / surrogate.force_scale).float()[-1:, surrogate.scene.loads.reach]
+    assert torch.allclose(inputs[-1:, :-1], scaled), "the stiffest body's are those over E L^2"
+
+
+def test_one_modulus_as_an_input_leaves_its_neighbours_in_reach(scene, batch):
+    """The tiny scene has E = 4500 Pa alone; a hundredth more is no other world."""
+    torch.manual_seed(0)
+    surrogate = Surrogate(FCNN(scene, young=True), MSE(), scene)
+    with torch.no_grad():
+        here, near = (
+            surrogate.predict(batch.load._replace(young=k * batch.young)) for k in (1, 1.01)
+        )
+    apart, size = (near - here).flatten(1).norm(dim=1), here.flatten(1).norm(dim=1)
+    assert ((apart > 0) & (apart < 0.1 * size)).all()
+
+
+def test_a_network_that_wants_youngs_modulus_says_so_where_it_is_not_given(over_moduli):
+    surrogate, load = over_moduli
+    with pytest.raises(ValueError, match="young is an input"):
+        surrogate.net(load.force.float())
+
+
 @pytest.mark.parametrize("options", [{"layers": 1}, {"width": 0}, {"layers": 0}])
 def test_options_out_of_range_are_refused_by_name(scene, options):
     with pytest.raises(ValueError, match=f"{next(iter(options))} = "):
