@@ -3,17 +3,19 @@
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
-from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.linear import full_matrix
 from dpl.fem.newton import Linear, gather
 from dpl.fem.problem import Problem
+from dpl.fem.solution import Load
 
 ENTRIES = 16_000  # numbers of a displacement at once: few enough for their strains to fit a cache
 REMEMBERED = 1_000_000  # loads whose scale is kept
+SPANNING = (0.0, 0.2, 0.4)  # Poisson's ratios whose K(0) span all others'
 STEP = 1e-5  # of the displacement gradient, where differences of forces stand for the tangent [-]
 
 
@@ -32,30 +34,56 @@ class Rest:
         """Return the rest of a body: the known one if that is its."""
         return known if known is not None and known.problem is problem else cls(problem)
 
-    def product(self, field: Tensor) -> Tensor:
-        """Return K(0) v, (B, N, D) [-], of v (B, N, D); zero where held."""
-        free, image = self.problem.free, torch.zeros_like(field)
+    def product(self, field: Tensor, poisson: Tensor | None = None) -> Tensor:
+        """Return K(0) v, (B, N, D) [-], of v (B, N, D); zero where held.
+
+        At rest every law is Hooke's, K(0) = lambda K1 + mu K2 + springs: that of any Poisson's
+        ratio is a sum of those of three.
+
+        Args:
+            field: v.
+            poisson: Of the loads, (B, P) [-]; P = 0 if left out.
+        """
+        problem = self.problem
+        if poisson is None or not poisson.shape[-1]:
+            return self._product(problem.at(field.new_zeros(1, 0)), field)
+        law = problem.material.at(poisson.flatten())
+        moduli = [torch.as_tensor(m).flatten().to(field) for m in (law.lam, law.mu)]
+        moduli.append(torch.ones_like(moduli[0]))
+        known = [(m.lam, m.mu, 1.0) for m in (problem.material.at(nu) for nu in SPANNING)]
+        shares = torch.linalg.solve(field.new_tensor(known).T, torch.stack(moduli))  # (3, B)
+        parts = [self._product(problem.at(nu), field) for nu in SPANNING]
+        return torch.einsum("kb,kbnd->bnd", shares, torch.stack(parts))
+
+    def _product(self, problem: Problem, field: Tensor) -> Tensor:
+        """Return K(0) v of one body."""
+        free, image = problem.free, torch.zeros_like(field)
         columns = field.detach()[:, free].T
-        if field.device.type == "cpu":
-            image[:, free] = torch.from_numpy(self._matrix @ columns.numpy()).T
+        if problem not in self._matrices:
+            self._matrices[problem] = _matrix(problem, field.device)
+        matrix = self._matrices[problem]
+        if isinstance(matrix, Tensor):
+            image[:, free] = (matrix @ columns).T
         else:
-            image[:, free] = (self._on_device @ columns).T
+            image[:, free] = torch.from_numpy(matrix @ columns.numpy()).T
         return image
 
-    def work(self, force: Tensor) -> Tensor:
+    def work(self, force: Tensor, poisson: Tensor) -> Tensor:
         """Return f.K(0)^-1 f / 2, the work of f (B, N, D) on its linear answer, (B,) [-].
 
         To about 1e-3: it is a scale. One solve with a stored factor, on the processor, for a force
         that is new; those of a data set come again every epoch and are remembered by their hash.
+        With Poisson's ratios (B, 1) of their own, the first time takes a factor for each.
         """
         problem, found = self._linear.problem, []
-        for one in force.cpu():
+        for one, own in zip(force.cpu(), poisson.cpu().expand(len(force), -1), strict=True):
             right = gather(one, problem)
-            key = hash(right.tobytes())
+            key = hash(right.tobytes() + own.numpy().tobytes())
             if key not in self._works:
                 if len(self._works) >= REMEMBERED:
                     self._works.clear()
-                self._works[key] = float(right @ self._linear.factor.solve(right, 1e-3)) / 2
+                factor = self._linear.at(own[None]).factor
+                self._works[key] = float(right @ factor.solve(right, 1e-3)) / 2
             found.append(self._works[key])
         return torch.tensor(found, dtype=force.dtype, device=force.device)
 
@@ -63,48 +91,61 @@ class Rest:
     def _works(self) -> dict[int, float]:
         return {}
 
+    def energy(self, poisson: Tensor) -> Tensor:
+        """Return W(0), (1,) or (B,) [-], which is not zero for every law."""
+        if not poisson.shape[-1]:
+            return self._energy
+        body = self.problem.at(poisson)
+        nothing = body.points.new_zeros(1, 1, 1, 3, 3)
+        volume = body.dV.expand(len(body.cells), -1).sum()
+        return volume * body.material.energy(nothing).flatten().expand(len(poisson))
+
     @cached_property
-    def energy(self) -> Tensor:
-        """W(0), (1,) [-], which is not zero for every law."""
+    def _energy(self) -> Tensor:
         return self.problem.energy(self.problem.points.new_zeros(1, *self.problem.shape))
+
+    @cached_property
+    def _matrices(self) -> dict[Problem, Any]:
+        return {}
 
     @cached_property
     def _linear(self) -> Linear:
         here = self.problem.points.device.type == "cpu"
         return Linear(self.problem if here else self.problem.to("cpu"))
 
-    @cached_property
-    def _matrix(self) -> csr_array:
-        problem = self._linear.problem
-        rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-        return full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())
-
-    @cached_property
-    def _on_device(self) -> Tensor:
-        whole, device = self._matrix, self.problem.points.device
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch calls its sparse matrices a beta
-            return torch.sparse_csr_tensor(
-                torch.from_numpy(whole.indptr),
-                torch.from_numpy(whole.indices),
-                torch.from_numpy(whole.data),
-                whole.shape,
-                device=device,
-            )
-
     def __getstate__(self) -> dict[str, object]:
         """Pickle without matrix and factor."""
         return {"problem": self.problem}
 
 
+def _matrix(problem: Problem, device: torch.device) -> Any:
+    """Return K(0) on the free degrees of freedom: scipy's on the processor, else torch's."""
+    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    here = problem if problem.points.device.type == "cpu" else problem.to("cpu")
+    whole = full_matrix(problem.pattern, here.linearise(rest).tangent[0].numpy())
+    if device.type == "cpu":
+        return whole
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch calls its sparse matrices a beta
+        return torch.sparse_csr_tensor(
+            torch.from_numpy(whole.indptr),
+            torch.from_numpy(whole.indices),
+            torch.from_numpy(whole.data),
+            whole.shape,
+            device=device,
+        )
+
+
 def potential(
-    displacement: Tensor, force: Tensor, problem: Problem, rest: Rest
+    displacement: Tensor, load: Load, problem: Problem, rest: Rest
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return W(u) - W(0) - f.u, (B,) [-], its slope (B, N, D), and whether all det F > 0, (B,)."""
-    internal, volume = problem.evaluate(displacement)
+    force, own = load.force, load.poisson.expand(len(displacement), -1)
+    internal, volume = problem.at(own).evaluate(displacement)
     slope = torch.where(problem.free, internal - force, 0.0)
-    parts = displacement.split(max(1, ENTRIES // displacement[0].numel()))
-    strain = torch.cat([problem.energy(part) for part in parts]) - rest.energy
+    count = max(1, ENTRIES // displacement[0].numel())
+    parts = zip(displacement.split(count), own.split(count), strict=True)
+    strain = torch.cat([problem.at(nu).energy(part) for part, nu in parts]) - rest.energy(own)
     energy = strain - (force * displacement).sum(dim=(1, 2))
     sound = (volume > 0) & energy.isfinite() & slope.flatten(1).isfinite().all(dim=1)
     return energy, slope, sound

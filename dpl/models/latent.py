@@ -1,11 +1,13 @@
 """The linear answer, and a network for what is nonlinear: the flagship."""
 
+from functools import reduce
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from dpl.models.moduli import Rests
 from dpl.models.pod import PODNet, evened, root_mean_square
 from dpl.scene import Sample, Scene
 
@@ -63,29 +65,37 @@ class Latent(PODNet):
             blocks=blocks,
             symmetry=symmetry,
         )
-        self.near = near
+        self.near, self.rests = near, Rests(scene.linear)
         self.register_buffer("unit", torch.tensor(0.0, dtype=torch.float64))
 
     def _reading(self, rank: int, coordinates: int) -> int:
         return rank
 
-    def forward(self, force: Tensor) -> Tensor:
-        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32."""
+    def _readings(self, scene: Scene) -> int:
+        return Rests(scene.linear).count
+
+    def combined(self, read: Tensor, poisson: Tensor | None) -> Tensor:
+        """See `PODNet.combined`."""
+        return self.rests.between(read, poisson)
+
+    def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
+        """See `PODNet.forward`."""
         acting = self.entering(force)
-        linear = acting @ self.read
-        learnt = self.learnt(linear @ self.scaled)
+        linear = self.combined(acting @ self.read, poisson)
+        learnt = self.learnt(self.beside(linear @ self.scaled, poisson))
         few = (acting != 0).sum(dim=1) <= self.near
         if not few.any():
             moved = (linear + learnt) @ self.basis
         else:
             moved = torch.where(few[:, None], learnt, linear + learnt) @ self.basis
             exact = _Respond.apply(acting[few].double(), self)
+            exact = self.combined(exact, None if poisson is None else poisson[few])
             moved = moved.index_add(0, few.nonzero()[:, 0], exact.to(moved.dtype))
         return self.leaving(moved, force)
 
     def network(self, inputs: Tensor) -> Tensor:
         """Return coordinates (B, R) of the nonlinear part from inputs (B, M), without symmetry."""
-        square = inputs.square().sum(dim=1, keepdim=True)
+        square = inputs[:, : self.scaled.shape[1]].square().sum(dim=1, keepdim=True)
         return square / (1 + square) * super().network(inputs)
 
     def plan(self) -> list[str]:
@@ -97,13 +107,18 @@ class Latent(PODNet):
                 f"no rank for near fields: forces on up to {self.near} degrees of freedom are "
                 "answered with the factor of K(0)"
             )
+        if self.rests.count > 1:
+            lines.append(
+                f"no K(0) for every Poisson's ratio: that of {self.rests.count} of them, and a "
+                "polynomial between"
+            )
         return lines
 
     def prepare(self, samples: Sample, unit: float) -> None:
         """Make the basis; see `PODNet.prepare`."""
         self.unit.fill_(unit)
         force, displacement = self._columns(samples)
-        linear = self.respond(force)
+        linear = self.respond(force, samples.poisson)
         size = displacement.norm(dim=1)
         weight = torch.where(size > 0, size.clamp(min=1e-12) ** -0.5, 0.0)
         parts = [weight[:, None] * linear, weight[:, None] * (displacement - linear)]
@@ -112,8 +127,8 @@ class Latent(PODNet):
         rests = parts[1] @ basis
         basis = basis @ torch.linalg.eigh(rests.T @ rests)[1].flip(1)
         self.basis.copy_(basis.T)
-        responses = self._respond_all(basis.T)
-        self.read.copy_(responses[:, self.acting.cpu()[self.moving.cpu()]].T)
+        responses = [self._respond_all(basis.T, k) for k in range(self.rests.count)]
+        self.read.copy_(torch.cat(responses)[:, self.acting.cpu()[self.moving.cpu()]].T)
         motions = self._motions(basis, self.moving)
         self._scale(linear @ basis, (displacement - linear) @ basis, weight, motions)
         self._turn(motions, motions)
@@ -137,24 +152,35 @@ class Latent(PODNet):
         size = root_mean_square(targets)
         self.spread.copy_((size * size.max()).sqrt())
 
-    def _known(self, force: Tensor) -> Tensor:
+    def _known(self, force: Tensor, poisson: Tensor) -> Tensor:
         """Return linear answers (S, outputs) of forces on the inputs (S, inputs), scaled.
 
         Those that the basis has of them for all but forces on few degrees of freedom.
         """
-        linear, basis = self.respond(force), self.basis.cpu().double()
+        linear, basis = self.respond(force, poisson), self.basis.cpu().double()
         few = (force != 0).sum(dim=1) <= self.near
         return torch.where(few[:, None], linear, (linear @ basis.T) @ basis)
 
-    def respond(self, acting: Tensor) -> Tensor:
+    def respond(self, acting: Tensor, poisson: Tensor | None = None) -> Tensor:
         """Return K(0)^-1 f, scaled: (B, outputs) of forces on the inputs (B, inputs), float64."""
+        every, weights = self._every(acting), self.rests.weights(poisson, acting)
+        answers = (self._respond_all(every, k) for k in range(self.rests.count))
+        return reduce(torch.add, (weights[:, k, None] * a for k, a in enumerate(answers)))
+
+    def _every(self, acting: Tensor) -> Tensor:
+        """Return forces on the inputs (B, inputs) as those on all that moves, (B, outputs)."""
         every = acting.new_zeros(len(acting), len(self.moving_places))
         every[:, self.acting[self.moving].to(acting.device)] = acting
-        return self._respond_all(every)
+        return every
 
-    def _respond_all(self, forces: Tensor) -> Tensor:
-        """Return K(0)^-1 f, scaled, (B, outputs) of forces on all that moves, (B, outputs)."""
-        factor = self.scene.linear.factor
+    def _respond_all(self, forces: Tensor, k: int) -> Tensor:
+        """Return K(0)^-1 f, scaled, (B, outputs) of forces on all that moves, (B, outputs).
+
+        Args:
+            forces: What acts.
+            k: Which of the Poisson's ratios of `rests`.
+        """
+        factor = self.rests.members[k].factor
         answers = [torch.from_numpy(factor.solve(one.numpy())) for one in forces.cpu()]
         return float(self.unit) * torch.stack(answers).to(forces.device)
 
@@ -164,13 +190,16 @@ class _Respond(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, acting: Tensor, net: Latent) -> Tensor:
-        """Return (B, outputs) of (B, inputs)."""
+        """Return (B, nodes outputs) of (B, inputs), at each of the Poisson's ratios of `rests`."""
         ctx.net = net
-        return net.respond(acting)
+        every = net._every(acting)
+        return torch.cat([net._respond_all(every, k) for k in range(net.rests.count)], dim=1)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None]:
         """Return the slope with respect to forces."""
         net = ctx.net
-        return net._respond_all(slope)[:, net.acting[net.moving]], None
+        parts = slope.chunk(net.rests.count, dim=1)
+        solved = sum(net._respond_all(part, k) for k, part in enumerate(parts))
+        return solved[:, net.acting[net.moving]], None
