@@ -3,9 +3,9 @@
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.linear import full_matrix
@@ -46,29 +46,26 @@ class Rest:
         """
         problem = self.problem
         if poisson is None or not poisson.shape[-1]:
-            return self._product(problem.at(field.new_zeros(1, 0)), field)
+            free, image = problem.free, torch.zeros_like(field)
+            columns = field.detach()[:, free].T
+            if field.device.type == "cpu":
+                image[:, free] = torch.from_numpy(self._matrix @ columns.numpy()).T
+            else:
+                image[:, free] = (self._on_device @ columns).T
+            return image
         law = problem.material.at(poisson.flatten())
         moduli = [torch.as_tensor(m).flatten().to(field) for m in (law.lam, law.mu)]
         moduli.append(torch.ones_like(moduli[0]))
         known = [(m.lam, m.mu, 1.0) for m in (problem.material.at(nu) for nu in SPANNING)]
         shares = torch.linalg.solve(field.new_tensor(known).T, torch.stack(moduli))  # (3, B)
-        parts = [self._product(problem.at(nu), field) for nu in SPANNING]
-        return torch.einsum("kb,kbnd->bnd", shares, torch.stack(parts))
+        parts = torch.stack([rest.product(field) for rest in self._spanning])
+        return torch.einsum("kb,kbnd->bnd", shares, parts)
 
-    def _product(self, problem: Problem, field: Tensor) -> Tensor:
-        """Return K(0) v of one body."""
-        free, image = problem.free, torch.zeros_like(field)
-        columns = field.detach()[:, free].T
-        if problem not in self._matrices:
-            self._matrices[problem] = _matrix(problem, field.device)
-        matrix = self._matrices[problem]
-        if isinstance(matrix, Tensor):
-            image[:, free] = (matrix @ columns).T
-        else:
-            image[:, free] = torch.from_numpy(matrix @ columns.numpy()).T
-        return image
+    @cached_property
+    def _spanning(self) -> "list[Rest]":
+        return [Rest(self.problem.at(nu)) for nu in SPANNING]
 
-    def work(self, force: Tensor, poisson: Tensor) -> Tensor:
+    def work(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
         """Return f.K(0)^-1 f / 2, the work of f (B, N, D) on its linear answer, (B,) [-].
 
         To about 1e-3: it is a scale. One solve with a stored factor, on the processor, for a force
@@ -76,6 +73,7 @@ class Rest:
         With Poisson's ratios (B, 1) of their own, the first time takes a factor for each.
         """
         problem, found = self._linear.problem, []
+        poisson = force.new_zeros(1, 0) if poisson is None else poisson
         for one, own in zip(force.cpu(), poisson.cpu().expand(len(force), -1), strict=True):
             right = gather(one, problem)
             key = hash(right.tobytes() + own.numpy().tobytes())
@@ -105,35 +103,32 @@ class Rest:
         return self.problem.energy(self.problem.points.new_zeros(1, *self.problem.shape))
 
     @cached_property
-    def _matrices(self) -> dict[Problem, Any]:
-        return {}
-
-    @cached_property
     def _linear(self) -> Linear:
         here = self.problem.points.device.type == "cpu"
         return Linear(self.problem if here else self.problem.to("cpu"))
 
+    @cached_property
+    def _matrix(self) -> csr_array:
+        problem = self._linear.problem
+        rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
+        return full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())
+
+    @cached_property
+    def _on_device(self) -> Tensor:
+        whole, device = self._matrix, self.problem.points.device
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch calls its sparse matrices a beta
+            return torch.sparse_csr_tensor(
+                torch.from_numpy(whole.indptr),
+                torch.from_numpy(whole.indices),
+                torch.from_numpy(whole.data),
+                whole.shape,
+                device=device,
+            )
+
     def __getstate__(self) -> dict[str, object]:
         """Pickle without matrix and factor."""
         return {"problem": self.problem}
-
-
-def _matrix(problem: Problem, device: torch.device) -> Any:
-    """Return K(0) on the free degrees of freedom: scipy's on the processor, else torch's."""
-    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    here = problem if problem.points.device.type == "cpu" else problem.to("cpu")
-    whole = full_matrix(problem.pattern, here.linearise(rest).tangent[0].numpy())
-    if device.type == "cpu":
-        return whole
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch calls its sparse matrices a beta
-        return torch.sparse_csr_tensor(
-            torch.from_numpy(whole.indptr),
-            torch.from_numpy(whole.indices),
-            torch.from_numpy(whole.data),
-            whole.shape,
-            device=device,
-        )
 
 
 def potential(

@@ -118,7 +118,7 @@ class Latent(PODNet):
         """Make the basis; see `PODNet.prepare`."""
         self.unit.fill_(unit)
         force, displacement = self._columns(samples)
-        linear = self.respond(force, samples.poisson)
+        linear = self.linear(force, samples.poisson)
         size = displacement.norm(dim=1)
         weight = torch.where(size > 0, size.clamp(min=1e-12) ** -0.5, 0.0)
         parts = [weight[:, None] * linear, weight[:, None] * (displacement - linear)]
@@ -157,21 +157,23 @@ class Latent(PODNet):
 
         Those that the basis has of them for all but forces on few degrees of freedom.
         """
-        linear, basis = self.respond(force, poisson), self.basis.cpu().double()
+        linear, basis = self.linear(force, poisson), self.basis.cpu().double()
         few = (force != 0).sum(dim=1) <= self.near
         return torch.where(few[:, None], linear, (linear @ basis.T) @ basis)
 
-    def respond(self, acting: Tensor, poisson: Tensor | None = None) -> Tensor:
-        """Return K(0)^-1 f, scaled: (B, outputs) of forces on the inputs (B, inputs), float64."""
-        every, weights = self._every(acting), self.rests.weights(poisson, acting)
-        answers = (self._respond_all(every, k) for k in range(self.rests.count))
-        return reduce(torch.add, (weights[:, k, None] * a for k, a in enumerate(answers)))
+    def linear(self, acting: Tensor, poisson: Tensor) -> Tensor:
+        """Return linear answers (S, outputs) of forces on the inputs (S, inputs), scaled."""
+        parts = zip(acting.split(256), poisson.split(256), strict=True)
+        return torch.cat([self.combined(self.respond(some), nu) for some, nu in parts])
 
-    def _every(self, acting: Tensor) -> Tensor:
-        """Return forces on the inputs (B, inputs) as those on all that moves, (B, outputs)."""
+    def respond(self, acting: Tensor) -> Tensor:
+        """Return K(0)^-1 f, scaled: (B, K outputs) of forces on the inputs (B, inputs), float64.
+
+        At each of the K Poisson's ratios of `rests`; where the law has one, K = 1.
+        """
         every = acting.new_zeros(len(acting), len(self.moving_places))
         every[:, self.acting[self.moving].to(acting.device)] = acting
-        return every
+        return torch.cat([self._respond_all(every, k) for k in range(self.rests.count)], dim=1)
 
     def _respond_all(self, forces: Tensor, k: int) -> Tensor:
         """Return K(0)^-1 f, scaled, (B, outputs) of forces on all that moves, (B, outputs).
@@ -190,10 +192,9 @@ class _Respond(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, acting: Tensor, net: Latent) -> Tensor:
-        """Return (B, nodes outputs) of (B, inputs), at each of the Poisson's ratios of `rests`."""
+        """Return (B, K outputs) of (B, inputs)."""
         ctx.net = net
-        every = net._every(acting)
-        return torch.cat([net._respond_all(every, k) for k in range(net.rests.count)], dim=1)
+        return net.respond(acting)
 
     @staticmethod
     @once_differentiable
@@ -201,5 +202,5 @@ class _Respond(torch.autograd.Function):
         """Return the slope with respect to forces."""
         net = ctx.net
         parts = slope.chunk(net.rests.count, dim=1)
-        solved = sum(net._respond_all(part, k) for k, part in enumerate(parts))
+        solved = reduce(torch.add, (net._respond_all(part, k) for k, part in enumerate(parts)))
         return solved[:, net.acting[net.moving]], None

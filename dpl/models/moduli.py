@@ -1,15 +1,17 @@
 """Poisson's ratio as an input of networks, where the law has a range of them."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from dpl.fem.newton import Linear
 
-EXACT = 1e-8  # aimed at between the nodes of `Rests`, relative error of a linear answer [-]
+EXACT = 1e-5  # aimed at between the nodes of `Rests`, relative error of a linear answer [-]
+MOST = 16  # nodes, whatever the range
 
 
 def placed(poisson: Tensor | None, span: tuple[float, float], like: Tensor) -> Tensor:
@@ -33,9 +35,10 @@ def placed(poisson: Tensor | None, span: tuple[float, float], like: Tensor) -> T
 class Rests:
     """K(0)^-1 at a few Poisson's ratios, the polynomial between them for all of a range.
 
-    K(0)^-1 is analytic in Poisson's ratio but at -1 and 0.5 and beyond, so that polynomials through
-    Chebyshev nodes converge geometrically, the slower the nearer the range comes to those. Where
-    the law has one, that is the only node, and nothing is between.
+    K(0)^-1 is an analytic function of z = (1 + nu)/(1 - 2 nu), 3/2 of bulk over shear modulus, but
+    for z <= 0. The variable w = (z - c)/(z + c), c = sqrt(z1 z2), maps a range [z1, z2] to [-a, a]
+    and those z to |w| >= 1, so that polynomials in w through Chebyshev nodes converge like rho^-K,
+    rho = (1 + sqrt(1 - a^2))/a. Where the law has one Poisson's ratio, that is the only node.
 
     Source: Trefethen (2019), Approximation Theory and Approximation Practice, theorem 8.2.
 
@@ -50,11 +53,27 @@ class Rests:
         """Poisson's ratios, (K,) [-]; none where the law has one."""
         if (span := self.linear.problem.material.poisson_range) is None:
             return []
-        middle, half = (span[0] + span[1]) / 2, (span[1] - span[0]) / 2
-        nearest = min(0.5 - middle, middle + 1.0) / half
-        rate = nearest + np.sqrt(nearest**2 - 1)
-        count = int(np.clip(np.ceil(-np.log(EXACT) / np.log(rate)), 3, 12))
-        return [float(middle - half * np.cos((k + 0.5) * np.pi / count)) for k in range(count)]
+        centre = self._centre
+        a = float(_stretched(span[1], centre))
+        count = math.ceil(-math.log(EXACT) / math.log(1 / self.rate))
+        count = min(max(count, 3), MOST)
+        w = [-a * math.cos((k + 0.5) * math.pi / count) for k in range(count)]
+        z = [centre * (1 + one) / (1 - one) for one in w]
+        return [(one - 1) / (1 + 2 * one) for one in z]
+
+    @property
+    def _centre(self) -> float:
+        """Return c, see the class."""
+        span = self.linear.problem.material.poisson_range or (0.0, 0.0)
+        low, high = ((1 + nu) / (1 - 2 * nu) for nu in span)
+        return math.sqrt(low * high)
+
+    @property
+    def rate(self) -> float:
+        """1/rho: what a node more leaves of the error between nodes [-]."""
+        span = self.linear.problem.material.poisson_range or (0.0, 0.0)
+        a = float(_stretched(span[1], self._centre))
+        return a / (1 + math.sqrt(1 - a * a))
 
     @property
     def count(self) -> int:
@@ -80,9 +99,10 @@ class Rests:
         if poisson is None:
             raise ValueError("poisson is an input of this network: give Poisson's ratios, (B, 1)")
         known = torch.tensor(self.nodes, dtype=poisson.dtype, device=poisson.device)
+        known, place = _stretched(known, self._centre), _stretched(poisson, self._centre)
         own = torch.eye(self.count, dtype=torch.bool, device=poisson.device)
         gaps = torch.where(own, 1.0, known[:, None] - known)
-        ratios = torch.where(own, 1.0, (poisson - known)[:, None, :] / gaps)
+        ratios = torch.where(own, 1.0, (place - known)[:, None, :] / gaps)
         return ratios.prod(dim=2).to(like)
 
     def between(self, answers: Tensor, poisson: Tensor | None) -> Tensor:
@@ -95,3 +115,9 @@ class Rests:
     def __getstate__(self) -> dict[str, object]:
         """Pickle without the factors."""
         return {"linear": self.linear}
+
+
+def _stretched(poisson: Any, centre: float) -> Any:
+    """Return w of Poisson's ratios, see `Rests`."""
+    z = (1 + poisson) / (1 - 2 * poisson)
+    return (z - centre) / (z + centre)
