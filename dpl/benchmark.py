@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dpl.fem.mesh import save as write_mesh
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, Solver, one_thread, solve
+from dpl.fem.solution import Solution, Solver, one_thread, solve
 from dpl.figures import deformed
 from dpl.hybrid import Direct, Hybrid
 from dpl.metrics import RelativeL2, metrics
@@ -62,9 +62,7 @@ def clock(
     """
     answers: dict[str, list[Solution]] = {name: [] for name in solvers}
     seconds: dict[str, list[float]] = {name: [] for name in solvers}
-    singles = [
-        Load(batch.force[k : k + 1], batch.young[k : k + 1]) for k in range(len(batch.force))
-    ]
+    singles = batch.load.singles()
     for solver in solvers.values():
         solve(solver, singles[0])
     for load in singles:
@@ -180,10 +178,12 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
     scene = surrogate.scene
     # the scene's own where it can be: its factor of K(0) is there already
     newton = scene.solver if tol == scene.solver.tol else replace(scene.solver, tol=tol)
+    # with Poisson's ratios of their own, loads have their own K(0): each solver makes it for itself
+    shared = scene.loads.poisson_range is None
     solvers: dict[str, Solver] = {
-        "linear": newton.rest,
+        "linear": newton.rest if shared else replace(newton.rest),
         "network": Direct(surrogate.predict, scene.problem, tol),
-        "hybrid Newton": Hybrid(surrogate.predict, newton),
+        "hybrid Newton": Hybrid(surrogate.predict, newton if shared else replace(newton)),
         "Newton from zero": newton,
     }
     with one_thread():

@@ -59,8 +59,8 @@ class Hybrid:
         guesses = _prediction(self.predict, load)
         yield from in_step(
             [
-                self._member(Load(load.force[k : k + 1], load.young[k : k + 1]), guess[None])
-                for k, guess in enumerate(guesses)
+                self._member(single, guess[None])
+                for single, guess in zip(load.singles(), guesses, strict=True)
             ]
         )
 

@@ -25,7 +25,8 @@ class Physics(NamedTuple):
     """What a loss may know of the scene.
 
     Attributes:
-        problem: The body, on the device of the batch.
+        problem: The body, on the device of the batch; with a range of Poisson's ratios that of a
+            batch is `problem.at(batch.poisson)`.
         largest_force: ||Phi q_max||, the paper's normaliser of residuals [-].
     """
 
@@ -195,7 +196,7 @@ class Stiffness(Loss):
         self._rest = rest = Rest.of(physics.problem, self._rest)
         with torch.no_grad():
             fields = torch.cat([prediction - batch.displacement, batch.displacement])
-            images = rest.product(fields)
+            images = rest.product(fields, torch.cat([batch.poisson, batch.poisson]))
             error, size = (fields * images).sum(dim=(1, 2)).chunk(2)
             size = floored(size, self.floor if self.relative else torch.inf)
             slope = 2 * images[: len(prediction)] / size[:, None, None]
@@ -241,10 +242,10 @@ class Energy(Loss):
         """See `Loss`."""
         self._rest = rest = Rest.of(physics.problem, self._rest)
         with torch.no_grad():
-            scale = floored(rest.work(batch.force), self.floor)
-            energy, slope, sound = potential(prediction, batch.force, physics.problem, rest)
+            scale = floored(rest.work(batch.force, batch.poisson), self.floor)
+            energy, slope, sound = potential(prediction, batch.load, physics.problem, rest)
             if not sound.all():
-                image = rest.product(prediction)
+                image = rest.product(prediction, batch.poisson)
                 energy = torch.where(sound, energy, (prediction * image).sum(dim=(1, 2)) / 2)
                 slope = torch.where(sound[:, None, None], slope, image)
             self.terms = {"inverted": 1 - sound.double().mean()}
@@ -348,7 +349,7 @@ def residual_norm(prediction: Tensor, batch: Sample, physics: Physics) -> Tensor
     inverted so far that the law has no stress, the norm is not finite; such samples take the
     largest finite norm of the batch (1 if there is none) and no gradient.
     """
-    problem = physics.problem
+    problem = physics.problem.at(batch.poisson)
     residual = torch.where(problem.free, problem.evaluate(prediction).internal - batch.force, 0.0)
     length = residual.flatten(1).norm(dim=1)
     norm, sound = length / physics.largest_force, length.isfinite()

@@ -116,7 +116,7 @@ class ResidualRatio(_PerLoad):
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
         """See `_PerLoad`."""
-        ratio = self.problem.residual_ratio(prediction, batch.force)
+        ratio = self.problem.at(batch.poisson).residual_ratio(prediction, batch.force)
         return torch.nan_to_num(ratio, nan=torch.inf)
 
     def reduce(self, values: Tensor) -> Tensor:

@@ -32,7 +32,8 @@ class Surrogate(L.LightningModule):
     and pascals the module answers in metres.
 
     Attributes:
-        net: Scaled force (B, N, D) to scaled displacement (B, N, D).
+        net: Scaled force (B, N, D) to scaled displacement (B, N, D). What it takes besides of a
+            load, by name, its `takes` says: "young", "poisson".
         scene: What it answers for.
         loss: What it is trained with.
         batch_errors: Relative L2 errors on the last training batch, (B,); None before the first.
@@ -56,12 +57,22 @@ class Surrogate(L.LightningModule):
             optimizer: From parameters to an optimiser.
             scheduler: From an optimiser and `total_steps` to a learning-rate schedule, stepped
                 every batch; none if left out.
+
+        Raises:
+            ValueError: The law has a range of Poisson's ratios that the network does not take.
         """
         super().__init__()
         self.net, self.loss, self.scene = net, loss, scene
         self.batch_errors: Tensor | None = None
         self._random_states: dict[str, Any] | None = None  # of the run that this one resumes
         self._optimizer, self._scheduler = optimizer, scheduler
+        span = scene.loads.poisson_range
+        self._own = int(span is not None)
+        if span is not None and "poisson" not in getattr(net, "takes", ()):
+            raise ValueError(
+                f"{type(net).__name__} takes no Poisson's ratio, and the law has a range of them, "
+                f"{list(span)}; take one of them (material.poisson) or another model"
+            )
         force_scale, displacement_scale = scales(scene)
         self.register_buffer("force_scale", force_scale)
         self.register_buffer("displacement_scale", displacement_scale)
@@ -72,15 +83,27 @@ class Surrogate(L.LightningModule):
         self.val_metrics = metrics(scene.problem).clone(prefix="val/")
         self.test_metrics = metrics(scene.problem).clone(prefix="test/")
 
-    def forward(self, force: Tensor, young: Tensor) -> Tensor:
-        """Return displacements (B, N, D) [m] under nodal forces (B, N, D) [N], moduli (B,) [Pa]."""
-        return self.scene.length * self.predict(self.scene.load_of(force, young))
+    def forward(self, force: Tensor, young: Tensor, poisson: Tensor | None = None) -> Tensor:
+        """Return displacements (B, N, D) [m] under nodal forces (B, N, D) [N].
+
+        Args:
+            force: What acts.
+            young: E, (B,) [Pa].
+            poisson: Poisson's ratios, (B,) [-]; wanted where the law has a range of them.
+        """
+        return self.scene.length * self.predict(self.scene.load_of(force, young, poisson))
 
     def predict(self, load: Load) -> Tensor:
         """Return displacements over L, (B, N, D), float64."""
         scaled = (load.force / self.force_scale).to(self.dtype)
-        more = (load.young,) if getattr(self.net, "takes_young", False) else ()
-        answer = self.net(scaled, *more).double() * self.displacement_scale
+        if load.poisson.shape[-1] != self._own:
+            raise ValueError(
+                "poisson: the law has a range of them, and the load does not say which"
+                if self._own
+                else "poisson: the law has one for all loads, and this load brings its own"
+            )
+        more = {name: getattr(load, name) for name in getattr(self.net, "takes", ())}
+        answer = self.net(scaled, **more).double() * self.displacement_scale
         return torch.where(self.physics.problem.free, answer, 0.0)
 
     def plan(self) -> list[str]:
@@ -235,7 +258,7 @@ def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:
     and displacements keep their proportions within the body.
     """
     force = scene.loads.sample((0, SCALES), range(count)).force
-    displacement = torch.stack([scene.linear.respond(one) for one in force])
+    displacement = torch.stack([scene.linear.reference.respond(one) for one in force])
     acting, moving = force[:, scene.loads.reach], displacement[:, scene.problem.free]
     return acting.square().mean().sqrt(), moving.square().mean().sqrt()
 

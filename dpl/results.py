@@ -113,7 +113,7 @@ def load_sets(scene: Scene, test: Sample, count: int = 50) -> dict[str, Sample]:
         load = drawn._replace(force=factor[:, None, None] * drawn.force)
         answer = solve(scene.solver, load)
         sound = answer.status == int(Status.CONVERGED)
-        sample = Sample(load.force, answer.displacement, load.young)
+        sample = Sample(load.force, answer.displacement, load.young, load.poisson)
         sets[name] = Sample(*(column[sound] for column in sample))
     return sets
 
@@ -139,7 +139,7 @@ def measure(
         repeats: Times that each load is asked.
     """
     for title, batch in sets.items():
-        singles = [Load(f[None], e[None]) for f, e in zip(batch.force, batch.young, strict=True)]
+        singles = batch.load.singles()
         answers: dict[str, list[Tensor]] = {name: [] for name in methods}
         seconds: dict[str, list[float]] = {name: [] for name in methods}
         with one_thread(), torch.no_grad():
@@ -190,7 +190,8 @@ def linear(scene: Scene) -> Method:
     """Return K(0)^-1 f."""
 
     def predict(load: Load) -> Tensor:
-        return torch.stack([scene.linear.respond(force) for force in load.force])
+        pairs = zip(load.force, load.poisson, strict=True)
+        return torch.stack([scene.linear.at(nu[None]).respond(force) for force, nu in pairs])
 
     return Method(predict)
 

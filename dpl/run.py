@@ -347,13 +347,13 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
     if cfg.scheduler:
         make(cfg, "scheduler", optimizer=trial, total_steps=1)
     torch.manual_seed(cfg.seed)
-    return Surrogate(
-        make(cfg, "model", scene=scene),
-        make(cfg, "loss"),
-        scene,
-        optimizer=make(cfg, "optimizer"),
-        scheduler=make(cfg, "scheduler") if cfg.scheduler else None,
-    )
+    parts = make(cfg, "model", scene=scene), make(cfg, "loss")
+    optimizer = make(cfg, "optimizer")
+    scheduler = make(cfg, "scheduler") if cfg.scheduler else None
+    try:
+        return Surrogate(*parts, scene, optimizer=optimizer, scheduler=scheduler)
+    except ValueError as error:
+        raise ConfigError(f"model: {error}") from error
 
 
 def check_processes(trainer: Any) -> None:

@@ -14,26 +14,39 @@ from torch import Tensor
 from dpl.fem.modes import ModalLoads
 from dpl.fem.newton import Linear, Newton
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load
+from dpl.fem.solution import Load, beside
 
 
-class Sample(NamedTuple):
+class _Sample(NamedTuple):
+    force: Tensor
+    displacement: Tensor
+    young: Tensor
+    poisson: Tensor
+
+
+class Sample(_Sample):
     """Loads with their displacements; a batch is the same with a leading B.
 
     Attributes:
         force: (B, N, D) [-].
         displacement: (B, N, D) [-].
         young: (B,) [Pa].
+        poisson: Poisson's ratios, (B, P) [-]: P = 1 where the law has a range of them, else P = 0,
+            which may be left out.
     """
 
-    force: Tensor
-    displacement: Tensor
-    young: Tensor
+    __slots__ = ()
+
+    def __new__(
+        cls, force: Tensor, displacement: Tensor, young: Tensor, poisson: Tensor | None = None
+    ) -> "Sample":
+        """Take the columns; Poisson's ratios (B,) too."""
+        return super().__new__(cls, force, displacement, young, beside(young, poisson))
 
     @property
     def load(self) -> Load:
         """The loads alone."""
-        return Load(self.force, self.young)
+        return Load(self.force, self.young, self.poisson)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +78,17 @@ class Scene:
         """L^(D-1) [m^2 in 3D, m in 2D]: forces are this times E times the dimensionless ones."""
         return self.length ** (self.problem.shape[1] - 1)
 
-    def load_of(self, force: Tensor, young: Tensor) -> Load:
-        """Return nodal forces (B, N, D) [N] (2D: [N/m]) on bodies of moduli (B,) [Pa] as a load."""
-        return Load(
-            force.double() / (young.double()[:, None, None] * self.force_unit), young.double()
-        )
+    def load_of(self, force: Tensor, young: Tensor, poisson: Tensor | None = None) -> Load:
+        """Return nodal forces (B, N, D) [N] (2D: [N/m]) on bodies of moduli (B,) [Pa] as a load.
+
+        Args:
+            force: What acts.
+            young: E.
+            poisson: Poisson's ratios, (B,) [-]; wanted where the law has a range of them.
+        """
+        dimensionless = force.double() / (young.double()[:, None, None] * self.force_unit)
+        poisson = None if poisson is None else poisson.double()
+        return Load(dimensionless, young.double(), poisson)
 
     def identity(self) -> dict[str, object]:
         """Return everything that decides a sample, as plain data; arrays as their SHA-256.
@@ -117,6 +136,12 @@ class Scene:
         low, high = loads.young_range
         young = f"E = {low:.4g} Pa" if low == high else f"E from {low:.4g} to {high:.4g} Pa"
         lines = [f"no E input, no samples per E: u/L depends on f/(E L^2) only ({young})"]
+        if (span := loads.poisson_range) is not None:
+            middle = problem.reference.material.poisson_ratio
+            lines.append(
+                f"one set of modes and scales for Poisson's ratios {span[0]:.4g} to {span[1]:.4g}: "
+                f"those of {middle:.4g}; each load has its own, an input, and a K(0) of its own"
+            )
         if problem.springs is None:
             lines.append("no springs, nothing of theirs assembled")
         elif low < high:
@@ -130,7 +155,10 @@ class Scene:
             f"{2 * len(problem.pattern.indices) - problem.pattern.size:,}: "
             "symmetric, pattern and ordering analysed once"
         )
-        lines.append("K(0) factorised once for modes, linear answers and every first Newton step")
+        if span is None:
+            lines.append(
+                "K(0) factorised once for modes, linear answers and every first Newton step"
+            )
         lines.append("no factorisation for loads whose linear answer meets the tolerance")
         if loads.modes.values.shape[0] > loads.n_modes:
             count = len(loads.modes.values)

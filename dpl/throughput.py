@@ -106,7 +106,7 @@ def _nearest(scene: Scene, pool: int) -> Guess:
     Near is what has a near linear answer; to it the linear answer to the difference is added.
     """
     loads = scene.loads.sample((2, 0), range(pool))
-    answers = [solve(scene.solver, Load(f[None], e[None])) for f, e in zip(*loads, strict=True)]
+    answers = [solve(scene.solver, single) for single in loads.singles()]
     displacement = torch.cat([answer.displacement for answer in answers])
     linear = torch.stack([scene.linear.respond(force) for force in loads.force])
 

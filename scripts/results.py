@@ -25,6 +25,11 @@ def main(cfg: DictConfig) -> None:
         trained, surrogate = run.load_run(folder, scene=scene)
         if scene is None:
             scene = surrogate.scene
+            if cfg.tolerance and scene.loads.poisson_range is not None:
+                raise run.ConfigError(
+                    "tolerance: POD-Galerkin has one Poisson's ratio, these runs a range of them; "
+                    "set tolerance=null"
+                )
             data = run.make(trained, "data", scene=scene)
             data.prepare_data()
             train = data.samples("train")

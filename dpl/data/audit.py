@@ -43,9 +43,13 @@ def flaw_of_shard(
     rounding = 1e-9 * loads.largest_force
     if not torch.allclose(shard["force"], loads.at(points).force, rtol=1e-6, atol=rounding):
         return "holds loads that this scene does not draw"
+    poisson = loads.poisson_at(points)
+    if not torch.allclose(shard["poisson"], poisson, rtol=0, atol=1e-12):
+        return "holds other Poisson's ratios than its seed draws"
     for k, (u, force) in enumerate(zip(shard["displacement"], shard["force"], strict=True)):
-        internal, volume = problem.evaluate(u[None])
-        balanced = problem.balanced(u[None], internal, force[None], scene.solver.tol)
+        body = problem.at(shard["poisson"][k, None])
+        internal, volume = body.evaluate(u[None])
+        balanced = body.balanced(u[None], internal, force[None], scene.solver.tol)
         if not (bool(volume > 0) and bool(balanced)):
             return f"holds an answer out of balance: load {int(shard['index'][k])}"
     return ""

@@ -38,7 +38,7 @@ class Samples(Dataset):
             return batch
         which = torch.tensor([i // count for i in indices])
         force, displacement = (images(field, self.group, which) for field in batch[:2])
-        return Sample(force, displacement, batch.young)
+        return batch._replace(force=force, displacement=displacement)
 
 
 class OfflineData(L.LightningDataModule):

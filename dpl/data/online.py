@@ -116,9 +116,10 @@ class OnlineSamples(IterableDataset):
                     self.store.spool.put(one)
             if one.accepted:
                 point = torch.from_numpy(one.point)
-                young = self.scene.loads.young_at(point[None])[0]
+                loads, where = self.scene.loads, point[None]
+                moduli = loads.young_at(where)[0], loads.poisson_at(where)[0]
                 fields = torch.from_numpy(one.force), torch.from_numpy(one.displacement)
-                yield Drawn(Sample(*fields, young), torch.tensor(index), point)
+                yield Drawn(Sample(*fields, *moduli), torch.tensor(index), point)
 
     def _solved(self, index: int, limit: float | None) -> Outcome:
         """Return a load, solved within so many seconds, or recorded as lost."""
@@ -296,7 +297,7 @@ class Replay:
             return batch
         which = torch.randint(len(self._group), (len(batch.force),), generator=self._generator)
         force, displacement = (images(field, self._group, which) for field in batch[:2])
-        return Sample(force, displacement, batch.young)
+        return batch._replace(force=force, displacement=displacement)
 
     def _next(self) -> Drawn | None:
         """Return new samples; None at the end of a stream that has one."""

@@ -1,7 +1,7 @@
 """Loads as tensors of a file, forces kept where they act, and back again."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,34 +15,51 @@ from dpl.data.outcome import Job, Outcome
 WHOLE = {"index", "carried", "node", "iterations"}  # columns of whole numbers
 
 
-def closed(kept: Sequence[Outcome], shape: tuple[int, ...], dimension: int) -> bytes:
+def closed(
+    kept: Sequence[Outcome],
+    shape: tuple[int, ...],
+    dimension: int,
+    poisson: Callable[[Tensor], Tensor] | None = None,
+) -> bytes:
     """Return accepted loads as a file.
 
     Args:
         kept: The loads.
         shape: N, D.
         dimension: d, numbers that a load is made of.
+        poisson: From points (B, d) to Poisson's ratios (B, 1), where each load has its own; no such
+            column if left out.
     """
 
     def column(name: str, *empty: int) -> Tensor:
         values = [getattr(one, name) for one in kept]
         return torch.from_numpy(np.stack(values) if values else np.zeros((0, *empty)))
 
+    point = column("point", dimension)
     return save(
         {
             "index": torch.tensor([one.job.number for one in kept], dtype=torch.int64),
-            "point": column("point", dimension),
+            "point": point,
             **compact(column("force", *shape)),
             "displacement": column("displacement", *shape),
             "residual": torch.tensor([one.residual for one in kept], dtype=torch.float64),
             "volume_ratio": torch.tensor([one.volume_ratio for one in kept], dtype=torch.float64),
             "iterations": torch.tensor([one.iterations for one in kept], dtype=torch.int64),
+            **({} if poisson is None else {"poisson": poisson(point).contiguous()}),
         }
     )
 
 
-def opened(content: bytes, shape: tuple[int, ...], dimension: int) -> dict[str, Tensor]:
-    """Return the columns of such a file, and `force` (B, N, D) [-].
+def opened(
+    content: bytes, shape: tuple[int, ...], dimension: int, own: int = 0
+) -> dict[str, Tensor]:
+    """Return the columns of such a file, and `force` (B, N, D) [-] and `poisson` (B, P) [-].
+
+    Args:
+        content: The file's.
+        shape: N, D.
+        dimension: d, numbers that a load is made of.
+        own: P, 1 where each load has a Poisson's ratio of its own.
 
     Raises:
         ValueError: It is none, or one of other bodies; the message goes on after the file's name.
@@ -61,6 +78,10 @@ def opened(content: bytes, shape: tuple[int, ...], dimension: int) -> dict[str, 
             "volume_ratio": (count,),
             "iterations": (count,),
         }
+        if own:
+            shapes["poisson"] = (count, own)
+        elif "poisson" in shard:
+            raise ValueError("holds Poisson's ratios, and this scene has one for all loads")
         for name, expected in shapes.items():
             column = shard[name]
             if tuple(column.shape) != expected or column.is_floating_point() == (name in WHOLE):
@@ -70,6 +91,7 @@ def opened(content: bytes, shape: tuple[int, ...], dimension: int) -> dict[str, 
     except (SafetensorError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"is damaged: {error}") from None
     shard["force"] = spread(shard, shape)
+    shard.setdefault("poisson", torch.zeros(count, 0, dtype=torch.float64))
     return shard
 
 

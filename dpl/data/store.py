@@ -109,7 +109,8 @@ class Store:
                 "choose another data.folder"
             )
         if card["fingerprint"] != self.scene.fingerprint:
-            differing = [k for k, v in self.scene.identity().items() if card["scene"].get(k) != v]
+            ours = json.loads(json.dumps(self.scene.identity()))  # lists for tuples, as on disk
+            differing = [k for k, v in ours.items() if card["scene"].get(k) != v]
             raise DataSetError(
                 f"{self.folder} is a data set of another scene: its fingerprint is "
                 f"{card['fingerprint'][:12]}, this scene's is {self.scene.fingerprint[:12]} "
@@ -152,11 +153,11 @@ class Store:
         keep = keep[index.numpy()[keep] < count]
         if not len(keep):
             raise DataSetError(f"{self.folder} holds no {split} samples")
-        force, displacement, point = (
+        force, displacement, point, poisson = (
             torch.cat([part[name] for part in parts])[keep]
-            for name in ("force", "displacement", "point")
+            for name in ("force", "displacement", "point", "poisson")
         )
-        return Sample(force, displacement, self.scene.loads.young_at(point))
+        return Sample(force, displacement, self.scene.loads.young_at(point), poisson)
 
     def _read(self, line: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return what a shard holds, forces as fields (B, N, D).
@@ -184,7 +185,9 @@ class Store:
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != line["sha256"]:
             raise ValueError("is damaged: its SHA-256 is not the manifest's")
-        return opened(content, self.scene.problem.shape, self.scene.loads.dimension)
+        loads = self.scene.loads
+        own = int(loads.poisson_range is not None)
+        return opened(content, self.scene.problem.shape, loads.dimension, own)
 
     def reader(self, split: str) -> Callable[[int], Outcome | None]:
         """Return what gives a split's loads one at a time, None for those not there at present."""
@@ -392,7 +395,9 @@ class Store:
         split, first = self._split(tried[0].job), tried[0].job.number
         kept = [one for one in tried if one.accepted]
         name = f"{split}-{first:06d}.safetensors"
-        content = closed(kept, self.scene.problem.shape, self.scene.loads.dimension)
+        loads = self.scene.loads
+        poisson = None if loads.poisson_range is None else loads.poisson_at
+        content = closed(kept, self.scene.problem.shape, loads.dimension, poisson)
         _write(self.folder / name, content)
         line = {
             "file": name,

@@ -44,8 +44,10 @@ class BatchedNewton:
         """Check the ranges.
 
         Raises:
-            ValueError: An attribute is out of range, or supports are moved.
+            ValueError: An attribute is out of range, supports are moved, or the law is not one.
         """
+        if self.problem.material.poisson_range is not None:
+            raise ValueError("poisson: a range of them needs dpl.fem.newton.Newton")
         for name in ("tol", "keep"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and 1")
@@ -54,7 +56,13 @@ class BatchedNewton:
 
     @torch.no_grad()
     def iterate(self, load: Load) -> Iterator[Solution]:
-        """Yield the batch before the first update and after each one."""
+        """Yield the batch before the first update and after each one.
+
+        Raises:
+            ValueError: Loads bring Poisson's ratios of their own.
+        """
+        if load.poisson.shape[-1]:
+            raise ValueError("poisson: loads with their own need dpl.fem.newton.Newton")
         problem, start = self.problem, time.perf_counter()
         force = load.force.to(self.inverse.device)
         u, gap = torch.zeros_like(force), None

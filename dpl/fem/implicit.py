@@ -45,13 +45,16 @@ class Equilibrium:
 
         Raises:
             ValueError: A load of the batch has no answer, and so no derivative; `dpl.fem.solution.
-                solve` tells more about it. Or the load is not on the processor.
+                solve` tells more about it. Or the load is not on the processor, or a derivative
+                with respect to Poisson's ratios is asked for.
             SingularMatrix: When the gradient is asked for: a load is critical, the tangent at its
                 answer has no inverse.
         """
         if load.force.device.type != "cpu":
             raise ValueError(f"the load is on {load.force.device}, Newton solves on the cpu")
-        return _Answer.apply(load.force.double(), guess, self)
+        if load.poisson.requires_grad:
+            raise ValueError("poisson: answers are differentiable in forces, not in it; detach it")
+        return _Answer.apply(load.force.double(), load.poisson, guess, self)
 
     def solution(self, load: Load, *, guess: Tensor | None = None) -> Solution:
         """Return Newton's answers with what is known of them, without derivatives."""
@@ -59,13 +62,20 @@ class Equilibrium:
             *_, last = self.newton.iterate(load, guess=guess)
         return last
 
-    def factors(self, displacement: Tensor) -> list[Factor]:
+    def factors(self, displacement: Tensor, poisson: Tensor | None = None) -> list[Factor]:
         """Return the factors of the tangents at displacements (B, N, D) [-], one each.
+
+        Args:
+            displacement: Where.
+            poisson: Of the loads, (B, P) [-].
 
         Raises:
             SingularMatrix: A tangent has none.
         """
-        tangents = [self.newton.problem.linearise(one[None]).tangent[0] for one in displacement]
+        problem = self.newton.problem
+        own = displacement.new_zeros(1, 0) if poisson is None else poisson
+        pairs = zip(displacement, own.expand(len(displacement), -1), strict=True)
+        tangents = [problem.at(nu[None]).linearise(u[None]).tangent[0] for u, nu in pairs]
         return [self._backend.factorise(tangent.numpy()) for tangent in tangents]
 
     @cached_property
@@ -83,27 +93,29 @@ class _Answer(torch.autograd.Function):
     """See `Equilibrium`."""
 
     @staticmethod
-    def forward(ctx: Any, force: Tensor, guess: Tensor | None, parent: Equilibrium) -> Tensor:
+    def forward(
+        ctx: Any, force: Tensor, poisson: Tensor, guess: Tensor | None, parent: Equilibrium
+    ) -> Tensor:
         guess = None if guess is None else guess.detach()
-        load = Load(force.detach(), torch.ones(len(force), dtype=torch.float64))
+        load = Load(force.detach(), torch.ones(len(force), dtype=torch.float64), poisson)
         answer = parent.solution(load, guess=guess)
         if not answer.converged.all():
             lost = (~answer.converged).nonzero().flatten().tolist()
             told = ", ".join(f"load {k}: {Status(int(answer.status[k]))}" for k in lost)
             raise ValueError(f"no equilibrium to differentiate; of {len(force)} loads, {told}")
-        ctx.parent, ctx.factors = parent, None
+        ctx.parent, ctx.poisson, ctx.factors = parent, poisson, None
         ctx.save_for_backward(answer.displacement)
         return answer.displacement
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
         problem = ctx.parent.newton.problem
         if ctx.factors is None:  # kept: rows of a Jacobian ask again and again
             (displacement,) = ctx.saved_tensors
-            ctx.factors = ctx.parent.factors(displacement)
+            ctx.factors = ctx.parent.factors(displacement, ctx.poisson)
         solved = [
             scatter(factor.solve(gather(one, problem)), problem)
             for factor, one in zip(ctx.factors, gradient, strict=True)
         ]
-        return torch.stack(solved), None, None
+        return torch.stack(solved), None, None, None

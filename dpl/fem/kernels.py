@@ -7,6 +7,7 @@ In here strains and stresses are 6 numbers, 11 22 33 12 23 13, strains as e = 2 
 """
 
 import contextlib
+import copy
 import inspect
 import math
 import sys
@@ -392,21 +393,45 @@ class Kernels:
         self.places = _in_blocks(places)
         self._law = (
             Law(type(material), _SOURCES),
-            np.array(material.constants),
             needed(material),
             float(material.finite),
         )
+        self._constants = np.array([material.constants])  # (1 or B, constants)
         self._nothing = np.zeros((0, 0, 0, WIDTH))
 
-    def force(self, u: Array, out: Array) -> float:
-        """Add the internal force (N, D) of u (N, D) to `out`; return min det F."""
-        return 1 + self._call(_force, *self._law, u, self.cells, self.dN, self.dV, out)
+    def under(self, material: Isotropic) -> "Kernels":
+        """Return the loops of the same body with other moduli of the same law."""
+        twin = copy.copy(self)
+        constants = np.broadcast_arrays(*(np.ravel(c) for c in material.constants))
+        twin._constants = np.stack(constants, axis=1)
+        return twin
+
+    def force(self, u: Array, out: Array, member: int = 0) -> float:
+        """Add the internal force (N, D) of u (N, D) to `out`; return min det F.
+
+        Args:
+            u: Displacement.
+            out: Where to add.
+            member: Whose moduli count, where each member of a batch has its own.
+        """
+        law, needs, finite = self._law
+        moduli = self._constants[member if len(self._constants) > 1 else 0]
+        arrays = (self.cells, self.dN, self.dV)
+        return 1 + self._call(_force, law, moduli, needs, finite, u, *arrays, out)
 
     def system(self, u: Array, gap: Array | None, out: Array, values: Array) -> float:
-        """Add force and tangent (nnz + 1,) at u; return the smallest det C of mixed points."""
+        """Add force and tangent (nnz + 1,) at u; return the smallest det C of mixed points.
+
+        Raises:
+            ValueError: Each member of a batch has moduli of its own.
+        """
+        law, needs, finite = self._law
+        if len(self._constants) > 1:
+            raise ValueError("bodies of several Poisson's ratios are linearised one by one")
         gap = self._nothing if gap is None else gap
         arrays = (self.cells, self.dN, self.dV, self.places)
-        return 1 + self._call(_system, *self._law, u, gap, *arrays, out, values)
+        moduli = self._constants[0]
+        return 1 + self._call(_system, law, moduli, needs, finite, u, gap, *arrays, out, values)
 
     def widened(self, gap: Array | None, length: float, update: Array) -> Array:
         """Return the gap between the strain of u and that of mixed points after a step."""

@@ -6,9 +6,9 @@ its stress as a difference of terms that cancel at rest.
 """
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Self, cast
 
 import torch
 from torch import Tensor
@@ -76,6 +76,8 @@ class Material:
         if self.has_response:
             S = self.response(green_lagrange(H)).stress
             return S + H @ S
+        if self.several:
+            return torch.func.grad(lambda G: self.energy(G).sum())(H)
         gradient = torch.func.vmap(torch.func.grad(self.energy))
         return gradient(H.reshape(-1, 3, 3)).reshape(H.shape)
 
@@ -105,23 +107,62 @@ class Material:
     def _at_rest(self) -> Tensor:
         return self.tangent(torch.zeros(1, 3, 3, dtype=torch.float64))[0]
 
+    @property
+    def poisson_range(self) -> tuple[float, float] | None:
+        """Smallest and largest Poisson's ratio [-] of a law with a range of them; None: it is one.
+
+        A law with a range has no moduli: it answers nothing before `at` has made it one.
+        """
+        return None
+
+    @property
+    def several(self) -> bool:
+        """Whether each member of a batch has moduli of its own, see `at`."""
+        return False
+
+    def at(self, poisson: float | Tensor) -> Self:
+        """Return the law with another Poisson's ratio.
+
+        Args:
+            poisson: Poisson's ratio [-]; or those of the members of a batch, (B,), which strains
+                (B, E, Q, 3, 3) are then taken for.
+
+        Raises:
+            ValueError: The law has none, or it lies outside (-1, 0.5).
+        """
+        raise ValueError(f"poisson: {type(self).__name__} has no Poisson's ratio among its moduli")
+
 
 @dataclass(frozen=True)
 class Hookean(Material):
     """Law that at rest is Hooke's, with Young's modulus 1: such laws can be swapped fairly.
 
     Attributes:
-        poisson: Poisson's ratio at rest [-], in (-1, 0.5).
+        poisson: Poisson's ratio at rest [-], in (-1, 0.5); or a range [low, high], of which each
+            load has its own.
     """
 
-    poisson: float
+    poisson: float | Sequence[float]
 
     def __post_init__(self) -> None:
         """Check the range.
 
         Raises:
-            ValueError: `poisson` lies outside (-1, 0.5) or is no finite number.
+            ValueError: `poisson` lies outside (-1, 0.5), is no finite number, or no range.
         """
+        if isinstance(self.poisson, Tensor):
+            if not ((self.poisson > -1.0) & (self.poisson < 0.5)).all():
+                raise ValueError("poisson must lie between -1 and 0.5 (both excluded) throughout")
+            return
+        if isinstance(self.poisson, Sequence):
+            low, high = self.poisson if len(self.poisson) == 2 else (math.nan, math.nan)
+            if not -1.0 < low < high < 0.5:
+                raise ValueError(
+                    f"poisson = {list(self.poisson)} must be a range [low, high], low below high, "
+                    "between -1 and 0.5 (both excluded)"
+                )
+            object.__setattr__(self, "poisson", (float(low), float(high)))
+            return
         if not (math.isfinite(self.poisson) and -1.0 < self.poisson < 0.5):
             raise ValueError(
                 f"poisson = {self.poisson} must lie between -1 and 0.5 (both excluded)"
@@ -130,17 +171,47 @@ class Hookean(Material):
     @property
     def mu(self) -> float:
         """Shear modulus over Young's modulus [-]."""
-        return 1.0 / (2.0 * (1.0 + self.poisson))
+        return 1.0 / (2.0 * (1.0 + self._one))
 
     @property
     def lam(self) -> float:
         """First Lame parameter over Young's modulus [-]."""
-        return self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
+        return self._one / ((1.0 + self._one) * (1.0 - 2.0 * self._one))
 
     @property
     def bulk(self) -> float:
         """Bulk modulus over Young's modulus [-]."""
         return self.lam + 2 / 3 * self.mu
+
+    @property
+    def poisson_range(self) -> tuple[float, float] | None:
+        """See `Material.poisson_range`."""
+        return self.poisson if isinstance(self.poisson, tuple) else None
+
+    @property
+    def several(self) -> bool:
+        """See `Material.several`."""
+        return isinstance(self.poisson, Tensor)
+
+    def at(self, poisson: float | Tensor) -> Self:
+        """See `Material.at`."""
+        # beside cells and points, so that numbers of a point, (B, E, Q), take their own
+        own: Any = poisson.view(-1, 1, 1) if isinstance(poisson, Tensor) else poisson
+        return replace(self, poisson=own)
+
+    @property
+    def _one(self) -> float:
+        """Poisson's ratio; (B, 1, 1) of a batch, which goes through the same arithmetic.
+
+        Raises:
+            ValueError: It is a range.
+        """
+        if isinstance(self.poisson, tuple):
+            raise ValueError(
+                f"poisson = {list(self.poisson)} is a range, and this needs one: each load brings "
+                "its own (Load.poisson), a body of one is Problem.at"
+            )
+        return cast(float, self.poisson)
 
 
 class Isotropic(Material):

@@ -76,12 +76,13 @@ class LinearElastic(SaintVenantKirchhoff):
     def stress(self, H: Tensor) -> Tensor:
         """Return lambda tr eps I + 2 mu eps, see `Material.stress`."""
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        return self.lam * trace(H)[..., None, None] * eye + self.mu * (H + H.mT)
+        return (self.lam * trace(H))[..., None, None] * eye + beside(self.mu, 2) * (H + H.mT)
 
     def tangent(self, H: Tensor) -> Tensor:
         """Return Hooke's moduli, see `Material.tangent`."""
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        hooke = self.lam * dyad(eye, eye) + 2 * self.mu * symmetric_product(eye)
+        hooke = beside(self.lam, 4) * dyad(eye, eye)
+        hooke = hooke + 2 * beside(self.mu, 4) * symmetric_product(eye)
         return hooke.expand(*H.shape, 3, 3)
 
     @property
@@ -268,6 +269,11 @@ class YeohK2(Isotropic):
     def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
         """Return the slopes, see `Isotropic.slopes`."""
         return polynomial_slopes(c, i1, i2, m1, c[4] * j * (1 + j), c[4] * (1 + j) * (1 + 2 * j))
+
+
+def beside(modulus: float, axes: int) -> Any:
+    """Return a modulus as a factor on tensors with so many components at each point."""
+    return modulus[(..., *[None] * axes)] if isinstance(modulus, Tensor) else modulus
 
 
 def polynomial_slopes(c: Any, i1: Any, i2: Any, m1: Any, q: Any, qJ: Any) -> tuple[Any, ...]:

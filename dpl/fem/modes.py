@@ -55,6 +55,7 @@ def eigenmodes(linear: Linear, count: int) -> Modes:
         ValueError: `count` is not between 1 and a third of the degrees of freedom, or the body is
             free to move.
     """
+    linear = linear.reference
     problem = linear.problem
     size = problem.pattern.size
     if not 1 <= count <= size // 3:
@@ -210,8 +211,21 @@ class ModalLoads:
 
     @property
     def dimension(self) -> int:
-        """d, numbers that a load is made of: M for q, then centre, radius, amplitude, modulus."""
-        return len(self.q_max) + 4
+        """d, numbers that a load is made of: M for q, then centre, radius, amplitude, modulus.
+
+        And Poisson's ratio where the law has a range of them.
+        """
+        return len(self.q_max) + 4 + self._own
+
+    @property
+    def poisson_range(self) -> tuple[float, float] | None:
+        """Smallest and largest Poisson's ratio [-]; None if the law has one for all loads."""
+        return self.problem.material.poisson_range
+
+    @property
+    def _own(self) -> int:
+        """P, moduli besides Young's of which each load draws its own."""
+        return int(self.poisson_range is not None)
 
     def points(self, seed: int | Sequence[int], indices: Sequence[int]) -> Tensor:
         """Return the points of the unit cube that loads stand for, (B, d)."""
@@ -221,12 +235,17 @@ class ModalLoads:
     def at(self, points: Tensor) -> Load:
         """Return the loads of points of the unit cube, (B, d)."""
         forces = torch.stack([self._force(point.numpy()) for point in points])
-        return Load(forces, self.young_at(points))
+        return Load(forces, self.young_at(points), self.poisson_at(points))
 
     def young_at(self, points: Tensor) -> Tensor:
         """Return the Young's moduli of points, (B,) [Pa]."""
         low, high = self.young_range
-        return low + (high - low) * points[:, -1]
+        return low + (high - low) * points[:, -1 - self._own]
+
+    def poisson_at(self, points: Tensor) -> Tensor:
+        """Return the Poisson's ratios of points, (B, P) [-]; P = 0 if the law has one."""
+        low, high = self.poisson_range or (0.0, 0.0)
+        return low + (high - low) * points[:, points.shape[1] - self._own :]
 
     def sample(
         self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0
@@ -243,8 +262,9 @@ class ModalLoads:
 
     def _force(self, point: Array) -> Tensor:
         """Return the force (N, D) of a point (d,)."""
-        centre, radius, amplitude, _ = point[-4:]
-        q = self.q_max * torch.from_numpy(self.distribution(point[:-4]))
+        modes = len(self.q_max)
+        centre, radius, amplitude = point[modes : modes + 3]
+        q = self.q_max * torch.from_numpy(self.distribution(point[:modes]))
         q = float(self.amplitude(np.asarray(amplitude))) * q
         points = self.problem.points
         places = points[self.reach.any(dim=1)]

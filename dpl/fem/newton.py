@@ -3,11 +3,11 @@
 import math
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -40,12 +40,37 @@ class Linear:
         """Factor of K(0)."""
         rest = torch.zeros(1, *self.problem.shape, dtype=torch.float64)
         values = self.problem.linearise(rest).tangent[0].numpy()
-        return _backend_of(self.problem, self.linear, lasting=True).factorise(values)
+        return self._backend.factorise(values)
+
+    @cached_property
+    def _backend(self) -> Backend:
+        return _backend_of(self.problem, self.linear, lasting=True)
+
+    def at(self, poisson: Tensor | float) -> "Linear":
+        """Return the linear answer of the body of another Poisson's ratio, see `Problem.at`."""
+        problem = self.problem.at(poisson)
+        return self if problem is self.problem else _kept(self._twins, problem, self._twin)
+
+    def _twin(self, problem: Problem) -> "Linear":
+        twin = replace(self, problem=problem)
+        twin.__dict__["_backend"] = self._backend
+        return twin
+
+    @cached_property
+    def _twins(self) -> "dict[Problem, Linear]":
+        return {}
+
+    @cached_property
+    def reference(self) -> "Linear":
+        """The linear answer of the reference body, see `Problem.reference`."""
+        problem = self.problem.reference
+        return self if problem is self.problem else self._twin(problem)
 
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield the linear answer."""
         start = time.perf_counter()
-        answer = torch.stack([self.respond(force) for force in load.force])
+        pairs = zip(load.force, load.poisson.expand(len(load.force), -1), strict=True)
+        answer = torch.stack([self.at(nu[None]).respond(force) for force, nu in pairs])
         seconds = (time.perf_counter() - start) / len(answer)
         yield judge(self.problem, answer, load, self.tol, iterations=1, seconds=seconds)
 
@@ -58,6 +83,7 @@ class Linear:
         return {"problem": self.problem, "tol": self.tol, "linear": self.linear}
 
 
+TWINS = 4  # bodies of other Poisson's ratios whose factors are kept
 DOUBT = 0.05  # eigenvalue, relative to a factor nearby, below which a tangent is examined
 PATIENCE = 8  # conjugate gradient steps with the factor of another tangent, then its own
 CAREFUL = 2.0**-4  # load step from which on the end of the path may be near: full accuracy
@@ -132,12 +158,32 @@ class Newton:
             load: What acts.
             guess: Where to start, (B, N, D) [-]; zero if left out, and where it is inverted.
         """
+        own = load.poisson.expand(len(load.force), -1)
+        guesses = [None] * len(own) if guess is None else guess.split(1)
         yield from in_step(
             [
-                self._member(force[None], None if guess is None else guess[k, None])
-                for k, force in enumerate(load.force)
+                self.at(nu[None])._member(force[None], start)
+                for force, nu, start in zip(load.force, own, guesses, strict=True)
             ]
         )
+
+    def at(self, poisson: Tensor | float) -> "Newton":
+        """Return the solver of the body of another Poisson's ratio, see `Problem.at`.
+
+        It has a K(0) of its own to factorise; those of the last few are kept.
+        """
+        problem = self.problem.at(poisson)
+        return self if problem is self.problem else _kept(self._twins, problem, self._twin)
+
+    def _twin(self, problem: Problem) -> "Newton":
+        twin = replace(self, problem=problem)
+        twin.__dict__["_backend"] = self._backend
+        twin.__dict__["rest"] = _kept(self.rest._twins, problem, self.rest._twin)
+        return twin
+
+    @cached_property
+    def _twins(self) -> "dict[Problem, Newton]":
+        return {}
 
     def _member(self, force: Tensor, guess: Tensor | None) -> Iterator[Solution]:
         """Yield the states under one load (1, N, D)."""
@@ -362,6 +408,18 @@ class _Count:
     near: Factor | None = None  # of the last tangent that was factorised
     tangent: SymmetricProduct | None = None  # the last one, if an older factor served for it
     start: float = field(default_factory=time.perf_counter)
+
+
+Twin = TypeVar("Twin")
+
+
+def _kept(twins: dict[Problem, Twin], problem: Problem, make: Callable[[Problem], Twin]) -> Twin:
+    """Return what belongs to a problem, made if it is not there; the oldest leaves for it."""
+    if problem not in twins:
+        if len(twins) >= TWINS:
+            twins.pop(next(iter(twins)))
+        twins[problem] = make(problem)
+    return twins[problem]
 
 
 def _backend_of(problem: Problem, name: str, *, lasting: bool = False) -> Backend:

@@ -34,6 +34,7 @@ ELEMENTS = {
     ("Hexahedral", 1): (skfem.ElementHex1, 3),
     ("Hexahedral", 2): (skfem.ElementHex2, 5),
 }
+TWINS = 64  # bodies of other Poisson's ratios that are kept
 QUADRATIC = {element for (_, degree), (element, _) in ELEMENTS.items() if degree == 2}
 
 
@@ -193,7 +194,7 @@ class Problem:
         """Return where linear elements will be far too stiff, a line each."""
         lines, shape = [], self.mesh.elem.refdom.name.lower()
         constant = self.dV.shape[1] == 1
-        nu = self.material.poisson_ratio
+        nu = (self.material.poisson_range or (self.material.poisson_ratio,))[-1]
         if self.degree == 1 and nu >= 0.45 and not self.mean_dilatation:
             remedy = "degree=2" if constant else "degree=2 or mean_dilatation=true"
             lines.append(f"linear {shape} elements lock at Poisson's ratio {nu:.4g}: set {remedy}")
@@ -215,6 +216,60 @@ class Problem:
         if self.springs is not None:
             tensors["springs"] = Springs(*(part.to(device) for part in self.springs))
         return replace(self, **tensors)
+
+    def at(self, poisson: Tensor | float) -> Self:
+        """Return the body of another Poisson's ratio: mesh, pattern and compiled loops are shared.
+
+        Args:
+            poisson: Poisson's ratio [-]; or those of loads, (B, P): with P = 0 the body itself,
+                with P = 1 and B > 1 one of which each member of a batch has its own. Such a one has
+                energy, forces and residuals, but is linearised one by one.
+
+        Raises:
+            ValueError: Loads say none and the body has a range, or the law has none.
+        """
+        if isinstance(poisson, Tensor) and not poisson.shape[-1]:
+            if (span := self.material.poisson_range) is not None:
+                raise ValueError(
+                    f"poisson: the body has a range of them, {list(span)}, and the load does not "
+                    "say which: Load(force, young, poisson)"
+                )
+            return self
+        if isinstance(poisson, Tensor) and len(poisson) != 1:
+            return self._twin(poisson.detach().to(self.points.device, torch.float64))
+        one = float(poisson)
+        if one not in self._twins:
+            if len(self._twins) >= TWINS:
+                self._twins.clear()
+            self._twins[one] = self._twin(one)
+        return self._twins[one]
+
+    def _twin(self, poisson: Tensor | float) -> Self:
+        twin = replace(self, material=self.material.at(poisson))
+        for name in ("pattern", "moved_supports", "_operator"):
+            twin.__dict__[name] = getattr(self, name)
+        if self.material.poisson_range is None:
+            twin.__dict__["_first"] = self.__dict__.get("_first", self)
+        elif isinstance(poisson, Tensor) or poisson != self._middle:
+            twin.__dict__["_first"] = self.reference
+        return twin
+
+    @cached_property
+    def _twins(self) -> dict[float, Self]:
+        return {}
+
+    @property
+    def _middle(self) -> float:
+        low, high = self.material.poisson_range or (0.0, 0.0)
+        return (low + high) / 2
+
+    @property
+    def reference(self) -> Self:
+        """The body in the middle of the range of Poisson's ratios; itself if there is none.
+
+        What all loads share is its: modes, scales, largest loads.
+        """
+        return self if self.material.poisson_range is None else self.at(self._middle)
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle without what is computed from the rest."""
@@ -269,8 +324,8 @@ class Problem:
         displacement = displacement.detach().contiguous()
         internal = torch.zeros(displacement.shape, dtype=torch.float64)
         lowest = [
-            kernels.force(u.numpy(), out.numpy())
-            for u, out in zip(displacement, internal, strict=True)
+            kernels.force(u.numpy(), out.numpy(), k)
+            for k, (u, out) in enumerate(zip(displacement, internal, strict=True))
         ]
         internal = self._with_springs(internal, displacement)
         return Evaluation(internal, torch.tensor(lowest, dtype=torch.float64))
@@ -307,15 +362,17 @@ class Problem:
         return self._rounding * displacement.abs().amax(dim=(1, 2))
 
     @cached_property
-    def _rounding(self) -> float:
+    def _rounding(self) -> float | Tensor:
         size = self.dN.norm(dim=-1)  # (E or 1, Q, A)
-        moduli = self.material.lam + 2 * self.material.mu
+        moduli, each = self.material.lam + 2 * self.material.mu, 1.0
+        if isinstance(moduli, Tensor):
+            moduli, each = 1.0, moduli.flatten()
         terms = moduli * (self.dV[..., None] * size * size.sum(-1, keepdim=True)).sum(1)
         terms = terms.expand(len(self.cells), -1)[None, ..., None]
         held = ~self.free.any(dim=1)
         summed = self._gathered(terms.expand(-1, -1, -1, self.shape[1]))[0, :, 0]
         summed = torch.where(held, 0.0, summed)
-        return torch.finfo(torch.float64).eps * float(summed.norm())
+        return torch.finfo(torch.float64).eps * float(summed.norm()) * each
 
     @cached_property
     def moved_supports(self) -> bool:
@@ -409,6 +466,8 @@ class Problem:
         law = self.material
         if self.mean_dilatation or not isinstance(law, Isotropic):
             return None
+        if (first := self.__dict__.get("_first")) is not None and first._compiled is not None:
+            return first._compiled.under(law)
         # Copies: sending a problem to a worker process moves the memory of its tensors.
         cells, dN, dV = (tensor.numpy().copy() for tensor in (self.cells, self.dN, self.dV))
         places = self.pattern.places

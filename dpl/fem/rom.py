@@ -120,6 +120,7 @@ class PODGalerkin:
             ValueError: `rank` is not between 1 and the number of snapshots, or of free degrees of
                 freedom.
         """
+        _refuse_range(problem)
         rest = snapshots[:, problem.free].double()
         if lift is not None:
             supports = _support_force(problem)
@@ -143,6 +144,7 @@ class PODGalerkin:
         Raises:
             ValueError: An attribute is out of range, or V is none of this body.
         """
+        _refuse_range(self.problem)
         for name in ("tol", "reduced_tol", "keep", "smallest_step"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and 1")
@@ -156,7 +158,13 @@ class PODGalerkin:
             raise ValueError(f"vectors of shape {found} must have {wanted}")
 
     def iterate(self, load: Load) -> Iterator[Solution]:
-        """Yield the answer; iterations and factorisations are those of reduced tangents."""
+        """Yield the answer; iterations and factorisations are those of reduced tangents.
+
+        Raises:
+            ValueError: Loads bring Poisson's ratios of their own.
+        """
+        if load.poisson.shape[-1]:
+            raise ValueError("poisson: loads with their own need dpl.fem.newton.Newton")
         found, seconds = [], []
         for force in load.force:
             start = time.perf_counter()
@@ -439,6 +447,15 @@ def _broyden(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
 
 def _norm(vector: Tensor) -> float:
     return float(torch.linalg.vector_norm(vector))
+
+
+def _refuse_range(problem: Problem) -> None:
+    """Raise where the law has a range of Poisson's ratios: what is reduced here has one."""
+    if (span := problem.material.poisson_range) is not None:
+        raise ValueError(
+            f"poisson: reduced stiffness and cells are those of one, not of a range, {list(span)}; "
+            "take Problem.at or dpl.fem.newton.Newton"
+        )
 
 
 def _support_force(problem: Problem) -> Tensor:

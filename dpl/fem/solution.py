@@ -12,16 +12,39 @@ from torch import Tensor
 from dpl.fem.problem import Problem
 
 
-class Load(NamedTuple):
+class _Load(NamedTuple):
+    force: Tensor
+    young: Tensor
+    poisson: Tensor
+
+
+class Load(_Load):
     """Dead nodal forces on a batch of bodies.
 
     Attributes:
         force: Nodal forces over E L^2 (E L in 2D), (B, N, D) [-].
         young: Young's moduli E that these stand for, (B,) [Pa]; no answer depends on them.
+        poisson: Poisson's ratios of the bodies, (B, P) [-]: P = 1 where each load has its own, else
+            P = 0, which may be left out.
     """
 
-    force: Tensor
-    young: Tensor
+    __slots__ = ()
+
+    def __new__(cls, force: Tensor, young: Tensor, poisson: Tensor | None = None) -> "Load":
+        """Take the columns; Poisson's ratios (B,) too."""
+        return super().__new__(cls, force, young, beside(young, poisson))
+
+    def singles(self) -> "list[Load]":
+        """Return each load alone, B = 1."""
+        parts = (slice(k, k + 1) for k in range(len(self.force)))
+        return [Load(*(column[part] for column in self)) for part in parts]
+
+
+def beside(young: Tensor, poisson: Tensor | None) -> Tensor:
+    """Return Poisson's ratios (B,) or (B, P) as (B, P), P = 0 if left out, of moduli (B,)."""
+    if poisson is None:
+        return young.new_zeros(*young.shape, 0)
+    return poisson[..., None] if poisson.dim() == young.dim() else poisson
 
 
 class Status(IntEnum):
@@ -123,6 +146,7 @@ def judge(
     seconds: float = 0.0,
 ) -> Solution:
     """Return a displacement (B, N, D) as the solution it is: evaluated, nothing believed."""
+    problem = problem.at(load.poisson)
     internal, volume = problem.evaluate(displacement)
     balanced = problem.balanced(displacement, internal, load.force, tol) & (volume > 0)
     count = torch.full_like(volume, iterations, dtype=torch.int64)

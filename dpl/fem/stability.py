@@ -71,7 +71,7 @@ def branches(
     for sign in (1.0, -1.0):
         bent = newton.problem.prescribed[None]
         for part in np.linspace(0.1, 1.0, 10):
-            pushed = Load(part * (load.force + sign * push), load.young)
+            pushed = load._replace(force=part * (load.force + sign * push))
             bent = _end(newton, pushed, bent).displacement
         answers.append(_end(newton, load, bent))
     return answers

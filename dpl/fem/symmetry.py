@@ -89,8 +89,8 @@ def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetr
 
 def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
     """Return what must commute with a symmetry: supports, cells, springs, each on its own scale."""
-    springs = problem.springs
-    cells = problem if springs is None else replace(problem, springs=None)
+    springs, body = problem.springs, problem.reference  # isotropic: every Poisson's ratio alike
+    cells = body if springs is None else replace(body, springs=None)
     operators: list[Callable[[Tensor], Tensor]] = [
         lambda field: torch.where(problem.free, field, 0.0),
         lambda field: cells.evaluate(field).internal,

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from dpl.fem.problem import Problem
 from dpl.models.grid import Immersion, Permutation, cubic_grid, filling, own_grid
 from dpl.models.memory import refuse_beyond
+from dpl.models.moduli import placed
 from dpl.scene import Scene
 
 COARSE = 3  # grid points along a side across which two convolutions carry everything
@@ -73,7 +74,9 @@ class CNN(nn.Module):
         self.immersion = Permutation(points, shape) if shape == own else Immersion(points, shape)
         constant = self._constant(problem, shape)
         self.register_buffer("constant", constant, persistent=False)
-        self.net = UNet(dim + len(constant), dim, sizes, widths)
+        self.poisson_range = scene.loads.poisson_range
+        self.takes = () if self.poisson_range is None else ("poisson",)
+        self.net = UNet(dim + len(constant) + len(self.takes), dim, sizes, widths)
 
     def _constant(self, problem: Problem, shape: tuple[int, ...]) -> Tensor:
         """Return the channels that no load changes and that are not the same everywhere."""
@@ -89,10 +92,20 @@ class CNN(nn.Module):
         varying = [channel for channel in channels if channel.min() < channel.max()]
         return torch.stack(varying) if varying else share[:0]
 
-    def forward(self, force: Tensor) -> Tensor:
-        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32."""
+    def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
+        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
+
+        Args:
+            force: What acts.
+            poisson: Poisson's ratios, (B, 1) [-]; wanted where the law has a range of them.
+        """
         constant = self.constant.expand(len(force), *self.constant.shape)
-        return self.immersion.read(self.net(torch.cat([self.immersion.spread(force), constant], 1)))
+        fields = [self.immersion.spread(force), constant]
+        if self.poisson_range is not None:
+            place = placed(poisson, self.poisson_range, force)
+            sides = fields[0].shape[2:]
+            fields.append(place.view(-1, 1, *[1] * len(sides)).expand(-1, -1, *sides))
+        return self.immersion.read(self.net(torch.cat(fields, 1)))
 
     def plan(self) -> list[str]:
         """Return what the network leaves out, a line each."""

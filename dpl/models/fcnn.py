@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from dpl.models.memory import refuse_beyond
+from dpl.models.moduli import placed
 from dpl.scene import Scene
 
 
@@ -55,10 +56,13 @@ class FCNN(nn.Module):
         everything = torch.ones(scene.problem.shape, dtype=torch.bool)
         inputs = everything if all_dofs else scene.loads.reach
         outputs = everything if all_dofs else scene.problem.free
-        self.takes_young, (low, high) = young, scene.loads.young_range
+        low, high = scene.loads.young_range
         self.largest, self.middle = high, (low + high) / 2  # [Pa]
         self.spread = (high - low) / 2 or high  # of one modulus, itself: others are not far away
-        ends = int(inputs.sum()) + young, int(outputs.sum())
+        self.poisson_range = scene.loads.poisson_range
+        varying = {"young": young, "poisson": self.poisson_range is not None}
+        self.takes = tuple(name for name, enters in varying.items() if enters)
+        ends = int(inputs.sum()) + len(self.takes), int(outputs.sum())
         hidden = width or ends[1]
         sizes = [ends[0], *[hidden] * (layers - 1), ends[1]]
         self.parameters_needed = _parameters(sizes)
@@ -73,23 +77,28 @@ class FCNN(nn.Module):
             stages += [nn.PReLU(before), nn.Linear(before, after)]
         self.stages = nn.Sequential(*stages)
 
-    def forward(self, force: Tensor, young: Tensor | None = None) -> Tensor:
+    def forward(
+        self, force: Tensor, young: Tensor | None = None, poisson: Tensor | None = None
+    ) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
 
         Args:
             force: Over E L^2, scaled.
             young: E, (B,) [Pa]; wanted where it is an input, ignored elsewhere.
+            poisson: Poisson's ratios, (B, 1) [-]; wanted where the law has a range of them.
 
         Raises:
             ValueError: It is wanted and not there.
         """
         entering = force[:, self.inputs]
-        if self.takes_young:
+        if "young" in self.takes:
             if young is None:
                 raise ValueError("young is an input of this network: give E, (B,) [Pa]")
             size = (young / self.largest).to(force.dtype)[:, None]
             place = ((young - self.middle) / self.spread).to(force.dtype)[:, None]
             entering = torch.cat([size * entering, place], dim=1)
+        if self.poisson_range is not None:
+            entering = torch.cat([entering, placed(poisson, self.poisson_range, force)], dim=1)
         displacement = torch.zeros_like(force)
         displacement[:, self.outputs] = self.stages(entering)
         return displacement

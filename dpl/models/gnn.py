@@ -11,6 +11,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import gelu
 
 from dpl.models.graph import Floats, Graph, Integers, hierarchy, means
+from dpl.models.moduli import placed
 from dpl.scene import Scene
 
 WIDEST = 4  # largest width of a level over that of the nodes
@@ -72,14 +73,26 @@ class GNN(nn.Module):
         )
         self.sizes = [len(graph.points) for graph in graphs]
         self.whole = graphs[-1].whole
+        self.poisson_range = scene.loads.poisson_range
+        self.takes = () if self.poisson_range is None else ("poisson",)
+        self.moduli = nn.ModuleList(nn.Linear(1, wide) for wide in widths if self.takes)
         self.passes = nn.ModuleList(Pass(dim, widths) for _ in range(passes))
         self.decode = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, dim))
 
-    def forward(self, force: Tensor) -> Tensor:
-        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32."""
+    def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
+        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
+
+        Args:
+            force: What acts.
+            poisson: Poisson's ratios, (B, 1) [-]; wanted where the law has a range of them.
+        """
         states = [
             level(*load) for level, load in zip(self.levels, self.resultants(force), strict=True)
         ]
+        if self.poisson_range is not None:
+            place = placed(poisson, self.poisson_range, force)
+            pairs = zip(states, self.moduli, strict=True)
+            states = [state + encoder(place)[None] for state, encoder in pairs]
         for one in self.passes:
             states = one(states, self.levels, self.steps)
         return self.decode(states[0]).transpose(0, 1)

@@ -1,11 +1,13 @@
 """The linear answer, and a network for what is nonlinear: the flagship."""
 
+from functools import reduce
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from dpl.models.moduli import Rests
 from dpl.models.pod import PODNet, evened, root_mean_square
 from dpl.scene import Sample, Scene
 
@@ -70,47 +72,60 @@ class Latent(PODNet):
             blocks=blocks,
             symmetry=symmetry,
         )
-        self.linear_tol = linear_tol
+        self.linear_tol, self.rests = linear_tol, Rests(scene.linear)
         self.register_buffer("unit", torch.tensor(0.0, dtype=torch.float64))
         members = max(1, len(self.group))
         count = -(-PROBES // members) * members
-        self.register_buffer("probes", torch.zeros(len(self.read), count))
+        self.register_buffer("probes", torch.zeros(len(self.read), self.rests.count * count))
         inputs = self.scaled.shape[1]
+        bent = inputs * (1 + self.turns.shape[1] - inputs)  # x, and x nu where nu is an input
         self.left = nn.Linear(inputs, width, bias=False)
-        self.right = nn.Linear(inputs, width, bias=False)
+        self.right = nn.Linear(bent, width, bias=False)
         self.product = nn.Linear(width, len(self.basis), bias=False)
 
     def _reading(self, rank: int, coordinates: int) -> int:
         return rank
 
-    def forward(self, force: Tensor) -> Tensor:
-        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32."""
+    def _readings(self, scene: Scene) -> int:
+        return Rests(scene.linear).count
+
+    def combined(self, read: Tensor, poisson: Tensor | None) -> Tensor:
+        """See `PODNet.combined`."""
+        return self.rests.between(read, poisson)
+
+    def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
+        """See `PODNet.forward`."""
         acting = self.entering(force)
-        linear = acting @ self.read
-        learnt = self.learnt(linear @ self.scaled)
-        local = self._local(acting, linear)
+        linear = self.combined(acting @ self.read, poisson)
+        learnt = self.learnt(self.beside(linear @ self.scaled, poisson))
+        local = self._local(acting, linear, poisson)
         if not local.any():
             moved = (linear + learnt) @ self.basis
         else:
             moved = torch.where(local[:, None], learnt, linear + learnt) @ self.basis
             exact = _Respond.apply(acting[local].double(), self)
+            exact = self.combined(exact, None if poisson is None else poisson[local])
             moved = moved.index_add(0, local.nonzero()[:, 0], exact.to(moved.dtype))
         return self.leaving(moved, force)
 
-    def _local(self, acting: Tensor, linear: Tensor) -> Tensor:
+    def _local(self, acting: Tensor, linear: Tensor, poisson: Tensor | None) -> Tensor:
         """Return of which loads (B, inputs) the basis misses too much, (B,).
 
         Args:
             acting: The loads.
             linear: Coordinates of their linear answers, (B, R).
+            poisson: Poisson's ratios, (B, P) [-].
         """
-        missed = (acting @ self.probes.to(acting.dtype)).square().mean(dim=1)
+        probed = self.combined(acting @ self.probes.to(acting), poisson)
+        missed = probed.square().mean(dim=1)
         return missed >= self.linear_tol**2 * (linear.square().sum(dim=1) + missed)
 
     def network(self, inputs: Tensor) -> Tensor:
         """Return coordinates (B, R) of the nonlinear part from inputs (B, M), without symmetry."""
-        square = inputs.square().sum(dim=1, keepdim=True)
-        curved = self.spread * self.product(self.left(inputs) * self.right(inputs))
+        x, beside = inputs.tensor_split([self.scaled.shape[1]], dim=1)
+        square = x.square().sum(dim=1, keepdim=True)
+        bent = torch.cat([x, *(x * one for one in beside.split(1, dim=1))], dim=1)
+        curved = self.spread * self.product(self.left(x) * self.right(bent))
         return curved / (1 + square) + (square / (1 + square)) ** 1.5 * super().network(inputs)
 
     def plan(self) -> list[str]:
@@ -122,13 +137,18 @@ class Latent(PODNet):
                 "no rank for near fields: loads of whose linear answer the basis misses more than "
                 f"{self.linear_tol:.2g} are answered with the factor of K(0)"
             )
+        if self.rests.count > 1:
+            lines.append(
+                f"no K(0) for every Poisson's ratio: that of {self.rests.count} of them, and a "
+                "polynomial between"
+            )
         return lines
 
     def prepare(self, samples: Sample, unit: float) -> None:
         """Make the basis; see `PODNet.prepare`."""
         self.unit.fill_(unit)
         force, displacement = self._columns(samples)
-        linear = self.respond(force, rtol=1e-12)
+        linear = self.linear(force, samples.poisson, rtol=1e-12)
         size = displacement.norm(dim=1)
         weight = torch.where(size > 0, size.clamp(min=1e-12) ** -0.5, 0.0)
         parts = [weight[:, None] * linear, weight[:, None] * (displacement - linear)]
@@ -138,24 +158,27 @@ class Latent(PODNet):
         basis = basis @ torch.linalg.eigh(rests.T @ rests)[1].flip(1)
         self.basis.copy_(basis.T)
         acting = self.acting.cpu()[self.moving.cpu()]
-        self.read.copy_(self._respond_all(basis.T, rtol=1e-12)[:, acting].T)
-        self.probes.copy_(self._missed(basis)[:, acting].T)
+        probes = self._probing(basis)
+        for known, fields in {"read": basis.T, "probes": probes}.items():
+            members = range(self.rests.count)
+            responses = [self._respond_all(fields, k, rtol=1e-12)[:, acting] for k in members]
+            getattr(self, known).copy_(torch.cat(responses).T)
         motions = self._motions(basis, self.moving)
         self._scale(linear @ basis, (displacement - linear) @ basis, weight, motions)
         self._turn(motions, motions)
         self.prepared.fill_(True)
 
-    def _missed(self, basis: Tensor) -> Tensor:
-        """Return K(0)^-1 of random fields less what a basis (outputs, R) has of them, (P, outputs).
+    def _probing(self, basis: Tensor) -> Tensor:
+        """Return random fields less what a basis (outputs, R) has of them, (P, outputs).
 
-        Of few fields and their images, so that a load and its images are told alike.
+        Few fields and their images, so that a load and its images are told alike.
         """
         members = max(1, len(self.group))
         random = torch.Generator().manual_seed(0)
-        count = self.probes.shape[1] // members
+        count = self.probes.shape[1] // (members * self.rests.count)
         fields = torch.randn(count, len(basis), generator=random, dtype=torch.float64)
         every = torch.cat([self._image(fields, self.moving, k) for k in range(members)])
-        return self._respond_all(every - (every @ basis) @ basis.T, rtol=1e-12)
+        return every - (every @ basis) @ basis.T
 
     def _scale(self, read: Tensor, targets: Tensor, weight: Tensor, motions: Tensor) -> None:
         def spread(columns: Tensor) -> Tensor:
@@ -175,27 +198,44 @@ class Latent(PODNet):
         size = root_mean_square(targets)
         self.spread.copy_((size * size.max()).sqrt())
 
-    def _split(self, force: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _split(
+        self, force: Tensor, displacement: Tensor, poisson: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """See `PODNet._split`; of the linear answer the basis has its part, unless it is exact."""
         basis, reading = self.basis.cpu().double(), self.read.cpu().double()
-        linear, whole = force @ reading, displacement @ basis.T
+        linear, whole = self.combined(force @ reading, poisson), displacement @ basis.T
         missed = displacement.square().sum(dim=1) - whole.square().sum(dim=1)
-        local = self._local(force, linear)
+        local = self._local(force, linear, poisson)
         if local.any():
-            beyond = displacement[local] - self.respond(force[local])
+            beyond = displacement[local] - self.linear(force[local], poisson[local])
             inside = beyond @ basis.T
             missed[local] = beyond.square().sum(dim=1) - inside.square().sum(dim=1)
         return linear, whole - linear, missed
 
+    def linear(self, acting: Tensor, poisson: Tensor, rtol: float = RESPONSE) -> Tensor:
+        """Return linear answers (S, outputs) of forces on the inputs (S, inputs), scaled."""
+        parts = zip(acting.split(256), poisson.split(256), strict=True)
+        return torch.cat([self.combined(self.respond(some, rtol), nu) for some, nu in parts])
+
     def respond(self, acting: Tensor, rtol: float = RESPONSE) -> Tensor:
-        """Return K(0)^-1 f, scaled: (B, outputs) of forces on the inputs (B, inputs), float64."""
+        """Return K(0)^-1 f, scaled: (B, K outputs) of forces on the inputs (B, inputs), float64.
+
+        At each of the K Poisson's ratios of `rests`; where the law has one, K = 1.
+        """
         every = acting.new_zeros(len(acting), len(self.moving_places))
         every[:, self.acting[self.moving].to(acting.device)] = acting
-        return self._respond_all(every, rtol)
+        members = range(self.rests.count)
+        return torch.cat([self._respond_all(every, k, rtol) for k in members], dim=1)
 
-    def _respond_all(self, forces: Tensor, rtol: float = RESPONSE) -> Tensor:
-        """Return K(0)^-1 f, scaled, (B, outputs) of forces on all that moves, (B, outputs)."""
-        factor = self.scene.linear.factor
+    def _respond_all(self, forces: Tensor, k: int, rtol: float = RESPONSE) -> Tensor:
+        """Return K(0)^-1 f, scaled, (B, outputs) of forces on all that moves, (B, outputs).
+
+        Args:
+            forces: What acts.
+            k: Which of the Poisson's ratios of `rests`.
+            rtol: Residual ratio.
+        """
+        factor = self.rests.members[k].factor
         answers = [torch.from_numpy(factor.solve(one.numpy(), rtol)) for one in forces.cpu()]
         return float(self.unit) * torch.stack(answers).to(forces.device)
 
@@ -205,7 +245,7 @@ class _Respond(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, acting: Tensor, net: Latent) -> Tensor:
-        """Return (B, outputs) of (B, inputs)."""
+        """Return (B, K outputs) of (B, inputs)."""
         ctx.net = net
         return net.respond(acting)
 
@@ -214,4 +254,6 @@ class _Respond(torch.autograd.Function):
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None]:
         """Return the slope with respect to forces."""
         net = ctx.net
-        return net._respond_all(slope)[:, net.acting[net.moving]], None
+        parts = slope.chunk(net.rests.count, dim=1)
+        solved = reduce(torch.add, (net._respond_all(part, k) for k, part in enumerate(parts)))
+        return solved[:, net.acting[net.moving]], None

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from dpl.fem.pod import LARGE, pod
 from dpl.fem.symmetry import images, symmetries
 from dpl.models.coordinates import Coordinates, CoordinateSamples
+from dpl.models.moduli import placed
 from dpl.scene import Sample, Scene
 
 SNAPSHOTS = 16_000  # images of samples that make a basis, at most
@@ -105,17 +106,20 @@ class PODNet(nn.Module):
         members = max(1, len(self.group))
         width_of_reading = self._reading(rank, coordinates)
         coordinates = min(coordinates, width_of_reading)
+        self.poisson_range = scene.loads.poisson_range
+        self.takes = () if self.poisson_range is None else ("poisson",)
+        entering = coordinates + len(self.takes)
         for name, shape in {
             "basis": (rank, outputs),
-            "read": (inputs, width_of_reading),
+            "read": (inputs, width_of_reading * self._readings(scene)),
             "scaled": (width_of_reading, coordinates),
             "spread": (rank,),
-            "turns": (members, coordinates, coordinates),
+            "turns": (members, entering, entering),
             "returns": (members, rank, rank),
         }.items():
             self.register_buffer(name, torch.zeros(shape))
         self.register_buffer("prepared", torch.tensor(False))
-        self.enter = nn.Linear(coordinates, width)
+        self.enter = nn.Linear(entering, width)
         self.blocks = nn.Sequential(*(Block(width) for _ in range(blocks)))
         self.leave = nn.Linear(width, rank)
 
@@ -123,10 +127,30 @@ class PODNet(nn.Module):
         """Return how many coordinates of a load are read, C."""
         return coordinates
 
-    def forward(self, force: Tensor) -> Tensor:
-        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32."""
-        read = self.entering(force) @ self.read
-        return self.leaving(self.learnt(read @ self.scaled) @ self.basis, force)
+    def _readings(self, scene: Scene) -> int:
+        """Return of how many Poisson's ratios a load is read, see `combined`."""
+        return 1
+
+    def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
+        """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
+
+        Args:
+            force: What acts.
+            poisson: Poisson's ratios, (B, 1) [-]; wanted where the law has a range of them.
+        """
+        read = self.combined(self.entering(force) @ self.read, poisson)
+        inputs = self.beside(read @ self.scaled, poisson)
+        return self.leaving(self.learnt(inputs) @ self.basis, force)
+
+    def beside(self, inputs: Tensor, poisson: Tensor | None) -> Tensor:
+        """Return inputs (B, M) with the place of Poisson's ratio, where there is a range."""
+        if self.poisson_range is None:
+            return inputs
+        return torch.cat([inputs, placed(poisson, self.poisson_range, inputs)], dim=1)
+
+    def combined(self, read: Tensor, poisson: Tensor | None) -> Tensor:
+        """Return coordinates (B, C) of a load from those read at several Poisson's ratios."""
+        return read
 
     def entering(self, force: Tensor) -> Tensor:
         """Return the forces on the inputs, (B, inputs), of (B, N, D)."""
@@ -201,7 +225,9 @@ class PODNet(nn.Module):
     def _turn(self, loads: Tensor, basis: Tensor) -> None:
         """Set what symmetries do to inputs and outputs, from what they do to coordinates."""
         scaled = self.scaled.cpu().double()
-        self.turns.copy_(torch.linalg.pinv(scaled) @ loads @ scaled)
+        count = scaled.shape[1]
+        self.turns.copy_(torch.eye(self.turns.shape[1]).expand_as(self.turns))
+        self.turns[:, :count, :count] = (torch.linalg.pinv(scaled) @ loads @ scaled).to(self.turns)
         self.returns.copy_(basis.mT)
 
     def _columns(self, samples: Sample) -> tuple[Tensor, Tensor]:
@@ -259,21 +285,24 @@ class PODNet(nn.Module):
     def encode(self, samples: Sample) -> CoordinateSamples:
         """Return scaled samples (S, N, D), float64, in coordinates."""
         force, displacement = self._columns(samples)
-        read, targets, missed = self._split(force, displacement)
+        read, targets, missed = self._split(force, displacement, samples.poisson)
         coordinates = Coordinates(
-            inputs=(read @ self.scaled.cpu().double()).float(),
+            inputs=self.beside(read @ self.scaled.cpu().double(), samples.poisson).float(),
             targets=targets.float(),
             rest=missed.clamp(min=0),
             size=displacement.square().sum(1) / self.acting.numel(),
         )
         return CoordinateSamples(coordinates, self.turns.cpu(), self.returns.mT.cpu())
 
-    def _split(self, force: Tensor, displacement: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _split(
+        self, force: Tensor, displacement: Tensor, poisson: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return what of samples is read, to be learnt, and out of reach.
 
         Args:
             force: On the inputs, (S, inputs), float64.
             displacement: (S, outputs), float64.
+            poisson: Poisson's ratios, (S, P) [-].
 
         Returns:
             Coordinates of the loads (S, C), of what the network is to answer (S, R), and squares of
@@ -282,7 +311,7 @@ class PODNet(nn.Module):
         basis, reading = self.basis.cpu().double(), self.read.cpu().double()
         targets = displacement @ basis.T
         missed = displacement.square().sum(dim=1) - targets.square().sum(dim=1)
-        return force @ reading, targets, missed
+        return self.combined(force @ reading, poisson), targets, missed
 
 
 def evened(size: Tensor) -> Tensor:

@@ -450,7 +450,10 @@ def unsolved(monkeypatch):
         )
 
     monkeypatch.setattr("dpl.data.online.outcome", fake)
-    return SimpleNamespace(loads=SimpleNamespace(young_at=lambda points: points[:, -1]))
+    loads = SimpleNamespace(
+        young_at=lambda points: points[:, -1], poisson_at=lambda points: points[:, :0]
+    )
+    return SimpleNamespace(loads=loads)
 
 
 def test_new_loads_concentrate_where_the_errors_are_largest(unsolved, replay):

@@ -1,0 +1,534 @@
+"""Laws of a range of Poisson's ratios: each load is solved, kept, judged and learnt in its own."""
+
+import json
+import pickle
+from functools import partial
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+
+from dpl import run
+from dpl.benchmark import evaluate
+from dpl.data.datamodule import OfflineData, OnlineData
+from dpl.data.durable import DataSetError
+from dpl.data.shard import opened
+from dpl.data.store import Store
+from dpl.fem.batched import BatchedNewton
+from dpl.fem.energy import Rest
+from dpl.fem.implicit import Equilibrium
+from dpl.fem.law import Material
+from dpl.fem.materials import (
+    LinearElastic,
+    NeoHookeanIsoK2,
+    NeoHookeanIsoK4,
+    NeoHookeanLn,
+    SaintVenantKirchhoff,
+    StableNeoHookean,
+    YeohK2,
+)
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.fem.rom import PODGalerkin
+from dpl.fem.solution import Load, solve
+from dpl.hybrid import Hybrid
+from dpl.losses import MSE, Energy, LrPlus, LrStar, Physics, Stiffness
+from dpl.metrics import RelativeL2, ResidualRatio
+from dpl.models.cnn import CNN
+from dpl.models.fcnn import FCNN
+from dpl.models.gnn import GNN
+from dpl.models.latent import Latent
+from dpl.models.moduli import Rests
+from dpl.models.pod import PODNet
+from dpl.module import Surrogate
+from dpl.scene import Sample
+
+SPAN = [0.2, 0.4]
+LAWS = [
+    NeoHookeanLn,
+    SaintVenantKirchhoff,
+    LinearElastic,
+    StableNeoHookean,
+    NeoHookeanIsoK2,
+    NeoHookeanIsoK4,
+]
+
+
+@pytest.fixture(scope="module")
+def wide(make_scene):
+    """The tiny scene, its Poisson's ratio from a range."""
+    return make_scene(poisson=SPAN)
+
+
+@pytest.fixture(scope="module")
+def _folder(wide, tmp_path_factory):
+    folder = str(tmp_path_factory.mktemp("wide") / "set")
+    OfflineData(wide, folder=folder, train=96, val=8, test=24, workers=0).prepare_data()
+    return folder
+
+
+@pytest.fixture
+def sets(wide, _folder):
+    return OfflineData(wide, folder=_folder, train=96, val=8, test=24, batch_size=16, workers=0)
+
+
+@pytest.fixture
+def few(sets):
+    return Sample(*(column[:4] for column in sets.samples("train")))
+
+
+def member(batch, k):
+    return Sample(*(column[k : k + 1] for column in batch))
+
+
+# ------------------------------------------------------------------ the law and the body
+
+
+@pytest.mark.parametrize(
+    "span", [[0.4, 0.2], [0.3, 0.3], [0.2, 0.5], [-1.0, 0.2], [0.2], [0.1, 0.2, 0.3], [np.nan, 0.2]]
+)
+def test_a_range_that_is_none_is_refused_by_name(span):
+    with pytest.raises(ValueError, match=r"poisson = \[.*must be a range"):
+        NeoHookeanLn(span)
+
+
+def test_a_law_with_a_range_has_no_moduli_before_it_is_one():
+    law = NeoHookeanLn(SPAN)
+    for moduli in (lambda: law.mu, lambda: law.lam, lambda: law.poisson_ratio):
+        with pytest.raises(ValueError, match=r"poisson = \[0.2, 0.4\] is a range"):
+            moduli()
+    assert law.at(0.25).lam == NeoHookeanLn(0.25).lam
+    with pytest.raises(ValueError, match=r"poisson = 0.5"):
+        law.at(0.5)
+
+
+def test_a_law_without_one_refuses_another():
+    with pytest.raises(ValueError, match="poisson: YeohK2 has no"):
+        YeohK2(0.2, -0.02, 0.005, 2.0).at(0.3)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_batch_is_its_members_each_a_body_of_its_own(make_scene, law):
+    """By compiled loops and by tensors: forces, energies, rounding."""
+    scene = make_scene(law=law, poisson=SPAN)
+    load = scene.loads.sample((0, 0), range(3))
+    u = solve(scene.solver, load).displacement
+    body = scene.problem.at(load.poisson)
+    for k in range(3):
+        one = make_scene(law=law, poisson=float(load.poisson[k])).problem
+        alone = u[k : k + 1]
+        for name in ("energy", "internal_force", "rounding"):
+            found, expected = getattr(body, name)(u)[k], getattr(one, name)(alone)[0]
+            assert torch.allclose(found, expected, rtol=1e-12, atol=1e-18), name
+        assert torch.equal(body.evaluate(u).internal[k], one.evaluate(alone).internal[0])
+        product = body.tangent_product(u, u)[k]
+        assert torch.allclose(product, one.tangent_product(alone, alone)[0], rtol=1e-9, atol=1e-15)
+
+
+def test_a_law_that_is_its_energy_alone_has_batches_too(make_scene):
+    class Slow(NeoHookeanLn):
+        response = Material.response
+        stress = Material.stress
+        tangent = Material.tangent
+
+    slow, fast = (make_scene(law=law, poisson=SPAN) for law in (Slow, NeoHookeanLn))
+    load = fast.loads.sample((0, 0), range(3))
+    u = solve(fast.solver, load).displacement
+    found = slow.problem.at(load.poisson).internal_force(u)
+    expected = fast.problem.at(load.poisson).internal_force(u)
+    assert torch.allclose(found, expected, rtol=1e-9, atol=1e-15)
+
+
+def test_nothing_is_compiled_or_analysed_again(wide, monkeypatch):
+    loads = wide.loads.sample((0, 0), range(6))
+    solve(wide.solver, Load(*(column[:1] for column in loads)))
+    monkeypatch.setattr("dpl.fem.problem.Pattern.build", None)
+    monkeypatch.setattr("dpl.fem.newton.backend", None)
+    monkeypatch.setattr("dpl.fem.problem.Kernels.__init__", None)
+    monkeypatch.setattr("dpl.fem.kernels._alone", None)
+    assert solve(wide.solver, loads).converged.all()
+
+
+# ------------------------------------------------------------------ truth
+
+
+@pytest.mark.parametrize("mean_dilatation", [False, True])
+def test_the_truth_of_a_sample_is_that_of_a_body_with_its_poissons_ratio(
+    sets, wide, make_scene, mean_dilatation
+):
+    batch = sets.samples("train")
+    assert batch.poisson.shape == (96, 1)
+    assert len(batch.poisson.unique()) == 96
+    assert SPAN[0] <= float(batch.poisson.min()) < 0.22
+    assert 0.38 < float(batch.poisson.max()) <= SPAN[1]
+    problem = wide.problem
+    for k in range(5):
+        law = NeoHookeanLn(float(batch.poisson[k]))
+        body = Problem.build(
+            problem.mesh.scaled(problem.length),
+            law,
+            fixed=~problem.free.numpy(),
+            mean_dilatation=mean_dilatation,
+        )
+        load = member(batch, k).load
+        expected = solve(Newton(body, linear="superlu"), Load(load.force, load.young)).displacement
+        found = batch.displacement[k]
+        if mean_dilatation:
+            whole = Problem.build(
+                problem.mesh.scaled(problem.length),
+                problem.material,
+                fixed=~problem.free.numpy(),
+                mean_dilatation=True,
+            )
+            found = solve(Newton(whole, linear="superlu"), load).displacement[0]
+        assert (found - expected[0]).norm() < 1e-10 * expected.norm()
+
+
+def test_poissons_ratio_is_a_function_of_stream_and_index_and_moves_no_other_number(wide, scene):
+    one, other = wide.loads.sample((3, 0), [0, 5]), wide.loads.sample((3, 0), [5])
+    assert torch.equal(one.poisson[1:], other.poisson)
+    fixed = scene.loads.points((3, 0), [0, 5])
+    assert torch.equal(wide.loads.points((3, 0), [0, 5])[:, :-1], fixed)
+    assert torch.equal(wide.loads.young_at(torch.rand(2, wide.loads.dimension)), one.young)
+
+
+def test_every_solver_takes_each_load_with_its_own(wide, few):
+    exact = few.displacement
+    for solver in (wide.solver, Hybrid(lambda load: 0 * load.force, wide.solver)):
+        assert torch.allclose(solve(solver, few.load).displacement, exact, rtol=0, atol=1e-9)
+    linear = solve(wide.linear, few.load).displacement
+    for k in range(4):
+        one = wide.linear.at(float(few.poisson[k])).respond(few.force[k])
+        assert torch.equal(linear[k], one)
+    assert not torch.allclose(linear[0], wide.linear.reference.respond(few.force[0]), rtol=1e-3)
+
+
+def test_a_load_that_does_not_say_which_is_refused(wide, few):
+    silent = Load(few.force, few.young)
+    for solver in (wide.solver, wide.linear):
+        with pytest.raises(ValueError, match=r"poisson: .*does not say which"):
+            solve(solver, silent)
+    with pytest.raises(ValueError, match=r"poisson: .*does not say which"):
+        Surrogate(FCNN(wide, width=4), MSE(), wide).predict(silent)
+
+
+def test_a_scene_of_one_refuses_to_predict_for_another(scene, few):
+    with pytest.raises(ValueError, match="poisson: the law has one"):
+        Surrogate(FCNN(scene, width=4), MSE(), scene).predict(few.load)
+
+
+def test_what_knows_one_body_only_refuses_a_range(wide, few):
+    with pytest.raises(ValueError, match="poisson: a range"):
+        BatchedNewton(wide.problem)
+    with pytest.raises(ValueError, match="poisson: reduced stiffness"):
+        PODGalerkin.fit(wide.problem, few.displacement, 2)
+    with pytest.raises(ValueError, match="poisson: loads with their own"):
+        solve(BatchedNewton(wide.problem.reference), few.load)
+
+
+def test_gradients_of_exact_answers_are_those_of_the_body_of_each_load(wide, few, make_scene):
+    force = few.force.clone().requires_grad_()
+    Equilibrium(wide.solver)(Load(force, few.young, few.poisson)).square().sum().backward()
+    one = make_scene(poisson=float(few.poisson[1]))
+    alone = few.force[1:2].clone().requires_grad_()
+    Equilibrium(one.solver)(Load(alone, few.young[1:2])).square().sum().backward()
+    assert torch.allclose(force.grad[1], alone.grad[0], rtol=1e-6, atol=1e-12)
+    with pytest.raises(ValueError, match="poisson"):
+        Equilibrium(wide.solver)(Load(few.force, few.young, few.poisson.clone().requires_grad_()))
+
+
+def test_a_scene_with_a_range_goes_to_another_process(wide):
+    twin = pickle.loads(pickle.dumps(wide))
+    assert twin.fingerprint == wide.fingerprint
+    assert torch.equal(
+        twin.loads.sample((0, 0), [2]).poisson, wide.loads.sample((0, 0), [2]).poisson
+    )
+
+
+# ------------------------------------------------------------------ identity, data
+
+
+def test_only_a_range_shows_in_the_identity(scene, wide, make_scene):
+    assert json.loads(json.dumps(scene.identity()["law"])) == {
+        "name": "NeoHookeanLn",
+        "poisson": 0.3,
+    }
+    assert json.loads(json.dumps(wide.identity()["law"]))["poisson"] == SPAN
+    assert set(scene.identity()) == set(wide.identity())
+    assert set(scene.identity()["loads"]) == set(wide.identity()["loads"])
+    others = [make_scene(poisson=span).fingerprint for span in ([0.2, 0.41], [0.21, 0.4])]
+    assert len({scene.fingerprint, wide.fingerprint, *others}) == 4
+    assert make_scene(poisson=tuple(SPAN)).fingerprint == wide.fingerprint
+
+
+def test_the_data_set_keeps_poissons_ratios_and_that_of_one_has_no_such_column(sets, data, wide):
+    kept = sets.store.load("train", 96)
+    assert torch.equal(
+        kept.poisson, wide.loads.sample(sets.store.stream("train"), range(96)).poisson
+    )
+    assert [flaw for _, flaw in sets.store.verify() if flaw] == []
+    for module, there in ((sets, True), (data, False)):
+        line = module.store.shards()[0]
+        content = (module.store.folder / line["file"]).read_bytes()
+        assert (b'"poisson"' in content[:2000]) == there
+    assert data.samples("train").poisson.shape == (12, 0)
+
+
+def test_a_data_set_of_another_range_is_refused(sets, make_scene, scene):
+    for other in (scene, make_scene(poisson=[0.2, 0.3])):
+        with pytest.raises(DataSetError, match=r"another scene.*\(law differ\)"):
+            Store(sets.store.folder, other, 0).load("train", 4)
+
+
+def test_a_shard_with_or_without_poissons_ratios_is_read_as_such_only(sets, data):
+    content = (sets.store.folder / sets.store.shards()[0]["file"]).read_bytes()
+    with pytest.raises(ValueError, match="holds Poisson's ratios"):
+        opened(content, (45, 3), 8)
+    content = (data.store.folder / data.store.shards()[0]["file"]).read_bytes()
+    with pytest.raises(ValueError, match="poisson"):
+        opened(content, (45, 3), 7, 1)
+
+
+def test_an_audit_finds_other_poissons_ratios(sets):
+    from dpl.data.audit import flaw_of_shard
+
+    line = sets.store.shards()[0]
+    shard = sets.store._sound(line)
+    stream = sets.store.stream(line["split"])
+    assert flaw_of_shard(sets.scene, stream, line, shard) == ""
+    shard["poisson"] = shard["poisson"].flip(0)
+    assert "Poisson" in flaw_of_shard(sets.scene, stream, line, shard)
+
+
+def test_images_and_streams_carry_poissons_ratios(wide, sets, tmp_path):
+    stream = OnlineData(wide, folder=str(tmp_path), val=1, test=1, workers=0, batches=1,
+                        batch_size=8, symmetry=True)  # fmt: skip
+    batch = next(iter(stream.train_dataloader()))
+    assert batch.poisson.shape == (8, 1)
+    assert ResidualRatio(wide.problem).measure(batch.displacement, batch).max() < 1e-8
+    module = OfflineData(wide, folder=str(sets.store.folder), train=16, symmetry=True, workers=0)
+    batch = next(iter(module.train_dataloader()))
+    assert ResidualRatio(wide.problem).measure(batch.displacement, batch).max() < 1e-8
+
+
+# ------------------------------------------------------------------ losses, metrics
+
+
+PHYSICS = {
+    "lr_star": lambda: LrStar(per_sample=True),
+    "lr_plus": LrPlus,
+    "stiffness": lambda: Stiffness(floor=0.0),
+    "energy": lambda: Energy(floor=0.0),
+}
+
+
+@pytest.mark.parametrize("name", PHYSICS)
+def test_a_physics_loss_judges_each_sample_as_the_body_that_it_is(few, wide, make_scene, name):
+    near = (few.displacement * 1.05).requires_grad_()
+    physics = Surrogate(FCNN(wide, width=4), MSE(), wide).physics
+    whole = PHYSICS[name]()(near, few, physics)
+    (slope,) = torch.autograd.grad(whole, near)
+    values, slopes = [], []
+    for k in range(4):
+        one = make_scene(poisson=float(few.poisson[k]))
+        body = Physics(one.problem, physics.largest_force)
+        alone = near[k : k + 1].detach().requires_grad_()
+        sample = member(few, k)._replace(poisson=few.poisson[:1, :0])
+        values.append(PHYSICS[name]()(alone, sample, body))
+        slopes.append(torch.autograd.grad(values[-1], alone)[0])
+    assert float(whole) == pytest.approx(float(torch.stack(values).mean()), rel=1e-5)
+    expected = torch.cat(slopes) / 4
+    assert torch.allclose(slope, expected, rtol=1e-4, atol=1e-6 * float(expected.abs().max()))
+
+
+def test_the_rest_stiffness_of_a_batch_is_that_of_each_body(wide, few):
+    found = Rest(wide.problem).product(few.displacement, few.poisson)
+    for k in range(4):
+        one = Rest(wide.problem.at(float(few.poisson[k])))
+        expected = one.product(few.displacement[k : k + 1])[0]
+        assert torch.allclose(found[k], expected, rtol=1e-10, atol=1e-16)
+
+
+def test_the_truth_has_no_residual_and_no_other_poissons_ratio_has_none(wide, few):
+    measure = ResidualRatio(wide.problem).measure
+    assert measure(few.displacement, few).max() < 1e-8
+    assert measure(few.displacement, few._replace(poisson=few.poisson.flip(0))).min() > 1e-3
+
+
+# ------------------------------------------------------------------ networks
+
+
+class Untold(FCNN):
+    """Looks at the middle of the range whatever the load says."""
+
+    def forward(self, force, poisson=None):
+        return super().forward(force, poisson=torch.full_like(poisson, 0.3))
+
+
+def median_error(module, test):
+    """Return the median relative L2 error."""
+    with torch.no_grad():
+        return float(RelativeL2().measure(module.predict(test.load), test).median())
+
+
+def by_poisson(module, sample, span=SPAN):
+    """Return the displacements of one load at both ends of the range."""
+    load = Load(sample.force.repeat(2, 1, 1), sample.young.repeat(2), torch.tensor(span).double())
+    with torch.no_grad():
+        return module.predict(load)
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda scene: FCNN(scene, width=8),
+        lambda scene: CNN(scene, channels=2),
+        lambda scene: GNN(scene, width=4),
+        lambda scene: PODNet(scene, rank=20, coordinates=8, width=16, blocks=1),
+        lambda scene: Latent(scene, rank=20, coordinates=8, width=16, blocks=1),
+    ],
+    ids=["fcnn", "cnn", "gnn", "pod", "latent"],
+)
+def test_every_network_hears_poissons_ratio_and_a_batch_is_its_members(build, wide, sets, few):
+    torch.manual_seed(0)
+    module = Surrogate(build(wide), MSE(), wide).eval()
+    if isinstance(module.net, PODNet):
+        module.prepare(sets.samples("train"))
+    low, high = by_poisson(module, member(few, 0))
+    assert (low - high).norm() > 1e-4 * low.norm()
+    with torch.no_grad():
+        whole = module.predict(few.load)
+        parts = torch.cat([module.predict(one) for one in few.load.singles()])
+    assert torch.allclose(whole, parts, rtol=1e-4, atol=1e-6 * float(whole.abs().max()))
+
+
+def test_a_network_that_takes_none_is_refused(wide):
+    with pytest.raises(ValueError, match=r"Flatten takes no Poisson's ratio.*\[0.2, 0.4\]"):
+        Surrogate(torch.nn.Flatten(), MSE(), wide)
+
+
+@pytest.mark.parametrize("span", [[0.2, 0.4], [0.0, 0.45], [0.1, 0.49]])
+def test_linear_answers_between_nodes_are_those_of_every_poissons_ratio(make_scene, span):
+    scene = make_scene(poisson=span)
+    rests, free = Rests(scene.linear), scene.problem.free
+    force = scene.loads.sample((0, 0), [1]).force[0]
+    right = force[free].numpy()
+    answers = torch.cat([torch.from_numpy(one.factor.solve(right)) for one in rests.members])
+    assert all(span[0] <= nu <= span[1] for nu in rests.nodes)
+    for nu in torch.linspace(*span, 7, dtype=torch.float64):
+        exact = scene.linear.at(float(nu)).respond(force)[free]
+        found = rests.between(answers[None], nu.view(1, 1))[0]
+        assert (found - exact).norm() < 1e-5 * exact.norm()
+
+
+@pytest.mark.parametrize("near", [0, 300])
+def test_small_loads_are_answered_linearly_at_every_poissons_ratio(wide, sets, few, near):
+    """To the rank of the basis without the factors, exactly with them; however badly trained."""
+    torch.manual_seed(0)
+    net = Latent(wide, rank=90, coordinates=8, width=16, blocks=1, near=near, symmetry=False)
+    module = Surrogate(net, MSE(), wide).eval()
+    module.prepare(sets.samples("train"))
+    light = few._replace(force=1e-4 * few.force)
+    exact = solve(wide.linear, light.load).displacement
+    with torch.no_grad():
+        found = module.predict(light.load)
+    reference = torch.stack([wide.linear.reference.respond(force) for force in light.force])
+
+    def error(field):
+        return float(((field - exact).flatten(1).norm(dim=1) / exact.flatten(1).norm(dim=1)).max())
+
+    assert error(found) < 1e-3
+    assert error(found) < error(reference) / 20
+
+
+def test_encoded_samples_are_what_the_network_sees(wide, sets, few):
+    net = Latent(wide, rank=20, coordinates=8, width=16, blocks=1, near=0)
+    module = Surrogate(net, MSE(), wide).eval()
+    module.prepare(sets.samples("train"))
+    encoded = module.encode(few).__getitems__(list(range(4)))
+    seen = []
+    net.learnt = lambda inputs: seen.append(inputs) or torch.zeros(len(inputs), 20)
+    linear = module.predict(few.load)
+    assert torch.allclose(encoded.inputs, seen[0], rtol=1e-3, atol=1e-5)
+    assert torch.allclose(encoded.inputs[:, -1:], ((few.poisson - 0.3) / 0.1).float(), atol=1e-6)
+    missed = (few.displacement - linear) / module.displacement_scale
+    square = encoded.targets.double().square().sum(1) + encoded.rest
+    assert torch.allclose(missed.square().flatten(1).sum(1), square, rtol=1e-3)
+
+
+def test_a_network_that_is_told_poissons_ratio_is_clearly_better(make_scene, tmp_path):
+    """Loads of two modes on the whole boundary: three numbers and Poisson's ratio make them."""
+    scene = make_scene(poisson=[0.0, 0.45], n_modes=2, patch=(2.0, 2.0), deflection=0.2)
+    data = OfflineData(scene, folder=str(tmp_path), train=256, val=1, test=64, workers=0)
+    data.prepare_data()
+    batch, errors = data.samples("train"), {}
+    for kind in (FCNN, Untold):
+        torch.manual_seed(0)
+        module = Surrogate(kind(scene, width=64, layers=3), MSE(), scene)
+        force = (batch.force / module.force_scale).float()
+        displacement = (batch.displacement / module.displacement_scale).float()
+        optimizer = torch.optim.Adam(module.net.parameters(), lr=1e-2)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 1000)
+        for _ in range(1000):
+            optimizer.zero_grad()
+            answer = module.net(force, poisson=batch.poisson)
+            (answer - displacement).square().mean().backward()
+            optimizer.step()
+            schedule.step()
+        errors[kind] = median_error(module, data.samples("test"))
+    assert errors[FCNN] < 0.6 * errors[Untold]
+
+
+def test_latent_trains_in_coordinates_and_is_evaluated(wide, sets, tmp_path):
+    torch.manual_seed(0)
+    net = Latent(wide, rank=60, coordinates=15, width=32, blocks=1)
+    adam = partial(torch.optim.Adam, lr=3e-3)
+    module = Surrogate(net, MSE(relative=1.0), wide, optimizer=adam)
+    trainer = L.Trainer(
+        max_epochs=100,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        accelerator="cpu",
+        limit_val_batches=0,
+    )
+    trainer.fit(module, datamodule=sets)
+    module.eval()
+    test = sets.samples("test")
+    linear = solve(wide.linear, test.load).displacement
+    told = median_error(module, test)
+    assert told < float(RelativeL2().measure(linear, test).median()) / 2
+    assert told < median_error(module, test._replace(poisson=0 * test.poisson + 0.3)) / 2
+    rows = evaluate(module, Sample(*(column[:6] for column in test)), tmp_path)
+    assert {row.solver: row.converged for row in rows}["hybrid Newton"] == 6
+
+
+# ------------------------------------------------------------------ configuration
+
+
+def test_a_range_is_an_option_of_the_law(scene_of):
+    scene = scene_of("mesh.nodes=[5,3,3]", "material.poisson=[0.2,0.4]", "solver.linear=superlu")
+    assert scene.loads.poisson_range == (0.2, 0.4)
+    assert any("0.2 to 0.4" in line for line in scene.plan())
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("material.poisson=[0.4,0.2]", r"material: poisson = \[0.4, 0.2\] must be a range"),
+        ("material.poisson=[0.2,0.5]", r"material: poisson = \[0.2, 0.5\] must be a range"),
+        ("material.poisson=[0.2]", r"material: poisson = \[0.2\] must be a range"),
+        ("material.poisson=[a,b]", r"material.poisson = \['a', 'b'\] must be a number or a list"),
+    ],
+)
+def test_a_wrong_range_ends_with_one_line_that_names_the_key(scene_of, override, told):
+    with pytest.raises(run.ConfigError, match=told):
+        scene_of("mesh.nodes=[5,3,3]", override)
+
+
+@pytest.mark.parametrize("law", ["yeoh_k2", "ogden_k2", "mooney_rivlin_k2"])
+def test_a_law_without_poissons_ratio_refuses_a_range(scene_of, law):
+    with pytest.raises(run.ConfigError, match=r"material\.poisson: .*has no such option"):
+        scene_of(f"material={law}", "+material.poisson=[0.2,0.4]")
