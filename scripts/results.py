@@ -21,24 +21,26 @@ def main(cfg: DictConfig) -> None:
         raise run.ConfigError(f"run: {cfg.run} holds no runs; train some with run={cfg.run}/NAME")
     methods: dict[str, results.Method] = {}
     scene = None
+
+    def made(key: str, *parts: object) -> results.Method:
+        try:
+            return run.make(cfg, key)(*parts)
+        except ValueError as error:
+            raise run.ConfigError(f"{key}: {error}; {key}=null leaves it out") from error
+
     for folder in folders:
         trained, surrogate = run.load_run(folder, scene=scene)
         if scene is None:
             scene = surrogate.scene
-            if cfg.tolerance and scene.loads.poisson_range is not None:
-                raise run.ConfigError(
-                    "tolerance: POD-Galerkin has one Poisson's ratio, these runs a range of them; "
-                    "set tolerance=null"
-                )
             data = run.make(trained, "data", scene=scene)
             data.prepare_data()
             train = data.samples("train")
             methods["linear"] = results.linear(scene)
             if cfg.galerkin:
-                methods["POD-Galerkin"] = run.make(cfg, "galerkin")(scene, train)
+                methods["POD-Galerkin"] = made("galerkin", scene, train)
         methods[folder.name] = results.network(surrogate, folder, trained.data.train)
         if cfg.corrected and isinstance(surrogate.net, PODNet):
-            tier = run.make(cfg, "corrected")(surrogate, methods[folder.name], train)
+            tier = made("corrected", surrogate, methods[folder.name], train)
             methods[f"{folder.name} corrected"] = tier
     sets = results.load_sets(scene, data.samples("test"), cfg.count)
     rows, errors = results.paper(cfg.name), {}

@@ -124,7 +124,7 @@ class Latent(PODNet):
         """Return coordinates (B, R) of the nonlinear part from inputs (B, M), without symmetry."""
         x, beside = inputs.tensor_split([self.scaled.shape[1]], dim=1)
         square = x.square().sum(dim=1, keepdim=True)
-        bent = torch.cat([x, *(x * one for one in beside.split(1, dim=1))], dim=1)
+        bent = torch.cat([x, *(x * one[:, None] for one in beside.unbind(1))], dim=1)
         curved = self.spread * self.product(self.left(x) * self.right(bent))
         return curved / (1 + square) + (square / (1 + square)) ** 1.5 * super().network(inputs)
 

@@ -171,7 +171,7 @@ def test_only_loads_of_which_the_basis_misses_too_much_are_solved_for(scene, bat
     monkeypatch.setattr(
         Latent,
         "respond",
-        lambda net, acting, **how: asked.append(len(acting)) or original(net, acting, **how),
+        lambda net, acting, *how: asked.append(len(acting)) or original(net, acting, *how),
     )
     module = prepared(scene, batch, rank=20, linear_tol=torch.inf)
     force = torch.cat([batch.force, sparse(scene, 2), sparse(scene, 60)])
