@@ -219,7 +219,7 @@ class Pardiso:
         """Return x, (n,), with K x = right, for a matrix that has been factorised before."""
         if self.held is not matrix:
             self._factorise(matrix)
-        return self._call(33, matrix, right)
+        return self._call(33, matrix, np.ascontiguousarray(right))  # MKL knows no strides
 
     def _factorise(self, matrix: csr_array) -> None:
         self.held = None

@@ -210,6 +210,16 @@ def test_right_hand_side_stays_as_it_is(name, stiffness):
     assert np.array_equal(first, second)
 
 
+def test_right_hand_side_may_be_a_column_of_many(name, stiffness):
+    """Not one after the other in memory."""
+    pattern, values = stiffness
+    many = np.random.default_rng(0).standard_normal((pattern.size, 3))
+    factor = backend(pattern, name).factorise(values)
+    for right in (*many.T, many[::-1, 0]):
+        expected = factor.solve(right.copy())
+        assert factor.solve(right) == pytest.approx(expected, rel=1e-9)
+
+
 def test_no_load_has_no_answer_but_zero(name, stiffness):
     pattern, values = stiffness
     assert not backend(pattern, name).factorise(values).solve(np.zeros(pattern.size)).any()
