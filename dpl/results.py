@@ -3,7 +3,6 @@
 import copy
 import csv
 import json
-import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -303,32 +302,6 @@ def paper(experiment: str) -> list[Result]:
             )
         )  # fmt: skip
     return rows
-
-
-def over_seeds(rows: Sequence[Result]) -> list[Result]:
-    """Return rows whose methods differ in their seed alone as one, numbers as medians.
-
-    Names are those of a sweep's folders, such as "loss=mse,seed=0".
-    """
-    groups: dict[tuple[str, str], list[Result]] = {}
-    for row in rows:
-        words = row.method.split(",")
-        name = ",".join(word for word in words if not word.strip().startswith("seed="))
-        groups.setdefault((name, row.loads), []).append(row)
-    return [_median(name, group) for (name, _), group in groups.items()]
-
-
-def _median(name: str, rows: Sequence[Result]) -> Result:
-    if len(rows) == 1:
-        return rows[0]
-    columns: dict[str, object] = {}
-    for field in fields(Result):
-        values = [getattr(row, field.name) for row in rows]
-        numbers = [float(value) for value in values if isinstance(value, int | float)]
-        whole = all(isinstance(value, int) for value in values)
-        middle = statistics.median(numbers) if len(numbers) == len(rows) else values[0]
-        columns[field.name] = int(middle) if whole else middle
-    return Result(**{**columns, "method": f"{name} ({len(rows)} seeds)"})  # type: ignore[arg-type]
 
 
 def show(rows: Sequence[Result], title: str) -> None:

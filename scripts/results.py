@@ -1,7 +1,4 @@
-"""All methods on one experiment side by side: python scripts/results.py name=beam_svk.
-
-Runs whose folders differ in seed=... alone, as those of a sweep do, make one row of medians.
-"""
+"""All methods on one experiment side by side: python scripts/results.py name=beam_svk."""
 
 from pathlib import Path
 
@@ -52,7 +49,6 @@ def main(cfg: DictConfig) -> None:
     for row, error in results.measure(methods, sets, scene.solver, generation_minutes=minutes):
         rows.append(row)
         errors[row.method, row.loads] = error
-    rows = results.over_seeds(rows)
     results.show(rows, f"{cfg.name}, one load at a time, 1 thread")
     results.save(rows, errors, peers.machine(), Path(cfg.folder) / cfg.name)
 

@@ -147,28 +147,6 @@ def test_rows_of_the_paper_are_marked_as_such():
     assert results.paper("mine") == []
 
 
-def test_runs_that_differ_in_their_seed_make_one_row_of_medians():
-    def row(method, e_mean, iterations, loads="in range"):
-        return results.Result(method, loads, 7, e_mean=e_mean, newton_iterations=iterations)
-
-    rows = [row("linear", 1.0, 4.0)]
-    rows += [row(f"loss=mse,seed={k}", e, 3.0 + k) for k, e in enumerate((1e-3, 9e-3, 2e-3))]
-    rows += [row(f"loss=mse,seed={k}", 5.0, None, "small") for k in range(3)]
-    rows += [row("seed=0,loss=lr_star", 1e-4, 2.0), row("loss=lr_star,seed=1", 3e-4, 3.0)]
-    found = results.over_seeds(rows)
-    assert [(r.method, r.loads) for r in found] == [
-        ("linear", "in range"),
-        ("loss=mse (3 seeds)", "in range"),
-        ("loss=mse (3 seeds)", "small"),
-        ("loss=lr_star (2 seeds)", "in range"),
-    ]
-    assert found[0] == rows[0]
-    assert (found[1].e_mean, found[1].newton_iterations, found[1].count) == (2e-3, 4.0, 7)
-    assert isinstance(found[1].count, int)
-    assert (found[2].e_mean, found[2].newton_iterations, found[2].ms) == (5.0, None, None)
-    assert found[3].e_mean == pytest.approx(2e-4)
-
-
 # ------------------------------------------------------------------ the command
 
 
