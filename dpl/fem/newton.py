@@ -3,7 +3,7 @@
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -138,14 +138,7 @@ class Newton:
         Raises:
             ValueError: An attribute is out of range, or the backend is not there.
         """
-        for name in ("tol", "loose", "keep", "smallest_step"):
-            if not 0 < getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and 1")
-        if not 0 <= self.reuse < math.inf:
-            raise ValueError(f"reuse = {self.reuse} must be 0 or more")
-        for name in ("max_iter", "budget"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)} must be 1 or more")
+        check_steps(self, parts=("tol", "loose", "keep", "smallest_step"))
         chosen(self.linear)
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
@@ -420,6 +413,22 @@ def _kept(twins: dict[Problem, Twin], problem: Problem, make: Callable[[Problem]
             twins.pop(next(iter(twins)))
         twins[problem] = make(problem)
     return twins[problem]
+
+
+def check_steps(solver: Any, parts: Sequence[str]) -> None:
+    """Check the numbers of a solver that steps: `parts`, and reuse, max_iter, budget.
+
+    Raises:
+        ValueError: One is out of range.
+    """
+    for name in parts:
+        if not 0 < getattr(solver, name) < 1:
+            raise ValueError(f"{name} = {getattr(solver, name)} must lie between 0 and 1")
+    if not 0 <= solver.reuse < math.inf:
+        raise ValueError(f"reuse = {solver.reuse} must be 0 or more")
+    for name in ("max_iter", "budget"):
+        if getattr(solver, name) < 1:
+            raise ValueError(f"{name} = {getattr(solver, name)} must be 1 or more")
 
 
 def _backend_of(problem: Problem, name: str, *, lasting: bool = False) -> Backend:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.cubature import Cells, Cubature, cubature, whitening
-from dpl.fem.newton import Linear, gather, scatter
+from dpl.fem.newton import Linear, check_steps, gather, scatter
 from dpl.fem.pod import pod
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, judge
@@ -145,14 +145,7 @@ class PODGalerkin:
             ValueError: An attribute is out of range, or V is none of this body.
         """
         _refuse_range(self.problem)
-        for name in ("tol", "reduced_tol", "keep", "smallest_step"):
-            if not 0 < getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and 1")
-        if not 0 <= self.reuse < math.inf:
-            raise ValueError(f"reuse = {self.reuse} must be 0 or more")
-        for name in ("max_iter", "budget"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)} must be 1 or more")
+        check_steps(self, parts=("tol", "reduced_tol", "keep", "smallest_step"))
         if tuple(self.vectors.shape[:2]) != self.problem.shape:
             found, wanted = tuple(self.vectors.shape), (*self.problem.shape, "R")
             raise ValueError(f"vectors of shape {found} must have {wanted}")
