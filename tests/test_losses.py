@@ -39,7 +39,8 @@ LOSSES = sorted((Path(__file__).parents[1] / "conf" / "loss").glob("*.yaml"))
 
 @pytest.fixture(params=LOSSES, ids=lambda path: path.stem)
 def loss(request) -> Loss:
-    return instantiate(OmegaConf.load(request.param))
+    whole = {"loss": OmegaConf.load(request.param), "trainer": {"max_epochs": 10}}
+    return instantiate(OmegaConf.create(whole).loss)
 
 
 @pytest.fixture(scope="module")
