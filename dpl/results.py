@@ -38,6 +38,11 @@ PAPER: dict[str, dict[str, tuple[float, float | None, float | None, int]]] = {
     },
 }
 STREAMS = {"twice": 4, "small": 5}  # of loads; those of samples and scales are below
+TITLES = {
+    "in range": "loads in range",
+    "twice": "one to two times the range",
+    "small": "1 to 10 % of the range",
+}
 
 
 @dataclass(frozen=True)
@@ -352,8 +357,10 @@ def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
             if of == title:
                 part = torch.linspace(0, 100, len(values))
                 ax.semilogy(part, values.sort().values.clamp(min=1e-9), label=method)
-        ax.axhline(10 ** (-(50 if title == "small" else 60) / 20), color="0.7", ls=":")
-        ax.set_title(f"{title} loads", fontsize=10)
+        aim = 50 if title == "small" else 60  # [dB]
+        ax.axhline(10 ** (-aim / 20), color="0.7", ls=":")
+        ax.annotate(f"{aim} dB", (0, 10 ** (-aim / 20)), fontsize=7, color="0.4", va="bottom")
+        ax.set_title(TITLES.get(title, title), fontsize=10)
         ax.set_xlabel("part of the loads [%]")
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("relative L2 error, no more than")
