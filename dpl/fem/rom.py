@@ -121,22 +121,39 @@ class PODGalerkin:
                 freedom.
         """
         _refuse_range(problem)
-        rest = snapshots[:, problem.free].double()
-        if lift is not None:
-            supports = _support_force(problem)
-            for row, u in zip(rest, snapshots, strict=True):
-                force = problem.evaluate(u[None]).internal[0] - supports
-                row -= _linear_answer(lift, force)[problem.free]
-        basis = pod(rest, rank).vectors
+        basis = pod(_beyond_linear(problem, snapshots, lift), rank).vectors
         vectors = torch.zeros(*problem.shape, rank, dtype=torch.float64)
         vectors[problem.free] = basis
         if tolerance is None:
             return cls(problem, vectors, None, lift)
         some = torch.linspace(0, len(snapshots) - 1, min(states, len(snapshots))).round().long()
-        beyond = rest[some] - (rest[some] @ basis) @ basis.T
-        trained = snapshots[some].clone()
-        trained[:, problem.free] -= beyond
-        return cls(problem, vectors, cubature(problem, vectors, trained, tolerance), lift)
+        return cls.within(problem, vectors, snapshots[some], tolerance=tolerance, lift=lift)
+
+    @classmethod
+    def within(
+        cls,
+        problem: Problem,
+        vectors: Tensor,
+        states: Tensor,
+        *,
+        tolerance: float,
+        lift: Linear | None = None,
+        **options: Any,
+    ) -> Self:
+        """Return the solver in a subspace that is there, with cells chosen at some states.
+
+        Args:
+            problem: The body.
+            vectors: V, orthonormal, zero where held, (N, D, R) [-].
+            states: Displacements in equilibrium, (S, N, D) [-]; the subspace's part of them counts.
+            tolerance: See `cubature`.
+            lift: The linear answer, to be added to what the subspace holds.
+            options: Attributes of the solver.
+        """
+        rest, basis = _beyond_linear(problem, states, lift), vectors[problem.free]
+        held = states.clone()
+        held[:, problem.free] -= rest - (rest @ basis) @ basis.T
+        return cls(problem, vectors, cubature(problem, vectors, held, tolerance), lift, **options)
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -449,6 +466,17 @@ def _refuse_range(problem: Problem) -> None:
             f"poisson: reduced stiffness and cells are those of one, not of a range, {list(span)}; "
             "take Problem.at or dpl.fem.newton.Newton"
         )
+
+
+def _beyond_linear(problem: Problem, snapshots: Tensor, lift: Linear | None) -> Tensor:
+    """Return what moves of displacements in equilibrium, less their linear answers, (S, n)."""
+    rest = snapshots[:, problem.free].double()
+    if lift is not None:
+        supports = _support_force(problem)
+        for row, u in zip(rest, snapshots, strict=True):
+            force = problem.evaluate(u[None]).internal[0] - supports
+            row -= _linear_answer(lift, force)[problem.free]
+    return rest
 
 
 def _support_force(problem: Problem) -> Tensor:
