@@ -434,9 +434,10 @@ def check_steps(solver: Any, parts: Sequence[str]) -> None:
 def _backend_of(problem: Problem, name: str, *, lasting: bool = False) -> Backend:
     """Return the backend for a problem's tangents, or for one whose factor answers many loads."""
     motions = problem.rigid_motions()[0][problem.free].numpy()
-    if lasting and chosen(name, problem.pattern, motions) == "band32" != name:
-        name = "band"  # in float32 factorising is faster, a solve to all digits is not
-    return backend(problem.pattern, name, motions)
+    best = chosen(name, problem.pattern, motions)
+    if lasting and best == "band32" != name:
+        best = "band"  # in float32 factorising is faster, a solve to all digits is not
+    return backend(problem.pattern, best, motions)
 
 
 def gather(field: Tensor, problem: Problem) -> NDArray[np.float64]:
