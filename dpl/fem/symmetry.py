@@ -55,6 +55,15 @@ def images(field: Tensor, group: Sequence[Symmetry], which: Tensor) -> Tensor:
     return image
 
 
+def products(group: Sequence[Symmetry]) -> Tensor:
+    """Return which member image j of image i is, (G, G) int64; (1, 1) for an empty group."""
+    if not group:
+        return torch.zeros(1, 1, dtype=torch.int64)
+    Q = torch.stack([symmetry.rotation for symmetry in group]).cpu()
+    every = Q[None] @ Q[:, None]  # first i, then j
+    return (every[:, :, None] - Q).flatten(3).norm(dim=3).argmin(dim=2)
+
+
 def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetry]:
     """Return the group of a body's symmetries, the identity first, always in the same order.
 

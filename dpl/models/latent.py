@@ -7,8 +7,10 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from dpl.fem.symmetry import products
 from dpl.models.moduli import Rests
-from dpl.models.pod import PODNet, evened, root_mean_square
+from dpl.models.orbits import turned_back
+from dpl.models.pod import PODNet, evened, left_over, root_mean_square
 from dpl.scene import Sample, Scene
 
 SAME = 1e-4  # eigenvalues closer than this, relatively, belong to one family
@@ -29,12 +31,14 @@ class Latent(PODNet):
 
     Attributes:
         unit: What scaled linear answers are multiples of, ().
-        probes: Each square of a force's product with one of these is, in the mean, that of what the
-            basis misses of its linear answer, (inputs, P).
+        probers: From forces at the inlet to products with images of random fields, see `missed`,
+            (n' D, K F G) with F fields at each of K Poisson's ratios.
+        pairs: Which image of the load and of a field meet, (G, G).
     """
 
     unit: Tensor
-    probes: Tensor
+    probers: Tensor
+    pairs: Tensor
 
     def __init__(
         self,
@@ -42,7 +46,7 @@ class Latent(PODNet):
         *,
         rank: int = 160,
         coordinates: int = 60,
-        width: int = 256,
+        width: int = 128,
         blocks: int = 4,
         symmetry: bool = True,
         linear_tol: float = 5e-4,
@@ -53,7 +57,7 @@ class Latent(PODNet):
             scene: What it is to answer.
             rank: Modes of the displacement, R.
             coordinates: Inputs of the network, M.
-            width: Units in the hidden layers.
+            width: Units in the hidden layers, for each image of a load.
             blocks: Residual blocks of two layers.
             symmetry: Find the symmetries of the body and respect them.
             linear_tol: Part of its linear answer that the basis may miss; a load of which it
@@ -74,14 +78,17 @@ class Latent(PODNet):
         )
         self.linear_tol, self.rests = linear_tol, Rests(scene.linear)
         self.register_buffer("unit", torch.tensor(0.0, dtype=torch.float64))
-        members = max(1, len(self.group))
-        count = -(-PROBES // members) * members
-        self.register_buffer("probes", torch.zeros(len(self.read), self.rests.count * count))
+        members = len(self.turns)
+        columns = -(-PROBES // members) * members
+        probers = torch.zeros(len(self.readers), self.rests.count * columns)
+        self.register_buffer("probers", probers)
+        pairs = products(self.group) * members + torch.arange(members)
+        self.register_buffer("pairs", pairs, persistent=False)
         inputs = self.scaled.shape[1]
         bent = inputs * (1 + self.turns.shape[1] - inputs)  # x, and x nu where nu is an input
         self.left = nn.Linear(inputs, width, bias=False)
         self.right = nn.Linear(bent, width, bias=False)
-        self.product = nn.Linear(width, len(self.basis), bias=False)
+        self.product = nn.Linear(width, len(self.modes), bias=False)
 
     def _reading(self, rank: int, coordinates: int) -> int:
         return rank
@@ -89,44 +96,66 @@ class Latent(PODNet):
     def _readings(self, scene: Scene) -> int:
         return Rests(scene.linear).count
 
-    def combined(self, read: Tensor, poisson: Tensor | None) -> Tensor:
-        """See `PODNet.combined`."""
-        return self.rests.between(read, poisson)
+    def _more_buffers(self, read: int, members: int) -> dict[str, tuple[int, ...]]:
+        return {}
+
+    @property
+    def read_returns(self) -> Tensor:  # type: ignore[override]
+        """Those of the displacement: linear answers are read in its basis."""
+        return self.returns
 
     def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
         """See `PODNet.forward`."""
-        acting = self.entering(force)
-        linear = self.combined(acting @ self.read, poisson)
+        seen = self.inlet.seen(force)
+        linear = self.reading(seen, poisson)
         learnt = self.learnt(self.beside(linear @ self.scaled, poisson))
-        local = self._local(acting, linear, poisson)
+        local = self._local(seen, linear, poisson)
         if not local.any():
-            moved = (linear + learnt) @ self.basis
-        else:
-            moved = torch.where(local[:, None], learnt, linear + learnt) @ self.basis
-            exact = _Respond.apply(acting[local].double(), self)
-            exact = self.combined(exact, None if poisson is None else poisson[local])
-            moved = moved.index_add(0, local.nonzero()[:, 0], exact.to(moved.dtype))
-        return self.leaving(moved, force)
+            return self.field(linear + learnt, force)
+        moved = self.field(torch.where(local[:, None], learnt, linear + learnt), force)
+        exact = _Respond.apply(force[local][:, self.acting].double(), self)
+        exact = self.rests.between(exact, None if poisson is None else poisson[local])
+        return moved.index_add(0, local.nonzero()[:, 0], self._fields(exact, self.moving).to(moved))
 
-    def _local(self, acting: Tensor, linear: Tensor, poisson: Tensor | None) -> Tensor:
-        """Return of which loads (B, inputs) the basis misses too much, (B,).
+    def reading(self, seen: Tensor, poisson: Tensor | None) -> Tensor:
+        """See `PODNet.reading`; coordinates of the linear answer."""
+        read = (seen @ self.readers.to(seen)).unflatten(2, (self.rests.count, -1))
+        returns = self.returns.to(seen)
+        every = [turned_back(one, returns) for one in read.unbind(2)]
+        return self.rests.between(torch.cat(every, dim=1), poisson)
+
+    def missed(self, seen: Tensor, poisson: Tensor | None) -> Tensor:
+        """Return about what squares the basis misses of linear answers, (B,).
+
+        The mean square of the products of what it misses with random fields and all their images,
+        so that a load and its images are told alike.
 
         Args:
-            acting: The loads.
+            seen: Images of the loads at the inlet, (B, G, n' D).
+            poisson: Poisson's ratios, (B, P) [-].
+        """
+        met = (seen @ self.probers.to(seen)).unflatten(2, (-1, len(self.pairs)))  # (B, G, K F, G)
+        met = met.movedim(1, 2).flatten(2)[..., self.pairs].sum(dim=3)
+        return self.rests.between(met.flatten(1), poisson).square().mean(dim=1)
+
+    def _local(self, seen: Tensor, linear: Tensor, poisson: Tensor | None) -> Tensor:
+        """Return of which loads the basis misses too much, (B,).
+
+        Args:
+            seen: Their images at the inlet, (B, G, n' D).
             linear: Coordinates of their linear answers, (B, R).
             poisson: Poisson's ratios, (B, P) [-].
         """
-        probed = self.combined(acting @ self.probes.to(acting), poisson)
-        missed = probed.square().mean(dim=1)
+        missed = self.missed(seen, poisson)
         return missed >= self.linear_tol**2 * (linear.square().sum(dim=1) + missed)
 
-    def network(self, inputs: Tensor) -> Tensor:
-        """Return coordinates (B, R) of the nonlinear part from inputs (B, M), without symmetry."""
-        x, beside = inputs.tensor_split([self.scaled.shape[1]], dim=1)
-        square = x.square().sum(dim=1, keepdim=True)
-        bent = torch.cat([x, *(x * one[:, None] for one in beside.unbind(1))], dim=1)
-        curved = self.spread * self.product(self.left(x) * self.right(bent))
-        return curved / (1 + square) + (square / (1 + square)) ** 1.5 * super().network(inputs)
+    def answers(self, turned: Tensor) -> Tensor:
+        """See `PODNet.answers`; of the nonlinear part."""
+        x, beside = turned.tensor_split([self.scaled.shape[1]], dim=2)
+        square = x.square().sum(dim=2, keepdim=True)
+        bent = torch.cat([x, *(x * one[..., None] for one in beside.unbind(2))], dim=2)
+        curved = self.product(self.left(x) * self.right(bent))
+        return curved / (1 + square) + (square / (1 + square)) ** 1.5 * super().answers(turned)
 
     def plan(self) -> list[str]:
         """Return what the network leaves out, a line each."""
@@ -152,33 +181,34 @@ class Latent(PODNet):
         size = displacement.norm(dim=1)
         weight = torch.where(size > 0, size.clamp(min=1e-12) ** -0.5, 0.0)
         parts = [weight[:, None] * linear, weight[:, None] * (displacement - linear)]
-        basis = self._modes(torch.cat(parts), self.moving, len(self.basis))
+        basis = self._modes(torch.cat(parts), self.moving, len(self.modes))
         # its coordinates in the order of what they have of the rests
         rests = parts[1] @ basis
         basis = basis @ torch.linalg.eigh(rests.T @ rests)[1].flip(1)
-        self.basis.copy_(basis.T)
-        acting = self.acting.cpu()[self.moving.cpu()]
-        probes = self._probing(basis)
-        for known, fields in {"read": basis.T, "probes": probes}.items():
-            members = range(self.rests.count)
-            responses = [self._respond_all(fields, k, rtol=1e-12)[:, acting] for k in members]
-            getattr(self, known).copy_(torch.cat(responses).T)
+        self._set_modes(basis)
+        members = range(self.rests.count)
+        read = [self._read(self._reach(basis.T, k)) for k in members]
+        self.readers.copy_(torch.cat(read).T)
+        fields = self._probing(basis)
+        probed = [self._fields(self._reach(fields, k).T, self.acting) for k in members]
+        images = self.inlet.seen(torch.cat(probed).to(self.probers.device)) * self.inlet.share
+        self.probers.copy_(images.flatten(0, 1).T)
         motions = self._motions(basis, self.moving)
         self._scale(linear @ basis, (displacement - linear) @ basis, weight, motions)
         self._turn(motions, motions)
         self.prepared.fill_(True)
 
-    def _probing(self, basis: Tensor) -> Tensor:
-        """Return random fields less what a basis (outputs, R) has of them, (P, outputs).
+    def _reach(self, fields: Tensor, k: int) -> Tensor:
+        """Return K(0)^-1 of fields (S, outputs) where loads act, (inputs, S); see `respond`."""
+        acting = self.acting.cpu()[self.moving.cpu()]
+        return self._respond_all(fields, k, rtol=1e-12)[:, acting].T
 
-        Few fields and their images, so that a load and its images are told alike.
-        """
-        members = max(1, len(self.group))
+    def _probing(self, basis: Tensor) -> Tensor:
+        """Return random fields less what a basis (outputs, R) has of them, (F, outputs)."""
         random = torch.Generator().manual_seed(0)
-        count = self.probes.shape[1] // (members * self.rests.count)
+        count = self.probers.shape[1] // (len(self.turns) * self.rests.count)
         fields = torch.randn(count, len(basis), generator=random, dtype=torch.float64)
-        every = torch.cat([self._image(fields, self.moving, k) for k in range(members)])
-        return every - (every @ basis) @ basis.T
+        return fields - (fields @ basis) @ basis.T
 
     def _scale(self, read: Tensor, targets: Tensor, weight: Tensor, motions: Tensor) -> None:
         def spread(columns: Tensor) -> Tensor:
@@ -198,31 +228,30 @@ class Latent(PODNet):
         size = root_mean_square(targets)
         self.spread.copy_((size * size.max()).sqrt())
 
-    def _split(
-        self, force: Tensor, displacement: Tensor, poisson: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _split(self, samples: Sample) -> tuple[Tensor, Tensor, Tensor]:
         """See `PODNet._split`; of the linear answer the basis has its part, unless it is exact."""
-        basis, reading = self.basis.cpu().double(), self.read.cpu().double()
-        linear, whole = self.combined(force @ reading, poisson), displacement @ basis.T
-        missed = displacement.square().sum(dim=1) - whole.square().sum(dim=1)
-        local = self._local(force, linear, poisson)
+        seen = self.inlet.seen(samples.force)
+        linear, whole = self.reading(seen, samples.poisson), self.coordinates(samples.displacement)
+        missed = left_over(samples.displacement, whole)
+        local = self._local(seen, linear, samples.poisson)
         if local.any():
-            beyond = displacement[local] - self.linear(force[local], poisson[local])
-            inside = beyond @ basis.T
-            missed[local] = beyond.square().sum(dim=1) - inside.square().sum(dim=1)
+            acting = samples.force[local][:, self.acting]
+            exact = self._fields(self.linear(acting, samples.poisson[local]), self.moving)
+            beyond = samples.displacement[local] - exact
+            missed[local] = left_over(beyond, self.coordinates(beyond))
         return linear, whole - linear, missed
 
     def linear(self, acting: Tensor, poisson: Tensor, rtol: float = RESPONSE) -> Tensor:
         """Return linear answers (S, outputs) of forces on the inputs (S, inputs), scaled."""
         parts = zip(acting.split(256), poisson.split(256), strict=True)
-        return torch.cat([self.combined(self.respond(some, rtol), nu) for some, nu in parts])
+        return torch.cat([self.rests.between(self.respond(some, rtol), nu) for some, nu in parts])
 
     def respond(self, acting: Tensor, rtol: float = RESPONSE) -> Tensor:
         """Return K(0)^-1 f, scaled: (B, K outputs) of forces on the inputs (B, inputs), float64.
 
         At each of the K Poisson's ratios of `rests`; where the law has one, K = 1.
         """
-        every = acting.new_zeros(len(acting), len(self.moving_places))
+        every = acting.new_zeros(len(acting), int(self.moving.sum()))
         every[:, self.acting[self.moving].to(acting.device)] = acting
         members = range(self.rests.count)
         return torch.cat([self._respond_all(every, k, rtol) for k in members], dim=1)

@@ -12,51 +12,40 @@ from dpl.fem.pod import LARGE, pod
 from dpl.fem.symmetry import images, symmetries
 from dpl.models.coordinates import Coordinates, CoordinateSamples
 from dpl.models.moduli import placed
+from dpl.models.orbits import Orbits, turned, turned_back
+from dpl.models.sets import Block, bent
 from dpl.scene import Sample, Scene
 
 SNAPSHOTS = 16_000  # images of samples that make a basis, at most
-
-
-class Block(nn.Module):
-    """x + B gelu(A x): a residual block."""
-
-    def __init__(self, width: int) -> None:
-        """Build it, close to the identity."""
-        super().__init__()
-        self.inner, self.outer = nn.Linear(width, width), nn.Linear(width, width)
-        with torch.no_grad():
-            self.outer.weight.mul_(0.1)
-            self.outer.bias.zero_()
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return (B, W) of (B, W)."""
-        return cast(Tensor, x + self.outer(nn.functional.gelu(self.inner(x))))
+CHUNK = 256  # samples that are worked on at a time
 
 
 class PODNet(nn.Module):
     """POD basis of the displacements, a residual network from coordinates of the load to its own.
 
     The load is read in the POD basis of the training loads. Where the body has symmetries, both
-    bases are invariant under them, and the answer to a load is the mean over its images, each
-    turned back: it has the symmetries exactly.
+    bases are invariant under them, the layers work on the set of all images of a load, and the
+    answer is the mean over them, each turned back: it has the symmetries exactly.
 
     Source: Hesthaven, Ubbiali (2018), Non-intrusive reduced order modeling of nonlinear problems
     using neural networks, J. Comput. Phys. 363.
 
     Attributes:
-        basis: Rows are the modes of the displacement, orthonormal, (R, outputs).
-        read: From forces on the inputs to coordinates of the load, (inputs, C).
-        scaled: From those to the inputs of the network, (C, M).
+        modes: Of the displacement, orthonormal, at one node of each orbit, (R, n D); see `Orbits`.
+        readers: From forces there to coordinates of the load, (n' D, C).
+        read_returns: What turns coordinates of an image of a load back, (G, C, C).
+        scaled: From them to the inputs of the network, (C, M).
         spread: Size of each output of the network, (R,).
+        turns: What symmetries do to inputs, x -> x T, (G, M, M).
+        returns: What turns coordinates of the displacement of an image back, (G, R, R).
         prepared: Whether the bases are there, ().
     """
 
     acting: Tensor
     moving: Tensor
-    acting_places: Tensor
-    moving_places: Tensor
-    basis: Tensor
-    read: Tensor
+    modes: Tensor
+    readers: Tensor
+    read_returns: Tensor
     scaled: Tensor
     spread: Tensor
     turns: Tensor
@@ -69,7 +58,7 @@ class PODNet(nn.Module):
         *,
         rank: int = 100,
         coordinates: int = 60,
-        width: int = 256,
+        width: int = 128,
         blocks: int = 4,
         symmetry: bool = True,
     ) -> None:
@@ -79,7 +68,7 @@ class PODNet(nn.Module):
             scene: What it is to answer.
             rank: Modes of the displacement, R; fewer where the body moves in fewer ways.
             coordinates: Inputs of the network, M; fewer where loads act in fewer ways.
-            width: Units in the hidden layers.
+            width: Units in the hidden layers, for each image of a load.
             blocks: Residual blocks of two layers.
             symmetry: Find the symmetries of the body and respect them.
 
@@ -98,10 +87,8 @@ class PODNet(nn.Module):
         self.group = symmetries(scene.problem, also=also) if symmetry else []
         self.register_buffer("acting", scene.loads.reach, persistent=False)
         self.register_buffer("moving", scene.problem.free, persistent=False)
-        for name, where in {"acting": self.acting, "moving": self.moving}.items():
-            places = where.flatten().nonzero()[:, 0]  # faster than a mask
-            self.register_buffer(f"{name}_places", places, persistent=False)
-        inputs, outputs = len(self.acting_places), len(self.moving_places)
+        self.inlet, self.outlet = (Orbits(self.group, w) for w in (self.acting, self.moving))
+        inputs, outputs = int(self.acting.sum()), int(self.moving.sum())
         rank, coordinates = min(rank, outputs), min(coordinates, inputs)
         members = max(1, len(self.group))
         width_of_reading = self._reading(rank, coordinates)
@@ -110,17 +97,18 @@ class PODNet(nn.Module):
         self.takes = () if self.poisson_range is None else ("poisson",)
         entering = coordinates + len(self.takes)
         for name, shape in {
-            "basis": (rank, outputs),
-            "read": (inputs, width_of_reading * self._readings(scene)),
+            "modes": (rank, len(self.outlet.share)),
+            "readers": (len(self.inlet.share), width_of_reading * self._readings(scene)),
             "scaled": (width_of_reading, coordinates),
             "spread": (rank,),
             "turns": (members, entering, entering),
             "returns": (members, rank, rank),
+            **self._more_buffers(width_of_reading, members),
         }.items():
             self.register_buffer(name, torch.zeros(shape))
         self.register_buffer("prepared", torch.tensor(False))
         self.enter = nn.Linear(entering, width)
-        self.blocks = nn.Sequential(*(Block(width) for _ in range(blocks)))
+        self.blocks = nn.Sequential(*(Block(width, alone=members == 1) for _ in range(blocks)))
         self.leave = nn.Linear(width, rank)
 
     def _reading(self, rank: int, coordinates: int) -> int:
@@ -131,6 +119,10 @@ class PODNet(nn.Module):
         """Return of how many Poisson's ratios a load is read, see `combined`."""
         return 1
 
+    def _more_buffers(self, read: int, members: int) -> dict[str, tuple[int, ...]]:
+        """Return shapes of further buffers, for C coordinates of a load and G symmetries."""
+        return {"read_returns": (members, read, read)}
+
     def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
 
@@ -138,9 +130,13 @@ class PODNet(nn.Module):
             force: What acts.
             poisson: Poisson's ratios, (B, 1) [-]; wanted where the law has a range of them.
         """
-        read = self.combined(self.entering(force) @ self.read, poisson)
+        read = self.reading(self.inlet.seen(force), poisson)
         inputs = self.beside(read @ self.scaled, poisson)
-        return self.leaving(self.learnt(inputs) @ self.basis, force)
+        return self.field(self.learnt(inputs), force)
+
+    def reading(self, seen: Tensor, poisson: Tensor | None) -> Tensor:
+        """Return the coordinates (B, C) of loads, of their images at the inlet (B, G, n' D)."""
+        return turned_back(seen @ self.readers.to(seen), self.read_returns.to(seen))
 
     def beside(self, inputs: Tensor, poisson: Tensor | None) -> Tensor:
         """Return inputs (B, M) with the place of Poisson's ratio, where there is a range."""
@@ -148,39 +144,28 @@ class PODNet(nn.Module):
             return inputs
         return torch.cat([inputs, placed(poisson, self.poisson_range, inputs)], dim=1)
 
-    def combined(self, read: Tensor, poisson: Tensor | None) -> Tensor:
-        """Return coordinates (B, C) of a load from those read at several Poisson's ratios."""
-        return read
+    def field(self, coordinates: Tensor, like: Tensor) -> Tensor:
+        """Return displacements (B, N, D), shaped like forces, of coordinates (B, R)."""
+        images = turned(coordinates, self.returns.to(coordinates)) @ self.modes.to(coordinates)
+        return self.outlet.whole(images, like)
 
-    def entering(self, force: Tensor) -> Tensor:
-        """Return the forces on the inputs, (B, inputs), of (B, N, D)."""
-        return force.flatten(1).index_select(1, self.acting_places)
-
-    def leaving(self, moved: Tensor, force: Tensor) -> Tensor:
-        """Return displacements (B, outputs) as a field like the force, (B, N, D)."""
-        field = moved.new_zeros(len(force), force[0].numel())
-        return field.index_copy(1, self.moving_places, moved).view_as(force)
+    def coordinates(self, displacement: Tensor) -> Tensor:
+        """Return the coordinates (B, R) of displacements (B, N, D)."""
+        modes = (self.modes * self.outlet.share).to(displacement)
+        return turned_back(self.outlet.seen(displacement) @ modes.T, self.returns.to(displacement))
 
     def learnt(self, inputs: Tensor) -> Tensor:
-        """Return coordinates (B, R) of the displacement from inputs (B, M).
+        """Return coordinates (B, R) of the displacement from inputs (B, M)."""
+        answers = self.spread * self.answers(torch.einsum("bm,gmk->bgk", inputs, self.turns))
+        return turned_back(answers, self.returns) / len(self.turns)
 
-        In evaluation the mean over the symmetries; in training the network alone, which meets
-        images as samples.
-        """
-        if self.training or len(self.turns) == 1:
-            return self.network(inputs)
-        turned = torch.einsum("bm,gmk->bgk", inputs, self.turns)
-        answers = self.network(turned.flatten(0, 1)).unflatten(0, turned.shape[:2])
-        return answers.flatten(1) @ self.returns.flatten(0, 1) / len(self.turns)
-
-    def network(self, inputs: Tensor) -> Tensor:
-        """Return coordinates (B, R) from inputs (B, M), without symmetry."""
-        hidden = nn.functional.gelu(self.blocks(self.enter(inputs)))
-        return cast(Tensor, self.spread * self.leave(hidden))
+    def answers(self, turned: Tensor) -> Tensor:
+        """Return an answer (B, G, R) to each image of the inputs, (B, G, M), not turned back."""
+        return cast(Tensor, self.leave(bent(self.blocks(self.enter(turned)))))
 
     def plan(self) -> list[str]:
         """Return what the network leaves out, a line each."""
-        rank, outputs = self.basis.shape
+        rank, outputs = len(self.modes), int(self.moving.sum())
         lines = [f"{rank} coordinates learnt instead of {outputs} displacements"]
         if len(self.turns) > 1:
             lines.append(f"nothing learnt {len(self.turns)} times: the answer has the symmetries")
@@ -199,14 +184,40 @@ class PODNet(nn.Module):
         force, displacement = self._columns(samples)
         weight = displacement.norm(dim=1).clamp(min=1e-12) ** -0.5
         weight = weight * (displacement.norm(dim=1) > 0)
-        basis = self._modes(weight[:, None] * displacement, self.moving, len(self.basis))
-        loads = self._modes(weight[:, None] * force, self.acting, self.read.shape[1])
-        self.basis.copy_(basis.T)
-        self.read.copy_(loads)
+        basis = self._modes(weight[:, None] * displacement, self.moving, len(self.modes))
+        loads = self._modes(weight[:, None] * force, self.acting, self.readers.shape[1])
+        self._set_modes(basis)
+        self.readers.copy_(self._read(loads).T)
         motions = self._motions(loads, self.acting)
         self._scale(force @ loads, displacement @ basis, weight, motions)
+        self.read_returns.copy_(motions.mT)
         self._turn(motions, self._motions(basis, self.moving))
         self.prepared.fill_(True)
+
+    def _set_modes(self, basis: Tensor) -> None:
+        """Take up the modes, (outputs, R)."""
+        fields = self._fields(basis.T, self.moving).to(self.modes.device)
+        self.modes.copy_(self.outlet.first(fields))
+
+    def _read(self, columns: Tensor) -> Tensor:
+        """Return what reads coordinates of loads at the inlet, (C, n' D), from (inputs, C)."""
+        fields = self._fields(columns.T, self.acting).to(self.readers.device)
+        return self.inlet.first(fields) * self.inlet.share.to(fields)
+
+    @property
+    def basis(self) -> Tensor:
+        """The modes of the displacement, whole, (R, outputs)."""
+        like = self.modes.new_zeros(len(self.modes), *self.moving.shape)
+        fields = self.field(torch.eye(len(self.modes)).to(self.modes), like)
+        return fields[:, self.moving]
+
+    @staticmethod
+    def _fields(columns: Tensor, where: Tensor) -> Tensor:
+        """Return fields (S, N, D) of what they are on some degrees of freedom, (S, n)."""
+        where = where.to(columns.device)
+        fields = columns.new_zeros(len(columns), *where.shape)
+        fields[:, where] = columns
+        return fields
 
     def _scale(self, read: Tensor, targets: Tensor, weight: Tensor, motions: Tensor) -> None:
         """Set sizes from the coordinates of all samples, (S, C) and (S, R), and their weights.
@@ -272,10 +283,9 @@ class PODNet(nn.Module):
         """Return fields (S, n) on some degrees of freedom as their images under a symmetry."""
         if k == 0:
             return columns
-        where = where.cpu()
-        field = columns.new_zeros(len(columns), *where.shape)
-        field[:, where] = columns
-        return images(field, self.group, torch.full((len(field),), k))[:, where]
+        fields = self._fields(columns, where)
+        which = torch.full((len(fields),), k)
+        return images(fields, self.group, which)[:, where.to(columns.device)]
 
     def _motions(self, basis: Tensor, where: Tensor) -> Tensor:
         """Return what each symmetry does to coordinates in a basis (n, r): c -> c T, (G, r, r)."""
@@ -284,34 +294,44 @@ class PODNet(nn.Module):
 
     def encode(self, samples: Sample) -> CoordinateSamples:
         """Return scaled samples (S, N, D), float64, in coordinates."""
-        force, displacement = self._columns(samples)
-        read, targets, missed = self._split(force, displacement, samples.poisson)
-        coordinates = Coordinates(
-            inputs=self.beside(read @ self.scaled.cpu().double(), samples.poisson).float(),
+        samples = samples._replace(
+            displacement=torch.where(self.moving.cpu(), samples.displacement, 0.0)
+        )
+        device = self.spread.device
+        parts = zip(*(column.split(CHUNK) for column in samples), strict=True)
+        encoded = [self._encoded(Sample(*(one.to(device) for one in part))) for part in parts]
+        return CoordinateSamples(Coordinates(*map(torch.cat, zip(*encoded, strict=True))))
+
+    def _encoded(self, samples: Sample) -> Coordinates:
+        read, targets, missed = self._split(samples)
+        encoded = Coordinates(
+            inputs=self.beside(read @ self.scaled.to(read), samples.poisson).float(),
             targets=targets.float(),
             rest=missed.clamp(min=0),
-            size=displacement.square().sum(1) / self.acting.numel(),
+            size=samples.displacement.flatten(1).square().sum(1) / self.acting.numel(),
         )
-        return CoordinateSamples(coordinates, self.turns.cpu(), self.returns.mT.cpu())
+        return Coordinates(*(column.cpu() for column in encoded))
 
-    def _split(
-        self, force: Tensor, displacement: Tensor, poisson: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what of samples is read, to be learnt, and out of reach.
-
-        Args:
-            force: On the inputs, (S, inputs), float64.
-            displacement: (S, outputs), float64.
-            poisson: Poisson's ratios, (S, P) [-].
+    def _split(self, samples: Sample) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what of samples (S, N, D) is read, to be learnt, and out of reach.
 
         Returns:
             Coordinates of the loads (S, C), of what the network is to answer (S, R), and squares of
             what the basis misses (S,).
         """
-        basis, reading = self.basis.cpu().double(), self.read.cpu().double()
-        targets = displacement @ basis.T
-        missed = displacement.square().sum(dim=1) - targets.square().sum(dim=1)
-        return self.combined(force @ reading, poisson), targets, missed
+        targets = self.coordinates(samples.displacement)
+        read = self.reading(self.inlet.seen(samples.force), samples.poisson)
+        return read, targets, left_over(samples.displacement, targets)
+
+
+def left_over(field: Tensor, coordinates: Tensor) -> Tensor:
+    """Return squares (B,) of what of fields (B, N, D) an orthonormal basis does not hold.
+
+    Args:
+        field: The fields.
+        coordinates: In the basis, (B, R).
+    """
+    return field.flatten(1).square().sum(dim=1) - coordinates.square().sum(dim=1)
 
 
 def evened(size: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from dpl.fem.newton import Linear, Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, solve
 from dpl.fem.supports import Displacement, Spring
-from dpl.fem.symmetry import symmetries
+from dpl.fem.symmetry import products, symmetries
 
 NH = NeoHookeanLn(0.3)
 LEFT, RIGHT = Plane(0, "min"), Plane(0, "max")
@@ -156,6 +156,25 @@ def test_turns_and_mirrors_of_rings_are_found_however_they_lie(corners):
     group = symmetries(Problem.build(ring(corners), NH))
     assert len(group) == 4 * corners
     check_group(group)
+
+
+@pytest.mark.parametrize("mesh", [CUBE, propeller()], ids=["cube", "propeller"])
+def test_products_are_the_members_that_images_of_images_are(mesh):
+    problem = Problem.build(mesh, NH, fixed=None if mesh is CUBE else Tag("bore"))
+    group = symmetries(problem)
+    table, every = products(group), torch.arange(len(group))
+    field = torch.randn(problem.shape, generator=torch.Generator().manual_seed(0)).double()
+    for i, j in [(0, 1), (1, 0), (1, 2), (2, 1), (3, 5), (5, 3), (4, 4)]:
+        both = group[j].image(group[i].image(field))
+        assert_close(both, group[int(table[i, j])].image(field), rtol=0, atol=1e-9)
+    assert torch.equal(table[0], every), "the identity first"
+    for row in (*table, *table.T):
+        assert torch.equal(row.sort().values, every)
+    assert not torch.equal(table, table.T), "order matters"
+
+
+def test_without_a_group_the_only_product_is_the_identity():
+    assert products([]).tolist() == [[0]]
 
 
 def test_neither_size_nor_place_nor_numbering_matters():

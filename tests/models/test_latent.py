@@ -96,7 +96,7 @@ def test_what_is_added_to_the_linear_answer_is_quadratic_in_the_load(scene, batc
         found.append(sizes(answer_to(wild, s * force) - s * linear) / s**2)
     found = torch.stack(found)
     assert float(found.max() / found[-1].min()) < 1e6, "bounded"
-    assert torch.allclose(found[-1], found[-2], rtol=1e-2)
+    assert torch.allclose(found[-1], found[-2], rtol=1e-2, atol=1e-4 * float(found[-1].max()))
     assert (found[-1] > 0).all()
 
 
@@ -159,7 +159,7 @@ def test_probes_tell_what_the_basis_misses_of_a_linear_answer(scene, batch):
     force = torch.cat([batch.force, sparse(scene, 2), sparse(scene, 60)])
     linear = linear_of(scene, force) * net.unit
     missed = sizes(linear - projected(net, linear))
-    told = (force[:, net.acting] @ net.probes).square().mean(dim=1).sqrt()
+    told = net.missed(net.inlet.seen(force), None).sqrt()
     assert float(missed.max() / missed.min()) > 100
     assert (told / missed > 1 / 3).all()
     assert (told / missed < 3).all()
@@ -191,8 +191,7 @@ def test_images_of_a_load_are_told_alike(scene, batch):
     assert len(net.group) > 1
     told = []
     for symmetry in net.group:
-        force = symmetry.image(batch.force)[:, net.acting]
-        told.append((force @ net.probes).square().mean(dim=1))
+        told.append(net.missed(net.inlet.seen(symmetry.image(batch.force)), None))
     assert torch.allclose(torch.stack(told), told[0].expand(len(told), -1), rtol=1e-4)
 
 
@@ -304,11 +303,11 @@ def home(tmp_path_factory):
 
 @pytest.fixture
 def overrides(tiny_training):
-    """The command line of a run of four epochs on the tiny scene."""
+    """The command line of a run of 128 steps on the tiny scene."""
 
     def overrides(name, *more):
         small = ["model=latent", "model.blocks=1", "model.coordinates=8", "data.folder=data"]
-        return [*tiny_training, *small, "trainer.max_epochs=4", f"run={name}", *more]
+        return [*tiny_training, *small, "trainer.max_epochs=64", f"run={name}", *more]
 
     return overrides
 
@@ -364,7 +363,7 @@ def test_a_run_makes_its_bases_from_the_training_samples(trained, home, monkeypa
     expected = run.build_surrogate(cfg, module.scene)
     expected.prepare(train)
     buffers = dict(expected.net.named_buffers())
-    assert buffers["basis"].any()
+    assert buffers["modes"].any()
     assert alike(buffers, dict(module.net.named_buffers()))
 
 
@@ -379,7 +378,7 @@ def test_a_run_that_was_interrupted_ends_bit_for_bit_like_one_that_was_not(
     step = Surrogate.training_step
 
     def interrupted(module, batch, batch_idx):
-        if module.trainer.current_epoch == 2 and batch_idx == 3:
+        if module.trainer.current_epoch == 16 and batch_idx == 1:
             raise KeyboardInterrupt
         return step(module, batch, batch_idx)
 
@@ -387,11 +386,11 @@ def test_a_run_that_was_interrupted_ends_bit_for_bit_like_one_that_was_not(
         patch.setattr(Surrogate, "training_step", interrupted)
         assert script("train", *overrides("part"), cwd=home).status == 130
     folder = home / "part"
-    assert checkpoint(folder)["epoch"] == 1
+    assert checkpoint(folder)["epoch"] == 15
     ended = script("train", *overrides("part", "ckpt_path=last"), cwd=home)
     assert ended.status == 0, ended.err
     whole, resumed = checkpoint(trained), checkpoint(folder)
-    assert (whole["epoch"], whole["global_step"]) == (3, 64)
+    assert (whole["epoch"], whole["global_step"]) == (63, 128)
     for part in ("epoch", "global_step", "state_dict", "optimizer_states", "lr_schedulers"):
         assert alike(whole[part], resumed[part]), part
 
@@ -405,9 +404,9 @@ def test_a_run_that_resumes_makes_no_bases_again(trained, script, overrides, hom
         Surrogate, "prepare", lambda module, samples: made.append(0) or prepare(module, samples)
     )
     shutil.copytree(trained, home / "longer")
-    more = ("ckpt_path=last", "trainer.max_epochs=5")
+    more = ("ckpt_path=last", "trainer.max_epochs=65")
     assert script("train", *overrides("longer", *more), cwd=home).status == 0
-    assert checkpoint(home / "longer")["epoch"] == 4
+    assert checkpoint(home / "longer")["epoch"] == 64
     assert made == []
 
 
@@ -418,7 +417,7 @@ def test_a_run_that_is_to_resume_before_it_began_makes_its_bases(script, overrid
     assert ended.status == 0, ended.err
     state = checkpoint(home / "fresh")["state_dict"]
     assert state["net.prepared"]
-    assert state["net.basis"].any()
+    assert state["net.modes"].any()
 
 
 def test_a_stream_trains_it_on_bases_of_the_validation_loads(script, overrides, home, trained):

@@ -86,6 +86,12 @@ def eye(size):
     return torch.eye(size, dtype=torch.float64)
 
 
+def read(net):
+    """Return what a network reads of a unit force on each degree of freedom, (inputs, C)."""
+    units = net._fields(torch.eye(int(net.acting.sum())), net.acting)
+    return net.reading(net.inlet.seen(units), None).double()
+
+
 def left_over(basis, net, where):
     """Return the largest part of an image of a mode (R, n) that the modes do not reach."""
     basis = basis.double()
@@ -171,7 +177,8 @@ def test_all_modes_of_few_samples_are_invariant_under_the_symmetries(scene, batc
 
 def test_all_modes_of_few_loads_are_invariant_under_the_symmetries(scene, batch):
     net = prepared(PODNet, scene, some(batch, 2), **WHOLE).net
-    kept = net.read[:, net.read.any(dim=0)].T.double()
+    kept = read(net)
+    kept = kept[:, kept.abs().amax(dim=0) > 1e-5].T
     assert left_over(kept, net, net.acting) < 1e-5
 
 
@@ -183,8 +190,8 @@ def test_a_basis_of_any_rank_is_invariant_under_the_symmetries(kind, scene, batc
 
 
 def test_the_basis_of_loads_is_orthonormal_and_holds_them(scene, batch):
-    read = prepared(PODNet, scene, batch, **WHOLE).net.read.double()
-    kept = read[:, read.any(dim=0)]
+    kept = read(prepared(PODNet, scene, batch, **WHOLE).net)
+    kept = kept[:, kept.abs().amax(dim=0) > 1e-5]
     assert torch.allclose(kept.T @ kept, eye(kept.shape[1]), rtol=0, atol=1e-6)
     force = batch.force[:, scene.loads.reach]
     assert float((force - force @ kept @ kept.T).norm() / force.norm()) < 1e-5
@@ -250,10 +257,10 @@ def test_answers_have_the_symmetries_exactly(kind, bar, seed):
 
 
 @NETWORKS
-def test_in_training_it_is_the_network_alone(kind, bar):
+def test_in_training_answers_have_the_symmetries_too(kind, bar):
     scene, samples = bar
     net = exact(prepared(kind, scene, samples, **WHOLE)).train()
-    assert asymmetry(net, noise(scene)) > 1e-4
+    assert asymmetry(net, noise(scene)) < 1e-6
 
 
 @NETWORKS
@@ -334,7 +341,6 @@ def test_a_body_in_the_plane_is_answered_with_its_mirror_image(kind, plane):
     assert net(force).shape == force.shape == (4, 14, 2)
     assert net(force).abs().max() > 0
     assert asymmetry(net, force) < 1e-6
-    assert asymmetry(net.train(), force) > 1e-4
 
 
 @NETWORKS
@@ -475,6 +481,7 @@ def test_more_width_and_blocks_are_more_parameters(scene):
         )
 
     for width, blocks in ((16, 0), (16, 3), (24, 2)):
-        inner = blocks * 2 * (width * width + width)
-        expected = (20 * width + width) + inner + (10 * width + 10)
-        assert count(width=width, blocks=blocks) == expected
+        for matrices, options in ((2, {}), (1, {"symmetry": False})):
+            inner = blocks * 2 * (matrices * width * width + width)
+            expected = (20 * width + width) + inner + (10 * width + 10)
+            assert count(width=width, blocks=blocks, **options) == expected

@@ -1,0 +1,78 @@
+"""Laws of fields by their images at a few nodes."""
+
+import pytest
+import torch
+
+from dpl.fem.mesh import box
+from dpl.fem.symmetry import symmetries
+from dpl.models.orbits import Orbits, turned, turned_back
+
+
+@pytest.fixture(scope="module", params=["even", "odd", "skew"])
+def body(request, make_scene):
+    """Beams whose mirror planes hold no node, or some; and one without symmetries."""
+    if request.param == "skew":
+        return make_scene(mesh=box([100.0, 30.0, 25.0], [4, 3, 2], "tetra"))
+    return make_scene(nodes=(4, 4, 4) if request.param == "even" else (4, 5, 5))
+
+
+@pytest.fixture(scope="module")
+def group(body):
+    return symmetries(body.problem)
+
+
+@pytest.fixture(scope="module")
+def orbits(body, group):
+    return Orbits(group, body.problem.free)
+
+
+def noise(body, count=3):
+    random = torch.Generator().manual_seed(0)
+    field = torch.randn(count, *body.problem.shape, generator=random, dtype=torch.float64)
+    return torch.where(body.problem.free, field, 0.0)
+
+
+def test_fields_are_what_their_images_are_at_few_nodes(body, orbits):
+    field = noise(body)
+    assert torch.allclose(orbits.whole(orbits.seen(field), field), field, rtol=0, atol=1e-14)
+
+
+def test_images_are_seen(body, group, orbits):
+    field = noise(body)
+    for k, symmetry in enumerate(group):
+        expected = orbits.first(symmetry.image(field))
+        assert torch.allclose(orbits.seen(field)[:, k], expected, rtol=0, atol=1e-14)
+
+
+def test_shares_make_a_scalar_product(body, orbits):
+    one, other = noise(body), noise(body).roll(1, dims=0)
+    found = (orbits.seen(one) * orbits.share * orbits.seen(other)).sum(dim=(1, 2))
+    assert torch.allclose(found, (one * other).sum(dim=(1, 2)), rtol=1e-12)
+
+
+def test_there_is_one_node_of_each_orbit(body, group, orbits):
+    free = body.problem.free.any(dim=1)
+    sources = torch.stack([symmetry.source for symmetry in group])[:, free]
+    count = len({tuple(sorted(set(column.tolist()))) for column in sources.T})
+    assert len(orbits.share) == 3 * count
+    assert len(orbits.share) <= 3 * int(free.sum()) / (len(group) / 2)
+
+
+def test_without_a_group_all_nodes_stand_for_themselves(body):
+    orbits, field = Orbits([], body.problem.free), noise(body)
+    free = body.problem.free.any(dim=1)
+    assert torch.equal(orbits.first(field), field[:, free].flatten(1))
+    assert torch.equal(orbits.seen(field)[:, 0], orbits.first(field))
+    assert torch.equal(orbits.whole(orbits.seen(field), field), field)
+    assert (orbits.share == 1).all()
+
+
+def test_turned_coordinates_are_turned_back():
+    """Of the quarter turns of the plane."""
+    quarter = torch.tensor([[0.0, 1.0], [-1.0, 0.0]])
+    motions = torch.stack([torch.linalg.matrix_power(quarter, k) for k in range(4)])
+    one = torch.randn(5, 2, generator=torch.Generator().manual_seed(0))
+    every = turned(one, motions.mT)
+    for k in range(4):
+        assert torch.allclose(every[:, k], one @ motions[k], atol=1e-6)
+    assert torch.allclose(turned_back(every, motions.mT), 4 * one, atol=1e-5)
