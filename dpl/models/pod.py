@@ -116,7 +116,7 @@ class PODNet(nn.Module):
         return coordinates
 
     def _readings(self, scene: Scene) -> int:
-        """Return of how many Poisson's ratios a load is read, see `combined`."""
+        """Return at how many Poisson's ratios a load is read, K."""
         return 1
 
     def _more_buffers(self, read: int, members: int) -> dict[str, tuple[int, ...]]:
