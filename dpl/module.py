@@ -129,7 +129,7 @@ class Surrogate(L.LightningModule):
     def _loss_of_coordinates(self, batch: Coordinates) -> Tensor:
         """Return the loss of a batch in coordinates: of its mean squared errors alone."""
         net = cast(PODNet, self.net)
-        missed = (net.learnt(batch.inputs) - batch.targets).square().sum(dim=1) + batch.rest
+        missed = (net.network(batch.inputs) - batch.targets).square().sum(dim=1) + batch.rest
         square = self.displacement_scale**2
         error = square * missed / self.scene.problem.free.numel()
         return cast(MSE, self.loss).of_squares(error, square * batch.size)
@@ -137,7 +137,7 @@ class Surrogate(L.LightningModule):
     def encode(self, samples: Sample, *, images: bool = False) -> CoordinateSamples | None:
         """Return training samples (S, N, D) in the coordinates of the network; None if it has none.
 
-        A network that has the symmetries needs no images. Where only the caller knows them: None.
+        With their images if the network knows the symmetries; None if only the caller does.
 
         In an orthonormal basis the squared error of a displacement is that of its coordinates: a
         loss that is a function of squared errors needs no field.

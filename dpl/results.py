@@ -147,7 +147,7 @@ def measure(
         singles = batch.load.singles()
         answers: dict[str, list[Tensor]] = {name: [] for name in methods}
         seconds: dict[str, list[float]] = {name: [] for name in methods}
-        with one_thread(), torch.no_grad():
+        with one_thread(), torch.inference_mode():
             for method in methods.values():
                 method.predict(singles[0])
             for name, method in methods.items():

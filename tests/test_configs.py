@@ -199,7 +199,7 @@ def test_a_network_may_bring_an_optimiser_and_a_loss_of_its_own(compose, name):
     assert cfg.optimizer.lr == 5e-3
     assert cfg.optimizer.momentum == 0.95, "the rest is that of conf/optimizer"
     assert cfg.loss._target_.endswith("MeanNorm")
-    assert (cfg.data.batch_size, cfg.trainer.max_epochs) == (256, 400)
+    assert (cfg.data.batch_size, cfg.trainer.max_epochs) == (512, 188)
     assert "defaults" not in cfg
 
 

@@ -24,14 +24,26 @@ class Coordinates(NamedTuple):
 
 
 class CoordinateSamples(Dataset):
-    """Samples in coordinates, fetched a batch at a time."""
+    """Samples in coordinates with their images under symmetries, fetched a batch at a time."""
 
-    def __init__(self, samples: Coordinates) -> None:
-        """Take S of them."""
-        self.samples = samples
+    def __init__(self, samples: Coordinates, inputs: Tensor, targets: Tensor) -> None:
+        """Make the images.
+
+        Args:
+            samples: S of them.
+            inputs: What each symmetry does to the inputs, x -> x T, (G, M, M); identity first.
+            targets: What it does to the targets, (G, R, R).
+        """
+        images = len(inputs)
+        self.samples = Coordinates(
+            inputs=(samples.inputs @ inputs).flatten(0, 1),
+            targets=(samples.targets @ targets).flatten(0, 1),
+            rest=samples.rest.repeat(images),
+            size=samples.size.repeat(images),
+        )
 
     def __len__(self) -> int:
-        """Return S."""
+        """Return S times the number of symmetries."""
         return len(self.samples.rest)
 
     def __getitems__(self, indices: list[int]) -> Coordinates:

@@ -46,7 +46,7 @@ class Latent(PODNet):
         *,
         rank: int = 160,
         coordinates: int = 60,
-        width: int = 128,
+        width: int = 256,
         blocks: int = 4,
         symmetry: bool = True,
         linear_tol: float = 5e-4,
@@ -57,7 +57,7 @@ class Latent(PODNet):
             scene: What it is to answer.
             rank: Modes of the displacement, R.
             coordinates: Inputs of the network, M.
-            width: Units in the hidden layers, for each image of a load.
+            width: Units in the hidden layers.
             blocks: Residual blocks of two layers.
             symmetry: Find the symmetries of the body and respect them.
             linear_tol: Part of its linear answer that the basis may miss; a load of which it
@@ -149,13 +149,13 @@ class Latent(PODNet):
         missed = self.missed(seen, poisson)
         return missed >= self.linear_tol**2 * (linear.square().sum(dim=1) + missed)
 
-    def answers(self, turned: Tensor) -> Tensor:
-        """See `PODNet.answers`; of the nonlinear part."""
-        x, beside = turned.tensor_split([self.scaled.shape[1]], dim=2)
-        square = x.square().sum(dim=2, keepdim=True)
-        bent = torch.cat([x, *(x * one[..., None] for one in beside.unbind(2))], dim=2)
-        curved = self.product(self.left(x) * self.right(bent))
-        return curved / (1 + square) + (square / (1 + square)) ** 1.5 * super().answers(turned)
+    def network(self, inputs: Tensor) -> Tensor:
+        """Return coordinates (..., R) of the nonlinear part from inputs (..., M), see `PODNet`."""
+        x, beside = inputs.tensor_split([self.scaled.shape[1]], dim=-1)
+        square = x.square().sum(dim=-1, keepdim=True)
+        bent = torch.cat([x, *(x * one[..., None] for one in beside.unbind(-1))], dim=-1)
+        curved = self.spread * self.product(self.left(x) * self.right(bent))
+        return curved / (1 + square) + (square / (1 + square)) ** 1.5 * super().network(inputs)
 
     def plan(self) -> list[str]:
         """Return what the network leaves out, a line each."""

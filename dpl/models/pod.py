@@ -13,19 +13,34 @@ from dpl.fem.symmetry import images, symmetries
 from dpl.models.coordinates import Coordinates, CoordinateSamples
 from dpl.models.moduli import placed
 from dpl.models.orbits import Orbits, turned, turned_back
-from dpl.models.sets import Block, bent
 from dpl.scene import Sample, Scene
 
 SNAPSHOTS = 16_000  # images of samples that make a basis, at most
 CHUNK = 256  # samples that are worked on at a time
 
 
+class Block(nn.Module):
+    """x + B gelu(A x): a residual block."""
+
+    def __init__(self, width: int) -> None:
+        """Build it, close to the identity."""
+        super().__init__()
+        self.inner, self.outer = nn.Linear(width, width), nn.Linear(width, width)
+        with torch.no_grad():
+            self.outer.weight.mul_(0.1)
+            self.outer.bias.zero_()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return (..., W) of (..., W)."""
+        return cast(Tensor, x + self.outer(nn.functional.gelu(self.inner(x))))
+
+
 class PODNet(nn.Module):
     """POD basis of the displacements, a residual network from coordinates of the load to its own.
 
     The load is read in the POD basis of the training loads. Where the body has symmetries, both
-    bases are invariant under them, the layers work on the set of all images of a load, and the
-    answer is the mean over them, each turned back: it has the symmetries exactly.
+    bases are invariant under them, and the answer to a load is the mean over its images, each
+    turned back: it has the symmetries exactly.
 
     Source: Hesthaven, Ubbiali (2018), Non-intrusive reduced order modeling of nonlinear problems
     using neural networks, J. Comput. Phys. 363.
@@ -58,7 +73,7 @@ class PODNet(nn.Module):
         *,
         rank: int = 100,
         coordinates: int = 60,
-        width: int = 128,
+        width: int = 256,
         blocks: int = 4,
         symmetry: bool = True,
     ) -> None:
@@ -68,7 +83,7 @@ class PODNet(nn.Module):
             scene: What it is to answer.
             rank: Modes of the displacement, R; fewer where the body moves in fewer ways.
             coordinates: Inputs of the network, M; fewer where loads act in fewer ways.
-            width: Units in the hidden layers, for each image of a load.
+            width: Units in the hidden layers.
             blocks: Residual blocks of two layers.
             symmetry: Find the symmetries of the body and respect them.
 
@@ -108,7 +123,7 @@ class PODNet(nn.Module):
             self.register_buffer(name, torch.zeros(shape))
         self.register_buffer("prepared", torch.tensor(False))
         self.enter = nn.Linear(entering, width)
-        self.blocks = nn.Sequential(*(Block(width, alone=members == 1) for _ in range(blocks)))
+        self.blocks = nn.Sequential(*(Block(width) for _ in range(blocks)))
         self.leave = nn.Linear(width, rank)
 
     def _reading(self, rank: int, coordinates: int) -> int:
@@ -155,13 +170,20 @@ class PODNet(nn.Module):
         return turned_back(self.outlet.seen(displacement) @ modes.T, self.returns.to(displacement))
 
     def learnt(self, inputs: Tensor) -> Tensor:
-        """Return coordinates (B, R) of the displacement from inputs (B, M)."""
-        answers = self.spread * self.answers(torch.einsum("bm,gmk->bgk", inputs, self.turns))
+        """Return coordinates (B, R) of the displacement from inputs (B, M).
+
+        In evaluation the mean over the symmetries; in training the network alone, which meets
+        images as samples.
+        """
+        if self.training or len(self.turns) == 1:
+            return self.network(inputs)
+        answers = self.network((inputs @ self.turns).movedim(0, 1))
         return turned_back(answers, self.returns) / len(self.turns)
 
-    def answers(self, turned: Tensor) -> Tensor:
-        """Return an answer (B, G, R) to each image of the inputs, (B, G, M), not turned back."""
-        return cast(Tensor, self.leave(bent(self.blocks(self.enter(turned)))))
+    def network(self, inputs: Tensor) -> Tensor:
+        """Return coordinates (..., R) from inputs (..., M), without symmetry."""
+        hidden = nn.functional.gelu(self.blocks(self.enter(inputs)))
+        return cast(Tensor, self.spread * self.leave(hidden))
 
     def plan(self) -> list[str]:
         """Return what the network leaves out, a line each."""
@@ -300,7 +322,8 @@ class PODNet(nn.Module):
         device = self.spread.device
         parts = zip(*(column.split(CHUNK) for column in samples), strict=True)
         encoded = [self._encoded(Sample(*(one.to(device) for one in part))) for part in parts]
-        return CoordinateSamples(Coordinates(*map(torch.cat, zip(*encoded, strict=True))))
+        whole = Coordinates(*map(torch.cat, zip(*encoded, strict=True)))
+        return CoordinateSamples(whole, self.turns.cpu(), self.returns.mT.cpu())
 
     def _encoded(self, samples: Sample) -> Coordinates:
         read, targets, missed = self._split(samples)

@@ -96,7 +96,7 @@ def test_what_is_added_to_the_linear_answer_is_quadratic_in_the_load(scene, batc
         found.append(sizes(answer_to(wild, s * force) - s * linear) / s**2)
     found = torch.stack(found)
     assert float(found.max() / found[-1].min()) < 1e6, "bounded"
-    assert torch.allclose(found[-1], found[-2], rtol=1e-2, atol=1e-4 * float(found[-1].max()))
+    assert torch.allclose(found[-1], found[-2], rtol=1e-2)
     assert (found[-1] > 0).all()
 
 
@@ -303,11 +303,11 @@ def home(tmp_path_factory):
 
 @pytest.fixture
 def overrides(tiny_training):
-    """The command line of a run of 128 steps on the tiny scene."""
+    """The command line of a run of four epochs on the tiny scene."""
 
     def overrides(name, *more):
         small = ["model=latent", "model.blocks=1", "model.coordinates=8", "data.folder=data"]
-        return [*tiny_training, *small, "trainer.max_epochs=64", f"run={name}", *more]
+        return [*tiny_training, *small, "trainer.max_epochs=4", f"run={name}", *more]
 
     return overrides
 
@@ -378,7 +378,7 @@ def test_a_run_that_was_interrupted_ends_bit_for_bit_like_one_that_was_not(
     step = Surrogate.training_step
 
     def interrupted(module, batch, batch_idx):
-        if module.trainer.current_epoch == 16 and batch_idx == 1:
+        if module.trainer.current_epoch == 2 and batch_idx == 3:
             raise KeyboardInterrupt
         return step(module, batch, batch_idx)
 
@@ -386,11 +386,11 @@ def test_a_run_that_was_interrupted_ends_bit_for_bit_like_one_that_was_not(
         patch.setattr(Surrogate, "training_step", interrupted)
         assert script("train", *overrides("part"), cwd=home).status == 130
     folder = home / "part"
-    assert checkpoint(folder)["epoch"] == 15
+    assert checkpoint(folder)["epoch"] == 1
     ended = script("train", *overrides("part", "ckpt_path=last"), cwd=home)
     assert ended.status == 0, ended.err
     whole, resumed = checkpoint(trained), checkpoint(folder)
-    assert (whole["epoch"], whole["global_step"]) == (63, 128)
+    assert (whole["epoch"], whole["global_step"]) == (3, 64)
     for part in ("epoch", "global_step", "state_dict", "optimizer_states", "lr_schedulers"):
         assert alike(whole[part], resumed[part]), part
 
@@ -404,9 +404,9 @@ def test_a_run_that_resumes_makes_no_bases_again(trained, script, overrides, hom
         Surrogate, "prepare", lambda module, samples: made.append(0) or prepare(module, samples)
     )
     shutil.copytree(trained, home / "longer")
-    more = ("ckpt_path=last", "trainer.max_epochs=65")
+    more = ("ckpt_path=last", "trainer.max_epochs=5")
     assert script("train", *overrides("longer", *more), cwd=home).status == 0
-    assert checkpoint(home / "longer")["epoch"] == 64
+    assert checkpoint(home / "longer")["epoch"] == 4
     assert made == []
 
 

@@ -257,10 +257,10 @@ def test_answers_have_the_symmetries_exactly(kind, bar, seed):
 
 
 @NETWORKS
-def test_in_training_answers_have_the_symmetries_too(kind, bar):
+def test_in_training_it_is_the_network_alone(kind, bar):
     scene, samples = bar
     net = exact(prepared(kind, scene, samples, **WHOLE)).train()
-    assert asymmetry(net, noise(scene)) < 1e-6
+    assert asymmetry(net, noise(scene)) > 1e-4
 
 
 @NETWORKS
@@ -341,6 +341,7 @@ def test_a_body_in_the_plane_is_answered_with_its_mirror_image(kind, plane):
     assert net(force).shape == force.shape == (4, 14, 2)
     assert net(force).abs().max() > 0
     assert asymmetry(net, force) < 1e-6
+    assert asymmetry(net.train(), force) > 1e-4
 
 
 @NETWORKS
@@ -481,7 +482,6 @@ def test_more_width_and_blocks_are_more_parameters(scene):
         )
 
     for width, blocks in ((16, 0), (16, 3), (24, 2)):
-        for matrices, options in ((2, {}), (1, {"symmetry": False})):
-            inner = blocks * 2 * (matrices * width * width + width)
-            expected = (20 * width + width) + inner + (10 * width + 10)
-            assert count(width=width, blocks=blocks, **options) == expected
+        inner = blocks * 2 * (width * width + width)
+        expected = (20 * width + width) + inner + (10 * width + 10)
+        assert count(width=width, blocks=blocks) == expected
