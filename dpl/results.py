@@ -37,6 +37,7 @@ PAPER: dict[str, dict[str, tuple[float, float | None, float | None, int | None]]
     },
 }
 STREAMS = {"twice": 4, "small": 5}  # of loads; those of samples and scales are below
+CORRECTED = " corrected"  # ends the name of a network that is corrected
 STATES = 256  # samples at which cells are chosen for corrections
 TITLES = {
     "in range": "loads in range",
@@ -343,13 +344,21 @@ def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
     from matplotlib.figure import Figure
 
     sets = list(dict.fromkeys(title for _, title in errors))
-    figure = Figure(figsize=(4 * len(sets), 3.8), layout="constrained")
+    methods = list(dict.fromkeys(method for method, _ in errors))
+    colours = list(dict.fromkeys(method.removesuffix(CORRECTED) for method in methods))
+    figure = Figure(figsize=(4 * len(sets) + 1.6, 3.8), layout="constrained")
     axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for ax, title in zip(axes, sets, strict=True):
-        for (method, of), values in errors.items():
-            if of == title:
-                part = torch.linspace(0, 100, len(values))
-                ax.semilogy(part, values.sort().values.clamp(min=1e-9), label=method)
+        for method in methods:
+            name = method.removesuffix(CORRECTED)
+            values = errors[method, title].sort().values.clamp(min=1e-9)
+            ax.semilogy(
+                torch.linspace(0, 100, len(values)),
+                values,
+                color=f"C{colours.index(name)}",
+                ls="-" if method == name else "--",
+                label=method,
+            )
         aim = 50 if title == "small" else 60  # [dB]
         ax.axhline(10 ** (-aim / 20), color="0.7", ls=":")
         ax.annotate(f"{aim} dB", (0, 10 ** (-aim / 20)), fontsize=7, color="0.4", va="bottom")
@@ -357,5 +366,6 @@ def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
         ax.set_xlabel("part of the loads [%]")
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("relative L2 error, no more than")
-    axes[-1].legend(fontsize=8)
+    handles, names = axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside right center", fontsize=8)
     figure.savefig(path, dpi=130)

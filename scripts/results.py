@@ -41,7 +41,7 @@ def main(cfg: DictConfig) -> None:
         methods[folder.name] = results.network(surrogate, folder, trained.data.train)
         if cfg.corrected and isinstance(surrogate.net, PODNet):
             tier = made("corrected", surrogate, methods[folder.name], train)
-            methods[f"{folder.name} corrected"] = tier
+            methods[folder.name + results.CORRECTED] = tier
     sets = results.load_sets(scene, data.samples("test"), cfg.count)
     rows, errors = results.paper(cfg.name), {}
     a_load = data.store.seconds_a_load()
