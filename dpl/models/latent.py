@@ -97,12 +97,7 @@ class Latent(PODNet):
         return Rests(scene.linear).count
 
     def _more_buffers(self, read: int, members: int) -> dict[str, tuple[int, ...]]:
-        return {}
-
-    @property
-    def read_returns(self) -> Tensor:  # type: ignore[override]
-        """Those of the displacement: linear answers are read in its basis."""
-        return self.returns
+        return {}  # linear answers are read in the basis of the displacement, and turned as it is
 
     def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
         """See `PODNet.forward`."""

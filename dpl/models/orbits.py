@@ -67,9 +67,9 @@ class Orbits(nn.Module):
 
     def whole(self, images: Tensor, like: Tensor) -> Tensor:
         """Return fields (B, N, D), shaped like others, of their images (B, G, n D)."""
-        turned = images.unflatten(2, (-1, like.shape[2])) @ self.turns.mT.to(images)
+        values = images.unflatten(2, (-1, like.shape[2])) @ self.turns.mT.to(images)
         field = images.new_zeros(like.shape)
-        return field.index_copy(1, self.nodes, turned.flatten(1, 2).index_select(1, self.places))
+        return field.index_copy(1, self.nodes, values.flatten(1, 2).index_select(1, self.places))
 
     def first(self, field: Tensor) -> Tensor:
         """Return fields (B, N, D) at one node of each orbit, (B, n D)."""
