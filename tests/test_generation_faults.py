@@ -105,6 +105,11 @@ def workers_of(members, group):
     return found
 
 
+def gone(members, group):
+    """Return whether no process of a group is left; one that ends has closed its files before."""
+    return waited_for(lambda: not members(group), 2.0)
+
+
 def spooled(folder):
     return len(list(folder.glob("spool/*.load")))
 
@@ -139,7 +144,7 @@ def test_a_killed_parent_takes_workers_amid_a_solve_along(start, members, slow, 
     assert len(workers_of(members, process.pid)) == 2
     process.kill()
     process.wait()
-    assert waited_for(lambda: not members(process.pid), 2.0)
+    assert gone(members, process.pid)
 
 
 @pytest.mark.slow
@@ -226,7 +231,7 @@ def test_asked_once_it_finishes_the_loads_at_work_and_keeps_them(
     (os.killpg if group else os.kill)(process.pid, number)
     ended, _, err = finish(process, 20)
     assert ended == status, err[-2000:]
-    assert not members(process.pid)
+    assert gone(members, process.pid)
     assert "Traceback" not in err
     assert before < spooled(tmp_path / "d") <= before + 2
     resumed = made(script, slow(), tmp_path)
@@ -243,7 +248,7 @@ def test_asked_twice_it_stops_at_once(start, members, slow, tmp_path):
     os.killpg(process.pid, signal.SIGINT)
     status, _, err = finish(process, 5)
     assert status == 130, err[-2000:]
-    assert not members(process.pid)
+    assert gone(members, process.pid)
     assert err.strip().endswith("interrupted")
     assert err.count("once more to stop at once") == 1
 
@@ -272,7 +277,7 @@ def test_an_impatient_user_gets_no_traceback(start, members, slow, tmp_path):
     status, _, err = finish(process, 10)
     assert status == 130, err[-2000:]
     assert "Traceback" not in err
-    assert not members(process.pid)
+    assert gone(members, process.pid)
 
 
 # ------------------------------------------------------------------ several writers
