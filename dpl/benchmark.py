@@ -176,14 +176,13 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
         tol: Residual ratio of Newton and the hybrid [-].
     """
     scene = surrogate.scene
-    # the scene's own where it can be: its factor of K(0) is there already
-    newton = scene.solver if tol == scene.solver.tol else replace(scene.solver, tol=tol)
+    newton, corrector = scene.solver.but(tol=tol), scene.corrector.but(tol=tol)
     # with Poisson's ratios of their own, loads have their own K(0): each solver makes it for itself
     shared = scene.loads.poisson_range is None
     solvers: dict[str, Solver] = {
         "linear": newton.rest if shared else replace(newton.rest),
         "network": Direct(surrogate.predict, scene.problem, tol),
-        "hybrid Newton": Hybrid(surrogate.predict, newton if shared else replace(newton)),
+        "hybrid Newton": Hybrid(surrogate.predict, corrector if shared else replace(corrector)),
         "Newton from zero": newton,
     }
     with one_thread():

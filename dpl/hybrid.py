@@ -11,6 +11,8 @@ from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, in_step, judge
 
 Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]
+RULES = ("best", "paper")
+SECOND = 0.1  # part of the displacement that the second correction may be in any case
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,44 +31,67 @@ class Direct:
 
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield the prediction."""
-        yield judge(self.problem, _prediction(self.predict, load), load, self.tol)
+        prediction = _prediction(self.predict, load)
+        yield judge(self.problem, prediction, load, self.tol, from_guess=True)
 
 
 @dataclass(frozen=True, eq=False)
 class Hybrid:
     """Network guess, Newton correction: the answer is as exact as Newton's.
 
-    The prediction is the answer if it balances the load. Otherwise one classic Newton step is taken
-    from zero, and Newton goes on from the prediction where its residual is smaller than that after
-    the step, else from the step. A prediction that is not finite or inverts an element is never
-    picked: what follows is the classic path, bit for bit.
+    The prediction is the answer if it balances the load. One that is not finite or inverts an
+    element is never picked: what follows is the classic path from rest, bit for bit.
 
-    Source: Odot, Haferssas, Cotin (2022), DeepPhysics, algorithm 2.
+    `rule="paper"`: one classic step is taken from rest, and Newton goes on from the prediction
+    where its residual is smaller than that after the step, else from the step.
+
+    `rule="best"`: Newton goes on from the prediction as long as its corrections contract. The
+    first must be less than half of the displacement that it leads to, ||du|| < ||u + du|| / 2,
+    where from rest the two are equal; each that follows, less than half of the one before. The
+    second may also be a tenth of the displacement: the first removes what stiff directions resist
+    and shows only then what soft ones lack. If not, Newton starts again from rest. Corrections,
+    unlike residuals, do not depend on how stiff the body is against an error.
+
+    Source: Odot, Haferssas, Cotin (2022), DeepPhysics, algorithm 2; Deuflhard (2011), Newton
+    Methods for Nonlinear Problems, section 3.2 (natural monotonicity).
 
     Attributes:
         predict: From a load to displacements over L.
         newton: The corrector.
+        rule: How a prediction is picked.
     """
 
     predict: Predict
     newton: Newton
+    rule: str = "best"
+
+    def __post_init__(self) -> None:
+        """Check the rule.
+
+        Raises:
+            ValueError: There is no such rule.
+        """
+        if self.rule not in RULES:
+            raise ValueError(f"rule = {self.rule!r} must be {' or '.join(RULES)}")
 
     def iterate(self, load: Load) -> Iterator[Solution]:
-        """Yield the prediction, the state after the classic step, and what Newton makes of it.
+        """Yield the prediction, or rest where it is useless, and what Newton makes of it.
 
-        The classic step counts as an iteration also where it is discarded.
+        By the paper's rule the prediction comes first in any case, then the state after the classic
+        step. What is discarded counts: the classic step, or corrections of the prediction.
         """
         guesses = _prediction(self.predict, load)
+        member = self._by_paper if self.rule == "paper" else self._by_corrections
         yield from in_step(
             [
-                self._member(single, guess[None])
+                member(single, guess[None])
                 for single, guess in zip(load.singles(), guesses, strict=True)
             ]
         )
 
-    def _member(self, load: Load, guess: Tensor) -> Iterator[Solution]:
+    def _by_paper(self, load: Load, guess: Tensor) -> Iterator[Solution]:
         """Yield the states under one load."""
-        predicted = judge(self.newton.problem, guess, load, self.newton.tol)
+        predicted = judge(self.newton.problem, guess, load, self.newton.tol, from_guess=True)
         yield predicted
         if predicted.converged:
             return
@@ -79,12 +104,26 @@ class Hybrid:
         if not pick(predicted, first):
             yield from classic
             return
-        for state in self.newton.iterate(load, guess=guess):
-            yield state._replace(
-                iterations=state.iterations + first.iterations,
-                factorisations=state.factorisations + first.factorisations,
-                seconds=state.seconds + first.seconds,
-            )
+        yield from _after(first, self.newton.iterate(load, guess=guess))
+
+    def _by_corrections(self, load: Load, guess: Tensor) -> Iterator[Solution]:
+        """Yield the states under one load."""
+        states = self.newton.iterate(load, guess=guess)
+        last = next(states)
+        yield last
+        before = float("inf")
+        for k, state in enumerate(states):
+            size = float((state.displacement - last.displacement).norm())
+            whole = float(state.displacement.norm())
+            allowed = max(0.5 * min(before, whole), SECOND * whole if k == 1 else 0.0)
+            contracts = bool(state.from_guess) and size < allowed
+            if last.from_guess and not (contracts or state.converged):
+                classic = self.newton.iterate(load)
+                next(classic)
+                yield from _after(state, classic)
+                return
+            yield state
+            last, before = state, size
 
 
 def pick(predicted: Solution, first: Solution) -> bool:
@@ -93,6 +132,16 @@ def pick(predicted: Solution, first: Solution) -> bool:
     Written so that a residual that is not a number never picks.
     """
     return bool(predicted.volume_ratio > 0) and bool(predicted.residual < first.residual)
+
+
+def _after(spent: Solution, states: Iterator[Solution]) -> Iterator[Solution]:
+    """Yield states with what was spent before them added."""
+    for state in states:
+        yield state._replace(
+            iterations=state.iterations + spent.iterations,
+            factorisations=state.factorisations + spent.factorisations,
+            seconds=state.seconds + spent.seconds,
+        )
 
 
 def _prediction(predict: Predict, load: Load) -> Tensor:

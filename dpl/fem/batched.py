@@ -173,4 +173,5 @@ class BatchedNewton:
             factorisations=torch.zeros_like(count),
             load_factor=good.to(u.dtype),
             seconds=torch.full_like(state.volume_ratio, seconds),
+            from_guess=torch.zeros_like(good),
         )

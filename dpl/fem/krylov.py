@@ -26,7 +26,13 @@ Map = Callable[[Array], Array]  # (n,) -> (n,)
 
 
 def conjugate_gradients(
-    product: Map, precondition: Map, right: Array, rtol: float, max_iter: int
+    product: Map,
+    precondition: Map,
+    right: Array,
+    rtol: float,
+    max_iter: int,
+    *,
+    doubtful: bool = False,
 ) -> Array:
     """Return x, (n,), with ||right - K x|| <= rtol ||right||.
 
@@ -39,6 +45,8 @@ def conjugate_gradients(
         right: Right-hand side, (n,).
         rtol: Where to stop [-].
         max_iter: Products to spend at most.
+        doubtful: Give up as soon as the residual, shrinking as it has on average, would not be
+            there in time.
 
     Raises:
         SingularMatrix: K is not positive definite, or `max_iter` is not enough.
@@ -50,7 +58,8 @@ def conjugate_gradients(
     residual = right.copy()
     z = precondition(residual)
     direction, rz = z.copy(), residual @ z
-    for _ in range(max_iter):
+    before_all = np.linalg.norm(right)
+    for k in range(1, max_iter + 1):
         image = product(direction)
         curvature = direction @ image
         if not (curvature > 0 and rz > 0):
@@ -58,8 +67,11 @@ def conjugate_gradients(
         length = rz / curvature
         x += length * direction
         residual -= length * image
-        if np.linalg.norm(residual) <= enough:
+        left = np.linalg.norm(residual)
+        if left <= enough:
             return x
+        if doubtful and k >= 3 and (left / before_all) ** (max_iter / k) > rtol:
+            break
         z = precondition(residual)
         rz, before = residual @ z, rz
         direction *= rz / before

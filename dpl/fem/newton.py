@@ -14,11 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dpl.fem.band import Cholesky
 from dpl.fem.krylov import conjugate_gradients, lowest
 from dpl.fem.linear import Backend, Factor, SingularMatrix, backend, chosen
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, Status, in_step, judge
 from dpl.fem.sparse import SymmetricProduct
+from dpl.fem.turned import Turned, Turning
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,13 @@ class Linear:
         rest = torch.zeros(1, *self.problem.shape, dtype=torch.float64)
         values = self.problem.linearise(rest).tangent[0].numpy()
         return self._backend.factorise(values)
+
+    @cached_property
+    def turning(self) -> Turning:
+        """What turns the factor of K(0) with the nodes; in float32 where it is a band."""
+        factor = self.factor
+        rough = factor.rounded() if isinstance(factor, Cholesky) else factor
+        return Turning(self.problem, rough)
 
     @cached_property
     def _backend(self) -> Backend:
@@ -86,6 +95,7 @@ class Linear:
 TWINS = 4  # bodies of other Poisson's ratios whose factors are kept
 DOUBT = 0.05  # eigenvalue, relative to a factor nearby, below which a tangent is examined
 PATIENCE = 8  # conjugate gradient steps with the factor of another tangent, then its own
+TURNS = 16  # of the same with K(0)'s, turned
 CAREFUL = 2.0**-4  # load step from which on the end of the path may be near: full accuracy
 
 
@@ -119,6 +129,9 @@ class Newton:
             Leonetti, Garcea 2017), for laws that can: fewer iterations, far larger steps.
         reuse: Residual ratio below which the last factor, as preconditioner of conjugate gradients
             on the new tangent, stands for a new one [-]; 0: a factor for every tangent.
+        turned: Let the factor of K(0), turned with the nodes, stand for those of tangents while
+            conjugate gradients with it are short. Whether an answer is stable is then known only
+            where they were not.
     """
 
     problem: Problem
@@ -131,6 +144,7 @@ class Newton:
     linear: str = "auto"
     mixed: bool = True
     reuse: float = 0.1
+    turned: bool = False
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -160,6 +174,12 @@ class Newton:
             ]
         )
 
+    def but(self, **changes: Any) -> "Newton":
+        """Return the solver with other attributes, those of its K(0) excepted: it keeps that."""
+        other = replace(self, **changes)
+        other.__dict__["rest"] = self.rest
+        return other
+
     def at(self, poisson: Tensor | float) -> "Newton":
         """Return the solver of the body of another Poisson's ratio, see `Problem.at`.
 
@@ -181,13 +201,14 @@ class Newton:
     def _member(self, force: Tensor, guess: Tensor | None) -> Iterator[Solution]:
         """Yield the states under one load (1, N, D)."""
         problem, count = self.problem, _Count()
-        state = base = self._state(torch.zeros_like(force), problem.prescribed[None])
-        guessed = guess is not None and bool(force.any() or problem.moved_supports)
+        state = base = self._rest(force)
+        guessed = guess is not None and bool(guess.any())
+        guessed &= bool(force.any()) or problem.moved_supports
         if guess is not None and guessed:
             held = torch.where(problem.free, guess, problem.prescribed)
             start = self._state(held, torch.zeros_like(force))
             state, guessed = (start, True) if start.volume_ratio > 0 else (base, False)
-        count.known, step = 0.0, 1.0
+        count.known, count.guessed, step = 0.0, guessed, 1.0
         yield self._report(state, force, count)
         while not self._balanced(state, force, 1.0, self.tol):
             target = min(count.known + step, 1.0)
@@ -199,8 +220,8 @@ class Newton:
             if self._balanced(state, force, target, tol):
                 base, count.known, step = state, target, 2 * step
             else:  # a guess that failed costs no load step
-                step, guessed = (step, False) if guessed else ((target - count.known) / 2, False)
-                state = base
+                step = step if count.guessed else (target - count.known) / 2
+                state, count.guessed = base, False
             lost = step < self.smallest_step
             spent = count.iterations >= self.budget
             if lost or (spent and not self._balanced(state, force, 1.0, self.tol)):
@@ -225,7 +246,7 @@ class Newton:
             except SingularMatrix:
                 return
             count.iterations += 1
-            stepped = self._stepped(state, update)
+            stepped = self._stepped(state, update, shorten=not count.guessed)
             if stepped is None:
                 return
             state = stepped._replace(before=ratio)
@@ -243,7 +264,8 @@ class Newton:
         Source: Eisenstat, Walker (1996), SIAM J. Sci. Comput. 17, choice 2.
         """
         enough = 0.1 * self.tol / ratio if ratio > 0 else 0.0
-        earned = 0.01 * (ratio / before) ** 2 if before > 0 else 0.0
+        unknown = 1e-3 if self.turned else 0.0
+        earned = 0.01 * (ratio / before) ** 2 if before > 0 else unknown
         return max(1e-12, enough, min(1e-3, earned))
 
     def _update(self, state: "_State", force: Tensor, count: "_Count", rtol: float) -> Tensor:
@@ -263,12 +285,19 @@ class Newton:
             system = problem.linearise(u)
         right, values = self._right(state, force, system.force), system.tangent[0].numpy()
         step = None
+        if count.near is None and count.turns and self.turned:
+            count.near = self.rest.turning.at(u)
         if count.near is not None and count.near.negative_pivots == 0:
             product = SymmetricProduct(problem.pattern, values)
+            doubtful = isinstance(count.near, Turned)
+            steps = TURNS if doubtful else PATIENCE
             with suppress(SingularMatrix):
-                step = conjugate_gradients(product, count.near.apply, right, rtol, PATIENCE)
+                step = conjugate_gradients(
+                    product, count.near.apply, right, rtol, steps, doubtful=doubtful
+                )
                 count.tangent = product
         if step is None:
+            count.turns &= not isinstance(count.near, Turned)
             count.factorisations += 1
             count.near = None  # its storage serves the next one
             count.near = self._backend.factorise(values)
@@ -283,10 +312,13 @@ class Newton:
             right = right - self.problem.tangent_product(state.displacement, state.jump)
         return gather(right[0], self.problem)
 
-    def _stepped(self, state: "_State", update: Tensor) -> "_State | None":
-        """Return the state after the longest of the steps 1, 1/2, 1/4, ... that inverts nothing."""
+    def _stepped(self, state: "_State", update: Tensor, *, shorten: bool) -> "_State | None":
+        """Return the state after the longest of the steps 1, 1/2, 1/4, ... that inverts nothing.
+
+        Only the whole one unless it is to `shorten`: a guess is good, or it is given up.
+        """
         floor = self.keep * min(float(state.volume_ratio), 1.0)
-        for length in (0.5 ** np.arange(10)).tolist():
+        for length in (0.5 ** np.arange(10 if shorten else 1)).tolist():
             jump = (1 - length) * state.jump
             end = self._state(state.displacement + length * update, jump)
             if end.volume_ratio > floor:
@@ -307,6 +339,11 @@ class Newton:
     def __getstate__(self) -> dict[str, object]:
         """Pickle without factors."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def _rest(self, force: Tensor) -> "_State":
+        """Return the state of the body at rest, which needs no evaluation."""
+        zero, one = torch.zeros_like(force), torch.ones(1, dtype=force.dtype)
+        return _State(zero, zero, one, self.problem.prescribed[None], None, {})
 
     def _state(self, displacement: Tensor, jump: Tensor, gap: Any = None) -> "_State":
         return _State(displacement, *self.problem.evaluate(displacement), jump, gap, {})
@@ -330,7 +367,7 @@ class Newton:
     def _report(
         self, state: "_State", force: Tensor, count: "_Count", end: Status | None = None
     ) -> Solution:
-        balanced = end is None and self._balanced(state, force, 1.0, self.tol)
+        balanced, pivots = end is None and self._balanced(state, force, 1.0, self.tol), -1
         if balanced:
             if (ratio := self._ratio(state, force, 1.0)) >= self.tol:
                 warnings.warn(
@@ -338,11 +375,11 @@ class Newton:
                     "this body (very thin cells, moduli far apart?)",
                     stacklevel=2,
                 )
-            end = Status.UNSTABLE if self._negative_pivots(state, count) > 0 else Status.CONVERGED
+            pivots = self._negative_pivots(state, count)
+            end = Status.UNSTABLE if pivots > 0 else Status.CONVERGED
         elif end is None:
             end = Status.NOT_CONVERGED
         factor = 1.0 if balanced else count.known
-        pivots = count.negative_pivots if balanced else -1
         return Solution(
             displacement=state.displacement,
             residual=torch.tensor([self._ratio(state, force, 1.0)], dtype=force.dtype),
@@ -353,6 +390,7 @@ class Newton:
             factorisations=torch.tensor([count.factorisations]),
             load_factor=torch.tensor([factor], dtype=force.dtype),
             seconds=torch.tensor([time.perf_counter() - count.start], dtype=torch.float64),
+            from_guess=torch.tensor([count.guessed]),
         )
 
     def _negative_pivots(self, state: "_State", count: "_Count") -> int:
@@ -361,6 +399,8 @@ class Newton:
         There may if the last tangent had some; or, where an older factor served for it, if it has
         an eigenvalue far below that factor's.
         """
+        if isinstance(count.near, Turned):
+            return -1
         suspect = count.negative_pivots > 0
         if count.tangent is not None and count.near is not None:
             size = self.problem.pattern.size
@@ -398,8 +438,10 @@ class _Count:
     factorisations: int = 0
     negative_pivots: int = -1
     known: float = 0.0
-    near: Factor | None = None  # of the last tangent that was factorised
+    guessed: bool = False  # whether the guess, if there was one, has not failed
+    near: Factor | Turned | None = None  # of the last tangent that was factorised
     tangent: SymmetricProduct | None = None  # the last one, if an older factor served for it
+    turns: bool = True  # whether K(0)'s factor, turned, has not failed yet
     start: float = field(default_factory=time.perf_counter)
 
 

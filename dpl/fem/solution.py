@@ -73,6 +73,7 @@ class Solution(NamedTuple):
         factorisations: Tangents factorised so far, (B,); that of the rest state is the scene's.
         load_factor: Part of the load for which an equilibrium is known, (B,) [-].
         seconds: Time so far, (B,) [s].
+        from_guess: Whether it goes on from a guess that was given, (B,).
     """
 
     displacement: Tensor
@@ -84,6 +85,7 @@ class Solution(NamedTuple):
     factorisations: Tensor
     load_factor: Tensor
     seconds: Tensor
+    from_guess: Tensor
 
     @property
     def converged(self) -> Tensor:
@@ -144,6 +146,7 @@ def judge(
     *,
     iterations: int = 0,
     seconds: float = 0.0,
+    from_guess: bool = False,
 ) -> Solution:
     """Return a displacement (B, N, D) as the solution it is: evaluated, nothing believed."""
     problem = problem.at(load.poisson)
@@ -160,4 +163,5 @@ def judge(
         factorisations=torch.zeros_like(count),
         load_factor=balanced.to(volume.dtype),
         seconds=torch.full_like(volume, seconds),
+        from_guess=torch.full_like(balanced, from_guess),
     )

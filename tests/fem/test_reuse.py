@@ -210,7 +210,7 @@ def test_preconditioner_that_does_not_help_is_replaced_after_its_patience(
     steps = []
     original = newton_module.conjugate_gradients
 
-    def hopeless(product, precondition, right, rtol, max_iter):
+    def hopeless(product, precondition, right, rtol, max_iter, **_):
         steps.append(max_iter)
         return original(product, lambda r: r, right, rtol, max_iter)
 

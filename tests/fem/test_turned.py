@@ -1,0 +1,164 @@
+"""Laws of K(0)'s factor turned with the nodes: what it turns by, and Newton's answers with it."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from dpl.fem.forces import Traction
+from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
+from dpl.fem.mesh import Plane, box, rectangle
+from dpl.fem.newton import Linear, Newton, gather
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, Status, solve
+from dpl.fem.supports import Displacement
+
+NH, SVK = NeoHookeanLn(0.3), SaintVenantKirchhoff(0.3)
+
+
+def body(dim=3, law=NH, degree=1, **more):
+    """Return a slender clamped body, four times as long as high."""
+    mesh = box([4.0, 1.0, 1.0], [9, 3, 3]) if dim == 3 else rectangle([4.0, 1.0], [13, 4])
+    return Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree, **more)
+
+
+def bend(problem, total):
+    """Return a load across the far end, `total` over E L^2."""
+    direction = torch.zeros(problem.shape[1])
+    direction[-1] = -total * 16
+    force = Traction(Plane(0, "max"), direction.tolist()).on(problem)
+    return Load(force[None], torch.ones(1, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("angle", [0.0, 1e-3, 1.0, 3.0])
+def test_nodes_turn_by_the_rotation_of_their_gradient(dim, degree, angle):
+    problem = body(dim, degree=degree)
+    axis = np.array([1.0, 2.0, 3.0]) / math.sqrt(14)
+    if dim == 3:
+        turn = Rotation.from_rotvec(angle * axis).as_matrix()
+    else:
+        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    stretch = np.diag([1.3, 0.8, 1.1][:dim])
+    u = problem.points @ torch.from_numpy(turn @ stretch - np.eye(dim)).T
+    turned = Linear(problem).turning.at(u[None])
+    whole = problem.free.all(dim=1).numpy()
+    assert np.allclose(turned.rotations[whole], turn, atol=1e-8)
+    assert np.array_equal(
+        turned.rotations[~whole], np.broadcast_to(np.eye(dim), turned.rotations[~whole].shape)
+    )
+
+
+def test_nodes_of_an_inverted_body_do_not_turn():
+    problem = body()
+    turned = Linear(problem).turning.at(-2.0 * problem.points[None])
+    assert np.array_equal(turned.rotations, np.broadcast_to(np.eye(3), turned.rotations.shape))
+
+
+def test_at_rest_it_is_the_inverse_of_the_stiffness():
+    problem = body()
+    linear = Linear(problem)
+    zero = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    right = np.random.default_rng(0).standard_normal(problem.pattern.size)
+    ours, exact = linear.turning.at(zero).apply(right), linear.factor.solve(right)
+    assert np.linalg.norm(ours - exact) < 1e-4 * np.linalg.norm(exact)
+    assert linear.turning.steps(zero) == 1
+
+
+@pytest.mark.parametrize("backend", ["auto", "superlu"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_it_is_symmetric_and_positive(dim, backend):
+    problem = body(dim)
+    random = np.random.default_rng(1)
+    u = torch.from_numpy(0.02 * random.standard_normal((1, *problem.shape)))
+    turned = Linear(problem, linear=backend).turning.at(u)
+    for _ in range(5):
+        x, y = random.standard_normal((2, problem.pattern.size))
+        size = np.linalg.norm(x) * np.linalg.norm(turned.apply(y))
+        assert abs(y @ turned.apply(x) - x @ turned.apply(y)) < 1e-5 * size
+        assert x @ turned.apply(x) > 0
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"law": SVK},
+        {"dim": 2},
+        {"degree": 2},
+        {"dim": 2, "degree": 2},
+        {"mean_dilatation": True},
+        {"law": NeoHookeanLn(0.49), "mean_dilatation": True},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("mixed", [True, False])
+def test_newton_has_the_same_answer_with_it(options, mixed):
+    problem = body(**options)
+    load = bend(problem, 1e-4 if problem.shape[1] == 3 else 5e-4)
+    plain = Newton(problem, mixed=mixed)
+    ours, theirs = solve(plain.but(turned=True), load), solve(plain, load)
+    assert theirs.displacement.norm(dim=-1).max() > 0.09, "or it would prove nothing"
+    assert ours.converged.all()
+    assert (ours.residual < 1e-8).all()
+    assert torch.allclose(ours.displacement, theirs.displacement, rtol=0, atol=1e-8)
+    assert (ours.factorisations < theirs.factorisations).all()
+
+
+def test_far_from_rest_it_is_far_better_than_the_factor_as_it_is(monkeypatch):
+    problem = body()
+    answer = solve(Newton(problem), bend(problem, 4e-4)).displacement
+    turning = Linear(problem).turning
+    turned = turning.steps(answer)
+    monkeypatch.setattr(type(turning), "at", lambda self, u: self.factor)
+    assert turned <= 8
+    assert turning.steps(answer) > 2 * turned
+
+
+def test_where_it_does_not_contract_a_factor_takes_over():
+    """A plate a hundredth thick: strains through the thickness resist every wrong rotation."""
+    problem = Problem.build(box([1.0, 0.2, 0.01], [17, 5, 2]), NH, fixed=Plane(0, "min"))
+    force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
+    load = Load(force[None], torch.ones(1, dtype=torch.float64))
+    plain = Newton(problem)
+    ours, theirs = solve(plain.but(turned=True), load), solve(plain, load)
+    assert ours.factorisations.all()
+    assert ours.converged.all()
+    assert torch.allclose(ours.displacement, theirs.displacement, rtol=0, atol=1e-8)
+
+
+def test_without_a_factor_stability_is_not_claimed():
+    problem = body()
+    load = bend(problem, 2e-4)
+    ours, theirs = solve(Newton(problem, turned=True), load), solve(Newton(problem), load)
+    assert not ours.factorisations.any()
+    assert ours.negative_pivots.tolist() == [-1]
+    assert theirs.negative_pivots.tolist() == [0]
+    assert ours.status.tolist() == [int(Status.CONVERGED)]
+
+
+def test_moved_supports_go_with_it():
+    shift = Displacement(Plane(0, "max"), [0.0, 0.0, -0.6])
+    problem = body(supports=[shift])
+    none = Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
+    ours, theirs = solve(Newton(problem, turned=True), none), solve(Newton(problem), none)
+    assert ours.converged.all()
+    assert torch.allclose(ours.displacement, theirs.displacement, rtol=0, atol=1e-8)
+
+
+def test_other_attributes_keep_the_factor_of_rest():
+    newton = Newton(body())
+    other = newton.but(tol=1e-3, turned=True)
+    assert (other.tol, other.turned) == (1e-3, True)
+    assert other.rest is newton.rest
+    assert other.rest.factor is newton.rest.factor
+
+
+def test_a_load_of_nothing_needs_no_tangent():
+    problem = body()
+    right = gather(torch.zeros(problem.shape, dtype=torch.float64), problem)
+    zero = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    assert not Linear(problem).turning.at(zero).apply(right).any()
