@@ -9,4 +9,29 @@ Inside the package everything is dimensionless: lengths / L, forces / (E L^2) (E
 thickness), Young's modulus 1. SI units live at the border, in `dpl.scene.Scene`.
 """
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from dpl.simulator import Simulator
+
 __version__ = "0.1.0"
+
+
+def load(folder: "str | Path", *, trust: bool = False) -> "Simulator":
+    """Return the simulator of a training run.
+
+    Args:
+        folder: The run's, as `runs/...`.
+        trust: Whether its configuration may name objects outside this package, such as your own
+            law: they are imported and called.
+
+    Raises:
+        ValueError: There is no finished run, its checkpoint is of another scene, or it names what
+            is not trusted.
+    """
+    from dpl.run import load_run
+    from dpl.simulator import Simulator
+
+    return Simulator(load_run(folder, trust=trust)[1])

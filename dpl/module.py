@@ -1,9 +1,10 @@
 """Surrogate: a network with its scales and its loss, trained by Lightning."""
 
+import json
 import math
 import random
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -205,6 +206,7 @@ class Surrogate(L.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Write down whose surrogate this is, and where random numbers are."""
         checkpoint["scene"] = self.scene.fingerprint
+        checkpoint["identity"] = self.scene.identity()
         checkpoint["random"] = random_states()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -215,13 +217,34 @@ class Surrogate(L.LightningModule):
         """
         theirs, ours = checkpoint.get("scene", "unknown"), self.scene.fingerprint
         if theirs != ours:
-            raise ValueError(f"the checkpoint is of scene {theirs[:12]}, this scene is {ours[:12]}")
+            found = differences(checkpoint.get("identity", {}), self.scene.identity())
+            raise ValueError(
+                f"the checkpoint is of scene {theirs[:12]}, this scene is {ours[:12]}"
+                + "".join(f"; {line}" for line in found)
+            )
         self._random_states = checkpoint.get("random")
 
     def on_train_start(self) -> None:
         """Go on with the random numbers of the run that this one resumes."""
         if self._random_states is not None:
             set_random_states(self._random_states)
+
+
+def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any], path: str = "") -> list[str]:
+    """Return in what the identities of two scenes differ, see `Scene.identity`, a line each.
+
+    What the first lacks, as those that older checkpoints hold, counts as equal.
+    """
+    lines = []
+    for key in theirs:
+        place, a, b = f"{path}{key}", theirs[key], ours.get(key)
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            lines += differences(a, b, f"{place}.")
+        elif json.dumps(a) != json.dumps(b):
+            digest = isinstance(a, str) and len(a) == 64
+            words = "differ" if digest else f"{a} there, {b} here"
+            lines.append(f"{place}: {words}")
+    return lines
 
 
 def warmup_cosine(

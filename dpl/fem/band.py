@@ -3,7 +3,7 @@
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbtrf, dpbtrs, spbtrf, spbtrs
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
-from threadpoolctl import ThreadpoolController
 
 from dpl.fem.krylov import conjugate_gradients
 from dpl.fem.sparse import (
@@ -24,6 +23,7 @@ from dpl.fem.sparse import (
     require_finite,
     row_numbers,
 )
+from dpl.fem.threads import blas
 
 
 class Layout(NamedTuple):
@@ -78,12 +78,6 @@ def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order), dtype=order.dtype)
     return rank
-
-
-@cache
-def _blas() -> ThreadpoolController:
-    """The BLAS libraries of this process; to find them takes milliseconds, to limit them none."""
-    return ThreadpoolController().select(user_api="blas")
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +160,7 @@ class Band:
         storage.ravel()[layout.place] = values.astype(self.dtype, copy=False)  # cast, then scatter
         diagonal = storage[:, 0].copy()
         factorise = dpbtrf if self.dtype == np.float64 else spbtrf
-        with _blas().limit(limits=1):
+        with blas().limit(limits=1):
             lower, info = factorise(storage.T, lower=1, overwrite_ab=1)
         if info or (storage[:, 0] ** 2 <= 4 * np.finfo(self.dtype).eps * diagonal).any():
             return None

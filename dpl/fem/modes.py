@@ -260,6 +260,30 @@ class ModalLoads:
         load = self.at(self.points(seed, indices))
         return load._replace(force=amplitude * load.force)
 
+    def place(self, force: Tensor) -> tuple[Tensor, Tensor]:
+        """Return where forces (B, N, D) [-] lie among these loads: amplitudes (B,), strangeness.
+
+        The amplitude is the largest modal load over its largest value here, of the smallest modal
+        loads that come closest to the force where it acts: above 1 it is beyond these loads. What
+        they leave of it, ||f - Phi q|| / ||f||, is strange: it is zero for these loads. An area
+        that is no ball counts as one of theirs.
+        """
+        own = force if self.always is None else force - self.always
+        fields = torch.where(self.reach[..., None], self.modes.vectors, 0.0) * self.q_max
+        amplitudes, strange = [], []
+        for f in own:
+            size = float(f.norm())
+            if size == 0:
+                amplitudes.append(0.0)
+                strange.append(0.0)
+                continue
+            acting = f.any(dim=-1)
+            shapes = fields[acting].flatten(0, 1)
+            q = torch.linalg.lstsq(shapes, f[acting].flatten()[:, None], driver="gelsd").solution
+            amplitudes.append(float(q.abs().max()))
+            strange.append(float((f[acting].flatten() - shapes @ q[:, 0]).norm()) / size)
+        return force.new_tensor(amplitudes), force.new_tensor(strange)
+
     def _force(self, point: Array) -> Tensor:
         """Return the force (N, D) of a point (d,)."""
         modes = len(self.q_max)

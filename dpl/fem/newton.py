@@ -410,12 +410,16 @@ class Newton:
         if suspect:
             count.factorisations += 1
             count.near = None
-            tangent = self.problem.linearise(state.displacement).tangent
-            try:
-                count.negative_pivots = self._backend.factorise(tangent[0].numpy()).negative_pivots
-            except SingularMatrix:  # at the critical load itself
-                count.negative_pivots = 1
+            count.negative_pivots = self.negative_pivots(state.displacement)
         return count.negative_pivots
+
+    def negative_pivots(self, displacement: Tensor) -> int:
+        """Return the negative eigenvalues of the tangent at (1, N, D); 1 where it is singular."""
+        tangent = self.problem.linearise(displacement).tangent
+        try:
+            return self._backend.factorise(tangent[0].numpy()).negative_pivots
+        except SingularMatrix:  # at the critical load itself
+            return 1
 
 
 class _State(NamedTuple):

@@ -6,10 +6,10 @@ from enum import IntEnum
 from typing import NamedTuple, Protocol
 
 import torch
-from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from dpl.fem.problem import Problem
+from dpl.fem.threads import blas
 
 
 class _Load(NamedTuple):
@@ -115,7 +115,7 @@ def one_thread() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with threadpool_limits(1):
+        with blas().limit(limits=1):
             yield
     finally:
         torch.set_num_threads(before)

@@ -1,0 +1,307 @@
+"""Laws of the simulator: its answers keep what was asked or say that they do not, in SI units."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import dpl
+from dpl import run
+from dpl.fem.solution import Status, solve
+from dpl.hybrid import Hybrid
+from dpl.losses import MSE
+from dpl.models.fcnn import FCNN
+from dpl.module import Surrogate
+from dpl.simulator import Simulator, nearest
+
+E = 4500.0
+
+
+def simulator_of(scene, predict=None, **more):
+    """Return a simulator whose network is a function of a load; left out: half the truth."""
+    torch.manual_seed(0)
+    surrogate = Surrogate(FCNN(scene, width=4), MSE(), scene)
+    half = lambda load: 0.5 * solve(scene.solver, load).displacement  # noqa: E731
+    surrogate.predict = predict or half
+    return Simulator(surrogate, **more)
+
+
+@pytest.fixture(scope="module")
+def loads(scene):
+    """Four loads that need several iterations."""
+    return scene.loads.sample((0, 9), range(4))
+
+
+@pytest.fixture(scope="module")
+def forces(scene, loads):
+    """The same, (B, N, D) [N]."""
+    return loads.force * scene.force_unit * E
+
+
+@pytest.fixture(scope="module")
+def truth(scene, loads):
+    """Their displacements, (B, N, D) [m]."""
+    return scene.length * solve(scene.solver, loads).displacement
+
+
+def test_a_tolerance_is_kept_and_the_answer_is_newtons(scene, forces, truth):
+    sim = simulator_of(scene)
+    for tol in (1e-3, 1e-6, 1e-8):
+        answer = sim(forces, tol=tol)
+        assert answer.converged.all()
+        assert (answer.residual < tol).all()
+        assert (answer.volume_ratio > 0).all()
+        problem = scene.problem
+        u = answer.displacement / scene.length
+        ours = problem.residual_ratio(u, forces / (E * scene.force_unit))
+        assert torch.allclose(ours, answer.residual, rtol=1e-6, atol=1e-14)
+    assert torch.allclose(answer.displacement, truth, rtol=0, atol=1e-6 * scene.length)
+
+
+def test_without_a_tolerance_the_network_answers_and_says_how_wrong_it_is(scene, forces, truth):
+    answer = simulator_of(scene)(forces)
+    assert answer.tier == ["network"] * 4
+    assert torch.allclose(answer.displacement, 0.5 * truth)
+    assert not answer.converged.any()
+    assert not answer.iterations.any()
+    assert all("out of balance by" in words for words in answer.verdict)
+
+
+def test_an_exact_prediction_needs_no_iteration(scene, forces):
+    sim = simulator_of(scene, lambda load: solve(scene.solver, load).displacement)
+    answer = sim(forces, tol=1e-6)
+    assert answer.tier == ["network"] * 4
+    assert answer.converged.all()
+    assert not answer.iterations.any()
+
+
+BAD = {
+    "nan": lambda u: torch.full_like(u, torch.nan),
+    "inverted": lambda u: u - 3.0,
+    "huge": lambda u: 1e6 * u,
+    "minus": lambda u: -u,
+    "zero": lambda u: 0 * u,
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_whatever_the_network_says_a_tolerance_is_kept(scene, forces, truth, name):
+    def predict(load):
+        u = BAD[name](solve(scene.solver, load).displacement)
+        return torch.where(scene.problem.free, u, 0.0) if name != "nan" else u
+
+    answer = simulator_of(scene, predict)(forces, tol=1e-8)
+    assert answer.converged.all()
+    assert torch.allclose(answer.displacement, truth, rtol=0, atol=1e-6 * scene.length)
+
+
+def test_a_useless_network_alone_is_said_to_be_not_valid(scene, forces):
+    answer = simulator_of(scene, lambda load: torch.full_like(load.force, torch.nan))(forces)
+    assert all(words.startswith("NOT VALID") for words in answer.verdict)
+    assert not answer.converged.any()
+
+
+def test_numpy_in_numpy_out_and_one_load_gives_one_answer(scene, forces):
+    sim = simulator_of(scene)
+    several, single = sim(forces.numpy(), tol=1e-6), sim(forces[1].numpy(), tol=1e-6)
+    assert isinstance(several.displacement, np.ndarray)
+    assert several.displacement.shape == forces.shape
+    assert isinstance(several.residual, np.ndarray)
+    assert isinstance(single.displacement, np.ndarray)
+    assert single.displacement.shape == forces.shape[1:]
+    assert isinstance(single.residual, float)
+    assert isinstance(single.converged, bool)
+    assert isinstance(single.verdict, str)
+    assert isinstance(single.tier, str)
+    assert np.array_equal(single.displacement, several.displacement[1])
+    tensors = sim(forces, tol=1e-6)
+    assert isinstance(tensors.displacement, torch.Tensor)
+    assert np.array_equal(tensors.displacement.numpy(), several.displacement)
+    tensors.displacement.mul_(2.0)  # not a tensor of inference mode
+
+
+def test_answers_scale_with_youngs_modulus(scene, forces):
+    sim = simulator_of(scene)
+    soft, stiff = sim(forces, tol=1e-8), sim(1e6 * forces, young=1e6 * E, tol=1e-8)
+    assert torch.allclose(soft.displacement, stiff.displacement, rtol=1e-9)
+    mixed = sim(forces, young=[E, 2 * E, E, E], tol=1e-8)
+    assert mixed.displacement[1].norm() < soft.displacement[1].norm()
+    assert torch.equal(mixed.displacement[0], soft.displacement[0])
+
+
+def test_a_body_without_load_is_at_rest(scene, forces):
+    answer = simulator_of(scene, lambda load: 0.1 * torch.ones_like(load.force))(
+        0 * forces[0], tol=1e-6
+    )
+    assert (answer.tier, answer.converged) == ("rest", True)
+    assert not answer.displacement.any()
+    assert "at rest" in answer.verdict
+
+
+def test_small_loads_are_answered_linearly(scene, forces):
+    sim = simulator_of(scene)
+    answer = sim(1e-7 * forces[0], tol=1e-3)
+    assert answer.tier == "linear"
+    assert answer.converged
+
+
+def test_a_correction_is_taken_where_it_is_better(scene, forces, truth):
+    exact = dict(zip(map(float, forces.flatten(1).norm(dim=1)), truth, strict=True))
+
+    def correct(force, displacement):
+        size = float((force * E * scene.force_unit).norm())
+        return exact[min(exact, key=lambda key: abs(key - size))] / scene.length
+
+    good = simulator_of(scene, correct=correct)(forces, tol=1e-6)
+    assert good.tier == ["corrected"] * 4
+    worse = simulator_of(scene, correct=lambda force, u: -u)(forces, tol=1e-6)
+    assert worse.converged.all()
+    assert "corrected" not in worse.tier
+
+
+def test_a_budget_ends_it_and_the_best_so_far_is_returned(scene, forces, monkeypatch):
+    sim = simulator_of(scene)
+    whole = sim(forces[0], tol=1e-10)
+    short = sim(forces[0], tol=1e-10, budget_ms=1e-6)
+    assert short.tier == "network"
+    assert not short.converged
+    assert short.milliseconds < whole.milliseconds
+    plenty = sim(forces[0], tol=1e-8, budget_ms=1e6)
+    assert plenty.converged
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0])
+def test_loads_of_the_family_lie_inside(scene, factor):
+    drawn = scene.loads.sample((0, 10), range(20), amplitude=factor)
+    answer = simulator_of(scene)(drawn.force * scene.force_unit * E)
+    assert (answer.strange < 1e-9).all()
+    assert not answer.outside.any()
+
+
+def test_how_far_a_load_lies_outside_is_said(scene):
+    sim = simulator_of(scene)
+    largest = scene.loads.modes.vectors @ (2.5 * scene.loads.q_max)
+    reach = torch.where(scene.loads.reach, largest, 0.0) * scene.force_unit * E
+    answer = sim(reach)
+    assert answer.outside
+    assert answer.amplitude == pytest.approx(2.5)
+    assert "2.5 times the training's largest" in answer.verdict
+    inner = torch.zeros(scene.problem.shape, dtype=torch.float64)
+    inner[~scene.problem.boundary] = 1.0
+    strange = sim(inner)
+    assert strange.outside
+    assert strange.strange == pytest.approx(1.0)
+    assert "unlike the training's" in strange.verdict
+
+
+def test_stability_is_examined_where_it_is_asked_for(scene, forces):
+    sim = simulator_of(scene)
+    plain, examined = sim(forces[0], tol=1e-8), sim(forces[0], tol=1e-8, stability=True)
+    assert examined.negative_pivots == 0
+    assert examined.verdict.endswith(", stable")
+    if plain.negative_pivots < 0:
+        assert "not examined" in plain.verdict
+
+
+def test_an_unstable_answer_is_said_to_be_unstable(make_scene):
+    """A straight column beyond its critical load, which a network holds straight."""
+    scene = make_scene(size=(10.0, 1.0, 1.0), nodes=(11, 3, 3))
+    force = torch.zeros(1, *scene.problem.shape, dtype=torch.float64)
+    end = scene.problem.points[:, 0] == 1.0
+    force[:, end, 0] = -2 * math.pi**2 / 4 * (0.1**4 / 12) / int(end.sum())
+    sim = simulator_of(scene, lambda load: scene.linear.respond(load.force[0])[None])
+    answer = sim(force[0] * E * scene.force_unit, tol=1e-8, stability=True)
+    assert answer.converged
+    assert answer.negative_pivots > 0
+    assert "UNSTABLE" in answer.verdict
+
+
+def test_a_load_without_an_answer_is_said_to_have_none(scene, forces):
+    answer = simulator_of(scene)(1e6 * forces[0], tol=1e-8)
+    assert not answer.converged
+    assert "estimate" in answer.verdict or "NOT VALID" in answer.verdict
+    assert "times the training's largest" in answer.verdict
+
+
+def test_the_last_answer_starts_the_next_where_it_is_nearer(scene, forces, truth):
+    sim = simulator_of(scene, lambda load: 0.2 * scene.linear.respond(load.force[0])[None])
+    first = sim(forces[0], tol=1e-8)
+    again = sim(1.001 * forces[0], tol=1e-8, warm=True)
+    cold = sim(1.001 * forces[0], tol=1e-8)
+    assert again.iterations < cold.iterations
+    assert again.tier == "hybrid"
+    assert torch.allclose(again.displacement, cold.displacement, atol=1e-6 * scene.length)
+    assert not torch.equal(again.displacement, first.displacement)
+
+
+def test_the_nearest_guess_is_the_one_with_the_smallest_correction(scene, loads):
+    load = loads.singles()[0]
+    exact = solve(scene.solver, load).displacement
+    noise = torch.randn(exact.shape, generator=torch.Generator().manual_seed(0)).double()
+    rough = exact + 1e-5 * torch.where(scene.problem.free, noise, 0.0)
+    guesses = [0.9 * exact, rough, torch.full_like(exact, torch.nan), -exact]
+    assert nearest(scene.corrector, load, guesses) is rough
+    residuals = [float(scene.problem.residual_ratio(u, load.force)) for u in (rough, 0.9 * exact)]
+    assert min(residuals) > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"force": np.zeros((3, 3))}, "force: its shape is"),
+        ({"force": np.zeros(7)}, "force: its shape is"),
+        ({"force": None}, "force"),
+        ({"tol": 0.0}, "tol = 0.0"),
+        ({"tol": math.nan}, "tol = nan"),
+        ({"budget_ms": -1.0}, "budget_ms = -1.0"),
+        ({"young": 0.0}, "young: a modulus"),
+        ({"young": [1.0, 2.0]}, "young: 2 numbers for 1 loads"),
+        ({"young": math.inf}, "young: a number is not finite"),
+        ({"poisson": 0.3}, "poisson: the law has its own"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_asked_is_refused_in_words(scene, forces, arguments, words):
+    asked = {"force": forces[0].numpy()} | arguments
+    if asked["force"] is None:
+        asked["force"] = forces[0].numpy() * np.nan
+    with pytest.raises(ValueError, match=words):
+        simulator_of(scene)(**asked)
+
+
+def test_a_range_of_moduli_wants_to_know_which(make_scene):
+    scene = make_scene(young=[1e9, 2e9])
+    force = torch.zeros(scene.problem.shape, dtype=torch.float64)
+    with pytest.raises(ValueError, match="young: the scene has a range"):
+        simulator_of(scene)(force)
+    assert simulator_of(scene)(force, young=1e12).tier == "rest"
+
+
+def test_a_trained_run_becomes_a_simulator(script, tiny_training, tmp_path):
+    ended = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/a", cwd=tmp_path)
+    assert ended.status == 0, ended.err[-2000:]
+    sim = dpl.load(tmp_path / "runs" / "a")
+    force = sim.scene.loads.sample((0, 9), [0]).force[0] * sim.scene.force_unit * E
+    answer = sim(force, tol=1e-6)
+    assert answer.converged
+    assert answer.tier in ("hybrid", "full Newton")
+    config = tmp_path / "runs" / "a" / "config.yaml"
+    config.write_text(config.read_text().replace("poisson: 0.3", "poisson: 0.35"))
+    with pytest.raises(run.ConfigError, match=r"law\.poisson: 0\.3 there, 0\.35 here"):
+        dpl.load(tmp_path / "runs" / "a")
+    config.write_text(config.read_text().replace("- 5\n  - 3\n  - 3", "- 6\n  - 3\n  - 3"))
+    with pytest.raises(run.ConfigError):
+        dpl.load(tmp_path / "runs" / "a")
+
+
+def test_the_corrector_is_the_solver_with_the_same_stiffness(scene):
+    assert scene.corrector.rest is scene.solver.rest
+    assert scene.corrector.tol == scene.solver.tol
+    load = scene.loads.sample((0, 9), [3])
+    ours, theirs = (
+        solve(Hybrid(lambda load: 0 * load.force, newton), load)
+        for newton in (scene.corrector, scene.solver)
+    )
+    assert torch.allclose(ours.displacement, theirs.displacement, atol=1e-8)
+    assert ours.status.tolist() == theirs.status.tolist() == [int(Status.CONVERGED)]
