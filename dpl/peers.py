@@ -173,7 +173,8 @@ def measured_peer(python: str, program: Path, repeats: int) -> dict[str, Time]:
         raise OSError(f"{program.name} with {python}: {done.stderr.strip().splitlines()[-1]}")
     rows = json.loads(done.stdout.strip().splitlines()[-1])
     return {
-        name: Time(program.stem, row["seconds"], row["iterations"]) for name, row in rows.items()
+        name: Time(program.stem, row["seconds"], row["iterations"], row.get("note", ""))
+        for name, row in rows.items()
     }
 
 

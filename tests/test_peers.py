@@ -40,13 +40,16 @@ def test_peer_is_another_program_that_reads_cases_and_writes_times(tmp_path):
         import json, sys
         cases = json.load(sys.stdin)
         print("noise")
-        print(json.dumps({n: {"seconds": c["force"], "iterations": 7} for n, c in cases.items()}))
+        rows = {n: {"seconds": c["force"], "iterations": 7} for n, c in cases.items()}
+        rows["S2"]["note"] = "which one"
+        print(json.dumps(rows))
         """)
     )
     times = peers.measured_peer(sys.executable, program, 1)
     assert set(times) == set(peers.CASES)
     assert times["S1"].seconds == 20100.0
     assert times["S1"].iterations == 7
+    assert [times["S1"].note, times["S2"].note] == ["", "which one"]
 
 
 def test_peer_that_fails_says_why(tmp_path):
