@@ -6,12 +6,13 @@ degrees of freedom; and thousands of random loads.
 """
 
 import json
+import math
 import os
 import resource
 import statistics
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -66,8 +67,12 @@ class Case:
 
     def error(self, problem: Problem, solution: Solution) -> float:
         """Return how far the tip is from where the codes agree it is, over L [-]."""
-        tip = solution.displacement[0, self.end(problem)].mean(dim=0)[[0, 2]]
-        return float((tip - torch.tensor(self.tip, dtype=torch.float64) / problem.length).norm())
+        tip = solution.displacement[0, self.end(problem)].mean(dim=0) * problem.length
+        return self.miss(tip.tolist())
+
+    def miss(self, tip: Sequence[float]) -> float:
+        """Return how far a tip, x, y and z [m], is from where the codes agree it is, over L [-]."""
+        return math.dist((tip[0], tip[2]), self.tip) / self.size[0]
 
 
 LONG, SHORT = (100.0, 25.0, 25.0), (1.0, 0.25, 0.25)
@@ -145,7 +150,7 @@ def measured_peer(python: str, program: Path, repeats: int) -> dict[str, Time]:
     """Return the time of each case in another code, run by the Python that has it.
 
     Raises:
-        OSError: There is no such Python, or the program failed.
+        OSError: There is no such Python, the program failed, or its answer is wrong.
     """
     cases = {
         name: {
@@ -170,11 +175,16 @@ def measured_peer(python: str, program: Path, repeats: int) -> dict[str, Time]:
         check=False,
     )
     if done.returncode:
-        raise OSError(f"{program.name} with {python}: {done.stderr.strip().splitlines()[-1]}")
-    rows = json.loads(done.stdout.strip().splitlines()[-1])
-    return {
-        name: Time(program.stem, row["seconds"], row["iterations"]) for name, row in rows.items()
-    }
+        reason = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+        raise OSError(f"{program.name} with {python}: {reason[-1]}")
+    rows = {}
+    for name, row in json.loads(done.stdout.strip().splitlines()[-1]).items():
+        error = CASES[name].miss(row["tip"])
+        if not error <= 1e-8:
+            raise OSError(f"{program.name} with {python}: {name}: tip {error:.1e} L off")
+        note = f"tip to {error:.0e} L" + (f", {row['note']}" if "note" in row else "")
+        rows[name] = Time(program.stem, row["seconds"], row["iterations"], note)
+    return rows
 
 
 def pieces(repeats: int) -> list[Time]:

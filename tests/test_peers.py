@@ -33,26 +33,52 @@ def test_median_leaves_the_first_call_out():
     assert len(calls) == 4
 
 
-def test_peer_is_another_program_that_reads_cases_and_writes_times(tmp_path):
-    program = tmp_path / "other_beam.py"
-    program.write_text(
-        textwrap.dedent("""
-        import json, sys
-        cases = json.load(sys.stdin)
-        print("noise")
-        print(json.dumps({n: {"seconds": c["force"], "iterations": 7} for n, c in cases.items()}))
-        """)
-    )
-    times = peers.measured_peer(sys.executable, program, 1)
+@pytest.fixture
+def peer(tmp_path):
+    """A program that answers with tips, off by so much."""
+
+    def peer(off=0.0):
+        tips = {name: [case.tip[0], 0.0, case.tip[1] + off] for name, case in peers.CASES.items()}
+        program = tmp_path / "other_beam.py"
+        program.write_text(
+            textwrap.dedent(f"""
+            import json, sys
+            nan = float("nan")
+            tips = {tips}
+            cases = json.load(sys.stdin)
+            print("noise")
+            row = {{"iterations": 7, "note": "a note"}}
+            rows = {{n: row | {{"seconds": c["force"], "tip": tips[n]}} for n, c in cases.items()}}
+            print(json.dumps(rows))
+            """)
+        )
+        return program
+
+    return peer
+
+
+def test_peer_is_another_program_that_reads_cases_and_writes_times(peer):
+    times = peers.measured_peer(sys.executable, peer(), 1)
     assert set(times) == set(peers.CASES)
     assert times["S1"].seconds == 20100.0
     assert times["S1"].iterations == 7
+    assert times["S1"].note == "tip to 0e+00 L, a note"
 
 
-def test_peer_that_fails_says_why(tmp_path):
+@pytest.mark.parametrize("off", [1e-5, math.nan])
+def test_peer_with_another_answer_is_not_timed(peer, off):
+    with pytest.raises(OSError, match="S1: tip"):
+        peers.measured_peer(sys.executable, peer(off), 1)
+
+
+@pytest.mark.parametrize(
+    ("end", "reason"),
+    [("raise SystemExit('no such library')", "no such library"), ("sys.exit(3)", "exit status 3")],
+)
+def test_peer_that_fails_says_why(tmp_path, end, reason):
     program = tmp_path / "broken_beam.py"
-    program.write_text("raise SystemExit('no such library')\n")
-    with pytest.raises(OSError, match="no such library"):
+    program.write_text(f"import sys\n{end}\n")
+    with pytest.raises(OSError, match=reason):
         peers.measured_peer(sys.executable, program, 1)
 
 
