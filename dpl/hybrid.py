@@ -2,17 +2,35 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, in_step, judge
 
 Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]
 RULES = ("best", "paper")
 SECOND = 0.1  # part of the displacement that the second correction may be in any case
+
+
+class Corrector(Protocol):
+    """A Newton method that can start from a guess."""
+
+    @property
+    def problem(self) -> Problem:
+        """The body."""
+        ...
+
+    @property
+    def tol(self) -> float:
+        """Residual ratio below which an answer counts as converged [-]."""
+        ...
+
+    def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
+        """Yield the start and the state after each iteration."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +80,7 @@ class Hybrid:
     """
 
     predict: Predict
-    newton: Newton
+    newton: Corrector
     rule: str = "best"
 
     def __post_init__(self) -> None:

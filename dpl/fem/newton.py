@@ -413,11 +413,15 @@ class Newton:
             count.negative_pivots = self.negative_pivots(state.displacement)
         return count.negative_pivots
 
+    def factorise(self, tangent: NDArray[np.float64]) -> Factor:
+        """Return the factor of a tangent's entries (nnz,), see `Backend.factorise`."""
+        return self._backend.factorise(tangent)
+
     def negative_pivots(self, displacement: Tensor) -> int:
         """Return the negative eigenvalues of the tangent at (1, N, D); 1 where it is singular."""
         tangent = self.problem.linearise(displacement).tangent
         try:
-            return self._backend.factorise(tangent[0].numpy()).negative_pivots
+            return self.factorise(tangent[0].numpy()).negative_pivots
         except SingularMatrix:  # at the critical load itself
             return 1
 
