@@ -49,7 +49,7 @@ KEYS = {  # what a configuration may hold at its top
     *("action", "shard", "shards"),
     *("parts", "linear", "repeats", "count", "workers", "peers", "samples"),
     *("name", "galerkin", "corrected"),
-    *("networks", "tols", "far"),
+    *("networks", "tols", "far", "threads", "across"),
 }
 
 ASIDE = {  # where a run lies and how it is watched, not what it is

@@ -1,26 +1,37 @@
 """The mechanics against public codes: python scripts/benchmark.py.
 
 Long parts on demand: parts=[large] (run alone, it reports its memory), parts=[robustness],
-parts=[generation].
+parts=[generation]; run time against error: parts=[accuracy] run=runs/beam_svk, parts=[sizes].
 """
 
 import json
+from contextlib import nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hydra
+import torch
 from omegaconf import DictConfig
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
 from dpl import peers, run, throughput
 from dpl.fem.linear import installed
 from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
-from dpl.fem.solution import one_thread
+from dpl.fem.solution import Solver, one_thread
+from dpl.scene import Sample
+
+if TYPE_CHECKING:
+    from dpl import tradeoff
 
 CONSOLE = Console(width=150)
-PARTS = ("scenes", "pieces", "propeller", "large", "robustness", "generation")
+PARTS = (
+    *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
+    *("accuracy", "sizes"),
+)
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="benchmark")
@@ -35,7 +46,7 @@ def main(cfg: DictConfig) -> None:
     folder = Path(cfg.folder)
     folder.mkdir(parents=True, exist_ok=True)
     for part in cfg.parts:
-        with one_thread():
+        with one_thread() if part != "accuracy" else nullcontext():  # which sets its own
             results = globals()[part](cfg, backends)
         text = json.dumps({"machine": peers.machine(), part: results}, indent=1, default=asdict)
         (folder / f"{part}.json").write_text(text + "\n")
@@ -115,6 +126,105 @@ def generation(cfg: DictConfig, backends: list[str]) -> dict[str, list[throughpu
             table.add_row(row.way, f"{1e3 * row.seconds:.1f}", f"{row.rate:.2f}", *count, done)
         CONSOLE.print(table)
     return results
+
+
+def accuracy(cfg: DictConfig, backends: list[str]) -> "list[tradeoff.Point]":
+    """Return how wrong every solver is and when, with the networks of a folder of runs."""
+    from dpl import tradeoff
+
+    folders = sorted(path.parent for path in Path(cfg.run or "").glob("*/config.yaml"))
+    if cfg.run is None or not folders:
+        raise run.ConfigError(f"run: {cfg.run} holds no runs; name a folder of them")
+    title = Path(cfg.run).name
+    solvers, batch = _solvers(cfg, folders)
+    rows = []
+    for threads in cfg.threads:
+        count = threads or tradeoff.all_threads()
+        with Progress() as progress:
+            bar = progress.add_task(f"solvers, {count} threads", total=len(solvers))
+            tick = partial(progress.advance, bar)
+            rows += tradeoff.points(solvers, batch, threads=count, tick=tick)
+    meshes = tradeoff.discretisations(repeats=cfg.repeats)
+    own = next(mesh for mesh in meshes if mesh.cells == (39, 9, 9))
+    table = Table(title, "iterate", "threads", "ms", "p99", "error", "worst", "||R||/||f||")
+    for row in rows:
+        if row.iterate:
+            table.add_row("", *_numbers(row))
+        else:
+            table.add_row(row.solver, *_numbers(row))
+    CONSOLE.print(table)
+    table = Table("Newton to 1e-6 on", "DOFs", "ms", "tip [m]", "error against the limit")
+    for mesh in meshes:
+        name = f"{'x'.join(map(str, mesh.cells))}, degree {mesh.degree}"
+        table.add_row(
+            name, f"{mesh.dofs:,}", f"{mesh.ms:.1f}", f"{mesh.tip:.4f}", f"{mesh.error:.1e}"
+        )
+    CONSOLE.print(table)
+    stem = Path(cfg.folder) / f"accuracy_{title}"
+    tradeoff.write(rows, stem.with_suffix(".csv"))
+    tradeoff.write(meshes, Path(cfg.folder) / "accuracy_meshes.csv")
+    first = [row for row in rows if row.threads == rows[0].threads]
+    tradeoff.draw_points(first, meshes, own.error, stem.with_suffix(".png"))
+    return rows
+
+
+def _numbers(row: "tradeoff.Point") -> list[str]:
+    times = f"{row.ms:.2f}", f"{row.ms_p99:.2f}"
+    errors = f"{row.error:.1e}", f"{row.worst:.1e}", f"{row.residual:.1e}"
+    return [str(row.iterate), str(row.threads), *times, *errors]
+
+
+def _solvers(cfg: DictConfig, folders: list[Path]) -> tuple[dict[str, Solver], Sample]:
+    """Return every solver there is with the networks of some runs, and the test loads."""
+    from dpl import results, tradeoff
+    from dpl.hybrid import Direct, Hybrid
+    from dpl.models.pod import PODNet
+
+    first, surrogate = run.load_run(folders[0])
+    scene = surrogate.scene
+    data = run.make(first, "data", scene=scene)
+    data.prepare_data()
+    train = data.samples("train")
+    robust, quick = scene.solver, scene.corrector
+    solvers: dict[str, Solver] = {"linear": scene.linear}
+    solvers |= {f"Newton to {tol:g}": robust.but(tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
+    if cfg.galerkin:
+        model = run.make(cfg, "galerkin")(scene, train)
+        solvers["POD-Galerkin"] = Direct(model.predict, scene.problem)
+    for folder in folders:
+        trained, surrogate = run.load_run(folder, scene=scene)
+        name, predict = folder.name, surrogate.predict
+        solvers[name] = Direct(predict, scene.problem)
+        if cfg.corrected and isinstance(surrogate.net, PODNet):
+            row = results.network(surrogate, folder, trained.data.train)
+            tier = run.make(cfg, "corrected")(surrogate, row, train)
+            solvers[f"{name}, corrected"] = Direct(tier.predict, scene.problem)
+        solvers[f"{name}, hybrid"] = Hybrid(predict, quick)
+        if torch.cuda.is_available():
+            copy = run.load_run(folder, scene=scene)[1]
+            solvers[f"{name}, GPU"] = Direct(tradeoff.on_gpu(copy), scene.problem)
+    return solvers, data.samples("test")
+
+
+def sizes(cfg: DictConfig, backends: list[str]) -> "list[tradeoff.Size]":
+    """Return what solvers and networks cost on beams of growing size."""
+    from dpl import tradeoff
+
+    rows = []
+    table = Table("beam", "DOFs", "ms", "parameters", "memory [MB]", "peak [MB]")
+    with Progress() as progress:
+        bar = progress.add_task("beams", total=len(cfg.across))
+        for part in tradeoff.sizes(cfg.across, loads=cfg.repeats):
+            rows += part
+            progress.advance(bar)
+    for row in rows:
+        kept = "" if row.memory is None else f"{row.memory:.1f}"
+        count = "" if row.parameters is None else f"{row.parameters:,}"
+        table.add_row(row.what, f"{row.dofs:,}", f"{row.ms:.2f}", count, kept, f"{row.peak:.0f}")
+    CONSOLE.print(table)
+    tradeoff.write(rows, Path(cfg.folder) / "sizes.csv")
+    tradeoff.draw_sizes(rows, Path(cfg.folder) / "sizes.png")
+    return rows
 
 
 def _listed(rows: list[peers.Time], title: str) -> list[peers.Time]:
