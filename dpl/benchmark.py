@@ -164,10 +164,11 @@ def save(rows: Sequence[Row], path: Path) -> None:
 
 
 def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1e-8) -> list[Row]:
-    """Judge a surrogate: a table of four solvers, printed and saved, with a figure and one case.
+    """Judge a surrogate: a table of five solvers, printed and saved, with a figure and one case.
 
-    Linear answer, network, hybrid Newton from the network and Newton from zero, each asked one
-    load at a time on one thread. Writes `evaluation.json`, `shapes.png` and `worst.vtu`.
+    Linear answer, network, hybrid Newton from the network by the paper's rule and by the best, and
+    Newton from zero, each asked one load at a time on one thread. Writes `evaluation.json`,
+    `shapes.png` and `worst.vtu`.
 
     Args:
         surrogate: On the CPU.
@@ -180,9 +181,10 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
     # with Poisson's ratios of their own, loads have their own K(0): each solver makes it for itself
     shared = scene.loads.poisson_range is None
     solvers: dict[str, Solver] = {
-        "linear": newton.rest if shared else replace(newton.rest),
+        "linear": replace(newton.rest, tol=tol),
         "network": Direct(surrogate.predict, scene.problem, tol),
-        "hybrid Newton": Hybrid(surrogate.predict, corrector if shared else replace(corrector)),
+        "hybrid Newton": Hybrid(surrogate.predict, newton if shared else replace(newton), "paper"),
+        "hybrid, best rule": Hybrid(surrogate.predict, corrector if shared else replace(corrector)),
         "Newton from zero": newton,
     }
     with one_thread():
