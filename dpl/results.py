@@ -260,13 +260,9 @@ def corrected(
     Raises:
         ValueError: A number is out of range.
     """
-    net, problem = cast(PODNet, surrogate.net), surrogate.scene.problem
+    net = cast(PODNet, surrogate.net)
     start = time.perf_counter()
-    basis = torch.linalg.qr(net.basis[:rank].double().T)[0]
-    vectors = torch.zeros(*problem.shape, basis.shape[1], dtype=torch.float64)
-    vectors[problem.free] = basis
-    states = train.displacement[:STATES]
-    solver = PODGalerkin.within(problem, vectors, states, tolerance=tolerance, reduced_tol=1e-3)
+    solver = net.galerkin(train.displacement[:STATES], rank=rank, tolerance=tolerance)
     minutes = (method.training_minutes or 0.0) + (time.perf_counter() - start) / 60
     tier = copy.copy(surrogate)
     tier._modules = {**surrogate._modules, "net": copy.copy(net)}

@@ -32,6 +32,7 @@ from dpl.fem.linear import slow_blas
 from dpl.scene import Scene
 
 if typing.TYPE_CHECKING:
+    from dpl.data.datamodule import OfflineData
     from dpl.fem.problem import Problem
     from dpl.module import Surrogate
 
@@ -472,3 +473,18 @@ def load_run(
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError(f"{best} cannot be used: {reason}") from error
     return cfg, surrogate.eval()
+
+
+def load_data(cfg: DictConfig, scene: Scene) -> "OfflineData":
+    """Return the data set of a training run, made where it is missing.
+
+    Args:
+        cfg: The run's configuration.
+        scene: Its scene.
+
+    Raises:
+        ConfigError: It cannot be made.
+    """
+    data = make(cfg, "data", scene=scene)
+    data.prepare_data()
+    return data

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -14,12 +14,14 @@ from torch import Tensor
 from dpl.fem.newton import Newton, gather
 from dpl.fem.solution import Load, Solution, Status, judge, one_thread
 from dpl.hybrid import Hybrid
+from dpl.models.pod import PODNet
 from dpl.module import Surrogate
 from dpl.scene import Scene
 
 Correct = Callable[[Tensor, Tensor], Tensor]  # force (N, D), displacement (N, D) -> displacement
 SMALL = 0.05  # amplitude below which the linear answer is worth a look
 STRANGE = 1e-3  # part of a force, not made of the training's modes, that counts as none
+STATES = 256  # samples at which cells are chosen for corrections
 SLACK = 1e-9  # rounding in amplitudes
 
 
@@ -79,6 +81,27 @@ class Simulator:
         self.surrogate, self.correct = surrogate.eval(), correct
         self._before: tuple[Tensor, Tensor] | None = None  # Poisson's ratios, displacement
         self._pace = 0.0  # time of an iteration [s]
+
+    @classmethod
+    def corrected(
+        cls, surrogate: Surrogate, states: Tensor, *, rank: int = 60, tolerance: float = 1e-2
+    ) -> Self:
+        """Return the simulator that corrects predictions by equilibrium in the network's modes.
+
+        Args:
+            surrogate: On the CPU, with a network between coordinates.
+            states: Displacements of training samples, (S, N, D) [-].
+            rank: Modes in which to correct.
+            tolerance: Of the choice of cells, see `dpl.fem.cubature.cubature`.
+
+        Raises:
+            ValueError: The network has no modes, or a number is out of range.
+        """
+        net = surrogate.net
+        if not isinstance(net, PODNet):
+            raise ValueError(f"corrected: {type(net).__name__} has no modes to correct in")
+        solver = net.galerkin(states[:STATES], rank=rank, tolerance=tolerance)
+        return cls(surrogate, correct=solver.correct)
 
     @property
     def scene(self) -> Scene:

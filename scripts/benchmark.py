@@ -182,8 +182,7 @@ def _solvers(cfg: DictConfig, folders: list[Path]) -> tuple[dict[str, Solver], S
 
     first, surrogate = run.load_run(folders[0])
     scene = surrogate.scene
-    data = run.make(first, "data", scene=scene)
-    data.prepare_data()
+    data = run.load_data(first, scene)
     train = data.samples("train")
     robust, quick = scene.solver, scene.corrector
     solvers: dict[str, Solver] = {"linear": scene.linear}

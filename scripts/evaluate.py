@@ -15,9 +15,8 @@ def main(cfg: DictConfig) -> None:
     """Repeat the evaluation at the end of a training run."""
     run.check(cfg)
     trained, surrogate = run.load_run(cfg.run)
-    data = run.make(trained, "data", scene=surrogate.scene)
-    data.prepare_data()
-    evaluate(surrogate, data.samples("test"), Path(cfg.run), tol=cfg.tol)
+    test = run.load_data(trained, surrogate.scene).samples("test")
+    evaluate(surrogate, test, Path(cfg.run), tol=cfg.tol)
 
 
 if __name__ == "__main__":

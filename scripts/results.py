@@ -32,8 +32,7 @@ def main(cfg: DictConfig) -> None:
         trained, surrogate = run.load_run(folder, scene=scene)
         if scene is None:
             scene = surrogate.scene
-            data = run.make(trained, "data", scene=scene)
-            data.prepare_data()
+            data = run.load_data(trained, scene)
             train = data.samples("train")
             methods["linear"] = results.linear(scene)
             if cfg.galerkin:

@@ -20,13 +20,13 @@ from rich.progress import (
     track,
 )
 
-import dpl
 from dpl.data import balance
 from dpl.data.crew import Stop
 from dpl.data.durable import append_line
 from dpl.data.outcome import Job
 from dpl.data.store import Store
 from dpl.scene import Scene
+from dpl.version import __version__
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ class _Session:
                 "machine": socket.gethostname(),
                 "process": os.getpid(),
                 "python": platform.python_version(),
-                "dpl": dpl.__version__,
+                "dpl": __version__,
                 "workers": self.workers,
                 "loads": self.loads,
                 "seconds": round(time.perf_counter() - self.begin, 3),

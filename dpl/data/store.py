@@ -27,7 +27,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-import dpl
 from dpl.data import balance
 from dpl.data.audit import flaw_of_modes, flaw_of_shard
 from dpl.data.crew import Stop, outcomes
@@ -44,6 +43,7 @@ from dpl.data.shard import closed, opened, taken
 from dpl.data.spool import Spool, sweep
 from dpl.fem.modes import Modes
 from dpl.scene import Sample, Scene
+from dpl.version import __version__
 
 FORMAT = 2
 MODES = "modes.safetensors"
@@ -285,7 +285,7 @@ class Store:
             "scene": self.scene.identity(),
             "seed": self.seed,
             "versions": {
-                "dpl": dpl.__version__,
+                "dpl": __version__,
                 "torch": torch.__version__,
                 "numpy": np.__version__,
             },

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from dpl.fem.pod import LARGE, pod
+from dpl.fem.rom import PODGalerkin
 from dpl.fem.symmetry import images, symmetries
 from dpl.models.coordinates import Coordinates, CoordinateSamples
 from dpl.models.moduli import placed
@@ -232,6 +233,22 @@ class PODNet(nn.Module):
         like = self.modes.new_zeros(len(self.modes), *self.moving.shape)
         fields = self.field(torch.eye(len(self.modes)).to(self.modes), like)
         return fields[:, self.moving]
+
+    def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> PODGalerkin:
+        """Return equilibrium in the first modes, which corrects what the network predicts.
+
+        Args:
+            states: Displacements in equilibrium at which cells are chosen, (S, N, D) [-].
+            rank: Modes.
+            tolerance: Of the choice of cells, see `dpl.fem.cubature.cubature`.
+
+        Raises:
+            ValueError: A number is out of range.
+        """
+        problem = self.scene.problem
+        vectors = torch.zeros(*problem.shape, min(rank, len(self.modes)), dtype=torch.float64)
+        vectors[problem.free] = torch.linalg.qr(self.basis[:rank].double().cpu().T)[0]
+        return PODGalerkin.within(problem, vectors, states, tolerance=tolerance, reduced_tol=1e-3)
 
     @staticmethod
     def _fields(columns: Tensor, where: Tensor) -> Tensor:
