@@ -16,7 +16,7 @@ from dpl.fem.mesh import save as write_mesh
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Solution, Solver, one_thread, solve
 from dpl.figures import deformed
-from dpl.hybrid import Direct, Hybrid
+from dpl.hybrid import Direct, Hybrid, best
 from dpl.metrics import RelativeL2, metrics
 from dpl.module import Surrogate
 from dpl.scene import Sample
@@ -177,14 +177,14 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
         tol: Residual ratio of Newton and the hybrid [-].
     """
     scene = surrogate.scene
-    newton, corrector = scene.solver.but(tol=tol), scene.corrector.but(tol=tol)
+    newton = scene.solver.but(tol=tol)
     # with Poisson's ratios of their own, loads have their own K(0): each solver makes it for itself
     shared = scene.loads.poisson_range is None
     solvers: dict[str, Solver] = {
         "linear": replace(newton.rest, tol=tol),
         "network": Direct(surrogate.predict, scene.problem, tol),
         "hybrid Newton": Hybrid(surrogate.predict, newton if shared else replace(newton), "paper"),
-        "hybrid, best rule": Hybrid(surrogate.predict, corrector if shared else replace(corrector)),
+        "hybrid, best rule": best(surrogate.predict, scene if shared else replace(scene), tol),
         "Newton from zero": newton,
     }
     with one_thread():

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from dpl.fem.accelerated import Accelerated
 from dpl.fem.linear import SingularMatrix
 from dpl.fem.newton import Newton, gather, scatter
 from dpl.fem.problem import Problem
@@ -101,7 +102,8 @@ class Row:
         count: Loads.
         converged: Answered to the tolerance with nothing inverted [%].
         picked: Answers that go on from the prediction [%].
-        iterations: Mean linear solves with a tangent, of those that converged.
+        iterations: Mean linear solves, with a tangent or what stands for one, of those that
+            converged.
         worst: Most of them.
         factorisations: Mean, of those that converged.
         ms: Median wall time of those that converged, prediction included [ms].
@@ -160,6 +162,7 @@ def contestants(
         solvers["hybrid, paper's rule", name] = Hybrid(predict, plain, "paper")
         solvers["hybrid, best rule, factors", name] = Hybrid(predict, robust)
         solvers["hybrid, best rule", name] = Hybrid(predict, quick)
+        solvers["hybrid, without tangents", name] = Hybrid(predict, quick, steps=Accelerated(quick))
     return solvers
 
 
@@ -297,7 +300,7 @@ def draw(times: Mapping[tuple[float, str, str], Tensor], path: Path) -> None:
             label = f"{solver}, {network}" if network else solver
             ax.step(
                 taken[there], part[there], where="post", color=colour, ls=styles[solver],
-                label=label, lw=2 if solver == "hybrid, best rule" else 1.2,
+                label=label, lw=2 if solver == "hybrid, without tangents" else 1.2,
             )  # fmt: skip
         ax.set_xscale("log")
         ax.xaxis.set_minor_formatter(NullFormatter())

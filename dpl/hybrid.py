@@ -7,8 +7,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from dpl.fem.accelerated import Accelerated
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, in_step, judge
+from dpl.scene import Scene
 
 Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]
 RULES = ("best", "paper")
@@ -70,6 +72,8 @@ class Hybrid:
     and shows only then what soft ones lack. If not, Newton starts again from rest. Corrections,
     unlike residuals, do not depend on how stiff the body is against an error.
 
+    With `steps`, those are tried first from a prediction, and Newton goes on from the best of them.
+
     Source: Odot, Haferssas, Cotin (2022), DeepPhysics, algorithm 2; Deuflhard (2011), Newton
     Methods for Nonlinear Problems, section 3.2 (natural monotonicity).
 
@@ -77,11 +81,13 @@ class Hybrid:
         predict: From a load to displacements over L.
         newton: The corrector.
         rule: How a prediction is picked.
+        steps: Cheaper ones that a good prediction is improved by; None: Newton at once.
     """
 
     predict: Predict
     newton: Corrector
     rule: str = "best"
+    steps: Accelerated | None = None
 
     def __post_init__(self) -> None:
         """Check the rule.
@@ -126,6 +132,24 @@ class Hybrid:
 
     def _by_corrections(self, load: Load, guess: Tensor) -> Iterator[Solution]:
         """Yield the states under one load."""
+        if self.steps is None or not load.force.any():
+            yield from self._corrected(load, guess)
+            return
+        best = None
+        for state in self.steps.iterate(load, guess=guess):
+            if not state.volume_ratio > 0:
+                break
+            yield state
+            best = state if best is None or state.residual < best.residual else best
+        if state.converged:
+            return
+        states = self._corrected(load, guess if best is None else best.displacement)
+        if best is not None:
+            next(states)  # it has been yielded
+        yield from _after(state, states)
+
+    def _corrected(self, load: Load, guess: Tensor) -> Iterator[Solution]:
+        """Yield Newton's states from a guess while its corrections contract, else from rest."""
         states = self.newton.iterate(load, guess=guess)
         last = next(states)
         yield last
@@ -142,6 +166,20 @@ class Hybrid:
                 return
             yield state
             last, before = state, size
+
+
+def best(predict: Predict, scene: Scene, tol: float | None = None) -> Hybrid:
+    """Return the hybrid that suits a scene.
+
+    Where K(0)'s factor, turned, stands for those of tangents, steps without tangents come first.
+
+    Args:
+        predict: From a load to displacements over L.
+        scene: What is simulated.
+        tol: Residual ratio [-]; the scene's if left out.
+    """
+    newton = scene.corrector if tol is None else scene.corrector.but(tol=tol)
+    return Hybrid(predict, newton, steps=Accelerated(newton) if newton.turned else None)
 
 
 def pick(predicted: Solution, first: Solution) -> bool:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dpl.fem.newton import Newton, gather
 from dpl.fem.solution import Load, Solution, Status, judge, one_thread
-from dpl.hybrid import Hybrid
+from dpl.hybrid import best
 from dpl.models.pod import PODNet
 from dpl.module import Surrogate
 from dpl.scene import Scene
@@ -222,14 +222,14 @@ class Simulator:
         tol = scene.solver.tol if ask.tol is None else ask.tol
         if not load.force.any() and not scene.problem.moved_supports:
             return "rest", judge(scene.problem, torch.zeros_like(prediction), load, tol)
-        best: tuple[str, Solution] | None = None
+        found: tuple[str, Solution] | None = None
         for tier, last in self._tiers(load, prediction, amplitude, tol, ask):
-            if best is None or _rank(last) <= _rank(best[1]):
-                best = tier, last
+            if found is None or _rank(last) <= _rank(found[1]):
+                found = tier, last
             if last.converged or ask.over(self._pace):
                 break
-        assert best is not None
-        tier, state = best
+        assert found is not None
+        tier, state = found
         return tier, state._replace(status=last.status, load_factor=last.load_factor)
 
     def _tiers(
@@ -253,7 +253,7 @@ class Simulator:
             guesses.append(self._before[1])
         start = guess if len(guesses) == 1 else nearest(newton, load, guesses)
         clock = time.perf_counter()
-        for state in Hybrid(lambda load: start, newton).iterate(load):
+        for state in best(lambda load: start, self.scene, tol).iterate(load):
             if int(state.iterations):
                 now = time.perf_counter()
                 self._pace, clock = now - clock, now

@@ -177,14 +177,14 @@ def _numbers(row: "tradeoff.Point") -> list[str]:
 def _solvers(cfg: DictConfig, folders: list[Path]) -> tuple[dict[str, Solver], Sample]:
     """Return every solver there is with the networks of some runs, and the test loads."""
     from dpl import results, tradeoff
-    from dpl.hybrid import Direct, Hybrid
+    from dpl.hybrid import Direct, best
     from dpl.models.pod import PODNet
 
     first, surrogate = run.load_run(folders[0])
     scene = surrogate.scene
     data = run.load_data(first, scene)
     train = data.samples("train")
-    robust, quick = scene.solver, scene.corrector
+    robust = scene.solver
     solvers: dict[str, Solver] = {"linear": scene.linear}
     solvers |= {f"Newton to {tol:g}": robust.but(tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
     if cfg.galerkin:
@@ -198,7 +198,7 @@ def _solvers(cfg: DictConfig, folders: list[Path]) -> tuple[dict[str, Solver], S
             row = results.network(surrogate, folder, trained.data.train)
             tier = run.make(cfg, "corrected")(surrogate, row, train)
             solvers[f"{name}, corrected"] = Direct(tier.predict, scene.problem)
-        solvers[f"{name}, hybrid"] = Hybrid(predict, quick)
+        solvers[f"{name}, hybrid"] = best(predict, scene)
         if torch.cuda.is_available():
             copy = run.load_run(folder, scene=scene)[1]
             solvers[f"{name}, GPU"] = Direct(tradeoff.on_gpu(copy), scene.problem)

@@ -109,7 +109,7 @@ def test_the_script_measures_the_runs_of_a_folder(script, tiny_training, tmp_pat
     ended = script("convergence", *few, cwd=tmp_path)
     assert ended.status == 0, ended.err[-2000:]
     written = list(csv.DictReader((tmp_path / "results" / "hybrid_newton.csv").open()))
-    assert len(written) == 2 + (3 * 2 + 2) * 7
+    assert len(written) == 2 + (3 * 2 + 2) * 8
     assert (tmp_path / "results" / "hybrid_newton.png").is_file()
     refused = script("convergence", "run=runs/none", cwd=tmp_path)
     assert refused.status == 2

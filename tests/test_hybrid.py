@@ -6,11 +6,12 @@ The stubs and the pick rule are those of the verification dossier, T19, T20 and 
 import pytest
 import torch
 
+from dpl.fem.accelerated import Accelerated
 from dpl.fem.linear import SuperLU
 from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, Status, solve
-from dpl.hybrid import RULES, Direct, Hybrid, pick
+from dpl.hybrid import RULES, Direct, Hybrid, best, pick
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +61,7 @@ STUBS = [*USELESS, "huge", "zero", "exact", "half", "minus"]
 STUBS += [f"noise {e:g}" for e in (1e-2, 1e-3, 1e-4, 1e-5)]
 
 RULED = pytest.mark.parametrize("rule", RULES)
+EVERY = pytest.mark.parametrize("rule", [*RULES, "steps"])
 
 
 def hybrid(scene, loads, prediction, rule="best"):
@@ -69,6 +71,8 @@ def hybrid(scene, loads, prediction, rule="best"):
         same = (load.force[:, None] == loads.force[None]).flatten(2).all(dim=2)
         return prediction[same.double().argmax(dim=1)]
 
+    if rule == "steps":
+        return Hybrid(predict, scene.solver, steps=Accelerated(scene.solver))
     return Hybrid(predict, scene.solver, rule)
 
 
@@ -102,7 +106,7 @@ def counted(monkeypatch):
 
 
 @pytest.mark.parametrize("name", STUBS)
-@RULED
+@EVERY
 def test_whatever_is_predicted_the_answer_is_newtons(rule, scene, loads, truth, stubs, name):
     answer = solve(hybrid(scene, loads, stubs[name], rule), loads)
     assert answer.converged.all()
@@ -113,7 +117,7 @@ def test_whatever_is_predicted_the_answer_is_newtons(rule, scene, loads, truth, 
 
 
 @pytest.mark.parametrize("name", USELESS)
-@RULED
+@EVERY
 def test_a_useless_prediction_leaves_the_classic_path_bit_for_bit(rule, scene, loads, stubs, name):
     load = first_of(loads)
     _, *path = hybrid(scene, loads, stubs[name], rule).iterate(load)
@@ -126,7 +130,7 @@ def test_a_useless_prediction_leaves_the_classic_path_bit_for_bit(rule, scene, l
 
 
 @pytest.mark.parametrize("name", USELESS)
-@RULED
+@EVERY
 def test_a_useless_prediction_costs_no_iteration(rule, scene, loads, stubs, name):
     """The classic step is taken once, not thrown away and taken again."""
     load = first_of(loads)
@@ -134,7 +138,7 @@ def test_a_useless_prediction_costs_no_iteration(rule, scene, loads, stubs, name
     assert torch.equal(ours.iterations, classic.iterations)
 
 
-@RULED
+@EVERY
 def test_an_exact_prediction_costs_no_iteration_no_tangent_and_no_factor(
     rule, scene, loads, stubs, counted
 ):
@@ -227,6 +231,36 @@ def test_smaller_noise_costs_fewer_iterations(rule, scene, loads, stubs):
     assert counts[-1] < classic
 
 
+@pytest.mark.parametrize("size", [1e-3, 1e-4, 1e-5])
+def test_from_a_good_prediction_no_tangent_is_needed(scene, loads, stubs, size, counted):
+    scene.solver.rest.turning  # noqa: B018  # its factor is the scene's
+    before = dict(counted)
+    states = list(hybrid(scene, loads, stubs[f"noise {size:g}"], "steps").iterate(loads))
+    assert counted == before
+    assert states[-1].converged.all()
+    assert not states[-1].factorisations.any()
+    assert states[-1].from_guess.all()
+
+
+def test_steps_that_do_not_contract_leave_it_to_newton(scene, loads, stubs):
+    spent = 3
+    steps = Accelerated(scene.solver, max_iter=spent)
+    load = first_of(loads)
+    guess = stubs["noise 0.0001"][-1:]
+    answer = solve(Hybrid(lambda load: guess, scene.solver, steps=steps), load)
+    alone = solve(Hybrid(lambda load: guess, scene.solver), load)
+    assert answer.converged.all()
+    assert spent < int(answer.iterations) <= spent + int(alone.iterations)
+
+
+def test_the_hybrid_that_suits_a_scene_has_its_tolerance(scene, stubs):
+    for tol, wanted in ((None, scene.solver.tol), (1e-3, 1e-3)):
+        suited = best(lambda load: 0 * load.force, scene, tol)
+        assert suited.newton.tol == wanted
+        assert suited.newton.rest is scene.solver.rest
+        assert (suited.steps is not None) == scene.corrector.turned
+
+
 def test_the_discarded_classic_step_is_counted(scene, loads, stubs):
     load = first_of(loads)
     guess = stubs["noise 0.0001"][-1:]
@@ -237,7 +271,7 @@ def test_the_discarded_classic_step_is_counted(scene, loads, stubs):
     assert int(answer.iterations) == int(from_guess.iterations) + 1
 
 
-@RULED
+@EVERY
 def test_a_batch_is_its_members(rule, scene, loads, stubs):
     mixed = torch.stack(
         [

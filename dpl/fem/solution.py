@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from dpl.fem.problem import Problem
+from dpl.fem.problem import Evaluation, Problem
 from dpl.fem.threads import blas
 
 
@@ -69,7 +69,7 @@ class Solution(NamedTuple):
         volume_ratio: min det F at `displacement`, (B,) [-].
         status: `Status` as a number, (B,).
         negative_pivots: Negative eigenvalues of the tangent there, (B,); -1: not examined.
-        iterations: Linear solves with a tangent so far, (B,).
+        iterations: Linear solves so far, with a tangent or with what stands for one, (B,).
         factorisations: Tangents factorised so far, (B,); that of the rest state is the scene's.
         load_factor: Part of the load for which an equilibrium is known, (B,) [-].
         seconds: Time so far, (B,) [s].
@@ -147,10 +147,22 @@ def judge(
     iterations: int = 0,
     seconds: float = 0.0,
     from_guess: bool = False,
+    evaluation: Evaluation | None = None,
 ) -> Solution:
-    """Return a displacement (B, N, D) as the solution it is: evaluated, nothing believed."""
+    """Return a displacement (B, N, D) as the solution it is: evaluated, nothing believed.
+
+    Args:
+        problem: The body.
+        displacement: Over L [-].
+        load: What acts.
+        tol: Residual ratio below which it counts as converged [-].
+        iterations: Spent on it.
+        seconds: Spent on it [s].
+        from_guess: Whether it goes on from a guess.
+        evaluation: The body at the displacement, if that is there already.
+    """
     problem = problem.at(load.poisson)
-    internal, volume = problem.evaluate(displacement)
+    internal, volume = evaluation or problem.evaluate(displacement)
     balanced = problem.balanced(displacement, internal, load.force, tol) & (volume > 0)
     count = torch.full_like(volume, iterations, dtype=torch.int64)
     return Solution(

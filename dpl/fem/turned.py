@@ -35,8 +35,8 @@ class Turning:
     def at(self, displacement: Tensor) -> "Turned":
         """Return the factor of K(0), turned as the body is at a displacement (1, N, D) [-].
 
-        A node turns by the rotation of its mean deformation gradient; one that is partly held, or
-        has none, does not turn.
+        A node turns by the rotation of its mean deformation gradient, one that is held in one
+        direction only across that, one that is held in two not at all.
 
         Source: Mueller, Dorsey, McMillan, Jagnow, Cutler (2002), Stable real-time deformations,
         section 3.2 (K(0), turned node by node).
@@ -133,48 +133,74 @@ def _gradients(u, cells, slopes, volumes, F):
 
 @njit(cache=True)
 def _rotations(F, places):
-    """Set each gradient (N, D, D), up to a positive factor, to its rotation.
+    """Set each gradient (N, D, D), up to a positive factor, to its node's rotation.
+
+    Of a node with two free components, only the rotation in their plane; of one with fewer, none.
+    """
+    dim = F.shape[1]
+    R = np.empty((dim, dim))
+    for n in range(F.shape[0]):
+        count, last = 0, -1
+        for i in range(dim):
+            if places[n, i] >= 0:
+                count += 1
+            else:
+                last = i
+        for i in range(dim):
+            for j in range(dim):
+                R[i, j] = 1.0 if i == j else 0.0
+        if count == 2:
+            a = 0 if last != 0 else 1
+            b = 3 - a - last if dim == 3 else 1
+            _plane(F[n], a, b, R)
+        elif count == 3:
+            _polar(F[n], R)
+        F[n] = R
+
+
+@njit(cache=True)
+def _plane(X, a, b, R):
+    """Set rows and columns a and b of R to the rotation of those of X, unless they invert."""
+    cosine, sine = X[a, a] + X[b, b], X[b, a] - X[a, b]
+    size = np.sqrt(cosine**2 + sine**2)
+    if X[a, a] * X[b, b] - X[a, b] * X[b, a] > 0 and size > 0:
+        R[a, a], R[b, b] = cosine / size, cosine / size
+        R[b, a], R[a, b] = sine / size, -sine / size
+
+
+@njit(cache=True)
+def _polar(X, R):
+    """Set R to the rotation of X (3, 3), which is overwritten; leave it unless det X > 0.
 
     Source: Higham (1986), SIAM J. Sci. Stat. Comput. 7: X <- (s X + X^-T / s) / 2.
     """
-    dim = F.shape[1]
-    inverse = np.empty((dim, dim))  # transposed
-    for n in range(F.shape[0]):
-        X = F[n]
-        sound = places[n].min() >= 0
-        change = 1.0
-        for _ in range(POLAR):
-            if not sound or change < ENOUGH:
-                break
-            det = _cofactors(X, inverse)
-            sound = det > 0
-            if not sound:
-                break
-            size, other = 0.0, 0.0
-            for i in range(dim):
-                for j in range(dim):
-                    inverse[i, j] /= det
-                    size += X[i, j] ** 2
-                    other += inverse[i, j] ** 2
-            scale = np.sqrt(np.sqrt(other / size))
-            change = 0.0
-            for i in range(dim):
-                for j in range(dim):
-                    new = 0.5 * (scale * X[i, j] + inverse[i, j] / scale)
-                    change = max(change, abs(new - X[i, j]))
-                    X[i, j] = new
-        if not sound:
-            for i in range(dim):
-                for j in range(dim):
-                    X[i, j] = 1.0 if i == j else 0.0
+    inverse = np.empty((3, 3))  # transposed
+    change = 1.0
+    for _ in range(POLAR):
+        if change < ENOUGH:
+            break
+        det = _cofactors(X, inverse)
+        if not det > 0:
+            return
+        size, other = 0.0, 0.0
+        for i in range(3):
+            for j in range(3):
+                inverse[i, j] /= det
+                size += X[i, j] ** 2
+                other += inverse[i, j] ** 2
+        scale = np.sqrt(np.sqrt(other / size))
+        change = 0.0
+        for i in range(3):
+            for j in range(3):
+                new = 0.5 * (scale * X[i, j] + inverse[i, j] / scale)
+                change = max(change, abs(new - X[i, j]))
+                X[i, j] = new
+    R[:] = X
 
 
 @njit(cache=True)
 def _cofactors(X, out):
-    """Set `out` to the cofactors of a matrix (D, D); return its determinant."""
-    if X.shape[0] == 2:
-        out[0, 0], out[0, 1], out[1, 0], out[1, 1] = X[1, 1], -X[1, 0], -X[0, 1], X[0, 0]
-        return X[0, 0] * out[0, 0] + X[0, 1] * out[0, 1]
+    """Set `out` to the cofactors of X (3, 3); return its determinant."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         for c in range(3):

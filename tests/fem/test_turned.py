@@ -52,6 +52,28 @@ def test_nodes_turn_by_the_rotation_of_their_gradient(dim, degree, angle):
     )
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_node_held_in_one_direction_turns_across_it(axis):
+    sides = [None, None, None]
+    sides[axis] = 0.0
+    problem = body(supports=[Displacement(Plane(1, "min"), sides)])
+    turn = Rotation.from_rotvec(0.7 * np.eye(3)[axis]).as_matrix()
+    u = problem.points @ torch.from_numpy(turn - np.eye(3)).T
+    turned = Linear(problem).turning.at(u[None])
+    partly = (problem.free.sum(dim=1) == 2).numpy()
+    assert partly.sum() > 10
+    assert np.allclose(turned.rotations[partly], turn, atol=1e-8)
+
+
+def test_a_node_held_in_two_directions_does_not_turn():
+    problem = body(supports=[Displacement(Plane(1, "min"), [0.0, 0.0, None])])
+    turn = Rotation.from_rotvec([0.2, 0.3, 0.4]).as_matrix()
+    u = problem.points @ torch.from_numpy(turn - np.eye(3)).T
+    turned = Linear(problem).turning.at(u[None])
+    fixed = (problem.free.sum(dim=1) < 2).numpy()
+    assert np.array_equal(turned.rotations[fixed], np.tile(np.eye(3), (fixed.sum(), 1, 1)))
+
+
 def test_nodes_of_an_inverted_body_do_not_turn():
     problem = body()
     turned = Linear(problem).turning.at(-2.0 * problem.points[None])
