@@ -3,17 +3,13 @@
 The paper's experiment 4, and beyond it.
 """
 
-import csv
-import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from dpl.fem.accelerated import Accelerated
@@ -241,32 +237,6 @@ def paper() -> list[Row]:
         Row(name, "", "in range and twice", math.nan, 100, converged, picked, iterations)
         for name, (converged, picked, iterations) in PAPER.items()
     ]
-
-
-def show(rows: Sequence[Row], title: str) -> None:
-    """Print rows as a table."""
-    table = Table(title=title, title_justify="left")
-    for field in fields(Row):
-        table.add_column(field.name)
-    for row in rows:
-        table.add_row(*(_text(value) for value in asdict(row).values()))
-    Console(width=max(Console().width, 160)).print(table)
-
-
-def _text(value: object) -> str:
-    if isinstance(value, float):
-        return "" if math.isnan(value) else f"{value:.3g}"
-    return "" if value is None else str(value)
-
-
-def save(rows: Sequence[Row], machine: str, stem: Path) -> None:
-    """Write rows as CSV, the machine as JSON."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    with stem.with_suffix(".csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow([field.name for field in fields(Row)])
-        writer.writerows([_text(value) for value in asdict(row).values()] for row in rows)
-    stem.with_suffix(".json").write_text(json.dumps({"machine": machine, "threads": 1}) + "\n")
 
 
 def draw(times: Mapping[tuple[float, str, str], Tensor], path: Path) -> None:

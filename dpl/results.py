@@ -1,17 +1,14 @@
 """All methods on one scene side by side: how wrong on three sets of loads, how slow, how large."""
 
 import copy
-import csv
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import cast
 
 import torch
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from dpl.fem.newton import Newton
@@ -21,6 +18,7 @@ from dpl.metrics import RelativeL2, metrics
 from dpl.models.latent import Latent
 from dpl.models.pod import PODNet
 from dpl.module import Surrogate
+from dpl.rows import write, write_machine
 from dpl.scene import Sample, Scene
 
 Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]
@@ -299,34 +297,12 @@ def paper(experiment: str) -> list[Result]:
     return rows
 
 
-def show(rows: Sequence[Result], title: str) -> None:
-    """Print rows as a table."""
-    table = Table(title=title, title_justify="left")
-    for field in fields(Result):
-        table.add_column(field.name.replace("_", " "))
-    for row in rows:
-        table.add_row(*(_text(value) for value in asdict(row).values()))
-    Console(width=max(Console().width, 200)).print(table)
-
-
-def _text(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.3g}"
-    return "" if value is None else str(value)
-
-
 def save(
     rows: Sequence[Result], errors: Mapping[tuple[str, str], Tensor], machine: str, stem: Path
 ) -> None:
     """Write rows as CSV, the machine as JSON, and a figure of the errors of all loads as PNG."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    with stem.with_suffix(".csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(Result)])
-        writer.writeheader()
-        for row in rows:
-            numbers = asdict(row).items()
-            writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in numbers})
-    stem.with_suffix(".json").write_text(json.dumps({"machine": machine, "threads": 1}) + "\n")
+    write(rows, stem.with_suffix(".csv"))
+    write_machine(machine, stem.with_suffix(".json"))
     draw(errors, stem.with_suffix(".png"))
 
 

@@ -1,6 +1,5 @@
 """Run time against error: every solver and every iterate of it; meshes; and growth with size."""
 
-import csv
 import math
 import multiprocessing
 import os
@@ -10,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -324,16 +323,6 @@ def on_gpu(surrogate: Surrogate) -> Callable[[Load], Tensor]:
         return there.predict(Load(*(column.to(device) for column in load))).cpu()
 
     return predict
-
-
-def write(rows: Sequence[Point] | Sequence[Discretisation] | Sequence[Size], path: Path) -> None:
-    """Write rows as CSV."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(rows[0])])
-        writer.writeheader()
-        for row in rows:
-            numbers = asdict(row).items()
-            writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in numbers})
 
 
 def draw_points(

@@ -22,6 +22,7 @@ from dpl import peers, run, throughput
 from dpl.fem.linear import installed
 from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.solution import Solver, one_thread
+from dpl.rows import write
 from dpl.scene import Sample
 
 if TYPE_CHECKING:
@@ -161,8 +162,8 @@ def accuracy(cfg: DictConfig, backends: list[str]) -> "list[tradeoff.Point]":
         )
     CONSOLE.print(table)
     stem = Path(cfg.folder) / f"accuracy_{title}"
-    tradeoff.write(rows, stem.with_suffix(".csv"))
-    tradeoff.write(meshes, Path(cfg.folder) / "accuracy_meshes.csv")
+    write(rows, stem.with_suffix(".csv"))
+    write(meshes, Path(cfg.folder) / "accuracy_meshes.csv")
     first = [row for row in rows if row.threads == rows[0].threads]
     tradeoff.draw_points(first, meshes, own.error, stem.with_suffix(".png"))
     return rows
@@ -221,7 +222,7 @@ def sizes(cfg: DictConfig, backends: list[str]) -> "list[tradeoff.Size]":
         count = "" if row.parameters is None else f"{row.parameters:,}"
         table.add_row(row.what, f"{row.dofs:,}", f"{row.ms:.2f}", count, kept, f"{row.peak:.0f}")
     CONSOLE.print(table)
-    tradeoff.write(rows, Path(cfg.folder) / "sizes.csv")
+    write(rows, Path(cfg.folder) / "sizes.csv")
     tradeoff.draw_sizes(rows, Path(cfg.folder) / "sizes.png")
     return rows
 

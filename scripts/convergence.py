@@ -15,6 +15,7 @@ from dpl import run
 def main(cfg: DictConfig) -> None:
     """Measure all solvers on all loads; write rows, machine and figure."""
     from dpl import convergence, peers
+    from dpl import rows as table
 
     run.check(cfg)
     folders = sorted(path.parent for path in Path(cfg.run).glob("*/config.yaml"))
@@ -44,9 +45,10 @@ def main(cfg: DictConfig) -> None:
             for (solver, network), each in taken.items() if name in ("in range", "twice") else ():
                 before = times.get((tol, solver, network), torch.zeros(0).double())
                 times[tol, solver, network] = torch.cat([before, each])
-    convergence.show(rows, f"{cfg.name}, one load at a time, 1 thread")
     stem = Path(cfg.folder) / cfg.name
-    convergence.save(rows, peers.machine(), stem)
+    table.show(rows, f"{cfg.name}, one load at a time, 1 thread")
+    table.write(rows, stem.with_suffix(".csv"))
+    table.write_machine(peers.machine(), stem.with_suffix(".json"))
     convergence.draw(times, stem.with_suffix(".png"))
 
 

@@ -14,6 +14,7 @@ def main(cfg: DictConfig) -> None:
     """Measure every run of an experiment; write rows, machine and figure."""
     from dpl import peers, results
     from dpl.models.pod import PODNet
+    from dpl.rows import show
 
     run.check(cfg)
     folders = sorted(path.parent for path in Path(cfg.run).glob("*/config.yaml"))
@@ -48,7 +49,7 @@ def main(cfg: DictConfig) -> None:
     for row, error in results.measure(methods, sets, scene.solver, generation_minutes=minutes):
         rows.append(row)
         errors[row.method, row.loads] = error
-    results.show(rows, f"{cfg.name}, one load at a time, 1 thread")
+    show(rows, f"{cfg.name}, one load at a time, 1 thread")
     results.save(rows, errors, peers.machine(), Path(cfg.folder) / cfg.name)
 
 

@@ -10,6 +10,7 @@ from dpl import convergence
 from dpl.convergence import PlainNewton, contestants, load_sets, measure
 from dpl.fem.newton import Newton
 from dpl.fem.solution import solve
+from dpl.rows import write
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +93,7 @@ def test_what_does_not_converge_has_no_iterations_and_no_time(scene, loads, netw
 
 def test_rows_and_figure_are_written(scene, loads, networks, tmp_path):
     rows, times = measure(contestants(scene, networks, 1e-3), "in range", loads, 1e-3)
-    convergence.save(convergence.paper() + rows, "a machine", tmp_path / "a")
+    write(convergence.paper() + rows, tmp_path / "a.csv")
     convergence.draw({(1e-3, *key): each for key, each in times.items()}, tmp_path / "a.png")
     written = list(csv.DictReader((tmp_path / "a.csv").open()))
     assert len(written) == 2 + len(rows)

@@ -9,6 +9,7 @@ import torch
 from dpl import tradeoff
 from dpl.fem.solution import solve
 from dpl.hybrid import Direct, Hybrid
+from dpl.rows import write
 from dpl.scene import Sample
 
 
@@ -98,7 +99,7 @@ def test_each_size_is_measured_in_a_process_of_its_own(tmp_path):
     whole = [row for row in rows if row.what.startswith("fcnn")]
     assert [row.parameters for row in whole] == [4 * n**2 + 7 * n for n in (243, 624)]
     assert all(row.peak > 100 for row in rows)
-    tradeoff.write(rows, tmp_path / "sizes.csv")
+    write(rows, tmp_path / "sizes.csv")
     tradeoff.draw_sizes(rows, tmp_path / "sizes.png")
     assert len(list(csv.DictReader((tmp_path / "sizes.csv").open()))) == len(rows)
     assert (tmp_path / "sizes.png").stat().st_size > 10_000
@@ -112,7 +113,7 @@ def test_exponents_are_slopes():
 
 def test_the_figure_and_the_rows_are_written(rows, tmp_path):
     meshes = tradeoff.discretisations(linear=((4, 1, 1),), repeats=1)
-    tradeoff.write(rows, tmp_path / "a.csv")
+    write(rows, tmp_path / "a.csv")
     tradeoff.draw_points(rows, meshes, 0.01, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 10_000
     written = list(csv.DictReader((tmp_path / "a.csv").open()))
