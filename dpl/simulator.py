@@ -81,6 +81,7 @@ class Simulator:
         self.surrogate, self.correct = surrogate.eval(), correct
         self._before: tuple[Tensor, Tensor] | None = None  # Poisson's ratios, displacement
         self._pace = 0.0  # time of an iteration [s]
+        self.scene.corrector  # noqa: B018  # made here, not on the first answer's time
 
     @classmethod
     def corrected(
