@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dpl.fem.mesh import save as write_mesh
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Solution, Solver, one_thread, solve
+from dpl.fem.solution import Solution, Solver, joined, one_thread, solve
 from dpl.figures import deformed
 from dpl.hybrid import Direct, Hybrid, best
 from dpl.metrics import RelativeL2, metrics
@@ -70,10 +70,7 @@ def clock(
             start = time.perf_counter()
             answers[name].append(solve(solver, load))
             seconds[name].append(time.perf_counter() - start)
-    whole = {
-        name: Solution(*(torch.cat(column) for column in zip(*parts, strict=True)))
-        for name, parts in answers.items()
-    }
+    whole = {name: joined(parts) for name, parts in answers.items()}
     rows = [
         _row(name, answer, torch.tensor(seconds[name]), batch, problem)
         for name, answer in whole.items()
@@ -180,11 +177,12 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
     newton = scene.solver.but(tol=tol)
     # with Poisson's ratios of their own, loads have their own K(0): each solver makes it for itself
     shared = scene.loads.poisson_range is None
+    own = scene if shared else replace(scene, solver=replace(scene.solver))
     solvers: dict[str, Solver] = {
         "linear": replace(newton.rest, tol=tol),
         "network": Direct(surrogate.predict, scene.problem, tol),
         "hybrid Newton": Hybrid(surrogate.predict, newton if shared else replace(newton), "paper"),
-        "hybrid, best rule": best(surrogate.predict, scene if shared else replace(scene), tol),
+        "hybrid, best rule": best(surrogate.predict, own, tol),
         "Newton from zero": newton,
     }
     with one_thread():

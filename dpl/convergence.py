@@ -16,7 +16,7 @@ from dpl.fem.accelerated import Accelerated
 from dpl.fem.linear import SingularMatrix
 from dpl.fem.newton import Newton, gather, scatter
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, Solver, in_step, judge, one_thread, solve
+from dpl.fem.solution import Load, Solution, Solver, in_step, joined, judge, one_thread, solve
 from dpl.hybrid import Hybrid, Predict
 from dpl.scene import Scene
 
@@ -192,10 +192,7 @@ def measure(
                 answers[key].append(solve(solver, single))
                 seconds[key].append(time.perf_counter() - start)
             tick()
-    whole = {
-        key: Solution(*(torch.cat(column) for column in zip(*parts, strict=True)))
-        for key, parts in answers.items()
-    }
+    whole = {key: joined(parts) for key, parts in answers.items()}
     times = {key: 1e3 * torch.tensor(taken).double() for key, taken in seconds.items()}
     reference = whole[REFERENCE, ""], times[REFERENCE, ""]
     rows = [_row(key, title, tol, whole[key], times[key], *reference) for key in solvers]

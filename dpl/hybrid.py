@@ -135,16 +135,16 @@ class Hybrid:
         if self.steps is None or not load.force.any():
             yield from self._corrected(load, guess)
             return
-        best = None
+        least = None
         for state in self.steps.iterate(load, guess=guess):
             if not state.volume_ratio > 0:
                 break
             yield state
-            best = state if best is None or state.residual < best.residual else best
+            least = state if least is None or state.residual < least.residual else least
         if state.converged:
             return
-        states = self._corrected(load, guess if best is None else best.displacement)
-        if best is not None:
+        states = self._corrected(load, guess if least is None else least.displacement)
+        if least is not None:
             next(states)  # it has been yielded
         yield from _after(state, states)
 

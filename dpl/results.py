@@ -36,7 +36,6 @@ PAPER: dict[str, dict[str, tuple[float, float | None, float | None, int | None]]
 }
 STREAMS = {"twice": 4, "small": 5}  # of loads; those of samples and scales are below
 CORRECTED = " corrected"  # ends the name of a network that is corrected
-STATES = 256  # samples at which cells are chosen for corrections
 TITLES = {
     "in range": "loads in range",
     "twice": "one to two times the range",
@@ -260,7 +259,7 @@ def corrected(
     """
     net = cast(PODNet, surrogate.net)
     start = time.perf_counter()
-    solver = net.galerkin(train.displacement[:STATES], rank=rank, tolerance=tolerance)
+    solver = net.galerkin(train.displacement, rank=rank, tolerance=tolerance)
     minutes = (method.training_minutes or 0.0) + (time.perf_counter() - start) / 60
     tier = copy.copy(surrogate)
     tier._modules = {**surrogate._modules, "net": copy.copy(net)}

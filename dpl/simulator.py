@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dpl.fem.newton import Newton, gather
-from dpl.fem.solution import Load, Solution, Status, judge, one_thread
+from dpl.fem.solution import Load, Solution, Status, joined, judge, one_thread
 from dpl.hybrid import best
 from dpl.models.pod import PODNet
 from dpl.module import Surrogate
@@ -21,7 +21,6 @@ from dpl.scene import Scene
 Correct = Callable[[Tensor, Tensor], Tensor]  # force (N, D), displacement (N, D) -> displacement
 SMALL = 0.05  # amplitude below which the linear answer is worth a look
 STRANGE = 1e-3  # part of a force, not made of the training's modes, that counts as none
-STATES = 256  # samples at which cells are chosen for corrections
 SLACK = 1e-9  # rounding in amplitudes
 
 
@@ -101,7 +100,7 @@ class Simulator:
         net = surrogate.net
         if not isinstance(net, PODNet):
             raise ValueError(f"corrected: {type(net).__name__} has no modes to correct in")
-        solver = net.galerkin(states[:STATES], rank=rank, tolerance=tolerance)
+        solver = net.galerkin(states, rank=rank, tolerance=tolerance)
         return cls(surrogate, correct=solver.correct)
 
     @property
@@ -156,7 +155,7 @@ class Simulator:
                 self._before = single.poisson, state.displacement
                 found.append((tier, state, 1e3 * (time.perf_counter() - ask.begin)))
         tiers, states, times = zip(*found, strict=True)
-        state = Solution(*(torch.cat(column) for column in zip(*states, strict=True)))
+        state = joined(states)
         outside = (amplitude > 1 + SLACK) | (strange > STRANGE) | self._elsewhere(load)
         words = [
             "no load: at rest" if tier == "rest" else _verdict(one, float(a), float(s), bool(out))

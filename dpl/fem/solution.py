@@ -127,11 +127,16 @@ def solve(solver: Solver, load: Load) -> Solution:
     return last
 
 
+def joined(parts: Sequence[Solution]) -> Solution:
+    """Return solutions as one batch."""
+    return Solution(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+
 def in_step(members: Sequence[Iterator[Solution]]) -> Iterator[Solution]:
     """Yield the solutions of single loads as batches; a load that has ended repeats its end."""
     states = [next(member) for member in members]
     while True:
-        yield Solution(*(torch.cat(column) for column in zip(*states, strict=True)))
+        yield joined(states)
         news = [next(member, None) for member in members]
         if all(new is None for new in news):
             return

@@ -19,6 +19,8 @@ from dpl.scene import Sample, Scene
 SNAPSHOTS = 16_000  # images of samples that make a basis, at most
 CHUNK = 256  # samples that are worked on at a time
 
+STATES = 256  # samples at which cells are chosen for corrections
+
 
 class Block(nn.Module):
     """x + B gelu(A x): a residual block."""
@@ -238,7 +240,7 @@ class PODNet(nn.Module):
         """Return equilibrium in the first modes, which corrects what the network predicts.
 
         Args:
-            states: Displacements in equilibrium at which cells are chosen, (S, N, D) [-].
+            states: Displacements in equilibrium, (S, N, D) [-]; cells are chosen at the first 256.
             rank: Modes.
             tolerance: Of the choice of cells, see `dpl.fem.cubature.cubature`.
 
@@ -248,7 +250,9 @@ class PODNet(nn.Module):
         problem = self.scene.problem
         vectors = torch.zeros(*problem.shape, min(rank, len(self.modes)), dtype=torch.float64)
         vectors[problem.free] = torch.linalg.qr(self.basis[:rank].double().cpu().T)[0]
-        return PODGalerkin.within(problem, vectors, states, tolerance=tolerance, reduced_tol=1e-3)
+        return PODGalerkin.within(
+            problem, vectors, states[:STATES], tolerance=tolerance, reduced_tol=1e-3
+        )
 
     @staticmethod
     def _fields(columns: Tensor, where: Tensor) -> Tensor:
