@@ -50,7 +50,7 @@ KEYS = {  # what a configuration may hold at its top
     *("action", "shard", "shards"),
     *("parts", "linear", "repeats", "count", "workers", "peers", "samples"),
     *("name", "galerkin", "corrected"),
-    *("networks", "tols", "far", "threads", "across"),
+    *("networks", "tols", "far", "resume", "threads", "across", "cases"),
 }
 
 ASIDE = {  # where a run lies and how it is watched, not what it is
@@ -397,6 +397,18 @@ def check_sweep(arguments: Sequence[str]) -> None:
         sys.exit(2)
 
 
+def failed(error: Exception) -> float:
+    """Return infinity to a sweep, which goes on with its next run.
+
+    Raises:
+        ConfigError: There is no sweep: the error ends the command.
+    """
+    if HydraConfig.get().mode != RunMode.MULTIRUN:
+        raise ConfigError(str(error)) from error
+    print(f"error: {error}", file=sys.stderr)
+    return math.inf
+
+
 def best_error(trainer: Any) -> float | None:
     """Return the smallest validation e_mean of a training [-], which a sweep minimises.
 
@@ -473,6 +485,30 @@ def load_run(
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError(f"{best} cannot be used: {reason}") from error
     return cfg, surrogate.eval()
+
+
+def load_runs(
+    folder: str | Path, names: Sequence[str] | None = None
+) -> dict[str, tuple[DictConfig, "Surrogate"]]:
+    """Return the configurations and surrogates of the runs in a folder; they share one scene.
+
+    Args:
+        folder: That holds the folders of runs.
+        names: Of those; all if left out.
+
+    Raises:
+        ConfigError: There are none, or one cannot be used or belongs to another scene.
+    """
+    if names is None:
+        names = sorted(path.parent.name for path in Path(folder).glob("*/config.yaml"))
+    if not names:
+        raise ConfigError(f"run: {folder} holds no runs; train some with run={folder}/NAME")
+    runs: dict[str, tuple[DictConfig, Surrogate]] = {}
+    scene = None
+    for name in names:
+        runs[name] = load_run(Path(folder) / name, scene=scene)
+        scene = runs[name][1].scene
+    return runs
 
 
 def load_data(cfg: DictConfig, scene: Scene) -> "OfflineData":

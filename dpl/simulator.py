@@ -266,7 +266,7 @@ class Simulator:
         if not state.converged or int(state.negative_pivots) >= 0:
             return state
         pivots = self.scene.solver.at(load.poisson).negative_pivots(state.displacement)
-        status = Status.UNSTABLE if pivots else Status.CONVERGED
+        status = Status.UNSTABLE if pivots > 0 else Status.CONVERGED
         return state._replace(
             negative_pivots=torch.full_like(state.negative_pivots, pivots),
             status=torch.full_like(state.status, int(status)),

@@ -18,15 +18,18 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from dpl import peers, run, throughput
+from dpl import run
+from dpl.benchmarks import generation as ways
+from dpl.benchmarks import peers
+from dpl.benchmarks.rows import machine, write, write_machine
 from dpl.fem.linear import installed
 from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.solution import Solver, one_thread
-from dpl.rows import write
-from dpl.scene import Sample
+from dpl.scene import Sample, Scene
 
 if TYPE_CHECKING:
-    from dpl import tradeoff
+    from dpl.benchmarks.accuracy import Point
+    from dpl.benchmarks.sizes import Size
 
 CONSOLE = Console(width=150)
 PARTS = (
@@ -43,13 +46,15 @@ def main(cfg: DictConfig) -> None:
     if unknown := [part for part in cfg.parts if part not in PARTS]:
         raise run.ConfigError(f"parts: {unknown[0]!r} is none of {', '.join(PARTS)}")
     backends = [name for name in cfg.linear if name == "auto" or name in installed()]
-    CONSOLE.print(f"{peers.machine()}, 1 thread, medians of {cfg.repeats}")
+    CONSOLE.print(f"{machine()}, 1 thread, medians of {cfg.repeats}")
     folder = Path(cfg.folder)
     folder.mkdir(parents=True, exist_ok=True)
     for part in cfg.parts:
         with one_thread() if part != "accuracy" else nullcontext():  # which sets its own
             results = globals()[part](cfg, backends)
-        text = json.dumps({"machine": peers.machine(), part: results}, indent=1, default=asdict)
+        if results is None:  # written by itself
+            continue
+        text = json.dumps({"machine": machine(), part: results}, indent=1, default=asdict)
         (folder / f"{part}.json").write_text(text + "\n")
     print(f"written to {folder}")
 
@@ -107,7 +112,7 @@ def robustness(cfg: DictConfig, backends: list[str]) -> dict[str, dict[str, floa
     return results
 
 
-def generation(cfg: DictConfig, backends: list[str]) -> dict[str, list[throughput.Cost]]:
+def generation(cfg: DictConfig, backends: list[str]) -> dict[str, list[ways.Cost]]:
     """Return what a sample costs on one core, with and without what makes it faster."""
     scenes = {
         "paper's beam, NH-ln": peers.beam_scene(NeoHookeanLn(0.3)),
@@ -119,7 +124,7 @@ def generation(cfg: DictConfig, backends: list[str]) -> dict[str, list[throughpu
         scenes, guess = {cfg.run: surrogate.scene}, surrogate.predict
     results = {}
     for name, scene in scenes.items():
-        rows = results[name] = throughput.costs(scene, cfg.samples, surrogate=guess)
+        rows = results[name] = ways.costs(scene, cfg.samples, surrogate=guess)
         table = Table(name, "ms", "samples/s on a core", "iterations", "factors", "accepted")
         for row in rows:
             count = f"{row.iterations:.2f}", f"{row.factorisations:.2f}"
@@ -129,59 +134,61 @@ def generation(cfg: DictConfig, backends: list[str]) -> dict[str, list[throughpu
     return results
 
 
-def accuracy(cfg: DictConfig, backends: list[str]) -> "list[tradeoff.Point]":
-    """Return how wrong every solver is and when, with the networks of a folder of runs."""
-    from dpl import tradeoff
+def accuracy(cfg: DictConfig, backends: list[str]) -> None:
+    """Write how wrong every solver is and when, with the networks of a folder of runs."""
+    from dpl.benchmarks import accuracy as clock
+    from dpl.benchmarks import meshes
 
-    folders = sorted(path.parent for path in Path(cfg.run or "").glob("*/config.yaml"))
-    if cfg.run is None or not folders:
-        raise run.ConfigError(f"run: {cfg.run} holds no runs; name a folder of them")
+    if cfg.run is None:
+        raise run.ConfigError("run: name a folder of runs, for example runs/beam_svk")
     title = Path(cfg.run).name
-    solvers, batch = _solvers(cfg, folders)
-    rows = []
+    scene, solvers, batch = _solvers(cfg)
+    rows: list[Point] = []
     for threads in cfg.threads:
-        count = threads or tradeoff.all_threads()
+        count = threads or clock.all_threads()
         with Progress() as progress:
             bar = progress.add_task(f"solvers, {count} threads", total=len(solvers))
             tick = partial(progress.advance, bar)
-            rows += tradeoff.points(solvers, batch, threads=count, tick=tick)
-    meshes = tradeoff.discretisations(repeats=cfg.repeats)
-    own = next(mesh for mesh in meshes if mesh.cells == (39, 9, 9))
+            rows += clock.points(solvers, batch, threads=count, tick=tick)
     table = Table(title, "iterate", "threads", "ms", "p99", "error", "worst", "||R||/||f||")
     for row in rows:
-        if row.iterate:
-            table.add_row("", *_numbers(row))
-        else:
-            table.add_row(row.solver, *_numbers(row))
-    CONSOLE.print(table)
-    table = Table("Newton to 1e-6 on", "DOFs", "ms", "tip [m]", "error against the limit")
-    for mesh in meshes:
-        name = f"{'x'.join(map(str, mesh.cells))}, degree {mesh.degree}"
-        table.add_row(
-            name, f"{mesh.dofs:,}", f"{mesh.ms:.1f}", f"{mesh.tip:.4f}", f"{mesh.error:.1e}"
-        )
+        table.add_row("" if row.iterate else row.solver, *_numbers(row))
     CONSOLE.print(table)
     stem = Path(cfg.folder) / f"accuracy_{title}"
     write(rows, stem.with_suffix(".csv"))
-    write(meshes, Path(cfg.folder) / "accuracy_meshes.csv")
+    family = meshes.family_of(scene.problem)
+    others, floor = [], None
+    if family is not None:  # a body on which discretisation errors are known
+        with one_thread():
+            law = scene.problem.material
+            others = meshes.discretisations(family, law, repeats=cfg.repeats)
+        floor = next(mesh.error for mesh in others if (mesh.cells, mesh.degree) == (family.own, 1))
+        table = Table("Newton to 1e-6 on", "DOFs", "ms", "value", "error against the limit")
+        for mesh in others:
+            name = f"{'x'.join(map(str, mesh.cells))}, degree {mesh.degree}"
+            numbers = f"{mesh.ms:.1f}", f"{mesh.value:.6g}", f"{mesh.error:.1e}"
+            table.add_row(name, f"{mesh.dofs:,}", *numbers)
+        CONSOLE.print(table)
+        write(others, Path(cfg.folder) / f"accuracy_{title}_meshes.csv")
     first = [row for row in rows if row.threads == rows[0].threads]
-    tradeoff.draw_points(first, meshes, own.error, stem.with_suffix(".png"))
-    return rows
+    clock.draw(first, others, floor, stem.with_suffix(".png"))
+    write_machine(stem.with_suffix(".json"), threads=rows[0].threads)
 
 
-def _numbers(row: "tradeoff.Point") -> list[str]:
+def _numbers(row: "Point") -> list[str]:
     times = f"{row.ms:.2f}", f"{row.ms_p99:.2f}"
     errors = f"{row.error:.1e}", f"{row.worst:.1e}", f"{row.residual:.1e}"
     return [str(row.iterate), str(row.threads), *times, *errors]
 
 
-def _solvers(cfg: DictConfig, folders: list[Path]) -> tuple[dict[str, Solver], Sample]:
-    """Return every solver there is with the networks of some runs, and the test loads."""
-    from dpl import results, tradeoff
+def _solvers(cfg: DictConfig) -> tuple[Scene, dict[str, Solver], Sample]:
+    """Return the scene of some runs, every solver there is with their networks, and test loads."""
+    from dpl.benchmarks import accuracy, results
     from dpl.hybrid import Direct, best
     from dpl.models.pod import PODNet
 
-    first, surrogate = run.load_run(folders[0])
+    runs = run.load_runs(cfg.run)
+    first, surrogate = next(iter(runs.values()))
     scene = surrogate.scene
     data = run.load_data(first, scene)
     train = data.samples("train")
@@ -191,40 +198,39 @@ def _solvers(cfg: DictConfig, folders: list[Path]) -> tuple[dict[str, Solver], S
     if cfg.galerkin:
         model = run.make(cfg, "galerkin")(scene, train)
         solvers["POD-Galerkin"] = Direct(model.predict, scene.problem)
-    for folder in folders:
-        trained, surrogate = run.load_run(folder, scene=scene)
-        name, predict = folder.name, surrogate.predict
+    for name, (trained, surrogate) in runs.items():
+        predict = surrogate.predict
         solvers[name] = Direct(predict, scene.problem)
         if cfg.corrected and isinstance(surrogate.net, PODNet):
-            row = results.network(surrogate, folder, trained.data.train)
+            row = results.network(surrogate, Path(cfg.run) / name, trained.data.train)
             tier = run.make(cfg, "corrected")(surrogate, row, train)
             solvers[f"{name}, corrected"] = Direct(tier.predict, scene.problem)
         solvers[f"{name}, hybrid"] = best(predict, scene)
         if torch.cuda.is_available():
-            copy = run.load_run(folder, scene=scene)[1]
-            solvers[f"{name}, GPU"] = Direct(tradeoff.on_gpu(copy), scene.problem)
-    return solvers, data.samples("test")
+            copy = run.load_run(Path(cfg.run) / name, scene=scene)[1]
+            solvers[f"{name}, GPU"] = Direct(accuracy.on_gpu(copy), scene.problem)
+    return scene, solvers, data.samples("test")
 
 
-def sizes(cfg: DictConfig, backends: list[str]) -> "list[tradeoff.Size]":
-    """Return what solvers and networks cost on beams of growing size."""
-    from dpl import tradeoff
+def sizes(cfg: DictConfig, backends: list[str]) -> None:
+    """Write what solvers and networks cost on beams of growing size."""
+    from dpl.benchmarks import sizes as beams
 
-    rows = []
+    rows: list[Size] = []
     table = Table("beam", "DOFs", "ms", "parameters", "memory [MB]", "peak [MB]")
     with Progress() as progress:
         bar = progress.add_task("beams", total=len(cfg.across))
-        for part in tradeoff.sizes(cfg.across, loads=cfg.repeats):
+        for part in beams.sizes(cfg.across, loads=cfg.repeats):
             rows += part
+            write(rows, Path(cfg.folder) / "sizes.csv")
             progress.advance(bar)
     for row in rows:
         kept = "" if row.memory is None else f"{row.memory:.1f}"
         count = "" if row.parameters is None else f"{row.parameters:,}"
         table.add_row(row.what, f"{row.dofs:,}", f"{row.ms:.2f}", count, kept, f"{row.peak:.0f}")
     CONSOLE.print(table)
-    write(rows, Path(cfg.folder) / "sizes.csv")
-    tradeoff.draw_sizes(rows, Path(cfg.folder) / "sizes.png")
-    return rows
+    beams.draw(rows, Path(cfg.folder) / "sizes.png")
+    write_machine(Path(cfg.folder) / "sizes.json")
 
 
 def _listed(rows: list[peers.Time], title: str) -> list[peers.Time]:

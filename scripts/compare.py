@@ -6,7 +6,7 @@ import hydra
 from omegaconf import DictConfig
 
 from dpl import run
-from dpl.benchmark import compare
+from dpl.benchmarks.evaluation import compare
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")

@@ -1,55 +1,75 @@
 """Newton from rest and from predictions: python scripts/convergence.py run=runs/beam_svk."""
 
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hydra
-import torch
 from omegaconf import DictConfig
 from rich.progress import Progress
 
 from dpl import run
+from dpl.benchmarks import rows as table
+
+if TYPE_CHECKING:
+    from dpl.benchmarks.convergence import Trial
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="convergence")
 @run.command
 def main(cfg: DictConfig) -> None:
-    """Measure all solvers on all loads; write rows, machine and figure."""
-    from dpl import convergence, peers
-    from dpl import rows as table
+    """Measure all solvers on all loads; write rows, machine and figure; what is there is kept."""
+    from dpl.benchmarks import convergence
 
     run.check(cfg)
-    folders = sorted(path.parent for path in Path(cfg.run).glob("*/config.yaml"))
-    if cfg.networks is not None:
-        folders = [Path(cfg.run) / name for name in cfg.networks]
-    if not folders:
-        raise run.ConfigError(f"run: {cfg.run} holds no runs; train some with run={cfg.run}/NAME")
-    scene, networks = None, {}
-    for folder in folders:
-        _, surrogate = run.load_run(folder, scene=scene)
-        scene, networks[folder.name] = surrogate.scene, surrogate.predict
-    assert scene is not None
+    runs = run.load_runs(cfg.run, cfg.networks)
+    scene = next(iter(runs.values()))[1].scene
+    networks = {name: surrogate.predict for name, (_, surrogate) in runs.items()}
     sets = convergence.load_sets(scene, cfg.count, cfg.far)
     middle = sorted(cfg.tols)[len(cfg.tols) // 2]
-    tasks = [(tol, name) for tol in cfg.tols for name in ("in range", "twice")]
+    tasks = [(tol, name) for tol in cfg.tols for name in sets if not name.endswith("times")]
     tasks += [(middle, name) for name in sets if name.endswith("times")]
-    rows = convergence.paper()
-    times: dict[tuple[float, str, str], torch.Tensor] = {}
+    raw = Path(cfg.run) / f"{cfg.name}.csv"
+    trials = _measured(raw, list(runs)) if cfg.resume else []
     with Progress() as progress:
         bar = progress.add_task("loads", total=sum(len(sets[name].force) for _, name in tasks))
         for tol, name in tasks:
             solvers = convergence.contestants(scene, networks, tol)
-            more, taken = convergence.measure(
-                solvers, name, sets[name], tol, lambda: progress.advance(bar)
-            )
-            rows += more
-            for (solver, network), each in taken.items() if name in ("in range", "twice") else ():
-                before = times.get((tol, solver, network), torch.zeros(0).double())
-                times[tol, solver, network] = torch.cat([before, each])
+            known = {(t.solver, t.network): t for t in trials if (t.tol, t.loads) == (tol, name)}
+            count = len(sets[name].force)
+            if set(known) == set(solvers) and all(t.number == count - 1 for t in known.values()):
+                progress.advance(bar, count)
+                continue
+            trials = [t for t in trials if (t.tol, t.loads) != (tol, name)]
+            tick = partial(progress.advance, bar)
+            trials += convergence.measure(solvers, name, sets[name], tol, tick)
+            table.write(trials, raw)
+    rows = convergence.paper() + convergence.summary(trials)
     stem = Path(cfg.folder) / cfg.name
     table.show(rows, f"{cfg.name}, one load at a time, 1 thread")
     table.write(rows, stem.with_suffix(".csv"))
-    table.write_machine(peers.machine(), stem.with_suffix(".json"))
-    convergence.draw(times, stem.with_suffix(".png"))
+    table.write_machine(stem.with_suffix(".json"))
+    near = [trial for trial in trials if not trial.loads.endswith("times")]
+    if near:
+        convergence.draw(near, stem.with_suffix(".png"))
+
+
+def _measured(raw: Path, names: list[str]) -> list["Trial"]:
+    """Return what an interrupted run has measured of the networks that there are now."""
+    from dpl.benchmarks.convergence import Trial
+
+    if not raw.is_file():
+        return []
+    networks = [path for name in names for path in (raw.parent / name).glob("checkpoints/*.ckpt")]
+    if any(path.stat().st_mtime > raw.stat().st_mtime for path in networks):
+        print(f"{raw} is older than a network: all is measured anew")
+        return []
+    try:
+        trials = table.read(Trial, raw)
+    except ValueError as error:
+        raise run.ConfigError(f"{error}; remove it, or set resume=false") from error
+    print(f"{len(trials):,} answers are in {raw}; resume=false measures them anew")
+    return trials
 
 
 if __name__ == "__main__":

@@ -12,16 +12,16 @@ from dpl import run
 @run.command
 def main(cfg: DictConfig) -> None:
     """Measure every run of an experiment; write rows, machine and figure."""
-    from dpl import peers, results
+    from dpl.benchmarks import results
+    from dpl.benchmarks.rows import show
     from dpl.models.pod import PODNet
-    from dpl.rows import show
 
     run.check(cfg)
-    folders = sorted(path.parent for path in Path(cfg.run).glob("*/config.yaml"))
-    if not folders:
-        raise run.ConfigError(f"run: {cfg.run} holds no runs; train some with run={cfg.run}/NAME")
-    methods: dict[str, results.Method] = {}
-    scene = None
+    runs = run.load_runs(cfg.run)
+    first, surrogate = next(iter(runs.values()))
+    scene = surrogate.scene
+    data = run.load_data(first, scene)
+    train = data.samples("train")
 
     def made(key: str, *parts: object) -> results.Method:
         try:
@@ -29,19 +29,14 @@ def main(cfg: DictConfig) -> None:
         except ValueError as error:
             raise run.ConfigError(f"{key}: {error}; {key}=null leaves it out") from error
 
-    for folder in folders:
-        trained, surrogate = run.load_run(folder, scene=scene)
-        if scene is None:
-            scene = surrogate.scene
-            data = run.load_data(trained, scene)
-            train = data.samples("train")
-            methods["linear"] = results.linear(scene)
-            if cfg.galerkin:
-                methods["POD-Galerkin"] = made("galerkin", scene, train)
-        methods[folder.name] = results.network(surrogate, folder, trained.data.train)
+    methods = {"linear": results.linear(scene)}
+    if cfg.galerkin:
+        methods["POD-Galerkin"] = made("galerkin", scene, train)
+    for name, (trained, surrogate) in runs.items():
+        row = results.network(surrogate, Path(cfg.run) / name, trained.data.train)
+        methods[name] = row
         if cfg.corrected and isinstance(surrogate.net, PODNet):
-            tier = made("corrected", surrogate, methods[folder.name], train)
-            methods[folder.name + results.CORRECTED] = tier
+            methods[name + results.CORRECTED] = made("corrected", surrogate, row, train)
     sets = results.load_sets(scene, data.samples("test"), cfg.count)
     rows, errors = results.paper(cfg.name), {}
     a_load = data.store.seconds_a_load()
@@ -50,7 +45,7 @@ def main(cfg: DictConfig) -> None:
         rows.append(row)
         errors[row.method, row.loads] = error
     show(rows, f"{cfg.name}, one load at a time, 1 thread")
-    results.save(rows, errors, peers.machine(), Path(cfg.folder) / cfg.name)
+    results.save(rows, errors, Path(cfg.folder) / cfg.name)
 
 
 if __name__ == "__main__":

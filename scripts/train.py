@@ -19,7 +19,8 @@ def main(cfg: DictConfig) -> float | None:
     import torch
     from torch.utils.tensorboard.summary import hparams
 
-    from dpl.benchmark import evaluate
+    from dpl.benchmarks.evaluation import evaluate
+    from dpl.guard import Diverged
 
     run.check(cfg)
     folder = Path(cfg.folder)
@@ -33,6 +34,8 @@ def main(cfg: DictConfig) -> float | None:
         run.save_config(cfg, folder)
     try:
         trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
+    except Diverged as error:
+        return run.failed(error)
     except SystemExit as leaving:  # how Lightning passes Ctrl-C on
         if leaving.code == 128 + signal.SIGTERM:
             raise

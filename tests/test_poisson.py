@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dpl import run
-from dpl.benchmark import evaluate
+from dpl.benchmarks.evaluation import evaluate
 from dpl.data.datamodule import OfflineData, OnlineData
 from dpl.data.durable import DataSetError
 from dpl.data.shard import opened

@@ -70,10 +70,9 @@ class Accelerated:
             return
         turned = newton.rest.turning.at(u)
         ratios = [float(state.residual)]
-        moves: list[Array] = []
-        changes: list[Array] = []
+        past = _Past(self.memory, len(right))
         while count < self.max_iter:
-            step = _mixed(moves, changes, right, turned)
+            step = past.step(right, turned)
             u, count, before = u + scatter(step, problem)[None], count + 1, right
             state, right = self._state(load, u, count, start)
             yield state
@@ -82,8 +81,7 @@ class Accelerated:
             slow = count >= WINDOW and not min(ratios[-WINDOW:]) < 0.5 * ratios[-WINDOW - 1]
             if state.converged or lost or slow:
                 return
-            moves = [*moves, step][-self.memory :]
-            changes = [*changes, right - before][-self.memory :]
+            past.add(step, right - before)
 
     def _state(self, load: Load, u: Tensor, count: int, start: float) -> tuple[Solution, Array]:
         """Return a displacement as a solution, with what is out of balance there, (n,)."""
@@ -97,17 +95,33 @@ class Accelerated:
         return state, gather((load.force - internal)[0], problem)
 
 
-def _mixed(moves: list[Array], changes: list[Array], right: Array, turned: Turned) -> Array:
-    """Return the step (n,) from the mixture of iterates with the smallest residual.
+class _Past:
+    """The last steps, what they did to the residual, and the products of the latter."""
 
-    Args:
-        moves: Earlier steps, (n,) each.
-        changes: What they did to the residual, (n,) each.
-        right: The residual now, (n,).
-        turned: M.
-    """
-    if not changes:
-        return turned.apply(right)
-    basis = np.stack(changes, axis=1)
-    mix = np.linalg.lstsq(basis.T @ basis, basis.T @ right, rcond=1e-13)[0]
-    return turned.apply(right - basis @ mix) - np.stack(moves, axis=1) @ mix
+    def __init__(self, memory: int, size: int) -> None:
+        """Make room for so many steps (n,)."""
+        self.moves, self.changes = np.empty((memory, size)), np.empty((memory, size))
+        self.gram = np.empty((memory, memory))
+        self.count = 0
+
+    def add(self, move: Array, change: Array) -> None:
+        """Remember a step and what it did, in the place of the oldest if there is no other."""
+        place = self.count % len(self.moves)
+        self.moves[place], self.changes[place] = move, change
+        self.count += 1
+        kept = min(self.count, len(self.moves))
+        self.gram[place, :kept] = self.gram[:kept, place] = self.changes[:kept] @ change
+
+    def step(self, right: Array, turned: Turned) -> Array:
+        """Return the step (n,) from the mixture of iterates with the smallest residual.
+
+        Args:
+            right: The residual now, (n,).
+            turned: M.
+        """
+        kept = min(self.count, len(self.moves))
+        if not kept:
+            return turned.apply(right)
+        moves, changes = self.moves[:kept], self.changes[:kept]
+        mix = np.linalg.lstsq(self.gram[:kept, :kept], changes @ right, rcond=1e-13)[0]
+        return turned.apply(right - mix @ changes) - mix @ moves

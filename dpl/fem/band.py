@@ -7,12 +7,14 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import float32, float64, njit
+from numba.types import Array as Typed
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpbtrf, dpbtrs, spbtrf, spbtrs
+from scipy.linalg.lapack import dpbtrf, spbtrf
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dpl.fem.krylov import conjugate_gradients
+from dpl.fem.ordering import narrow
 from dpl.fem.sparse import (
     Array,
     Backend,
@@ -54,7 +56,7 @@ def band_layout(pattern: Pattern, sweeps: int = 50) -> Layout:
     ones = np.ones(len(rows), dtype=np.int8)
     upper = csr_matrix((ones, columns, pattern.indptr), shape=(n, n))
     graph = upper + upper.T
-    trial, idle = reverse_cuthill_mckee(graph, symmetric_mode=True), 0
+    trial, idle = narrow(graph), 0
     for _ in range(sweeps):
         rank = _inverse(trial)
         neighbours = rank[graph.indices]
@@ -80,6 +82,76 @@ def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
     return rank
 
 
+@njit(
+    [
+        float64[::1](Typed(float64, 2, "C", readonly=True), Typed(float64, 1, "C", readonly=True)),
+        float32[::1](Typed(float32, 2, "C", readonly=True), Typed(float32, 1, "C", readonly=True)),
+    ],
+    cache=True,
+    fastmath={"reassoc", "contract"},  # sums in vector registers, one for each lane
+)
+def substituted(L, right):  # type: ignore[no-untyped-def]
+    """Return x, (n,), with L L^T x = right, four columns of L at a time.
+
+    LAPACK's xPBTRS calls xTBSV, which calls a vector operation for each column and reads and writes
+    the answer each time; this does so once for four.
+
+    Args:
+        L: See `Cholesky`; zero where a column ends below the last row.
+        right: (n,), of the same dtype.
+    """
+    n, w = L.shape
+    x = np.zeros(n + w + 3, L.dtype)
+    x[:n] = right
+    whole = n - n % 4 if w > 3 else 0
+    for j in range(0, whole, 4):
+        p, q, r, s = L[j], L[j + 1], L[j + 2], L[j + 3]
+        a = x[j] / p[0]
+        b = (x[j + 1] - p[1] * a) / q[0]
+        c = (x[j + 2] - p[2] * a - q[1] * b) / r[0]
+        d = (x[j + 3] - p[3] * a - q[2] * b - r[1] * c) / s[0]
+        x[j], x[j + 1], x[j + 2], x[j + 3] = a, b, c, d
+        below = x[j + 4 :]
+        for k in range(w - 4):
+            below[k] -= p[k + 4] * a + q[k + 3] * b + r[k + 2] * c + s[k + 1] * d
+        for k in range(max(w - 4, 0), w - 1):
+            below[k] -= s[k + 1] * d
+            if k + 2 < w:
+                below[k] -= r[k + 2] * c
+            if k + 3 < w:
+                below[k] -= q[k + 3] * b
+    for j in range(whole, n):
+        x[j] /= L[j, 0]
+        for k in range(1, w):
+            x[j + k] -= L[j, k] * x[j]
+    x[n:] = 0
+    for j in range(n - 1, whole - 1, -1):
+        for k in range(1, w):
+            x[j] -= L[j, k] * x[j + k]
+        x[j] /= L[j, 0]
+    for j in range(whole - 4, -1, -4):
+        p, q, r, s = L[j], L[j + 1], L[j + 2], L[j + 3]
+        a, b, c, d = x[j], x[j + 1], x[j + 2], x[j + 3]
+        below = x[j + 4 :]
+        for k in range(w - 4):
+            a -= p[k + 4] * below[k]
+            b -= q[k + 3] * below[k]
+            c -= r[k + 2] * below[k]
+            d -= s[k + 1] * below[k]
+        for k in range(max(w - 4, 0), w - 1):
+            d -= s[k + 1] * below[k]
+            if k + 2 < w:
+                c -= r[k + 2] * below[k]
+            if k + 3 < w:
+                b -= q[k + 3] * below[k]
+        d /= s[0]
+        c = (c - r[1] * d) / r[0]
+        b = (b - q[1] * c - q[2] * d) / q[0]
+        a = (a - p[1] * b - p[2] * c - p[3] * d) / p[0]
+        x[j], x[j + 1], x[j + 2], x[j + 3] = a, b, c, d
+    return x[:n].copy()
+
+
 @dataclass(frozen=True, eq=False)
 class Cholesky:
     """Banded Cholesky factor; in float64 it is a backend's factor as it is.
@@ -96,9 +168,8 @@ class Cholesky:
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right, to the rounding of the storage."""
-        solve = dpbtrs if self.storage.dtype == np.float64 else spbtrs
         ordered = right if self.order is None else right[self.order]
-        answer = solve(self.storage.T, ordered, lower=1)[0].ravel()
+        answer = substituted(self.storage, np.ascontiguousarray(ordered, self.storage.dtype))
         x = np.empty_like(right)
         x[slice(None) if self.order is None else self.order] = answer
         return x

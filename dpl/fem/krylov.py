@@ -23,6 +23,11 @@ from dpl.fem.sparse import (
 )
 
 Map = Callable[[Array], Array]  # (n,) -> (n,)
+SEEN = 1e-6  # relative residual of noise below which every eigenvalue has been met
+
+
+class NotDefinite(SingularMatrix):
+    """A matrix that is known to have an eigenvalue that is not above zero."""
 
 
 def conjugate_gradients(
@@ -63,7 +68,7 @@ def conjugate_gradients(
         image = product(direction)
         curvature = direction @ image
         if not (curvature > 0 and rz > 0):
-            raise SingularMatrix("the matrix is not positive definite: negative curvature")
+            raise NotDefinite("the matrix is not positive definite: negative curvature")
         length = rz / curvature
         x += length * direction
         residual -= length * image
@@ -131,13 +136,30 @@ class CGFactor:
         product: x -> K x.
         precondition: r -> approximately K^-1 r.
         max_iter: Conjugate gradient steps a solve may take.
-        negative_pivots: 0; a solve that meets negative curvature raises.
+        negative_pivots: -1, not counted; `examined` tells none from some.
     """
 
     product: SymmetricProduct
     precondition: Map
     max_iter: int
-    negative_pivots: int = 0
+    negative_pivots: int = -1
+
+    @cached_property
+    def examined(self) -> int:
+        """0 if the matrix is positive definite, 1 if it is not, -1 if that did not show in time.
+
+        A solve may miss directions that its right-hand side does not hold, noise holds all: a
+        residual polynomial that is 1 at zero and has only positive roots exceeds 1 at a negative
+        eigenvalue, so that none can be left where the residual of noise is small.
+        """
+        noise = np.random.default_rng(0).standard_normal(len(self.product.diagonal))
+        try:
+            self.solve(noise, SEEN)
+        except NotDefinite:
+            return 1
+        except SingularMatrix:
+            return -1
+        return 0
 
     def apply(self, right: Array) -> Array:
         """Return the preconditioner's answer, (n,)."""
@@ -148,7 +170,7 @@ class CGFactor:
         try:
             return conjugate_gradients(self.product, self.precondition, right, rtol, self.max_iter)
         except np.linalg.LinAlgError as error:  # from the coarsest grid's Cholesky
-            raise SingularMatrix(f"the matrix is not positive definite: {error}") from error
+            raise NotDefinite(f"the matrix is not positive definite: {error}") from error
 
 
 @dataclass(frozen=True, eq=False)

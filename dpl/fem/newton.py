@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.band import Cholesky
-from dpl.fem.krylov import conjugate_gradients, lowest
+from dpl.fem.krylov import CGFactor, conjugate_gradients, lowest
 from dpl.fem.linear import Backend, Factor, SingularMatrix, backend, chosen
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, Status, in_step, judge
@@ -278,7 +278,7 @@ class Newton:
         count.tangent = None
         if not u.any():
             right = self._right(state, force, state.internal)
-            count.negative_pivots = self.rest.factor.negative_pivots
+            count.negative_pivots = _pivots(self.rest.factor)
             return scatter(self.rest.factor.solve(right, rtol), problem)[None] + state.jump
         system = problem.linearise(u, state.gap)
         if not system.valid:
@@ -287,7 +287,7 @@ class Newton:
         step = None
         if count.near is None and count.turns and self.turned:
             count.near = self.rest.turning.at(u)
-        if count.near is not None and count.near.negative_pivots == 0:
+        if count.near is not None and count.near.negative_pivots <= 0:
             product = SymmetricProduct(problem.pattern, values)
             doubtful = isinstance(count.near, Turned)
             steps = TURNS if doubtful else PATIENCE
@@ -396,13 +396,13 @@ class Newton:
     def _negative_pivots(self, state: "_State", count: "_Count") -> int:
         """Return those of the tangent at an answer; factorised only where there may be some.
 
-        There may if the last tangent had some; or, where an older factor served for it, if it has
-        an eigenvalue far below that factor's.
+        There may if the last tangent had some, or was not examined (conjugate gradients); or, where
+        an older factor served for it, if it has an eigenvalue far below that factor's.
         """
         if isinstance(count.near, Turned):
             return -1
-        suspect = count.negative_pivots > 0
-        if count.tangent is not None and count.near is not None:
+        suspect = count.negative_pivots > 0 or isinstance(count.near, CGFactor)
+        if not suspect and count.tangent is not None and count.near is not None:
             size = self.problem.pattern.size
             with suppress(SingularMatrix):
                 suspect |= lowest(count.tangent, count.near.apply, size) < DOUBT
@@ -418,10 +418,13 @@ class Newton:
         return self._backend.factorise(tangent)
 
     def negative_pivots(self, displacement: Tensor) -> int:
-        """Return the negative eigenvalues of the tangent at (1, N, D); 1 where it is singular."""
+        """Return the negative eigenvalues of the tangent at (1, N, D); 1 where it is singular.
+
+        Conjugate gradients do not count them: 1 stands for some, -1 for not known.
+        """
         tangent = self.problem.linearise(displacement).tangent
         try:
-            return self.factorise(tangent[0].numpy()).negative_pivots
+            return _pivots(self.factorise(tangent[0].numpy()))
         except SingularMatrix:  # at the critical load itself
             return 1
 
@@ -479,6 +482,11 @@ def check_steps(solver: Any, parts: Sequence[str]) -> None:
     for name in ("max_iter", "budget"):
         if getattr(solver, name) < 1:
             raise ValueError(f"{name} = {getattr(solver, name)} must be 1 or more")
+
+
+def _pivots(factor: Factor) -> int:
+    """Return the negative eigenvalues of what was factorised, see `Newton.negative_pivots`."""
+    return factor.examined if isinstance(factor, CGFactor) else factor.negative_pivots
 
 
 def _backend_of(problem: Problem, name: str, *, lasting: bool = False) -> Backend:

@@ -8,9 +8,9 @@ import numpy as np
 import skfem
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dpl.fem.checks import check
+from dpl.fem.ordering import narrow
 from dpl.fem.regions import Cylinder, facets_in
 
 Points = NDArray[np.float64]  # (3, ...)
@@ -184,7 +184,7 @@ def _joined(hub: Points, blade: Points, blades: int) -> skfem.Mesh:
     t = np.concatenate([_hexahedra(grid) for grid in grids], axis=1)
     rows, columns = (t[list(c)].ravel() for c in zip(*np.ndindex(8, 8), strict=True))
     graph = coo_array((np.ones(len(rows)), (rows, columns))).tocsr()
-    order = reverse_cuthill_mckee(graph, symmetric_mode=True)
+    order = narrow(graph)
     return skfem.MeshHex(np.ascontiguousarray(points[:, order]), np.argsort(order)[t])
 
 

@@ -40,7 +40,7 @@ class Factor(Protocol):
 
     @property
     def negative_pivots(self) -> int:
-        """Number of negative eigenvalues; iterative backends count 0 until they meet one."""
+        """Number of negative eigenvalues; -1: not counted, as by iterative backends."""
         ...
 
     def apply(self, right: Array) -> Array:

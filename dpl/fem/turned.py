@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
+from numba import boolean, float64, int64, njit, void
+from numba.types import Array as Typed
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -18,6 +19,12 @@ from dpl.fem.sparse import Array, Factor, SingularMatrix, SymmetricProduct
 
 POLAR = 20  # iterations of a polar decomposition at most; near a rotation it takes three
 ENOUGH = 1e-5  # change by the last one after which the error is of its square
+
+FIELD = Typed(float64, 2, "A", readonly=True)  # (N, D)
+TENSORS = Typed(float64, 3, "A", readonly=True)  # (N, D, D)
+VALUES = Typed(float64, 1, "A", readonly=True)
+PLACES = Typed(int64, 2, "A", readonly=True)
+OUT = Typed(float64, 3, "A")
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +80,8 @@ class Turning:
         dN, dV = self.problem.dN.numpy(), self.problem.dV.numpy()
         volumes = dV.sum(axis=1)
         slopes = np.einsum("eqaj,eq->eaj", dN, dV) / volumes[:, None, None]
-        return slopes, volumes, np.ascontiguousarray(self.problem.cells.numpy())
+        # a copy: sending the problem to a process moves the memory of its tensors
+        return slopes, volumes, self.problem.cells.numpy().copy(order="C")
 
     @cached_property
     def _places(self) -> NDArray[np.int64]:
@@ -113,7 +121,9 @@ class Turned:
         return inner
 
 
-@njit(cache=True)
+# One signature each, compiled at once: two processes that save several of one function's to numba's
+# cache at the same time could take each other's machine code for their own.
+@njit([void(FIELD, PLACES, TENSORS, VALUES, OUT)], cache=True)
 def _gradients(u, cells, slopes, volumes, F):
     """Set F (N, D, D) to the sums, over the cells of a node, of volume times mean gradient."""
     dim = u.shape[1]
@@ -131,34 +141,7 @@ def _gradients(u, cells, slopes, volumes, F):
                     F[cells[e, a], i, j] += volumes[own] * mean[i, j]
 
 
-@njit(cache=True)
-def _rotations(F, places):
-    """Set each gradient (N, D, D), up to a positive factor, to its node's rotation.
-
-    Of a node with two free components, only the rotation in their plane; of one with fewer, none.
-    """
-    dim = F.shape[1]
-    R = np.empty((dim, dim))
-    for n in range(F.shape[0]):
-        count, last = 0, -1
-        for i in range(dim):
-            if places[n, i] >= 0:
-                count += 1
-            else:
-                last = i
-        for i in range(dim):
-            for j in range(dim):
-                R[i, j] = 1.0 if i == j else 0.0
-        if count == 2:
-            a = 0 if last != 0 else 1
-            b = 3 - a - last if dim == 3 else 1
-            _plane(F[n], a, b, R)
-        elif count == 3:
-            _polar(F[n], R)
-        F[n] = R
-
-
-@njit(cache=True)
+@njit
 def _plane(X, a, b, R):
     """Set rows and columns a and b of R to the rotation of those of X, unless they invert."""
     cosine, sine = X[a, a] + X[b, b], X[b, a] - X[a, b]
@@ -168,7 +151,18 @@ def _plane(X, a, b, R):
         R[b, a], R[a, b] = sine / size, -sine / size
 
 
-@njit(cache=True)
+@njit
+def _cofactors(X, out):
+    """Set `out` to the cofactors of X (3, 3); return its determinant."""
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for c in range(3):
+            d, e = (c + 1) % 3, (c + 2) % 3
+            out[i, c] = X[j, d] * X[k, e] - X[j, e] * X[k, d]
+    return X[0, 0] * out[0, 0] + X[0, 1] * out[0, 1] + X[0, 2] * out[0, 2]
+
+
+@njit
 def _polar(X, R):
     """Set R to the rotation of X (3, 3), which is overwritten; leave it unless det X > 0.
 
@@ -198,18 +192,34 @@ def _polar(X, R):
     R[:] = X
 
 
-@njit(cache=True)
-def _cofactors(X, out):
-    """Set `out` to the cofactors of X (3, 3); return its determinant."""
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        for c in range(3):
-            d, e = (c + 1) % 3, (c + 2) % 3
-            out[i, c] = X[j, d] * X[k, e] - X[j, e] * X[k, d]
-    return X[0, 0] * out[0, 0] + X[0, 1] * out[0, 1] + X[0, 2] * out[0, 2]
+@njit([void(OUT, PLACES)], cache=True)
+def _rotations(F, places):
+    """Set each gradient (N, D, D), up to a positive factor, to its node's rotation.
+
+    Of a node with two free components, only the rotation in their plane; of one with fewer, none.
+    """
+    dim = F.shape[1]
+    R = np.empty((dim, dim))
+    for n in range(F.shape[0]):
+        count, last = 0, -1
+        for i in range(dim):
+            if places[n, i] >= 0:
+                count += 1
+            else:
+                last = i
+        for i in range(dim):
+            for j in range(dim):
+                R[i, j] = 1.0 if i == j else 0.0
+        if count == 2:
+            a = 0 if last != 0 else 1
+            b = 3 - a - last if dim == 3 else 1
+            _plane(F[n], a, b, R)
+        elif count == 3:
+            _polar(F[n], R)
+        F[n] = R
 
 
-@njit(cache=True)
+@njit([void(TENSORS, PLACES, VALUES, boolean, Typed(float64, 1, "A"))], cache=True)
 def _turn(rotations, places, values, back, out):
     """Set out (n,) to the free values (n,), turned node by node; by the transposed with `back`."""
     dim = places.shape[1]

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl import peers
+from dpl.benchmarks import peers
 from dpl.fem.forces import Traction
 from dpl.fem.materials import Material, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane

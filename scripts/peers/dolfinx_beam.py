@@ -1,4 +1,4 @@
-"""The four scenes of `dpl.peers` in dolfinx with MUMPS: plain Newton from zero, one step.
+"""The scenes of `dpl.benchmarks.peers` in dolfinx with MUMPS: plain Newton from zero, one step.
 
 A program of its own, for the Python that has dolfinx 0.5 (Debian 12: python3-dolfinx):
 

@@ -1,4 +1,4 @@
-"""The four scenes of `dpl.peers` in felupe: its own laws and Newton from zero, one step.
+"""The four scenes of `dpl.benchmarks.peers` in felupe: its own laws and Newton from zero, one step.
 
 A program of its own, for a Python that has felupe 11 (python3 -m venv, pip install felupe):
 

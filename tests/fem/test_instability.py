@@ -1,7 +1,6 @@
 """Where equilibria end or lose stability: VERIFICATION 1.8 g to i and the bodies of 1.11."""
 
 import math
-from functools import cache
 
 import numpy as np
 import pytest
@@ -15,12 +14,12 @@ from dpl.fem.materials import (
     NeoHookeanIsoK2,
     NeoHookeanLn,
     SaintVenantKirchhoff,
-    YeohK2,
 )
 from dpl.fem.mesh import Plane, box
 from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, Status, judge, solve
+from dpl.fem.solution import Solution, Status, judge, solve
+from dpl.stress.shapes import RUBBER, bowed, column, cube, load_of, stretched, swollen
 
 # a cell that is uniformly strained does not lock
 pytestmark = [
@@ -30,11 +29,6 @@ pytestmark = [
 
 SVK, NH = SaintVenantKirchhoff(0.0), NeoHookeanLn(0.0)
 EYE = torch.eye(3, dtype=torch.float64)
-
-
-def load_of(force: Tensor) -> Load:
-    """Return nodal forces (N, D) [-] as a load of one member; no answer depends on its modulus."""
-    return Load(force[None], torch.ones(1, dtype=torch.float64))
 
 
 def inertia(problem: Problem, displacement: Tensor) -> int:
@@ -51,14 +45,6 @@ def bisected(loses, stable: float, unstable: float) -> float:
         middle = (stable + unstable) / 2
         stable, unstable = (stable, middle) if loses(middle) else (middle, unstable)
     return (stable + unstable) / 2
-
-
-@cache
-def column(law: Material, cells: tuple[int, int, int]) -> tuple[Problem, Tensor]:
-    """Return the column 10 x 1 x 1 in hex27, E = 1000, nu = 0, and the axial load P = 1."""
-    mesh = box([10.0, 1.0, 1.0], [n + 1 for n in cells])
-    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=2)
-    return problem, Traction(Plane(0, "max"), [-1 / 1000, 0.0, 0.0]).on(problem)
 
 
 def squeezed(problem: Problem, force: Tensor, P: float, **options) -> Solution:
@@ -95,23 +81,6 @@ def test_column_loses_its_stability_at_the_critical_load(law, cells, printed):
         assert answer.negative_pivots.item() == negative
 
 
-def bowed(problem: Problem, angle: float, side: float = 1.0) -> Tensor:
-    """Return the column bent to a quarter sine of section angles, `angle` at its end, (1, N, 3)."""
-    along = torch.linspace(0, 1, 2001, dtype=torch.float64)
-    turn = angle * (np.pi / 2 * along).sin()
-    x, y, z = problem.points.T
-    height = z - z.max() / 2
-
-    def at(values: Tensor) -> Tensor:
-        return torch.from_numpy(np.interp(x.numpy(), along.numpy(), values.numpy()))
-
-    line = [torch.cumulative_trapezoid(f, along) for f in (turn.cos(), turn.sin())]
-    axis, rise = (at(torch.nn.functional.pad(f, (1, 0))) for f in line)
-    t = at(turn)
-    bent = [axis - side * height * t.sin(), y, side * rise + height * t.cos() + z.max() / 2]
-    return (torch.stack(bent, dim=1) - problem.points)[None]
-
-
 # VERIFICATION 1.8g, beyond buckling: P, angle of the guess, w / L and u / L of the end's centre,
 # the same of the elastica
 BUCKLED = [(2.5, 1.2, (0.6873, 0.3885), (0.66363, 0.34682))]
@@ -134,9 +103,6 @@ def test_buckled_column_is_found_from_a_bent_guess(mixed, side, P, angle, printe
     assert abs(end[1].item()) < 1e-9
 
 
-RUBBER = YeohK2(0.5, -0.25, 0.025, 1e6)  # VERIFICATION 1.8h; its bulk modulus stands for infinity
-
-
 def pulled(stretch: float | None = None) -> tuple[Problem, Tensor]:
     """Return a cube of one cell that slides on three planes, and its unit load along x.
 
@@ -148,12 +114,6 @@ def pulled(stretch: float | None = None) -> tuple[Problem, Tensor]:
         held[:, 0], given[:, 0] = True, (stretch - 1) * mesh.p[0]
     problem = Problem.build(mesh, RUBBER, fixed=held, prescribed=given, length=1.0)
     return problem, Traction(Plane(0, "max"), [1.0, 0.0, 0.0]).on(problem)
-
-
-def uniform(problem: Problem, stretch: float) -> Tensor:
-    """Return the uniaxial stretch that keeps the volume, (1, N, 3)."""
-    sides = torch.tensor([stretch, stretch**-0.5, stretch**-0.5], dtype=torch.float64)
-    return (problem.points * (sides - 1))[None]
 
 
 @pytest.mark.parametrize("off", [0.0, -0.01, 0.01])
@@ -170,7 +130,7 @@ def test_pull_on_yeohs_rubber_has_the_tabulated_extremes(stretch, printed, sign,
     problem, _ = pulled(stretch + off)
     none = torch.zeros(problem.shape, dtype=torch.float64)
     solver = Newton(problem, tol=1e-11, linear="superlu")
-    *_, answer = solver.iterate(load_of(none), guess=uniform(problem, stretch + off))
+    *_, answer = solver.iterate(load_of(none), guess=stretched(problem, stretch + off))
     assert answer.converged.all()
     far = problem.points[:, 0] == 1
     pull = problem.internal_force(answer.displacement)[0, far, 0].sum().item()
@@ -194,7 +154,7 @@ def test_rubber_beyond_the_peak_has_snapped_through():
     """VERIFICATION 1.8h: at P = .57 the stretch is 2.836546, where a guess beyond the gap leads."""
     problem, unit = pulled()
     solver = Newton(problem, tol=1e-10, linear="superlu")
-    *_, answer = solver.iterate(load_of(0.57 * unit), guess=uniform(problem, 2.8))
+    *_, answer = solver.iterate(load_of(0.57 * unit), guess=stretched(problem, 2.8))
     assert answer.status.item() == Status.CONVERGED
     assert answer.load_factor.item() == 1
     stretch = 1 + answer.displacement[..., 0].max().item()
@@ -203,16 +163,7 @@ def test_rubber_beyond_the_peak_has_snapped_through():
 
 def rivlin(law: Material) -> tuple[Problem, Tensor]:
     """Return a cube of one cell that slides on three planes, pulled on the others by T = 1."""
-    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
-    problem = Problem.build(mesh, law, fixed=mesh.p.T == 0, length=1.0)
-    sides = [Traction(Plane(i, "max"), EYE[i].tolist()).on(problem) for i in range(3)]
-    return problem, sum(sides)
-
-
-def swollen(problem: Problem, stretch: float) -> tuple[Tensor, float]:
-    """Return the symmetric state (1, N, 3) of Rivlin's cube, and the load T on its sides."""
-    T = problem.material.stress((stretch - 1) * EYE)[0, 0].item()
-    return ((stretch - 1) * problem.points)[None], T
+    return cube(law, 1, (0, 1, 2))
 
 
 @pytest.mark.parametrize(
@@ -255,9 +206,7 @@ def test_cube_of_rivlin_loses_its_symmetry_at_two_shear_moduli_in_the_limit():
 
 def bar(law: Material) -> tuple[Problem, Tensor]:
     """Return a cube of 2 x 2 x 2 cells that slides on three planes, and the load P = 1 along x."""
-    mesh = box([1.0, 1.0, 1.0], [3, 3, 3])
-    problem = Problem.build(mesh, law, fixed=mesh.p.T == 0, length=1.0)
-    return problem, Traction(Plane(0, "max"), [1.0, 0.0, 0.0]).on(problem)
+    return cube(law, 2)
 
 
 @pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])

@@ -1,8 +1,10 @@
 """Laws of meshes: grids, the propeller, what a file may hold, and what it gives back."""
 
 import math
+import os
+import subprocess
+import sys
 import time
-from pathlib import Path
 
 import meshio
 import numpy as np
@@ -22,22 +24,16 @@ from dpl.fem.mesh import (
     rectangle,
     save,
 )
-
-CORNERS = np.array(  # of a hexahedron, in the order of files (VTK, Gmsh)
-    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], float
+from dpl.stress.flaws import (
+    BAD,
+    CORNERS,
+    FAN,
+    PATCH,
+    TETS,
+    TWO_CUBES,
+    TWO_HEXES,
+    write,
 )
-TETS = np.array([[0, 1, 3, 4], [1, 2, 3, 6], [1, 3, 4, 6], [1, 4, 5, 6], [3, 4, 6, 7]])  # of a cube
-TWO_CUBES = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1, 2)], float)
-TWO_HEXES = np.array([[0, 1, 4, 3, 6, 7, 10, 9], [1, 2, 5, 4, 7, 8, 11, 10]])
-PATCH = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0]])  # four triangles
-FAN = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
-
-
-def write(path: Path, points, **cells) -> Path:
-    """Write a mesh by meshio alone; cells are its kinds and their nodes."""
-    kind = {"file_format": "gmsh"} if path.suffix == ".msh" else {}
-    meshio.write(path, meshio.Mesh(points, list(cells.items())), **kind)
-    return path
 
 
 def volumes(mesh: skfem.Mesh) -> np.ndarray:
@@ -369,96 +365,6 @@ def test_half_a_file_is_an_error(tmp_path):
         load(path)
 
 
-def with_node(points: np.ndarray, index: int, place) -> np.ndarray:
-    """Return the points with one of them elsewhere."""
-    moved = np.array(points, dtype=float)
-    moved[index] = place
-    return moved
-
-
-FAR = TWO_CUBES + np.array([5, 0, 0])
-NEXT = TWO_CUBES + np.array([2, 0, 0])
-BAD = {
-    "not a number": ("not finite", with_node(TWO_CUBES, 3, np.nan), {"hexahedron": TWO_HEXES}),
-    "infinite": ("not finite", with_node(TWO_CUBES, 3, np.inf), {"hexahedron": TWO_HEXES}),
-    "index from one": ("does the numbering start at 1?", TWO_CUBES, {"hexahedron": TWO_HEXES + 1}),
-    "index too large": (
-        "to 99",
-        TWO_CUBES,
-        {"hexahedron": np.where(TWO_HEXES > 10, 99, TWO_HEXES)},
-    ),
-    "index below zero": ("nodes -1", TWO_CUBES, {"hexahedron": TWO_HEXES - 1}),
-    "node listed twice": (
-        "1 cells list a node twice: 0",
-        TWO_CUBES,
-        {"hexahedron": np.where(TWO_HEXES == 9, 10, TWO_HEXES)},
-    ),
-    "cell listed twice": (
-        "1 cells are listed twice: 1 and 5",
-        CORNERS,
-        {"tetra": np.concatenate([TETS, TETS[1:2, [1, 2, 3, 0]]])},
-    ),
-    "side of three": (
-        "a side is shared by three or more cells: 0, 1, 2",
-        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1], [0, 0, 1], [0.3, 0.3, -1]]),
-        {"tetra": np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 2, 5]])},
-    ),
-    "inverted hexahedron": (
-        "inverted",
-        with_node(TWO_CUBES, 8, [0.2, -0.2, 0.8]),
-        {"hexahedron": TWO_HEXES},
-    ),
-    "inverted tetrahedron": ("inverted", with_node(CORNERS, 0, [2, 2, 2]), {"tetra": TETS}),
-    "folded tetrahedra": (
-        "2 cells are inverted, folded over their neighbours: 0, 1",
-        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1], [0.2, 0.2, 1]]),
-        {"tetra": np.array([[0, 1, 2, 3], [0, 1, 2, 4]])},
-    ),
-    "inverted triangle": ("inverted", with_node(PATCH, 4, [1.5, 0.5, 0]), {"triangle": FAN}),
-    "flat hexahedra": ("no volume", TWO_CUBES * [1, 1, 0], {"hexahedron": TWO_HEXES}),
-    "one flat hexahedron": (
-        "1 cells are of no volume: 1",
-        np.minimum(TWO_CUBES, 1),
-        {"hexahedron": TWO_HEXES},
-    ),
-    "flat tetrahedron": (
-        "no volume",
-        CORNERS,
-        {"tetra": np.concatenate([TETS, [[0, 1, 2, 3]]])},
-    ),
-    "flat triangle": ("no volume", with_node(PATCH, 4, [0.5, 0, 0]), {"triangle": FAN}),
-    "crack": (
-        "4 nodes coincide with others: 2 and 12, 5 and 15, 8 and 18, 11 and 21; merge them",
-        np.concatenate([TWO_CUBES, NEXT]),
-        {"hexahedron": np.concatenate([TWO_HEXES, TWO_HEXES + 12])},
-    ),
-    "two pieces": (
-        "2 pieces (of 12, 12 nodes)",
-        np.concatenate([TWO_CUBES, FAR]),
-        {"hexahedron": np.concatenate([TWO_HEXES, TWO_HEXES + 12])},
-    ),
-    "hanging nodes": (
-        "1 nodes lie inside a side of a cell that does not have them as vertices "
-        "(hanging nodes): 4",
-        np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [1, 2, 0], [0, 3, 0], [2, 3, 0]]),
-        {"triangle": np.array([[0, 1, 2], [0, 2, 3], [3, 4, 5], [4, 6, 5], [4, 2, 6]])},
-    ),
-    "two kinds": (
-        "mixes hexahedron and tetra",
-        np.concatenate([TWO_CUBES, CORNERS + np.array([2, 0, 0])]),
-        {"hexahedron": TWO_HEXES, "tetra": TETS + 12},
-    ),
-    "lines only": ("no cells that can be solved", TWO_CUBES, {"line": TWO_HEXES[:, :2]}),
-    "wedges": ("no cells that can be solved", TWO_CUBES, {"wedge": np.array([[0, 1, 3, 6, 7, 9]])}),
-    "surface in space": (
-        "surface in space",
-        with_node(PATCH, 4, [0.5, 0.5, 0.3]),
-        {"triangle": FAN},
-    ),
-    "surface of a box": ("surface in space", TWO_CUBES, {"quad": TWO_HEXES[:, :4] + [0, 0, 6, 6]}),
-}
-
-
 @pytest.mark.parametrize("flaw", BAD)
 def test_mesh_that_cannot_be_solved_is_an_error_that_says_why(tmp_path, flaw):
     message, points, cells = BAD[flaw]
@@ -639,3 +545,20 @@ def test_save_and_load_give_the_mesh_and_its_fields_back(tmp_path, mesh, suffix)
     assert np.array_equal(data["displacement"][:vertices, :dim], vector[:vertices])
     assert not data["displacement"][:, dim:].any()
     assert np.array_equal(data["energy"][:vertices], scalar[:vertices])
+
+
+def test_the_propeller_s_nodes_have_one_order_on_all_processors():
+    """NumPy sorts ties in one way on AVX-512, in others on AVX2 and without both."""
+    program = (
+        "import numpy as np; from dpl.fem.mesh import propeller; m = propeller();"
+        "print(m.t.ravel()[:99].tolist(), np.round(m.p[:, :9], 9).tolist())"
+    )
+    printed = set()
+    for without in ("", "X86_V3", "X86_V4"):
+        environment = os.environ | {"NPY_DISABLE_CPU_FEATURES": without}
+        done = subprocess.run(
+            [sys.executable, "-W", "ignore", "-c", program],
+            capture_output=True, text=True, check=True, env=environment,
+        )  # fmt: skip
+        printed.add(done.stdout)
+    assert len(printed) == 1

@@ -1,6 +1,7 @@
 """Laws of K(0)'s factor turned with the nodes: what it turns by, and Newton's answers with it."""
 
 import math
+from multiprocessing.reduction import ForkingPickler
 
 import numpy as np
 import pytest
@@ -184,3 +185,15 @@ def test_a_load_of_nothing_needs_no_tangent():
     right = gather(torch.zeros(problem.shape, dtype=torch.float64), problem)
     zero = torch.zeros(1, *problem.shape, dtype=torch.float64)
     assert not Linear(problem).turning.at(zero).apply(right).any()
+
+
+def test_frames_outlive_the_memory_of_the_problem():
+    """Sending a problem to a process moves its tensors: what compiled loops read is a copy."""
+    problem = body()
+    turning = Newton(problem).rest.turning
+    u = 0.1 * problem.points.roll(1, dims=1)[None] * problem.free
+    before = turning.at(u).rotations.copy()
+    kept = turning._means[2]
+    assert kept.ctypes.data != problem.cells.data_ptr()
+    ForkingPickler.dumps(problem)
+    assert np.array_equal(turning.at(u).rotations, before)

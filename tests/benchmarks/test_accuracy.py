@@ -1,4 +1,4 @@
-"""Laws of run time against error: iterates are clocked, meshes tend to a limit, sizes grow."""
+"""Laws of run time against error: every iterate is clocked, and judged."""
 
 import csv
 import itertools
@@ -6,10 +6,10 @@ import itertools
 import pytest
 import torch
 
-from dpl import tradeoff
+from dpl.benchmarks import accuracy, meshes
+from dpl.benchmarks.rows import write
 from dpl.fem.solution import solve
 from dpl.hybrid import Direct, Hybrid
-from dpl.rows import write
 from dpl.scene import Sample
 
 
@@ -34,7 +34,7 @@ def solvers(scene):
 
 @pytest.fixture(scope="module")
 def rows(solvers, batch):
-    return tradeoff.points(solvers, batch)
+    return accuracy.points(solvers, batch)
 
 
 def test_every_iterate_has_a_row_and_time_goes_on(rows, solvers):
@@ -67,69 +67,32 @@ def test_threads_are_set_and_given_back(solvers, batch):
             seen.append(torch.get_num_threads())
             return solvers["near"].iterate(load)
 
-    (row,) = tradeoff.points({"spy": Spy()}, batch, threads=2)
+    (row,) = accuracy.points({"spy": Spy()}, batch, threads=2)
     assert set(seen) == {2}
     assert row.threads == 2
     assert torch.get_num_threads() == before
 
 
-def test_values_on_meshes_twice_as_fine_tend_to_the_limit():
-    values = [3.0 + 0.5 * 4.0**-k for k in range(3)]
-    assert tradeoff.limit(*values) == pytest.approx(3.0, rel=1e-12)
-
-
-def test_finer_meshes_are_nearer_to_the_limit_and_quadratic_ones_nearer_still():
-    """The tips are those of the verification dossier, 1.8e: Saint Venant-Kirchhoff, q = 20 Pa."""
-    meshes = tradeoff.discretisations(linear=((4, 1, 1), (8, 2, 2), (16, 4, 4)), repeats=1)
-    tips = [mesh.tip for mesh in meshes]
-    known = [-18.7537, -24.79226, -27.28787, -27.72827, -28.2134, -28.3413]
-    assert tips == pytest.approx(known, abs=5e-5)
-    linear, quadratic = meshes[:3], meshes[3:]
-    for family in (linear, quadratic):
-        assert all(a.error > b.error for a, b in itertools.pairwise(family))
-    assert all(a.dofs == b.dofs for a, b in zip(linear[1:], quadratic, strict=False))
-    assert all(a.error > b.error for a, b in zip(linear[1:], quadratic, strict=False))
-    assert quadratic[-1].error == pytest.approx(1 - 28.3413 / 28.387, rel=0.02)
-
-
-@pytest.mark.slow
-def test_each_size_is_measured_in_a_process_of_its_own(tmp_path):
-    rows = [row for part in tradeoff.sizes([2, 3], loads=2) for row in part]
-    assert sorted({row.dofs for row in rows}) == [3 * 9 * 9, 3 * 13 * 16]
-    whole = [row for row in rows if row.what.startswith("fcnn")]
-    assert [row.parameters for row in whole] == [4 * n**2 + 7 * n for n in (243, 624)]
-    assert all(row.peak > 100 for row in rows)
-    write(rows, tmp_path / "sizes.csv")
-    tradeoff.draw_sizes(rows, tmp_path / "sizes.png")
-    assert len(list(csv.DictReader((tmp_path / "sizes.csv").open()))) == len(rows)
-    assert (tmp_path / "sizes.png").stat().st_size > 10_000
-
-
-def test_exponents_are_slopes():
-    rows = [tradeoff.Size("x", n, 3e-4 * n**1.5) for n in (10, 100, 1000)]
-    assert tradeoff.exponent(rows) == pytest.approx(1.5)
-    assert tradeoff.exponent(rows[:1]) != tradeoff.exponent(rows[:1])
-
-
 def test_the_figure_and_the_rows_are_written(rows, tmp_path):
-    meshes = tradeoff.discretisations(linear=((4, 1, 1),), repeats=1)
+    others = [meshes.Discretisation((4, 1, 1), 1, 60, 3.0, -18.8, 0.34)]
     write(rows, tmp_path / "a.csv")
-    tradeoff.draw_points(rows, meshes, 0.01, tmp_path / "a.png")
-    assert (tmp_path / "a.png").stat().st_size > 10_000
+    accuracy.draw(rows, others, 0.01, tmp_path / "a.png")
+    accuracy.draw(rows, [], None, tmp_path / "b.png")
+    sizes = [(tmp_path / name).stat().st_size for name in ("a.png", "b.png")]
+    assert sizes[0] > sizes[1] > 10_000
     written = list(csv.DictReader((tmp_path / "a.csv").open()))
     assert [row["solver"] for row in written] == [row.solver for row in rows]
 
 
-def test_the_script_measures_the_runs_of_a_folder(script, tiny_training, tmp_path, monkeypatch):
+def test_the_script_measures_the_runs_of_a_folder(script, tiny_training, tmp_path):
     ended = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/e/a", cwd=tmp_path)
     assert ended.status == 0, ended.err[-2000:]
-    meshes = tradeoff.discretisations(linear=((4, 1, 1), (39, 9, 9)), repeats=1)
-    monkeypatch.setattr(tradeoff, "discretisations", lambda repeats: meshes)
     few = ["parts=[accuracy]", "run=runs/e", "galerkin.rank=3", "repeats=1"]
     ended = script("benchmark", *few, cwd=tmp_path)
     assert ended.status == 0, ended.err[-2000:]
     folder = tmp_path / "runs" / "benchmark"
     assert (folder / "accuracy_e.png").is_file()
+    assert not (folder / "accuracy_e_meshes.csv").exists()  # another body than the paper's
     written = list(csv.DictReader((folder / "accuracy_e.csv").open()))
     assert {row["solver"] for row in written} >= {"linear", "POD-Galerkin", "a", "a, hybrid"}
     refused = script("benchmark", "parts=[accuracy]", "run=runs/none", cwd=tmp_path)

@@ -6,7 +6,7 @@ import json
 import pytest
 import torch
 
-from dpl import results
+from dpl.benchmarks import results
 from dpl.fem.solution import solve
 from dpl.losses import MSE
 from dpl.metrics import metrics

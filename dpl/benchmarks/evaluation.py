@@ -2,7 +2,6 @@
 
 import json
 import re
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -12,9 +11,10 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from dpl.benchmarks.clock import in_turn
 from dpl.fem.mesh import save as write_mesh
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Solution, Solver, joined, one_thread, solve
+from dpl.fem.solution import Solution, Solver, one_thread
 from dpl.figures import deformed
 from dpl.hybrid import Direct, Hybrid, best
 from dpl.metrics import RelativeL2, metrics
@@ -52,33 +52,19 @@ def clock(
 ) -> tuple[list[Row], dict[str, Tensor]]:
     """Return a row for each solver, and the displacements (B, N, D) [-] that it answered.
 
-    Every solver is warmed up on the first load, then asked each load alone; the solvers take turns
-    on each load, so that a change of the machine's speed meets them all.
+    Loads are asked one at a time, see `dpl.benchmarks.clock.in_turn`.
 
     Args:
         solvers: Named.
         batch: The loads with the truth.
         problem: The body.
     """
-    answers: dict[str, list[Solution]] = {name: [] for name in solvers}
-    seconds: dict[str, list[float]] = {name: [] for name in solvers}
-    singles = batch.load.singles()
-    for solver in solvers.values():
-        solve(solver, singles[0])
-    for load in singles:
-        for name, solver in solvers.items():
-            start = time.perf_counter()
-            answers[name].append(solve(solver, load))
-            seconds[name].append(time.perf_counter() - start)
-    whole = {name: joined(parts) for name, parts in answers.items()}
-    rows = [
-        _row(name, answer, torch.tensor(seconds[name]), batch, problem)
-        for name, answer in whole.items()
-    ]
-    return rows, {name: answer.displacement for name, answer in whole.items()}
+    whole = in_turn(solvers, batch.load)
+    rows = [_row(name, *taken, batch, problem) for name, taken in whole.items()]
+    return rows, {name: answer.displacement for name, (answer, _) in whole.items()}
 
 
-def _row(name: str, answer: Solution, seconds: Tensor, batch: Sample, problem: Problem) -> Row:
+def _row(name: str, answer: Solution, times: Tensor, batch: Sample, problem: Problem) -> Row:
     errors = metrics(problem)
     errors.update(answer.displacement, batch)
     return Row(
@@ -88,8 +74,8 @@ def _row(name: str, answer: Solution, seconds: Tensor, batch: Sample, problem: P
         loads=len(answer.converged),
         iterations=float(answer.iterations.double().mean()),
         worst_iterations=int(answer.iterations.max()),
-        milliseconds=1e3 * float(seconds.median()),
-        slowest=1e3 * float(seconds.quantile(0.95)),
+        milliseconds=float(times.median()),
+        slowest=float(times.quantile(0.95)),
     )
 
 

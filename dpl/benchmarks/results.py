@@ -3,7 +3,7 @@
 import copy
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import cast
@@ -11,17 +11,16 @@ from typing import cast
 import torch
 from torch import Tensor
 
+from dpl.benchmarks.rows import write, write_machine
 from dpl.fem.newton import Newton
 from dpl.fem.rom import PODGalerkin
 from dpl.fem.solution import Load, Status, one_thread, solve
+from dpl.hybrid import Predict
 from dpl.metrics import RelativeL2, metrics
 from dpl.models.latent import Latent
 from dpl.models.pod import PODNet
 from dpl.module import Surrogate
-from dpl.rows import write, write_machine
 from dpl.scene import Sample, Scene
-
-Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]
 
 # Odot, Haferssas, Cotin (2022), tables 1 to 3: e_mean, e_max, SNR_min [dB], samples. Experiments 3
 # and 3b are one here: they differ in the range of Young's modulus, which no answer depends on.
@@ -296,12 +295,10 @@ def paper(experiment: str) -> list[Result]:
     return rows
 
 
-def save(
-    rows: Sequence[Result], errors: Mapping[tuple[str, str], Tensor], machine: str, stem: Path
-) -> None:
+def save(rows: Sequence[Result], errors: Mapping[tuple[str, str], Tensor], stem: Path) -> None:
     """Write rows as CSV, the machine as JSON, and a figure of the errors of all loads as PNG."""
     write(rows, stem.with_suffix(".csv"))
-    write_machine(machine, stem.with_suffix(".json"))
+    write_machine(stem.with_suffix(".json"))
     draw(errors, stem.with_suffix(".png"))
 
 

@@ -302,11 +302,3 @@ def robustness(
             ),
         }
     return results
-
-
-def machine() -> str:
-    """Return what a table of times must say of the machine."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return f"{models[0] if models else 'unknown processor'}, {os.cpu_count()} cores"

@@ -4,25 +4,28 @@ The paper's experiment 4, and beyond it.
 """
 
 import math
+import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from dpl.benchmarks.clock import in_turn
 from dpl.fem.accelerated import Accelerated
 from dpl.fem.linear import SingularMatrix
 from dpl.fem.newton import Newton, gather, scatter
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, Solver, in_step, joined, judge, one_thread, solve
+from dpl.fem.solution import Load, Solution, Solver, in_step, judge, one_thread
 from dpl.hybrid import Hybrid, Predict
 from dpl.scene import Scene
 
 DASHES = ("-", "--", ":", "-.")
 REFERENCE = "robust Newton"  # what times are compared with
 STREAMS = {"in range": 2, "twice": 4, "3 times": 7, "5 times": 8}  # of loads; the first: test loads
+BOTH = "in range and twice"  # the loads of the paper
 
 # Odot, Haferssas, Cotin (2022), table 5: converged, prediction picked [%], mean iterations
 PAPER = {"paper: Newton": (46, None, 6.1), "paper: hybrid Newton": (71, 66, 5.0)}
@@ -84,6 +87,37 @@ class PlainNewton:
                 u = u + scatter(factor.solve(right, 1e-10), problem)[None]
             except SingularMatrix:
                 return
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One solver on one load, to one tolerance.
+
+    Attributes:
+        solver: Its name.
+        network: Whose predictions it starts from; empty: from rest.
+        loads: Name of the set.
+        tol: Residual ratio asked for [-].
+        number: Of the load in its set.
+        converged: Whether it is answered to the tolerance with nothing inverted.
+        picked: Whether the answer goes on from the prediction.
+        iterations: Linear solves, with a tangent or what stands for one.
+        factorisations: Of tangents.
+        ms: Wall time, prediction included [ms].
+        apart: Relative distance from robust Newton's answer [-].
+    """
+
+    solver: str
+    network: str
+    loads: str
+    tol: float
+    number: int
+    converged: bool
+    picked: bool
+    iterations: int
+    factorisations: int
+    ms: float
+    apart: float
 
 
 @dataclass(frozen=True)
@@ -168,10 +202,8 @@ def measure(
     load: Load,
     tol: float,
     tick: Callable[[], None] = lambda: None,
-) -> tuple[list[Row], dict[tuple[str, str], Tensor]]:
-    """Return a row for each solver, and its times (B,) [ms], infinite where it did not converge.
-
-    Loads are asked one at a time on one thread; solvers take turns on each.
+) -> list[Trial]:
+    """Return every solver on every load, one at a time on one thread.
 
     Args:
         solvers: By name and network; `REFERENCE` from rest among them.
@@ -180,77 +212,80 @@ def measure(
         tol: What the solvers are to reach [-].
         tick: Called after each load.
     """
-    answers: dict[tuple[str, str], list[Solution]] = {key: [] for key in solvers}
-    seconds: dict[tuple[str, str], list[float]] = {key: [] for key in solvers}
-    singles = load.singles()
     with one_thread(), torch.inference_mode():
-        for solver in solvers.values():
-            solve(solver, singles[0])
-        for single in singles:
-            for key, solver in solvers.items():
-                start = time.perf_counter()
-                answers[key].append(solve(solver, single))
-                seconds[key].append(time.perf_counter() - start)
-            tick()
-    whole = {key: joined(parts) for key, parts in answers.items()}
-    times = {key: 1e3 * torch.tensor(taken).double() for key, taken in seconds.items()}
-    reference = whole[REFERENCE, ""], times[REFERENCE, ""]
-    rows = [_row(key, title, tol, whole[key], times[key], *reference) for key in solvers]
-    return rows, {key: torch.where(whole[key].converged, times[key], math.inf) for key in solvers}
+        whole = in_turn(solvers, load, tick)
+    exact = whole[REFERENCE, ""][0].displacement.flatten(1)
+    trials = []
+    for (name, network), (answer, times) in whole.items():
+        apart = (answer.displacement.flatten(1) - exact).norm(dim=1) / exact.norm(dim=1)
+        columns = (
+            answer.converged, answer.from_guess, answer.iterations, answer.factorisations,
+            times, apart,
+        )  # fmt: skip
+        numbers = zip(*(column.tolist() for column in columns), strict=True)
+        trials += [Trial(name, network, title, tol, k, *row) for k, row in enumerate(numbers)]
+    return trials
 
 
-def _row(
-    key: tuple[str, str],
-    title: str,
-    tol: float,
-    answer: Solution,
-    times: Tensor,
-    reference: Solution,
-    reference_times: Tensor,
-) -> Row:
-    done, both = answer.converged, answer.converged & reference.converged
-    count = len(done)
-    row = Row(*key, title, tol, count, 100 * int(done.sum()) / count)
-    if not done.any():
+def summary(trials: Iterable[Trial]) -> list[Row]:
+    """Return a row for each solver, set of loads and tolerance, the paper's two sets also as one.
+
+    Args:
+        trials: Each solver's in the same order.
+    """
+    groups: dict[tuple[str, float], dict[tuple[str, str], list[Trial]]] = {}
+    every = list(trials)
+    both = [replace(trial, loads=BOTH) for trial in every if trial.loads in ("in range", "twice")]
+    for trial in [*both, *every]:
+        group = groups.setdefault((trial.loads, trial.tol), {})
+        group.setdefault((trial.solver, trial.network), []).append(trial)
+    return [_row(own, group[REFERENCE, ""]) for group in groups.values() for own in group.values()]
+
+
+def _row(trials: Sequence[Trial], reference: Sequence[Trial]) -> Row:
+    first, count = trials[0], len(trials)
+    done = [trial for trial in trials if trial.converged]
+    row = Row(
+        first.solver, first.network, first.loads, first.tol, count, 100 * len(done) / count,
+        100 * sum(trial.picked for trial in trials) / count if first.network else None,
+    )  # fmt: skip
+    if not done:
         return row
-    apart = (answer.displacement - reference.displacement).flatten(1).norm(dim=1)
-    apart = apart / reference.displacement.flatten(1).norm(dim=1)
-    numbers = {
-        "picked": 100 * int(answer.from_guess.sum()) / count if key[1] else None,
-        "iterations": float(answer.iterations[done].double().mean()),
-        "worst": int(answer.iterations[done].max()),
-        "factorisations": float(answer.factorisations[done].double().mean()),
-        "ms": float(times[done].median()),
-    }
-    if both.any():
-        numbers["ratio"] = float(times[both].sum() / reference_times[both].sum())
-        numbers["apart"] = float(apart[both].max())
-    return Row(**asdict(row) | numbers)
+    both = [pair for pair in zip(trials, reference, strict=True) if all(t.converged for t in pair)]
+    return replace(
+        row,
+        iterations=statistics.mean(trial.iterations for trial in done),
+        worst=max(trial.iterations for trial in done),
+        factorisations=statistics.mean(trial.factorisations for trial in done),
+        ms=statistics.median(trial.ms for trial in done),
+        ratio=sum(own.ms for own, _ in both) / sum(ref.ms for _, ref in both) if both else None,
+        apart=max(own.apart for own, _ in both) if both else None,
+    )
 
 
 def paper() -> list[Row]:
     """Return the paper's rows; its 100 loads are half in range, half up to twice."""
     return [
-        Row(name, "", "in range and twice", math.nan, 100, converged, picked, iterations)
+        Row(name, "", BOTH, math.nan, 100, converged, picked, iterations)
         for name, (converged, picked, iterations) in PAPER.items()
     ]
 
 
-def draw(times: Mapping[tuple[float, str, str], Tensor], path: Path) -> None:
+def draw(trials: Sequence[Trial], path: Path) -> None:
     """Draw how many loads each solver has answered within a time, a panel for each tolerance.
 
     Source: Dolan, More (2002), Benchmarking optimization software with performance profiles, with
     times as they are.
 
     Args:
-        times: By tolerance, solver and network, (B,) [ms]; infinite: not answered.
+        trials: Those to be drawn.
         path: Of the picture.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter
 
-    tols = list(dict.fromkeys(tol for tol, _, _ in times))
-    names = list(dict.fromkeys((solver, network) for _, solver, network in times))
+    tols = list(dict.fromkeys(trial.tol for trial in trials))
+    names = list(dict.fromkeys((trial.solver, trial.network) for trial in trials))
     networks = list(dict.fromkeys(network for _, network in names))
     styles: dict[str, str] = {}
     for network in networks:
@@ -260,13 +295,13 @@ def draw(times: Mapping[tuple[float, str, str], Tensor], path: Path) -> None:
     axes = figure.subplots(1, len(tols), sharex=True, sharey=True, squeeze=False)[0]
     for ax, tol in zip(axes, tols, strict=True):
         for solver, network in names:
-            taken = times[tol, solver, network].sort().values
-            part = 100 * torch.arange(1, len(taken) + 1) / len(taken)
-            there = taken.isfinite()
+            own = [t for t in trials if (t.tol, t.solver, t.network) == (tol, solver, network)]
+            taken = sorted(trial.ms for trial in own if trial.converged)
+            part = [100 * k / len(own) for k in range(1, len(taken) + 1)]
             colour = f"C{networks.index(network)}" if network else "0.3"
             label = f"{solver}, {network}" if network else solver
             ax.step(
-                taken[there], part[there], where="post", color=colour, ls=styles[solver],
+                taken, part, where="post", color=colour, ls=styles[solver],
                 label=label, lw=2 if solver == "hybrid, without tangents" else 1.2,
             )  # fmt: skip
         ax.set_xscale("log")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.benchmark import Row, clock, compare, evaluate, save, show
+from dpl.benchmarks.evaluation import Row, clock, compare, evaluate, save, show
 from dpl.fem.solution import Load, Solution, judge
 from dpl.losses import MSE
 from dpl.metrics import RelativeL2

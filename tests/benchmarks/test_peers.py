@@ -7,7 +7,7 @@ import textwrap
 
 import pytest
 
-from dpl import peers
+from dpl.benchmarks import peers
 from dpl.fem.solution import solve
 
 

@@ -1,0 +1,177 @@
+"""Laws of the comparison of Newtons: textbook steps, honest counts, a row for each."""
+
+import csv
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dpl.benchmarks import convergence
+from dpl.benchmarks.convergence import (
+    PlainNewton,
+    Trial,
+    contestants,
+    load_sets,
+    measure,
+    summary,
+)
+from dpl.benchmarks.rows import read, write
+from dpl.fem.newton import Newton
+from dpl.fem.solution import solve
+
+
+@pytest.fixture(scope="module")
+def loads(scene):
+    return scene.loads.sample((0, 9), range(4))
+
+
+@pytest.fixture(scope="module")
+def networks(scene):
+    """A network that knows the answer to a thousandth, and one that knows nothing."""
+    near = lambda load: 1.001 * solve(scene.solver, load).displacement  # noqa: E731
+    return {"near": near, "nan": lambda load: torch.full_like(load.force, torch.nan)}
+
+
+def test_plain_newton_takes_whole_steps_until_it_balances(scene, loads):
+    load = loads.singles()[0]
+    states = list(PlainNewton(scene.solver).iterate(load))
+    assert states[-1].converged
+    assert [int(s.iterations) for s in states] == list(range(len(states)))
+    assert torch.allclose(states[1].displacement[0], scene.linear.respond(load.force[0]), atol=1e-9)
+    exact = solve(scene.solver, load).displacement
+    assert torch.allclose(states[-1].displacement, exact, atol=1e-8)
+
+
+def test_plain_newton_may_fail_and_says_so(scene, loads):
+    load = loads.singles()[0]
+    hard = load._replace(force=200 * load.force)
+    end = solve(PlainNewton(scene.solver), hard)
+    assert not end.converged
+    assert int(end.iterations) <= 20
+
+
+def test_plain_newton_is_quadratic_from_a_guess(scene, loads, networks):
+    load = loads.singles()[0]
+    states = list(PlainNewton(scene.solver).iterate(load, guess=networks["near"](load)))
+    assert states[0].from_guess
+    assert len(states) <= 4
+
+
+def test_loads_are_those_of_the_test_set_and_larger_ones(scene):
+    sets = load_sets(scene, 6, 2)
+    assert {name: len(load.force) for name, load in sets.items()} == {
+        "in range": 6, "twice": 6, "3 times": 2, "5 times": 2,
+    }  # fmt: skip
+    assert torch.equal(sets["in range"].force, scene.loads.sample((0, 2), range(6)).force)
+    drawn = scene.loads.sample((0, 4), range(6)).force
+    factors = sets["twice"].force.flatten(1).norm(dim=1) / drawn.flatten(1).norm(dim=1)
+    assert torch.allclose(factors, torch.linspace(1, 2, 6).double())
+    assert set(load_sets(scene, 6, 0)) == {"in range", "twice"}
+
+
+@pytest.mark.parametrize("tol", [1e-3, 1e-8])
+def test_each_solver_has_a_row(scene, loads, networks, tol):
+    solvers = contestants(scene, networks, tol)
+    ticks = []
+    trials = measure(solvers, "in range", loads, tol, lambda: ticks.append(1))
+    assert len(ticks) == 4
+    assert len(trials) == 4 * len(solvers)
+    rows = [row for row in summary(trials) if row.loads == "in range"]
+    assert [(row.solver, row.network) for row in rows] == list(solvers)
+    by = {(row.solver, row.network): row for row in rows}
+    reference = by[convergence.REFERENCE, ""]
+    assert reference.ratio == 1.0
+    assert reference.picked is None
+    best, useless = by["hybrid, best rule", "near"], by["hybrid, best rule", "nan"]
+    assert (best.picked, useless.picked) == (100, 0)
+    assert best.iterations < reference.iterations
+    assert best.apart < 10 * tol
+    assert all(row.converged == 100 for row in rows)
+    assert all(0 < trial.ms < math.inf for trial in trials)
+
+
+def trial(solver, number, converged, ms, iterations=3, apart=0.0):
+    network = "" if solver == convergence.REFERENCE else "net"
+    return Trial(
+        solver, network, "in range", 1e-6, number, converged, True, iterations, 1, ms, apart
+    )
+
+
+def test_rows_count_what_converged_and_compare_where_both_did():
+    """Of four loads, robust Newton answers three, the hybrid three, both of them two."""
+    trials = [
+        trial(convergence.REFERENCE, k, converged, ms)
+        for k, (converged, ms) in enumerate([(True, 10), (True, 30), (True, 99), (False, 999)])
+    ]
+    hybrid = [(True, 5, 1, 1e-7), (True, 15, 2, 1e-9), (False, 7, 40, 0.5), (True, 8, 6, 0.3)]
+    trials += [
+        trial("hybrid", k, converged, ms, iterations, apart)
+        for k, (converged, ms, iterations, apart) in enumerate(hybrid)
+    ]
+    twice = [replace(each, loads="twice", ms=3 * each.ms) for each in trials]
+    rows = {(r.loads, r.solver): r for r in summary([*trials, *twice])}
+    assert len(rows) == 6
+    both = rows["in range and twice", "hybrid"]
+    assert (both.count, both.converged, both.ratio, both.ms) == (8, 75, 20 / 40, 15)
+    reference, row = rows["in range", convergence.REFERENCE], rows["in range", "hybrid"]
+    assert (reference.converged, reference.picked, reference.ratio) == (75, None, 1)
+    assert (row.converged, row.picked, row.iterations, row.worst) == (75, 100, 3, 6)
+    assert (row.ms, row.ratio, row.apart) == (8, 20 / 40, 1e-7)
+
+
+def test_what_does_not_converge_has_no_iterations_and_no_time(scene, loads):
+    hard = loads._replace(force=1e5 * loads.force)
+    solver = Newton(scene.problem, smallest_step=0.9, max_iter=2)
+    trials = measure({(convergence.REFERENCE, ""): solver}, "in range", hard, 1e-8)
+    row, same = summary(trials)
+    assert (row.loads, same.loads) == ("in range and twice", "in range")
+    assert row.converged == 0
+    assert row.iterations is row.ms is row.ratio is None
+
+
+def test_answers_rows_and_figure_are_written(scene, loads, networks, tmp_path):
+    trials = measure(contestants(scene, networks, 1e-3), "in range", loads, 1e-3)
+    write(trials, tmp_path / "trials.csv")
+    again = read(Trial, tmp_path / "trials.csv")
+    assert [replace(t, ms=0.0, apart=0.0) for t in again] == [
+        replace(t, ms=0.0, apart=0.0) for t in trials
+    ]
+    assert [t.ms for t in again] == pytest.approx([t.ms for t in trials], rel=1e-3)
+    write(convergence.paper() + summary(trials), tmp_path / "a.csv")
+    convergence.draw(trials, tmp_path / "a.png")
+    written = list(csv.DictReader((tmp_path / "a.csv").open()))
+    assert len(written) == 2 + 2 * (4 + 2 * 4)
+    assert written[1]["picked"] == "66"
+    assert written[0]["tol"] == ""
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+    with pytest.raises(ValueError, match=r"a\.csv has not the columns solver, network"):
+        read(Trial, tmp_path / "a.csv")
+
+
+def test_the_script_measures_the_runs_of_a_folder_and_goes_on(script, tiny_training, tmp_path):
+    ended = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/e/a", cwd=tmp_path)
+    assert ended.status == 0, ended.err[-2000:]
+    few = ["run=runs/e", "tols=[1e-3,1e-6,1e-8]", "count=2", "far=1"]
+    ended = script("convergence", *few, cwd=tmp_path)
+    assert ended.status == 0, ended.err[-2000:]
+    results, raw = tmp_path / "results", tmp_path / "runs" / "e" / "hybrid_newton.csv"
+    whole = list(csv.DictReader((results / "hybrid_newton.csv").open()))
+    assert len(whole) == 2 + (3 * 3 + 2) * 8
+    assert (results / "hybrid_newton.png").is_file()
+    lines = raw.read_text().splitlines(keepends=True)
+    assert len(lines) == 1 + (3 * 2 * 2 + 2) * 8
+    raw.write_text("".join(lines[: 1 + 3 * 16 + 5]))  # three sets, and one that was interrupted
+    again = script("convergence", *few, cwd=tmp_path)
+    assert again.status == 0, again.err[-2000:]
+    kept = raw.read_text().splitlines(keepends=True)
+    assert kept[: 1 + 3 * 16] == lines[: 1 + 3 * 16]
+    assert len(kept) == len(lines)
+    assert len(list(csv.DictReader((results / "hybrid_newton.csv").open()))) == len(whole)
+    raw.write_text("a,b\n")
+    refused = script("convergence", *few, cwd=tmp_path)
+    assert refused.status == 2
+    assert "has not the columns" in refused.err
+    refused = script("convergence", "run=runs/none", cwd=tmp_path)
+    assert refused.status == 2
+    assert "holds no runs" in refused.err

@@ -1,0 +1,109 @@
+"""Laws of the guard: no step that is not finite, a count, and an end in words."""
+
+import lightning as L
+import pytest
+import torch
+from torch import nn
+from torch.utils.data import DataLoader
+
+from dpl.guard import Diverged, Guard
+from dpl.optimizers import Muon
+
+
+class Line(L.LightningModule):
+    """Learns y = 3 x; of a batch that is not finite its loss, or only the slope, is not."""
+
+    def __init__(self, optimizer, kind="loss"):
+        super().__init__()
+        self.net, self.make, self.kind = nn.Linear(1, 1), optimizer, kind
+
+    def training_step(self, x, _):
+        finite = torch.nan_to_num(x)
+        loss = (self.net(finite) - 3 * finite).square().mean()
+        if self.kind == "loss":
+            return loss * (1 + 0 * x.sum())
+        if x.isnan().any():  # a finite loss, a slope that is not: the root at zero
+            return loss + (self.net.weight - self.net.weight.detach()).abs().sqrt().sum()
+        return loss
+
+    def configure_optimizers(self):
+        return self.make(self.parameters())
+
+
+OPTIMIZERS = {
+    "adam": lambda parameters: torch.optim.AdamW(parameters, lr=0.05, fused=True),
+    "muon": lambda parameters: Muon(parameters, lr=0.05),
+    "sgd": lambda parameters: torch.optim.SGD(parameters, lr=0.1, momentum=0.5),
+}
+
+
+def fit(tmp_path, batches, *, optimizer="adam", kind="loss", epochs=1, guard=None, ckpt_path=None):
+    torch.manual_seed(0)
+    module, guard = Line(OPTIMIZERS[optimizer], kind), guard or Guard(patience=3)
+    trainer = L.Trainer(
+        max_epochs=epochs, logger=False, enable_progress_bar=False, enable_model_summary=False,
+        callbacks=[guard], default_root_dir=tmp_path, accelerator="cpu", log_every_n_steps=1,
+        enable_checkpointing=False,
+    )  # fmt: skip
+    trainer.fit(module, DataLoader(batches, batch_size=None), ckpt_path=ckpt_path)
+    return module, guard, trainer
+
+
+GOOD = [torch.tensor([[x], [-x]]) for x in torch.linspace(0.5, 1.5, 40).tolist()]
+BAD = torch.tensor([[1.0], [torch.nan]])
+
+
+@pytest.mark.parametrize("kind", ["loss", "slope"])
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_a_bad_step_changes_nothing_and_is_counted(tmp_path, capsys, optimizer, kind):
+    clean, none, _ = fit(tmp_path, GOOD, optimizer=optimizer, kind=kind)
+    poisoned = [*GOOD[:10], BAD, *GOOD[10:20], BAD, BAD, *GOOD[20:]]
+    module, guard, trainer = fit(tmp_path, poisoned, optimizer=optimizer, kind=kind)
+    assert (none.skipped, guard.skipped) == (0, 3)
+    assert float(trainer.callback_metrics["skipped"]) == 3
+    assert all(map(torch.equal, module.parameters(), clean.parameters()))
+    told = capsys.readouterr().err
+    assert "epoch 0, step 10: gradients are not finite; the step is skipped" in told
+    assert "3 steps were skipped" in told
+
+
+def test_a_training_without_finite_steps_ends_in_words(tmp_path):
+    with pytest.raises(Diverged, match=r"3 steps in a row, .*learning rate of 5.0e-02; lower opt"):
+        fit(tmp_path, [*GOOD[:5], *[BAD] * 9])
+
+
+def test_skipped_steps_that_are_not_in_a_row_do_not_end_it(tmp_path):
+    _, guard, _ = fit(tmp_path, [part for good in GOOD for part in (BAD, BAD, good)])
+    assert guard.skipped == 80
+
+
+def test_the_count_goes_on_in_a_resumed_run():
+    guard, other = Guard(), Guard()
+    guard.skipped = 7
+    other.load_state_dict(guard.state_dict())
+    assert other.skipped == 7
+
+
+@pytest.mark.parametrize("patience", [0, -1])
+def test_a_patience_out_of_range_is_refused(patience):
+    with pytest.raises(ValueError, match=f"patience = {patience} must be 1 or more"):
+        Guard(patience=patience)
+
+
+@pytest.mark.parametrize(("error", "said"), [(1.7, True), (torch.nan, True), (0.4, False)])
+def test_a_network_that_has_learnt_nothing_is_told(tmp_path, capsys, error, said):
+    _, guard, trainer = fit(tmp_path, GOOD)
+    trainer.callback_metrics["val/rel_L2_median"] = torch.tensor(error)
+    capsys.readouterr()
+    guard.on_train_end(trainer, trainer.lightning_module)
+    assert ("no better than no answer at all" in capsys.readouterr().err) == said
+
+
+def test_a_rate_far_too_high_ends_with_one_line(script, tiny_training, tmp_path):
+    wild = ["optimizer.lr=1e30", "trainer.max_epochs=30", "run=runs/wild"]
+    ended = script("train", *tiny_training, *wild, cwd=tmp_path)
+    assert ended.status == 2
+    last = ended.err.strip().splitlines()[-1]
+    assert last.startswith("error: training has diverged: 20 steps in a row")
+    assert "lower optimizer.lr" in last
+    assert "Traceback" not in ended.err
