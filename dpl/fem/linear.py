@@ -66,11 +66,23 @@ def backend(pattern: Pattern, name: str = "auto", near_null: Array | None = None
     return BACKENDS[chosen(name, pattern, near_null)](pattern, near_null)
 
 
-def chosen(name: str, pattern: Pattern | None = None, near_null: Array | None = None) -> str:
+def chosen(
+    name: str,
+    pattern: Pattern | None = None,
+    near_null: Array | None = None,
+    *,
+    lasting: bool = False,
+) -> str:
     """Return the name of the backend that a name stands for.
 
     "auto" depends on the pattern and on what is installed, never on a clock: it stays "auto"
     where no pattern is given.
+
+    Args:
+        name: As for `backend`.
+        pattern: Structure of the matrices.
+        near_null: Fields that cost no energy, (n, k), see `Problem.rigid_motions`.
+        lasting: One factor is to answer many right-hand sides: it may cost more if they cost less.
 
     Raises:
         ValueError: No such backend, or it is not installed.
@@ -79,25 +91,28 @@ def chosen(name: str, pattern: Pattern | None = None, near_null: Array | None = 
         raise ValueError(f"linear = {name!r} must be auto, {', '.join(BACKENDS)}")
     if name != "auto" and name not in installed():
         raise ValueError(f"linear = {name!r} is not installed: pip install 'deepphysics[{name}]'")
-    return name if name != "auto" or pattern is None else _automatic(pattern, near_null)
+    return name if name != "auto" or pattern is None else _automatic(pattern, near_null, lasting)
 
 
 # Measured on beams, cubes, stars, plates of 1,000 to 100,000 degrees of freedom: a band costs n b^2
 # operations, a sparse factor of a solid about n^2 slower ones, so b^2 / n decides.
 PAYS = {"pardiso": 22, "superlu": 100, "cg": 10}  # b^2 / n below which a band is faster
 LARGE = {"pardiso": 100_000, "superlu": 30_000}  # n from which on multigrid is faster
+LASTING = 3.0  # times that where one factor answers many right-hand sides: it must fit in memory
 WIDE = 250  # b from which on float32 saves more than the iterations on it cost
 
 
-def _automatic(pattern: Pattern, near_null: Array | None) -> str:
+def _automatic(pattern: Pattern, near_null: Array | None, lasting: bool) -> str:
     names = installed()
     sparse = "pardiso" if "pardiso" in names else "superlu"
     multigrid = "cg" in names and near_null is not None and multigrid_installed()
-    best = "cg" if multigrid and pattern.size > LARGE[sparse] else sparse
+    large = LARGE[sparse] * (LASTING if lasting else 1)
+    best = "cg" if multigrid and pattern.size > large else sparse
     if "band" in names:
         half = band_layout(pattern).half
         if half**2 < PAYS[best] * pattern.size:
-            return "band32" if half >= WIDE else "band"
+            # In float32 factorising is faster, a solve to all digits is not.
+            return "band32" if half >= WIDE and not lasting else "band"
     return best
 
 

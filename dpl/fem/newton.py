@@ -492,9 +492,7 @@ def _pivots(factor: Factor) -> int:
 def _backend_of(problem: Problem, name: str, *, lasting: bool = False) -> Backend:
     """Return the backend for a problem's tangents, or for one whose factor answers many loads."""
     motions = problem.rigid_motions()[0][problem.free].numpy()
-    best = chosen(name, problem.pattern, motions)
-    if lasting and best == "band32" != name:
-        best = "band"  # in float32 factorising is faster, a solve to all digits is not
+    best = chosen(name, problem.pattern, motions, lasting=lasting)
     return backend(problem.pattern, best, motions)
 
 

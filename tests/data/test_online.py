@@ -1,6 +1,5 @@
 """Laws of the endless stream: whoever solves it, every load once, used boundedly, nobody left."""
 
-import hashlib
 import itertools
 import json
 import multiprocessing
@@ -562,7 +561,8 @@ class Hanging(Newton):
 
 
 def hangs(force):
-    return hashlib.sha256(force.numpy().tobytes()).digest()[0] % 4 == 0
+    """By a count: the last bits of a force are another processor's business."""
+    return int((force != 0).any(dim=-1).sum()) % 4 == 3
 
 
 @pytest.fixture(scope="module")

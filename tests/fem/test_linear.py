@@ -598,6 +598,18 @@ def test_very_large_body_gets_multigrid_where_its_rigid_motions_are_known(monkey
     assert chosen("auto", wide, fields) != "cg"
 
 
+def test_factor_that_lasts_is_direct_for_longer_and_never_in_float32(monkeypatch, hide):
+    pytest.importorskip("pyamg")
+    wide, fields = of_band(800, 400), np.ones((800, 6))
+    for largest, name in ((799, "direct"), (266, "cg")):  # three times 266 is below 800
+        monkeypatch.setattr(linear, "LARGE", {"pardiso": largest, "superlu": largest})
+        assert chosen("auto", wide, fields) == "cg"
+        assert (chosen("auto", wide, fields, lasting=True) == "cg") == (name == "cg")
+    assert chosen("auto", of_band(8000, 300), lasting=True) == "band"
+    hide("pypardiso", "pyamg")
+    assert chosen("auto", of_band(8000, 300), lasting=True) == "band"
+
+
 def test_choice_is_between_the_backends_that_are_installed(monkeypatch):
     monkeypatch.setattr(linear, "installed", lambda: ["superlu"])
     assert chosen("auto", of_band(200, 5)) == "superlu"
