@@ -14,6 +14,7 @@ import matplotlib
 import pytest
 import torch
 from hydra.core.global_hydra import GlobalHydra
+from hypothesis import HealthCheck, settings
 from omegaconf import DictConfig
 
 from dpl import run
@@ -27,6 +28,15 @@ from dpl.scene import Sample, Scene
 
 torch.set_num_threads(1)
 matplotlib.use("Agg")
+
+# pytest --hypothesis-profile=many tests/properties: anew each time, and a hundred times as long
+_fixtures = {
+    "deadline": None,
+    "suppress_health_check": [HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+}
+settings.register_profile("few", max_examples=10, derandomize=True, database=None, **_fixtures)
+settings.register_profile("many", max_examples=1000, print_blob=True, **_fixtures)
+settings.load_profile("few")
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
