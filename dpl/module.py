@@ -11,10 +11,9 @@ from typing import Any, cast
 import lightning as L
 import numpy as np
 import torch
-from lightning.fabric.plugins import TorchCheckpointIO
 from torch import Tensor, nn
 
-from dpl.data.durable import append_line, whole_file
+from dpl.data.durable import append_line
 from dpl.fem.solution import Load
 from dpl.losses import MSE, Loss, Physics
 from dpl.metrics import metrics
@@ -306,24 +305,6 @@ def set_random_states(states: dict[str, Any]) -> None:
     np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))  # noqa: NPY002
     version, numbers, gauss = states["python"]
     random.setstate((version, tuple(numbers), gauss))
-
-
-class WholeCheckpoints(TorchCheckpointIO):
-    """Checkpoints that are whole or not there.
-
-    Lightning's own go through the default temporary folder; where that is another file system, a
-    kill while writing leaves half a file under the final name.
-    """
-
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
-    ) -> None:
-        """Write a checkpoint; what a killed run was writing in its place is removed."""
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        for part in Path(path).parent.glob(f".{Path(path).name}.*.part"):
-            part.unlink(missing_ok=True)
-        with whole_file(Path(path)) as file:
-            torch.save(checkpoint, file)
 
 
 class TrainingTime(L.Callback):

@@ -16,11 +16,11 @@ import typing
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import hydra
 import torch
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.types import RunMode
@@ -40,7 +40,13 @@ R = typing.TypeVar("R")
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
-TRUSTED = ("dpl.", "torch.optim.", "lightning.")  # what a run's folder may name without being asked
+TRUSTED = (  # where that is made what a run's folder may name without being asked; nothing writes
+    *(f"dpl.fem.{name}" for name in ("mesh", "regions", "propeller", "materials", "ogden")),
+    *(f"dpl.fem.{name}" for name in ("supports", "forces", "modes", "sampling", "newton")),
+    *("dpl.fem.files.load", "dpl.data.datamodule", "dpl.models", "dpl.losses"),
+    *("dpl.optimizers", "dpl.module.warmup_cosine", "torch.optim"),
+)
+LONGEST = 1_000_000  # bytes of a run's configuration
 
 KEYS = {  # what a configuration may hold at its top
     *("mesh", "degree", "mean_dilatation", "clamped", "supports", "forces"),
@@ -56,6 +62,13 @@ KEYS = {  # what a configuration may hold at its top
 ASIDE = {  # where a run lies and how it is watched, not what it is
     *("run", "folder", "ckpt_path", "data.folder"),
     *("trainer.callbacks", "trainer.logger", "trainer.plugins"),
+}
+RESUMED = {  # what may change where a run is resumed: how long it is, and the machine's part
+    *(f"trainer.max_{unit}" for unit in ("epochs", "steps", "time")),
+    *(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy")),
+    *("trainer.log_every_n_steps", "trainer.check_val_every_n_epoch", "trainer.profiler"),
+    *("trainer.enable_progress_bar", "trainer.enable_model_summary"),
+    *("data.workers", "data.timeout"),
 }
 
 
@@ -151,7 +164,8 @@ def check(cfg: DictConfig, *, trust: bool = True) -> None:
 
     Args:
         cfg: The configuration.
-        trust: Whether it may name any object to call, or only those of `TRUSTED`.
+        trust: Whether it may name any object to call, or only those of `TRUSTED`; `trainer` is
+            then left out, for nothing of it is called.
 
     Raises:
         ConfigError: A key that its object does not know, a value of another type, a number that is
@@ -167,15 +181,26 @@ def check(cfg: DictConfig, *, trust: bool = True) -> None:
     for path, node in _walk(plain(cfg)):
         if not isinstance(node, dict) or "_target_" not in node:
             continue
+        if not trust and path.partition(".")[0] == "trainer":
+            continue
         name = node["_target_"]
-        if not trust and not name.startswith(TRUSTED):
-            raise ConfigError(f"{path} names {name}, which is none of this package's; not called")
+        refusal = f"{path} names {name}, which is none of this package's parts; not called"
+        if not trust and not str(name).startswith(("dpl.", "torch.optim.")):
+            raise ConfigError(refusal)
         try:
             module, _, attribute = name.rpartition(".")
             target = getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError, ValueError):
             raise ConfigError(f"{path}._target_ = {name!r} does not exist") from None
+        if not trust and not _trusted(target):
+            raise ConfigError(refusal)
         _check_call(path, node, target)
+
+
+def _trusted(target: Any) -> bool:
+    """Return whether a class or function is made in one of `TRUSTED`, wherever it was found."""
+    place = f"{getattr(target, '__module__', '')}.{getattr(target, '__qualname__', '')}."
+    return callable(target) and place.startswith(tuple(f"{name}." for name in TRUSTED))
 
 
 def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> None:
@@ -454,6 +479,69 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
     there.write_text(OmegaConf.to_yaml(OmegaConf.create(plain(cfg))))
 
 
+def check_resumed(cfg: DictConfig) -> None:
+    """Hold a configuration against that of the run that it resumes.
+
+    Raises:
+        ConfigError: There is nothing to resume, or they differ in what makes the run what it is.
+    """
+    if not cfg.ckpt_path:
+        return
+    last = Path(cfg.folder) / "checkpoints" / "last.ckpt"
+    path = last if cfg.ckpt_path == "last" else Path(cfg.ckpt_path)
+    if not path.is_file():
+        raise ConfigError(f"ckpt_path: there is no {path} to resume; leave it out to begin anew")
+    before = path.parent.parent / "config.yaml"
+    if not before.is_file():
+        return
+    theirs, ours = dict(_leaves(_read_config(before))), dict(_leaves(plain(cfg)))
+    changed = [
+        f"{key} was {theirs.get(key)}, is {ours.get(key)}"
+        for key in sorted(theirs.keys() | ours.keys())
+        if theirs.get(key) != ours.get(key) and not _may_change(key)
+    ]
+    if changed:
+        raise ConfigError(
+            f"ckpt_path: {path} is of another configuration: {'; '.join(changed)}; "
+            "set them back, or begin a run of another name"
+        )
+
+
+def _leaves(node: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the values of plain data that hold no others, and their paths."""
+    for path, value in _walk(node):
+        if not isinstance(value, dict | list):
+            yield path, value
+
+
+def _may_change(key: str) -> bool:
+    return any(key == part or key.startswith(f"{part}.") for part in (*ASIDE, *RESUMED))
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    """Return the configuration of a run, plain data: nothing in it is called or looked up.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    try:
+        if path.stat().st_size > LONGEST:
+            raise ValueError(f"has more than {LONGEST} bytes")
+        text = path.read_text()
+        marks = yaml.AnchorToken, yaml.AliasToken  # a few lines of which unfold to gigabytes
+        if any(isinstance(token, marks) for token in yaml.scan(text, yaml.SafeLoader)):
+            raise ValueError("refers to parts of itself")
+        found: Any = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
+        if not isinstance(found, dict):
+            raise ValueError("is no list of keys and values")
+        if any(isinstance(value, str) and "${" in value for _, value in _walk(found)):
+            raise ValueError("holds an interpolation, which no saved run does")
+    except (ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{path} is not the configuration of a run: {reason}") from error
+    return found
+
+
 def load_run(
     folder: str | Path, *, trust: bool = False, scene: Scene | None = None
 ) -> tuple[DictConfig, "Surrogate"]:
@@ -468,20 +556,23 @@ def load_run(
     Raises:
         ConfigError: There is no finished run, or it names what is not trusted.
     """
-    config, best = Path(folder) / "config.yaml", Path(folder) / "checkpoints" / "best.ckpt"
+    from dpl import checkpoints  # which imports Lightning
+
+    config = Path(folder) / "config.yaml"
+    best = Path(folder) / "checkpoints" / f"best{checkpoints.WEIGHTS}"
     if not best.exists():  # a run too short to be validated
         best = best.with_name("last.ckpt")
     for path in (config, best):
         if not path.is_file():
             raise ConfigError(f"run = {folder} has no {path.relative_to(folder)}; train it first")
-    cfg = typing.cast(DictConfig, OmegaConf.load(config))
+    cfg = OmegaConf.create(_read_config(config))
     check(cfg, trust=trust)
     surrogate = build_surrogate(cfg, build_scene(cfg) if scene is None else scene)
     try:
-        checkpoint = torch.load(best, map_location="cpu", weights_only=True)
+        checkpoint = checkpoints.read(best)
         surrogate.on_load_checkpoint(checkpoint)
         surrogate.load_state_dict(checkpoint["state_dict"])
-    except (OSError, ValueError, KeyError, RuntimeError, EOFError, UnpicklingError) as error:
+    except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError(f"{best} cannot be used: {reason}") from error
     return cfg, surrogate.eval()

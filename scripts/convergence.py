@@ -60,7 +60,7 @@ def _measured(raw: Path, names: list[str]) -> list["Trial"]:
 
     if not raw.is_file():
         return []
-    networks = [path for name in names for path in (raw.parent / name).glob("checkpoints/*.ckpt")]
+    networks = [path for name in names for path in (raw.parent / name).glob("checkpoints/*")]
     if any(path.stat().st_mtime > raw.stat().st_mtime for path in networks):
         print(f"{raw} is older than a network: all is measured anew")
         return []

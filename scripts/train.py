@@ -23,6 +23,7 @@ def main(cfg: DictConfig) -> float | None:
     from dpl.guard import Diverged
 
     run.check(cfg)
+    run.check_resumed(cfg)
     folder = Path(cfg.folder)
     scene = run.build_scene(cfg)
     data = run.make(cfg, "data", scene=scene)

@@ -99,7 +99,7 @@ def test_two_processes_end_with_equal_weights_and_one_evaluation(trained, tmp_pa
     rows = json.loads((tmp_path / "r/evaluation.json").read_text())
     assert next(row for row in rows if row["solver"] == "hybrid Newton")["converged"] == 4
     assert sorted(path.name for path in (tmp_path / "r/checkpoints").iterdir()) == [
-        "best.ckpt",
+        "best.safetensors",
         "last.ckpt",
     ]
     assert [path.name for path in tmp_path.glob("runs*")] == []

@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
+from dpl.checkpoints import WholeCheckpoints, read
 from dpl.data.datamodule import OfflineData, OnlineData
 from dpl.fem.solution import Load
 from dpl.figures import DeformedShapes
@@ -21,7 +22,6 @@ from dpl.losses import MSE, LrPlus, LrStar
 from dpl.models.fcnn import FCNN
 from dpl.module import (
     Surrogate,
-    WholeCheckpoints,
     random_states,
     scales,
     set_random_states,
@@ -53,7 +53,7 @@ def trainer(folder, *callbacks, **options):
     checkpoints = [
         instantiate(OmegaConf.merge(node, {"dirpath": str(folder)}))
         for node in nodes
-        if node._target_.endswith("ModelCheckpoint")
+        if node._target_.endswith(("ModelCheckpoint", "BestWeights"))
     ]
     return L.Trainer(
         callbacks=[*checkpoints, *callbacks],
@@ -477,8 +477,8 @@ def test_best_is_the_checkpoint_with_the_smallest_error(scene, data, tmp_path):
 
     tutor = trainer(tmp_path, Watch(), max_epochs=4)
     tutor.fit(surrogate(scene, lr=3e-2), datamodule=data)
-    assert sorted(path.name for path in tmp_path.glob("*.ckpt")) == ["best.ckpt", "last.ckpt"]
-    checkpoint = torch.load(tmp_path / "best.ckpt", weights_only=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["best.safetensors", "last.ckpt"]
+    checkpoint = read(tmp_path / "best.safetensors")
     assert checkpoint["epoch"] == int(np.argmin(seen))
 
 
@@ -517,32 +517,6 @@ def test_the_checkpoint_of_another_scene_is_refused_naming_both(scene, make_scen
 def test_a_checkpoint_without_a_scene_is_refused(scene):
     with pytest.raises(ValueError, match="unknown"):
         surrogate(scene).on_load_checkpoint({"state_dict": {}})
-
-
-class Unwritable:
-    """An object whose pickling fails half way, as a full disk does."""
-
-    def __reduce__(self):
-        raise OSError("no space left on device")
-
-
-def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one(tmp_path):
-    path = tmp_path / "folder" / "last.ckpt"
-    files = WholeCheckpoints()
-    files.save_checkpoint({"epoch": 1}, path)
-    with pytest.raises(OSError, match="no space"):
-        files.save_checkpoint({"big": torch.zeros(10_000), "bad": Unwritable()}, path)
-    assert torch.load(path, weights_only=True) == {"epoch": 1}
-    assert [p.name for p in path.parent.iterdir()] == ["last.ckpt"]
-    files.save_checkpoint({"epoch": 2}, path)
-    assert torch.load(path, weights_only=True) == {"epoch": 2}
-
-
-def test_checkpoints_are_read_without_running_code(scene, data, tmp_path):
-    """weights_only accepts all that a run writes down."""
-    run(scene, tmp_path, data, epochs=1)
-    for path in tmp_path.glob("*.ckpt"):
-        assert torch.load(path, weights_only=True)["epoch"] == 0
 
 
 def test_the_plan_is_that_of_network_and_loss(scene):

@@ -17,6 +17,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from dpl.checkpoints import read
+
 ROOT = Path(__file__).parents[1]
 EPOCHS = 6  # of two steps each
 ELSEWHERE = "/dev/shm"  # another file system: what is renamed from there to here is copied
@@ -48,13 +50,14 @@ class Noisy(nn.Module):
 
 KILLER = textwrap.dedent(
     """
-    import io, os, runpy, signal, sys
-    import torch
+    import contextlib, io, os, runpy, signal, sys
+    from dpl import checkpoints
     from dpl.module import Surrogate
 
     script, where, at = sys.argv[1], sys.argv[2], int(sys.argv[3])
     sys.argv = [script, *sys.argv[4:]]
-    step, save = Surrogate.training_step, torch.save
+    step, write, whole_file = Surrogate.training_step, checkpoints.write, checkpoints.whole_file
+    epoch = None
 
     def die():
         os.kill(os.getpid(), signal.SIGKILL)
@@ -65,19 +68,26 @@ KILLER = textwrap.dedent(
             die()
         return loss
 
-    def saving(checkpoint, file):
-        content = io.BytesIO()
-        save(checkpoint, content)
-        if checkpoint["epoch"] == at and where in file.name:
-            file.write(content.getvalue()[: len(content.getvalue()) // 2])
-            file.flush()
-            die()
-        file.write(content.getvalue())
+    def writing(checkpoint, path):
+        global epoch
+        epoch = checkpoint["epoch"]
+        write(checkpoint, path)
+
+    @contextlib.contextmanager
+    def half_file(path):
+        with whole_file(path) as file:
+            content = io.BytesIO()
+            yield content
+            if epoch == at and where == path.name:
+                file.write(content.getvalue()[: len(content.getvalue()) // 2])
+                file.flush()
+                die()
+            file.write(content.getvalue())
 
     if where == "step":
         Surrogate.training_step = training_step
     else:
-        torch.save = saving
+        checkpoints.write, checkpoints.whole_file = writing, half_file
     runpy.run_path(script, run_name="__main__")
     """
 )
@@ -211,7 +221,7 @@ def test_a_run_killed_in_a_step_ends_bit_for_bit_like_one_that_was_not(
     assert run.status == 0, run.err
     assert "not solved again" in run.out
     assert_same(straight("fcnn"), last(folder))
-    best = [torch.load(home / name / "checkpoints/best.ckpt") for name in ("fcnn", "step")]
+    best = [read(home / name / "checkpoints/best.safetensors") for name in ("fcnn", "step")]
     assert best[0]["epoch"] == best[1]["epoch"]
     assert digest(best[0]["state_dict"]) == digest(best[1]["state_dict"])
 
@@ -232,14 +242,14 @@ def test_a_killed_run_of_a_network_that_draws_ends_bit_for_bit_too(
         ("step", 2, 0),  # the first step of the second epoch
         ("step", 11, 4),  # the very last one
         ("last.ckpt", 3, 2),  # half of a checkpoint is written
-        ("best.ckpt", 3, 2),
+        ("best.safetensors", 3, 2),
         ("last.ckpt", 5, 4),  # that of the last epoch
     ],
 )
 def test_wherever_a_run_is_killed_it_ends_bit_for_bit_the_same(
     straight, killed, script, overrides, home, where, at, there
 ):
-    name = f"{where.removesuffix('.ckpt')}{at}"
+    name = f"{where.partition('.')[0]}{at}"
     folder = killed(name, "fcnn", where, at)
     assert last(folder)["epoch"] == there, "the checkpoint before is whole"
     run = script("train", *overrides(name, "fcnn"), "ckpt_path=last", cwd=home)
@@ -252,7 +262,7 @@ def test_wherever_a_run_is_killed_it_ends_bit_for_bit_the_same(
 def test_a_network_that_draws_ends_the_same_wherever_it_is_killed(
     straight, killed, script, overrides, home, where, at
 ):
-    name = f"noisy-{where.removesuffix('.ckpt')}{at}"
+    name = f"noisy-{where.partition('.')[0]}{at}"
     folder = killed(name, "noisy", where, at)
     assert script("train", *overrides(name, "noisy"), "ckpt_path=last", cwd=home).status == 0
     assert_same(straight("noisy"), last(folder))
@@ -311,4 +321,4 @@ def test_a_resumed_run_removes_what_the_killed_one_was_writing(
     folder = killed("litter", "fcnn", "last.ckpt", 3)
     assert script("train", *overrides("litter", "fcnn"), "ckpt_path=last", cwd=home).status == 0
     left = sorted(path.name for path in (folder / "checkpoints").iterdir())
-    assert left == ["best.ckpt", "last.ckpt"]
+    assert left == ["best.safetensors", "last.ckpt"]

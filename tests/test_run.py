@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+from itertools import pairwise
 from pathlib import Path
 
 import hydra
@@ -14,8 +15,9 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import OmegaConf
+from safetensors.torch import save_file
 
-from dpl import run
+from dpl import checkpoints, run
 from dpl.run import ConfigError
 
 ROOT = Path(__file__).parents[1]
@@ -321,7 +323,11 @@ def _trained(folder, *overrides):
     with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         places = [f"data.folder={folder}/data", f"folder={folder}", "run=here"]
         cfg = hydra.compose("train", overrides=[*overrides, *places])
-    kept = [node for node in cfg.trainer.callbacks if "ModelCheckpoint" in node._target_]
+    kept = [
+        node
+        for node in cfg.trainer.callbacks
+        if node._target_.endswith(("ModelCheckpoint", "BestWeights"))
+    ]
     cfg.trainer.callbacks = kept
     cfg.trainer.max_epochs = 1
     scene = run.build_scene(cfg)
@@ -399,7 +405,7 @@ def test_a_run_without_a_checkpoint_is_refused(copied):
 
 
 @pytest.mark.parametrize(
-    "path", ["mesh", "material", "loads.distribution", "model", "trainer.callbacks.0"]
+    "path", ["mesh", "material", "loads.distribution", "model", "optimizer", "data"]
 )
 def test_a_run_that_names_what_is_not_ours_is_not_called(copied, path, tmp_path):
     cfg = OmegaConf.load(copied / "config.yaml")
@@ -409,27 +415,136 @@ def test_a_run_that_names_what_is_not_ours_is_not_called(copied, path, tmp_path)
         run.load_run(copied)
 
 
-def test_a_run_cannot_reach_out_of_the_package_through_it(copied):
-    """dpl.run.sys.exit begins with `dpl.` and is not ours all the same."""
+def test_nothing_of_the_trainer_of_a_run_is_called(copied):
     cfg = OmegaConf.load(copied / "config.yaml")
-    cfg.mesh = {"_target_": "dpl.run.importlib.import_module", "name": "antigravity"}
+    cfg.trainer.callbacks = [{"_target_": "pathlib.Path.touch"}]
     (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
-    with pytest.raises(ConfigError, match=r"dpl\.run\.importlib"):
+    run.load_run(copied)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "dpl.run.importlib.import_module",  # not ours, though the name begins with `dpl.`
+        "dpl.run.load_run",
+        "dpl.fem.files.save",  # writes
+        "dpl.benchmarks.rows.write",
+        "dpl.data.durable.whole_file",
+        "dpl.fem.mesh.Sequence",
+        "torch.optim.Optimizer.__init__.__globals__",
+        "lightning.fabric.utilities.cloud_io._load",  # a pickle, where it is asked to
+        "torch.load",
+        None,
+    ],
+)
+def test_a_run_cannot_reach_out_of_the_package_through_it(copied, name):
+    cfg = OmegaConf.load(copied / "config.yaml")
+    cfg.mesh = {"_target_": name, "path": "x"}
+    (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    with pytest.raises(ConfigError, match=r"mesh\b.*(not called|does not exist)"):
         run.load_run(copied)
 
 
-@pytest.mark.parametrize("harm", ["truncated", "text", "no weights"])
+def test_all_that_a_run_of_conf_calls_is_trusted(copied):
+    """What is new in conf/ must be put where it may be read back, or a run of it could not be."""
+    parts = ("mesh", "material", "clamped", "loads", "data", "model", "loss", "optimizer")
+    for path in (path for part in parts for path in (ROOT / "conf" / part).glob("*.yaml")):
+        for _, node in run._walk(OmegaConf.to_container(OmegaConf.load(path))):
+            if isinstance(node, dict) and "_target_" in node:
+                assert run._trusted(hydra.utils.get_object(node["_target_"])), node["_target_"]
+
+
+BOMB = "\n".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in pairwise("abcdefgh"))
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("a: &a [lol]\n" + BOMB, "refers to parts of itself"),
+        ("seed: ${oc.env:HOME}", "holds an interpolation"),
+        ("seed: [1", "is not the configuration of a run"),
+        ("- 1", "is no list of keys and values"),
+        ("!!python/object/apply:os.system [ls]", "is not the configuration of a run"),
+        ("a: " + "[" * 5000, "is not the configuration of a run"),
+        ("a: " + "x" * 2_000_000, "has more than 1000000 bytes"),
+    ],
+    ids=range(7),
+)
+def test_a_configuration_that_no_run_writes_is_refused_by_name(copied, text, told):
+    (copied / "config.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=told) as refusal:
+        run.load_run(copied)
+    assert "config.yaml" in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("harm", ["truncated", "text", "no weights", "no scene"])
 def test_a_damaged_checkpoint_is_refused_by_name(copied, harm):
-    best = copied / "checkpoints" / "best.ckpt"
+    best = copied / "checkpoints" / "best.safetensors"
     if harm == "truncated":
         best.write_bytes(best.read_bytes()[:-1000])
     elif harm == "text":
         best.write_text("hello")
+    elif harm == "no scene":
+        save_file(checkpoints.read(best)["state_dict"], best)
     else:
-        state = torch.load(best, weights_only=True)
-        torch.save({**state, "state_dict": {}}, best)
-    with pytest.raises(ConfigError, match=r"best\.ckpt"):
+        checkpoints.write({**checkpoints.read(best), "state_dict": {}}, best)
+    with pytest.raises(ConfigError, match=r"best\.safetensors"):
         run.load_run(copied)
+
+
+def test_a_run_without_validation_comes_back_from_its_last_checkpoint(copied):
+    (copied / "checkpoints" / "best.safetensors").unlink()
+    assert not run.load_run(copied)[1].training
+
+
+# ------------------------------------------------------------------ resumed
+
+
+@pytest.fixture
+def resumed(compose, tiny_training, trained):
+    """The configuration that resumes the run, changed as asked."""
+
+    def resumed(*overrides):
+        folder = trained[0]
+        common = [f"folder={folder}", "trainer.max_epochs=1", *tiny_training]
+        path = f"{folder}/checkpoints/last.ckpt"
+        return compose(*common, f"ckpt_path={path}", *overrides, command="train")
+
+    return resumed
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["trainer.max_epochs=9", "data.workers=1", "data.folder=elsewhere", "trainer.devices=2"],
+)
+def test_a_run_may_be_resumed_for_longer_and_elsewhere(resumed, override):
+    run.check_resumed(resumed(override))
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("model.width=17", "model.width was 16, is 17"),
+        ("material.poisson=0.25", "material.poisson was 0.3, is 0.25"),
+        ("seed=1", "data.shuffle was 0, is 1; seed was 0, is 1"),
+        ("data.train=17", "data.train was 16, is 17"),
+        ("loss=mse", "loss._target_ was dpl.losses.LrStar, is dpl.losses.MSE"),
+        ("+trainer.gradient_clip_val=1.0", "trainer.gradient_clip_val was None, is 1.0"),
+        ("~scheduler", "scheduler"),
+    ],
+)
+def test_a_run_is_not_resumed_with_another_configuration(resumed, override, told):
+    with pytest.raises(ConfigError, match="is of another configuration") as refusal:
+        run.check_resumed(resumed(override))
+    assert told in str(refusal.value)
+
+
+def test_a_run_that_is_not_there_is_not_resumed(compose, tmp_path):
+    for path in ("last", f"{tmp_path}/nowhere.ckpt"):
+        cfg = compose(f"folder={tmp_path}", f"ckpt_path={path}", command="train")
+        with pytest.raises(ConfigError, match="ckpt_path: there is no"):
+            run.check_resumed(cfg)
 
 
 def test_the_run_of_another_scene_is_refused(copied):

@@ -68,7 +68,7 @@ def test_a_run_leaves_configuration_checkpoints_events_figure_and_case(trained, 
     left = {path.name for path in (home / "runs/first").iterdir()}
     assert {"config.yaml", "checkpoints", "evaluation.json", "shapes.png", "worst.vtu"} <= left
     names = sorted(path.name for path in (home / "runs/first/checkpoints").iterdir())
-    assert names == ["best.ckpt", "last.ckpt"]
+    assert names == ["best.safetensors", "last.ckpt"]
     (data,) = (home / "datasets").iterdir()
     assert data.name.endswith("-seed0")
     assert sorted(path.name for path in home.iterdir()) == ["datasets", "runs"]
@@ -438,7 +438,7 @@ def test_every_network_trains_with_either_loss_in_one_command(start, tiny_traini
     for folder in runs.values():
         rows = json.loads((folder / "evaluation.json").read_text())
         assert np.isfinite(rows[1]["errors"]["e_mean"])
-        assert (folder / "checkpoints/best.ckpt").exists()
+        assert (folder / "checkpoints/best.safetensors").exists()
     assert len(list((tmp_path / "datasets").iterdir())) == 1
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from dpl import run
+from dpl.checkpoints import read
 from dpl.data.datamodule import OnlineData
 from dpl.fem.solution import Load, solve
 from dpl.losses import MSE
@@ -322,8 +323,8 @@ def trained(script, overrides, home):
     return home / "whole"
 
 
-def checkpoint(folder, name="last"):
-    return torch.load(folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
+def checkpoint(folder, name="last.ckpt"):
+    return read(folder / "checkpoints" / name)
 
 
 def alike(one, other):
@@ -340,7 +341,7 @@ def alike(one, other):
 def test_a_run_comes_back_as_it_was(trained, home, monkeypatch):
     monkeypatch.chdir(home)
     cfg, module = run.load_run(trained)
-    saved = checkpoint(trained, "best")["state_dict"]
+    saved = checkpoint(trained, "best.safetensors")["state_dict"]
     assert cfg.model._target_.endswith("Latent")
     assert module.net.prepared
     assert alike(saved, dict(module.state_dict()))
@@ -471,11 +472,11 @@ def test_a_wrong_option_ends_with_one_line_before_anything_is_solved(
 
 def test_a_run_of_another_rank_is_refused(trained, home, monkeypatch, tmp_path):
     monkeypatch.chdir(home)
-    for name in ("config.yaml", "checkpoints/best.ckpt"):
+    for name in ("config.yaml", "checkpoints/best.safetensors"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes((trained / name).read_bytes())
     text = (tmp_path / "config.yaml").read_text()
     assert "rank: 160" in text
     (tmp_path / "config.yaml").write_text(text.replace("rank: 160", "rank: 20"))
-    with pytest.raises(run.ConfigError, match=r"best\.ckpt cannot be used"):
+    with pytest.raises(run.ConfigError, match=r"best\.safetensors cannot be used"):
         run.load_run(tmp_path)

@@ -1,0 +1,133 @@
+"""Checkpoints are whole or not there, come back as they were, and run nothing when read."""
+
+import io
+import json
+import os
+import pickle
+import zipfile
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from dpl.checkpoints import WholeCheckpoints, read, write
+
+WEIGHTS = {"net.a": torch.arange(6.0).reshape(2, 3), "scale": torch.tensor(2.0).double()}
+CHECKPOINT = {
+    "state_dict": WEIGHTS,
+    "scene": "0f",
+    "identity": {"mesh": {"nodes": 9}},
+    "epoch": 3,
+    "global_step": 12,
+    "random": {"python": (3, (1, 2), None)},
+}
+
+
+class Unwritable:
+    """An object whose pickling fails half way, as a full disk does."""
+
+    def __reduce__(self):
+        raise OSError("no space left on device")
+
+
+class Harm:
+    """An object that runs a command where it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.mark.parametrize("name", ["best.safetensors", "last.ckpt"])
+def test_a_checkpoint_comes_back_as_it_was(tmp_path, name):
+    write(CHECKPOINT, tmp_path / "folder" / name)
+    found = read(tmp_path / "folder" / name)
+    for key, tensor in WEIGHTS.items():
+        assert torch.equal(found["state_dict"][key], tensor)
+        assert found["state_dict"][key].dtype == tensor.dtype
+    kept = CHECKPOINT.keys() - ({"random"} if name.startswith("best") else set())
+    assert found.keys() == kept
+    assert all(found[key] == CHECKPOINT[key] for key in kept - {"state_dict"})
+
+
+def test_weights_that_are_views_of_others_are_kept(tmp_path):
+    state = {"whole": WEIGHTS["net.a"].T, "part": WEIGHTS["net.a"].T[0]}
+    write({**CHECKPOINT, "state_dict": state}, tmp_path / "best.safetensors")
+    found = read(tmp_path / "best.safetensors")["state_dict"]
+    assert all(torch.equal(found[key], state[key]) for key in state)
+
+
+def test_lightning_writes_and_reads_through_it(tmp_path):
+    files = WholeCheckpoints()
+    files.save_checkpoint(CHECKPOINT, str(tmp_path / "last.ckpt"))
+    assert files.load_checkpoint(str(tmp_path / "last.ckpt"))["epoch"] == 3
+    (tmp_path / "last.ckpt").write_bytes(b"hello")
+    with pytest.raises(ValueError, match=r"last\.ckpt"):
+        files.load_checkpoint(tmp_path / "last.ckpt")
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one(tmp_path):
+    path = tmp_path / "folder" / "last.ckpt"
+    write(CHECKPOINT, path)
+    with pytest.raises(OSError, match="no space"):
+        write({"big": torch.zeros(10_000), "bad": Unwritable()}, path)
+    assert read(path)["epoch"] == 3
+    assert [p.name for p in path.parent.iterdir()] == ["last.ckpt"]
+    write({**CHECKPOINT, "epoch": 4}, path)
+    assert read(path)["epoch"] == 4
+
+
+def test_a_pickle_is_not_run(tmp_path):
+    path, harm = tmp_path / "last.ckpt", tmp_path / "harm"
+    torch.save({**CHECKPOINT, "more": Harm(harm)}, path)
+    with pytest.raises(ValueError, match=r"."):
+        read(path)
+    path.write_bytes(pickle.dumps(Harm(harm)))
+    with pytest.raises(ValueError, match=r"."):
+        read(path)
+    assert not harm.exists()
+
+
+def test_a_checkpoint_that_is_larger_inside_is_not_unpacked(tmp_path):
+    path, content = tmp_path / "last.ckpt", io.BytesIO()
+    torch.save({**CHECKPOINT, "zeros": torch.zeros(1_000_000)}, content)
+    with (
+        zipfile.ZipFile(content) as source,
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed,
+    ):
+        for member in source.infolist():
+            packed.writestr(member.filename, source.read(member))
+    assert path.stat().st_size < 100_000
+    with pytest.raises(ValueError, match="unpacks to"):
+        read(path)
+
+
+@pytest.mark.parametrize("what", [[], {"state_dict": 1}, {"weights": {}}])
+def test_what_holds_no_weights_is_refused(tmp_path, what):
+    torch.save(what, tmp_path / "last.ckpt")
+    with pytest.raises(ValueError, match="holds no weights"):
+        read(tmp_path / "last.ckpt")
+
+
+@pytest.mark.parametrize("header", [None, {"dpl": "1"}, {"dpl": "{"}, {"other": "{}"}])
+def test_weights_without_a_header_are_refused(tmp_path, header):
+    save_file(WEIGHTS, tmp_path / "best.safetensors", header)
+    with pytest.raises(ValueError, match=r"."):
+        read(tmp_path / "best.safetensors")
+
+
+def test_a_header_says_no_more_than_it_may(tmp_path):
+    told = {"dpl": json.dumps({"scene": "0f", "state_dict": {}, "random": 1})}
+    save_file(WEIGHTS, tmp_path / "best.safetensors", told)
+    found = read(tmp_path / "best.safetensors")
+    assert found.keys() == {"scene", "state_dict"}
+    assert found["state_dict"].keys() == WEIGHTS.keys()
+
+
+def test_a_header_of_a_length_that_no_file_has_is_refused(tmp_path):
+    path = tmp_path / "best.safetensors"
+    path.write_bytes((2**62).to_bytes(8, "little") + b"{}")
+    with pytest.raises(ValueError, match=r"."):
+        read(path)
