@@ -56,7 +56,7 @@ KEYS = {  # what a configuration may hold at its top
     *("action", "shard", "shards"),
     *("parts", "linear", "repeats", "count", "workers", "peers", "samples"),
     *("name", "galerkin", "corrected"),
-    *("networks", "tols", "far", "resume", "threads", "across", "cases"),
+    *("networks", "tols", "far", "resume", "threads", "across", "cases", "minutes"),
 }
 
 ASIDE = {  # where a run lies and how it is watched, not what it is
@@ -383,14 +383,20 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
         raise ConfigError(f"model: {error}") from error
 
 
-def check_processes(trainer: Any) -> None:
-    """Refuse the sweep whose training starts further processes: each would start the sweep again.
+def check_trainer(trainer: Any, cfg: DictConfig) -> None:
+    """Refuse what a trainer cannot do with the rest of a configuration, before it begins.
 
     Raises:
-        ConfigError: It is one.
+        ConfigError: A schedule of the learning rate over a training without end, or a sweep whose
+            training starts further processes: each would start the sweep again.
     """
     from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
+    if cfg.scheduler and trainer.max_epochs == -1 and trainer.max_steps == -1:
+        raise ConfigError(
+            "trainer.max_epochs = -1: the schedule of the learning rate needs an end; give it "
+            "one, or trainer.max_steps, or set scheduler=null"
+        )
     sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
     launcher = getattr(trainer.strategy, "launcher", None)
     if not sweep or not isinstance(launcher, _SubprocessScriptLauncher):

@@ -29,7 +29,7 @@ def main(cfg: DictConfig) -> float | None:
     data = run.make(cfg, "data", scene=scene)
     surrogate = run.build_surrogate(cfg, scene)
     trainer = run.make(cfg, "trainer")
-    run.check_processes(trainer)
+    run.check_trainer(trainer, cfg)
     if trainer.is_global_zero:
         run.show_plan(scene, data, surrogate)
         run.save_config(cfg, folder)

@@ -20,6 +20,7 @@ from dpl import run
 from dpl.run import ConfigError
 
 ROOT = Path(__file__).parents[1]
+SCHEDULED = OmegaConf.create({"scheduler": {"_target_": "dpl.module.warmup_cosine"}})
 TWO = ["trainer.accelerator=cpu", "trainer.devices=2", "++trainer.strategy=ddp"]
 
 
@@ -174,7 +175,7 @@ def test_a_refused_sweep_ends_with_one_line_and_makes_nothing(script, tiny, tmp_
 def test_processes_that_run_the_command_again_are_refused_in_a_sweep(sweeping, strategy):
     sweeping()
     with pytest.raises(ConfigError, match=r"trainer\.strategy: .* -m") as refusal:
-        run.check_processes(trainer(devices=2, strategy=strategy))
+        run.check_trainer(trainer(devices=2, strategy=strategy), SCHEDULED)
     assert "\n" not in str(refusal.value)
 
 
@@ -185,13 +186,13 @@ def test_processes_that_run_the_command_again_are_refused_in_a_sweep(sweeping, s
 )
 def test_what_does_not_run_the_command_again_is_not_refused_in_a_sweep(sweeping, options):
     sweeping()
-    run.check_processes(trainer(**options))
+    run.check_trainer(trainer(**options), SCHEDULED)
 
 
 def test_without_a_sweep_nothing_is_refused(sweeping):
-    run.check_processes(trainer(devices=2, strategy="ddp"))
+    run.check_trainer(trainer(devices=2, strategy="ddp"), SCHEDULED)
     sweeping(RunMode.RUN)
-    run.check_processes(trainer(devices=2, strategy="ddp"))
+    run.check_trainer(trainer(devices=2, strategy="ddp"), SCHEDULED)
 
 
 class Outside(LightningEnvironment):
@@ -202,4 +203,4 @@ class Outside(LightningEnvironment):
 
 def test_the_remedies_that_the_refusal_names_are_not_refused(sweeping):
     sweeping()
-    run.check_processes(trainer(devices=2, strategy="ddp", plugins=[Outside()]))
+    run.check_trainer(trainer(devices=2, strategy="ddp", plugins=[Outside()]), SCHEDULED)

@@ -498,6 +498,13 @@ def test_a_run_without_validation_comes_back_from_its_last_checkpoint(copied):
     assert not run.load_run(copied)[1].training
 
 
+def test_a_schedule_over_a_training_without_end_is_refused(tiny_training, script, tmp_path):
+    ended = script("train", *tiny_training, "trainer.max_epochs=-1", cwd=tmp_path)
+    assert ended.status == 2
+    assert ended.err.splitlines()[-1].startswith("error: trainer.max_epochs = -1: the schedule")
+    assert not (tmp_path / "datasets").exists()
+
+
 # ------------------------------------------------------------------ resumed
 
 
