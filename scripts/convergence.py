@@ -34,7 +34,8 @@ def main(cfg: DictConfig) -> None:
     with Progress() as progress:
         bar = progress.add_task("loads", total=sum(len(sets[name].force) for _, name in tasks))
         for tol, name in tasks:
-            solvers = convergence.contestants(scene, networks, tol)
+            budget = cfg.budget if name.endswith("times") else None
+            solvers = convergence.contestants(scene, networks, tol, budget=budget)
             known = {(t.solver, t.network): t for t in trials if (t.tol, t.loads) == (tol, name)}
             count = len(sets[name].force)
             if set(known) == set(solvers) and all(t.number == count - 1 for t in known.values()):

@@ -171,7 +171,7 @@ def load_sets(scene: Scene, count: int, far: int) -> dict[str, Load]:
 
 
 def contestants(
-    scene: Scene, networks: Mapping[str, Predict], tol: float
+    scene: Scene, networks: Mapping[str, Predict], tol: float, *, budget: int | None = None
 ) -> dict[tuple[str, str], Solver]:
     """Return the solvers, by name and network, that have the same body and linear solver.
 
@@ -179,8 +179,11 @@ def contestants(
         scene: What is simulated.
         networks: Predictions, named.
         tol: Residual ratio [-].
+        budget: Iterations before a load is given up; the scene's if left out.
     """
-    robust, quick = scene.solver.but(tol=tol), scene.corrector.but(tol=tol)
+    settings: dict[str, float] = {"tol": tol}
+    settings |= {} if budget is None else {"budget": budget}
+    robust, quick = scene.solver.but(**settings), scene.corrector.but(**settings)
     plain = PlainNewton(robust)
     solvers: dict[tuple[str, str], Solver] = {
         ("plain Newton", ""): plain,
