@@ -15,12 +15,13 @@ from omegaconf import DictConfig
 from dpl import run
 
 LOOKS = 360  # at each work
+WORKS = ("training", "simulator")
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="soak")
 @run.command
 def main(cfg: DictConfig) -> None:
-    """Train, then simulate, and look at both."""
+    """Train, simulate, and look at both."""
     # here and not above: worker processes import this file, and need none of it
     from dpl.benchmarks import rows as table
     from dpl.simulator import Simulator
@@ -29,7 +30,44 @@ def main(cfg: DictConfig) -> None:
     run.check(cfg)
     if not cfg.minutes > 0:
         raise run.ConfigError(f"minutes = {cfg.minutes} must be above 0")
+    if not cfg.works or not set(cfg.works) <= set(WORKS):
+        raise run.ConfigError(f"works = {cfg.works} must be some of {', '.join(WORKS)}")
     folder, seconds = Path(cfg.folder), 60.0 * cfg.minutes
+    rows, wrong = [], []
+
+    def seen(work: list) -> None:
+        rows.extend(work)
+        wrong.extend(f"{work[-1].what}: {line}" for line in soak.flaws(work))
+        table.write(rows, folder / "soak.csv")
+        table.write_machine(folder / "machine.json")
+        soak.draw(rows, folder / "soak.png")
+        print(soak.told(work))
+
+    if "training" in cfg.works:
+        before = soak.vitals("before", 0.0, 0)
+        seen(_trained(cfg, seconds))
+        gc.collect()  # the last batches, in shared memory
+        time.sleep(2.0)  # in which workers end
+        after = soak.vitals("after", 0.0, 0)
+        wrong += [f"after the training: {line}" for line in soak.left(before, after)]
+    if "simulator" in cfg.works:
+        _, surrogate = run.load_run(folder, trust=True)
+        asked = []
+        for row in soak.simulator(Simulator(surrogate), seconds, every=seconds / LOOKS):
+            asked.append(row)
+            print(
+                f"{row.seconds / 60:.1f} min: {row.done:,} answers ...", end="\r", file=sys.stderr
+            )
+        seen(asked)
+    print("\n".join(wrong) or "nothing grew, slowed down or was left behind")
+    if wrong:
+        sys.exit(1)
+
+
+def _trained(cfg: DictConfig, seconds: float) -> list:
+    """Train for so long and return what was seen."""
+    from dpl.stress import soak
+
     scene = run.build_scene(cfg)
     data = run.make(cfg, "data", scene=scene)
     surrogate = run.build_surrogate(cfg, scene)
@@ -37,30 +75,12 @@ def main(cfg: DictConfig) -> None:
     run.check_trainer(trainer, cfg)
     pulse = soak.Pulse(seconds, every=seconds / LOOKS)
     trainer.callbacks.append(pulse)
-    run.save_config(cfg, folder)
-    before = soak.vitals("before", 0.0, 0)
-    trainer.fit(surrogate, datamodule=data)
-    data.teardown("fit")
-    del trainer, data, surrogate  # and with them the last batches, in shared memory
-    gc.collect()
-    time.sleep(2.0)  # in which workers end
-    after = soak.vitals("after", 0.0, 0)
-    _, best = run.load_run(folder, trust=True, scene=scene)
-    simulated = []
-    for row in soak.simulator(Simulator(best), seconds, every=seconds / LOOKS):
-        simulated.append(row)
-        print(f"{row.seconds / 60:.1f} min: {row.done:,} answers ...", end="\r", file=sys.stderr)
-    works = (pulse.rows, simulated)
-    table.write([row for rows in works for row in rows], folder / "soak.csv")
-    table.write_machine(folder / "machine.json")
-    soak.draw([row for rows in works for row in rows], folder / "soak.png")
-    wrong = [f"after the training: {line}" for line in soak.left(before, after)]
-    for rows in works:
-        print(soak.told(rows))
-        wrong += [f"{rows[-1].what}: {line}" for line in soak.flaws(rows)]
-    print("\n".join(wrong) or "nothing grew, slowed down or was left behind")
-    if wrong:
-        sys.exit(1)
+    run.save_config(cfg, Path(cfg.folder))
+    try:
+        trainer.fit(surrogate, datamodule=data)
+    finally:
+        data.teardown("fit")
+    return pulse.rows
 
 
 if __name__ == "__main__":

@@ -60,6 +60,35 @@ def test_a_batch_is_its_members(build, scene):
     assert torch.allclose(whole, parts, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("kind", ["all the same", "all zero", "one degree of freedom moves"])
+def test_samples_without_variance_do_no_harm(build, scene, batch, kind):
+    """Nothing is divided by the spread of a degree of freedom that has none."""
+    force, displacement = (
+        batch.force[:1].expand(6, -1, -1),
+        batch.displacement[:1].expand(6, -1, -1),
+    )
+    if kind != "all the same":
+        force, displacement = 0 * force, 0 * displacement
+    if kind.startswith("one"):
+        displacement[:, *scene.problem.free.nonzero()[0]] = 1e-3
+    even = batch._replace(force=force, displacement=displacement, young=batch.young[:6])
+    surrogate = Surrogate(build(), MSE(), scene)
+    if isinstance(surrogate.net, PODNet):
+        surrogate.prepare(even)
+    optimizer = torch.optim.Adam(surrogate.parameters(), lr=1e-3)
+    for _ in range(3):
+        loss = surrogate.loss(surrogate.predict(even.load), even, surrogate.physics)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    answer = surrogate.eval().predict(even.load)
+    assert answer.isfinite().all()
+    assert all(tensor.isfinite().all() for tensor in surrogate.state_dict().values())
+    assert torch.equal(
+        answer[:, ~scene.problem.free], answer.new_zeros(6, int((~scene.problem.free).sum()))
+    )
+
+
 def test_a_network_overfits_one_batch(build, scene, batch):
     """A hundred times smaller error on four samples within 300 steps."""
     surrogate = Surrogate(build(), MSE(), scene)
