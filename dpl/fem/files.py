@@ -1,8 +1,5 @@
 """Mesh files in and out, with the names that they give to parts of the body."""
 
-import contextlib
-import io
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -13,6 +10,7 @@ from numpy.typing import NDArray
 from skfem.io.meshio import from_meshio, to_meshio
 
 from dpl.fem.checks import check, listed
+from dpl.fem.untrusted import read
 
 CELLS = {  # meshio's names of what can be solved, best first: dimension, nodes
     "hexahedron": (3, 8),
@@ -66,39 +64,11 @@ def load(path: str | Path) -> skfem.Mesh:
             that are kept.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such mesh file")
-    if path.suffix.lower() == ".vtu" and path.read_bytes().count(b"<Piece") > 1:
-        raise ValueError(f"{path}: holds several pieces, of which meshio keeps one; join them")
-    raw = _read(path)
+    raw = read(path)
     try:
         return _body(raw)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-
-
-def _read(path: Path) -> meshio.Mesh:
-    """Return what meshio reads; what it prints and how it exits become part of the error."""
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            raw = meshio.read(path)
-    except (Exception, SystemExit) as error:  # meshio calls sys.exit on files it cannot read
-        known = isinstance(error, (SystemExit, meshio.ReadError, ImportError))
-        text = said.getvalue().split("Error:")[0] if isinstance(error, SystemExit) else str(error)
-        reason = " ".join(text.split())
-        if "'gmsh:physical'" in reason:
-            reason = "only some of its cells are in physical groups; give each part one"
-        elif not (known and reason):
-            reason = f"it is damaged or ends too early{f' ({reason})' if reason else ''}"
-        raise ValueError(f"{path}: cannot be read as a mesh: {reason}") from error
-    promised = (
-        re.search(rb"CELL_TYPES\s+(\d+)", path.read_bytes()) if path.suffix == ".vtk" else None
-    )
-    missing = promised and int(promised[1]) != sum(len(block.data) for block in raw.cells)
-    if missing or "not closed" in said.getvalue():
-        raise ValueError(f"{path}: cannot be read as a mesh: it ends too early")
-    return raw
 
 
 def _body(raw: meshio.Mesh) -> skfem.Mesh:
