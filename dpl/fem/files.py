@@ -82,9 +82,14 @@ def _body(raw: meshio.Mesh) -> skfem.Mesh:
     kinds = [kind for kind in kinds if CELLS[kind][0] == dim]
     if len(kinds) > 1:
         raise ValueError(f"mixes {' and '.join(kinds)} cells; convert them to one kind")
-    if any(np.ndim(block.data) != 2 for block in raw.cells):
-        raise ValueError("lists cells with too few nodes; does it end too early?")
+    wide = {kinds[0]: CELLS[kinds[0]][1]}
+    for block in raw.cells:
+        shape = np.shape(block.data)
+        if len(shape) != 2 or shape[1] != wide.get(block.type, shape[1]):
+            raise ValueError("lists cells with too few nodes; does it end too early?")
     points = np.asarray(raw.points, dtype=np.float64)
+    if points.ndim != 2:
+        raise ValueError("lists nodes with too few coordinates; does it end too early?")
     cells = np.concatenate([block.data for block in raw.cells if block.type == kinds[0]])
     cells = cells.astype(np.int64)
     if points.shape[1] < dim:
@@ -138,11 +143,13 @@ def _tagged(mesh: skfem.Mesh, raw: meshio.Mesh, kind: str, corners: Numbers) -> 
     count, width = 0, len(mesh.facets)
     for block in raw.cells:
         kept = block.type == kind
+        _within(f"{block.type} cells", block.data, len(vertex))
         places.append(count + np.arange(len(block.data)) if kept else None)
         count += len(block.data) if kept else 0
         fits = not kept and SIDES.get(block.type) == width
         known.append(_find(mesh, vertex[block.data[:, :width]]) if fits else None)
     for name, b, members in _cell_sets(raw):
+        _within(f"the set {name!r}", members, len(raw.cells[b].data) if b < len(places) else 0)
         if (own := places[b]) is not None:
             cells.setdefault(name, []).append(own[members])
         elif (side := known[b]) is not None:
@@ -215,9 +222,18 @@ def _node_sets(raw: meshio.Mesh) -> Iterator[tuple[str, NDArray[np.bool_]]]:
         sets += [(f"{field}={number}", members) for _, number, members in _values([data])]
         sets += [(field, np.flatnonzero(data))] if _is_mask([data]) else []
     for name, members in sets:
+        _within(f"the set {name!r}", members, len(inside))
         inside[:] = False
         inside[members] = True
         yield name, inside
+
+
+def _within(name: str, members: Numbers, count: int) -> None:
+    """Hold numbers to those that there are, for NumPy takes negative ones too."""
+    if np.size(members) and not 0 <= np.min(members) <= np.max(members) < count:
+        raise ValueError(
+            f"{name[:80]} name {np.min(members)} to {np.max(members)}, there are 0 to {count - 1}"
+        )
 
 
 def _values(blocks: list) -> Iterator[tuple[int, int, Numbers]]:

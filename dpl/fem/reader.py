@@ -101,6 +101,7 @@ def stricter() -> None:
         # else rows that a file declares and does not list are what was in memory before
         module.np = types.SimpleNamespace(**{**vars(np), "empty": _nothing})
     gmsh[0]._gmsh_to_meshio_order = _counted_from_one(common._gmsh_to_meshio_order)
+    gmsh[0]._read_cells_ascii = _of_their_length(gmsh[0])
     vtu.vtk_cells_from_data = vtk.vtk_cells_from_data = _whole(shared)
 
 
@@ -124,6 +125,24 @@ def _counted_from_one(ordered: Any) -> Any:
         if np.size(nodes) and np.min(nodes) < 0:  # would count from the last one
             raise meshio.ReadError(f"cells name node {np.min(nodes) + 1}, nodes count from 1")
         return ordered(kind, nodes)
+
+    return checked
+
+
+def _of_their_length(gmsh22: Any) -> Any:
+    read_cells = gmsh22._read_cells_ascii
+
+    def checked(file: Any, cells: Any, tags: Any, total: int) -> None:
+        start = file.tell()
+        for _ in range(total):
+            row = file.readline().split()
+            kind = gmsh22._gmsh_to_meshio_type[int(row[1])]
+            if len(row) != 3 + int(row[2]) + gmsh22.num_nodes_per_cell[kind]:
+                raise meshio.ReadError(
+                    f"element {row[0].decode()[:20]} is no {kind}, by its length"
+                )
+        file.seek(start)
+        read_cells(file, cells, tags, total)
 
     return checked
 
