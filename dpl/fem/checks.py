@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 # Degree that the quadrature integrates exactly; no problem here puts its points more densely.
 ORDERS = {"Triangular": 4, "Quadrilateral": 5, "Tetrahedral": 4, "Hexahedral": 5}
+LARGEST = 1e50  # of coordinates [m]; with more, volumes would overflow
 
 Numbers = NDArray[np.int_]
 
@@ -23,10 +24,10 @@ def check(mesh: skfem.Mesh, *, numbers: Numbers | None = None) -> skfem.Mesh:
 
     Raises:
         ValueError: The first of these flaws, with the cells or nodes that have it: coordinates that
-            are not finite, nodes without a cell, cells that list a node twice, cells listed twice,
-            inverted or flat cells, sides shared by three cells, cells folded over their neighbours,
-            nodes in one place, hanging nodes, sides that overlap without being the same, a body
-            in several pieces.
+            are not finite or beyond `LARGEST`, nodes without a cell, cells that list a node twice,
+            cells listed twice, inverted or flat cells, sides shared by three cells, cells folded
+            over their neighbours, nodes in one place, hanging nodes, sides that overlap without
+            being the same, a body in several pieces.
     """
     numbers = np.arange(mesh.p.shape[1]) if numbers is None else numbers
     _check_nodes(mesh, numbers)
@@ -48,6 +49,11 @@ def _check_nodes(mesh: skfem.Mesh, numbers: Numbers) -> None:
     bad = np.flatnonzero(~np.isfinite(mesh.p).all(axis=0))
     if len(bad):
         raise ValueError(f"coordinates of {len(bad)} nodes are not finite: {_nodes(bad, numbers)}")
+    bad = np.flatnonzero((np.abs(mesh.p) > LARGEST).any(axis=0))
+    if len(bad):
+        raise ValueError(
+            f"coordinates of {len(bad)} nodes are beyond {LARGEST:.0e} m: {_nodes(bad, numbers)}"
+        )
     bad = np.flatnonzero(np.bincount(mesh.t.ravel(), minlength=mesh.nvertices) == 0)
     if len(bad):
         raise ValueError(f"{len(bad)} nodes belong to no cell: {_nodes(bad, numbers)}")

@@ -9,7 +9,7 @@ import skfem
 from numpy.typing import NDArray
 from skfem.io.meshio import from_meshio, to_meshio
 
-from dpl.fem.checks import check, listed
+from dpl.fem.checks import LARGEST, check, listed
 from dpl.fem.untrusted import read
 
 CELLS = {  # meshio's names of what can be solved, best first: dimension, nodes
@@ -91,6 +91,8 @@ def _body(raw: meshio.Mesh) -> skfem.Mesh:
     if points.ndim != 2:
         raise ValueError("lists nodes with too few coordinates; does it end too early?")
     cells = np.concatenate([block.data for block in raw.cells if block.type == kinds[0]])
+    if cells.dtype.kind not in "iu":
+        raise ValueError("numbers the nodes of cells by what are no whole numbers")
     cells = cells.astype(np.int64)
     if points.shape[1] < dim:
         raise ValueError(f"{kinds[0]} cells need nodes of {dim} coordinates")
@@ -122,6 +124,12 @@ def _flat(points: NDArray[np.float64], used: Numbers) -> NDArray[np.float64]:
     """
     points = points[used]
     if points.shape[1] == 3:
+        bad = np.flatnonzero(~(np.abs(points[:, 2]) <= LARGEST))
+        if len(bad):  # which the comparison with their distances would let pass
+            raise ValueError(
+                f"coordinates of {len(bad)} nodes are not finite or beyond {LARGEST:.0e} m: "
+                + listed(used[bad])
+            )
         away = np.abs(points[:, 2] - points[0, 2])
         bad = np.flatnonzero(away > 1e-9 * np.ptp(points, axis=0).max())
         if len(bad):

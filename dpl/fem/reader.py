@@ -5,6 +5,7 @@ to say about it. Here meshio is held to what files declare; in the process that 
 it is.
 """
 
+import builtins
 import contextlib
 import importlib
 import io
@@ -21,6 +22,8 @@ from typing import Any
 
 import meshio
 import numpy as np
+
+MOST_ENDS = 1000  # times that a reader may ask for more after the end
 
 
 def main() -> None:
@@ -83,6 +86,7 @@ def read(path: str) -> tuple[meshio.Mesh | None, dict[str, Any]]:
     except (Exception, SystemExit) as error:  # meshio calls sys.exit on files it cannot read
         known = isinstance(error, (SystemExit, meshio.ReadError, ImportError))
         text = said.getvalue().split("Error:")[0] if isinstance(error, SystemExit) else str(error)
+        text = "".join(c if c.isprintable() else " " for c in text)
         return None, {"text": " ".join(text.split())[:500], "known": known}
 
 
@@ -95,6 +99,7 @@ def stricter() -> None:
         for name in ("vtu._vtu", "vtk._vtk_51", "_vtk_common", "dolfin._dolfin")
     ]
     vtu, vtk, shared, dolfin = modules
+    builtins.open = _open  # type: ignore[assignment]
     for module in (*gmsh, common, main_):
         module._fast_forward_to_end_block = _end_block
     for module in (*gmsh[1:], dolfin):
@@ -103,6 +108,40 @@ def stricter() -> None:
     gmsh[0]._gmsh_to_meshio_order = _counted_from_one(common._gmsh_to_meshio_order)
     gmsh[0]._read_cells_ascii = _of_their_length(gmsh[0])
     vtu.vtk_cells_from_data = vtk.vtk_cells_from_data = _whole(shared)
+
+
+class _Ending:
+    """A file that does not let a reader look for more after its end for ever."""
+
+    ends = 0
+
+    def readline(self, *size: Any) -> Any:
+        """Return the next line; raise an error when it is asked for too often after the last."""
+        return self._counted(super().readline(*size))  # type: ignore[misc]
+
+    def read(self, *size: Any) -> Any:
+        """Return what is left, or so much of it; raise an error as `readline` does."""
+        return self._counted(super().read(*size))  # type: ignore[misc]
+
+    def _counted(self, found: Any) -> Any:
+        self.ends += not found
+        if self.ends > MOST_ENDS:
+            raise meshio.ReadError("it ends too early")
+        return found
+
+
+class _Bytes(_Ending, io.BufferedReader): ...
+
+
+class _Text(_Ending, io.TextIOWrapper): ...
+
+
+def _open(name: Any, mode: str = "r", *more: Any, **options: Any) -> Any:
+    if mode == "rb" and not more and not options:
+        return _Bytes(io.FileIO(name))
+    if mode == "r" and not more and not options:
+        return _Text(io.BufferedReader(io.FileIO(name)))
+    return open(name, mode, *more, **options)
 
 
 def _end_block(file: Any, block: str) -> None:
