@@ -10,12 +10,14 @@ import contextlib
 import importlib
 import io
 import json
+import lzma
 import os
 import pickle
 import signal
 import sys
 import types
 import warnings
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from typing import Any
 import meshio
 import numpy as np
 
+UNPACKED = (2**26, 100)  # that packed data may hold [B]: at any rate, and per byte of the file
 MOST_ENDS = 1000  # times that a reader may ask for more after the end
 
 
@@ -80,6 +83,7 @@ def read(path: str) -> tuple[meshio.Mesh | None, dict[str, Any]]:
         ):
             warnings.simplefilter("ignore")
             warnings.filterwarnings("error", ".*could not be read to its end")
+            _Unpacker.left = UNPACKED[0] + UNPACKED[1] * os.path.getsize(path)
             return meshio.read(path), {}
     except MemoryError:
         return None, {"memory": True}
@@ -107,7 +111,28 @@ def stricter() -> None:
         module.np = types.SimpleNamespace(**{**vars(np), "empty": _nothing})
     gmsh[0]._gmsh_to_meshio_order = _counted_from_one(common._gmsh_to_meshio_order)
     gmsh[0]._read_cells_ascii = _of_their_length(gmsh[0])
+    vtu.zlib, vtu.lzma = _Unpacker(zlib.decompressobj), _Unpacker(lzma.LZMADecompressor)
     vtu.vtk_cells_from_data = vtk.vtk_cells_from_data = _whole(shared)
+
+
+class _Unpacker:
+    """Stands for a module that unpacks, until the data of one file have grown too large."""
+
+    left = 0  # bytes, of all unpackers together
+
+    def __init__(self, start: Any) -> None:
+        self._start = start
+
+    def decompress(self, data: bytes) -> bytes:
+        """Return the unpacked bytes."""
+        unpacking = self._start()
+        found = unpacking.decompress(data, max(_Unpacker.left, 1))
+        _Unpacker.left -= len(found)
+        if _Unpacker.left <= 0:
+            raise meshio.ReadError("its data unpack to more than a file of its size should hold")
+        if not unpacking.eof:
+            raise meshio.ReadError("its packed data end too early")
+        return found
 
 
 class _Ending:
@@ -199,6 +224,8 @@ def _whole(shared: types.ModuleType) -> Any:
         if (sizes < 0).any() or sizes.sum() != len(connectivity):
             raise meshio.ReadError("the offsets of its cells do not fit their nodes")
         for kind in np.unique(types):
+            if int(kind) not in shared.vtk_to_meshio_type:  # would be left out
+                raise meshio.ReadError(f"it holds cells of VTK's type {kind}; convert them")
             if int(kind) in known and (sizes[types == kind] != known[int(kind)]).any():
                 raise meshio.ReadError(f"cells of type {kind} have {known[int(kind)]} nodes")
         return cells_from_data(connectivity, offsets, types, data)
