@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 # Degree that the quadrature integrates exactly; no problem here puts its points more densely.
 ORDERS = {"Triangular": 4, "Quadrilateral": 5, "Tetrahedral": 4, "Hexahedral": 5}
+CROWD = 100  # nodes in one place of which pairs are not worth listing: they are many
 LARGEST = 1e50  # of coordinates [m]; with more, volumes would overflow
 
 Numbers = NDArray[np.int_]
@@ -137,6 +138,15 @@ def _outward(mesh: skfem.Mesh, side: list[int]) -> NDArray[np.int_]:
 def _check_places(mesh: skfem.Mesh, numbers: Numbers) -> None:
     """Hold all nodes, those of quadratic edges too, to places of their own."""
     close = 1e-9 * np.ptp(mesh.p, axis=1).max()
+    _, place, count = np.unique(
+        np.round(mesh.p / (10 * close)), axis=1, return_inverse=True, return_counts=True
+    )
+    if count.max() > CROWD:
+        bad = np.flatnonzero(place.ravel() == count.argmax())
+        raise ValueError(
+            f"{len(bad)} nodes coincide in one place: {_nodes(bad, numbers)}; merge them, "
+            "or the body is cracked"
+        )
     twins = cKDTree(mesh.p.T).query_pairs(close, output_type="ndarray")
     if len(twins):
         known = twins[(twins < len(numbers)).all(axis=1)]

@@ -78,10 +78,11 @@ def _body(raw: meshio.Mesh) -> skfem.Mesh:
         raise ValueError(
             f"holds no cells that can be solved ({', '.join(sorted(found)) or 'none'})"
         )
-    dim = max(CELLS[kind][0] for kind in kinds)
-    kinds = [kind for kind in kinds if CELLS[kind][0] == dim]
-    if len(kinds) > 1:
-        raise ValueError(f"mixes {' and '.join(kinds)} cells; convert them to one kind")
+    dim = max(block.dim for block in raw.cells if len(block.data))
+    kinds = sorted({block.type for block in raw.cells if block.dim == dim and len(block.data)})
+    if len(kinds) > 1 or kinds[0] not in CELLS:
+        what = f"mixes {' and '.join(kinds)} cells" if len(kinds) > 1 else f"holds {kinds[0]} cells"
+        raise ValueError(f"{what}; convert them to one kind: {', '.join(CELLS)}")
     wide = {kinds[0]: CELLS[kinds[0]][1]}
     for block in raw.cells:
         shape = np.shape(block.data)

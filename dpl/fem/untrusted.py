@@ -14,6 +14,7 @@ import math
 import os
 import pickle
 import re
+import signal
 import stat
 import subprocess
 import sys
@@ -60,8 +61,10 @@ def read(path: Path) -> meshio.Mesh:
 def _reason(said: dict[str, Any]) -> str:
     if said.get("memory"):
         return f"it takes more memory than a file of its size should; {FIXES}"
-    if said.get("died"):
-        return f"it takes too long, or breaks the reader (status {said['died']}); {FIXES}"
+    if "died" in said:
+        late = hasattr(signal, "SIGALRM") and said["died"] == -signal.SIGALRM
+        what = "takes longer than a file of its size should" if late else "breaks the reader"
+        return f"it {what} (status {said['died']}); {FIXES}"
     text = said["text"]
     if "'gmsh:physical'" in text:
         return "only some of its cells are in physical groups; give each part one"

@@ -67,7 +67,7 @@ COUNTED = (
     "medit",
     "dolfin-xml",
 )  # tell how many cells they hold
-TEXTS = [b"nan", b"inf", b"-1", b"0", b"1", b"7", b"1e308", b"1e-320", b"1.5", b"", b"abc"]
+TEXTS = [b"nan", b"inf", b"-1", b"0", b"1", b"6", b"1e308", b"1e-320", b"1.5", b"", b"abc"]
 TEXTS += [str(n).encode() for n in (999999999999, 2**31, -(2**31) - 1, 2**63, 20_000_001, 3000000)]
 NUMBERS = [0, 1, -1, 2**31 - 1, -(2**31), 20_000_001, 7, 8]
 
@@ -94,7 +94,7 @@ def good(kind: str, cell: str) -> bytes | None:
         with contextlib.redirect_stderr(io.StringIO()):
             try:
                 meshio.write(path, made, file_format=name, **options)
-            except (meshio.WriteError, KeyError):
+            except (meshio.WriteError, KeyError, AssertionError):
                 return None
         again = load(path)
         assert sorted(map(tuple, again.p.T)) == sorted(map(tuple, body.p.T))
@@ -174,7 +174,8 @@ def tried(path: Path) -> skfem.Mesh | None:
             assert text.startswith(f"{path}: ")
             assert text.isprintable()
             assert len(text) < 1000
-            assert "takes too long, or breaks" not in text
+            assert "breaks the reader" not in text
+            assert "longer than" not in text
     assert said.getvalue() == ""
     assert sorted(os.listdir(path.parent)) == files
     assert time.monotonic() - start < 4
