@@ -55,7 +55,8 @@ def load(path: str | Path) -> skfem.Mesh:
     single points or, in 3D, of curves are not kept.
 
     Args:
-        path: A file (.msh, .vtu, .vtk, .inp, ...), coordinates in metres.
+        path: A file (.msh, .vtu, .vtk, .inp, ...), coordinates in metres. It need not be trusted:
+            `dpl.fem.untrusted` says what is refused.
 
     Raises:
         FileNotFoundError: There is no such file.

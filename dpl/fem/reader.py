@@ -109,6 +109,8 @@ def stricter() -> None:
     for module in (*gmsh[1:], dolfin):
         # else rows that a file declares and does not list are what was in memory before
         module.np = types.SimpleNamespace(**{**vars(np), "empty": _nothing})
+    for module in gmsh[1:]:
+        module._read_nodes = _listed(module._read_nodes)
     gmsh[0]._gmsh_to_meshio_order = _counted_from_one(common._gmsh_to_meshio_order)
     gmsh[0]._read_cells_ascii = _of_their_length(gmsh[0])
     vtu.zlib, vtu.lzma = _Unpacker(zlib.decompressobj), _Unpacker(lzma.LZMADecompressor)
@@ -182,6 +184,16 @@ def _end_block(file: Any, block: str) -> None:
 
 def _nothing(shape: Any, dtype: Any = float) -> np.ndarray:
     return np.full(shape, np.nan if np.dtype(dtype).kind == "f" else -1, dtype)
+
+
+def _listed(read_nodes: Any) -> Any:
+    def checked(*args: Any) -> Any:
+        found = read_nodes(*args)
+        if np.min(found[1], initial=0) < 0:
+            raise meshio.ReadError("$Nodes lists fewer nodes than it declares, or one of number 0")
+        return found
+
+    return checked
 
 
 def _counted_from_one(ordered: Any) -> Any:
