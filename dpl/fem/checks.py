@@ -9,6 +9,8 @@ from scipy.spatial import cKDTree
 
 # Degree that the quadrature integrates exactly; no problem here puts its points more densely.
 ORDERS = {"Triangular": 4, "Quadrilateral": 5, "Tetrahedral": 4, "Hexahedral": 5}
+CROWD = 100  # nodes in one place of which pairs are not worth listing: they are many
+LARGEST = 1e50  # of coordinates [m]; with more, volumes would overflow
 
 Numbers = NDArray[np.int_]
 
@@ -23,10 +25,10 @@ def check(mesh: skfem.Mesh, *, numbers: Numbers | None = None) -> skfem.Mesh:
 
     Raises:
         ValueError: The first of these flaws, with the cells or nodes that have it: coordinates that
-            are not finite, nodes without a cell, cells that list a node twice, cells listed twice,
-            inverted or flat cells, sides shared by three cells, cells folded over their neighbours,
-            nodes in one place, hanging nodes, sides that overlap without being the same, a body
-            in several pieces.
+            are not finite or beyond `LARGEST`, nodes without a cell, cells that list a node twice,
+            cells listed twice, inverted or flat cells, sides shared by three cells, cells folded
+            over their neighbours, nodes in one place, hanging nodes, sides that overlap without
+            being the same, a body in several pieces.
     """
     numbers = np.arange(mesh.p.shape[1]) if numbers is None else numbers
     _check_nodes(mesh, numbers)
@@ -48,6 +50,11 @@ def _check_nodes(mesh: skfem.Mesh, numbers: Numbers) -> None:
     bad = np.flatnonzero(~np.isfinite(mesh.p).all(axis=0))
     if len(bad):
         raise ValueError(f"coordinates of {len(bad)} nodes are not finite: {_nodes(bad, numbers)}")
+    bad = np.flatnonzero((np.abs(mesh.p) > LARGEST).any(axis=0))
+    if len(bad):
+        raise ValueError(
+            f"coordinates of {len(bad)} nodes are beyond {LARGEST:.0e} m: {_nodes(bad, numbers)}"
+        )
     bad = np.flatnonzero(np.bincount(mesh.t.ravel(), minlength=mesh.nvertices) == 0)
     if len(bad):
         raise ValueError(f"{len(bad)} nodes belong to no cell: {_nodes(bad, numbers)}")
@@ -131,6 +138,15 @@ def _outward(mesh: skfem.Mesh, side: list[int]) -> NDArray[np.int_]:
 def _check_places(mesh: skfem.Mesh, numbers: Numbers) -> None:
     """Hold all nodes, those of quadratic edges too, to places of their own."""
     close = 1e-9 * np.ptp(mesh.p, axis=1).max()
+    _, place, count = np.unique(
+        np.round(mesh.p / (10 * close)), axis=1, return_inverse=True, return_counts=True
+    )
+    if count.max() > CROWD:
+        bad = np.flatnonzero(place.ravel() == count.argmax())
+        raise ValueError(
+            f"{len(bad)} nodes coincide in one place: {_nodes(bad, numbers)}; merge them, "
+            "or the body is cracked"
+        )
     twins = cKDTree(mesh.p.T).query_pairs(close, output_type="ndarray")
     if len(twins):
         known = twins[(twins < len(numbers)).all(axis=1)]

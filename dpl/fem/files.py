@@ -1,8 +1,5 @@
 """Mesh files in and out, with the names that they give to parts of the body."""
 
-import contextlib
-import io
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -12,7 +9,8 @@ import skfem
 from numpy.typing import NDArray
 from skfem.io.meshio import from_meshio, to_meshio
 
-from dpl.fem.checks import check, listed
+from dpl.fem.checks import LARGEST, check, listed
+from dpl.fem.untrusted import read
 
 CELLS = {  # meshio's names of what can be solved, best first: dimension, nodes
     "hexahedron": (3, 8),
@@ -57,7 +55,8 @@ def load(path: str | Path) -> skfem.Mesh:
     single points or, in 3D, of curves are not kept.
 
     Args:
-        path: A file (.msh, .vtu, .vtk, .inp, ...), coordinates in metres.
+        path: A file (.msh, .vtu, .vtk, .inp, ...), coordinates in metres. It need not be trusted:
+            `dpl.fem.untrusted` says what is refused.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -66,39 +65,11 @@ def load(path: str | Path) -> skfem.Mesh:
             that are kept.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such mesh file")
-    if path.suffix.lower() == ".vtu" and path.read_bytes().count(b"<Piece") > 1:
-        raise ValueError(f"{path}: holds several pieces, of which meshio keeps one; join them")
-    raw = _read(path)
+    raw = read(path)
     try:
         return _body(raw)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-
-
-def _read(path: Path) -> meshio.Mesh:
-    """Return what meshio reads; what it prints and how it exits become part of the error."""
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            raw = meshio.read(path)
-    except (Exception, SystemExit) as error:  # meshio calls sys.exit on files it cannot read
-        known = isinstance(error, (SystemExit, meshio.ReadError, ImportError))
-        text = said.getvalue().split("Error:")[0] if isinstance(error, SystemExit) else str(error)
-        reason = " ".join(text.split())
-        if "'gmsh:physical'" in reason:
-            reason = "only some of its cells are in physical groups; give each part one"
-        elif not (known and reason):
-            reason = f"it is damaged or ends too early{f' ({reason})' if reason else ''}"
-        raise ValueError(f"{path}: cannot be read as a mesh: {reason}") from error
-    promised = (
-        re.search(rb"CELL_TYPES\s+(\d+)", path.read_bytes()) if path.suffix == ".vtk" else None
-    )
-    missing = promised and int(promised[1]) != sum(len(block.data) for block in raw.cells)
-    if missing or "not closed" in said.getvalue():
-        raise ValueError(f"{path}: cannot be read as a mesh: it ends too early")
-    return raw
 
 
 def _body(raw: meshio.Mesh) -> skfem.Mesh:
@@ -108,14 +79,22 @@ def _body(raw: meshio.Mesh) -> skfem.Mesh:
         raise ValueError(
             f"holds no cells that can be solved ({', '.join(sorted(found)) or 'none'})"
         )
-    dim = max(CELLS[kind][0] for kind in kinds)
-    kinds = [kind for kind in kinds if CELLS[kind][0] == dim]
-    if len(kinds) > 1:
-        raise ValueError(f"mixes {' and '.join(kinds)} cells; convert them to one kind")
-    if any(np.ndim(block.data) != 2 for block in raw.cells):
-        raise ValueError("lists cells with too few nodes; does it end too early?")
+    dim = max(block.dim for block in raw.cells if len(block.data))
+    kinds = sorted({block.type for block in raw.cells if block.dim == dim and len(block.data)})
+    if len(kinds) > 1 or kinds[0] not in CELLS:
+        what = f"mixes {' and '.join(kinds)} cells" if len(kinds) > 1 else f"holds {kinds[0]} cells"
+        raise ValueError(f"{what}; convert them to one kind: {', '.join(CELLS)}")
+    wide = {kinds[0]: CELLS[kinds[0]][1]}
+    for block in raw.cells:
+        shape = np.shape(block.data)
+        if len(shape) != 2 or shape[1] != wide.get(block.type, shape[1]):
+            raise ValueError("lists cells with too few nodes; does it end too early?")
     points = np.asarray(raw.points, dtype=np.float64)
+    if points.ndim != 2:
+        raise ValueError("lists nodes with too few coordinates; does it end too early?")
     cells = np.concatenate([block.data for block in raw.cells if block.type == kinds[0]])
+    if cells.dtype.kind not in "iu":
+        raise ValueError("numbers the nodes of cells by what are no whole numbers")
     cells = cells.astype(np.int64)
     if points.shape[1] < dim:
         raise ValueError(f"{kinds[0]} cells need nodes of {dim} coordinates")
@@ -147,6 +126,12 @@ def _flat(points: NDArray[np.float64], used: Numbers) -> NDArray[np.float64]:
     """
     points = points[used]
     if points.shape[1] == 3:
+        bad = np.flatnonzero(~(np.abs(points[:, 2]) <= LARGEST))
+        if len(bad):  # which the comparison with their distances would let pass
+            raise ValueError(
+                f"coordinates of {len(bad)} nodes are not finite or beyond {LARGEST:.0e} m: "
+                + listed(used[bad])
+            )
         away = np.abs(points[:, 2] - points[0, 2])
         bad = np.flatnonzero(away > 1e-9 * np.ptp(points, axis=0).max())
         if len(bad):
@@ -168,11 +153,13 @@ def _tagged(mesh: skfem.Mesh, raw: meshio.Mesh, kind: str, corners: Numbers) -> 
     count, width = 0, len(mesh.facets)
     for block in raw.cells:
         kept = block.type == kind
+        _within(f"{block.type} cells", block.data, len(vertex))
         places.append(count + np.arange(len(block.data)) if kept else None)
         count += len(block.data) if kept else 0
         fits = not kept and SIDES.get(block.type) == width
         known.append(_find(mesh, vertex[block.data[:, :width]]) if fits else None)
     for name, b, members in _cell_sets(raw):
+        _within(f"the set {name!r}", members, len(raw.cells[b].data) if b < len(places) else 0)
         if (own := places[b]) is not None:
             cells.setdefault(name, []).append(own[members])
         elif (side := known[b]) is not None:
@@ -245,9 +232,18 @@ def _node_sets(raw: meshio.Mesh) -> Iterator[tuple[str, NDArray[np.bool_]]]:
         sets += [(f"{field}={number}", members) for _, number, members in _values([data])]
         sets += [(field, np.flatnonzero(data))] if _is_mask([data]) else []
     for name, members in sets:
+        _within(f"the set {name!r}", members, len(inside))
         inside[:] = False
         inside[members] = True
         yield name, inside
+
+
+def _within(name: str, members: Numbers, count: int) -> None:
+    """Hold numbers to those that there are, for NumPy takes negative ones too."""
+    if np.size(members) and not 0 <= np.min(members) <= np.max(members) < count:
+        raise ValueError(
+            f"{name[:80]} name {np.min(members)} to {np.max(members)}, there are 0 to {count - 1}"
+        )
 
 
 def _values(blocks: list) -> Iterator[tuple[int, int, Numbers]]:

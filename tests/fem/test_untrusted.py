@@ -1,0 +1,475 @@
+"""Laws of mesh files that mean harm: refused in one line, without waiting and without a price."""
+
+import base64
+import lzma
+import os
+import resource
+import struct
+import sys
+import time
+import zlib
+
+import meshio
+import numpy as np
+import pytest
+
+from dpl.fem import formats, untrusted
+from dpl.fem.files import _body
+from dpl.fem.mesh import box, load, rectangle
+from dpl.stress.flaws import CORNERS, FAN, PATCH, TETS, TWO_CUBES, TWO_HEXES, write
+
+
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch):
+    monkeypatch.setattr(untrusted, "SECONDS", (4.0, 0.0))
+
+
+def refused(path, match: str, seconds: float = 3.0) -> None:
+    """Hold `load` to one line that names the file, soon and in little memory."""
+    before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
+    with pytest.raises(ValueError, match=match) as error:
+        load(path)
+    text = str(error.value)
+    assert text.startswith(f"{path}: ")
+    assert text.isprintable()
+    assert len(text) < 1000
+    assert time.monotonic() - start < seconds
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # [kB]
+
+
+def cube(tmp_path, name: str = "cube.vtu", **options):
+    """Return a good file."""
+    path = tmp_path / name
+    meshio.write(path, meshio.Mesh(CORNERS, [("tetra", TETS)]), **options)
+    return path
+
+
+def replaced(path, old: str, new: str):
+    """Replace a text that is there in a file."""
+    text = path.read_bytes()
+    assert old.encode() in text
+    path.write_bytes(text.replace(old.encode(), new.encode(), 1))
+    return path
+
+
+LAUGHS = """<!DOCTYPE lolz [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>"""
+OUTSIDE = """<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]>"""
+
+
+@pytest.mark.parametrize("suffix", ["vtu", "xdmf", "xmf", "xml"])
+@pytest.mark.parametrize("text", [LAUGHS, OUTSIDE, "<!DOCTYPE x SYSTEM 'http://localhost/x'>"])
+@pytest.mark.parametrize("code", ["utf-8", "utf-16"])
+def test_xml_with_entities_is_refused(tmp_path, suffix, text, code):
+    path = tmp_path / f"bomb.{suffix}"
+    head = f'<?xml version="1.0" encoding="{code}"?>{text}'
+    path.write_bytes(f"{head}<VTKFile type='UnstructuredGrid'>x</VTKFile>".encode(code))
+    refused(path, "document type or entities")
+
+
+def test_cell_data_beside_a_dolfin_file_is_held_to_the_same(tmp_path):
+    path = tmp_path / "cube.xml"
+    meshio.write(path, meshio.Mesh(CORNERS, [("tetra", TETS)]), file_format="dolfin-xml")
+    load(path)
+    (tmp_path / "cube_part.xml").write_text(f"{LAUGHS}<dolfin/>")
+    refused(path, "document type or entities")
+    (tmp_path / "cube_part.xml").unlink()
+    os.mkfifo(tmp_path / "cube_part.xml")
+    refused(path, "no file")
+
+
+def test_deep_xml_is_refused(tmp_path):
+    path = tmp_path / "deep.vtu"
+    path.write_text("<VTKFile type='UnstructuredGrid'>" + "<a>" * 10**6)
+    refused(path, "nested more than")
+
+
+@pytest.mark.parametrize("name", ["NumberOfPoints", "NumberOfCells"])
+@pytest.mark.parametrize("count", [10**12, 10**8, -5])
+def test_vtu_that_declares_what_it_cannot_hold_is_refused(tmp_path, name, count):
+    path = cube(tmp_path)
+    number = len(CORNERS) if name == "NumberOfPoints" else len(TETS)
+    refused(replaced(path, f'{name}="{number}"', f'{name}="{count}"'), "declares")
+
+
+def packed(data: bytes, *, blocks: int = 1, squeeze=zlib.compress) -> str:
+    """Return a block of compressed data of a .vtu file, with a header that lies about its size."""
+    part = squeeze(data)
+    header = struct.pack(f"<{3 + blocks}I", blocks, 100, 100, *[len(part)] * blocks)
+    return base64.b64encode(header).decode() + base64.b64encode(part * blocks).decode()
+
+
+VTU = """<?xml version="1.0"?>
+<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian" compressor="{compressor}">
+<UnstructuredGrid><Piece NumberOfPoints="8" NumberOfCells="1">
+<Points><DataArray type="Float64" NumberOfComponents="3" format="{kind}" offset="0">{here}</DataArray></Points>
+<Cells><DataArray type="Int64" Name="connectivity" format="ascii">{nodes}</DataArray>
+<DataArray type="Int64" Name="offsets" format="ascii">{offsets}</DataArray>
+<DataArray type="UInt8" Name="types" format="ascii">{types}</DataArray></Cells>
+</Piece></UnstructuredGrid>{after}</VTKFile>"""  # noqa: E501
+GOOD = {
+    "compressor": "vtkZLibDataCompressor", "kind": "binary", "after": "",
+    "nodes": "0 1 2 3 4 5 6 7", "offsets": "8", "types": "12",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["binary", "appended"])
+@pytest.mark.parametrize("compressor", ["vtkZLibDataCompressor", "vtkLZMADataCompressor"])
+def test_a_compressed_bomb_costs_the_process_nothing(tmp_path, kind, compressor):
+    squeeze = zlib.compress if "ZLib" in compressor else lzma.compress
+    text = packed(bytes(100 * 2**20), blocks=3, squeeze=squeeze)
+    values = GOOD | {"compressor": compressor, "kind": kind, "here": text}
+    if kind == "appended":
+        after = f'<AppendedData encoding="base64">_{text}</AppendedData>'
+        values |= {"here": "", "after": after}
+    path = tmp_path / "bomb.vtu"
+    path.write_text(VTU.format(**values))
+    refused(path, "unpack to more than")
+    assert load(cube(tmp_path)).t.shape[0] == 4
+
+
+def test_the_vtu_of_the_bombs_is_good_without_one(tmp_path):
+    path = tmp_path / "good.vtu"
+    path.write_text(VTU.format(**GOOD, here=packed(CORNERS.astype("<f8").tobytes())))
+    assert load(path).nelements == 1
+
+
+@pytest.mark.parametrize(
+    ("nodes", "offsets", "types"),
+    [
+        ("0 1 2 3 4 5 6 7", "1000000000", "7"),  # a polygon of 10^9 nodes
+        ("0 1 2 3 4 5 6 7", "7", "12"),
+        ("0 1 2 3 4 5 6 7 7", "9", "12"),
+        ("0 1 2 3 4 5 6 7", "8", "11"),  # a voxel, which meshio leaves out
+        ("0 1 2 3 4 5 6 7", "8", "10"),  # the last four would make a tetrahedron
+    ],
+)
+def test_offsets_must_fit_the_cells(tmp_path, nodes, offsets, types):
+    path = tmp_path / "bad.vtu"
+    here = packed(CORNERS.astype("<f8").tobytes())
+    path.write_text(
+        VTU.format(**(GOOD | {"nodes": nodes, "offsets": offsets, "types": types}), here=here)
+    )
+    refused(path, "offsets of its cells|have [48] nodes|type 11")
+
+
+def test_polyhedra_are_refused(tmp_path):
+    """Meshio could loop for ever over their faces."""
+    path = cube(tmp_path, binary=False)
+    refused(replaced(path, 'Name="offsets"', 'Name="faces"'), "polyhedra")
+
+
+VTK = "# vtk DataFile Version 4.2\nx\nASCII\nDATASET "
+XDMF = """<Xdmf Version="3.0"><Domain><Grid Name="Grid"><Geometry GeometryType="XYZ">
+<DataItem DataType="Float" Dimensions="8 3" Format="{kind}" Precision="8">{name}</DataItem>
+</Geometry></Grid></Domain></Xdmf>"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        ("HDF", "/etc/passwd:/data"),
+        ("HDF", "../secret.h5:/data"),
+        ("HDF", "link.h5:/data"),
+        ("HDF", "folder/inner.h5:/data"),
+        ("HDF", "http://localhost/x.h5:/data"),
+        ("HDF", "none.h5:/data"),
+        ("HDF", "pipe.h5:/data"),
+        ("Binary", "/etc/passwd"),
+        ("Binary", "../secret.h5"),
+        ("Binary", "link.h5"),
+        ("Binary", "pipe.h5"),
+        ("Binary", "/dev/zero"),
+        ("Binary", "https://localhost/x.bin"),
+        ("Binary", "../inside.d/../secret.h5"),
+    ],
+)
+@pytest.mark.parametrize("escaped", [False, True])
+def test_xdmf_that_reads_files_elsewhere_is_refused(tmp_path, kind, name, escaped):
+    (tmp_path / "secret.h5").write_bytes(bytes(192))
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    (folder / "link.h5").symlink_to(tmp_path / "secret.h5")
+    (folder / "folder").symlink_to(tmp_path)
+    os.mkfifo(folder / "pipe.h5")
+    path = folder / "mesh.xdmf"
+    text = "".join(f"&#{ord(c)};" for c in name) if escaped else name
+    path.write_text(XDMF.format(kind=kind, name=text))
+    refused(path, "names")
+
+
+def test_xml_inside_the_text_of_xdmf_has_no_entities_either(tmp_path):
+    path = tmp_path / "mesh.xdmf"
+    path.write_text(f"<Xdmf><Information><![CDATA[{LAUGHS}<a/>]]></Information></Xdmf>")
+    refused(path, "entities")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.msh", "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n999999999999\n"),
+        ("b.msh", "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n1000000\n1 0 0 0\n$EndNodes\n"),
+        ("c.msh", "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 999999999999 1 1\n"),
+        ("d.msh", "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Elements\n999999999999\n"),
+        ("e.vtk", VTK + "UNSTRUCTURED_GRID\nPOINTS 99999999 double\n"),
+        ("f.vtk", VTK + "UNSTRUCTURED_GRID\nCELL_TYPES 99999 double\n"),
+        ("g.vtk", VTK + "STRUCTURED_POINTS\nDIMENSIONS 9999 9999 9999\n"),
+        ("h.su2", "NDIME= 3\nNPOIN= 999999999999\n"),
+        ("i.su2", "NDIME= 3\nNELEM= 999999999\n"),
+        ("j.xml", "<dolfin><mesh><vertices size='99999999999'/></mesh></dolfin>"),
+    ],
+)  # fmt: skip
+def test_counts_beyond_the_size_of_the_file_are_refused(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    refused(tmp_path / name, "refused: it declares")
+
+
+def gmsh41(blocks: int, nodes: int, *, data: bytes = b"") -> bytes:
+    """Return the start of a binary file of Gmsh with a header of nodes."""
+    head = b"$MeshFormat\n4.1 1 8\n" + struct.pack("i", 1) + b"\n$EndMeshFormat\n$Nodes\n"
+    return head + struct.pack("4Q", blocks, nodes, 1, nodes) + data
+
+
+def test_a_binary_count_is_read_too(tmp_path):
+    (tmp_path / "a.msh").write_bytes(gmsh41(1, 10**12))
+    refused(tmp_path / "a.msh", "declares 1000000000000 nodes")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        # tables by the largest number: 16 GB
+        ("a.msh", "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n1\n2000000000 0 0 0\n$EndNodes\n"
+         "$Elements\n1\n1 15 0 2000000000\n$EndElements\n"),
+        # a list of as many texts
+        ("b.msh", "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$NodeData\n999999999\n"),
+        ("c.inp", "*NODE\n1,0,0,0\n*NSET,NSET=A,GENERATE\n1,2000000000,1\n"),
+        ("d.mesh", "MeshVersionFormatted 2\nDimension 3\nRidges\n99999999999\n"),
+    ],
+)  # fmt: skip
+def test_numbers_that_cost_memory_or_time_end_the_reader_only(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    refused(tmp_path / name, "more memory|ends too early|longer than", seconds=8)
+    assert load(cube(tmp_path)).t.shape[0] == 4
+
+
+def test_a_reader_that_loops_is_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(untrusted, "SECONDS", (0.5, 0.0))
+    path = cube(tmp_path, "slow.msh", file_format="gmsh22", binary=False)
+    replaced(path, "$Elements", "$Periodic\n" + "99999999\n" + "0 0 0\n0\n" * 3_000_000)
+    refused(path, "longer than", seconds=6)
+    monkeypatch.setattr(untrusted, "SECONDS", (4.0, 0.0))
+    assert load(cube(tmp_path)).t.shape[0] == 4
+
+
+@pytest.mark.parametrize("name", ["a.nas", "a.ele", "a.mdpa", "a.dat", "a.msh"])
+def test_what_ends_too_early_is_not_looked_for_for_ever(tmp_path, name):
+    texts = {
+        "a.nas": "BEGIN BULK\n\n",
+        "a.mdpa": "Begin Nodes\n",
+        "a.dat": 'TITLE = "x"\nVARIABLES = "X"\n',
+        "a.msh": "(0 x)\n(10 (1 1 5 0 3)(\n",
+    }
+    (tmp_path / name).write_text(texts.get(name, "\n"))
+    (tmp_path / "a.node").write_text("\n")
+    refused(tmp_path / name, "cannot be read")
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["*INCLUDE, INPUT=/etc/passwd", "*include,input=a.inp", " *Inc*lude ,input=x", "INCLUDE,"],
+)
+def test_abaqus_files_that_include_others_are_refused(tmp_path, line):
+    """One that includes itself too."""
+    path = cube(tmp_path, "a.inp")
+    path.write_text(path.read_text() + line + "\n")
+    refused(path, "includes another file")
+    path.write_text(path.read_text().replace(line, "** INCLUDE, this is a comment"))
+    assert load(path).t.shape[0] == 4
+
+
+@pytest.mark.parametrize("magic", [b"\x1f\x8b\x08", b"PK\x03\x04", b"BZh9", b"\xfd7zXZ\x00"])
+@pytest.mark.parametrize("name", ["a.vtu", "a.vol.gz", "a.post.gz", "a.msh"])
+def test_packed_files_are_refused(tmp_path, magic, name):
+    (tmp_path / name).write_bytes(magic + bytes(100))
+    refused(tmp_path / name, "packed")
+
+
+@pytest.mark.parametrize("suffix", ["vtu", "msh", "inp", "xdmf", "h5m"])
+def test_pipes_and_devices_are_refused_and_folders_are_no_files(tmp_path, suffix):
+    os.mkfifo(tmp_path / f"pipe.{suffix}")
+    refused(tmp_path / f"pipe.{suffix}", "pipe")
+    (tmp_path / f"zero.{suffix}").symlink_to("/dev/zero")
+    refused(tmp_path / f"zero.{suffix}", "device")
+    (tmp_path / f"folder.{suffix}").mkdir()
+    with pytest.raises(FileNotFoundError, match="folder"):
+        load(tmp_path / f"folder.{suffix}")
+    with pytest.raises(FileNotFoundError, match="no such"):
+        load(tmp_path / f"no\0ne.{suffix}")
+
+
+def test_files_of_more_than_four_gigabytes_are_refused(tmp_path):
+    path = tmp_path / "large.vtu"
+    with path.open("wb") as file:
+        file.truncate(formats.MOST_BYTES + 1)  # takes no room
+    refused(path, "GiB")
+
+
+def test_a_link_to_a_good_file_is_read(tmp_path):
+    cube(tmp_path)
+    (tmp_path / "link.vtu").symlink_to(tmp_path / "cube.vtu")
+    assert load(tmp_path / "link.vtu").t.shape[0] == 4
+
+
+@pytest.mark.parametrize("suffix", ["h5m", "med", "cgns", "hmf", "e", "vtu"])
+def test_hdf5_is_refused_without_h5py(tmp_path, suffix, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    (tmp_path / f"a.{suffix}").write_bytes(formats.HDF5 + bytes(100))
+    refused(tmp_path / f"a.{suffix}", "h5py")
+
+
+def test_hdf5_that_reads_other_files_is_refused(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["data"] = np.arange(3.0)
+    (tmp_path / "raw").write_bytes(bytes(24))
+    for number, make in enumerate(
+        (
+            lambda file: file.__setitem__("a/b", h5py.ExternalLink("other.h5", "/data")),
+            lambda file: file.create_dataset("a/b", (3,), "f8", external=[("raw", 0, 24)]),
+            lambda file: file.create_virtual_dataset("a", _virtual(h5py)),
+        )
+    ):
+        path = tmp_path / f"{number}.med"
+        with h5py.File(path, "w") as file:
+            make(file)
+        refused(path, "other file|another file")
+    path = tmp_path / "large.med"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("a", (10**12,), "f8", chunks=(1000,), compression="gzip")
+    refused(path, "GiB")
+    path = tmp_path / "loop.med"
+    with h5py.File(path, "w") as file:
+        file["a/b"] = h5py.SoftLink("/a")
+        file["a/c"] = file["a"]
+    refused(path, "cannot be read")
+
+
+def _virtual(h5py):
+    layout = h5py.VirtualLayout((3,), "f8")
+    layout[:] = h5py.VirtualSource("other.h5", "data", (3,))
+    return layout
+
+
+def test_a_reader_that_was_killed_is_started_again(tmp_path):
+    path = cube(tmp_path)
+    load(path)
+    untrusted.READER._process.kill()
+    untrusted.READER._process.wait()
+    assert load(path).t.shape[0] == 4
+    first = untrusted.READER._process.pid
+    load(path)
+    assert untrusted.READER._process.pid == first
+
+
+def test_a_path_from_the_working_folder_is_found_from_wherever_the_reader_started(
+    tmp_path, monkeypatch
+):
+    cube(tmp_path)
+    for folder in (tmp_path, tmp_path.parent):
+        monkeypatch.chdir(folder)
+        assert load((tmp_path / "cube.vtu").relative_to(folder)).t.shape[0] == 4
+
+
+# What damaged files taught: tests/properties/test_mesh_files.py found them
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e200"])
+def test_planar_nodes_have_a_finite_third_coordinate(tmp_path, value):
+    """No comparison with their distance from the plane holds of these."""
+    points = PATCH.astype(float)
+    points[2, 2] = float(value)
+    refused(write(tmp_path / "patch.vtu", points, triangle=FAN), "1 nodes are not finite.*: 2")
+
+
+@pytest.mark.parametrize("value", [1e60, -1e308])
+def test_coordinates_whose_volumes_overflow_are_an_error(tmp_path, value, recwarn):
+    points = TWO_CUBES.astype(float)
+    points[3, 1] = value
+    refused(write(tmp_path / "bar.vtu", points, hexahedron=TWO_HEXES), "1 nodes are beyond .*: 3")
+    assert not recwarn
+
+
+def test_elements_of_gmsh_have_the_length_of_their_type(tmp_path):
+    """Meshio takes the last nodes of a row: a triangle of a quadrilateral."""
+    mesh = rectangle([2.0, 1.0], [3, 2])
+    points = np.pad(mesh.p.T, ((0, 0), (0, 1)))
+    path = tmp_path / "a.msh"
+    meshio.write(
+        path, meshio.Mesh(points, [("quad", mesh.t.T)]), file_format="gmsh22", binary=False
+    )
+    refused(replaced(path, "\n1 3 ", "\n1 2 "), "by its length")
+
+
+def test_nodes_of_gmsh_count_from_one(tmp_path):
+    """Zero would be the last one."""
+    path = cube(tmp_path, "a.msh", file_format="gmsh22", binary=False)
+    lines = path.read_text().split("\n")
+    row = lines.index("$Elements") + 2
+    lines[row] = " ".join([*lines[row].split()[:-1], "0"])
+    path.write_text("\n".join(lines))
+    refused(path, "node 0, nodes count from 1")
+
+
+@pytest.mark.parametrize("block", ["Nodes", "Elements"])
+@pytest.mark.parametrize("form", ["gmsh", "gmsh22"])
+def test_rows_of_gmsh_beyond_their_count_are_an_error(tmp_path, block, form):
+    path = cube(tmp_path, "a.msh", file_format=form, binary=False)
+    refused(replaced(path, f"$End{block}", f"9 1 1 1 1\n$End{block}"), "more than it declares")
+
+
+@pytest.mark.parametrize("form", [{}, {"data_format": "XML"}, {"data_format": "Binary"}])
+def test_xdmf_may_have_its_data_beside_it(tmp_path, form, monkeypatch):
+    pytest.importorskip("h5py")
+    monkeypatch.chdir(tmp_path)
+    path = cube(tmp_path, "cube.xdmf", **form)
+    for data in tmp_path.glob("cube*.bin"):  # meshio names it as it was told to
+        assert data.parent == tmp_path
+    monkeypatch.chdir(tmp_path.parent)
+    if form.get("data_format") == "Binary":
+        path.write_text(path.read_text().replace(f"{tmp_path}/", ""))
+    assert load(path).t.shape[0] == 4
+
+
+def test_nodes_that_gmsh_declares_and_does_not_list_are_not_made_up(tmp_path):
+    """Meshio leaves what it finds in memory in their place."""
+    path = cube(tmp_path, "a.msh", file_format="gmsh", binary=False)
+    replaced(path, "$Nodes\n1 8 1 8\n", "$Nodes\n1 9 1 9\n")
+    refused(path, "fewer nodes than it declares")
+
+
+@pytest.mark.parametrize(("kind", "nodes"), [("wedge", 6), ("pyramid", 5), ("hexahedron20", 20)])
+def test_solid_cells_of_other_kinds_are_not_left_out(tmp_path, kind, nodes):
+    """A body of hexahedra and wedges would have holes."""
+    cells = {"hexahedron": TWO_HEXES, kind: np.arange(nodes)[None] % len(TWO_CUBES)}
+    refused(write(tmp_path / "mixed.vtu", TWO_CUBES, **cells), "mixes hexahedron")
+
+
+def test_many_nodes_in_one_place_are_told_without_listing_their_pairs(tmp_path):
+    """30,000 cubes in one place have 3.6 * 10^9 pairs of nodes."""
+    number = 30_000
+    cells = np.arange(8)[[0, 1, 3, 2, 4, 5, 7, 6]] + 8 * np.arange(number)[:, None]
+    corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float)
+    path = write(tmp_path / "crowd.vtu", np.tile(corners, (number, 1)), hexahedron=cells)
+    with pytest.raises(ValueError, match="30000 nodes coincide in one place: 0, 8, 16"):
+        load(path)
+
+
+def test_sets_name_nodes_and_cells_that_there_are(tmp_path):
+    mesh = box([2.0, 1.0, 1.0], [3, 2, 2], "tetra")
+    for sets in (
+        {"point_sets": {"a": np.array([-1, 3])}},
+        {"point_sets": {"a": np.array([0, 99])}},
+    ):
+        raw = meshio.Mesh(mesh.p.T, [("tetra", mesh.t.T)], **sets)
+        with pytest.raises(ValueError, match="the set 'a' name"):
+            _body(raw)
