@@ -190,7 +190,7 @@ def test_batch_is_evaluated_like_its_members(body, steepness, seed):
 # ---------------------------------------------------------------- supports and loads
 
 
-@given(body=bodies(FREE), seed=seeds, held=st.integers(0, 8), mask=seeds)
+@given(body=bodies(FREE), seed=seeds, held=st.integers(0, 7), mask=seeds)
 @counted
 def test_motions_that_are_named_loose_are_those_that_cost_nothing(body, seed, held, mask):
     random, problem = np.random.default_rng(mask), body.build()
@@ -304,7 +304,8 @@ def check_states(newton: Newton, load: Load, states: list[Solution]) -> None:
         assert (held - part * wanted).abs().max() <= 1e-12
     if last.converged:
         assert last.load_factor == 1
-        assert torch.equal(torch.where(problem.free, 0.0, last.displacement)[0], problem.prescribed)
+        apart = torch.where(problem.free, 0.0, last.displacement) - problem.prescribed
+        assert apart.abs().max() <= newton.budget * EPS * problem.prescribed.abs().max()
         return
     factor, u = last.load_factor, last.displacement
     if last.status == Status.NOT_CONVERGED:
@@ -523,7 +524,8 @@ def test_images_of_an_answer_answer_the_images_of_its_load(case):
     problem, load = newton.problem, push.on(body, newton.rest)
     answer = solve(newton, load)
     group = symmetries(problem)
-    assert len(group) >= (1 if body.support == "moved" or body.cell in ("tetra", "triangle") else 2)
+    mirrored = body.support not in ("moved", "rollers") and body.cell in ("quad", "hexahedron")
+    assert len(group) > mirrored
     for symmetry in group:
         image, force = symmetry.image(answer.displacement), symmetry.image(load.force)
         residual = symmetry.image(problem.residual(answer.displacement, load.force))
