@@ -18,7 +18,7 @@ from dpl.fem.band import Cholesky
 from dpl.fem.krylov import CGFactor, conjugate_gradients, lowest
 from dpl.fem.linear import Backend, Factor, SingularMatrix, backend, chosen
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, Status, in_step, judge
+from dpl.fem.solution import Load, Solution, Status, check_force, in_step, judge
 from dpl.fem.sparse import SymmetricProduct
 from dpl.fem.turned import Turned, Turning
 
@@ -76,7 +76,12 @@ class Linear:
         return self if problem is self.problem else self._twin(problem)
 
     def iterate(self, load: Load) -> Iterator[Solution]:
-        """Yield the linear answer."""
+        """Yield the linear answer.
+
+        Raises:
+            ValueError: The force is none for this body, see `check_force`.
+        """
+        check_force(self.problem, load)
         start = time.perf_counter()
         pairs = zip(load.force, load.poisson.expand(len(load.force), -1), strict=True)
         answer = torch.stack([self.at(nu[None]).respond(force) for force, nu in pairs])
@@ -164,7 +169,11 @@ class Newton:
         Args:
             load: What acts.
             guess: Where to start, (B, N, D) [-]; zero if left out, and where it is inverted.
+
+        Raises:
+            ValueError: The force is none for this body, see `check_force`.
         """
+        check_force(self.problem, load)
         own = load.poisson.expand(len(load.force), -1)
         guesses = [None] * len(own) if guess is None else guess.split(1)
         yield from in_step(

@@ -48,7 +48,7 @@ class OgdenK2(Material):
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
         j = volume_change(H)
-        logs = torch.log1p(2 * torch.linalg.eigvalsh(green_lagrange(H))) / 2
+        logs = torch.log1p(2 * _spectrum(green_lagrange(H))[0]) / 2
         logs = logs - torch.log1p(j)[..., None] / 3
         terms = [
             2 * mu / a**2 * torch.expm1(a * logs).sum(-1)
@@ -64,7 +64,7 @@ class OgdenK2(Material):
 
     def response(self, E: Tensor) -> Response:
         """Return stress and moduli, see `Material.response`."""
-        strain, axes = torch.linalg.eigh(E)
+        strain, axes = _spectrum(E)
         stress, slopes = self._principal(strain)
         gap = strain[..., :, None] - strain[..., None, :]
         same = gap.abs() < 1e-6  # there the quotient is its limit, to within as much
@@ -101,6 +101,13 @@ class OgdenK2(Material):
         stretch = 1 + 2 * strain
         slopes = (dT - 2 * T[..., :, None] * eye) / (stretch[..., :, None] * stretch[..., None, :])
         return T / stretch, slopes
+
+
+def _spectrum(E: Tensor) -> tuple[Tensor, Tensor]:
+    """Return eigenvalues (..., 3), NaN where E is not finite (LAPACK stops there), and axes."""
+    finite = E.isfinite().all(-1).all(-1)
+    values, axes = torch.linalg.eigh(torch.where(finite[..., None, None], E, 0.0))
+    return torch.where(finite[..., None], values, torch.nan), axes
 
 
 class _SpectralStress(torch.autograd.Function):

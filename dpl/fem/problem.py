@@ -338,14 +338,16 @@ class Problem:
         """Return ||R_free|| / ||f||, (B,) [-]: the one criterion by which answers are judged.
 
         Where supports are moved (`prescribed`), the reactions count as a load too: the larger norm
-        is taken. Zero load: the norm of R itself.
+        is taken. Zero load: the norm of R itself. A load that is not finite, on held nodes too, is
+        in balance with nothing: NaN.
         """
         residual = torch.where(self.free, internal - force, 0.0).flatten(1).norm(dim=1)
         scale = force.flatten(1).norm(dim=1)
         if self.moved_supports:
             reaction = torch.where(self.free, 0.0, internal).flatten(1).norm(dim=1)
             scale = torch.maximum(scale, reaction)
-        return residual / torch.where(scale > 0, scale, 1.0)
+        scale = torch.where(scale.isfinite(), scale, torch.nan)
+        return residual / torch.where(scale == 0, 1.0, scale)
 
     def balanced(self, displacement: Tensor, internal: Tensor, force: Tensor, tol: float) -> Tensor:
         """Return whether `imbalance` is below tol, or as small as rounding lets it be, (B,)."""
@@ -455,10 +457,13 @@ class Problem:
 
         Raises:
             ValueError: The displacement is that of another body: the loops would run past its end.
+                Or not in float64.
         """
         if tuple(displacement.shape[1:]) != tuple(self.shape):
             found, wanted = tuple(displacement.shape), ("B", *self.shape)
             raise ValueError(f"a displacement of shape {found} must have {wanted}")
+        if displacement.dtype != torch.float64:
+            raise ValueError(f"a displacement in {displacement.dtype} must be in torch.float64")
         return self._compiled if displacement.device.type == "cpu" else None
 
     @cached_property

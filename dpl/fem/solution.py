@@ -98,6 +98,19 @@ class Solution(NamedTuple):
         return self.status == Status.CONVERGED
 
 
+def check_force(problem: Problem, load: Load) -> None:
+    """Check that a load can act on a body. Forces that are not finite can: nothing balances them.
+
+    Raises:
+        ValueError: The force is not (B, N, D) of the body with B of 1 or more, or not float64.
+    """
+    shape, wanted = tuple(load.force.shape), tuple(problem.shape)
+    if len(shape) != 3 or shape[1:] != wanted or not shape[0]:
+        raise ValueError(f"force: its shape {shape} must be {('B', *wanted)}, B of 1 or more")
+    if load.force.dtype != torch.float64:
+        raise ValueError(f"force: {load.force.dtype} must be torch.float64")
+
+
 class Solver(Protocol):
     """Anything that answers which displacement balances a load."""
 

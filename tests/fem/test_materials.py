@@ -671,6 +671,18 @@ def test_neo_hookean_is_infinite_at_zero_volume_and_undefined_below():
     assert NH.stress(2 * flat).isnan().any()
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_ogden_has_no_stress_where_there_is_no_strain(laws, bad):
+    """Its eigenvalues do not exist; the points beside it have theirs."""
+    law, H = laws["Ogden3"], torch.zeros(3, 3, 3, dtype=torch.float64)
+    H[0, 0, 0], H[1, 2, 1] = 0.1, bad
+    for quantity in (law.energy, law.stress, law.tangent):
+        found = quantity(H).reshape(3, -1)
+        assert found[1].isnan().any()
+        assert found[0].isfinite().all()
+        assert torch.equal(found[[0, 2]], quantity(H[[0, 2]]).reshape(2, -1))
+
+
 def peak_of(stress: Callable[[float], float], low: float, high: float) -> float:
     """Return where a stress is largest."""
     return minimize_scalar(

@@ -382,6 +382,38 @@ def test_members_use_their_own_guess(law, beam, pull):
 
 
 @pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda force: force.float(), "float64"),
+        (lambda force: force.long(), "float64"),
+        (lambda force: force[0], "shape"),
+        (lambda force: force[:, 1:], "shape"),
+        (lambda force: force[..., 1:], "shape"),
+        (lambda force: force[:0], "shape"),
+    ],
+    ids=["single", "whole", "no batch", "nodes", "axes", "none"],
+)
+def test_force_of_another_kind_or_shape_is_an_error_that_says_so(beam, pull, change, message):
+    problem = beam(NH, 2, 1)
+    solver, load = newton(problem), load_of(change(pull(problem, 20.0)))
+    for each in (solver, solver.rest):
+        with pytest.raises(ValueError, match=f"force: .*{message}"):
+            solve(each, load)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("amplitude", [1e-12, 20.0])
+def test_force_that_is_no_number_has_no_answer_even_on_a_held_node(beam, pull, bad, amplitude):
+    problem = beam(NH, 2, 1)
+    load = load_of(pull(problem, amplitude))
+    held = int((~problem.free).any(dim=1).nonzero()[0, 0])
+    load.force[0, held, 0] = bad
+    solver = newton(problem)
+    for each in (solver, solver.rest):
+        assert not solve(each, load).converged.any()
+
+
+@pytest.mark.parametrize(
     "option",
     [
         *({name: value} for name in ("tol", "loose", "keep", "smallest_step") for value in (0, 1)),

@@ -438,6 +438,17 @@ def test_residual_of_no_load_is_absolute(body, bend):
     assert body.residual_ratio(none, none) == 0
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_load_that_is_not_finite_on_held_nodes_is_balanced_by_nothing(beam, bad):
+    """No displacement feels it, but relative to it every residual is small."""
+    problem = beam(NH, 2, 1)
+    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    force = torch.full_like(rest, 1e-9)
+    force[0, (~problem.free).any(dim=1).nonzero()[0, 0], 0] = bad
+    assert problem.residual_ratio(rest, force).isnan()
+    assert not problem.balanced(rest, rest, force, 1e-8)
+
+
 def test_reactions_count_as_load_where_supports_move(grid, bend):
     mesh = grid("hexahedron", 2, 0.1)
     ends = (mesh.p[0] < 0.2) | (mesh.p[0] > 0.8)
@@ -820,3 +831,13 @@ def test_a_displacement_of_another_body_is_refused_and_not_read_past_its_end(bea
         problem.evaluate(short)
     with pytest.raises(ValueError, match="must have"):
         problem.linearise(short)
+
+
+@pytest.mark.parametrize("dilated", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.int64])
+def test_a_displacement_of_another_precision_is_refused(beam, dilated, dtype):
+    problem = beam(NH, 2, 1, mean_dilatation=dilated)
+    rough = torch.zeros(1, *problem.shape, dtype=dtype)
+    for method in (problem.evaluate, problem.linearise):
+        with pytest.raises(ValueError, match="must be in torch"):
+            method(rough)

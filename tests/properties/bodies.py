@@ -1,0 +1,312 @@
+"""Random bodies, laws, supports, deformations and loads."""
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import skfem
+import torch
+from hypothesis import strategies as st
+from torch import Tensor
+
+from dpl.fem.forces import body_force, traction
+from dpl.fem.materials import (
+    LinearElastic,
+    Material,
+    MooneyRivlinK2,
+    NeoHookeanIsoK2,
+    NeoHookeanIsoK4,
+    NeoHookeanLn,
+    OgdenK2,
+    SaintVenantKirchhoff,
+    StableNeoHookean,
+    YeohK2,
+)
+from dpl.fem.mesh import box, rectangle
+from dpl.fem.newton import Linear
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load
+from dpl.fem.supports import Displacement, Spring
+
+CUBOID = {"hexahedron": box, "tetra": box, "quad": rectangle, "triangle": rectangle}
+HOOKEAN = (
+    *(SaintVenantKirchhoff, NeoHookeanLn, NeoHookeanIsoK2, NeoHookeanIsoK4),
+    *(StableNeoHookean, LinearElastic),
+)
+HELD = ("clamp", "clamps", "moved", "bed", "rollers")  # each leaves no rigid motion
+SHAKEN = 0.15  # of the distance to a neighbour: cells of any shape keep their sense
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def logarithmic(low: float, high: float) -> st.SearchStrategy[float]:
+    """Return numbers between two, their orders of magnitude even."""
+    return st.floats(np.log10(low), np.log10(high)).map(lambda power: float(10.0**power))
+
+
+@dataclass(frozen=True)
+class Body:
+    """A cuboid on a grid, described so that it can be turned, moved, made larger and built anew.
+
+    Attributes:
+        cell, degree: The element.
+        law: The law.
+        support: What holds it, one of `HELD`, or "free".
+        sides: Over its size, (D,).
+        counts: Vertices along each side.
+        grading: Power of each coordinate, from 0 to 1, by which the grid is no longer even.
+        shaken: By which part of their distance inner vertices move at most.
+        mean_dilatation: See `Problem`.
+        size: Its unit of length [m].
+        turned: Seed of its rotation; 0: not turned.
+        shift: How far it is from the origin, over its size.
+        seed: Of what else is random.
+    """
+
+    cell: str
+    degree: int
+    law: Material
+    support: str
+    sides: tuple[float, ...]
+    counts: tuple[int, ...]
+    grading: tuple[float, ...]
+    shaken: float
+    mean_dilatation: bool
+    size: float
+    turned: int
+    shift: float
+    seed: int
+
+    @property
+    def dim(self) -> int:
+        """D."""
+        return len(self.sides)
+
+    @cached_property
+    def rotation(self) -> np.ndarray:
+        """Q, (D, D)."""
+        return rotation(self.dim, self.turned).numpy()
+
+    @cached_property
+    def origin(self) -> np.ndarray:
+        """Where its corner lies, over its size, (D,)."""
+        way = np.random.default_rng(self.turned).standard_normal(self.dim)
+        return self.shift * way / np.linalg.norm(way)
+
+    @cached_property
+    def mesh(self) -> skfem.Mesh:
+        """Its mesh [m]."""
+        grid = CUBOID[self.cell]([1.0] * self.dim, self.counts, self.cell)
+        powers = np.array(self.grading)
+        ticks = [np.linspace(0, 1, n) ** g for n, g in zip(self.counts, powers, strict=True)]
+        room = np.array([np.diff(t).min() for t in ticks])
+        shift = np.random.default_rng(self.seed).uniform(-1, 1, grid.p.shape)
+        shift[:, grid.boundary_nodes()] = 0.0
+        p = grid.p ** powers[:, None] + self.shaken * room[:, None] * shift
+        p = self.rotation @ (p * np.array(self.sides)[:, None]) + self.origin[:, None]
+        return type(grid)(self.size * p, grid.t)
+
+    def face(self, axis: int, end: str):
+        """Return one of its sides as a region."""
+        at = {"min": 0.0, "max": self.sides[axis]}[end]
+
+        def side(points: np.ndarray) -> np.ndarray:
+            own = (points / self.size - self.origin) @ self.rotation
+            return np.abs(own[:, axis] - at) < 1e-7
+
+        return side
+
+    def build(self, **options) -> Problem:
+        """Return the problem; `options` of `Problem.build` come on top."""
+        supports = []
+        if self.support in ("clamp", "clamps", "moved"):
+            supports.append(Displacement(self.face(0, "min")))
+        if self.support in ("clamps", "moved"):
+            by = np.random.default_rng(self.seed).uniform(-0.1, 0.1, self.dim)
+            by = by * min(self.sides) * (self.support == "moved")
+            way = (self.size * self.rotation @ by).tolist()
+            supports.append(Displacement(self.face(0, "max"), way))
+        if self.support == "bed":
+            supports.append(Spring(self.face(0, "min"), 0.5 / self.size))
+        if self.support == "rollers":
+            for axis in range(self.dim):
+                value = [0.0 if i == axis else None for i in range(self.dim)]
+                supports.append(Displacement(self.face(axis, "min"), value))
+        options = {"mean_dilatation": self.mean_dilatation, "degree": self.degree} | options
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # linear elements may lock: not what is asked here
+            return Problem.build(self.mesh, self.law, supports=supports, **options)
+
+
+@dataclass(frozen=True)
+class Push:
+    """A load of one kind, turned as its body is.
+
+    Attributes:
+        kind: "noise" on all nodes, at one "point", "traction" on a side, "weight", or "squeeze":
+            pressure on the end, towards the held one.
+        size: Largest displacement of its linear answer over L.
+        seed: Of what is random.
+    """
+
+    kind: str
+    size: float
+    seed: int
+
+    def on(self, body: Body, linear: Linear) -> Load:
+        """Return the load on a body."""
+        problem, random = linear.problem, np.random.default_rng(self.seed)
+        way = random.standard_normal(body.dim)
+        if self.kind == "squeeze":
+            way = -np.eye(body.dim)[0]
+
+        def stress(x: np.ndarray) -> np.ndarray:
+            return np.multiply.outer(body.rotation @ way, np.ones(x.shape[1:]))
+
+        if self.kind == "noise":
+            force = torch.from_numpy(random.standard_normal(problem.shape) @ body.rotation.T)
+        elif self.kind == "point":
+            force = torch.zeros(problem.shape, dtype=torch.float64)
+            movable = problem.free.any(dim=1).nonzero().flatten()
+            node = movable[random.integers(len(movable))]
+            force[node] = torch.from_numpy(body.rotation @ way)
+        elif self.kind == "weight":
+            force = body_force(problem, stress)
+        else:
+            axis = 0 if self.kind == "squeeze" else 1
+            force = traction(problem, body.face(axis, "max"), stress, problem.length)
+        force = self.size * force / linear.respond(force).abs().max()
+        return load_of(force[None])
+
+
+def load_of(force: Tensor) -> Load:
+    """Return forces (B, N, D) as a load."""
+    return Load(force, torch.ones(len(force), dtype=torch.float64))
+
+
+def rotation(dim: int, seed: int) -> Tensor:
+    """Return a rotation (D, D), the identity for 0."""
+    if not seed:
+        return torch.eye(dim, dtype=torch.float64)
+    Q, R = np.linalg.qr(np.random.default_rng(seed).standard_normal((dim, dim)))
+    Q = Q * np.sign(np.diag(R))
+    Q[:, 0] *= np.linalg.det(Q)
+    return torch.from_numpy(Q)
+
+
+@st.composite
+def laws(draw, finite: bool = False) -> Material:
+    """Draw any law with constants for which it resists shear and pressure at rest.
+
+    Args:
+        draw: Hypothesis'.
+        finite: Not the one law of small strains.
+    """
+    kinds = HOOKEAN[:-1] if finite else HOOKEAN
+    kind = draw(st.sampled_from([*kinds, MooneyRivlinK2, YeohK2, OgdenK2]))
+    if kind in HOOKEAN:
+        return kind(draw(st.floats(-0.9, 0.49)))
+    bulk = draw(logarithmic(0.1, 100.0))
+    if kind is MooneyRivlinK2:
+        c10 = draw(st.floats(0.05, 0.5))
+        return MooneyRivlinK2(c10, draw(st.floats(-c10 / 2, 0.5)), bulk)
+    if kind is YeohK2:
+        c10, c20 = draw(st.floats(0.05, 0.5)), draw(st.floats(-0.05, 0.1))
+        return YeohK2(c10, c20, draw(st.floats(0.0, 0.05)), bulk)
+    exponents = st.floats(0.5, 5.0) | st.floats(-5.0, -0.5)
+    first = draw(st.floats(0.1, 0.5)), draw(exponents)
+    others = draw(st.lists(st.tuples(st.floats(-0.04, 0.3), exponents), max_size=2))
+    shear, powers = zip(first, *others, strict=True)
+    return OgdenK2(shear, powers, bulk)
+
+
+@st.composite
+def bodies(
+    draw,
+    supports: tuple[str, ...] = HELD,
+    law: st.SearchStrategy[Material] | None = None,
+    inner: bool = False,
+) -> Body:
+    """Draw a body of less than 130 nodes.
+
+    Args:
+        draw: Hypothesis'.
+        supports: What may hold it.
+        law: Any if left out.
+        inner: Whether it must have vertices inside.
+    """
+    cell, degree = draw(st.sampled_from(sorted(CUBOID))), draw(st.integers(1, 2))
+    dim = 3 if CUBOID[cell] is box else 2
+    support = draw(st.sampled_from(supports))
+    most = {(2, 1): 8, (2, 2): 5, (3, 1): 4, (3, 2): 3}[dim, degree]
+    least = [
+        3 if inner or (support in ("clamps", "moved") and axis == 0) else 2 for axis in range(dim)
+    ]
+    counts = tuple(draw(st.integers(low, most)) for low in least)
+    even = draw(st.booleans())
+    return Body(
+        cell=cell,
+        degree=degree,
+        law=draw(laws() if law is None else law),
+        support=support,
+        sides=(1.0, *(draw(logarithmic(0.1, 1.0)) for _ in counts[1:])),
+        counts=counts,
+        grading=tuple(1.0 if even else draw(st.floats(0.6, 1.8)) for _ in counts),
+        shaken=0.0 if even else draw(st.floats(0.0, SHAKEN)),
+        mean_dilatation=degree == 1 and cell in ("quad", "hexahedron") and draw(st.booleans()),
+        size=draw(logarithmic(1e-3, 1e3)),
+        turned=0 if support == "rollers" else draw(st.just(0) | seeds),
+        shift=draw(st.floats(0.0, 10.0)),
+        seed=draw(seeds),
+    )
+
+
+@st.composite
+def pushes(draw, body: Body, low: float = 1e-9, high: float = 10.0) -> Push:
+    """Draw a load that the supports of a body leave something to do.
+
+    Args:
+        draw: Hypothesis'.
+        body: What it acts on.
+        low, high: Bounds of its linear answer over L.
+    """
+    kinds = ["noise", "point", "weight"]
+    if body.support not in ("clamps", "moved") or body.counts[0] > 2:
+        kinds.append("traction")
+    if body.support in ("clamp", "bed", "rollers"):
+        kinds.append("squeeze")
+    return Push(draw(st.sampled_from(kinds)), draw(logarithmic(low, high)), draw(seeds))
+
+
+@st.composite
+def cases(draw, *, low: float = 1e-9, high: float = 10.0, **options) -> tuple[Body, Push]:
+    """Draw a body (`options` of `bodies`) and a load on it (bounds as for `pushes`)."""
+    body = draw(bodies(**options))
+    return body, draw(pushes(body, low, high))
+
+
+def gradients(problem: Problem, displacement: Tensor) -> Tensor:
+    """Return H of displacements (B, N, D), (B, E, Q, D, D), by the plainest sum."""
+    dN = problem.dN.expand(len(problem.cells), -1, -1, -1)
+    return torch.einsum("beai,eqaj->beqij", displacement[:, problem.cells], dN)
+
+
+def bent(problem: Problem, steepness: float, seed: int, batch: int = 1) -> Tensor:
+    """Return displacements (B, N, D) of waves and some noise, the largest |H| `steepness`.
+
+    Below 1 they invert nothing: no singular value of F is below 1 - |H|.
+    """
+    random, points = np.random.default_rng(seed), problem.points.numpy()
+    points = points - points.mean(axis=0)
+    dim = points.shape[1]
+    waves = [
+        points @ random.standard_normal((dim, dim))
+        + np.sin(4 * points @ random.standard_normal((dim, dim)) + random.uniform(0, 6, dim))
+        + random.choice([0.0, 0.02]) * random.standard_normal(points.shape)
+        for _ in range(batch)
+    ]
+    u = torch.from_numpy(np.stack(waves))
+    return (
+        u * (steepness / gradients(problem, u).norm(dim=(-2, -1)).flatten(1).amax(1))[:, None, None]
+    )
