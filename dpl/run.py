@@ -56,7 +56,8 @@ KEYS = {  # what a configuration may hold at its top
     *("action", "shard", "shards"),
     *("parts", "linear", "repeats", "count", "workers", "peers", "samples"),
     *("name", "galerkin", "corrected"),
-    *("networks", "tols", "far", "budget", "resume", "threads", "across", "cases", "minutes", "works"),
+    *("networks", "tols", "far", "budget", "resume", "threads", "across", "cases"),
+    *("minutes", "works"),
 }
 
 ASIDE = {  # where a run lies and how it is watched, not what it is
