@@ -40,18 +40,61 @@ R = typing.TypeVar("R")
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
-TRUSTED = ("dpl.", "torch.optim.", "lightning.")  # what a run's folder may name without being asked
-
-KEYS = {  # what a configuration may hold at its top
+WHOLE, NAMES = Sequence[int], Sequence[str] | None
+KEYS: dict[str, Any] = {  # what a configuration may hold at its top, and of which kind
+    **dict.fromkeys(("mesh", "material", "loads", "solver"), dict),
+    **dict.fromkeys(("clamped", "supports", "forces"), dict | None),
+    **{"degree": int, "mean_dilatation": bool, "young": float | Sequence[float]},
+    **dict.fromkeys(("data", "model", "loss", "optimizer", "trainer"), dict),
+    **{"scheduler": dict | None, "seed": int, "ckpt_path": str | None},
+    **{"run": str | None, "folder": str, "tol": float},
+    **{"action": str, "shard": int, "shards": int},
+    **{"parts": Sequence[str], "linear": Sequence[str], "peers": dict},
+    **dict.fromkeys(("repeats", "count", "workers", "samples", "far"), int),
+    **{"name": str, "galerkin": dict | None, "corrected": dict | None},
+    **{"networks": NAMES, "tols": Sequence[float], "resume": bool, "cases": NAMES},
+    **{"threads": Sequence[int | None], "across": WHOLE},
+}
+SPANS = {  # smallest and largest of them
+    **{"repeats": (1, 10**6), "samples": (1, 10**6), "shards": (1, math.inf)},
+    **{"count": (0, 10**6), "far": (0, 10**6), "workers": (0, 1024), "seed": (0, 2**32 - 1)},
+    **{"tol": (1e-15, 1), "tols": (1e-15, 1), "across": (1, 10**3), "threads": (1, 10**4)},
+}
+SCENE = (  # keys that make a scene, and those that make a surrogate of it
     *("mesh", "degree", "mean_dilatation", "clamped", "supports", "forces"),
     *("material", "young", "loads", "solver"),
-    *("data", "model", "loss", "optimizer", "scheduler", "trainer"),
-    *("seed", "ckpt_path", "run", "folder", "tol"),
-    *("action", "shard", "shards"),
-    *("parts", "linear", "repeats", "count", "workers", "peers", "samples"),
-    *("name", "galerkin", "corrected"),
-    *("networks", "tols", "far", "resume", "threads", "across", "cases"),
+)
+NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")
+
+KINDS = {  # what the call under a key must give: one of these, or of a class derived from them
+    "mesh": {"skfem.mesh.mesh.Mesh"},
+    "material": {"dpl.fem.law.Material"},
+    "clamped": {f"dpl.fem.regions.{n}" for n in ("Plane", "Box", "Sphere", "Cylinder", "Tag")},
+    "supports": {"dpl.fem.supports.Displacement", "dpl.fem.supports.Spring"},
+    "forces": {"dpl.fem.forces.Traction", "dpl.fem.forces.BodyForce"},
+    "solver": {"dpl.fem.newton.Newton"},
+    "loads": {"dpl.fem.modes.ModalLoads"},
+    "data": {"dpl.data.generate.DataSet", "dpl.data.datamodule.OfflineData"},
+    "model": {"torch.nn.modules.module.Module"},
+    "loss": {"dpl.losses.Loss"},
+    "optimizer": {"torch.optim.optimizer.Optimizer"},
+    "scheduler": {"torch.optim.lr_scheduler.LRScheduler"},
+    "trainer": {"lightning.pytorch.trainer.trainer.Trainer"},
 }
+SEVERAL = ("supports", "forces")  # keys that hold calls by name
+WATCHING = {  # what a trainer may be given besides
+    "lightning.pytorch.callbacks.callback.Callback",
+    "lightning.pytorch.loggers.logger.Logger",
+    "lightning.fabric.plugins.io.checkpoint_io.CheckpointIO",
+}
+TRUSTED = {  # functions that a run's folder may name without being asked; classes are in KINDS
+    *(f"dpl.fem.mesh.{name}" for name in ("box", "rectangle", "propeller", "load")),
+    *(f"dpl.fem.sampling.{name}" for name in ("uniform", "normal", "even", "one")),
+    *(f"dpl.fem.sampling.{name}" for name in ("logarithmic", "tail")),
+    "dpl.module.warmup_cosine",
+}
+OURS = ("dpl.", "torch.optim.")  # where those classes are
+OWN = {"_target_", "_partial_", "_recursive_", "_convert_"}  # Hydra's own options of a call
 
 ASIDE = {  # where a run lies and how it is watched, not what it is
     *("run", "folder", "ckpt_path", "data.folder"),
@@ -60,7 +103,11 @@ ASIDE = {  # where a run lies and how it is watched, not what it is
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot work: which key, what is wrong, what to do."""
+    """A configuration that cannot work: which key, what is wrong, what to do, in one line."""
+
+    def __init__(self, told: str) -> None:
+        """Fold what is told into a line."""
+        super().__init__(" ".join(filter(None, map(str.strip, told.splitlines()))))
 
 
 def command(task: Callable[[DictConfig], R]) -> Callable[[DictConfig], R]:
@@ -151,37 +198,90 @@ def check(cfg: DictConfig, *, trust: bool = True) -> None:
 
     Args:
         cfg: The configuration.
-        trust: Whether it may name any object to call, or only those of `TRUSTED`.
+        trust: Whether it may name any object to call, or only what the keys of a run stand for:
+            classes of this package and of PyTorch's optimisers, and the functions of `TRUSTED`.
 
     Raises:
         ConfigError: A key that its object does not know, a value of another type, a number that is
-            not finite, or an object that does not exist or is not trusted.
+            not finite or out of range, or an object that does not exist or is not trusted.
     """
-    if unknown := sorted(set(plain(cfg)) - KEYS):
+    resolved = plain(cfg)
+    if unknown := sorted({str(key) for key in resolved} - set(KEYS)):
         raise ConfigError(f"{unknown[0]}: no such key; there are {', '.join(sorted(KEYS))}")
-    for path, value in _walk(plain(cfg)):
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ConfigError(f"{path} = {value} is not a finite number")
-    if not _fits(cfg.get("seed", 0), int):
-        raise ConfigError(f"seed = {cfg.seed!r} must be a whole number")
-    for path, node in _walk(plain(cfg)):
-        if not isinstance(node, dict) or "_target_" not in node:
-            continue
-        name = node["_target_"]
-        if not trust and not name.startswith(TRUSTED):
-            raise ConfigError(f"{path} names {name}, which is none of this package's; not called")
-        try:
-            module, _, attribute = name.rpartition(".")
-            target = getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError):
-            raise ConfigError(f"{path}._target_ = {name!r} does not exist") from None
-        _check_call(path, node, target)
+    for node in (OmegaConf.to_container(cfg), resolved):  # first where a value is written
+        for path, value in _walk(node):
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ConfigError(f"{path} = {value} is not a finite number")
+            if isinstance(value, int) and not -(2**63) <= value < 2**63:
+                raise ConfigError(f"{path} = {value} does not fit into 64 bits")
+    for key, value in resolved.items():
+        _check_top(key, value)
+    for path, node in _walk(resolved):
+        if isinstance(node, dict) and "_target_" in node:
+            _check_call(path, node, _target(path, node["_target_"], trust=trust))
+        elif _is_call(path) and node is not None:
+            raise ConfigError(f"{path} = {node!r} must be a call: its _target_ is missing")
+
+
+def _is_call(path: str) -> bool:
+    """Return whether what lies at a path must be a call."""
+    key, *below = path.split(".")
+    return len(below) == (key in SEVERAL) and key in KINDS
+
+
+def _check_top(key: str, value: Any) -> None:
+    """Hold the value of a key against what it must be."""
+    if key == "folder" and value is None:  # of scripts that write nothing
+        return
+    if not _fits(value, KEYS[key]):
+        raise ConfigError(f"{key} = {value!r} must be {_words(KEYS[key])}")
+    least, most = SPANS.get(key, (-math.inf, math.inf))
+    for one in value if isinstance(value, list) else [value]:
+        if isinstance(one, int | float) and not least <= one <= most:
+            raise ConfigError(f"{key} = {value} must lie between {least:g} and {most:.10g}")
+
+
+def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
+    """Return what a call names.
+
+    Raises:
+        ConfigError: It does not exist, cannot be called or is not trusted.
+    """
+    foreign = f"{path} names {name}, which is none of this package's; not called"
+    watching = path.split(".")[0] == "trainer"
+    ours = (*OURS, "lightning.") if watching else OURS
+    if not isinstance(name, str):
+        raise ConfigError(f"{path}._target_ = {name!r} must be a text")
+    if not trust and not name.startswith(ours):
+        raise ConfigError(foreign)
+    try:
+        module, _, attribute = name.rpartition(".")
+        target = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError):
+        raise ConfigError(f"{path}._target_ = {name!r} does not exist") from None
+    if not callable(target):
+        raise ConfigError(f"{path}._target_ = {name!r} cannot be called")
+    if not trust and name not in TRUSTED:
+        kinds = set().union(*KINDS.values(), WATCHING if watching else ())
+        if not (inspect.isclass(target) and f"{target.__module__}.".startswith(ours)):
+            raise ConfigError(foreign)
+        if not _is_a(target, kinds):
+            raise ConfigError(foreign)
+    return typing.cast("Callable[..., Any]", target)
+
+
+def _is_a(kind: type, names: set[str]) -> bool:
+    """Return whether a class is one of these or derived from them, none of them imported."""
+    return not names.isdisjoint(f"{base.__module__}.{base.__qualname__}" for base in kind.__mro__)
 
 
 def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> None:
-    known, hints = _signature(target)
+    try:
+        known, hints = _signature(target)
+    except (TypeError, ValueError):  # of what is written in C
+        raise ConfigError(f"{path}._target_ = {node['_target_']!r} has no known options") from None
     for key, value in node.items():
-        if key.startswith("_") and key.endswith("_"):
+        if key in OWN:
             continue
         if key not in known:
             named = ", ".join(sorted(known))
@@ -213,32 +313,37 @@ def _fits(value: Any, hint: Any) -> bool:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
         return any(_fits(value, argument) for argument in arguments)
-    if isinstance(value, dict):
+    if isinstance(value, dict) and "_target_" in value:
         return True  # another call
     if hint is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool)
-    if hint in (bool, str, types.NoneType):
-        return isinstance(value, hint)
-    if origin is Sequence:
+    if origin is typing.Literal:
+        return value in arguments
+    if origin is tuple and Ellipsis not in arguments:
+        many = isinstance(value, list) and len(value) == len(arguments)
+        return many and all(map(_fits, value, arguments))
+    if origin in (Sequence, list, tuple):
         return isinstance(value, list) and all(_fits(item, arguments[0]) for item in value)
+    if origin is Callable:
+        return False
     if hint is Path:
         return isinstance(value, str)
-    if isinstance(hint, type) and hint is not object:
-        return isinstance(value, hint)
+    if isinstance(origin or hint, type) and hint is not object:
+        return isinstance(value, origin or hint)
     return True
 
 
 def _words(hint: Any) -> str:
     names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
-    names[Path] = "a path"
-    arguments = typing.get_args(hint)
-    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+    names |= {Path: "a path", types.NoneType: "null", dict: "a call or several by name"}
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
         return " or ".join(_words(argument) for argument in arguments)
-    if typing.get_origin(hint) is Sequence:
+    if origin is Sequence:
         return f"a list, each {_words(arguments[0])}"
-    return names.get(hint, "null" if hint is types.NoneType else str(hint))
+    return names.get(hint, str(hint))
 
 
 def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -257,16 +362,44 @@ def make(cfg: DictConfig, key: str, /, **more: Any) -> Any:
     """Return the object of one node; `more` goes into the call (of a partial: into the second).
 
     Raises:
-        ConfigError: Its values are out of range, or its file is not there.
+        ConfigError: It is not there, its values are out of range, it gives another kind of object
+            than the key stands for, or its file is not there.
     """
-    node = cfg[key]
+    _need(cfg, key)
+    made = _made(cfg[key], key, more)
+    own = callable(made) and key == "clamped"  # a region may be any function of points
+    partial = own or (not more and isinstance(made, functools.partial))
+    if key in KINDS and not partial and not _is_a(type(made), KINDS[key]):
+        raise ConfigError(f"{key} gives {_a(made)}; it must give {_named(KINDS[key])}")
+    return made
+
+
+def _made(node: Any, key: str, more: dict[str, Any]) -> Any:
     try:
         made = hydra.utils.instantiate(node, _convert_="all")
         return made(**more) if more else made
     except InstantiationException as error:
-        raise ConfigError(f"{key}: {error.__cause__ or error}") from error
-    except (ValueError, TypeError, MemoryError, OSError) as error:
+        cause = error.__cause__ or error
+        raise ConfigError(f"{key}: {cause or type(cause).__name__}") from error
+    except (ValueError, TypeError, ArithmeticError, LookupError) as error:
         raise ConfigError(f"{key}: {error}") from error
+    except (RuntimeError, MemoryError, OSError) as error:
+        raise ConfigError(f"{key}: {error or type(error).__name__}") from error
+
+
+def _need(cfg: DictConfig, *keys: str) -> None:
+    """Raise where one of the keys is not there."""
+    for key in keys:
+        if key not in cfg:
+            raise ConfigError(f"{key} is missing")
+
+
+def _a(made: Any) -> str:
+    return f"an object of {type(made).__name__}"
+
+
+def _named(kinds: set[str]) -> str:
+    return " or ".join(sorted(kind.rpartition(".")[2] for kind in kinds))
 
 
 def build_scene(cfg: DictConfig) -> Scene:
@@ -277,6 +410,7 @@ def build_scene(cfg: DictConfig) -> Scene:
     """
     from dpl.fem.problem import Problem
 
+    _need(cfg, *SCENE)
     material, mesh = make(cfg, "material"), make(cfg, "mesh")
     clamped = make(cfg, "clamped") if cfg.get("clamped") is not None else None
     if cfg.degree not in (1, 2):
@@ -324,7 +458,11 @@ def _parts(cfg: DictConfig, key: str) -> list[Any]:
         return []
     if not isinstance(node, DictConfig):
         raise ConfigError(f"{key} = {node!r} must name its parts: {key}: {{name: {{...}}}}")
-    return [make(node, name) for name in node if node[name] is not None]
+    parts = {str(name): _made(node[name], f"{key}.{name}", {}) for name in node if node[name]}
+    for name, part in parts.items():
+        if not _is_a(type(part), KINDS[key]):
+            raise ConfigError(f"{key}.{name} gives {_a(part)}; it must give {_named(KINDS[key])}")
+    return list(parts.values())
 
 
 def _always(cfg: DictConfig, problem: "Problem") -> torch.Tensor | None:
@@ -344,6 +482,7 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
     """
     from dpl.module import Surrogate
 
+    _need(cfg, *NETWORK)
     # both are tried on one number, so that their errors come before any solve
     trial = make(cfg, "optimizer", params=[torch.nn.Parameter(torch.zeros(1))])
     if cfg.scheduler:
