@@ -14,7 +14,7 @@ import sys
 import types
 import typing
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -282,6 +282,8 @@ def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> 
         raise ConfigError(f"{path}._target_ = {node['_target_']!r} has no known options") from None
     for key, value in node.items():
         if key in OWN:
+            if key.endswith(("partial_", "recursive_")) and not isinstance(value, bool):
+                raise ConfigError(f"{path}.{key} = {value!r} must be true or false")
             continue
         if key not in known:
             named = ", ".join(sorted(known))
@@ -324,7 +326,7 @@ def _fits(value: Any, hint: Any) -> bool:
     if origin is tuple and Ellipsis not in arguments:
         many = isinstance(value, list) and len(value) == len(arguments)
         return many and all(map(_fits, value, arguments))
-    if origin in (Sequence, list, tuple):
+    if origin in (Sequence, Iterable, list, tuple):
         return isinstance(value, list) and all(_fits(item, arguments[0]) for item in value)
     if origin is Callable:
         return False

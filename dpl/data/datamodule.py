@@ -89,7 +89,7 @@ class OfflineData(L.LightningDataModule):
         spans = {"val": val, "test": test, "batch_size": batch_size}
         for name, number in spans.items():
             if not 1 <= number <= MANY:
-                raise ValueError(f"{name} = {number} must lie between 1 and {MANY:,}")
+                raise ValueError(f"{name} = {number} must be 1 or more and at most {MANY:,}")
         if not 0 <= shuffle < 2**32:
             raise ValueError(f"shuffle = {shuffle} must be 0 or more and below 2^32")
         self.wanted = DataSet(
@@ -207,7 +207,7 @@ class OnlineData(OfflineData):
         """
         for name, number in (("batches", batches), ("fresh", fresh), ("reuse", reuse)):
             if not 1 <= number <= MANY:
-                raise ValueError(f"{name} = {number} must lie between 1 and {MANY:,}")
+                raise ValueError(f"{name} = {number} must be 1 or more and at most {MANY:,}")
         if capacity < fresh:
             raise ValueError(f"capacity = {capacity} must be fresh = {fresh} or more")
         needed = capacity * 2 * 8 * scene.problem.points.numel() / 1e9

@@ -69,7 +69,8 @@ class DataSet:
         spans = {"seed": 2**32 - 1, "train": MOST, "val": MOST, "test": MOST, "workers": WORKERS}
         for name, most in spans.items():
             if not 0 <= getattr(self, name) <= most:
-                raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and {most:,}")
+                told = f"{name} = {getattr(self, name)} must be 0 or more and at most {most:,}"
+                raise ValueError(told)
         if self.shards < 1:
             raise ValueError(f"shards = {self.shards} must be 1 or more")
         if self.timeout is not None and not self.timeout > 0:

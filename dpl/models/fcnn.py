@@ -52,7 +52,7 @@ class FCNN(nn.Module):
         """
         super().__init__()
         if not 2 <= layers <= DEEPEST:
-            raise ValueError(f"layers = {layers} must lie between 2 and {DEEPEST}")
+            raise ValueError(f"layers = {layers} must be 2 or more and at most {DEEPEST}")
         if width is not None and width < 1:
             raise ValueError(f"width = {width} must be 1 or more")
         everything = torch.ones(scene.problem.shape, dtype=torch.bool)

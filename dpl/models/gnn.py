@@ -59,7 +59,7 @@ class GNN(nn.Module):
         if levels is not None and levels < 1:
             raise ValueError(f"levels = {levels} must be 1 or more")
         if not 1 <= passes <= DEEPEST:
-            raise ValueError(f"passes = {passes} must lie between 1 and {DEEPEST}")
+            raise ValueError(f"passes = {passes} must be 1 or more and at most {DEEPEST}")
         problem = scene.problem
         nodes, dim = problem.shape
         graphs, clusters = hierarchy(problem, levels)

@@ -100,7 +100,7 @@ class PODNet(nn.Module):
             if number < 1:
                 raise ValueError(f"{name} = {number} must be 1 or more")
         if not 0 <= blocks <= DEEPEST:
-            raise ValueError(f"blocks = {blocks} must lie between 0 and {DEEPEST}")
+            raise ValueError(f"blocks = {blocks} must be 0 or more and at most {DEEPEST}")
         self.scene = scene
         always = scene.loads.always
         also = [] if always is None else [always]

@@ -1,18 +1,12 @@
-"""Laws of configurations with anything in them: refused in a line that names the key, or at work."""
+"""Laws of configurations with anything in them: refused in a line that names the key, or work."""
 
-import builtins
 import importlib
 import inspect
 import os
-import resource
-import shutil
-import signal
 import subprocess
 import sys
-import time
 import types
 from collections.abc import Iterator
-from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
 
@@ -20,6 +14,7 @@ import hydra
 import lightning as L
 import pytest
 import torch
+from bounds import bounded
 from hydra.core.global_hydra import GlobalHydra
 from hypothesis import given
 from hypothesis import strategies as st
@@ -61,12 +56,11 @@ NETWORKS = {  # of conf/train.yaml
     "online": ["data=online", "model.width=8", "loss=annealed"],
 }
 OTHERS = ("evaluate", "benchmark", "convergence", "results", "verify", "stress")
-LIMIT = 20.0  # of one input [s]
-MEMORY = 1.0  # that one input may take [GB]
 
 TEXTS = ("no such thing", "", "1e30", "-", "a\nb")
 OTHER_KINDS = (None, True, False, [], [None], ["a", {}], {}, {"a": 1}, [[1.0]], *TEXTS)
 NUMBERS = (
+    *(1, 2, 3, 7, 0.1, 0.5, 1e-3, 1e3, 1e6, 20),
     *(-1, 0, -0.5, 2.5, 1e30, -1e30, 1e-300, 5e-324, 1e300),
     *(10**9, 10**12, -(10**12), 10**30, 2**31, 2**63),
 )
@@ -76,7 +70,12 @@ FREE = {  # keys of any text, or of one that the script looks at
     *("folder", "run", "ckpt_path", "name", "save_dir", "version", "dirpath", "filename"),
     *("monitor", "action", "parts", "linear", "cases"),
 }
-SHARED = {"seed": "shuffle", "max_epochs": "epochs", "folder": "dirpath", "name": "run"}
+SHARED = {  # keys that others refer to
+    "seed": ("shuffle",),
+    "max_epochs": ("epochs",),
+    "folder": ("dirpath", "save_dir"),
+    "name": ("run",),
+}
 
 
 # ------------------------------------------------------------------ what is tried
@@ -92,7 +91,9 @@ def composed(command: str, *overrides: str) -> dict:
 
 
 def _bases() -> dict[str, dict]:
-    found = {f"generate {k}": composed("generate", *v, *SMALL[:3], SMALL[4]) for k, v in SCENES.items()}
+    found = {
+        f"generate {k}": composed("generate", *v, *SMALL[:3], SMALL[4]) for k, v in SCENES.items()
+    }
     for name, chosen in NETWORKS.items():
         sizes = [o for o in SMALL if not (name == "online" and o.startswith("data.train"))]
         found[f"train {name}"] = composed("train", *TINY, *sizes, *chosen, "folder=.", "run=here")
@@ -131,7 +132,9 @@ def harmed(draw, names=tuple(BASES)):
     cfg = deepcopy(BASES[name])
     path = draw(st.sampled_from(list(places(cfg))))
     done = draw(
-        st.sampled_from(["kind", "number", "number", "number", "endless", "unfinished", "less", "more"])
+        st.sampled_from(
+            ["kind", "number", "number", "number", "endless", "unfinished", "less", "more"]
+        )
     )
     old = at(cfg, path)
     if done == "less":
@@ -141,7 +144,10 @@ def harmed(draw, names=tuple(BASES)):
     if done == "more":
         while not isinstance(at(cfg, path), dict):
             path = path[:-1]
-        path = (*path, draw(st.sampled_from(["colour", "speed", "_args_", "_colour_", "memori_limit"])))
+        path = (
+            *path,
+            draw(st.sampled_from(["colour", "speed", "_args_", "_colour_", "memori_limit"])),
+        )
         value = draw(st.sampled_from([1, "red", [1], {}, {"_target_": "builtins.dict"}]))
     else:
         choices = {"kind": OTHER_KINDS, "number": NUMBERS, "endless": ENDLESS}
@@ -154,37 +160,6 @@ def harmed(draw, names=tuple(BASES)):
 
 
 # ------------------------------------------------------------------ what is wanted
-
-
-class Late(BaseException):
-    """An input took too long."""
-
-
-@contextmanager
-def bounded(seconds: float = LIMIT, memory: float = MEMORY) -> Iterator[None]:
-    """Hold what is done to a time and a memory [GB]."""
-
-    def late(*_):
-        raise Late(f"more than {seconds:g} s")
-
-    def peak() -> float:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-
-    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    before, handler = peak(), signal.signal(signal.SIGALRM, late)
-    left = signal.setitimer(signal.ITIMER_REAL, seconds)[0]
-    begin = time.monotonic()
-    resource.setrlimit(resource.RLIMIT_AS, (size + int(3e9 * memory), hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-        signal.signal(signal.SIGALRM, handler)
-        signal.setitimer(
-            signal.ITIMER_REAL, max(1e-3, left - (time.monotonic() - begin)) if left else 0.0
-        )
-    assert peak() - before < memory, f"{peak() - before:.1f} GB"
 
 
 def works(cfg: DictConfig, folder: Path) -> None:
@@ -233,7 +208,7 @@ def judge(change, line: str) -> None:
     name, _, path, done, value = change
     words = {part for part in path if isinstance(part, str)}
     if line:
-        words |= {other for key, other in SHARED.items() if key in words}
+        words |= {other for key in words for other in SHARED.get(key, ())}
         assert any(word in line for word in words), (path, value, line)
     elif not words & {"peers"}:
         assert done not in ("more", "endless", "unfinished"), (name, path, value)
@@ -247,6 +222,7 @@ def elsewhere(monkeypatch, tmp_path):
     return tmp_path
 
 
+@at_most(4)
 @given(harmed())
 @counted
 def test_a_configuration_is_refused_by_the_key_or_works(elsewhere, change):
@@ -323,6 +299,7 @@ def tripwires(monkeypatch, elsewhere):
     assert sorted(path.name for path in elsewhere.iterdir()) == ["evil", "run"]
 
 
+@at_most(3)
 @given(poisoned())
 @counted
 def test_a_runs_folder_calls_nothing_but_the_objects_of_a_run(tripwires, cfg):
@@ -346,7 +323,17 @@ def _names() -> list[str]:
 
 
 NAMES = _names()
-HARMLESS = {"dpl", "torch.optim", "lightning"}
+
+KINDS = {
+    *("Mesh", "Material", "Newton", "ModalLoads", "DataSet", "OfflineData", "Module", "Optimizer"),
+    *("LRScheduler", "Plane", "Box", "Sphere", "Cylinder", "Tag", "Displacement", "Spring"),
+    *("Traction", "BodyForce", "Loss"),
+}
+WATCHING = {"Trainer", "Callback", "Logger", "CheckpointIO"}
+FUNCTIONS = {
+    *("box", "rectangle", "propeller", "load", "warmup_cosine"),
+    *("uniform", "normal", "even", "one", "logarithmic", "tail"),
+}
 
 
 @at_most(10)
@@ -358,25 +345,15 @@ def test_what_a_runs_folder_may_name_is_of_a_kind_that_a_run_is_made_of(name, ke
     OmegaConf.update(cfg, key, {"_target_": name}, merge=False)
     try:
         run.check(cfg, trust=False)
-    except run.ConfigError as error:
-        assert "\n" not in str(error)
+    except run.ConfigError:
         return
     module, _, attribute = name.rpartition(".")
     found = getattr(sys.modules[module], attribute)
-    if inspect.isclass(found):
-        kinds = (torch.nn.Module, torch.optim.Optimizer, L.Trainer, L.Callback)
-        from dpl.fem.law import Material
-
-        others = ("Newton", "ModalLoads", "Mesh", "DataSet", "OfflineData", "LRScheduler")
-        named = {base.__name__ for base in found.__mro__}
-        assert issubclass(found, (*kinds, Material)) or named & {
-            *others,
-            *("Plane", "Box", "Sphere", "Cylinder", "Tag", "Displacement", "Spring"),
-            *("Traction", "BodyForce", "Logger", "CheckpointIO"),
-        }
-    else:
-        assert isinstance(found, types.FunctionType)
-        assert found.__module__.rpartition(".")[2] in ("mesh", "files", "propeller", "sampling", "module")
-        assert attribute not in ("save",)
-    if found.__module__.startswith("lightning"):
-        assert key.startswith("trainer")
+    if isinstance(found, types.FunctionType):
+        assert attribute in FUNCTIONS
+        assert found.__module__.startswith("dpl.")
+        return
+    assert inspect.isclass(found)
+    watching = key.startswith("trainer")
+    assert {base.__name__ for base in found.__mro__} & (KINDS | (WATCHING if watching else set()))
+    assert watching or found.__module__.startswith(("dpl.", "torch.optim."))
