@@ -437,6 +437,8 @@ def build_scene(cfg: DictConfig) -> Scene:
             raise ConfigError(f"{key}: {told.removeprefix('mean_dilatation: ')}") from error
     for line in {str(w.message): None for w in warned if w.category is UserWarning}:
         print(f"warning: {line}", file=sys.stderr)
+    if not problem.free.any():
+        raise ConfigError("clamped or supports: every node is held; hold fewer of them")
     if loose := problem.loose_modes():
         raise ConfigError(
             f"clamped: {len(loose)} rigid modes are unconstrained: {', '.join(loose)}"

@@ -76,7 +76,6 @@ BAD = {  # override -> what the message must name
     "loads.n_modes=1000000000000000000000": r"loads\.n_modes = 10+ does not fit into 64 bits",
     "loads.distribution=uniform": r"loads\.distribution = 'uniform' must be",
     "~mesh": r"mesh is missing",
-    "mesh=null": r"mesh is missing",
     "~forces": r"forces is missing",
     "~degree": r"degree is missing",
     "~mesh._target_": r"mesh = .* must be a call: its _target_ is missing",
@@ -201,6 +200,13 @@ def test_what_cannot_train_is_refused_by_its_key(compose, override, scene, tmp_p
 )
 def test_what_works_is_not_refused(compose, override):
     run.check(compose("folder=.", override, command="train"))
+
+
+def test_a_body_that_is_held_everywhere_is_refused(compose, tiny):
+    cfg = compose(*tiny)
+    cfg.clamped = {"_target_": "dpl.fem.mesh.Sphere", "centre": [0, 0, 0], "radius": 1e3}
+    with pytest.raises(ConfigError, match="clamped or supports: every node is held"):
+        run.build_scene(cfg)
 
 
 @pytest.mark.parametrize("made", ["dpl.losses.LrStar", "skfem.MeshHex", "dpl.fem.mesh.propeller"])

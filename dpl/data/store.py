@@ -15,6 +15,7 @@ by eight, the same loads give the same bytes.
 
 import hashlib
 import json
+import math
 import re
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -190,8 +191,8 @@ class Store:
         path = self.folder / line["file"]
         if path.parent != self.folder or path.is_symlink() or not path.is_file():
             raise ValueError("is missing")
-        problem = self.scene.problem
-        numbers = 3 * problem.points.numel() + self.scene.loads.dimension + 8  # of a load, at most
+        shape = self.scene.problem.shape
+        numbers = 3 * math.prod(shape) + self.scene.loads.dimension + 8  # of a load, at most
         if path.stat().st_size > HEADER + 8 * numbers * line["tried"]:
             raise ValueError("is damaged: it is larger than its loads")
         content = path.read_bytes()
@@ -199,7 +200,7 @@ class Store:
             raise ValueError("is damaged: its SHA-256 is not the manifest's")
         loads = self.scene.loads
         own = int(loads.poisson_range is not None)
-        shard = opened(content, problem.shape, loads.dimension, own)
+        shard = opened(content, shape, loads.dimension, own)
         if shard["index"].tolist() != _kept(line):
             raise ValueError("holds other loads than the manifest says")
         return shard
