@@ -7,14 +7,12 @@ import contextlib
 import errno
 import functools
 import importlib
-import inspect
 import logging
 import math
 import sys
-import types
 import typing
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +25,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from dpl import schema
 from dpl.data.durable import DataSetError
 from dpl.fem.linear import slow_blas
 from dpl.scene import Scene
+from dpl.schema import ConfigError
 
 if typing.TYPE_CHECKING:
     from dpl.data.datamodule import OfflineData
@@ -40,41 +40,13 @@ R = typing.TypeVar("R")
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
-TRUSTED = (  # where that is made what a run's folder may name without being asked; nothing writes
-    *(f"dpl.fem.{name}" for name in ("mesh", "regions", "propeller", "materials", "ogden")),
-    *(f"dpl.fem.{name}" for name in ("supports", "forces", "modes", "sampling", "newton")),
-    *("dpl.fem.files.load", "dpl.data.datamodule", "dpl.models", "dpl.losses"),
-    *("dpl.optimizers", "dpl.module.warmup_cosine", "torch.optim"),
-)
-LONGEST = 1_000_000  # bytes of a run's configuration
-
-KEYS = {  # what a configuration may hold at its top
+WHOLE, NAMES = Sequence[int], Sequence[str] | None
+SCENE = (  # keys that make a scene, and those that make a surrogate of it
     *("mesh", "degree", "mean_dilatation", "clamped", "supports", "forces"),
     *("material", "young", "loads", "solver"),
-    *("data", "model", "loss", "optimizer", "scheduler", "trainer"),
-    *("seed", "ckpt_path", "run", "folder", "tol"),
-    *("action", "shard", "shards"),
-    *("parts", "linear", "repeats", "count", "workers", "peers", "samples"),
-    *("name", "galerkin", "corrected"),
-    *("networks", "tols", "far", "budget", "resume", "threads", "across", "cases"),
-    *("minutes", "works"),
-}
-
-ASIDE = {  # where a run lies and how it is watched, not what it is
-    *("run", "folder", "ckpt_path", "data.folder"),
-    *("trainer.callbacks", "trainer.logger", "trainer.plugins"),
-}
-RESUMED = {  # what may change where a run is resumed: how long it is, and the machine's part
-    *(f"trainer.max_{unit}" for unit in ("epochs", "steps", "time")),
-    *(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy")),
-    *("trainer.log_every_n_steps", "trainer.check_val_every_n_epoch", "trainer.profiler"),
-    *("trainer.enable_progress_bar", "trainer.enable_model_summary"),
-    *("data.workers", "data.timeout"),
-}
-
-
-class ConfigError(ValueError):
-    """A configuration that cannot work: which key, what is wrong, what to do."""
+)
+NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")
+LONGEST = 1_000_000  # bytes of a run's configuration
 
 
 def command(task: Callable[[DictConfig], R]) -> Callable[[DictConfig], R]:
@@ -136,163 +108,66 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
 
 
 def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
-    """Return what makes one run differ from another, flat: numbers, truth values and texts.
-
-    Under the keys of the command line (`model.width`). A call stands under its own key by the name
-    of what it calls (`model`: FCNN). Left out are null and `ASIDE`.
+    """Return what makes one run differ from another, flat, see `dpl.schema.columns`.
 
     Raises:
         ConfigError: A value is missing.
     """
-    return dict(_columns(plain(cfg)))
-
-
-def _columns(node: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in node.items():
-        place = f"{path}.{key}" if path else key
-        if value is None or place in ASIDE:
-            continue
-        if isinstance(value, dict):
-            yield from _columns(value, place)
-        elif key == "_target_":
-            yield path, value.rpartition(".")[2]
-        elif not key.startswith("_"):
-            yield place, str(value) if isinstance(value, list) else value
+    return dict(schema.columns(plain(cfg)))
 
 
 def check(cfg: DictConfig, *, trust: bool = True) -> None:
-    """Hold a configuration against the signatures that it calls, before anything is called.
-
-    Args:
-        cfg: The configuration.
-        trust: Whether it may name any object to call, or only those of `TRUSTED`; `trainer` is
-            then left out, for nothing of it is called.
+    """Hold a configuration against `dpl.schema`, before anything is called.
 
     Raises:
-        ConfigError: A key that its object does not know, a value of another type, a number that is
-            not finite, or an object that does not exist or is not trusted.
+        ConfigError: See `dpl.schema.check`.
     """
-    if unknown := sorted(set(plain(cfg)) - KEYS):
-        raise ConfigError(f"{unknown[0]}: no such key; there are {', '.join(sorted(KEYS))}")
-    for path, value in _walk(plain(cfg)):
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ConfigError(f"{path} = {value} is not a finite number")
-    if not _fits(cfg.get("seed", 0), int):
-        raise ConfigError(f"seed = {cfg.seed!r} must be a whole number")
-    for path, node in _walk(plain(cfg)):
-        if not isinstance(node, dict) or "_target_" not in node:
-            continue
-        if not trust and path.partition(".")[0] == "trainer":
-            continue
-        name = node["_target_"]
-        refusal = f"{path} names {name}, which is none of this package's parts; not called"
-        if not trust and not str(name).startswith(("dpl.", "torch.optim.")):
-            raise ConfigError(refusal)
-        try:
-            module, _, attribute = name.rpartition(".")
-            target = getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError):
-            raise ConfigError(f"{path}._target_ = {name!r} does not exist") from None
-        if not trust and not _trusted(target):
-            raise ConfigError(refusal)
-        _check_call(path, node, target)
-
-
-def _trusted(target: Any) -> bool:
-    """Return whether a class or function is made in one of `TRUSTED`, wherever it was found."""
-    place = f"{getattr(target, '__module__', '')}.{getattr(target, '__qualname__', '')}."
-    return callable(target) and place.startswith(tuple(f"{name}." for name in TRUSTED))
-
-
-def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> None:
-    known, hints = _signature(target)
-    for key, value in node.items():
-        if key.startswith("_") and key.endswith("_"):
-            continue
-        if key not in known:
-            named = ", ".join(sorted(known))
-            raise ConfigError(
-                f"{path}.{key}: {node['_target_']} has no such option; it has {named}"
-            )
-        if key in hints and not _fits(value, hints[key]):
-            raise ConfigError(f"{path}.{key} = {value!r} must be {_words(hints[key])}")
-
-
-def _signature(target: Callable[..., Any]) -> tuple[set[str], dict[str, Any]]:
-    """Return the keywords of a call and their types; **kwargs stand for those of the parents."""
-    classes = inspect.getmro(target) if inspect.isclass(target) else ()
-    levels = [vars(c)["__init__"] for c in classes if "__init__" in vars(c)]
-    known: set[str] = set()
-    hints: dict[str, Any] = {}
-    for level in levels or [target]:
-        parameters = inspect.signature(level).parameters
-        known |= set(parameters)
-        with contextlib.suppress(NameError, TypeError):
-            hints = typing.get_type_hints(level) | hints
-        if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
-            break
-    return known - {"self", "args", "kwargs"}, hints
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a plain value can be what a type hint says; hints of objects accept all."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (types.UnionType, typing.Union):
-        return any(_fits(value, argument) for argument in arguments)
-    if isinstance(value, dict):
-        return True  # another call
-    if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool)
-    if hint in (bool, str, types.NoneType):
-        return isinstance(value, hint)
-    if origin is Sequence:
-        return isinstance(value, list) and all(_fits(item, arguments[0]) for item in value)
-    if hint is Path:
-        return isinstance(value, str)
-    if isinstance(hint, type) and hint is not object:
-        return isinstance(value, hint)
-    return True
-
-
-def _words(hint: Any) -> str:
-    names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
-    names[Path] = "a path"
-    arguments = typing.get_args(hint)
-    if typing.get_origin(hint) in (types.UnionType, typing.Union):
-        return " or ".join(_words(argument) for argument in arguments)
-    if typing.get_origin(hint) is Sequence:
-        return f"a list, each {_words(arguments[0])}"
-    return names.get(hint, "null" if hint is types.NoneType else str(hint))
-
-
-def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield a node and all below it with their paths."""
-    yield path, node
-    entries: Any = ()
-    if isinstance(node, dict):
-        entries = node.items()
-    elif isinstance(node, list):
-        entries = enumerate(node)
-    for key, value in entries:
-        yield from _walk(value, f"{path}.{key}" if path else str(key))
+    written = typing.cast("dict[str, Any]", OmegaConf.to_container(cfg))
+    schema.check(written, plain(cfg), trust=trust)
 
 
 def make(cfg: DictConfig, key: str, /, **more: Any) -> Any:
     """Return the object of one node; `more` goes into the call (of a partial: into the second).
 
     Raises:
-        ConfigError: Its values are out of range, or its file is not there.
+        ConfigError: It is not there, its values are out of range, it gives another kind of object
+            than the key stands for, or its file is not there.
     """
-    node = cfg[key]
+    _need(cfg, key)
+    made = _made(cfg[key], key, more)
+    own = callable(made) and key == "clamped"  # a region may be any function of points
+    partial = own or (not more and isinstance(made, functools.partial))
+    if key in schema.KINDS and not partial and not schema.is_a(type(made), schema.KINDS[key]):
+        raise ConfigError(f"{key} gives {_a(made)}; it must give {_named(schema.KINDS[key])}")
+    return made
+
+
+def _made(node: Any, key: str, more: dict[str, Any]) -> Any:
     try:
         made = hydra.utils.instantiate(node, _convert_="all")
         return made(**more) if more else made
     except InstantiationException as error:
-        raise ConfigError(f"{key}: {error.__cause__ or error}") from error
-    except (ValueError, TypeError, MemoryError, OSError) as error:
+        cause = error.__cause__ or error
+        raise ConfigError(f"{key}: {cause or type(cause).__name__}") from error
+    except (ValueError, TypeError, ArithmeticError, LookupError) as error:
         raise ConfigError(f"{key}: {error}") from error
+    except (RuntimeError, MemoryError, OSError) as error:
+        raise ConfigError(f"{key}: {error or type(error).__name__}") from error
+
+
+def _need(cfg: DictConfig, *keys: str) -> None:
+    """Raise where one of the keys is not there."""
+    for key in keys:
+        if key not in cfg:
+            raise ConfigError(f"{key} is missing")
+
+
+def _a(made: Any) -> str:
+    return f"an object of {type(made).__name__}"
+
+
+def _named(kinds: set[str]) -> str:
+    return " or ".join(sorted(kind.rpartition(".")[2] for kind in kinds))
 
 
 def build_scene(cfg: DictConfig) -> Scene:
@@ -303,6 +178,7 @@ def build_scene(cfg: DictConfig) -> Scene:
     """
     from dpl.fem.problem import Problem
 
+    _need(cfg, *SCENE)
     material, mesh = make(cfg, "material"), make(cfg, "mesh")
     clamped = make(cfg, "clamped") if cfg.get("clamped") is not None else None
     if cfg.degree not in (1, 2):
@@ -327,13 +203,15 @@ def build_scene(cfg: DictConfig) -> Scene:
             raise ConfigError(f"{key}: {told.removeprefix('mean_dilatation: ')}") from error
     for line in {str(w.message): None for w in warned if w.category is UserWarning}:
         print(f"warning: {line}", file=sys.stderr)
+    if not problem.free.any():
+        raise ConfigError("clamped or supports: every node is held; hold fewer of them")
     if loose := problem.loose_modes():
         raise ConfigError(
             f"clamped: {len(loose)} rigid modes are unconstrained: {', '.join(loose)}"
         )
     solver = make(cfg, "solver", problem=problem)
     young = OmegaConf.to_container(cfg.young) if isinstance(cfg.young, ListConfig) else cfg.young
-    if not _fits(young, float | Sequence[float]):
+    if not schema.fits(young, float | Sequence[float]):
         raise ConfigError(f"young = {young!r} must be a modulus [Pa] or a range [low, high]")
     loads = make(cfg, "loads", linear=solver.rest, young=young, always=_always(cfg, problem))
     try:
@@ -350,7 +228,13 @@ def _parts(cfg: DictConfig, key: str) -> list[Any]:
         return []
     if not isinstance(node, DictConfig):
         raise ConfigError(f"{key} = {node!r} must name its parts: {key}: {{name: {{...}}}}")
-    return [make(node, name) for name in node if node[name] is not None]
+    parts = {str(name): _made(node[name], f"{key}.{name}", {}) for name in node if node[name]}
+    for name, part in parts.items():
+        if not schema.is_a(type(part), schema.KINDS[key]):
+            raise ConfigError(
+                f"{key}.{name} gives {_a(part)}; it must give {_named(schema.KINDS[key])}"
+            )
+    return list(parts.values())
 
 
 def _always(cfg: DictConfig, problem: "Problem") -> torch.Tensor | None:
@@ -370,6 +254,7 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
     """
     from dpl.module import Surrogate
 
+    _need(cfg, *NETWORK)
     # both are tried on one number, so that their errors come before any solve
     trial = make(cfg, "optimizer", params=[torch.nn.Parameter(torch.zeros(1))])
     if cfg.scheduler:
@@ -501,28 +386,12 @@ def check_resumed(cfg: DictConfig) -> None:
     before = path.parent.parent / "config.yaml"
     if not before.is_file():
         return
-    theirs, ours = dict(_leaves(_read_config(before))), dict(_leaves(plain(cfg)))
-    changed = [
-        f"{key} was {theirs.get(key)}, is {ours.get(key)}"
-        for key in sorted(theirs.keys() | ours.keys())
-        if theirs.get(key) != ours.get(key) and not _may_change(key)
-    ]
+    changed = schema.changes(_read_config(before), plain(cfg))
     if changed:
         raise ConfigError(
             f"ckpt_path: {path} is of another configuration: {'; '.join(changed)}; "
             "set them back, or begin a run of another name"
         )
-
-
-def _leaves(node: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the values of plain data that hold no others, and their paths."""
-    for path, value in _walk(node):
-        if not isinstance(value, dict | list):
-            yield path, value
-
-
-def _may_change(key: str) -> bool:
-    return any(key == part or key.startswith(f"{part}.") for part in (*ASIDE, *RESUMED))
 
 
 def _read_config(path: Path) -> dict[str, Any]:
@@ -541,7 +410,7 @@ def _read_config(path: Path) -> dict[str, Any]:
         found: Any = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
         if not isinstance(found, dict):
             raise ValueError("is no list of keys and values")
-        if any(isinstance(value, str) and "${" in value for _, value in _walk(found)):
+        if any(isinstance(value, str) and "${" in value for _, value in schema.walk(found)):
             raise ValueError("holds an interpolation, which no saved run does")
     except (ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
         reason = " ".join(str(error).split())
@@ -572,7 +441,9 @@ def load_run(
     for path in (config, best):
         if not path.is_file():
             raise ConfigError(f"run = {folder} has no {path.relative_to(folder)}; train it first")
-    cfg = OmegaConf.create(_read_config(config))
+    found = _read_config(config)
+    found.pop("trainer", None)  # of which nothing is called
+    cfg = OmegaConf.create(found)
     check(cfg, trust=trust)
     surrogate = build_surrogate(cfg, build_scene(cfg) if scene is None else scene)
     try:

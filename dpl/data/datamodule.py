@@ -15,8 +15,11 @@ from torch.utils.data.distributed import DistributedSampler
 from dpl.data.durable import DataSetError
 from dpl.data.generate import DataSet
 from dpl.data.online import OnlineSamples, Rates, Replay, Worst
+from dpl.fem.memory import machine, refuse_beyond
 from dpl.fem.symmetry import Symmetry, images, symmetries
 from dpl.scene import Sample, Scene
+
+MANY = 10**9  # batches, and samples in one
 
 
 class Samples(Dataset):
@@ -83,9 +86,12 @@ class OfflineData(L.LightningDataModule):
             ValueError: A number is out of range.
         """
         super().__init__()
-        for name, number in {"val": val, "test": test, "batch_size": batch_size}.items():
-            if number < 1:
-                raise ValueError(f"{name} = {number} must be 1 or more")
+        spans = {"val": val, "test": test, "batch_size": batch_size}
+        for name, number in spans.items():
+            if not 1 <= number <= MANY:
+                raise ValueError(f"{name} = {number} must be 1 or more and at most {MANY:,}")
+        if not 0 <= shuffle < 2**32:
+            raise ValueError(f"shuffle = {shuffle} must be 0 or more and below 2^32")
         self.wanted = DataSet(
             scene, folder, seed, train, val, test, workers=workers, timeout=timeout
         )
@@ -197,12 +203,15 @@ class OnlineData(OfflineData):
 
         Raises:
             ValueError: A number is out of range, or options exclude each other.
+            MemoryError: So many samples do not fit.
         """
         for name, number in (("batches", batches), ("fresh", fresh), ("reuse", reuse)):
-            if number < 1:
-                raise ValueError(f"{name} = {number} must be 1 or more")
+            if not 1 <= number <= MANY:
+                raise ValueError(f"{name} = {number} must be 1 or more and at most {MANY:,}")
         if capacity < fresh:
             raise ValueError(f"capacity = {capacity} must be fresh = {fresh} or more")
+        needed = capacity * 2 * 8 * scene.problem.points.numel() / 1e9
+        refuse_beyond(needed, machine(), f"{capacity} samples", "take a smaller data.capacity")
         if not 0 <= worst <= 1:
             raise ValueError(f"worst = {worst} must lie between 0 and 1")
         if save and worst:

@@ -4,15 +4,22 @@ import fcntl
 import json
 import os
 import socket
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
+LARGE = 2.0**28  # bytes of a text of a data set
+
 
 class DataSetError(ValueError):
-    """A data set that cannot be used, and what to do about it."""
+    """A data set that cannot be used, and what to do about it, in one line."""
+
+    def __init__(self, told: str) -> None:
+        """Fold what is told into a line."""
+        super().__init__(" ".join(told.splitlines()))
 
 
 @contextmanager
@@ -48,7 +55,13 @@ def sync_folder(path: Path) -> None:
 
 
 def append_line(path: Path, line: dict[str, Any]) -> None:
-    """Add a line of JSON, synced; after a line that a crash has torn, on a line of its own."""
+    """Add a line of JSON, synced; after a line that a crash has torn, on a line of its own.
+
+    Raises:
+        DataSetError: The file is a link, a folder or a device, or far too large.
+    """
+    with suppress(FileNotFoundError):
+        _refuse_foreign(path, LARGE)
     with path.open("ab+", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - 1))
@@ -63,11 +76,42 @@ def append_line(path: Path, line: dict[str, Any]) -> None:
             raise
 
 
+def own_file(path: Path, most: float = LARGE) -> bytes:
+    """Return the content of a file of a data set.
+
+    Raises:
+        FileNotFoundError: There is none.
+        DataSetError: It is a link, a folder or a device, or larger than `most` bytes.
+    """
+    _refuse_foreign(path, most)
+    return path.read_bytes()
+
+
+def _refuse_foreign(path: Path, most: float) -> None:
+    status = path.lstat()
+    if not stat.S_ISREG(status.st_mode):
+        raise DataSetError(
+            f"{path} is no file of its own, and links are not followed; put the file itself there, "
+            "remove it, or choose another data.folder"
+        )
+    if status.st_size > most:
+        raise DataSetError(
+            f"{path} is damaged: it has {status.st_size:,} bytes, and at most {most:,.0f} are "
+            "expected; remove it or choose another data.folder"
+        )
+
+
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """Return the lines of JSON in a file, those left out that a crash has torn."""
-    lines = []
-    for line in path.read_bytes().splitlines() if path.exists() else ():
-        with suppress(ValueError):
+    """Return the lines of JSON in a file, those left out that a crash has torn.
+
+    Raises:
+        DataSetError: It is no file of its own, see `own_file`.
+    """
+    lines, content = [], b""
+    with suppress(FileNotFoundError):
+        content = own_file(path)
+    for line in content.splitlines():
+        with suppress(ValueError, RecursionError):
             lines.append(json.loads(line))
     return [line for line in lines if isinstance(line, dict)]
 

@@ -28,6 +28,9 @@ from dpl.data.store import Store
 from dpl.scene import Scene
 from dpl.version import __version__
 
+MOST = 10**7  # loads in a split
+WORKERS = 1024  # processes on a machine
+
 
 @dataclass(frozen=True)
 class DataSet:
@@ -63,11 +66,11 @@ class DataSet:
         Raises:
             ValueError: A number is out of range.
         """
-        for name in ("seed", "train", "val", "test", "workers"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} = {getattr(self, name)} must be 0 or more")
-        if self.seed >= 2**32:
-            raise ValueError(f"seed = {self.seed} must be below 2^32")
+        spans = {"seed": 2**32 - 1, "train": MOST, "val": MOST, "test": MOST, "workers": WORKERS}
+        for name, most in spans.items():
+            if not 0 <= getattr(self, name) <= most:
+                told = f"{name} = {getattr(self, name)} must be 0 or more and at most {most:,}"
+                raise ValueError(told)
         if self.shards < 1:
             raise ValueError(f"shards = {self.shards} must be 1 or more")
         if self.timeout is not None and not self.timeout > 0:

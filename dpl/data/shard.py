@@ -12,7 +12,9 @@ from torch import Tensor
 
 from dpl.data.outcome import Job, Outcome
 
-WHOLE = {"index", "carried", "node", "iterations"}  # columns of whole numbers
+WHOLE = dict.fromkeys(("index", "carried", "iterations"), torch.int64)  # columns of whole numbers
+WHOLE["node"] = torch.int32
+NUMBERS = {"point", "nodal_force", "displacement", "poisson"}  # what a sample is made of
 
 
 def closed(
@@ -84,8 +86,14 @@ def opened(
             raise ValueError("holds Poisson's ratios, and this scene has one for all loads")
         for name, expected in shapes.items():
             column = shard[name]
-            if tuple(column.shape) != expected or column.is_floating_point() == (name in WHOLE):
-                raise ValueError(f"is damaged: {name} has shape {tuple(column.shape)}")
+            kind = WHOLE.get(name, torch.float64)
+            if tuple(column.shape) != expected or column.dtype != kind:
+                found = f"{tuple(column.shape)}, {column.dtype}"
+                raise ValueError(f"is damaged: {name} has shape {found}")
+            if name in NUMBERS and not column.isfinite().all():
+                raise ValueError(f"is damaged: {name} is not finite")
+        if not ((shard["carried"] >= 0) & (shard["carried"] <= shape[0])).all():
+            raise ValueError("is damaged: forces act on more or on fewer nodes than there are")
         if carried and not 0 <= int(shard["node"].min()) <= int(shard["node"].max()) < shape[0]:
             raise ValueError("is damaged: there are no such nodes")
     except (SafetensorError, KeyError, TypeError, RuntimeError) as error:

@@ -1,16 +1,18 @@
 """Loads that are solved and wait for their shard: a file each, whole or not there."""
 
 import hashlib
+import re
 import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from dpl.data.durable import whole_file
+from dpl.data.durable import own_file, whole_file
 from dpl.data.outcome import Job, Outcome
 from dpl.data.shard import packed, unpacked
 
-DIGEST = 32  # bytes of SHA-256 before a load
+NAME = re.compile(r"([a-z]+)-(\d{6,18})\.load")
+DIGEST = 32  # bytes of SHA-256, of its name and itself, before a load
 LEFT = 10.0  # age from which on a file that was not finished is a killed process's [s]
 
 
@@ -34,7 +36,7 @@ class Spool:
         content = packed(one)
         # not synced: what a crash of the machine damages, its digest tells
         with whole_file(path, sync=False) as file:
-            file.write(hashlib.sha256(content).digest() + content)
+            file.write(_digest(path, content) + content)
         return path
 
     def get(self, path: Path) -> Outcome:
@@ -42,14 +44,19 @@ class Spool:
         return unpacked(path.read_bytes()[DIGEST:])
 
     def files(self) -> dict[Job, Path]:
-        """Return the loads that are there; damaged ones are removed."""
+        """Return the loads that are there; damaged ones are removed.
+
+        Raises:
+            DataSetError: One is no file of its own.
+        """
         found = {}
-        for path in sorted(self.folder.glob("*-*.load")):
-            split, number = path.stem.split("-")
+        for path in sorted(self.folder.glob("*.load")):
+            if not (name := NAME.fullmatch(path.name)) or name[1] not in self.streams:
+                continue
             with suppress(FileNotFoundError):  # another writer has made a shard of it meanwhile
-                content = path.read_bytes()
-                if hashlib.sha256(content[DIGEST:]).digest() == content[:DIGEST]:
-                    found[Job(self.streams[split], int(number))] = path
+                content = own_file(path)
+                if _digest(path, content[DIGEST:]) == content[:DIGEST]:
+                    found[Job(self.streams[name[1]], int(name[2]))] = path
                 else:
                     path.unlink()
         return found
@@ -58,6 +65,11 @@ class Spool:
         """Remove the folder if nothing is in it."""
         with suppress(OSError):
             self.folder.rmdir()
+
+
+def _digest(path: Path, content: bytes) -> bytes:
+    """Return what tells that a file is whole, and the load that its name says."""
+    return hashlib.sha256(path.name.encode() + content).digest()
 
 
 def sweep(folder: Path) -> None:

@@ -15,6 +15,8 @@ by eight, the same loads give the same bytes.
 
 import hashlib
 import json
+import math
+import re
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,8 +25,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors import SafetensorError
+from safetensors.torch import load, save
 from torch import Tensor
 
 from dpl.data import balance
@@ -33,6 +35,7 @@ from dpl.data.crew import Stop, outcomes
 from dpl.data.durable import (
     DataSetError,
     append_line,
+    own_file,
     read_lines,
     sole_writer,
     sync_folder,
@@ -47,7 +50,13 @@ from dpl.version import __version__
 
 FORMAT = 2
 MODES = "modes.safetensors"
-LINE = {"file", "sha256", "split", "first", "tried", "accepted", "amplitudes", "rejected"}  # has
+LINE = {  # what a line of the manifest has
+    *("file", "sha256", "split", "first", "tried", "accepted"),
+    *("iterations", "amplitudes", "rejected"),
+}
+NAME = re.compile(r"[\w.-][\w./-]{0,199}")  # of a shard
+MOST = 1e15  # that a number of a manifest or a journal can be
+HEADER = 100_000  # bytes of a shard besides its numbers, at most
 SHARD = 64  # loads in one file
 STREAMS = {"train": 0, "val": 1, "test": 2}  # disjoint streams of one seed
 MACHINE = ("timed out", "its worker died")  # reasons that lie with the machine: `repair` retries
@@ -89,10 +98,10 @@ class Store:
                 )
             return []
         try:
-            self._check(json.loads(card.read_text()))
+            self._check(json.loads(own_file(card)))
         except DataSetError:
             raise
-        except (ValueError, TypeError, AttributeError, KeyError) as error:
+        except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
             raise DataSetError(
                 f"{card} is damaged ({error}); choose another data.folder or remove this one"
             ) from None
@@ -180,14 +189,21 @@ class Store:
             ValueError: It is damaged; the message goes on after its name.
         """
         path = self.folder / line["file"]
-        if path.parent != self.folder or not path.is_file():
+        if path.parent != self.folder or path.is_symlink() or not path.is_file():
             raise ValueError("is missing")
+        shape = self.scene.problem.shape
+        numbers = 3 * math.prod(shape) + self.scene.loads.dimension + 8  # of a load, at most
+        if path.stat().st_size > HEADER + 8 * numbers * line["tried"]:
+            raise ValueError("is damaged: it is larger than its loads")
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != line["sha256"]:
             raise ValueError("is damaged: its SHA-256 is not the manifest's")
         loads = self.scene.loads
         own = int(loads.poisson_range is not None)
-        return opened(content, self.scene.problem.shape, loads.dimension, own)
+        shard = opened(content, shape, loads.dimension, own)
+        if shard["index"].tolist() != _kept(line):
+            raise ValueError("holds other loads than the manifest says")
+        return shard
 
     def reader(self, split: str) -> Callable[[int], Outcome | None]:
         """Return what gives a split's loads one at a time, None for those not there at present."""
@@ -222,9 +238,20 @@ class Store:
         return found.hexdigest()
 
     def modes(self) -> Modes:
-        """Return the modes that the data set's loads are made of."""
-        with safe_open(self.folder / MODES, framework="pt") as file:
-            return Modes(file.get_tensor("values"), file.get_tensor("vectors"))
+        """Return the modes that the data set's loads are made of.
+
+        Raises:
+            DataSetError: They are damaged.
+        """
+        path = self.folder / MODES
+        most = HEADER + 16 * sum(column.numel() for column in self.scene.loads.modes)
+        try:
+            found = load(own_file(path, most))
+            return Modes(found["values"], found["vectors"])
+        except (FileNotFoundError, KeyError, SafetensorError, ValueError) as error:
+            raise DataSetError(
+                f"{path} is damaged: {error}; scripts/generate.py action=repair makes it again"
+            ) from None
 
     def acceptance(self) -> list[balance.Bin]:
         """Return how many loads of each amplitude were accepted, all splits together."""
@@ -248,20 +275,28 @@ class Store:
                     f"  {split}: {accepted} of {tried} loads accepted, {mean:.1f} Newton iterations"
                 )
         lines += [f"  {row}" for row in balance.table(self.acceptance())]
-        sessions = read_lines(self.folder / "journal.jsonl")
+        sessions = self._sessions()
         if loads := sum(one["loads"] for one in sessions):
             core = sum(one["core_seconds"] for one in sessions) / loads
             wall = sum(one["seconds"] for one in sessions)
-            size = sum(path.stat().st_size for path in self.folder.glob("*.safetensors")) / 1e6
+            size = sum(path.lstat().st_size for path in self.folder.glob("*.safetensors")) / 1e6
             lines.append(
                 f"  {core:.3f} s a load on one core, {wall:.0f} s of wall time in {len(sessions)} "
                 f"sessions, {size:.0f} MB"
             )
         return "\n".join(lines)
 
+    def _sessions(self) -> list[dict[str, Any]]:
+        """Return the lines of the journal that say how long."""
+        return [
+            line
+            for line in read_lines(self.folder / "journal.jsonl")
+            if all(_is_number(line.get(key)) for key in ("loads", "seconds", "core_seconds"))
+        ]
+
     def seconds_a_load(self) -> float | None:
         """Return the wall time of a load in all sessions so far [s]; None before the first."""
-        sessions = read_lines(self.folder / "journal.jsonl")
+        sessions = self._sessions()
         loads = sum(one["loads"] for one in sessions)
         return sum(one["seconds"] for one in sessions) / loads if loads else None
 
@@ -432,13 +467,13 @@ class Store:
             raise DataSetError(f"{self.folder} holds no data set yet; generate it first")
         try:
             flaw = flaw_of_modes(self.scene, self.modes())
-        except (OSError, SafetensorError) as error:
+        except DataSetError as error:
             flaw = f"is damaged: {error}"
         yield {"file": MODES, "rejected": []}, flaw
         for line in self.shards():
             try:
                 shard = self._sound(line)
-                yield line, flaw_of_shard(self.scene, self.stream(line["split"]), line, shard)
+                yield line, flaw_of_shard(self.scene, self.stream(line["split"]), shard)
             except ValueError as error:
                 yield line, str(error)
 
@@ -466,7 +501,7 @@ class Store:
                 named |= {line["file"] for line in lines}
                 self._rewrite(manifest, lines)
             for path in [*self.folder.glob("*.safetensors"), *self.folder.rglob(".*.part")]:
-                if path.name not in named:
+                if path.name not in named and (path.is_symlink() or not path.is_dir()):
                     path.unlink()
             for path in self.spool.files().values():
                 if self.spool.get(path).reason.startswith(MACHINE):
@@ -488,13 +523,57 @@ def _runs(indices: Sequence[int]) -> Iterator[list[int]]:
 
 
 def _write(path: Path, content: bytes) -> None:
-    with whole_file(path) as file:
-        file.write(content)
+    try:
+        with whole_file(path) as file:
+            file.write(content)
+    except IsADirectoryError:
+        raise DataSetError(
+            f"{path} is a folder where a file must be; remove it or choose another data.folder"
+        ) from None
 
 
 def _lines(manifest: Path) -> list[dict[str, Any]]:
-    """Return the lines of a manifest; one that lacks something counts as torn."""
-    return [line for line in read_lines(manifest) if line.keys() >= LINE]
+    """Return the lines of a manifest; one that lacks something counts as torn.
+
+    So does one that says what cannot be: its loads are solved again.
+    """
+    return [line for line in read_lines(manifest) if line.keys() >= LINE and _is_possible(line)]
+
+
+def _is_possible(line: Mapping[str, Any]) -> bool:
+    """Return whether the values of a line are of their kinds and agree with each other."""
+    texts, counts = ("file", "sha256", "split"), ("first", "tried", "accepted", "iterations")
+    if not all(isinstance(line[key], str) for key in texts) or line["split"] not in STREAMS:
+        return False
+    if not all(type(line[key]) is int and 0 <= line[key] < 2**53 for key in counts):
+        return False
+    if not NAME.fullmatch(line["file"]):
+        return False
+    amplitudes, rejected = line["amplitudes"], line["rejected"]
+    if not isinstance(amplitudes, list) or not isinstance(rejected, list):
+        return False
+    if not len(amplitudes) == line["tried"] == line["accepted"] + len(rejected):
+        return False
+    numbers = range(line["first"], line["first"] + line["tried"])
+    return all(map(_is_number, amplitudes)) and all(
+        isinstance(one, dict)
+        and type(one.get("index")) is int
+        and one["index"] in numbers
+        and isinstance(one.get("reason"), str)
+        and "load_factor" in one
+        for one in rejected
+    )
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and 0 <= value < MOST
+
+
+def _kept(line: Mapping[str, Any]) -> list[int]:
+    """Return the loads that a shard must hold."""
+    rejected = {one["index"] for one in line["rejected"]}
+    numbers = range(line["first"], line["first"] + line["tried"])
+    return [number for number in numbers if number not in rejected]
 
 
 def _place(line: Mapping[str, Any]) -> tuple[int, int]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dpl.fem.checks import check
 from dpl.fem.files import load, save
+from dpl.fem.memory import refuse_mesh
 from dpl.fem.propeller import propeller
 from dpl.fem.regions import Box, Cylinder, Plane, Region, Sphere, Tag, facets_in, nodes_in
 
@@ -34,6 +35,9 @@ __all__ = [
     "save",
 ]
 
+SMALLEST, LARGEST = 1e-12, 1e12  # sides of a body [m]
+THINNEST = 1e6  # longest over shortest side
+
 
 def box(size: Sequence[float], nodes: Sequence[int], cell: str = "hexahedron") -> skfem.Mesh:
     """Return a box [0, size] of equal cells.
@@ -48,6 +52,7 @@ def box(size: Sequence[float], nodes: Sequence[int], cell: str = "hexahedron") -
 
     Raises:
         ValueError: A size or a number of nodes is out of range, or `cell` is unknown.
+        MemoryError: So many nodes do not fit.
     """
     kinds = {"hexahedron": skfem.MeshHex, "tetra": skfem.MeshTet}
     return _grid(kinds, size, nodes, cell)
@@ -63,6 +68,7 @@ def rectangle(size: Sequence[float], nodes: Sequence[int], cell: str = "quad") -
 
     Raises:
         ValueError: A size or a number of nodes is out of range, or `cell` is unknown.
+        MemoryError: So many nodes do not fit.
     """
     kinds = {"quad": skfem.MeshQuad, "triangle": skfem.MeshTri}
     return _grid(kinds, size, nodes, cell)
@@ -74,10 +80,16 @@ def _grid(
     if cell not in kinds:
         raise ValueError(f"cell = {cell!r} must be one of {', '.join(kinds)}")
     dim = kinds[cell].elem().dim
-    if len(size) != dim or not all(math.isfinite(s) and s > 0 for s in size):
-        raise ValueError(f"size = {list(size)} must be {dim} positive lengths [m]")
+    if len(size) != dim or not all(SMALLEST <= s <= LARGEST for s in size):
+        span = f"between {SMALLEST:g} and {LARGEST:g}"
+        raise ValueError(f"size = {list(size)} must be {dim} positive lengths {span} [m]")
+    if max(size) > THINNEST * min(size):
+        raise ValueError(
+            f"size = {list(size)} must be lengths that differ by {THINNEST:g} times at most"
+        )
     if len(nodes) != dim or not all(n == int(n) and n >= 2 for n in nodes):
         raise ValueError(f"nodes = {list(nodes)} must be {dim} whole numbers of 2 or more")
+    refuse_mesh(math.prod(map(int, nodes)), "mesh.nodes")
     sides = [np.linspace(0.0, s, int(n)) for s, n in zip(size, nodes, strict=True)]
     mesh = kinds[cell].init_tensor(*sides)
     order = np.lexsort([mesh.p[axis] for axis in np.argsort(nodes, kind="stable")])

@@ -25,6 +25,7 @@ from dpl.fem.solution import Load
 
 Array = NDArray[np.float64]
 SAME = 1e-6  # eigenvalues closer than this, relatively, are one eigenspace
+LEAST = 1e-12  # deflection, below which rounding answers [-]
 CLUSTER = 0.05  # eigenvalues closer than this belong to one family and are excited together
 
 
@@ -158,8 +159,9 @@ class ModalLoads:
         """
         if self.n_modes < 1:
             raise ValueError(f"n_modes = {self.n_modes} must be 1 or more")
-        if not 0 < self.deflection <= 10:
-            raise ValueError(f"deflection = {self.deflection} must lie between 0 and 10 (times L)")
+        if not LEAST <= self.deflection <= 10:
+            span = f"between {LEAST:g} and 10 (times L)"
+            raise ValueError(f"deflection = {self.deflection} must lie {span}")
         low, high = self.patch if len(self.patch) == 2 else (1, 0)
         if not 0 <= low <= high < math.inf:
             raise ValueError(f"patch = {list(self.patch)} must be a smallest and a largest radius")

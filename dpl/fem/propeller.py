@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 
 from dpl.fem.checks import check
+from dpl.fem.memory import refuse_mesh
 from dpl.fem.ordering import narrow
 from dpl.fem.regions import Cylinder, facets_in
 
@@ -56,6 +57,7 @@ def propeller(
 
     Raises:
         ValueError: A number is out of range, or the blades would touch or fold.
+        MemoryError: So many nodes do not fit.
     """
     diameters = {
         "bore_diameter": bore_diameter,
@@ -101,6 +103,9 @@ def _check_ranges(
         raise ValueError(f"blades = {blades} must be a whole number of 2 or more")
     if len(cells) != 5 or not all(n == int(n) and n >= 1 for n in cells):
         raise ValueError(f"cells = {list(cells)} must be 5 whole numbers of 1 or more")
+    t, g, w, c, s = map(int, cells)
+    nodes = blades * (c + 1) * ((t + g) * (w + 1) + (t + 1) * s)
+    refuse_mesh(int(nodes), "mesh.cells")
 
 
 def _hub(

@@ -6,9 +6,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from dpl.fem.memory import refuse_beyond
 from dpl.fem.problem import Problem
 from dpl.models.grid import Immersion, Permutation, cubic_grid, filling, own_grid
-from dpl.models.memory import refuse_beyond
 from dpl.models.moduli import placed
 from dpl.scene import Scene
 

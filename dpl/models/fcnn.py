@@ -5,9 +5,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from dpl.models.memory import refuse_beyond
+from dpl.fem.memory import refuse_weights
 from dpl.models.moduli import placed
 from dpl.scene import Scene
+
+DEEPEST = 1000  # layers
 
 
 class FCNN(nn.Module):
@@ -49,8 +51,8 @@ class FCNN(nn.Module):
             MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()
-        if layers < 2:
-            raise ValueError(f"layers = {layers} must be 2 or more")
+        if not 2 <= layers <= DEEPEST:
+            raise ValueError(f"layers = {layers} must be 2 or more and at most {DEEPEST}")
         if width is not None and width < 1:
             raise ValueError(f"width = {width} must be 1 or more")
         everything = torch.ones(scene.problem.shape, dtype=torch.bool)
@@ -69,7 +71,8 @@ class FCNN(nn.Module):
         self.parameters_saved = _parameters([everything.numel()] * (layers + 1)) - _parameters(
             sizes
         )
-        _refuse_beyond_memory(self.parameters_needed, memory_limit)
+        remedy = "take a coarser mesh, model.width or another model"
+        refuse_weights(self.parameters_needed, memory_limit, remedy)
         self.register_buffer("inputs", inputs, persistent=False)
         self.register_buffer("outputs", outputs, persistent=False)
         stages: list[nn.Module] = [nn.Linear(sizes[0], sizes[1])]
@@ -118,10 +121,3 @@ def _parameters(sizes: list[int]) -> int:
     """Return weights, biases and slopes of linear layers between these sizes."""
     linear = sum((before + 1) * after for before, after in pairwise(sizes))
     return linear + sum(sizes[1:-1])
-
-
-def _refuse_beyond_memory(parameters: int, limit: float | None) -> None:
-    """Raise where training in float32 would not fit."""
-    needed = parameters * 4 * 4 / 1e9  # parameters, gradients, two moments, 4 bytes each
-    what = f"{parameters:,} parameters with gradients and Adam's moments"
-    refuse_beyond(needed, limit, what, "take a coarser mesh, model.width or another model")

@@ -10,11 +10,13 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import gelu
 
+from dpl.fem.memory import refuse_weights
 from dpl.models.graph import Floats, Graph, Integers, hierarchy, means
 from dpl.models.moduli import placed
 from dpl.scene import Scene
 
 WIDEST = 4  # largest width of a level over that of the nodes
+DEEPEST = 1000  # passes
 CACHE = 2**17  # numbers of a block of messages that stay in a processor's cache
 
 
@@ -49,18 +51,22 @@ class GNN(nn.Module):
 
         Raises:
             ValueError: `width`, `levels` or `passes` is out of range.
+            MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()
         if width < 1:
             raise ValueError(f"width = {width} must be 1 or more")
         if levels is not None and levels < 1:
             raise ValueError(f"levels = {levels} must be 1 or more")
-        if passes < 1:
-            raise ValueError(f"passes = {passes} must be 1 or more")
+        if not 1 <= passes <= DEEPEST:
+            raise ValueError(f"passes = {passes} must be 1 or more and at most {DEEPEST}")
         problem = scene.problem
         nodes, dim = problem.shape
         graphs, clusters = hierarchy(problem, levels)
         widths = [width * min(2**k, WIDEST) for k in range(len(graphs))]
+        # a level and pass: 5 W^2 of messages, once or twice, 2 W^2 upwards, 2 or 3 W^2 downwards
+        weights = passes * sum(9 * wide**2 for wide in widths)
+        refuse_weights(weights, None, "take a smaller model.width or fewer model.passes")
         flags = np.column_stack([problem.free.numpy(), problem.boundary.numpy()]).astype(float)
         self.levels = nn.ModuleList()
         for k, graph in enumerate(graphs):

@@ -90,6 +90,10 @@ class Latent(PODNet):
         self.right = nn.Linear(bent, width, bias=False)
         self.product = nn.Linear(width, len(self.modes), bias=False)
 
+    def _weights(self, coordinates: int, rank: int, width: int) -> int:
+        bent = coordinates * (1 + len(self.takes))
+        return super()._weights(coordinates, rank, width) + width * (coordinates + bent + rank)
+
     def _reading(self, rank: int, coordinates: int) -> int:
         return rank
 

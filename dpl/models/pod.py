@@ -8,6 +8,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from dpl.fem.memory import refuse_weights
 from dpl.fem.pod import LARGE, pod
 from dpl.fem.rom import PODGalerkin
 from dpl.fem.symmetry import images, symmetries
@@ -18,7 +19,7 @@ from dpl.scene import Sample, Scene
 
 SNAPSHOTS = 16_000  # images of samples that make a basis, at most
 CHUNK = 256  # samples that are worked on at a time
-
+DEEPEST = 1000  # residual blocks
 STATES = 256  # samples at which cells are chosen for corrections
 
 
@@ -92,13 +93,14 @@ class PODNet(nn.Module):
 
         Raises:
             ValueError: A number is out of range.
+            MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()
         for name, number in {"rank": rank, "coordinates": coordinates, "width": width}.items():
             if number < 1:
                 raise ValueError(f"{name} = {number} must be 1 or more")
-        if blocks < 0:
-            raise ValueError(f"blocks = {blocks} must be 0 or more")
+        if not 0 <= blocks <= DEEPEST:
+            raise ValueError(f"blocks = {blocks} must be 0 or more and at most {DEEPEST}")
         self.scene = scene
         always = scene.loads.always
         also = [] if always is None else [always]
@@ -114,6 +116,8 @@ class PODNet(nn.Module):
         self.poisson_range = scene.loads.poisson_range
         self.takes = () if self.poisson_range is None else ("poisson",)
         entering = coordinates + len(self.takes)
+        weights = self._weights(coordinates, rank, width) + 2 * blocks * width * (width + 1)
+        refuse_weights(weights, None, "take a smaller model.width or model.blocks")
         for name, shape in {
             "modes": (rank, len(self.outlet.share)),
             "readers": (len(self.inlet.share), width_of_reading * self._readings(scene)),
@@ -128,6 +132,10 @@ class PODNet(nn.Module):
         self.enter = nn.Linear(entering, width)
         self.blocks = nn.Sequential(*(Block(width) for _ in range(blocks)))
         self.leave = nn.Linear(width, rank)
+
+    def _weights(self, coordinates: int, rank: int, width: int) -> int:
+        """Return the parameters outside the residual blocks."""
+        return width * (coordinates + len(self.takes) + 1) + (width + 1) * rank
 
     def _reading(self, rank: int, coordinates: int) -> int:
         """Return how many coordinates of a load are read, C."""

@@ -189,6 +189,27 @@ def test_a_killed_writer_does_not_count(tmp_path, environment):
     assert not held(tmp_path, 1, 2)
 
 
+def test_an_error_is_one_line():
+    assert str(DataSetError("a\nb")) == "a b"
+
+
+def test_lines_are_neither_read_from_nor_added_to_what_is_no_file(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "outside").write_text("mine\n")
+    (tmp_path / "link").symlink_to("outside")
+    for name in ("folder", "link"):
+        for use in (read_lines, lambda path: append_line(path, {"k": 0})):
+            with pytest.raises(DataSetError, match=f"{name} is no file of its own"):
+                use(tmp_path / name)
+    assert (tmp_path / "outside").read_text() == "mine\n"
+
+
+def test_a_line_that_is_nested_without_end_is_left_out(tmp_path):
+    path = tmp_path / "lines"
+    path.write_text("[" * 99_999 + '\n{"k": 1}\n')
+    assert read_lines(path) == [{"k": 1}]
+
+
 def test_a_writer_that_ends_while_it_is_asked_for_its_name_is_no_crash(tmp_path, monkeypatch):
     path = tmp_path / ".writer-0-1"
     real = fcntl.flock

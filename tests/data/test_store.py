@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -698,6 +699,106 @@ def test_a_shard_of_another_scene_is_found(copy, make_scene, tmp_path):
     name = lines(copy)[0]["file"]
     rewrite(copy, lambda shard: (other.folder / name).read_bytes())
     assert list(flaws(copy)) == [name]
+
+
+def as_float32(shard):
+    shard["displacement"] = shard["displacement"].float()
+
+
+def forces_on_less_than_no_node(shard):
+    shard["carried"] = shard["carried"].flip(0).contiguous()
+    shard["carried"][0] += shard["carried"][1] + 1
+    shard["carried"][1] = -1
+
+
+def endless_force(shard):
+    shard["nodal_force"][0, 0] = float("inf")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [as_float32, forces_on_less_than_no_node, endless_force, not_a_number, a_load_less],
+)
+def test_numbers_that_cannot_be_samples_are_refused_even_with_a_right_digest(copy, change):
+    name = rewrite(copy, change)
+    with pytest.raises(DataSetError, match=rf"{name} .*action=repair"):
+        copy.load("train", 12)
+
+
+IMPOSSIBLE = [
+    *({"split": "vrain"}, {"split": None}, {"file": 3}, {"file": "x" * 999}, {"file": "a\nb"}),
+    *({"file": "/dev/zero"}, {"first": -1}, {"first": "0"}, {"first": True}, {"tried": 10**12}),
+    *({"tried": 13}, {"accepted": 11}, {"iterations": None}, {"amplitudes": [1.0]}),
+    *({"amplitudes": 12 * ["a"]}, {"amplitudes": 12 * [float("nan")]}, {"rejected": None}),
+    *({"amplitudes": 12 * [10**30]}, {"sha256": None}),
+    *({"accepted": 11, "rejected": [one]} for one in ({"index": 3}, {"index": 99}, "text", 3)),
+]
+
+
+@pytest.mark.parametrize("harm", IMPOSSIBLE)
+def test_a_line_of_the_manifest_that_says_what_cannot_be_counts_as_torn(copy, data, harm):
+    found = lines(copy)
+    assert found[0]["split"] == "train"
+    found[0] |= harm
+    (copy.folder / "manifest.jsonl").write_text("".join(json.dumps(one) + "\n" for one in found))
+    assert copy.missing("train", 12) == list(range(12))
+    assert copy.summary()
+    copy.repair()
+    fill(copy)
+    assert content(copy) == content(data.store)
+
+
+@pytest.mark.parametrize("name", ["scene.json", "manifest.jsonl", "modes.safetensors", "shard"])
+@pytest.mark.parametrize("harm", ["a link", "a loop", "a folder", "a pipe", "huge"])
+def test_what_is_no_file_of_its_own_is_refused_by_name_and_not_read(copy, tmp_path, name, harm):
+    name = lines(copy)[0]["file"] if name == "shard" else name
+    path = copy.folder / name
+    if harm == "huge":
+        os.truncate(path, 2**40)
+    else:
+        path.rename(tmp_path / "outside")
+    if harm in ("a link", "a loop"):
+        path.symlink_to(tmp_path / "outside" if harm == "a link" else path.name)
+    elif harm == "a folder":
+        path.mkdir()
+    elif harm == "a pipe":
+        os.mkfifo(path)
+    read = copy.modes if name == "modes.safetensors" else partial(copy.load, "train", 12)
+    with pytest.raises(DataSetError, match=name) as refusal:
+        read()
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("harm", [b"", b"nothing", b"[" * 99_999, save({"values": torch.ones(3)})])
+def test_damaged_modes_are_refused_by_name(copy, harm):
+    (copy.folder / "modes.safetensors").write_bytes(harm)
+    with pytest.raises(DataSetError, match=r"modes\.safetensors is damaged.*action=repair"):
+        copy.modes()
+
+
+def test_modes_of_another_precision_are_found(copy):
+    path = copy.folder / "modes.safetensors"
+    path.write_bytes(save({name: column.float() for name, column in load_file(path).items()}))
+    assert list(flaws(copy)) == ["modes.safetensors"]
+
+
+@pytest.mark.parametrize("line", ["{}", '{"loads": "many"}', "[" * 99_999, '{"loads": NaN}'])
+def test_a_line_of_the_journal_that_says_nothing_is_left_out(copy, line):
+    told, a_load = copy.summary(), copy.seconds_a_load()
+    with (copy.folder / "journal.jsonl").open("a") as file:
+        file.write(line + "\n")
+    assert (copy.summary(), copy.seconds_a_load()) == (told, a_load)
+
+
+def test_a_load_under_the_name_of_another_is_solved_again(fresh, data, scene):
+    fresh.create()
+    paths = [fresh.spool.put(outcome(scene, Job((0, 0), number))) for number in (0, 1)]
+    paths[1].write_bytes(paths[0].read_bytes())
+    (paths[0].parent / "train-one.load").write_bytes(b"mine")
+    (paths[0].parent / "rain-000001.load").write_bytes(b"mine")
+    assert [job.number for job in fresh.spool.files()] == [0]
+    assert fill(fresh) == 19
+    assert fresh.digest("train", 12) == data.store.digest("train", 12)
 
 
 def test_a_file_outside_the_folder_is_not_read(copy):

@@ -87,6 +87,9 @@ def test_numbering_of_a_box_does_not_depend_on_where_its_long_side_points(order)
         ([1, 1, 1], [2, 2, 1], "hexahedron", "nodes"),
         ([1, 1, 1], [2, 2, 2.5], "hexahedron", "nodes"),
         ([1, 1, 1], [2, 2, 2], "quad", "cell"),
+        ([1, 1, 5e-324], [2, 2, 2], "hexahedron", "size"),
+        ([1, 1, 1e300], [2, 2, 2], "hexahedron", "size"),
+        ([1, 1, 2e6], [2, 2, 2], "hexahedron", "differ by 1e.06 times at most"),
     ],
 )
 def test_box_out_of_range_is_an_error(size, nodes, cell, message):
@@ -99,6 +102,20 @@ def test_rectangle_out_of_range_is_an_error():
         rectangle([1, 1, 1], [2, 2])
     with pytest.raises(ValueError, match="cell"):
         rectangle([1, 1], [2, 2], "hexahedron")
+
+
+def test_more_nodes_than_fit_are_refused_before_they_are_made(monkeypatch):
+    def forbidden(*_, **__):
+        raise AssertionError("allocated")
+
+    monkeypatch.setattr(np, "linspace", forbidden)
+    for make in (
+        lambda: box([1, 1, 1], [10**9, 3, 3]),
+        lambda: rectangle([1, 1], [10**6, 10**6]),
+        lambda: propeller(cells=[1, 1, 1, 2, 10**12]),
+    ):
+        with pytest.raises(MemoryError, match=r"nodes need .* GB, there are .* GB; take fewer"):
+            make()
 
 
 def turned(points: np.ndarray, angle: float) -> np.ndarray:

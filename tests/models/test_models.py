@@ -7,10 +7,12 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from dpl.fem.memory import refuse_weights
 from dpl.fem.solution import Load
 from dpl.losses import MSE
-from dpl.models import fcnn
-from dpl.models.fcnn import FCNN
+from dpl.models.fcnn import FCNN, _parameters
+from dpl.models.gnn import GNN
+from dpl.models.latent import Latent
 from dpl.models.pod import PODNet
 from dpl.module import Surrogate
 
@@ -149,7 +151,7 @@ def test_the_papers_network_has_4_n2_plus_7_n_parameters(make_scene):
 
 
 def test_the_papers_beam_has_576_million_parameters():
-    assert fcnn._parameters([12_000] * 5) == 4 * 12_000**2 + 7 * 12_000 == 576_084_000
+    assert _parameters([12_000] * 5) == 4 * 12_000**2 + 7 * 12_000 == 576_084_000
 
 
 @pytest.mark.parametrize("options", [{}, {"width": 20}, {"layers": 2}, {"layers": 6, "width": 7}])
@@ -202,8 +204,44 @@ def test_the_papers_beam_needs_nine_gigabytes():
     with pytest.raises(
         MemoryError, match=r"576,084,000 parameters .* need 9\.2 GB, there are 8\.0"
     ):
-        fcnn._refuse_beyond_memory(576_084_000, 8.0)
-    fcnn._refuse_beyond_memory(576_084_000, 9.3)
+        refuse_weights(576_084_000, 8.0, "take less")
+    refuse_weights(576_084_000, 9.3, "take less")
+
+
+@pytest.mark.parametrize(
+    ("network", "options"),
+    [
+        (PODNet, {"width": 10**12}),
+        (Latent, {"width": 10**7}),
+        (GNN, {"width": 10**6}),
+        (GNN, {"width": 10**12, "passes": 3}),
+        (FCNN, {"width": 10**18}),
+    ],
+)
+def test_a_width_that_no_memory_can_hold_is_refused_before_it_is_made(
+    scene, monkeypatch, network, options
+):
+    def forbidden(*_, **__):
+        raise AssertionError("allocated")
+
+    monkeypatch.setattr(torch.nn, "Linear", forbidden)
+    with pytest.raises(MemoryError, match=r"parameters .* need .* GB, there are .* GB; take"):
+        network(scene, **options)
+
+
+@pytest.mark.parametrize(
+    ("network", "options"),
+    [
+        (PODNet, {"blocks": 10**9, "width": 1}),
+        (Latent, {"blocks": 10**30, "width": 1}),
+        (GNN, {"passes": 10**9, "width": 1}),
+        (FCNN, {"layers": 10**9, "width": 1}),
+    ],
+)
+def test_a_depth_that_would_never_be_built_is_refused(scene, network, options):
+    name, number = next(iter(options.items()))
+    with pytest.raises(ValueError, match=f"{name} = {number} must be . or more and at most 1000"):
+        network(scene, **options)
 
 
 @pytest.fixture

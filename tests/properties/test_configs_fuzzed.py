@@ -1,0 +1,359 @@
+"""Laws of configurations with anything in them: refused in a line that names the key, or work."""
+
+import importlib
+import inspect
+import os
+import subprocess
+import sys
+import types
+from collections.abc import Iterator
+from copy import deepcopy
+from pathlib import Path
+
+import hydra
+import lightning as L
+import pytest
+import torch
+from bounds import bounded
+from hydra.core.global_hydra import GlobalHydra
+from hypothesis import given
+from hypothesis import strategies as st
+from omegaconf import DictConfig, OmegaConf
+from tried import at_most, counted
+
+from dpl import run
+from dpl.data.durable import DataSetError
+from dpl.fem.solution import solve
+
+CONF = Path(__file__).parents[2] / "conf"
+TINY = ["mesh.nodes=[5,3,3]", "loads.n_modes=3", "solver.linear=superlu"]
+FLAT = ["mesh=rectangle", "mesh.nodes=[9,3]", "loads.n_modes=3", "solver.linear=superlu"]
+BLADES = ["mesh=propeller", "mesh.cells=[1,1,1,2,3]", "clamped=cylinder", "clamped.radius=0.05"]
+SMALL = ["data.train=4", "data.val=2", "data.test=2", "data.batch_size=2", "data.workers=0"]
+DRAWN = ["loads=modal_small", "loads.radius.low=0.1"]
+HELD = [
+    "+supports.end={_target_: dpl.fem.supports.Displacement, value: [0.0, null, null], "
+    "region: {_target_: dpl.fem.mesh.Plane, axis: 0, at: max}}",
+    "+supports.soil={_target_: dpl.fem.supports.Spring, stiffness: 0.01, "
+    "region: {_target_: dpl.fem.mesh.Box, lower: [0, 0, 0], upper: [50, 25, 0]}}",
+    "+forces.weight={_target_: dpl.fem.forces.BodyForce, value: [0.0, 0.0, -1e-5]}",
+]
+SCENES = {  # overrides of conf/generate.yaml
+    "beam": TINY,
+    "rectangle": FLAT,
+    "propeller": [*BLADES, "solver.linear=superlu", "loads.n_modes=3"],
+    "drawn": [*TINY, *DRAWN, "young=[1e9,2e11]", "material.poisson=[0.2,0.4]"],
+    "held": [*TINY, *HELD, "degree=1", "material=stable_neo_hookean"],
+    "ogden": [*TINY, "material=ogden_k2"],
+    "yeoh": [*TINY, "material=yeoh_k2", "+mesh.cell=tetra"],
+}
+NETWORKS = {  # of conf/train.yaml
+    "fcnn": ["model.width=8"],
+    "latent": ["model=latent", "model.width=8", "model.rank=10", "model.coordinates=9"],
+    "pod": ["model=pod", "model.width=8", "model.rank=10", "model.coordinates=9"],
+    "cnn": ["model=cnn", "model.channels=2", "loss=lr_plus"],
+    "gnn": ["model=gnn", "model.width=4", "loss=energy"],
+    "online": ["data=online", "model.width=8", "loss=annealed"],
+}
+OTHERS = ("evaluate", "benchmark", "convergence", "results", "verify", "stress")
+
+TEXTS = ("no such thing", "", "1e30", "-", "a\nb")
+OTHER_KINDS = (None, True, False, [], [None], ["a", {}], {}, {"a": 1}, [[1.0]], *TEXTS)
+NUMBERS = (
+    *(1, 2, 3, 7, 0.1, 0.5, 1e-3, 1e3, 1e6, 20),
+    *(-1, 0, -0.5, 2.5, 1e30, -1e30, 1e-300, 5e-324, 1e300),
+    *(10**9, 10**12, -(10**12), 10**30, 2**31, 2**63),
+)
+ENDLESS = (float("nan"), float("inf"), float("-inf"))
+UNFINISHED = ("???", "${nowhere.at.all}", "${no_such_resolver:1}", "${oc.env:NO_SUCH_VARIABLE}")
+FREE = {  # keys of any text, or of one that the script looks at
+    *("folder", "run", "ckpt_path", "name", "save_dir", "version", "dirpath", "filename"),
+    *("monitor", "action", "parts", "linear", "cases"),
+}
+SHARED = {  # keys that others refer to
+    "seed": ("shuffle",),
+    "max_epochs": ("epochs",),
+    "folder": ("dirpath", "save_dir"),
+    "name": ("run",),
+}
+
+
+# ------------------------------------------------------------------ what is tried
+
+
+def composed(command: str, *overrides: str) -> dict:
+    """Return a configuration as plain data, its interpolations as they are."""
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = hydra.compose(command, overrides=list(overrides))
+    GlobalHydra.instance().clear()
+    return OmegaConf.to_container(cfg)
+
+
+def _bases() -> dict[str, dict]:
+    found = {
+        f"generate {k}": composed("generate", *v, *SMALL[:3], SMALL[4]) for k, v in SCENES.items()
+    }
+    for name, chosen in NETWORKS.items():
+        sizes = [o for o in SMALL if not (name == "online" and o.startswith("data.train"))]
+        found[f"train {name}"] = composed("train", *TINY, *sizes, *chosen, "folder=.", "run=here")
+    needed = {"evaluate": ["run=here"], "results": ["name=x"]}
+    return found | {name: composed(name, *needed.get(name, [])) for name in OTHERS}
+
+
+BASES = _bases()
+
+
+def places(node, path: tuple = ()) -> Iterator[tuple]:
+    """Yield the paths of everything below a node."""
+    entries = node.items() if isinstance(node, dict) else enumerate(node)
+    for key, value in entries:
+        yield (*path, key)
+        if isinstance(value, dict | list):
+            yield from places(value, (*path, key))
+
+
+def put(node, path: tuple, value) -> None:
+    for key in path[:-1]:
+        node = node[key]
+    node[path[-1]] = value
+
+
+def at(node, path: tuple):
+    for key in path:
+        node = node[key]
+    return node
+
+
+@st.composite
+def harmed(draw, names=tuple(BASES)):
+    """Return a base, a changed configuration, the path of what is changed, and what was done."""
+    name = draw(st.sampled_from(names))
+    cfg = deepcopy(BASES[name])
+    path = draw(st.sampled_from(list(places(cfg))))
+    done = draw(
+        st.sampled_from(
+            ["kind", "number", "number", "number", "endless", "unfinished", "less", "more"]
+        )
+    )
+    old = at(cfg, path)
+    if done == "less":
+        parent = at(cfg, path[:-1])
+        del parent[path[-1]]
+        return name, cfg, path, done, None
+    if done == "more":
+        while not isinstance(at(cfg, path), dict):
+            path = path[:-1]
+        path = (
+            *path,
+            draw(st.sampled_from(["colour", "speed", "_args_", "_colour_", "memori_limit"])),
+        )
+        value = draw(st.sampled_from([1, "red", [1], {}, {"_target_": "builtins.dict"}]))
+    else:
+        choices = {"kind": OTHER_KINDS, "number": NUMBERS, "endless": ENDLESS}
+        loops = tuple("${" + ".".join(map(str, path[:k])) + "}" for k in (1, len(path)))
+        value = draw(st.sampled_from(choices.get(done, (*UNFINISHED, *loops))))
+        if done == "number" and draw(st.booleans()) and isinstance(old, int | float):
+            value = type(value)(value)
+    put(cfg, path, value)
+    return name, cfg, path, done, value
+
+
+# ------------------------------------------------------------------ what is wanted
+
+
+def works(cfg: DictConfig, folder: Path) -> None:
+    """Make what a command makes before it computes, and let it answer a load."""
+    run.check(cfg)
+    if "mesh" not in cfg:
+        return
+    scene = run.build_scene(cfg)
+    data = run.make(cfg, "data", scene=scene)
+    load = scene.loads.sample((0, 0), [0])
+    surrogate = None
+    if "model" in cfg:
+        surrogate = run.build_surrogate(cfg, scene)
+        trainer = run.make(cfg, "trainer")
+        assert isinstance(trainer, L.Trainer)
+    scene.plan()
+    data.plan()
+    answer = solve(scene.solver, load)
+    assert answer.displacement.isfinite().all() or not answer.converged.all()
+    assert bool((answer.volume_ratio > 0).all()) or not answer.converged.all()
+    if surrogate is not None:
+        surrogate.plan()
+        if getattr(surrogate.net, "prepared", True):
+            with torch.no_grad():
+                assert surrogate.predict(load).isfinite().all()
+
+
+def refused(cfg: dict, folder: Path) -> str:
+    """Return the line that refuses a configuration; empty if it works."""
+    made = OmegaConf.create(cfg)
+    OmegaConf.set_struct(made, True)
+    try:
+        with bounded():
+            works(made, folder)
+    except (run.ConfigError, DataSetError) as error:
+        line = str(error)
+        assert line
+        assert "\n" not in line, line
+        assert "llocate" not in line, line
+        return line
+    return ""
+
+
+def judge(change, line: str) -> None:
+    """Hold the answer to a change against what it must be."""
+    name, _, path, done, value = change
+    words = {part for part in path if isinstance(part, str)}
+    if line:
+        words |= {other for key in words for other in SHARED.get(key, ())}
+        assert any(word in line for word in words), (path, value, line)
+    elif not words & {"peers"}:
+        assert done not in ("more", "endless", "unfinished"), (name, path, value)
+        if done == "kind" and isinstance(value, str):
+            assert words & FREE, (name, path, value)
+
+
+@pytest.fixture
+def elsewhere(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@at_most(4)
+@given(harmed())
+@counted
+def test_a_configuration_is_refused_by_the_key_or_works(elsewhere, change):
+    line = refused(change[1], elsewhere)
+    judge(change, line)
+    assert not list(elsewhere.iterdir())
+
+
+# ------------------------------------------------------------------ whom a run's folder may call
+
+FOREIGN = [  # what would do harm, and how it would be called
+    {"_target_": "os.system", "command": "touch harm"},
+    {"_target_": "builtins.eval", "_args_": ["open('harm', 'w')"]},
+    {"_target_": "builtins.exec", "_args_": ["open('harm', 'w')"]},
+    {"_target_": "subprocess.run", "args": ["touch", "harm"]},
+    {"_target_": "subprocess.Popen", "args": ["touch", "harm"]},
+    {"_target_": "pathlib.Path.touch", "self": "harm"},
+    {"_target_": "hydra.utils.call", "config": {"_target_": "os.system", "command": "touch harm"}},
+    {"_target_": "dpl.run.sys.exit", "_args_": [3]},
+    {"_target_": "dpl.run.make", "cfg": {"x": {"_target_": "os.getcwd"}}, "key": "x"},
+    {"_target_": "dpl.run.load_run", "folder": "evil", "trust": True},
+    {"_target_": "dpl.run.importlib", "name": "antigravity"},
+    {"_target_": "dpl.scene.partial", "func": "os.system"},
+    {"_target_": "dpl.module.append_line", "path": "harm", "line": {"a": 1}},
+    {"_target_": "dpl.data.durable.whole_file", "path": "harm"},
+    {"_target_": "dpl.fem.mesh.save", "mesh": {"_target_": "dpl.fem.mesh.box"}, "path": "harm.vtk"},
+    {"_target_": "dpl.benchmarks.peers.measured_peer", "python": "touch", "program": "harm"},
+    {
+        "_target_": "lightning.pytorch.cli.instantiate_class",
+        "args": ["touch harm"],
+        "init": {"class_path": "os.system"},
+    },
+    {"_target_": "lightning.pytorch.cli.LightningCLI", "run": False},
+    {"_target_": "lightning.fabric.utilities.cloud_io._load", "path_or_url": "evil.ckpt"},
+    {"_target_": "torch.load", "f": "evil.ckpt", "weights_only": False},
+    {"_target_": "torch.optim.os.system", "command": "touch harm"},
+    {"_target_": "torch.optim.lr_scheduler.partial", "func": "os.system"},
+    {"_target_": "dpl", "a": 1},
+    {"_target_": "dpl."},
+    {"_target_": "..."},
+    {"_target_": 3},
+    {"_target_": None},
+    {"_target_": ["os.system"]},
+    {"_target_": {"_target_": "os.system", "command": "touch harm"}},
+]
+
+
+@st.composite
+def poisoned(draw):
+    """Return the configuration of a run that calls what is not ours somewhere."""
+    name = draw(st.sampled_from([name for name in BASES if name.startswith("train")]))
+    cfg = deepcopy(BASES[name])
+    path = draw(st.sampled_from(list(places(cfg))))
+    call = deepcopy(draw(st.sampled_from(FOREIGN)))
+    call |= draw(st.sampled_from([{}, {"_partial_": True}, {"_recursive_": False}]))
+    deep = draw(st.sampled_from([None, "a", "_args_", "first"]))
+    put(cfg, path, call if deep is None else {"_target_": "dpl.losses.MSE", deep: [call]})
+    return cfg
+
+
+@pytest.fixture
+def tripwires(monkeypatch, elsewhere):
+    """Fails where anything starts a process, evaluates a text or leaves a file."""
+
+    def tripped(*args, **kwargs):
+        raise AssertionError(f"called with {args}, {kwargs}")
+
+    for module, name in [(os, "system"), (subprocess.Popen, "__init__"), (os, "execvp")]:
+        monkeypatch.setattr(module, name, tripped)
+    for folder in ("run", "evil"):
+        (elsewhere / folder / "checkpoints").mkdir(parents=True)
+        (elsewhere / folder / "checkpoints" / "best.ckpt").write_bytes(b"none")
+    yield elsewhere
+    assert sorted(path.name for path in elsewhere.iterdir()) == ["evil", "run"]
+
+
+@at_most(3)
+@given(poisoned())
+@counted
+def test_a_runs_folder_calls_nothing_but_the_objects_of_a_run(tripwires, cfg):
+    made = OmegaConf.create(cfg)
+    with bounded():
+        with pytest.raises(run.ConfigError):
+            run.check(made, trust=False)
+        (tripwires / "run" / "config.yaml").write_text(OmegaConf.to_yaml(made))
+        with pytest.raises(run.ConfigError) as refusal:
+            run.load_run(tripwires / "run")
+    assert "best.ckpt" not in str(refusal.value), "it was built"
+
+
+def _names() -> list[str]:
+    """Return all names that can be reached in what a run's folder may name parts of."""
+    for module in ("pytorch.cli", "fabric.utilities.cloud_io", "pytorch.demos.boring_classes"):
+        importlib.import_module(f"lightning.{module}")
+    ours = ("dpl.", "torch.optim.", "lightning.")
+    modules = [m for name, m in sys.modules.items() if name.startswith(ours)]
+    return sorted(f"{m.__name__}.{name}" for m in modules for name in vars(m))
+
+
+NAMES = _names()
+
+KINDS = {
+    *("Mesh", "Material", "Newton", "ModalLoads", "DataSet", "OfflineData", "Module", "Optimizer"),
+    *("LRScheduler", "Plane", "Box", "Sphere", "Cylinder", "Tag", "Displacement", "Spring"),
+    *("Traction", "BodyForce", "Loss"),
+}
+WATCHING = {"Trainer", "Callback", "Logger", "CheckpointIO"}
+FUNCTIONS = {
+    *("box", "rectangle", "propeller", "load", "warmup_cosine"),
+    *("uniform", "normal", "even", "one", "logarithmic", "tail"),
+}
+
+
+@at_most(10)
+@given(st.sampled_from(NAMES), st.sampled_from(["mesh", "loss", "trainer", "trainer.logger"]))
+@counted
+def test_what_a_runs_folder_may_name_is_of_a_kind_that_a_run_is_made_of(name, key):
+    """Whatever else our modules have imported, functions with a reach of their own included."""
+    cfg = OmegaConf.create({"trainer": {"_target_": "lightning.Trainer"}})
+    OmegaConf.update(cfg, key, {"_target_": name}, merge=False)
+    try:
+        run.check(cfg, trust=False)
+    except run.ConfigError:
+        return
+    module, _, attribute = name.rpartition(".")
+    found = getattr(sys.modules[module], attribute)
+    if isinstance(found, types.FunctionType):
+        assert attribute in FUNCTIONS
+        assert found.__module__.startswith("dpl.")
+        return
+    assert inspect.isclass(found)
+    watching = key.startswith("trainer")
+    assert {base.__name__ for base in found.__mro__} & (KINDS | (WATCHING if watching else set()))
+    assert watching or found.__module__.startswith(("dpl.", "torch.optim."))

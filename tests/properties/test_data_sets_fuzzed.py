@@ -1,0 +1,339 @@
+"""Laws of damaged data sets: the samples that were written, or an error that says what to do."""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+from bounds import bounded
+from hypothesis import given
+from hypothesis import strategies as st
+from safetensors.torch import load, save
+from tried import counted
+
+from dpl.data import store as store_module
+from dpl.data.datamodule import OfflineData
+from dpl.data.durable import DataSetError
+from dpl.data.outcome import Job, outcome
+from dpl.data.store import STREAMS, Store
+
+SIZES = {"train": 12, "val": 4, "test": 4}
+SPOOLED = (10, 11)  # loads of training whose shard is not complete
+SHARDS = ["train-000000", "train-000004", "train-000008", "val-000000", "test-000000"]
+FILES = [
+    *("scene.json", "manifest.jsonl", "journal.jsonl", "modes.safetensors"),
+    *(f"{name}.safetensors" for name in SHARDS),
+    *(f"spool/train-{number:06d}.load" for number in SPOOLED),
+]
+REMEDIES = ("action=repair", "data.folder", "data.seed", "remove", "generate")
+
+
+class Sound:
+    """A data set that is not harmed, and its samples."""
+
+    def __init__(self, folder: Path, samples: dict) -> None:
+        """Keep both."""
+        self.folder, self.samples = folder, samples
+
+
+@pytest.fixture(scope="module")
+def sound(scene, tmp_path_factory):
+    """A data set of five shards and two loads in the spool, and its samples."""
+    folder = tmp_path_factory.mktemp("sound") / "set"
+    store = Store(folder, scene, 0)
+    wanted = {**{split: range(size) for split, size in SIZES.items()}, "train": range(10)}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store_module, "SHARD", 4)
+        list(store.fill(wanted, workers=0))
+    for number in SPOOLED:
+        store.spool.put(outcome(scene, Job((0, 0), number)))
+    session = {"loads": 18, "seconds": 1.0, "core_seconds": 1.0}
+    (folder / "journal.jsonl").write_text(json.dumps(session) + "\n")
+    assert sorted(FILES) == sorted(
+        str(path.relative_to(folder))
+        for path in folder.rglob("*")
+        if path.is_file() and not path.name.startswith(".")
+    )
+    whole = shutil.copytree(folder, folder.with_name("whole"))
+    return Sound(folder, samples(scene, whole))
+
+
+@contextmanager
+def copied(folder: Path) -> Iterator[Path]:
+    """Give a copy to harm; what lies beside it is outside."""
+    copy = folder.with_name("copy") / "set"
+    shutil.copytree(folder, copy)
+    outside = copy.parent / "outside"
+    shutil.copytree(folder, outside)
+    try:
+        yield copy
+    finally:
+        shutil.rmtree(copy.parent)
+
+
+def opened(scene, folder: Path) -> OfflineData:
+    return OfflineData(scene, folder=str(folder), **SIZES, batch_size=4, workers=0)
+
+
+def samples(scene, folder: Path) -> dict:
+    """Return all samples, what is missing solved as every command does."""
+    data = opened(scene, folder)
+    data.plan()
+    data.prepare_data()
+    assert data.store.summary()
+    return {split: data.samples(split) for split in SIZES}
+
+
+def same(found: dict, written: dict) -> bool:
+    return all(
+        torch.equal(a, b)
+        for split in SIZES
+        for a, b in zip(found[split], written[split], strict=True)
+    )
+
+
+@contextmanager
+def told(folder: Path) -> Iterator[None]:
+    """Hold an error to the file that it names and what it says to do."""
+    try:
+        yield
+    except DataSetError as error:
+        line = str(error)
+        assert "\n" not in line
+        assert str(folder) in line, line
+        assert any(remedy in line for remedy in REMEDIES), line
+
+
+def law(scene, folder: Path, written: dict, *, trusts_digests: bool = True) -> None:
+    """Look at a damaged data set in every way there is; then repair it."""
+    store = Store(folder, scene, 0)
+    flaws = None
+    with bounded():
+        with told(folder):
+            flaws = [flaw for _, flaw in store.verify() if flaw]
+        with told(folder):
+            kept = store.modes()
+            assert trusts_digests or flaws or torch.allclose(kept.values, scene.loads.modes.values)
+        for split in STREAMS:
+            with told(folder):
+                read = store.reader(split)
+                for index in range(SIZES[split]):
+                    one = read(index)
+                    if one is not None and trusts_digests:
+                        there = written[split].displacement[index].numpy()
+                        assert (one.displacement == there).all()
+        with told(folder):
+            found = samples(scene, folder)
+            assert same(found, written) or (not trusts_digests and flaws)
+        with told(folder):
+            store.repair()
+            found = samples(scene, folder)
+            assert same(found, written)
+            assert not [flaw for _, flaw in store.verify() if flaw]
+
+
+# ------------------------------------------------------------------ bytes
+
+BYTES = st.binary(min_size=1, max_size=12)
+
+
+@st.composite
+def blows(draw):
+    """Return what is done to which file: a name and how."""
+    name = draw(st.sampled_from(FILES))
+    how = draw(
+        st.sampled_from(
+            [
+                *("flip", "flip", "cut", "remove", "repeat", "insert", "zero", "empty"),
+                *("delete", "swap", "folder", "pipe", "loop", "outside", "endless", "huge"),
+                "deep",
+            ]
+        )
+    )
+    place = draw(st.floats(0, 1)), draw(st.floats(0, 0.3))
+    return name, how, place, draw(st.sampled_from(FILES)), draw(BYTES), draw(st.integers(0, 7))
+
+
+def strike(folder: Path, blow) -> None:
+    name, how, (start, length), other, inserted, bit = blow
+    path = folder / name
+    if not path.is_file() or path.stat().st_size > 10**9:  # struck before
+        return
+    content = bytearray(path.read_bytes())
+    a = min(int(start * len(content)), max(0, len(content) - 1))
+    b = min(a + 1 + int(length * len(content)), len(content))
+    if how == "flip" and content:
+        content[a] ^= 1 << bit
+    elif how == "cut":
+        del content[a:]
+    elif how == "remove":
+        del content[a:b]
+    elif how == "repeat":
+        content[b:b] = content[a:b]
+    elif how == "insert":
+        content[a:a] = inserted
+    elif how == "zero":
+        content[a:b] = bytes(b - a)
+    elif how == "empty":
+        content.clear()
+    elif how == "deep":
+        content = bytearray(b"[" * 200_000)
+    elif how == "swap" and (folder / other).is_file():
+        held = (folder / other).read_bytes()
+        (folder / other).write_bytes(content)
+        content = bytearray(held)
+    if how in ("delete", "folder", "pipe", "loop", "outside", "endless"):
+        path.unlink()
+    if how == "folder":
+        path.mkdir()
+    elif how == "pipe":
+        os.mkfifo(path)
+    elif how == "loop":
+        path.symlink_to(path.name)
+    elif how == "outside":
+        path.symlink_to(folder.parent / "outside" / name)
+    elif how == "endless":
+        path.symlink_to("/dev/zero")
+    elif how == "huge":
+        os.truncate(path, 2**40)
+    elif how != "delete":
+        path.write_bytes(content)
+
+
+@given(st.lists(blows(), min_size=1, max_size=2))
+@counted
+def test_damaged_files_give_what_was_written_or_say_so(scene, sound, damage):
+    with copied(sound.folder) as folder:
+        for blow in damage:
+            strike(folder, blow)
+        law(scene, folder, sound.samples)
+
+
+# ------------------------------------------------------------------ what the manifest says
+
+VALUES = [
+    *(None, True, False, -1, 0, 1, 3, 4, 5, 8, 64, 10**6, 10**12, 10**30, -(10**30), 0.5, 1e300),
+    *(float("nan"), float("inf"), "", "train", "val", "no such thing", "3", [], [None], {}),
+    *([0, 1, 2, 3], [{"index": 1}], [{"index": 1, "reason": "x", "load_factor": 0.5}], [[[]]]),
+    *("../outside/train-000000.safetensors", "/dev/zero", "/etc/passwd", ".", "..", "modes"),
+    *("scene.json", "val-000000.safetensors", "train-000004.safetensors", "a\nb", "\0", "x" * 9999),
+]
+ABSENT = object()
+
+
+def entries(node, path=()) -> Iterator[tuple]:
+    for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+        yield (*path, key)
+        if isinstance(value, dict | list):
+            yield from entries(value, (*path, key))
+
+
+@given(st.data())
+@counted
+def test_a_manifest_with_anything_in_it_gives_what_was_written_or_an_error(scene, sound, data):
+    name = data.draw(
+        st.sampled_from(["manifest.jsonl", "manifest.jsonl", "scene.json", "journal.jsonl"])
+    )
+    with copied(sound.folder) as folder:
+        text = (folder / name).read_text()
+        lines = (
+            [json.loads(text)] if name == "scene.json" else list(map(json.loads, text.splitlines()))
+        )
+        for _ in range(data.draw(st.integers(1, 2))):
+            path = data.draw(st.sampled_from(list(entries(lines))))
+            value = data.draw(st.sampled_from([*VALUES, ABSENT, "twice"]))
+            node = lines
+            for key in path[:-1]:
+                node = node[key]
+            if value is ABSENT:
+                del node[path[-1]]
+            elif value == "twice" and isinstance(node, list):
+                node.append(node[path[-1]])
+            else:
+                node[path[-1]] = value
+            if not lines:
+                break
+        (folder / name).write_text("".join(json.dumps(line) + "\n" for line in lines))
+        law(scene, folder, sound.samples)
+
+
+# ------------------------------------------------------------------ shards whose digests are right
+
+
+def cast(kind):
+    return lambda column, k: column.to(kind)
+
+
+def filled(value):
+    def change(column, k):
+        flat = column.clone().flatten()
+        if flat.numel():
+            flat[k % flat.numel()] = value if column.is_floating_point() else int(value)
+        return flat.view(column.shape)
+
+    return change
+
+
+CHANGES = {
+    **{str(kind): cast(kind) for kind in (torch.float32, torch.float16, torch.int64, torch.int32)},
+    **{str(kind): cast(kind) for kind in (torch.uint8, torch.bool, torch.bfloat16, torch.float64)},
+    **{str(value): filled(value) for value in (-1, 0, 1, 44, 45, 2**31 - 1, 0.25, -1e-3)},
+    "flat": lambda column, k: column.flatten(),
+    "deeper": lambda column, k: column[None],
+    "fewer": lambda column, k: column[:-1],
+    "none": lambda column, k: column[:0],
+    "twice": lambda column, k: torch.cat([column, column]),
+    "turned": lambda column, k: column.flip(0),
+    "rolled": lambda column, k: column.roll(1),
+    "larger": lambda column, k: 2 * column,
+    "opposite": lambda column, k: -column,
+}
+ENDLESS = {str(value): filled(value) for value in map(float, ("nan", "inf", "-inf", "1e300"))}
+HEADERS = [
+    (2**63).to_bytes(8, "little"),
+    (2**31).to_bytes(8, "little") + b"{}",
+    *(
+        len(text).to_bytes(8, "little") + text
+        for text in (
+            b'{"index":{"dtype":"I64","shape":[1000000000000],"data_offsets":[0,8000000000000]}}',
+            b'{"index":{"dtype":"I64","shape":[4294967296,4294967296],"data_offsets":[0,0]}}',
+            b'{"index":{"dtype":"F99","shape":[1],"data_offsets":[0,8]}}' + bytes(8),
+            b'{"index":[]}',
+            b"[" * 100_000,
+            b"{}",
+        )
+    ),
+]
+
+
+@given(st.data())
+@counted
+def test_a_shard_with_a_right_digest_and_wrong_numbers_is_refused_or_found(scene, sound, data):
+    name = data.draw(st.sampled_from([*SHARDS, "modes"])) + ".safetensors"
+    with copied(sound.folder) as folder:
+        path = folder / name
+        columns = load(path.read_bytes())
+        which = data.draw(st.sampled_from(sorted(columns)))
+        how = data.draw(st.sampled_from([*CHANGES, *ENDLESS, "gone", "more", "header"]))
+        k = data.draw(st.integers(0, 10_000))
+        if how == "gone":
+            del columns[which]
+        elif how == "more":
+            columns["poisson"] = torch.zeros(4, 1, dtype=torch.float64)
+        elif how != "header":
+            if how in ENDLESS and not columns[which].is_floating_point():
+                which = "values" if name.startswith("modes") else "displacement"
+            columns[which] = (CHANGES | ENDLESS)[how](columns[which], k).contiguous()
+        content = HEADERS[k % len(HEADERS)] if how == "header" else save(columns)
+        path.write_bytes(content)
+        manifest = folder / "manifest.jsonl"
+        digest = hashlib.sha256(content).hexdigest()
+        pattern = rf'("file": "{re.escape(name)}", "sha256": )"\w+"'
+        manifest.write_text(re.sub(pattern, rf'\1"{digest}"', manifest.read_text()))
+        law(scene, folder, sound.samples, trusts_digests=False)
