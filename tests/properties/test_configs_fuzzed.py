@@ -75,6 +75,7 @@ SHARED = {  # keys that others refer to
     "max_epochs": ("epochs",),
     "folder": ("dirpath", "save_dir"),
     "name": ("run",),
+    "size": ("holds no",),
 }
 
 
