@@ -28,6 +28,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from dpl import schema
 from dpl.data.durable import DataSetError
 from dpl.fem.linear import slow_blas
+from dpl.fem.sparse import SingularMatrix
 from dpl.scene import Scene
 from dpl.schema import ConfigError
 
@@ -218,6 +219,9 @@ def build_scene(cfg: DictConfig) -> Scene:
         loads.modes  # noqa: B018  # which says whether there are so many
     except ValueError as error:
         raise ConfigError(f"loads: {error}") from error
+    except SingularMatrix as error:
+        told = f"material, mesh, clamped or supports: K(0) cannot be used: {error}"
+        raise ConfigError(told) from error
     return Scene(problem, loads, solver)
 
 

@@ -204,6 +204,20 @@ def test_what_works_is_not_refused(compose, override):
     run.check(compose("folder=.", override, command="train"))
 
 
+@pytest.mark.parametrize(
+    "law",
+    [
+        ["material=ogden_k2", "material.exponents=[5e-324,5.0,-2.0]"],
+        ["material=yeoh_k2", "material.bulk=1e300", "+mesh.cell=tetra"],
+    ],
+)
+def test_a_body_whose_stiffness_is_no_matrix_is_refused(compose, tiny, law):
+    cfg = compose(*tiny, *law)
+    run.check(cfg)
+    with pytest.raises(ConfigError, match=r"material, mesh, .*K\(0\) cannot be used"):
+        run.build_scene(cfg)
+
+
 def test_a_body_that_is_held_everywhere_is_refused(compose, tiny):
     cfg = compose(*tiny)
     cfg.clamped = {"_target_": "dpl.fem.mesh.Sphere", "centre": [0, 0, 0], "radius": 1e3}

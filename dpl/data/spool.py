@@ -53,6 +53,8 @@ class Spool:
         for path in sorted(self.folder.glob("*.load")):
             if not (name := NAME.fullmatch(path.name)) or name[1] not in self.streams:
                 continue
+            if path.is_symlink():  # not followed: its load is solved again
+                continue
             with suppress(FileNotFoundError):  # another writer has made a shard of it meanwhile
                 content = own_file(path)
                 if _digest(path, content[DIGEST:]) == content[:DIGEST]:

@@ -215,17 +215,17 @@ class Store:
         }
         spooled = self.spool.files()
         shard: dict[str, Tensor] = {}
-        name = ""
+        held: dict[str, Any] | None = None
 
         def read(index: int) -> Outcome | None:
-            nonlocal shard, name
+            nonlocal shard, held
             if (line := lines.get(index)) is None:
                 path = spooled.get(Job(self.stream(split), index))
                 with suppress(FileNotFoundError):  # it is in a shard by now
                     return self.spool.get(path) if path else None
                 return None
-            if name != line["file"]:
-                shard, name = self._read(line), line["file"]
+            if held is not line:
+                shard, held = self._read(line), line
             return taken(shard, Job(self.stream(split), index), line)
 
         return read

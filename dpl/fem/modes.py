@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, eigsh
+from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 from torch import Tensor
 
 from dpl.fem.linear import full_matrix
@@ -22,6 +22,7 @@ from dpl.fem.newton import Linear, gather, scatter
 from dpl.fem.problem import Problem
 from dpl.fem.sampling import SAMPLINGS, Quantile, even, one, uniform
 from dpl.fem.solution import Load
+from dpl.fem.sparse import SingularMatrix
 
 Array = NDArray[np.float64]
 SAME = 1e-6  # eigenvalues closer than this, relatively, are one eigenspace
@@ -55,6 +56,7 @@ def eigenmodes(linear: Linear, count: int) -> Modes:
     Raises:
         ValueError: `count` is not between 1 and a third of the degrees of freedom, or the body is
             free to move.
+        SingularMatrix: The moduli are so far apart that rounding leaves no mode.
     """
     linear = linear.reference
     problem = linear.problem
@@ -68,7 +70,10 @@ def eigenmodes(linear: Linear, count: int) -> Modes:
     inverse = LinearOperator((size, size), matvec=linear.factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(size)
     asked = min(count + 8, size - 2)
-    values, vectors = eigsh(stiffness, asked, sigma=0.0, OPinv=inverse, v0=start, tol=1e-12)
+    try:
+        values, vectors = eigsh(stiffness, asked, sigma=0.0, OPinv=inverse, v0=start, tol=1e-12)
+    except ArpackError as error:
+        raise SingularMatrix("its modes cannot be found") from error
     order = np.argsort(values)
     values, vectors = values[order], vectors[:, order]
     while count < asked and values[count] - values[count - 1] < CLUSTER * values[count]:

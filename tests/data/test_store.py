@@ -790,6 +790,19 @@ def test_a_line_of_the_journal_that_says_nothing_is_left_out(copy, line):
     assert (copy.summary(), copy.seconds_a_load()) == (told, a_load)
 
 
+def test_two_lines_of_one_shard_are_both_held_against_it(copy):
+    found = lines(copy)
+    found[1] |= {"file": found[0]["file"], "sha256": found[0]["sha256"]}
+    (copy.folder / "manifest.jsonl").write_text("".join(json.dumps(one) + "\n" for one in found))
+    first = found[0] | found[1] | {"split": "train", "first": 12}
+    with (copy.folder / "manifest.jsonl").open("a") as file:
+        file.write(json.dumps(first) + "\n")
+    read = copy.reader("train")
+    assert read(11) is not None
+    with pytest.raises(DataSetError, match=r"holds other loads than the manifest says"):
+        read(12)
+
+
 def test_a_load_under_the_name_of_another_is_solved_again(fresh, data, scene):
     fresh.create()
     paths = [fresh.spool.put(outcome(scene, Job((0, 0), number))) for number in (0, 1)]

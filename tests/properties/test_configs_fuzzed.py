@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import types
+import warnings
 from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
@@ -75,6 +76,7 @@ SHARED = {  # keys that others refer to
     "max_epochs": ("epochs",),
     "folder": ("dirpath", "save_dir"),
     "name": ("run",),
+    "size": ("holds no",),
 }
 
 
@@ -192,7 +194,8 @@ def refused(cfg: dict, folder: Path) -> str:
     made = OmegaConf.create(cfg)
     OmegaConf.set_struct(made, True)
     try:
-        with bounded():
+        with bounded(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # honest ones: thin cells, say
             works(made, folder)
     except (run.ConfigError, DataSetError) as error:
         line = str(error)

@@ -7,6 +7,7 @@ import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
@@ -256,7 +257,7 @@ def test_a_manifest_with_anything_in_it_gives_what_was_written_or_an_error(scene
             elif value == "twice" and isinstance(node, list):
                 node.append(node[path[-1]])
             else:
-                node[path[-1]] = value
+                node[path[-1]] = deepcopy(value)
             if not lines:
                 break
         (folder / name).write_text("".join(json.dumps(line) + "\n" for line in lines))
