@@ -378,12 +378,14 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
 def check_resumed(cfg: DictConfig) -> None:
     """Hold a configuration against that of the run that it resumes.
 
+    `ckpt_path=last` of a run that has not begun begins it: one command line for all starts of a job.
+
     Raises:
-        ConfigError: There is nothing to resume, or they differ in what makes the run what it is.
+        ConfigError: There is no such checkpoint, or they differ in what makes the run what it is.
     """
-    if not cfg.ckpt_path:
-        return
     last = Path(cfg.folder) / "checkpoints" / "last.ckpt"
+    if not cfg.ckpt_path or (cfg.ckpt_path == "last" and not last.exists()):
+        return
     path = last if cfg.ckpt_path == "last" else Path(cfg.ckpt_path)
     if not path.is_file():
         raise ConfigError(f"ckpt_path: there is no {path} to resume; leave it out to begin anew")

@@ -296,9 +296,9 @@ def test_an_audit_finds_other_poissons_ratios(sets):
     line = sets.store.shards()[0]
     shard = sets.store._sound(line)
     stream = sets.store.stream(line["split"])
-    assert flaw_of_shard(sets.scene, stream, line, shard) == ""
+    assert flaw_of_shard(sets.scene, stream, shard) == ""
     shard["poisson"] = shard["poisson"].flip(0)
-    assert "Poisson" in flaw_of_shard(sets.scene, stream, line, shard)
+    assert "Poisson" in flaw_of_shard(sets.scene, stream, shard)
 
 
 def test_images_and_streams_carry_poissons_ratios(wide, sets, tmp_path):

@@ -673,11 +673,12 @@ def test_a_run_is_not_resumed_with_another_configuration(resumed, override, told
     assert told in str(refusal.value)
 
 
-def test_a_run_that_is_not_there_is_not_resumed(compose, tmp_path):
-    for path in ("last", f"{tmp_path}/nowhere.ckpt"):
-        cfg = compose(f"folder={tmp_path}", f"ckpt_path={path}", command="train")
-        with pytest.raises(ConfigError, match="ckpt_path: there is no"):
-            run.check_resumed(cfg)
+def test_a_run_that_is_not_there_is_not_resumed_but_begun(compose, tmp_path):
+    path = f"{tmp_path}/nowhere.ckpt"
+    cfg = compose(f"folder={tmp_path}", f"ckpt_path={path}", command="train")
+    with pytest.raises(ConfigError, match="ckpt_path: there is no"):
+        run.check_resumed(cfg)
+    run.check_resumed(compose(f"folder={tmp_path}", "ckpt_path=last", command="train"))
 
 
 def test_the_run_of_another_scene_is_refused(copied):
