@@ -378,7 +378,7 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
 def check_resumed(cfg: DictConfig) -> None:
     """Hold a configuration against that of the run that it resumes.
 
-    `ckpt_path=last` of a run that has not begun begins it: one command line for all starts of a job.
+    `ckpt_path=last` of a run that has not begun begins it: a job has one command line.
 
     Raises:
         ConfigError: There is no such checkpoint, or they differ in what makes the run what it is.
