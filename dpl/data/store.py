@@ -16,7 +16,6 @@ by eight, the same loads give the same bytes.
 import hashlib
 import json
 import math
-import re
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -41,6 +40,7 @@ from dpl.data.durable import (
     sync_folder,
     whole_file,
 )
+from dpl.data.manifest import STREAMS, is_number, kept_in, lines_of, place
 from dpl.data.outcome import Job, Outcome
 from dpl.data.shard import closed, opened, taken
 from dpl.data.spool import Spool, sweep
@@ -50,15 +50,8 @@ from dpl.version import __version__
 
 FORMAT = 2
 MODES = "modes.safetensors"
-LINE = {  # what a line of the manifest has
-    *("file", "sha256", "split", "first", "tried", "accepted"),
-    *("iterations", "amplitudes", "rejected"),
-}
-NAME = re.compile(r"[\w.-][\w./-]{0,199}")  # of a shard
-MOST = 1e15  # that a number of a manifest or a journal can be
 HEADER = 100_000  # bytes of a shard besides its numbers, at most
 SHARD = 64  # loads in one file
-STREAMS = {"train": 0, "val": 1, "test": 2}  # disjoint streams of one seed
 MACHINE = ("timed out", "its worker died")  # reasons that lie with the machine: `repair` retries
 
 
@@ -105,8 +98,8 @@ class Store:
             raise DataSetError(
                 f"{card} is damaged ({error}); choose another data.folder or remove this one"
             ) from None
-        lines = [line for path in self._manifests() for line in _lines(path)]
-        return sorted(lines, key=_place)
+        lines = [line for path in self._manifests() for line in lines_of(path)]
+        return sorted(lines, key=place)
 
     def _manifests(self) -> list[Path]:
         return sorted(self.folder.glob("manifest*.jsonl"))
@@ -201,7 +194,7 @@ class Store:
         loads = self.scene.loads
         own = int(loads.poisson_range is not None)
         shard = opened(content, shape, loads.dimension, own)
-        if shard["index"].tolist() != _kept(line):
+        if shard["index"].tolist() != kept_in(line):
             raise ValueError("holds other loads than the manifest says")
         return shard
 
@@ -291,7 +284,7 @@ class Store:
         return [
             line
             for line in read_lines(self.folder / "journal.jsonl")
-            if all(_is_number(line.get(key)) for key in ("loads", "seconds", "core_seconds"))
+            if all(is_number(line.get(key)) for key in ("loads", "seconds", "core_seconds"))
         ]
 
     def seconds_a_load(self) -> float | None:
@@ -380,7 +373,7 @@ class Store:
                 spooled[one.job] = self.spool.put(one)
                 yield one
                 self._flush(files, spooled, manifest)
-            self._rewrite(self.folder / manifest, _lines(self.folder / manifest))
+            self._rewrite(self.folder / manifest, lines_of(self.folder / manifest))
             if shards == 1:
                 self.spool.tidy()
 
@@ -394,7 +387,7 @@ class Store:
 
     def _rewrite(self, manifest: Path, lines: Sequence[dict[str, Any]]) -> None:
         """Make a manifest of these lines, in order, if it is not that already."""
-        text = "".join(json.dumps(line) + "\n" for line in sorted(lines, key=_place)).encode()
+        text = "".join(json.dumps(line) + "\n" for line in sorted(lines, key=place)).encode()
         if manifest.exists() and manifest.read_bytes() != text:
             _write(manifest, text)
 
@@ -497,7 +490,7 @@ class Store:
                 _write(self.folder / MODES, save(self.scene.loads.modes._asdict()))
             named = {MODES}
             for manifest in self._manifests():
-                lines = [line for line in _lines(manifest) if line["file"] not in poor]
+                lines = [line for line in lines_of(manifest) if line["file"] not in poor]
                 named |= {line["file"] for line in lines}
                 self._rewrite(manifest, lines)
             for path in [*self.folder.glob("*.safetensors"), *self.folder.rglob(".*.part")]:
@@ -530,52 +523,3 @@ def _write(path: Path, content: bytes) -> None:
         raise DataSetError(
             f"{path} is a folder where a file must be; remove it or choose another data.folder"
         ) from None
-
-
-def _lines(manifest: Path) -> list[dict[str, Any]]:
-    """Return the lines of a manifest; one that lacks something counts as torn.
-
-    So does one that says what cannot be: its loads are solved again.
-    """
-    return [line for line in read_lines(manifest) if line.keys() >= LINE and _is_possible(line)]
-
-
-def _is_possible(line: Mapping[str, Any]) -> bool:
-    """Return whether the values of a line are of their kinds and agree with each other."""
-    texts, counts = ("file", "sha256", "split"), ("first", "tried", "accepted", "iterations")
-    if not all(isinstance(line[key], str) for key in texts) or line["split"] not in STREAMS:
-        return False
-    if not all(type(line[key]) is int and 0 <= line[key] < 2**53 for key in counts):
-        return False
-    if not NAME.fullmatch(line["file"]):
-        return False
-    amplitudes, rejected = line["amplitudes"], line["rejected"]
-    if not isinstance(amplitudes, list) or not isinstance(rejected, list):
-        return False
-    if not len(amplitudes) == line["tried"] == line["accepted"] + len(rejected):
-        return False
-    numbers = range(line["first"], line["first"] + line["tried"])
-    return all(map(_is_number, amplitudes)) and all(
-        isinstance(one, dict)
-        and type(one.get("index")) is int
-        and one["index"] in numbers
-        and isinstance(one.get("reason"), str)
-        and "load_factor" in one
-        for one in rejected
-    )
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and 0 <= value < MOST
-
-
-def _kept(line: Mapping[str, Any]) -> list[int]:
-    """Return the loads that a shard must hold."""
-    rejected = {one["index"] for one in line["rejected"]}
-    numbers = range(line["first"], line["first"] + line["tried"])
-    return [number for number in numbers if number not in rejected]
-
-
-def _place(line: Mapping[str, Any]) -> tuple[int, int]:
-    """Return where a line of the manifest belongs."""
-    return STREAMS[line["split"]], line["first"]

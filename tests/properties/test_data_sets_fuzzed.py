@@ -21,8 +21,9 @@ from tried import counted
 from dpl.data import store as store_module
 from dpl.data.datamodule import OfflineData
 from dpl.data.durable import DataSetError
+from dpl.data.manifest import STREAMS
 from dpl.data.outcome import Job, outcome
-from dpl.data.store import STREAMS, Store
+from dpl.data.store import Store
 
 SIZES = {"train": 12, "val": 4, "test": 4}
 SPOOLED = (10, 11)  # loads of training whose shard is not complete
