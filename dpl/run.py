@@ -441,9 +441,12 @@ def load_run(
     from dpl import checkpoints  # which imports Lightning
 
     config = Path(folder) / "config.yaml"
-    best = Path(folder) / "checkpoints" / f"best{checkpoints.WEIGHTS}"
-    if not best.exists():  # a run too short to be validated
-        best = best.with_name("last.ckpt")
+    # "best.ckpt" is of runs before weights had files of their own; a short run has only its last
+    kept = [
+        Path(folder) / "checkpoints" / name
+        for name in (f"best{checkpoints.WEIGHTS}", "best.ckpt", "last.ckpt")
+    ]
+    best = next((path for path in kept if path.exists()), kept[-1])
     for path in (config, best):
         if not path.is_file():
             raise ConfigError(f"run = {folder} has no {path.relative_to(folder)}; train it first")

@@ -624,6 +624,16 @@ def test_a_run_without_validation_comes_back_from_its_last_checkpoint(copied):
     assert not run.load_run(copied)[1].training
 
 
+def test_a_run_of_before_comes_back_from_its_best_checkpoint(copied):
+    folder = copied / "checkpoints"
+    last = checkpoints.read(folder / "last.ckpt")
+    better = {name: tensor + 1 for name, tensor in last["state_dict"].items()}
+    checkpoints.write({**last, "state_dict": better}, folder / "best.ckpt")
+    (folder / "best.safetensors").unlink()
+    found = run.load_run(copied)[1].state_dict()
+    assert all(torch.equal(found[name], tensor) for name, tensor in better.items())
+
+
 def test_a_schedule_over_a_training_without_end_is_refused(tiny_training, script, tmp_path):
     ended = script("train", *tiny_training, "trainer.max_epochs=-1", cwd=tmp_path)
     assert ended.status == 2
