@@ -106,7 +106,8 @@ def _probes(problem: Problem) -> Array:
 
 def _leaning(basis: Array, probes: Array) -> Array:
     """Return the basis of span(basis), (n, m), whose k-th vector is the k-th new probe in it."""
-    shadows = basis.T @ (probes / np.linalg.norm(probes, axis=0))  # (m, P)
+    sizes = np.linalg.norm(probes, axis=0)  # 0 of x^2 where all x are 0
+    shadows = basis.T @ (probes / np.where(sizes > 0, sizes, 1.0))  # (m, P)
     chosen = np.zeros((len(shadows), 0))
     for shadow in shadows.T:
         rest = shadow - chosen @ (chosen.T @ shadow)

@@ -530,7 +530,9 @@ def test_images_of_an_answer_answer_the_images_of_its_load(case):
         image, force = symmetry.image(answer.displacement), symmetry.image(load.force)
         residual = symmetry.image(problem.residual(answer.displacement, load.force))
         found = problem.residual(image, force)
-        assert (found - residual).norm() <= 10 * slack(problem, image) + 1e-10 * found.norm()
+        # where a cell is nearly flat, rounding of det F counts by its inverse
+        allowed = 10 * slack(problem, image) / answer.volume_ratio.clamp(max=1.0)
+        assert (found - residual).norm() <= allowed + 1e-10 * found.norm()
 
 
 # ---------------------------------------------------------------- broken input
