@@ -32,7 +32,6 @@ MEMORY = (2**30, 100)  # that reading may take [B]: at any rate, and per byte of
 SECONDS = (10.0, 2e-6)  # that reading may last [s]: at any rate, and per byte of the file
 PACKED = {b"\x1f\x8b": "gzip", b"PK\x03\x04": "zip", b"BZh": "bzip2", b"\xfd7zXZ": "xz"}
 XML = (".vtu", ".xdmf", ".xmf", ".xml")
-FIXES = "write it anew"
 
 
 def read(path: Path) -> meshio.Mesh:
@@ -60,11 +59,11 @@ def read(path: Path) -> meshio.Mesh:
 
 def _reason(said: dict[str, Any]) -> str:
     if said.get("memory"):
-        return f"it takes more memory than a file of its size should; {FIXES}"
+        return "it takes more memory than a file of its size should; write it anew"
     if "died" in said:
         late = hasattr(signal, "SIGALRM") and said["died"] == -signal.SIGALRM
         what = "takes longer than a file of its size should" if late else "breaks the reader"
-        return f"it {what} (status {said['died']}); {FIXES}"
+        return f"it {what} (status {said['died']}); write it anew"
     text = said["text"]
     if "'gmsh:physical'" in text:
         return "only some of its cells are in physical groups; give each part one"
