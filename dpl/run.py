@@ -12,7 +12,7 @@ import math
 import sys
 import typing
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,11 @@ if typing.TYPE_CHECKING:
     from dpl.module import Surrogate
 
 R = typing.TypeVar("R")
+HERE = Path(__file__).parent
 
+CONF = next(  # in a wheel inside the package, in a checkout beside it
+    path for path in (HERE / "conf", HERE.parent / "conf") if path.is_dir()
+)
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 WHOLE, NAMES = Sequence[int], Sequence[str] | None
@@ -50,37 +54,57 @@ NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")
 LONGEST = 1_000_000  # bytes of a run's configuration
 
 
-def command(task: Callable[[DictConfig], R]) -> Callable[[DictConfig], R]:
-    """Return a task that ends bad input with one line and a status of 2, Ctrl-C with 130."""
+def command(name: str) -> Callable[[Callable[[DictConfig], R]], Callable[[], R]]:
+    """Return what makes a command of a task: its configuration is `conf/NAME.yaml`.
 
-    @functools.wraps(task)
-    def wrapped(cfg: DictConfig) -> R:
-        logging.getLogger("skfem").setLevel(logging.WARNING)
-        for name in ("lightning.pytorch", "lightning.fabric"):  # they print for themselves
-            logging.getLogger(name).propagate = False
-        try:
-            return task(cfg)
-        except (ConfigError, DataSetError) as error:
-            print(f"error: {error}", file=sys.stderr)
-            _drop_empty(Path(HydraConfig.get().runtime.output_dir))
-            sys.exit(2)
-        except OSError as error:
-            if error.errno not in (*FULL, *FORBIDDEN):
-                raise
-            where = f" for {error.filename}" if error.filename else ""
-            full = error.errno in FULL
-            told = f"no space left{where}" if full else f"no permission to write{where}"
-            do = "make room" if full else "choose another folder or change its rights"
-            print(
-                f"error: {told}; what was there is whole: {do} and run the same command again",
-                file=sys.stderr,
-            )
-            sys.exit(2)
-        except KeyboardInterrupt:
-            print("interrupted", file=sys.stderr)
-            sys.exit(130)
+    Bad input ends it with one line and a status of 2, Ctrl-C with 130.
+    """
 
-    return wrapped
+    def decorate(task: Callable[[DictConfig], R]) -> Callable[[], R]:
+        @functools.wraps(task)
+        def guarded(cfg: DictConfig) -> R:
+            with _told():
+                return task(cfg)
+
+        started = hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(guarded)
+
+        @functools.wraps(task)
+        def main() -> R:
+            check_sweep(sys.argv[1:])
+            return started()
+
+        return main
+
+    return decorate
+
+
+@contextlib.contextmanager
+def _told() -> Iterator[None]:
+    """End the process with one line where what is done in here cannot be."""
+    logging.getLogger("skfem").setLevel(logging.WARNING)
+    for name in ("lightning.pytorch", "lightning.fabric"):  # they print for themselves
+        logging.getLogger(name).propagate = False
+    try:
+        yield
+    except (ConfigError, DataSetError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        _drop_empty(Path(HydraConfig.get().runtime.output_dir))
+        sys.exit(2)
+    except OSError as error:
+        if error.errno not in (*FULL, *FORBIDDEN):
+            raise
+        where = f" for {error.filename}" if error.filename else ""
+        full = error.errno in FULL
+        told = f"no space left{where}" if full else f"no permission to write{where}"
+        do = "make room" if full else "choose another folder or change its rights"
+        print(
+            f"error: {told}; what was there is whole: {do} and run the same command again",
+            file=sys.stderr,
+        )
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
 
 
 def _drop_empty(folder: Path) -> None:

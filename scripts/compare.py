@@ -1,24 +1,6 @@
 """The runs of a sweep side by side: python scripts/compare.py run=runs/..."""
 
-from pathlib import Path
-
-import hydra
-from omegaconf import DictConfig
-
-from dpl import run
-from dpl.benchmarks.evaluation import compare
-
-
-@hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")
-@run.command
-def main(cfg: DictConfig) -> None:
-    """Print a table of all evaluated runs below a folder."""
-    run.check(cfg)
-    try:
-        compare(Path(cfg.run))
-    except FileNotFoundError as error:
-        raise run.ConfigError(f"run: {error}") from error
-
-
 if __name__ == "__main__":
+    from dpl.commands.compare import main
+
     main()

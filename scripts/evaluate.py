@@ -1,23 +1,6 @@
 """A trained surrogate against finite elements: python scripts/evaluate.py run=runs/..."""
 
-from pathlib import Path
-
-import hydra
-from omegaconf import DictConfig
-
-from dpl import run
-from dpl.benchmarks.evaluation import evaluate
-
-
-@hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")
-@run.command
-def main(cfg: DictConfig) -> None:
-    """Repeat the evaluation at the end of a training run."""
-    run.check(cfg)
-    trained, surrogate = run.load_run(cfg.run)
-    test = run.load_data(trained, surrogate.scene).samples("test")
-    evaluate(surrogate, test, Path(cfg.run), tol=cfg.tol)
-
-
 if __name__ == "__main__":
+    from dpl.commands.evaluate import main
+
     main()

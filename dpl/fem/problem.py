@@ -297,7 +297,7 @@ class Problem:
 
     def energy(self, displacement: Tensor) -> Tensor:
         """Return the strain energy over E L^D, that of springs included, (B,) [-]."""
-        H = self._gradient(displacement)
+        H = self.gradient(displacement)
         if self.mean_dilatation:
             H = dilated(self.material, H, self.dV, self.shape[1])
         energy = (self.material.energy(H) * self.dV).sum((-2, -1))
@@ -308,7 +308,7 @@ class Problem:
 
     def internal_force(self, displacement: Tensor) -> Tensor:
         """Return f_int, the slope of the energy, (B, N, D) [-]; on held nodes the reactions."""
-        stress = self._effective_stress(self._gradient(displacement))
+        stress = self._effective_stress(self.gradient(displacement))
         return self._with_springs(self._spread(stress), displacement)
 
     def residual(self, displacement: Tensor, force: Tensor) -> Tensor:
@@ -385,16 +385,16 @@ class Problem:
         """Return the entries of K = d f_int / du on `pattern`, (B, nnz) [-]."""
         if self.mean_dilatation:
             return self._with_spring_entries(self._entries(self._cell_tangents(displacement)))
-        moduli = self.material.tangent(self._gradient(displacement))
+        moduli = self.material.tangent(self.gradient(displacement))
         return self._with_spring_entries(self._assembled(moduli))
 
     def strain(self, displacement: Tensor) -> Tensor:
         """Return the Green-Lagrange strain at the quadrature points, (B, E, Q, 3, 3) [-]."""
-        return green_lagrange(self._gradient(displacement))
+        return green_lagrange(self.gradient(displacement))
 
     def bending(self, update: Tensor) -> Tensor:
         """Return what a step's strain is beyond linear, dH^T dH / 2, (B, E, Q, 3, 3) [-]."""
-        dH = self._gradient(update)
+        dH = self.gradient(update)
         return dH.mT @ dH / 2
 
     def mixed_system(self, displacement: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
@@ -406,7 +406,7 @@ class Problem:
 
         Source: Magisano, Leonetti, Garcea (2017), CMAME 313, section 3.
         """
-        H = self._gradient(displacement)
+        H = self.gradient(displacement)
         response = self.material.response(green_lagrange(H) - gap)
         stress = response.stress + response.product(gap)
         force = self._with_springs(self._spread(stress + H @ stress), displacement)
@@ -552,12 +552,12 @@ class Problem:
 
     def volume_ratio(self, displacement: Tensor) -> Tensor:
         """Return min det F over the quadrature points, (B,) [-]; not above 0: inverted."""
-        change = volume_change(self._gradient(displacement))
+        change = volume_change(self.gradient(displacement))
         return 1 + torch.nan_to_num(change, nan=-torch.inf).flatten(1).amin(dim=1)
 
     def stress(self, displacement: Tensor) -> Tensor:
         """Return the first Piola-Kirchhoff stress over E at the quadrature points, (B,E,Q,3,3)."""
-        H = self._gradient(displacement)
+        H = self.gradient(displacement)
         if self.mean_dilatation:
             H = dilated(self.material, H, self.dV, self.shape[1])
         return self.material.stress(H)
@@ -606,7 +606,7 @@ class Problem:
         operator = self.dN.transpose(1, 2).flatten(-2).contiguous()
         return operator[0] if self.equal_cells else operator
 
-    def _gradient(self, displacement: Tensor) -> Tensor:
+    def gradient(self, displacement: Tensor) -> Tensor:
         """Return H = du/dX, (B, E, Q, 3, 3) [-]; in 2D with zeros out of the plane."""
         return self._cell_gradient(displacement[:, self.cells].mT)
 

@@ -1,0 +1,27 @@
+"""The data set alone: python scripts/generate.py data.train=4000 data.workers=8."""
+
+import sys
+
+from omegaconf import DictConfig
+
+from dpl import run
+
+ACTIONS = ("generate", "verify", "repair")
+
+
+@run.command("generate")
+def main(cfg: DictConfig) -> None:
+    """Solve what is missing of a data set; or look whether it is sound; or make it so."""
+    run.check(cfg)
+    if cfg.action not in ACTIONS:
+        raise run.ConfigError(f"action = {cfg.action!r} must be one of {', '.join(ACTIONS)}")
+    scene = run.build_scene(cfg)
+    data = run.make(cfg, "data", scene=scene)
+    run.show_plan(scene, data)
+    if cfg.action == "verify":
+        flaws = list(data.verify())
+        print(data.store.summary())
+        print(*flaws, f"{len(flaws)} damaged files", sep="\n")
+        sys.exit(bool(flaws))
+    store = data.repair() if cfg.action == "repair" else data.fill()
+    print(store.summary())
