@@ -1,0 +1,84 @@
+"""Links between files of the repository as links between pages of the site."""
+
+import os
+import re
+from collections.abc import Callable, Collection
+from pathlib import PurePosixPath
+
+from paths import DOCS, INCLUDED, ROOT
+
+LINK = re.compile(r"(?P<mark>!?)\[(?P<text>[^\]]*)\]\((?P<target>[^)\s]+)\)")
+NAME = re.compile(r"(?<![\[`])`(?P<name>dpl(?:\.\w+)+)`(?![\]`])")
+ELSEWHERE = re.compile(r"[a-z]+:|#|//")
+PLACES = {"conf": "options.md", "results": "results.md", "scripts": "commands.md"}
+
+
+def outside_code(text: str, change: Callable[[str], str]) -> str:
+    """Return a text with what is no fenced block changed."""
+    parts = re.split(r"(^ *```.*?^ *``` *$)", text, flags=re.M | re.S)
+    return "".join(part if k % 2 else change(part) for k, part in enumerate(parts))
+
+
+def targets(text: str) -> list[str]:
+    """Return the relative targets of a text's links and images, without anchors."""
+    found: list[str] = []
+
+    def collect(part: str) -> str:
+        found.extend(
+            match["target"].partition("#")[0]
+            for match in LINK.finditer(part)
+            if not ELSEWHERE.match(match["target"])
+        )
+        return part
+
+    outside_code(text, collect)
+    return found
+
+
+def place(path: str) -> str | None:
+    """Return the page or file of the site that shows a path of the repository; None if none."""
+    for page, source in INCLUDED.items():
+        if path == source and (ROOT / source).is_file():
+            return page
+    pure = PurePosixPath(path)
+    if pure.parts[0] == "docs":
+        inside = pure.relative_to("docs")
+        return str(inside) if (DOCS / inside).is_file() else None
+    if pure.parts[0] == "results" and pure.suffix:
+        return path
+    if pure.parts[0] == "notebooks" and pure.suffix == ".ipynb":
+        return str(pure.with_suffix(".md"))
+    return PLACES.get(pure.parts[0])
+
+
+def rewritten(text: str, source: str, page: str) -> str:
+    """Return a text of the repository as it stands in the site.
+
+    Args:
+        text: Markdown.
+        source: Path of its file in the repository.
+        page: Path of its page in the site.
+    """
+    above, here = os.path.dirname(source), os.path.dirname(page) or "."
+
+    def link(match: re.Match) -> str:
+        target = match["target"]
+        if ELSEWHERE.match(target):
+            return match[0]
+        path, hash_, anchor = target.partition("#")
+        found = place(os.path.normpath(os.path.join(above, path)))
+        if found is None:
+            return match["text"]
+        return f"{match['mark']}[{match['text']}]({os.path.relpath(found, here)}{hash_}{anchor})"
+
+    return outside_code(text, lambda part: LINK.sub(link, part))
+
+
+def named(text: str, known: Collection[str]) -> str:
+    """Return a text in which names of the package, set as code, lead to their page."""
+
+    def link(match: re.Match) -> str:
+        name = match["name"]
+        return f"[{match[0]}][{name}]" if name in known else match[0]
+
+    return outside_code(text, lambda part: NAME.sub(link, part))
