@@ -13,10 +13,10 @@ import options
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
-from paths import CONF, DOCS, INCLUDED, NOTEBOOKS, PACKAGE, RESULTS, ROOT
+from paths import CONF, DOCS, GENERATED, INCLUDED, NOTEBOOKS, PACKAGE, RESULTS, ROOT
 
 HERE = Path(__file__).parent
-GENERATED = {"options.md": options.page, "commands.md": commands.page, "results.md": measured.page}
+MADE = dict(zip(GENERATED, (options.page, commands.page, measured.page), strict=True))
 
 
 def on_config(config: MkDocsConfig) -> None:
@@ -69,7 +69,7 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
     def add(path: str, content: str | bytes) -> None:
         files.append(File.generated(config, path, content=content))
 
-    for page, make in GENERATED.items():
+    for page, make in MADE.items():
         add(page, make())
     for page, source in INCLUDED.items():
         if (ROOT / source).is_file():
@@ -96,9 +96,16 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
         markdown = links.rewritten(markdown, str(source.relative_to(ROOT)), path)
     if path.startswith("api/"):
         return markdown
-    return links.named(markdown, modules.linkable())
+    return links.named(markdown, modules.anchor)
 
 
 def on_page_content(html: str, **_: Any) -> str:
     """Draw the formulas."""
     return formulas.mathml(html)
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """Put the font of the formulas beside them."""
+    site = Path(config.site_dir)
+    pages = "".join(path.read_text(encoding="utf-8") for path in site.rglob("*.html"))
+    (site / "math.woff").write_bytes(formulas.font(pages))

@@ -2,10 +2,10 @@
 
 import os
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from pathlib import PurePosixPath
 
-from paths import DOCS, INCLUDED, ROOT
+from paths import DOCS, GENERATED, INCLUDED, ROOT
 
 LINK = re.compile(r"(?P<mark>!?)\[(?P<text>[^\]]*)\]\((?P<target>[^)\s]+)\)")
 NAME = re.compile(r"(?<![\[`])`(?P<name>dpl(?:\.\w+)+)`(?![\]`])")
@@ -42,8 +42,10 @@ def place(path: str) -> str | None:
             return page
     pure = PurePosixPath(path)
     if pure.parts[0] == "docs":
-        inside = pure.relative_to("docs")
-        return str(inside) if (DOCS / inside).is_file() else None
+        inside = str(pure.relative_to("docs"))
+        if inside in GENERATED or (inside in INCLUDED and (ROOT / INCLUDED[inside]).is_file()):
+            return inside
+        return inside if (DOCS / inside).is_file() else None
     if pure.parts[0] == "results" and pure.suffix:
         return path
     if pure.parts[0] == "notebooks" and pure.suffix == ".ipynb":
@@ -74,11 +76,16 @@ def rewritten(text: str, source: str, page: str) -> str:
     return outside_code(text, lambda part: LINK.sub(link, part))
 
 
-def named(text: str, known: Collection[str]) -> str:
-    """Return a text in which names of the package, set as code, lead to their page."""
+def named(text: str, anchor: Callable[[str], str | None]) -> str:
+    """Return a text in which names of the package, set as code, lead to their page.
+
+    Args:
+        text: Markdown.
+        anchor: From a dotted name to what it is linked by.
+    """
 
     def link(match: re.Match) -> str:
-        name = match["name"]
-        return f"[{match[0]}][{name}]" if name in known else match[0]
+        found = anchor(match["name"])
+        return f"[{match[0]}][{found}]" if found else match[0]
 
     return outside_code(text, lambda part: NAME.sub(link, part))

@@ -41,7 +41,8 @@ class Part:
         title: Of the section; groups of the pattern may stand in it and in `command`.
         command: Makes them.
         about: What is seen.
-        split: Column whose values get a table each; the first is open, the others folded.
+        split: Column whose values get a table each.
+        opened: So many of these tables are open, the others folded.
         keep: Rows that are shown; the file has all.
     """
 
@@ -50,6 +51,7 @@ class Part:
     command: str
     about: str
     split: str | None = None
+    opened: int = 1
     keep: Callable[[list[Row]], list[Row]] = lambda rows: rows
 
 
@@ -83,6 +85,7 @@ PARTS = (
         "The paper's experiment 4: 50 loads in range, 50 of one to two times the range, one at a "
         "time on one thread.",
         split="tol",
+        opened=2,
     ),
     Part(
         "hybrid_newton_far",
@@ -164,6 +167,7 @@ def page() -> str:
     order = {part: k for k, part in enumerate(PARTS)}
     there.sort(key=lambda stem: (order[part_of(stem)[0]], stem))
     parts = [
+        "---\nhide: [navigation]\n---\n",
         "# Results\n",
         "Tables and figures are those of `results/`, read when this page was made. What they mean "
         "is told in the [read me](readme.md#what-was-measured). Times differ from machine to "
@@ -185,7 +189,7 @@ def section(stem: str) -> Iterator[str]:
     if (RESULTS / f"{stem}.png").is_file():
         yield f"![{part.title.format(*groups)}](results/{stem}.png)\n"
     if (RESULTS / f"{stem}.csv").is_file():
-        yield from tables(part.keep(read(stem)), part.split)
+        yield from tables(part.keep(read(stem)), part.split, part.opened)
 
 
 def _machine(stem: str) -> str:
@@ -200,7 +204,7 @@ def _fact(key: str, value: object) -> str:
     return f"{value} thread{'s' * (value != 1)}" if key == "threads" else str(value)
 
 
-def tables(rows: list[Row], split: str | None) -> Iterator[str]:
+def tables(rows: list[Row], split: str | None, opened: int = 1) -> Iterator[str]:
     """Yield tables: one, or one for each value of a column."""
     if split is None:
         yield from table(rows)
@@ -209,7 +213,7 @@ def tables(rows: list[Row], split: str | None) -> Iterator[str]:
     for k, value in enumerate(values):
         mine = [{c: x for c, x in row.items() if c != split} for row in rows if row[split] == value]
         name = f"{split} {value}" if split == "tol" and value else value or "the paper"
-        if k == 0:
+        if k < opened:
             yield f"**{name}**\n"
             yield from table(mine)
             continue

@@ -102,6 +102,14 @@ def summary(name: str) -> str:
     return found.docstring.value.split("\n")[0].replace("|", "\\|")
 
 
+def anchor(name: str) -> str | None:
+    """Return under which name a dotted name can be linked to; None if it cannot."""
+    if name in linkable():
+        return name
+    found = find(name)
+    return found.path if found is not None and found.path in linkable() else None
+
+
 @functools.cache
 def linkable() -> frozenset[str]:
     """Return the dotted names that pages of modules have an anchor for."""

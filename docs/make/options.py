@@ -82,7 +82,7 @@ def read(path: Path) -> Option:
     if node is not None:
         for key, value in node.value:
             if key.value == "defaults":
-                composed = [_source(item, text) for item in value.value]
+                composed = [_entry(item) for item in value.value]
                 rows.append(Row("defaults", ", ".join(composed), ""))
                 continue
             _collect(f"{prefix}.{key.value}" if prefix else key.value, key, value, text, rows)
@@ -95,7 +95,8 @@ def read(path: Path) -> Option:
 
 def _collect(path: str, key: yaml.Node, value: yaml.Node, text: str, rows: list[Row]) -> None:
     """Add the rows of a key and of all below it."""
-    comment = _comment(text.splitlines(), key.start_mark.line)
+    whole = isinstance(value, yaml.MappingNode) and not value.flow_style
+    comment = _comment(text, key if whole else value)
     if isinstance(value, yaml.MappingNode) and value.value:
         if comment:
             rows.append(Row(path, "", comment))
@@ -111,15 +112,23 @@ def _collect(path: str, key: yaml.Node, value: yaml.Node, text: str, rows: list[
         rows.append(Row(path, _source(value, text), comment))
 
 
+def _entry(item: yaml.Node) -> str:
+    """Return an entry of a defaults list."""
+    if isinstance(item, yaml.ScalarNode):
+        return str(item.value)
+    return ", ".join(f"{key.value}: {chosen.value}" for key, chosen in item.value)
+
+
 def _source(node: yaml.Node, text: str) -> str:
     return " ".join(text[node.start_mark.index : node.end_mark.index].split())
 
 
-def _comment(lines: list[str], number: int) -> str:
-    """Return the comment behind a key and on the lines of comment that follow."""
-    found = re.search(r"(?:^|\s)#\s*(.*)", re.sub(r"\"[^\"]*\"|'[^']*'", "", lines[number]))
+def _comment(text: str, node: yaml.Node) -> str:
+    """Return the comment behind a node and on the lines of comment that follow."""
+    behind, *below = text[node.end_mark.index :].split("\n")
+    found = re.search(r"(?:^|[\s:])#\s*(.*)", behind)
     parts = [found[1]] if found else []
-    for line in lines[number + 1 :]:
+    for line in below:
         if not parts or not line.lstrip().startswith("#"):
             break
         parts.append(line.strip().lstrip("#").strip())
@@ -171,20 +180,9 @@ def page() -> str:
 def body(option: Option) -> Iterator[str]:
     """Yield the lines of one file."""
     yield f"{code_links(option.about)}\n"
-    if option.calls:
-        calls = ", ".join(
-            f"{reference(target)} (`{key}`)" if key else reference(target)
-            for key, target in option.calls.items()
-        )
-        yield f"Calls {calls}.\n"
     yield from table(option.rows, option.calls)
     for key, target in option.calls.items():
         yield from _defaulted(option, key, target)
-
-
-def reference(name: str) -> str:
-    """Return a dotted name as code, linked where it has a page."""
-    return f"[`{name}`][{name}]" if name in modules.linkable() else f"`{name}`"
 
 
 def code_links(text: str) -> str:
@@ -204,7 +202,8 @@ def table(rows: list[Row], calls: dict[str, str]) -> Iterator[str]:
         if owner in calls and last not in ("_target_", "_partial_"):
             known = parameters(calls[owner]).get(last)
             if known is not None and known.about:
-                told = f"{told}{'. ' if told else ''}{known.about}"
+                new = told.lower() not in known.about.lower()
+                told = f"{told}. {known.about}" if told and new else known.about
         default = f"`{row.default}`".replace("|", "\\|") if row.default else ""
         yield f"| `{row.key}` | {default} | {told} |"
     yield ""

@@ -15,3 +15,5 @@ INCLUDED = {  # page of the site -> file of the repository
     "contributing.md": "CONTRIBUTING.md",
     "changelog.md": "CHANGELOG.md",
 }
+
+GENERATED = ("options.md", "commands.md", "results.md")  # pages that are made of what is there
