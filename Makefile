@@ -4,7 +4,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup train test lint slow docs clean
+.PHONY: setup train test lint slow docs wheel clean
 
 setup: .venv/installed
 
@@ -31,6 +31,9 @@ slow: setup
 docs: setup
 	$(BIN)/pip install --quiet -c constraints.txt -e '.[docs]'
 	NO_MKDOCS_2_WARNING=1 NOTEBOOKS=$(or $(NOTEBOOKS),true) $(BIN)/python -m mkdocs build --strict -f docs/make/mkdocs.yml
+
+wheel: setup
+	$(BIN)/pip wheel --quiet --no-deps -w dist .
 
 clean:
 	rm -rf .venv build dist site

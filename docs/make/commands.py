@@ -35,7 +35,8 @@ def commands() -> list[Command]:
             if not isinstance(node, ast.FunctionDef):
                 continue
             for mark in node.decorator_list:
-                if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "run.command":
+                name = ast.unparse(mark.func) if isinstance(mark, ast.Call) else ""
+                if name.rpartition(".")[2] == "command":
                     about, does = ast.get_docstring(tree) or "", ast.get_docstring(node) or ""
                     found.append(Command(path.stem, about, does, mark.args[0].value))
     return found

@@ -9,7 +9,9 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+from mkdocs.exceptions import PluginError
 from paths import CONF, NOTEBOOKS, PACKAGE, ROOT
 
 CACHE = ROOT / ".cache" / "notebooks"
@@ -40,7 +42,7 @@ def pages(*, execute: bool) -> Iterator[tuple[str, str | bytes]]:
         execute: Otherwise they are shown as they lie there.
 
     Raises:
-        nbclient.exceptions.CellExecutionError: A cell fails.
+        PluginError: A cell fails.
     """
     import nbformat
     from nbconvert import MarkdownExporter
@@ -58,18 +60,28 @@ def pages(*, execute: bool) -> Iterator[tuple[str, str | bytes]]:
             yield f"notebooks/{name}", content
 
 
-def run(path: Path) -> "object":
-    """Return a notebook with its outputs."""
+def run(path: Path) -> Any:
+    """Return a notebook with its outputs.
+
+    Raises:
+        PluginError: A cell fails.
+    """
     import nbformat
     from nbclient import NotebookClient
+    from nbclient.exceptions import CellExecutionError
 
     kept = CACHE / f"{path.stem}-{digest(path)}.ipynb"
     if kept.is_file():
         return nbformat.read(kept, as_version=4)
     notebook = nbformat.read(path, as_version=4)
     os.environ.setdefault("PYTHONPATH", str(ROOT))
+    os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"  # figures as outputs
     work = {"metadata": {"path": str(NOTEBOOKS)}}
-    NotebookClient(notebook, timeout=LONGEST, kernel_name="python3", resources=work).execute()
+    client = NotebookClient(notebook, timeout=LONGEST, kernel_name="python3", resources=work)
+    try:
+        client.execute()
+    except CellExecutionError as error:
+        raise PluginError(f"{path.name}: {ANSI.sub('', str(error))}") from error
     CACHE.mkdir(parents=True, exist_ok=True)
     for old in CACHE.glob(f"{path.stem}-*.ipynb"):
         old.unlink()

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable
 from pathlib import PurePosixPath
 
-from paths import DOCS, GENERATED, INCLUDED, ROOT
+from paths import DOCS, GENERATED, INCLUDED, NOTEBOOKS, ROOT
 
 LINK = re.compile(r"(?P<mark>!?)\[(?P<text>[^\]]*)\]\((?P<target>[^)\s]+)\)")
 NAME = re.compile(r"(?<![\[`])`(?P<name>dpl(?:\.\w+)+)`(?![\]`])")
@@ -48,8 +48,9 @@ def place(path: str) -> str | None:
         return inside if (DOCS / inside).is_file() else None
     if pure.parts[0] == "results" and pure.suffix:
         return path
-    if pure.parts[0] == "notebooks" and pure.suffix == ".ipynb":
-        return str(pure.with_suffix(".md"))
+    if pure.parts[0] == "notebooks":
+        found = ROOT / path if pure.suffix else next(iter(sorted(NOTEBOOKS.glob("*.ipynb"))), ROOT)
+        return f"notebooks/{found.stem}.md" if found.is_file() else None
     return PLACES.get(pure.parts[0])
 
 

@@ -170,7 +170,7 @@ def page() -> str:
         "---\nhide: [navigation]\n---\n",
         "# Results\n",
         "Tables and figures are those of `results/`, read when this page was made. What they mean "
-        "is told in the [read me](readme.md#what-was-measured). Times differ from machine to "
+        "is told in [Measurements](measurements.md). Times differ from machine to "
         "machine.\n",
     ]
     for stem in there:
