@@ -29,7 +29,6 @@ slow: setup
 	$(BIN)/python -m pytest -m 'slow and not gpu' --timeout 1800
 
 docs: setup
-	$(BIN)/pip install --quiet -c constraints.txt -e '.[docs]'
 	NO_MKDOCS_2_WARNING=1 NOTEBOOKS=$(or $(NOTEBOOKS),true) $(BIN)/python -m mkdocs build --strict -f docs/make/mkdocs.yml
 
 wheel: setup

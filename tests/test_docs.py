@@ -26,7 +26,6 @@ BLOCK = re.compile(r"^```(python|yaml)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.
 @pytest.fixture
 def make(monkeypatch):
     """Imports a module of docs/make."""
-    pytest.importorskip("griffe", reason="needs the extra docs")
     monkeypatch.syspath_prepend(str(MAKE))
     return importlib.import_module
 
@@ -162,7 +161,6 @@ def test_a_number_that_is_shown_is_the_one_in_the_file_to_two_digits(make, text)
 
 
 def test_formulas_become_mathml_with_their_number(make):
-    pytest.importorskip("latex2mathml")
     html = r'<div class="arithmatex">\[ \frac{a}{b} &lt; 1 \tag{7} \]</div>'
     drawn = make("formulas").mathml(html)
     assert "<mfrac>" in drawn
@@ -234,10 +232,7 @@ def test_python_and_yaml_that_are_shown_can_be_read():
             ast.parse(text) if kind == "python" else yaml.safe_load(text)
 
 
-@pytest.mark.slow
 def test_the_site_is_made_without_a_warning_and_asks_no_other_host_for_anything(tmp_path):
-    pytest.importorskip("mkdocs")
-    pytest.importorskip("material")
     site = tmp_path / "site"
     build = ["build", "--strict", "-f", MAKE / "mkdocs.yml", "-d", site]
     told = subprocess.run(
