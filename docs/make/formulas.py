@@ -12,6 +12,7 @@ MARKED = re.compile(
     r'<(span|div) class="arithmatex">(?:\\\((?P<inline>.*?)\\\)|\\\[(?P<block>.*?)\\\])</\1>', re.S
 )
 TAG = re.compile(r"\\tag\{(.*?)\}")
+BAR = re.compile(r"<mo[^>]*>(&#x0?2016;|&#x0*7C;)</mo>")  # of norms: as high as letters
 ITALIC = [0x210E, *range(0x1D434, 0x1D468), *range(0x1D6E2, 0x1D71C)]  # what single letters become
 
 
@@ -22,12 +23,16 @@ def mathml(text: str) -> str:
 
 def _drawn(match: re.Match) -> str:
     if match["inline"] is not None:
-        return convert(html.unescape(match["inline"]))
-    source = html.unescape(match["block"]).strip()
-    tag = TAG.search(source)
-    drawn = convert(TAG.sub("", source), display="block")
+        return _converted(match["inline"])
+    tag = TAG.search(match["block"])
+    drawn = _converted(TAG.sub("", match["block"]), display="block")
     number = f'<span class="tag">({tag[1]})</span>' if tag else ""
     return f'<div class="formula">{drawn}{number}</div>'
+
+
+def _converted(source: str, **options: str) -> str:
+    drawn = convert(html.unescape(source).strip(), **options)
+    return BAR.sub(r'<mo stretchy="false">\1</mo>', drawn)
 
 
 def font(pages: str) -> bytes:

@@ -99,8 +99,10 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     return links.named(markdown, modules.anchor)
 
 
-def on_page_content(html: str, **_: Any) -> str:
-    """Draw the formulas."""
+def on_page_content(html: str, page: Page, **_: Any) -> str:
+    """Draw the formulas; let names in docstrings lead to theirs."""
+    if page.file.src_uri.startswith("api/"):
+        return links.named_in_html(html, modules.anchor)
     return formulas.mathml(html)
 
 

@@ -9,6 +9,7 @@ from paths import DOCS, GENERATED, INCLUDED, NOTEBOOKS, ROOT
 
 LINK = re.compile(r"(?P<mark>!?)\[(?P<text>[^\]]*)\]\((?P<target>[^)\s]+)\)")
 NAME = re.compile(r"(?<![\[`])`(?P<name>dpl(?:\.\w+)+)`(?![\]`])")
+MADE = re.compile(r"(?P<linked><(?:autoref|a) [^>]*>)?<code>(?P<name>dpl(?:\.\w+)+)</code>")
 ELSEWHERE = re.compile(r"[a-z]+:|#|//")
 PLACES = {"conf": "options.md", "results": "results.md", "scripts": "commands.md"}
 
@@ -90,3 +91,13 @@ def named(text: str, anchor: Callable[[str], str | None]) -> str:
         return f"[{match[0]}][{found}]" if found else match[0]
 
     return outside_code(text, lambda part: NAME.sub(link, part))
+
+
+def named_in_html(text: str, anchor: Callable[[str], str | None]) -> str:
+    """Return what `named` does, of a page of docstrings."""
+
+    def link(match: re.Match) -> str:
+        found = None if match["linked"] else anchor(match["name"])
+        return f'<autoref identifier="{found}">{match[0]}</autoref>' if found else match[0]
+
+    return MADE.sub(link, text)
