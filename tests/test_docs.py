@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import hydra
+import nbformat
 import pytest
 import yaml
 from hydra.core.global_hydra import GlobalHydra
@@ -161,11 +162,13 @@ def test_a_number_that_is_shown_is_the_one_in_the_file_to_two_digits(make, text)
 
 
 def test_formulas_become_mathml_with_their_number(make):
-    html = r'<div class="arithmatex">\[ \frac{a}{b} &lt; 1 \tag{7} \]</div>'
+    html = r'<div class="arithmatex">\[ \frac{\lVert a \rVert}{\ln b} &lt; 1 \tag{7} \]</div>'
     drawn = make("formulas").mathml(html)
     assert "<mfrac>" in drawn
+    assert drawn.count('<mo stretchy="false">&#x02016;</mo>') == 2
+    assert '<mo lspace="0.17em" rspace="0.17em">ln</mo>' in drawn
     assert "&lt;" in drawn or "&#x0003C;" in drawn
-    assert '<span class="tag">(7)</span>' in drawn or ">7<" in drawn
+    assert '<span class="tag">(7)</span></div>' in drawn
     assert "tag{" not in drawn
 
 
@@ -195,6 +198,27 @@ def test_links_out_of_docs_lead_to_pages_of_the_site(make):
     assert rewritten(text, "README.md", "readme.md") == (
         "[x](data.md) and [y](https://a.b/c)\n```\n[z](docs/no.md)\n```"
     )
+
+
+def test_a_notebook_is_executed_once_and_shown_with_its_figures(make, tmp_path, monkeypatch):
+    executed, links = make("executed"), make("links")
+    code = "import matplotlib.pyplot as plt\nplt.plot([1, 2])\nprint('\\x1b[31m40\\x1b[0m', 40 + 2)"
+    cells = [nbformat.v4.new_markdown_cell("# A trial"), nbformat.v4.new_code_cell(code)]
+    nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "1_trial.ipynb")
+    monkeypatch.setattr(executed, "NOTEBOOKS", tmp_path)
+    monkeypatch.setattr(executed, "CACHE", tmp_path / "cache")
+    assert executed.title(executed.paths()[0]) == "A trial"
+    (path, text), (figure, content) = executed.pages(execute=True)
+    assert path == "notebooks/1_trial.md"
+    assert "40 42" in text
+    shown = links.rewritten(text, "notebooks/1_trial.ipynb", path)
+    assert f"({figure.removeprefix('notebooks/')})" in shown
+    assert content.startswith(b"\x89PNG")
+    monkeypatch.setattr("nbclient.NotebookClient.execute", None)
+    assert dict(executed.pages(execute=True))[path] == text
+    bare = dict(executed.pages(execute=False))
+    assert list(bare) == [path]
+    assert "40 42" not in bare[path]
 
 
 def test_the_parts_of_the_page_on_adding_things_work(blocks, monkeypatch):

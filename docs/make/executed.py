@@ -7,6 +7,7 @@ package, so that a site made again executes what has changed.
 import hashlib
 import os
 import re
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -76,12 +77,13 @@ def run(path: Path) -> Any:
     notebook = nbformat.read(path, as_version=4)
     os.environ.setdefault("PYTHONPATH", str(ROOT))
     os.environ["MPLBACKEND"] = "module://matplotlib_inline.backend_inline"  # figures as outputs
-    work = {"metadata": {"path": str(NOTEBOOKS)}}
-    client = NotebookClient(notebook, timeout=LONGEST, kernel_name="python3", resources=work)
-    try:
-        client.execute()
-    except CellExecutionError as error:
-        raise PluginError(f"{path.name}: {ANSI.sub('', str(error))}") from error
+    with tempfile.TemporaryDirectory() as folder:
+        work = {"metadata": {"path": folder}}
+        client = NotebookClient(notebook, timeout=LONGEST, kernel_name="python3", resources=work)
+        try:
+            client.execute()
+        except CellExecutionError as error:
+            raise PluginError(f"{path.name}: {ANSI.sub('', str(error))}") from error
     CACHE.mkdir(parents=True, exist_ok=True)
     for old in CACHE.glob(f"{path.stem}-*.ipynb"):
         old.unlink()

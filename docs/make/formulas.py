@@ -13,6 +13,7 @@ MARKED = re.compile(
 )
 TAG = re.compile(r"\\tag\{(.*?)\}")
 BAR = re.compile(r"<mo[^>]*>(&#x0?2016;|&#x0*7C;)</mo>")  # of norms: as high as letters
+NAME = re.compile(r"<m[io]>(ln|log|exp|sin|cos|tan|det|min|max)</m[io]>")  # with space around
 ITALIC = [0x210E, *range(0x1D434, 0x1D468), *range(0x1D6E2, 0x1D71C)]  # what single letters become
 
 
@@ -32,7 +33,8 @@ def _drawn(match: re.Match) -> str:
 
 def _converted(source: str, **options: str) -> str:
     drawn = convert(html.unescape(source).strip(), **options)
-    return BAR.sub(r'<mo stretchy="false">\1</mo>', drawn)
+    drawn = BAR.sub(r'<mo stretchy="false">\1</mo>', drawn)
+    return NAME.sub(r'<mo lspace="0.17em" rspace="0.17em">\1</mo>', drawn)
 
 
 def font(pages: str) -> bytes:

@@ -50,8 +50,12 @@ def place(path: str) -> str | None:
     if pure.parts[0] == "results" and pure.suffix:
         return path
     if pure.parts[0] == "notebooks":
-        found = ROOT / path if pure.suffix else next(iter(sorted(NOTEBOOKS.glob("*.ipynb"))), ROOT)
-        return f"notebooks/{found.stem}.md" if found.is_file() else None
+        if pure.parent.name.endswith("_files"):  # figures, see `executed.pages`
+            return path
+        there = sorted(NOTEBOOKS.glob("*.ipynb"))
+        named = [one for one in there if one.name == pure.name]
+        first = there[:1] if pure.suffix != ".ipynb" else []
+        return f"notebooks/{(named or first)[0].stem}.md" if named or first else None
     return PLACES.get(pure.parts[0])
 
 
