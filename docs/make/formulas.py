@@ -33,7 +33,7 @@ def _drawn(match: re.Match) -> str:
 
 def _converted(source: str, **options: str) -> str:
     drawn = convert(html.unescape(source).strip(), **options)
-    drawn = BAR.sub(r'<mo stretchy="false">\1</mo>', drawn)
+    drawn = BAR.sub(r'<mo stretchy="false" lspace="0" rspace="0">\1</mo>', drawn)
     return NAME.sub(r'<mo lspace="0.17em" rspace="0.17em">\1</mo>', drawn)
 
 
