@@ -15,8 +15,9 @@ from torch import Tensor
 
 from dpl.benchmarks.clock import in_turn
 from dpl.fem.accelerated import Accelerated
+from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear import SingularMatrix
-from dpl.fem.newton import Newton, gather, scatter
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, Solver, in_step, judge, one_thread
 from dpl.hybrid import Hybrid, Predict

@@ -14,11 +14,12 @@ import numpy as np
 import torch
 
 from dpl.benchmarks.meshes import BEAM, YOUNG
+from dpl.fem.compliance import Linear
 from dpl.fem.linear import chosen
 from dpl.fem.materials import NeoHookeanLn
 from dpl.fem.mesh import Plane, box
 from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, one_thread, solve
 from dpl.losses import MSE

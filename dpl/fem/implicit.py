@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear import Backend, Factor, backend
-from dpl.fem.newton import Newton, gather, scatter
+from dpl.fem.newton import Newton
 from dpl.fem.solution import Load, Solution, Status
 
 

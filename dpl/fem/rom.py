@@ -13,11 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpl.fem.compliance import Linear
 from dpl.fem.cubature import Cells, Cubature, cubature, whitening
-from dpl.fem.newton import Linear, check_steps, gather, scatter
+from dpl.fem.dofs import gather, scatter
 from dpl.fem.pod import pod
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, judge
+from dpl.fem.solution import Load, Solution, check_steps, judge
 
 LIFT = 1e-6  # residual ratio to which the linear answer is found where the subspace adds to it
 

@@ -12,11 +12,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import Traction
 from dpl.fem.linear import BACKENDS, SuperLU, installed
 from dpl.fem.materials import Hookean, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, Status, judge, solve
 

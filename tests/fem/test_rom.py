@@ -9,11 +9,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from dpl.fem.compliance import Linear
 from dpl.fem.cubature import Cubature, nonnegative
 from dpl.fem.materials import LinearElastic, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box
 from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.pod import pod
 from dpl.fem.problem import Problem
 from dpl.fem.rom import PODGalerkin
