@@ -263,9 +263,9 @@ def test_no_cell_is_needed_by_a_linear_law(beam, pull):
 def test_forces_of_weighted_cells_have_an_energy(newton, snapshots):
     """The reduced tangent is the slope of the reduced force, and symmetric."""
     solver = PODGalerkin.fit(newton.problem, snapshots, 6, tolerance=1e-2)
-    task = solver._task(torch.zeros(newton.problem.shape, dtype=torch.float64))
+    task = solver._model.task(torch.zeros(newton.problem.shape, dtype=torch.float64))
     y, way = 3e-3 * noise(6), noise(6, seed=1)
-    at, ahead, back = (solver._state(task, y + h * way, 0.0) for h in (0.0, 1e-6, -1e-6))
+    at, ahead, back = (solver._model.state(task, y + h * way, 0.0) for h in (0.0, 1e-6, -1e-6))
     cells, rest = solver._model.cells, solver._model.rest
 
     def energy(state):
@@ -283,9 +283,9 @@ def test_small_strains_are_those_of_the_identity(newton, snapshots):
     """K(0) is the identity in the coordinates that the steps are taken in, cells or not."""
     for tolerance in (None, 1e-2):
         solver = PODGalerkin.fit(newton.problem, snapshots, 6, tolerance=tolerance)
-        task = solver._task(torch.zeros(newton.problem.shape, dtype=torch.float64))
+        task = solver._model.task(torch.zeros(newton.problem.shape, dtype=torch.float64))
         y = 1e-9 * noise(6)
-        assert_close(solver._state(task, y, 0.0).internal, y, rtol=1e-5, atol=1e-15)
+        assert_close(solver._model.state(task, y, 0.0).internal, y, rtol=1e-5, atol=1e-15)
 
 
 @pytest.mark.parametrize("lifted", [False, True])
