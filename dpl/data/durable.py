@@ -45,6 +45,21 @@ def whole_file(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
         sync_folder(path.parent)
 
 
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file of a data set, whole or not at all.
+
+    Raises:
+        DataSetError: A folder is in its place.
+    """
+    try:
+        with whole_file(path) as file:
+            file.write(content)
+    except IsADirectoryError:
+        raise DataSetError(
+            f"{path} is a folder where a file must be; remove it or choose another data.folder"
+        ) from None
+
+
 def sync_folder(path: Path) -> None:
     """Make what was renamed or removed in a folder survive a crash of the machine."""
     folder = os.open(path, os.O_RDONLY)
