@@ -144,7 +144,7 @@ def test_a_law_that_is_its_energy_alone_has_batches_too(make_scene):
 def test_nothing_is_compiled_or_analysed_again(wide, monkeypatch):
     loads = wide.loads.sample((0, 0), range(6))
     solve(wide.solver, Load(*(column[:1] for column in loads)))
-    monkeypatch.setattr("dpl.fem.problem.Pattern.build", None)
+    monkeypatch.setattr("dpl.fem.pattern.Pattern.build", None)
     monkeypatch.setattr("dpl.fem.compliance.backend", None)
     monkeypatch.setattr("dpl.fem.problem.Kernels.__init__", None)
     monkeypatch.setattr("dpl.fem.kernels._alone", None)

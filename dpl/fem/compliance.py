@@ -110,6 +110,6 @@ def kept(twins: dict[Problem, Twin], problem: Problem, make: Callable[[Problem],
 
 def backend_of(problem: Problem, name: str, *, lasting: bool = False) -> Backend:
     """Return the backend for a problem's tangents, or for one whose factor answers many loads."""
-    motions = problem.rigid_motions()[0][problem.free].numpy()
+    motions = problem.near_null
     best = chosen(name, problem.pattern, motions, lasting=lasting)
     return backend(problem.pattern, best, motions)

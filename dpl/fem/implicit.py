@@ -82,8 +82,7 @@ class Equilibrium:
     @cached_property
     def _backend(self) -> Backend:
         problem = self.newton.problem
-        motions = problem.rigid_motions()[0][problem.free].numpy()
-        return backend(problem.pattern, self.newton.linear, motions)
+        return backend(problem.pattern, self.newton.linear, problem.near_null)
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle without what the backend has analysed."""

@@ -58,7 +58,7 @@ def backend(pattern: Pattern, name: str = "auto", near_null: Array | None = None
     Args:
         pattern: Structure of the matrices.
         name: "band", "band32", "pardiso", "superlu", "cg", or "auto", see `chosen`.
-        near_null: Fields that cost no energy, (n, k), see `Problem.rigid_motions`; "cg" wants them.
+        near_null: Fields that cost no energy, (n, k), see `Body.near_null`; "cg" wants them.
 
     Raises:
         ValueError: No such backend, or it is not installed.
@@ -81,7 +81,7 @@ def chosen(
     Args:
         name: As for `backend`.
         pattern: Structure of the matrices.
-        near_null: Fields that cost no energy, (n, k), see `Problem.rigid_motions`.
+        near_null: Fields that cost no energy, (n, k), see `Body.near_null`.
         lasting: One factor is to answer many right-hand sides: it may cost more if they cost less.
 
     Raises:

@@ -453,9 +453,9 @@ def test_parts_made_by_several_writers_are_the_same_samples(scene, tmp_path, mon
 def test_a_second_writer_of_the_whole_or_of_the_same_part_is_refused(fresh):
     running = Writer(fresh, 0, 2).fill({"train": range(12)}, workers=0)
     next(running)
-    for part in ({}, {"shard": 0, "shards": 2}, {"shard": 1, "shards": 3}):
+    for part in ((), (0, 2), (1, 3)):
         with pytest.raises(DataSetError, match=f"process {os.getpid()} on "):
-            fill(fresh, {"train": range(12)}, **part)
+            next(Writer(fresh, *part).fill({"train": range(12)}, workers=0))
     with pytest.raises(DataSetError, match=f"process {os.getpid()} on "):
         repair(fresh)
     running.close()

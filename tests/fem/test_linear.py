@@ -81,7 +81,7 @@ def system(problem: Problem) -> System:
 
 
 def motions(problem: Problem) -> np.ndarray:
-    return problem.rigid_motions()[0][problem.free].numpy()
+    return problem.near_null
 
 
 @pytest.fixture(scope="module")
