@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-LARGE = 2.0**28  # bytes of a text of a data set
+TEXT = 2.0**28  # bytes of one in a data set, at most
 
 
 class DataSetError(ValueError):
@@ -76,7 +76,7 @@ def append_line(path: Path, line: dict[str, Any]) -> None:
         DataSetError: The file is a link, a folder or a device, or far too large.
     """
     with suppress(FileNotFoundError):
-        _refuse_foreign(path, LARGE)
+        _refuse_foreign(path, TEXT)
     with path.open("ab+", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - 1))
@@ -91,7 +91,7 @@ def append_line(path: Path, line: dict[str, Any]) -> None:
             raise
 
 
-def own_file(path: Path, most: float = LARGE) -> bytes:
+def own_file(path: Path, most: float = TEXT) -> bytes:
     """Return the content of a file of a data set.
 
     Raises:

@@ -97,7 +97,7 @@ def chosen(
 # Measured on beams, cubes, stars, plates of 1,000 to 100,000 degrees of freedom: a band costs n b^2
 # operations, a sparse factor of a solid about n^2 slower ones, so b^2 / n decides.
 PAYS = {"pardiso": 22, "superlu": 100, "cg": 10}  # b^2 / n below which a band is faster
-LARGE = {"pardiso": 100_000, "superlu": 30_000}  # n from which on multigrid is faster
+MULTIGRID = {"pardiso": 100_000, "superlu": 30_000}  # n from which on multigrid is faster
 LASTING = 3.0  # times that where one factor answers many right-hand sides: it must fit in memory
 WIDE = 250  # b from which on float32 saves more than the iterations on it cost
 
@@ -106,7 +106,7 @@ def _automatic(pattern: Pattern, near_null: Array | None, lasting: bool) -> str:
     names = installed()
     sparse = "pardiso" if "pardiso" in names else "superlu"
     multigrid = "cg" in names and near_null is not None and multigrid_installed()
-    large = LARGE[sparse] * (LASTING if lasting else 1)
+    large = MULTIGRID[sparse] * (LASTING if lasting else 1)
     best = "cg" if multigrid and pattern.size > large else sparse
     if "band" in names:
         half = band_layout(pattern).half

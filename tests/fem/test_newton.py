@@ -433,19 +433,6 @@ def test_unknown_backend_is_an_error(beam, pull):
         solve(newton(problem, linear="umfpack"), load_of(pull(problem, 1.0)))
 
 
-@pytest.fixture
-def counted(monkeypatch) -> list[int]:
-    """A list that grows by one with each factorisation."""
-    calls, factorise = [], SuperLU.factorise
-
-    def count(self, values):
-        calls.append(len(values))
-        return factorise(self, values)
-
-    monkeypatch.setattr(SuperLU, "factorise", count)
-    return calls
-
-
 def test_rest_state_is_factorised_once_for_all_loads(law, beam, pull, counted):
     """VERIFICATION 2.3; the factor of the rest state is the scene's, not the load's."""
     problem = beam(law)

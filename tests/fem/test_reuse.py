@@ -153,19 +153,6 @@ def test_more_reuse_means_fewer_factors(beam, pull, reuse):
     assert answer.factorisations.item() == counts[reuse]
 
 
-@pytest.fixture
-def counted(monkeypatch) -> list[int]:
-    """A list that grows by one with each factorisation."""
-    calls, factorise = [], SuperLU.factorise
-
-    def count(self, values):
-        calls.append(len(values))
-        return factorise(self, values)
-
-    monkeypatch.setattr(SuperLU, "factorise", count)
-    return calls
-
-
 @pytest.mark.parametrize("q", [5.0, 40.0, 160.0])
 def test_factors_are_counted_as_they_are_made(beam, pull, counted, q):
     problem = beam(NH)
