@@ -508,7 +508,8 @@ def test_an_error_in_writing_ends_the_workers_even_while_it_is_held(fresh, monke
 
 def test_a_data_set_of_another_scene_is_refused_naming_both_fingerprints(copy, make_scene):
     other = Store(copy.folder, make_scene(poisson=0.31), 0)
-    for use in (lambda: fill(other, WANTED), other.shards, other.repair, other.create):
+    uses = lambda: fill(other, WANTED), other.shards, lambda: repair(other), Writer(other).create
+    for use in uses:
         with pytest.raises(DataSetError) as refusal:
             use()
         assert copy.scene.fingerprint[:12] in str(refusal.value)
