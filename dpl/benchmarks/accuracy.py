@@ -171,10 +171,12 @@ def draw(
             color="0.55", ls=":", marker=marker, ms=5, mfc="none",
             label=f"Newton, {name} meshes, against\nthe limit (degrees of freedom)",
         )  # fmt: skip
-        away = {"textcoords": "offset points", "xytext": (4, 4 if degree == 1 else -10)}
+        away = 4, 4 if degree == 1 else -10
         for mesh in family:
-            at = mesh.ms, mesh.error
-            ax.annotate(f"{mesh.dofs:,}", at, fontsize=7, color="0.4", **away)
+            ax.annotate(
+                f"{mesh.dofs:,}", (mesh.ms, mesh.error), fontsize=7, color="0.4",
+                textcoords="offset points", xytext=away,
+            )  # fmt: skip
     if floor is not None:
         ax.axhline(floor, color="0.3", ls="--", lw=1)
         ax.annotate(
