@@ -11,7 +11,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from dpl.fem.newton import Newton, gather
+from dpl.fem.dofs import gather
+from dpl.fem.newton import Newton
 from dpl.fem.solution import Load, Solution, Status, joined, judge, one_thread
 from dpl.hybrid import best
 from dpl.models.pod import PODNet
