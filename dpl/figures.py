@@ -1,17 +1,14 @@
-"""Pictures of deformed bodies."""
+"""Pictures of deformed bodies and of how wrong they are."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import lightning as L
 import numpy as np
 import skfem
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.problem import Problem
-from dpl.scene import Sample
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,6 +48,7 @@ def deformed(
     predictions: Sequence[tuple[str, Tensor]],
     *,
     names: Sequence[str] = (),
+    most: int | None = None,
 ) -> "Figure":
     """Return a figure of deformed bodies coloured by the distance from where nodes should be.
 
@@ -59,18 +57,22 @@ def deformed(
     Args:
         problem: The body.
         truth: (B, N, D) [-].
-        predictions: Named, (B, N, D) [-] each.
+        predictions: Named, (B, N, D) [-] each; one alone needs no name.
         names: Titles of the loads.
+        most: Polygons of a body, see `coarse`; all if left out.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
     polygons, points = surface(problem.mesh), problem.points.cpu().numpy()
+    polygons = coarse(points, polygons, most) if most else polygons
     right = truth.detach().cpu().numpy()
     fields = [(name, field.detach().cpu().numpy()) for name, field in predictions]
     columns, dim = len(right), points.shape[1]
-    figure = Figure(figsize=(3.6 * columns + 1.2, 2.2 * len(fields) + 0.4), layout="constrained")
+    more = max((name.count("\n") for name in names), default=0)
+    height = 2.2 * len(fields) + 0.4 + 0.2 * more
+    figure = Figure(figsize=(3.6 * columns + 1.2, height), layout="constrained")
     axes = figure.subplots(
         len(fields), columns, squeeze=False, subplot_kw={"projection": "3d"} if dim == 3 else {}
     )
@@ -89,8 +91,8 @@ def deformed(
             _draw(ax, true, facecolors="none", edgecolors="0.4", linewidths=0.3)
             _frame(ax, seen)
             title = [names[column]] if row == 0 and names else []
-            ax.set_title("\n".join([*title, name]), fontsize=9)
-    figure.colorbar(scale, ax=axes, label="distance from the true position / L", shrink=0.8)
+            ax.set_title("\n".join(filter(None, [*title, name])), fontsize=9)
+    figure.colorbar(scale, ax=axes, label="distance from truth / L", shrink=0.8)
     return figure
 
 
@@ -118,36 +120,89 @@ def _frame(ax: Any, points: NDArray[np.float64]) -> None:
     ax.set_axis_off()
 
 
-class DeformedShapes(L.Callback):
-    """Puts pictures of predicted against true shapes into TensorBoard."""
+def spread(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "Figure":
+    """Return a figure of errors: against the size of the answer, and how many loads are below each.
 
-    def __init__(self, *, every: int = 20, loads: int = 3) -> None:
-        """Choose how often and how much.
+    Loads without a finite error are left out and counted in the title.
 
-        Args:
-            every: Validations between pictures.
-            loads: Validation loads shown.
-        """
-        self.every, self.loads, self._seen = every, loads, 0
+    Args:
+        relative: Relative L2 errors, (B,) [-].
+        size: Largest true displacement of each load over L, (B,) [-].
+        marked: Loads to be named.
+    """
+    from matplotlib.figure import Figure
 
-    def on_validation_epoch_end(self, trainer: L.Trainer, module: Any) -> None:
-        """Draw after every so many validations."""
-        if trainer.sanity_checking:
-            return
-        self._seen += 1
-        if self._seen % self.every == 0:
-            self._draw(trainer, module)
+    figure = Figure(figsize=(9.0, 3.4))
+    # by hand: a layout that is computed takes longer than all the rest
+    figure.subplots_adjust(left=0.08, right=0.98, bottom=0.16, top=0.9, wspace=0.06)
+    left, right = figure.subplots(1, 2, sharey=True)
+    error, amplitude = relative.cpu().numpy(), size.cpu().numpy()
+    finite = np.isfinite(error)
+    error = np.maximum(error, 1e-16)
+    left.scatter(amplitude[finite], error[finite], s=12, alpha=0.6, edgecolors="none")
+    for load in marked:
+        if finite[load]:
+            spot = amplitude[load], error[load]
+            left.plot(*spot, "o", color="C3", markersize=7, fillstyle="none")
+            left.annotate(f" {load}", spot, fontsize=8, color="C3", va="bottom")
+    left.set(xscale="log", yscale="log", xlabel="largest displacement / L")
+    left.set_ylabel("relative L2 error")
+    part = np.arange(1, len(error) + 1) / len(error)
+    right.step(part[: finite.sum()], np.sort(error[finite]), where="pre")
+    for quantile in (0.5, 0.9, 0.99):
+        right.axvline(quantile, color="0.8", linewidth=0.8, zorder=0)
+    right.set(xlim=(0, 1), xlabel="part of the loads with this error or less")
+    missing = int((~finite).sum())
+    for ax in (left, right):
+        ax.grid(visible=True, axis="y", linewidth=0.4)
+        ax.minorticks_off()  # which take as long as the rest
+    title = f"{len(error)} validation loads"
+    figure.suptitle(title + (f", {missing} of them without a finite error" if missing else ""))
+    return figure
 
-    def on_fit_end(self, trainer: L.Trainer, module: Any) -> None:
-        """Draw the last state."""
-        self._draw(trainer, module)
 
-    def _draw(self, trainer: L.Trainer, module: Any) -> None:
-        if not hasattr(getattr(trainer.logger, "experiment", None), "add_figure"):
-            return
-        some = trainer.datamodule.samples("val")
-        batch = Sample(*(column[: self.loads].to(module.device) for column in some))
-        with torch.no_grad():
-            prediction = module.predict(batch.load)
-        figure = deformed(module.scene.problem, batch.displacement, [("network", prediction)])
-        trainer.logger.experiment.add_figure("deformed shapes", figure, trainer.global_step)
+def coarse(points: NDArray[Any], polygons: NDArray[np.int_], most: int) -> NDArray[np.int_]:
+    """Return no more than so many polygons (P, corners) on some of the same points.
+
+    Points in one cell of a grid become one of them; polygons that fall together go. The grid is
+    the finest of those that halve their spacing.
+
+    Source: Rossignac, Borrel (1993), Multi-resolution 3D approximations for rendering complex
+    scenes, for clusters of vertices.
+
+    Args:
+        points: (N, D).
+        polygons: Of indices of points.
+        most: 1 or more.
+    """
+    span = np.ptp(points, axis=0).max()
+    cells, found = 2**10, polygons
+    while len(found) > most and cells > 1:
+        lattice = np.floor((points - points.min(axis=0)) / span * cells).astype(np.int64)
+        _, first, cluster = np.unique(lattice, axis=0, return_index=True, return_inverse=True)
+        merged = first[cluster.reshape(-1)][polygons]
+        ordered = np.sort(merged, axis=1)
+        distinct = 1 + (np.diff(ordered, axis=1) > 0).sum(axis=1)
+        _, once = np.unique(ordered, axis=0, return_index=True)
+        found = merged[once[distinct[once] > 2]]
+        cells //= 2
+    return found
+
+
+def triangles(polygons: NDArray[np.int_]) -> NDArray[np.int_]:
+    """Return polygons (P, corners) as triangles, (T, 3), which turn as they do."""
+    corners = polygons.shape[1]
+    fans = [polygons[:, [0, k, k + 1]] for k in range(1, corners - 1)]
+    flat = np.concatenate(fans)
+    a, b, c = flat.T
+    return flat[(a != b) & (b != c) & (c != a)]
+
+
+def colours(error: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return the colours (N, 3) of distances (N,), as `deformed` has them: three decades."""
+    from matplotlib import colormaps
+    from matplotlib.colors import LogNorm
+
+    top = max(1e-12, float(error.max(initial=0.0)))
+    scaled = LogNorm(top * 1e-3, top)(np.maximum(error, top * 1e-3))
+    return (colormaps["viridis"](scaled)[:, :3] * 255).round().astype(np.uint8)
