@@ -24,6 +24,14 @@ from dpl.metrics import MaxError, RelativeL2
 from dpl.scene import Sample, Scene
 
 GREY = 160  # of a true shape
+LOOK = {  # of meshes in the browser, in the words of three.js
+    "camera": {"cls": "PerspectiveCamera", "fov": 35},
+    "lights": [
+        {"cls": "AmbientLight", "color": "#ffffff", "intensity": 0.7},
+        {"cls": "DirectionalLight", "color": "#ffffff", "intensity": 0.5, "position": [1, 2, 3]},
+    ],
+    "material": {"cls": "MeshStandardMaterial", "side": 2, "roughness": 1, "metalness": 0},
+}
 ORDINALS = {1: "worst", 2: "2nd worst", 3: "3rd worst"}
 
 
@@ -41,11 +49,15 @@ class Judged(NamedTuple):
     size: Tensor
 
     def chosen(self, loads: int) -> list[int]:
-        """Return the loads with the largest relative, then absolute errors, then a typical one."""
+        """Return so many with the largest relative error, so many others with the largest absolute.
+
+        And a typical one, the median of the rest.
+        """
         relative, largest = self._order(self.relative), self._order(self.largest)
         most = relative[:loads]
         most += [load for load in largest if load not in most][:loads]
-        return list(dict.fromkeys([*most, relative[len(relative) // 2]]))
+        rest = [load for load in relative if load not in most]
+        return [*most, *rest[len(rest) // 2 :][:1]]
 
     def title(self, load: int) -> str:
         """Return what is said of a load, and how many are worse."""
@@ -139,16 +151,15 @@ class WorstCases(L.Callback):
         predicted = _predict(module, some)
         module.train(training)
         problem, names = module.scene.problem, [judged.title(load) for load in chosen]
-        shapes = deformed(
-            problem, some.displacement, [("", predicted)], names=names, most=self.most
-        )
+        shown = {"names": names, "upright": True, "most": self.most}
+        shapes = deformed(problem, some.displacement, [("", predicted)], **shown)
         errors = spread(judged.relative, judged.size, chosen)
         for board in boards:
             board.add_figure("validation/shapes", shapes, step)
             board.add_figure("validation/errors", errors, step)
             if self.meshes and predicted[0].isfinite().all():
                 pair = beside(module.scene, predicted[0], some.displacement[0], self.most)
-                board.add_mesh("validation/worst", **pair, global_step=step)
+                board.add_mesh("validation/worst", **pair, config_dict=LOOK, global_step=step)
             self._spent += time.perf_counter() - start
             board.add_scalar(
                 "time/pictures", self._spent / (time.perf_counter() - self._begin), step
@@ -299,10 +310,13 @@ class Session(L.Callback):
                 board._get_file_writer().add_summary(_end(failed=True))
 
     def finish(self, trainer: L.Trainer, errors: Mapping[str, float]) -> None:
-        """Tell the errors of the best weights on the test loads, as `test/NAME`."""
+        """Tell the errors of the best weights on the test loads, as `best/NAME`.
+
+        So they come first in the HPARAMS tab, which sorts by name and shows a few.
+        """
         if not trainer.is_global_zero:
             return
-        named = {f"test/{name}": value for name, value in errors.items()}
+        named = {f"best/{name}": value for name, value in errors.items()}
         for logger in trainer.loggers:
             logger.log_metrics(named, step=_step(trainer))
         for board in _boards(trainer):

@@ -26,6 +26,8 @@ FACETS = {
     ),
 }
 
+CARD = 140  # resolution of what TensorBoard shows small [dots per inch]
+
 
 def surface(mesh: skfem.Mesh) -> NDArray[np.int_]:
     """Return what is seen of a mesh as polygons of vertices, (P, corners).
@@ -48,6 +50,7 @@ def deformed(
     predictions: Sequence[tuple[str, Tensor]],
     *,
     names: Sequence[str] = (),
+    upright: bool = False,
     most: int | None = None,
 ) -> "Figure":
     """Return a figure of deformed bodies coloured by the distance from where nodes should be.
@@ -59,6 +62,7 @@ def deformed(
         truth: (B, N, D) [-].
         predictions: Named, (B, N, D) [-] each; one alone needs no name.
         names: Titles of the loads.
+        upright: One row a load, one column a prediction, narrow: for TensorBoard's small cards.
         most: Polygons of a body, see `coarse`; all if left out.
     """
     from matplotlib.cm import ScalarMappable
@@ -69,20 +73,20 @@ def deformed(
     polygons = coarse(points, polygons, most) if most else polygons
     right = truth.detach().cpu().numpy()
     fields = [(name, field.detach().cpu().numpy()) for name, field in predictions]
-    columns, dim = len(right), points.shape[1]
-    more = max((name.count("\n") for name in names), default=0)
-    height = 2.2 * len(fields) + 0.4 + 0.2 * more
-    figure = Figure(figsize=(3.6 * columns + 1.2, height), layout="constrained")
-    axes = figure.subplots(
-        len(fields), columns, squeeze=False, subplot_kw={"projection": "3d"} if dim == 3 else {}
-    )
+    count, shown, dim = len(right), len(fields), points.shape[1]
+    rows, columns = (count, shown) if upright else (shown, count)
+    size = (3.6 * columns + 0.8, 2.4 * rows) if upright else (3.6 * columns + 1.2, 2.2 * rows + 0.4)
+    figure = Figure(figsize=size, dpi=CARD if upright else 100, layout="constrained")
+    kind = {"projection": "3d"} if dim == 3 else {}
+    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw=kind)
+    axes = axes.T if upright else axes
     seen = np.concatenate([points[None] + right, points[None]])
     errors = [np.linalg.norm(field - right, axis=2) for _, field in fields]
     finite = [error[np.isfinite(error)] for error in errors]
     top = max(1e-12, *(float(error.max(initial=0.0)) for error in finite))
     scale = ScalarMappable(LogNorm(top * 1e-3, top), "viridis")
     for row, (name, field) in enumerate(fields):
-        for column in range(columns):
+        for column in range(count):
             ax = axes[row, column]
             error = errors[row][column][polygons].mean(axis=1)
             colours = scale.to_rgba(np.maximum(error, top * 1e-3))
@@ -92,7 +96,8 @@ def deformed(
             _frame(ax, seen)
             title = [names[column]] if row == 0 and names else []
             ax.set_title("\n".join(filter(None, [*title, name])), fontsize=9)
-    figure.colorbar(scale, ax=axes, label="distance from truth / L", shrink=0.8)
+    place = {"location": "bottom", "aspect": 40} if upright else {"shrink": 0.8}
+    figure.colorbar(scale, ax=axes, label="distance from the true position / L", **place)
     return figure
 
 
@@ -132,32 +137,33 @@ def spread(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "Figur
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.0, 3.4))
+    figure = Figure(figsize=(4.4, 5.6), dpi=CARD)
     # by hand: a layout that is computed takes longer than all the rest
-    figure.subplots_adjust(left=0.08, right=0.98, bottom=0.16, top=0.9, wspace=0.06)
-    left, right = figure.subplots(1, 2, sharey=True)
-    error, amplitude = relative.cpu().numpy(), size.cpu().numpy()
+    figure.subplots_adjust(left=0.15, right=0.96, bottom=0.09, top=0.94, hspace=0.25)
+    upper, lower = figure.subplots(2, 1, sharey=True)
+    error, amplitude = (np.maximum(part.cpu().numpy(), 1e-16) for part in (relative, size))
     finite = np.isfinite(error)
-    error = np.maximum(error, 1e-16)
-    left.scatter(amplitude[finite], error[finite], s=12, alpha=0.6, edgecolors="none")
+    upper.scatter(amplitude[finite], error[finite], s=12, alpha=0.6, edgecolors="none")
     for load in marked:
         if finite[load]:
             spot = amplitude[load], error[load]
-            left.plot(*spot, "o", color="C3", markersize=7, fillstyle="none")
-            left.annotate(f" {load}", spot, fontsize=8, color="C3", va="bottom")
-    left.set(xscale="log", yscale="log", xlabel="largest displacement / L")
-    left.set_ylabel("relative L2 error")
+            upper.plot(*spot, "o", color="C3", markersize=7, fillstyle="none")
+            upper.annotate(f" {load}", spot, fontsize=8, color="C3", va="bottom")
+    upper.set(xlabel="largest displacement / L", ylabel="relative L2 error")
+    if finite.any():
+        upper.set(xscale="log", yscale="log")
     part = np.arange(1, len(error) + 1) / len(error)
-    right.step(part[: finite.sum()], np.sort(error[finite]), where="pre")
+    lower.step(part[: finite.sum()], np.sort(error[finite]), where="pre")
     for quantile in (0.5, 0.9, 0.99):
-        right.axvline(quantile, color="0.8", linewidth=0.8, zorder=0)
-    right.set(xlim=(0, 1), xlabel="part of the loads with this error or less")
+        lower.axvline(quantile, color="0.8", linewidth=0.8, zorder=0)
+    lower.set(xlim=(0, 1), xlabel="part of the loads with this error or less")
+    lower.set_ylabel("relative L2 error")
     missing = int((~finite).sum())
-    for ax in (left, right):
+    for ax in (upper, lower):
         ax.grid(visible=True, axis="y", linewidth=0.4)
         ax.minorticks_off()  # which take as long as the rest
     title = f"{len(error)} validation loads"
-    figure.suptitle(title + (f", {missing} of them without a finite error" if missing else ""))
+    figure.suptitle(title + (f", {missing} without a finite error" if missing else ""), fontsize=11)
     return figure
 
 
