@@ -75,7 +75,7 @@ def deformed(
     fields = [(name, field.detach().cpu().numpy()) for name, field in predictions]
     count, shown, dim = len(right), len(fields), points.shape[1]
     rows, columns = (count, shown) if upright else (shown, count)
-    size = (3.6 * columns + 0.8, 2.4 * rows) if upright else (3.6 * columns + 1.2, 2.2 * rows + 0.4)
+    size = (3.6 * columns + 0.8, 2.5 * rows) if upright else (3.6 * columns + 1.2, 2.2 * rows + 0.4)
     figure = Figure(figsize=size, dpi=CARD if upright else 100, layout="constrained")
     kind = {"projection": "3d"} if dim == 3 else {}
     axes = figure.subplots(rows, columns, squeeze=False, subplot_kw=kind)
@@ -93,7 +93,7 @@ def deformed(
             shape, true = (points + field[column])[polygons], (points + right[column])[polygons]
             _draw(ax, shape, facecolors=colours, edgecolors="none")
             _draw(ax, true, facecolors="none", edgecolors="0.4", linewidths=0.3)
-            _frame(ax, seen)
+            _frame(ax, seen, zoom=1.6 if upright else 1.1)
             title = [names[column]] if row == 0 and names else []
             ax.set_title("\n".join(filter(None, [*title, name])), fontsize=9)
     place = {"location": "bottom", "aspect": 40} if upright else {"shrink": 0.8}
@@ -111,14 +111,14 @@ def _draw(ax: Any, polygons: Any, **style: Any) -> None:
         ax.add_collection(PolyCollection(polygons, **style))
 
 
-def _frame(ax: Any, points: NDArray[np.float64]) -> None:
+def _frame(ax: Any, points: NDArray[np.float64], *, zoom: float) -> None:
     """Show the box of all points, equal scales, no axes."""
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
     ax.set_xlim(low[0], high[0])
     ax.set_ylim(low[1], high[1])
     if len(low) == 3:
         ax.set_zlim(low[2], high[2])
-        ax.set_box_aspect(high - low, zoom=1.1)
+        ax.set_box_aspect(high - low, zoom=zoom)
         ax.view_init(elev=18, azim=-60)
     else:
         ax.set_aspect("equal")
