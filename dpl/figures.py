@@ -171,7 +171,7 @@ def coarse(points: NDArray[Any], polygons: NDArray[np.int_], most: int) -> NDArr
     """Return no more than so many polygons (P, corners) on some of the same points.
 
     Points in one cell of a grid become one of them; polygons that fall together go. The grid is
-    the finest of those that halve their spacing.
+    made coarser until they are few enough.
 
     Source: Rossignac, Borrel (1993), Multi-resolution 3D approximations for rendering complex
     scenes, for clusters of vertices.
@@ -181,17 +181,20 @@ def coarse(points: NDArray[Any], polygons: NDArray[np.int_], most: int) -> NDArr
         polygons: Of indices of points.
         most: 1 or more.
     """
-    span = np.ptp(points, axis=0).max()
-    cells, found = 2**10, polygons
-    while len(found) > most and cells > 1:
-        lattice = np.floor((points - points.min(axis=0)) / span * cells).astype(np.int64)
+    if len(polygons) <= most:
+        return polygons
+    used, flat = np.unique(polygons, return_inverse=True)
+    places = points[used] - points[used].min(axis=0)
+    cells, found = 2.0 * most**0.5, polygons
+    while len(found) > most:
+        lattice = np.floor(places / places.max() * cells).astype(np.int64)
         _, first, cluster = np.unique(lattice, axis=0, return_index=True, return_inverse=True)
-        merged = first[cluster.reshape(-1)][polygons]
+        merged = used[first[cluster.reshape(-1)]][flat.reshape(polygons.shape)]
         ordered = np.sort(merged, axis=1)
-        distinct = 1 + (np.diff(ordered, axis=1) > 0).sum(axis=1)
         _, once = np.unique(ordered, axis=0, return_index=True)
-        found = merged[once[distinct[once] > 2]]
-        cells //= 2
+        distinct = 1 + (np.diff(ordered[once], axis=1) > 0).sum(axis=1)
+        found = merged[once[distinct > 2]]
+        cells *= 0.85
     return found
 
 

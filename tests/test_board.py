@@ -373,11 +373,11 @@ def test_of_two_loggers_each_has_its_part(scene, data, tmp_path):
 
 
 def resumable(folder, *callbacks, **options):
-    kept = ModelCheckpoint(folder, "last", save_on_train_epoch_end=True)
-    kept.FILE_EXTENSION = ".ckpt"
-    options = {"enable_checkpointing": True, **options}
-    pictures = WorstCases(every=2), SampleRates(), Session({"model": "FCNN"})
-    return trainer(folder, *pictures, kept, *callbacks, **options)
+    kept = ModelCheckpoint(
+        folder, "last", save_on_train_epoch_end=True, enable_version_counter=False
+    )
+    pictures = WorstCases(every=2), SampleRates()
+    return trainer(folder, *pictures, kept, *callbacks, enable_checkpointing=True, **options)
 
 
 @pytest.fixture
@@ -385,20 +385,19 @@ def broken(scene, data, tmp_path):
     """A run of five epochs that ended in the midst of the fourth and was resumed; its folder."""
     folder = tmp_path / "broken"
     with pytest.raises(RuntimeError, match="power"):
-        resumable(folder, Fails(11, RuntimeError("power")), epochs=5).fit(
+        resumable(folder, Session({}), Fails(11, RuntimeError("power")), epochs=5).fit(
             surrogate(scene), datamodule=data
         )
     assert steps(events(folder).Scalars("loss/train"))[-1] >= 9, "beyond the checkpoint"
-    resumable(folder, epochs=5).fit(
-        surrogate(scene), datamodule=data, ckpt_path=str(folder / "last.ckpt"), weights_only=True
-    )
+    kept = {"ckpt_path": str(folder / "last.ckpt"), "weights_only": True}
+    resumable(folder, Session({}), epochs=5).fit(surrogate(scene), datamodule=data, **kept)
     return folder
 
 
 def test_a_resumed_run_goes_on_in_the_same_curves(scene, data, tmp_path, broken):
     """As if nothing had been: neither a step twice nor one left out, and the same values."""
     straight = tmp_path / "straight"
-    resumable(straight, epochs=5).fit(surrogate(scene), datamodule=data)
+    resumable(straight, Session({}), epochs=5).fit(surrogate(scene), datamodule=data)
     one, other = events(broken), events(straight)
     assert set(one.Tags()["scalars"]) == set(other.Tags()["scalars"])
     for tag in one.Tags()["scalars"]:
@@ -477,11 +476,11 @@ def test_runs_that_ended_otherwise_stand_beside_those_that_did_not(scene, data, 
 def test_a_run_that_is_resumed_after_an_interruption_succeeds(scene, data, tmp_path):
     folder, session = tmp_path / "run", Session({"name": "run"})
     with pytest.raises(SystemExit):
-        resumable(folder, Fails(4, KeyboardInterrupt()), epochs=3).fit(
+        resumable(folder, session, Fails(4, KeyboardInterrupt()), epochs=3).fit(
             surrogate(scene), datamodule=data
         )
     kept = {"ckpt_path": str(folder / "last.ckpt"), "weights_only": True}
-    tutor = trainer(folder, session, epochs=3)
+    tutor = resumable(folder, session, epochs=3)
     tutor.fit(surrogate(scene), datamodule=data, **kept)
     session.finish(tutor, {"e_mean": 0.5})
     ((status, errors),) = hparams_tab(tmp_path).values()
