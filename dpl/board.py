@@ -27,8 +27,8 @@ GREY = 160  # of a true shape
 LOOK = {  # of meshes in the browser, in the words of three.js
     "camera": {"cls": "PerspectiveCamera", "fov": 35},
     "lights": [
-        {"cls": "AmbientLight", "color": "#ffffff", "intensity": 0.7},
-        {"cls": "DirectionalLight", "color": "#ffffff", "intensity": 0.5, "position": [1, 2, 3]},
+        {"cls": "AmbientLight", "color": "#ffffff", "intensity": 0.9},
+        {"cls": "DirectionalLight", "color": "#ffffff", "intensity": 0.3, "position": [1, 2, 3]},
     ],
     "material": {"cls": "MeshStandardMaterial", "side": 2, "roughness": 1, "metalness": 0},
 }
@@ -59,6 +59,11 @@ class Judged(NamedTuple):
         rest = [load for load in relative if load not in most]
         return [*most, *rest[len(rest) // 2 :][:1]]
 
+    @property
+    def farthest(self) -> int:
+        """The load with the largest absolute error."""
+        return self._order(self.largest)[0]
+
     def title(self, load: int) -> str:
         """Return what is said of a load, and how many are worse."""
         orders = self._order(self.relative), self._order(self.largest)
@@ -81,9 +86,9 @@ class WorstCases(L.Callback):
 
     Under `validation/shapes` the loads with the largest relative and the largest absolute error
     beside a typical one; under `validation/errors` the errors of all; as the mesh
-    `validation/worst` the load with the largest relative error, to be turned: the prediction
-    coloured by its error (blue: a thousandth of the largest, yellow: the largest), the truth below
-    it in grey.
+    `validation/worst` the load with the largest absolute error, to be turned: the prediction
+    coloured by its error (blue: a thousandth of the largest or less, yellow: the largest), the
+    truth below it in grey.
 
     Pictures come after `every` validations, twice, four times as many and so on, and at the end of
     the training; `time/pictures` is the part of the training's time that they took.
@@ -147,6 +152,7 @@ class WorstCases(L.Callback):
         module.eval()
         judged = judge(module, truth, trainer.datamodule.batch_size)
         chosen = judged.chosen(self.loads)
+        worst = chosen.index(judged.farthest)
         some = Sample(*(column[chosen] for column in truth))
         predicted = _predict(module, some)
         module.train(training)
@@ -157,8 +163,8 @@ class WorstCases(L.Callback):
         for board in boards:
             board.add_figure("validation/shapes", shapes, step)
             board.add_figure("validation/errors", errors, step)
-            if self.meshes and predicted[0].isfinite().all():
-                pair = beside(module.scene, predicted[0], some.displacement[0], self.most)
+            if self.meshes and predicted[worst].isfinite().all():
+                pair = beside(module.scene, predicted[worst], some.displacement[worst], self.most)
                 board.add_mesh("validation/worst", **pair, config_dict=LOOK, global_step=step)
             self._spent += time.perf_counter() - start
             board.add_scalar(
