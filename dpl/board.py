@@ -157,8 +157,10 @@ class WorstCases(L.Callback):
         predicted = _predict(module, some)
         module.train(training)
         problem, names = module.scene.problem, [judged.title(load) for load in chosen]
-        shown = {"names": names, "upright": True, "most": self.most}
-        shapes = deformed(problem, some.displacement, [("", predicted)], **shown)
+        shown = [("", predicted)]
+        shapes = deformed(
+            problem, some.displacement, shown, names=names, upright=True, most=self.most
+        )
         errors = spread(judged.relative, judged.size, chosen)
         for board in boards:
             board.add_figure("validation/shapes", shapes, step)
@@ -303,8 +305,7 @@ class Session(L.Callback):
         _, start, _ = hparams(self.hyperparameters, {})
         for board in _boards(trainer):
             writer = board._get_file_writer()
-            if trainer.global_step:
-                writer.add_event(_restart(), trainer.global_step)
+            writer.add_event(_started(), trainer.global_step)  # readers count the second one
             writer.add_summary(start)
 
     def on_exception(
@@ -360,8 +361,8 @@ def _predict(module: Any, batch: Sample) -> Tensor:
         return module.predict(load).cpu()
 
 
-def _restart() -> Any:
-    """Return the event at which readers drop what they have of its step and later ones."""
+def _started() -> Any:
+    """Return the event of a session's start: readers drop what they have of later steps."""
     from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
     return Event(session_log=SessionLog(status=SessionLog.START))

@@ -76,7 +76,12 @@ def deformed(
     count, shown, dim = len(right), len(fields), points.shape[1]
     rows, columns = (count, shown) if upright else (shown, count)
     size = (3.6 * columns + 0.8, 2.5 * rows) if upright else (3.6 * columns + 1.2, 2.2 * rows + 0.4)
-    figure = Figure(figsize=size, dpi=CARD if upright else 100, layout="constrained")
+    figure = Figure(figsize=size, dpi=CARD if upright else 100)
+    if upright:  # by hand: a layout that is computed takes longer than all the rest
+        more = 0.25 + 0.15 * max((name.count("\n") for name in names), default=0)
+        figure.subplots_adjust(0, 0.7 / size[1], 1, 1 - more / size[1], hspace=more / 2)
+    else:
+        figure.set_layout_engine("constrained")
     kind = {"projection": "3d"} if dim == 3 else {}
     axes = figure.subplots(rows, columns, squeeze=False, subplot_kw=kind)
     axes = axes.T if upright else axes
@@ -93,11 +98,15 @@ def deformed(
             shape, true = (points + field[column])[polygons], (points + right[column])[polygons]
             _draw(ax, shape, facecolors=colours, edgecolors="none")
             _draw(ax, true, facecolors="none", edgecolors="0.4", linewidths=0.3)
-            _frame(ax, seen, zoom=1.6 if upright else 1.1)
+            _frame(ax, seen, zoom=1.4 if upright else 1.1)
             title = [names[column]] if row == 0 and names else []
             ax.set_title("\n".join(filter(None, [*title, name])), fontsize=9)
-    place = {"location": "bottom", "aspect": 40} if upright else {"shrink": 0.8}
-    figure.colorbar(scale, ax=axes, label="distance from the true position / L", **place)
+    label = "distance from the true position / L"
+    if upright:
+        below = figure.add_axes((0.1, 0.45 / size[1], 0.8, 0.1 / size[1]))
+        figure.colorbar(scale, cax=below, orientation="horizontal", label=label).minorticks_off()
+    else:
+        figure.colorbar(scale, ax=axes, label=label, shrink=0.8)
     return figure
 
 
@@ -138,7 +147,6 @@ def spread(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "Figur
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.4, 5.6), dpi=CARD)
-    # by hand: a layout that is computed takes longer than all the rest
     figure.subplots_adjust(left=0.15, right=0.96, bottom=0.09, top=0.94, hspace=0.25)
     upper, lower = figure.subplots(2, 1, sharey=True)
     error, amplitude = (np.maximum(part.cpu().numpy(), 1e-16) for part in (relative, size))

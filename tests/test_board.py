@@ -16,6 +16,9 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from PIL import Image
 from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.plugin_event_accumulator import (
+    EventAccumulator as Tensors,
+)
 from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
 from tensorboard.context import RequestContext
 from tensorboard.plugins.base_plugin import TBContext
@@ -405,6 +408,9 @@ def test_a_resumed_run_goes_on_in_the_same_curves(scene, data, tmp_path, broken)
         if tag.startswith(("loss/", "val/")):
             wanted = [event.value for event in other.Scalars(tag)]
             assert [event.value for event in seen] == pytest.approx(wanted, rel=1e-6), tag
+    shown = Tensors(str(broken), tensor_size_guidance={"scalars": 0})  # what its page is made from
+    shown.Reload()
+    assert steps(shown.Tensors("loss/train")) == list(range(15))
     for tag in one.Tags()["images"]:
         assert steps(one.Images(tag)) == steps(other.Images(tag)) == [5, 11, 14], tag
     for tag in (t for t in one.Tags()["tensors"] if "worst" in t):
