@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import lightning as L
 import numpy as np
 import torch
+from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
@@ -274,6 +275,25 @@ class SampleRates(L.Callback):
             sums["memory/gpu"] = torch.cuda.max_memory_allocated(pl_module.device) / 1e9
         pl_module.log_dict(sums, sync_dist=True, reduce_fx="sum")
         pl_module.log_dict(means, sync_dist=True)
+
+
+class LearningRate(LearningRateMonitor):
+    """Lightning's callback, which would end a training that has no logger."""
+
+    def on_train_start(self, trainer: L.Trainer, *args: Any, **kwargs: Any) -> None:
+        """Find the optimisers, if there is a logger."""
+        if trainer.loggers:
+            super().on_train_start(trainer, *args, **kwargs)
+
+    def on_train_batch_start(self, trainer: L.Trainer, *args: Any, **kwargs: Any) -> None:
+        """Log the rate, if there is a logger."""
+        if trainer.loggers:
+            super().on_train_batch_start(trainer, *args, **kwargs)
+
+    def on_train_epoch_start(self, trainer: L.Trainer, *args: Any, **kwargs: Any) -> None:
+        """Log the rate, if there is a logger."""
+        if trainer.loggers:
+            super().on_train_epoch_start(trainer, *args, **kwargs)
 
 
 class Session(L.Callback):

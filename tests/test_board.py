@@ -26,7 +26,16 @@ from tensorboard.plugins.hparams import api_pb2, get_experiment, list_session_gr
 from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.util import tensor_util
 
-from dpl.board import Judged, SampleRates, Session, WorstCases, beside, judge, resident
+from dpl.board import (
+    Judged,
+    LearningRate,
+    SampleRates,
+    Session,
+    WorstCases,
+    beside,
+    judge,
+    resident,
+)
 from dpl.data.datamodule import OnlineData
 from dpl.fem.mesh import box, rectangle
 from dpl.figures import surface
@@ -338,7 +347,7 @@ def test_a_stream_shows_what_it_makes_and_how_full_its_buffer_is(scene, folder, 
 
 def test_a_run_without_a_logger_runs(scene, data, tmp_path):
     session = Session({"model": "FCNN"})
-    callbacks = WorstCases(every=1), SampleRates(), session
+    callbacks = WorstCases(every=1), SampleRates(), LearningRate(), session
     tutor = trainer(tmp_path, *callbacks, logger=False, epochs=2)
     tutor.fit(surrogate(scene), datamodule=data)
     session.finish(tutor, {"e_mean": 0.1})
@@ -348,12 +357,13 @@ def test_a_run_without_a_logger_runs(scene, data, tmp_path):
 def test_another_logger_has_the_scalars_hyperparameters_and_errors(scene, data, tmp_path):
     logger = CSVLogger(tmp_path, name="", version="")
     session = Session({"model": "FCNN", "optimizer.lr": 1e-3})
-    callbacks = WorstCases(every=1), SampleRates(), session
+    callbacks = WorstCases(every=1), SampleRates(), LearningRate(), session
     tutor = trainer(tmp_path, *callbacks, logger=logger, epochs=2)
     tutor.fit(surrogate(scene), datamodule=data)
     session.finish(tutor, {"e_mean": 0.125})
     rows = list(csv.DictReader((tmp_path / "metrics.csv").open()))
     assert len([row for row in rows if row["rate/steps"]]) == 2
+    assert len([row for row in rows if row["lr-AdamW"]]) == 2 * BATCHES
     assert [float(row["best/e_mean"]) for row in rows if row["best/e_mean"]] == [0.125]
     assert "FCNN" in (tmp_path / "hparams.yaml").read_text()
 
@@ -489,3 +499,30 @@ def test_a_run_that_is_resumed_after_an_interruption_succeeds(scene, data, tmp_p
     ((status, errors),) = hparams_tab(tmp_path).values()
     assert status == [api_pb2.STATUS_SUCCESS]
     assert errors["best/e_mean"] == 0.5
+
+
+# ------------------------------------------------------------------ the command
+
+
+@pytest.mark.parametrize(
+    ("options", "left"),
+    [
+        (["trainer.logger=false"], set()),
+        (
+            [
+                "trainer.logger._target_=lightning.pytorch.loggers.CSVLogger",
+                "~trainer.logger.default_hp_metric",
+            ],
+            {"metrics.csv", "hparams.yaml"},
+        ),
+    ],
+)
+def test_the_command_works_with_another_logger_and_with_none(
+    script, tiny_training, folder, data, tmp_path, options, left
+):
+    sizes = ["data.train=12", f"data.folder={folder}", "trainer.max_epochs=2", "run=mine"]
+    ended = script("train", *tiny_training, *sizes, *options, cwd=tmp_path)
+    assert ended.status == 0, ended.err
+    found = {path.name for path in (tmp_path / "mine").iterdir() if path.is_file()}
+    fixed = {"config.yaml", "evaluation.json", "shapes.png", "training.jsonl", "worst.vtu"}
+    assert found == fixed | left
