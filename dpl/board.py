@@ -169,10 +169,10 @@ class WorstCases(L.Callback):
             if self.meshes and predicted[worst].isfinite().all():
                 pair = beside(module.scene, predicted[worst], some.displacement[worst], self.most)
                 board.add_mesh("validation/worst", **pair, config_dict=LOOK, global_step=step)
-            self._spent += time.perf_counter() - start
-            board.add_scalar(
-                "time/pictures", self._spent / (time.perf_counter() - self._begin), step
-            )
+        self._spent += time.perf_counter() - start
+        part = self._spent / (time.perf_counter() - self._begin)
+        for board in boards:
+            board.add_scalar("time/pictures", part, step)
 
 
 def judge(module: Any, truth: Sample, batch_size: int) -> Judged:
