@@ -6,9 +6,10 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from dpl import run
+from dpl.commands import entry
 
 
-@run.command("train")
+@entry.command("train")
 def main(cfg: DictConfig) -> float | None:
     """Train a surrogate and judge it; return its smallest validation e_mean [-] to a sweep."""
     # here and not above: worker processes import this file, and need none of it
@@ -25,7 +26,7 @@ def main(cfg: DictConfig) -> float | None:
     data = run.make(cfg, "data", scene=scene)
     surrogate = run.build_surrogate(cfg, scene)
     trainer = run.make(cfg, "trainer")
-    run.check_trainer(trainer, cfg)
+    entry.check_trainer(trainer, cfg)
     session = board.Session(run.hyperparameters(cfg))
     trainer.callbacks.append(session)
     if trainer.is_global_zero:
@@ -34,7 +35,7 @@ def main(cfg: DictConfig) -> float | None:
     try:
         trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
     except Diverged as error:
-        return run.failed(error)
+        return entry.failed(error)
     except SystemExit as leaving:  # how Lightning passes Ctrl-C on
         if leaving.code == 128 + signal.SIGTERM:
             raise
@@ -49,4 +50,4 @@ def main(cfg: DictConfig) -> float | None:
     rows = evaluate(best, data.samples("test"), folder)
     network = next(row for row in rows if row.solver == "network")
     session.finish(trainer, network.errors)
-    return run.best_error(trainer)
+    return entry.best_error(trainer)
