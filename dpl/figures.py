@@ -1,17 +1,14 @@
-"""Pictures of deformed bodies."""
+"""Pictures of deformed bodies and of how wrong they are."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import lightning as L
 import numpy as np
 import skfem
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.problem import Problem
-from dpl.scene import Sample
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,6 +25,8 @@ FACETS = {
         (3, 5, 7, 6),
     ),
 }
+
+CARD = 140  # resolution of what TensorBoard shows small [dots per inch]
 
 
 def surface(mesh: skfem.Mesh) -> NDArray[np.int_]:
@@ -51,6 +50,8 @@ def deformed(
     predictions: Sequence[tuple[str, Tensor]],
     *,
     names: Sequence[str] = (),
+    upright: bool = False,
+    most: int | None = None,
 ) -> "Figure":
     """Return a figure of deformed bodies coloured by the distance from where nodes should be.
 
@@ -59,38 +60,53 @@ def deformed(
     Args:
         problem: The body.
         truth: (B, N, D) [-].
-        predictions: Named, (B, N, D) [-] each.
+        predictions: Named, (B, N, D) [-] each; one alone needs no name.
         names: Titles of the loads.
+        upright: One row a load, one column a prediction, narrow: for TensorBoard's small cards.
+        most: Polygons of a body, see `coarse`; all if left out.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
     polygons, points = surface(problem.mesh), problem.points.cpu().numpy()
+    polygons = coarse(points, polygons, most) if most else polygons
     right = truth.detach().cpu().numpy()
     fields = [(name, field.detach().cpu().numpy()) for name, field in predictions]
-    columns, dim = len(right), points.shape[1]
-    figure = Figure(figsize=(3.6 * columns + 1.2, 2.2 * len(fields) + 0.4), layout="constrained")
-    axes = figure.subplots(
-        len(fields), columns, squeeze=False, subplot_kw={"projection": "3d"} if dim == 3 else {}
-    )
+    count, shown, dim = len(right), len(fields), points.shape[1]
+    rows, columns = (count, shown) if upright else (shown, count)
+    size = (3.6 * columns + 0.8, 2.5 * rows) if upright else (3.6 * columns + 1.2, 2.2 * rows + 0.4)
+    figure = Figure(figsize=size, dpi=CARD if upright else 100)
+    if upright:  # by hand: a layout that is computed takes longer than all the rest
+        more = 0.25 + 0.15 * max((name.count("\n") for name in names), default=0)
+        figure.subplots_adjust(0, 0.7 / size[1], 1, 1 - more / size[1], hspace=more / 2)
+    else:
+        figure.set_layout_engine("constrained")
+    kind = {"projection": "3d"} if dim == 3 else {}
+    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw=kind)
+    axes = axes.T if upright else axes
     seen = np.concatenate([points[None] + right, points[None]])
     errors = [np.linalg.norm(field - right, axis=2) for _, field in fields]
     finite = [error[np.isfinite(error)] for error in errors]
     top = max(1e-12, *(float(error.max(initial=0.0)) for error in finite))
     scale = ScalarMappable(LogNorm(top * 1e-3, top), "viridis")
     for row, (name, field) in enumerate(fields):
-        for column in range(columns):
+        for column in range(count):
             ax = axes[row, column]
             error = errors[row][column][polygons].mean(axis=1)
             colours = scale.to_rgba(np.maximum(error, top * 1e-3))
             shape, true = (points + field[column])[polygons], (points + right[column])[polygons]
             _draw(ax, shape, facecolors=colours, edgecolors="none")
             _draw(ax, true, facecolors="none", edgecolors="0.4", linewidths=0.3)
-            _frame(ax, seen)
+            _frame(ax, seen, zoom=1.4 if upright else 1.1)
             title = [names[column]] if row == 0 and names else []
-            ax.set_title("\n".join([*title, name]), fontsize=9)
-    figure.colorbar(scale, ax=axes, label="distance from the true position / L", shrink=0.8)
+            ax.set_title("\n".join(filter(None, [*title, name])), fontsize=9)
+    label = "distance from the true position / L"
+    if upright:
+        below = figure.add_axes((0.1, 0.45 / size[1], 0.8, 0.1 / size[1]))
+        figure.colorbar(scale, cax=below, orientation="horizontal", label=label).minorticks_off()
+    else:
+        figure.colorbar(scale, ax=axes, label=label, shrink=0.8)
     return figure
 
 
@@ -104,50 +120,106 @@ def _draw(ax: Any, polygons: Any, **style: Any) -> None:
         ax.add_collection(PolyCollection(polygons, **style))
 
 
-def _frame(ax: Any, points: NDArray[np.float64]) -> None:
+def _frame(ax: Any, points: NDArray[np.float64], *, zoom: float) -> None:
     """Show the box of all points, equal scales, no axes."""
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
     ax.set_xlim(low[0], high[0])
     ax.set_ylim(low[1], high[1])
     if len(low) == 3:
         ax.set_zlim(low[2], high[2])
-        ax.set_box_aspect(high - low, zoom=1.1)
+        ax.set_box_aspect(high - low, zoom=zoom)
         ax.view_init(elev=18, azim=-60)
     else:
         ax.set_aspect("equal")
     ax.set_axis_off()
 
 
-class DeformedShapes(L.Callback):
-    """Puts pictures of predicted against true shapes into TensorBoard."""
+def spread(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "Figure":
+    """Return a figure of errors: against the size of the answer, and how many loads are below each.
 
-    def __init__(self, *, every: int = 20, loads: int = 3) -> None:
-        """Choose how often and how much.
+    Loads without a finite error are left out and counted in the title.
 
-        Args:
-            every: Validations between pictures.
-            loads: Validation loads shown.
-        """
-        self.every, self.loads, self._seen = every, loads, 0
+    Args:
+        relative: Relative L2 errors, (B,) [-].
+        size: Largest true displacement of each load over L, (B,) [-].
+        marked: Loads to be named.
+    """
+    from matplotlib.figure import Figure
 
-    def on_validation_epoch_end(self, trainer: L.Trainer, module: Any) -> None:
-        """Draw after every so many validations."""
-        if trainer.sanity_checking:
-            return
-        self._seen += 1
-        if self._seen % self.every == 0:
-            self._draw(trainer, module)
+    figure = Figure(figsize=(4.4, 5.6), dpi=CARD)
+    figure.subplots_adjust(left=0.15, right=0.96, bottom=0.09, top=0.94, hspace=0.25)
+    upper, lower = figure.subplots(2, 1, sharey=True)
+    error, amplitude = (np.maximum(part.cpu().numpy(), 1e-16) for part in (relative, size))
+    finite = np.isfinite(error)
+    upper.scatter(amplitude[finite], error[finite], s=12, alpha=0.6, edgecolors="none")
+    for load in marked:
+        if finite[load]:
+            spot = amplitude[load], error[load]
+            upper.plot(*spot, "o", color="C3", markersize=7, fillstyle="none")
+            upper.annotate(f" {load}", spot, fontsize=8, color="C3", va="bottom")
+    upper.set(xlabel="largest displacement / L", ylabel="relative L2 error")
+    if finite.any():
+        upper.set(xscale="log", yscale="log")
+    part = np.arange(1, len(error) + 1) / len(error)
+    lower.step(part[: finite.sum()], np.sort(error[finite]), where="pre")
+    for quantile in (0.5, 0.9, 0.99):
+        lower.axvline(quantile, color="0.8", linewidth=0.8, zorder=0)
+    lower.set(xlim=(0, 1), xlabel="part of the loads with this error or less")
+    lower.set_ylabel("relative L2 error")
+    missing = int((~finite).sum())
+    for ax in (upper, lower):
+        ax.grid(visible=True, axis="y", linewidth=0.4)
+        ax.minorticks_off()  # which take as long as the rest
+    title = f"{len(error)} validation loads"
+    figure.suptitle(title + (f", {missing} without a finite error" if missing else ""), fontsize=11)
+    return figure
 
-    def on_fit_end(self, trainer: L.Trainer, module: Any) -> None:
-        """Draw the last state."""
-        self._draw(trainer, module)
 
-    def _draw(self, trainer: L.Trainer, module: Any) -> None:
-        if not hasattr(getattr(trainer.logger, "experiment", None), "add_figure"):
-            return
-        some = trainer.datamodule.samples("val")
-        batch = Sample(*(column[: self.loads].to(module.device) for column in some))
-        with torch.no_grad():
-            prediction = module.predict(batch.load)
-        figure = deformed(module.scene.problem, batch.displacement, [("network", prediction)])
-        trainer.logger.experiment.add_figure("deformed shapes", figure, trainer.global_step)
+def coarse(points: NDArray[Any], polygons: NDArray[np.int_], most: int) -> NDArray[np.int_]:
+    """Return no more than so many polygons (P, corners) on some of the same points.
+
+    Points in one cell of a grid become one of them; polygons that fall together go. The grid is
+    made coarser until they are few enough.
+
+    Source: Rossignac, Borrel (1993), Multi-resolution 3D approximations for rendering complex
+    scenes, for clusters of vertices.
+
+    Args:
+        points: (N, D).
+        polygons: Of indices of points.
+        most: 1 or more.
+    """
+    if len(polygons) <= most:
+        return polygons
+    used, flat = np.unique(polygons, return_inverse=True)
+    places = points[used] - points[used].min(axis=0)
+    cells, found = 2.0 * most**0.5, polygons
+    while len(found) > most:
+        lattice = np.floor(places / places.max() * cells).astype(np.int64)
+        _, first, cluster = np.unique(lattice, axis=0, return_index=True, return_inverse=True)
+        merged = used[first[cluster.reshape(-1)]][flat.reshape(polygons.shape)]
+        ordered = np.sort(merged, axis=1)
+        _, once = np.unique(ordered, axis=0, return_index=True)
+        distinct = 1 + (np.diff(ordered[once], axis=1) > 0).sum(axis=1)
+        found = merged[once[distinct > 2]]
+        cells *= 0.85
+    return found
+
+
+def triangles(polygons: NDArray[np.int_]) -> NDArray[np.int_]:
+    """Return polygons (P, corners) as triangles, (T, 3), which turn as they do."""
+    corners = polygons.shape[1]
+    fans = [polygons[:, [0, k, k + 1]] for k in range(1, corners - 1)]
+    flat = np.concatenate(fans)
+    a, b, c = flat.T
+    return flat[(a != b) & (b != c) & (c != a)]
+
+
+def colours(error: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return the colours (N, 3) of distances (N,), as `deformed` has them: three decades."""
+    from matplotlib import colormaps
+    from matplotlib.colors import LogNorm
+
+    top = max(1e-12, float(error.max(initial=0.0)))
+    scaled = LogNorm(top * 1e-3, top)(np.maximum(error, top * 1e-3))
+    return (colormaps["viridis"](scaled)[:, :3] * 255).round().astype(np.uint8)

@@ -8,7 +8,7 @@ import skfem
 import torch
 
 from dpl.fem.mesh import box, rectangle
-from dpl.figures import deformed, surface
+from dpl.figures import coarse, colours, deformed, spread, surface, triangles
 
 
 def edges(polygons):
@@ -106,3 +106,69 @@ def test_a_wrong_place_is_brighter(make_scene):
     light = colours[:, :3] @ [0.3, 0.6, 0.1]
     assert touched.sum() == 2
     assert light[touched].min() > light[~touched].max() + 0.3
+
+
+def test_upright_figures_have_a_row_a_load(make_scene):
+    scene = make_scene(n_modes=2)
+    truth = 0.01 * torch.randn(3, *scene.problem.shape, dtype=torch.float64)
+    shown = [("network", truth * 0.9), ("linear", truth * 1.1)]
+    figure = deformed(scene.problem, truth, shown, names=["a", "b", "c"], upright=True)
+    titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
+    assert sorted(titles) == sorted(["a\nnetwork", "b\nnetwork", "c\nnetwork", *["linear"] * 3])
+    figure.canvas.draw()
+    heights = {ax.get_title(): ax.get_position().y0 for ax in figure.axes}
+    assert heights["a\nnetwork"] > heights["b\nnetwork"] > heights["c\nnetwork"]
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_triangles_cover_what_polygons_do(name):
+    mesh, facets, corners = BODIES[name]
+    found = triangles(surface(mesh))
+    assert found.shape == (facets * (corners - 2), 3)
+    assert area(mesh.p.T, found) == pytest.approx(area(mesh.p.T, surface(mesh)))
+    assert set(edges(found).values()) == {2}
+
+
+@pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
+@pytest.mark.parametrize("most", [1000, 300, 100])
+def test_a_coarse_body_has_no_more_polygons_than_are_wanted_and_about_its_shape(cell, most):
+    mesh = box([4.0, 2.0, 1.0], [17, 9, 5], cell)
+    points, polygons = mesh.p.T, surface(mesh)
+    found = coarse(points, polygons, most)
+    assert 10 < len(found) <= most
+    assert set(found.ravel()) <= set(polygons.ravel())
+    assert np.ptp(points[np.unique(found)], axis=0) == pytest.approx([4, 2, 1], abs=0.6)
+    if len(polygons) <= most:
+        assert np.array_equal(found, polygons)
+    faces = triangles(found)
+    assert all(len(set(face)) == 3 for face in faces.tolist())
+
+
+def test_colours_grow_brighter_over_three_decades():
+    error = np.array([0.0, 1e-6, 1e-3, 1e-2, 1e-1, 1.0])
+    found = colours(error)
+    light = found @ [0.3, 0.6, 0.1]
+    assert found.dtype == np.uint8
+    assert light[0] == light[1] == light[2]
+    assert (np.diff(light[2:]) > 20).all()
+    assert (colours(np.zeros(3)) == colours(np.zeros(3))[0]).all()
+
+
+def test_errors_are_drawn_against_the_size_of_the_answer_and_sorted():
+    relative = torch.tensor([0.5, 0.01, torch.nan, 0.1, torch.inf])
+    size = torch.tensor([0.001, 0.2, 0.1, 0.05, 0.3])
+    figure = spread(relative, size, [0, 2])
+    upper, lower = figure.axes
+    assert "5 validation loads, 2 without" in figure.get_suptitle()
+    shown = np.asarray(upper.collections[0].get_offsets())
+    assert shown == pytest.approx(np.array([[0.001, 0.5], [0.2, 0.01], [0.05, 0.1]]))
+    assert [text.get_text().strip() for text in upper.texts] == ["0"]
+    parts, errors = lower.lines[0].get_data()
+    assert list(parts) == pytest.approx([0.2, 0.4, 0.6])
+    assert list(errors) == pytest.approx([0.01, 0.1, 0.5])
+    figure.canvas.draw()
+
+
+@pytest.mark.parametrize("value", [0.0, torch.nan])
+def test_errors_that_are_all_zero_or_no_number_can_be_drawn(value):
+    spread(torch.full((3,), value), torch.zeros(3), [0]).canvas.draw()

@@ -17,7 +17,6 @@ from torch import nn
 from dpl.checkpoints import WholeCheckpoints, read
 from dpl.data.datamodule import OfflineData, OnlineData
 from dpl.fem.solution import Load
-from dpl.figures import DeformedShapes
 from dpl.losses import MSE, LrPlus, LrStar
 from dpl.models.fcnn import FCNN
 from dpl.module import (
@@ -270,34 +269,23 @@ def test_tests_are_logged_under_their_own_names(scene, data, tmp_path):
     assert set(numbers) == {f"test/{name}" for name in METRICS}
 
 
-def test_tensorboard_shows_losses_metrics_rate_and_a_picture(scene, data, tmp_path):
+def test_tensorboard_shows_losses_metrics_and_rate(scene, data, tmp_path):
     module = surrogate(scene, LrStar())
     logger = TensorBoardLogger(tmp_path, name="", version="", default_hp_metric=False)
-    shapes, rate = DeformedShapes(every=100, loads=1), LearningRateMonitor()
-    tutor = trainer(tmp_path, shapes, rate, logger=logger, max_epochs=2, log_every_n_steps=1)
+    rate = LearningRateMonitor()
+    tutor = trainer(tmp_path, rate, logger=logger, max_epochs=2, log_every_n_steps=1)
     tutor.fit(module, datamodule=data)
     logger.finalize("success")
-    events = EventAccumulator(str(tmp_path), size_guidance={"images": 0, "scalars": 0})
+    events = EventAccumulator(str(tmp_path), size_guidance={"scalars": 0})
     events.Reload()
     scalars = set(events.Tags()["scalars"])
     wanted = {f"val/{name}" for name in METRICS}
     wanted |= {"loss/train", "loss/val", "loss/mse", "loss/residual", "lr-AdamW"}
     assert wanted <= scalars
-    assert events.Tags()["images"] == ["deformed shapes"]
     assert len(events.Scalars("loss/train")) == 6  # 3 batches an epoch
     assert len(events.Scalars("val/e_mean")) == 2
     rates = [event.value for event in events.Scalars("lr-AdamW")]
     assert len(set(rates)) > 1
-
-
-def test_pictures_come_every_so_many_validations_and_at_the_end(scene, data, tmp_path):
-    logger = TensorBoardLogger(tmp_path, name="", version="")
-    tutor = trainer(tmp_path, DeformedShapes(every=2, loads=1), logger=logger, max_epochs=3)
-    tutor.fit(surrogate(scene), datamodule=data)
-    logger.finalize("success")
-    events = EventAccumulator(str(tmp_path), size_guidance={"images": 0})
-    events.Reload()
-    assert [event.step for event in events.Images("deformed shapes")] == [6, 9]
 
 
 def test_validation_runs_no_backward(scene, data, tmp_path):

@@ -84,9 +84,8 @@ def test_tensorboard_has_hparams_with_the_final_metrics(trained, home):
     rows = json.loads((home / "runs/first/evaluation.json").read_text())
     errors = next(row for row in rows if row["solver"] == "network")["errors"]
     assert any("hparams" in name for name in plugins)
-    for name in ("e_mean", "rel_L2_median", "SNR_min"):
-        (tag,) = [tag for tag in scalars if tag.rpartition("/")[2] == name and "val" not in tag]
-        assert scalars[tag] == pytest.approx(errors[name], rel=1e-5)
+    for name, value in errors.items():
+        assert scalars[f"best/{name}"] == pytest.approx(value, rel=1e-5)
 
 
 def test_evaluate_repeats_the_table_without_solving_again(trained, start, home):
@@ -403,7 +402,8 @@ def test_the_hparams_tab_shows_the_runs_of_a_sweep_side_by_side(swept):
     assert {"model", "loss", "optimizer.lr", "model.layers", "model.rank", "young"} <= names
     assert not [name for name in names if "_" in (name[0], name[-1]) or "callbacks" in name]
     metrics = {info.name.tag for info in columns.metric_infos}
-    assert {"e_mean", "e_max", "SNR_min", "rel_L2_median", "residual"} <= metrics
+    judged = ("e_mean", "e_max", "SNR_min", "rel_L2_median", "residual")
+    assert {f"best/{name}" for name in judged} <= metrics
 
     assert len(lines) == 4
     folders = configurations(swept / "sweep")
@@ -415,7 +415,8 @@ def test_the_hparams_tab_shows_the_runs_of_a_sweep_side_by_side(swept):
                 folders[shown["model"], shown["loss"], shown["optimizer"]] / "evaluation.json"
             ).read_text()
         )
-        assert errors["e_mean"] == pytest.approx(rows[1]["errors"]["e_mean"], rel=1e-5)
+        for name in judged:
+            assert errors[f"best/{name}"] == pytest.approx(rows[1]["errors"][name], rel=1e-5)
         width, wanted = line.hparams["model.width"].number_value, 16
         assert width == wanted
         assert ("model.rank" in line.hparams) == (shown["model"] == "Latent")

@@ -13,10 +13,9 @@ from dpl.commands import entry
 def main(cfg: DictConfig) -> float | None:
     """Train a surrogate and judge it; return its smallest validation e_mean [-] to a sweep."""
     # here and not above: worker processes import this file, and need none of it
-    import lightning as L
     import torch
-    from torch.utils.tensorboard.summary import hparams
 
+    from dpl import board
     from dpl.benchmarks.evaluation import evaluate
     from dpl.guard import Diverged
 
@@ -28,6 +27,8 @@ def main(cfg: DictConfig) -> float | None:
     surrogate = run.build_surrogate(cfg, scene)
     trainer = run.make(cfg, "trainer")
     entry.check_trainer(trainer, cfg)
+    session = board.Session(run.hyperparameters(cfg))
+    trainer.callbacks.append(session)
     if trainer.is_global_zero:
         run.show_plan(scene, data, surrogate)
         run.save_config(cfg, folder)
@@ -48,12 +49,5 @@ def main(cfg: DictConfig) -> float | None:
     _, best = run.load_run(folder, trust=True, scene=scene)
     rows = evaluate(best, data.samples("test"), folder)
     network = next(row for row in rows if row.solver == "network")
-    if isinstance(trainer.logger, L.pytorch.loggers.TensorBoardLogger):
-        trainer.logger.log_metrics(network.errors)
-        # not the list of columns, which Lightning would write: it hides those of other runs
-        _, *session = hparams(run.hyperparameters(cfg), network.errors)
-        for part in session:
-            trainer.logger.experiment.file_writer.add_summary(part)
-        trainer.logger.save()
-        trainer.logger.finalize("success")
+    session.finish(trainer, network.errors)
     return entry.best_error(trainer)

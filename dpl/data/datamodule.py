@@ -172,7 +172,11 @@ class OfflineData(L.LightningDataModule):
 
 
 class OnlineData(OfflineData):
-    """Training samples solved while the network trains; validation and test from disk."""
+    """Training samples solved while the network trains; validation and test from disk.
+
+    Attributes:
+        rates: How fast the samples of the last epoch were made and used; None before its end.
+    """
 
     def __init__(
         self,
@@ -223,6 +227,7 @@ class OnlineData(OfflineData):
         super().__init__(scene, train=0, workers=workers, batch_size=batch_size, **kwargs)  # type: ignore[arg-type]
         self._options = {"batches": batches, "fresh": fresh, "reuse": reuse, "capacity": capacity}
         self._save, self._worst = save, worst
+        self.rates: Rates | None = None
         self._replay: Replay | None = None
         self._produced = self._first = 0  # what earlier runs took that this one resumes
 
@@ -268,10 +273,8 @@ class OnlineData(OfflineData):
         return getattr(module, "batch_errors", None)
 
     def _report(self, rates: Rates) -> None:
-        """Log an epoch's rates; write what makes whole shards."""
-        if self.trainer is not None and self.trainer.logger is not None:
-            named = {f"online/{name}": value for name, value in rates._asdict().items()}
-            self.trainer.logger.log_metrics(named, step=self.trainer.global_step)
+        """Keep an epoch's rates; write what makes whole shards."""
+        self.rates = rates
         if self._save and self.place[0] == 0:
             with suppress(DataSetError):  # another process writes there; shards can wait
                 Writer(self.store).collect("train")

@@ -160,12 +160,14 @@ class Rates(NamedTuple):
         produced, consumed: Samples a second.
         waiting: Part of the time in which the optimiser had nothing to do.
         uses: How often the samples made so far have been used, on average.
+        buffer: Samples kept.
     """
 
     produced: float
     consumed: float
     waiting: float
     uses: float
+    buffer: int
 
 
 class Replay:
@@ -245,6 +247,7 @@ class Replay:
                     consumed=(self._used - used) / seconds,
                     waiting=(self._waited - waited) / seconds,
                     uses=self._used / max(self.produced, 1),
+                    buffer=self._buffer.size,
                 )
                 self._report(self.rates)
             yield batch
@@ -341,6 +344,11 @@ class _Buffer:
     def full(self) -> bool:
         """Whether the oldest sample leaves for the next one."""
         return self._count >= self._capacity
+
+    @property
+    def size(self) -> int:
+        """Samples kept."""
+        return min(self._count, self._capacity)
 
     @property
     def left(self) -> int:

@@ -9,8 +9,6 @@ import lightning as L
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dpl.data.audit import verify
 from dpl.data.datamodule import OfflineData, OnlineData, Samples
@@ -621,50 +619,28 @@ def test_two_workers_keep_what_they_solve(scene, saving, tmp_path):
 
 
 @pytest.fixture
-def fitted(scene, tmp_path):
+def fitted(scene):
     """Trains on a stream for some epochs; returns the trainer."""
 
     def fitted(module, epochs=2):
         torch.manual_seed(0)
-        logger = TensorBoardLogger(tmp_path / "log", name="", version="")
         trainer = L.Trainer(
-            accelerator="cpu", max_epochs=epochs, logger=logger, num_sanity_val_steps=0,
+            accelerator="cpu", max_epochs=epochs, logger=False, num_sanity_val_steps=0,
             enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
-            log_every_n_steps=1,
         )  # fmt: skip
         trainer.fit(Surrogate(FCNN(scene, width=4), MSE(), scene), datamodule=module)
-        logger.finalize("success")
         return trainer
 
     return fitted
 
 
-def scalars(folder):
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
-    events.Reload()
-    return {tag: events.Scalars(tag) for tag in events.Tags()["scalars"]}
-
-
-def test_the_rates_of_the_stream_are_handed_to_the_logger(online):
-    module, logged = online(reuse=2), []
-    logger = SimpleNamespace(log_metrics=lambda numbers, step: logged.append((step, numbers)))
-    module.trainer = SimpleNamespace(logger=logger, global_step=7, global_rank=0, world_size=1)
+def test_the_rates_of_an_epoch_are_there_at_its_end(online):
+    module = online(reuse=2)
+    assert module.rates is None
     list(module.train_dataloader())
-    ((step, numbers),) = logged
-    assert step == 7
-    assert set(numbers) == {f"online/{name}" for name in Rates._fields}
-    assert numbers["online/uses"] == pytest.approx(12 / 12)
-
-
-REPORT = "Lightning asks for `len` batches and no more: what follows `yield from` never runs"
-
-
-def test_tensorboard_shows_the_rates_of_each_epoch(online, fitted, tmp_path):
-    fitted(online(), epochs=3)
-    found = scalars(tmp_path / "log")
-    for name in Rates._fields:
-        first, second, third = (event.step for event in found[f"online/{name}"])
-        assert 0 < first <= 3 < second <= 6 < third <= 9
+    assert isinstance(module.rates, Rates)
+    assert module.rates.uses == pytest.approx(12 / 12)
+    assert module.rates.buffer == 12
 
 
 def test_a_trained_stream_leaves_whole_shards(saving, fitted, tmp_path):
