@@ -14,6 +14,7 @@ from dpl.fem.problem import Problem
 from dpl.scene import Sample
 
 if TYPE_CHECKING:
+    from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
 # Vertices of a cell's facets in turn around each facet, by cell shape.
@@ -94,6 +95,42 @@ def deformed(
     return figure
 
 
+def body(
+    ax: Any,
+    problem: Problem,
+    displacement: Tensor | None = None,
+    *,
+    values: Tensor | None = None,
+    limits: tuple[float, float] | None = None,
+    colours: str = "viridis",
+    room: Sequence[Tensor] = (),
+) -> "ScalarMappable":
+    """Draw a body on matplotlib's axes, deformed, and return its colours, for a colour bar.
+
+    Args:
+        ax: Of projection "3d" for a body in 3D.
+        problem: The body.
+        displacement: (N, D) [-]; at rest if left out.
+        values: What its colours show, (N,), each polygon the mean of its corners; grey if left out.
+        limits: Smallest and largest value of the colours; those of the values if left out.
+        colours: Name of a colour map of matplotlib.
+        room: Further displacements (N, D) that the axes are to have room for, so that pictures
+            side by side have one scale.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    polygons, points = surface(problem.mesh), problem.points.cpu().numpy()
+    moved = [points + u.detach().cpu().numpy() for u in (displacement, *room) if u is not None]
+    places = points if displacement is None else moved[0]
+    shades = np.zeros(len(points)) if values is None else values.detach().cpu().numpy()
+    scale = ScalarMappable(Normalize(*(limits or (shades.min(), shades.max()))), colours)
+    faces: Any = "0.85" if values is None else scale.to_rgba(shades[polygons].mean(axis=1))
+    _draw(ax, places[polygons], facecolors=faces, edgecolors="0.3", linewidths=0.2)
+    _frame(ax, np.stack([points, *moved]), zoom=1.25)
+    return scale
+
+
 def _draw(ax: Any, polygons: Any, **style: Any) -> None:
     from matplotlib.collections import PolyCollection
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -104,14 +141,14 @@ def _draw(ax: Any, polygons: Any, **style: Any) -> None:
         ax.add_collection(PolyCollection(polygons, **style))
 
 
-def _frame(ax: Any, points: NDArray[np.float64]) -> None:
+def _frame(ax: Any, points: NDArray[np.float64], zoom: float = 1.1) -> None:
     """Show the box of all points, equal scales, no axes."""
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
     ax.set_xlim(low[0], high[0])
     ax.set_ylim(low[1], high[1])
     if len(low) == 3:
         ax.set_zlim(low[2], high[2])
-        ax.set_box_aspect(high - low, zoom=1.1)
+        ax.set_box_aspect(high - low, zoom=zoom)
         ax.view_init(elev=18, azim=-60)
     else:
         ax.set_aspect("equal")
