@@ -127,7 +127,7 @@ def body(
     scale = ScalarMappable(Normalize(*(limits or (shades.min(), shades.max()))), colours)
     faces: Any = "0.85" if values is None else scale.to_rgba(shades[polygons].mean(axis=1))
     _draw(ax, places[polygons], facecolors=faces, edgecolors="0.3", linewidths=0.2)
-    _frame(ax, np.stack([points, *moved]), zoom=1.15)
+    _frame(ax, np.stack([points, *moved]), zoom=1.0)
     return scale
 
 
