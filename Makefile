@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup train test lint slow clean
+.PHONY: setup train test lint slow wheel clean
 
 setup: .venv/installed
 
@@ -26,6 +26,9 @@ lint: setup
 
 slow: setup
 	$(BIN)/python -m pytest -m 'slow and not gpu' --timeout 1800
+
+wheel: setup
+	$(BIN)/pip wheel --quiet --no-deps -w dist .
 
 clean:
 	rm -rf .venv build dist

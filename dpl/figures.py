@@ -88,7 +88,7 @@ def deformed(
             shape, true = (points + field[column])[polygons], (points + right[column])[polygons]
             _draw(ax, shape, facecolors=colours, edgecolors="none")
             _draw(ax, true, facecolors="none", edgecolors="0.4", linewidths=0.3)
-            _frame(ax, seen)
+            _frame(ax, seen, zoom=1.1)
             title = [names[column]] if row == 0 and names else []
             ax.set_title("\n".join([*title, name]), fontsize=9)
     figure.colorbar(scale, ax=axes, label="distance from the true position / L", shrink=0.8)
@@ -141,7 +141,7 @@ def _draw(ax: Any, polygons: Any, **style: Any) -> None:
         ax.add_collection(PolyCollection(polygons, **style))
 
 
-def _frame(ax: Any, points: NDArray[np.float64], zoom: float = 1.1) -> None:
+def _frame(ax: Any, points: NDArray[np.float64], *, zoom: float) -> None:
     """Show the box of all points, equal scales, no axes."""
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
     ax.set_xlim(low[0], high[0])
