@@ -11,6 +11,7 @@ from torch import Tensor
 from dpl.fem.problem import Problem
 
 if TYPE_CHECKING:
+    from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
 # Vertices of a cell's facets in turn around each facet, by cell shape.
@@ -108,6 +109,42 @@ def deformed(
     else:
         figure.colorbar(scale, ax=axes, label=label, shrink=0.8)
     return figure
+
+
+def body(
+    ax: Any,
+    problem: Problem,
+    displacement: Tensor | None = None,
+    *,
+    values: Tensor | None = None,
+    limits: tuple[float, float] | None = None,
+    colours: str = "viridis",
+    room: Sequence[Tensor] = (),
+) -> "ScalarMappable":
+    """Draw a body on matplotlib's axes, deformed, and return its colours, for a colour bar.
+
+    Args:
+        ax: Of projection "3d" for a body in 3D.
+        problem: The body.
+        displacement: (N, D) [-]; at rest if left out.
+        values: What its colours show, (N,), each polygon the mean of its corners; grey if left out.
+        limits: Smallest and largest value of the colours; those of the values if left out.
+        colours: Name of a colour map of matplotlib.
+        room: Further displacements (N, D) that the axes are to have room for, so that pictures
+            side by side have one scale.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    polygons, points = surface(problem.mesh), problem.points.cpu().numpy()
+    moved = [points + u.detach().cpu().numpy() for u in (displacement, *room) if u is not None]
+    places = points if displacement is None else moved[0]
+    shades = np.zeros(len(points)) if values is None else values.detach().cpu().numpy()
+    scale = ScalarMappable(Normalize(*(limits or (shades.min(), shades.max()))), colours)
+    faces: Any = "0.85" if values is None else scale.to_rgba(shades[polygons].mean(axis=1))
+    _draw(ax, places[polygons], facecolors=faces, edgecolors="0.3", linewidths=0.2)
+    _frame(ax, np.stack([points, *moved]), zoom=1.0)
+    return scale
 
 
 def _draw(ax: Any, polygons: Any, **style: Any) -> None:

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 import skfem
 import torch
+from matplotlib.figure import Figure
 
-from dpl.fem.mesh import box, rectangle
-from dpl.figures import coarse, colours, deformed, spread, surface, triangles
+from dpl.fem.materials import NeoHookeanLn
+from dpl.fem.mesh import Plane, box, rectangle
+from dpl.fem.problem import Problem
+from dpl.figures import body, coarse, colours, deformed, spread, surface, triangles
 
 
 def edges(polygons):
@@ -172,3 +175,30 @@ def test_errors_are_drawn_against_the_size_of_the_answer_and_sorted():
 @pytest.mark.parametrize("value", [0.0, torch.nan])
 def test_errors_that_are_all_zero_or_no_number_can_be_drawn(value):
     spread(torch.full((3,), value), torch.zeros(3), [0]).canvas.draw()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_body_is_drawn_where_its_nodes_are_and_in_the_colours_of_their_values(dim):
+    shape = {2: rectangle([2.0, 1.0], [3, 2]), 3: box([2.0, 1.0, 1.0], [3, 2, 2])}[dim]
+    problem = Problem.build(shape, NeoHookeanLn(0.3), fixed=Plane(0, "min"))
+    moved = torch.zeros(problem.shape, dtype=torch.float64)
+    moved[:, 0] = 0.3 * problem.points[:, 0]
+    ax = Figure().add_subplot(projection="3d" if dim == 3 else None)
+    scale = body(ax, problem, moved, values=problem.points[:, 0], room=[-moved])
+    (drawn,) = ax.collections
+    faces = drawn.get_facecolor()
+    if dim == 2:
+        assert max(path.vertices[:, 0].max() for path in drawn.get_paths()) == pytest.approx(1.3)
+        assert np.allclose(faces, scale.to_rgba([0.25, 0.75]))  # means of their corners
+    assert ax.get_xlim() == (pytest.approx(0.0), pytest.approx(1.3))
+    assert scale.get_clim() == (0.0, 1.0)
+    assert len(np.unique(faces, axis=0)) > 1
+
+
+def test_a_body_without_values_is_grey_and_at_rest():
+    problem = Problem.build(rectangle([2.0, 1.0], [3, 2]), NeoHookeanLn(0.3), fixed=Plane(0, "min"))
+    ax = Figure().add_subplot()
+    body(ax, problem)
+    (drawn,) = ax.collections
+    assert len(np.unique(drawn.get_facecolor()[:, :3])) == 1
+    assert ax.get_xlim() == (0.0, 1.0)

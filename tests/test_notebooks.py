@@ -1,0 +1,76 @@
+"""Notebooks as a reader finds them: nothing in them has run yet, and all of it does."""
+
+import re
+import time
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+SECONDS = 300  # for one cell, where everything has to be compiled first
+
+every = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+def test_there_are_six_and_the_index_names_each():
+    index = (ROOT / "notebooks" / "README.md").read_text()
+    assert [path.name[:2] for path in NOTEBOOKS] == [f"{k}_" for k in range(1, 7)]
+    assert [path.name for path in NOTEBOOKS if f"({path.name})" not in index] == []
+
+
+@every
+def test_a_notebook_is_stored_as_it_was_written(path):
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert (notebook.nbformat, notebook.nbformat_minor) == (4, 5)
+    assert set(notebook.metadata) <= {"kernelspec", "language_info"}
+    assert 10 <= len(notebook.cells) <= 25
+    assert notebook.cells[0].source.startswith("# ")
+    for cell in notebook.cells:
+        assert not cell.metadata
+        if cell.cell_type == "code":
+            assert cell.outputs == []
+            assert cell.execution_count is None
+
+
+@every
+def test_a_notebook_names_no_place_of_a_machine(path):
+    text = path.read_text()
+    assert (
+        re.findall(r"(?<![\w.])/(?:home|tmp|work|root|usr|opt|mnt|Users)/|[A-Z]:\\\\", text) == []
+    )
+
+
+@every
+def test_a_notebook_links_to_what_is_there(path):
+    for target in re.findall(r"\]\(([^)#]+\.ipynb)\)", path.read_text()):
+        assert (path.parent / target).is_file()
+
+
+@every
+@pytest.mark.timeout(1200)
+def test_a_notebook_runs_and_leaves_nothing_behind(path, tmp_path, monkeypatch, environment):
+    """Its assertions hold; it draws, warns of nothing and works outside the repository."""
+    for name, value in environment().items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.delenv("MPLBACKEND")  # a kernel's own, which puts figures into the notebook
+    before = _files()
+    notebook = nbformat.read(path, as_version=4)
+    place = {"metadata": {"path": str(tmp_path)}}
+    start = time.perf_counter()
+    NotebookClient(notebook, timeout=SECONDS, kernel_name="python3", resources=place).execute()
+    print(f"{path.name}: {time.perf_counter() - start:.1f} s")
+    outputs = [out for cell in notebook.cells for out in cell.get("outputs", [])]
+    assert sum("image/png" in out.get("data", {}) for out in outputs) >= 5
+    said = [out.text for out in outputs if out.get("name") == "stderr"]
+    assert [text for text in said if "Warning" in text] == []
+    assert list(tmp_path.iterdir()) == []
+    assert _files() == before
+
+
+def _files() -> set[Path]:
+    """Return what lies beside the notebooks and at the top of the repository."""
+    return {*(ROOT / "notebooks").rglob("*"), *ROOT.glob("[!.]*")}
