@@ -4,15 +4,14 @@
 #include <cmath>
 #include <fstream>
 #include <iostream>
-#include <iterator>
 #include <string>
 #include <vector>
 
 std::vector<double> read(const std::string& path) {  // float64, little-endian
   std::ifstream file(path, std::ios::binary);
-  const std::vector<char> bytes{std::istreambuf_iterator<char>(file), {}};
-  const auto* numbers = reinterpret_cast<const double*>(bytes.data());
-  return {numbers, numbers + bytes.size() / sizeof(double)};
+  std::vector<double> numbers;
+  for (double x; file.read(reinterpret_cast<char*>(&x), sizeof x);) numbers.push_back(x);
+  return numbers;
 }
 
 int main(int argc, char** argv) {

@@ -89,7 +89,7 @@ def model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
     }
     with whole_file(folder / "report.json") as file:
         file.write((json.dumps(report, indent=1) + "\n").encode())
-    table.show(compared, "ONNX against torch: largest differences over the answer")
+    table.show(compared, "ONNX against torch")
     table.show(times, f"medians of {cfg.repeats} [ms], 1 thread")
     if not report["passed"]:
         for part in folder.glob("model.onnx*"):

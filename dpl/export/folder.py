@@ -53,6 +53,7 @@ class Reference:
         residual: ||R_free|| / ||f|| of the surrogate's answer [-].
         exact_residual: Of the other [-].
         converged: Whether that is below the tolerance of the scene.
+        local: Whether the load is local after all.
         error: Relative difference of the two, ||a - b|| / ||b|| [-].
     """
 
@@ -62,6 +63,7 @@ class Reference:
     residual: float
     exact_residual: float
     converged: bool
+    local: bool
     error: float
 
     def fields(self) -> dict[str, Array]:
@@ -95,6 +97,7 @@ def reference(graph: Graph, *, most: int = 16) -> Reference:
         float(answer.residual),
         float(exact.residual),
         bool(exact.converged),
+        any(map(bool, local)),
         float(apart),
     )
 
@@ -165,6 +168,7 @@ def described(
             "residual": told.residual,
             "exact_residual": told.exact_residual,
             "exact_converged": told.converged,
+            "local": told.local,
             "error": told.error,
         },
         "mesh": _mesh(scene.problem),

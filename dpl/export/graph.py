@@ -56,6 +56,7 @@ class Graph(nn.Module):
         """Take a trained surrogate on the CPU."""
         super().__init__()
         self.surrogate = surrogate.eval()
+        self.basis = isinstance(surrogate.net, Latent)
         self.flags = isinstance(surrogate.net, Latent) and surrogate.net.linear_tol < torch.inf
 
     @property
@@ -82,11 +83,12 @@ class Graph(nn.Module):
         module = self.surrogate
         load = module.scene.load_of(force, young, poisson)
         scaled, more = module.entering(load)
-        if not self.flags:
+        if not self.basis:
             return (module.scene.length * module.leaving(module.net(scaled, **more)),)
         answer, local = module.net.within(scaled, **more)
+        metres = module.scene.length * module.leaving(answer)
         loaded = (force != 0).flatten(1).any(dim=1)  # at rest the basis misses nothing
-        return module.scene.length * module.leaving(answer), local & loaded
+        return (metres, local & loaded) if self.flags else (metres,)
 
 
 def export(graph: Graph, path: Path) -> None:

@@ -36,6 +36,12 @@ SIDES = {  # of these cells: corners, which meshio lists first
     "quad8": 4,
     "quad9": 4,
 }
+MIRRORED = {  # nodes of a simplex whose first two corners change places
+    "triangle": [1, 0, 2],
+    "triangle6": [1, 0, 2, 3, 5, 4],
+    "tetra": [1, 0, 2, 3],
+    "tetra10": [1, 0, 2, 3, 4, 6, 5, 8, 7, 9],
+}
 MOST_VALUES = 1000  # of a field that tells parts apart; with more it counts something else
 
 Numbers = NDArray[np.int_]
@@ -276,6 +282,8 @@ def _is_mask(blocks: list) -> bool:
 def flat(mesh: skfem.Mesh, nodes: int) -> tuple[str, Numbers]:
     """Return the cells of a body as files list them: meshio's name, nodes in VTK's order (E, A).
 
+    Simplices are right-handed.
+
     Args:
         mesh: The body.
         nodes: Of its fields: those of the mesh, or of quadratic cells on it.
@@ -288,7 +296,15 @@ def flat(mesh: skfem.Mesh, nodes: int) -> tuple[str, Numbers]:
     if nodes != mesh.p.shape[1]:
         raise ValueError(f"fields at {nodes} nodes are of another body")
     (block,) = to_meshio(mesh, encode_cell_data=False).cells
-    return block.type, block.data
+    if block.type not in MIRRORED:
+        return block.type, block.data
+    # scikit-fem sorts the nodes of simplices, so that half of them are left-handed
+    dim = mesh.dim()
+    corners = mesh.p.T[block.data[:, : dim + 1]]
+    left = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
+    cells = block.data.copy()
+    cells[left] = cells[left][:, MIRRORED[block.type]]
+    return block.type, cells
 
 
 def _quadratic(mesh: skfem.Mesh) -> skfem.Mesh:
@@ -305,9 +321,12 @@ def _quadratic(mesh: skfem.Mesh) -> skfem.Mesh:
 
 def _written(mesh: skfem.Mesh, fields: Mapping[str, Array]) -> meshio.Mesh:
     """Return a body with its fields as meshio writes them, see `save`."""
-    nodes = {len(field) for field in fields.values()} or {mesh.p.shape[1]}
-    kind, cells = flat(mesh, *nodes)
-    whole = mesh if nodes == {mesh.p.shape[1]} else _quadratic(mesh)
+    counts = {len(field) for field in fields.values()} or {mesh.p.shape[1]}
+    if len(counts) > 1:
+        raise ValueError(f"fields at {', '.join(map(str, sorted(counts)))} nodes: of one body each")
+    (nodes,) = counts
+    kind, cells = flat(mesh, nodes)
+    whole = mesh if nodes == mesh.p.shape[1] else _quadratic(mesh)
     tags = to_meshio(mesh).cell_data
     data = {name: _spatial(field) for name, field in fields.items()}
     return meshio.Mesh(_spatial(whole.p.T), [(kind, cells)], point_data=data, cell_data=tags)
