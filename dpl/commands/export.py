@@ -77,7 +77,7 @@ def model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
         "tolerance": cfg.tol,
         "largest_error": worst,
         "reference_error": repeated,
-        "loads": [asdict(row) | {"local_error": _known(row.local_error)} for row in compared],
+        "loads": [{key: _known(value) for key, value in asdict(row).items()} for row in compared],
         "milliseconds": [asdict(row) for row in times],
         "threads": 1,
         "repeats": cfg.repeats,
@@ -122,7 +122,7 @@ def _errors(folder: Path) -> dict[str, float] | None:
         ) from error
 
 
-def _known(value: float) -> float | None:
+def _known(value: Any) -> Any:
     """Return a number for JSON, which has no NaN."""
     return value if value == value else None
 

@@ -296,15 +296,34 @@ def flat(mesh: skfem.Mesh, nodes: int) -> tuple[str, Numbers]:
     if nodes != mesh.p.shape[1]:
         raise ValueError(f"fields at {nodes} nodes are of another body")
     (block,) = to_meshio(mesh, encode_cell_data=False).cells
-    if block.type not in MIRRORED:
-        return block.type, block.data
-    # scikit-fem sorts the nodes of simplices, so that half of them are left-handed
-    dim = mesh.dim()
-    corners = mesh.p.T[block.data[:, : dim + 1]]
-    left = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
-    cells = block.data.copy()
-    cells[left] = cells[left][:, MIRRORED[block.type]]
+    left, cells = _left(mesh), block.data.copy()
+    if left.any():
+        cells[left] = cells[left][:, MIRRORED[block.type]]
     return block.type, cells
+
+
+def _left(mesh: skfem.Mesh) -> NDArray[np.bool_]:
+    """Return which simplices are left-handed, (E,), as scikit-fem's may be; of other cells none."""
+    if mesh.elem.refdom.name not in ("Triangular", "Tetrahedral"):
+        return np.zeros(mesh.nelements, dtype=bool)
+    corners = mesh.p.T[mesh.t[: mesh.dim() + 1].T]
+    return np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
+
+
+def _tags(mesh: skfem.Mesh) -> dict[str, list[Array]]:
+    """Return the tags of a body as data of its cells, whose facets are numbered as `flat` does.
+
+    Sets of facets are a bit for each side of each cell. Where two corners of a simplex change
+    places the last two of its sides do.
+    """
+    tags: dict[str, list[Array]] = to_meshio(mesh).cell_data
+    last = mesh.dim()
+    for name, (bits,) in tags.items():
+        if name.startswith("skfem:b:"):
+            whole = np.asarray(bits).astype(np.int64)
+            change = (whole >> last ^ whole >> (last - 1)) & _left(mesh)
+            tags[name] = [(whole ^ (change << last | change << (last - 1))).astype(bits.dtype)]
+    return tags
 
 
 def _quadratic(mesh: skfem.Mesh) -> skfem.Mesh:
@@ -327,9 +346,8 @@ def _written(mesh: skfem.Mesh, fields: Mapping[str, Array]) -> meshio.Mesh:
     (nodes,) = counts
     kind, cells = flat(mesh, nodes)
     whole = mesh if nodes == mesh.p.shape[1] else _quadratic(mesh)
-    tags = to_meshio(mesh).cell_data
     data = {name: _spatial(field) for name, field in fields.items()}
-    return meshio.Mesh(_spatial(whole.p.T), [(kind, cells)], point_data=data, cell_data=tags)
+    return meshio.Mesh(_spatial(whole.p.T), [(kind, cells)], point_data=data, cell_data=_tags(mesh))
 
 
 def _spatial(field: Array) -> Array:

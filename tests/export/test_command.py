@@ -39,8 +39,8 @@ def test_export_writes_a_folder_that_others_can_use(script, trained):
     }
     report = json.loads((folder / "report.json").read_text(), parse_constant=pytest.fail)
     assert report["passed"]
-    assert report["largest_error"] <= report["tolerance"] == 1e-5
-    assert [row["batch"] for row in report["milliseconds"]] == [1, 28]
+    assert report["largest_error"] <= report["tolerance"] == 1e-4
+    assert [row["batch"] for row in report["milliseconds"]] == [1, 4]
     assert all(row["torch"] > 0 < row["onnxruntime"] for row in report["milliseconds"])
     meta = json.loads((folder / "meta.json").read_text(), parse_constant=pytest.fail)
     judged = json.loads((trained / "runs/first/evaluation.json").read_text())

@@ -106,7 +106,7 @@ def test_without_finite_elements_no_error_is_claimed(scene_on, tmp_path):
 
 @pytest.mark.parametrize("name", ["tetra", "tetra, quadratic", "triangle", "triangle, quadratic"])
 def test_simplices_are_written_right_handed(scene_on, tmp_path, name):
-    """Of Kuhn's tetrahedra half are left-handed in scikit-fem, which sorts their nodes."""
+    """Of Kuhn's tetrahedra half are left-handed."""
     problem = scene_on(name).problem
     save(tmp_path / "body.vtu", problem.mesh, {"x": problem.points.numpy()[:, 0]})
     found = meshio.read(tmp_path / "body.vtu")
