@@ -36,9 +36,7 @@ SIDES = {  # of these cells: corners, which meshio lists first
     "quad8": 4,
     "quad9": 4,
 }
-MIRRORED = {  # nodes of a simplex whose first two corners change places
-    "triangle": [1, 0, 2],
-    "triangle6": [1, 0, 2, 3, 5, 4],
+MIRRORED = {  # nodes of a tetrahedron whose first two corners change places
     "tetra": [1, 0, 2, 3],
     "tetra10": [1, 0, 2, 3, 4, 6, 5, 8, 7, 9],
 }
@@ -282,7 +280,7 @@ def _is_mask(blocks: list) -> bool:
 def flat(mesh: skfem.Mesh, nodes: int) -> tuple[str, Numbers]:
     """Return the cells of a body as files list them: meshio's name, nodes in VTK's order (E, A).
 
-    Simplices are right-handed.
+    Tetrahedra are right-handed, as scikit-fem's need not be.
 
     Args:
         mesh: The body.
@@ -303,26 +301,25 @@ def flat(mesh: skfem.Mesh, nodes: int) -> tuple[str, Numbers]:
 
 
 def _left(mesh: skfem.Mesh) -> NDArray[np.bool_]:
-    """Return which simplices are left-handed, (E,), as scikit-fem's may be; of other cells none."""
-    if mesh.elem.refdom.name not in ("Triangular", "Tetrahedral"):
+    """Return which cells are left-handed tetrahedra, (E,)."""
+    if mesh.elem.refdom.name != "Tetrahedral":
         return np.zeros(mesh.nelements, dtype=bool)
-    corners = mesh.p.T[mesh.t[: mesh.dim() + 1].T]
+    corners = mesh.p.T[mesh.t[:4].T]
     return np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
 
 
 def _tags(mesh: skfem.Mesh) -> dict[str, list[Array]]:
     """Return the tags of a body as data of its cells, whose facets are numbered as `flat` does.
 
-    Sets of facets are a bit for each side of each cell. Where two corners of a simplex change
-    places the last two of its sides do.
+    Sets of facets are a bit for each side of each cell. Where the first two corners of a
+    tetrahedron change places its last two sides do.
     """
     tags: dict[str, list[Array]] = to_meshio(mesh).cell_data
-    last = mesh.dim()
     for name, (bits,) in tags.items():
         if name.startswith("skfem:b:"):
             whole = np.asarray(bits).astype(np.int64)
-            change = (whole >> last ^ whole >> (last - 1)) & _left(mesh)
-            tags[name] = [(whole ^ (change << last | change << (last - 1))).astype(bits.dtype)]
+            change = (whole >> 3 ^ whole >> 2) & _left(mesh)
+            tags[name] = [(whole ^ (change << 3 | change << 2)).astype(bits.dtype)]
     return tags
 
 
