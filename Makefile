@@ -1,9 +1,10 @@
 # make train: environment, installation and the main job on the small default scene.
 # make test:  installation and the checks that CI makes.
+# make docs:  the documentation into site/; NOTEBOOKS=false leaves them unexecuted.
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup train test lint slow clean
+.PHONY: setup train test lint slow docs wheel clean
 
 setup: .venv/installed
 
@@ -27,5 +28,11 @@ lint: setup
 slow: setup
 	$(BIN)/python -m pytest -m 'slow and not gpu' --timeout 1800
 
+docs: setup
+	NO_MKDOCS_2_WARNING=1 NOTEBOOKS=$(or $(NOTEBOOKS),true) $(BIN)/python -m mkdocs build --strict -f docs/make/mkdocs.yml
+
+wheel: setup
+	$(BIN)/pip wheel --quiet --no-deps -w dist .
+
 clean:
-	rm -rf .venv build dist
+	rm -rf .venv build dist site

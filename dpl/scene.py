@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpl.fem.compliance import Linear
 from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, beside, solve
 

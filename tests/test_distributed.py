@@ -16,7 +16,7 @@ from hydra.types import RunMode
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import OmegaConf
 
-from dpl import run
+from dpl.commands import entry
 from dpl.run import ConfigError
 
 ROOT = Path(__file__).parents[1]
@@ -140,7 +140,7 @@ def sweeping(monkeypatch):
 
     def sweeping(mode=RunMode.MULTIRUN):
         config = SimpleNamespace(initialized=lambda: True, get=lambda: SimpleNamespace(mode=mode))
-        monkeypatch.setattr(run, "HydraConfig", config)
+        monkeypatch.setattr(entry, "HydraConfig", config)
 
     return sweeping
 
@@ -175,7 +175,7 @@ def test_a_refused_sweep_ends_with_one_line_and_makes_nothing(script, tiny, tmp_
 def test_processes_that_run_the_command_again_are_refused_in_a_sweep(sweeping, strategy):
     sweeping()
     with pytest.raises(ConfigError, match=r"trainer\.strategy: .* -m") as refusal:
-        run.check_trainer(trainer(devices=2, strategy=strategy), SCHEDULED)
+        entry.check_trainer(trainer(devices=2, strategy=strategy), SCHEDULED)
     assert "\n" not in str(refusal.value)
 
 
@@ -186,13 +186,13 @@ def test_processes_that_run_the_command_again_are_refused_in_a_sweep(sweeping, s
 )
 def test_what_does_not_run_the_command_again_is_not_refused_in_a_sweep(sweeping, options):
     sweeping()
-    run.check_trainer(trainer(**options), SCHEDULED)
+    entry.check_trainer(trainer(**options), SCHEDULED)
 
 
 def test_without_a_sweep_nothing_is_refused(sweeping):
-    run.check_trainer(trainer(devices=2, strategy="ddp"), SCHEDULED)
+    entry.check_trainer(trainer(devices=2, strategy="ddp"), SCHEDULED)
     sweeping(RunMode.RUN)
-    run.check_trainer(trainer(devices=2, strategy="ddp"), SCHEDULED)
+    entry.check_trainer(trainer(devices=2, strategy="ddp"), SCHEDULED)
 
 
 class Outside(LightningEnvironment):
@@ -203,4 +203,4 @@ class Outside(LightningEnvironment):
 
 def test_the_remedies_that_the_refusal_names_are_not_refused(sweeping):
     sweeping()
-    run.check_trainer(trainer(devices=2, strategy="ddp", plugins=[Outside()]), SCHEDULED)
+    entry.check_trainer(trainer(devices=2, strategy="ddp", plugins=[Outside()]), SCHEDULED)

@@ -11,6 +11,7 @@ import torch
 
 from dpl import run
 from dpl.benchmarks.evaluation import evaluate
+from dpl.data.audit import verify
 from dpl.data.datamodule import OfflineData, OnlineData
 from dpl.data.durable import DataSetError
 from dpl.data.shard import opened
@@ -143,8 +144,8 @@ def test_a_law_that_is_its_energy_alone_has_batches_too(make_scene):
 def test_nothing_is_compiled_or_analysed_again(wide, monkeypatch):
     loads = wide.loads.sample((0, 0), range(6))
     solve(wide.solver, Load(*(column[:1] for column in loads)))
-    monkeypatch.setattr("dpl.fem.problem.Pattern.build", None)
-    monkeypatch.setattr("dpl.fem.newton.backend", None)
+    monkeypatch.setattr("dpl.fem.pattern.Pattern.build", None)
+    monkeypatch.setattr("dpl.fem.compliance.backend", None)
     monkeypatch.setattr("dpl.fem.problem.Kernels.__init__", None)
     monkeypatch.setattr("dpl.fem.kernels._alone", None)
     assert solve(wide.solver, loads).converged.all()
@@ -267,7 +268,7 @@ def test_the_data_set_keeps_poissons_ratios_and_that_of_one_has_no_such_column(s
     assert torch.equal(
         kept.poisson, wide.loads.sample(sets.store.stream("train"), range(96)).poisson
     )
-    assert [flaw for _, flaw in sets.store.verify() if flaw] == []
+    assert [flaw for _, flaw in verify(sets.store) if flaw] == []
     for module, there in ((sets, True), (data, False)):
         line = module.store.shards()[0]
         content = (module.store.folder / line["file"]).read_bytes()
@@ -294,7 +295,7 @@ def test_an_audit_finds_other_poissons_ratios(sets):
     from dpl.data.audit import flaw_of_shard
 
     line = sets.store.shards()[0]
-    shard = sets.store._sound(line)
+    shard = sets.store.sound(line)
     stream = sets.store.stream(line["split"])
     assert flaw_of_shard(sets.scene, stream, shard) == ""
     shard["poisson"] = shard["poisson"].flip(0)

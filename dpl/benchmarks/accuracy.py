@@ -16,6 +16,7 @@ from dpl.metrics import RelativeL2
 from dpl.module import Surrogate
 from dpl.scene import Sample
 
+COLOURS = [f"C{k}" for k in range(10) if k != 7]  # grey is for what is beside
 WARM_UP = 5  # loads asked before the clock starts
 
 
@@ -151,7 +152,7 @@ def draw(
         path_of = [row for row in rows if row.solver == name and row.error < 1]
         x, y = [row.ms for row in path_of], [max(row.error, 1e-12) for row in path_of]
         tier = name.partition(", ")[2]
-        colour = "0.1" if _family(name) == "Newton" else f"C{families.index(_family(name)) % 10}"
+        colour = "0.1" if _family(name) == "Newton" else COLOURS[families.index(_family(name)) % 9]
         marker = {"corrected": "D", "hybrid": "s", "GPU": "*"}.get(tier, "o")
         shown = not tier or tier == "GPU"  # other marks are explained below
         label = name.partition(" to ")[0] if shown and _family(name) not in named else None
@@ -168,22 +169,28 @@ def draw(
             [mesh.ms for mesh in family],
             [mesh.error for mesh in family],
             color="0.55", ls=":", marker=marker, ms=5, mfc="none",
-            label=f"Newton, {name} meshes, against the limit",
+            label=f"Newton, {name} meshes, against\nthe limit (degrees of freedom)",
         )  # fmt: skip
+        away = 4, 4 if degree == 1 else -10
         for mesh in family:
-            ax.annotate(f"{mesh.dofs:,}", (mesh.ms, mesh.error), fontsize=6, color="0.4")
+            ax.annotate(
+                f"{mesh.dofs:,}", (mesh.ms, mesh.error), fontsize=7, color="0.4",
+                textcoords="offset points", xytext=away,
+            )  # fmt: skip
     if floor is not None:
         ax.axhline(floor, color="0.3", ls="--", lw=1)
         ax.annotate(
-            "discretisation error of this mesh",
-            (0.99, floor),
+            "what the mesh itself is off",
+            (0.01, floor),
             xycoords=("axes fraction", "data"),
             fontsize=8,
-            ha="right",
-            va="bottom",
+            va="top",
+            xytext=(0, -2),
+            textcoords="offset points",
         )
     ax.set_xlabel("time of one load [ms]")
-    ax.set_ylabel("relative error, median")
+    ax.set_ylabel("relative error, median of the loads")
+    ax.xaxis.set_major_formatter("{x:g}")
     ax.grid(alpha=0.3)
     figure.legend(loc="outside right center", fontsize=8)
     figure.savefig(file, dpi=130)

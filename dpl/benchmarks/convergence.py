@@ -15,8 +15,9 @@ from torch import Tensor
 
 from dpl.benchmarks.clock import in_turn
 from dpl.fem.accelerated import Accelerated
+from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear import SingularMatrix
-from dpl.fem.newton import Newton, gather, scatter
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, Solver, in_step, judge, one_thread
 from dpl.hybrid import Hybrid, Predict
@@ -90,14 +91,27 @@ class PlainNewton:
 
 
 @dataclass(frozen=True)
-class Trial:
-    """One solver on one load, to one tolerance.
+class Asked:
+    """What a solver is asked for.
 
     Attributes:
         solver: Its name.
         network: Whose predictions it starts from; empty: from rest.
         loads: Name of the set.
         tol: Residual ratio asked for [-].
+    """
+
+    solver: str
+    network: str
+    loads: str
+    tol: float
+
+
+@dataclass(frozen=True)
+class Trial(Asked):
+    """One solver on one load, to one tolerance.
+
+    Attributes:
         number: Of the load in its set.
         converged: Whether it is answered to the tolerance with nothing inverted.
         picked: Whether the answer goes on from the prediction.
@@ -107,10 +121,6 @@ class Trial:
         apart: Relative distance from robust Newton's answer [-].
     """
 
-    solver: str
-    network: str
-    loads: str
-    tol: float
     number: int
     converged: bool
     picked: bool
@@ -121,14 +131,10 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Row:
+class Row(Asked):
     """One solver, on one set of loads, to one tolerance.
 
     Attributes:
-        solver: Its name.
-        network: Whose predictions it starts from; empty: from rest.
-        loads: Name of the set.
-        tol: Residual ratio asked for [-].
         count: Loads.
         converged: Answered to the tolerance with nothing inverted [%].
         picked: Answers that go on from the prediction [%].
@@ -141,10 +147,6 @@ class Row:
         apart: Largest relative distance from robust Newton's answer, where both converged [-].
     """
 
-    solver: str
-    network: str
-    loads: str
-    tol: float
     count: int
     converged: float
     picked: float | None = None

@@ -22,11 +22,12 @@ import torch
 
 from dpl.data.crew import outcomes
 from dpl.data.outcome import Job
+from dpl.fem.dofs import gather
 from dpl.fem.linear import backend, chosen
 from dpl.fem.materials import Material, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, Tag, box, propeller
 from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Newton, gather
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, solve
 from dpl.scene import Scene

@@ -22,6 +22,7 @@ from dpl import run
 from dpl.benchmarks import generation as ways
 from dpl.benchmarks import peers
 from dpl.benchmarks.rows import machine, write, write_machine
+from dpl.commands.entry import command
 from dpl.fem.linear import installed
 from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.solution import Solver, one_thread
@@ -38,7 +39,7 @@ PARTS = (
 )
 
 
-@run.command("benchmark")
+@command("benchmark")
 def main(cfg: DictConfig) -> None:
     """Time the parts that are asked for, print tables and write them down."""
     run.check(cfg)

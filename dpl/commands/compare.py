@@ -6,9 +6,10 @@ from omegaconf import DictConfig
 
 from dpl import run
 from dpl.benchmarks.evaluation import compare
+from dpl.commands.entry import command
 
 
-@run.command("evaluate")
+@command("evaluate")
 def main(cfg: DictConfig) -> None:
     """Print a table of all evaluated runs below a folder."""
     run.check(cfg)

@@ -9,12 +9,13 @@ from rich.progress import Progress
 
 from dpl import run
 from dpl.benchmarks import rows as table
+from dpl.commands.entry import command
 
 if TYPE_CHECKING:
     from dpl.benchmarks.convergence import Trial
 
 
-@run.command("convergence")
+@command("convergence")
 def main(cfg: DictConfig) -> None:
     """Measure all solvers on all loads; write rows, machine and figure; what is there is kept."""
     from dpl.benchmarks import convergence

@@ -6,9 +6,10 @@ from omegaconf import DictConfig
 
 from dpl import run
 from dpl.benchmarks.evaluation import evaluate
+from dpl.commands.entry import command
 
 
-@run.command("evaluate")
+@command("evaluate")
 def main(cfg: DictConfig) -> None:
     """Repeat the evaluation at the end of a training run."""
     run.check(cfg)

@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 
 from dpl import run
 from dpl.benchmarks import rows as table
+from dpl.commands.entry import command
 from dpl.data.durable import whole_file
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ SHOWN = (0, 12)  # the stream of the loads in results
 INSTALL = "pip install -c constraints.txt -e '.[onnx]'"
 
 
-@run.command("export")
+@command("export")
 def main(cfg: DictConfig) -> None:
     """Write the parts that are asked for."""
     from dpl.export.graph import missing

@@ -5,11 +5,12 @@ import sys
 from omegaconf import DictConfig
 
 from dpl import run
+from dpl.commands.entry import command
 
 ACTIONS = ("generate", "verify", "repair")
 
 
-@run.command("generate")
+@command("generate")
 def main(cfg: DictConfig) -> None:
     """Solve what is missing of a data set; or look whether it is sound; or make it so."""
     run.check(cfg)

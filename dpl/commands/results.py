@@ -5,9 +5,10 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from dpl import run
+from dpl.commands.entry import command
 
 
-@run.command("results")
+@command("results")
 def main(cfg: DictConfig) -> None:
     """Measure every run of an experiment; write rows, machine and figure."""
     from dpl.benchmarks import results

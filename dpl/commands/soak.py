@@ -12,12 +12,13 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from dpl import run
+from dpl.commands import entry
 
 LOOKS = 360  # at each work
 WORKS = ("training", "simulator")
 
 
-@run.command("soak")
+@entry.command("soak")
 def main(cfg: DictConfig) -> None:
     """Train, simulate, and look at both."""
     # here and not above: worker processes import this file, and need none of it
@@ -71,7 +72,7 @@ def _trained(cfg: DictConfig, seconds: float) -> list:
     data = run.make(cfg, "data", scene=scene)
     surrogate = run.build_surrogate(cfg, scene)
     trainer = run.make(cfg, "trainer")
-    run.check_trainer(trainer, cfg)
+    entry.check_trainer(trainer, cfg)
     pulse = soak.Pulse(seconds, every=seconds / LOOKS)
     trainer.callbacks.append(pulse)
     run.save_config(cfg, Path(cfg.folder))

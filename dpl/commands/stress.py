@@ -11,11 +11,12 @@ from rich.console import Console
 
 from dpl import run
 from dpl.benchmarks import rows as table
+from dpl.commands.entry import command
 
 COLOURS = {"as expected": "green", "reported": "yellow", "silently wrong": "bold red"}
 
 
-@run.command("stress")
+@command("stress")
 def main(cfg: DictConfig) -> None:
     """Run the matrix; rows are written after each case, the figure at the end."""
     from dpl import stress

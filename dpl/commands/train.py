@@ -6,9 +6,10 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from dpl import run
+from dpl.commands import entry
 
 
-@run.command("train")
+@entry.command("train")
 def main(cfg: DictConfig) -> float | None:
     """Train a surrogate and judge it; return its smallest validation e_mean [-] to a sweep."""
     # here and not above: worker processes import this file, and need none of it
@@ -26,14 +27,14 @@ def main(cfg: DictConfig) -> float | None:
     data = run.make(cfg, "data", scene=scene)
     surrogate = run.build_surrogate(cfg, scene)
     trainer = run.make(cfg, "trainer")
-    run.check_trainer(trainer, cfg)
+    entry.check_trainer(trainer, cfg)
     if trainer.is_global_zero:
         run.show_plan(scene, data, surrogate)
         run.save_config(cfg, folder)
     try:
         trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path, weights_only=True)
     except Diverged as error:
-        return run.failed(error)
+        return entry.failed(error)
     except SystemExit as leaving:  # how Lightning passes Ctrl-C on
         if leaving.code == 128 + signal.SIGTERM:
             raise
@@ -55,4 +56,4 @@ def main(cfg: DictConfig) -> float | None:
             trainer.logger.experiment.file_writer.add_summary(part)
         trainer.logger.save()
         trainer.logger.finalize("success")
-    return run.best_error(trainer)
+    return entry.best_error(trainer)

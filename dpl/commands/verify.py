@@ -9,10 +9,11 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from dpl import run, verification
+from dpl.commands.entry import command
 from dpl.fem.solution import one_thread
 
 
-@run.command("verify")
+@command("verify")
 def main(cfg: DictConfig) -> None:
     """Solve the cases that are asked for, and write the page of all that there are."""
     run.check(cfg)

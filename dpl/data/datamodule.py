@@ -15,6 +15,7 @@ from torch.utils.data.distributed import DistributedSampler
 from dpl.data.durable import DataSetError
 from dpl.data.generate import DataSet
 from dpl.data.online import OnlineSamples, Rates, Replay, Worst
+from dpl.data.writer import Writer
 from dpl.fem.memory import machine, refuse_beyond
 from dpl.fem.symmetry import Symmetry, images, symmetries
 from dpl.scene import Sample, Scene
@@ -273,13 +274,13 @@ class OnlineData(OfflineData):
             self.trainer.logger.log_metrics(named, step=self.trainer.global_step)
         if self._save and self.place[0] == 0:
             with suppress(DataSetError):  # another process writes there; shards can wait
-                self.store.collect("train")
+                Writer(self.store).collect("train")
 
     def prepare_data(self) -> None:
         """Solve what is missing of validation and test."""
         super().prepare_data()
         if self._save:
-            self.store.create()
+            Writer(self.store).create()
 
     def teardown(self, stage: str) -> None:
         """Stop the workers."""

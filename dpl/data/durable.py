@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-LARGE = 2.0**28  # bytes of a text of a data set
+TEXT = 2.0**28  # bytes of one in a data set, at most
 
 
 class DataSetError(ValueError):
@@ -45,6 +45,21 @@ def whole_file(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
         sync_folder(path.parent)
 
 
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file of a data set, whole or not at all.
+
+    Raises:
+        DataSetError: A folder is in its place.
+    """
+    try:
+        with whole_file(path) as file:
+            file.write(content)
+    except IsADirectoryError:
+        raise DataSetError(
+            f"{path} is a folder where a file must be; remove it or choose another data.folder"
+        ) from None
+
+
 def sync_folder(path: Path) -> None:
     """Make what was renamed or removed in a folder survive a crash of the machine."""
     folder = os.open(path, os.O_RDONLY)
@@ -61,7 +76,7 @@ def append_line(path: Path, line: dict[str, Any]) -> None:
         DataSetError: The file is a link, a folder or a device, or far too large.
     """
     with suppress(FileNotFoundError):
-        _refuse_foreign(path, LARGE)
+        _refuse_foreign(path, TEXT)
     with path.open("ab+", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - 1))
@@ -76,7 +91,7 @@ def append_line(path: Path, line: dict[str, Any]) -> None:
             raise
 
 
-def own_file(path: Path, most: float = LARGE) -> bytes:
+def own_file(path: Path, most: float = TEXT) -> bytes:
     """Return the content of a file of a data set.
 
     Raises:

@@ -21,10 +21,12 @@ from rich.progress import (
 )
 
 from dpl.data import balance
+from dpl.data.audit import repair, verify
 from dpl.data.crew import Stop
 from dpl.data.durable import append_line
 from dpl.data.outcome import Job
 from dpl.data.store import Store
+from dpl.data.writer import Writer
 from dpl.scene import Scene
 from dpl.version import __version__
 
@@ -144,14 +146,8 @@ class DataSet:
         done = _Session(workers=self.workers)
         with Stop() as stop, Progress(*columns, refresh_per_second=2) as progress:
             bar = progress.add_task("loads", total=len(jobs), completed=found, news="")
-            solving = self.store.fill(
-                missing,
-                workers=self.workers,
-                timeout=self.timeout,
-                stop=stop,
-                shard=self.shard,
-                shards=self.shards,
-            )
+            writer = Writer(self.store, self.shard, self.shards)
+            solving = writer.fill(missing, workers=self.workers, timeout=self.timeout, stop=stop)
             try:
                 with closing(solving):  # which ends the workers before anything else
                     for one in solving:
@@ -164,14 +160,14 @@ class DataSet:
     def verify(self) -> Iterator[str]:
         """Yield what is wrong with the data set, a line for each damaged file."""
         files = len(self.store.shards()) + 1
-        for line, flaw in track(self.store.verify(), "looking at files", total=files):
+        for line, flaw in track(verify(self.store), "looking at files", total=files):
             if flaw:
                 yield f"{self.store.folder / line['file']} {flaw}"
 
     def repair(self) -> Store:
         """Return the data set, its damaged files made again, also those beyond the sizes wanted."""
         missing = self.missing()
-        for name, line in sorted(self.store.repair().items()):
+        for name, line in sorted(repair(self.store).items()):
             print(f"making {name} again")
             again = range(line["first"], line["first"] + line["tried"])
             missing[line["split"]] = sorted({*missing[line["split"]], *again})

@@ -16,7 +16,7 @@ by eight, the same loads give the same bytes.
 import hashlib
 import json
 import math
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,34 +25,26 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors.torch import load
 from torch import Tensor
 
 from dpl.data import balance
-from dpl.data.audit import flaw_of_modes, flaw_of_shard
-from dpl.data.crew import Stop, outcomes
 from dpl.data.durable import (
     DataSetError,
-    append_line,
     own_file,
     read_lines,
-    sole_writer,
-    sync_folder,
-    whole_file,
 )
 from dpl.data.manifest import STREAMS, is_number, kept_in, lines_of, place
 from dpl.data.outcome import Job, Outcome
-from dpl.data.shard import closed, opened, taken
-from dpl.data.spool import Spool, sweep
+from dpl.data.shard import opened, taken
+from dpl.data.spool import Spool
 from dpl.fem.modes import Modes
 from dpl.scene import Sample, Scene
-from dpl.version import __version__
 
 FORMAT = 2
 MODES = "modes.safetensors"
 HEADER = 100_000  # bytes of a shard besides its numbers, at most
 SHARD = 64  # loads in one file
-MACHINE = ("timed out", "its worker died")  # reasons that lie with the machine: `repair` retries
 
 
 @dataclass(frozen=True)
@@ -69,12 +61,14 @@ class Store:
     scene: Scene
     seed: int
 
+    def stream(self, split: str) -> tuple[int, int]:
+        """Return the seed of a split's loads."""
+        return self.seed, STREAMS[split]
+
     @property
     def spool(self) -> Spool:
         """The loads that are solved and wait for their shard."""
         return Spool(self.folder / "spool", {name: self.stream(name) for name in STREAMS})
-
-    # ------------------------------------------------------------------ reading
 
     def shards(self) -> list[dict[str, Any]]:
         """Return the lines of all manifests by first load; none if there is no data set yet.
@@ -98,10 +92,11 @@ class Store:
             raise DataSetError(
                 f"{card} is damaged ({error}); choose another data.folder or remove this one"
             ) from None
-        lines = [line for path in self._manifests() for line in lines_of(path)]
+        lines = [line for path in self.manifests() for line in lines_of(path)]
         return sorted(lines, key=place)
 
-    def _manifests(self) -> list[Path]:
+    def manifests(self) -> list[Path]:
+        """Return the manifests of all writers."""
         return sorted(self.folder.glob("manifest*.jsonl"))
 
     def _check(self, card: dict[str, Any]) -> None:
@@ -140,6 +135,14 @@ class Store:
         mine = (index for index in range(count) if index // SHARD % shards == shard)
         return [index for index in mine if index not in tried]
 
+    def tried(self) -> set[Job]:
+        """Return the loads that are in a shard, or rejected there."""
+        return {
+            Job(self.stream(line["split"]), index)
+            for line in self.shards()
+            for index in range(line["first"], line["first"] + line["tried"])
+        }
+
     def load(self, split: str, count: int) -> Sample:
         """Return the accepted ones of the first `count` loads of a split, in order.
 
@@ -168,14 +171,14 @@ class Store:
             DataSetError: It is damaged.
         """
         try:
-            return self._sound(line)
+            return self.sound(line)
         except ValueError as error:
             raise DataSetError(
                 f"{self.folder / line['file']} {error}; scripts/generate.py action=repair with the "
                 "same scene solves its loads again"
             ) from None
 
-    def _sound(self, line: Mapping[str, Any]) -> dict[str, Tensor]:
+    def sound(self, line: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return what a shard holds.
 
         Raises:
@@ -293,233 +296,19 @@ class Store:
         loads = sum(one["loads"] for one in sessions)
         return sum(one["seconds"] for one in sessions) / loads if loads else None
 
-    # ------------------------------------------------------------------ writing
 
-    def create(self) -> None:
-        """Write down whose data set this is, if it is not there yet.
+def runs(indices: Sequence[int], *, whole: bool = False) -> Iterator[list[int]]:
+    """Yield runs of consecutive indices, none across a multiple of SHARD: a file each.
 
-        Raises:
-            DataSetError: The folder holds something else.
-        """
-        self.shards()
-        if (self.folder / "scene.json").exists():
-            return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        modes = self.scene.loads.modes
-        _write(self.folder / MODES, save(modes._asdict()))
-        card = {
-            "format": FORMAT,
-            "fingerprint": self.scene.fingerprint,
-            "scene": self.scene.identity(),
-            "seed": self.seed,
-            "versions": {
-                "dpl": __version__,
-                "torch": torch.__version__,
-                "numpy": np.__version__,
-            },
-        }
-        _write(self.folder / "scene.json", json.dumps(card, indent=1).encode())
-
-    def stream(self, split: str) -> tuple[int, int]:
-        """Return the seed of a split's loads."""
-        return self.seed, STREAMS[split]
-
-    def fill(
-        self,
-        missing: Mapping[str, Sequence[int]],
-        *,
-        workers: int,
-        timeout: float | None = None,
-        stop: Stop | None = None,
-        shard: int = 0,
-        shards: int = 1,
-    ) -> Generator[Outcome, None, None]:
-        """Solve loads that are missing, by split; yield each as it is done.
-
-        Each is kept in the spool as soon as it is solved; a shard is written when it is complete,
-        in order. Loads that were spooled before an interruption are not solved again.
-
-        Args:
-            missing: Numbers of the loads, by split.
-            workers: Processes that solve; 0: this one.
-            timeout: Longest time for a load [s].
-            stop: Asked whether to begin no more.
-            shard: Which files to write, of
-            shards: so many writers.
-
-        Raises:
-            DataSetError: The folder holds something else, or another process writes there.
-        """
-        self.create()
-        with sole_writer(self.folder, shard, shards):
-            manifest = "manifest.jsonl" if shards == 1 else f"manifest-{shard}-of-{shards}.jsonl"
-            sweep(self.folder)
-            spooled, tried = self.spool.files(), self._tried()
-            for job in [*spooled]:
-                if job in tried:  # killed between writing its shard and removing it
-                    spooled.pop(job).unlink(missing_ok=True)
-            wanted = {
-                split: [i for i in indices if Job(self.stream(split), i) not in tried]
-                for split, indices in missing.items()
-            }
-            files = [
-                [Job(self.stream(split), index) for index in run]
-                for split, indices in wanted.items()
-                for run in _runs(indices)
-            ]
-            jobs = [job for file in files for job in file if job not in spooled]
-            self._flush(files, spooled, manifest)
-            for one in outcomes(self.scene, jobs, workers=workers, timeout=timeout, stop=stop):
-                spooled[one.job] = self.spool.put(one)
-                yield one
-                self._flush(files, spooled, manifest)
-            self._rewrite(self.folder / manifest, lines_of(self.folder / manifest))
-            if shards == 1:
-                self.spool.tidy()
-
-    def _tried(self) -> set[Job]:
-        """Return the loads that are in a shard, or rejected there."""
-        return {
-            Job(self.stream(line["split"]), index)
-            for line in self.shards()
-            for index in range(line["first"], line["first"] + line["tried"])
-        }
-
-    def _rewrite(self, manifest: Path, lines: Sequence[dict[str, Any]]) -> None:
-        """Make a manifest of these lines, in order, if it is not that already."""
-        text = "".join(json.dumps(line) + "\n" for line in sorted(lines, key=place)).encode()
-        if manifest.exists() and manifest.read_bytes() != text:
-            _write(manifest, text)
-
-    def _split(self, job: Job) -> str:
-        return {self.stream(name): name for name in STREAMS}[job.seed]
-
-    def _flush(self, files: list[list[Job]], spooled: dict[Job, Path], manifest: str) -> None:
-        """Write the first shards that are complete; take them off both lists."""
-        while files and all(job in spooled for job in files[0]):
-            jobs = files.pop(0)
-            paths = [spooled.pop(job) for job in jobs]
-            self._append([self.spool.get(path) for path in paths], manifest)
-            for path in paths:
-                path.unlink()
-
-    def collect(self, split: str) -> None:
-        """Write those spooled loads of a split that make whole shards.
-
-        Raises:
-            DataSetError: Another process writes there.
-        """
-        with sole_writer(self.folder):
-            spooled = self.spool.files()
-            mine = {job for job in spooled if job.seed == self.stream(split)}
-            count = max((job.number for job in mine), default=-1) + 1
-            runs = [run for run in _runs(self.missing(split, count)) if len(run) == SHARD]
-            files = [[Job(self.stream(split), index) for index in run] for run in runs]
-            whole = [file for file in files if mine.issuperset(file)]
-            self._flush(whole, spooled, "manifest.jsonl")
-
-    def _append(self, tried: Sequence[Outcome], manifest: str) -> None:
-        """Write one shard, then its line of the manifest."""
-        split, first = self._split(tried[0].job), tried[0].job.number
-        kept = [one for one in tried if one.accepted]
-        name = f"{split}-{first:06d}.safetensors"
-        loads = self.scene.loads
-        poisson = None if loads.poisson_range is None else loads.poisson_at
-        content = closed(kept, self.scene.problem.shape, loads.dimension, poisson)
-        _write(self.folder / name, content)
-        line = {
-            "file": name,
-            "sha256": hashlib.sha256(content).hexdigest(),
-            "split": split,
-            "first": first,
-            "tried": len(tried),
-            "accepted": len(kept),
-            "iterations": sum(one.iterations for one in tried),
-            "amplitudes": [round(one.amplitude, 6) for one in tried],
-            "rejected": [
-                {"index": one.job.number, "reason": one.reason, "load_factor": one.load_factor}
-                for one in tried
-                if not one.accepted
-            ],
-        }
-        append_line(self.folder / manifest, line)
-
-    # ------------------------------------------------------------------ trust
-
-    def verify(self) -> Iterator[tuple[dict[str, Any], str]]:
-        """Yield each shard's line with what is wrong with it; empty if nothing is.
-
-        A shard is sound if its bytes are those that were written, its loads those that the scene
-        draws, and each displacement balances its load to the tolerance, evaluated again, with
-        nothing inverted.
-
-        Raises:
-            DataSetError: There is none.
-        """
-        if not (self.folder / "scene.json").exists():
-            raise DataSetError(f"{self.folder} holds no data set yet; generate it first")
-        try:
-            flaw = flaw_of_modes(self.scene, self.modes())
-        except DataSetError as error:
-            flaw = f"is damaged: {error}"
-        yield {"file": MODES, "rejected": []}, flaw
-        for line in self.shards():
-            try:
-                shard = self._sound(line)
-                yield line, flaw_of_shard(self.scene, self.stream(line["split"]), shard)
-            except ValueError as error:
-                yield line, str(error)
-
-    def repair(self) -> dict[str, dict[str, Any]]:
-        """Forget damaged shards, and those with loads that the machine lost; return their lines.
-
-        Their loads count as missing from then on. Files that no manifest names are removed.
-
-        Raises:
-            DataSetError: Another process writes there.
-        """
-        if not (self.folder / "scene.json").exists():
-            return {}
-        with sole_writer(self.folder):
-            poor = {
-                line["file"]: line
-                for line, flaw in self.verify()
-                if flaw or any(one["reason"].startswith(MACHINE) for one in line["rejected"])
-            }
-            if poor.pop(MODES, None):
-                _write(self.folder / MODES, save(self.scene.loads.modes._asdict()))
-            named = {MODES}
-            for manifest in self._manifests():
-                lines = [line for line in lines_of(manifest) if line["file"] not in poor]
-                named |= {line["file"] for line in lines}
-                self._rewrite(manifest, lines)
-            for path in [*self.folder.glob("*.safetensors"), *self.folder.rglob(".*.part")]:
-                if path.name not in named and (path.is_symlink() or not path.is_dir()):
-                    path.unlink()
-            for path in self.spool.files().values():
-                if self.spool.get(path).reason.startswith(MACHINE):
-                    path.unlink()
-            sync_folder(self.folder)
-        return poor
-
-
-def _runs(indices: Sequence[int]) -> Iterator[list[int]]:
-    """Yield runs of consecutive indices, none across a multiple of SHARD."""
+    Args:
+        indices: Ascending.
+        whole: Those of SHARD indices alone.
+    """
     run: list[int] = []
-    for index in indices:
-        if run and (index != run[-1] + 1 or index % SHARD == 0):
-            yield run
+    for index in [*indices, None]:
+        if run and (index is None or index != run[-1] + 1 or index % SHARD == 0):
+            if not whole or len(run) == SHARD:
+                yield run
             run = []
-        run.append(index)
-    if run:
-        yield run
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        with whole_file(path) as file:
-            file.write(content)
-    except IsADirectoryError:
-        raise DataSetError(
-            f"{path} is a folder where a file must be; remove it or choose another data.folder"
-        ) from None
+        if index is not None:
+            run.append(index)

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.newton import Newton, gather, scatter
+from dpl.fem.dofs import gather, scatter
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, in_step, judge
 from dpl.fem.sparse import Array

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.newton import Linear
+from dpl.fem.compliance import Linear
 from dpl.fem.problem import Evaluation, Problem
 from dpl.fem.solution import Load, Solution, Status
 from dpl.fem.tensors import volume_change

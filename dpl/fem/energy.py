@@ -8,8 +8,9 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from dpl.fem.compliance import Linear
+from dpl.fem.dofs import gather
 from dpl.fem.linear import full_matrix
-from dpl.fem.newton import Linear, gather
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load
 

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear import Backend, Factor, backend
-from dpl.fem.newton import Newton, gather, scatter
+from dpl.fem.newton import Newton
 from dpl.fem.solution import Load, Solution, Status
 
 
@@ -81,8 +82,7 @@ class Equilibrium:
     @cached_property
     def _backend(self) -> Backend:
         problem = self.newton.problem
-        motions = problem.rigid_motions()[0][problem.free].numpy()
-        return backend(problem.pattern, self.newton.linear, motions)
+        return backend(problem.pattern, self.newton.linear, problem.near_null)
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle without what the backend has analysed."""

@@ -1,15 +1,13 @@
 """Compiled element loops: force, tangent and det F of a body under an isotropic law.
 
 WIDTH cells are worked on at once, one in each lane of the processor's vectors. The loops say the
-same as `Problem`'s tensor methods, which stay the reference; tests hold the two together.
-
-In here strains and stresses are 6 numbers, 11 22 33 12 23 13, strains as e = 2 E.
+same as `Body`'s tensor operations, which stay the reference; tests hold the two together.
+What they do at a point is in `dpl.fem.voigt`.
 """
 
 import contextlib
 import copy
 import inspect
-import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,19 +17,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from dpl.fem import lanes, slopes
+from dpl.fem import lanes, slopes, voigt
 from dpl.fem.lanes import WIDTH, load, sqrt, store
 from dpl.fem.law import Isotropic
-from dpl.fem.slopes import Law, needed, slopes_of
+from dpl.fem.slopes import Law, needed
 
 Array = NDArray[np.float64]
 
-VOIGT = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2]])
-FIRST = np.array([0, 1, 2, 0, 1, 0])  # the two indices of each of the 6
-SECOND = np.array([0, 1, 2, 1, 2, 2])
 
-
-_SOURCES = "".join(inspect.getsource(m) for m in (lanes, slopes, sys.modules[__name__]))
+_SOURCES = "".join(inspect.getsource(m) for m in (lanes, slopes, voigt, sys.modules[__name__]))
 
 
 @njit
@@ -79,149 +73,19 @@ def _gradient(ue, g, H):
 
 
 @njit
-def _quadratic(H, scale, e):
-    """Add scale * H^T H to e."""
-    for v in range(6):
-        i, j = FIRST[v], SECOND[v]
-        square = (
-            load(H, i) * load(H, j)
-            + load(H, 3 + i) * load(H, 3 + j)
-            + load(H, 6 + i) * load(H, 6 + j)
-        )
-        store(e, v, load(e, v) + scale * square)
-
-
-@njit
-def _strain(H, finite, e):
-    """Set e to 2 E = H + H^T + H^T H, without the last term where `finite` is 0."""
-    for v in range(6):
-        store(e, v, load(H, 3 * FIRST[v] + SECOND[v]) + load(H, 3 * SECOND[v] + FIRST[v]))
-    _quadratic(H, finite, e)
-
-
-@njit
-def _volume_change(H):
-    """Return det(I + H) - 1."""
-    a, b, c = load(H, 0), load(H, 1), load(H, 2)
-    d, e, f = load(H, 3), load(H, 4), load(H, 5)
-    g, h, i = load(H, 6), load(H, 7), load(H, 8)
-    minors = a * e - b * d + e * i - f * h + a * i - c * g
-    return a + e + i + minors + a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-
-
-@njit
-def _square(e):
-    """Return det C - 1 of C = I + e."""
-    e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
-    e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
-    m0, m1, m2 = e1 * e2 - e4 * e4, e0 * e2 - e5 * e5, e0 * e1 - e3 * e3
-    third = e0 * m0 - e3 * (e3 * e2 - e4 * e5) + e5 * (e3 * e4 - e1 * e5)
-    return e0 + e1 + e2 + m0 + m1 + m2 + third
-
-
-@njit
-def _stress(law, c, needs, e, j, X, S, scratch, D, moduli):
-    """Set S and X = C^-1, and with `moduli` D = dS/dE (rows 6 I + J), at e with det F = 1 + j.
-
-    Where det F is negative a law of ln J has no stress (NaN).
-    """
-    e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
-    e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
-    i1 = e0 + e1 + e2
-    m0, m1, m2 = e1 * e2 - e4 * e4, e0 * e2 - e5 * e5, e0 * e1 - e3 * e3
-    second = m0 + m1 + m2
-    if needs > 0:
-        inverse = 1.0 / (1.0 + _square(e))
-        store(X, 0, (1.0 + e1 + e2 + m0) * inverse)
-        store(X, 1, (1.0 + e0 + e2 + m1) * inverse)
-        store(X, 2, (1.0 + e0 + e1 + m2) * inverse)
-        store(X, 3, (e4 * e5 - e3 - e3 * e2) * inverse)
-        store(X, 4, (e3 * e5 - e4 - e0 * e4) * inverse)
-        store(X, 5, (e3 * e4 - e5 - e1 * e5) * inverse)
-    store(scratch, 0, j)
-    if needs > 1:
-        for lane in range(WIDTH):
-            scratch[0, lane] = math.log1p(scratch[0, lane])
-            if needs > 2:
-                scratch[1, lane] = math.expm1(-2 / 3 * scratch[0, lane])
-    i2 = 2.0 * i1 + second
-    slopes = slopes_of(law, c, i1, i2, j, load(scratch, 0), load(scratch, 1))
-    rest, W2, p, W11, W12, W22, W1J, W2J, pJ = slopes
-    pressure = rest + 2.0 * W2 * i1
-    for v in range(6):
-        stress = -2.0 * W2 * load(e, v)
-        if v < 3:
-            stress = stress + pressure
-        if needs > 0:  # - p e X
-            i, k = 3 * FIRST[v], SECOND[v]
-            turned = 0.0 * i1
-            for n in range(3):
-                turned = turned + load(e, VOIGT[FIRST[v], n]) * load(X, VOIGT[n, k])
-            stress = stress - p * turned
-        store(S, v, stress)
-    if moduli:
-        for v in range(6):
-            normal = 2.0 if v < 3 else 0.0
-            t2 = normal * (2.0 + i1) - 2.0 * load(e, v)
-            x = load(X, v)
-            store(scratch, 2 + v, t2)
-            store(scratch, 8 + v, W11 * normal + W12 * t2 + W1J * x)
-            store(scratch, 14 + v, W12 * normal + W22 * t2 + W2J * x)
-            store(scratch, 20 + v, W1J * normal + W2J * t2 + pJ * x)
-        for v in range(6):
-            i, k = FIRST[v], SECOND[v]
-            for w in range(v, 6):
-                m, n = FIRST[w], SECOND[w]
-                d = load(scratch, 8 + v) * (2.0 if w < 3 else 0.0)
-                d = d + load(scratch, 14 + v) * load(scratch, 2 + w)
-                d = d + load(scratch, 20 + v) * load(X, w)
-                d = d - p * (
-                    load(X, VOIGT[i, m]) * load(X, VOIGT[k, n])
-                    + load(X, VOIGT[i, n]) * load(X, VOIGT[k, m])
-                )
-                if v == w and v > 2:
-                    d = d - 2.0 * W2
-                if v != w and w < 3:
-                    d = d + 4.0 * W2
-                store(D, 6 * v + w, d)
-                store(D, 6 * w + v, d)
-
-
-@njit
 def _spread(F, S, weight, g, P, fe):
     """Add the nodal forces of stress F S at a point of volume `weight` to fe (rows 3 a + i)."""
     for i in range(3):
         for j in range(3):
-            stress = load(F, 3 * i) * load(S, VOIGT[0, j])
-            stress = stress + load(F, 3 * i + 1) * load(S, VOIGT[1, j])
-            stress = stress + load(F, 3 * i + 2) * load(S, VOIGT[2, j])
+            stress = load(F, 3 * i) * load(S, voigt.VOIGT[0, j])
+            stress = stress + load(F, 3 * i + 1) * load(S, voigt.VOIGT[1, j])
+            stress = stress + load(F, 3 * i + 2) * load(S, voigt.VOIGT[2, j])
             store(P, 3 * i + j, weight * stress)
     for a in range(g.shape[0] // 3):
         g0, g1, g2 = load(g, 3 * a), load(g, 3 * a + 1), load(g, 3 * a + 2)
         for i in range(3):
             force = load(P, 3 * i) * g0 + load(P, 3 * i + 1) * g1 + load(P, 3 * i + 2) * g2
             store(fe, 3 * a + i, load(fe, 3 * a + i) + force)
-
-
-@njit
-def _push_forward(F, D, S, weight, finite, T, A):
-    """Set A (rows ((i 3 + k) 3 + J) 3 + L) to dP_iJ/dF_kL times the volume of the point."""
-    for J in range(3):
-        d0, d1, d2 = 6 * VOIGT[0, J], 6 * VOIGT[1, J], 6 * VOIGT[2, J]
-        for i in range(3):
-            f0, f1, f2 = load(F, 3 * i), load(F, 3 * i + 1), load(F, 3 * i + 2)
-            for v in range(6):
-                t = f0 * load(D, d0 + v) + f1 * load(D, d1 + v) + f2 * load(D, d2 + v)
-                store(T, v, weight * t)
-            for k in range(3):
-                f0, f1, f2 = load(F, 3 * k), load(F, 3 * k + 1), load(F, 3 * k + 2)
-                for L in range(3):
-                    a = load(T, VOIGT[0, L]) * f0
-                    a = a + load(T, VOIGT[1, L]) * f1
-                    a = a + load(T, VOIGT[2, L]) * f2
-                    if i == k:
-                        a = a + finite * weight * load(S, VOIGT[J, L])
-                    store(A, ((3 * i + k) * 3 + J) * 3 + L, a)
 
 
 @njit
@@ -279,11 +143,11 @@ def _force(law, c, needs, finite, u, cells, dN, dV, force):
         fe[:] = 0.0
         for q in range(Q):
             _gradient(ue, g[q], H)
-            j = _volume_change(H)
+            j = voigt.volume_change(H)
             store(scratch, 0, j)
             low = _lowest(scratch, count, low)
-            _strain(H, finite, e)
-            _stress(law, c, needs, e, j, X, S, scratch, D, False)
+            voigt.strain(H, finite, e)
+            voigt.stress(law, c, needs, e, j, X, S, scratch, D, False)
             for r in range(9):
                 store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
             _spread(H, S, load(weight, q), g[q], P, fe)
@@ -318,20 +182,20 @@ def _system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values)
         K[:] = 0.0
         for q in range(Q):
             _gradient(ue, g[q], H)
-            _strain(H, finite, e)
+            voigt.strain(H, finite, e)
             mixed = len(gap) > 0
-            j = _volume_change(H)
+            j = voigt.volume_change(H)
             if mixed:
                 for v in range(6):
                     store(e, v, load(e, v) - load(gap[block, q], v))
-                square = _square(e)
+                square = voigt.square(e)
                 store(scratch, 0, square)
                 low = _lowest(scratch, count, low)
                 j = square / (1.0 + sqrt(1.0 + square))
-            _stress(law, c, needs, e, j, X, S, scratch, D, True)
+            voigt.stress(law, c, needs, e, j, X, S, scratch, D, True)
             for r in range(9):
                 store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
-            _push_forward(H, D, S, load(weight, q), finite, T, A)
+            voigt.push_forward(H, D, S, load(weight, q), finite, T, A)
             if mixed:
                 for v in range(6):
                     stress = load(S, v)
@@ -364,7 +228,7 @@ def _widen(law, gap, length, update, cells, dN, dV):
             if len(gap) > 0:
                 for v in range(6):
                     store(wider[block, q], v, (1.0 - length) * load(gap[block, q], v))
-            _quadratic(H, length * length, wider[block, q])
+            voigt.quadratic(H, length * length, wider[block, q])
     return wider
 
 

@@ -182,7 +182,7 @@ class CG:
 
     Attributes:
         pattern: Structure of the matrices.
-        near_null: Fields that cost no energy, (n, k), see `Problem.rigid_motions`.
+        near_null: Fields that cost no energy, (n, k), see `Body.near_null`.
     """
 
     pattern: Pattern

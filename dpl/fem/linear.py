@@ -58,7 +58,7 @@ def backend(pattern: Pattern, name: str = "auto", near_null: Array | None = None
     Args:
         pattern: Structure of the matrices.
         name: "band", "band32", "pardiso", "superlu", "cg", or "auto", see `chosen`.
-        near_null: Fields that cost no energy, (n, k), see `Problem.rigid_motions`; "cg" wants them.
+        near_null: Fields that cost no energy, (n, k), see `Body.near_null`; "cg" wants them.
 
     Raises:
         ValueError: No such backend, or it is not installed.
@@ -81,7 +81,7 @@ def chosen(
     Args:
         name: As for `backend`.
         pattern: Structure of the matrices.
-        near_null: Fields that cost no energy, (n, k), see `Problem.rigid_motions`.
+        near_null: Fields that cost no energy, (n, k), see `Body.near_null`.
         lasting: One factor is to answer many right-hand sides: it may cost more if they cost less.
 
     Raises:
@@ -97,7 +97,7 @@ def chosen(
 # Measured on beams, cubes, stars, plates of 1,000 to 100,000 degrees of freedom: a band costs n b^2
 # operations, a sparse factor of a solid about n^2 slower ones, so b^2 / n decides.
 PAYS = {"pardiso": 22, "superlu": 100, "cg": 10}  # b^2 / n below which a band is faster
-LARGE = {"pardiso": 100_000, "superlu": 30_000}  # n from which on multigrid is faster
+MULTIGRID = {"pardiso": 100_000, "superlu": 30_000}  # n from which on multigrid is faster
 LASTING = 3.0  # times that where one factor answers many right-hand sides: it must fit in memory
 WIDE = 250  # b from which on float32 saves more than the iterations on it cost
 
@@ -106,7 +106,7 @@ def _automatic(pattern: Pattern, near_null: Array | None, lasting: bool) -> str:
     names = installed()
     sparse = "pardiso" if "pardiso" in names else "superlu"
     multigrid = "cg" in names and near_null is not None and multigrid_installed()
-    large = LARGE[sparse] * (LASTING if lasting else 1)
+    large = MULTIGRID[sparse] * (LASTING if lasting else 1)
     best = "cg" if multigrid and pattern.size > large else sparse
     if "band" in names:
         half = band_layout(pattern).half

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 from torch import Tensor
 
+from dpl.fem.compliance import Linear
+from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear import full_matrix
-from dpl.fem.newton import Linear, gather, scatter
 from dpl.fem.problem import Problem
 from dpl.fem.sampling import SAMPLINGS, Quantile, even, one, uniform
 from dpl.fem.solution import Load

@@ -1,106 +1,24 @@
-"""Newton-Raphson on the nodal equilibrium f_int(u) = f, and the linear answer it starts with."""
+"""Newton-Raphson on the nodal equilibrium f_int(u) = f, with load steps where it must."""
 
-import math
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.band import Cholesky
-from dpl.fem.krylov import CGFactor, conjugate_gradients, lowest
-from dpl.fem.linear import Backend, Factor, SingularMatrix, backend, chosen
+from dpl.fem.compliance import Linear, backend_of, kept
+from dpl.fem.dofs import gather, scatter
+from dpl.fem.linear import Backend, Factor, SingularMatrix, chosen
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, Status, check_force, in_step, judge
-from dpl.fem.sparse import SymmetricProduct
-from dpl.fem.turned import Turned, Turning
+from dpl.fem.reuse import Factors, pivots_at
+from dpl.fem.solution import Load, Solution, Status, check_force, check_steps, in_step
 
-
-@dataclass(frozen=True, eq=False)
-class Linear:
-    """The linear answer K(0)^-1 f: exact for infinitesimal loads, one solve with a stored factor.
-
-    Attributes:
-        problem: The body.
-        tol: Residual ratio below which the answer counts as converged [-].
-        linear: Backend of the sparse solves, see `dpl.fem.linear.backend`.
-    """
-
-    problem: Problem
-    tol: float = 1e-8
-    linear: str = "auto"
-
-    @cached_property
-    def factor(self) -> Factor:
-        """Factor of K(0)."""
-        rest = torch.zeros(1, *self.problem.shape, dtype=torch.float64)
-        values = self.problem.linearise(rest).tangent[0].numpy()
-        return self._backend.factorise(values)
-
-    @cached_property
-    def turning(self) -> Turning:
-        """What turns the factor of K(0) with the nodes; in float32 where it is a band."""
-        factor = self.factor
-        rough = factor.rounded() if isinstance(factor, Cholesky) else factor
-        return Turning(self.problem, rough)
-
-    @cached_property
-    def _backend(self) -> Backend:
-        return _backend_of(self.problem, self.linear, lasting=True)
-
-    def at(self, poisson: Tensor | float) -> "Linear":
-        """Return the linear answer of the body of another Poisson's ratio, see `Problem.at`."""
-        problem = self.problem.at(poisson)
-        return self if problem is self.problem else _kept(self._twins, problem, self._twin)
-
-    def _twin(self, problem: Problem) -> "Linear":
-        twin = replace(self, problem=problem)
-        twin.__dict__["_backend"] = self._backend
-        return twin
-
-    @cached_property
-    def _twins(self) -> "dict[Problem, Linear]":
-        return {}
-
-    @cached_property
-    def reference(self) -> "Linear":
-        """The linear answer of the reference body, see `Problem.reference`."""
-        problem = self.problem.reference
-        return self if problem is self.problem else self._twin(problem)
-
-    def iterate(self, load: Load) -> Iterator[Solution]:
-        """Yield the linear answer.
-
-        Raises:
-            ValueError: The force is none for this body, see `check_force`.
-        """
-        check_force(self.problem, load)
-        start = time.perf_counter()
-        pairs = zip(load.force, load.poisson.expand(len(load.force), -1), strict=True)
-        answer = torch.stack([self.at(nu[None]).respond(force) for force, nu in pairs])
-        seconds = (time.perf_counter() - start) / len(answer)
-        yield judge(self.problem, answer, load, self.tol, iterations=1, seconds=seconds)
-
-    def respond(self, force: Tensor) -> Tensor:
-        """Return K(0)^-1 f, (N, D) [-], for f (N, D) [-]; zero where held."""
-        return scatter(self.factor.solve(gather(force, self.problem)), self.problem)
-
-    def __getstate__(self) -> dict[str, object]:
-        """Pickle without the factor."""
-        return {"problem": self.problem, "tol": self.tol, "linear": self.linear}
-
-
-TWINS = 4  # bodies of other Poisson's ratios whose factors are kept
-DOUBT = 0.05  # eigenvalue, relative to a factor nearby, below which a tangent is examined
-PATIENCE = 8  # conjugate gradient steps with the factor of another tangent, then its own
-TURNS = 16  # of the same with K(0)'s, turned
 CAREFUL = 2.0**-4  # load step from which on the end of the path may be near: full accuracy
 
 
@@ -195,12 +113,12 @@ class Newton:
         It has a K(0) of its own to factorise; those of the last few are kept.
         """
         problem = self.problem.at(poisson)
-        return self if problem is self.problem else _kept(self._twins, problem, self._twin)
+        return self if problem is self.problem else kept(self._twins, problem, self._twin)
 
     def _twin(self, problem: Problem) -> "Newton":
         twin = replace(self, problem=problem)
         twin.__dict__["_backend"] = self._backend
-        twin.__dict__["rest"] = _kept(self.rest._twins, problem, self.rest._twin)
+        twin.__dict__["rest"] = self.rest.of(problem)
         return twin
 
     @cached_property
@@ -209,7 +127,8 @@ class Newton:
 
     def _member(self, force: Tensor, guess: Tensor | None) -> Iterator[Solution]:
         """Yield the states under one load (1, N, D)."""
-        problem, count = self.problem, _Count()
+        problem = self.problem
+        count = _Count(Factors(self.rest, self.factorise, turned=self.turned))
         state = base = self._rest(force)
         guessed = guess is not None and bool(guess.any())
         guessed &= bool(force.any()) or problem.moved_supports
@@ -245,11 +164,11 @@ class Newton:
     ) -> Iterator["_State"]:
         """Yield iterates under `target` times a load until they balance it or cannot go on."""
         before = float("nan")
-        count.near = None
+        count.factors.forget()
         for _ in range(self.max_iter):
             ratio = self._ratio(state, force, target)
             if not ratio < self.reuse:
-                count.near = None
+                count.factors.forget()
             try:
                 update = self._update(state, target * force, count, self._forcing(ratio, before))
             except SingularMatrix:
@@ -284,34 +203,14 @@ class Newton:
             SingularMatrix: The tangent has no factor.
         """
         problem, u = self.problem, state.displacement
-        count.tangent = None
         if not u.any():
             right = self._right(state, force, state.internal)
-            count.negative_pivots = _pivots(self.rest.factor)
-            return scatter(self.rest.factor.solve(right, rtol), problem)[None] + state.jump
+            return scatter(count.factors.at_rest(right, rtol), problem)[None] + state.jump
         system = problem.linearise(u, state.gap)
         if not system.valid:
             system = problem.linearise(u)
-        right, values = self._right(state, force, system.force), system.tangent[0].numpy()
-        step = None
-        if count.near is None and count.turns and self.turned:
-            count.near = self.rest.turning.at(u)
-        if count.near is not None and count.near.negative_pivots <= 0:
-            product = SymmetricProduct(problem.pattern, values)
-            doubtful = isinstance(count.near, Turned)
-            steps = TURNS if doubtful else PATIENCE
-            with suppress(SingularMatrix):
-                step = conjugate_gradients(
-                    product, count.near.apply, right, rtol, steps, doubtful=doubtful
-                )
-                count.tangent = product
-        if step is None:
-            count.turns &= not isinstance(count.near, Turned)
-            count.factorisations += 1
-            count.near = None  # its storage serves the next one
-            count.near = self._backend.factorise(values)
-            step = count.near.solve(right, rtol)
-            count.negative_pivots = count.near.negative_pivots
+        right = self._right(state, force, system.force)
+        step = count.factors.solve(system.tangent[0].numpy(), u, right, rtol)
         return scatter(step, problem)[None] + state.jump
 
     def _right(self, state: "_State", force: Tensor, internal: Tensor) -> NDArray[np.float64]:
@@ -343,7 +242,7 @@ class Newton:
 
     @cached_property
     def _backend(self) -> Backend:
-        return _backend_of(self.problem, self.linear)
+        return backend_of(self.problem, self.linear)
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle without factors."""
@@ -384,7 +283,7 @@ class Newton:
                     "this body (very thin cells, moduli far apart?)",
                     stacklevel=2,
                 )
-            pivots = self._negative_pivots(state, count)
+            pivots = count.factors.negative_pivots(state.displacement)
             end = Status.UNSTABLE if pivots > 0 else Status.CONVERGED
         elif end is None:
             end = Status.NOT_CONVERGED
@@ -396,31 +295,11 @@ class Newton:
             status=torch.tensor([int(end)]),
             negative_pivots=torch.tensor([pivots]),
             iterations=torch.tensor([count.iterations]),
-            factorisations=torch.tensor([count.factorisations]),
+            factorisations=torch.tensor([count.factors.count]),
             load_factor=torch.tensor([factor], dtype=force.dtype),
             seconds=torch.tensor([time.perf_counter() - count.start], dtype=torch.float64),
             from_guess=torch.tensor([count.guessed]),
         )
-
-    def _negative_pivots(self, state: "_State", count: "_Count") -> int:
-        """Return those of the tangent at an answer; factorised only where there may be some.
-
-        There may if the last tangent had some, or was not examined (conjugate gradients); or, where
-        an older factor served for it, if it has an eigenvalue far below that factor's.
-        """
-        if isinstance(count.near, Turned):
-            return -1
-        suspect = count.negative_pivots > 0 or isinstance(count.near, CGFactor)
-        if not suspect and count.tangent is not None and count.near is not None:
-            size = self.problem.pattern.size
-            with suppress(SingularMatrix):
-                suspect |= lowest(count.tangent, count.near.apply, size) < DOUBT
-            count.tangent = None
-        if suspect:
-            count.factorisations += 1
-            count.near = None
-            count.negative_pivots = self.negative_pivots(state.displacement)
-        return count.negative_pivots
 
     def factorise(self, tangent: NDArray[np.float64]) -> Factor:
         """Return the factor of a tangent's entries (nnz,), see `Backend.factorise`."""
@@ -431,11 +310,7 @@ class Newton:
 
         Conjugate gradients do not count them: 1 stands for some, -1 for not known.
         """
-        tangent = self.problem.linearise(displacement).tangent
-        try:
-            return _pivots(self.factorise(tangent[0].numpy()))
-        except SingularMatrix:  # at the critical load itself
-            return 1
+        return pivots_at(self.problem, self.factorise, displacement)
 
 
 class _State(NamedTuple):
@@ -454,64 +329,8 @@ class _State(NamedTuple):
 class _Count:
     """What one load has cost so far, and what is known of it."""
 
+    factors: Factors
     iterations: int = 0
-    factorisations: int = 0
-    negative_pivots: int = -1
     known: float = 0.0
     guessed: bool = False  # whether the guess, if there was one, has not failed
-    near: Factor | Turned | None = None  # of the last tangent that was factorised
-    tangent: SymmetricProduct | None = None  # the last one, if an older factor served for it
-    turns: bool = True  # whether K(0)'s factor, turned, has not failed yet
     start: float = field(default_factory=time.perf_counter)
-
-
-Twin = TypeVar("Twin")
-
-
-def _kept(twins: dict[Problem, Twin], problem: Problem, make: Callable[[Problem], Twin]) -> Twin:
-    """Return what belongs to a problem, made if it is not there; the oldest leaves for it."""
-    if problem not in twins:
-        if len(twins) >= TWINS:
-            twins.pop(next(iter(twins)))
-        twins[problem] = make(problem)
-    return twins[problem]
-
-
-def check_steps(solver: Any, parts: Sequence[str]) -> None:
-    """Check the numbers of a solver that steps: `parts`, and reuse, max_iter, budget.
-
-    Raises:
-        ValueError: One is out of range.
-    """
-    for name in parts:
-        if not 0 < getattr(solver, name) < 1:
-            raise ValueError(f"{name} = {getattr(solver, name)} must lie between 0 and 1")
-    if not 0 <= solver.reuse < math.inf:
-        raise ValueError(f"reuse = {solver.reuse} must be 0 or more")
-    for name in ("max_iter", "budget"):
-        if getattr(solver, name) < 1:
-            raise ValueError(f"{name} = {getattr(solver, name)} must be 1 or more")
-
-
-def _pivots(factor: Factor) -> int:
-    """Return the negative eigenvalues of what was factorised, see `Newton.negative_pivots`."""
-    return factor.examined if isinstance(factor, CGFactor) else factor.negative_pivots
-
-
-def _backend_of(problem: Problem, name: str, *, lasting: bool = False) -> Backend:
-    """Return the backend for a problem's tangents, or for one whose factor answers many loads."""
-    motions = problem.rigid_motions()[0][problem.free].numpy()
-    best = chosen(name, problem.pattern, motions, lasting=lasting)
-    return backend(problem.pattern, best, motions)
-
-
-def gather(field: Tensor, problem: Problem) -> NDArray[np.float64]:
-    """Return the free components, (n,), of a nodal field (N, D)."""
-    return field[problem.free].numpy()
-
-
-def scatter(values: NDArray[np.float64], problem: Problem) -> Tensor:
-    """Return the nodal field (N, D) with these free components (n,), zero where held."""
-    field = torch.zeros(problem.shape, dtype=torch.float64)
-    field[problem.free] = torch.from_numpy(values)
-    return field

@@ -13,13 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.cubature import Cells, Cubature, cubature, whitening
-from dpl.fem.newton import Linear, check_steps, gather, scatter
+from dpl.fem.compliance import Linear
+from dpl.fem.cubature import Cubature, cubature
 from dpl.fem.pod import pod
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, judge
-
-LIFT = 1e-6  # residual ratio to which the linear answer is found where the subspace adds to it
+from dpl.fem.reduced import ReducedBody, State, Task, beyond_linear, norm, refuse_range
+from dpl.fem.solution import Load, Solution, check_steps, judge
 
 
 class Reduced(NamedTuple):
@@ -120,8 +119,8 @@ class PODGalerkin:
             ValueError: `rank` is not between 1 and the number of snapshots, or of free degrees of
                 freedom.
         """
-        _refuse_range(problem)
-        basis = pod(_beyond_linear(problem, snapshots, lift), rank).vectors
+        refuse_range(problem)
+        basis = pod(beyond_linear(problem, snapshots, lift), rank).vectors
         vectors = torch.zeros(*problem.shape, rank, dtype=torch.float64)
         vectors[problem.free] = basis
         if tolerance is None:
@@ -150,7 +149,7 @@ class PODGalerkin:
             lift: The linear answer, to be added to what the subspace holds.
             options: Attributes of the solver.
         """
-        rest, basis = _beyond_linear(problem, states, lift), vectors[problem.free]
+        rest, basis = beyond_linear(problem, states, lift), vectors[problem.free]
         held = states.clone()
         held[:, problem.free] -= rest - (rest @ basis) @ basis.T
         return cls(problem, vectors, cubature(problem, vectors, held, tolerance), lift, **options)
@@ -161,7 +160,7 @@ class PODGalerkin:
         Raises:
             ValueError: An attribute is out of range, or V is none of this body.
         """
-        _refuse_range(self.problem)
+        refuse_range(self.problem)
         check_steps(self, parts=("tol", "reduced_tol", "keep", "smallest_step"))
         if tuple(self.vectors.shape[:2]) != self.problem.shape:
             found, wanted = tuple(self.vectors.shape), (*self.problem.shape, "R")
@@ -192,10 +191,11 @@ class PODGalerkin:
 
         Where none is found, that under the largest part of the load for which one was.
         """
-        task, count = self._task(force), _Count()
-        state = self._state(task, torch.zeros_like(task.load), 0.0)
+        model, count = self._model, _Count()
+        task = model.task(force)
+        state = model.state(task, torch.zeros_like(task.load), 0.0)
         known, step = 0.0, 1.0
-        if not task.moves and self._ratio(task, state, 1.0) < self.reduced_tol:
+        if not task.moves and model.ratio(task, state, 1.0) < self.reduced_tol:
             known = 1.0
         while known < 1 and step >= self.smallest_step and count.iterations < self.budget:
             target = min(known + step, 1.0)
@@ -205,9 +205,9 @@ class PODGalerkin:
             else:
                 state, known, step = end, target, 2 * step
         return Reduced(
-            displacement=self._model.whole(state.y).add_(task.offset, alpha=known),
-            coordinates=self._model.coordinates(state.y),
-            residual=self._ratio(task, state, 1.0),
+            displacement=model.whole(state.y).add_(task.offset, alpha=known),
+            coordinates=model.coordinates(state.y),
+            residual=model.ratio(task, state, 1.0),
             load_factor=known,
             iterations=count.iterations,
             factorisations=count.factorisations,
@@ -230,7 +230,7 @@ class PODGalerkin:
             steps: At most; each takes an evaluation of all cells.
         """
         model, problem = self._model, self.problem
-        scale, none = _norm(model.load(force)) or 1.0, torch.zeros_like(model.pull)
+        scale, none = norm(model.load(force)) or 1.0, torch.zeros_like(model.pull)
         answer = guess
         for _ in range(steps):
             internal, volume = problem.evaluate(answer[None])
@@ -238,8 +238,8 @@ class PODGalerkin:
                 break
             unbalanced = model.load(torch.where(problem.free, force - internal[0], 0.0))
             at_cells = answer[model.cells.nodes].flatten()
-            task = _Task(none, scale, True, answer, at_cells, none, none)
-            state = self._state(task, none, 1.0)
+            task = Task(none, scale, True, answer, at_cells, none, none)
+            state = model.state(task, none, 1.0)
             task = task._replace(load=state.internal + unbalanced)
             end = self._corrected(task, state, 1.0, _Count())
             if end is None:
@@ -247,15 +247,15 @@ class PODGalerkin:
             answer = answer + model.whole(end.y)
         return answer
 
-    def _corrected(
-        self, task: "_Task", state: "_State", target: float, count: "_Count"
-    ) -> "_State | None":
+    def _corrected(self, task: Task, state: State, target: float, count: "_Count") -> State | None:
         """Return the equilibrium under `target` times a load, None where steps do not lead."""
-        inverse, ratio, before = None, self._ratio(task, state, target), math.inf
+        model = self._model
+        inverse, ratio, before = None, model.ratio(task, state, target), math.inf
         for _ in range(self.max_iter):
             jump = target - state.part if task.moves else 0.0
             if inverse is None or jump or not ratio < min(self.reuse, before / 2):
-                inverse, right = self._tangent(task, state, target, jump, count)
+                count.factorisations += not state.at_rest
+                inverse, right = model.tangent(task, state, target, jump)
                 if inverse is None:
                     return None
             else:
@@ -265,131 +265,39 @@ class PODGalerkin:
             count.iterations += 1
             if new is None:
                 return None
-            before, ratio = ratio, self._ratio(task, new, target)
+            before, ratio = ratio, model.ratio(task, new, target)
             if new.part == target or not task.moves:
                 short = 1e-2 * self.reduced_tol * target * task.scale
-                if ratio < self.reduced_tol or (not jump and _norm(step) < short):
+                if ratio < self.reduced_tol or (not jump and norm(step) < short):
                     return new
             if count.iterations >= self.budget:
                 return None
             if ratio >= self.reuse:
-                new = self._widened(state, new)
+                new = model.widened(state, new)
             elif not jump:
                 inverse = _broyden(inverse, new.y - state.y, new.internal - state.internal)
             state = new
         return None
 
-    def _tangent(
-        self, task: "_Task", state: "_State", target: float, jump: float, count: "_Count"
-    ) -> tuple[Tensor | None, Tensor]:
-        """Return the tangent's inverse, None if it has none, and what a step has to balance."""
-        model, cells = self._model, self._model.cells
-        if state.part == 0 and not state.y.any():
-            return torch.eye(len(state.y), dtype=torch.float64), target * (task.load - task.pull)
-        system = cells.problem.linearise(state.field, state.gap)
-        if not system.valid:
-            system = cells.problem.linearise(state.field)
-        upper = cells.tangents(system.tangent[0])
-        right = target * task.load - model.internal(cells.project(system.force), state.y)
-        if task.moves:
-            right -= state.part * task.rest
-        if jump:
-            right -= jump * (cells.project(cells.product(upper, task.at_cells)) + task.rest)
-        count.factorisations += 1
-        inverse, failed = torch.linalg.inv_ex(cells.reduced(upper) + model.rest)
-        return (None if failed else inverse), right
-
     def _stepped(
-        self, task: "_Task", state: "_State", step: Tensor, jump: float, target: float
-    ) -> "_State | None":
+        self, task: Task, state: State, step: Tensor, jump: float, target: float
+    ) -> State | None:
         """Return the state after the longest of the steps 1, 1/2, 1/4, ... that inverts nothing."""
         floor = self.keep * min(state.volume, 1.0)
         for length in (0.5 ** np.arange(10)).tolist():
             part = target if jump and length == 1 else state.part + length * jump
-            end = self._state(task, state.y + length * step, part)
+            end = self._model.state(task, state.y + length * step, part)
             if end.volume > floor:
                 return end._replace(length=length)
         return None
 
-    def _widened(self, state: "_State", new: "_State") -> "_State":
-        """Return the state after a step with the gap that its mixed points have."""
-        problem = self._model.cells.problem
-        if not problem.mixes:
-            return new
-        update = (new.field - state.field) / new.length
-        return new._replace(gap=problem.widened(state.gap, new.length, update))
-
-    def _state(self, task: "_Task", y: Tensor, part: float) -> "_State":
-        """Return coordinates with what is known of them; `part` of the offset is there."""
-        model, cells = self._model, self._model.cells
-        values = cells.basis @ y
-        if task.moves:
-            values += part * task.at_cells
-        field = cells.field(values)
-        force, volume = cells.problem.evaluate(field)
-        internal = model.internal(cells.project(force), y)
-        if task.moves:
-            internal += part * task.rest
-        return _State(y, part, field, internal, float(volume))
-
-    def _ratio(self, task: "_Task", state: "_State", target: float) -> float:
-        """Return the reduced residual ratio under `target` times a load."""
-        return _norm(target * task.load - state.internal) / (target * task.scale)
-
-    def _task(self, force: Tensor) -> "_Task":
-        """Return what a load (N, D) is in reduced coordinates."""
-        model, problem = self._model, self.problem
-        load, pull = model.load(force), model.pull
-        scale = _norm(load - pull)
-        offset, moves = problem.prescribed, self.lift is not None or problem.moved_supports
-        if self.lift is not None:
-            offset = offset + _linear_answer(self.lift, force - model.supports)
-            pull = load
-        at_cells = offset[model.cells.nodes].flatten() if moves else offset
-        rest = pull - at_cells @ model.stiffness if moves else pull
-        return _Task(load, scale if scale > 0 else 1.0, moves, offset, at_cells, pull, rest)
-
     @cached_property
-    def _model(self) -> "_Model":
-        return _Model(self.problem, self.vectors, self.cubature)
+    def _model(self) -> ReducedBody:
+        return ReducedBody(self.problem, self.vectors, self.cubature, self.lift)
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle without what is computed from the rest."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
-
-
-class _Task(NamedTuple):
-    """A load in reduced coordinates.
-
-    Attributes:
-        load: V^T f, (R,).
-        scale: Norm of what the first step has to balance, without lift.
-        moves: Whether there is an offset.
-        offset: Where u starts from at full load, (N, D).
-        at_cells: The same at the cells' nodes, (C A D,).
-        pull: V^T K(0) offset, (R,).
-        rest: What of it the cells do not say, (R,).
-    """
-
-    load: Tensor
-    scale: float
-    moves: bool
-    offset: Tensor
-    at_cells: Tensor
-    pull: Tensor
-    rest: Tensor
-
-
-class _State(NamedTuple):
-    """An iterate, evaluated once, and the part of the offset that is in it."""
-
-    y: Tensor
-    part: float
-    field: Tensor
-    internal: Tensor
-    volume: float
-    length: float = 1.0  # of the step that led here
-    gap: Any = None
 
 
 @dataclass
@@ -398,49 +306,6 @@ class _Count:
 
     iterations: int = 0
     factorisations: int = 0
-
-
-class _Model:
-    """What all loads share.
-
-    Attributes:
-        cells: The cells, with the basis W = V L^-T in which K(0) is the identity.
-        stiffness: K(0) W of these cells alone, (C A D, R).
-        rest: I less W^T K(0) W of these cells, (R, R).
-        supports: K(0) prescribed, (N, D); zero where supports do not move.
-        pull: The same in W, (R,).
-    """
-
-    def __init__(self, problem: Problem, vectors: Tensor, chosen: Cubature | None) -> None:
-        """Take the body, V (N, D, R), and the cells that stand for all."""
-        self.problem = problem
-        self._white = whitening(problem, vectors)
-        white = vectors @ self._white
-        every = torch.arange(len(problem.cells))
-        cells, weights = (every, torch.ones(len(every))) if chosen is None else chosen[:2]
-        self.cells = Cells(problem, white, cells, weights.double())
-        self.stiffness = self.cells.product(self.cells.at_rest(), self.cells.basis)
-        rank = vectors.shape[2]
-        self.rest = torch.eye(rank, dtype=torch.float64) - self.cells.basis.T @ self.stiffness
-        self._white_rows = white.flatten(0, 1)
-        self.supports = _support_force(problem)
-        self.pull = self.load(self.supports)
-
-    def load(self, force: Tensor) -> Tensor:
-        """Return W^T f, (R,), of f (N, D)."""
-        return force.flatten() @ self._white_rows
-
-    def internal(self, force: Tensor, y: Tensor) -> Tensor:
-        """Return the internal force of all cells, (R,), from that of the chosen ones."""
-        return force + self.rest @ y
-
-    def whole(self, y: Tensor) -> Tensor:
-        """Return the displacement (N, D) of coordinates in W."""
-        return (self._white_rows @ y).view(self.problem.shape)
-
-    def coordinates(self, y: Tensor) -> Tensor:
-        """Return coordinates in V, (R,), of those in W."""
-        return self._white @ y
 
 
 def _broyden(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
@@ -453,41 +318,3 @@ def _broyden(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
     if not scale.abs() > 1e-8 * step.norm() * moved.norm():
         return inverse
     return inverse + torch.outer((step - moved) / scale, step @ inverse)
-
-
-def _norm(vector: Tensor) -> float:
-    return float(torch.linalg.vector_norm(vector))
-
-
-def _refuse_range(problem: Problem) -> None:
-    """Raise where the law has a range of Poisson's ratios: what is reduced here has one."""
-    if (span := problem.material.poisson_range) is not None:
-        raise ValueError(
-            f"poisson: reduced stiffness and cells are those of one, not of a range, {list(span)}; "
-            "take Problem.at or dpl.fem.newton.Newton"
-        )
-
-
-def _beyond_linear(problem: Problem, snapshots: Tensor, lift: Linear | None) -> Tensor:
-    """Return what moves of displacements in equilibrium, less their linear answers, (S, n)."""
-    rest = snapshots[:, problem.free].double()
-    if lift is not None:
-        supports = _support_force(problem)
-        for row, u in zip(rest, snapshots, strict=True):
-            force = problem.evaluate(u[None]).internal[0] - supports
-            row -= _linear_answer(lift, force)[problem.free]
-    return rest
-
-
-def _support_force(problem: Problem) -> Tensor:
-    """Return K(0) prescribed, (N, D)."""
-    if not problem.moved_supports:
-        return torch.zeros(problem.shape, dtype=torch.float64)
-    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    return problem.tangent_product(rest, problem.prescribed[None])[0]
-
-
-def _linear_answer(lift: Linear, force: Tensor) -> Tensor:
-    """Return K(0)^-1 f, (N, D); what it is short of, the subspace adds."""
-    problem = lift.problem
-    return scatter(lift.factor.solve(gather(force, problem), LIFT), problem)

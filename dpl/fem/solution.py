@@ -1,9 +1,10 @@
 """What every solver takes and gives: Load, Solution, and the one sentence they all say."""
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -109,6 +110,22 @@ def check_force(problem: Problem, load: Load) -> None:
         raise ValueError(f"force: its shape {shape} must be {('B', *wanted)}, B of 1 or more")
     if load.force.dtype != torch.float64:
         raise ValueError(f"force: {load.force.dtype} must be torch.float64")
+
+
+def check_steps(solver: Any, parts: Sequence[str]) -> None:
+    """Check the numbers of a solver that steps: `parts`, and reuse, max_iter, budget.
+
+    Raises:
+        ValueError: One is out of range.
+    """
+    for name in parts:
+        if not 0 < getattr(solver, name) < 1:
+            raise ValueError(f"{name} = {getattr(solver, name)} must lie between 0 and 1")
+    if not 0 <= solver.reuse < math.inf:
+        raise ValueError(f"reuse = {solver.reuse} must be 0 or more")
+    for name in ("max_iter", "budget"):
+        if getattr(solver, name) < 1:
+            raise ValueError(f"{name} = {getattr(solver, name)} must be 1 or more")
 
 
 class Solver(Protocol):

@@ -7,8 +7,9 @@ import torch
 from scipy.sparse.linalg import LinearOperator, eigsh
 from torch import Tensor
 
+from dpl.fem.dofs import scatter
 from dpl.fem.linear import backend, full_matrix
-from dpl.fem.newton import Newton, scatter
+from dpl.fem.newton import Newton
 from dpl.fem.solution import Load, Solution
 
 

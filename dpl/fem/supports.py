@@ -106,3 +106,31 @@ Support = Displacement | Spring
 def joined(springs: Sequence[Springs]) -> Springs | None:
     """Return several beds as one, None if there are none."""
     return Springs(*map(torch.cat, zip(*springs, strict=True))) if springs else None
+
+
+def held(
+    basis: skfem.Basis,
+    scale: float,
+    supports: Sequence[Support],
+    *,
+    fixed: Region | NDArray[np.bool_] | None = None,
+    prescribed: NDArray[np.float64] | None = None,
+) -> tuple[NDArray[np.float64], Springs | None]:
+    """Return g over `scale`, (N, D) [-], NaN where free, and the springs; arguments as in a build.
+
+    Raises:
+        ValueError: A region is empty, or a support is none for this body.
+    """
+    shape = basis.N, basis.mesh.dim()
+    given = np.full(shape, np.nan)
+    if fixed is not None:
+        where = fixed if isinstance(fixed, np.ndarray) else nodes_in(fixed, basis, scale)
+        if not where.any():
+            raise ValueError(f"{fixed} holds no node of the mesh")
+        everywhere = np.broadcast_to(where[:, None] if where.ndim == 1 else where, shape)
+        given = np.where(everywhere, 0.0 if prescribed is None else prescribed, np.nan)
+    for support in supports:
+        if isinstance(support, Displacement):
+            value = support.on(basis, scale)
+            given = np.where(np.isnan(value), given, value)
+    return given, joined([s.on(basis, scale) for s in supports if isinstance(s, Spring)])

@@ -1,4 +1,4 @@
-"""Samples as a network sees them that works on few coordinates: small enough to stay in a cache."""
+"""Samples in the few coordinates that a network works on: small enough to stay in a cache."""
 
 from typing import NamedTuple
 
@@ -50,3 +50,27 @@ class CoordinateSamples(Dataset):
         """Return a batch."""
         chosen = torch.tensor(indices)
         return Coordinates(*(column[chosen] for column in self.samples))
+
+
+def left_over(field: Tensor, coordinates: Tensor) -> Tensor:
+    """Return squares (B,) of what of fields (B, N, D) an orthonormal basis does not hold.
+
+    Args:
+        field: The fields.
+        coordinates: In the basis, (B, R).
+    """
+    return field.flatten(1).square().sum(dim=1) - coordinates.square().sum(dim=1)
+
+
+def evened(size: Tensor) -> Tensor:
+    """Return what coordinates of sizes (n,) are divided by, (n,).
+
+    Between whitened and as they are: small ones matter less, but not nothing, and rounding least.
+    """
+    largest = size.max().clamp(min=1e-30)
+    return (size**0.6 * largest**0.4).clamp(min=1e-3 * float(largest))
+
+
+def root_mean_square(columns: Tensor) -> Tensor:
+    """Return the size of each column of (S, n), (n,)."""
+    return columns.square().mean(dim=0).sqrt()

@@ -8,9 +8,10 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from dpl.fem.symmetry import products
+from dpl.models.coordinates import evened, left_over, root_mean_square
 from dpl.models.moduli import Rests
 from dpl.models.orbits import turned_back
-from dpl.models.pod import PODNet, evened, left_over, root_mean_square
+from dpl.models.pod import PODNet, Reading
 from dpl.scene import Sample, Scene
 
 SAME = 1e-4  # eigenvalues closer than this, relatively, belong to one family
@@ -94,14 +95,9 @@ class Latent(PODNet):
         bent = coordinates * (1 + len(self.takes))
         return super()._weights(coordinates, rank, width) + width * (coordinates + bent + rank)
 
-    def _reading(self, rank: int, coordinates: int) -> int:
-        return rank
-
-    def _readings(self, scene: Scene) -> int:
-        return Rests(scene.linear).count
-
-    def _more_buffers(self, read: int, members: int) -> dict[str, tuple[int, ...]]:
-        return {}  # linear answers are read in the basis of the displacement, and turned as it is
+    def _reading(self, rank: int, coordinates: int) -> Reading:
+        """Return how linear answers are read: in the basis of the displacement."""
+        return Reading(rank, Rests(self.scene.linear).count, own=False)
 
     def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
         """See `PODNet.forward`."""

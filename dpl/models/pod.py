@@ -3,7 +3,7 @@
 The basis comes from the training samples (`prepare`) and is kept in the network's buffers.
 """
 
-from typing import cast
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +12,13 @@ from dpl.fem.memory import refuse_weights
 from dpl.fem.pod import LARGE, pod
 from dpl.fem.rom import PODGalerkin
 from dpl.fem.symmetry import images, symmetries
-from dpl.models.coordinates import Coordinates, CoordinateSamples
+from dpl.models.coordinates import (
+    Coordinates,
+    CoordinateSamples,
+    evened,
+    left_over,
+    root_mean_square,
+)
 from dpl.models.moduli import placed
 from dpl.models.orbits import Orbits, turned, turned_back
 from dpl.scene import Sample, Scene
@@ -37,6 +43,21 @@ class Block(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Return (..., W) of (..., W)."""
         return cast(Tensor, x + self.outer(nn.functional.gelu(self.inner(x))))
+
+
+class Reading(NamedTuple):
+    """How loads are read.
+
+    Attributes:
+        coordinates: Of a load, C.
+        times: How often it is read: once at each of K Poisson's ratios.
+        own: Whether it is in a basis of its own, which images turn in, and not in that of the
+            displacement.
+    """
+
+    coordinates: int
+    times: int = 1
+    own: bool = True
 
 
 class PODNet(nn.Module):
@@ -111,8 +132,9 @@ class PODNet(nn.Module):
         inputs, outputs = int(self.acting.sum()), int(self.moving.sum())
         rank, coordinates = min(rank, outputs), min(coordinates, inputs)
         members = max(1, len(self.group))
-        width_of_reading = self._reading(rank, coordinates)
-        coordinates = min(coordinates, width_of_reading)
+        reading = self._reading(rank, coordinates)
+        read = reading.coordinates
+        coordinates = min(coordinates, read)
         self.poisson_range = scene.loads.poisson_range
         self.takes = () if self.poisson_range is None else ("poisson",)
         entering = coordinates + len(self.takes)
@@ -120,12 +142,12 @@ class PODNet(nn.Module):
         refuse_weights(weights, None, "take a smaller model.width or model.blocks")
         for name, shape in {
             "modes": (rank, len(self.outlet.share)),
-            "readers": (len(self.inlet.share), width_of_reading * self._readings(scene)),
-            "scaled": (width_of_reading, coordinates),
+            "readers": (len(self.inlet.share), read * reading.times),
+            "scaled": (read, coordinates),
             "spread": (rank,),
             "turns": (members, entering, entering),
             "returns": (members, rank, rank),
-            **self._more_buffers(width_of_reading, members),
+            **({"read_returns": (members, read, read)} if reading.own else {}),
         }.items():
             self.register_buffer(name, torch.zeros(shape))
         self.register_buffer("prepared", torch.tensor(False))
@@ -137,17 +159,9 @@ class PODNet(nn.Module):
         """Return the parameters outside the residual blocks."""
         return width * (coordinates + len(self.takes) + 1) + (width + 1) * rank
 
-    def _reading(self, rank: int, coordinates: int) -> int:
-        """Return how many coordinates of a load are read, C."""
-        return coordinates
-
-    def _readings(self, scene: Scene) -> int:
-        """Return at how many Poisson's ratios a load is read, K."""
-        return 1
-
-    def _more_buffers(self, read: int, members: int) -> dict[str, tuple[int, ...]]:
-        """Return shapes of further buffers, for C coordinates of a load and G symmetries."""
-        return {"read_returns": (members, read, read)}
+    def _reading(self, rank: int, coordinates: int) -> Reading:
+        """Return how loads are read, for R modes and so many inputs."""
+        return Reading(coordinates)
 
     def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
@@ -374,27 +388,3 @@ class PODNet(nn.Module):
         targets = self.coordinates(samples.displacement)
         read = self.reading(self.inlet.seen(samples.force), samples.poisson)
         return read, targets, left_over(samples.displacement, targets)
-
-
-def left_over(field: Tensor, coordinates: Tensor) -> Tensor:
-    """Return squares (B,) of what of fields (B, N, D) an orthonormal basis does not hold.
-
-    Args:
-        field: The fields.
-        coordinates: In the basis, (B, R).
-    """
-    return field.flatten(1).square().sum(dim=1) - coordinates.square().sum(dim=1)
-
-
-def evened(size: Tensor) -> Tensor:
-    """Return what coordinates of sizes (n,) are divided by, (n,).
-
-    Between whitened and as they are: small ones matter less, but not nothing, and rounding least.
-    """
-    largest = size.max().clamp(min=1e-30)
-    return (size**0.6 * largest**0.4).clamp(min=1e-3 * float(largest))
-
-
-def root_mean_square(columns: Tensor) -> Tensor:
-    """Return the size of each column of (S, n), (n,)."""
-    return columns.square().mean(dim=0).sqrt()

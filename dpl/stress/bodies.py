@@ -5,12 +5,13 @@ from functools import cache, partial
 
 import torch
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import Traction
 from dpl.fem.linear import installed
 from dpl.fem.materials import Material, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box
 from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import solve
 from dpl.scene import Scene

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from dpl.data.outcome import Job, outcome
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import Traction
 from dpl.fem.materials import Material, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane
 from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Solution, Status, judge, solve
 from dpl.scene import Scene

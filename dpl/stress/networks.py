@@ -8,10 +8,11 @@ from torch import Tensor
 
 from dpl.benchmarks.convergence import PlainNewton
 from dpl.fem.accelerated import Accelerated
+from dpl.fem.compliance import Linear
 from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box
 from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solver, solve
 from dpl.hybrid import Direct, Hybrid, Predict, pick

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import Traction
 from dpl.fem.linear import installed
 from dpl.fem.materials import NeoHookeanLn
 from dpl.fem.mesh import Box, Plane, Tag, box, check, load
 from dpl.fem.modes import ModalLoads, eigenmodes
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Status
 from dpl.fem.supports import Displacement, Spring

@@ -9,10 +9,11 @@ import skfem
 import torch
 from torch import Tensor
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import Traction, body_force
 from dpl.fem.materials import Material, NeoHookeanIsoK4, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box, rectangle
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.verification.bodies import NAMES, Array, balanced, lattice
 from dpl.verification.drawing import COLOURS, measured, panel, picture, reference, side, triangle

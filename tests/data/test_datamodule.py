@@ -12,12 +12,14 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from dpl.data.audit import verify
 from dpl.data.datamodule import OfflineData, OnlineData, Samples
 from dpl.data.durable import sole_writer
 from dpl.data.generate import DataSet
 from dpl.data.online import Rates
 from dpl.data.outcome import Job, outcome
 from dpl.data.store import SHARD
+from dpl.data.writer import Writer
 from dpl.fem.symmetry import symmetries
 from dpl.losses import MSE
 from dpl.models.fcnn import FCNN
@@ -470,7 +472,7 @@ def test_a_data_set_begun_online_is_completed_to_the_one_made_offline(scene, sav
     sizes = {"train": 100, "val": 1, "test": 1, "workers": 0}
     one = DataSet(scene, str(tmp_path / "d"), **sizes)
     solved = []
-    for got in one.store.fill(one.missing(), workers=0):
+    for got in Writer(one.store).fill(one.missing(), workers=0):
         solved.append(got.job.number)
     assert solved == list(range(80, 100)), "no load is solved again"
     other = DataSet(scene, str(tmp_path / "offline"), **sizes)
@@ -482,7 +484,7 @@ def test_a_data_set_begun_online_is_completed_to_the_one_made_offline(scene, sav
 
     assert manifest(one) == manifest(other)
     assert one.store.digest("train", 100) == other.store.digest("train", 100)
-    assert all(not flaw for _, flaw in one.store.verify())
+    assert all(not flaw for _, flaw in verify(one.store))
     assert not (tmp_path / "d" / "spool").exists()
 
 
@@ -609,7 +611,7 @@ def test_two_workers_keep_what_they_solve(scene, saving, tmp_path):
     seen = forces(module.train_dataloader())
     module.teardown("fit")
     store = DataSet(scene, str(tmp_path / "d"), train=80, val=1, test=1, workers=0).fill()
-    assert all(not flaw for _, flaw in store.verify())
+    assert all(not flaw for _, flaw in verify(store))
     assert names(tmp_path / "d")[0] == "train-000000.safetensors"
     assert set(seen) <= set(drawn(scene, 128))
     assert module.store.missing("train", SHARD) == []

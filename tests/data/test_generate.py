@@ -10,6 +10,7 @@ import pytest
 from dpl.data.generate import DataSet
 from dpl.data.outcome import lost, outcome
 from dpl.data.spool import Spool
+from dpl.data.writer import Writer
 from dpl.fem.materials import SaintVenantKirchhoff
 
 SIZES = {"train": 6, "val": 2, "test": 2}
@@ -373,7 +374,7 @@ def test_what_cannot_work_ends_with_one_line_and_a_status_of_2(
 
 def test_a_second_writer_is_told_who_the_first_is(script, tiny, scene_of, tmp_path):
     wanted = DataSet(scene_of(*tiny), str(tmp_path / "d"), train=4, val=0, test=0, workers=0)
-    running = wanted.store.fill({"train": range(4)}, workers=0)
+    running = Writer(wanted.store).fill({"train": range(4)}, workers=0)
     next(running)
     ended = script("generate", *tiny, "data.folder=d", "data.workers=0", cwd=tmp_path)
     running.close()

@@ -17,12 +17,15 @@ from safetensors.torch import load_file, save
 
 from dpl.data import crew
 from dpl.data import store as store_module
+from dpl.data import writer as writer_module
+from dpl.data.audit import MACHINE, repair, verify
 from dpl.data.crew import Stop
 from dpl.data.durable import DataSetError
 from dpl.data.outcome import Job, lost, outcome
 from dpl.data.shard import compact, spread
 from dpl.data.spool import Spool
-from dpl.data.store import MACHINE, Store
+from dpl.data.store import Store
+from dpl.data.writer import Writer
 from dpl.fem.materials import SaintVenantKirchhoff
 from dpl.fem.mesh import rectangle
 
@@ -67,7 +70,7 @@ def fill(store, missing=None, workers=0, **more):
     """Solve what is missing of the tiny data set; return how many loads that were."""
     if missing is None:
         missing = {split: store.missing(split, size) for split, size in SIZES.items()}
-    return len(list(store.fill(missing, workers=workers, **more)))
+    return len(list(Writer(store).fill(missing, workers=workers, **more)))
 
 
 def lines(store, name="manifest.jsonl"):
@@ -104,7 +107,7 @@ def rewrite(store, change, which=0):
 
 
 def flaws(store):
-    return {line["file"]: flaw for line, flaw in store.verify() if flaw}
+    return {line["file"]: flaw for line, flaw in verify(store) if flaw}
 
 
 # ------------------------------------------------------------------ what is stored
@@ -266,7 +269,7 @@ def test_the_bytes_do_not_depend_on_the_order_in_which_loads_are_solved(data, fr
     def backwards(scene, jobs, **more):
         return crew.outcomes(scene, list(jobs)[::-1], **more)
 
-    monkeypatch.setattr(store_module, "outcomes", backwards)
+    monkeypatch.setattr(writer_module, "outcomes", backwards)
     fill(fresh, WANTED)
     assert content(fresh) == content(data.store)
 
@@ -289,7 +292,7 @@ def test_a_run_interrupted_anywhere_and_resumed_makes_the_same_bytes(
     whole, store = Store(tmp_path / "whole", scene, 0), Store(tmp_path / "d", scene, 0)
     fill(whole)
     solved.clear()
-    running = store.fill(WANTED, workers=0)
+    running = Writer(store).fill(WANTED, workers=0)
     for _ in range(after):
         next(running)
     running.close()
@@ -302,7 +305,7 @@ def test_a_run_interrupted_anywhere_and_resumed_makes_the_same_bytes(
 
 
 def test_interrupted_at_every_load_the_bytes_are_the_same(data, fresh, solved):
-    while running := fresh.fill(
+    while running := Writer(fresh).fill(
         {split: fresh.missing(split, size) for split, size in SIZES.items()}, workers=0
     ):
         if next(running, None) is None:
@@ -327,7 +330,7 @@ def test_what_was_solved_before_a_kill_between_shard_and_spool_is_cleared_away(
 
 
 def test_a_spooled_load_that_is_damaged_is_solved_again(data, fresh, solved):
-    running = fresh.fill(WANTED, workers=0)
+    running = Writer(fresh).fill(WANTED, workers=0)
     for _ in range(5):
         next(running)
     running.close()
@@ -345,7 +348,7 @@ def test_a_spooled_load_that_is_damaged_is_solved_again(data, fresh, solved):
 
 
 def test_what_killed_processes_were_writing_is_removed(data, fresh):
-    running = fresh.fill(WANTED, workers=0)
+    running = Writer(fresh).fill(WANTED, workers=0)
     next(running)
     running.close()
     long_ago = time.time() - 3600
@@ -426,7 +429,7 @@ def test_parts_made_by_several_writers_are_the_same_samples(scene, tmp_path, mon
     running = []
     for part in range(2):  # at the same time, a load each in turn
         mine = {split: store.missing(split, size, part, 2) for split, size in SIZES.items()}
-        running.append(store.fill(mine, workers=0, shard=part, shards=2))
+        running.append(Writer(store, part, 2).fill(mine, workers=0))
     found = []
     while running:
         for one in list(running):
@@ -448,19 +451,19 @@ def test_parts_made_by_several_writers_are_the_same_samples(scene, tmp_path, mon
 
 
 def test_a_second_writer_of_the_whole_or_of_the_same_part_is_refused(fresh):
-    running = fresh.fill({"train": range(12)}, workers=0, shard=0, shards=2)
+    running = Writer(fresh, 0, 2).fill({"train": range(12)}, workers=0)
     next(running)
-    for part in ({}, {"shard": 0, "shards": 2}, {"shard": 1, "shards": 3}):
+    for part in ((), (0, 2), (1, 3)):
         with pytest.raises(DataSetError, match=f"process {os.getpid()} on "):
-            fill(fresh, {"train": range(12)}, **part)
+            next(Writer(fresh, *part).fill({"train": range(12)}, workers=0))
     with pytest.raises(DataSetError, match=f"process {os.getpid()} on "):
-        fresh.repair()
+        repair(fresh)
     running.close()
     assert fill(fresh) == 19
 
 
 def test_a_load_of_another_part_that_vanishes_from_the_spool_is_no_crash(data, fresh):
-    fresh.create()
+    Writer(fresh).create()
     spool = fresh.folder / "spool"
     spool.mkdir()
     gone = spool / "train-000099.load"
@@ -475,7 +478,7 @@ def test_a_load_of_another_part_that_vanishes_from_the_spool_is_no_crash(data, f
 def test_a_stop_keeps_what_is_solved(fresh):
     stop = Stop()
     found = 0
-    for _ in fresh.fill(WANTED, workers=0, stop=stop):
+    for _ in Writer(fresh).fill(WANTED, workers=0, stop=stop):
         found += 1
         stop._asked = found == 3
     assert found == 3
@@ -505,7 +508,8 @@ def test_an_error_in_writing_ends_the_workers_even_while_it_is_held(fresh, monke
 
 def test_a_data_set_of_another_scene_is_refused_naming_both_fingerprints(copy, make_scene):
     other = Store(copy.folder, make_scene(poisson=0.31), 0)
-    for use in (lambda: fill(other, WANTED), other.shards, other.repair, other.create):
+    uses = lambda: fill(other, WANTED), other.shards, lambda: repair(other), Writer(other).create
+    for use in uses:
         with pytest.raises(DataSetError) as refusal:
             use()
         assert copy.scene.fingerprint[:12] in str(refusal.value)
@@ -541,7 +545,7 @@ def test_a_folder_that_is_no_data_set_is_refused_and_left_as_it_is(scene, tmp_pa
     store = Store(tmp_path, scene, 0)
     with pytest.raises(DataSetError, match="no data set"):
         fill(store, WANTED)
-    store.repair()
+    repair(store)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
@@ -586,14 +590,15 @@ def test_a_folder_that_may_only_be_read_is_read(copy, environment):
         "import sys; from dpl.data.durable import read_lines; from pathlib import Path; "
         "folder = Path(sys.argv[1]); "
         "assert len(read_lines(folder / 'manifest.jsonl')) == 3; "
-        "from dpl.data.store import Store; from types import SimpleNamespace as N; import json; "
+        "from dpl.data.store import Store; from dpl.data.writer import Writer; "
+        "from types import SimpleNamespace as N; import json; "
         "card = json.loads((folder / 'scene.json').read_text()); "
         "scene = N(fingerprint=card['fingerprint'], identity=lambda: card['scene'], "
         "problem=N(shape=(45, 3)), loads=N(dimension=7, poisson_range=None, "
         "young_at=lambda point: point[:, -1])); "
         "store = Store(folder, scene, 0); "
         "assert len(store.load('train', 12).force) == 12; "
-        "assert store.missing('train', 13) == [12]; store.create(); store.summary(); "
+        "assert store.missing('train', 13) == [12]; Writer(store).create(); store.summary(); "
         "print('read')\ntry:\n    (folder / 'x').touch()\nexcept OSError:\n    print('only')"
     )
     mount = 'mount --bind $0 $0 && mount -o remount,bind,ro $0 && exec $1 -c "$2" $0'
@@ -684,7 +689,7 @@ def test_verify_trusts_no_digest(data, copy, change):
     before = content(data.store)
     name = rewrite(copy, change)
     assert list(flaws(copy)) == [name]
-    assert [*copy.repair()] == [name]
+    assert [*repair(copy)] == [name]
     fill(copy)
     after = content(copy)
     assert sorted(after.pop("manifest.jsonl").splitlines()) == sorted(
@@ -743,7 +748,7 @@ def test_a_line_of_the_manifest_that_says_what_cannot_be_counts_as_torn(copy, da
     (copy.folder / "manifest.jsonl").write_text("".join(json.dumps(one) + "\n" for one in found))
     assert copy.missing("train", 12) == list(range(12))
     assert copy.summary()
-    copy.repair()
+    repair(copy)
     fill(copy)
     assert content(copy) == content(data.store)
 
@@ -804,7 +809,7 @@ def test_two_lines_of_one_shard_are_both_held_against_it(copy):
 
 
 def test_a_load_under_the_name_of_another_is_solved_again(fresh, data, scene):
-    fresh.create()
+    Writer(fresh).create()
     paths = [fresh.spool.put(outcome(scene, Job((0, 0), number))) for number in (0, 1)]
     paths[1].write_bytes(paths[0].read_bytes())
     (paths[0].parent / "train-one.load").write_bytes(b"mine")
@@ -830,7 +835,7 @@ def test_damaged_modes_are_found_and_made_again(copy, harm):
     whole = path.read_bytes()
     path.write_bytes(harm or b"") if harm is not None else path.unlink()
     found = flaws(copy)
-    copy.repair()
+    repair(copy)
     fill(copy)
     assert "modes.safetensors" in found
     assert path.read_bytes() == whole
@@ -838,8 +843,8 @@ def test_damaged_modes_are_found_and_made_again(copy, harm):
 
 def test_a_sound_set_has_no_flaw_and_repair_changes_nothing(copy, solved):
     before = content(copy)
-    assert [flaw for _, flaw in copy.verify()] == 4 * [""]
-    assert not copy.repair()
+    assert [flaw for _, flaw in verify(copy)] == 4 * [""]
+    assert not repair(copy)
     assert fill(copy) == 0
     assert solved == []
     assert content(copy) == before
@@ -849,7 +854,7 @@ def test_repair_makes_damaged_shards_again_and_no_others(copy, data, solved):
     before = content(data.store)
     damaged = lines(copy)[1]
     (copy.folder / damaged["file"]).write_bytes(b"nothing")
-    assert [*copy.repair()] == [damaged["file"]]
+    assert [*repair(copy)] == [damaged["file"]]
     fill(copy)
     assert len(solved) == damaged["tried"]
     after = content(copy)
@@ -860,7 +865,7 @@ def test_repair_makes_damaged_shards_again_and_no_others(copy, data, solved):
 
 def test_a_repaired_manifest_is_that_of_a_set_made_at_once(copy, data):
     (copy.folder / lines(copy)[0]["file"]).unlink()
-    copy.repair()
+    repair(copy)
     fill(copy)
     assert content(copy) == content(data.store)
 
@@ -881,11 +886,11 @@ def test_repair_retries_loads_that_the_machine_lost_and_no_others(hard, tmp_path
     fill(store, {"train": range(9)})
     assert store.digest("train", 9) != sound.digest("train", 9)
     monkeypatch.setattr("dpl.data.crew.outcome", outcome)
-    assert [*store.repair()] == ["train-000000.safetensors", "train-000003.safetensors"]
+    assert [*repair(store)] == ["train-000000.safetensors", "train-000003.safetensors"]
     assert fill(store, {"train": store.missing("train", 9)}) == 6
     assert store.digest("train", 9) == sound.digest("train", 9)
     assert sorted(map(str, lines(store))) == sorted(map(str, lines(sound)))
-    assert not store.repair()
+    assert not repair(store)
 
 
 def test_repair_removes_what_no_manifest_names(copy):
@@ -897,7 +902,7 @@ def test_repair_removes_what_no_manifest_names(copy):
     (copy.folder / "notes.txt").write_text("mine")
     assert copy.missing("train", 20) == list(range(12, 20))
     assert len(copy.load("train", 20).force) == 12
-    copy.repair()
+    repair(copy)
     assert not stray.exists()
     assert not part.exists()
     assert (copy.folder / "notes.txt").exists()
@@ -914,7 +919,7 @@ def test_a_torn_last_line_of_the_manifest_is_solved_again(copy, data, solved):
     assert len(solved) == torn["tried"]
     for split, size in SIZES.items():
         assert same(copy.load(split, size), data.store.load(split, size))
-    copy.repair()
+    repair(copy)
     assert content(copy) == content(data.store), "repair clears the torn line away"
 
 
@@ -932,13 +937,13 @@ def test_a_line_torn_inside_its_reject_list_is_solved_again(hard, tmp_path):
 
 def test_kept_loads_make_shards_when_they_make_whole_ones(data, fresh, scene, monkeypatch):
     monkeypatch.setattr(store_module, "SHARD", 4)
-    fresh.create()
+    Writer(fresh).create()
     for number in (5, 1, 0, 2, 7, 6, 4):
         fresh.spool.put(outcome(scene, Job((0, 0), number)))
-    fresh.collect("train")
+    Writer(fresh).collect("train")
     assert [line["first"] for line in lines(fresh)] == [4]
     assert len(fresh.spool.files()) == 3
     fresh.spool.put(outcome(scene, Job((0, 0), 3)))
-    fresh.collect("train")
+    Writer(fresh).collect("train")
     assert fresh.spool.files() == {}
     assert fresh.digest("train", 8) == data.store.digest("train", 8)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.forces import traction
+from dpl.fem.linear import SuperLU
 from dpl.fem.materials import (
     LinearElastic,
     Material,
@@ -148,3 +149,16 @@ def corner() -> Callable[[Problem, Tensor], Tensor]:
         return displacement[0, int(problem.points.sum(dim=1).argmax())]
 
     return corner
+
+
+@pytest.fixture
+def counted(monkeypatch) -> list[int]:
+    """A list that grows by one with each factorisation."""
+    calls, factorise = [], SuperLU.factorise
+
+    def count(self, values):
+        calls.append(len(values))
+        return factorise(self, values)
+
+    monkeypatch.setattr(SuperLU, "factorise", count)
+    return calls

@@ -8,11 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import Traction
 from dpl.fem.materials import Material, NeoHookeanIsoK4, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box, rectangle
 from dpl.fem.modes import eigenmodes
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, Status, solve
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import BodyForce, Traction, body_force, traction
 from dpl.fem.materials import LinearElastic, NeoHookeanLn
 from dpl.fem.mesh import Plane, box, rectangle
-from dpl.fem.newton import Linear
 from dpl.fem.problem import Problem
 
 

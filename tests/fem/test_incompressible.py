@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import Traction, traction
 from dpl.fem.linear import full_matrix
 from dpl.fem.materials import (
@@ -23,7 +24,7 @@ from dpl.fem.materials import (
     YeohK2,
 )
 from dpl.fem.mesh import Plane
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, Status, solve
 

@@ -81,7 +81,7 @@ def system(problem: Problem) -> System:
 
 
 def motions(problem: Problem) -> np.ndarray:
-    return problem.rigid_motions()[0][problem.free].numpy()
+    return problem.near_null
 
 
 @pytest.fixture(scope="module")
@@ -590,7 +590,7 @@ def test_compact_body_gets_a_sparse_factor(hide):
 def test_very_large_body_gets_multigrid_where_its_rigid_motions_are_known(monkeypatch, hide):
     pytest.importorskip("pyamg")
     wide, fields = of_band(800, 400), np.ones((800, 6))
-    monkeypatch.setattr(linear, "LARGE", {"pardiso": 799, "superlu": 799})
+    monkeypatch.setattr(linear, "MULTIGRID", {"pardiso": 799, "superlu": 799})
     assert chosen("auto", wide, fields) == "cg"
     assert chosen("auto", wide) != "cg"
     assert chosen("auto", of_band(800, 40), fields) == "band"
@@ -602,7 +602,7 @@ def test_factor_that_lasts_is_direct_for_longer_and_never_in_float32(monkeypatch
     pytest.importorskip("pyamg")
     wide, fields = of_band(800, 400), np.ones((800, 6))
     for largest, name in ((799, "direct"), (266, "cg")):  # three times 266 is below 800
-        monkeypatch.setattr(linear, "LARGE", {"pardiso": largest, "superlu": largest})
+        monkeypatch.setattr(linear, "MULTIGRID", {"pardiso": largest, "superlu": largest})
         assert chosen("auto", wide, fields) == "cg"
         assert (chosen("auto", wide, fields, lasting=True) == "cg") == (name == "cg")
     assert chosen("auto", of_band(8000, 300), lasting=True) == "band"

@@ -11,11 +11,12 @@ import scipy.sparse.linalg
 import torch
 
 from dpl.fem import modes as modes_module
+from dpl.fem.compliance import Linear
 from dpl.fem.linear import full_matrix
 from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import box, rectangle
 from dpl.fem.modes import ModalLoads, eigenmodes
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.sampling import SAMPLINGS, even, logarithmic, normal, one, tail
 from dpl.fem.solution import Load, solve

@@ -12,11 +12,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import Traction
 from dpl.fem.linear import BACKENDS, SuperLU, installed
 from dpl.fem.materials import Hookean, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, Status, judge, solve
 
@@ -430,19 +431,6 @@ def test_unknown_backend_is_an_error(beam, pull):
     problem = beam(NH, 4, 1)
     with pytest.raises(ValueError, match="linear = "):
         solve(newton(problem, linear="umfpack"), load_of(pull(problem, 1.0)))
-
-
-@pytest.fixture
-def counted(monkeypatch) -> list[int]:
-    """A list that grows by one with each factorisation."""
-    calls, factorise = [], SuperLU.factorise
-
-    def count(self, values):
-        calls.append(len(values))
-        return factorise(self, values)
-
-    monkeypatch.setattr(SuperLU, "factorise", count)
-    return calls
 
 
 def test_rest_state_is_factorised_once_for_all_loads(law, beam, pull, counted):

@@ -15,11 +15,12 @@ from scipy.sparse.linalg import eigsh
 from torch import Tensor
 from torch.testing import assert_close
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import Traction
 from dpl.fem.linear import full_matrix
 from dpl.fem.materials import MooneyRivlinK2, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Box, Plane, box, rectangle
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, solve
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dpl.fem import newton as newton_module
+from dpl.fem import reuse as reuse_module
 from dpl.fem.band import Band
 from dpl.fem.forces import Traction
 from dpl.fem.krylov import multigrid_installed
@@ -153,19 +153,6 @@ def test_more_reuse_means_fewer_factors(beam, pull, reuse):
     assert answer.factorisations.item() == counts[reuse]
 
 
-@pytest.fixture
-def counted(monkeypatch) -> list[int]:
-    """A list that grows by one with each factorisation."""
-    calls, factorise = [], SuperLU.factorise
-
-    def count(self, values):
-        calls.append(len(values))
-        return factorise(self, values)
-
-    monkeypatch.setattr(SuperLU, "factorise", count)
-    return calls
-
-
 @pytest.mark.parametrize("q", [5.0, 40.0, 160.0])
 def test_factors_are_counted_as_they_are_made(beam, pull, counted, q):
     problem = beam(NH)
@@ -208,18 +195,18 @@ def test_preconditioner_that_does_not_help_is_replaced_after_its_patience(
     load = load_of(pull(problem, 40.0)[0])
     every, few = pair(problem, load)
     steps = []
-    original = newton_module.conjugate_gradients
+    original = reuse_module.conjugate_gradients
 
     def hopeless(product, precondition, right, rtol, max_iter, **_):
         steps.append(max_iter)
         return original(product, lambda r: r, right, rtol, max_iter)
 
-    monkeypatch.setattr(newton_module, "conjugate_gradients", hopeless)
+    monkeypatch.setattr(reuse_module, "conjugate_gradients", hopeless)
     answer = solve(Newton(problem, linear="superlu"), load)
     assert answer.converged.all()
     assert answer.iterations.item() == every.iterations.item()
     assert answer.factorisations.item() == every.factorisations.item() > few.factorisations.item()
-    assert set(steps) == {newton_module.PATIENCE}
+    assert set(steps) == {reuse_module.PATIENCE}
     assert torch.equal(answer.displacement, every.displacement)
 
 

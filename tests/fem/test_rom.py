@@ -9,13 +9,15 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from dpl.fem.compliance import Linear
 from dpl.fem.cubature import Cubature, nonnegative
 from dpl.fem.materials import LinearElastic, NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box
 from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.pod import pod
 from dpl.fem.problem import Problem
+from dpl.fem.rigid import rigid_motions
 from dpl.fem.rom import PODGalerkin
 from dpl.fem.solution import Load, Status, solve
 from dpl.fem.supports import Displacement, Spring
@@ -262,9 +264,9 @@ def test_no_cell_is_needed_by_a_linear_law(beam, pull):
 def test_forces_of_weighted_cells_have_an_energy(newton, snapshots):
     """The reduced tangent is the slope of the reduced force, and symmetric."""
     solver = PODGalerkin.fit(newton.problem, snapshots, 6, tolerance=1e-2)
-    task = solver._task(torch.zeros(newton.problem.shape, dtype=torch.float64))
+    task = solver._model.task(torch.zeros(newton.problem.shape, dtype=torch.float64))
     y, way = 3e-3 * noise(6), noise(6, seed=1)
-    at, ahead, back = (solver._state(task, y + h * way, 0.0) for h in (0.0, 1e-6, -1e-6))
+    at, ahead, back = (solver._model.state(task, y + h * way, 0.0) for h in (0.0, 1e-6, -1e-6))
     cells, rest = solver._model.cells, solver._model.rest
 
     def energy(state):
@@ -282,9 +284,9 @@ def test_small_strains_are_those_of_the_identity(newton, snapshots):
     """K(0) is the identity in the coordinates that the steps are taken in, cells or not."""
     for tolerance in (None, 1e-2):
         solver = PODGalerkin.fit(newton.problem, snapshots, 6, tolerance=tolerance)
-        task = solver._task(torch.zeros(newton.problem.shape, dtype=torch.float64))
+        task = solver._model.task(torch.zeros(newton.problem.shape, dtype=torch.float64))
         y = 1e-9 * noise(6)
-        assert_close(solver._state(task, y, 0.0).internal, y, rtol=1e-5, atol=1e-15)
+        assert_close(solver._model.state(task, y, 0.0).internal, y, rtol=1e-5, atol=1e-15)
 
 
 @pytest.mark.parametrize("lifted", [False, True])
@@ -377,7 +379,7 @@ def test_wrong_rank_is_refused(newton, snapshots, rank):
 
 def test_body_that_is_free_to_move_is_refused(unseen):
     problem = Problem.build(box([1.0, 1.0, 1.0], [2, 2, 2]), NH)
-    solver = PODGalerkin(problem, problem.rigid_motions()[0])
+    solver = PODGalerkin(problem, rigid_motions(problem.points)[0])
     with pytest.raises(ValueError, match="free to move"):
         solver.reduced(torch.zeros(problem.shape, dtype=torch.float64))
 

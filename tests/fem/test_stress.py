@@ -11,12 +11,13 @@ from functools import cache
 import pytest
 import torch
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import Traction
 from dpl.fem.linear import installed
 from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box, check
 from dpl.fem.modes import eigenmodes
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Solution, Status, judge, solve
 from dpl.stress.refusals import NOWHERE, USES

@@ -10,11 +10,12 @@ import skfem
 import torch
 from torch.testing import assert_close
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import Traction
 from dpl.fem.materials import LinearElastic, Material, NeoHookeanLn
 from dpl.fem.mesh import Box, Plane, Tag, box, propeller, rectangle
 from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, solve
 from dpl.fem.supports import Displacement, Spring

@@ -8,10 +8,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from dpl.fem.compliance import Linear
+from dpl.fem.dofs import gather
 from dpl.fem.forces import Traction
 from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.mesh import Plane, box, rectangle
-from dpl.fem.newton import Linear, Newton, gather
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Status, solve
 from dpl.fem.supports import Displacement

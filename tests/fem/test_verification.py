@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.testing import assert_close
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import Traction, body_force, traction
 from dpl.fem.materials import (
     LinearElastic,
@@ -23,7 +24,7 @@ from dpl.fem.materials import (
 )
 from dpl.fem.mesh import Plane, box
 from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Linear, Newton
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, solve
 from dpl.scene import Scene

@@ -10,6 +10,7 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
+from dpl.fem.compliance import Linear
 from dpl.fem.forces import body_force, traction
 from dpl.fem.materials import (
     LinearElastic,
@@ -24,7 +25,6 @@ from dpl.fem.materials import (
     YeohK2,
 )
 from dpl.fem.mesh import box, rectangle
-from dpl.fem.newton import Linear
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load
 from dpl.fem.supports import Displacement, Spring

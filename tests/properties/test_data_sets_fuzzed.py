@@ -19,11 +19,13 @@ from safetensors.torch import load, save
 from tried import counted
 
 from dpl.data import store as store_module
+from dpl.data.audit import repair, verify
 from dpl.data.datamodule import OfflineData
 from dpl.data.durable import DataSetError
 from dpl.data.manifest import STREAMS
 from dpl.data.outcome import Job, outcome
 from dpl.data.store import Store
+from dpl.data.writer import Writer
 
 SIZES = {"train": 12, "val": 4, "test": 4}
 SPOOLED = (10, 11)  # loads of training whose shard is not complete
@@ -52,7 +54,7 @@ def sound(scene, tmp_path_factory):
     wanted = {**{split: range(size) for split, size in SIZES.items()}, "train": range(10)}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(store_module, "SHARD", 4)
-        list(store.fill(wanted, workers=0))
+        list(Writer(store).fill(wanted, workers=0))
     for number in SPOOLED:
         store.spool.put(outcome(scene, Job((0, 0), number)))
     session = {"loads": 18, "seconds": 1.0, "core_seconds": 1.0}
@@ -118,7 +120,7 @@ def law(scene, folder: Path, written: dict, *, trusts_digests: bool = True) -> N
     flaws = None
     with bounded():
         with told(folder):
-            flaws = [flaw for _, flaw in store.verify() if flaw]
+            flaws = [flaw for _, flaw in verify(store) if flaw]
         with told(folder):
             kept = store.modes()
             assert trusts_digests or flaws or torch.allclose(kept.values, scene.loads.modes.values)
@@ -134,10 +136,10 @@ def law(scene, folder: Path, written: dict, *, trusts_digests: bool = True) -> N
             found = samples(scene, folder)
             assert same(found, written) or (not trusts_digests and flaws)
         with told(folder):
-            store.repair()
+            repair(store)
             found = samples(scene, folder)
             assert same(found, written)
-            assert not [flaw for _, flaw in store.verify() if flaw]
+            assert not [flaw for _, flaw in verify(store) if flaw]
 
 
 # ------------------------------------------------------------------ bytes

@@ -25,11 +25,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 from tried import at_most, counted
 
+from dpl.fem.compliance import Linear
+from dpl.fem.dofs import gather
 from dpl.fem.forces import body_force, traction
 from dpl.fem.linear import full_matrix, installed
 from dpl.fem.materials import LinearElastic
 from dpl.fem.modes import eigenmodes
-from dpl.fem.newton import Linear, Newton, gather
+from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, Solution, Status, joined, judge, solve
 from dpl.fem.symmetry import symmetries

@@ -1,0 +1,107 @@
+"""The page of all commands, from dpl/commands/, conf/ and pyproject.toml."""
+
+import ast
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import options
+from paths import CONF, PACKAGE, ROOT
+
+
+@dataclass(frozen=True)
+class Command:
+    """A module of dpl/commands/.
+
+    Attributes:
+        name: Its script.
+        about: Docstring of the module.
+        does: Docstring of its main function.
+        config: Its configuration in conf/, without suffix.
+    """
+
+    name: str
+    about: str
+    does: str
+    config: str
+
+
+def commands() -> list[Command]:
+    """Return all of them."""
+    found = []
+    for path in sorted((PACKAGE / "commands").glob("[a-z]*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in tree.body:
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            for mark in node.decorator_list:
+                name = ast.unparse(mark.func) if isinstance(mark, ast.Call) else ""
+                if name.rpartition(".")[2] == "command":
+                    about, does = ast.get_docstring(tree) or "", ast.get_docstring(node) or ""
+                    found.append(Command(path.stem, about, does, mark.args[0].value))
+    return found
+
+
+def page() -> str:
+    """Return the page."""
+    found = commands()
+    parts = [
+        "# Commands\n",
+        "Made from `dpl/commands/` and `conf/`. In a checkout a command is "
+        "`python scripts/NAME.py key=value ...`; installed, it is `dpl-NAME key=value ...`. "
+        "`--help` prints its keys, `--cfg job` the whole configuration, `-m` makes a sweep of "
+        "lists. Bad input ends with one line and status 2, Ctrl-C with 130.\n",
+        "| command | |",
+        "| --- | --- |",
+    ]
+    parts += [
+        f"| [`{one.name}`](#{one.name}) | {options.code_links(_first(one.about))} |"
+        for one in found
+    ]
+    for one in found:
+        parts += section(one)
+    return "\n".join(parts) + "\n"
+
+
+def _first(text: str) -> str:
+    return " ".join(text.split("\n\n")[0].split())
+
+
+def section(one: Command) -> Iterator[str]:
+    """Yield the lines of one command."""
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    doors = [
+        name
+        for name, target in scripts["project"]["scripts"].items()
+        if target == f"dpl.commands.{one.name}:main"
+    ]
+    yield f"\n## {one.name}\n"
+    yield "```\n" + "\n".join([f"python scripts/{one.name}.py", *doors]) + "\n```\n"
+    yield f"{options.code_links(one.about)}\n"
+    if one.does:
+        yield f"{options.code_links(one.does)}\n"
+    path = CONF / f"{one.config}.yaml"
+    if not path.is_file():
+        return
+    config = options.read(path)
+    own = [row for row in config.rows if row.key != "defaults"]
+    yield f"Configuration: `conf/{one.config}.yaml`. {options.code_links(config.about)}\n"
+    if config.composed:
+        yield f"Composed of {', '.join(_entry(entry) for entry in config.composed)}.\n"
+    yield from options.table(own, config.calls)
+
+
+def _entry(entry: str) -> str:
+    """Return an entry of a defaults list, linked to what it chooses."""
+    group, _, chosen = entry.partition(":")
+    group, chosen = group.split()[-1].lstrip("/"), chosen.strip()
+    if not chosen:
+        if not (CONF / f"{entry}.yaml").is_file():
+            return f"`{entry}`"
+        mine = (PACKAGE / "commands" / f"{entry}.py").is_file()
+        return f"[`{entry}`]({'' if mine else 'options.md'}#{entry})"
+    if (CONF / group / f"{chosen}.yaml").is_file():
+        return f"[`{entry}`](options.md#{group}-{chosen})"
+    if (CONF / group).is_dir():
+        return f"[`{entry}`](options.md#group-{group})"
+    return f"`{entry}`"

@@ -1,0 +1,276 @@
+"""The documentation is true: generated pages hold all there is, links lead on, code runs."""
+
+import ast
+import importlib
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import hydra
+import nbformat
+import pytest
+import yaml
+from hydra.core.global_hydra import GlobalHydra
+
+from dpl import run
+
+ROOT = Path(__file__).parents[1]
+DOCS, CONF, RESULTS = ROOT / "docs", ROOT / "conf", ROOT / "results"
+MAKE = DOCS / "make"
+COMING = ("viewer.md", "export.md", "monitoring.md", "live.gif", "notebooks")  # need not be there
+WRITTEN = [*sorted(DOCS.glob("*.md")), *sorted(ROOT.glob("*.md"))]
+BLOCK = re.compile(r"^```(python|yaml)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.M | re.S)
+
+
+@pytest.fixture
+def make(monkeypatch):
+    """Imports a module of docs/make."""
+    monkeypatch.syspath_prepend(str(MAKE))
+    return importlib.import_module
+
+
+@pytest.fixture
+def blocks(tmp_path, monkeypatch):
+    """Writes the files that a page's blocks name, and runs its other blocks of Python, in order."""
+
+    def blocks(page, **names):
+        found = BLOCK.findall((DOCS / page).read_text(encoding="utf-8"))
+        for _, name, text in found:
+            if name:
+                path = tmp_path / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with path.open("a") as file:
+                    file.write(text)
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.syspath_prepend(str(tmp_path))
+        for kind, name, text in found:
+            if kind == "python" and not name:
+                exec(compile(text, page, "exec"), names)
+        return names
+
+    yield blocks
+    sys.modules.pop("my_parts", None)
+
+
+def keys_of(node, path=""):
+    """Yield the path of every key that holds a value, of every mapping with one, of lists too."""
+    if isinstance(node, dict) and node:
+        for key, value in node.items():
+            yield from keys_of(value, f"{path}.{key}" if path else str(key))
+    elif node == {} and not path:
+        return
+    elif isinstance(node, list) and any(isinstance(item, dict) for item in node):
+        for k, item in enumerate(node):
+            yield from keys_of(item, f"{path}[{k}]")
+    else:
+        yield path
+
+
+@pytest.mark.parametrize(
+    "path", sorted(CONF.glob("*/*.yaml")), ids=lambda p: f"{p.parent.name}-{p.stem}"
+)
+def test_every_key_of_every_option_stands_in_its_section(make, path):
+    text = make("options").page()
+    group, name = path.parent.name, path.stem
+    section = text.split(f"{{ #{group}-{name} }}")[1].split("\n### ")[0]
+    node = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    node.pop("defaults", None)
+    whole = path.read_text(encoding="utf-8").startswith("# @package _global_")
+    for key in keys_of(node):
+        assert f"| `{key if whole else f'{group}.{key}'}` |" in section, key
+
+
+def test_what_commands_share_stands_among_the_options(make):
+    section = make("options").page().split("{ #scene }")[1].split("\n## ")[0]
+    node = yaml.safe_load((CONF / "scene.yaml").read_text(encoding="utf-8"))
+    node.pop("defaults")
+    for key in keys_of(node):
+        assert f"| `{key}` |" in section, key
+
+
+def test_an_option_s_page_says_what_its_call_takes_besides(make):
+    section = make("options").page().split("{ #mesh-beam }")[1].split("\n### ")[0]
+    assert "`+mesh.cell` | `'hexahedron'`" in section
+    assert "Vertices along each side" in section
+    assert "[m]" in section
+
+
+def test_every_command_stands_there_with_all_its_keys(make):
+    text = make("commands").page()
+    for path in sorted((ROOT / "scripts").glob("*.py")):
+        assert f"\n## {path.stem}\n" in text, path
+    for command in make("commands").commands():
+        section = text.split(f"\n## {command.name}\n")[1].split("\n## ")[0]
+        assert f"python scripts/{command.name}.py" in section
+        assert f"dpl-{command.name}" in section
+        config = CONF / f"{command.config}.yaml"
+        node = yaml.safe_load(config.read_text(encoding="utf-8"))
+        node.pop("defaults", None)
+        for key in keys_of(node):
+            assert f"| `{key}` |" in section, (command.name, key)
+
+
+def test_every_public_module_has_a_page_of_its_own(make):
+    pages = dict(make("modules").pages())
+    for path in (ROOT / "dpl").rglob("*.py"):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        if "programs" in parts:
+            continue
+        name = ".".join(parts).removesuffix(".__init__")
+        page = "index" if name == "dpl" else name.removeprefix("dpl.")
+        assert f"::: {name}\n" in pages[f"api/{page}.md"]
+
+
+def test_every_result_stands_there_with_the_command_that_makes_it(make):
+    measured = make("measured")
+    text = measured.page()
+    for path in RESULTS.iterdir():
+        assert f"(results/{path.name})" in text or path.suffix == ".json", path
+    for part in measured.PARTS:
+        script = part.command.split()[1]
+        assert (ROOT / script).is_file(), script
+    row = measured.read("beam_svk")[1]
+    assert measured.shown(row["e_mean"]) in text.split("{ #beam-svk }")[1].split("\n## ")[0]
+
+
+def test_a_result_of_no_known_command_is_refused(make, tmp_path, monkeypatch):
+    measured = make("measured")
+    (tmp_path / "mystery.csv").write_text("a\n1\n")
+    monkeypatch.setattr(measured, "RESULTS", tmp_path)
+    with pytest.raises(LookupError, match="mystery: which command makes it"):
+        measured.page()
+
+
+def test_numbers_of_results_are_filled_in_and_ambiguous_ones_refused(make):
+    measured = make("measured")
+    number = next(r for r in measured.read("beam_svk") if r["method"] == "paper")["e_mean"]
+    assert measured.filled("{{ beam_svk: method=paper: e_mean }}") == measured.shown(number)
+    with pytest.raises(LookupError, match="rows are"):
+        measured.filled("{{ beam_svk: loads=in range: e_mean }}")
+    for path in DOCS.glob("*.md"):
+        assert "{{" not in measured.filled(path.read_text(encoding="utf-8")), path
+
+
+@pytest.mark.parametrize(
+    "text", ["0.0001934", "8e-06", "12345.6", "576000000", "0.73", "nan", "inf"]
+)
+def test_a_number_that_is_shown_is_the_one_in_the_file_to_two_digits(make, text):
+    shown = make("measured").shown(text)
+    assert float(shown.replace(",", "")) == pytest.approx(float(text), rel=0.05, nan_ok=True)
+
+
+def test_formulas_become_mathml_with_their_number(make):
+    html = r'<div class="arithmatex">\[ \frac{\lVert a \rVert}{\ln b} &lt; 1 \tag{7} \]</div>'
+    drawn = make("formulas").mathml(html)
+    assert "<mfrac>" in drawn
+    assert drawn.count('<mo stretchy="false" lspace="0" rspace="0">&#x02016;</mo>') == 2
+    assert '<mo lspace="0.17em" rspace="0.17em">ln</mo>' in drawn
+    assert "&lt;" in drawn or "&#x0003C;" in drawn
+    assert '<span class="tag">(7)</span></div>' in drawn
+    assert "tag{" not in drawn
+
+
+@pytest.mark.parametrize("path", WRITTEN, ids=lambda path: path.name)
+def test_links_and_images_lead_to_files_that_are_there(make, path):
+    for target in make("links").targets(path.read_text(encoding="utf-8")):
+        if not target:
+            continue
+        place = (path.parent / target).resolve()
+        generated = path.parent == DOCS and generated_page(make, target)
+        assert place.exists() or generated or Path(target).name in COMING, target
+
+
+def generated_page(make, target):
+    """Whether a link in docs/ leads to a page that the site makes."""
+    paths = make("paths")
+    return target in paths.GENERATED or target in paths.INCLUDED
+
+
+def test_links_out_of_docs_lead_to_pages_of_the_site(make):
+    rewritten = make("links").rewritten
+    text = "![a](../results/soak.png), [b](../DESIGN.md#rules), [c](options.md#x), [d](../LICENSE)"
+    assert rewritten(text, "docs/stress.md", "stress.md") == (
+        "![a](results/soak.png), [b](house.md#rules), [c](options.md#x), d"
+    )
+    text = "[x](docs/data.md) and [y](https://a.b/c)\n```\n[z](docs/no.md)\n```"
+    assert rewritten(text, "README.md", "readme.md") == (
+        "[x](data.md) and [y](https://a.b/c)\n```\n[z](docs/no.md)\n```"
+    )
+
+
+def test_a_notebook_is_executed_once_and_shown_with_its_figures(make, tmp_path, monkeypatch):
+    executed, links = make("executed"), make("links")
+    code = "import matplotlib.pyplot as plt\nplt.plot([1, 2])\nprint('\\x1b[31m40\\x1b[0m', 40 + 2)"
+    cells = [nbformat.v4.new_markdown_cell("# A trial"), nbformat.v4.new_code_cell(code)]
+    nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "1_trial.ipynb")
+    monkeypatch.setattr(executed, "NOTEBOOKS", tmp_path)
+    monkeypatch.setattr(executed, "CACHE", tmp_path / "cache")
+    assert executed.title(executed.paths()[0]) == "A trial"
+    (path, text), (figure, content) = executed.pages(execute=True)
+    assert path == "notebooks/1_trial.md"
+    assert "40 42" in text
+    shown = links.rewritten(text, "notebooks/1_trial.ipynb", path)
+    assert f"({figure.removeprefix('notebooks/')})" in shown
+    assert content.startswith(b"\x89PNG")
+    monkeypatch.setattr("nbclient.NotebookClient.execute", None)
+    assert dict(executed.pages(execute=True))[path] == text
+    bare = dict(executed.pages(execute=False))
+    assert list(bare) == [path]
+    assert "40 42" not in bare[path]
+
+
+def test_the_parts_of_the_page_on_adding_things_work(blocks, monkeypatch):
+    made = blocks("extend.md")
+    assert made["answers"].converged.all()
+    monkeypatch.setattr(sys, "path", [str(Path.cwd()), *sys.path])
+    GlobalHydra.instance().clear()
+    own = f"hydra.searchpath=[file://{Path.cwd() / 'my_conf'}]"
+    chosen = ["material=gent", "mesh=tube", "model=modal", "loss=tip", "folder=."]
+    try:
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            cfg = hydra.compose("train", overrides=[own, *chosen])
+            run.check(cfg)
+            scene = run.build_scene(cfg)
+            surrogate = run.build_surrogate(cfg, scene)
+    finally:
+        GlobalHydra.instance().clear()
+    assert (surrogate.net.inner[0].out_features, type(surrogate.loss).__name__) == (64, "TipError")
+    search = yaml.safe_load((Path.cwd() / "my_conf/sweep/modal.yaml").read_text())
+    assert set(search["hydra"]["sweeper"]["params"]) == {"model.width", "optimizer.lr"}
+    assert search["defaults"][0] == {"override /model": "modal"}
+
+
+def test_the_quick_start_works_on_a_trained_run(blocks, script, tiny_training, tmp_path):
+    made = ["run=runs/mine", "trainer.max_epochs=1", "model=fcnn"]
+    assert script("train", *tiny_training, *made, cwd=tmp_path).status == 0
+    names = blocks("index.md")
+    assert names["exact"].residual < 1e-6
+    assert names["bent"].converged
+
+
+def test_python_and_yaml_that_are_shown_can_be_read():
+    for path in DOCS.glob("*.md"):
+        for kind, _, text in BLOCK.findall(path.read_text(encoding="utf-8")):
+            ast.parse(text) if kind == "python" else yaml.safe_load(text)
+
+
+def test_the_site_is_made_without_a_warning_and_asks_no_other_host_for_anything(tmp_path):
+    site = tmp_path / "site"
+    build = ["build", "--strict", "-f", MAKE / "mkdocs.yml", "-d", site]
+    told = subprocess.run(
+        [sys.executable, "-m", "mkdocs", *build],
+        env={**os.environ, "NOTEBOOKS": "false", "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert told.returncode == 0, told.stderr
+    fetched = re.compile(
+        r'<(?:script|img|link|iframe|source)[^>]*(?:src|href)="(?:https?:)?//[^"]+"'
+    )
+    for page in site.rglob("*.html"):
+        text = re.sub(r'<link rel="canonical"[^>]*>', "", page.read_text(encoding="utf-8"))
+        assert not fetched.search(text), page
+    assert "<mfrac>" in (site / "concepts.html").read_text(encoding="utf-8")
