@@ -95,6 +95,11 @@ class Surrogate(L.LightningModule):
 
     def predict(self, load: Load) -> Tensor:
         """Return displacements over L, (B, N, D), float64."""
+        scaled, more = self.entering(load)
+        return self.leaving(self.net(scaled, **more))
+
+    def entering(self, load: Load) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return what the network takes of loads: scaled forces (B, N, D), and more by name."""
         scaled = (load.force / self.force_scale).to(self.dtype)
         if load.poisson.shape[-1] != self._own:
             raise ValueError(
@@ -102,9 +107,12 @@ class Surrogate(L.LightningModule):
                 if self._own
                 else "poisson: the law has one for all loads, and this load brings its own"
             )
-        more = {name: getattr(load, name) for name in getattr(self.net, "takes", ())}
-        answer = self.net(scaled, **more).double() * self.displacement_scale
-        return torch.where(self.physics.problem.free, answer, 0.0)
+        return scaled, {name: getattr(load, name) for name in getattr(self.net, "takes", ())}
+
+    def leaving(self, answer: Tensor) -> Tensor:
+        """Return displacements over L, float64, of the network's answers, (B, N, D)."""
+        displacement = answer.double() * self.displacement_scale
+        return torch.where(self.physics.problem.free, displacement, 0.0)
 
     def plan(self) -> list[str]:
         """Return what network and loss leave out, a line each."""

@@ -99,7 +99,7 @@ class CNN(nn.Module):
             force: What acts.
             poisson: Poisson's ratios, (B, 1) [-]; wanted where the law has a range of them.
         """
-        constant = self.constant.expand(len(force), *self.constant.shape)
+        constant = self.constant.expand(force.shape[0], *self.constant.shape)
         fields = [self.immersion.spread(force), constant]
         if self.poisson_range is not None:
             place = placed(poisson, self.poisson_range, force)

@@ -24,6 +24,8 @@ class FCNN(nn.Module):
 
     inputs: Tensor
     outputs: Tensor
+    entries: Tensor
+    exits: Tensor
 
     def __init__(
         self,
@@ -75,6 +77,8 @@ class FCNN(nn.Module):
         refuse_weights(self.parameters_needed, memory_limit, remedy)
         self.register_buffer("inputs", inputs, persistent=False)
         self.register_buffer("outputs", outputs, persistent=False)
+        for name, where in {"entries": inputs, "exits": outputs}.items():
+            self.register_buffer(name, where.flatten().nonzero()[:, 0], persistent=False)
         stages: list[nn.Module] = [nn.Linear(sizes[0], sizes[1])]
         for before, after in pairwise(sizes[1:]):
             stages += [nn.PReLU(before), nn.Linear(before, after)]
@@ -93,7 +97,7 @@ class FCNN(nn.Module):
         Raises:
             ValueError: It is wanted and not there.
         """
-        entering = force[:, self.inputs]
+        entering = force.flatten(1).index_select(1, self.entries)
         if "young" in self.takes:
             if young is None:
                 raise ValueError("young is an input of this network: give E, (B,) [Pa]")
@@ -102,9 +106,8 @@ class FCNN(nn.Module):
             entering = torch.cat([size * entering, place], dim=1)
         if self.poisson_range is not None:
             entering = torch.cat([entering, placed(poisson, self.poisson_range, force)], dim=1)
-        displacement = torch.zeros_like(force)
-        displacement[:, self.outputs] = self.stages(entering)
-        return displacement
+        whole = torch.zeros_like(force).flatten(1)
+        return whole.index_copy(1, self.exits, self.stages(entering)).view_as(force)
 
     def plan(self) -> list[str]:
         """Return what the network leaves out, a line."""

@@ -61,7 +61,7 @@ class Immersion(nn.Module):
     def spread(self, values: Tensor) -> Tensor:
         """Return nodal values (B, N, C) shared out to the grid, (B, C, *shape): sums are kept."""
         shares = (values[:, :, None] * self.weights[..., None]).flatten(1, 2)
-        field = values.new_zeros(len(values), math.prod(self.shape), values.shape[2])
+        field = values.new_zeros(values.shape[0], math.prod(self.shape), values.shape[2])
         return field.index_add(1, self.corners.flatten(), shares).mT.unflatten(2, self.shape)
 
     def read(self, field: Tensor) -> Tensor:

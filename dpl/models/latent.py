@@ -101,16 +101,28 @@ class Latent(PODNet):
 
     def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
         """See `PODNet.forward`."""
-        seen = self.inlet.seen(force)
-        linear = self.reading(seen, poisson)
-        learnt = self.learnt(self.beside(linear @ self.scaled, poisson))
-        local = self._local(seen, linear, poisson)
+        linear, learnt, local = self._parts(force, poisson)
         if not local.any():
             return self.field(linear + learnt, force)
         moved = self.field(torch.where(local[:, None], learnt, linear + learnt), force)
         exact = _Respond.apply(force[local][:, self.acting].double(), self)
         exact = self.rests.between(exact, None if poisson is None else poisson[local])
         return moved.index_add(0, local.nonzero()[:, 0], self._fields(exact, self.moving).to(moved))
+
+    def within(self, force: Tensor, poisson: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return answers within the basis (B, N, D), and of which loads it misses too much, (B,).
+
+        Where it does not, they are those of `forward`; where it does, a factor of K(0) is wanted.
+        """
+        linear, learnt, local = self._parts(force, poisson)
+        return self.field(linear + learnt, force), local
+
+    def _parts(self, force: Tensor, poisson: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return coordinates (B, R) of linear answer and rest, and which loads are local, (B,)."""
+        seen = self.inlet.seen(force)
+        linear = self.reading(seen, poisson)
+        learnt = self.learnt(self.beside(linear @ self.scaled, poisson))
+        return linear, learnt, self._local(seen, linear, poisson)
 
     def reading(self, seen: Tensor, poisson: Tensor | None) -> Tensor:
         """See `PODNet.reading`; coordinates of the linear answer."""

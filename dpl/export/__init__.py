@@ -1,0 +1,1 @@
+"""A trained surrogate handed on: a graph for ONNX, its weights, its description, its results."""

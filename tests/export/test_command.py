@@ -1,0 +1,103 @@
+"""scripts/export.py, end to end, and what it refuses."""
+
+import json
+import shutil
+
+import meshio
+import numpy as np
+import pytest
+
+from dpl.export import graph
+
+MISSING = graph.missing()
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """The folder in which a user works."""
+    return tmp_path_factory.mktemp("home")
+
+
+@pytest.fixture
+def trained(script, tiny_training, home):
+    """A short training run, made once."""
+    if not (home / "runs" / "first").exists():
+        ended = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/first", cwd=home)
+        assert ended.status == 0, ended.err[-2000:]
+    return home
+
+
+@pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed (extra onnx)")
+def test_export_writes_a_folder_that_others_can_use(script, trained):
+    ended = script("export", "run=runs/first", "samples=4", "repeats=2", "count=2", cwd=trained)
+    assert ended.status == 0, ended.err[-2000:]
+    folder = trained / "runs/first/export"
+    names = {path.name for path in folder.iterdir()}
+    assert names == {
+        *("model.onnx", "weights.safetensors", "meta.json", "modes.f64", "report.json"),
+        *("reference", "results"),
+    }
+    report = json.loads((folder / "report.json").read_text(), parse_constant=pytest.fail)
+    assert report["passed"]
+    assert report["largest_error"] <= report["tolerance"] == 1e-4
+    assert [row["batch"] for row in report["milliseconds"]] == [1, 4]
+    assert all(row["torch"] > 0 < row["onnxruntime"] for row in report["milliseconds"])
+    meta = json.loads((folder / "meta.json").read_text(), parse_constant=pytest.fail)
+    judged = json.loads((trained / "runs/first/evaluation.json").read_text())
+    assert meta["errors"] == judged[1]["errors"]
+    assert "largest difference" in ended.out
+    assert "results.pvd" in ended.out
+    assert "[HYDRA]" not in ended.out + ended.err
+    assert (folder / "results" / "results_001.vtu").is_file()
+    ended = script("export", "run=runs/first", "parts=[results]", "count=1", cwd=trained)
+    assert ended.status == 0
+    assert not (folder / "results" / "results_001.vtu").exists(), "of the series before"
+    found = meshio.read(folder / "results" / "results_000.vtu").point_data
+    assert np.isfinite(found["error [m]"]).all()
+
+
+@pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed (extra onnx)")
+def test_a_graph_that_is_off_is_not_handed_on(script, trained):
+    asked = ["run=runs/first", "folder=off", "parts=[model]", "samples=4", "repeats=1"]
+    ended = script("export", *asked, "tol=1e-12", cwd=trained)
+    assert ended.status == 1
+    (line,) = ended.err.strip().splitlines()
+    assert line.startswith("error: ONNX and torch differ by ")
+    assert "tol = 1e-12" in line
+    assert not (trained / "off" / "model.onnx").exists()
+    assert not json.loads((trained / "off" / "report.json").read_text())["passed"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["run=runs/none"], "run = runs/none has no config.yaml; train it first"),
+        (["run=runs/first", "parts=[modal]"], "parts: 'modal' is none of model, results"),
+        (["run=runs/first", "parts=[]"], "parts: choose of model, results"),
+        (["run=runs/first", "parts=[results]", "count=0"], "count = 0 must be 1 or more"),
+        (["run=runs/first", "tol=0"], "tol = 0 must lie between"),
+        (["run=runs/first", "exact=2"], "exact = 2 must be true or false"),
+    ],
+)
+def test_bad_input_ends_with_one_line(script, trained, arguments, told):
+    ended = script("export", *arguments, cwd=trained)
+    assert ended.status == 2
+    assert f"error: {told}" in ended.err
+    assert len(ended.err.strip().splitlines()) == 1
+
+
+def test_without_onnx_the_way_to_install_it_is_named(script, trained, monkeypatch):
+    monkeypatch.setattr(graph, "missing", lambda: ["onnx"])
+    ended = script("export", "run=runs/first", cwd=trained)
+    assert ended.status == 2
+    assert "error: parts: model needs onnx: pip install" in ended.err
+    assert "parts=[results]" in ended.err
+
+
+@pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed (extra onnx)")
+def test_an_evaluation_that_is_none_is_told(script, trained):
+    shutil.copytree(trained / "runs/first", trained / "runs/broken")
+    (trained / "runs/broken/evaluation.json").write_text("[{}]")
+    ended = script("export", "run=runs/broken", "samples=1", "repeats=1", cwd=trained)
+    assert ended.status == 2
+    assert "is no evaluation" in ended.err

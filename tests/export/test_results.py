@@ -1,0 +1,136 @@
+"""Results for ParaView, read back."""
+
+import xml.etree.ElementTree as ElementTree
+
+import meshio
+import numpy as np
+import pytest
+import torch
+
+from dpl.export.results import results
+from dpl.fem.fields import fields
+from dpl.fem.files import save_series
+from dpl.fem.mesh import box, load, rectangle, save
+from dpl.losses import MSE
+from dpl.models.fcnn import FCNN
+from dpl.module import Surrogate
+
+BODIES = {
+    "hexahedron": (1, "hexahedron", 8),
+    "hexahedron, quadratic": (2, "hexahedron27", 27),
+    "tetra": (1, "tetra", 4),
+    "tetra, quadratic": (2, "tetra10", 10),
+    "quad": (1, "quad", 4),
+    "quad, quadratic": (2, "quad9", 9),
+    "triangle": (1, "triangle", 3),
+    "triangle, quadratic": (2, "triangle6", 6),
+}
+
+
+@pytest.fixture
+def scene_on(make_scene):
+    """Builds a small scene on cells of a kind."""
+
+    def scene_on(name):
+        cell, degree = name.split(",")[0], BODIES[name][0]
+        solid = cell in ("hexahedron", "tetra")
+        size, nodes = [100.0, 25.0, 25.0], [3, 2, 2]
+        grid = box(size, nodes, cell) if solid else rectangle(size[:2], [4, 2], cell)
+        return make_scene(mesh=grid, degree=degree, n_modes=2)
+
+    return scene_on
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_series_hold_the_fields_of_the_answers_in_si_units(scene_on, tmp_path, name):
+    scene = scene_on(name)
+    _, kind, corners = BODIES[name]
+    torch.manual_seed(0)
+    surrogate = Surrogate(FCNN(scene, width=8), MSE(), scene).eval()
+    asked = scene.loads.sample((0, 12), range(2))
+    rows, files = results(surrogate, asked, tmp_path / "new" / "series")
+    assert [path.name for path in files] == ["series.pvd", "series.xdmf"]
+    collection = ElementTree.parse(files[0]).getroot()
+    named = [one.get("file") for one in collection.iter("DataSet")]
+    assert [one.get("timestep") for one in collection.iter("DataSet")] == ["0", "1"]
+    newton = "N" if scene.problem.shape[1] == 3 else "N/m"
+    nodes, dim = scene.problem.shape
+    with torch.no_grad():
+        answer = torch.cat([surrogate.predict(single) for single in asked.singles()])
+    inside = fields(scene.problem, answer)
+    for k, file in enumerate(named):
+        found = meshio.read(tmp_path / "new" / file)
+        assert [(block.type, block.data.shape[1]) for block in found.cells] == [(kind, corners)]
+        points = (scene.length * scene.problem.points).numpy()
+        assert np.allclose(found.points[:, :dim], points, rtol=1e-14)
+        data = found.point_data
+        unit = 4500.0 * scene.force_unit
+        assert np.allclose(data[f"force [{newton}]"][:, :dim], unit * asked.force[k].numpy())
+        assert np.allclose(data["displacement [m]"][:, :dim], scene.length * answer[k].numpy())
+        assert not data["displacement [m]"][:, dim:].any()
+        stress = data["Cauchy stress [Pa]"].reshape(nodes, 3, 3)
+        assert np.allclose(stress, 4500.0 * inside.stress[k].numpy())
+        assert np.allclose(data["von Mises stress [Pa]"], 4500.0 * inside.von_mises[k].numpy())
+        assert np.allclose(data["det F"], inside.volume_ratio[k].numpy())
+        exact = data["exact displacement [m]"][:, :dim] / scene.length
+        balance = scene.problem.residual_ratio(
+            torch.from_numpy(exact)[None], asked.force[k : k + 1]
+        )
+        assert float(balance) < 1e-7
+        error = np.linalg.norm(exact - answer[k].numpy(), axis=1)
+        assert np.allclose(data["error [m]"], scene.length * error)
+        assert rows[k].error == pytest.approx(np.linalg.norm(error) / np.linalg.norm(exact))
+    with meshio.xdmf.TimeSeriesReader(files[1]) as series:
+        points, cells = series.read_points_cells()
+        assert [block.type for block in cells] == [kind]
+        for k, file in enumerate(named):
+            time, data, _ = series.read_data(k)
+            assert time == k
+            single = meshio.read(tmp_path / "new" / file)
+            assert np.array_equal(points, single.points)
+            assert set(data) == set(single.point_data)
+            for key, column in data.items():
+                assert np.allclose(
+                    column.reshape(single.point_data[key].shape), single.point_data[key]
+                )
+
+
+def test_without_finite_elements_no_error_is_claimed(scene_on, tmp_path):
+    scene = scene_on("quad")
+    surrogate = Surrogate(FCNN(scene, width=8), MSE(), scene).eval()
+    asked = scene.loads.sample((0, 12), range(1))
+    rows, _ = results(surrogate, asked, tmp_path / "series", exact=False)
+    assert np.isnan(rows[0].error)
+    assert "error [m]" not in meshio.read(tmp_path / "series_000.vtu").point_data
+
+
+@pytest.mark.parametrize("name", ["tetra", "tetra, quadratic"])
+def test_tetrahedra_are_written_right_handed(scene_on, tmp_path, name):
+    """Of Kuhn's tetrahedra half are left-handed."""
+    problem = scene_on(name).problem
+    save(tmp_path / "body.vtu", problem.mesh, {"x": problem.points.numpy()[:, 0]})
+    found = meshio.read(tmp_path / "body.vtu")
+    nodes = found.points[found.cells[0].data]
+    volume = np.linalg.det(nodes[:, 1:4] - nodes[:, :1]) / 6
+    assert (volume > 0).all()
+    assert volume.sum() == pytest.approx(float(problem.dV.expand(len(problem.cells), -1).sum()))
+    pairs = {"tetra10": [(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]}
+    for k, (i, j) in enumerate(pairs.get(found.cells[0].type, [])):
+        middle = (nodes[:, i] + nodes[:, j]) / 2
+        assert np.allclose(nodes[:, 4 + k], middle), "in VTK's order"
+    assert len(load(tmp_path / "body.vtu").p.T) == len(problem.points)
+
+
+def test_fields_of_another_body_are_refused(tmp_path):
+    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
+    with pytest.raises(ValueError, match="9 nodes are of another body"):
+        save(tmp_path / "body.vtu", mesh, {"x": np.zeros(9)})
+    with pytest.raises(ValueError, match="8, 27"):
+        save(tmp_path / "body.vtu", mesh, {"x": np.zeros(8), "y": np.zeros(27)})
+
+
+def test_names_that_xml_knows_are_written(tmp_path):
+    mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
+    files = save_series(tmp_path / 'a&"b', mesh, [{"x": np.zeros(8)}])
+    (one,) = ElementTree.parse(files[0]).getroot().iter("DataSet")
+    assert (tmp_path / one.get("file")).is_file()
