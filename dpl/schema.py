@@ -28,7 +28,7 @@ KEYS: dict[str, Any] = {  # what a configuration may hold at its top, and of whi
     **{"networks": NAMES, "tols": Sequence[float], "resume": bool, "cases": NAMES},
     **{"threads": Sequence[int | None], "across": WHOLE, "budget": int},
     **{"minutes": float, "works": Sequence[str]},
-    **{"host": str, "port": int, "names": Sequence[str], "movie": str | None},
+    **{"host": str, "port": int, "names": Sequence[str], "movie": str | None, "speed": bool},
 }
 SPANS = {  # smallest and largest of them
     **{"repeats": (1, 10**6), "samples": (1, 10**6), "shards": (1, math.inf)},

@@ -12,6 +12,7 @@ from dpl import run
 
 if TYPE_CHECKING:
     from dpl.viewer.door import Door
+    from dpl.viewer.page import Page
     from dpl.viewer.state import Body
 
 MISSING = "pip install -c constraints.txt -e '.[viewer]'"
@@ -31,6 +32,9 @@ def main(cfg: DictConfig) -> None:
     door = _door(cfg)
     page = Page(_body(cfg), door, title=str(cfg.run), folder=Path(cfg.folder))
     try:
+        if cfg.speed:
+            _show_speed(page)
+            return
         print(f"the page is at {door.address}  (Ctrl-C ends it)", flush=True)
         while True:
             time.sleep(0.1)
@@ -72,6 +76,13 @@ def _door(cfg: DictConfig) -> "Door":
             file=sys.stderr,
         )
     return door
+
+
+def _show_speed(page: "Page") -> None:
+    from dpl.benchmarks.rows import show
+    from dpl.viewer.speed import speed
+
+    show(speed(page), "a frame: milliseconds on the server, and what arrives a second")
 
 
 def _film(body: "Body", path: Path) -> None:

@@ -26,6 +26,8 @@ from dpl.viewer.worker import Worker
 Hold = Callable[[float | None, float | None], Asked]  # E, Poisson's ratio -> load
 ALONE, BUDGET = "network alone", "as far as the budget"
 ANSWERS = (ALONE, *(f"corrected to {tol:.0e}" for tol in TIERS), BUDGET)
+NEAR = 0.8  # distance of the camera from one body
+DOTS = 120  # at most, that mark a patch
 DARK, GREY, RED = (28, 32, 44), (160, 166, 178), (214, 40, 57)
 
 
@@ -158,11 +160,14 @@ class Page:
         self._draws = 0
         self._build_scene()
         self._build_panel(title)
-        self.worker = Worker(
-            body, self._show, beside=self._show_beside, trouble=self._trouble
-        )
+        self.worker = Worker(body, self._show, beside=self._show_beside, trouble=self._trouble)
         self.worker.start()
         self._mark()
+
+    @property
+    def address(self) -> str:
+        """What is typed into the browser, with the token."""
+        return self._door.address
 
     def close(self) -> None:
         """End."""
@@ -177,11 +182,14 @@ class Page:
         server, surface = self.server, self.body.surface
         low, high = surface.rest.min(axis=0), surface.rest.max(axis=0)
         server.gui.configure_theme(
-            show_logo=False, show_share_button=False, brand_color=(37, 99, 235), control_width="large"
+            show_logo=False,
+            show_share_button=False,
+            brand_color=(37, 99, 235),
+            control_width="large",
         )
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(370)
-        camera = Camera.before(surface, wide=0.8)
+        camera = Camera.before(surface, wide=NEAR)
         server.initial_camera.position = camera.position
         server.initial_camera.look_at = camera.look_at
         server.initial_camera.fov = camera.field
@@ -219,12 +227,12 @@ class Page:
         self._fe.frame.position = self._aside
         self._fe.frame.visible = False
         corner = np.array([low[0], low[1], high[2] + 0.12])
-        self._labels = [
-            server.scene.add_label("/network/label", "", position=corner, visible=False),
-            server.scene.add_label("/fe/label", "Newton from rest", position=corner),
-        ]
+        server.scene.add_label("/fe/label", "Newton from rest", position=corner)
+        self._label = server.scene.add_label(
+            "/network/label", "answer", position=corner, visible=False
+        )
         self._patch_dots = server.scene.add_point_cloud(
-            "/patch", np.zeros((1, 3)), RED, point_size=0.006, point_shape="circle"
+            "/patch", np.zeros((1, 3)), RED, point_size=0.004, point_shape="circle"
         )
         self._arrow = server.scene.add_arrows(
             "/arrow",
@@ -327,7 +335,9 @@ class Page:
             self._radius = gui.add_slider(
                 "patch radius / L", 0.0, float(span), 0.01, float(min(max(0.4, low), span))
             )
-            self._direction = gui.add_vector3("direction", (0.0, 1.0 if dim == 2 else 0.0, 1.0), step=0.1)
+            self._direction = gui.add_vector3(
+                "direction", (0.0, 1.0 if dim == 2 else 0.0, 1.0), step=0.1
+            )
             self._amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
             least, most = self.body.young_span
             self._young = gui.add_slider(
@@ -337,13 +347,19 @@ class Page:
             self._poisson = (
                 None
                 if span_nu is None
-                else gui.add_slider("Poisson's ratio", *map(float, span_nu), 1e-3, self.body.poisson)
+                else gui.add_slider(
+                    "Poisson's ratio", *map(float, span_nu), 1e-3, self.body.poisson
+                )
             )
             self._beyond = gui.add_checkbox(
-                "beyond range", False, hint="let a drag ask for more than the training's largest loads"
+                "beyond range",
+                False,
+                hint="let a drag ask for more than the training's largest loads",
             )
             self._uniform = gui.add_checkbox(
-                "even force", False, hint="one force at all nodes of the patch: unlike the training's"
+                "even force",
+                False,
+                hint="one force at all nodes of the patch: unlike the training's",
             )
             random, reset = (
                 gui.add_button("Random load of the training"),
@@ -383,11 +399,12 @@ class Page:
         if self._quantity.value != self.worker.wish.quantity:
             self._scale = Scale()
         if compare != self.worker.wish.compare:
-            self._fe.frame.visible = self._newton.visible = compare
+            self._fe.frame.visible = self._newton.visible = self._label.visible = compare
+            middle = self._aside / 2 if compare else np.zeros(3)
+            camera = Camera.before(self.body.surface, wide=1.25 if compare else NEAR)
             for client in self.server.get_clients().values():
-                client.camera.position = client.camera.position + self._aside / (
-                    2 if compare else -2
-                )
+                client.camera.position = camera.position + middle
+                client.camera.look_at = camera.look_at + middle
         try:
             self.worker.ask(wish=Wish(self._quantity.value, tol, budget, compare))
         except ValueError as error:
@@ -457,13 +474,15 @@ class Page:
         force = frame.asked.force.numpy()
         size = float(np.linalg.norm(force))
         with self.server.atomic():
-            self._patch_dots.points = np.nan_to_num(frame.points[where]).astype(np.float32)
+            dots = frame.points[where]
+            dots = dots[:: len(dots) // DOTS + 1]
+            self._patch_dots.points = np.nan_to_num(dots).astype(np.float32)
             self._arrow.visible = size > 0
             if size > 0:
                 total = np.pad(force.sum(axis=0), (0, 3 - force.shape[1]))
                 way = total / max(float(np.linalg.norm(total)), 1e-300)
-                centre = np.flatnonzero(self.body.surface.nodes == self._node)[0]
-                start = np.nan_to_num(frame.points[centre])
+                acts = np.linalg.norm(force[self.body.surface.nodes], axis=1)
+                start = np.nan_to_num(frame.points).T @ (acts / max(acts.sum(), 1e-300))
                 share = 0.0 if frame.answer is None else min(float(frame.answer.amplitude), 2.0)
                 ends = np.stack([start, start + (0.08 + 0.3 * share) * way])
                 self._arrow.points = ends[None].astype(np.float32)

@@ -32,7 +32,7 @@ def readout(frame: Frame, rate: float) -> str:
             f"{'outside' if away else 'inside'}, {answer.amplitude:.2f}",
             f"color:{BAD if away else GOOD}",
         ),
-        _row("frames a second", f"{rate:.0f}"),
+        _row("answers a second", f"{rate:.0f}"),
     ]
     words = html.escape(str(answer.verdict))
     verdict = (
@@ -66,11 +66,11 @@ def legend(quantity: str, top: float, low: float, high: float) -> str:
     ticks = "".join(f"<span>{top * k / 4:.3g}</span>" for k in range(5))
     return BOX.format(
         f'<div style="display:flex;justify-content:space-between;margin-bottom:4px">'
-        f'<b>{html.escape(quantity)} [{unit}]</b><span style="opacity:.62">{BANDS} bands</span></div>'
+        f"<b>{html.escape(quantity)} [{unit}]</b>"
+        f'<span style="opacity:.62">{BANDS} bands</span></div>'
         f'<div style="display:flex;height:14px;border-radius:3px;overflow:hidden">{cells}</div>'
         f'<div style="display:flex;justify-content:space-between;font-size:11.5px;opacity:.75">'
-        f"{ticks}</div>"
-        + _row("on the surface", f"{low:.3g} to {high:.3g} {unit}")
+        f"{ticks}</div>" + _row("on the surface", f"{low:.3g} to {high:.3g} {unit}")
     )
 
 

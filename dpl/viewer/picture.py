@@ -10,7 +10,8 @@ from numba import njit
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from dpl.viewer.surface import Floats, Ints, Surface
+from dpl.viewer.state import QUANTITIES
+from dpl.viewer.surface import Floats, Surface
 
 COLOURS = {"displacement": "viridis", "von Mises stress": "turbo", "error against FE": "magma"}
 BANDS = 12
@@ -171,7 +172,9 @@ def _fill(seen, triangles, levels, normals, depth, value, normal):  # type: igno
                     value[row, column] = w * levels[i] + u * levels[j] + v * levels[k]
                     for axis in range(3):
                         normal[row, column, axis] = (
-                            w * normals[t, 0, axis] + u * normals[t, 1, axis] + v * normals[t, 2, axis]
+                            w * normals[t, 0, axis]
+                            + u * normals[t, 1, axis]
+                            + v * normals[t, 2, axis]
                         )
 
 
@@ -210,14 +213,17 @@ def _write(image: Image.Image, words: Sequence[str]) -> None:
     row = 18 * unit
     for number, line in enumerate(words):
         size = round((25 if number == 0 else 17) * unit)
-        pen.text((22 * unit, row), line, fill=INK if number == 0 else LINE, font=_font(size, bold=number == 0))
+        pen.text(
+            (22 * unit, row),
+            line,
+            fill=INK if number == 0 else LINE,
+            font=_font(size, bold=number == 0),
+        )
         row += 1.5 * size
 
 
 def _legend(image: Image.Image, quantity: str, top: float) -> None:
     """Put the colours and what they stand for at the right."""
-    from dpl.viewer.state import QUANTITIES
-
     pen = ImageDraw.Draw(image)
     unit = image.height / 540
     right, high, low = image.width - 92 * unit, 120 * unit, image.height - 60 * unit
@@ -228,9 +234,8 @@ def _legend(image: Image.Image, quantity: str, top: float) -> None:
         pen.rectangle((right, y, right + 18 * unit, y + step), fill=tuple(int(c) for c in colour))
     for k in range(0, BANDS + 1, 3):
         y = low - k * step
-        pen.text((right + 24 * unit, y), f"{top * k / BANDS:.3g}", fill=LINE, font=font, anchor="lm")
+        pen.text(
+            (right + 24 * unit, y), f"{top * k / BANDS:.3g}", fill=LINE, font=font, anchor="lm"
+        )
     title = f"{quantity} [{QUANTITIES[quantity]}]"
     pen.text((image.width - 22 * unit, high - 22 * unit), title, fill=INK, font=font, anchor="rm")
-
-
-__all__ = ["BANDS", "Camera", "Ints", "Scenery", "colours"]

@@ -1,22 +1,23 @@
 """What was shown, kept: a series for ParaView, or a film."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 
 from dpl.data.durable import whole_file
 from dpl.fem.fields import fields
 from dpl.fem.mesh import save
-from dpl.viewer.picture import Scenery
+from dpl.viewer.picture import INK, PAPER, Scenery, colours
 from dpl.viewer.state import Body, Frame, Scale
 
 MOST = 900  # frames of a recording, 30 s at 30 a second
-RATE = 25  # frames of a film a second
+RATE = 20  # frames of a film a second
 FORMATS = (".gif", ".mp4")
 
 
@@ -118,29 +119,35 @@ def evenly(frames: list[tuple[float, Frame]]) -> list[Frame]:
     return [frames[k][1] for k in chosen]
 
 
-def film(path: Path, frames: list[Frame], scenery: Scenery) -> None:
+def film(
+    path: Path,
+    frames: list[Frame],
+    scenery: Scenery,
+    words: Callable[[Frame], list[str]] | None = None,
+) -> None:
     """Write frames, `RATE` a second, as a film; a GIF runs in a loop.
+
+    Args:
+        path: A .gif or .mp4 file.
+        frames: One or more.
+        scenery: Where they are drawn.
+        words: What stands on the picture of a frame; `caption` if left out.
 
     Raises:
         ValueError: No such format.
     """
     if path.suffix not in FORMATS:
         raise ValueError(f"{path.name} must end with {' or '.join(FORMATS)}")
-    pictures = _pictures(frames, scenery)
+    pictures = _pictures(frames, scenery, words or caption)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".mp4":
         _mp4(path, pictures, scenery.size)
         return
-    from PIL import Image
-
-    found = [Image.fromarray(picture) for picture in pictures]
-    # one palette for all, from a few: colours do not flicker, and unchanged pixels cost nothing
-    some = found[:: max(1, len(found) // 6)]
-    strip = Image.new("RGB", (scenery.size[0], scenery.size[1] * len(some)))
-    for k, picture in enumerate(some):
-        strip.paste(picture, (0, k * scenery.size[1]))
-    palette = strip.quantize(96, method=Image.Quantize.MEDIANCUT)
-    flat = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in found]
+    palette = _palette({frame.quantity for frame in frames})
+    flat = [
+        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
+        for picture in pictures
+    ]
     with whole_file(path) as file:
         flat[0].save(
             file,
@@ -168,16 +175,30 @@ def _mp4(path: Path, pictures: Iterator[NDArray[np.uint8]], size: tuple[int, int
         part.unlink(missing_ok=True)
 
 
-def _pictures(frames: list[Frame], scenery: Scenery) -> Iterator[NDArray[np.uint8]]:
+def _palette(quantities: set[str]) -> Image.Image:
+    """Return the colours of a GIF: bands in light and shade, and from paper to ink.
+
+    One palette for all pictures, so that what does not move costs nothing and does not flicker.
+    """
+    shades = np.linspace(0.45, 1.05, 16 // len(quantities))[:, None, None]
+    bands = [np.clip(shades * colours(quantity), 0, 255) for quantity in sorted(quantities)]
+    greys = np.linspace(PAPER, INK, 40)
+    flat = np.concatenate([*(shade.reshape(-1, 3) for shade in bands), greys]).round()
+    image = Image.new("P", (1, 1))
+    image.putpalette(flat.astype(np.uint8).tobytes())
+    return image
+
+
+def _pictures(
+    frames: list[Frame], scenery: Scenery, words: Callable[[Frame], list[str]]
+) -> Iterator[NDArray[np.uint8]]:
     """Yield the pictures of frames; colours span what the whole film holds."""
-    scale = Scale()
-    for frame in frames:
-        scale.top = max(scale.top, scale.follow(frame.values))
-    top = scale.top
+    largest = np.concatenate([frame.values for frame in frames])
+    top = Scale().follow(largest)
     before: tuple[Frame, NDArray[np.uint8]] | None = None
     for frame in frames:
         if before is None or frame is not before[0]:
-            image = scenery.draw(frame.points, frame.values, top, frame.quantity, caption(frame))
+            image = scenery.draw(frame.points, frame.values, top, frame.quantity, words(frame))
             before = frame, np.asarray(image)
         yield before[1]
 

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -125,7 +125,7 @@ class Body:
         if span is None:
             poisson = None
         else:
-            poisson = self.poisson if poisson is None else poisson
+            poisson = sum(span) / 2 if poisson is None else poisson
             if not span[0] <= poisson <= span[1]:
                 raise ValueError(f"Poisson's ratio {poisson:g} must lie in {list(span)}")
         always = self.scene.loads.always
@@ -134,7 +134,9 @@ class Body:
 
     def rest(self, young: float | None = None, poisson: float | None = None) -> Asked:
         """Return the load of no hand."""
-        return self.asked(torch.zeros(self.scene.problem.shape, dtype=torch.float64), young, poisson)
+        return self.asked(
+            torch.zeros(self.scene.problem.shape, dtype=torch.float64), young, poisson
+        )
 
     def sample(self, index: int) -> Asked:
         """Return a random load like those of the training."""
@@ -166,16 +168,11 @@ class Body:
 
     def answer(self, asked: Asked, wish: Wish) -> Frame:
         """Return the answer to a load, and what it is worth, as it is shown."""
-        more = {} if asked.poisson is None else {"poisson": asked.poisson}
-        answer = self.simulator(
-            asked.force, young=asked.young, tol=wish.tol, budget_ms=wish.budget_ms, **more
-        )
+        answer = self._ask(asked, tol=wish.tol, budget_ms=wish.budget_ms)
         over_length = answer.displacement / self.scene.length
         other = None
         if wish.quantity == "error against FE":
-            exact = self.simulator(
-                asked.force, young=asked.young, tol=self.scene.solver.tol, warm=True, **more
-            )
+            exact = self._ask(asked, tol=self.scene.solver.tol, warm=True)
             other = exact.displacement / self.scene.length
         return Frame(
             asked,
@@ -189,6 +186,9 @@ class Body:
             answer.volume_ratio,
             answer.converged,
         )
+
+    def _ask(self, asked: Asked, **options: Any) -> Answer:
+        return self.simulator(asked.force, young=asked.young, poisson=asked.poisson, **options)
 
     def newton(self, asked: Asked, wish: Wish, beside: Frame) -> Iterator[Frame]:
         """Yield Newton's iterates from rest as they are shown; errors are those of `beside`."""
@@ -232,7 +232,7 @@ class Scale:
         """Return the upper end for values, of which some may not be finite."""
         finite = values[np.isfinite(values)]
         largest = float(finite.max()) if len(finite) else 0.0
-        if largest > self.top or largest < 0.3 * self.top:
+        if largest > self.top or largest < 0.4 * self.top:
             self.top = round_up(largest)
         return self.top
 
@@ -251,12 +251,4 @@ def between(old: Asked, new: Asked, share: float) -> Asked:
     if share >= 1:
         return new
     force = torch.lerp(old.force, new.force, share)
-    return replace_load(new, force, old.young + share * (new.young - old.young))
-
-
-def replace_load(asked: Asked, force: Tensor, young: float) -> Asked:
-    """Return a load of another force and E."""
-    return asked._replace(force=force, young=young)
-
-
-__all__ = ["QUANTITIES", "TIERS", "Body", "Frame", "Scale", "Wish", "between", "replace", "round_up"]
+    return new._replace(force=force, young=old.young + share * (new.young - old.young))

@@ -60,7 +60,7 @@ class Surface:
         np.add.at(total, where.ravel(), normals[owner])
         count = np.bincount(where.ravel(), minlength=len(lines))
         bent = (total**2).sum(axis=1) < 2 + 2 * SHARP  # |n + m|^2 of two unit normals
-        nodes, inverse = np.unique(facets, return_inverse=True)
+        nodes = np.unique(facets)
         number = np.full(len(rest), -1)
         number[nodes] = np.arange(len(nodes))
         triangles = number[np.concatenate(fans)]
@@ -78,10 +78,10 @@ class Surface:
         drawn = torch.zeros(body.shape[0], dtype=torch.bool)
         drawn[self.nodes] = True
         kept = drawn[body.cells].any(dim=1)
-        part = {"cells": body.cells[kept]}
-        if not body.equal_cells:
-            part |= {"dN": body.dN[kept], "dV": body.dV[kept]}
-        return replace(body, **part)
+        cells = body.cells[kept]
+        if body.equal_cells:
+            return replace(body, cells=cells)
+        return replace(body, cells=cells, dN=body.dN[kept], dV=body.dV[kept])
 
     def moved(self, displacement: Tensor) -> Floats:
         """Return the nodes of the surface where displacements (N, D) [-] take them, (S, 3) [-]."""
@@ -118,7 +118,7 @@ def bands(points: Floats, triangles: Ints, levels: Floats, count: int) -> list[F
     """
     levels = np.clip(levels, 0.0, count * (1 - 1e-9))
     order = np.argsort(levels[triangles], axis=1, kind="stable")
-    odd = (order[:, 1] == (order[:, 0] + 2) % 3)
+    odd = order[:, 1] == (order[:, 0] + 2) % 3
     sorted_ = np.take_along_axis(triangles, order, axis=1)
     lowest, highest = levels[sorted_[:, 0]].astype(int), levels[sorted_[:, 2]].astype(int)
     owner = np.repeat(np.arange(len(triangles)), highest - lowest + 1)
@@ -145,9 +145,12 @@ def bands(points: Floats, triangles: Ints, levels: Floats, count: int) -> list[F
     pieces = [(a, c, b), (a, d, c), (a[kink], e[kink], d[kink])]
     ways, belongs = [turned, turned, turned[kink]], [band, band, band[kink]]
     soup = np.stack([np.concatenate(column) for column in zip(*pieces, strict=True)], axis=1)
-    back = np.concatenate(ways)
+    back, whose = np.concatenate(ways), np.concatenate(belongs)
     soup[back] = soup[back][:, [0, 2, 1]]
-    whose = np.concatenate(belongs)
+    kept = np.ones(len(soup), dtype=bool)
+    for i, j in ((0, 1), (1, 2), (0, 2)):  # where a cut goes through a corner
+        kept &= (soup[:, i] != soup[:, j]).any(axis=1)
+    soup, whose = soup[kept], whose[kept]
     ranked = np.argsort(whose, kind="stable")
     cuts = np.searchsorted(whose[ranked], np.arange(1, count))
     return [part.reshape(-1, 3) for part in np.split(soup[ranked], cuts)]

@@ -70,9 +70,9 @@ class Worker(threading.Thread):
 
     @property
     def rate(self) -> float:
-        """Answers in the last second."""
-        now = time.monotonic()
-        return float(sum(now - then < 1.0 for then in list(self._times)))
+        """Answers in the second before the last."""
+        times = list(self._times)
+        return float(sum(times[-1] - then < 1.0 for then in times))
 
     def settle(self, timeout: float) -> bool:
         """Wait until the newest wish is answered; return whether it is."""
