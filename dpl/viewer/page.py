@@ -124,6 +124,7 @@ class Page:
         body: What is simulated.
         worker: What answers.
         server: viser's.
+        camera: Where a browser begins.
     """
 
     def __init__(self, body: Body, door: Door, *, title: str, folder: Path) -> None:
@@ -161,8 +162,8 @@ class Page:
         self._build_scene()
         self._build_panel(title)
         self.worker = Worker(body, self._show, beside=self._show_beside, trouble=self._trouble)
-        self.worker.start()
         self._mark()
+        self.worker.start()
 
     @property
     def address(self) -> str:
@@ -189,7 +190,7 @@ class Page:
         )
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(370)
-        camera = Camera.before(surface, wide=NEAR)
+        self.camera = camera = Camera.before(surface, wide=NEAR)
         server.initial_camera.position = camera.position
         server.initial_camera.look_at = camera.look_at
         server.initial_camera.fov = camera.field

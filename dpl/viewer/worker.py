@@ -98,7 +98,7 @@ class Worker(threading.Thread):
                 number, make, wish = self._asked, self._make, self._wish
             try:
                 here = self._serve(number, make, wish, here)
-            except (ValueError, RuntimeError, ArithmeticError) as error:
+            except Exception as error:  # the page must go on, whatever one load did
                 self._trouble(" ".join(str(error).split()) or type(error).__name__)
                 self._finish(number)
 
@@ -106,12 +106,13 @@ class Worker(threading.Thread):
         """Go to a load, and return where the newer one found it."""
         goal = make()
         here = goal if here is None or self._glide <= 0 else here
+        size = max(float(here.force.norm()), float(goal.force.norm())) or 1.0
+        left = self._left(here, goal, size)
         self._beside(None)
         before = time.monotonic()
-        left = 1.0
         while True:
-            here = between(here, goal, 1.0 if left < NEAR or here is goal else self._share(before))
-            left = 0.0 if here is goal else self._left(here, goal)
+            here = between(here, goal, 1.0 if left < NEAR else self._share(before))
+            left = self._left(here, goal, size)
             before = time.monotonic()
             frame = self.body.answer(here, wish)
             self._times.append(time.monotonic())
@@ -136,11 +137,10 @@ class Worker(threading.Thread):
         return 1 - math.exp(-since / self._glide)
 
     @staticmethod
-    def _left(here: Asked, goal: Asked) -> float:
-        """Return how far a load is from where it goes, relatively."""
-        way = float((goal.force - here.force).norm())
-        size = max(float(goal.force.norm()), float(here.force.norm()), 1e-300)
-        return max(way / size, abs(goal.young - here.young) / goal.young)
+    def _left(here: Asked, goal: Asked, size: float) -> float:
+        """Return how far a load is from another, in parts of the larger force and of E."""
+        way = float((goal.force - here.force).norm()) / size
+        return max(way, abs(goal.young - here.young) / goal.young)
 
     def _interrupted(self, number: int, seconds: float) -> bool:
         """Wait so long for a newer wish; return whether there is one."""

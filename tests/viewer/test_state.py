@@ -150,13 +150,11 @@ def test_colours_are_what_they_are_called(body, pushed):
 
 def test_a_softer_body_is_moved_further_and_stress_is_in_pascals(body, pushed):
     _, asked = pushed
-    stiff = body.answer(asked._replace(young=2 * asked.young), Wish(quantity=STRESS, tol=1e-8))
-    soft = body.answer(asked, Wish(quantity=STRESS, tol=1e-8))
+    wish = Wish(quantity=STRESS, tol=1e-8)
+    stiff = body.answer(asked._replace(young=2 * asked.young), wish)
+    soft = body.answer(asked, wish)
     assert stiff.displacement.norm() < 0.7 * soft.displacement.norm()
-    bigger = body.answer(
-        asked._replace(force=3 * asked.force, young=3 * asked.young),
-        Wish(quantity=STRESS, tol=1e-8),
-    )
+    bigger = body.answer(asked._replace(force=3 * asked.force, young=3 * asked.young), wish)
     assert bigger.values == pytest.approx(3 * soft.values, rel=1e-5)
 
 

@@ -44,6 +44,27 @@ def test_the_last_frame_is_of_the_newest_load(make_worker, body, shown):
     assert sizes == sorted(sizes)
 
 
+def test_it_glides_to_no_load_in_a_moment(make_worker, body, shown):
+    worker = make_worker(glide=0.05)
+    for make in (lambda: body.sample(1), body.rest):
+        before = len(shown)
+        worker.ask(make)
+        assert worker.settle(30)
+        assert 3 < len(shown) - before < 60
+    assert shown[-1].answer.tier == "rest"
+
+
+def test_another_wish_for_the_same_load_is_one_frame(make_worker, body, shown):
+    worker = make_worker(glide=0.05)
+    worker.ask(lambda: body.sample(1))
+    assert worker.settle(30)
+    before = len(shown)
+    worker.ask(wish=Wish(tol=1e-6))
+    assert worker.settle(30)
+    assert len(shown) == before + 1
+    assert shown[-1].converged
+
+
 def test_without_a_glide_there_is_one_frame_for_a_load(make_worker, body, shown):
     worker = make_worker(glide=0.0)
     worker.ask(lambda: body.sample(1))
