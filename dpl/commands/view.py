@@ -91,5 +91,8 @@ def _film(body: "Body", path: Path) -> None:
 
     if path.suffix not in FORMATS:
         raise run.ConfigError(f"movie = {path} must end with {' or '.join(FORMATS)}")
-    moving_load(body, path)
+    try:
+        moving_load(body, path)
+    except ImportError as error:  # of what writes MP4
+        raise run.ConfigError(f"movie: {path.suffix} needs {error.name}: {MISSING}") from error
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")

@@ -467,6 +467,7 @@ class Page:
         top = self._scale.follow(frame.values)
         self._network.show(frame.points, frame.values, top, frame.quantity, self._mesh.value)
         self._show_load(frame)
+        self.server.flush()  # now, and not with viser's next window
         self.recording.take(frame, time.monotonic())
 
     def _show_load(self, frame: Frame) -> None:
@@ -485,7 +486,7 @@ class Page:
                 acts = np.linalg.norm(force[self.body.surface.nodes], axis=1)
                 start = np.nan_to_num(frame.points).T @ (acts / max(acts.sum(), 1e-300))
                 share = 0.0 if frame.answer is None else min(float(frame.answer.amplitude), 2.0)
-                ends = np.stack([start, start + (0.08 + 0.3 * share) * way])
+                ends = np.stack([start, start + (0.06 + 0.22 * share) * way])
                 self._arrow.points = ends[None].astype(np.float32)
 
     def _show_beside(self, frame: Frame | None) -> None:
