@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 import torch
-import viser
 from torch import Tensor
 
 from dpl.viewer import panel
 from dpl.viewer.door import Door, behind, check
+from dpl.viewer.drawn import Drawn, Server
 from dpl.viewer.loads import Asked
-from dpl.viewer.picture import BANDS, Camera, Scenery, colours
+from dpl.viewer.picture import Camera, Scenery
 from dpl.viewer.record import MOST, Recording
 from dpl.viewer.state import QUANTITIES, TIERS, Body, Frame, Scale, Wish
-from dpl.viewer.surface import Floats, bands
+from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
 Hold = Callable[[float | None, float | None], Asked]  # E, Poisson's ratio -> load
@@ -28,93 +28,7 @@ ALONE, BUDGET = "network alone", "as far as the budget"
 ANSWERS = (ALONE, *(f"corrected to {tol:.0e}" for tol in TIERS), BUDGET)
 NEAR = 0.8  # distance of the camera from one body
 DOTS = 120  # at most, that mark a patch
-DARK, GREY, RED = (28, 32, 44), (160, 166, 178), (214, 40, 57)
-
-
-class Server(viser.ViserServer):
-    """viser's server, that is not shared with the world."""
-
-    def request_share_url(self, verbose: bool = True) -> None:
-        """Refuse: a browser may ask for a tunnel to this machine."""
-
-
-class Drawn:
-    """One body in the browser: bands of one colour, lines, and what is grabbed.
-
-    Attributes:
-        root: Its name in the tree.
-    """
-
-    def __init__(self, server: Server, root: str, body: Body, *, grab: bool) -> None:
-        """Add it.
-
-        Args:
-            server: Where.
-            root: Its name.
-            body: Whose.
-            grab: Whether it can be dragged.
-        """
-        self.root, self._server, self._surface = root, server, body.surface
-        scene, surface = server.scene, body.surface
-        self.frame = scene.add_frame(root, show_axes=False)
-        nothing = np.zeros((3, 3)), np.array([[0, 1, 2]])
-        self._bands = [
-            scene.add_mesh_simple(
-                f"{root}/band{k}", *nothing, flat_shading=True, side="double", cast_shadow=True
-            )
-            for k in range(BANDS)
-        ]
-        self._empty = [True] * BANDS
-        self._lines = scene.add_line_segments(
-            f"{root}/lines",
-            surface.rest[surface.lines],
-            DARK,
-            thickness=1.0,
-            thickness_units="screen",
-        )
-        scene.add_line_segments(
-            f"{root}/rest",
-            surface.rest[surface.rims],
-            GREY,
-            thickness=1.0,
-            thickness_units="screen",
-        )
-        self.grip = None
-        if grab:
-            self.grip = scene.add_mesh_simple(
-                f"{root}/grip",
-                surface.rest,
-                surface.triangles,
-                opacity=0.0,
-                side="double",
-                cast_shadow=False,
-                receive_shadow=False,
-            )
-
-    def show(self, points: Floats, values: Floats, top: float, quantity: str, lines: bool) -> None:
-        """Draw a deformed surface."""
-        levels = np.nan_to_num(values / top * BANDS if top > 0 else np.zeros_like(values))
-        points = np.nan_to_num(points)
-        cut = bands(points, self._surface.triangles, levels, BANDS)
-        shades = colours(quantity)
-        with self._server.atomic():
-            for k, (handle, soup) in enumerate(zip(self._bands, cut, strict=True)):
-                if not len(soup):
-                    if not self._empty[k]:
-                        handle.visible = False
-                    self._empty[k] = True
-                    continue
-                handle.vertices = soup.astype(np.float32)
-                handle.faces = np.arange(len(soup), dtype=np.uint32).reshape(-1, 3)
-                handle.color = tuple(int(c) for c in shades[k])
-                if self._empty[k]:
-                    handle.visible = True
-                self._empty[k] = False
-            self._lines.visible = lines
-            if lines:
-                self._lines.points = points[self._surface.lines].astype(np.float32)
-            if self.grip is not None:
-                self.grip.vertices = points.astype(np.float32)
+RED = (214, 40, 57)
 
 
 class Page:
