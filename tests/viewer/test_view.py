@@ -79,7 +79,8 @@ def test_a_port_that_is_taken_is_named(script, home):
 
 def test_without_viser_it_says_how_to_get_it(script, home, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    monkeypatch.delitem(sys.modules, "dpl.viewer.page", raising=False)
+    for name in ("page", "drawn"):
+        monkeypatch.delitem(sys.modules, f"dpl.viewer.{name}", raising=False)
     ended = script("view", "run=runs/a", cwd=home)
     assert ended.status == 2
     assert ended.err.endswith("pip install -c constraints.txt -e '.[viewer]'\n")
