@@ -29,11 +29,12 @@ KEYS: dict[str, Any] = {  # what a configuration may hold at its top, and of whi
     **{"exact": bool},
     **{"threads": Sequence[int | None], "across": WHOLE, "budget": int},
     **{"minutes": float, "works": Sequence[str]},
+    **{"host": str, "port": int, "names": Sequence[str], "movie": str | None, "speed": bool},
 }
 SPANS = {  # smallest and largest of them
     **{"repeats": (1, 10**6), "samples": (1, 10**6), "shards": (1, math.inf)},
     **{"count": (0, 10**6), "far": (0, 10**6), "workers": (0, 1024), "seed": (0, 2**32 - 1)},
-    **{"budget": (1, 10**6), "minutes": (1e-2, 1e6)},
+    **{"budget": (1, 10**6), "minutes": (1e-2, 1e6), "port": (0, 65535)},
     **{"tol": (1e-15, 1), "tols": (1e-15, 1), "across": (1, 10**3), "threads": (1, 10**4)},
 }
 KINDS = {  # what the call under a key must give: one of these, or of a class derived from them

@@ -1,0 +1,99 @@
+"""A trained run in the browser: python scripts/view.py run=runs/..."""
+
+import errno
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omegaconf import DictConfig
+
+from dpl import run
+from dpl.commands.entry import command
+
+if TYPE_CHECKING:
+    from dpl.viewer.door import Door
+    from dpl.viewer.page import Page
+    from dpl.viewer.state import Body
+
+MISSING = "pip install -c constraints.txt -e '.[viewer]'"
+
+
+@command("view")
+def main(cfg: DictConfig) -> None:
+    """Serve the page until Ctrl-C; with `movie` write an animation instead."""
+    run.check(cfg)
+    if cfg.movie:
+        _film(_body(cfg), Path(cfg.movie))
+        return
+    try:
+        from dpl.viewer.page import Page
+    except ImportError as error:
+        raise run.ConfigError(f"the viewer cannot be used ({error}): {MISSING}") from error
+    door = _door(cfg)
+    page = Page(_body(cfg), door, title=str(cfg.run), folder=Path(cfg.folder))
+    try:
+        if cfg.speed:
+            _show_speed(page)
+            return
+        print(f"the page is at {door.address}  (Ctrl-C ends it)", flush=True)
+        while True:
+            time.sleep(0.1)
+            page.refresh()
+    finally:
+        page.close()
+
+
+def _body(cfg: DictConfig) -> "Body":
+    import torch
+
+    from dpl.simulator import Simulator
+    from dpl.viewer.state import Body
+
+    torch.set_num_threads(1)
+    return Body(Simulator(run.load_run(cfg.run)[1]))
+
+
+def _door(cfg: DictConfig) -> "Door":
+    """Return where the page will be, bound already.
+
+    Raises:
+        ConfigError: It cannot be there.
+    """
+    from dpl.viewer.door import Door
+
+    try:
+        door = Door.bound(cfg.host, cfg.port, cfg.names)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            told = f"port = {cfg.port} is taken; name another, or port=0 for any that is free"
+        else:
+            told = f"host = {cfg.host}, port = {cfg.port} cannot be served: {error.strerror}"
+        raise run.ConfigError(told) from error
+    if door.open_to_all:
+        print(
+            f"warning: host = {cfg.host}: whoever reaches this machine and has the address can "
+            "use the page; it is not encrypted",
+            file=sys.stderr,
+        )
+    return door
+
+
+def _show_speed(page: "Page") -> None:
+    from dpl.benchmarks.rows import show
+    from dpl.viewer.speed import speed
+
+    show(speed(page), "a frame: milliseconds on the server, and what arrives a second")
+
+
+def _film(body: "Body", path: Path) -> None:
+    from dpl.viewer.film import moving_load
+    from dpl.viewer.record import FORMATS
+
+    if path.suffix not in FORMATS:
+        raise run.ConfigError(f"movie = {path} must end with {' or '.join(FORMATS)}")
+    try:
+        moving_load(body, path)
+    except ImportError as error:  # of what writes MP4
+        raise run.ConfigError(f"movie: {path.suffix} needs {error.name}: {MISSING}") from error
+    print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")

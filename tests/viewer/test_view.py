@@ -1,0 +1,95 @@
+"""The command: what a user types, and how it says no."""
+
+import os
+import re
+import signal
+import socket
+import sys
+
+import pytest
+from PIL import Image
+
+from dpl.viewer.record import RATE
+
+
+@pytest.fixture(scope="module")
+def home(start, tiny_training, tmp_path_factory):
+    """The folder of a user with a trained run."""
+    home = tmp_path_factory.mktemp("home")
+    process = start("train", *tiny_training, "trainer.max_epochs=1", "run=runs/a", cwd=home)
+    _, err = process.communicate(timeout=240)
+    assert process.returncode == 0, err[-2000:]
+    return home
+
+
+def test_the_page_says_where_it_is_and_ctrl_c_ends_it_whole(start, members, home):
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    process = start("view", "run=runs/a", "port=0", cwd=home)
+    line = process.stdout.readline()
+    assert re.fullmatch(
+        r"the page is at http://127\.0\.0\.1:\d+/[\w-]{32}/  \(Ctrl-C ends it\)\n", line
+    ), line + process.stderr.read()
+    os.kill(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (130, "", "interrupted\n")
+    assert not members(process.pid)
+
+
+def test_a_host_that_others_reach_is_warned_of(start, home):
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    process = start("view", "run=runs/a", "port=0", "host=0.0.0.0", cwd=home)
+    assert process.stdout.readline().startswith("the page is at http://127.0.0.1:")
+    os.kill(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert err.startswith("warning: host = 0.0.0.0: whoever reaches this machine")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run=runs/none"], "run = runs/none has no config.yaml; train it first"),
+        ([], "run is missing; set it on the command line"),
+        (["run=runs/a", "port=70000"], "port = 70000 must lie between 0 and 65535"),
+        (["run=runs/a", "host=no.such.host.invalid"], "host = no.such.host.invalid, port = "),
+        (["run=runs/a", "hots=x"], ""),
+        (["run=runs/a", "movie=x.avi"], "movie = x.avi must end with .gif or .mp4"),
+    ],
+    ids=str,
+)
+def test_bad_input_ends_with_one_line(script, home, arguments, words):
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    ended = script("view", *arguments, cwd=home)
+    assert ended.status != 0
+    if words:
+        assert ended.status == 2
+        assert ended.err.startswith(f"error: {words}")
+        assert ended.err.count("\n") == 1
+
+
+def test_a_port_that_is_taken_is_named(script, home):
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        ended = script("view", "run=runs/a", f"port={port}", cwd=home)
+    told = f"error: port = {port} is taken; name another, or port=0 for any that is free\n"
+    assert (ended.status, ended.err) == (2, told)
+
+
+def test_without_viser_it_says_how_to_get_it(script, home, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    for name in ("page", "drawn"):
+        monkeypatch.delitem(sys.modules, f"dpl.viewer.{name}", raising=False)
+    ended = script("view", "run=runs/a", cwd=home)
+    assert ended.status == 2
+    assert ended.err.endswith("pip install -c constraints.txt -e '.[viewer]'\n")
+    assert ended.err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_a_movie_is_written_without_a_browser(script, home):
+    ended = script("view", "run=runs/a", "movie=films/live.gif", cwd=home)
+    assert ended.status == 0, ended.err
+    image = Image.open(home / "films" / "live.gif")
+    assert (image.n_frames, image.size) == (5 * RATE, (720, 405))
