@@ -15,7 +15,6 @@ import socket
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
-from unittest import mock
 
 import websockets.asyncio.server
 from websockets.datastructures import Headers
@@ -156,8 +155,11 @@ def behind(door: Door) -> Iterator[None]:
             handler, sock=door.socket, process_request=door.guarding(process_request), **more
         )
 
-    with mock.patch.object(websockets.asyncio.server, "serve", serve):
+    websockets.asyncio.server.serve = serve
+    try:
         yield
+    finally:
+        websockets.asyncio.server.serve = genuine
 
 
 def status_of(door: Door, path: str, **headers: str) -> int:

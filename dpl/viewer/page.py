@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.viewer import panel
+from dpl.viewer import panel, stage
 from dpl.viewer.door import Door, behind, check
 from dpl.viewer.drawn import Drawn, Server
 from dpl.viewer.loads import Asked
@@ -96,45 +96,8 @@ class Page:
     def _build_scene(self) -> None:
         server, surface = self.server, self.body.surface
         low, high = surface.rest.min(axis=0), surface.rest.max(axis=0)
-        server.gui.configure_theme(
-            show_logo=False,
-            show_share_button=False,
-            brand_color=(37, 99, 235),
-            control_width="large",
-        )
-        server.gui.main_panel.dock_right()
-        server.gui.main_panel.set_width(370)
-        self.camera = camera = Camera.before(surface, wide=NEAR)
-        server.initial_camera.position = camera.position
-        server.initial_camera.look_at = camera.look_at
-        server.initial_camera.fov = camera.field
-        server.scene.configure_environment_map(None)
-        server.scene.configure_default_lights(False)
-        server.scene.add_light_ambient("/ambient", intensity=1.9)
-        towards = np.subtract(camera.position, camera.look_at)
-        for name, way, strength, shadow in (
-            ("sun", np.array([-0.3, 0.25, 1.0]), 1.5, True),
-            ("eye", towards, 1.4, False),
-        ):
-            place = (low + high) / 2 + 4 * way / np.linalg.norm(way)
-            server.scene.add_light_directional(
-                f"/{name}", intensity=strength, position=place, cast_shadow=shadow
-            )
-        flat = self._problem.shape[1] == 2
-        server.scene.add_grid(
-            "/ground",
-            width=6.0,
-            height=6.0,
-            cell_size=0.1,
-            section_size=0.5,
-            cell_color=(226, 228, 233),
-            section_color=(200, 204, 212),
-            plane_color=(246, 247, 249),
-            plane_opacity=0.0 if flat else 0.6,
-            shadow_opacity=0.18,
-            fade_distance=7.0,
-            position=(*((low + high) / 2)[:2], float(low[2]) - (0.01 if flat else 0.45)),
-        )
+        self.camera = Camera.before(surface, wide=NEAR)
+        stage.build(server, self.camera, low, high, flat=self._problem.shape[1] == 2)
         self._network = Drawn(server, "/network", self.body, grab=True)
         self._fe = Drawn(server, "/fe", self.body, grab=False)
         aside = float(high[1] - low[1]) + 0.7
