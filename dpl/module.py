@@ -17,8 +17,7 @@ from dpl.data.durable import append_line
 from dpl.fem.solution import Load
 from dpl.losses import MSE, Loss, Physics
 from dpl.metrics import metrics
-from dpl.models.coordinates import Coordinates, CoordinateSamples
-from dpl.models.pod import PODNet
+from dpl.models.coordinates import BetweenCoordinates, Coordinates, CoordinateSamples
 from dpl.scene import Sample, Scene
 
 SCALES = 3  # the stream of the loads that give the scales; those of samples are below
@@ -117,7 +116,7 @@ class Surrogate(L.LightningModule):
     def plan(self) -> list[str]:
         """Return what network and loss leave out, a line each."""
         lines = [*getattr(self.net, "plan", list)(), *self.loss.plan()]
-        if isinstance(self.net, PODNet) and isinstance(self.loss, MSE):
+        if isinstance(self.net, BetweenCoordinates) and isinstance(self.loss, MSE):
             lines.append("no field in training from disk: squared errors are those of coordinates")
         return lines
 
@@ -136,7 +135,7 @@ class Surrogate(L.LightningModule):
 
     def _loss_of_coordinates(self, batch: Coordinates) -> Tensor:
         """Return the loss of a batch in coordinates: of its mean squared errors alone."""
-        net = cast(PODNet, self.net)
+        net = cast(BetweenCoordinates, self.net)
         missed = (net.network(batch.inputs) - batch.targets).square().sum(dim=1) + batch.rest
         square = self.displacement_scale**2
         error = square * missed / self.scene.problem.free.numel()
@@ -150,7 +149,7 @@ class Surrogate(L.LightningModule):
         In an orthonormal basis the squared error of a displacement is that of its coordinates: a
         loss that is a function of squared errors needs no field.
         """
-        if not (isinstance(self.net, PODNet) and isinstance(self.loss, MSE)):
+        if not (isinstance(self.net, BetweenCoordinates) and isinstance(self.loss, MSE)):
             return None
         if images and not self.net.group:
             return None
@@ -165,7 +164,7 @@ class Surrogate(L.LightningModule):
     def prepare(self, samples: Sample) -> None:
         """Let the network make its bases from training samples (S, N, D)."""
         unit = float(self.force_scale / self.displacement_scale)
-        cast(PODNet, self.net).prepare(self._scaled(samples), unit)
+        cast(BetweenCoordinates, self.net).prepare(self._scaled(samples), unit)
 
     def validation_step(self, batch: Sample, batch_idx: int) -> None:
         """Update the metrics."""
@@ -187,7 +186,7 @@ class Surrogate(L.LightningModule):
             problem = problem.to(self.device)
         self.physics = Physics(problem, self.largest_force)
         # here: schedules ask for the batches, which want the bases, before any later hook
-        if stage == "fit" and isinstance(self.net, PODNet) and not self.net.prepared:
+        if stage == "fit" and isinstance(self.net, BetweenCoordinates) and not self.net.prepared:
             self.prepare(self.trainer.datamodule.snapshots())
         for collection in (self.val_metrics, self.test_metrics):
             for metric in collection.values():

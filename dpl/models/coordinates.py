@@ -1,10 +1,15 @@
 """Samples in the few coordinates that a network works on: small enough to stay in a cache."""
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.data import Dataset
+
+from dpl.fem.symmetry import Symmetry
+from dpl.scene import Sample
 
 
 class Coordinates(NamedTuple):
@@ -50,6 +55,33 @@ class CoordinateSamples(Dataset):
         """Return a batch."""
         chosen = torch.tensor(indices)
         return Coordinates(*(column[chosen] for column in self.samples))
+
+
+class BetweenCoordinates(nn.Module, ABC):
+    """A network that works between few coordinates of loads and of displacements.
+
+    `dpl.module.Surrogate` lets it make its bases before training starts and, where the loss is a
+    function of squared errors, trains it on samples in coordinates.
+
+    Attributes:
+        prepared: Whether its bases are there, ().
+        group: The symmetries that it knows; empty: none.
+    """
+
+    prepared: Tensor
+    group: Sequence[Symmetry]
+
+    @abstractmethod
+    def prepare(self, samples: Sample, unit: float) -> None:
+        """Make the bases of training samples, scaled; `unit`: scale of forces over that of u."""
+
+    @abstractmethod
+    def encode(self, samples: Sample) -> CoordinateSamples:
+        """Return training samples, scaled, in coordinates, with their images."""
+
+    @abstractmethod
+    def network(self, inputs: Tensor) -> Tensor:
+        """Return coordinates (B, R) of displacements from those of loads (B, M)."""
 
 
 def left_over(field: Tensor, coordinates: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from dpl.fem.pod import LARGE, pod
 from dpl.fem.rom import PODGalerkin
 from dpl.fem.symmetry import images, symmetries
 from dpl.models.coordinates import (
+    BetweenCoordinates,
     Coordinates,
     CoordinateSamples,
     evened,
@@ -60,7 +61,7 @@ class Reading(NamedTuple):
     own: bool = True
 
 
-class PODNet(nn.Module):
+class PODNet(BetweenCoordinates):
     """POD basis of the displacements, a residual network from coordinates of the load to its own.
 
     The load is read in the POD basis of the training loads. Where the body has symmetries, both

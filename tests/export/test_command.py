@@ -71,7 +71,10 @@ def test_a_graph_that_is_off_is_not_handed_on(script, trained):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["run=runs/none", "parts=[results]"], "run = runs/none has no config.yaml; train it first"),
+        (
+            ["run=runs/none", "parts=[results]"],
+            "run = runs/none has no config.yaml; train it first",
+        ),
         (["run=runs/first", "parts=[modal]"], "parts: 'modal' is none of model, results"),
         (["run=runs/first", "parts=[]"], "parts: choose of model, results"),
         (["run=runs/first", "parts=[results]", "count=0"], "count = 0 must be 1 or more"),
