@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import lightning as L
 import numpy as np
@@ -21,7 +21,7 @@ from torch import Tensor
 from dpl.data.datamodule import OnlineData
 from dpl.figures import coarse, colours, deformed, spread, surface, triangles
 from dpl.guard import Diverged
-from dpl.metrics import MaxError, RelativeL2
+from dpl.metrics import Judged, MaxError, RelativeL2
 from dpl.scene import Sample, Scene
 
 GREY = 160  # of a true shape
@@ -33,53 +33,6 @@ LOOK = {  # of meshes in the browser, in the words of three.js
     ],
     "material": {"cls": "MeshStandardMaterial", "side": 2, "roughness": 1, "metalness": 0},
 }
-ORDINALS = {1: "worst", 2: "2nd worst", 3: "3rd worst"}
-
-
-class Judged(NamedTuple):
-    """How wrong the answers to some loads are.
-
-    Attributes:
-        relative: Relative L2 errors, (B,) [-].
-        largest: Largest distance of a node from where it should be, over L, (B,) [-].
-        size: Largest true displacement over L, (B,) [-].
-    """
-
-    relative: Tensor
-    largest: Tensor
-    size: Tensor
-
-    def chosen(self, loads: int) -> list[int]:
-        """Return so many with the largest relative error, so many others with the largest absolute.
-
-        And a typical one, the median of the rest.
-        """
-        relative, largest = self._order(self.relative), self._order(self.largest)
-        most = relative[:loads]
-        most += [load for load in largest if load not in most][:loads]
-        rest = [load for load in relative if load not in most]
-        return [*most, *rest[len(rest) // 2 :][:1]]
-
-    @property
-    def farthest(self) -> int:
-        """The load with the largest absolute error."""
-        return self._order(self.largest)[0]
-
-    def title(self, load: int) -> str:
-        """Return what is said of a load, and how many are worse."""
-        orders = self._order(self.relative), self._order(self.largest)
-        first, second = (_rank(order.index(load) + 1, len(order)) for order in orders)
-        return (
-            f"load {load}, moved by {self.size[load]:.2g} L\n"
-            f"relative L2 {100 * self.relative[load]:.3g} %: {first}\n"
-            f"largest error {self.largest[load]:.2g} L: {second}"
-        )
-
-    @staticmethod
-    def _order(errors: Tensor) -> list[int]:
-        """Return loads, the worst first; what is no number is worst of all."""
-        known = torch.nan_to_num(errors, nan=torch.inf)
-        return known.argsort(descending=True, stable=True).tolist()
 
 
 class WorstCases(L.Callback):
@@ -398,7 +351,3 @@ def _end(*, failed: bool) -> Any:
     data = plugin_data_pb2.HParamsPluginData(session_end_info=info)
     described = metadata.create_summary_metadata(data)
     return Summary(value=[Summary.Value(tag=metadata.SESSION_END_INFO_TAG, metadata=described)])
-
-
-def _rank(place: int, count: int) -> str:
-    return ORDINALS.get(place, f"{place - 1} of {count} are worse")

@@ -5,7 +5,7 @@ Every metric is updated with (prediction, batch): displacements over L, (B, N, D
 Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 3.1.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,6 +14,8 @@ from torchmetrics.utilities import dim_zero_cat
 
 from dpl.fem.problem import Problem
 from dpl.scene import Sample
+
+ORDINALS = {1: "worst", 2: "2nd worst", 3: "3rd worst"}
 
 
 class _PerLoad(Metric):
@@ -159,3 +161,53 @@ def metrics(problem: Problem) -> MetricCollection:
 
 def _error(prediction: Tensor, batch: Sample) -> Tensor:
     return (prediction - batch.displacement).flatten(1)
+
+
+class Judged(NamedTuple):
+    """How wrong the answers to some loads are.
+
+    Attributes:
+        relative: Relative L2 errors, (B,) [-].
+        largest: Largest distance of a node from where it should be, over L, (B,) [-].
+        size: Largest true displacement over L, (B,) [-].
+    """
+
+    relative: Tensor
+    largest: Tensor
+    size: Tensor
+
+    def chosen(self, loads: int) -> list[int]:
+        """Return so many with the largest relative error, so many others with the largest absolute.
+
+        And a typical one, the median of the rest.
+        """
+        relative, largest = self._order(self.relative), self._order(self.largest)
+        most = relative[:loads]
+        most += [load for load in largest if load not in most][:loads]
+        rest = [load for load in relative if load not in most]
+        return [*most, *rest[len(rest) // 2 :][:1]]
+
+    @property
+    def farthest(self) -> int:
+        """The load with the largest absolute error."""
+        return self._order(self.largest)[0]
+
+    def title(self, load: int) -> str:
+        """Return what is said of a load, and how many are worse."""
+        orders = self._order(self.relative), self._order(self.largest)
+        first, second = (_rank(order.index(load) + 1, len(order)) for order in orders)
+        return (
+            f"load {load}, moved by {self.size[load]:.2g} L\n"
+            f"relative L2 {100 * self.relative[load]:.3g} %: {first}\n"
+            f"largest error {self.largest[load]:.2g} L: {second}"
+        )
+
+    @staticmethod
+    def _order(errors: Tensor) -> list[int]:
+        """Return loads, the worst first; what is no number is worst of all."""
+        known = torch.nan_to_num(errors, nan=torch.inf)
+        return known.argsort(descending=True, stable=True).tolist()
+
+
+def _rank(place: int, count: int) -> str:
+    return ORDINALS.get(place, f"{place - 1} of {count} are worse")

@@ -27,7 +27,6 @@ from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.util import tensor_util
 
 from dpl.board import (
-    Judged,
     LearningRate,
     SampleRates,
     Session,
@@ -41,7 +40,7 @@ from dpl.fem.mesh import box, rectangle
 from dpl.figures import surface
 from dpl.guard import Diverged
 from dpl.losses import MSE
-from dpl.metrics import metrics
+from dpl.metrics import Judged, metrics
 from dpl.models.fcnn import FCNN
 from dpl.module import Surrogate
 from dpl.scene import Sample
