@@ -547,7 +547,7 @@ def test_nothing_of_the_trainer_of_a_run_is_called(copied):
     [
         "dpl.run.importlib.import_module",  # not ours, though the name begins with `dpl.`
         "dpl.run.load_run",
-        "dpl.fem.files.save",  # writes
+        "dpl.fem.written.save",  # writes
         "dpl.benchmarks.rows.write",
         "dpl.data.durable.whole_file",
         "dpl.fem.mesh.Sequence",

@@ -25,9 +25,9 @@ from dpl import checkpoints
 from dpl.data.durable import whole_file
 from dpl.export.check import TRIED
 from dpl.export.graph import Array, Graph, opset
-from dpl.fem.files import flat
 from dpl.fem.problem import Problem
 from dpl.fem.solution import judge, solve
+from dpl.fem.written import flat
 from dpl.figures import surface
 from dpl.module import Surrogate
 from dpl.scene import Scene

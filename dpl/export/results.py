@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from dpl.fem.fields import fields
-from dpl.fem.files import save_series
 from dpl.fem.solution import Load, solve
+from dpl.fem.written import save_series
 from dpl.module import Surrogate
 
 

@@ -11,10 +11,11 @@ import skfem
 from numpy.typing import NDArray
 
 from dpl.fem.checks import check
-from dpl.fem.files import load, save
+from dpl.fem.files import load
 from dpl.fem.memory import refuse_mesh
 from dpl.fem.propeller import propeller
 from dpl.fem.regions import Box, Cylinder, Plane, Region, Sphere, Tag, facets_in, nodes_in
+from dpl.fem.written import save
 
 __all__ = [
     "Box",

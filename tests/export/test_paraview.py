@@ -9,8 +9,8 @@ import torch
 
 from dpl.export.results import results
 from dpl.fem.fields import fields
-from dpl.fem.files import save_series
 from dpl.fem.mesh import box, load, rectangle, save
+from dpl.fem.written import save_series
 from dpl.losses import MSE
 from dpl.models.fcnn import FCNN
 from dpl.module import Surrogate
