@@ -14,35 +14,37 @@ if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
-# Vertices of a cell's facets in turn around each facet, by cell shape.
-FACETS = {
-    "Tetrahedral": ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)),
-    "Hexahedral": (
-        (0, 1, 4, 2),
-        (0, 1, 5, 3),
-        (0, 2, 6, 3),
-        (1, 4, 7, 5),
-        (2, 4, 7, 6),
-        (3, 5, 7, 6),
-    ),
-}
-
 CARD = 140  # resolution of what TensorBoard shows small [dots per inch]
 
 
 def surface(mesh: skfem.Mesh) -> NDArray[np.int_]:
-    """Return what is seen of a mesh as polygons of vertices, (P, corners).
+    """Return what is seen of a mesh as polygons of vertices, (P, corners), in turn around each.
 
-    In 3D the facets on the boundary, in 2D the cells.
+    In 3D the facets on the boundary, in 2D the cells; anticlockwise seen from outside, in 2D from
+    above.
     """
+    points = mesh.p.T
     if mesh.dim() == 2:
-        corners = 3 if mesh.elem.refdom.name == "Triangular" else 4
-        return mesh.t[:corners].T
-    faces = np.concatenate([mesh.t[list(corners)].T for corners in FACETS[mesh.elem.refdom.name]])
-    _, first, count = np.unique(
-        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
-    )
-    return faces[first[count == 1]]
+        polygons = mesh.t.T.copy()
+        (a, b), (c, d) = _sides(points, polygons)
+        backwards = a * d < b * c
+    else:
+        facets = mesh.boundary_facets()
+        polygons = mesh.facets[:, facets].T.copy()
+        inside = points[mesh.t[:, mesh.f2t[0, facets]]].mean(axis=0)
+        outwards = points[polygons].mean(axis=1) - inside
+        first, second = (side.T for side in _sides(points, polygons))
+        backwards = (np.cross(first, second) * outwards).sum(axis=1) < 0
+    polygons[backwards] = polygons[backwards][:, ::-1]
+    return polygons
+
+
+def _sides(
+    points: NDArray[np.float64], polygons: NDArray[np.int_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return vectors from the first corner of polygons to the next two, (D, P) each."""
+    a, b, c = (points[polygons[:, k]] for k in range(3))
+    return (b - a).T, (c - a).T
 
 
 def deformed(

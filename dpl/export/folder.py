@@ -28,7 +28,7 @@ from dpl.export.graph import Array, Graph, opset
 from dpl.fem.problem import Problem
 from dpl.fem.solution import judge, solve
 from dpl.fem.written import flat
-from dpl.figures import surface
+from dpl.figures import surface, triangles
 from dpl.module import Surrogate
 from dpl.scene import Scene
 from dpl.version import __version__
@@ -204,33 +204,8 @@ def _mesh(problem: Problem) -> dict[str, Any]:
         "cell_type": kind,
         "cell_order": "VTK",
         "cells": cells.tolist(),
-        "triangles": triangles(problem).tolist(),
+        "triangles": triangles(surface(problem.mesh)).tolist(),
     }
-
-
-def triangles(problem: Problem) -> np.ndarray:
-    """Return the surface (in 2D the cells) as triangles of corner nodes, (T, 3).
-
-    Seen from outside (in 2D from above) counter-clockwise.
-    """
-    mesh, points = problem.mesh, problem.points.numpy()
-    polygons = surface(mesh)
-    last = polygons.shape[1] - 1
-    split = [polygons[:, [0, k, k + 1]] for k in range(1, last)]
-    found = np.concatenate(split)
-    a, b, c = (points[found[:, k]] for k in range(3))
-    if mesh.dim() == 2:
-        u, v = b - a, c - a
-        backwards = u[:, 0] * v[:, 1] < u[:, 1] * v[:, 0]
-    else:
-        facets = mesh.boundary_facets()
-        corners = map(tuple, np.sort(mesh.facets[:, facets], axis=0).T.tolist())
-        owner = dict(zip(corners, mesh.f2t[0, facets].tolist(), strict=True))
-        cells = [owner[tuple(face)] for face in np.sort(polygons, axis=1).tolist()]
-        inside = points[mesh.t.T].mean(axis=1)[cells * len(split)]
-        backwards = (np.cross(b - a, c - a) * (a - inside)).sum(axis=1) < 0
-    found[backwards] = found[backwards][:, ::-1]
-    return found
 
 
 def write(folder: Path, surrogate: Surrogate, told: Reference, meta: Mapping[str, Any]) -> None:

@@ -10,6 +10,7 @@ from dpl.fem.fields import fields
 from dpl.fem.solution import Load, solve
 from dpl.fem.written import save_series
 from dpl.module import Surrogate
+from dpl.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ def results(
         if exact:
             found = solve(scene.solver, single)
             truth = torch.where(found.converged, found.displacement[0], torch.nan)
-        step = _fields(surrogate, single, answer, truth)
+        step = shown(scene, single, answer, truth)
         steps.append({name: field.numpy() for name, field in step.items()})
         error = float((answer - truth).norm() / truth.norm()) if truth is not None else torch.nan
         rows.append(
@@ -73,14 +74,21 @@ def results(
     return rows, save_series(path, scene.problem.mesh.scaled(scene.length), steps)
 
 
-def _fields(
-    surrogate: Surrogate, load: Load, answer: Tensor, truth: Tensor | None
+def shown(
+    scene: Scene, load: Load, answer: Tensor, truth: Tensor | None = None
 ) -> dict[str, Tensor]:
-    """Return what is shown of one load, at the nodes, in SI units."""
-    scene, young = surrogate.scene, float(load.young)
+    """Return what is shown of one load, at the nodes, in SI units.
+
+    Args:
+        scene: What is answered.
+        load: One, dimensionless.
+        answer: (N, D) [-].
+        truth: The same by finite elements.
+    """
+    young = float(load.young)
     newton = "N" if scene.problem.shape[1] == 3 else "N/m"
     inside = fields(scene.problem.at(load.poisson), answer[None])
-    shown = {
+    found = {
         f"force [{newton}]": young * scene.force_unit * load.force[0],
         "displacement [m]": scene.length * answer,
         "Cauchy stress [Pa]": young * inside.stress[0],
@@ -88,6 +96,6 @@ def _fields(
         "det F": inside.volume_ratio[0],
     }
     if truth is not None:
-        shown["exact displacement [m]"] = scene.length * truth
-        shown["error [m]"] = scene.length * (answer - truth).norm(dim=1)
-    return shown
+        found["exact displacement [m]"] = scene.length * truth
+        found["error [m]"] = scene.length * (answer - truth).norm(dim=1)
+    return found

@@ -133,14 +133,24 @@ def save_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Array
     path.parent.mkdir(parents=True, exist_ok=True)
     for name, body in zip(names, bodies, strict=True):
         meshio.write(path.with_name(name), body)
-    lines = [f'<DataSet timestep="{k}" file={quoteattr(name)}/>' for k, name in enumerate(names)]
-    head = '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">'
     collection, series = path.with_name(f"{path.name}.pvd"), path.with_name(f"{path.name}.xdmf")
-    rows = ['<?xml version="1.0"?>', head, "<Collection>", *lines, "</Collection>", "</VTKFile>"]
-    collection.write_text("\n".join(rows) + "\n")
+    save_collection(collection, list(enumerate(names)))
     kept = "HDF" if importlib.util.find_spec("h5py") else "XML"
     with contextlib.chdir(path.parent), TimeSeriesWriter(series.name, data_format=kept) as file:
         file.write_points_cells(bodies[0].points, bodies[0].cells)
         for k, body in enumerate(bodies):
             file.write_data(k, point_data=body.point_data)
     return [collection, series]
+
+
+def save_collection(path: Path, files: Sequence[tuple[float, str]]) -> None:
+    """Write a PVD file, which opens VTU files as a series in ParaView.
+
+    Args:
+        path: Of the PVD file.
+        files: Time of each, and its name from the folder of `path`.
+    """
+    lines = [f'<DataSet timestep="{time:.6g}" file={quoteattr(name)}/>' for time, name in files]
+    head = '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">'
+    rows = ['<?xml version="1.0"?>', head, "<Collection>", *lines, "</Collection>", "</VTKFile>"]
+    path.write_text("\n".join(rows) + "\n")

@@ -3,7 +3,6 @@
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import torch
@@ -11,8 +10,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dpl.data.durable import whole_file
-from dpl.fem.fields import fields
-from dpl.fem.mesh import save
+from dpl.export.results import shown
+from dpl.fem.written import save, save_collection
 from dpl.viewer.picture import INK, PAPER, Scenery, colours
 from dpl.viewer.state import Body, Frame, Scale
 
@@ -64,34 +63,23 @@ class Recording:
     def save_series(self, folder: Path) -> Path:
         """Write frames as VTU files and a PVD file that ParaView opens; return that.
 
-        With forces [N], displacement [m], von Mises stress [Pa] and det F at the nodes of the mesh.
+        With what an export has at the nodes, see `dpl.export.results.shown`.
 
         Raises:
             ValueError: There are none.
         """
-        kept = self._some()
-        problem = self.body.scene.problem
-        mesh = problem.mesh.scaled(problem.length)
+        kept, scene = self._some(), self.body.scene
+        mesh = scene.problem.mesh.scaled(scene.length)
         place = free_name(folder, "recording", ".pvd")
-        lines = []
+        files = []
         for number, (time, frame) in enumerate(kept):
-            over_length = frame.displacement[None] / problem.length
-            body = problem.at(self.body.load(frame.asked).poisson)
+            load = self.body.load(frame.asked)
             with torch.inference_mode():
-                found = fields(body, over_length)
+                found = shown(scene, load, frame.displacement / scene.length)
             name = f"{place.stem}/frame_{number:04d}.vtu"
-            columns: dict[str, NDArray[np.float64]] = {
-                "force [N]": frame.asked.force.numpy(),
-                "displacement [m]": frame.displacement.numpy(),
-                "von Mises stress [Pa]": (frame.asked.young * found.von_mises[0]).numpy(),
-                "det F": found.volume_ratio[0].numpy(),
-            }
-            save(folder / name, mesh, columns)
-            lines.append(f'    <DataSet timestep="{time:.4f}" file={quoteattr(name)}/>')
-        head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>'
-        text = "\n".join([head, *lines, "  </Collection>\n</VTKFile>\n"])
-        with whole_file(place) as file:
-            file.write(text.encode())
+            save(folder / name, mesh, {key: field.numpy() for key, field in found.items()})
+            files.append((time, name))
+        save_collection(place, files)
         return place
 
     def save_film(self, folder: Path, scenery: Scenery, kind: str) -> Path:

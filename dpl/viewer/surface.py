@@ -4,13 +4,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import skfem
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.fields import fields
 from dpl.fem.problem import Problem
+from dpl.figures import surface
+from dpl.figures import triangles as fans
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -38,20 +39,9 @@ class Surface:
     @classmethod
     def of(cls, problem: Problem) -> "Surface":
         """Return the surface of a body."""
-        mesh = problem.mesh
         rest = _in_space(problem.points.numpy())
-        if problem.shape[1] == 3:
-            facets, cells = _facets(mesh)
-            middle = rest[mesh.t[:, cells]].mean(axis=0)
-            outward = rest[facets].mean(axis=1) - middle
-            flip = (_normals(rest, facets[:, :3]) * outward).sum(axis=1) < 0
-            facets[flip] = facets[flip, ::-1]
-        else:
-            facets = mesh.t.T.astype(np.int64)
-            flip = _normals(rest, facets[:, :3])[:, 2] < 0
-            facets[flip] = facets[flip, ::-1]
+        facets = surface(problem.mesh)
         corners = facets.shape[1]
-        fans = [facets[:, [0, k, k + 1]] for k in range(1, corners - 1)]
         normals = _normals(rest, facets[:, :3])
         sides = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
         lines, where = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
@@ -63,7 +53,7 @@ class Surface:
         nodes = np.unique(facets)
         number = np.full(len(rest), -1)
         number[nodes] = np.arange(len(nodes))
-        triangles = number[np.concatenate(fans)]
+        triangles = number[fans(facets)]
         return cls(problem, nodes, triangles, number[lines], number[lines[bent | (count == 1)]])
 
     @cached_property
@@ -160,12 +150,6 @@ def _between(p: Floats, q: Floats, v: Floats, w: Floats, level: Floats) -> Float
     """Return the points of segments pq, of values v to w, at a level."""
     share = np.divide(level - v, w - v, out=np.zeros_like(v), where=w > v)
     return p + np.clip(share, 0.0, 1.0)[:, None] * (q - p)
-
-
-def _facets(mesh: skfem.Mesh) -> tuple[Ints, Ints]:
-    """Return facets of the boundary (F, corners), corners in a round, and their cells (F,)."""
-    found = mesh.boundary_facets()
-    return mesh.facets[:, found].T.astype(np.int64), mesh.f2t[0, found]
 
 
 def _normals(points: Floats, triangles: Ints) -> Floats:

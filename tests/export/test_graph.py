@@ -19,13 +19,13 @@ from dpl.export.folder import (
     read_raw,
     read_reference,
     reference,
-    triangles,
     verify,
     write,
 )
 from dpl.export.graph import Graph, Session, export
 from dpl.fem.mesh import rectangle
 from dpl.fem.solution import Load, solve
+from dpl.figures import surface, triangles
 from dpl.losses import MSE
 from dpl.models.cnn import CNN
 from dpl.models.fcnn import FCNN
@@ -294,7 +294,7 @@ def test_triangles_enclose_the_body_and_look_outwards(make_scene, cell):
     flat = cell in ("quad", "triangle")
     body = {"mesh": rectangle([100.0, 25.0], [5, 3], cell)} if flat else {"cell": cell}
     problem = make_scene(**body).problem
-    corners = problem.points.numpy()[triangles(problem)]
+    corners = problem.points.numpy()[triangles(surface(problem.mesh))]
     edges = corners[:, 1:] - corners[:, :1]
     if flat:
         assert np.linalg.det(edges).sum() / 2 == pytest.approx(0.25)
