@@ -306,7 +306,7 @@ def test_two_parts_made_at_the_same_time_are_the_set_made_at_once(start, script,
     assert sorted(lines) == sorted((tmp_path / "once/manifest.jsonl").read_text().splitlines())
     sound = script("generate", *slow(**sizes), "action=verify", cwd=tmp_path)
     assert sound.status == 0
-    assert "0 damaged files" in sound.out
+    assert "0 flaws found" in sound.out
 
 
 @pytest.mark.slow

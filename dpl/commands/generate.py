@@ -22,7 +22,7 @@ def main(cfg: DictConfig) -> None:
     if cfg.action == "verify":
         flaws = list(data.verify())
         print(data.store.summary())
-        print(*flaws, f"{len(flaws)} damaged files", sep="\n")
+        print(*flaws, f"{len(flaws)} flaws found", sep="\n")
         sys.exit(bool(flaws))
     store = data.repair() if cfg.action == "repair" else data.fill()
     print(store.summary())

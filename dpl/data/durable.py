@@ -122,13 +122,26 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
     Raises:
         DataSetError: It is no file of its own, see `own_file`.
     """
-    lines, content = [], b""
+    return [line for line in parsed_lines(path) if line is not None]
+
+
+def parsed_lines(path: Path) -> list[dict[str, Any] | None]:
+    """Return what each line of a file holds, None for a line that is not a JSON object.
+
+    Raises:
+        DataSetError: It is no file of its own, see `own_file`.
+    """
+    content = b""
     with suppress(FileNotFoundError):
         content = own_file(path)
-    for line in content.splitlines():
-        with suppress(ValueError, RecursionError):
-            lines.append(json.loads(line))
-    return [line for line in lines if isinstance(line, dict)]
+    return [_parsed(line) for line in content.splitlines()]
+
+
+def _parsed(line: bytes) -> dict[str, Any] | None:
+    with suppress(ValueError, RecursionError):
+        found = json.loads(line)
+        return found if isinstance(found, dict) else None
+    return None
 
 
 @contextmanager

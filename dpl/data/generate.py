@@ -158,19 +158,38 @@ class DataSet:
             stop.leave()
 
     def verify(self) -> Iterator[str]:
-        """Yield what is wrong with the data set, a line for each damaged file."""
+        """Yield what is wrong with the data set, a line for each flaw.
+
+        Flaws are those of `dpl.data.audit.verify`, and loads that are wanted and are not there.
+
+        Raises:
+            DataSetError: There is no data set.
+        """
         files = len(self.store.shards()) + 1
-        for line, flaw in track(verify(self.store), "looking at files", total=files):
+        for part, flaw in track(verify(self.store), "looking at files", total=files):
             if flaw:
-                yield f"{self.store.folder / line['file']} {flaw}"
+                yield f"{self.store.folder / part.file} {flaw}"
+        for split, numbers in self.missing().items():
+            if numbers:
+                yield (
+                    f"{self.store.folder} lacks {len(numbers)} of the loads that data.{split} = "
+                    f"{self.sizes[split]} asks for; the first is load {numbers[0]}"
+                )
 
     def repair(self) -> Store:
-        """Return the data set, its damaged files made again, also those beyond the sizes wanted."""
+        """Return the data set, its damaged files made again, also those beyond the sizes wanted.
+
+        What is done is printed, a line for each flaw.
+        """
+        mended = repair(self.store)
         missing = self.missing()
-        for name, line in sorted(repair(self.store).items()):
-            print(f"making {name} again")
-            again = range(line["first"], line["first"] + line["tried"])
-            missing[line["split"]] = sorted({*missing[line["split"]], *again})
+        for part, told in mended:
+            print(f"{self.store.folder / part.file} {told}")
+            if part.split:
+                missing[part.split] = sorted({*missing[part.split], *part.loads})
+        for split, numbers in missing.items():
+            if numbers:
+                print(f"{len(numbers)} loads of {split} are not there; they are solved")
         if any(missing.values()):
             self._solve(missing)
         return self.fill()

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dpl.data.durable import read_lines
+from dpl.data.durable import parsed_lines
 
 STREAMS = {"train": 0, "val": 1, "test": 2}  # disjoint streams of one seed
 LINE = {  # what a line of the manifest has
@@ -17,29 +17,50 @@ MOST = 1e15  # that a number of a manifest or a journal can be
 
 
 def lines_of(manifest: Path) -> list[dict[str, Any]]:
-    """Return the lines of a manifest; one that lacks something counts as torn.
+    """Return the lines of a manifest that describe a shard.
 
-    So does one that says what cannot be: its loads are solved again.
+    The other lines are left out, so that their loads are solved again; see `torn_lines`.
     """
-    return [line for line in read_lines(manifest) if line.keys() >= LINE and _is_possible(line)]
+    return [line for line in parsed_lines(manifest) if line is not None and not _flaw_of(line)]
 
 
-def _is_possible(line: Mapping[str, Any]) -> bool:
-    """Return whether the values of a line are of their kinds and agree with each other."""
-    texts, counts = ("file", "sha256", "split"), ("first", "tried", "accepted", "iterations")
-    if not all(isinstance(line[key], str) for key in texts) or line["split"] not in STREAMS:
-        return False
-    if not all(type(line[key]) is int and 0 <= line[key] < 2**53 for key in counts):
-        return False
+def torn_lines(manifest: Path) -> list[tuple[int, str]]:
+    """Return the number (from 1) of each line that `lines_of` leaves out, and the reason."""
+    flaws = (
+        "is not a JSON object" if line is None else _flaw_of(line)
+        for line in parsed_lines(manifest)
+    )
+    return [(number, flaw) for number, flaw in enumerate(flaws, 1) if flaw]
+
+
+def _flaw_of(line: Mapping[str, Any]) -> str:
+    """Return why a line cannot describe a shard; empty if it can."""
+    if absent := LINE - line.keys():
+        return f"lacks {', '.join(sorted(absent))}"
+    for key in ("file", "sha256", "split"):
+        if not isinstance(line[key], str):
+            return f"has a {key} that is not text"
+    if line["split"] not in STREAMS:
+        return "names a split that does not exist"
     if not NAME.fullmatch(line["file"]):
-        return False
+        return "names a file that is not in the folder of the data set"
+    for key in ("first", "tried", "accepted", "iterations"):
+        if not (type(line[key]) is int and 0 <= line[key] < 2**53):
+            return f"has a number {key} that cannot be"
+    return _flaw_of_loads(line)
+
+
+def _flaw_of_loads(line: Mapping[str, Any]) -> str:
+    """Return why the loads that a line lists cannot be those of a shard; empty if they can."""
     amplitudes, rejected = line["amplitudes"], line["rejected"]
     if not isinstance(amplitudes, list) or not isinstance(rejected, list):
-        return False
+        return "has amplitudes or rejected loads that are not lists"
     if not len(amplitudes) == line["tried"] == line["accepted"] + len(rejected):
-        return False
+        return "has numbers of loads that disagree"
+    if not all(map(is_number, amplitudes)):
+        return "has an amplitude that cannot be"
     numbers = range(line["first"], line["first"] + line["tried"])
-    return all(map(is_number, amplitudes)) and all(
+    possible = all(
         isinstance(one, dict)
         and type(one.get("index")) is int
         and one["index"] in numbers
@@ -47,6 +68,7 @@ def _is_possible(line: Mapping[str, Any]) -> bool:
         and "load_factor" in one
         for one in rejected
     )
+    return "" if possible else "has a rejected load that cannot be"
 
 
 def is_number(value: Any) -> bool:

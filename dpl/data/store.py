@@ -185,21 +185,30 @@ class Store:
             ValueError: It is damaged; the message goes on after its name.
         """
         path = self.folder / line["file"]
-        if path.parent != self.folder or path.is_symlink() or not path.is_file():
+        if path.parent != self.folder:
+            raise ValueError("is not in the folder of the data set and is not read")
+        if path.is_symlink() or not path.is_file():
             raise ValueError("is missing")
-        shape = self.scene.problem.shape
-        numbers = 3 * math.prod(shape) + self.scene.loads.dimension + 8  # of a load, at most
-        if path.stat().st_size > HEADER + 8 * numbers * line["tried"]:
+        if path.stat().st_size > self.largest(line["tried"]):
             raise ValueError("is damaged: it is larger than its loads")
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != line["sha256"]:
             raise ValueError("is damaged: its SHA-256 is not the manifest's")
-        loads = self.scene.loads
-        own = int(loads.poisson_range is not None)
-        shard = opened(content, shape, loads.dimension, own)
+        shard = self.opened(content)
         if shard["index"].tolist() != kept_in(line):
             raise ValueError("holds other loads than the manifest says")
         return shard
+
+    def largest(self, loads: int) -> int:
+        """Return the number of bytes that a shard of so many loads has at most."""
+        numbers = 3 * math.prod(self.scene.problem.shape) + self.scene.loads.dimension + 8
+        return HEADER + 8 * numbers * loads
+
+    def opened(self, content: bytes) -> dict[str, Tensor]:
+        """Return the columns of a shard of this scene, see `dpl.data.shard.opened`."""
+        loads = self.scene.loads
+        own = int(loads.poisson_range is not None)
+        return opened(content, self.scene.problem.shape, loads.dimension, own)
 
     def reader(self, split: str) -> Callable[[int], Outcome | None]:
         """Return what gives a split's loads one at a time, None for those not there at present."""

@@ -300,7 +300,9 @@ def test_repair_makes_damaged_files_again(made, wanted, solved, capsys):
     (made.folder / "val-000000.safetensors").write_bytes(b"")
     capsys.readouterr()
     wanted().repair()
-    assert "making val-000000.safetensors again" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "val-000000.safetensors is damaged" in told
+    assert "; it is removed, and its 2 loads are solved again" in told
     assert solved == [(1, 0), (1, 1)]
     after = content(made.folder)
     manifests = [sorted(found.pop("manifest.jsonl").splitlines()) for found in (after, before)]
@@ -333,7 +335,7 @@ def test_the_command_says_whether_a_set_is_sound_and_repairs_it(script, tiny, tm
     before = content(tmp_path / "d")
     sound = script("generate", *sizes, "action=verify", cwd=tmp_path)
     assert sound.status == 0
-    assert "0 damaged files" in sound.out
+    assert "0 flaws found" in sound.out
     assert "train: 4 of 4 loads accepted" in sound.out
     path = tmp_path / "d/test-000000.safetensors"
     harmed = bytearray(path.read_bytes())
@@ -342,7 +344,7 @@ def test_the_command_says_whether_a_set_is_sound_and_repairs_it(script, tiny, tm
     found = script("generate", *sizes, "action=verify", cwd=tmp_path)
     assert found.status == 1
     assert "d/test-000000.safetensors is damaged" in found.out
-    assert "1 damaged files" in found.out
+    assert "1 flaws found" in found.out
     repaired = script("generate", *sizes, "action=repair", cwd=tmp_path)
     assert repaired.status == 0
     assert "1/1" in repaired.out

@@ -107,7 +107,11 @@ def rewrite(store, change, which=0):
 
 
 def flaws(store):
-    return {line["file"]: flaw for line, flaw in verify(store) if flaw}
+    return {part.file: flaw for part, flaw in verify(store) if flaw}
+
+
+def mended(store):
+    return [part.file for part, _ in repair(store)]
 
 
 # ------------------------------------------------------------------ what is stored
@@ -689,7 +693,7 @@ def test_verify_trusts_no_digest(data, copy, change):
     before = content(data.store)
     name = rewrite(copy, change)
     assert list(flaws(copy)) == [name]
-    assert [*repair(copy)] == [name]
+    assert mended(copy) == [name]
     fill(copy)
     after = content(copy)
     assert sorted(after.pop("manifest.jsonl").splitlines()) == sorted(
@@ -824,9 +828,14 @@ def test_a_file_outside_the_folder_is_not_read(copy):
     shutil.copy(copy.folder / found[0]["file"], copy.folder.parent / "outside.safetensors")
     found[0]["file"] = "../outside.safetensors"
     (copy.folder / "manifest.jsonl").write_text("".join(json.dumps(line) + "\n" for line in found))
-    with pytest.raises(DataSetError, match="is missing"):
+    with pytest.raises(
+        DataSetError, match=r"outside\.safetensors is not in the folder of the data set"
+    ):
         copy.load(found[0]["split"], 4)
-    assert list(flaws(copy)) == ["../outside.safetensors"]
+    assert list(flaws(copy)) == [
+        "../outside.safetensors",
+        found[0]["split"] + "-000000.safetensors",
+    ]
 
 
 @pytest.mark.parametrize("harm", [b"", b"half of it", None])
@@ -854,7 +863,7 @@ def test_repair_makes_damaged_shards_again_and_no_others(copy, data, solved):
     before = content(data.store)
     damaged = lines(copy)[1]
     (copy.folder / damaged["file"]).write_bytes(b"nothing")
-    assert [*repair(copy)] == [damaged["file"]]
+    assert mended(copy) == [damaged["file"]]
     fill(copy)
     assert len(solved) == damaged["tried"]
     after = content(copy)
@@ -886,7 +895,7 @@ def test_repair_retries_loads_that_the_machine_lost_and_no_others(hard, tmp_path
     fill(store, {"train": range(9)})
     assert store.digest("train", 9) != sound.digest("train", 9)
     monkeypatch.setattr("dpl.data.crew.outcome", outcome)
-    assert [*repair(store)] == ["train-000000.safetensors", "train-000003.safetensors"]
+    assert mended(store) == ["train-000000.safetensors", "train-000003.safetensors"]
     assert fill(store, {"train": store.missing("train", 9)}) == 6
     assert store.digest("train", 9) == sound.digest("train", 9)
     assert sorted(map(str, lines(store))) == sorted(map(str, lines(sound)))

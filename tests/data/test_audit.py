@@ -1,0 +1,338 @@
+"""Laws of `verify` and `repair`: nothing that is wrong with a data set goes unnoticed."""
+
+import hashlib
+import json
+import shutil
+
+import pytest
+import torch
+from safetensors.torch import load_file, save
+
+from dpl.data import audit
+from dpl.data.audit import flaw_of_modes, repair, verify
+from dpl.data.generate import DataSet
+from dpl.data.store import Store
+from dpl.fem.modes import Modes
+
+SIZES = {"train": 12, "val": 4, "test": 4}
+
+
+@pytest.fixture
+def copy(data, tmp_path):
+    """The tiny data set in a folder that may be harmed."""
+    folder = tmp_path / "copy"
+    shutil.copytree(data.store.folder, folder)
+    return Store(folder, data.scene, data.store.seed)
+
+
+def wanted(store, **sizes):
+    return DataSet(store.scene, str(store.folder), **{**SIZES, **sizes}, workers=0)
+
+
+def lines(store):
+    return [json.loads(line) for line in (store.folder / "manifest.jsonl").read_text().splitlines()]
+
+
+def write(store, found):
+    text = "".join(line if isinstance(line, str) else json.dumps(line) + "\n" for line in found)
+    (store.folder / "manifest.jsonl").write_text(text)
+
+
+def content(folder):
+    return {
+        p.name: p.read_bytes() for p in [*folder.glob("*.safetensors"), *folder.glob("m*.jsonl")]
+    }
+
+
+def flaws(store):
+    return {part.file: flaw for part, flaw in verify(store) if flaw}
+
+
+# ------------------------------------------------------------------ what is noticed
+
+
+@pytest.mark.parametrize(("split", "size"), SIZES.items())
+def test_a_split_whose_line_is_lost_is_noticed(copy, data, split, size, capsys):
+    write(copy, [line for line in lines(copy) if line["split"] != split])
+    assert list(wanted(copy).verify()) == [
+        f"{copy.folder}/{split}-000000.safetensors is named by no manifest",
+        f"{copy.folder} lacks {size} of the loads that data.{split} = {size} asks for; "
+        "the first is load 0",
+    ]
+    capsys.readouterr()
+    wanted(copy).repair()
+    told = capsys.readouterr().out
+    assert "is named by no manifest; it is removed, and its" in told
+    assert f"{size} loads of {split} are not there; they are solved" in told
+    assert content(copy.folder) == content(data.store.folder)
+    assert list(wanted(copy).verify()) == []
+
+
+def test_a_data_set_without_its_manifest_is_not_sound(copy, data):
+    (copy.folder / "manifest.jsonl").unlink()
+    assert len(list(wanted(copy).verify())) == 6
+    wanted(copy).repair()
+    assert content(copy.folder) == content(data.store.folder)
+
+
+@pytest.mark.parametrize(
+    ("lost", "told"),
+    [
+        (
+            {"train": 13},
+            ["lacks 1 of the loads that data.train = 13 asks for; the first is load 12"],
+        ),
+        ({"val": 9}, ["lacks 5 of the loads that data.val = 9 asks for; the first is load 4"]),
+        ({"train": 14, "test": 5}, ["data.train = 14", "data.test = 5"]),
+        ({"train": 3, "val": 0}, []),
+    ],
+)
+def test_loads_that_are_wanted_and_not_there_are_noticed(copy, lost, told):
+    found = list(wanted(copy, **lost).verify())
+    assert len(found) == len(told)
+    assert all(words in line for words, line in zip(told, found, strict=True))
+
+
+def test_a_part_of_a_data_set_answers_for_its_own_loads_alone(copy, monkeypatch):
+    monkeypatch.setattr("dpl.data.store.SHARD", 12)
+    found = [list(wanted(copy, train=24, shard=k, shards=2).verify()) for k in range(2)]
+    assert found[0] == []
+    assert [line.split()[1:3] for line in found[1]] == [["lacks", "12"]]
+
+
+TORN = {
+    "torn": (lambda line: json.dumps(line)[:40] + "\n", "is not a JSON object"),
+    "no object": (lambda line: "[1, 2]\n", "is not a JSON object"),
+    "empty": (lambda line: "\n", "is not a JSON object"),
+    "lacking": (lambda line: {"file": line["file"]}, "lacks accepted, amplitudes"),
+    "elsewhere": (lambda line: line | {"file": "/dev/zero"}, "not in the folder of the data set"),
+}
+
+
+@pytest.mark.parametrize(("harm", "why"), TORN.values(), ids=TORN)
+@pytest.mark.parametrize("which", [0, 2])
+def test_a_line_that_describes_no_shard_is_noticed_with_its_number(copy, data, harm, why, which):
+    found = lines(copy)
+    name = found[which]["file"]
+    found[which] = harm(found[which])
+    write(copy, found)
+    told = flaws(copy)
+    assert sorted(told) == sorted(["manifest.jsonl", name])
+    assert told["manifest.jsonl"].startswith(
+        f"has 1 lines that describe no shard; the first is line {which + 1}, which "
+    )
+    assert why in told["manifest.jsonl"]
+    assert told[name] == "is named by no manifest"
+    done = {part.file: words for part, words in repair(copy)}
+    assert done["manifest.jsonl"].endswith("; these lines are removed")
+    wanted(copy).repair()
+    assert content(copy.folder) == content(data.store.folder)
+
+
+def test_torn_lines_are_counted_for_each_manifest(copy):
+    with (copy.folder / "manifest.jsonl").open("a") as file:
+        file.write("{\n{}\n")
+    (copy.folder / "manifest-1-of-2.jsonl").write_text("torn")
+    told = flaws(copy)
+    assert told["manifest.jsonl"].startswith("has 2 lines")
+    assert "the first is line 4" in told["manifest.jsonl"]
+    assert told["manifest-1-of-2.jsonl"].startswith("has 1 lines")
+    repair(copy)
+    assert flaws(copy) == {}
+
+
+@pytest.mark.parametrize("name", ["../outside.safetensors", "sub/outside.safetensors", "sub/../x"])
+def test_a_line_that_names_a_file_elsewhere_is_noticed_and_the_file_is_left(copy, data, name):
+    found = lines(copy)
+    genuine = copy.folder / found[0]["file"]
+    (copy.folder / "sub").mkdir()
+    outside = copy.folder / name
+    genuine.rename(outside)
+    found[0]["file"] = name
+    write(copy, found)
+    assert flaws(copy) == {name: "is not in the folder of the data set and is not read"}
+    wanted(copy).repair()
+    assert outside.exists()
+    assert content(copy.folder)[genuine.name] == genuine.read_bytes()
+    assert copy.digest("train", 12) == data.store.digest("train", 12)
+    assert list(wanted(copy).verify()) == []
+
+
+@pytest.mark.parametrize("harm", ["a copy", "no shard", "a link", "larger than any shard"])
+def test_a_file_that_no_manifest_names_is_noticed_and_removed(copy, data, harm):
+    stray = copy.folder / "train-000064.safetensors"
+    if harm == "a copy":
+        shutil.copy(copy.folder / "train-000000.safetensors", stray)
+    elif harm == "a link":
+        stray.symlink_to(copy.folder / "train-000000.safetensors")
+    else:
+        stray.write_bytes(b"nothing" if harm == "no shard" else bytes(copy.largest(64) + 1))
+    assert flaws(copy) == {stray.name: "is named by no manifest"}
+    ((part, told),) = repair(copy)
+    assert (part.file, list(part.loads)) == (stray.name, []), "none of its loads is of its name"
+    assert told == "is named by no manifest; it is removed"
+    assert content(copy.folder) == content(data.store.folder)
+
+
+def test_the_loads_of_a_shard_whose_line_is_lost_are_solved_again_even_if_fewer_are_wanted(
+    copy, data
+):
+    write(copy, [line for line in lines(copy) if line["split"] != "train"])
+    wanted(copy, train=2).repair()
+    assert copy.missing("train", 12) == []
+    assert copy.digest("train", 12) == data.store.digest("train", 12)
+
+
+def test_a_folder_with_the_name_of_a_shard_is_left_alone(copy):
+    (copy.folder / "train-000064.safetensors").mkdir()
+    wanted(copy).repair()
+    assert (copy.folder / "train-000064.safetensors").is_dir()
+
+
+def flip_lowest_bit(path, column):
+    """Flip the lowest bit of the mantissa of the last number of a column that is not 0."""
+    whole = bytearray(path.read_bytes())
+    length = int.from_bytes(whole[:8], "little")
+    first, last = json.loads(whole[8 : 8 + length])[column]["data_offsets"]
+    places = range(8 + length + first, 8 + length + last, 8)
+    place = next(k for k in reversed(places) if any(whole[k : k + 8]))
+    whole[place] ^= 1
+    path.write_bytes(whole)
+
+
+@pytest.mark.parametrize(
+    "column", ["displacement", "nodal_force", "point", "residual", "volume_ratio", "iterations"]
+)
+def test_a_flipped_bit_that_only_the_digest_can_tell_is_noticed(copy, column):
+    """Equilibrium, loads and shapes stay right within their tolerances."""
+    path = copy.folder / "train-000000.safetensors"
+    before = load_file(path)[column].clone()
+    flip_lowest_bit(path, column)
+    after = load_file(path)[column]
+    assert (before != after).sum() == 1
+    if after.is_floating_point():
+        assert torch.allclose(before, after, rtol=1e-15, atol=0)
+    assert flaws(copy) == {path.name: "is damaged: its SHA-256 is not the manifest's"}
+    with pytest.raises(ValueError, match="SHA-256"):
+        copy.load("train", 12)
+    found = lines(copy)
+    found[0]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    write(copy, found)
+    assert flaws(copy) == {}, "no other check can tell"
+
+
+# ------------------------------------------------------------------ how far off a number may be
+
+
+def harmed(store, change):
+    """Change the columns of the first shard; return its flaw, the digest being right."""
+    found = lines(store)
+    path = store.folder / found[0]["file"]
+    shard = load_file(path)
+    change(shard)
+    path.write_bytes(save(shard))
+    found[0]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    write(store, found)
+    return flaws(store).get(path.name, "")
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(
+    ("column", "error", "flaw"),
+    [
+        ("point", 1e-9, "holds other loads than its seed draws"),
+        ("nodal_force", 1e-4, "holds loads that this scene does not draw"),
+        ("displacement", 1e-4, "holds an answer out of balance: load 11"),
+    ],
+)
+def test_a_number_of_one_load_that_is_a_little_off_is_noticed(copy, column, error, flaw, sign):
+    def change(shard):
+        values = shard[column].view(-1)
+        place = int(values.nonzero()[-1])  # of the last load
+        values[place] *= 1 + sign * error
+
+    assert harmed(copy, change) == flaw
+
+
+def test_an_answer_whose_volume_is_not_positive_is_noticed(copy, monkeypatch):
+    """However well it balances its load."""
+    body = type(copy.scene.problem)
+    monkeypatch.setattr(body, "balanced", lambda *_: torch.tensor(True))
+    assert flaws(copy) == {}
+    genuine = body.evaluate
+
+    def flat(self, u):
+        internal, volume = genuine(self, u)
+        return internal, 0 * volume
+
+    monkeypatch.setattr(body, "evaluate", flat)
+    assert flaws(copy)["train-000000.safetensors"] == "holds an answer out of balance: load 0"
+
+
+@pytest.mark.parametrize("which", ["values", "vectors"])
+def test_modes_are_compared_to_six_digits_with_their_signs(scene, which):
+    modes = scene.loads.modes
+    assert flaw_of_modes(scene, modes) == ""
+    column = getattr(modes, which)
+    for factor, sound in ((1 + 1e-9, True), (1 + 1e-4, False), (-1.0, False)):
+        found = flaw_of_modes(scene, modes._replace(**{which: column * factor}))
+        assert found == ("" if sound else "holds other modes than this scene has")
+    fewer = Modes(modes.values[:-1], modes.vectors[:-1])
+    assert flaw_of_modes(scene, fewer) == "holds other modes than this scene has"
+
+
+# ------------------------------------------------------------------ the command
+
+HARMS = {
+    "a lost line": lambda store: write(store, lines(store)[1:]),
+    "a torn line": lambda store: write(store, [*lines(store)[:2], '{"file": "val-0000']),
+    "a file elsewhere": lambda store: write(
+        store, [lines(store)[0] | {"file": "/dev/zero"}, *lines(store)[1:]]
+    ),
+    "a file beside the folder": lambda store: write(
+        store, [lines(store)[0] | {"file": "../train"}, *lines(store)[1:]]
+    ),
+    "a shard too many": lambda store: shutil.copy(
+        store.folder / "val-000000.safetensors", store.folder / "val-000064.safetensors"
+    ),
+    "a flipped bit": lambda store: flip_lowest_bit(
+        store.folder / "val-000000.safetensors", "displacement"
+    ),
+}
+
+
+@pytest.fixture
+def made(scene_of, tiny, tmp_path):
+    """A data set that the command's own options describe, in the folder d."""
+    sizes = [*tiny, "data.train=3", "data.val=2", "data.test=1", "data.workers=0", "data.folder=d"]
+    store = DataSet(scene_of(*tiny), str(tmp_path / "d"), train=3, val=2, test=1, workers=0).fill()
+    return store, sizes
+
+
+@pytest.mark.parametrize("harm", HARMS.values(), ids=HARMS)
+def test_the_command_fails_where_something_is_wrong_and_repair_mends_it(
+    script, made, tmp_path, harm
+):
+    store, sizes = made
+    before = content(store.folder)
+    harm(store)
+    found = script("generate", *sizes, "action=verify", cwd=tmp_path)
+    assert found.status == 1
+    assert "0 flaws found" not in found.out
+    mended = script("generate", *sizes, "action=repair", cwd=tmp_path)
+    assert mended.status == 0
+    assert any(words in mended.out for words in ("removed", "solved"))
+    assert content(store.folder) == before
+    sound = script("generate", *sizes, "action=verify", cwd=tmp_path)
+    assert (sound.status, sound.out.splitlines()[-1]) == (0, "0 flaws found")
+
+
+def test_the_command_fails_where_loads_that_it_asks_for_are_not_there(script, made, tmp_path):
+    _, sizes = made
+    found = script("generate", *sizes, "data.val=3", "action=verify", cwd=tmp_path)
+    assert found.status == 1
+    assert "d lacks 1 of the loads that data.val = 3 asks for; the first is load 2" in found.out
+
+
+def test_the_reasons_that_lie_with_the_machine_are_those_that_are_recorded():
+    assert audit.MACHINE == ("timed out", "its worker died")

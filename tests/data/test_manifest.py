@@ -1,0 +1,139 @@
+"""Laws of the lines of a manifest: which describe a shard, and what they say of it."""
+
+import json
+
+import pytest
+
+from dpl.data.manifest import MOST, is_number, kept_in, lines_of, place, torn_lines
+
+LINE = {
+    "file": "val-000064.safetensors",
+    "sha256": 64 * "0",
+    "split": "val",
+    "first": 64,
+    "tried": 3,
+    "accepted": 2,
+    "iterations": 11,
+    "amplitudes": [0.5, 0, 1],
+    "rejected": [{"index": 65, "reason": "diverged", "load_factor": 0.25}],
+}
+REJECT = LINE["rejected"][0]
+
+
+@pytest.fixture
+def manifest(tmp_path):
+    """Writes a manifest of so many lines; returns its path."""
+
+    def manifest(*lines):
+        path = tmp_path / "manifest.jsonl"
+        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+        return path
+
+    return manifest
+
+
+def test_a_manifest_that_is_not_there_has_no_lines(tmp_path):
+    assert lines_of(tmp_path / "manifest.jsonl") == []
+    assert torn_lines(tmp_path / "manifest.jsonl") == []
+
+
+POSSIBLE = [
+    *({}, {"more": 1}, {"first": 63}, {"first": 65}, {"iterations": 0}, {"iterations": 2**53 - 1}),
+    {"first": 2**53 - 1, "rejected": [REJECT | {"index": 2**53}]},
+    *({"split": "train"}, {"split": "test"}, {"file": "a"}, {"file": "a" * 200}),
+    *({"amplitudes": [0, 0, 0]}, {"amplitudes": [1e14, 10**15 - 1, 0.0]}),
+    {"tried": 0, "accepted": 0, "amplitudes": [], "rejected": []},
+    {"accepted": 3, "rejected": []},
+    {"accepted": 0, "rejected": [REJECT | {"index": k} for k in (64, 65, 66)]},
+    {"rejected": [REJECT | {"load_factor": None}]},
+]
+
+
+@pytest.mark.parametrize("change", POSSIBLE, ids=str)
+def test_a_line_that_can_be_is_kept_as_it_is(manifest, change):
+    line = LINE | change
+    assert lines_of(manifest(line)) == [line]
+    assert torn_lines(manifest(line)) == []
+
+
+IMPOSSIBLE = {
+    "has a file that is not text": [{"file": None}, {"file": 3}],
+    "has a sha256 that is not text": [{"sha256": None}, {"sha256": []}],
+    "has a split that is not text": [{"split": 0}, {"split": None}],
+    "names a split that does not exist": [{"split": ""}, {"split": "Train"}],
+    "names a file that is not in the folder": [
+        *({"file": ""}, {"file": "/a"}, {"file": "a b"}, {"file": "a\n"}, {"file": "a" * 201}),
+    ],
+    "has a number first that cannot be": [
+        *({"first": -1}, {"first": 2**53}, {"first": True}, {"first": 64.0}, {"first": "64"}),
+    ],
+    "has a number tried that cannot be": [{"tried": -3}, {"tried": 3.0}, {"tried": None}],
+    "has a number accepted that cannot be": [{"accepted": -2}, {"accepted": 2.0}],
+    "has a number iterations that cannot be": [{"iterations": -1}, {"iterations": 2**53}],
+    "has amplitudes or rejected loads that are not lists": [
+        *({"amplitudes": {}}, {"amplitudes": "abc"}, {"rejected": {}}, {"rejected": None}),
+    ],
+    "has numbers of loads that disagree": [
+        *({"tried": 2}, {"tried": 4}, {"accepted": 1}, {"accepted": 3}, {"rejected": []}),
+        *({"amplitudes": [1, 1]}, {"amplitudes": [1, 1, 1, 1]}),
+    ],
+    "has an amplitude that cannot be": [
+        *({"amplitudes": [1, 1, value]} for value in (-1e-9, True, None, "1", 10**15, [1])),
+        *({"amplitudes": [float(value), 1, 1]} for value in ("nan", "inf")),
+    ],
+    "has a rejected load that cannot be": [
+        *({"rejected": [REJECT | {"index": value}]} for value in (63, 67, True, 65.0, None)),
+        *({"rejected": [REJECT | {"reason": value}]} for value in (None, 3)),
+        *({"rejected": [{k: v for k, v in REJECT.items() if k != name}]} for name in REJECT),
+        *({"rejected": [value]} for value in (65, "text", None, [65])),
+    ],
+}
+CASES = [(change, why) for why, changes in IMPOSSIBLE.items() for change in changes]
+
+
+@pytest.mark.parametrize(("change", "why"), CASES, ids=str)
+def test_a_line_that_cannot_be_is_left_out_with_its_number_and_the_reason(manifest, change, why):
+    path = manifest(LINE, LINE | change)
+    assert lines_of(path) == [LINE]
+    ((number, told),) = torn_lines(path)
+    assert number == 2
+    assert told.startswith(why)
+
+
+@pytest.mark.parametrize("name", LINE)
+def test_a_line_that_lacks_something_is_left_out_and_says_what(manifest, name):
+    path = manifest({key: value for key, value in LINE.items() if key != name}, LINE)
+    assert lines_of(path) == [LINE]
+    assert torn_lines(path) == [(1, f"lacks {name}")]
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", "null", "\0", "[" * 99_999])
+def test_a_line_that_is_no_object_is_left_out(manifest, text):
+    path = manifest(LINE)
+    path.write_text(text + "\n" + path.read_text())
+    assert lines_of(path) == [LINE]
+    assert torn_lines(path) == [(1, "is not a JSON object")]
+
+
+@pytest.mark.parametrize(
+    ("value", "possible"),
+    [
+        *((0, True), (0.0, True), (1e-300, True), (MOST - 1, True), (MOST, False), (-1, False)),
+        *((True, False), (False, False), (None, False), ("1", False), (10**30, False)),
+        *((float("nan"), False), (float("inf"), False)),
+    ],
+)
+def test_numbers_are_finite_and_not_negative(value, possible):
+    assert is_number(value) is possible
+
+
+def test_a_shard_holds_the_loads_that_were_tried_and_not_rejected():
+    assert kept_in(LINE) == [64, 66]
+    assert kept_in(LINE | {"rejected": []}) == [64, 65, 66]
+    assert kept_in(LINE | {"tried": 0, "rejected": []}) == []
+
+
+def test_lines_are_ordered_by_split_and_first_load():
+    keys = [("train", 0), ("train", 64), ("val", 0), ("val", 128), ("test", 0)]
+    found = [place({"split": split, "first": first}) for split, first in keys]
+    assert found == sorted(found) == [(0, 0), (0, 64), (1, 0), (1, 128), (2, 0)]
