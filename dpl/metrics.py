@@ -18,6 +18,15 @@ from dpl.scene import Sample
 ORDINALS = {1: "worst", 2: "2nd worst", 3: "3rd worst"}
 
 
+def median(values: Tensor) -> Tensor:
+    """Return the median along the first axis of (S, ...): (...).
+
+    Of an even number of values it is the mean of the two in the middle, where `torch.median` gives
+    the smaller one. It is NaN where a value is NaN.
+    """
+    return (values.median(dim=0).values - (-values).median(dim=0).values) / 2
+
+
 class _PerLoad(Metric):
     """Keeps one number a load and reduces them in the end."""
 
@@ -106,7 +115,7 @@ class RelativeL2(_PerLoad):
 
     def reduce(self, values: Tensor) -> Tensor:
         """See `_PerLoad`."""
-        return values.max() if self.worst else values.median()
+        return values.max() if self.worst else median(values)
 
 
 class ResidualRatio(_PerLoad):
@@ -123,7 +132,7 @@ class ResidualRatio(_PerLoad):
 
     def reduce(self, values: Tensor) -> Tensor:
         """See `_PerLoad`."""
-        return values.median()
+        return median(values)
 
 
 class MinVolumeRatio(_PerLoad):

@@ -17,7 +17,7 @@ from dpl.fem.problem import Problem
 from dpl.fem.solution import Solution, Solver, one_thread
 from dpl.figures import deformed
 from dpl.hybrid import Direct, Hybrid, best
-from dpl.metrics import RelativeL2, metrics
+from dpl.metrics import RelativeL2, median, metrics
 from dpl.module import Surrogate
 from dpl.scene import Sample
 
@@ -136,7 +136,7 @@ def compare(folder: Path) -> None:
         groups.setdefault(re.sub(r",?seed=\d+,?", "", name), []).append(numbers)
     table.add_section()
     for name, members in groups.items():
-        medians = torch.tensor(members).median(dim=0).values.tolist()
+        medians = median(torch.tensor(members)).tolist()
         table.add_row(f"median of {len(members)}: {name}", *(f"{number:.3g}" for number in medians))
     Console(width=max(Console().width, 160)).print(table)
 
@@ -186,7 +186,9 @@ def _picture(
     scene, network = surrogate.scene, answers["network"]
     error = RelativeL2().measure(network, test)
     order = error.argsort()
-    chosen = order[[0, (len(order) - 1) // 2, -1]]  # the median as torch takes it
+    chosen = order[
+        [0, (len(order) - 1) // 2, -1]
+    ]  # of an even number of loads the better one in the middle
     names = [
         f"{name} load: relative L2 {error[k]:.2%}"
         for name, k in zip(("best", "median", "worst"), chosen, strict=True)
