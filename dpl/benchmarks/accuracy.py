@@ -12,7 +12,7 @@ from torch import Tensor
 from dpl.benchmarks.clock import path
 from dpl.benchmarks.meshes import Discretisation
 from dpl.fem.solution import Load, Solver, one_thread, solve
-from dpl.metrics import RelativeL2
+from dpl.metrics import RelativeL2, median
 from dpl.module import Surrogate
 from dpl.scene import Sample
 
@@ -92,9 +92,9 @@ def points(
                         len(singles),
                         float(taken.median()),
                         float(taken.quantile(0.99)),
-                        float(error.median()),
+                        float(median(error)),
                         float(error.max()),
-                        float(residual.median()),
+                        float(median(residual)),
                     )
                 )
             tick()
