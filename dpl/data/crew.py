@@ -7,21 +7,20 @@ process, no worker outlives it.
 
 import atexit
 import contextlib
-import ctypes
-import multiprocessing
 import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from multiprocessing import connection, parent_process, resource_tracker
+from multiprocessing import connection
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from types import FrameType
 from typing import Any
 
 from dpl.data.outcome import Job, Outcome, lost, outcome
+from dpl.data.processes import spawning, unsignalled
 from dpl.scene import Scene
 
 TRIES = 3  # of a load whose worker died, before it is given up
@@ -203,53 +202,10 @@ class _Crew:
         return done, dead, [self._replace(pipe) for pipe in late]
 
 
-def spawning() -> multiprocessing.context.SpawnContext:
-    """Return the way to start workers: forking a process with BLAS threads can hang it.
-
-    A process of joblib's has a way of its own, which those that it spawns do not know by name.
-    """
-    if multiprocessing.get_start_method() not in multiprocessing.get_all_start_methods():
-        multiprocessing.set_start_method("spawn", force=True)
-    return multiprocessing.get_context("spawn")
-
-
-@contextlib.contextmanager
-def unsignalled(*numbers: signal.Signals) -> Iterator[None]:
-    """Start processes that these signals do not reach: they are their parent's to handle."""
-    resource_tracker.ensure_running()  # which would unblock them
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 def _work(pipe: Connection, scene: Scene) -> None:
     """Solve what comes through the pipe until it closes."""
     for number in (signal.SIGINT, signal.SIGTERM):  # whatever has unblocked them here
         signal.signal(number, signal.SIG_IGN)
-    die_with_parent()
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
             pipe.send(outcome(scene, pipe.recv()))
-
-
-def die_with_parent() -> None:
-    """End this worker process, even amidst a solve, as soon as the one that started it has ended.
-
-    Linux does that by itself (prctl); elsewhere a thread watches.
-    """
-    parent = parent_process()
-    if parent is None:
-        return
-    if sys.platform == "linux":
-        set_death_signal = 1  # PR_SET_PDEATHSIG
-        ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)
-        if os.getppid() != parent.pid:  # it has ended before
-            os._exit(1)
-
-    def watch() -> None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()

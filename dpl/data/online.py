@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from dpl.data.crew import GRACE, HOPELESS, TRIES, die_with_parent, spawning, unsignalled
+from dpl.data.crew import GRACE, HOPELESS, TRIES
 from dpl.data.outcome import Job, Outcome, lost, outcome
+from dpl.data.processes import spawning, unsignalled
 from dpl.data.store import Store
 from dpl.fem.symmetry import Symmetry, images
 from dpl.scene import Sample, Scene, stack
@@ -389,9 +390,8 @@ class _Buffer:
 
 
 def _begin(worker: int) -> None:
-    """Make a worker process leave Ctrl-C to its parent and die with it."""
+    """Make a worker process leave Ctrl-C to its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    die_with_parent()
 
 
 def _batch(drawn: list[Drawn]) -> Drawn:

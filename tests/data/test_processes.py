@@ -1,0 +1,131 @@
+"""Laws of worker processes: none outlives the process that started it, at any moment."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from contextlib import suppress
+
+import pytest
+
+from dpl.data.processes import spawning
+
+LONG = 120  # no test waits so long, unless a process is left behind [s]
+
+# Both processes hold the standard output, so that it ends when both have ended. Its main module is
+# what a worker imports first; there it stays for ever.
+PROGRAM = textwrap.dedent(
+    """
+    import os
+    import signal
+    import threading
+
+    if __name__ == "__mp_main__":
+        print("importing", flush=True)
+        threading.Event().wait()
+
+    def task():
+        print("at work", flush=True)
+
+    if __name__ == "__main__":
+        {start}
+        {then}
+    """
+)
+STARTS = {
+    "a worker of a crew": """
+        from dpl.data.processes import spawning
+        spawning().Process(target=task, daemon=True).start()
+    """,
+    "a worker of a stream": """
+        from dpl.data.online import Replay
+        from torch.utils.data import IterableDataset
+
+        class Source(IterableDataset):
+            first, lane, lanes, starts, worst = 0, 0, 1, {}, None
+
+            def __iter__(self):
+                task()
+
+        globals()["Source"] = Source
+        Source.__qualname__ = "Source"
+        sizes = {"batch_size": 1, "batches": 1, "fresh": 1, "reuse": 1, "capacity": 4}
+        replay = Replay(Source(), workers=1, **sizes)
+        replay._start()
+    """,
+}
+MOMENTS = {
+    "at once": "os.kill(os.getpid(), signal.SIGKILL)",
+    "while it imports": "print('started', flush=True); threading.Event().wait()",
+}
+
+
+@pytest.fixture
+def launched(tmp_path, environment):
+    """Starts a program in a process group of its own, of which nothing is left in the end."""
+    started = []
+
+    def launched(text):
+        path = tmp_path / "program.py"
+        path.write_text(text)
+        process = subprocess.Popen(
+            [sys.executable, str(path)],
+            cwd=tmp_path,
+            env=environment(),
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        started.append(process)
+        return process
+
+    yield launched
+    for process in started:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def program(start, then):
+    indented = textwrap.indent(textwrap.dedent(start).strip(), 4 * " ").lstrip()
+    return PROGRAM.format(start=indented, then=then)
+
+
+@pytest.mark.timeout(3 * LONG)
+@pytest.mark.parametrize("start", STARTS.values(), ids=STARTS)
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_a_worker_that_is_still_importing_ends_with_its_parent(launched, start, moment):
+    parent = launched(program(start, MOMENTS[moment]))
+    if moment == "while it imports":
+        lines = {parent.stdout.readline() for _ in range(2)}
+        assert lines == {"started\n", "importing\n"}
+        parent.kill()
+    out, _ = parent.communicate(timeout=LONG)  # which waits for the worker's output to end
+    assert parent.returncode == -signal.SIGKILL
+    assert "at work" not in out
+
+
+@pytest.mark.timeout(3 * LONG)
+def test_a_worker_lives_as_long_as_its_parent_and_tells_it_how_it_ended(launched):
+    text = program(
+        STARTS["a worker of a crew"]
+        .replace("spawning().Process", "worker = spawning().Process")
+        .replace(").start()", ")\n        worker.start()"),
+        "worker.join(); print(worker.exitcode, worker.pid != os.getpid())",
+    ).replace('    print("importing", flush=True)\n    threading.Event().wait()', "    pass")
+    out, _ = launched(text).communicate(timeout=LONG)
+    assert out == "at work\n0 True\n"
+
+
+def test_other_processes_are_started_as_ever():
+    from multiprocessing import spawn
+
+    before = spawn.get_command_line
+    context = spawning()
+    worker = context.Process(target=os.getpid)
+    worker.start()
+    worker.join()
+    assert worker.exitcode == 0
+    assert spawn.get_command_line is before
+    assert context.get_start_method() == "spawn"
