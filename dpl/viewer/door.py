@@ -5,6 +5,7 @@ made to point there (DNS rebinding). So every request must bring the token, ask 
 this one, and open its socket from this page.
 """
 
+import asyncio
 import contextlib
 import hmac
 import http
@@ -19,6 +20,8 @@ from typing import Any
 import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
+
+from dpl.viewer.complaints import Complaints
 
 Handle = Callable[[Any, Request], Response | None]
 LARGEST = 2**18  # bytes of a message from the browser
@@ -48,12 +51,14 @@ class Door:
         host: Where it is bound.
         names: Names of this host, besides those of the loopback, that may be asked for.
         token: What the path begins with.
+        complaints: Prints what goes wrong with requests.
     """
 
     socket: socket.socket
     host: str
     names: tuple[str, ...] = ()
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
+    complaints: Complaints = field(default_factory=Complaints, repr=False)
 
     @classmethod
     def bound(cls, host: str, port: int, names: Sequence[str] = ()) -> "Door":
@@ -95,11 +100,12 @@ class Door:
         if len(hosts) != 1 or not self._ours(hosts[0]):
             return http.HTTPStatus.MISDIRECTED_REQUEST, "This is not the host you asked for.\n"
         own = [f"http://{hosts[0]}"]
-        upgrade = "upgrade" in request.headers.get("Connection", "").lower()
+        upgrade = "upgrade" in ",".join(request.headers.get_all("Connection")).lower()
         if origins != own and (upgrade or origins):
             return http.HTTPStatus.FORBIDDEN, "Only this page's own socket is served.\n"
         token = re.split("[/?]", request.path, maxsplit=2)[1:2] or [""]
-        if not hmac.compare_digest(token[0].encode(), self.token.encode()):
+        given = token[0].encode("ascii", "surrogateescape")  # as websockets has decoded it
+        if not hmac.compare_digest(given, self.token.encode()):
             return http.HTTPStatus.FORBIDDEN, "The address lacks the token that was printed.\n"
         return None
 
@@ -109,13 +115,13 @@ class Door:
         def guarded(connection: Any, request: Request) -> Response | None:
             refused = self.refusal(request)
             if refused is not None:
-                status, words = refused
-                body = words.encode()
-                headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(body))})
-                return Response(status.value, status.phrase, headers, body)
+                return _answer(*refused)
             path = request.path.removeprefix(f"/{self.token}")
             inner = Request(path if path.startswith("/") else "/" + path, request.headers)
-            response = handle(connection, inner)
+            try:
+                response = handle(connection, inner)
+            except (LookupError, OSError, ValueError):  # two of a header, or a path too long
+                return _answer(http.HTTPStatus.BAD_REQUEST, "The request cannot be read.\n")
             if response is not None:
                 for name, value in HEADERS.items():
                     host = request.headers["Host"]
@@ -141,6 +147,12 @@ class Door:
         return True
 
 
+def _answer(status: http.HTTPStatus, words: str) -> Response:
+    body = words.encode()
+    headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(body))})
+    return Response(status.value, status.phrase, headers, body)
+
+
 @contextlib.contextmanager
 def behind(door: Door) -> Iterator[None]:
     """Let a server that is started in here take its requests through a door.
@@ -150,7 +162,10 @@ def behind(door: Door) -> Iterator[None]:
     genuine = websockets.asyncio.server.serve
 
     def serve(handler: Any, host: str, port: int, *, process_request: Handle, **more: Any) -> Any:
-        more |= {"max_size": LARGEST, "server_header": None}
+        more |= {"max_size": LARGEST, "server_header": None, "logger": door.complaints.logger}
+        asyncio.get_running_loop().set_exception_handler(
+            lambda loop, told: door.complaints.add(told["message"], told.get("exception"))
+        )
         return genuine(
             handler, sock=door.socket, process_request=door.guarding(process_request), **more
         )

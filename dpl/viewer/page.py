@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import logging
 import time
 from collections.abc import Callable
 from functools import partial
@@ -55,7 +54,6 @@ class Page:
         """
         self.body, self._door, self._folder = body, door, folder
         self._problem = body.scene.problem
-        logging.getLogger("websockets.server").setLevel(logging.ERROR)
         with behind(door), contextlib.redirect_stdout(io.StringIO()):
             self.server = Server(host=door.host, port=door.port, label="dpl", verbose=False)
         try:
@@ -122,8 +120,9 @@ class Page:
         )
         self._arrow.visible = False
         assert self._network.grip is not None
-        self._network.grip.on_drag("left")(self._dragged)
-        self._network.grip.on_click(self._clicked)
+        caught = self._door.complaints.caught
+        self._network.grip.on_drag("left")(caught(self._dragged))
+        self._network.grip.on_click(caught(self._clicked))
 
     async def _dragged(self, event: Any) -> None:
         """Move the grabbed point with the hand."""
@@ -253,18 +252,21 @@ class Page:
             self._record = gui.add_button("Start recording", color="red")
             self._state = gui.add_html(panel.told(f"Saved into {self._folder}", "inherit"))
             saves = gui.add_button_group("save as", ("VTU", "GIF", "MP4"))
+        caught = self._door.complaints.caught
         for control in (self._direction, self._amplitude, self._uniform, self._radius):
-            control.on_update(self._controlled)
+            control.on_update(caught(self._controlled))
         for control in (self._young, self._poisson):
             if control is not None:
-                control.on_update(lambda event: None if event.client is None else self._ask())
+                control.on_update(
+                    caught(lambda event: None if event.client is None else self._ask())
+                )
         for control in (self._answered, self._budget, self._quantity, self._compare):
-            control.on_update(self._wished)
-        self._mesh.on_update(lambda event: self._wished(event))
-        random.on_click(self._sampled)
-        reset.on_click(self._reset)
-        self._record.on_click(self._toggle)
-        saves.on_click(self._save)
+            control.on_update(caught(self._wished))
+        self._mesh.on_update(caught(self._wished))
+        random.on_click(caught(self._sampled))
+        reset.on_click(caught(self._reset))
+        self._record.on_click(caught(self._toggle))
+        saves.on_click(caught(self._save))
 
     def _wished(self, event: Any) -> None:
         """Ask for the same load, answered or shown otherwise."""

@@ -1,18 +1,24 @@
 """Who may come in, asked with real sockets; and how the command says no."""
 
+import asyncio
+import gc
 import socket
-import time
+import threading
+from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip("viser", reason="the extra viewer is not installed")
 
+import msgspec
 import viser
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from dpl.viewer.door import LARGEST, Door, status_of
+from dpl.viewer.complaints import LONGEST, PERIOD, Complaints
+from dpl.viewer.door import LARGEST, Door, check, status_of
 
+LONG = 120  # no test waits so long, unless what it waits for does not come [s]
 UPGRADE = {
     "Connection": "Upgrade",
     "Upgrade": "websocket",
@@ -87,21 +93,195 @@ def test_only_this_machine_can_reach_it(door):
     assert not door.open_to_all
 
 
-def drained(call, seconds=20):
+def drained(call):
     """Receive until the connection ends."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        call.recv(timeout=5)
+    while True:
+        call.recv(timeout=LONG)
+
+
+def connected(door):
+    """Return a socket of the page."""
+    return connect(
+        door.address.replace("http", "ws"),
+        origin=f"http://{home(door)}",
+        subprotocols=[f"viser-v{viser.__version__}"],
+        max_size=None,
+        open_timeout=LONG,
+    )
 
 
 def test_a_message_that_is_too_long_ends_the_connection(door):
-    address, origin = door.address.replace("http", "ws"), f"http://{home(door)}"
-    protocol = [f"viser-v{viser.__version__}"]
-    with connect(address, origin=origin, subprotocols=protocol, max_size=None) as call:
+    with connected(door) as call:
         call.send(b"x" * (LARGEST + 1))
         with pytest.raises(ConnectionClosed) as closed:
             drained(call)
     assert closed.value.rcvd.code == 1009
+
+
+def test_a_message_of_the_largest_size_is_read(door, told):
+    with connected(door) as call:
+        call.send(packed("GuiModalMessage", title="x" * LARGEST)[:LARGEST])
+        with pytest.raises(ConnectionClosed) as closed:
+            drained(call)
+    assert closed.value.rcvd.code == 1011, "it was read and is garbage"
+
+
+# ------------------------------------------------------------------ what strangers send
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *("/\u00e9/", "/\u00e9", "/{token}\u00e9/", "/\u00e9{token}/", "/\U0001f600/", "/\udcff/"),
+        "/?\u00e9",
+    ],
+    ids=ascii,
+)
+def test_a_token_that_is_not_ascii_is_wrong_and_no_error(door, capfd, path):
+    path = path.format(token=door.token)
+    assert raw_status(door, path.encode("utf-8", "surrogateescape")) == 403
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("more", ["\u00e9", "%00", "%ff", "x" * 5000, "../" * 9, "%2e%2e/x"])
+def test_a_path_behind_the_token_that_is_no_file_is_not_found_and_no_error(door, capfd, more):
+    found = raw_status(door, f"/{door.token}/{more}".encode())
+    assert found in (400, 404)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("name", ["Connection", "Accept-Encoding", "Upgrade", "Origin", "Host"])
+def test_a_header_that_comes_twice_is_no_error(door, capfd, name):
+    twice = f"{name}: x\r\n{name}: y\r\n".encode()
+    found = raw_status(door, f"/{door.token}/".encode(), twice)
+    assert found == {"Host": 421, "Origin": 403, "Connection": 200}.get(name, 400)
+    assert capfd.readouterr().err == ""
+
+
+def raw_status(door, path, headers=b""):
+    """Return the status that a request of these bytes is answered with."""
+    with socket.create_connection(("127.0.0.1", door.port), timeout=LONG) as call:
+        host = f"Host: {home(door)}\r\n".encode()
+        call.sendall(b"GET " + path + b" HTTP/1.1\r\n" + host + headers + b"\r\n")
+        return int(call.recv(64).split()[1])
+
+
+@pytest.fixture
+def told(door, monkeypatch):
+    """Complaints of the page's door as they come: a list, and an event for each new one."""
+    heard, genuine = SimpleNamespace(all=[], news=threading.Event()), door.complaints.add
+
+    def add(*what):
+        genuine(*what)
+        heard.all.append(what)
+        heard.news.set()
+
+    monkeypatch.setattr(door.complaints, "add", add)
+    return heard
+
+
+def packed(kind, **fields):
+    return msgspec.msgpack.encode({"type": kind, **fields})
+
+
+GARBAGE = {
+    "text": "hello",
+    "nothing": b"",
+    "no msgpack": b"\xc1\xff\x00",
+    "no mapping": msgspec.msgpack.encode([1, 2]),
+    "no type": msgspec.msgpack.encode({"a": 1}),
+    "unknown type": packed("\x1b[31m[bold]" + "x" * 5000),
+    "unknown field": packed("GuiUpdateMessage", foo=1),
+}
+
+
+@pytest.mark.parametrize("message", GARBAGE.values(), ids=GARBAGE)
+def test_garbage_ends_its_connection_with_one_line(door, told, capfd, message):
+    with connected(door) as call:
+        call.send(message)
+        with pytest.raises(ConnectionClosed):
+            drained(call)
+    assert told.news.wait(LONG)
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("warning: a request of a browser failed: connection handler failed: ")
+    assert line.isascii()
+    assert line.isprintable()
+    assert len(line) < LONGEST + 60
+    assert status_of(door, f"/{door.token}/", Host=home(door)) == 200, "others are served"
+
+
+def test_garbage_again_and_again_is_one_line(door, told, capfd, monkeypatch):
+    monkeypatch.setattr(door.complaints, "_clock", lambda: 0.0)
+    for _ in range(5):
+        told.news.clear()
+        with connected(door) as call:
+            call.send(b"\xc1")
+            with pytest.raises(ConnectionClosed):
+                drained(call)
+        assert told.news.wait(LONG)
+    assert len(told.all) == 5
+    assert capfd.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("update", [{"value": "x"}, {"no_such_thing": 1}, {"value": None}])
+def test_a_value_that_a_control_cannot_have_is_one_line(page, door, told, capfd, update):
+    slider = page._radius
+    before = slider.value
+    with connected(door) as call:
+        call.send(packed("GuiUpdateMessage", uuid=slider._impl.uuid, updates=update))
+        while not told.news.wait(0.1):  # the task's error is told once the task is collected
+            gc.collect()
+    assert slider.value == before
+    err = capfd.readouterr().err
+    assert err.count("\n") == 1
+    assert err.startswith("warning: a request of a browser failed: ")
+
+
+def test_an_error_of_any_control_is_one_line(page, capfd):
+    now = 0.0
+    page._door.complaints._clock = lambda: now
+    page._ask = page._sampled = None  # whatever calls it fails
+    page.worker.ask = page.recording.start = page.recording.stop = None
+    event = SimpleNamespace(client=object(), target=SimpleNamespace(value="VTU"))
+    for name in ("_direction", "_amplitude", "_uniform", "_radius", "_young", "_mesh", "_compare"):
+        (callback,) = getattr(page, name)._impl.update_cb
+        callback(event)
+        now += PERIOD
+        (line,) = capfd.readouterr().err.splitlines()
+        assert line.startswith("warning: a request of a browser failed: a control: TypeError: ")
+
+
+def test_errors_of_callbacks_are_told_whether_they_are_awaited_or_not(capfd):
+    async def awaited(event):
+        raise ZeroDivisionError(event)
+
+    def called(event):
+        raise ZeroDivisionError(event)
+
+    asyncio.run(Complaints().caught(awaited)("far\naway"))
+    Complaints().caught(called)("far\naway")
+    told = "warning: a request of a browser failed: a control: ZeroDivisionError: far away"
+    assert capfd.readouterr().err.splitlines() == [told, told]
+
+
+def test_one_line_a_second_is_printed_and_the_others_are_counted(capfd):
+    now = 5.0
+    complaints = Complaints(lambda: now)
+    lines = []
+    for step in (0.0, 0.25, PERIOD - 0.25 - 2**-20, 2**-20, 0.5, 3.0, 0.0):
+        now += step
+        complaints.logger.error("it failed")
+        lines.append(capfd.readouterr().err)
+    plain = "warning: a request of a browser failed: it failed"
+    assert lines == [
+        *(f"{plain}\n", "", "", f"{plain} (2 more were not printed)\n"),
+        *("", f"{plain} (1 more were not printed)\n", ""),
+    ]
+
+
+def test_warnings_are_no_complaints(capfd):
+    Complaints().logger.warning("slow")
+    assert capfd.readouterr().err == ""
 
 
 def test_the_answer_forbids_to_fetch_from_elsewhere(door):
@@ -128,6 +308,69 @@ def test_a_door_to_all_takes_addresses_and_its_names_but_no_others():
 def test_a_browser_cannot_ask_for_a_tunnel(page):
     assert page.server.request_share_url() is None
     assert page.server._share_tunnel is None
+
+
+@pytest.mark.parametrize("which", range(5))
+def test_a_door_that_answers_one_request_wrongly_is_not_served(door, monkeypatch, which):
+    asked = []
+
+    def status(door, path, **headers):
+        asked.append((path, headers))
+        found = status_of(door, path, **headers)
+        return 500 if len(asked) == which + 1 else found
+
+    monkeypatch.setattr("dpl.viewer.door.status_of", status)
+    must = (200, 403, 421, 403, 403)[which]
+    with pytest.raises(RuntimeError, match=f"not safe: 500 where {must} must be; not served"):
+        check(door)
+    monkeypatch.undo()
+    check(door)
+
+
+def test_a_host_without_a_port_is_that_of_port_80(door):
+    bound = SimpleNamespace(getsockname=lambda: ("127.0.0.1", 80))
+    other = Door(bound, "127.0.0.1", ("lab",))
+    for host in ("127.0.0.1", "localhost", "[::1]", "LAB", "127.0.0.1:80", "localhost:00080"):
+        assert other._ours(host), host
+    for host in (
+        "127.0.0.1:81",
+        "lab:8080",
+        "::1",
+        "[lab",
+        "lab:",
+        "lab:800000",
+        "la",
+        "127.0.0.2",
+    ):
+        assert not other._ours(host), host
+
+
+@pytest.mark.parametrize(
+    ("host", "open_to_all", "address"),
+    [
+        ("127.0.0.1", False, "http://127.0.0.1:81/t/"),
+        ("localhost", False, "http://localhost:81/t/"),
+        ("::1", False, "http://[::1]:81/t/"),
+        ("0.0.0.0", True, "http://127.0.0.1:81/t/"),
+        ("::", True, "http://127.0.0.1:81/t/"),
+        ("10.0.0.3", True, "http://10.0.0.3:81/t/"),
+        ("fe80::1", True, "http://[fe80::1]:81/t/"),
+    ],
+)
+def test_the_address_is_what_a_browser_can_open(host, open_to_all, address):
+    bound = SimpleNamespace(getsockname=lambda: (host, 81))
+    door = Door(bound, host, (), "t")
+    assert (door.open_to_all, door.address) == (open_to_all, address)
+
+
+def test_a_door_to_all_takes_its_own_names_too():
+    bound = SimpleNamespace(getsockname=lambda: ("0.0.0.0", 81))
+    name = socket.gethostname().lower()
+    assert Door(bound, "0.0.0.0")._ours(f"{name}:81")
+    assert Door(bound, "Lab-7.example")._ours("lab-7.EXAMPLE:81")
+    assert not Door(bound, "127.0.0.1")._ours(f"{name}.example:81")
+    assert Door(bound, "0.0.0.0")._ours("[fe80::7]:81")
+    assert not Door(bound, "127.0.0.1")._ours("[fe80::7]:81")
 
 
 def test_two_pages_have_two_tokens():
