@@ -287,7 +287,9 @@ def test_a_mesh_in_the_file_is_that_of_the_load_with_the_largest_error(scene, da
     for part, name in (("VERTEX", "vertices"), ("FACE", "faces"), ("COLOR", "colors")):
         (event,) = found.Tensors(f"validation/worst_{part}")
         written = tensor_util.make_ndarray(event.tensor_proto)
-        assert np.array_equal(written, pair[name].numpy()), name
+        # answers to a batch of another size differ by the rounding of single precision
+        off = np.abs(written.astype(float) - pair[name].numpy())
+        assert off.max() <= {"vertices": 1e-4, "faces": 0, "colors": 2}[name], name
     kinds = found.summary_metadata["validation/worst_VERTEX"].plugin_data
     assert kinds.plugin_name == "mesh"
 

@@ -11,7 +11,7 @@ from dpl.fem.symmetry import products
 from dpl.models.coordinates import evened, left_over, root_mean_square
 from dpl.models.moduli import Rests
 from dpl.models.orbits import turned_back
-from dpl.models.pod import PODNet, Reading
+from dpl.models.pod import PODNet, Reading, padded
 from dpl.scene import Sample, Scene
 
 SAME = 1e-4  # eigenvalues closer than this, relatively, belong to one family
@@ -192,6 +192,10 @@ class Latent(PODNet):
         # its coordinates in the order of what they have of the rests
         rests = parts[1] @ basis
         basis = basis @ torch.linalg.eigh(rests.T @ rests)[1].flip(1)
+        motions = self._motions(basis, self.moving)
+        self._scale(linear @ basis, (displacement - linear) @ basis, weight, motions)
+        self._turn(motions, motions)
+        basis = padded(basis, len(self.modes))
         self._set_modes(basis)
         members = range(self.rests.count)
         read = [self._read(self._reach(basis.T, k)) for k in members]
@@ -200,9 +204,6 @@ class Latent(PODNet):
         probed = [self._fields(self._reach(fields, k).T, self.acting) for k in members]
         images = self.inlet.seen(torch.cat(probed).to(self.probers.device)) * self.inlet.share
         self.probers.copy_(images.flatten(0, 1).T)
-        motions = self._motions(basis, self.moving)
-        self._scale(linear @ basis, (displacement - linear) @ basis, weight, motions)
-        self._turn(motions, motions)
         self.prepared.fill_(True)
 
     def _reach(self, fields: Tensor, k: int) -> Tensor:
@@ -225,15 +226,15 @@ class Latent(PODNet):
         values, axes = (
             found.flip(-1) for found in torch.linalg.eigh(spread(weight[:, None] * read))
         )
-        count = self.scaled.shape[1]
+        count = min(self.scaled.shape[1], len(values))
         gaps = -values.diff()
         while 0 < count < len(values) and gaps[count - 1] < SAME * values[count - 1]:
             count -= 1  # a family is kept whole or not at all
-        axes = nn.functional.pad(axes[:, :count], (0, self.scaled.shape[1] - count))
+        axes = padded(axes[:, :count], self.scaled.shape[1])
         size = ((axes.T @ spread(read)) * axes.T).sum(dim=1).clamp(min=0).sqrt()
-        self.scaled.copy_(axes / evened(size))
+        self.scaled.zero_()[: len(axes)] = (axes / evened(size)).to(self.scaled)
         size = root_mean_square(targets)
-        self.spread.copy_((size * size.max()).sqrt())
+        self.spread.zero_()[: len(size)] = (size * size.max()).sqrt().to(self.spread)
 
     def _split(self, samples: Sample) -> tuple[Tensor, Tensor, Tensor]:
         """See `PODNet._split`; of the linear answer the basis has its part, unless it is exact."""

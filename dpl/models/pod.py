@@ -30,6 +30,11 @@ DEEPEST = 1000  # residual blocks
 STATES = 256  # samples at which cells are chosen for corrections
 
 
+def padded(basis: Tensor, rank: int) -> Tensor:
+    """Return a basis (n, r) with columns of zeros behind, (n, rank)."""
+    return nn.functional.pad(basis, (0, rank - basis.shape[1]))
+
+
 class Block(nn.Module):
     """x + B gelu(A x): a residual block."""
 
@@ -234,6 +239,8 @@ class PODNet(BetweenCoordinates):
         weight = weight * (displacement.norm(dim=1) > 0)
         basis = self._modes(weight[:, None] * displacement, self.moving, len(self.modes))
         loads = self._modes(weight[:, None] * force, self.acting, self.readers.shape[1])
+        basis = padded(basis, len(self.modes))
+        loads = padded(loads, self.readers.shape[1])
         self._set_modes(basis)
         self.readers.copy_(self._read(loads).T)
         motions = self._motions(loads, self.acting)
@@ -301,18 +308,19 @@ class PODNet(BetweenCoordinates):
 
     def _turn(self, loads: Tensor, basis: Tensor) -> None:
         """Set what symmetries do to inputs and outputs, from what they do to coordinates."""
-        scaled = self.scaled.cpu().double()
+        scaled = self.scaled[: loads.shape[1]].cpu().double()
         count = scaled.shape[1]
         self.turns.copy_(torch.eye(self.turns.shape[1]).expand_as(self.turns))
         self.turns[:, :count, :count] = (torch.linalg.pinv(scaled) @ loads @ scaled).to(self.turns)
-        self.returns.copy_(basis.mT)
+        rank = basis.shape[1]
+        self.returns.zero_()[:, :rank, :rank] = basis.mT.to(self.returns)
 
     def _columns(self, samples: Sample) -> tuple[Tensor, Tensor]:
         """Return forces on the inputs (S, inputs) and displacements (S, outputs)."""
         return samples.force[:, self.acting.cpu()], samples.displacement[:, self.moving.cpu()]
 
     def _modes(self, snapshots: Tensor, where: Tensor, rank: int) -> Tensor:
-        """Return POD modes (n, rank), zero beyond the rank of the snapshots (S, n).
+        """Return POD modes (n, r) of snapshots (S, n), r at most `rank` and their number.
 
         Images of the snapshots under the symmetries count as snapshots.
         """
@@ -323,8 +331,7 @@ class PODNet(BetweenCoordinates):
         every = torch.cat([self._image(some, where, k) for k in range(members)])
         found = self._invariant(pod(every, min(rank, *every.shape)).vectors.double(), where)
         seen = every @ found.to(every.dtype)
-        found = found @ torch.linalg.eigh((seen.T @ seen).double())[1].flip(1)  # largest first
-        return nn.functional.pad(found, (0, rank - found.shape[1]))
+        return found @ torch.linalg.eigh((seen.T @ seen).double())[1].flip(1)  # largest first
 
     def _invariant(self, modes: Tensor, where: Tensor) -> Tensor:
         """Return a basis (n, r) of what symmetries map onto itself of the span of modes (n, rank).
