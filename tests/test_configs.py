@@ -101,6 +101,7 @@ def test_laws_share_young_and_poisson_at_rest(material):
 def test_an_experiment_composes_and_passes_the_check(compose, name):
     cfg = compose(f"experiment={name}", "folder=.", command="train")
     run.check(cfg)
+    assert_holds(cfg, "experiment", name)
 
 
 @pytest.mark.parametrize("experiment", [None, "beam_svk"])
@@ -130,7 +131,18 @@ def test_a_sweep_composes_passes_the_check_and_searches_among_what_there_is(
     ("group", "name"), [(group, name) for group in GROUPS for name in options(group)]
 )
 def test_every_option_composes_and_passes_the_check(compose, overrides, group, name):
-    run.check(compose(*overrides(group, name), "folder=.", command="train"))
+    cfg = compose(*overrides(group, name), "folder=.", command="train")
+    run.check(cfg)
+    assert_holds(cfg, group, name)
+
+
+def assert_holds(cfg, group, name):
+    """The values of an option's file are those of the configuration."""
+    path = CONF / group / f"{name}.yaml"
+    option = OmegaConf.load(path)
+    option.pop("defaults", None)
+    whole = path.read_text().startswith("# @package _global_")
+    assert OmegaConf.merge(cfg, option if whole else {group: option}) == cfg
 
 
 @pytest.mark.parametrize("command", ["generate", "train"])

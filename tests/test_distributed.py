@@ -186,13 +186,19 @@ def test_processes_that_run_the_command_again_are_refused_in_a_sweep(sweeping, s
 )
 def test_what_does_not_run_the_command_again_is_not_refused_in_a_sweep(sweeping, options):
     sweeping()
-    entry.check_trainer(trainer(**options), SCHEDULED)
+    assert entry.check_trainer(trainer(**options), SCHEDULED) is None
+    with pytest.raises(ConfigError):
+        entry.check_trainer(trainer(**{**options, "devices": 2, "strategy": "ddp"}), SCHEDULED)
 
 
 def test_without_a_sweep_nothing_is_refused(sweeping):
-    entry.check_trainer(trainer(devices=2, strategy="ddp"), SCHEDULED)
+    two = trainer(devices=2, strategy="ddp")
+    assert entry.check_trainer(two, SCHEDULED) is None
     sweeping(RunMode.RUN)
-    entry.check_trainer(trainer(devices=2, strategy="ddp"), SCHEDULED)
+    assert entry.check_trainer(two, SCHEDULED) is None
+    sweeping()
+    with pytest.raises(ConfigError):
+        entry.check_trainer(two, SCHEDULED)
 
 
 class Outside(LightningEnvironment):
@@ -203,4 +209,5 @@ class Outside(LightningEnvironment):
 
 def test_the_remedies_that_the_refusal_names_are_not_refused(sweeping):
     sweeping()
-    entry.check_trainer(trainer(devices=2, strategy="ddp", plugins=[Outside()]), SCHEDULED)
+    outside = trainer(devices=2, strategy="ddp", plugins=[Outside()])
+    assert entry.check_trainer(outside, SCHEDULED) is None

@@ -250,9 +250,12 @@ def test_the_quick_start_works_on_a_trained_run(blocks, script, tiny_training, t
 
 
 def test_python_and_yaml_that_are_shown_can_be_read():
+    seen = set()
     for path in DOCS.glob("*.md"):
         for kind, _, text in BLOCK.findall(path.read_text(encoding="utf-8")):
-            ast.parse(text) if kind == "python" else yaml.safe_load(text)
+            seen.add(kind)
+            assert ast.parse(text).body if kind == "python" else yaml.safe_load(text), path
+    assert seen == {"python", "yaml"}
 
 
 def test_the_site_is_made_without_a_warning_and_asks_no_other_host_for_anything(tmp_path):

@@ -88,13 +88,20 @@ def test_a_figure_has_a_row_a_prediction_and_a_column_a_load(make_scene, cell):
 
 def test_an_exact_prediction_can_be_drawn(scene, batch):
     truth = batch.displacement[:1]
-    deformed(scene.problem, truth, [("network", truth)]).canvas.draw()
+    figure = deformed(scene.problem, truth, [("network", truth)])
+    figure.canvas.draw()
+    colours = np.asarray(figure.axes[0].collections[0].get_facecolor())
+    assert not np.ptp(colours, axis=0).any(), "no place is brighter than another"
 
 
 def test_a_prediction_that_is_no_number_can_be_drawn(scene, batch):
     truth = batch.displacement[:1]
     broken = torch.full_like(truth, torch.nan)
-    deformed(scene.problem, truth, [("network", broken), ("linear", truth)]).canvas.draw()
+    figure = deformed(scene.problem, truth, [("network", broken), ("linear", truth)])
+    figure.canvas.draw()
+    colours = [np.asarray(ax.collections[0].get_facecolor()) for ax in figure.axes[:2]]
+    assert not colours[0][:, 3].any(), "of no colour"
+    assert colours[1][:, 3].all()
 
 
 def test_a_wrong_place_is_brighter(make_scene):
@@ -174,7 +181,12 @@ def test_errors_are_drawn_against_the_size_of_the_answer_and_sorted():
 
 @pytest.mark.parametrize("value", [0.0, torch.nan])
 def test_errors_that_are_all_zero_or_no_number_can_be_drawn(value):
-    spread(torch.full((3,), value), torch.zeros(3), [0]).canvas.draw()
+    figure = spread(torch.full((3,), value), torch.zeros(3), [0])
+    figure.canvas.draw()
+    missing = 3 if np.isnan(value) else 0
+    assert ("3 without a finite error" in figure.get_suptitle()) == bool(missing)
+    (points,) = figure.axes[0].collections
+    assert len(points.get_offsets()) == 3 - missing
 
 
 @pytest.mark.parametrize("dim", [2, 3])

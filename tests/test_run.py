@@ -202,7 +202,10 @@ def test_what_cannot_train_is_refused_by_its_key(compose, override, scene, tmp_p
     ["young=1", "young=[1e9,2e11]", "mesh.size=[1,1,2]", "model.width=null", "+solver.max_iter=9"],
 )
 def test_what_works_is_not_refused(compose, override):
-    run.check(compose("folder=.", override, command="train"))
+    cfg = compose("folder=.", override, command="train")
+    before = OmegaConf.to_yaml(cfg)
+    run.check(cfg)
+    assert OmegaConf.to_yaml(cfg) == before, "a check changes nothing"
 
 
 @pytest.mark.parametrize(
@@ -258,13 +261,12 @@ def test_no_configuration_may_leave_the_body_loose(compose, tiny):
 
 
 def test_checking_calls_nothing(compose, monkeypatch):
-    def forbidden(path):
-        raise AssertionError("called")
-
-    monkeypatch.setattr("dpl.fem.mesh.load", forbidden)
+    called = []
+    monkeypatch.setattr("dpl.fem.mesh.load", lambda path: called.append(path))
     cfg = compose("mesh=file", "mesh.path=part.msh")
     cfg.mesh._target_ = "dpl.fem.mesh.load"
     run.check(cfg)
+    assert called == []
 
 
 def test_a_range_of_moduli_reaches_the_loads(scene_of, tiny):
@@ -535,11 +537,13 @@ def test_a_run_calls_only_what_a_run_is_made_of(copied, call):
         run.load_run(copied)
 
 
-def test_nothing_of_the_trainer_of_a_run_is_called(copied):
-    cfg = OmegaConf.load(copied / "config.yaml")
+def test_nothing_of_the_trainer_of_a_run_is_called(copied, monkeypatch):
+    cfg, called = OmegaConf.load(copied / "config.yaml"), []
     cfg.trainer.callbacks = [{"_target_": "pathlib.Path.touch"}]
     (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    monkeypatch.setattr("pathlib.Path.touch", lambda *given, **_: called.append(given))
     run.load_run(copied)
+    assert called == []
 
 
 @pytest.mark.parametrize(
@@ -567,10 +571,13 @@ def test_a_run_cannot_reach_out_of_the_package_through_it(copied, name):
 def test_all_that_a_run_of_conf_calls_is_trusted(copied):
     """What is new in conf/ must be put where it may be read back, or a run of it could not be."""
     parts = ("mesh", "material", "clamped", "loads", "data", "model", "loss", "optimizer")
+    seen = set()
     for path in (path for part in parts for path in (ROOT / "conf" / part).glob("*.yaml")):
         for _, node in schema.walk(OmegaConf.to_container(OmegaConf.load(path))):
             if isinstance(node, dict) and "_target_" in node:
-                schema._target("here", node["_target_"], trust=False)
+                assert callable(schema._target("here", node["_target_"], trust=False)), path
+                seen.add(path.parent.name)
+    assert seen >= set(parts), "each part is made by a call"
 
 
 BOMB = "\n".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in pairwise("abcdefgh"))
@@ -655,7 +662,12 @@ def resumed(compose, tiny_training, trained):
     ["trainer.max_epochs=9", "data.workers=1", "data.folder=elsewhere", "trainer.devices=2"],
 )
 def test_a_run_may_be_resumed_for_longer_and_elsewhere(resumed, override):
-    run.check_resumed(resumed(override))
+    cfg, key = resumed(override), override.partition("=")[0]
+    before = OmegaConf.load(f"{cfg.folder}/config.yaml")
+    assert OmegaConf.select(before, key) != OmegaConf.select(cfg, key)
+    assert run.check_resumed(cfg) is None
+    with pytest.raises(ConfigError, match=r"model\.width"):
+        run.check_resumed(resumed(override, "model.width=17"))
 
 
 @pytest.mark.parametrize(

@@ -163,12 +163,15 @@ def test_the_plan_counts_what_is_there(offline, scene, folder, tmp_path):
     assert not (tmp_path / "new").exists(), "a plan computes nothing and writes nothing"
 
 
-def test_preparing_twice_solves_nothing(offline, monkeypatch):
-    def forbidden(*_, **__):
-        raise AssertionError("solved again")
+def test_preparing_twice_solves_nothing(offline, folder, monkeypatch):
+    def written():
+        return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
-    monkeypatch.setattr("dpl.data.crew.outcome", forbidden)
-    offline().prepare_data()
+    module, before, solved = offline(), written(), []
+    monkeypatch.setattr("dpl.data.crew.outcome", lambda *_, **__: solved.append(1))
+    module.prepare_data()
+    assert solved == []
+    assert written() == before != {}
 
 
 @pytest.mark.parametrize(

@@ -712,6 +712,7 @@ def test_a_closed_stream_can_be_closed_again(replay):
     next(iter(stream))
     stream.close()
     stream.close()
+    assert len(set(places(next(iter(stream))))) == 8, "it begins again when it is asked"
 
 
 # ------------------------------------------------------------------ nobody outlives the parent

@@ -465,7 +465,8 @@ def test_a_layer_of_slivers_is_no_flaw(cell, thin, at):
     mesh = box([100.0, 25.0, 25.0], [9, 3, 3], cell)
     p = mesh.p.copy()
     p[0, p[0] == at] = 37.5 + 12.5 * thin if at == 50.0 else 100 - 12.5 * thin
-    check(type(mesh)(p, mesh.t))
+    thinned = type(mesh)(p, mesh.t)
+    assert check(thinned) is thinned
 
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
@@ -473,7 +474,8 @@ def test_shaken_thin_and_distant_meshes_are_sound(cell, grid):
     mesh = grid(cell, 4, shaken=0.15)
     flat = np.where(np.arange(mesh.dim()) == mesh.dim() - 1, 1e-3, 1.0)[:, None]
     for p in (mesh.p, mesh.p + 1e4, mesh.p * 1e-6, mesh.p * 1e6, mesh.p * flat, -mesh.p):
-        check(type(mesh)(p, mesh.t))
+        moved = type(mesh)(p, mesh.t)
+        assert check(moved) is moved
 
 
 @pytest.mark.parametrize("seed", range(20))

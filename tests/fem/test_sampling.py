@@ -230,7 +230,8 @@ def test_no_point_is_drawn_with_a_warning(drawn):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for index in (0, 1, 2, 3, 1000, 12_345):
-            drawn((0, 0), index, 9)
+            point = drawn((0, 0), index, 9)
+            assert ((point > 0) & (point < 1)).all()
 
 
 def test_points_far_out_in_the_stream_are_there(drawn):
