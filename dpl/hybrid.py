@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dpl.fem.accelerated import Accelerated
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, in_step, judge
+from dpl.fem.solution import Load, Solution, check_tol, in_step, judge
 from dpl.scene import Scene
 
 Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]
@@ -42,12 +42,20 @@ class Direct:
     Attributes:
         predict: From a load to displacements over L.
         problem: The body.
-        tol: Residual ratio below which the answer counts as converged [-].
+        tol: Residual ratio below which the answer counts as converged [-]; at least 1e-15, below 1.
     """
 
     predict: Predict
     problem: Problem
     tol: float = 1e-8
+
+    def __post_init__(self) -> None:
+        """Check the tolerance.
+
+        Raises:
+            ValueError: It is out of range.
+        """
+        check_tol(self.tol)
 
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield the prediction."""
@@ -132,7 +140,7 @@ class Hybrid:
 
     def _by_corrections(self, load: Load, guess: Tensor) -> Iterator[Solution]:
         """Yield the states under one load."""
-        if self.steps is None or not load.force.any():
+        if self.steps is None or not self.newton.problem.acting(load.force).any():
             yield from self._corrected(load, guess)
             return
         least = None

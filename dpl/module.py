@@ -99,7 +99,7 @@ class Surrogate(L.LightningModule):
 
     def entering(self, load: Load) -> tuple[Tensor, dict[str, Tensor]]:
         """Return what the network takes of loads: scaled forces (B, N, D), and more by name."""
-        scaled = (load.force / self.force_scale).to(self.dtype)
+        scaled = (self._felt(load.force) / self.force_scale).to(self.dtype)
         if load.poisson.shape[-1] != self._own:
             raise ValueError(
                 "poisson: the law has a range of them, and the load does not say which"
@@ -107,6 +107,17 @@ class Surrogate(L.LightningModule):
                 else "poisson: the law has one for all loads, and this load brings its own"
             )
         return scaled, {name: getattr(load, name) for name in getattr(self.net, "takes", ())}
+
+    def _felt(self, force: Tensor) -> Tensor:
+        """Return forces (B, N, D) that are on held degrees of freedom as they were in training.
+
+        Those have no effect on the body, so a network must not answer to them.
+        """
+        problem, always = self.physics.problem, self.scene.loads.always
+        force = problem.acting(force)
+        if always is None:
+            return force
+        return force + torch.where(problem.free, 0.0, always.to(force.device))
 
     def leaving(self, answer: Tensor) -> Tensor:
         """Return displacements over L, float64, of the network's answers, (B, N, D)."""

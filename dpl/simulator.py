@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
+from numbers import Real
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -13,7 +14,8 @@ from torch import Tensor
 
 from dpl.fem.dofs import gather
 from dpl.fem.newton import Newton
-from dpl.fem.solution import Load, Solution, Status, joined, judge, one_thread
+from dpl.fem.problem import FAINT
+from dpl.fem.solution import Load, Solution, Status, check_tol, joined, judge, one_thread
 from dpl.hybrid import best
 from dpl.models.pod import PODNet
 from dpl.module import Surrogate
@@ -31,10 +33,10 @@ class Answer:
 
     Attributes:
         displacement: (N, D) [m]; of the kind that the force was, NumPy or torch.
-        residual: ||R_free|| / ||f||, evaluated at the displacement [-].
+        residual: ||R_free|| / ||f||, evaluated at the displacement [-], see `Problem.imbalance`.
         volume_ratio: min det F there [-]; at 0 or below an element is inverted.
         converged: Whether the residual is below the tolerance that was asked for (without one, the
-            scene's) and nothing is inverted.
+            scene's) and nothing is inverted. False too where rounding does not allow it.
         negative_pivots: Negative eigenvalues of the tangent there; -1: not examined.
         amplitude: Largest modal load over the largest of the training [-], see `ModalLoads.place`.
         strange: Part of the force that is not made of the training's modes [-].
@@ -124,24 +126,29 @@ class Simulator:
 
         Args:
             force: (N, D) or, several, (B, N, D) [N] (2D: [N/m]); what acts on held degrees of
-                freedom does nothing.
+                freedom does nothing. Integers and floating-point numbers of any width are taken,
+                in NumPy arrays, nested lists or dense tensors on any device; the answer has no
+                gradient with respect to them.
             young: E, one number or (B,) [Pa]; may be left out where the scene has one.
             poisson: Poisson's ratios, alike [-]; only where the law has a range of them.
-            tol: Residual ratio that the answer is to keep [-].
+            tol: Residual ratio that the answer is to keep [-], at least 1e-15 and below 1.
             budget_ms: Wall time that each load may take [ms]: no iteration is begun that would,
                 by those before, go beyond it.
             warm: Start from the last answer where that is nearer than the network's.
             stability: Factorise the tangent at the answer, which tells whether it is stable.
 
         Raises:
-            ValueError: Something has another shape, is not finite or out of range.
+            ValueError: Something has another shape, holds no real numbers (booleans, text, complex
+                and masked entries are none), is not finite or out of range.
         """
         begin = time.perf_counter()
-        given = force if isinstance(force, Tensor) else torch.from_numpy(np.asarray(force, float))
+        given = _numbers("force", force)
         load = self._load(given, young, poisson)
-        for name, number in (("tol", tol), ("budget_ms", budget_ms)):
-            if number is not None and not 0 < number < math.inf:
-                raise ValueError(f"{name} = {number} must be a number above 0")
+        tol, budget_ms = _number("tol", tol), _number("budget_ms", budget_ms)
+        wanted = self.scene.solver.tol if tol is None else tol
+        check_tol(wanted)
+        if budget_ms is not None and not 0 < budget_ms < math.inf:
+            raise ValueError(f"budget_ms = {budget_ms} must be a number above 0")
         count = len(load.force)
         with one_thread(), torch.inference_mode():
             predictions = self.surrogate.predict(load)
@@ -157,16 +164,21 @@ class Simulator:
                 found.append((tier, state, 1e3 * (time.perf_counter() - ask.begin)))
         tiers, states, times = zip(*found, strict=True)
         state = joined(states)
+        kept = state.converged & (state.residual < wanted)
         outside = (amplitude > 1 + SLACK) | (strange > STRANGE) | self._elsewhere(load)
         words = [
-            "no load: at rest" if tier == "rest" else _verdict(one, float(a), float(s), bool(out))
-            for tier, one, a, s, out in zip(tiers, states, amplitude, strange, outside, strict=True)
+            "no load: at rest"
+            if tier == "rest"
+            else _verdict(one, bool(ok), float(a), float(s), bool(out))
+            for tier, one, ok, a, s, out in zip(
+                *(tiers, states, kept, amplitude, strange, outside), strict=True
+            )
         ]
         answer = {
             "displacement": self.scene.length * state.displacement,
             "residual": state.residual,
             "volume_ratio": state.volume_ratio,
-            "converged": state.converged,
+            "converged": kept,
             "negative_pivots": state.negative_pivots,
             "amplitude": amplitude,
             "strange": strange,
@@ -184,9 +196,10 @@ class Simulator:
         if force.shape[-2:] != shape or force.ndim not in (2, 3) or not force.numel():
             words = f"({shape[0]}, {shape[1]}) or (B, {shape[0]}, {shape[1]})"
             raise ValueError(f"force: its shape is {tuple(force.shape)} and must be {words}")
-        force = force.detach().reshape(-1, *shape).double().cpu()
+        force = force.reshape(-1, *shape)
         if not force.isfinite().all():
             raise ValueError("force: a number is not finite")
+        force = scene.problem.acting(force)
         low, high = scene.loads.young_range
         if young is None and low < high:
             raise ValueError(f"young: the scene has a range, {low:g} to {high:g} Pa; say which")
@@ -202,7 +215,16 @@ class Simulator:
         ratios = None if poisson is None else _column("poisson", poisson, len(force))
         if ratios is not None and not ((ratios > -1) & (ratios < 0.5)).all():
             raise ValueError("poisson: a ratio is not between -1 and 0.5")
-        return scene.load_of(force, moduli, ratios)
+        load = scene.load_of(force, moduli, ratios)
+        sizes = load.force.abs().amax(dim=(1, 2))
+        lost = (sizes < FAINT) & force.any(dim=2).any(dim=1)
+        if bool(lost.any()) or not sizes.isfinite().all():
+            unit = "E L^2" if shape[1] == 3 else "E L"
+            raise ValueError(
+                f"force: its largest entry over {unit} must be 0, or a number from {FAINT:g} that "
+                "float64 holds; check the units of force and young"
+            )
+        return load
 
     def _elsewhere(self, load: Load) -> Tensor:
         """Return for which loads a modulus that the network takes lies outside its range, (B,)."""
@@ -227,7 +249,7 @@ class Simulator:
         for tier, last in self._tiers(load, prediction, amplitude, tol, ask):
             if found is None or _rank(last) <= _rank(found[1]):
                 found = tier, last
-            if last.converged or ask.over(self._pace):
+            if last.converged or ask.over(self._pace):  # a residual that rounding ends, too
                 break
         assert found is not None
         tier, state = found
@@ -315,15 +337,17 @@ def _rank(state: Solution) -> tuple[bool, bool, float]:
     return not bool(state.converged), not upright, residual if residual == residual else math.inf
 
 
-def _verdict(state: Solution, amplitude: float, strange: float, outside: bool) -> str:
-    """Return what one answer is worth, in words."""
+def _verdict(state: Solution, kept: bool, amplitude: float, strange: float, outside: bool) -> str:
+    """Return what one answer is worth, in words; `kept`: whether it keeps the tolerance."""
     residual = float(state.residual)
-    if not float(state.volume_ratio) > 0:
-        words = "NOT VALID: an element is inverted"
-    elif not bool(state.converged):
-        words = f"an estimate, out of balance by {residual:.1e} of the load"
-    else:
+    if kept:
         words = f"in balance to {residual:.1e} of the load, nothing inverted"
+    elif not float(state.volume_ratio) > 0:
+        words = "NOT VALID: an element is inverted"
+    else:
+        words = f"an estimate, out of balance by {residual:.1e} of the load"
+        words += ", the least that rounding allows" if state.converged else ""
+    if bool(state.converged):
         pivots = int(state.negative_pivots)
         if pivots > 0:
             words += f", UNSTABLE ({pivots} negative eigenvalues)"
@@ -340,9 +364,56 @@ def _verdict(state: Solution, amplitude: float, strange: float, outside: bool) -
     return words + "; a modulus lies outside the training's range"
 
 
+def _numbers(name: str, value: Any) -> Tensor:
+    """Return what was given as a tensor in float64 on the processor, a copy.
+
+    Raises:
+        ValueError: It holds something else than real numbers.
+    """
+    refused = f"{name} must be real numbers"
+    if isinstance(value, Tensor):
+        if value.layout != torch.strided or value.is_meta or value.is_quantized:
+            raise ValueError(f"{refused}; this tensor has no dense values")
+        if value.is_complex() or value.dtype == torch.bool:
+            raise ValueError(f"{refused}, not {value.dtype}")
+        return value.detach().to("cpu", torch.float64, copy=True)
+    try:
+        array = np.asarray(value)
+        real = array.dtype.kind in "iuf" or (
+            array.dtype.kind == "O" and all(map(_real, array.flat))
+        )
+        numbers = np.array(array, np.float64, order="C", subok=False) if real else None
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        told = str(error).partition("\n")[0]
+        raise ValueError(f"{refused}; {told}") from error
+    if numbers is None:
+        raise ValueError(f"{refused}, not {array.dtype}")
+    if np.ma.is_masked(value):
+        raise ValueError(f"{refused}; masked entries have no value, fill them")
+    return torch.from_numpy(numbers)
+
+
+def _real(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _number(name: str, value: Any) -> float | None:
+    """Return one number that was given, None for None.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    if value is None:
+        return None
+    number = _numbers(name, value)
+    if number.ndim:
+        raise ValueError(f"{name} must be one number; its shape is {tuple(number.shape)}")
+    return float(number)
+
+
 def _column(name: str, value: Any, count: int) -> Tensor:
     """Return one number, or one for each load, as (B,)."""
-    column = torch.as_tensor(np.asarray(value, dtype=np.float64))
+    column = _numbers(name, value)
     if column.numel() not in (1, count) or column.ndim > 1:
         raise ValueError(f"{name}: {column.numel()} numbers for {count} loads")
     if not column.isfinite().all():

@@ -1,6 +1,9 @@
 """Laws of the simulator: its answers keep what was asked or say that they do not, in SI units."""
 
 import math
+import warnings
+from fractions import Fraction
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +14,9 @@ from dpl import run
 from dpl.fem.solution import Status, solve
 from dpl.hybrid import Hybrid
 from dpl.losses import MSE
+from dpl.models.cnn import CNN
 from dpl.models.fcnn import FCNN
+from dpl.models.gnn import GNN
 from dpl.module import Surrogate
 from dpl.simulator import Simulator, nearest
 
@@ -55,8 +60,9 @@ def test_a_tolerance_is_kept_and_the_answer_is_newtons(scene, forces, truth):
         problem = scene.problem
         u = answer.displacement / scene.length
         ours = problem.residual_ratio(u, forces / (E * scene.force_unit))
-        # u is rounded in metres, and stiffness magnifies that: about 1e-14 of the load
-        assert torch.allclose(ours, answer.residual, rtol=1e-6, atol=1e-12)
+        dimensionless = forces / (E * scene.force_unit)
+        off = (ours - answer.residual).abs() * dimensionless.flatten(1).norm(dim=1)
+        assert (off <= problem.rounding(u)).all()  # metres and back round u
     assert torch.allclose(answer.displacement, truth, rtol=0, atol=1e-6 * scene.length)
 
 
@@ -247,6 +253,243 @@ def test_the_nearest_guess_is_the_one_with_the_smallest_correction(scene, loads)
     assert min(residuals) > 0
 
 
+def test_forces_on_held_nodes_change_nothing(scene, forces):
+    """Programs export reactions with the loads; 1e10 N on a clamp are nothing either."""
+    held = ~scene.problem.free
+    reactions = (
+        scene.problem.internal_force(
+            solve(
+                scene.solver, scene.load_of(forces, torch.full((4,), E, dtype=torch.float64))
+            ).displacement
+        )
+        * E
+        * scene.force_unit
+    )
+    seen = []
+
+    def predict(load):
+        seen.append(load.force)
+        return 0.5 * solve(scene.solver, load).displacement
+
+    sim = simulator_of(scene, predict)
+    for tol in (None, 1e-6):
+        plain = sim(forces, tol=tol)
+        for extra in (-reactions, torch.tensor(1e10, dtype=torch.float64)):
+            loaded = sim(torch.where(held, extra, forces), tol=tol)
+            assert torch.equal(loaded.displacement, plain.displacement)
+            assert torch.equal(loaded.residual, plain.residual)
+            assert torch.equal(loaded.amplitude, plain.amplitude)
+            assert torch.equal(loaded.strange, plain.strange)
+            assert loaded.verdict == plain.verdict
+            assert loaded.tier == plain.tier
+    assert not any(force[:, held].any() for force in seen)
+    only = sim(1e10 * held.double(), tol=1e-6)
+    assert (only.tier, only.amplitude, only.strange) == ("rest", 0.0, 0.0)
+    assert not only.displacement.any()
+
+
+def test_a_wrong_answer_is_not_in_balance_because_of_forces_on_held_nodes(scene, forces, truth):
+    """3 % off, with 1e10 N on the clamp: in balance to 4e-7 of all that was given."""
+    off = lambda load: 1.03 * truth[:1] / scene.length  # noqa: E731
+    force = torch.where(scene.problem.free, forces[0], 1e10)
+    answer = simulator_of(scene, off)(force, tol=1e-6)
+    assert answer.converged
+    assert answer.tier != "network"
+    assert torch.allclose(answer.displacement, truth[0], rtol=0, atol=1e-5 * scene.length)
+    alone = simulator_of(scene, off)(force)
+    assert not alone.converged
+    assert alone.residual > 1e-2
+
+
+@pytest.mark.parametrize("network", ["fcnn", "gnn", "cnn"])
+def test_a_network_is_not_told_of_forces_on_held_nodes(make_scene, network):
+    """With weight on all nodes in training it hears of that and of nothing else."""
+    weight = torch.full((45, 3), -1e-5, dtype=torch.float64)
+    for scene in (make_scene(), make_scene(always=weight)):
+        nets = {"fcnn": partial(FCNN, width=4), "gnn": partial(GNN, width=4), "cnn": CNN}
+        torch.manual_seed(0)
+        surrogate = Surrogate(nets[network](scene), MSE(), scene).eval()
+        load = scene.loads.sample((0, 9), [0])
+        held = load._replace(force=torch.where(scene.problem.free, load.force, 7.0))
+        with torch.no_grad():
+            assert torch.equal(surrogate.predict(held), surrogate.predict(load))
+            scaled, _ = surrogate.entering(load)
+        assert torch.equal(scaled, (load.force / surrogate.force_scale).float())
+
+
+@pytest.mark.parametrize("size", [1e-100, 1e-158, 1e-200, 1e-280])
+@pytest.mark.parametrize("tol", [1e-6, 1e-12])
+def test_tiny_forces_are_answered_as_small_ones_are(scene, forces, size, tol):
+    """Their squares are 0 in float64, and so was once ||R|| / ||f||."""
+    linear = scene.length * scene.linear.respond(forces[0] / (E * scene.force_unit))
+    zero = simulator_of(scene, lambda load: 0 * load.force)
+    answer = zero(size * forces[0], tol=tol)
+    assert answer.converged
+    assert torch.allclose(answer.displacement / size, linear, rtol=1e-9, atol=0)
+    assert answer.residual > 0
+    assert not zero(size * forces[0]).converged
+    stiff = zero(forces[0], young=E / size, tol=tol)
+    assert stiff.converged
+    assert torch.allclose(stiff.displacement / size, linear, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("size", [1e100, 1e158, 1e200, 1e290])
+def test_huge_forces_are_never_in_balance(scene, forces, size):
+    for tol in (None, 1e-6):
+        answer = simulator_of(scene, lambda load: 0 * load.force)(size * forces[0], tol=tol)
+        assert not answer.converged
+        assert answer.residual == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("size", "young"),
+    [(1e-300, E), (5e-324, E), (1.0, 1e300), (1.0, 1e308), (1e300, 1e-300), (1.0, 5e-324)],
+)
+def test_forces_that_float64_cannot_hold_over_the_modulus_are_refused(scene, size, young):
+    force = size * scene.problem.free.double()
+    with pytest.raises(ValueError, match="force: its largest entry over E L\\^2 must be 0"):
+        simulator_of(scene)(force, young=young, tol=1e-6)
+    assert simulator_of(scene)(0 * force, young=young).tier == "rest"
+
+
+def test_a_tolerance_that_rounding_does_not_allow_is_said_not_to_be_kept(scene, forces, truth):
+    with pytest.warns(UserWarning, match="rounding allows no less"):
+        answer = simulator_of(scene)(forces[0], tol=1e-15, stability=True)
+    assert not answer.converged
+    assert 1e-15 <= answer.residual < 1e-11
+    assert "the least that rounding allows, stable" in answer.verdict
+    assert answer.verdict.startswith("an estimate, out of balance by")
+    assert torch.allclose(answer.displacement, truth[0], rtol=0, atol=1e-6 * scene.length)
+
+
+REALS = {
+    "float32": lambda f: f.astype(np.float32),
+    "long double": lambda f: f.astype(np.longdouble),
+    "big endian": lambda f: f.astype(">f8"),
+    "nested lists": lambda f: f.tolist(),
+    "objects": lambda f: f.astype(object),
+    "negative strides": lambda f: f[::-1, ::-1].copy()[::-1, ::-1],
+    "columns first": np.asfortranarray,
+    "every other": lambda f: np.repeat(f, 2, axis=0)[::2],
+    "unmasked": lambda f: np.ma.masked_array(f),
+    "tensor": torch.from_numpy,
+    "list of tensors": lambda f: list(torch.from_numpy(f)),
+    "tensor with gradient": lambda f: torch.from_numpy(f).requires_grad_(),
+    "transposed tensor": lambda f: torch.from_numpy(f.T.copy()).T,
+    "half": lambda f: torch.from_numpy(f).half(),
+}
+
+
+@pytest.mark.parametrize("kind", REALS)
+def test_real_numbers_are_taken_however_they_are_held(scene, forces, kind):
+    sim, array = simulator_of(scene), forces[0].numpy()
+    given = REALS[kind](array)
+    read_only = array.copy()
+    read_only.flags.writeable = False
+    answer, plain = sim(given), sim(read_only)
+    assert isinstance(answer.displacement, torch.Tensor) == isinstance(given, torch.Tensor)
+    exact = "half" not in kind and kind != "float32"
+    found = np.asarray(answer.displacement)
+    close = {"rtol": 0, "atol": 0} if exact else {"rtol": 0, "atol": 1e-2 * scene.length}
+    np.testing.assert_allclose(found, plain.displacement, **close)
+    assert answer.residual == pytest.approx(plain.residual, rel=1e-12 if exact else 1e-1)
+
+
+def test_what_is_given_is_not_changed(scene, forces):
+    sim, array = simulator_of(scene), forces[0].numpy().copy()
+    before = array.copy()
+    held = torch.from_numpy(array)
+    sim(array, tol=1e-3)
+    sim(held, tol=1e-3)
+    assert np.array_equal(array, before)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        2 * E,
+        int(2 * E),
+        np.float32(2 * E),
+        [2 * E],
+        np.array(2 * E),
+        torch.tensor(2 * E),
+        Fraction(int(2 * E)),
+    ],
+    ids=repr,
+)
+def test_a_modulus_is_any_real_number(scene, forces, value):
+    sim = simulator_of(scene)
+    for k in (slice(0, 1), 0):
+        found, wanted = sim(forces[k], young=value), sim(forces[k] / 2)
+        assert torch.equal(found.displacement, wanted.displacement)
+
+
+@pytest.mark.parametrize("value", [1e-3, np.float32(1e-3), np.array(1e-3), torch.tensor(1e-3)])
+def test_a_tolerance_is_any_real_number(scene, forces, value):
+    answer = simulator_of(scene)(forces[0], tol=value, budget_ms=1e9 * value)
+    assert answer.converged
+    assert answer.residual < 1.001e-3
+
+
+ABSURD = {
+    "text": "1e-3",
+    "boolean": True,
+    "complex": 1e-3 + 1e-3j,
+    "date": np.datetime64("2020-01-01"),
+    "function": abs,
+    "number too large": 10**400,
+    "unequal rows": [[1.0, 2.0], [3.0]],
+    "empty": [],
+    "text in objects": np.array(["1e-3"], dtype=object),
+    "boolean in objects": np.array([True, 1e-3], dtype=object),
+    "nothing in objects": np.array([None, 1e-3], dtype=object),
+    "masked": np.ma.masked_array([1e-3], [True]),
+    "meta tensor": torch.empty(3, device="meta"),
+    "sparse tensor": torch.eye(3).to_sparse(),
+    "complex tensor": torch.ones(1, dtype=torch.complex128),
+    "boolean tensor": torch.ones(1, dtype=torch.bool),
+    "NaN": math.nan,
+    "infinite": math.inf,
+    "minus": -1.0,
+}
+
+
+@pytest.mark.parametrize("name", ["force", "young", "tol", "budget_ms"])
+@pytest.mark.parametrize("kind", ABSURD)
+def test_what_is_no_real_number_is_refused_in_a_line_that_names_it(scene, forces, name, kind):
+    asked = {"force": forces[0].numpy(), name: ABSURD[kind]}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ValueError, match=f"^{name}") as caught:
+            simulator_of(scene)(**asked)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("kind", ["complex", "bool", "text", "masked", "meta", "sparse", "gap"])
+def test_forces_of_the_right_shape_that_are_no_real_numbers_are_refused(scene, forces, kind):
+    array = forces[0].numpy()
+    given = {
+        "complex": array + 1j,
+        "bool": array > 0,
+        "text": array.astype(str),
+        "masked": np.ma.masked_array(array, array > 0),
+        "meta": forces[0].to("meta"),
+        "sparse": forces[0].to_sparse(),
+        "gap": [row[:-1] if k == 3 else row for k, row in enumerate(array.tolist())],
+    }[kind]
+    with pytest.raises(ValueError, match=r"^force must be real numbers") as caught:
+        simulator_of(scene)(given)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_force_that_is_not_finite_on_a_held_node_is_refused(scene, forces, bad):
+    force = torch.where(scene.problem.free, forces[0], bad)
+    with pytest.raises(ValueError, match="force: a number is not finite"):
+        simulator_of(scene)(force)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -255,6 +498,10 @@ def test_the_nearest_guess_is_the_one_with_the_smallest_correction(scene, loads)
         ({"force": None}, "force"),
         ({"tol": 0.0}, "tol = 0.0"),
         ({"tol": math.nan}, "tol = nan"),
+        ({"tol": 1.0}, "tol = 1.0 must be at least 1e-15 and below 1"),
+        ({"tol": 100}, "tol = 100.0 must be"),
+        ({"tol": 1e-20}, "tol = 1e-20 must be"),
+        ({"tol": [1e-3]}, "tol must be one number"),
         ({"budget_ms": -1.0}, "budget_ms = -1.0"),
         ({"young": 0.0}, "young: a modulus"),
         ({"young": [1.0, 2.0]}, "young: 2 numbers for 1 loads"),

@@ -67,7 +67,7 @@ def outcome(scene: Scene, job: Job, *, point: Tensor | None = None) -> Outcome:
         point=where,
         force=load.force[0].numpy(),
         displacement=solution.displacement[0].numpy(),
-        amplitude=float(load.force.norm()) / scene.loads.largest_force,
+        amplitude=_amplitude(scene, load),
         accepted=accepted,
         residual=float(solution.residual),
         volume_ratio=float(solution.volume_ratio),
@@ -82,10 +82,14 @@ def lost(scene: Scene, job: Job, reason: str, seconds: float = 0.0) -> Outcome:
     """Return a load that the machine, and not mechanics, has left without an answer."""
     load, where = _drawn(scene, job, None)
     force = load.force[0].numpy()
-    amplitude = float(load.force.norm()) / scene.loads.largest_force
     return Outcome(
-        job, where, force, 0 * force, amplitude, False, np.nan, np.nan, 0.0, 0, seconds, reason
+        *(job, where, force, 0 * force, _amplitude(scene, load), False, np.nan, np.nan),
+        *(0.0, 0, seconds, reason),
     )
+
+
+def _amplitude(scene: Scene, load: Load) -> float:
+    return float(scene.problem.acting(load.force).norm()) / scene.loads.largest_force
 
 
 def _drawn(scene: Scene, job: Job, point: Tensor | None) -> tuple[Load, NDArray[np.float64]]:

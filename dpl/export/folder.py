@@ -36,9 +36,9 @@ from dpl.version import __version__
 FORMAT = 1  # of meta.json; a later one may mean something else by a key
 RAW = np.dtype("<f8")
 RANGE = (
-    "f: a force over E L^(D-1), less `always`. q: the least-squares fit of `modes` to f on the "
-    "nodes on which f acts. In range: max |q| is 1 or less, and |f - modes q| <= 1e-3 |f| there. "
-    "Without a fit: |f| above `largest_force` is out of range."
+    "f: a force over E L^(D-1), less `always`, and 0 where held. q: the least-squares fit of "
+    "`modes` to f on the nodes on which f acts. In range: max |q| is 1 or less, and "
+    "|f - modes q| <= 1e-3 |f| there. Without a fit: |f| above `largest_force` is out of range."
 )
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dpl.fem.compliance import Linear
 from dpl.fem.problem import Evaluation, Problem
-from dpl.fem.solution import Load, Solution, Status
+from dpl.fem.solution import Load, Solution, Status, check_tol
 from dpl.fem.tensors import volume_change
 
 
@@ -28,7 +28,8 @@ class BatchedNewton:
 
     Attributes:
         problem: The body, on the device that is to do the work.
-        tol: Residual ratio ||R_free|| / ||f|| of an answer [-].
+        tol: Residual ratio ||R_free|| / ||f|| of an answer [-], see `Problem.imbalance`; at least
+            1e-15, below 1.
         max_iter: Newton iterations.
         max_linear: Conjugate-gradient iterations in one of them.
         keep: Part of det F that one step may leave of the smallest one [-].
@@ -48,9 +49,9 @@ class BatchedNewton:
         """
         if self.problem.material.poisson_range is not None:
             raise ValueError("poisson: a range of them needs dpl.fem.newton.Newton")
-        for name in ("tol", "keep"):
-            if not 0 < getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and 1")
+        check_tol(self.tol)
+        if not 0 < self.keep < 1:
+            raise ValueError(f"keep = {self.keep} must lie between 0 and 1")
         if self.problem.moved_supports:
             raise ValueError("prescribed displacements other than zero need dpl.fem.newton.Newton")
 

@@ -13,7 +13,7 @@ from dpl.fem.band import Cholesky
 from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear import Backend, Factor, backend, chosen
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, check_force, judge
+from dpl.fem.solution import Load, Solution, check_force, check_tol, judge
 from dpl.fem.turned import Turning
 
 TWINS = 4  # bodies of other Poisson's ratios whose factors are kept
@@ -25,13 +25,21 @@ class Linear:
 
     Attributes:
         problem: The body.
-        tol: Residual ratio below which the answer counts as converged [-].
+        tol: Residual ratio below which the answer counts as converged [-]; at least 1e-15, below 1.
         linear: Backend of the sparse solves, see `dpl.fem.linear.backend`.
     """
 
     problem: Problem
     tol: float = 1e-8
     linear: str = "auto"
+
+    def __post_init__(self) -> None:
+        """Check the tolerance.
+
+        Raises:
+            ValueError: It is out of range.
+        """
+        check_tol(self.tol)
 
     @cached_property
     def factor(self) -> Factor:

@@ -57,13 +57,15 @@ def conjugate_gradients(
         SingularMatrix: K is not positive definite, or `max_iter` is not enough.
     """
     x = np.zeros_like(right)
-    enough = rtol * np.linalg.norm(right)
-    if enough == 0:
+    largest = float(np.abs(right).max(initial=0.0))
+    if largest == 0:
         return x
-    residual = right.copy()
+    unit = 2.0 ** np.clip(np.frexp(largest)[1], -1021, 1023)  # else squares under- or overflow
+    residual = right / unit
+    before_all = np.linalg.norm(residual)
+    enough = rtol * before_all
     z = precondition(residual)
     direction, rz = z.copy(), residual @ z
-    before_all = np.linalg.norm(right)
     for k in range(1, max_iter + 1):
         image = product(direction)
         curvature = direction @ image
@@ -74,7 +76,7 @@ def conjugate_gradients(
         residual -= length * image
         left = np.linalg.norm(residual)
         if left <= enough:
-            return x
+            return unit * x
         if doubtful and k >= 3 and (left / before_all) ** (max_iter / k) > rtol:
             break
         z = precondition(residual)

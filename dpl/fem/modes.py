@@ -275,22 +275,23 @@ class ModalLoads:
         The amplitude is the largest modal load over its largest value here, of the smallest modal
         loads that come closest to the force where it acts: above 1 it is beyond these loads. What
         they leave of it, ||f - Phi q|| / ||f||, is strange: it is zero for these loads. An area
-        that is no ball counts as one of theirs.
+        that is no ball counts as one of theirs. What acts on held degrees of freedom does not
+        count, see `Problem.acting`.
         """
-        own = force if self.always is None else force - self.always
+        own = self.problem.acting(force if self.always is None else force - self.always)
         fields = torch.where(self.reach[..., None], self.modes.vectors, 0.0) * self.q_max
         amplitudes, strange = [], []
         for f in own:
-            size = float(f.norm())
-            if size == 0:
+            unit = float(f.abs().max())
+            if unit == 0:
                 amplitudes.append(0.0)
                 strange.append(0.0)
                 continue
             acting = f.any(dim=-1)
-            shapes = fields[acting].flatten(0, 1)
-            q = torch.linalg.lstsq(shapes, f[acting].flatten()[:, None], driver="gelsd").solution
-            amplitudes.append(float(q.abs().max()))
-            strange.append(float((f[acting].flatten() - shapes @ q[:, 0]).norm()) / size)
+            shapes, there = fields[acting].flatten(0, 1), f[acting].flatten() / unit
+            q = torch.linalg.lstsq(shapes, there[:, None], driver="gelsd").solution
+            amplitudes.append(unit * float(q.abs().max()))
+            strange.append(float((there - shapes @ q[:, 0]).norm() / there.norm()))
         return force.new_tensor(amplitudes), force.new_tensor(strange)
 
     def _force(self, point: Array) -> Tensor:

@@ -1,5 +1,6 @@
 """Newton-Raphson on the nodal equilibrium f_int(u) = f, with load steps where it must."""
 
+import math
 import time
 import warnings
 from collections.abc import Iterator
@@ -41,7 +42,9 @@ class Newton:
 
     Attributes:
         problem: The body.
-        tol: Residual ratio ||R_free|| / ||f|| of an answer [-].
+        tol: Residual ratio ||R_free|| / ||f|| of an answer [-], see `Problem.imbalance`; at least
+            1e-15, below 1. Where rounding does not allow it, on very thin cells, an answer whose
+            residual no longer falls counts as converged, with a warning.
         max_iter: Iterations per load step before it is halved.
         budget: Iterations in all before a load is given up.
         smallest_step: Load step, as a part of the load, below which to give up [-].
@@ -75,7 +78,7 @@ class Newton:
         Raises:
             ValueError: An attribute is out of range, or the backend is not there.
         """
-        check_steps(self, parts=("tol", "loose", "keep", "smallest_step"))
+        check_steps(self, parts=("loose", "keep", "smallest_step"))
         chosen(self.linear)
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
@@ -92,12 +95,12 @@ class Newton:
             ValueError: The force is none for this body, see `check_force`.
         """
         check_force(self.problem, load)
-        own = load.poisson.expand(len(load.force), -1)
+        acting, own = self.problem.acting(load.force), load.poisson.expand(len(load.force), -1)
         guesses = [None] * len(own) if guess is None else guess.split(1)
         yield from in_step(
             [
                 self.at(nu[None])._member(force[None], start)
-                for force, nu, start in zip(load.force, own, guesses, strict=True)
+                for force, nu, start in zip(acting, own, guesses, strict=True)
             ]
         )
 
@@ -322,7 +325,7 @@ class _State(NamedTuple):
     jump: Tensor
     gap: Any
     ratios: dict[float, float]
-    before: float = 0.0  # residual ratio that the step came from
+    before: float = math.inf  # residual ratio that the step came from
 
 
 @dataclass

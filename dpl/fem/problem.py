@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -22,6 +22,7 @@ from dpl.fem.supports import Support, held
 from dpl.fem.tensors import volume_change
 
 TWINS = 64  # bodies of other Poisson's ratios that are kept
+FAINT = 1e-292  # largest force below which arithmetic rounds to an absolute precision [-]
 
 
 class Evaluation(NamedTuple):
@@ -215,6 +216,17 @@ class Problem(Body):
         internal = self._with_springs(internal, displacement)
         return Evaluation(internal, torch.tensor(lowest, dtype=torch.float64))
 
+    def acting(self, force: Tensor) -> Tensor:
+        """Return what of a force (B, N, D) acts on free degrees of freedom: all that has an effect.
+
+        On held ones the result is 0, or NaN where the force is not finite.
+        """
+        return force * self._mask
+
+    @cached_property
+    def _mask(self) -> Tensor:
+        return self.free.double()
+
     def residual_ratio(self, displacement: Tensor, force: Tensor) -> Tensor:
         """Return ||R_free|| / ||f||, (B,) [-], see `imbalance`."""
         return self.imbalance(self.evaluate(displacement).internal, force)
@@ -222,23 +234,42 @@ class Problem(Body):
     def imbalance(self, internal: Tensor, force: Tensor) -> Tensor:
         """Return ||R_free|| / ||f||, (B,) [-]: the one criterion by which answers are judged.
 
-        Where supports are moved (`prescribed`), the reactions count as a load too: the larger norm
-        is taken. Zero load: the norm of R itself. A load that is not finite, on held nodes too, is
-        in balance with nothing: NaN.
+        ||f|| is the norm of the forces on free degrees of freedom. Forces on held ones do no work
+        and change no displacement, so they do not count. Where supports are moved, the reactions
+        do work: ||f|| is then at least the norm of the reactions on the degrees of freedom whose
+        prescribed displacement is not 0. Reactions of supports that are not moved never count.
+
+        Norms are taken of multiples of the largest force, so that no square underflows or
+        overflows. Without forces the result is ||R_free|| itself. It is NaN for a force that is
+        not finite, on held degrees of freedom too, and for one whose largest entry is below
+        `FAINT`, of which no residual can be computed.
+
+        Source: OptiStruct 2020, Nonlinear Convergence Criteria (its relative error in loads counts
+        "nodal reactions due to specified displacements").
+
+        Args:
+            internal: f_int, (B, N, D) [-].
+            force: f, (B, N, D) [-].
         """
-        residual = torch.where(self.free, internal - force, 0.0).flatten(1).norm(dim=1)
-        scale = force.flatten(1).norm(dim=1)
-        if self.moved_supports:
-            reaction = torch.where(self.free, 0.0, internal).flatten(1).norm(dim=1)
-            scale = torch.maximum(scale, reaction)
-        scale = torch.where(scale.isfinite(), scale, torch.nan)
-        return residual / torch.where(scale == 0, 1.0, scale)
+        return self._measured(internal, force)[0]
 
     def balanced(self, displacement: Tensor, internal: Tensor, force: Tensor, tol: float) -> Tensor:
         """Return whether `imbalance` is below tol, or as small as rounding lets it be, (B,)."""
-        residual = torch.where(self.free, internal - force, 0.0).flatten(1).norm(dim=1)
-        ratio = self.imbalance(internal, force)
-        return (ratio < tol) | ((ratio < 1e-4) & (residual <= self.rounding(displacement)))
+        ratio, scale = self._measured(internal, force)
+        return (ratio < tol) | ((ratio < 1e-4) & (ratio * scale <= self.rounding(displacement)))
+
+    def _measured(self, internal: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `imbalance` and the ||f|| that it is relative to, (B,) [-]."""
+        loads = [self.acting(force).flatten(1)]
+        if self.moved_supports:
+            loads.append((internal * (self.prescribed != 0)).flatten(1))
+        unit = reduce(torch.maximum, [load.abs().amax(1) for load in loads])  # NaN if an entry is
+        unit = torch.where(unit == 0, 1.0, unit)
+        unit = torch.where((unit >= FAINT) & (unit < torch.inf), unit, torch.nan)
+        size = reduce(torch.maximum, [(load / unit[:, None]).norm(dim=1) for load in loads])
+        size = torch.where(size == 0, 1.0, size)
+        residual = self.acting(internal - force).flatten(1)
+        return (residual / unit[:, None]).norm(dim=1) / size, size * unit
 
     def rounding(self, displacement: Tensor) -> Tensor:
         """Return what rounding alone can make of ||R_free||, (B,) [-].

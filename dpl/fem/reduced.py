@@ -1,5 +1,6 @@
 """A body in a subspace: its forces and tangents in few coordinates, from few weighted cells."""
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -157,8 +158,11 @@ class ReducedBody:
 
 
 def norm(vector: Tensor) -> float:
-    """Return the Euclidean norm of a vector."""
-    return float(torch.linalg.vector_norm(vector))
+    """Return the Euclidean norm of a vector (R,); no square of an entry over- or underflows."""
+    largest = float(vector.abs().amax())
+    if not 0 < largest < math.inf:
+        return largest
+    return largest * float(torch.linalg.vector_norm(vector / largest))
 
 
 def refuse_range(problem: Problem) -> None:

@@ -68,7 +68,8 @@ class PODGalerkin:
         vectors: V, orthonormal, zero where held, (N, D, R) [-].
         cubature: The cells that stand for all; None: all of them.
         lift: The linear answer, if V is a basis of what is beyond it.
-        tol: Residual ratio ||R_free|| / ||f|| below which an answer counts as converged [-].
+        tol: Residual ratio ||R_free|| / ||f|| below which an answer counts as converged [-], see
+            `Problem.imbalance`; at least 1e-15, below 1.
         reduced_tol: Reduced residual ratio that ends the iterations [-].
         max_iter: Steps per load step before it is halved.
         budget: Steps in all before a load is given up.
@@ -161,7 +162,7 @@ class PODGalerkin:
             ValueError: An attribute is out of range, or V is none of this body.
         """
         refuse_range(self.problem)
-        check_steps(self, parts=("tol", "reduced_tol", "keep", "smallest_step"))
+        check_steps(self, parts=("reduced_tol", "keep", "smallest_step"))
         if tuple(self.vectors.shape[:2]) != self.problem.shape:
             found, wanted = tuple(self.vectors.shape), (*self.problem.shape, "R")
             raise ValueError(f"vectors of shape {found} must have {wanted}")

@@ -12,6 +12,8 @@ from torch import Tensor
 from dpl.fem.problem import Evaluation, Problem
 from dpl.fem.threads import blas
 
+LEAST_TOL = 1e-15  # below it, rounding decides whether an answer is accepted [-]
+
 
 class _Load(NamedTuple):
     force: Tensor
@@ -66,7 +68,8 @@ class Solution(NamedTuple):
 
     Attributes:
         displacement: Over L, (B, N, D) [-].
-        residual: ||R_free|| / ||f|| at `displacement` under the whole load, (B,) [-].
+        residual: ||R_free|| / ||f|| at `displacement` under the whole load, (B,) [-], see
+            `Problem.imbalance`.
         volume_ratio: min det F at `displacement`, (B,) [-].
         status: `Status` as a number, (B,).
         negative_pivots: Negative eigenvalues of the tangent there, (B,); -1: not examined.
@@ -112,12 +115,23 @@ def check_force(problem: Problem, load: Load) -> None:
         raise ValueError(f"force: {load.force.dtype} must be torch.float64")
 
 
+def check_tol(tol: float) -> None:
+    """Check a tolerance of residual ratios.
+
+    Raises:
+        ValueError: It is not at least `LEAST_TOL` and below 1.
+    """
+    if not LEAST_TOL <= tol < 1:
+        raise ValueError(f"tol = {tol} must be at least {LEAST_TOL:g} and below 1")
+
+
 def check_steps(solver: Any, parts: Sequence[str]) -> None:
-    """Check the numbers of a solver that steps: `parts`, and reuse, max_iter, budget.
+    """Check the numbers of a solver that steps: tol, `parts`, and reuse, max_iter, budget.
 
     Raises:
         ValueError: One is out of range.
     """
+    check_tol(solver.tol)
     for name in parts:
         if not 0 < getattr(solver, name) < 1:
             raise ValueError(f"{name} = {getattr(solver, name)} must lie between 0 and 1")
@@ -190,19 +204,24 @@ def judge(
         problem: The body.
         displacement: Over L [-].
         load: What acts.
-        tol: Residual ratio below which it counts as converged [-].
+        tol: Residual ratio below which it counts as converged [-], at least `LEAST_TOL`, below 1.
         iterations: Spent on it.
         seconds: Spent on it [s].
         from_guess: Whether it goes on from a guess.
         evaluation: The body at the displacement, if that is there already.
+
+    Raises:
+        ValueError: `tol` is out of range.
     """
+    check_tol(tol)
     problem = problem.at(load.poisson)
     internal, volume = evaluation or problem.evaluate(displacement)
-    balanced = problem.balanced(displacement, internal, load.force, tol) & (volume > 0)
+    ratio = problem.imbalance(internal, load.force)
+    balanced = (ratio < tol) & (volume > 0)
     count = torch.full_like(volume, iterations, dtype=torch.int64)
     return Solution(
         displacement=displacement,
-        residual=problem.imbalance(internal, load.force),
+        residual=ratio,
         volume_ratio=volume,
         status=torch.where(balanced, int(Status.CONVERGED), int(Status.NOT_CONVERGED)),
         negative_pivots=torch.full_like(count, -1),

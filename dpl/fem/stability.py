@@ -67,7 +67,7 @@ def branches(
     """
     newton = replace(newton, mixed=True)  # plain Newton falls back to what gave way
     direction = unstable_directions(newton, solution)[:1]
-    push = imperfection * load.force.norm() * direction / direction.norm()
+    push = imperfection * newton.problem.acting(load.force).norm() * direction / direction.norm()
     answers = []
     for sign in (1.0, -1.0):
         bent = newton.problem.prescribed[None]

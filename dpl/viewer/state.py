@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.solution import Load, Solution, one_thread
+from dpl.fem.solution import Load, Solution, check_tol, one_thread
 from dpl.simulator import Answer, Simulator
 from dpl.viewer.loads import Asked, Patch
 from dpl.viewer.surface import Surface
@@ -45,9 +45,10 @@ class Wish:
         """
         if self.quantity not in QUANTITIES:
             raise ValueError(f"quantity = {self.quantity!r} must be {' or '.join(QUANTITIES)}")
-        for name, value in (("tol", self.tol), ("budget_ms", self.budget_ms)):
-            if value is not None and not 0 < value < math.inf:
-                raise ValueError(f"{name} = {value} must be a number above 0")
+        if self.tol is not None:
+            check_tol(self.tol)
+        if self.budget_ms is not None and not 0 < self.budget_ms < math.inf:
+            raise ValueError(f"budget_ms = {self.budget_ms} must be a number above 0")
 
 
 class Frame(NamedTuple):

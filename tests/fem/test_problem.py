@@ -426,10 +426,50 @@ def test_residual_ratio_is_relative_to_the_load(body, bend):
     u, f = bend(body.points, 2), bend(body.points, 2, seed=1)
     norm = body.residual(u, f).flatten(1).norm(dim=1)
     assert not body.moved_supports
-    assert_close(body.residual_ratio(u, f), norm / f.flatten(1).norm(dim=1), rtol=1e-14, atol=0)
+    acting = f[:, body.free].norm(dim=1)
+    assert_close(body.residual_ratio(u, f), norm / acting, rtol=1e-13, atol=0)
     rest = torch.zeros_like(u)
     ones = torch.where(body.free, 1.0, 0.0).expand_as(f).to(f)
     assert_close(body.residual_ratio(rest, ones), torch.ones(2, dtype=torch.float64))
+
+
+def test_forces_on_held_nodes_do_not_count(body, bend):
+    """Reactions, as programs export them with the loads, must not make an answer look better."""
+    u, f = bend(body.points, 2), bend(body.points, 2, seed=1)
+    internal, free = body.internal_force(u), torch.where(body.free, f, 0.0)
+    ratio = body.imbalance(internal, free)
+    for size in (1.0, 1e10, 1e200):
+        held = torch.where(body.free, f, size)
+        assert_close(body.imbalance(internal, held), ratio, rtol=1e-14, atol=0)
+        assert torch.equal(body.acting(held), free)
+        assert not body.balanced(u, internal, held, 0.9 * float(ratio.min())).any()
+    only = torch.where(body.free, 0.0, 1e10).expand_as(f).to(f)
+    assert not body.acting(only).any()
+    assert_close(body.residual_ratio(u, only), body.residual(u, only).flatten(1).norm(dim=1))
+
+
+@pytest.mark.parametrize("power", [-290, -200, -158, -100, 100, 158, 200, 290])
+def test_a_ratio_does_not_depend_on_the_size_of_the_forces(bent, power):
+    """Squares of these numbers are 0 or infinite in float64."""
+    problem, force, u = bent
+    internal, size = problem.internal_force(u) - 0.3 * force, 10.0**power
+    force = force / problem.acting(force).abs().max()
+    ratio = problem.imbalance(internal, force)
+    assert ratio > 1e-3
+    assert_close(problem.imbalance(size * internal, size * force), ratio, rtol=1e-12, atol=0)
+    for tol, met in ((1.01 * float(ratio), True), (0.99 * float(ratio), False)):
+        found = problem.balanced(size * u, size * internal, size * force, tol)
+        assert found.item() is met
+
+
+@pytest.mark.parametrize("size", [1e-300, 5e-324])
+def test_forces_that_arithmetic_cannot_resolve_are_balanced_by_nothing(bent, size):
+    problem, force, u = bent
+    faint = size * (problem.acting(force) / problem.acting(force).abs().max())
+    assert faint.any()
+    for internal in (faint, 0 * faint):
+        assert problem.imbalance(internal, faint).isnan()
+        assert not problem.balanced(u, internal, faint, 1e-8)
 
 
 def test_residual_of_no_load_is_absolute(body, bend):
@@ -459,10 +499,34 @@ def test_reactions_count_as_load_where_supports_move(grid, bend):
     assert not problem.prescribed[problem.free].any()
     u = bend(problem.points)
     internal, none = problem.internal_force(u), torch.zeros_like(u)
-    reaction = internal[:, ~problem.free].norm()
-    assert_close(
-        problem.residual_ratio(u, none), problem.residual(u, none).flatten(1).norm(dim=1) / reaction
-    )
+    moved = problem.prescribed != 0
+    reaction, off = internal[:, moved].norm(), problem.residual(u, none).norm()
+    assert reaction < 0.99 * internal[:, ~problem.free].norm()
+    assert_close(problem.residual_ratio(u, none), (off / reaction)[None])
+    held = torch.where(problem.free, 0.0, 1e10).to(u)[None]
+    assert_close(problem.residual_ratio(u, held), (off / reaction)[None])
+    for size in (0.1, 10.0):  # the larger of the two counts
+        force = problem.acting(torch.ones_like(u))
+        force *= size * reaction / force.norm()
+        ratio = problem.residual(u, force).norm() / max(reaction, force.norm())
+        assert_close(problem.residual_ratio(u, force), ratio[None])
+
+
+def test_reactions_of_supports_that_are_not_moved_never_count(grid, bend):
+    """One node that is moved by next to nothing must not change how a load is judged."""
+    mesh = grid("hexahedron", 2, 0.1)
+    problem = Problem.build(mesh, NH, fixed=mesh.p[0] < 0.2, length=1.0)
+    u = bend(problem.points)
+    f = problem.acting(1e-3 * bend(problem.points, seed=1))
+    node = int((~problem.free).any(dim=1).nonzero()[0, 0])
+    prescribed = torch.zeros_like(problem.prescribed)
+    prescribed[node, 1] = 1e-9
+    moved = replace(problem, prescribed=prescribed)
+    internal = problem.internal_force(u)
+    norm = torch.maximum(f.norm(), internal[0, node, 1].abs())
+    assert norm < 0.5 * internal[:, ~problem.free].norm()
+    off = problem.residual(u, f).norm()
+    assert_close(moved.imbalance(internal, f), (off / norm)[None])
 
 
 @pytest.mark.parametrize("degree", [1, 2])
@@ -611,7 +675,7 @@ def test_evaluation_is_force_and_smallest_volume_ratio(body, bend):
     internal, volume = body.evaluate(u)
     assert_close(internal, body.internal_force(u), rtol=1e-11, atol=1e-14)
     assert_close(volume, body.volume_ratio(u), rtol=1e-13, atol=0)
-    ratio = body.residual(u, f).flatten(1).norm(dim=1) / f.flatten(1).norm(dim=1)
+    ratio = body.residual(u, f).flatten(1).norm(dim=1) / f[:, body.free].norm(dim=1)
     assert_close(body.imbalance(internal, f), ratio, rtol=1e-11, atol=0)
 
 
