@@ -119,6 +119,9 @@ class BatchedNewton:
         """
         free, (rows, columns, off) = self.problem.free, self._links
         b = right[:, free]
+        unit = b.abs().amax(1, keepdim=True)  # without it squares of small forces are 0
+        unit = torch.where(unit > 0, unit, 1.0)
+        b = b / unit
         x, r = torch.zeros_like(b), b
         z = r @ self.inverse
         p, rho = z, (r * z).sum(1)
@@ -137,7 +140,7 @@ class BatchedNewton:
             rho, last = (r * z).sum(1), rho
             p = z + torch.where(going, rho / last, 0.0)[:, None] * p
         step = torch.zeros_like(right)
-        step[:, free] = x
+        step[:, free] = unit * x
         return step
 
     @cached_property

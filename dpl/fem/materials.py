@@ -62,8 +62,10 @@ class SaintVenantKirchhoff(Hookean, Isotropic):
 class LinearElastic(SaintVenantKirchhoff):
     """Linear elasticity: lambda/2 (tr eps)^2 + mu eps:eps, eps = (H + H^T)/2.
 
-    Source: Bonet, Wood (2008), eq. 6.29 at small strains. Exact where rotations are small; one
-    Newton step answers any load.
+    Source: Bonet, Wood (2008), eq. 6.29 at small strains. Exact where rotations are small. The
+    tangent is the same for all loads: one Newton step answers a load under which det F stays above
+    `Newton.keep` everywhere. Below that steps are shortened, and there is no answer where det F of
+    the linear one is not above 0.
     """
 
     finite: ClassVar[bool] = False
