@@ -206,6 +206,6 @@ def _picture(
     }
     write_mesh(
         folder / "worst.vtu",
-        scene.problem.mesh.scaled(length),
+        scene.problem.mesh_in_metres,
         {name: field.numpy() for name, field in fields.items()},
     )

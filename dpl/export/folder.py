@@ -200,7 +200,7 @@ def _range(scene: Scene) -> dict[str, Any]:
 def _mesh(problem: Problem) -> dict[str, Any]:
     kind, cells = flat(problem.mesh, len(problem.points))
     return {
-        "points": (problem.length * problem.points).tolist(),
+        "points": (problem.length * (problem.points.numpy() + problem.origin)).tolist(),
         "cell_type": kind,
         "cell_order": "VTK",
         "cells": cells.tolist(),

@@ -71,7 +71,7 @@ def results(
                 error,
             )
         )
-    return rows, save_series(path, scene.problem.mesh.scaled(scene.length), steps)
+    return rows, save_series(path, scene.problem.mesh_in_metres, steps)
 
 
 def shown(

@@ -28,10 +28,12 @@ class Body:
     differentiable, on any device.
 
     Attributes:
-        mesh: Geometry, coordinates over `length`.
+        mesh: Geometry, coordinates from `origin`, over `length`.
         degree: Polynomial degree of the displacement, 1 or 2.
         material: The law.
         length: L, longest side of the body [m].
+        origin: Where coordinates have their origin, over `length`, (D,) [-]. It is zero unless the
+            body lies farther from zero than its size. Nodes are at L (origin + points) [m].
         points: Nodes (N, D) [-]; for degree 2 those of edges, faces and cells too.
         cells: Nodes of each cell, (E, A).
         dN: Gradients of the shape functions, (E, Q, A, D) [-]; (1, Q, A, D) if all cells are equal.
@@ -47,6 +49,7 @@ class Body:
     degree: int
     material: Material
     length: float
+    origin: NDArray[np.float64]
     points: Tensor
     cells: Tensor
     dN: Tensor
@@ -76,6 +79,11 @@ class Body:
     def basis(self) -> skfem.Basis:
         """scikit-fem's basis of one displacement component."""
         return basis_of(self.mesh, self.degree)
+
+    @property
+    def mesh_in_metres(self) -> skfem.Mesh:
+        """The mesh where the body lies [m]."""
+        return self.mesh.scaled(self.length).translated(self.length * self.origin)
 
     @property
     def shape(self) -> tuple[int, int]:

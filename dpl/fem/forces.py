@@ -74,8 +74,7 @@ def body_force(problem: Problem, density: Field) -> Tensor:
         density: Force density times L/E [-] at dimensionless points; (D, ...) to (D, ...).
     """
     basis = problem.basis
-    values = density(basis.global_coordinates())  # (D, E, Q)
-    return _tested(problem, basis, values)
+    return _tested(problem, basis, density(_places(problem, basis)))
 
 
 def traction(problem: Problem, region: Region, stress: Field, scale: float = 1.0) -> Tensor:
@@ -92,9 +91,14 @@ def traction(problem: Problem, region: Region, stress: Field, scale: float = 1.0
         ValueError: The region holds no boundary facet.
     """
     mesh = problem.mesh
-    facets = facets_in(region, mesh, scale)
+    facets = facets_in(region, mesh, scale, problem.origin)
     basis = skfem.FacetBasis(mesh, problem.basis.elem, facets=facets, intorder=4)
-    return _tested(problem, basis, stress(basis.global_coordinates()))
+    return _tested(problem, basis, stress(_places(problem, basis)))
+
+
+def _places(problem: Problem, basis: skfem.Basis) -> NDArray[np.float64]:
+    """Return the quadrature points of a basis, (D, E, Q), where the body lies, over L."""
+    return np.asarray(basis.global_coordinates()) + problem.origin[:, None, None]
 
 
 def _tested(problem: Problem, basis: skfem.Basis, values: NDArray[np.float64]) -> Tensor:

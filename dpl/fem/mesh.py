@@ -30,6 +30,7 @@ __all__ = [
     "facets_in",
     "load",
     "longest_side",
+    "near_origin",
     "nodes_in",
     "propeller",
     "rectangle",
@@ -109,6 +110,23 @@ def longest_side(points: NDArray[np.float64]) -> float:
     return float(
         min(boxes, key=lambda sides: np.prod(sides) * (1 + 1e-9 * (sides is boxes[1]))).max()
     )
+
+
+def near_origin(mesh: skfem.Mesh) -> tuple[skfem.Mesh, NDArray[np.float64]]:
+    """Return a body moved towards the origin by whole multiples of its size, and by how much.
+
+    A body that lies about the origin stays where it is, to the last bit.
+
+    Args:
+        mesh: The body [m].
+
+    Returns:
+        The mesh, and where its origin is in the coordinates of `mesh`, (D,) [m].
+    """
+    low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
+    size = (high - low).max()
+    origin = size * np.trunc((low / 2 + high / 2) / size) + 0.0
+    return mesh.translated(-origin), origin
 
 
 def aspect_ratio(mesh: skfem.Mesh) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from dpl.fem.body import Body
 from dpl.fem.elements import QUADRATIC, basis_of, gradients
 from dpl.fem.kernels import Kernels
 from dpl.fem.law import Isotropic, Material
-from dpl.fem.mesh import aspect_ratio, longest_side
+from dpl.fem.mesh import aspect_ratio, longest_side, near_origin
 from dpl.fem.regions import Region
 from dpl.fem.supports import Support, held
 from dpl.fem.tensors import volume_change
@@ -73,6 +73,10 @@ class Problem(Body):
     ) -> Self:
         """Return the problem of a body.
 
+        Geometry is evaluated from an origin near the body, so that far from zero nothing is lost
+        but the digits that the coordinates themselves lack. Regions and fields see the coordinates
+        of `mesh`.
+
         Args:
             mesh: scikit-fem mesh [m]. Its own degree, if higher, takes the place of `degree`.
             material: The law.
@@ -97,14 +101,17 @@ class Problem(Body):
             raise ValueError(f"degree = {degree} must be 1 or 2")
         degree = 2 if mesh.elem in QUADRATIC else degree
         length = longest_side(mesh.p.T) if length is None else length
-        mesh = mesh.scaled(1.0 / length)
+        mesh, origin = near_origin(mesh)
+        mesh, origin = mesh.scaled(1.0 / length), origin / length
         basis = basis_of(mesh, degree)
         if mean_dilatation and (degree == 2 or basis.dx.shape[1] == 1):
             raise ValueError(
                 "mean_dilatation: is for linear quadrilaterals and hexahedra; "
                 "set degree=2 instead, quadratic elements hardly lock"
             )
-        given, springs = held(basis, length, supports, fixed=fixed, prescribed=prescribed)
+        given, springs = held(
+            basis, length, supports, origin=origin, fixed=fixed, prescribed=prescribed
+        )
         dN, dV = gradients(basis)
         boundary = np.zeros(basis.N, dtype=bool)
         boundary[basis.get_dofs(mesh.boundary_facets()).all()] = True
@@ -113,6 +120,7 @@ class Problem(Body):
             degree=degree,
             material=material,
             length=length,
+            origin=origin,
             points=torch.from_numpy(np.ascontiguousarray(basis.doflocs.T)),
             cells=torch.from_numpy(np.ascontiguousarray(basis.element_dofs.T.astype(np.int64))),
             dN=torch.from_numpy(np.ascontiguousarray(dN)),

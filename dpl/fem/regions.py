@@ -99,7 +99,7 @@ class Sphere:
         """Return which of points (N, D) [m] lie in the region, (N,)."""
         _same_dimension("centre", self.centre, points)
         distance = np.linalg.norm(points - np.array(self.centre, dtype=np.float64), axis=1)
-        return distance <= self.radius * (1 + SLACK)
+        return distance <= _reach(self.radius, points)
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Cylinder:
         _same_dimension("centre", centre, points)
         across = [i for i in range(points.shape[1]) if i != self.axis]
         distance = np.linalg.norm((points - np.array(centre, dtype=np.float64))[:, across], axis=1)
-        return distance <= self.radius * (1 + SLACK)
+        return distance <= _reach(self.radius, points)
 
 
 @dataclass(frozen=True)
@@ -171,10 +171,13 @@ class Tag:
         raise ValueError(f"{self}: the mesh has {', '.join(names[:20]) or 'no tags at all'}{more}")
 
 
+Origin = NDArray[np.float64] | float
 Region = Callable[[NDArray[np.float64]], NDArray[np.bool_]] | Tag
 
 
-def nodes_in(region: Region, basis: skfem.Basis, scale: float = 1.0) -> NDArray[np.bool_]:
+def nodes_in(
+    region: Region, basis: skfem.Basis, scale: float = 1.0, origin: Origin = 0.0
+) -> NDArray[np.bool_]:
     """Return which nodes lie in a region, (N,).
 
     Args:
@@ -182,6 +185,7 @@ def nodes_in(region: Region, basis: skfem.Basis, scale: float = 1.0) -> NDArray[
         basis: scikit-fem basis of one displacement component; its N nodes may be those of edges,
             faces and cells too.
         scale: [m] per unit of the basis' mesh.
+        origin: Where that mesh has its origin, (D,), in its own unit.
 
     Raises:
         ValueError: No node lies there, there is no such tag, or the region does not answer with
@@ -195,13 +199,15 @@ def nodes_in(region: Region, basis: skfem.Basis, scale: float = 1.0) -> NDArray[
         elif len(facets):  # scikit-fem takes an empty set for the whole boundary
             inside[basis.get_dofs(facets).all()] = True
     else:
-        inside = _inside(region, basis.doflocs.T * scale)
+        inside = _inside(region, (basis.doflocs.T + origin) * scale)
     if not inside.any():
         raise ValueError(f"{_name(region)} holds no node of the mesh")
     return inside
 
 
-def facets_in(region: Region, mesh: skfem.Mesh, scale: float = 1.0) -> NDArray[np.int_]:
+def facets_in(
+    region: Region, mesh: skfem.Mesh, scale: float = 1.0, origin: Origin = 0.0
+) -> NDArray[np.int_]:
     """Return the facets of the boundary that lie in a region, ascending.
 
     Args:
@@ -209,6 +215,7 @@ def facets_in(region: Region, mesh: skfem.Mesh, scale: float = 1.0) -> NDArray[n
             those of which all vertices belong to its cells.
         mesh: The body.
         scale: [m] per unit of the mesh.
+        origin: Where the mesh has its origin, (D,), in its own unit.
 
     Raises:
         ValueError: No facet of the boundary lies there, there is no such tag, or the region does
@@ -223,7 +230,7 @@ def facets_in(region: Region, mesh: skfem.Mesh, scale: float = 1.0) -> NDArray[n
             inside = np.zeros(mesh.p.shape[1], dtype=bool)
             inside[mesh.t[:, mesh.subdomains[region.name]]] = True
         else:
-            inside = _inside(region, mesh.p.T * scale)
+            inside = _inside(region, (mesh.p.T + origin) * scale)
         facets = boundary[inside[mesh.facets[:, boundary]].all(axis=0)]
     if not len(facets):
         raise ValueError(f"{_name(region)} holds no facet of the boundary")
@@ -242,6 +249,11 @@ def _inside(region: Callable, points: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 def _name(region: Region) -> str:
     return getattr(region, "__name__", None) or repr(region)
+
+
+def _reach(radius: float, points: NDArray[np.float64]) -> float:
+    """Return a radius with the slack for its own rounding and for that of coordinates far away."""
+    return radius * (1 + SLACK) + 4 * float(np.finfo(np.float64).eps * np.abs(points).max())
 
 
 def _round(name: str, centre: Sequence[float], radius: float) -> None:

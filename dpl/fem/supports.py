@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.regions import Region, facets_in, nodes_in
+from dpl.fem.regions import Origin, Region, facets_in, nodes_in
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,13 @@ class Displacement:
     region: Region
     value: Sequence[float | None] | None = None
 
-    def on(self, basis: skfem.Basis, scale: float) -> NDArray[np.float64]:
+    def on(self, basis: skfem.Basis, scale: float, origin: Origin = 0.0) -> NDArray[np.float64]:
         """Return g over `scale`, (N, D) [-], NaN where it leaves a component free.
 
         Args:
             basis: Scalar basis of a body whose coordinates are over `scale`.
             scale: L [m].
+            origin: Where these coordinates have their origin, (D,) [-].
 
         Raises:
             ValueError: The region holds no node, or `value` has not D entries, one of them given.
@@ -41,7 +42,7 @@ class Displacement:
         given = [math.nan if g is None else float(g) / scale for g in value]
         if len(given) != dim or all(map(math.isnan, given)) or any(map(math.isinf, given)):
             raise ValueError(f"value = {value} must be {dim} lengths [m], null where free")
-        where = nodes_in(self.region, basis, scale)
+        where = nodes_in(self.region, basis, scale, origin)
         return np.where(where[:, None], np.array(given), math.nan)
 
 
@@ -58,7 +59,7 @@ class Spring:
     region: Region
     stiffness: float | Sequence[float]
 
-    def on(self, basis: skfem.Basis, scale: float) -> "Springs":
+    def on(self, basis: skfem.Basis, scale: float, origin: Origin = 0.0) -> "Springs":
         """Return the springs' matrix over E L^(D - 2), see `Displacement.on`.
 
         Raises:
@@ -71,7 +72,7 @@ class Spring:
             raise ValueError(
                 f"stiffness = {self.stiffness} must be a number above 0 [1/m], or {dim} of them"
             )
-        facets = facets_in(self.region, basis.mesh, scale)
+        facets = facets_in(self.region, basis.mesh, scale, origin)
         boundary = skfem.FacetBasis(basis.mesh, basis.elem, facets=facets, intorder=4)
         mass = skfem.BilinearForm(lambda u, v, _: u * v).assemble(boundary).tocoo()
         linked = np.abs(mass.data) > 1e-14 * np.abs(mass.data).max()
@@ -113,10 +114,19 @@ def held(
     scale: float,
     supports: Sequence[Support],
     *,
+    origin: Origin = 0.0,
     fixed: Region | NDArray[np.bool_] | None = None,
     prescribed: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], Springs | None]:
     """Return g over `scale`, (N, D) [-], NaN where free, and the springs; arguments as in a build.
+
+    Args:
+        basis: Scalar basis of a body whose coordinates are over `scale`.
+        scale: L [m].
+        supports: What holds it.
+        origin: Where these coordinates have their origin, (D,) [-].
+        fixed: What is clamped besides.
+        prescribed: Displacement of that over `scale`, (N, D) [-]; zero if left out.
 
     Raises:
         ValueError: A region is empty, or a support is none for this body.
@@ -124,13 +134,13 @@ def held(
     shape = basis.N, basis.mesh.dim()
     given = np.full(shape, np.nan)
     if fixed is not None:
-        where = fixed if isinstance(fixed, np.ndarray) else nodes_in(fixed, basis, scale)
+        where = fixed if isinstance(fixed, np.ndarray) else nodes_in(fixed, basis, scale, origin)
         if not where.any():
             raise ValueError(f"{fixed} holds no node of the mesh")
         everywhere = np.broadcast_to(where[:, None] if where.ndim == 1 else where, shape)
         given = np.where(everywhere, 0.0 if prescribed is None else prescribed, np.nan)
     for support in supports:
         if isinstance(support, Displacement):
-            value = support.on(basis, scale)
+            value = support.on(basis, scale, origin)
             given = np.where(np.isnan(value), given, value)
-    return given, joined([s.on(basis, scale) for s in supports if isinstance(s, Spring)])
+    return given, joined([s.on(basis, scale, origin) for s in supports if isinstance(s, Spring)])

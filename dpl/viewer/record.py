@@ -69,7 +69,7 @@ class Recording:
             ValueError: There are none.
         """
         kept, scene = self._some(), self.body.scene
-        mesh = scene.problem.mesh.scaled(scene.length)
+        mesh = scene.problem.mesh_in_metres
         place = free_name(folder, "recording", ".pvd")
         files = []
         for number, (time, frame) in enumerate(kept):

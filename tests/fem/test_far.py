@@ -1,0 +1,153 @@
+"""Laws of bodies far from the origin: they answer as they do near it.
+
+Coordinates at a distance of d lack eps * d of their digits, which is eps * d / h of a cell of size
+h. Results may differ by a small multiple of this, and nothing may differ by more.
+"""
+
+import numpy as np
+import pytest
+import skfem
+import torch
+from torch.testing import assert_close
+
+from dpl.fem.compliance import Linear
+from dpl.fem.forces import BodyForce, Traction, body_force, traction
+from dpl.fem.materials import NeoHookeanLn
+from dpl.fem.mesh import Box, Cylinder, Plane, Sphere, box, check, propeller
+from dpl.fem.modes import eigenmodes
+from dpl.fem.newton import Newton
+from dpl.fem.problem import Problem
+from dpl.fem.solution import Load, solve
+from dpl.fem.supports import Displacement, Spring
+from dpl.fem.symmetry import symmetries
+
+NH, EPS = NeoHookeanLn(0.3), np.finfo(float).eps
+CELLS = 3  # along the sides of the grids
+DISTANCES = [0.0, 1e3, 1e6]
+
+
+def away(mesh: skfem.Mesh, distance: float) -> skfem.Mesh:
+    """Return the mesh that far away, in no special direction."""
+    return mesh.translated(distance * np.array([1.0, -0.7, 0.9])[: mesh.dim()])
+
+
+def tolerance(distance: float, cells: int = CELLS) -> float:
+    """Return what the digits of coordinates make of a relative error, a hundred times over."""
+    return 100 * EPS * max(1.0, distance * cells)
+
+
+@pytest.fixture(params=DISTANCES)
+def distance(request) -> float:
+    """How many lengths away a body lies."""
+    return request.param
+
+
+def test_a_body_about_the_origin_is_not_moved(beam):
+    problem = beam(NH)
+    assert not problem.origin.any()
+    assert np.array_equal(problem.mesh.p, box([100.0, 25.0, 25.0], [9, 3, 3]).p / 100.0)
+
+
+def test_a_far_body_is_written_where_it_lies(kind, grid, distance):
+    mesh = away(grid(kind[0], CELLS, 0.15), distance)
+    problem = Problem.build(mesh, NH, degree=kind[1])
+    assert np.abs(problem.points.numpy()).max() < 3
+    assert problem.mesh_in_metres.p == pytest.approx(mesh.p, abs=2 * EPS * max(distance, 1))
+
+
+def test_far_elements_pass_the_patch_test_as_near_ones_do(kind, grid, distance):
+    """The geometry is that of the rounded coordinates: inner nodes are in balance to rounding."""
+    mesh = away(grid(kind[0], CELLS, 0.15), distance)
+    problem = Problem.build(check(mesh), NH, degree=kind[1], length=1.0)
+    dim = problem.shape[1]
+    H = torch.tensor([[0.02, 0.05, -0.01], [0.03, -0.04, 0.02], [-0.02, 0.01, 0.03]]).double()
+    field = (problem.points @ H[:dim, :dim].T)[None]
+    force = problem.internal_force(field)[0]
+    assert force[~problem.boundary].norm() < problem.rounding(field)
+
+
+def test_loads_and_springs_on_a_far_body_are_those_on_a_near_one(kind, grid, distance):
+    """Hexahedra ask for the reference points of facets, which Newton's method finds."""
+    values = []
+    for d in (0.0, distance):
+        mesh = away(grid(kind[0], CELLS, 0.15, inside=True), d)
+        problem = Problem.build(mesh, NH, degree=kind[1], supports=[Spring(Plane(0, "min"), 0.3)])
+        dim = problem.shape[1]
+        stress = Traction(Plane(0, "max"), [0.3, -2.0, 0.7][:dim]).on(problem)
+        values.append((stress, BodyForce([0.3, -2.0, 0.7][:dim]).on(problem)))
+        pull = problem.springs.force(torch.ones(1, *problem.shape, dtype=torch.float64))
+        values[-1] += (pull,)
+    for near, far in zip(*values, strict=True):
+        assert_close(far, near, rtol=0.0, atol=tolerance(distance) * float(near.abs().max()))
+
+
+def test_fields_of_loads_see_the_coordinates_of_the_user(grid, distance):
+    mesh = away(grid("hexahedron", CELLS), distance)
+    problem = Problem.build(mesh, NH, length=1.0)
+    low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
+
+    def seen(x):
+        assert (x >= low[:, None, None] - 4 * EPS * max(distance, 1)).all()
+        assert (x <= high[:, None, None] + 4 * EPS * max(distance, 1)).all()
+        return np.zeros_like(x)
+
+    body_force(problem, seen)
+    traction(problem, Plane(0, "max"), seen)
+
+
+def test_regions_in_absolute_coordinates_hold_the_same_nodes(distance):
+    """The corners of a box, a ball and a cylinder lie on nodes, where rounding decides."""
+    near = box([4.0, 1.0, 1.0], [9, 5, 5])
+    mesh = away(near, 4 * distance)
+    shift = mesh.p[:, 0] - near.p[:, 0]
+    for region in (
+        lambda at: Plane(0, at[0] + 0.5),
+        lambda at: Box(at, at + np.array([1.0, 0.5, 1.0])),
+        lambda at: Sphere(at, 0.5),
+        lambda at: Cylinder(0, 0.25, at),
+    ):
+        held = [
+            ~Problem.build(m, NH, supports=[Displacement(region(at))]).free
+            for m, at in ((near, np.zeros(3)), (mesh, shift))
+        ]
+        assert held[0].any()
+        assert torch.equal(*held)
+
+
+def test_a_far_bore_is_held_by_its_cylinder(distance):
+    mesh = away(propeller(), distance)
+    centre = distance * np.array([1.0, -0.7, 0.9])
+    problem = Problem.build(mesh, NH, fixed=Cylinder(0, 0.05, centre))
+    assert (~problem.free).sum() == 525
+
+
+def test_modes_of_a_far_body_are_those_of_a_near_one(distance):
+    found = []
+    for d in (0.0, distance):
+        mesh = away(box([4.0, 1.1, 1.0], [9, 3, 3]), 4 * d)
+        found.append(eigenmodes(Linear(Problem.build(mesh, NH, fixed=Plane(0, "min"))), 4))
+    near, far = found
+    allowed = tolerance(distance, 8)
+    assert far.values.numpy() == pytest.approx(near.values.numpy(), rel=allowed)
+    # a vector turns by the error over the gap between eigenvalues
+    gap = float((near.values.diff() / near.values[1:]).min())
+    assert_close(far.vectors, near.vectors, rtol=0.0, atol=allowed / gap)
+
+
+def test_a_far_beam_bends_as_a_near_one(distance):
+    """The traction on its end raised an error of Newton's method inside scikit-fem."""
+    answers = []
+    for d in (0.0, distance):
+        mesh = away(box([100.0, 25.0, 25.0], [9, 3, 3]), 100 * d)
+        problem = Problem.build(mesh, NH, fixed=Plane(0, "min"))
+        force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
+        answer = solve(Newton(problem, tol=1e-10), Load(force[None], torch.ones(1)))
+        assert answer.converged.all()
+        answers.append(answer.displacement)
+    near, far = answers
+    assert_close(far, near, rtol=0.0, atol=1e-8 + 10 * tolerance(distance, 8))
+
+
+def test_a_body_a_thousand_lengths_away_keeps_its_symmetries():
+    problem = Problem.build(away(box([4.0, 1.0, 1.0], [5, 3, 3]), 4e3), NH, fixed=Plane(0, "min"))
+    assert len(symmetries(problem)) == 8
