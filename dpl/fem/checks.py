@@ -28,7 +28,7 @@ def check(mesh: skfem.Mesh, *, numbers: Numbers | None = None) -> skfem.Mesh:
             are not finite or beyond `LARGEST`, nodes without a cell, cells that list a node twice,
             cells listed twice, inverted or flat cells, sides shared by three cells, cells folded
             over their neighbours, nodes in one place, hanging nodes, sides that overlap without
-            being the same, a body in several pieces.
+            being the same, a body in several pieces, parts that touch only in nodes or edges.
     """
     numbers = np.arange(mesh.p.shape[1]) if numbers is None else numbers
     _check_nodes(mesh, numbers)
@@ -38,6 +38,7 @@ def check(mesh: skfem.Mesh, *, numbers: Numbers | None = None) -> skfem.Mesh:
     _check_places(mesh, numbers)
     _check_contacts(mesh, numbers)
     _check_pieces(mesh)
+    _check_joints(mesh, numbers)
     return mesh
 
 
@@ -252,6 +253,23 @@ def _check_pieces(mesh: skfem.Mesh) -> None:
         sizes = listed(np.sort(np.bincount(member))[::-1], 8)
         raise ValueError(
             f"the body is in {pieces} pieces (of {sizes} nodes); join or separate them"
+        )
+
+
+def _check_joints(mesh: skfem.Mesh, numbers: Numbers) -> None:
+    """Hold the cells to being joined by sides: parts that touch in an edge or node are hinged."""
+    pairs = mesh.f2t[:, mesh.f2t[1] >= 0]
+    graph = coo_array((np.ones(pairs.shape[1]), pairs), shape=(mesh.nelements,) * 2)
+    parts, member = connected_components(graph, directed=False)
+    if parts > 1:
+        both = np.unique(
+            np.stack([mesh.t, np.broadcast_to(member, mesh.t.shape)]).reshape(2, -1), axis=1
+        )
+        touching = np.flatnonzero(np.bincount(both[0]) > 1)
+        sizes = listed(np.sort(np.bincount(member))[::-1], 8)
+        raise ValueError(
+            f"the body is in {parts} parts (of {sizes} cells) that touch only in nodes or edges: "
+            f"{_nodes(touching, numbers)}; join them by sides of cells or separate them"
         )
 
 

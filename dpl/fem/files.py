@@ -1,7 +1,9 @@
 """Mesh files read, with the names that they give to parts of the body."""
 
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
@@ -32,6 +34,21 @@ SIDES = {  # of these cells: corners, which meshio lists first
     "quad8": 4,
     "quad9": 4,
 }
+CORNERS: dict[str, Any] = {  # of the reference cells, in the order of files
+    "hexahedron": [
+        (0, 0, 0),
+        (1, 0, 0),
+        (1, 1, 0),
+        (0, 1, 0),
+        (0, 0, 1),
+        (1, 0, 1),
+        (1, 1, 1),
+        (0, 1, 1),
+    ],
+    "tetra": [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)],
+    "quad": [(0, 0), (1, 0), (1, 1), (0, 1)],
+    "triangle": [(0, 0), (1, 0), (0, 1)],
+}
 MOST_VALUES = 1000  # of a field that tells parts apart; with more it counts something else
 
 Numbers = NDArray[np.int_]
@@ -42,7 +59,8 @@ def load(path: str | Path) -> skfem.Mesh:
     """Return the mesh of any file that meshio reads, checked.
 
     The cells of the highest dimension are kept in their order, nodes that no cell uses are dropped,
-    and a planar mesh with a third coordinate of zero becomes a 2D one.
+    and a planar mesh with a third coordinate of zero becomes a 2D one. Cells may list their nodes
+    inside out: they are read as if they did not. Those of a plane body may all be clockwise.
 
     The file's names for parts are kept as scikit-fem's `mesh.boundaries` (facets) and
     `mesh.subdomains` (cells), where `dpl.fem.regions.Tag` finds them:
@@ -64,16 +82,23 @@ def load(path: str | Path) -> skfem.Mesh:
         ValueError: The file cannot be read, or its mesh cannot be solved; the message says why.
             Nodes have the place in which the file lists them, from 0; so have cells among those
             that are kept.
+
+    Warns:
+        UserWarning: Nodes are dropped, or cells are listed inside out; the message says how many.
     """
     path = Path(path)
     raw = read(path)
     try:
-        return _body(raw)
+        mesh, repairs = _body(raw)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+    if repairs:
+        warnings.warn(f"{path}: {'; '.join(repairs)}", stacklevel=2)
+    return mesh
 
 
-def _body(raw: meshio.Mesh) -> skfem.Mesh:
+def _body(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
+    """Return the mesh, checked, and what was corrected, a clause each."""
     found = {block.type for block in raw.cells if len(block.data)}
     kinds = [kind for kind in CELLS if kind in found]
     if not kinds:
@@ -105,7 +130,27 @@ def _body(raw: meshio.Mesh) -> skfem.Mesh:
     points = _flat(points, used) if dim == 2 else points[used]
     mesh = from_meshio(meshio.Mesh(points, [(kinds[0], compact)]))
     corners = np.unique(cells[:, : len(mesh.t)])  # vertex k is node corners[k] of the file
-    return _tagged(check(mesh, numbers=corners), raw, kinds[0], corners)
+    mesh = _tagged(check(mesh, numbers=corners), raw, kinds[0], corners)
+    return mesh, _repairs(kinds[0], points[compact], len(raw.points) - len(used))
+
+
+def _repairs(kind: str, nodes: Array, unused: int) -> list[str]:
+    """Return what is corrected of cells with nodes at (E, A, D), a clause each."""
+    corners = np.array(CORNERS[kind.rstrip("0123456789")], dtype=np.float64)
+    # the Jacobian in the middle of a cell: the linear map that fits its corners best
+    fit = np.linalg.pinv(corners - corners.mean(axis=0))
+    J = fit @ nodes[:, : len(corners)]  # (E, D, D)
+    repairs = []
+    backwards = int((np.linalg.det(J) < 0).sum())
+    plane = len(fit) == 2  # which may be seen from either side
+    if backwards and not (plane and backwards == len(J)):
+        how = "clockwise, unlike the others," if plane else "inside out"
+        repairs.append(
+            f"{backwards} of {len(J)} cells list their nodes {how} and are read the other way round"
+        )
+    if unused:
+        repairs.append(f"{unused} of the nodes are used by no cell and are left out")
+    return repairs
 
 
 def _check_range(cells: Numbers, nodes: int) -> None:

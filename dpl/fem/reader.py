@@ -84,7 +84,9 @@ def read(path: str) -> tuple[meshio.Mesh | None, dict[str, Any]]:
             warnings.simplefilter("ignore")
             warnings.filterwarnings("error", ".*could not be read to its end")
             _Unpacker.left = UNPACKED[0] + UNPACKED[1] * os.path.getsize(path)
-            return meshio.read(path), {}
+            mesh = meshio.read(path)
+            _once(getattr(mesh, "points_id", ()))  # of Nastran
+            return mesh, {}
     except MemoryError:
         return None, {"memory": True}
     except (Exception, SystemExit) as error:  # meshio calls sys.exit on files it cannot read
@@ -111,6 +113,11 @@ def stricter() -> None:
         module.np = types.SimpleNamespace(**{**vars(np), "empty": _nothing})
     for module in gmsh[1:]:
         module._read_nodes = _listed(module._read_nodes)
+    for module, first in zip(gmsh, (0, 0, 1), strict=True):  # 4.1 has them counted from 0
+        module._read_nodes = _numbered_once(module._read_nodes, first)
+    for name in ("abaqus._abaqus", "permas._permas", "avsucd._avsucd"):
+        other: Any = importlib.import_module(f"meshio.{name}")
+        other._read_nodes = _numbered_once(other._read_nodes)
     gmsh[0]._gmsh_to_meshio_order = _counted_from_one(common._gmsh_to_meshio_order)
     gmsh[0]._read_cells_ascii = _of_their_length(gmsh[0])
     vtu.zlib, vtu.lzma = _Unpacker(zlib.decompressobj), _Unpacker(lzma.LZMADecompressor)
@@ -194,6 +201,41 @@ def _listed(read_nodes: Any) -> Any:
         return found
 
     return checked
+
+
+def _numbered_once(read_nodes: Any, first: int = 0) -> Any:
+    """Return a reader that refuses nodes with one number, of which meshio uses the last.
+
+    Args:
+        read_nodes: Returns points and, beside them, their numbers or places by number.
+        first: What is added to the numbers.
+    """
+
+    def checked(*args: Any) -> Any:
+        found = read_nodes(*args)
+        for part in found:
+            if isinstance(part, dict):  # from numbers to places, in which the last is kept
+                points = next(len(p) for p in found if isinstance(p, np.ndarray))
+                if lost := sorted(set(range(points)) - set(part.values())):
+                    raise meshio.ReadError(
+                        f"{len(lost)} nodes have the number of a later one: those in the places "
+                        f"{', '.join(map(str, lost[:5]))} (counted from 0); number each node once"
+                    )
+                return found
+        _once(np.asarray(found[1]).astype(np.int64) + first)
+        return found
+
+    return checked
+
+
+def _once(numbers: Any) -> None:
+    """Raise where a node number is listed twice."""
+    found, count = np.unique(numbers, return_counts=True)
+    if twice := [int(number) for number in found[count > 1]]:
+        raise meshio.ReadError(
+            f"{len(twice)} node numbers are listed more than once: "
+            f"{', '.join(map(str, twice[:5]))}; number each node once"
+        )
 
 
 def _counted_from_one(ordered: Any) -> Any:

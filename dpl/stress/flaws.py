@@ -95,6 +95,16 @@ BAD: dict[str, tuple[str, Any, dict[str, Any]]] = {
         np.concatenate([TWO_CUBES, FAR]),
         {"hexahedron": np.concatenate([TWO_HEXES, TWO_HEXES + 12])},
     ),
+    "parts that touch in an edge": (
+        "2 parts (of 1, 1 cells) that touch only in nodes or edges: 2, 6",
+        np.concatenate([CORNERS, (CORNERS + np.array([1, 1, 0]))[[1, 2, 3, 5, 6, 7]]]),
+        {"hexahedron": np.array([[*range(8)], [2, 8, 9, 10, 6, 11, 12, 13]])},
+    ),
+    "parts that touch in a node": (
+        "2 parts (of 2, 1 cells) that touch only in nodes or edges: 2",
+        np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 1, 0], [1, 2, 0]]),
+        {"triangle": np.array([[0, 1, 2], [0, 2, 3], [2, 4, 5]])},
+    ),
     "hanging nodes": (
         "1 nodes lie inside a side of a cell that does not have them as vertices "
         "(hanging nodes): 4",

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+import warnings
 
 import meshio
 import numpy as np
@@ -326,14 +327,98 @@ def test_quadratic_hexahedra_keep_their_volume(tmp_path):
     assert volumes(mesh) == pytest.approx(6.0, rel=1e-13)
 
 
-def test_listing_the_nodes_of_a_cell_the_other_way_round_changes_nothing(tmp_path):
+INSIDE_OUT = {  # file with cells the other way round, and the words of the warning
+    "hexahedron": (TWO_CUBES, TWO_HEXES[:, [4, 5, 6, 7, 0, 1, 2, 3]], "2 of 2 .* inside out"),
+    "one hexahedron": (
+        *(TWO_CUBES, np.stack([TWO_HEXES[0], TWO_HEXES[1, [4, 5, 6, 7, 0, 1, 2, 3]]])),
+        "1 of 2 cells list their nodes inside out and are read the other way round$",
+    ),
+    "tetra": (CORNERS, TETS[:, [1, 0, 2, 3]], "5 of 5 cells .* inside out"),
+    "one tetra": (
+        *(CORNERS, np.concatenate([TETS[:4], TETS[4:, [1, 0, 2, 3]]])),
+        "1 of 5 cells .* inside out",
+    ),
+    "triangle": (
+        *(PATCH, np.concatenate([FAN[:3], FAN[3:, ::-1]])),
+        "1 of 4 cells list their nodes clockwise, unlike the others, and are read",
+    ),
+    "quad": (
+        np.concatenate([PATCH[:4], PATCH[:4][[3, 2]] + np.array([0, 1, 0])]),
+        np.array([[0, 1, 2, 3], [3, 4, 5, 2]]),
+        "1 of 2 cells .* clockwise",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", INSIDE_OUT)
+def test_cells_that_are_listed_inside_out_are_read_and_counted_in_a_warning(tmp_path, name):
     """Files differ in it, and so do the tetrahedra of one box."""
-    tets = TETS.copy()
-    tets[1::2, :2] = tets[1::2, 1::-1]
-    mesh = load(write(tmp_path / "cube.vtu", CORNERS, tetra=tets))
-    assert volumes(mesh).sum() == pytest.approx(1.0, rel=1e-14)
-    mesh = load(write(tmp_path / "fan.vtu", PATCH, triangle=FAN[:, ::-1]))
-    assert volumes(mesh).sum() == pytest.approx(1.0, rel=1e-14)
+    points, cells, told = INSIDE_OUT[name]
+    path = write(tmp_path / "part.vtu", points, **{name.removeprefix("one "): cells})
+    with pytest.warns(UserWarning, match=rf"part\.vtu: {told}") as warned:
+        mesh = load(path)
+    assert len(warned) == 1
+    size = np.ptp(points, axis=0)
+    assert volumes(mesh).sum() == pytest.approx(np.prod(size[: mesh.dim()]), rel=1e-14)
+
+
+def test_nodes_that_no_cell_uses_are_counted_in_the_warning(tmp_path):
+    points = np.concatenate([[[9, 9, 9]], TWO_CUBES, [[8, 8, 8], [7, 7, 7]]])
+    path = write(tmp_path / "part.vtu", points, hexahedron=TWO_HEXES + 1)
+    with pytest.warns(UserWarning, match="3 of the nodes are used by no cell and are left out$"):
+        mesh = load(path)
+    assert np.array_equal(mesh.p.T, TWO_CUBES)
+
+
+def test_a_file_without_repairs_is_read_without_a_word(tmp_path):
+    for kind, points, cells in (
+        ("hexahedron", TWO_CUBES, TWO_HEXES),
+        ("tetra", CORNERS, TETS),
+        ("triangle", PATCH, FAN),
+        ("triangle", PATCH, FAN[:, ::-1]),  # a plane body, seen from the other side
+    ):
+        path = write(tmp_path / f"{kind}.vtu", points, **{kind: cells})
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            load(path)
+
+
+NUMBERS = {  # format: file, a node of it, the same with the number of another, words
+    "gmsh22": ("cube.msh", "\n4 0.0", "\n3 0.0", r"1 node numbers .* more than once: 3"),
+    "gmsh": ("cube.msh", "\n4\n5\n", "\n3\n5\n", r"1 node numbers .* more than once: 3"),
+    "abaqus": ("cube.inp", "\n4, 0.0", "\n3, 0.0", r"1 nodes have the number .* places 2 "),
+    "permas": ("cube.dato", "\n4 0.0", "\n3 0.0", r"1 nodes have the number .* places 2 "),
+    "nastran": (
+        *("cube.bdf", "BEGIN BULK\n", "BEGIN BULK\nGRID,3,,9.0,9.0,9.0\n"),
+        r"1 node numbers .* more than once: 3",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+def test_a_node_number_that_is_listed_twice_is_an_error_that_names_it(tmp_path, kind):
+    """Meshio would use the last node of that number, wherever it is."""
+    name, own, other, told = NUMBERS[kind]
+    path = tmp_path / name
+    binary = {"binary": False} if kind.startswith("gmsh") else {}
+    meshio.write(path, meshio.Mesh(CORNERS, [("tetra", TETS)]), file_format=kind, **binary)
+    assert load(path).nvertices == 8
+    text = path.read_text()
+    assert text.count(own) == 1
+    path.write_text(text.replace(own, other))
+    with pytest.raises(ValueError, match=told) as error:
+        load(path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
+def test_a_body_that_touches_itself_in_a_node_is_one_body(cell):
+    """A ring of cells that is pinched: joined by sides all around."""
+    grid, dim = (rectangle, 2) if cell in ("quad", "triangle") else (box, 3)
+    mesh = grid([4.0, 4.0, 1.0][:dim], [5, 5, 2][:dim], cell)
+    x, y = mesh.p[:2, mesh.t].mean(axis=1)
+    hole = ((x > 1) & (x < 2) & (y > 1) & (y < 2)) | ((x > 2) & (x < 3) & (y > 2) & (y < 3))
+    check(mesh.restrict(np.flatnonzero(~hole)))
 
 
 def test_load_keeps_the_cells_of_the_highest_dimension_and_the_nodes_they_use(tmp_path):
@@ -394,7 +479,7 @@ def test_mesh_that_cannot_be_solved_is_an_error_that_says_why(tmp_path, flaw):
 
 @pytest.mark.parametrize("flaw", ["crack", "hanging nodes", "not a number", "surface in space"])
 def test_errors_number_nodes_as_the_file_does(tmp_path, flaw):
-    """Nodes that no cell uses are dropped, and nobody needs to know: here every second one."""
+    """Nodes that no cell uses are dropped: here every second one."""
     _, points, cells = BAD[flaw]
     loose = np.repeat(points, 2, axis=0).astype(float)
     loose[::2] += np.nan  # not even that counts
