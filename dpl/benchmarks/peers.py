@@ -16,10 +16,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from dpl.benchmarks import blas
 from dpl.data.crew import outcomes
 from dpl.data.outcome import Job
 from dpl.fem.dofs import gather
@@ -150,8 +152,17 @@ def beams(linear: str, repeats: int) -> dict[str, Time]:
 def measured_peer(python: str, program: Path, repeats: int) -> dict[str, Time]:
     """Return the time of each case in another code, run by the Python that has it.
 
+    The program is first asked for its shared libraries. Where its BLAS is the reference one and
+    Debian's OpenBLAS is installed, the program is given that; the notes name the BLAS.
+
+    Args:
+        python: The interpreter.
+        program: What it runs, see `dpl.benchmarks.programs`.
+        repeats: Timed solves of each case.
+
     Raises:
-        OSError: There is no such Python, the program failed, or its answer is wrong.
+        OSError: There is no such Python, the program failed, its answer is wrong, or its BLAS is
+            the reference one or cannot be told.
     """
     cases = {
         name: {
@@ -167,6 +178,35 @@ def measured_peer(python: str, program: Path, repeats: int) -> dict[str, Time]:
     }
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")} | threads
+    used = blas.name(_asked(python, program, {}, environment)["libraries"])
+    if used == blas.REFERENCE and (folder := blas.optimised()):
+        before = environment.get("LD_LIBRARY_PATH")
+        environment["LD_LIBRARY_PATH"] = f"{folder}:{before}" if before else folder
+        used = blas.name(_asked(python, program, {}, environment)["libraries"])
+    if used in (None, blas.REFERENCE):
+        flaw = "the reference BLAS, several times slower than others" if used else "no known BLAS"
+        raise OSError(
+            f"{program.name} with {python}: it uses {flaw}, and is not compared; install OpenBLAS "
+            "for it (Debian: libopenblas0-pthread)"
+        )
+    rows = {}
+    for name, row in _asked(python, program, cases, environment)["times"].items():
+        error = CASES[name].miss(row["tip"])
+        if not error <= 1e-8:
+            raise OSError(f"{program.name} with {python}: {name}: tip {error:.1e} L off")
+        note = ", ".join(filter(None, [f"tip to {error:.0e} L", row.get("note"), used]))
+        rows[name] = Time(program.stem, row["seconds"], row["iterations"], note)
+    return rows
+
+
+def _asked(
+    python: str, program: Path, cases: Mapping[str, object], environment: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return what a program answers to cases: its shared libraries, and times by case.
+
+    Raises:
+        OSError: There is no such Python, or the program failed.
+    """
     done = subprocess.run(
         [python, str(program)],
         input=json.dumps(cases),
@@ -178,14 +218,7 @@ def measured_peer(python: str, program: Path, repeats: int) -> dict[str, Time]:
     if done.returncode:
         reason = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
         raise OSError(f"{program.name} with {python}: {reason[-1]}")
-    rows = {}
-    for name, row in json.loads(done.stdout.strip().splitlines()[-1]).items():
-        error = CASES[name].miss(row["tip"])
-        if not error <= 1e-8:
-            raise OSError(f"{program.name} with {python}: {name}: tip {error:.1e} L off")
-        note = f"tip to {error:.0e} L" + (f", {row['note']}" if "note" in row else "")
-        rows[name] = Time(program.stem, row["seconds"], row["iterations"], note)
-    return rows
+    return dict(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
 def pieces(repeats: int) -> list[Time]:

@@ -7,7 +7,7 @@ import textwrap
 
 import pytest
 
-from dpl.benchmarks import peers
+from dpl.benchmarks import blas, peers
 from dpl.fem.solution import solve
 
 
@@ -35,21 +35,24 @@ def test_median_leaves_the_first_call_out():
 
 @pytest.fixture
 def peer(tmp_path):
-    """A program that answers with tips, off by so much."""
+    """A program that answers with tips, off by so much, and names its shared libraries."""
 
-    def peer(off=0.0):
+    def peer(off=0.0, libraries=("/opt/lib/libmkl_rt.so.2",)):
         tips = {name: [case.tip[0], 0.0, case.tip[1] + off] for name, case in peers.CASES.items()}
         program = tmp_path / "other_beam.py"
         program.write_text(
             textwrap.dedent(f"""
-            import json, sys
+            import json, os, sys
             nan = float("nan")
             tips = {tips}
             cases = json.load(sys.stdin)
             print("noise")
+            libraries = {list(libraries)}
+            if os.environ.get("LD_LIBRARY_PATH", "").startswith("/opt/openblas-pthread"):
+                libraries = ["/opt/openblas-pthread/libblas.so.3"]
             row = {{"iterations": 7, "note": "a note"}}
             rows = {{n: row | {{"seconds": c["force"], "tip": tips[n]}} for n, c in cases.items()}}
-            print(json.dumps(rows))
+            print(json.dumps({{"libraries": libraries, "times": rows}}))
             """)
         )
         return program
@@ -62,7 +65,51 @@ def test_peer_is_another_program_that_reads_cases_and_writes_times(peer):
     assert set(times) == set(peers.CASES)
     assert times["S1"].seconds == 20100.0
     assert times["S1"].iterations == 7
-    assert times["S1"].note == "tip to 0e+00 L, a note"
+    assert times["S1"].note == "tip to 0e+00 L, a note, MKL"
+
+
+REFERENCE = "/usr/lib/x86_64-linux-gnu/blas/libblas.so.3.11.0"
+
+
+@pytest.mark.parametrize(
+    ("libraries", "told"),
+    [
+        ([REFERENCE, "/usr/lib/x86_64-linux-gnu/libdmumps-5.5.0.so"], "reference BLAS"),
+        (["/usr/lib64/libblas.so.3", "/w/numpy.libs/libscipy_openblas64_.so"], "reference BLAS"),
+        (["/usr/lib/x86_64-linux-gnu/openblas-pthread/libblas.so.3"], "OpenBLAS"),
+        (["/w/numpy.libs/libscipy_openblas64_-8fb3d286.so"], "OpenBLAS"),
+        (["/w/libmkl_rt.so.2", "/w/numpy.libs/libopenblas64_p-r0-15.so"], "MKL and OpenBLAS"),
+        (["/usr/lib/x86_64-linux-gnu/blis-openmp/libblas.so.3"], "BLIS"),
+        (["/usr/lib/x86_64-linux-gnu/atlas/libblas.so.3"], "ATLAS"),
+        (["/usr/lib/x86_64-linux-gnu/libCombBLAS.so.1.16.0", "/usr/lib/libc.so.6"], None),
+    ],
+)
+def test_a_blas_is_named_after_its_file_and_folder(libraries, told):
+    assert blas.name(libraries) == told
+
+
+def test_a_folder_with_openblas_as_the_blas_is_found(tmp_path):
+    assert blas.optimised(f"{tmp_path}/*/openblas*/libblas.so.3") is None
+    file = tmp_path / "lib/openblas-pthread/libblas.so.3"
+    file.parent.mkdir(parents=True)
+    file.touch()
+    assert blas.optimised(f"{tmp_path}/*/openblas*/libblas.so.3") == str(file.parent)
+
+
+def test_a_peer_with_the_reference_blas_is_given_openblas_which_its_note_names(peer, monkeypatch):
+    monkeypatch.setattr(blas, "optimised", lambda: "/opt/openblas-pthread")
+    times = peers.measured_peer(sys.executable, peer(libraries=[REFERENCE]), 1)
+    assert times["S1"].note == "tip to 0e+00 L, a note, OpenBLAS"
+
+
+@pytest.mark.parametrize(
+    ("libraries", "flaw"), [([REFERENCE], "the reference BLAS"), ([], "no known BLAS")]
+)
+def test_a_peer_without_an_optimised_blas_is_not_compared(peer, monkeypatch, libraries, flaw):
+    monkeypatch.setattr(blas, "optimised", lambda: None)
+    with pytest.raises(OSError, match=f"it uses {flaw}.* libopenblas0") as refused:
+        peers.measured_peer(sys.executable, peer(libraries=libraries), 1)
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("off", [1e-5, math.nan])

@@ -4,7 +4,8 @@ A program of its own, for the Python that has dolfinx 0.5 (Debian 12: python3-do
 
     python scripts/benchmark.py peers.dolfinx=/usr/bin/python3
 
-Reads scenes as JSON from standard input, writes seconds, iterations and the tip as JSON.
+Reads scenes as JSON from standard input, writes seconds, iterations and the tip of each,
+and the shared libraries that are loaded, as JSON.
 """
 
 import json
@@ -85,4 +86,11 @@ def solved(scene: dict) -> dict:
     return {"seconds": float(np.median(seconds)), "iterations": iterations, "tip": tip.tolist()}
 
 
-print(json.dumps({name: solved(scene) for name, scene in json.load(sys.stdin).items()}))
+def libraries() -> list[str]:
+    """Return the paths of the shared libraries that this process has loaded."""
+    with open("/proc/self/maps") as maps:
+        return sorted({line.split(maxsplit=5)[5].strip() for line in maps if ".so" in line})
+
+
+times = {name: solved(scene) for name, scene in json.load(sys.stdin).items()}
+print(json.dumps({"libraries": libraries(), "times": times}))

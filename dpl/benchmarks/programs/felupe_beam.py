@@ -8,7 +8,8 @@ SuperLU, felupe's default, solves the linear systems or, where pypardiso is inst
 PARDISO for symmetric indefinite matrices, as felupe's guide to external solvers has it: each solve
 analyses the matrix again.
 
-Reads scenes as JSON from standard input, writes seconds, iterations, the tip and a note as JSON.
+Reads scenes as JSON from standard input, writes seconds, iterations, the tip and a note of
+each, and the shared libraries that are loaded, as JSON.
 """
 
 import json
@@ -88,4 +89,11 @@ def solved(scene: dict) -> dict:
     }
 
 
-print(json.dumps({name: solved(scene) for name, scene in json.load(sys.stdin).items()}))
+def libraries() -> list[str]:
+    """Return the paths of the shared libraries that this process has loaded."""
+    with open("/proc/self/maps") as maps:
+        return sorted({line.split(maxsplit=5)[5].strip() for line in maps if ".so" in line})
+
+
+times = {name: solved(scene) for name, scene in json.load(sys.stdin).items()}
+print(json.dumps({"libraries": libraries(), "times": times}))
