@@ -11,6 +11,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
+from dpl.benchmarks.clock import latency
 from dpl.benchmarks.rows import write, write_machine
 from dpl.fem.newton import Newton
 from dpl.fem.rom import PODGalerkin
@@ -56,7 +57,8 @@ class Result:
         training_minutes: Wall time of the training, or of the making of a basis.
         parameters: Numbers that were trained.
         e_mean, e_max, SNR_min, rel_L2_median, rel_L2_worst, residual, min_det_F: See `dpl.metrics`.
-        ms: Median wall time of a prediction, batch 1, one thread [ms].
+        ms: Median latency of the bare network, see `dpl.benchmarks.clock`: force in, displacement
+            out, nothing checked [ms].
         ms_p99: 99th percentile of the same [ms].
         newton_iterations: Mean iterations of Newton from it to the scene's tolerance, in range.
     """
@@ -142,27 +144,15 @@ def measure(
     """
     for title, batch in sets.items():
         singles = batch.load.singles()
-        answers: dict[str, list[Tensor]] = {name: [] for name in methods}
-        seconds: dict[str, list[float]] = {name: [] for name in methods}
         with one_thread(), torch.inference_mode():
-            for method in methods.values():
-                method.predict(singles[0])
             for name, method in methods.items():
-                for turn in range(repeats):
-                    for load in singles:
-                        start = time.perf_counter()
-                        answer = method.predict(load)
-                        seconds[name].append(time.perf_counter() - start)
-                        if turn == 0:
-                            answers[name].append(answer)
-            for name, method in methods.items():
-                answer = torch.cat(answers[name])
+                answer = torch.cat([method.predict(load) for load in singles])
+                taken = latency(method.predict, singles, repeats=repeats)
                 iterations = None if title in STREAMS else _iterations(newton, singles, answer)
                 errors = metrics(newton.problem)
                 errors.update(answer, batch)
                 known = {field.name for field in fields(Result)}
                 numbers = {k: float(v) for k, v in errors.compute().items() if k in known}
-                taken = torch.tensor(seconds[name], dtype=torch.float64)
                 row = Result(
                     method=name,
                     loads=title,
@@ -171,8 +161,8 @@ def measure(
                     generation_minutes=generation_minutes if method.samples else None,
                     training_minutes=method.training_minutes,
                     parameters=method.parameters,
-                    ms=1e3 * float(taken.median()),
-                    ms_p99=1e3 * float(taken.quantile(0.99)),
+                    ms=taken.p50,
+                    ms_p99=taken.p99,
                     newton_iterations=iterations,
                     **numbers,
                 )

@@ -3,7 +3,6 @@
 import math
 import multiprocessing
 import resource
-import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dpl.benchmarks.clock import latency
 from dpl.benchmarks.meshes import BEAM, YOUNG
 from dpl.fem.compliance import Linear
 from dpl.fem.linear import chosen
@@ -84,13 +84,7 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     singles = batch.singles()[:loads]
 
     def row(what: str, call: Callable[[Load], object], **more: float | int) -> Size:
-        call(singles[0])
-        taken = []
-        for load in singles:
-            start = time.perf_counter()
-            call(load)
-            taken.append(1e3 * (time.perf_counter() - start))
-        return Size(what, dofs, statistics.median(taken), **more)  # type: ignore[arg-type]
+        return Size(what, dofs, latency(call, singles).p50, **more)  # type: ignore[arg-type]
 
     start = time.perf_counter()
     Linear(problem).factor  # noqa: B018

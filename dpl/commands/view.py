@@ -80,10 +80,13 @@ def _door(cfg: DictConfig) -> "Door":
 
 
 def _show_speed(page: "Page") -> None:
+    from dpl.benchmarks.clock import told
     from dpl.benchmarks.rows import show
     from dpl.viewer.speed import speed
 
-    show(speed(page), "a frame: milliseconds on the server, and what arrives a second")
+    rows, measured = speed(page)
+    show(rows, "a frame: milliseconds on the server, and what arrives a second")
+    print(told(measured))
 
 
 def _film(body: "Body", path: Path) -> None:

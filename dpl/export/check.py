@@ -1,16 +1,16 @@
 """A graph against the surrogate that it was made of: how far apart, and how fast."""
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dpl.benchmarks.clock import latency
 from dpl.export.graph import Array, Graph, Session
-from dpl.fem.solution import Load, one_thread
+from dpl.fem.solution import Load
 from dpl.scene import Scene
 
 TRIED = (0, 11)  # the stream of the loads that graphs are checked on
@@ -66,17 +66,21 @@ class Row:
 
 @dataclass(frozen=True)
 class Times:
-    """Medians of wall times on one thread, the two in turn.
+    """Latency of the bare network, see `dpl.benchmarks.clock`.
 
     Attributes:
-        batch: Loads at once.
-        torch: Of the surrogate, of all of them [ms].
-        onnxruntime: Of the graph [ms].
+        batch: Loads in a call.
+        torch_p50: Median wall time of a call of the surrogate [ms].
+        torch_p99: 99th percentile of the same [ms].
+        onnxruntime_p50: Median wall time of a call of the graph [ms].
+        onnxruntime_p99: 99th percentile of the same [ms].
     """
 
     batch: int
-    torch: float
-    onnxruntime: float
+    torch_p50: float
+    torch_p99: float
+    onnxruntime_p50: float
+    onnxruntime_p99: float
 
 
 def trial(scene: Scene, count: int) -> Trial:
@@ -158,36 +162,31 @@ def distance(answer: Array, truth: Array) -> Array:
 
 
 def clock(
-    graph: Graph, session: Session, tried: Trial, *, repeats: int, batches: Sequence[int] = ()
+    graph: Graph, session: Session, tried: Trial, *, calls: int, batches: Sequence[int] = (1, BATCH)
 ) -> list[Times]:
     """Return the times of surrogate and graph on loads of the training's range, none of them local.
+
+    Where all of these are local, the times are those of all loads.
 
     Args:
         graph: Of whose surrogate.
         session: Of the graph.
-        tried: The loads; the first of them are asked.
-        repeats: How often each is asked.
-        batches: Loads at once; 1 and `BATCH` if left out.
+        tried: The loads.
+        calls: How often each is called at least.
+        batches: Loads in a call.
     """
     local = session(*(column.numpy() for column in tried.part(slice(None)))).local
     usual = [k for k, kind in enumerate(tried.kinds) if kind == IN_RANGE and not local[k]]
+    usual = usual or list(range(len(local)))
     rows = []
-    for batch in batches or (1, BATCH):
-        given = tried.part((usual or list(range(len(local))))[:batch])
-        arrays = [column.numpy() for column in given]
-        tasks: dict[str, Callable[[], Any]] = {
-            "torch": lambda given=given: graph.surrogate(*given),  # type: ignore[misc]
-            "onnxruntime": lambda arrays=arrays: session(*arrays),  # type: ignore[misc]
-        }
-        times: dict[str, list[float]] = {name: [] for name in tasks}
-        with one_thread(), torch.inference_mode():
-            for task in tasks.values():
-                task()
-            for _ in range(repeats):
-                for name, task in tasks.items():
-                    start = time.perf_counter()
-                    task()
-                    times[name].append(1e3 * (time.perf_counter() - start))
-        medians = {name: round(float(np.median(taken)), 4) for name, taken in times.items()}
-        rows.append(Times(len(arrays[0]), **medians))
+    for batch in batches:
+        size = min(batch, len(usual))
+        starts = range(0, len(usual) - size + 1, size)
+        given = [tried.part(usual[start : start + size]) for start in starts]
+        arrays = [tuple(column.numpy() for column in part) for part in given]
+        repeats = -(-calls // len(given))
+        ours = latency(lambda part: graph.surrogate(*part), given, repeats=repeats)
+        theirs = latency(lambda part: session(*part), arrays, repeats=repeats)
+        numbers = (ours.p50, ours.p99, theirs.p50, theirs.p99)
+        rows.append(Times(size, *(round(number, 4) for number in numbers)))
     return rows

@@ -40,7 +40,7 @@ def moving_load(
     def words(frame: Frame) -> list[str]:
         error = difference(body, frame)
         return [
-            f"network: {typical:.1f} ms",
+            f"sim(force): {typical:.1f} ms",
             f"{count:,} degrees of freedom",
             f"residual {frame.residual:.1e} of the load",
             f"displacement within {100 * error:.1g} % of finite elements",

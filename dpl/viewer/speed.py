@@ -1,4 +1,4 @@
-"""What a frame costs, part by part, and how many reach a browser."""
+"""What a frame costs, part by part, how many reach a browser, and how long an answer takes."""
 
 import statistics
 import time
@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from functools import partial
 
 import msgspec
+import torch
 import viser
 import websockets.sync.client
 import zstandard
 from websockets.typing import Origin, Subprotocol
 
+from dpl.benchmarks import clock
+from dpl.fem.solution import Load
 from dpl.viewer.film import answers
 from dpl.viewer.loads import Asked
 from dpl.viewer.page import Page
@@ -26,38 +29,42 @@ class Row:
 
     Attributes:
         colours: What they show.
-        answered: The answer of the simulator.
-        coloured: That and what colours show.
+        coloured: The answer of the simulator, and what colours show.
         cut: The surface into bands.
         arrived: Frames at the other end of the socket, a second.
         megabytes: Of those, a second.
     """
 
     colours: str
-    answered: float
     coloured: float
     cut: float
     arrived: float
     megabytes: float
 
 
-def speed(page: Page, seconds: float = 4.0) -> list[Row]:
-    """Return what frames cost under the load that goes round, for each quantity."""
+def speed(page: Page, seconds: float = 4.0) -> tuple[list[Row], dict[str, clock.Latency]]:
+    """Return what frames cost under the load that goes round, and the latency of its answers.
+
+    Args:
+        page: Where frames arrive.
+        seconds: For how long frames are counted, for each quantity [s].
+    """
     body = page.body
     loads = [frame.asked for frame in answers(body, radius=0.45, deflection=0.3)]
+    columns = zip(*map(body.load, loads), strict=True)
+    measured = clock.latencies(body.simulator, Load(*map(torch.cat, columns)))
     rows = []
     for quantity in QUANTITIES:
         wish = Wish(quantity=quantity)
-        times = zip(*_times(body, loads, wish), strict=True)
-        answered, coloured, cut = map(statistics.median, times)
+        coloured, cut = map(statistics.median, zip(*_times(body, loads, wish), strict=True))
         page.worker.ask(wish=wish)
         arrived, size = _arrived(page, loads, seconds)
-        rows.append(Row(quantity, answered, coloured, cut, arrived / seconds, size / seconds / 1e6))
-    return rows
+        rows.append(Row(quantity, coloured, cut, arrived / seconds, size / seconds / 1e6))
+    return rows, measured
 
 
-def _times(body: Body, loads: list[Asked], wish: Wish) -> Iterator[tuple[float, float, float]]:
-    """Yield of each load how long the answer, that and its colours, and the bands took [ms]."""
+def _times(body: Body, loads: list[Asked], wish: Wish) -> Iterator[tuple[float, float]]:
+    """Yield of each load how long the answer with its colours and the bands took [ms]."""
     for load in loads[:40]:
         begin = time.perf_counter()
         frame = body.answer(load, wish)
@@ -65,8 +72,7 @@ def _times(body: Body, loads: list[Asked], wish: Wish) -> Iterator[tuple[float, 
         levels = frame.values / max(float(frame.values.max()), 1e-300) * BANDS
         bands(frame.points, body.surface.triangles, levels, BANDS)
         end = time.perf_counter()
-        assert frame.answer is not None
-        yield float(frame.answer.milliseconds), 1e3 * (shown - begin), 1e3 * (end - shown)
+        yield 1e3 * (shown - begin), 1e3 * (end - shown)
 
 
 def _arrived(page: Page, loads: list[Asked], seconds: float) -> tuple[int, int]:

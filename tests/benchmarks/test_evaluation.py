@@ -2,8 +2,8 @@
 
 import json
 import re
-import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import matplotlib.image
 import meshio
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from dpl.benchmarks import clock as timing
 from dpl.benchmarks.evaluation import Row, clock, compare, evaluate, save, show
 from dpl.fem.solution import Load, Solution, judge
 from dpl.losses import MSE
@@ -26,17 +27,16 @@ def few(batch) -> Sample:
 
 
 class Known:
-    """Knows the answers (B, N, D) to a batch of loads; counts and takes time as it is told."""
+    """Knows the answers (B, N, D) to a batch of loads, and counts as it is told."""
 
-    def __init__(self, problem, batch, answers, counts, seconds=0.0):
+    def __init__(self, problem, batch, answers, counts):
         self.problem, self.batch, self.answers, self.counts = problem, batch, answers, counts
-        self.seconds, self.asked = seconds, []
+        self.asked = []
 
     def iterate(self, load):
         assert len(load.force) == 1, "one load at a time"
         (k,) = [k for k, force in enumerate(self.batch.force) if torch.equal(force, load.force[0])]
         self.asked.append(k)
-        time.sleep(self.seconds)
         yield judge(self.problem, torch.zeros_like(load.force), load, 1e-8)
         answer = self.answers[k : k + 1]
         yield judge(self.problem, answer, load, 1e-8, iterations=self.counts[k])
@@ -74,13 +74,21 @@ def test_every_solver_is_warmed_up_then_asked_each_load_in_turn(scene, few):
     assert order == [a, b] + [a, b] * 4
 
 
-def test_the_clock_measures_the_solver(scene, few):
-    slow = Known(scene.problem, few, few.displacement, [1] * 4, seconds=0.02)
+def test_the_clock_measures_the_solver(scene, few, monkeypatch):
+    watch = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: watch.now))
+
+    class Slow(Known):
+        def iterate(self, load):
+            yield from super().iterate(load)
+            watch.now += 1e-3 * (10 + self.asked[-1])
+
+    slow = Slow(scene.problem, few, few.displacement, [1] * 4)
     fast = Known(scene.problem, few, few.displacement, [1] * 4)
     (first, second), _ = clock({"slow": slow, "fast": fast}, few, scene.problem)
-    assert first.milliseconds > 20
-    assert first.slowest >= first.milliseconds
-    assert second.milliseconds < first.milliseconds
+    assert first.milliseconds == pytest.approx(11.5)
+    assert first.slowest == pytest.approx(12.97)
+    assert second.milliseconds == second.slowest == 0.0
 
 
 def test_a_solver_that_fails_is_a_row_and_no_crash(scene, few):
@@ -151,6 +159,18 @@ def test_an_evaluation_has_four_rows_that_are_saved(evaluated):
     assert [row["errors"]["e_mean"] for row in saved] == [row.errors["e_mean"] for row in rows]
 
 
+def test_the_network_s_row_has_the_latency_of_the_simulator_and_of_the_bare_network(evaluated):
+    folder = evaluated[1]
+    for row in json.loads((folder / "evaluation.json").read_text()):
+        if row["solver"] != "network":
+            assert row["latency"] == {}
+            continue
+        assert list(row["latency"]) == ["sim(force)", "bare network"]
+        for one in row["latency"].values():
+            assert one["loads"] == 4
+            assert 0 < one["p50"] <= one["p99"]
+
+
 def test_hybrid_and_newton_answer_every_load(evaluated):
     linear, network, *hybrids, newton = evaluated[0]
     for hybrid in hybrids:
@@ -175,7 +195,8 @@ def test_the_table_prints_every_row(surrogate, few, tmp_path, capsys, monkeypatc
     evaluate(surrogate, few, tmp_path)
     out = capsys.readouterr().out
     assert "4 fresh loads, one at a time, 1 thread, tol 1e-08" in out
-    for words in ("linear", "network", "hybrid Newton", "Newton from zero", "4/4"):
+    assert "latency, 1 thread, 4 loads: sim(force) p50 " in out
+    for words in ("linear", "network", "hybrid Newton", "Newton from zero", "4/4", "p99"):
         assert words in out
 
 

@@ -41,7 +41,11 @@ def test_export_writes_a_folder_that_others_can_use(script, trained):
     assert report["passed"]
     assert report["largest_error"] <= report["tolerance"] == 1e-4
     assert [row["batch"] for row in report["milliseconds"]] == [1, 4]
-    assert all(row["torch"] > 0 < row["onnxruntime"] for row in report["milliseconds"])
+    for row in report["milliseconds"]:
+        for engine in ("torch", "onnxruntime"):
+            assert 0 < row[f"{engine}_p50"] <= row[f"{engine}_p99"]
+    assert list(report["latency"]) == ["sim(force)", "bare network"]
+    assert "latency, 1 thread, 4 loads: sim(force) p50 " in ended.out
     meta = json.loads((folder / "meta.json").read_text(), parse_constant=pytest.fail)
     judged = json.loads((trained / "runs/first/evaluation.json").read_text())
     assert meta["errors"] == judged[1]["errors"]
