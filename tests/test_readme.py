@@ -2,6 +2,7 @@
 
 import csv
 import re
+import statistics
 from pathlib import Path
 
 import pytest
@@ -36,7 +37,8 @@ def paper_rows() -> list[tuple[str, list[str]]]:
 
 @pytest.mark.parametrize(("experiment", "cells"), paper_rows())
 def test_a_row_against_the_paper_is_that_of_the_results(experiment, cells):
-    method, samples, weights, *errors = cells
+    title, samples, weights, *errors = cells
+    method = title.partition(", ")[0]
     row = measured(experiment, method)
     assert samples == f"{int(row['samples']):,}"
     assert errors[:2] == [f"{float(row[name]):.1e}" for name in ("e_mean", "e_max")]
@@ -65,3 +67,63 @@ def test_what_is_said_of_run_time_against_error_is_in_its_table():
     assert int(newton) == round(
         min(reached(f"Newton to {tol}") for tol in ("0.001", "1e-06", "1e-08"))
     )
+
+
+def test_the_row_of_a_loss_names_the_losses(compose):
+    titles = [cells[0] for experiment, cells in paper_rows() if experiment == "beam_nh_loss"]
+    assert titles == ["paper, L_r^*", "latent, mean_norm", "latent corrected, mean_norm"]
+    for experiment in ("beam_svk", "propeller_nh", "beam_nh_loss", "beam_young"):
+        cfg = compose(f"experiment={experiment}", "model=latent", command="train")
+        assert cfg.loss._target_ == "dpl.losses.MeanNorm"
+
+
+def test_a_row_that_is_worse_than_the_network_alone_says_why():
+    rows = {(experiment, cells[0].partition(", ")[0]): cells for experiment, cells in paper_rows()}
+    for (experiment, method), cells in rows.items():
+        if not method.endswith(" corrected"):
+            continue
+        alone = rows[experiment, method.removesuffix(" corrected")]
+        assert ("too few modes: see below" in cells[0]) == (float(cells[3]) > float(alone[3]))
+
+
+def test_what_is_said_of_experiment_4_is_in_its_table():
+    with (ROOT / "results/hybrid_newton.csv").open(newline="") as file:
+        rows = {
+            (row["solver"], row["network"], row["loads"]): row
+            for row in csv.DictReader(file)
+            if row["tol"] in ("", "1e-06")
+        }
+    (text,) = (part for part in README.split("\n\n") if part.startswith("Experiment 4"))
+    found = re.search(
+        r"plain Newton converges on (\d+) and its hybrid on (\d+) of its (\d+) loads; on\sour "
+        r"(\d+) loads our hybrid converges on (\d+), and plain Newton converges on (\d+) as well",
+        text,
+    )
+    both = "in range and twice"
+    expected = [
+        rows["paper: Newton", "", both]["converged"],
+        rows["paper: hybrid Newton", "", both]["converged"],
+        rows["paper: Newton", "", both]["count"],
+        rows["plain Newton", "", both]["count"],
+        rows["hybrid, best rule", "latent", both]["converged"],
+        rows["plain Newton", "", both]["converged"],
+    ]
+    assert list(found.groups()) == expected
+    taken = re.search(r"takes (\S+), without a factorisation, and plain Newton (\S+)\s", text)
+    solvers = ("hybrid, best rule", "latent"), ("plain Newton", "")
+    for said, solver in zip(taken.groups(), solvers, strict=True):
+        assert said == f"{float(rows[(*solver, 'in range')]['iterations']):.1f}"
+    assert rows["hybrid, best rule", "latent", "in range"]["factorisations"] == "0"
+
+
+def test_what_is_said_of_deflections_is_in_their_table():
+    with (ROOT / "results/deflections.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    found = re.findall(
+        r"median of (\S+) L and a maximum of (\S+) L on the (beam|propeller)", README
+    )
+    assert [body for *_, body in found] == ["beam", "propeller"]
+    for middle, largest, body in found:
+        values = [float(row["deflection"]) for row in rows if row["body"].startswith(body)]
+        assert len(values) == 100
+        assert (middle, largest) == (f"{statistics.median(values):.2g}", f"{max(values):.2g}")

@@ -60,6 +60,17 @@ def _ends(rows: list[Row]) -> list[Row]:
     return [row for row in rows if row["last"] == "True" and row["threads"] == "1"]
 
 
+def _extremes(rows: list[Row]) -> list[Row]:
+    """Return the load of the smallest and that of the largest deflection of each body."""
+    kept = []
+    for body in dict.fromkeys(row["body"] for row in rows):
+        mine = sorted(
+            (row for row in rows if row["body"] == body), key=lambda row: float(row["deflection"])
+        )
+        kept += [mine[0], mine[-1]]
+    return kept
+
+
 def _moments(rows: list[Row]) -> list[Row]:
     """Return the first, middle and last of the rows of each work."""
     kept = []
@@ -113,6 +124,15 @@ PARTS = (
         "Cost against degrees of freedom",
         "python scripts/benchmark.py parts=[sizes] repeats=3 folder=results",
         "Beams from 4 to 20 cells across, each in a process of its own, random weights.",
+    ),
+    Part(
+        "deflections",
+        "How far test loads move the bodies",
+        "python scripts/benchmark.py parts=[deflections] count=100 folder=results",
+        "The largest nodal displacement of each test load of `beam_svk` and of `propeller_nh`, "
+        "over the longest side of the body. The table has the loads that move each body least and "
+        "most.",
+        keep=_extremes,
     ),
     Part(
         r"stress_(\w+)",

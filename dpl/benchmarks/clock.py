@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -80,7 +80,7 @@ def latencies(simulator: Simulator, load: Load) -> dict[str, Latency]:
     columns = {"force": unit[:, None, None] * load.force, "young": load.young}
     if load.poisson.shape[1]:
         columns["poisson"] = load.poisson[:, 0]
-    asked = [
+    asked: list[dict[str, Any]] = [
         {name: column[k : k + 1] for name, column in columns.items()} for k in range(len(unit))
     ]
     return {

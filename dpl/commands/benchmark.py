@@ -1,10 +1,12 @@
 """The mechanics against public codes: python scripts/benchmark.py.
 
 Long parts on demand: parts=[large] (run alone, it reports its memory), parts=[robustness],
-parts=[generation]; run time against error: parts=[accuracy] run=runs/beam_svk, parts=[sizes].
+parts=[generation]; run time against error: parts=[accuracy] run=runs/beam_svk, parts=[sizes];
+how far test loads move the bodies: parts=[deflections] count=100.
 """
 
 import json
+import statistics
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
 CONSOLE = Console(width=150)
 PARTS = (
     *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
-    *("accuracy", "sizes"),
+    *("accuracy", "sizes", "deflections"),
 )
 
 
@@ -231,6 +233,24 @@ def sizes(cfg: DictConfig, backends: list[str]) -> None:
     CONSOLE.print(table)
     beams.draw(rows, Path(cfg.folder) / "sizes.png")
     write_machine(Path(cfg.folder) / "sizes.json")
+
+
+def deflections(cfg: DictConfig, backends: list[str]) -> None:
+    """Write how far test loads move the paper's beam and propeller, as rows and as histograms."""
+    from dpl.benchmarks import deflections as sizes
+
+    scenes = {
+        "beam_svk": peers.beam_scene(SaintVenantKirchhoff(0.3)),
+        "propeller_nh": peers.propeller_scene(),
+    }
+    rows = sizes.deflections(scenes, cfg.count, cfg.workers)
+    table = Table("largest nodal displacement / L", "loads", "smallest", "median", "largest")
+    for name, values in sizes.by_body(rows).items():
+        numbers = min(values), statistics.median(values), max(values)
+        table.add_row(name, f"{len(values)}", *(f"{number:.2g}" for number in numbers))
+    CONSOLE.print(table)
+    write(rows, Path(cfg.folder) / "deflections.csv")
+    sizes.draw(rows, Path(cfg.folder) / "deflections.png")
 
 
 def _listed(rows: list[peers.Time], title: str) -> list[peers.Time]:
