@@ -1,10 +1,11 @@
 # make train: environment, installation and the main job on the small default scene.
 # make test:  installation and the checks that CI makes.
+# make mutants: changes of the source that no test notices; ARGS="dpl/metrics.py --sample 60".
 # make docs:  the documentation into site/; NOTEBOOKS=false leaves them unexecuted.
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup train test lint slow docs wheel clean
+.PHONY: setup train test lint slow mutants docs wheel clean
 
 setup: .venv/installed
 
@@ -27,6 +28,10 @@ lint: setup
 
 slow: setup
 	$(BIN)/python -m pytest -m 'slow and not gpu' --timeout 1800
+
+mutants: setup
+	$(BIN)/pip install --quiet -c constraints.txt -e '.[mutation]'
+	$(BIN)/python tests/mutants.py $(ARGS)
 
 docs: setup
 	NO_MKDOCS_2_WARNING=1 NOTEBOOKS=$(or $(NOTEBOOKS),true) $(BIN)/python -m mkdocs build --strict -f docs/make/mkdocs.yml
