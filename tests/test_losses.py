@@ -386,6 +386,29 @@ def test_negative_options_are_refused_by_name(options):
         LrPlus(**options)
 
 
+@pytest.mark.parametrize("loss", [LrPlus(weight=2.0), LrStar(), LrStar(per_sample=True)])
+def test_the_terms_of_a_residual_loss_are_its_error_and_its_residual(loss, few, physics, near):
+    loss(near, few, physics)
+    norm = residual_norm(near, few, physics).mean()
+    assert set(loss.terms) == {"mse", "residual"}
+    assert float(loss.terms["mse"]) == pytest.approx(float(MSE()(near, few, physics)), rel=1e-12)
+    assert float(loss.terms["residual"]) == pytest.approx(float(norm), rel=1e-12)
+
+
+def test_an_inverted_sample_has_the_largest_residual_of_the_batch_and_no_gradient(
+    few, physics, near, inverted
+):
+    mixed = torch.cat([near[:3], inverted[3:]])
+    norms = residual_norm(mixed, few, physics)
+    sound = residual_norm(near, few, physics)[:3]
+    assert norms.tolist() == pytest.approx([*sound.tolist(), float(sound.max())], rel=1e-12)
+    assert residual_norm(inverted, few, physics).tolist() == [1.0] * 4
+    u = mixed.clone().requires_grad_()
+    residual_norm(u, few, physics).sum().backward()
+    assert not u.grad[3].any()
+    assert all(u.grad[k].any() for k in range(3))
+
+
 # ------------------------------------------------------------------ the energy norm of the error
 
 
@@ -419,6 +442,15 @@ def test_stiffness_evaluates_one_tangent_and_no_other_finite_element(
     for _ in range(3):
         gradient(loss, near, few, physics)
     assert evaluations == []
+    assert len(made) == 1
+
+
+def test_the_energy_assembles_one_tangent(few, physics, near, monkeypatch):
+    made, linearise = [], Problem.linearise
+    monkeypatch.setattr(Problem, "linearise", lambda *a: made.append(1) or linearise(*a))
+    loss = Energy()
+    for _ in range(3):
+        loss(near, few, physics)
     assert len(made) == 1
 
 
@@ -469,6 +501,12 @@ def test_a_floor_out_of_range_is_refused(kind, floor):
         kind(floor=floor)
 
 
+@pytest.mark.parametrize("kind", [MSE, Stiffness, Energy])
+@pytest.mark.parametrize("floor", [0, 1])
+def test_a_floor_may_be_zero_or_one(kind, floor):
+    assert kind(floor=floor).floor == floor
+
+
 # ------------------------------------------------------------------ the energy, without answers
 
 
@@ -516,6 +554,20 @@ def test_zero_loads_are_no_trouble(few, physics, near):
         for u in (near, 0 * near):
             assert loss(u, still, physics).isfinite()
             assert gradient(loss, u, still, physics).isfinite().all()
+
+
+def test_an_inverted_sample_has_the_energy_of_the_linear_body(scene, few, physics, inverted):
+    """Half of u^T K(0) u, over the work of the linear answer."""
+    problem = scene.problem
+    image = problem.tangent_product(torch.zeros_like(inverted), inverted)
+    linear = torch.stack([scene.linear.respond(force) for force in few.force])
+    work = (few.force * linear).sum(dim=(1, 2)) / 2
+    expected = (inverted * image).sum(dim=(1, 2)) / 2 / work
+    found = float(Energy(floor=0.0)(inverted, few, physics))
+    assert found == pytest.approx(float(expected.mean()), rel=1e-9)
+    slope = gradient(Energy(floor=0.0), inverted, few, physics)
+    expected = torch.where(problem.free, image, 0.0) / work[:, None, None] / len(work)
+    assert torch.allclose(slope, expected, rtol=1e-9, atol=1e-12 * float(expected.abs().max()))
 
 
 def test_inverted_samples_lead_to_where_nothing_is_inverted(scene, unanswered, physics, inverted):
@@ -628,6 +680,16 @@ def test_the_parts_of_an_annealed_loss_anneal_too():
     loss = Annealed(MSE(), LrPlus(weight=2.0, warmup_epochs=4), epochs=2)
     loss.on_train_epoch_start(SimpleNamespace(current_epoch=3), None)
     assert loss.second.weight == 1.5
+
+
+def test_the_parts_of_an_annealed_loss_see_the_trainer_and_the_module():
+    class Watch(MSE):
+        def on_train_epoch_start(self, trainer, module):
+            self.seen = trainer, module
+
+    parts, trainer, module = (Watch(), Watch()), SimpleNamespace(current_epoch=0), object()
+    Annealed(*parts, epochs=1).on_train_epoch_start(trainer, module)
+    assert all(part.seen == (trainer, module) for part in parts)
 
 
 def test_an_annealed_loss_leaves_out_what_both_do():

@@ -6,6 +6,7 @@ import torch
 
 from dpl.fem.problem import Problem
 from dpl.metrics import (
+    Judged,
     MaxError,
     MeanError,
     MinSNR,
@@ -158,3 +159,79 @@ def test_a_prediction_that_is_no_number_is_never_the_best(scene, batch):
     assert numbers["min_det_F"] == -torch.inf
     for name in ("e_mean", "e_max", "rel_L2_worst"):
         assert not numbers[name] < 1e9
+
+
+METRICS = [MeanError, MaxError, MinSNR, RelativeL2, ResidualRatio, MinVolumeRatio]
+
+
+@pytest.mark.parametrize("kind", METRICS[:5])
+def test_a_metric_measures_each_load_by_itself(scene, prediction, batch, kind):
+    """The volume ratio is that of the whole batch, in `Problem.volume_ratio`."""
+    metric = kind(scene.problem) if kind is ResidualRatio else kind()
+    whole = metric.measure(prediction, batch)
+    assert whole.shape == (len(prediction),)
+    for k in range(len(prediction)):
+        one = metric.measure(
+            prediction[k : k + 1], Sample(*(column[k : k + 1] for column in batch))
+        )
+        assert float(one) == pytest.approx(float(whole[k]), rel=1e-12)
+
+
+def test_numbers_of_several_processes_are_those_of_all_loads(prediction, batch):
+    """What torchmetrics does with the states of two processes, without the processes."""
+    parts = [MeanError(), MeanError()]
+    for part, rows in zip(parts, (slice(0, 5), slice(5, 12)), strict=True):
+        part.update(prediction[rows], Sample(*(column[rows] for column in batch)))
+    parts[0].merge_state(parts[1])
+    whole = MeanError()
+    whole.update(prediction, batch)
+    assert float(parts[0].compute()) == pytest.approx(float(whole.compute()), rel=1e-12)
+
+
+def test_metrics_that_agree_on_the_first_batch_are_still_measured_apart(scene, prediction, batch):
+    """At the exact answer e_mean and e_max are both zero, and their states the same."""
+    found = metrics(scene.problem)
+    found.update(batch.displacement, batch)
+    found.update(prediction, batch)
+    expected = by_hand(scene.problem, prediction, batch)
+    numbers = {name: float(value) for name, value in found.compute().items()}
+    for name in ("e_max", "SNR_min", "SNR_min_printed", "rel_L2_worst"):
+        assert numbers[name] == pytest.approx(expected[name], rel=1e-9), name
+    assert numbers["e_mean"] == pytest.approx(expected["e_mean"] / 2, rel=1e-9)
+
+
+# ------------------------------------------------------------------ which loads are shown
+
+
+def test_a_load_is_told_by_its_size_its_errors_and_its_rank_in_each():
+    relative = torch.tensor([0.012345, 0.04, 0.03, 0.02])
+    largest = torch.tensor([0.4, 0.1, 0.2, 0.3])
+    judged = Judged(relative, largest, torch.tensor([0.2567, 0.1, 0.1, 0.1]))
+    assert judged.title(0) == (
+        "load 0, moved by 0.26 L\nrelative L2 1.23 %: 3 of 4 are worse\nlargest error 0.4 L: worst"
+    )
+    ranks = [[line.split(": ")[1] for line in judged.title(k).split("\n")[1:]] for k in (1, 2, 3)]
+    assert ranks == [
+        ["worst", "3 of 4 are worse"],
+        ["2nd worst", "3rd worst"],
+        ["3rd worst", "2nd worst"],
+    ]
+
+
+def test_the_farthest_load_has_the_largest_absolute_error():
+    relative, largest = torch.tensor([0.9, 0.1, 0.2]), torch.tensor([0.1, 0.8, 0.7])
+    assert Judged(relative, largest, largest).farthest == 1
+    assert Judged(relative, torch.tensor([0.1, 0.8, torch.nan]), largest).farthest == 2
+
+
+def test_equal_errors_are_in_the_order_of_the_loads():
+    """Enough of them that a sort which is not stable would mix them."""
+    same = torch.full((1000,), 0.5)
+    assert Judged(same, same, same).chosen(3) == [*range(6), 503]
+
+
+def test_few_loads_are_all_chosen_and_none_twice():
+    one = torch.tensor([0.5])
+    assert Judged(one, one, one).chosen(2) == [0]
+    two = torch.tensor([0.5, 0.7])
+    assert Judged(two, two, two).chosen(1) == [1, 0]
