@@ -24,7 +24,13 @@ from dpl.fem.materials import (
     StableNeoHookean,
     YeohK2,
 )
-from dpl.fem.tensors import green_lagrange, volume_change
+from dpl.fem.tensors import (
+    cofactor,
+    green_lagrange,
+    invariants,
+    inverse_transpose,
+    volume_change,
+)
 
 SVK, NH, SNH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3), StableNeoHookean(0.3)
 HOOKEAN = [
@@ -784,3 +790,161 @@ def test_law_without_energy_says_so():
 def test_law_of_invariants_without_slopes_says_so():
     with pytest.raises(NotImplementedError):
         Isotropic().stress(0.1 * EYE)
+
+
+# ------------------------------------------------------------------ a batch of Poisson's ratios
+
+
+@dataclass(frozen=True)
+class SoleEnergy(Hookean):
+    """The energy of NH-ln with a Poisson's ratio for each member of a batch, and nothing else."""
+
+    def energy(self, H):
+        return NeoHookeanLn(self.poisson).energy(H)
+
+
+RATIOS = torch.tensor([-0.3, 0.0, 0.2, 0.3, 0.45], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("kind", [*HOOKEAN, SoleEnergy])
+def test_members_of_a_batch_answer_as_bodies_with_their_own_poissons_ratio(kind, gradients):
+    """H is (B, E, Q, 3, 3), and each member's ratio holds in all of its cells and points."""
+    H = gradients.reshape(5, 2, 2, 3, 3)
+    whole = kind(0.1).at(RATIOS)
+    assert whole.several
+    assert not kind(0.1).several
+    for k, ratio in enumerate(RATIOS.tolist()):
+        one = kind(0.1).at(ratio)
+        assert one == kind(ratio)
+        assert_close(whole.energy(H)[k], one.energy(H[k]), rtol=1e-12, atol=1e-15)
+        assert_close(whole.stress(H)[k], one.stress(H[k]), rtol=1e-12, atol=1e-14)
+        if kind is not SoleEnergy:
+            assert_close(whole.tangent(H)[k], one.tangent(H[k]), rtol=1e-12, atol=1e-13)
+        if whole.has_response and kind is not SoleEnergy:
+            E = green_lagrange(H)
+            found, wanted = whole.response(E), one.response(E[k])
+            assert_close(found.stress[k], wanted.stress, rtol=1e-12, atol=1e-14)
+            assert_close(found.moduli[k], wanted.moduli, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "ratios", [[-1.0, 0.3], [0.3, 0.5], [0.3, math.nan], [0.3, 0.7], [-2.0, 0.3]]
+)
+def test_a_batch_with_one_ratio_out_of_range_is_an_error(hookean, ratios):
+    with pytest.raises(ValueError, match="poisson"):
+        hookean(0.3).at(torch.tensor(ratios, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("span", [[0.2, 0.4], (0.2, 0.4), [-0.999, 0.499], [0, 0.4]])
+def test_a_law_with_a_range_says_so_and_has_no_moduli(hookean, span):
+    law = hookean(span)
+    assert law.poisson_range == tuple(span)
+    assert all(isinstance(end, float) for end in law.poisson_range)
+    assert not law.several
+    for moduli in (lambda: law.mu, lambda: law.lam, lambda: law.bulk):
+        with pytest.raises(ValueError, match="is a range"):
+            moduli()
+
+
+@pytest.mark.parametrize(
+    "span",
+    [
+        *([0.4, 0.2], [0.3, 0.3], [-1.0, 0.3], [0.2, 0.5], [-2.0, 0.3], [0.2, 0.6], []),
+        *([0.2], [0.1, 0.2, 0.3], [math.nan, 0.3], [0.2, math.nan]),
+    ],
+)
+def test_a_range_that_holds_no_ratios_is_an_error(hookean, span):
+    with pytest.raises(ValueError, match="must be a range"):
+        hookean(span)
+
+
+def test_a_law_of_one_poissons_ratio_has_no_range(law):
+    assert law.poisson_range is None
+    assert law.several is False
+
+
+@pytest.mark.parametrize("name", ["MR", "Yeoh", "Ogden3"])
+def test_a_law_without_poissons_ratio_has_none_to_change(laws, name):
+    with pytest.raises(ValueError, match="has no Poisson's ratio"):
+        laws[name].at(0.3)
+
+
+# ------------------------------------------------------------------ shapes, precision, extremes
+
+
+def test_a_gradient_alone_is_answered_like_one_of_a_batch(law, gradients):
+    H = gradients.reshape(5, 2, 2, 3, 3)
+    for quantity, axes in ((law.energy, 0), (law.stress, 2), (law.tangent, 4)):
+        found = quantity(H)
+        assert found.shape == (5, 2, 2, *[3] * axes)
+        assert_close(found[3, 1, 0], quantity(H[3, 1, 0]), rtol=1e-12, atol=1e-13)
+
+
+def test_single_precision_stays_single_and_is_as_exact(law, gradients):
+    for quantity in (law.energy, law.stress, law.tangent):
+        single, double = quantity(gradients.float()), quantity(gradients)
+        assert single.dtype == torch.float32
+        size = double.abs().max().item()
+        assert_close(single.double(), double, rtol=0, atol=1e-4 * size)
+
+
+@pytest.mark.parametrize("constant", [math.nan, math.inf])
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda c: YeohK2(0.2, c, 0.1, 2.0),
+        lambda c: YeohK2(0.2, 0.1, c, 2.0),
+        lambda c: YeohK2(0.2, 0.1, 0.1, c),
+        lambda c: MooneyRivlinK2(0.1, 0.1, c),
+        lambda c: OgdenK2([0.1], [c], 2.0),
+        lambda c: OgdenK2([0.1], [2.0], c),
+    ],
+)
+def test_a_modulus_that_is_no_finite_number_is_an_error(build, constant):
+    with pytest.raises(ValueError, match="must be"):
+        build(constant)
+
+
+def test_moduli_may_be_negative_where_the_body_still_resists():
+    """Only the shear and the bulk modulus at rest have a sign."""
+    assert MooneyRivlinK2(0.2, -0.1, 2.0).mu == pytest.approx(0.2)
+    assert YeohK2(0.2, -0.1, -0.1, 2.0).mu == pytest.approx(0.4)
+    assert OgdenK2([0.3, -0.1], [2.0, -2.0], 0.5).mu == pytest.approx(0.2)
+    assert OgdenK2([0.3], [2.0], 0.5).lam + 2 / 3 * 0.3 == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-12, 1e-9, 1e-7, 3e-7, 3e-6, 1e-5])
+def test_ogden_is_continuous_where_stretches_meet(laws, gap):
+    """The quotient of stresses and its limit give the same tangent on either side of 1e-6."""
+    law = laws["Ogden3"]
+    axis = torch.tensor([0.3, -0.7, 0.5], dtype=torch.float64)
+    turn = torch.matrix_exp(torch.linalg.cross(EYE, axis.expand(3, 3)))
+    strains = torch.tensor([0.2, 0.2 + gap, -0.1], dtype=torch.float64)
+    E = turn @ torch.diag(strains) @ turn.mT
+    D = law.response(E).moduli
+    change = torch.tensor([[0.3, 0.1, -0.2], [0.1, -0.4, 0.5], [-0.2, 0.5, 0.2]]).double()
+    ahead, behind = (law.response(E + h * change).stress for h in (1e-4, -1e-4))
+    slope = (ahead - behind) / 2e-4
+    found = torch.einsum("ijkl,kl->ij", D, change)
+    assert_close(found, slope, rtol=0, atol=1e-6 * slope.abs().max().item())
+
+
+def test_cofactor_is_the_slope_of_the_determinant(gradients):
+    F = EYE + gradients
+    slope = torch.func.vmap(torch.func.grad(torch.linalg.det))(F)
+    assert_close(cofactor(F), slope, rtol=1e-12, atol=1e-14)
+    assert_close(cofactor(F) @ F.mT, torch.linalg.det(F)[:, None, None] * EYE)
+
+
+def test_inverse_transpose_is_that_of_the_deformation(gradients):
+    found = inverse_transpose(gradients, volume_change(gradients))
+    assert_close(found, torch.linalg.inv(EYE + gradients).mT, rtol=1e-12, atol=1e-13)
+
+
+def test_invariants_are_those_of_the_eigenvalues(gradients):
+    e = gradients + gradients.mT
+    a, b, c = torch.linalg.eigvalsh(e).unbind(-1)
+    first, second, third = invariants(e)
+    assert_close(first, a + b + c, rtol=1e-11, atol=1e-13)
+    assert_close(second, a * b + b * c + c * a, rtol=1e-11, atol=1e-13)
+    assert_close(third, (1 + a) * (1 + b) * (1 + c) - 1, rtol=1e-11, atol=1e-13)
