@@ -259,11 +259,17 @@ class Session(L.Callback):
 
     Attributes:
         hyperparameters: Flat, numbers, truth values and texts.
+        begun: Whether an epoch has begun in this session.
     """
 
     def __init__(self, hyperparameters: Mapping[str, bool | int | float | str]) -> None:
         """Keep what to tell."""
         self.hyperparameters = dict(hyperparameters)
+        self.begun = False
+
+    def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Remember that what is resumed has been restored."""
+        self.begun = True
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Tell what run this is."""

@@ -9,20 +9,25 @@ which torch reads tensors and plain data only (`weights_only`).
 
 import json
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
 
+import lightning as L
 import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import ModelCheckpoint
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save
 
 from dpl.data.durable import whole_file
 
 WEIGHTS = ".safetensors"
 HEADER = ("scene", "identity", "epoch", "global_step")  # what stands beside the weights, as JSON
+# "best.ckpt" is of runs before weights had files of their own; a short run has only its last
+KEPT = (f"best{WEIGHTS}", "best.ckpt", "last.ckpt")  # files of weights that a run is loaded from
+RESUMED = {"loops", "callbacks", "optimizer_states", "lr_schedulers"}  # parts that resuming needs
 MOST = 8e9  # bytes of a file that is read
 
 
@@ -60,12 +65,32 @@ def read(path: Path) -> dict[str, Any]:
         if inside > path.stat().st_size:
             raise ValueError(f"unpacks to {inside / 1e9:.3g} GB, which no checkpoint does")
         found = torch.load(path, map_location="cpu", weights_only=True)
-    except (SafetensorError, zipfile.BadZipFile, RuntimeError, EOFError, UnpicklingError) as error:
+    except UnpicklingError as error:  # torch advises to read it all the same
+        raise ValueError("holds more than tensors and plain data, and is not read") from error
+    except OSError:
+        raise
+    except Exception as error:  # torch raises errors of any kind at a damaged pickle
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(reason) from error
+        raise ValueError(f"is damaged or no checkpoint: {reason}") from error
     if not isinstance(found, dict) or not isinstance(found.get("state_dict"), dict):
         raise ValueError("is no checkpoint: it holds no weights")
     return found
+
+
+def epochs(checkpoint: Mapping[str, Any]) -> int:
+    """Return how many epochs a checkpoint was written after.
+
+    Raises:
+        ValueError: It holds less than resuming takes.
+    """
+    if missing := RESUMED - checkpoint.keys():
+        raise ValueError(
+            f"holds no {', '.join(sorted(missing))}, which resuming takes; resume from last.ckpt"
+        )
+    epoch = checkpoint.get("epoch")
+    if not isinstance(epoch, int):
+        raise ValueError(f"says epoch = {epoch!r}, which must be a whole number")
+    return epoch + 1
 
 
 def _weights(path: Path) -> dict[str, Any]:
@@ -104,11 +129,45 @@ class WholeCheckpoints(TorchCheckpointIO):
             raise ValueError(f"{path} {error}") from error
 
 
+def keeps(callback: Any, trainer: L.Trainer, folder: str | Path) -> bool:
+    """Return whether a callback writes weights from which a run can be loaded.
+
+    Args:
+        callback: Of the trainer.
+        trainer: The trainer, before it begins.
+        folder: The run's.
+    """
+    if not isinstance(callback, ModelCheckpoint) or callback.save_top_k == 0:
+        return False
+    if callback.monitor is not None and not _validates(trainer):
+        return False
+    place = Path(folder).resolve() / "checkpoints"
+    there = callback.dirpath is not None and Path(callback.dirpath).resolve() == place
+    named = f"{callback.filename}{callback.FILE_EXTENSION}" in KEPT or callback.save_last
+    return bool(there and named and not getattr(trainer, "fast_dev_run", False))
+
+
+def _validates(trainer: L.Trainer) -> bool:
+    """Return whether there is a validation before a training ends."""
+    every, most = trainer.check_val_every_n_epoch, trainer.max_epochs
+    return trainer.limit_val_batches != 0 and (
+        every is None or most is None or most == -1 or every <= most
+    )
+
+
 class BestWeights(ModelCheckpoint):
-    """The weights of the smallest validation error, as a file of tensors."""
+    """The weights of the smallest validation error, as a file of tensors.
+
+    An error that is infinite or not a number is never the smallest.
+    """
 
     FILE_EXTENSION = WEIGHTS
 
     def __init__(self, **options: Any) -> None:
         """Choose as for Lightning's `ModelCheckpoint`."""
         super().__init__(save_weights_only=True, **options)
+
+    def check_monitor_top_k(self, trainer: L.Trainer, current: torch.Tensor | None = None) -> bool:
+        """Return whether an error is finite and smaller than those before."""
+        finite = current is None or bool(current.isfinite())
+        return finite and super().check_monitor_top_k(trainer, current)

@@ -1,10 +1,9 @@
 """Surrogate: a network with its scales and its loss, trained by Lightning."""
 
-import json
 import math
 import random
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, cast
 
@@ -232,12 +231,12 @@ class Surrogate(L.LightningModule):
         Raises:
             ValueError: It is one.
         """
-        theirs, ours = checkpoint.get("scene", "unknown"), self.scene.fingerprint
-        if theirs != ours:
-            found = differences(checkpoint.get("identity", {}), self.scene.identity())
+        theirs, identity = checkpoint.get("scene", "unknown"), checkpoint.get("identity", {})
+        if not self.scene.matches(theirs, identity):
             raise ValueError(
-                f"the checkpoint is of scene {theirs[:12]}, this scene is {ours[:12]}"
-                + "".join(f"; {line}" for line in found)
+                f"the checkpoint is of scene {theirs[:12]}, this scene is "
+                f"{self.scene.fingerprint[:12]}"
+                + "".join(f"; {line}" for line in self.scene.differences(identity))
             )
         self._random_states = checkpoint.get("random")
 
@@ -245,23 +244,6 @@ class Surrogate(L.LightningModule):
         """Go on with the random numbers of the run that this one resumes."""
         if self._random_states is not None:
             set_random_states(self._random_states)
-
-
-def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any], path: str = "") -> list[str]:
-    """Return in what the identities of two scenes differ, see `Scene.identity`, a line each.
-
-    What the first lacks, as those that older checkpoints hold, counts as equal.
-    """
-    lines = []
-    for key in theirs:
-        place, a, b = f"{path}{key}", theirs[key], ours.get(key)
-        if isinstance(a, Mapping) and isinstance(b, Mapping):
-            lines += differences(a, b, f"{place}.")
-        elif json.dumps(a) != json.dumps(b):
-            digest = isinstance(a, str) and len(a) == 64
-            words = "differ" if digest else f"{a} there, {b} here"
-            lines.append(f"{place}: {words}")
-    return lines
 
 
 def warmup_cosine(

@@ -31,11 +31,11 @@ if typing.TYPE_CHECKING:
 
 
 SCENE = (  # keys that make a scene, and those that make a surrogate of it
-    *("mesh", "degree", "mean_dilatation", "clamped", "supports", "forces"),
+    *("mesh", "degree", "mean_dilatation", "supports", "forces"),
     *("material", "young", "loads", "solver"),
 )
 NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")
-LONGEST = 1_000_000  # bytes of a run's configuration
+LONGEST = 100_000  # bytes of a run's configuration
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -51,7 +51,8 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key} is missing; set it on the command line") from None
     except OmegaConfBaseException as error:
-        raise ConfigError(f"{error.full_key or 'config'}: {error.msg or error}") from None
+        told = str(error.msg or error).splitlines()[0]
+        raise ConfigError(f"{error.full_key or 'config'}: {told}") from None
 
 
 def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
@@ -243,28 +244,61 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
     there.write_text(OmegaConf.to_yaml(OmegaConf.create(plain(cfg))))
 
 
-def check_resumed(cfg: DictConfig) -> None:
-    """Hold a configuration against that of the run that it resumes.
+def check_resumed(cfg: DictConfig) -> dict[str, Any] | None:
+    """Return the checkpoint that a run resumes; None if it begins anew.
 
     `ckpt_path=last` of a run that has not begun begins it: a job has one command line.
 
     Raises:
-        ConfigError: There is no such checkpoint, or they differ in what makes the run what it is.
+        ConfigError: There is no such checkpoint, it cannot be resumed, or its run differs in what
+            makes the run what it is.
     """
     last = Path(cfg.folder) / "checkpoints" / "last.ckpt"
     if not cfg.ckpt_path or (cfg.ckpt_path == "last" and not last.exists()):
-        return
+        return None
     path = last if cfg.ckpt_path == "last" else Path(cfg.ckpt_path)
     if not path.is_file():
         raise ConfigError(f"ckpt_path: there is no {path} to resume; leave it out to begin anew")
     before = path.parent.parent / "config.yaml"
-    if not before.is_file():
-        return
-    changed = schema.changes(_read_config(before), plain(cfg))
-    if changed:
+    if before.is_file() and (changed := schema.changes(_read_config(before), plain(cfg))):
         raise ConfigError(
             f"ckpt_path: {path} is of another configuration: {'; '.join(changed)}; "
             "set them back, or begin a run of another name"
+        )
+    from dpl import checkpoints
+
+    try:
+        found = checkpoints.read(path)
+        done = checkpoints.epochs(found)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"ckpt_path = {path} cannot be resumed: it {error}") from error
+    most = cfg.trainer.get("max_epochs")
+    if most is not None and 0 <= most < done:
+        raise ConfigError(
+            f"trainer.max_epochs = {most} must be {done} or more; the run in ckpt_path = {path} "
+            "has done as many"
+        )
+    return found
+
+
+def check_weights(surrogate: "Surrogate", checkpoint: dict[str, Any]) -> None:
+    """Hold the checkpoint that a run resumes against its untrained surrogate.
+
+    Raises:
+        ConfigError: It is of another scene or of another network.
+    """
+    try:
+        surrogate.on_load_checkpoint(checkpoint)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ConfigError(f"ckpt_path: {error}") from error
+    ours, theirs = (
+        {name: tuple(t.shape) for name, t in state.items() if isinstance(t, torch.Tensor)}
+        for state in (surrogate.state_dict(), checkpoint["state_dict"])
+    )
+    if differing := sorted(dict(ours.items() ^ theirs.items())):
+        raise ConfigError(
+            f"ckpt_path: the checkpoint is of another network: {differing[0]} has shape "
+            f"{theirs.get(differing[0])} there, {ours.get(differing[0])} here"
         )
 
 
@@ -276,7 +310,7 @@ def _read_config(path: Path) -> dict[str, Any]:
     """
     try:
         if path.stat().st_size > LONGEST:
-            raise ValueError(f"has more than {LONGEST} bytes")
+            raise ValueError(f"has {path.stat().st_size:,} bytes, of {LONGEST:,} at most")
         text = path.read_text()
         marks = yaml.AnchorToken, yaml.AliasToken  # a few lines of which unfold to gigabytes
         if any(isinstance(token, marks) for token in yaml.scan(text, yaml.SafeLoader)):
@@ -309,11 +343,7 @@ def load_run(
     from dpl import checkpoints  # which imports Lightning
 
     config = Path(folder) / "config.yaml"
-    # "best.ckpt" is of runs before weights had files of their own; a short run has only its last
-    kept = [
-        Path(folder) / "checkpoints" / name
-        for name in (f"best{checkpoints.WEIGHTS}", "best.ckpt", "last.ckpt")
-    ]
+    kept = [Path(folder) / "checkpoints" / name for name in checkpoints.KEPT]
     best = next((path for path in kept if path.exists()), kept[-1])
     for path in (config, best):
         if not path.is_file():

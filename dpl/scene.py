@@ -2,10 +2,11 @@
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import NamedTuple
+from numbers import Real
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -113,7 +114,7 @@ class Scene:
         """Return everything that decides a sample, as plain data; arrays as their SHA-256.
 
         Sizes and Young's moduli are absent: u/L depends on f/(E L^2) alone. Coordinates count to
-        1e-9 L.
+        1e-9 L. Real parameters are floats, so that 1 and 1.0 make one scene.
         """
         points = self.problem.points.numpy()
         # Not rounded: the halves among dyadic coordinates would flip with the last bit.
@@ -127,26 +128,40 @@ class Scene:
             "mean_dilatation": self.problem.mean_dilatation,
             "prescribed": _digest(self.problem.prescribed.numpy()),
             "springs": [_digest(part.numpy()) for part in self.problem.springs or ()],
-            "law": {"name": type(law).__name__, **vars(law)},
+            "law": {"name": type(law).__name__, **_real(vars(law))},
             "loads": {
                 "name": type(loads).__name__,
                 "n_modes": loads.n_modes,
-                "deflection": loads.deflection,
+                "deflection": float(loads.deflection),
                 "patch": [float(radius) for radius in loads.patch],
                 "distribution": _name(loads.distribution),
-                "spectrum": loads.spectrum,
+                "spectrum": float(loads.spectrum),
                 "radius": _name(loads.radius),
                 "amplitude": _name(loads.amplitude),
                 "sampling": loads.sampling,
                 "always": None if loads.always is None else _digest(loads.always.numpy()),
             },
-            "tol": self.solver.tol,
+            "tol": float(self.solver.tol),
         }
 
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of `identity`, in hexadecimal."""
         return hashlib.sha256(json.dumps(self.identity(), sort_keys=True).encode()).hexdigest()
+
+    def matches(self, fingerprint: str, identity: Any) -> bool:
+        """Return whether a fingerprint and an identity that were written down are this scene's.
+
+        Those of before numbers were canonical differ in fingerprint alone: 1 equals 1.0.
+        """
+        return fingerprint == self.fingerprint or _plain(identity) == _plain(self.identity())
+
+    def differences(self, identity: Any) -> list[str]:
+        """Return in what an identity that was written down differs from this scene's, a line each.
+
+        What it lacks, as those of older versions do, counts as equal.
+        """
+        return _differences(_plain(identity), _plain(self.identity()))
 
     def plan(self) -> list[str]:
         """Return what this scene does not need and what is therefore skipped, a line each."""
@@ -188,9 +203,35 @@ class Scene:
 def _name(function: Callable[..., object]) -> str:
     """Return what a function or a partial of one is called, with its arguments."""
     if isinstance(function, partial):
-        keywords = dict(sorted(function.keywords.items()))
-        return f"{_name(function.func)}{function.args or ''}{keywords or ''}"
+        keywords = _real(dict(sorted(function.keywords.items())))
+        return f"{_name(function.func)}{_real(function.args) or ''}{keywords or ''}"
     return getattr(function, "__name__", repr(function))
+
+
+def _real(value: Any) -> Any:
+    """Return plain data with all numbers as floats."""
+    if isinstance(value, Mapping):
+        return {key: _real(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(map(_real, value))
+    return float(value) if isinstance(value, Real) and not isinstance(value, bool) else value
+
+
+def _plain(identity: Any) -> Any:
+    """Return an identity as it is read from a file: lists for tuples."""
+    return json.loads(json.dumps(identity))
+
+
+def _differences(theirs: Any, ours: Mapping[str, Any], path: str = "") -> list[str]:
+    lines = []
+    for key, a in theirs.items() if isinstance(theirs, Mapping) else ():
+        place, b = f"{path}{key}", ours.get(key)
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            lines += _differences(a, b, f"{place}.")
+        elif _real(a) != b and a != b:
+            digest = isinstance(a, str) and len(a) == 64
+            lines.append(f"{place}: " + ("differ" if digest else f"{a} there, {b} here"))
+    return lines
 
 
 def _digest(array: np.ndarray) -> str:

@@ -4,12 +4,13 @@ Signatures are the schema: options and their types are those of the classes and 
 """
 
 import contextlib
+import difflib
 import importlib
 import inspect
 import math
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,15 @@ SPANS = {  # smallest and largest of them
     **{"count": (0, 10**6), "far": (0, 10**6), "workers": (0, 1024), "seed": (0, 2**32 - 1)},
     **{"budget": (1, 10**6), "minutes": (1e-2, 1e6), "port": (0, 65535)},
     **{"tol": (1e-15, 1), "tols": (1e-15, 1), "across": (1, 10**3), "threads": (1, 10**4)},
+    **{"young": (1e-30, 1e30)},  # [Pa]
 }
+TRAINED = {  # smallest and largest of what only a training must keep to; 1e-30 is "above 0"
+    **{"data.train": (1, 10**7), "optimizer.lr": (1e-30, 1e6)},
+    **{f"trainer.{key}": (1, 10**9) for key in ("max_epochs", "max_steps")},
+    **{"trainer.check_val_every_n_epoch": (1, 10**9), "trainer.log_every_n_steps": (0, 10**9)},
+    **{"trainer.limit_train_batches": (1e-30, 10**9)},
+}
+ENDLESS = {"trainer.max_epochs", "trainer.max_steps"}  # -1 of these stands for no limit
 KINDS = {  # what the call under a key must give: one of these, or of a class derived from them
     "mesh": {"skfem.mesh.mesh.Mesh"},
     "material": {"dpl.fem.law.Material"},
@@ -97,7 +106,7 @@ def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = Tr
             not finite or out of range, or an object that does not exist or is not trusted.
     """
     if unknown := sorted({str(key) for key in resolved} - set(KEYS)):
-        raise ConfigError(f"{unknown[0]}: no such key; there are {', '.join(sorted(KEYS))}")
+        raise ConfigError(f"{unknown[0]}: there is no such key; {instead(unknown[0], KEYS)}")
     for node in (written, resolved):  # first where a value is written
         for path, value in walk(node):
             if isinstance(value, float) and not math.isfinite(value):
@@ -106,7 +115,11 @@ def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = Tr
                 raise ConfigError(f"{path} = {value} does not fit into 64 bits")
     for key, value in resolved.items():
         _check_top(key, value)
+    trained = TRAINED if "trainer" in resolved else {}
     for path, node in walk(resolved):
+        if path in trained and not (path in ENDLESS and node == -1):
+            least, most = trained[path]
+            _check_span(path, node, least, most, " or be -1" * (path in ENDLESS))
         if isinstance(node, dict) and "_target_" in node:
             _check_call(path, node, _target(path, node["_target_"], trust=trust))
         elif _is_call(path) and node is not None:
@@ -125,10 +138,15 @@ def _check_top(key: str, value: Any) -> None:
         return
     if not fits(value, KEYS[key]):
         raise ConfigError(f"{key} = {value!r} must be {_words(KEYS[key])}")
-    least, most = SPANS.get(key, (-math.inf, math.inf))
+    _check_span(key, value, *SPANS.get(key, (-math.inf, math.inf)))
+
+
+def _check_span(key: str, value: Any, least: float, most: float, more: str = "") -> None:
+    """Hold a number, or those in a list, against the smallest and the largest."""
     for one in value if isinstance(value, list) else [value]:
         if isinstance(one, int | float) and not least <= one <= most:
-            raise ConfigError(f"{key} = {value} must lie between {least:g} and {most:.10g}")
+            span = f"between {least:g} and {most:.10g}"
+            raise ConfigError(f"{key} = {value} must lie {span}{more}")
 
 
 def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
@@ -172,12 +190,35 @@ def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> 
                 raise ConfigError(f"{path}.{key} = {value!r} must be true or false")
             continue
         if key not in known:
-            named = ", ".join(sorted(known))
-            raise ConfigError(
-                f"{path}.{key}: {node['_target_']} has no such option; it has {named}"
-            )
+            told = instead(str(key), known, f"{path}.")
+            raise ConfigError(f"{path}.{key}: {node['_target_']} has no such option; {told}")
         if key in hints and not fits(value, hints[key]):
             raise ConfigError(f"{path}.{key} = {value!r} must be {_words(hints[key])}")
+
+
+def options_of(node: Mapping[str, Any]) -> set[str]:
+    """Return the options of what a call names; none where it is no call or names nothing."""
+    with contextlib.suppress(ConfigError, TypeError, ValueError):
+        return _signature(_target("", node.get("_target_"), trust=True))[0]
+    return set()
+
+
+def near(name: str, known: Collection[str]) -> str | None:
+    """Return the known name that is most like another one; None if none is."""
+    return next(iter(difflib.get_close_matches(name, known, 1)), None)
+
+
+def instead(name: str, known: Collection[str], place: str = "") -> str:
+    """Return which known name may be meant, or all of them.
+
+    Args:
+        name: The unknown name.
+        known: The known names.
+        place: What stands before the name that is meant.
+    """
+    if found := near(name, known):
+        return f"did you mean {place}{found}?"
+    return f"there are {', '.join(sorted(known))}"
 
 
 def _signature(target: Callable[..., Any]) -> tuple[set[str], dict[str, Any]]:

@@ -25,7 +25,7 @@ from dpl.benchmarks import generation as ways
 from dpl.benchmarks import peers
 from dpl.benchmarks.rows import machine, write, write_machine
 from dpl.commands.entry import command
-from dpl.fem.linear import installed
+from dpl.fem.linear import BACKENDS, installed
 from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
 from dpl.fem.solution import Solver, one_thread
 from dpl.scene import Sample, Scene
@@ -47,7 +47,12 @@ def main(cfg: DictConfig) -> None:
     run.check(cfg)
     if unknown := [part for part in cfg.parts if part not in PARTS]:
         raise run.ConfigError(f"parts: {unknown[0]!r} is none of {', '.join(PARTS)}")
+    if unknown := [name for name in cfg.linear if name not in ("auto", *BACKENDS)]:
+        known = ", ".join(("auto", *BACKENDS))
+        raise run.ConfigError(f"linear: {unknown[0]!r} is none of {known}")
     backends = [name for name in cfg.linear if name == "auto" or name in installed()]
+    if not backends:
+        raise run.ConfigError(f"linear = {list(cfg.linear)} must name one that is installed: auto")
     CONSOLE.print(f"{machine()}, 1 thread, medians of {cfg.repeats}")
     folder = Path(cfg.folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -17,8 +17,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from dpl.commands import asked
 from dpl.data.durable import DataSetError
 from dpl.schema import ConfigError
+from dpl.version import install
 
 R = typing.TypeVar("R")
 
@@ -30,10 +32,16 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the sh
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
-def command(name: str) -> Callable[[Callable[[DictConfig], R]], Callable[[], R]]:
+def command(
+    name: str, rehearse: Callable[[DictConfig], Any] | None = None
+) -> Callable[[Callable[[DictConfig], R]], Callable[[], R]]:
     """Return what makes a command of a task: its configuration is `conf/NAME.yaml`.
 
     Bad input ends it with one line and a status of 2, Ctrl-C with 130.
+
+    Args:
+        name: Name of the configuration.
+        rehearse: Builds what a job needs before it computes, see `dpl.commands.asked.check`.
     """
 
     def decorate(task: Callable[[DictConfig], R]) -> Callable[[], R]:
@@ -47,6 +55,8 @@ def command(name: str) -> Callable[[Callable[[DictConfig], R]], Callable[[], R]]
         @functools.wraps(task)
         def main() -> R:
             check_sweep(sys.argv[1:])
+            with readable_errors():
+                asked.check(name, CONF, sys.argv[1:], rehearse)
             return started()
 
         return main
@@ -64,23 +74,44 @@ def readable_errors() -> Iterator[None]:
         yield
     except (ConfigError, DataSetError) as error:
         print(f"error: {error}", file=sys.stderr)
-        _drop_empty(Path(HydraConfig.get().runtime.output_dir))
+        if HydraConfig.initialized():
+            _drop_empty(Path(HydraConfig.get().runtime.output_dir))
         sys.exit(2)
-    except OSError as error:
-        if error.errno not in (*FULL, *FORBIDDEN):
+    except (OSError, RuntimeError) as error:
+        cause = _failed_access(error)
+        if cause is None:
             raise
-        where = f" for {error.filename}" if error.filename else ""
-        full = error.errno in FULL
-        told = f"no space left{where}" if full else f"no permission to write{where}"
-        do = "make room" if full else "choose another folder or change its rights"
-        print(
-            f"error: {told}; what was there is whole: {do} and run the same command again",
-            file=sys.stderr,
-        )
+        print(f"error: {_told(cause)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def _failed_access(error: BaseException | None) -> OSError | None:
+    """Return the failed access to a file that an error comes from; None if it does not.
+
+    PyTorch's writer of archives and the loggers raise errors of their own after it.
+    """
+    while error is not None:
+        if isinstance(error, OSError) and error.errno is not None:
+            return error
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def _told(error: OSError) -> str:
+    """Return in one line which access to a file failed, and what to do."""
+    where = f" for {error.filename}" if error.filename else ""
+    if error.errno in FULL:
+        told, do = f"no space left{where}", "make room"
+    elif error.errno in FORBIDDEN:
+        told = f"no permission to write{where}"
+        do = "choose another folder or change its rights"
+    else:
+        told = f"{error.strerror}{where}"
+        do = "choose another folder or mend this one"
+    return f"{told}; what was there is whole: {do} and run the same command again"
 
 
 def _drop_empty(folder: Path) -> None:
@@ -106,8 +137,8 @@ def check_sweep(arguments: Sequence[str]) -> None:
     try:
         importlib.import_module("hydra_plugins.hydra_optuna_sweeper._impl")
     except ImportError as error:
-        do = "pip install -c constraints.txt -e '.[sweep]'"
-        print(f"error: sweep: Optuna cannot be used ({error}): {do}", file=sys.stderr)
+        told = f"sweep: Optuna cannot be used ({error}): {install('sweep')}"
+        print(f"error: {told}", file=sys.stderr)
         sys.exit(2)
 
 
@@ -115,15 +146,24 @@ def check_trainer(trainer: Any, cfg: DictConfig) -> None:
     """Refuse what a trainer cannot do with the rest of a configuration, before it begins.
 
     Raises:
-        ConfigError: A schedule of the learning rate over a training without end, or a sweep whose
-            training starts further processes: each would start the sweep again.
+        ConfigError: A schedule of the learning rate over a training without end, callbacks that
+            keep no weights, or a sweep whose training starts further processes: each would start
+            the sweep again.
     """
     from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
+
+    from dpl import checkpoints
 
     if cfg.scheduler and trainer.max_epochs == -1 and trainer.max_steps == -1:
         raise ConfigError(
             "trainer.max_epochs = -1: the schedule of the learning rate needs an end; give it "
             "one, or trainer.max_steps, or set scheduler=null"
+        )
+    if not any(checkpoints.keeps(kept, trainer, cfg.folder) for kept in trainer.callbacks):
+        raise ConfigError(
+            "trainer.callbacks keep no weights that the run can be loaded from; add "
+            "{_target_: lightning.pytorch.callbacks.ModelCheckpoint, "
+            "dirpath: ${folder}/checkpoints, filename: last, enable_version_counter: false}"
         )
     sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
     launcher = getattr(trainer.strategy, "launcher", None)

@@ -17,13 +17,13 @@ from dpl import run
 from dpl.benchmarks import rows as table
 from dpl.commands.entry import command
 from dpl.data.durable import whole_file
+from dpl.version import install
 
 if TYPE_CHECKING:
     from dpl.module import Surrogate
 
 PARTS = ("model", "results")
 SHOWN = (0, 12)  # the stream of the loads in results
-INSTALL = "pip install -c constraints.txt -e '.[onnx]'"
 
 
 @command("export")
@@ -37,7 +37,7 @@ def main(cfg: DictConfig) -> None:
     if not cfg.parts:
         raise run.ConfigError(f"parts: choose of {', '.join(PARTS)}")
     if "model" in cfg.parts and (absent := missing()):
-        told = f"parts: model needs {', '.join(absent)}: {INSTALL}, or take parts=[results]"
+        told = f"parts: model needs {', '.join(absent)}: {install('onnx')}, or take parts=[results]"
         raise run.ConfigError(told)
     _, surrogate = run.load_run(cfg.run)
     folder = Path(cfg.run) / "export" if cfg.folder is None else Path(cfg.folder)

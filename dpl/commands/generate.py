@@ -6,18 +6,29 @@ from omegaconf import DictConfig
 
 from dpl import run
 from dpl.commands.entry import command
+from dpl.data.generate import DataSet
+from dpl.scene import Scene
 
 ACTIONS = ("generate", "verify", "repair")
 
 
-@command("generate")
-def main(cfg: DictConfig) -> None:
-    """Solve what is missing of a data set; or look whether it is sound; or make it so."""
-    run.check(cfg)
+def parts(cfg: DictConfig) -> tuple[Scene, DataSet]:
+    """Return the scene and the data set that is wanted; nothing is solved or written.
+
+    Raises:
+        ConfigError: One of them cannot be built.
+    """
     if cfg.action not in ACTIONS:
         raise run.ConfigError(f"action = {cfg.action!r} must be one of {', '.join(ACTIONS)}")
     scene = run.build_scene(cfg)
-    data = run.make(cfg, "data", scene=scene)
+    return scene, run.make(cfg, "data", scene=scene)
+
+
+@command("generate", rehearse=parts)
+def main(cfg: DictConfig) -> None:
+    """Solve what is missing of a data set; or look whether it is sound; or make it so."""
+    run.check(cfg)
+    scene, data = parts(cfg)
     run.show_plan(scene, data)
     if cfg.action == "verify":
         flaws = list(data.verify())

@@ -10,13 +10,12 @@ from omegaconf import DictConfig
 
 from dpl import run
 from dpl.commands.entry import command
+from dpl.version import install
 
 if TYPE_CHECKING:
     from dpl.viewer.door import Door
     from dpl.viewer.page import Page
     from dpl.viewer.state import Body
-
-MISSING = "pip install -c constraints.txt -e '.[viewer]'"
 
 
 @command("view")
@@ -29,7 +28,9 @@ def main(cfg: DictConfig) -> None:
     try:
         from dpl.viewer.page import Page
     except ImportError as error:
-        raise run.ConfigError(f"the viewer cannot be used ({error}): {MISSING}") from error
+        raise run.ConfigError(
+            f"the viewer cannot be used ({error}): {install('viewer')}"
+        ) from error
     door = _door(cfg)
     page = Page(_body(cfg), door, title=str(cfg.run), folder=Path(cfg.folder))
     try:
@@ -98,5 +99,7 @@ def _film(body: "Body", path: Path) -> None:
     try:
         moving_load(body, path)
     except ImportError as error:  # of what writes MP4
-        raise run.ConfigError(f"movie: {path.suffix} needs {error.name}: {MISSING}") from error
+        raise run.ConfigError(
+            f"movie: {path.suffix} needs {error.name}: {install('viewer')}"
+        ) from error
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")

@@ -77,6 +77,8 @@ class Store:
             DataSetError: The folder holds something else.
         """
         card = self.folder / "scene.json"
+        if self.folder.exists() and not self.folder.is_dir():
+            raise DataSetError(f"data.folder = {self.folder} must be a folder; choose another")
         there = {path.name for path in self.folder.iterdir()} if self.folder.exists() else set()
         if card.name not in there:
             if not {name for name in there if name[0] != "."} <= {MODES}:
@@ -105,13 +107,13 @@ class Store:
                 f"{self.folder} has format {card.get('format')}, this dpl reads {FORMAT}; "
                 "choose another data.folder"
             )
-        if card["fingerprint"] != self.scene.fingerprint:
-            ours = json.loads(json.dumps(self.scene.identity()))  # lists for tuples, as on disk
-            differing = [k for k, v in ours.items() if card["scene"].get(k) != v]
+        if not self.scene.matches(card["fingerprint"], card["scene"]):
+            found = self.scene.differences(card["scene"]) or ["written by another version"]
             raise DataSetError(
                 f"{self.folder} is a data set of another scene: its fingerprint is "
                 f"{card['fingerprint'][:12]}, this scene's is {self.scene.fingerprint[:12]} "
-                f"({', '.join(differing)} differ); choose another data.folder or restore the scene"
+                f"({'; '.join(found)}); choose another "
+                "data.folder or restore the scene"
             )
         if card["seed"] != self.seed:
             raise DataSetError(

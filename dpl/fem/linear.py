@@ -30,6 +30,7 @@ from dpl.fem.sparse import (
     require_finite,
     row_numbers,
 )
+from dpl.version import install
 
 __all__ = [
     "BACKENDS",
@@ -90,7 +91,7 @@ def chosen(
     if name not in (*BACKENDS, "auto"):
         raise ValueError(f"linear = {name!r} must be auto, {', '.join(BACKENDS)}")
     if name != "auto" and name not in installed():
-        raise ValueError(f"linear = {name!r} is not installed: pip install 'deepphysics[{name}]'")
+        raise ValueError(f"linear = {name!r} is not installed: {install(name)}")
     return name if name != "auto" or pattern is None else _automatic(pattern, near_null, lasting)
 
 
