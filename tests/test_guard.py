@@ -100,7 +100,7 @@ def test_a_network_that_has_learnt_nothing_is_told(tmp_path, capsys, error, said
 
 
 def test_a_rate_far_too_high_ends_with_one_line(script, tiny_training, tmp_path):
-    wild = ["optimizer.lr=1e30", "trainer.max_epochs=30", "run=runs/wild"]
+    wild = ["optimizer.lr=1e6", "trainer.max_epochs=30", "run=runs/wild"]
     ended = script("train", *tiny_training, *wild, cwd=tmp_path)
     assert ended.status == 2
     last = ended.err.strip().splitlines()[-1]

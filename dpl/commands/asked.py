@@ -1,6 +1,7 @@
 """What a command line asks for: composed and checked, job by job, before Hydra starts the first."""
 
 import itertools
+import logging
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -56,8 +57,12 @@ def check(
     for cfg in every:
         run.check(cfg)
     if sweep and rehearse is not None and REMOTE not in str(first.hydra.launcher):
-        for cfg in _different(every):
-            rehearse(cfg)
+        logging.disable(logging.INFO)  # what trainers say of the machine, each job says again
+        try:
+            for cfg in _different(every):
+                rehearse(cfg)
+        finally:
+            logging.disable(logging.NOTSET)
     try_folder(place)
 
 
@@ -142,7 +147,7 @@ def _folder(cfg: DictConfig, mode: str) -> Path:
     try:
         return Path(cfg.hydra[mode].dir)
     except OmegaConfBaseException:
-        told = OmegaConf.to_container(cfg, resolve=False)["run"]
+        told = OmegaConf.to_container(cfg, resolve=False)["run"] or "null"
         raise ConfigError(f"run = {told} must be a text, the name of a folder") from None
 
 
