@@ -1,7 +1,8 @@
 """Laws of scripts/generate.py among killed processes, signals, full disks and second writers.
 
 Real processes of the tiny scene. Its loads are drawn by `Slow`, which takes its time in workers and
-is no part of what is drawn: the same bytes whatever the pause.
+is no part of what is drawn: the same bytes whatever the pause. What a test waits for is an event (a
+line, a file, the end of a process); no duration decides.
 """
 
 import hashlib
@@ -19,29 +20,34 @@ from pathlib import Path
 
 import pytest
 
+from dpl.data.manifest import lines_of
 from dpl.fem.modes import ModalLoads
 
 HERE = Path(__file__)
-STARTING = 20.0  # a worker that imports sees only afterwards that its parent is gone [s]
+LONG = 240.0  # no test waits so long, unless what it waits for does not come [s]
+pytestmark = pytest.mark.timeout(1800)
 SCRIPT = HERE.parents[1] / "scripts" / "generate.py"
 
 
 @dataclass(frozen=True, eq=False)
 class Slow(ModalLoads):
-    """Loads that take time in workers.
+    """Loads that take time in workers, each of which says in a file `begun-...` that it has begun.
 
     Attributes:
-        pause: So much [s]; below 0: all time, in one call that no signal handler interrupts, and
-            a file `begun-...` in the folder of the process says so.
+        pause: So much [s]; below 0: all time, in one call that no signal handler interrupts.
+        gate: A file that they wait for; none if left out.
     """
 
     pause: float = 0.0
+    gate: str = ""
 
     def points(self, seed, indices):
         if multiprocessing.parent_process() is not None:
+            Path(f"begun-{os.getpid()}").touch()
             if self.pause < 0:
-                Path(f"begun-{os.getpid()}").touch()
                 sum(range(10**12))
+            while self.gate and not Path(self.gate).exists():
+                time.sleep(0.01)
             time.sleep(self.pause)
         return super().points(seed, indices)
 
@@ -51,9 +57,10 @@ def slow(monkeypatch, tiny):
     """Overrides of a data set, `d`, of so many loads that take so long."""
     monkeypatch.setenv("PYTHONPATH", str(HERE.parent))
 
-    def slow(pause=0.0, train=40, val=5, test=5, workers=2, folder="d"):
+    def slow(pause=0.0, train=40, val=5, test=5, workers=2, folder="d", gate=""):
         sizes = [f"data.train={train}", f"data.val={val}", f"data.test={test}"]
         loads = [f"loads._target_={HERE.stem}.Slow", f"+loads.pause={pause}"]
+        loads += [f"+loads.gate={gate}"] if gate else []
         return [*tiny, *sizes, *loads, f"data.workers={workers}", f"data.folder={folder}"]
 
     return slow
@@ -71,20 +78,20 @@ def limited(environment):
             env=environment(),
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=3 * LONG,
         )
         return ended.returncode, ended.stdout, ended.stderr
 
     return limited
 
 
-def finish(process, timeout=120):
-    out, err = process.communicate(timeout=timeout)
+def finish(process):
+    out, err = process.communicate(timeout=LONG)
     return process.returncode, out, err
 
 
-def waited_for(condition, seconds=60.0):
-    end = time.monotonic() + seconds
+def waited_for(condition):
+    end = time.monotonic() + LONG
     while time.monotonic() < end:
         if condition():
             return True
@@ -106,8 +113,23 @@ def workers_of(members, group):
 
 
 def gone(members, group):
-    """Return whether no process of a group is left; one that ends has closed its files before."""
-    return waited_for(lambda: not members(group), 2.0)
+    """Wait until no process of a group is left; return whether none is."""
+    return waited_for(lambda: not members(group))
+
+
+def told_to_stop(process):
+    """Read what a process says until it has heard that it is asked to stop; return that."""
+    said = ""
+    while line := process.stderr.readline():
+        said += line
+        if "once more to stop at once" in line:
+            return said
+    raise AssertionError(said)
+
+
+def done(folder):
+    """Return how many loads are kept."""
+    return spooled(folder) + sum(line["tried"] for line in lines_of(folder / "manifest.jsonl"))
 
 
 def spooled(folder):
@@ -148,21 +170,20 @@ def test_a_killed_parent_takes_workers_amid_a_solve_along(start, members, slow, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("delay", [0.0, 1.0])
 def test_a_killed_parent_takes_workers_that_are_still_starting_along(
-    start, members, slow, tmp_path, delay
+    start, members, slow, tmp_path
 ):
+    """See tests/data/test_processes.py for workers that are held while they import."""
     process = start("generate", *slow(pause=-1), cwd=tmp_path)
     assert waited_for(lambda: workers_of(members, process.pid))
-    time.sleep(delay)
     process.kill()
     process.wait()
-    assert waited_for(lambda: not members(process.pid), STARTING)
+    assert gone(members, process.pid)
     assert not begun(tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
+@pytest.mark.timeout(3600)
 def test_twenty_kills_and_a_resume_make_the_bytes_of_one_run(
     start, members, script, slow, tmp_path
 ):
@@ -171,22 +192,18 @@ def test_twenty_kills_and_a_resume_make_the_bytes_of_one_run(
     rng = random.Random(0)
     folder = tmp_path / "d"
 
-    def state():
-        return spooled(folder), content(folder)
-
     def killed(cycle):
         """Return whether it was amid work."""
-        before = state()
+        before, more = done(folder), rng.randint(1, 6)
         process = start("generate", *slow(pause=0.08, **sizes), cwd=tmp_path)
-        if cycle % 4:  # most of them amid work, the others at any time
-            waited_for(lambda: state() != before or process.poll() == 0)
-            time.sleep(rng.random())
+        if cycle % 4:  # most of them amid work, the others as soon as there are workers
+            waited_for(lambda: done(folder) >= before + more or process.poll() == 0)
         else:
-            time.sleep(8 * rng.random())
-        amid = process.poll() is None and state() != before
+            waited_for(lambda: workers_of(members, process.pid) or process.poll() == 0)
+        amid = process.poll() is None and done(folder) != before
         process.kill()
         process.wait()
-        assert waited_for(lambda: not members(process.pid), STARTING), f"orphans of kill {cycle}"
+        assert gone(members, process.pid), f"orphans of kill {cycle}"
         return amid
 
     amid = sum(killed(cycle) for cycle in range(20))
@@ -205,9 +222,11 @@ def test_twenty_kills_and_a_resume_make_the_bytes_of_one_run(
 @pytest.mark.slow
 def test_a_killed_worker_costs_nothing_but_time(start, members, script, slow, tmp_path):
     made(script, slow(folder="once"), tmp_path)
-    process = start("generate", *slow(pause=0.1), cwd=tmp_path)
-    assert waited_for(lambda: spooled(tmp_path / "d") > 3)
+    process = start("generate", *slow(gate="go"), cwd=tmp_path)
+    assert waited_for(lambda: begun(tmp_path) == 2)
     os.kill(workers_of(members, process.pid)[0], signal.SIGKILL)
+    assert waited_for(lambda: begun(tmp_path) == 3), "another one takes its place"
+    (tmp_path / "go").touch()
     status, out, err = finish(process)
     assert status == 0, err[-2000:]
     assert "50 accepted, 0 rejected" in out
@@ -225,15 +244,17 @@ def test_asked_once_it_finishes_the_loads_at_work_and_keeps_them(
     start, members, script, slow, tmp_path, number, group, status
 ):
     made(script, slow(folder="once"), tmp_path)
-    process = start("generate", *slow(pause=1.0), cwd=tmp_path)
-    assert waited_for(lambda: spooled(tmp_path / "d") >= 2)
-    before = spooled(tmp_path / "d")
+    process = start("generate", *slow(gate="go"), cwd=tmp_path)
+    assert waited_for(lambda: begun(tmp_path) == 2)
     (os.killpg if group else os.kill)(process.pid, number)
-    ended, _, err = finish(process, 20)
+    said = told_to_stop(process)
+    assert spooled(tmp_path / "d") == 0, "the loads at work go on"
+    (tmp_path / "go").touch()
+    ended, _, err = finish(process)
     assert ended == status, err[-2000:]
     assert gone(members, process.pid)
-    assert "Traceback" not in err
-    assert before < spooled(tmp_path / "d") <= before + 2
+    assert "Traceback" not in said + err
+    assert spooled(tmp_path / "d") == 2
     resumed = made(script, slow(), tmp_path)
     assert "50/50" in resumed.out
     assert content(tmp_path / "d") == content(tmp_path / "once")
@@ -243,14 +264,15 @@ def test_asked_twice_it_stops_at_once(start, members, slow, tmp_path):
     process = start("generate", *slow(pause=-1), cwd=tmp_path)
     assert waited_for(lambda: begun(tmp_path) == 2)
     os.killpg(process.pid, signal.SIGINT)
-    time.sleep(0.5)
+    said = told_to_stop(process)
     assert process.poll() is None, "the loads at work go on"
+    assert len(workers_of(members, process.pid)) == 2
     os.killpg(process.pid, signal.SIGINT)
-    status, _, err = finish(process, 5)
+    status, _, err = finish(process)  # the loads at work would take for ever
     assert status == 130, err[-2000:]
     assert gone(members, process.pid)
     assert err.strip().endswith("interrupted")
-    assert err.count("once more to stop at once") == 1
+    assert (said + err).count("once more to stop at once") == 1
 
 
 @pytest.mark.slow
@@ -258,9 +280,8 @@ def test_a_stop_while_workers_start_is_as_quiet_as_any(start, members, slow, tmp
     """A terminal sends Ctrl-C to them too, before they can have set their handlers."""
     process = start("generate", *slow(pause=0.2, train=20), cwd=tmp_path)
     assert waited_for(lambda: len(workers_of(members, process.pid)) == 2)
-    time.sleep(0.5)
     os.killpg(process.pid, signal.SIGINT)
-    status, _, err = finish(process, 60)
+    status, _, err = finish(process)
     assert status == 130, err[-2000:]
     assert "Traceback" not in err
 
@@ -274,7 +295,7 @@ def test_an_impatient_user_gets_no_traceback(start, members, slow, tmp_path):
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGINT)
         time.sleep(0.03)
-    status, _, err = finish(process, 10)
+    status, _, err = finish(process)
     assert status == 130, err[-2000:]
     assert "Traceback" not in err
     assert gone(members, process.pid)
@@ -313,8 +334,8 @@ def test_two_parts_made_at_the_same_time_are_the_set_made_at_once(start, script,
 def test_a_second_process_is_refused_until_the_first_is_dead(
     start, members, script, slow, tmp_path
 ):
-    first = start("generate", *slow(pause=0.2, train=100), cwd=tmp_path)
-    assert waited_for(lambda: spooled(tmp_path / "d") > 0)
+    first = start("generate", *slow(gate="never", train=100), cwd=tmp_path)
+    assert waited_for(lambda: begun(tmp_path) == 2)
     for part in ([], ["shard=1", "shards=2"], ["action=repair"]):
         second = script("generate", *slow(workers=0, train=100), *part, cwd=tmp_path)
         assert second.status == 2

@@ -182,7 +182,7 @@ def status_of(door: Door, path: str, **headers: str) -> int:
     lines = [f"GET {path} HTTP/1.1"]
     lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(door.host, door.host)
-    with socket.create_connection((host, door.port), timeout=10) as call:
+    with socket.create_connection((host, door.port), timeout=60) as call:
         call.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
         return int(call.recv(64).split()[1])
 

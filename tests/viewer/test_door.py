@@ -285,7 +285,7 @@ def test_warnings_are_no_complaints(capfd):
 
 
 def test_the_answer_forbids_to_fetch_from_elsewhere(door):
-    with socket.create_connection(("127.0.0.1", door.port), timeout=10) as call:
+    with socket.create_connection(("127.0.0.1", door.port), timeout=LONG) as call:
         call.sendall(f"GET /{door.token}/ HTTP/1.1\r\nHost: {home(door)}\r\n\r\n".encode())
         head = call.recv(4096).decode("latin1").split("\r\n\r\n")[0].lower()
     assert "content-security-policy: default-src 'none'" in head

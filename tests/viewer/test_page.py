@@ -27,7 +27,7 @@ def any_page(request, make_scene, make_body, tmp_path):
     """A page of each kind of body."""
     body = make_body(make_scene(**BODIES[request.param]))
     page = Page(body, Door.bound("127.0.0.1", 0), title="t", folder=tmp_path)
-    assert page.worker.settle(60)
+    assert page.worker.settle(240)
     yield page
     page.close()
 
@@ -40,7 +40,7 @@ def drag(page, way):
             phase=phase, start_position=tuple(place), end_position=tuple(place + share * way)
         )
         asyncio.run(page._dragged(event))
-    assert page.worker.settle(60)
+    assert page.worker.settle(240)
 
 
 def test_a_drag_moves_the_body_with_the_hand(any_page):
@@ -60,39 +60,39 @@ def test_controls_load_the_patch(any_page):
     page = any_page
     page._amplitude.value = 0.5
     page._controlled(SimpleNamespace(client=object()))
-    assert page.worker.settle(60)
+    assert page.worker.settle(240)
     assert page._frame.asked.force.any()
     assert page._frame.answer.amplitude == pytest.approx(0.5, abs=0.5)
     page._sampled(None)
-    assert page.worker.settle(60)
+    assert page.worker.settle(240)
     assert not page._frame.answer.outside
     page._reset(None)
-    assert page.worker.settle(60)
+    assert page.worker.settle(240)
     assert page._frame.answer.tier == "rest"
 
 
 def test_a_click_places_the_patch_on_the_near_side(page):
-    assert page.worker.settle(60)
+    assert page.worker.settle(240)
     event = SimpleNamespace(ray_origin=(0.5, -3.0, 0.125), ray_direction=(0.0, 1.0, 0.0))
     asyncio.run(page._clicked(event))
     assert page.body.scene.problem.points[page._node].tolist() == [0.5, 0.0, 0.125]
 
 
 def test_trouble_is_read_and_nothing_of_it_is_markup(page):
-    assert page.worker.settle(60)
+    assert page.worker.settle(240)
     page._trouble("<script>")
     page.refresh()
     assert "&lt;script&gt;" in page._told.content
 
 
 def test_a_frame_that_is_not_finite_is_said_to_be_invalid(page):
-    assert page.worker.settle(60)
+    assert page.worker.settle(240)
     surrogate = page.body.simulator.surrogate
     good = surrogate.predict
     try:
         surrogate.predict = lambda load: torch.full_like(load.force, torch.nan)
         page._sampled(None)
-        assert page.worker.settle(60)
+        assert page.worker.settle(240)
         page.refresh()
         assert "NOT VALID" in page._reading.content
     finally:

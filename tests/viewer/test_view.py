@@ -30,7 +30,7 @@ def test_the_page_says_where_it_is_and_ctrl_c_ends_it_whole(start, members, home
         r"the page is at http://127\.0\.0\.1:\d+/[\w-]{32}/  \(Ctrl-C ends it\)\n", line
     ), line + process.stderr.read()
     os.kill(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=240)
     assert (process.returncode, out, err) == (130, "", "interrupted\n")
     assert not members(process.pid)
 
@@ -40,7 +40,7 @@ def test_a_host_that_others_reach_is_warned_of(start, home):
     process = start("view", "run=runs/a", "port=0", "host=0.0.0.0", cwd=home)
     assert process.stdout.readline().startswith("the page is at http://127.0.0.1:")
     os.kill(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=240)
     assert err.startswith("warning: host = 0.0.0.0: whoever reaches this machine")
 
 
