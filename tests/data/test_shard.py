@@ -1,0 +1,179 @@
+"""Laws of shards as files: what is put in comes out, and nothing else is taken for a shard."""
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load, save
+
+from dpl.data import store as store_module
+from dpl.data.outcome import Job, Outcome
+from dpl.data.shard import closed, opened, packed, taken, unpacked
+from dpl.data.store import runs
+
+SHAPE, DIMENSION = (4, 3), 2
+
+
+def solved(number, *, nodes=(0, 3), accepted=True):
+    """Return a load on these nodes."""
+    rng = np.random.default_rng(number)
+    force = np.zeros(SHAPE)
+    force[list(nodes)] = rng.normal(size=(len(nodes), SHAPE[1]))
+    return Outcome(
+        job=Job((7, 1), number),
+        point=rng.random(DIMENSION),
+        force=force,
+        displacement=rng.normal(size=SHAPE),
+        amplitude=0.5 + number,
+        accepted=accepted,
+        residual=1e-9 * number,
+        volume_ratio=0.25 + number,
+        load_factor=1.0,
+        iterations=3 + number,
+        seconds=0.0,
+        reason="" if accepted else "diverged",
+    )
+
+
+def content(*kept, poisson=None):
+    return closed(kept, SHAPE, DIMENSION, poisson)
+
+
+def same(one, other):
+    return all(
+        np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+def line(*tried, rejected=()):
+    return {
+        "first": tried[0].job.number,
+        "amplitudes": [one.amplitude for one in tried],
+        "rejected": [{"index": k, "reason": "diverged", "load_factor": 0.5} for k in rejected],
+    }
+
+
+def test_loads_come_out_as_they_were_put_in():
+    loads = [solved(5), solved(6, nodes=(0, 1, 2, 3)), solved(7, nodes=())]
+    shard = opened(content(*loads), SHAPE, DIMENSION)
+    for one in loads:
+        assert same(taken(shard, one.job, line(*loads)), one)
+    assert shard["poisson"].shape == (3, 0)
+    assert shard["iterations"].tolist() == [8, 9, 10]
+
+
+def test_a_rejected_load_comes_out_with_its_reason():
+    loads = [solved(5), solved(6, accepted=False), solved(7)]
+    shard = opened(content(loads[0], loads[2]), SHAPE, DIMENSION)
+    found = taken(shard, loads[1].job, line(*loads, rejected=[6]))
+    assert (found.accepted, found.reason, found.load_factor) == (False, "diverged", 0.5)
+    assert found.amplitude == loads[1].amplitude
+    assert (found.iterations, found.seconds, len(found.force)) == (0, 0.0, 0)
+    assert np.isnan([found.residual, found.volume_ratio]).all()
+    assert same(taken(shard, loads[2].job, line(*loads, rejected=[6])), loads[2])
+
+
+def test_poissons_ratios_are_kept_where_loads_have_their_own():
+    loads = [solved(5), solved(6)]
+    ratio = lambda points: points[:, -1:]  # noqa: E731
+    whole = content(*loads, poisson=ratio)
+    points = torch.from_numpy(np.stack([one.point for one in loads]))
+    assert torch.equal(opened(whole, SHAPE, DIMENSION, 1)["poisson"], ratio(points))
+    with pytest.raises(ValueError, match="this scene has one for all loads"):
+        opened(whole, SHAPE, DIMENSION, 0)
+    with pytest.raises(ValueError, match="is damaged"):
+        opened(content(*loads), SHAPE, DIMENSION, 1)
+
+
+def test_a_load_of_the_spool_comes_out_as_it_was_put_in():
+    for one in (solved(3), solved(4, nodes=()), solved(5, accepted=False)):
+        assert same(unpacked(packed(one)), one)
+
+
+def change(name, values):
+    columns = load(content(solved(5, nodes=(0, 1, 2, 3)), solved(6)))
+    columns[name] = torch.as_tensor(values, dtype=columns[name].dtype)
+    return save(columns)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "sound"),
+    [
+        *(("node", [0, 1, 2, 3, 0, 3], True), ("node", [0, 1, 2, 3, 0, 4], False)),
+        ("node", [0, 1, 2, 3, -1, 3], False),
+        *(("carried", [4, 2], True), ("carried", [2, 4], True), ("carried", [5, 1], False)),
+        ("carried", [7, -1], False),
+        *(("carried", [6, 0], False), ("carried", [3, 2], False), ("carried", [4, 3], False)),
+    ],
+)
+def test_forces_act_on_nodes_that_are_there(name, values, sound):
+    if sound:
+        assert opened(change(name, values), SHAPE, DIMENSION)["force"].shape == (2, *SHAPE)
+        return
+    with pytest.raises(ValueError, match="is damaged"):
+        opened(change(name, values), SHAPE, DIMENSION)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", ["point", "nodal_force", "displacement"])
+def test_numbers_of_a_sample_are_finite(name, value):
+    columns = load(content(solved(5)))
+    columns[name].view(-1)[-1] = value
+    with pytest.raises(ValueError, match=f"is damaged: {name} is not finite"):
+        opened(save(columns), SHAPE, DIMENSION)
+
+
+@pytest.mark.parametrize("name", sorted(load(content(solved(5)))))
+def test_each_column_has_its_shape_and_kind(name):
+    genuine = load(content(solved(5), solved(6)))
+    column = genuine[name]
+    other = torch.int16 if column.dtype != torch.int64 else torch.int32
+    for wrong in (column[:-1].clone(), column[None].clone(), column.to(other)):
+        with pytest.raises(ValueError, match="is damaged"):
+            opened(save(genuine | {name: wrong}), SHAPE, DIMENSION)
+    with pytest.raises(ValueError, match="is damaged"):
+        opened(
+            save({key: value for key, value in genuine.items() if key != name}), SHAPE, DIMENSION
+        )
+
+
+# ------------------------------------------------------------------ what the store makes of them
+
+
+@pytest.mark.parametrize(
+    ("indices", "whole", "expected"),
+    [
+        ([], False, []),
+        ([0, 1, 2, 3, 4], False, [[0, 1, 2, 3], [4]]),
+        ([0, 1, 2, 3, 4], True, [[0, 1, 2, 3]]),
+        ([1, 2, 3, 4], True, []),
+        ([2, 3, 5, 8, 9, 10, 11, 12], False, [[2, 3], [5], [8, 9, 10, 11], [12]]),
+        ([3, 4, 5, 6, 7], True, [[4, 5, 6, 7]]),
+    ],
+)
+def test_a_file_holds_consecutive_loads_of_one_block(monkeypatch, indices, whole, expected):
+    monkeypatch.setattr(store_module, "SHARD", 4)
+    assert list(runs(indices, whole=whole)) == expected
+
+
+def test_blocks_of_loads_fall_to_writers_in_turn(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(store_module, "SHARD", 2)
+    store = store_module.Store(tmp_path / "none", scene, 0)
+    assert store.missing("train", 9) == list(range(9))
+    assert [store.missing("train", 9, k, 3) for k in range(3)] == [[0, 1, 6, 7], [2, 3, 8], [4, 5]]
+
+
+def test_the_largest_shard_is_one_whose_loads_act_on_every_node(scene):
+    store = store_module.Store(None, scene, 0)
+    nodes, dim = scene.problem.shape
+    every = Outcome(
+        *(Job((0, 0), 0), np.zeros(scene.loads.dimension), np.ones((nodes, dim))),
+        *(np.ones((nodes, dim)), 1.0, True, 0.0, 1.0, 1.0, 1, 0.0, ""),
+    )
+    sizes = []
+    for count in (1, 2):
+        kept = [every._replace(job=Job((0, 0), k)) for k in range(count)]
+        sizes.append(len(closed(kept, (nodes, dim), scene.loads.dimension, None)))
+    load_size = store.largest(2) - store.largest(1)
+    assert sizes[1] - sizes[0] <= load_size <= 2 * (sizes[1] - sizes[0])
+    assert store.largest(0) == store_module.HEADER
