@@ -1,11 +1,12 @@
 # make train: environment, installation and the main job on the small default scene.
 # make test:  installation and the checks that CI makes.
 # make mutants: changes of the source that no test notices; ARGS="dpl/metrics.py --sample 60".
+# make matrix: the tests under other processor features and thread numbers; see tests/matrix.py.
 # make docs:  the documentation into site/; NOTEBOOKS=false leaves them unexecuted.
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup train test lint slow mutants docs wheel clean
+.PHONY: setup train test lint slow matrix mutants docs wheel clean
 
 setup: .venv/installed
 
@@ -28,6 +29,9 @@ lint: setup
 
 slow: setup
 	$(BIN)/python -m pytest -m 'slow and not gpu' --timeout 1800
+
+matrix: setup
+	$(BIN)/python tests/matrix.py $(ARGS)
 
 mutants: setup
 	$(BIN)/pip install --quiet -c constraints.txt -e '.[mutation]'

@@ -16,6 +16,7 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from hypothesis import HealthCheck, settings
 from omegaconf import DictConfig
+from threadpoolctl import threadpool_limits
 
 from dpl import run
 from dpl.data.datamodule import OfflineData
@@ -26,7 +27,9 @@ from dpl.fem.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.scene import Sample, Scene
 
-torch.set_num_threads(1)
+THREADS = int(os.environ.get("DPL_TEST_THREADS", "1"))  # see tests/matrix.py
+torch.set_num_threads(THREADS)
+threadpool_limits(THREADS)
 matplotlib.use("Agg")
 
 # pytest --hypothesis-profile=many tests/properties: anew each time, and a hundred times as long
@@ -150,7 +153,7 @@ def environment() -> Callable[..., dict[str, str]]:
     return _environment
 
 
-def _environment(threads: int = 1) -> dict[str, str]:
+def _environment(threads: int = THREADS) -> dict[str, str]:
     one = dict.fromkeys(
         ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads)
     )

@@ -25,8 +25,6 @@ from dpl.fem.materials import (
 from dpl.fem.mesh import Plane, box, rectangle
 from dpl.fem.problem import Problem
 
-torch.set_num_threads(1)
-
 YOUNG, LENGTH = 4500.0, 100.0  # of the beam of VERIFICATION 1.8e [Pa], [m]
 LAWS = {  # VERIFICATION 1.1 with its constants
     "linear": LinearElastic(0.3),
