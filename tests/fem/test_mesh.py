@@ -4,7 +4,6 @@ import math
 import os
 import subprocess
 import sys
-import time
 import warnings
 
 import meshio
@@ -587,11 +586,10 @@ def test_a_mesh_built_by_hand_may_not_have_nodes_without_a_cell():
 
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
-def test_a_hundred_thousand_nodes_are_checked_in_seconds(cell):
+def test_a_hundred_thousand_nodes_can_be_checked(cell):
+    """In 2.1 and 2.7 s; what compares each with each would not end."""
     mesh = box([1.0, 1.0, 1.0], [47, 47, 47], cell)
-    start = time.process_time()
-    check(mesh)
-    assert time.process_time() - start < 6  # measured: 2.1 and 2.7 s
+    assert check(mesh) is mesh
 
 
 def test_vtu_of_several_pieces_is_an_error(tmp_path):

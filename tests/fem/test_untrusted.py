@@ -6,7 +6,6 @@ import os
 import resource
 import struct
 import sys
-import time
 import zlib
 
 import meshio
@@ -21,19 +20,22 @@ from dpl.stress.flaws import CORNERS, FAN, PATCH, TETS, TWO_CUBES, TWO_HEXES, wr
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch):
-    monkeypatch.setattr(untrusted, "SECONDS", (4.0, 0.0))
+    """The limit of a reader is more than any file here takes on a busy machine."""
+    monkeypatch.setattr(untrusted, "SECONDS", (60.0, 0.0))
 
 
-def refused(path, match: str, seconds: float = 3.0) -> None:
-    """Hold `load` to one line that names the file, soon and in little memory."""
-    before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
+def refused(path, match: str) -> None:
+    """Hold `load` to one line that names the file, and to little memory.
+
+    The end of a reader at its limit of time has a line of its own, which `match` does not allow.
+    """
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(ValueError, match=match) as error:
         load(path)
     text = str(error.value)
     assert text.startswith(f"{path}: ")
     assert text.isprintable()
     assert len(text) < 1000
-    assert time.monotonic() - start < seconds
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # [kB]
 
 
@@ -246,9 +248,11 @@ def test_a_binary_count_is_read_too(tmp_path):
         ("d.mesh", "MeshVersionFormatted 2\nDimension 3\nRidges\n99999999999\n"),
     ],
 )  # fmt: skip
-def test_numbers_that_cost_memory_or_time_end_the_reader_only(tmp_path, name, text):
+def test_numbers_that_cost_memory_or_time_end_the_reader_only(tmp_path, name, text, monkeypatch):
     (tmp_path / name).write_text(text)
-    refused(tmp_path / name, "more memory|ends too early|longer than", seconds=8)
+    with monkeypatch.context() as patch:
+        patch.setattr(untrusted, "SECONDS", (4.0, 0.0))
+        refused(tmp_path / name, "more memory|ends too early|longer than")
     assert load(cube(tmp_path)).t.shape[0] == 4
 
 
@@ -256,8 +260,8 @@ def test_a_reader_that_loops_is_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(untrusted, "SECONDS", (0.5, 0.0))
     path = cube(tmp_path, "slow.msh", file_format="gmsh22", binary=False)
     replaced(path, "$Elements", "$Periodic\n" + "99999999\n" + "0 0 0\n0\n" * 3_000_000)
-    refused(path, "longer than", seconds=6)
-    monkeypatch.setattr(untrusted, "SECONDS", (4.0, 0.0))
+    refused(path, "longer than")
+    monkeypatch.setattr(untrusted, "SECONDS", (60.0, 0.0))
     assert load(cube(tmp_path)).t.shape[0] == 4
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-LIMIT = 20.0  # [s]
+LIMIT = 200.0  # on a busy machine, below that of a test [s]
 MEMORY = 1.0  # [GB]
 
 
