@@ -271,6 +271,151 @@ def test_the_discarded_classic_step_is_counted(scene, loads, stubs):
     assert int(answer.iterations) == int(from_guess.iterations) + 1
 
 
+class Scripted:
+    """A corrector whose iterates are given: lengths along one degree of freedom.
+
+    Attributes:
+        problem, tol: As of any corrector.
+        guessed: Iterates from a guess, the guess first.
+        classic: Iterates from rest.
+        ends: Which iterate from the guess is in balance; None: none is.
+        lost: From which iterate on it does not go on from the guess any more.
+    """
+
+    def __init__(self, problem, guessed, *, ends=None, lost=None):
+        self.problem, self.tol = problem, 1e-8
+        self.guessed, self.classic = guessed, (0.0, 7.0, 8.0)
+        self.ends, self.lost = ends, lost
+
+    def iterate(self, load, *, guess=None):
+        way = self.classic if guess is None else self.guessed
+        for k, x in enumerate(way):
+            ended = k == (2 if guess is None else self.ends)
+            u = torch.zeros_like(load.force)
+            u[:, -1, 0] = x
+            good = int(Status.CONVERGED if ended else Status.NOT_CONVERGED)
+            yield Solution(
+                displacement=u,
+                residual=torch.ones(1),
+                volume_ratio=torch.ones(1),
+                status=torch.tensor([good]),
+                negative_pivots=torch.zeros(1, dtype=torch.int64),
+                iterations=torch.tensor([k]),
+                factorisations=torch.tensor([10 * k]),
+                load_factor=torch.zeros(1),
+                seconds=torch.tensor([100.0 * k]),
+                from_guess=torch.tensor([guess is not None and (not self.lost or k < self.lost)]),
+            )
+
+
+def followed(scene, loads, guessed, **how):
+    """Return the iterates that a hybrid shows of a scripted corrector, and their iterations."""
+    corrector = Scripted(scene.problem, guessed, **how)
+    states = list(Hybrid(lambda load: load.force, corrector).iterate(first_of(loads)))
+    assert all(s.factorisations == 10 * s.iterations for s in states)
+    assert all(s.seconds == 100 * s.iterations for s in states)
+    return [float(s.displacement[0, -1, 0]) for s in states], [int(s.iterations) for s in states]
+
+
+@pytest.mark.parametrize(
+    ("guessed", "goes_on"),
+    [
+        # the first correction is less than half of where it leads, upwards and downwards
+        ((1.0, 1.99), True),
+        ((1.0, 2.01), False),
+        ((1.0, 2.0), False),
+        ((1.0, 0.67), True),
+        ((1.0, 0.66), False),
+        ((0.0, 1e-9), False),
+        ((1.0, torch.nan), False),
+        ((1.0, torch.inf), False),
+        # the second one is less than half of the first, or a tenth of where it leads
+        ((1.0, 1.4, 1.59), True),
+        ((1.0, 1.4, 1.61), False),
+        ((1.0, 1.01, 1.12), True),
+        ((1.0, 1.01, 1.13), False),
+        ((1.0, 1.0, 1.11), True),
+        # the third one and those that follow are less than half of the one before
+        ((1.0, 1.2, 1.28, 1.319), True),
+        ((1.0, 1.2, 1.28, 1.321), False),
+        ((1.0, 1.2, 1.21, 1.2151), False),
+        ((1.0, 1.2, 1.28, 1.31, 1.324), True),
+        ((1.0, 1.2, 1.28, 1.31, 1.326), False),
+    ],
+)
+def test_newton_goes_on_from_a_prediction_while_its_corrections_contract(
+    scene, loads, guessed, goes_on
+):
+    """The rule that `Hybrid` states, at its limits."""
+    shown, counts = followed(scene, loads, guessed)
+    if goes_on:
+        assert shown == list(guessed)
+        assert counts == list(range(len(guessed)))
+        return
+    spent = len(guessed) - 1
+    assert shown == [*guessed[:-1], 7.0, 8.0], "the classic path, its start at rest left out"
+    assert counts == [*range(spent), spent + 1, spent + 2], "what was discarded counts"
+
+
+def test_an_answer_is_taken_whatever_correction_led_to_it(scene, loads):
+    assert followed(scene, loads, (1.0, 5.0), ends=1) == ([1.0, 5.0], [0, 1])
+    assert followed(scene, loads, (1.0, 1.2, 9.0), ends=2) == ([1.0, 1.2, 9.0], [0, 1, 2])
+
+
+def test_a_guess_that_newton_has_given_up_is_given_up(scene, loads):
+    """Newton would go on in load steps from the last equilibrium; the classic path is known."""
+    shown, counts = followed(scene, loads, (1.0, 1.2, 1.21, 1.211), lost=2)
+    assert shown == [1.0, 1.2, 7.0, 8.0]
+    assert counts == [0, 1, 3, 4]
+
+
+def test_a_guess_that_newton_never_took_leaves_its_path_alone(scene, loads):
+    """Newton began at rest: there is nothing to go back to."""
+    corrector = Scripted(scene.problem, (0.0, 5.0, -9.0, 3.0))
+    corrector.lost = None
+    original = corrector.iterate
+    corrector.iterate = lambda load, guess=None: (
+        state._replace(from_guess=torch.tensor([False])) for state in original(load, guess=guess)
+    )
+    states = list(Hybrid(lambda load: load.force, corrector).iterate(first_of(loads)))
+    assert [float(s.displacement[0, -1, 0]) for s in states] == [0.0, 5.0, -9.0, 3.0]
+
+
+POOR = {"minus": lambda u: -u, "half": lambda u: 0.5 * u, "too far": lambda u: 1.5 * u}
+
+
+@pytest.mark.parametrize("name", POOR)
+def test_a_poor_prediction_is_given_up_for_the_classic_path(scene, loads, truth, name):
+    """Newton itself would go on from it: 8 to 13 iterations where 6 from rest are enough."""
+    for load, exact in zip(loads.singles(), truth.split(1), strict=True):
+        states = list(Hybrid(lambda load, u=exact: POOR[name](u), scene.solver).iterate(load))
+        alone = [*scene.solver.iterate(load, guess=POOR[name](exact))][-1]
+        _, *classic = scene.solver.iterate(load)
+        assert states[0].from_guess.all()
+        assert not states[-1].from_guess.any()
+        assert torch.equal(states[-1].displacement, classic[-1].displacement)
+        spent = int(states[-1].iterations - classic[-1].iterations)
+        assert 1 <= spent <= 3
+        assert int(states[-1].iterations) < int(alone.iterations) + spent
+        ours = states[-len(classic) :]
+        for one, other in zip(ours, classic, strict=True):
+            assert torch.equal(one.displacement, other.displacement)
+            assert int(one.iterations - other.iterations) == spent
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e-4, 1e-5])
+def test_a_good_prediction_is_kept_to_the_end(scene, loads, stubs, size):
+    for k, load in enumerate(loads.singles()):
+        guess = stubs[f"noise {size:g}"][k : k + 1]
+        states = list(Hybrid(lambda load, u=guess: u, scene.solver).iterate(load))
+        alone = list(scene.solver.iterate(load, guess=guess))
+        assert all(state.from_guess.all() for state in states)
+        assert len(states) == len(alone)
+        for one, other in zip(states, alone, strict=True):
+            assert same(one, other)
+        assert int(states[-1].iterations) < int(solve(scene.solver, load).iterations)
+
+
 @EVERY
 def test_a_batch_is_its_members(rule, scene, loads, stubs):
     mixed = torch.stack(

@@ -88,16 +88,11 @@ def test_forces_on_held_nodes_change_no_answer(newton, load, solvers, name):
         assert same(solvers[name](held), plain)
 
 
-@pytest.mark.parametrize(
-    "name", [name for name in SOLVERS if name not in ("direct", "accelerated")]
-)
+@pytest.mark.parametrize("name", sorted({*SOLVERS} - {"direct", "accelerated"}))
 def test_forces_on_held_nodes_alone_leave_the_body_at_rest(newton, load, solvers, name):
     """A guess of something else is none of this load's, as it is none of no load's."""
     only = load._replace(force=1e10 * (~newton.problem.free).double()[None])
     answer = solvers[name](only)
-    if name == "hybrid, paper":  # judges the prediction first
-        assert not answer.displacement.any() or not answer.converged
-        return
     assert answer.converged.all()
     assert not answer.displacement.any()
     assert float(answer.residual) == 0
