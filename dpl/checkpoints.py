@@ -24,7 +24,8 @@ from safetensors.torch import save
 from dpl.data.durable import whole_file
 
 WEIGHTS = ".safetensors"
-HEADER = ("scene", "identity", "epoch", "global_step")  # what stands beside the weights, as JSON
+# what stands beside the weights, as JSON
+HEADER = ("scene", "identity", "nodes", "epoch", "global_step")
 # "best.ckpt" is of runs before weights had files of their own; a short run has only its last
 KEPT = (f"best{WEIGHTS}", "best.ckpt", "last.ckpt")  # files of weights that a run is loaded from
 RESUMED = {"loops", "callbacks", "optimizer_states", "lr_schedulers"}  # parts that resuming needs

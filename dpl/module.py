@@ -223,6 +223,7 @@ class Surrogate(L.LightningModule):
         """Write down whose surrogate this is, and where random numbers are."""
         checkpoint["scene"] = self.scene.fingerprint
         checkpoint["identity"] = self.scene.identity()
+        checkpoint["nodes"] = self.scene.problem.shape[0]
         checkpoint["random"] = random_states()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -3,11 +3,12 @@
 Above it only `commands` know Hydra, below it nothing does.
 """
 
+import contextlib
 import functools
 import sys
 import typing
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,10 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from dpl import schema
+from dpl.data.durable import whole_file
 from dpl.fem.linear import slow_blas
+from dpl.fem.memory import at_most
+from dpl.fem.mesh import save_exactly
 from dpl.fem.sparse import SingularMatrix
 from dpl.scene import Scene
 from dpl.schema import ConfigError
@@ -35,6 +39,8 @@ SCENE = (  # keys that make a scene, and those that make a surrogate of it
     *("material", "young", "loads", "solver"),
 )
 NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")
+READ = "dpl.fem.mesh.load"  # of a mesh that is a file, of which a run keeps a copy:
+MESH = "mesh.vtu"
 LONGEST = 100_000  # bytes of a run's configuration
 
 
@@ -127,14 +133,15 @@ def build_scene(cfg: DictConfig) -> Scene:
     from dpl.fem.problem import Problem
 
     _need(cfg, *SCENE)
-    material, mesh = make(cfg, "material"), make(cfg, "mesh")
+    material = make(cfg, "material")
+    with _shown_warnings():
+        mesh = make(cfg, "mesh")
     clamped = make(cfg, "clamped") if cfg.get("clamped") is not None else None
     if cfg.degree not in (1, 2):
         raise ConfigError(f"degree = {cfg.degree} must be 1 or 2")
     if not isinstance(cfg.mean_dilatation, bool):
         raise ConfigError(f"mean_dilatation = {cfg.mean_dilatation!r} must be true or false")
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always", UserWarning)
+    with _shown_warnings():
         try:
             problem = Problem.build(
                 mesh,
@@ -149,8 +156,6 @@ def build_scene(cfg: DictConfig) -> Scene:
             told = str(error)
             key = "mean_dilatation" if told.startswith("mean_dilatation") else key
             raise ConfigError(f"{key}: {told.removeprefix('mean_dilatation: ')}") from error
-    for line in {str(w.message): None for w in warned if w.category is UserWarning}:
-        print(f"warning: {line}", file=sys.stderr)
     if not problem.free.any():
         raise ConfigError("clamped or supports: every node is held; hold fewer of them")
     if loose := problem.loose_modes():
@@ -170,6 +175,16 @@ def build_scene(cfg: DictConfig) -> Scene:
         told = f"material, mesh, clamped or supports: K(0) cannot be used: {error}"
         raise ConfigError(told) from error
     return Scene(problem, loads, solver)
+
+
+@contextlib.contextmanager
+def _shown_warnings() -> Iterator[None]:
+    """Print what is warned of in here, a line each, once."""
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always", UserWarning)
+        yield
+    for line in {str(w.message): None for w in warned if w.category is UserWarning}:
+        print(f"warning: {line}", file=sys.stderr)
 
 
 def _parts(cfg: DictConfig, key: str) -> list[Any]:
@@ -220,9 +235,10 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
         raise ConfigError(f"model: {error}") from error
 
 
-def show_plan(*parts: Any) -> None:
-    """Print what the parts of a run do not need and skip."""
-    lines = [line for part in parts for line in part.plan()]
+def show_plan(scene: Scene, *parts: Any) -> None:
+    """Print the size of the body, and what a scene and the parts of a run do not need and skip."""
+    lines = [line for part in (scene, *parts) for line in part.plan()]
+    print(scene.body())
     print("plan: skipped, because this scene does not need it")
     print("\n".join(f"  - {line}" for line in lines), flush=True)
     if advice := slow_blas():
@@ -230,7 +246,7 @@ def show_plan(*parts: Any) -> None:
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:
-    """Write a configuration, resolved, into a run's folder.
+    """Write a configuration, resolved, into a run's folder, and a copy of the mesh file it names.
 
     Raises:
         ConfigError: The folder holds a run already, and this one does not resume it.
@@ -241,7 +257,44 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
             f"run: {folder} holds a run; resume it with ckpt_path=last or name another"
         )
     folder.mkdir(parents=True, exist_ok=True)
+    _keep_mesh(cfg, folder)
     there.write_text(OmegaConf.to_yaml(OmegaConf.create(plain(cfg))))
+
+
+def _keep_mesh(cfg: DictConfig, folder: Path) -> None:
+    """Write the mesh file of a configuration into a run's folder, as `MESH`."""
+    cfg = with_mesh_of_resumed(cfg)
+    if cfg.mesh._target_ != READ or Path(cfg.mesh.path) == folder / MESH:
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # it was read before, and they were shown
+        mesh = make(cfg, "mesh")
+    with whole_file(folder / MESH) as file:
+        save_exactly(Path(file.name), mesh)
+
+
+def _with_mesh(cfg: DictConfig, path: Path) -> DictConfig:
+    """Return a configuration that reads its mesh, if that is a file, from another one."""
+    return OmegaConf.merge(cfg, {"mesh": {"path": str(path)}})
+
+
+def _resumed(cfg: DictConfig) -> Path | None:
+    """Return the checkpoint that a configuration resumes, None if it begins a run."""
+    last = Path(cfg.folder) / "checkpoints" / "last.ckpt"
+    if not cfg.ckpt_path or (cfg.ckpt_path == "last" and not last.exists()):
+        return None
+    return last if cfg.ckpt_path == "last" else Path(cfg.ckpt_path)
+
+
+def with_mesh_of_resumed(cfg: DictConfig) -> DictConfig:
+    """Return a configuration that reads its mesh file, if it names one, from the run it resumes.
+
+    The original may have been moved or changed.
+    """
+    if cfg.mesh._target_ != READ or (checkpoint := _resumed(cfg)) is None:
+        return cfg
+    own = checkpoint.parent.parent / MESH
+    return _with_mesh(cfg, own) if own.is_file() else cfg
 
 
 def check_resumed(cfg: DictConfig) -> dict[str, Any] | None:
@@ -253,10 +306,8 @@ def check_resumed(cfg: DictConfig) -> dict[str, Any] | None:
         ConfigError: There is no such checkpoint, it cannot be resumed, or its run differs in what
             makes the run what it is.
     """
-    last = Path(cfg.folder) / "checkpoints" / "last.ckpt"
-    if not cfg.ckpt_path or (cfg.ckpt_path == "last" and not last.exists()):
+    if (path := _resumed(cfg)) is None:
         return None
-    path = last if cfg.ckpt_path == "last" else Path(cfg.ckpt_path)
     if not path.is_file():
         raise ConfigError(f"ckpt_path: there is no {path} to resume; leave it out to begin anew")
     before = path.parent.parent / "config.yaml"
@@ -352,15 +403,56 @@ def load_run(
     found.pop("trainer", None)  # of which nothing is called
     cfg = OmegaConf.create(found)
     check(cfg, trust=trust)
-    surrogate = build_surrogate(cfg, build_scene(cfg) if scene is None else scene)
     try:
         checkpoint = checkpoints.read(best)
+    except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
+        raise _unusable(best, error) from error
+    if scene is None:
+        scene = _scene_of_run(cfg, Path(folder), checkpoint, trust=trust)
+    surrogate = build_surrogate(cfg, scene)
+    try:
         surrogate.on_load_checkpoint(checkpoint)
         surrogate.load_state_dict(checkpoint["state_dict"])
-    except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ConfigError(f"{best} cannot be used: {reason}") from error
+    except (ValueError, TypeError, KeyError, RuntimeError) as error:
+        raise _unusable(best, error) from error
     return cfg, surrogate.eval()
+
+
+def _unusable(checkpoint: Path, error: Exception) -> ConfigError:
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return ConfigError(f"{checkpoint} cannot be used: {reason}")
+
+
+def _scene_of_run(
+    cfg: DictConfig, folder: Path, checkpoint: dict[str, Any], *, trust: bool
+) -> Scene:
+    """Return the scene of a run, its mesh read from its folder and held to its weights.
+
+    Args:
+        cfg: Its configuration.
+        folder: Where it lies.
+        checkpoint: Its weights. A body has no more nodes than they have numbers, of any network.
+        trust: Whether the mesh may have more nodes, and lie elsewhere if the run has no copy.
+
+    Raises:
+        ConfigError: The run has no copy of its mesh file, or the mesh has too many nodes.
+    """
+    _need(cfg, *SCENE)
+    if cfg.mesh._target_ == READ:
+        own = folder / MESH
+        if own.resolve().parent == folder.resolve() and own.is_file():
+            cfg = _with_mesh(cfg, own)
+        elif not trust:
+            raise ConfigError(
+                f"mesh.path = {cfg.mesh.path} must be kept in the run's folder as {own}; write it "
+                "there (dpl.fem.mesh.save_exactly), or load the run with trust=True"
+            )
+    if trust:
+        return build_scene(cfg)
+    values = sum(t.numel() for t in checkpoint["state_dict"].values() if torch.is_tensor(t))
+    nodes = checkpoint.get("nodes")
+    with at_most(min(nodes, values) if isinstance(nodes, int) else values):
+        return build_scene(cfg)
 
 
 def load_runs(

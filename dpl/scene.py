@@ -19,6 +19,12 @@ from dpl.fem.problem import Problem
 from dpl.fem.solution import Load, beside, solve
 
 TYPICAL = 6  # the stream of the loads that the corrector is chosen on
+CELLS = {  # scikit-fem's names of shapes and those of bodies, in the plural
+    "Hexahedral": "hexahedra",
+    "Tetrahedral": "tetrahedra",
+    "Quadrilateral": "quadrilaterals",
+    "Triangular": "triangles",
+}
 SHORT = 8  # conjugate gradient steps, on the mean, that cost less than a factor
 
 
@@ -162,6 +168,17 @@ class Scene:
         What it lacks, as those of older versions do, counts as equal.
         """
         return _differences(_plain(identity), _plain(self.identity()))
+
+    def body(self) -> str:
+        """Return a line on the body: its extent along the axes [m], nodes, cells, unknowns."""
+        problem = self.problem
+        sides = (problem.points.amax(dim=0) - problem.points.amin(dim=0)) * self.length
+        cells = CELLS[problem.mesh.elem.refdom.name]
+        return (
+            f"body: {' x '.join(f'{side:.4g}' for side in sides.tolist())} m, "
+            f"{problem.shape[0]:,} nodes, {len(problem.cells):,} {cells}, "
+            f"{problem.points.numel():,} degrees of freedom"
+        )
 
     def plan(self) -> list[str]:
         """Return what this scene does not need and what is therefore skipped, a line each."""

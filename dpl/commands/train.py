@@ -23,7 +23,7 @@ def parts(cfg: DictConfig) -> tuple["Scene", Any, "Surrogate", Any]:
         ConfigError: One of them cannot be built, or the run cannot be resumed.
     """
     resumed = run.check_resumed(cfg)
-    scene = run.build_scene(cfg)
+    scene = run.build_scene(run.with_mesh_of_resumed(cfg))
     data = run.make(cfg, "data", scene=scene)
     surrogate = run.build_surrogate(cfg, scene)
     if resumed is not None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from skfem.io.meshio import from_meshio
 
 from dpl.fem.checks import LARGEST, check, listed
+from dpl.fem.memory import refuse_mesh
 from dpl.fem.untrusted import read
 
 CELLS = {  # meshio's names of what can be solved, best first: dimension, nodes
@@ -79,6 +80,7 @@ def load(path: str | Path) -> skfem.Mesh:
 
     Raises:
         FileNotFoundError: There is no such file.
+        MemoryError: So many nodes do not fit.
         ValueError: The file cannot be read, or its mesh cannot be solved; the message says why.
             Nodes have the place in which the file lists them, from 0; so have cells among those
             that are kept.
@@ -126,6 +128,7 @@ def _body(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
         raise ValueError(f"{kinds[0]} cells need nodes of {dim} coordinates")
     _check_range(cells, len(points))
     used, compact = np.unique(cells, return_inverse=True)
+    refuse_mesh(len(used), "its size")
     compact = compact.reshape(-1, CELLS[kinds[0]][1])
     points = _flat(points, used) if dim == 2 else points[used]
     mesh = from_meshio(meshio.Mesh(points, [(kinds[0], compact)]))
@@ -149,7 +152,7 @@ def _repairs(kind: str, nodes: Array, unused: int) -> list[str]:
             f"{backwards} of {len(J)} cells list their nodes {how} and are read the other way round"
         )
     if unused:
-        repairs.append(f"{unused} of the nodes are used by no cell and are left out")
+        repairs.append(f"{unused} nodes are used by no cell and are left out")
     return repairs
 
 

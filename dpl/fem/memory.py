@@ -1,10 +1,14 @@
 """What does not fit into memory is refused before it is made."""
 
+import contextlib
 import os
+from collections.abc import Iterator
+from contextvars import ContextVar
 
 import torch
 
 NODE = 1000  # of a node with its row of K(0), in 2D, where it is least [bytes]
+_MOST: ContextVar[int | None] = ContextVar("most nodes of a mesh", default=None)
 
 
 def refuse_beyond(needed: float, limit: float | None, what: str, remedy: str) -> None:
@@ -30,8 +34,24 @@ def machine() -> float:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
 
 
+@contextlib.contextmanager
+def at_most(nodes: int) -> Iterator[None]:
+    """Let `refuse_mesh` refuse meshes of more nodes, before they are made."""
+    token = _MOST.set(nodes)
+    try:
+        yield
+    finally:
+        _MOST.reset(token)
+
+
 def refuse_mesh(nodes: int, key: str) -> None:
-    """Raise where not even the stiffness matrix of so many nodes would fit, see `refuse_beyond`."""
+    """Raise where not even the stiffness matrix of so many nodes would fit, see `refuse_beyond`.
+
+    Raises:
+        ValueError: They are more than `at_most` allows.
+    """
+    if (most := _MOST.get()) is not None and nodes > most:
+        raise ValueError(f"{key} = {_count(nodes)} nodes must be {_count(most)} at most")
     refuse_beyond(nodes * NODE / 1e9, machine(), f"{_count(nodes)} nodes", f"take fewer {key}")
 
 

@@ -15,7 +15,7 @@ from dpl.fem.files import load
 from dpl.fem.memory import refuse_mesh
 from dpl.fem.propeller import propeller
 from dpl.fem.regions import Box, Cylinder, Plane, Region, Sphere, Tag, facets_in, nodes_in
-from dpl.fem.written import save
+from dpl.fem.written import save, save_exactly
 
 __all__ = [
     "Box",
@@ -35,6 +35,7 @@ __all__ = [
     "propeller",
     "rectangle",
     "save",
+    "save_exactly",
 ]
 
 SMALLEST, LARGEST = 1e-12, 1e12  # sides of a body [m]

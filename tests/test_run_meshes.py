@@ -1,0 +1,239 @@
+"""Laws of runs on a mesh file: a run holds its mesh, and answers wherever it is taken."""
+
+import json
+import shutil
+import struct
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+import dpl
+from dpl import run
+from dpl.fem.mesh import box, load, save_exactly
+from dpl.run import ConfigError
+from dpl.scene import Scene
+from dpl.stress.flaws import write
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory):
+    """A beam of tetrahedra in a file, a quarter of its cells inside out, with a node of no cell."""
+    beam = box([100.0, 25.0, 25.0], [5, 3, 3], "tetra")
+    cells = beam.t.T.copy()
+    corners = beam.p.T[cells]
+    left = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
+    cells[left] = cells[left][:, [1, 0, 2, 3]]
+    cells[::4] = cells[::4][:, [1, 0, 2, 3]]
+    path = tmp_path_factory.mktemp("drawings") / "part.vtu"
+    return write(path, np.concatenate([beam.p.T, [[0, 0, 1e3]]]), tetra=cells)
+
+
+@pytest.fixture(scope="module")
+def overrides(tiny_training):
+    """Overrides of a short training on a mesh file."""
+    kept = [o for o in tiny_training if not o.startswith("mesh.")]
+    quiet = "trainer.callbacks.3._target_=lightning.pytorch.callbacks.TQDMProgressBar"
+    return [*kept, quiet, "mesh=file", "trainer.max_epochs=1"]
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """A folder, and what the command said that trained in it: nothing yet."""
+    return tmp_path_factory.mktemp("done"), {}
+
+
+@pytest.fixture
+def trained(part, overrides, script, done, tmp_path):
+    """A run on a copy of the file, in a folder that may be harmed, and what the command said."""
+    origin, said = done
+    options = [*overrides, "mesh.path=part.vtu", f"data.folder={origin}/data", "run=runs/part"]
+    if not said:
+        (origin / "home").mkdir()
+        shutil.copy(part, origin / "home" / "part.vtu")
+        said["ended"] = script("train", *options, cwd=origin / "home")
+        assert said["ended"].status == 0, said["ended"].err
+    return shutil.copytree(origin / "home", tmp_path / "home"), options, said["ended"]
+
+
+@pytest.fixture
+def moved(trained, tmp_path):
+    """The run elsewhere, its mesh file and its folder gone."""
+    home, _, _ = trained
+    there = tmp_path / "elsewhere"
+    shutil.move(home / "runs" / "part", there / "runs" / "part")
+    shutil.rmtree(home)
+    return there
+
+
+def test_a_run_on_a_mesh_file_says_what_it_is_and_what_was_corrected(trained):
+    _, _, ended = trained
+    lines = ended.err.splitlines()
+    assert [line for line in lines if line.startswith("warning: ") and "part.vtu" in line] == [
+        "warning: part.vtu: 24 of 96 cells list their nodes inside out and are read the other way "
+        "round; 1 nodes are used by no cell and are left out"
+    ]
+    size = "body: 100 x 25 x 25 m, 45 nodes, 96 tetrahedra, 135 degrees of freedom"
+    assert ended.out.splitlines().count(size) == 1
+    assert ended.out.index(size) < ended.out.index("plan: ")
+
+
+def test_a_run_answers_the_same_where_its_mesh_file_is_not(trained, tmp_path, monkeypatch):
+    home, _, _ = trained
+    _, before = run.load_run(home / "runs" / "part")
+    load_ = before.scene.loads.sample((0, 2), range(2))
+    there = tmp_path / "there"
+    shutil.move(home / "runs" / "part", there)
+    shutil.rmtree(home)
+    monkeypatch.chdir(tmp_path)
+    cfg, after = run.load_run(there)
+    assert cfg.mesh.path == "part.vtu"
+    assert after.scene.fingerprint == before.scene.fingerprint
+    assert torch.equal(after.scene.problem.points, before.scene.problem.points)
+    with torch.no_grad():
+        assert torch.equal(after.predict(load_), before.predict(load_))
+    scene = after.scene
+    force = scene.force_unit * 4500.0 * load_.force[0]
+    assert dpl.load("there")(force, tol=1e-6).converged
+
+
+def test_all_commands_take_a_run_whose_mesh_file_is_gone(moved, script):
+    for name, arguments in {
+        "evaluate": ["run=runs/part"],
+        "compare": ["run=runs"],
+        "export": ["run=runs/part", "count=1", "parts=[results]"],
+        "view": ["run=runs/part", "movie=film.gif"],
+        "results": ["run=runs", "name=parts", "galerkin=null", "corrected=null", "count=2"],
+    }.items():
+        ended = script(name, *arguments, cwd=moved)
+        assert ended.status == 0, (name, ended.err)
+
+
+def test_a_run_whose_mesh_file_is_gone_is_resumed(trained, script):
+    home, options, _ = trained
+    (home / "part.vtu").unlink()
+    before = (home / "runs" / "part" / "mesh.vtu").read_bytes()
+    more = [o for o in options if "max_epochs" not in o]
+    ended = script("train", *more, "trainer.max_epochs=2", "ckpt_path=last", cwd=home)
+    assert ended.status == 0, ended.err
+    assert (home / "runs" / "part" / "mesh.vtu").read_bytes() == before
+    last = torch.load(home / "runs" / "part" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert last["epoch"] == 1
+    # another run that goes on from this one's checkpoint holds the mesh as well
+    checkpoint = "ckpt_path=runs/part/checkpoints/last.ckpt"
+    more = [o for o in more if not o.startswith("run=")]
+    ended = script("train", *more, "run=runs/b", checkpoint, "trainer.max_epochs=3", cwd=home)
+    assert ended.status == 0, ended.err
+    assert np.array_equal(load(home / "runs/b/mesh.vtu").t, load(home / "runs/part/mesh.vtu").t)
+
+
+def test_a_run_is_not_resumed_on_another_mesh_file(trained, script, part):
+    home, options, _ = trained
+    shutil.copy(part, home / "other.vtu")
+    other = [o for o in options if "mesh.path" not in o]
+    ended = script("train", *other, "mesh.path=other.vtu", "ckpt_path=last", cwd=home)
+    assert ended.status == 2
+    assert "mesh.path was part.vtu, is other.vtu" in ended.err
+
+
+def test_a_run_reads_no_mesh_outside_of_its_folder(trained, tmp_path):
+    home, _, _ = trained
+    folder = home / "runs" / "part"
+    cfg = OmegaConf.load(folder / "config.yaml")
+    cfg.mesh.path = str(home / "part.vtu")
+    (folder / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    run.load_run(folder)  # by the copy
+    (folder / "mesh.vtu").unlink()
+    with pytest.raises(ConfigError, match=r"mesh\.path = .* must be kept in the run's folder"):
+        run.load_run(folder)
+    (folder / "mesh.vtu").symlink_to(home / "part.vtu")
+    with pytest.raises(ConfigError, match=r"must be kept in the run's folder"):
+        run.load_run(folder)
+    (folder / "mesh.vtu").unlink()
+    run.load_run(folder, trust=True)
+
+
+# ------------------------------------------------------------------ hostile sizes
+
+
+def _renamed(path, change):
+    """Rewrite the header of a file of weights."""
+    data = path.read_bytes()
+    (size,) = struct.unpack("<Q", data[:8])
+    header = json.loads(data[8 : 8 + size])
+    told = json.loads(header["__metadata__"]["dpl"])
+    change(told)
+    header["__metadata__"]["dpl"] = json.dumps(told)
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    path.write_bytes(struct.pack("<Q", len(text)) + text + data[8 + size :])
+
+
+@pytest.fixture(scope="module")
+def boxed(tiny_training, tmp_path_factory):
+    """A folder in which a run on a box is trained, or was."""
+    return tmp_path_factory.mktemp("boxed")
+
+
+@pytest.fixture
+def handed_on(boxed, tiny_training, script, tmp_path):
+    """A run on a box of 45 nodes, in a folder that may be harmed."""
+    if not (boxed / "runs" / "box").exists():
+        quiet = "trainer.callbacks.3._target_=lightning.pytorch.callbacks.TQDMProgressBar"
+        options = [*tiny_training, quiet, "trainer.max_epochs=1", "run=runs/box"]
+        assert script("train", *options, cwd=boxed).status == 0
+    return shutil.copytree(boxed / "runs" / "box", tmp_path / "run")
+
+
+MESHES = {
+    "box": {"_target_": "dpl.fem.mesh.box", "size": [1, 1, 1], "nodes": [200, 200, 200]},
+    "thin": {"_target_": "dpl.fem.mesh.box", "size": [100, 25, 25], "nodes": [46, 3, 3]},
+    "rectangle": {"_target_": "dpl.fem.mesh.rectangle", "size": [1, 1], "nodes": [2000, 2000]},
+    "propeller": {"_target_": "dpl.fem.mesh.propeller", "cells": [90, 90, 90, 90, 90]},
+}
+LIES = {
+    "nothing": lambda told: None,
+    "no number of nodes": lambda told: told.pop("nodes"),
+    "a number that fits": lambda told: told.update(nodes=10**9),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+@pytest.mark.parametrize("name", MESHES)
+def test_a_mesh_of_more_nodes_than_the_weights_have_is_refused_before_it_is_made(
+    handed_on, name, lie, monkeypatch
+):
+    """Where the header lies too, a body has no more nodes than the weights have numbers."""
+    if name == "thin" and lie != "nothing":
+        pytest.skip("so few nodes are more than 45, and fewer than the numbers")
+    cfg = OmegaConf.load(handed_on / "config.yaml")
+    cfg.mesh = MESHES[name]
+    (handed_on / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    _renamed(handed_on / "checkpoints" / "best.safetensors", LIES[lie])
+
+    def forbidden(*_, **__):
+        raise AssertionError("made")
+
+    monkeypatch.setattr(np, "linspace", forbidden)
+    monkeypatch.setattr(Scene, "__init__", forbidden)
+    with pytest.raises(
+        ConfigError, match=r"^mesh: mesh\.\w+ = .* nodes must be .* at most"
+    ) as told:
+        run.load_run(handed_on)
+    assert "\n" not in str(told.value)
+
+
+def test_a_larger_mesh_file_in_the_folder_is_refused_by_its_nodes(handed_on, part):
+    cfg = OmegaConf.load(handed_on / "config.yaml")
+    cfg.mesh = {"_target_": "dpl.fem.mesh.load", "path": "x"}
+    (handed_on / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    save_exactly(handed_on / "mesh.vtu", box([100.0, 25.0, 25.0], [6, 3, 3]))
+    with pytest.raises(ConfigError, match=r"mesh: .*mesh\.vtu: its size = 54 nodes must be 45"):
+        run.load_run(handed_on)
+
+
+def test_a_trusted_run_may_have_any_mesh_that_its_weights_fit(handed_on):
+    _, surrogate = run.load_run(handed_on)
+    assert surrogate.scene.problem.shape[0] == 45
+    assert run.load_run(handed_on, trust=True)[1].scene.fingerprint == surrogate.scene.fingerprint
