@@ -408,7 +408,7 @@ def load_run(
     except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
         raise _unusable(best, error) from error
     if scene is None:
-        scene = _scene_of_run(cfg, Path(folder), checkpoint, trust=trust)
+        scene = _scene_of_run(cfg, best, checkpoint, trust=trust)
     surrogate = build_surrogate(cfg, scene)
     try:
         surrogate.on_load_checkpoint(checkpoint)
@@ -424,14 +424,15 @@ def _unusable(checkpoint: Path, error: Exception) -> ConfigError:
 
 
 def _scene_of_run(
-    cfg: DictConfig, folder: Path, checkpoint: dict[str, Any], *, trust: bool
+    cfg: DictConfig, weights: Path, checkpoint: dict[str, Any], *, trust: bool
 ) -> Scene:
     """Return the scene of a run, its mesh read from its folder and held to its weights.
 
     Args:
         cfg: Its configuration.
-        folder: Where it lies.
-        checkpoint: Its weights. A body has no more nodes than they have numbers, of any network.
+        weights: The file of its weights, in its folder.
+        checkpoint: What is in it. A body has no more nodes than weights have numbers, of any
+            network.
         trust: Whether the mesh may have more nodes, and lie elsewhere if the run has no copy.
 
     Raises:
@@ -439,6 +440,7 @@ def _scene_of_run(
     """
     _need(cfg, *SCENE)
     if cfg.mesh._target_ == READ:
+        folder = weights.parent.parent
         own = folder / MESH
         if own.resolve().parent == folder.resolve() and own.is_file():
             cfg = _with_mesh(cfg, own)
@@ -451,7 +453,8 @@ def _scene_of_run(
         return build_scene(cfg)
     values = sum(t.numel() for t in checkpoint["state_dict"].values() if torch.is_tensor(t))
     nodes = checkpoint.get("nodes")
-    with at_most(min(nodes, values) if isinstance(nodes, int) else values):
+    most = min(nodes, values) if isinstance(nodes, int) else values
+    with at_most(most, f"{weights} is of no larger body"):
         return build_scene(cfg)
 
 

@@ -8,7 +8,7 @@ from contextvars import ContextVar
 import torch
 
 NODE = 1000  # of a node with its row of K(0), in 2D, where it is least [bytes]
-_MOST: ContextVar[int | None] = ContextVar("most nodes of a mesh", default=None)
+_MOST: ContextVar[tuple[int, str] | None] = ContextVar("most nodes of a mesh", default=None)
 
 
 def refuse_beyond(needed: float, limit: float | None, what: str, remedy: str) -> None:
@@ -35,9 +35,9 @@ def machine() -> float:
 
 
 @contextlib.contextmanager
-def at_most(nodes: int) -> Iterator[None]:
-    """Let `refuse_mesh` refuse meshes of more nodes, before they are made."""
-    token = _MOST.set(nodes)
+def at_most(nodes: int, reason: str) -> Iterator[None]:
+    """Let `refuse_mesh` refuse meshes of more nodes, before they are made, and say why."""
+    token = _MOST.set((nodes, reason))
     try:
         yield
     finally:
@@ -50,8 +50,9 @@ def refuse_mesh(nodes: int, key: str) -> None:
     Raises:
         ValueError: They are more than `at_most` allows.
     """
-    if (most := _MOST.get()) is not None and nodes > most:
-        raise ValueError(f"{key} = {_count(nodes)} nodes must be {_count(most)} at most")
+    most, reason = _MOST.get() or (nodes, "")
+    if nodes > most:
+        raise ValueError(f"{key} = {_count(nodes)} nodes must be {_count(most)} at most; {reason}")
     refuse_beyond(nodes * NODE / 1e9, machine(), f"{_count(nodes)} nodes", f"take fewer {key}")
 
 
