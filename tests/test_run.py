@@ -30,7 +30,7 @@ BAD = {  # override -> what the message must name
     "material.poisson=true": r"material\.poisson = True must be a number",
     "material.poisson=null": r"material\.poisson = None must be a number",
     "+material.e=1": r"material\.e: .* has no such option",
-    "+material.poison=1": r"material\.poison: .* has no such option; did you mean material\.poisson\?",
+    "+material.poison=1": r"material\.poison: .* did you mean material\.poisson\?",
     "material._target_=dpl.fem.materials.Rubber": r"material\._target_ = .*Rubber' does not exist",
     "material._target_=nowhere.Rubber": r"material\._target_ = .*nowhere\.Rubber' does not exist",
     "young=-1": r"young = -1",

@@ -1,14 +1,18 @@
 """What a command line asks for: composed and checked, job by job, before Hydra starts the first."""
 
+import contextlib
 import itertools
 import logging
 import tempfile
+import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-import hydra
-from hydra._internal.utils import get_args_parser
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path, get_args_parser
+from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -45,10 +49,8 @@ def check(
     args = parser.parse_args(arguments)
     if args.help or args.hydra_help or args.shell_completion or args.experimental_rerun:
         return
-    own = [] if args.config_dir is None else [_searched(args.config_dir)]
-    folder = str(Path(args.config_path or conf).absolute())
-    with hydra.initialize_config_dir(folder, version_base="1.3", job_name=name):
-        first, jobs = _jobs(args.config_name or name, [*own, *args.overrides], args.multirun)
+    with _initialized(args.config_path or conf, args.config_dir):
+        first, jobs = _jobs(args.config_name or name, args.overrides, args.multirun)
         if args.cfg or args.info is not None:
             return
         sweep = jobs is not None
@@ -72,12 +74,24 @@ def _unreadable(message: str) -> NoReturn:
     )
 
 
-def _searched(folder: str) -> str:
-    """Return the override that stands for `--config-dir`."""
-    path = Path(folder).absolute()
-    if not path.is_dir():
-        raise ConfigError(f"--config-dir = {folder} must be an existing folder")
-    return f"hydra.searchpath=['file://{path}']"
+@contextlib.contextmanager
+def _initialized(conf: str | Path, beside: str | None) -> Iterator[None]:
+    """Let Hydra find configurations in a folder, and in one beside it (`--config-dir`).
+
+    Raises:
+        ConfigError: The second folder is not there.
+    """
+    search = create_config_search_path(str(Path(conf).absolute()))
+    if beside is not None:
+        own = Path(beside).absolute()
+        if not own.is_dir():
+            raise ConfigError(f"--config-dir = {beside} must be an existing folder")
+        search.prepend("command-line", f"file://{own}", SearchPathQuery(provider="schema"))
+    Hydra.create_main_hydra2("check", search)
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().clear()
 
 
 def _jobs(
@@ -132,7 +146,8 @@ def _different(jobs: Iterable[DictConfig]) -> Iterator[DictConfig]:
     """Yield the jobs that differ in more than their seed and their folder."""
     seen = set()
     for job in jobs:
-        told = repr([(key, value) for key, value in run.plain(job).items() if key not in SAME])
+        written = typing.cast("dict[str, Any]", OmegaConf.to_container(job, resolve=False))
+        told = repr([(key, value) for key, value in written.items() if key not in SAME])
         if told not in seen:
             yield job
         seen.add(told)

@@ -98,25 +98,28 @@ def options(group: str) -> list[str]:
 def _reason(name: str, asked: list[Override], error: Exception) -> str:
     """Return in one line why overrides cannot be applied."""
     groups = [one for one in asked if options(one.key_or_group)]
-    chosen = set(hydra.compose(name, return_hydra_config=True).hydra.runtime.choices)
-    if told := next(filter(None, (_bad_option(one, chosen) for one in groups)), None):
-        return told
     with contextlib.suppress(*REFUSED):
-        lines = [one.input_line for one in groups]
+        chosen = set(hydra.compose(name, return_hydra_config=True).hydra.runtime.choices)
+        found = [_bad_option(one, chosen, str(error)) for one in groups]
+        if told := next(filter(None, found), None):
+            return told
+        ways = [one for one in asked if one.key_or_group == "hydra.searchpath"]
+        lines = [one.input_line for one in (*ways, *groups)]
         base = hydra.compose(name, overrides=lines, return_hydra_config=True)
-        keys = [_bad_key(one, base) for one in asked if one not in groups]
-        if told := next(filter(None, keys), None):
+        found = [_bad_key(one, base) for one in asked if one not in groups]
+        if told := next(filter(None, found), None):
             return told
     told = str(error).partition("Config search path")[0]
     return " ".join(line.strip() for line in told.splitlines() if "://" not in line)
 
 
-def _bad_option(one: Override, chosen: set[str]) -> str | None:
+def _bad_option(one: Override, chosen: set[str], error: str) -> str | None:
     """Return what is wrong with the choice of an option; None if nothing is.
 
     Args:
         one: The choice.
         chosen: Groups of which the command has an option already.
+        error: What Hydra says of all overrides; a missing option is named there.
     """
     value, group = one.value(), one.key_or_group
     known, adds = options(group), one.is_add() or one.is_force_add()
@@ -124,7 +127,8 @@ def _bad_option(one: Override, chosen: set[str]) -> str | None:
         return f"{group}: an option is chosen already; write {one.input_line.lstrip('+')}"
     if not adds and group not in chosen:
         return f"{group}: this command has no such key; {schema.instead(group, chosen)}"
-    if one.is_delete() or isinstance(value, list) or value in known:
+    missing = f"{group}/{value}" in error or not isinstance(value, str)
+    if one.is_delete() or isinstance(value, list) or value in known or not missing:
         return None
     near = schema.near(str(value), known)
     told = f"{group} = {'null' if value is None else value}: there is no such option; "
@@ -146,6 +150,8 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
     place = ""
     for part in key.split("."):
         known = _below(node)
+        if part in known and OmegaConf.is_list(node) and one.is_delete() and key == place + part:
+            return f"{key} is an entry of a list, which cannot be removed; write the whole list"
         if part in known:
             node, place = known[part], f"{place}{part}."
             continue

@@ -1,0 +1,226 @@
+"""Laws of command lines: nonsense ends with one line before anything is solved or written."""
+
+import os
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from dpl import run
+from dpl.commands import asked, generate, train
+from dpl.commands.entry import CONF
+from dpl.run import ConfigError
+
+OPTIONS = "model is one of cnn, fcnn, gnn, latent, pod"
+EXPERIMENTS = "experiment is one of beam_nh_loss, beam_poisson, beam_svk, "
+NONSENSE = {  # command line -> what the one line says
+    "train experiment=beam_yuong": f"experiment = beam_yuong: .* beam_young\\? {EXPERIMENTS}",
+    "generate experiment=beam_yuong": f"experiment = beam_yuong: .* beam_young\\? {EXPERIMENTS}",
+    "train sweep=latnt": r"sweep = latnt: there is no such option; did you mean latent\?",
+    "train modle=fcnn": r"^modle: there is no such key; did you mean model\?$",
+    "train +modle=fcnn": r"^modle: this command has no such key; did you mean model\?$",
+    "train ~modle": r"^modle: there is no such key; did you mean model\?$",
+    "train +port=3": r"^port: this command has no such key",
+    "train model=fcn": f"^model = fcn: there is no such option; did you mean fcnn\\? {OPTIONS}$",
+    "train model=xyz": f"^model = xyz: there is no such option; {OPTIONS}$",
+    "train model=3": f"^model = 3: there is no such option; {OPTIONS}$",
+    "train model=null": f"^model = null: there is no such option; {OPTIONS}; ~model leaves it out$",
+    "train clamped=null": r"^clamped = null: .* one of cylinder, plane, tag; ~clamped leaves it",
+    "train clamped=3": r"^clamped = 3: .* one of cylinder, plane, tag$",
+    "train +model=cnn": r"^model: an option is chosen already; write model=cnn$",
+    "train tiers=default": r"^tiers: this command has no such key",
+    "train model/part=cnn": r"^model/part: there is no such group",
+    "train hydra/launcher=jobblib": r"^hydra/launcher = jobblib: .*pip install .*launch",
+    "train hydra.swep.dir=3": r"^hydra\.swep\.dir: .*; did you mean hydra\.sweep\?$",
+    "train model.widht=3": r"^model\.widht: there is no such key; did you mean model\.width\?$",
+    "train trainer.max_epoch=3": r"did you mean trainer\.max_epochs\?$",
+    "train ~trainer.callbacks.4": r"^trainer\.callbacks\.4 is an entry of a list, .*whole list$",
+    "train trainer.callbacks.9.every=3": r"^trainer\.callbacks\.9\.every: there is no such key",
+    "train mesh.cell=tetra": r"^mesh\.cell is not in this .*; add it with \+mesh\.cell=tetra$",
+    "train +mesh.cel=tetra": r"^mesh\.cel: .* has no such option; did you mean mesh\.cell\?$",
+    "train model=fcnn,cnn": r"^model=fcnn,cnn names several values; add -m",
+    "train model.width=[1,2": r"^model\.width=\[1,2 cannot be read; quote the value",
+    "train model": r"^model must be written as KEY=VALUE$",
+    "train --foo": r"^unrecognized arguments: --foo; .*--help",
+    "train seed=1 -m seed=2": r"^unrecognized arguments: seed=2; flags such as -m stand before",
+    "train --config-dir nowhere": r"^--config-dir = nowhere must be an existing folder$",
+    "train --config-name nowhere": r"^Cannot find primary config 'nowhere'",
+    "train young=${nowhere}": r"^young: Interpolation key 'nowhere' not found$",
+    "train run=null": r"^run = null must be a text",
+    "train run=${nowhere}": r"^run = \$\{nowhere\} must be a text",
+    "train run=/proc/nope": r"^run = /proc/nope cannot be written: No such file",
+    "train run=file": r"^run = file cannot be written: File exists",
+    "train run=file/below": r"^run = file/below cannot be written: Not a directory",
+    "train -m run=file seed=1,2": r"^run = file cannot be written: File exists",
+    "train -m seed=range(0)": r"^seed=range\(0\) must name one value or more",
+    "train -m optimizer.lr=interval(1e-3,1)": r"^optimizer\.lr=interval.* is a range for a search",
+    "train -m model=fcnn,fcn": r"^model = fcn: there is no such option",
+    "train -m data.train=8,0": r"^data\.train = 0 must lie between",
+    "train -m seed=0,1 optimizer.lr=1e-3,1e30": r"^optimizer\.lr = 1e\+30 must lie between",
+    "train -m model.layers=2,1": r"^model: layers = 1 must be 2 or more",
+    "train -m loss=lr_plus loss.weight=1,-1": r"^loss: weight = -1",
+    "train -m clamped.axis=0,3": r"^clamped: axis = 3",
+    "train -m trainer.accelerator=cpu,foo": r"^trainer: .*foo",
+    "generate -m shard=range(4) shards=3": r"^data: shard = 3 must be one of 0 to shards - 1 = 2$",
+    "generate actoin=verify": r"^actoin: there is no such key; did you mean action\?$",
+    "view rn=3": r"^rn: there is no such key; did you mean run\?$",
+    "evaluate": r"^run is missing",
+}
+PARTS = {"train": train.parts, "generate": generate.parts}
+
+
+@pytest.fixture
+def ask(monkeypatch, tmp_path):
+    """Checks a command line as its command does, in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    GlobalHydra.instance().clear()
+
+    def ask(command, *arguments):
+        asked.check(command, CONF, arguments, PARTS.get(command))
+
+    return ask
+
+
+@pytest.mark.parametrize("line", NONSENSE)
+def test_a_command_line_that_cannot_work_is_refused_in_one_line(ask, capfd, tiny, line, tmp_path):
+    command, *arguments = line.split()
+    small = [*tiny, "model.width=8"] if line.startswith("train -m") else []
+    with pytest.raises(ConfigError, match=NONSENSE[line]) as refusal:
+        ask(command, *arguments, *small)
+    assert "\n" not in str(refusal.value)
+    assert "full_key" not in str(refusal.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "train",
+        "train ~experiment ~sweep",
+        "train experiment=beam_young",
+        "train +mesh.cell=tetra ++model.width=8",
+        "train run=new/folder",
+        "generate --cfg job young=-1",
+        "train --help modle=3",
+    ],
+)
+def test_a_command_line_that_works_is_not_refused_and_leaves_nothing(ask, line, tmp_path):
+    ask(*line.split())
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_every_job_of_a_sweep_is_checked_and_rehearsed_before_the_first(ask, monkeypatch):
+    rehearsed = []
+    monkeypatch.setitem(PARTS, "train", rehearsed.append)
+    ask("train", "-m", "model=fcnn,cnn", "loss=mse,lr_star", "seed=0,1")
+    seen = {tuple(c[k]._target_.rpartition(".")[2] for k in ("model", "loss")) for c in rehearsed}
+    assert seen == {(model, loss) for model in ("FCNN", "CNN") for loss in ("MSE", "LrStar")}
+    assert len(rehearsed) == 4, "a seed decides nothing about whether a job can work"
+
+
+def test_a_single_job_builds_its_own_parts_only(ask, monkeypatch):
+    rehearsed = []
+    monkeypatch.setitem(PARTS, "train", rehearsed.append)
+    ask("train")
+    assert not rehearsed
+
+
+def test_configurations_beside_those_of_the_package_are_checked_too(ask, tmp_path):
+    (tmp_path / "mine/material").mkdir(parents=True)
+    soft = "_target_: dpl.fem.materials.NeoHookeanLn\npoisson: 0.1\n"
+    (tmp_path / "mine/material/soft.yaml").write_text(soft)
+    ask("generate", "--config-dir", "mine", "material=soft")
+    with pytest.raises(ConfigError, match=r"did you mean soft\?"):
+        ask("generate", "--config-dir", "mine", "material=sofd")
+
+
+def test_a_folder_that_is_there_and_what_is_in_it_are_left_alone(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/kept").touch()
+    asked.try_folder(tmp_path / "run")
+    asked.try_folder(tmp_path / "run/new/deep")
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["kept"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_is_read_only_is_refused(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(ConfigError, match="cannot be written: Permission denied"):
+        asked.try_folder(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "train modle=fcnn",
+        "train clamped=null",
+        "train -m seed=range(0)",
+        "train run=/proc/nope",
+        "train data.folder=/dev/null",
+        "train trainer.callbacks=[]",
+        "benchmark linear=[foo]",
+        "benchmark linear=[]",
+    ],
+)
+def test_a_command_ends_with_one_line_and_2(script, tiny, tmp_path, line):
+    command, *arguments = line.split()
+    small = tiny if command == "train" else []
+    ended = script(command, *arguments, *small, cwd=tmp_path)
+    assert ended.status == 2
+    assert ended.err.startswith("error: ")
+    assert ended.err.count("\n") == 1
+    assert "solving" not in ended.out
+    assert not list(tmp_path.glob("datasets"))
+
+
+def test_a_region_may_be_left_out_where_supports_hold_the_body(scene_of, tiny):
+    """As a refused `clamped=null` advises."""
+    with pytest.raises(ConfigError, match="6 rigid modes are unconstrained"):
+        scene_of(*tiny, "~clamped")
+    held = (
+        "+supports.end={_target_: dpl.fem.supports.Displacement, value: [0, 0, 0], "
+        "region: {_target_: dpl.fem.mesh.Plane, axis: 0, at: min}}"
+    )
+    usual, scene = scene_of(*tiny), scene_of(*tiny, "~clamped", held)
+    assert bool((scene.problem.free == usual.problem.free).all())
+
+
+LAST = "{_target_:lightning.pytorch.callbacks.ModelCheckpoint,dirpath:./checkpoints,filename:last}"
+BEST = (
+    "{_target_:dpl.checkpoints.BestWeights,dirpath:./checkpoints,filename:best,monitor:val/e_mean}"
+)
+OFTEN = "trainer.check_val_every_n_epoch=1"
+OTHER = LAST.replace("last", "other")
+CALLBACKS = {  # what keeps weights from which a run can be loaded, and what does not
+    "": True,
+    "trainer.callbacks=[]": False,
+    "+trainer.fast_dev_run=true": False,
+    "trainer.callbacks.1.dirpath=x trainer.callbacks.0.dirpath=x": False,
+    f"trainer.callbacks=[{OTHER}]": False,
+    f"trainer.callbacks=[{LAST}]": True,
+    f"trainer.callbacks=[{BEST}]": False,  # no epoch is validated
+    f"trainer.callbacks=[{BEST}] {OFTEN}": True,
+    f"trainer.callbacks=[{BEST}] {OFTEN} +trainer.limit_val_batches=0": False,
+}
+
+
+@pytest.mark.parametrize("line", CALLBACKS)
+def test_a_training_that_would_keep_no_weights_is_refused(compose, tiny_training, line):
+    sizes = [one for one in tiny_training if "check_val" not in one]
+    cfg = compose("folder=.", *sizes, "trainer.max_epochs=2", *line.split(), command="train")
+    run.check(cfg)
+    if CALLBACKS[line]:
+        train.parts(cfg)
+        return
+    with pytest.raises(ConfigError, match=r"trainer\.callbacks keep no weights.*add \{_target_"):
+        train.parts(cfg)
+
+
+def test_the_advice_for_extras_works_where_it_is_given(monkeypatch):
+    from dpl import version
+
+    assert version.install("onnx") == "pip install -c constraints.txt -e '.[onnx]'"
+    monkeypatch.setattr(version, "ROOT", Path("nowhere/site-packages"))
+    assert version.install("onnx") == "pip install 'deepphysics[onnx]'"
