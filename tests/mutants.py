@@ -29,6 +29,7 @@ import signal
 import sys
 import time
 import tomllib
+import traceback
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -135,14 +136,15 @@ def judged(path: Path, text: str, tests: Sequence[str], limit: float | None, sho
         path: The module.
         text: What it says instead of its file.
         tests: Arguments of pytest.
-        limit: Seconds after which the process is ended; None: any number.
+        limit: CPU time after which the process is ended, or ten times as long by the clock, for a
+            process that waits [s]; None: no limit.
         show: Whether to print what pytest prints.
     """
     sys.stdout.flush()
     pid = os.fork()
     if pid == 0:
-        _run(path, text, tests, show)
-    end = time.monotonic() + (limit or float("inf"))
+        _run(path, text, tests, limit, show)
+    end = time.monotonic() + 10 * (limit or float("inf"))
     status = None
     while status is None and time.monotonic() < end:
         ended, waited = os.waitpid(pid, os.WNOHANG)
@@ -151,11 +153,12 @@ def judged(path: Path, text: str, tests: Sequence[str], limit: float | None, sho
         os.killpg(pid, signal.SIGKILL)
     if status is None:
         os.waitpid(pid, 0)
+    if status is None or status == signal.SIGXCPU:
         return "timeout"
     return "survived" if status == 0 else "killed"
 
 
-def _run(path: Path, text: str, tests: Sequence[str], show: bool) -> None:
+def _run(path: Path, text: str, tests: Sequence[str], limit: float | None, show: bool) -> None:
     """Run the tests with a changed module and end this process with their status."""
     status = 1
     try:
@@ -165,6 +168,10 @@ def _run(path: Path, text: str, tests: Sequence[str], show: bool) -> None:
             for stream in (0, 1, 2):
                 os.dup2(quiet, stream)
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        if limit:
+            used = resource.getrusage(resource.RUSAGE_SELF)
+            seconds = int(used.ru_utime + used.ru_stime + limit) + 1
+            resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 5))
         sys.meta_path.insert(0, Changed(path, text))
         status = int(pytest.main([*OPTIONS, *tests]))
     finally:
@@ -193,10 +200,10 @@ def survey(path: str, options: argparse.Namespace, before: Any) -> Iterator[dict
     elif options.sample and options.sample < len(texts):
         chosen = random.Random(options.seed).sample(range(len(texts)), options.sample)
         texts = [texts[k] for k in sorted(chosen)]
-    start = time.monotonic()
     if judged(ROOT / path, source, tests, None, True) != "survived":
         raise SystemExit(f"error: {path} unchanged must pass {' '.join(tests)}; mend that first")
-    limit = options.limit or 20 + 4 * (time.monotonic() - start)
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    limit = options.limit or 20 + 4 * (used.ru_utime + used.ru_stime)
     for one in texts:
         verdict = judged(ROOT / path, one, tests, limit, False)
         yield {"diff": difference(path, source, one), "verdict": verdict, "text": text}
@@ -206,13 +213,13 @@ def survey(path: str, options: argparse.Namespace, before: Any) -> Iterator[dict
 
 def table(results: dict[str, list[dict[str, Any]]]) -> str:
     """Return the counts of each module and the changes that no test noticed."""
-    rows = [f"{'module':28} mutants killed timeout survived   kill %   text"]
+    rows = [f"{'module':28} mutants killed timeout survived kill %   text"]
     for path, found in results.items():
         verdicts = Counter(one["verdict"] for one in found)
         part = 100 * (1 - verdicts["survived"] / len(found)) if found else 100.0
         counts = (len(found), *(verdicts[name] for name in ("killed", "timeout", "survived")))
         text = found[0]["text"] if found else 0
-        rows.append("{:28} {:7} {:6} {:7} {:8}   {:6.1f} {:6}".format(path, *counts, part, text))
+        rows.append("{:28} {:7} {:6} {:7} {:8} {:6.1f} {:6}".format(path, *counts, part, text))
     for found in results.values():
         rows += ["\n" + one["diff"] for one in found if one["verdict"] == "survived"]
     return "\n".join(rows)
@@ -224,7 +231,9 @@ def main() -> None:
     parser.add_argument("modules", nargs="*", help="files of [tool.mutants.modules]; all")
     parser.add_argument("--sample", type=int, default=0, help="mutants of each module; 0: all")
     parser.add_argument("--seed", type=int, default=0, help="of the sample")
-    parser.add_argument("--limit", type=float, help="seconds for a mutant; 20 + 4 x the tests' own")
+    parser.add_argument(
+        "--limit", type=float, help="CPU seconds for a mutant; 20 + 4 x the tests' own"
+    )
     parser.add_argument("--survivors", action="store_true", help="those of the last results alone")
     parser.add_argument("--out", type=Path, default=ROOT / "build/mutants.json", help="results")
     options = parser.parse_args()
@@ -258,6 +267,8 @@ def _judge_module(path: str, options: argparse.Namespace) -> None:
         status = 0
     except SystemExit as end:
         print(end, file=sys.stderr)
+    except Exception:
+        traceback.print_exc()
     finally:
         sys.stdout.flush()
         os._exit(status)
