@@ -155,12 +155,13 @@ class Scene:
         """SHA-256 of `identity`, in hexadecimal."""
         return hashlib.sha256(json.dumps(self.identity(), sort_keys=True).encode()).hexdigest()
 
-    def matches(self, fingerprint: str, identity: Any) -> bool:
-        """Return whether a fingerprint and an identity that were written down are this scene's.
+    def matches(self, identity: Any) -> bool:
+        """Return whether an identity that was written down is this scene's; 1 equals 1.0.
 
-        Those of before numbers were canonical differ in fingerprint alone: 1 equals 1.0.
+        The fingerprints of equal identities may differ: older versions did not make integers that
+        stand for real numbers floats.
         """
-        return fingerprint == self.fingerprint or _plain(identity) == _plain(self.identity())
+        return bool(_plain(identity) == _plain(self.identity()))
 
     def differences(self, identity: Any) -> list[str]:
         """Return in what an identity that was written down differs from this scene's, a line each.

@@ -5,12 +5,14 @@ import json
 import os
 import pickle
 import zipfile
+from math import inf, nan
 
+import lightning as L
 import pytest
 import torch
 from safetensors.torch import save_file
 
-from dpl.checkpoints import WholeCheckpoints, read, write
+from dpl.checkpoints import BestWeights, WholeCheckpoints, epochs, read, write
 
 WEIGHTS = {"net.a": torch.arange(6.0).reshape(2, 3), "scale": torch.tensor(2.0).double()}
 CHECKPOINT = {
@@ -102,6 +104,46 @@ def test_a_checkpoint_that_is_larger_inside_is_not_unpacked(tmp_path):
     assert path.stat().st_size < 100_000
     with pytest.raises(ValueError, match="unpacks to"):
         read(path)
+
+
+def test_a_refused_pickle_is_told_without_advice_to_read_it_all_the_same(tmp_path):
+    torch.save({**CHECKPOINT, "more": Harm(tmp_path / "harm")}, tmp_path / "last.ckpt")
+    with pytest.raises(ValueError, match="holds more than tensors and plain data") as refusal:
+        read(tmp_path / "last.ckpt")
+    assert "weights_only" not in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("harm", [0, 1, 10, 200, 1000, -1, -100])
+def test_a_file_cut_anywhere_is_refused_in_one_line(tmp_path, harm):
+    path = tmp_path / "last.ckpt"
+    write(CHECKPOINT, path)
+    path.write_bytes(path.read_bytes()[:harm])
+    with pytest.raises(ValueError, match=r"is damaged or no checkpoint: .") as refusal:
+        read(path)
+    assert "\n" not in str(refusal.value)
+
+
+def test_epochs_are_those_that_were_done_and_weights_alone_have_none():
+    whole = {
+        **CHECKPOINT,
+        "loops": {},
+        "callbacks": {},
+        "optimizer_states": [],
+        "lr_schedulers": [],
+    }
+    assert epochs(whole) == 4
+    with pytest.raises(ValueError, match="holds no loops, optimizer_states, which resuming takes"):
+        epochs({k: v for k, v in whole.items() if k not in ("loops", "optimizer_states")})
+    with pytest.raises(ValueError, match="says epoch = 'three'"):
+        epochs({**whole, "epoch": "three"})
+
+
+def test_an_error_that_is_not_finite_is_never_the_best(tmp_path):
+    best = BestWeights(dirpath=tmp_path, filename="best", monitor="val/e_mean")
+    trainer = L.Trainer(logger=False, callbacks=[best], accelerator="cpu")
+    asked = [best.check_monitor_top_k(trainer, torch.tensor(e)) for e in (nan, inf, -inf, 0.5)]
+    assert asked == [False, False, False, True]
 
 
 @pytest.mark.parametrize("what", [[], {"state_dict": 1}, {"weights": {}}])

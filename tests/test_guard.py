@@ -107,3 +107,15 @@ def test_a_rate_far_too_high_ends_with_one_line(script, tiny_training, tmp_path)
     assert last.startswith("error: training has diverged: 20 steps in a row")
     assert "lower optimizer.lr" in last
     assert "Traceback" not in ended.err
+
+
+def test_a_training_whose_answers_are_not_finite_does_not_end_well(script, tiny_training, tmp_path):
+    """Too short for the guard to give up, and validated as NaN each time."""
+    wild = ["optimizer.lr=1e6", "trainer.max_epochs=3", "run=wild"]
+    ended = script("train", *tiny_training, *wild, cwd=tmp_path)
+    assert ended.status == 2
+    last = ended.err.strip().splitlines()[-1]
+    assert last.startswith("error: training has diverged: the answers of the network in")
+    assert "Traceback" not in ended.err
+    left = [path.name for path in (tmp_path / "wild/checkpoints").iterdir()]
+    assert left == ["last.ckpt"], "nothing is called best"

@@ -198,6 +198,71 @@ def assert_same(one, other):
         assert digest(one[part]) == digest(other[part]), part
 
 
+LIMITED = textwrap.dedent(
+    """
+    import resource, runpy, sys
+    from dpl import checkpoints
+    script, name, most = sys.argv[1:4]
+    sys.argv = [script, *sys.argv[4:]]
+    write = checkpoints.write
+
+    def full(checkpoint, path):
+        if path.name == name and checkpoint["epoch"] == 2:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (int(most), resource.RLIM_INFINITY))
+        write(checkpoint, path)
+
+    checkpoints.write = full
+    runpy.run_path(script, run_name="__main__")
+    """
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "most"), [("best.safetensors", 0), ("last.ckpt", 5000), ("last.ckpt", 50_000)]
+)
+def test_a_full_disk_ends_training_with_one_line_and_what_was_there_is_whole(
+    straight, environment, overrides, home, name, most
+):
+    """No file may grow beyond a limit from the third epoch on, which is how a full disk fails."""
+    straight("fcnn")
+    run = f"full-{name}-{most}"
+    command = [sys.executable, "-c", LIMITED, str(ROOT / "scripts/train.py"), name, str(most)]
+    ended = subprocess.run(
+        [*command, *overrides(run, "fcnn")],
+        cwd=home, env=environment(), capture_output=True, text=True,
+    )  # fmt: skip
+    assert ended.returncode == 2, ended.stderr[-2000:]
+    line = ended.stderr.strip().splitlines()[-1]
+    assert line.startswith("error: no space left"), line
+    assert "Traceback" not in ended.stderr
+    assert last(home / run)["epoch"] == 1, "the checkpoint before is whole"
+    assert read(home / run / "checkpoints/best.safetensors")["epoch"] <= 2
+    left = {path.name for path in (home / run / "checkpoints").iterdir()}
+    assert left == {"best.safetensors", "last.ckpt"}
+
+
+@pytest.mark.skipif(os.system("unshare -rm true 2>/dev/null") != 0, reason="needs unshare")
+@pytest.mark.parametrize("below", [".", "checkpoints"])
+def test_a_folder_that_may_only_be_read_ends_training_with_one_line(
+    straight, environment, overrides, home, below
+):
+    """Root may write everywhere, so it is mounted so."""
+    straight("fcnn")
+    run = home / f"read-only-{below}"
+    (run / below).mkdir(parents=True)
+    mount = 'mount --bind $0 $0 && mount -o remount,bind,ro $0 && exec "$@"'
+    script = [sys.executable, str(ROOT / "scripts/train.py"), *overrides(run.name, "fcnn")]
+    ended = subprocess.run(
+        ["unshare", "-rm", "bash", "-c", mount, str(run / below), *script],
+        cwd=home, env=environment(), capture_output=True, text=True,
+    )  # fmt: skip
+    assert ended.returncode == 2, ended.stderr[-2000:]
+    line = ended.stderr.strip().splitlines()[-1]
+    assert line.startswith("error: "), line
+    assert "ead-only" in line or "no permission to write" in line, line
+    assert "Traceback" not in ended.stderr
+
+
 def test_two_runs_that_nobody_kills_are_the_same(straight, script, overrides, home):
     """Else there is nothing to compare with."""
     assert script("train", *overrides("again", "fcnn"), cwd=home).status == 0

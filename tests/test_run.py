@@ -1,6 +1,7 @@
 """Laws of the composition root: what cannot work is refused by name before anything is computed."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -706,6 +707,61 @@ def test_a_run_that_is_not_there_is_not_resumed_but_begun(compose, tmp_path):
     with pytest.raises(ConfigError, match="ckpt_path: there is no"):
         run.check_resumed(cfg)
     run.check_resumed(compose(f"folder={tmp_path}", "ckpt_path=last", command="train"))
+
+
+@pytest.mark.parametrize("harm", ["empty", "truncated", "text", "weights", "pickle", "folder"])
+def test_a_checkpoint_that_cannot_be_resumed_is_refused_in_one_line(resumed, copied, harm):
+    path = copied / "checkpoints" / "last.ckpt"
+    content = {"empty": b"", "truncated": path.read_bytes()[:-1000], "text": b"hello"}
+    if harm in content:
+        path.write_bytes(content[harm])
+    elif harm == "weights":
+        path = copied / "checkpoints" / "best.safetensors"
+    elif harm == "folder":
+        path = copied / "checkpoints"
+    else:
+        torch.save({**checkpoints.read(path), "more": Path(path)}, path)
+    with pytest.raises(ConfigError, match=r"^ckpt_path(:| =)") as refusal:
+        run.check_resumed(resumed(f"ckpt_path={path}"))
+    assert "\n" not in str(refusal.value)
+    assert "weights_only" not in str(refusal.value)
+
+
+def test_a_run_is_not_resumed_for_fewer_epochs_than_it_has_done(resumed, copied):
+    path = copied / "checkpoints" / "last.ckpt"
+    found = {**checkpoints.read(path), "epoch": 4}
+    checkpoints.write(found, path)
+    run.check_resumed(resumed(f"ckpt_path={path}", "trainer.max_epochs=5"))
+    with pytest.raises(ConfigError, match=r"^trainer\.max_epochs = 4 must be 5 or more; the run"):
+        run.check_resumed(resumed(f"ckpt_path={path}", "trainer.max_epochs=4"))
+
+
+FOREIGN = {  # what is changed in a checkpoint -> what the one line says
+    "identity": ({"degree": 7}, "the checkpoint is of scene .*; degree: 7 there, 1 here"),
+    "state_dict": ({"a": torch.zeros(2)}, "is of another network: a has shape"),
+    "loops": ({"fit_loop": 3}, "cannot be resumed"),
+    "callbacks": (3, "cannot be resumed"),
+    "optimizer_states": ([{}], "cannot be resumed"),
+    "lr_schedulers": ([3], "cannot be resumed"),
+    "random": ({"numpy": 3}, "cannot be resumed"),
+}
+
+
+@pytest.mark.parametrize("part", FOREIGN)
+def test_a_foreign_checkpoint_ends_training_with_one_line(
+    copied, script, tiny_training, part, tmp_path
+):
+    path, (value, told) = copied / "checkpoints" / "last.ckpt", FOREIGN[part]
+    found = checkpoints.read(path)
+    more = {"scene": "0f" * 32} if part == "identity" else {}
+    checkpoints.write({**found, part: value, **more}, path)
+    (copied / "config.yaml").unlink()  # else that would tell the difference
+    quiet = [f"data.folder={copied}/data", "trainer.max_epochs=2", "run=new"]
+    ended = script("train", *tiny_training, *quiet, f"ckpt_path={path}", cwd=tmp_path)
+    assert ended.status == 2, ended.err
+    line = ended.err.strip().splitlines()[-1]
+    assert re.search(f"^error: ckpt_path.*{told}", line), line
+    assert "Traceback" not in ended.err
 
 
 def test_the_run_of_another_scene_is_refused(copied):

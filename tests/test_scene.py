@@ -1,5 +1,6 @@
 """Laws of the scene: its identity, its border to SI units, and a plan that says what is skipped."""
 
+import json
 import subprocess
 import sys
 from functools import partial
@@ -30,6 +31,32 @@ def test_the_fingerprint_knows_neither_size_nor_stiffness(make_scene, scene):
 
 def test_the_fingerprint_knows_not_how_matrices_are_solved(make_scene, scene):
     assert make_scene(linear="auto").fingerprint == scene.fingerprint
+
+
+def test_whole_numbers_and_floats_make_one_scene(make_scene):
+    """As YAML writes them: deflection: 1, low: 1, poisson: 0."""
+    one = {"deflection": 1, "spectrum": 1, "poisson": 0, "radius": partial(logarithmic, low=1)}
+    other = {"deflection": 1.0, "spectrum": 1.0, "poisson": 0.0}
+    whole, real = make_scene(**one), make_scene(**other, radius=partial(logarithmic, low=1.0))
+    assert whole.fingerprint == real.fingerprint
+    assert whole.identity() == real.identity()
+
+
+def test_an_identity_written_with_whole_numbers_is_that_of_the_scene(make_scene):
+    scene = make_scene(deflection=1.0)
+    written = json.loads(json.dumps(scene.identity()))
+    written["loads"]["deflection"] = 1
+    assert json.dumps(written) != json.dumps(scene.identity())
+    assert scene.matches(written)
+    assert scene.differences(written) == []
+    written["loads"]["deflection"] = 2
+    assert not scene.matches(written)
+    assert scene.differences(written) == ["loads.deflection: 2 there, 1.0 here"]
+
+
+def test_the_default_scene_has_the_identity_that_data_sets_on_disk_have(scene_of):
+    """Data sets are found by it: a change here makes all of them be solved anew."""
+    assert scene_of().fingerprint.startswith("d48610120497")
 
 
 def reordered(scene):

@@ -107,7 +107,8 @@ class Store:
                 f"{self.folder} has format {card.get('format')}, this dpl reads {FORMAT}; "
                 "choose another data.folder"
             )
-        if not self.scene.matches(card["fingerprint"], card["scene"]):
+        same = card["fingerprint"] == self.scene.fingerprint
+        if not same and not self.scene.matches(card["scene"]):
             found = self.scene.differences(card["scene"]) or ["written by another version"]
             raise DataSetError(
                 f"{self.folder} is a data set of another scene: its fingerprint is "

@@ -574,6 +574,31 @@ def test_a_damaged_card_is_refused_naming_it(copy, harm):
         copy.shards()
 
 
+def test_a_data_set_of_another_scene_is_refused_by_key_with_both_values(copy):
+    card = json.loads((copy.folder / "scene.json").read_text())
+    card["fingerprint"], card["scene"]["loads"]["deflection"] = "0f" * 32, 0.3
+    (copy.folder / "scene.json").write_text(json.dumps(card))
+    with pytest.raises(DataSetError, match=r"\(loads\.deflection: 0\.3 there, 0\.4 here\)"):
+        copy.shards()
+
+
+def test_a_data_set_whose_card_says_1_for_1_0_is_that_of_the_scene(copy):
+    """As older versions wrote it, with another fingerprint."""
+    card = json.loads((copy.folder / "scene.json").read_text())
+    lines = copy.shards()
+    card["fingerprint"], card["scene"]["degree"] = "0f" * 32, 1.0
+    (copy.folder / "scene.json").write_text(json.dumps(card))
+    assert copy.shards() == lines
+
+
+@pytest.mark.parametrize("kind", ["file", "device"])
+def test_a_folder_that_is_none_is_refused_by_its_key(scene, tmp_path, kind):
+    path = Path("/dev/null") if kind == "device" else tmp_path / "file"
+    path.touch()
+    with pytest.raises(DataSetError, match=r"^data\.folder = .* must be a folder"):
+        Store(path, scene, 0).shards()
+
+
 @pytest.mark.parametrize("harm", ["{}", '{"split": "train"}', '{"first": 0, "tried": 3}'])
 def test_a_line_of_the_manifest_that_lacks_something_counts_as_torn(copy, harm):
     with (copy.folder / "manifest.jsonl").open("a") as file:
