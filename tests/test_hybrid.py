@@ -3,6 +3,8 @@
 The stubs and the pick rule are those of the verification dossier, T19, T20 and section 0.
 """
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -379,6 +381,93 @@ def test_a_guess_that_newton_never_took_leaves_its_path_alone(scene, loads):
     )
     states = list(Hybrid(lambda load: load.force, corrector).iterate(first_of(loads)))
     assert [float(s.displacement[0, -1, 0]) for s in states] == [0.0, 5.0, -9.0, 3.0]
+
+
+class Steps:
+    """Scripted steps from a guess: places, residuals, volume ratios; the last may be an answer."""
+
+    def __init__(self, *steps, ends=False):
+        self.steps, self.ends = steps, ends
+
+    def iterate(self, load, *, guess):
+        for k, (x, residual, volume) in enumerate(self.steps):
+            (state,) = list(Scripted(None, (x,), ends=None).iterate(load, guess=guess))
+            ended = self.ends and k == len(self.steps) - 1
+            yield state._replace(
+                residual=torch.tensor([residual]),
+                volume_ratio=torch.tensor([volume]),
+                iterations=torch.tensor([k]),
+                status=torch.tensor([int(Status.CONVERGED if ended else Status.NOT_CONVERGED)]),
+            )
+
+
+def stepped(scene, loads, steps):
+    """Return what a hybrid shows after scripted steps, their iterations, and Newton's guesses."""
+    corrector, guesses = Scripted(scene.problem, (3.0, 3.1, 3.11)), []
+    original = corrector.iterate
+
+    def iterate(load, *, guess=None):
+        guesses.append(float(guess[0, -1, 0]))
+        return original(load, guess=guess)
+
+    corrector.iterate = iterate
+    given = torch.full_like(first_of(loads).force, 4.0)
+    states = list(Hybrid(lambda load: given, corrector, steps=steps).iterate(first_of(loads)))
+    places = [float(s.displacement[0, -1, 0]) for s in states]
+    return places, [int(s.iterations) for s in states], guesses
+
+
+@pytest.mark.parametrize("least", range(3))
+def test_newton_goes_on_from_the_step_with_the_smallest_residual(scene, loads, least):
+    residuals = [0.5, 0.4, 0.3]
+    residuals[least] = 0.1
+    steps = Steps(*((float(10 + k), r, 1.0) for k, r in enumerate(residuals)))
+    shown, counts, guesses = stepped(scene, loads, steps)
+    assert guesses == [10.0 + least]
+    assert shown == [10.0, 11.0, 12.0, 3.1, 3.11], "Newton's start has been shown"
+    assert counts == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("volume", [0.0, -1.0, torch.nan])
+def test_a_step_that_inverts_an_element_is_not_shown_and_not_gone_on_from(scene, loads, volume):
+    steps = Steps((10.0, 0.5, 1.0), (11.0, 1e-3, volume), (12.0, 1e-6, 1.0))
+    shown, counts, guesses = stepped(scene, loads, steps)
+    assert guesses == [10.0]
+    assert shown == [10.0, 3.1, 3.11]
+    assert counts == [0, 2, 3], "it counts"
+    shown, counts, guesses = stepped(scene, loads, Steps((10.0, 0.5, volume), (11.0, 0.1, 1.0)))
+    assert guesses == [4.0], "Newton says itself what it starts from"
+    assert shown == [3.0, 3.1, 3.11]
+
+
+def test_steps_that_end_at_the_answer_need_no_newton(scene, loads):
+    steps = Steps((10.0, 0.5, 1.0), (11.0, 1e-9, 1.0), ends=True)
+    assert stepped(scene, loads, steps) == ([10.0, 11.0], [0, 1], [])
+
+
+@pytest.mark.parametrize("rule", ["", "Best", "papers", None])
+def test_a_rule_that_there_is_not_is_refused(scene, rule):
+    with pytest.raises(ValueError, match="must be best or paper"):
+        Hybrid(lambda load: load.force, scene.solver, rule)
+
+
+@RULED
+def test_it_is_said_what_goes_on_from_a_guess(scene, loads, stubs, rule):
+    load = first_of(loads)
+    for name, guessed in (("noise 0.0001", True), ("nan", False)):
+        first, *_, last = hybrid(scene, loads, stubs[name], rule).iterate(load)
+        assert bool(first.from_guess) == (guessed or rule == "paper")
+        assert bool(last.from_guess) == guessed
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_steps_come_first_where_a_turned_factor_serves(scene, turned):
+    corrector = scene.solver.but(turned=turned)
+    suited = best(lambda load: load.force, SimpleNamespace(corrector=corrector))
+    assert suited.newton is corrector
+    assert (suited.steps is not None) == turned
+    if turned:
+        assert suited.steps.newton is corrector
 
 
 POOR = {"minus": lambda u: -u, "half": lambda u: 0.5 * u, "too far": lambda u: 1.5 * u}

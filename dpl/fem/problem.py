@@ -229,11 +229,7 @@ class Problem(Body):
 
         On held ones the result is 0, or NaN where the force is not finite.
         """
-        return force * self._mask
-
-    @cached_property
-    def _mask(self) -> Tensor:
-        return self.free.double()
+        return force * self.free
 
     def residual_ratio(self, displacement: Tensor, force: Tensor) -> Tensor:
         """Return ||R_free|| / ||f||, (B,) [-], see `imbalance`."""
