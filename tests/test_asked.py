@@ -120,6 +120,25 @@ def test_every_job_of_a_sweep_is_checked_and_rehearsed_before_the_first(ask, mon
     assert len(rehearsed) == 4, "a seed decides nothing about whether a job can work"
 
 
+def test_the_ends_of_the_ranges_of_a_search_are_checked(ask, monkeypatch, tmp_path):
+    """With a sweeper that is not Hydra's own; the command line wins over a file."""
+    sweeper = tmp_path / "mine/hydra/sweeper/other.yaml"
+    sweeper.parent.mkdir(parents=True)
+    rate, width = "tag(log, interval(1e-3, 2e-2))", "int(interval(2, 6))"
+    params = f"params: {{optimizer.lr: '{rate}', model.width: '{width}', seed: 'choice(1, 2)'}}"
+    sweeper.write_text(f"_target_: other.Sweeper\n{params}\n")
+    rehearsed = []
+    monkeypatch.setitem(PARTS, "train", rehearsed.append)
+    search = ["-m", "--config-dir", "mine", "hydra/sweeper=other"]
+    ask("train", *search)
+    seen = [(job.optimizer.lr, job.model.width) for job in rehearsed]
+    assert seen == [(1e-3, 2), (2e-2, 2), (1e-3, 6)]
+    with pytest.raises(ConfigError, match=r"^optimizer\.lr = 1000000000"):
+        ask("train", *search, "optimizer.lr=interval(1e-3,1e9)")
+    with pytest.raises(ConfigError, match=r"^model\.widht: there is no such key"):
+        ask("train", *search, "model.widht=choice(1,2)")
+
+
 def test_a_single_job_builds_its_own_parts_only(ask, monkeypatch):
     rehearsed = []
     monkeypatch.setitem(PARTS, "train", rehearsed.append)
