@@ -1,10 +1,11 @@
 # make train: environment, installation and the main job on the small default scene.
-# make test:  installation and the checks that CI makes.
+# make test:  installation and the checks that CI makes; WORKERS processes share the tests.
 # make mutants: changes of the source that no test notices; ARGS="dpl/metrics.py --sample 60".
 # make matrix: the tests under other processor features and thread numbers; see tests/matrix.py.
 # make docs:  the documentation into site/; NOTEBOOKS=false leaves them unexecuted.
 PYTHON ?= python3
 BIN := .venv/bin
+WORKERS ?= 2
 
 .PHONY: setup train test lint slow matrix mutants docs wheel clean
 
@@ -19,7 +20,7 @@ train: setup
 	$(BIN)/python scripts/train.py $(ARGS)
 
 test: lint
-	$(BIN)/python -m pytest -m 'not slow and not gpu'
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m 'not slow and not gpu'
 
 lint: setup
 	$(BIN)/ruff check .

@@ -31,6 +31,8 @@ THREADS = int(os.environ.get("DPL_TEST_THREADS", "1"))  # see tests/matrix.py
 torch.set_num_threads(THREADS)
 threadpool_limits(THREADS)
 matplotlib.use("Agg")
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what it puts behind &
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # else processes of tests ignore it
 
 # pytest --hypothesis-profile=many tests/properties: anew each time, and a hundred times as long
 _fixtures = {
