@@ -1,15 +1,18 @@
 """Laws of the simulator: its answers keep what was asked or say that they do not, in SI units."""
 
+import itertools
 import math
 import warnings
 from fractions import Fraction
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 import dpl
+import dpl.simulator as simulator_module
 from dpl import run
 from dpl.fem.solution import Status, solve
 from dpl.hybrid import Hybrid
@@ -73,6 +76,7 @@ def test_without_a_tolerance_the_network_answers_and_says_how_wrong_it_is(scene,
     assert not answer.converged.any()
     assert not answer.iterations.any()
     assert all("out of balance by" in words for words in answer.verdict)
+    assert not any("stab" in words for words in answer.verdict)
 
 
 def test_an_exact_prediction_needs_no_iteration(scene, forces):
@@ -167,15 +171,42 @@ def test_a_correction_is_taken_where_it_is_better(scene, forces, truth):
     assert "corrected" not in worse.tier
 
 
-def test_a_budget_ends_it_and_the_best_so_far_is_returned(scene, forces, monkeypatch):
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that goes on by a millisecond whenever the simulator reads it."""
+    reads = itertools.count(1000)
+    fake = SimpleNamespace(perf_counter=lambda: 1e-3 * next(reads))
+    monkeypatch.setattr(simulator_module, "time", fake)
+    return reads
+
+
+def test_a_budget_ends_it_and_the_best_so_far_is_returned(scene, forces, clock):
     sim = simulator_of(scene)
     whole = sim(forces[0], tol=1e-10)
-    short = sim(forces[0], tol=1e-10, budget_ms=1e-6)
-    assert short.tier == "network"
-    assert not short.converged
-    assert short.milliseconds < whole.milliseconds
-    plenty = sim(forces[0], tol=1e-8, budget_ms=1e6)
-    assert plenty.converged
+    assert whole.converged
+    found = []
+    for budget in range(1, 80, 2):
+        answer = simulator_of(scene)(forces[0], tol=1e-10, budget_ms=budget)
+        found.append(answer)
+        assert answer.milliseconds <= max(budget, 6) + 2  # the network's answer is always given
+        assert "network" in answer.tier or answer.iterations > 0
+        assert not answer.converged or answer.iterations == whole.iterations
+    counts = [answer.iterations for answer in found]
+    assert counts == sorted(counts)
+    assert counts[0] == 0
+    assert found[0].tier == "network"
+    assert len(set(counts)) >= 3
+    assert found[-1].converged
+    ended = [answer for answer in found if not answer.converged]
+    assert all(answer.residual <= found[0].residual for answer in ended)
+
+
+def test_several_loads_share_the_time_that_they_took(scene, forces, clock):
+    begin = next(clock)
+    answer = simulator_of(scene)(forces, tol=1e-6)
+    spent = next(clock) - begin
+    assert (answer.milliseconds > 0).all()
+    assert 0.5 * spent < float(answer.milliseconds.sum()) <= spent
 
 
 @pytest.mark.parametrize("factor", [0.1, 1.0])
@@ -481,6 +512,24 @@ def test_forces_of_the_right_shape_that_are_no_real_numbers_are_refused(scene, f
     with pytest.raises(ValueError, match=r"^force must be real numbers") as caught:
         simulator_of(scene)(given)
     assert "\n" not in str(caught.value)
+
+
+def test_of_rows_of_unequal_lengths_it_is_said_what_is_wrong(scene):
+    with pytest.raises(ValueError, match=r"force must be real numbers; .*inhomogeneous"):
+        simulator_of(scene)([[1.0, 2.0, 3.0], [1.0]])
+
+
+@pytest.mark.parametrize("ratio", [-1.0, -1.5, 0.5, 0.7])
+def test_a_poisson_ratio_that_no_solid_has_is_refused(make_scene, ratio):
+    scene = make_scene(poisson=[0.2, 0.4])
+    sim = Simulator(Surrogate(FCNN(scene, width=4), MSE(), scene))
+    force = scene.loads.sample((0, 9), [0]).force[0] * E * scene.force_unit
+    with pytest.raises(ValueError, match=r"poisson: a ratio is not between -1 and 0\.5"):
+        sim(force, poisson=ratio)
+    with pytest.raises(ValueError, match="poisson: the law has a range"):
+        sim(force)
+    for inside in (-0.9, 0.3, 0.49):
+        assert sim(force, poisson=inside).outside == (inside != 0.3)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
