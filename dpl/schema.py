@@ -136,7 +136,8 @@ def _check_top(key: str, value: Any) -> None:
     """Hold the value of a key against what it must be."""
     if key == "folder" and value is None:  # of scripts that write nothing
         return
-    if not fits(value, KEYS[key]):
+    plain = {} if isinstance(value, dict) else value  # only some keys may be calls
+    if not fits(plain, KEYS[key]):
         raise ConfigError(f"{key} = {value!r} must be {_words(KEYS[key])}")
     _check_span(key, value, *SPANS.get(key, (-math.inf, math.inf)))
 

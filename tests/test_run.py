@@ -183,6 +183,7 @@ BAD_COMMANDS = {
     "benchmark samples=1000000000000": r"samples = 10+ must lie between 1 and",
     "benchmark peers=text": r"peers = 'text' must be",
     "stress cases=T2": r"cases = 'T2' must be a list, each a text or null",
+    "view run=x speed={_target_:builtins.dict}": r"speed = .* must be true or false",
     "verify parts=3": r"parts = 3 must be a list, each a text",
 }
 
