@@ -415,7 +415,8 @@ def _column(name: str, value: Any, count: int) -> Tensor:
     """Return one number, or one for each load, as (B,)."""
     column = _numbers(name, value)
     if column.numel() not in (1, count) or column.ndim > 1:
-        raise ValueError(f"{name}: {column.numel()} numbers for {count} loads")
+        given = f"{column.numel()} numbers for {count} loads, of shape {tuple(column.shape)}"
+        raise ValueError(f"{name}: {given}; give one number, or one for each load")
     if not column.isfinite().all():
         raise ValueError(f"{name}: a number is not finite")
     return column.reshape(-1).expand(count).clone()

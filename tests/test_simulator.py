@@ -119,6 +119,7 @@ def test_numpy_in_numpy_out_and_one_load_gives_one_answer(scene, forces):
     assert isinstance(several.displacement, np.ndarray)
     assert several.displacement.shape == forces.shape
     assert isinstance(several.residual, np.ndarray)
+    assert several.tier.shape == several.verdict.shape == (len(forces),)
     assert isinstance(single.displacement, np.ndarray)
     assert single.displacement.shape == forces.shape[1:]
     assert isinstance(single.residual, float)
@@ -554,6 +555,7 @@ def test_a_force_that_is_not_finite_on_a_held_node_is_refused(scene, forces, bad
         ({"budget_ms": -1.0}, "budget_ms = -1.0"),
         ({"young": 0.0}, "young: a modulus"),
         ({"young": [1.0, 2.0]}, "young: 2 numbers for 1 loads"),
+        ({"young": [[E]]}, "young: 1 numbers for 1 loads"),
         ({"young": math.inf}, "young: a number is not finite"),
         ({"poisson": 0.3}, "poisson: the law has its own"),
     ],
