@@ -33,14 +33,24 @@ def installed(wheel, tmp_path_factory) -> Path:
     return folder
 
 
-def run_from(installed: Path, name: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess:
-    """Run a console script as pip writes it, with nothing of the checkout on the path."""
+def run_from(
+    installed: Path, name: str, *arguments: str, cwd: Path, compiles: bool = False
+) -> subprocess.CompletedProcess:
+    """Run a console script as pip writes it, with nothing of the checkout on the path.
+
+    What solves nothing need not compile loops where the wheel lies, which takes 10 s.
+    """
     module, function = COMMANDS[f"dpl-{name}"].split(":")
     code = f"import sys; from {module} import {function}; sys.exit({function}())"
     return subprocess.run(
         [sys.executable, "-c", code, *arguments],
         cwd=cwd,
-        env={**os.environ, "PYTHONPATH": str(installed), "OMP_NUM_THREADS": "1"},
+        env={
+            **os.environ,
+            "PYTHONPATH": str(installed),
+            "OMP_NUM_THREADS": "1",
+            "NUMBA_DISABLE_JIT": str(int(not compiles)),
+        },
         capture_output=True,
         text=True,
     )
@@ -76,7 +86,7 @@ def test_a_command_of_the_wheel_refuses_bad_input_as_the_script_does(installed, 
 @pytest.mark.slow  # compiles all loops
 def test_a_command_of_the_wheel_runs_in_an_empty_folder(installed, tmp_path, tiny):
     sizes = ["data.train=4", "data.val=2", "data.test=2", "data.workers=0"]
-    done = run_from(installed, "generate", *tiny, *sizes, cwd=tmp_path)
+    done = run_from(installed, "generate", *tiny, *sizes, cwd=tmp_path, compiles=True)
     assert done.returncode == 0, done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["datasets"]
 

@@ -487,7 +487,7 @@ def test_latent_trains_in_coordinates_and_is_evaluated(wide, sets, tmp_path):
     adam = partial(torch.optim.Adam, lr=3e-3)
     module = Surrogate(net, MSE(relative=1.0), wide, optimizer=adam)
     trainer = L.Trainer(
-        max_epochs=100,
+        max_epochs=40,
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,
