@@ -20,7 +20,7 @@ import sys
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -92,13 +92,24 @@ def run(result: Path, variables: Mapping[str, str], workers: int, more: Sequence
     spread = ["-n", str(workers), "--dist", "worksteal"] if workers > 1 else []
     command = [sys.executable, "-m", "pytest", *chosen, *spread, *ignored, *more]
     with result.with_suffix(".log").open("w") as log:
-        ended = subprocess.run(
-            command, cwd=ROOT, env={**os.environ, **variables}, stdout=log, stderr=log
+        process = subprocess.Popen(
+            command,
+            cwd=ROOT,
+            env={**os.environ, **variables},
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
         )
+    try:
+        status = process.wait()
+    finally:
+        with suppress(ProcessLookupError):  # the processes that share the tests end with it
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
     if part.exists():
         os.utime(part, (begun, begun))
         part.replace(result)
-    return ended.returncode
+    return status
 
 
 def outcomes(result: Path) -> tuple[Outcomes, float]:
