@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import lightning as L
 import pytest
 from hydra.types import RunMode
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import OmegaConf
 
@@ -20,7 +21,7 @@ from dpl.commands import entry
 from dpl.run import ConfigError
 
 ROOT = Path(__file__).parents[1]
-SCHEDULED = OmegaConf.create({"scheduler": {"_target_": "dpl.module.warmup_cosine"}})
+SCHEDULED = OmegaConf.create({"scheduler": {"_target_": "dpl.module.warmup_cosine"}, "folder": "."})
 TWO = ["trainer.accelerator=cpu", "trainer.devices=2", "++trainer.strategy=ddp"]
 
 
@@ -146,7 +147,8 @@ def sweeping(monkeypatch):
 
 
 def trainer(**options):
-    return L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, **options)
+    kept = ModelCheckpoint(dirpath="checkpoints", filename="last")
+    return L.Trainer(accelerator="cpu", logger=False, callbacks=[kept], **options)
 
 
 def test_a_sweep_whose_runs_start_processes_is_refused_with_the_remedy(script, tiny, tmp_path):

@@ -277,8 +277,9 @@ def test_the_data_set_keeps_poissons_ratios_and_that_of_one_has_no_such_column(s
 
 
 def test_a_data_set_of_another_range_is_refused(sets, make_scene, scene):
-    for other in (scene, make_scene(poisson=[0.2, 0.3])):
-        with pytest.raises(DataSetError, match=r"another scene.*\(law differ\)"):
+    for other, ours in ((scene, r"0\.3"), (make_scene(poisson=[0.2, 0.3]), r"\[0\.2, 0\.3\]")):
+        told = rf"another scene.*law\.poisson: \[0\.2, 0\.4\] there, {ours} here"
+        with pytest.raises(DataSetError, match=told):
             Store(sets.store.folder, other, 0).load("train", 4)
 
 

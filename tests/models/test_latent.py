@@ -455,7 +455,7 @@ def test_the_plan_of_a_stream_promises_coordinates_from_disk_only(script, overri
         ("model.rank=1.5", "model.rank = 1.5 must be a whole number"),
         ("+model.modes=3", "model.modes: dpl.models.latent.Latent has no such option"),
         ("optimizer.momentum=1.5", "optimizer: momentum = 1.5 must be"),
-        ("optimizer.lr=-1", "optimizer: Invalid learning rate: -1"),
+        ("optimizer.lr=-1", "optimizer.lr = -1 must lie between"),
         ("loss.relative=2", "loss: relative = 2 must lie between 0 and 1"),
     ],
 )

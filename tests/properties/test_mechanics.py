@@ -229,7 +229,7 @@ def test_spread_loads_have_their_sum_and_their_moment(body, value):
         total = torch.from_numpy(size * value)
         assert (force.sum(dim=0) - total).norm() <= 1e-12 * total.norm() + 1e-300
         place = torch.from_numpy(body.rotation @ centre + unit * body.origin)
-        moment = turning(problem.points - place, force)
+        moment = turning(problem.points + torch.from_numpy(problem.origin) - place, force)
         assert moment.norm() <= 1e-11 * total.norm() * (1 + body.shift)
 
 
