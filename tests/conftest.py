@@ -44,7 +44,13 @@ settings.register_profile("many", max_examples=1000, print_blob=True, **_fixture
 settings.load_profile("few")
 
 ROOT = Path(__file__).parents[1]
+LONG = "tests/test_notebooks.py"  # few tests that take minutes
 CONF = ROOT / "conf"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest tests first, so that processes that share the tests end together."""
+    items.sort(key=lambda item: not item.nodeid.startswith(LONG))
 
 
 @pytest.fixture(scope="session")

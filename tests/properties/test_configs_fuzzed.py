@@ -9,6 +9,7 @@ import types
 import warnings
 from collections.abc import Iterator
 from copy import deepcopy
+from functools import cache
 from pathlib import Path
 
 import hydra
@@ -92,7 +93,9 @@ def composed(command: str, *overrides: str) -> dict:
     return OmegaConf.to_container(cfg)
 
 
-def _bases() -> dict[str, dict]:
+@cache
+def bases() -> dict[str, dict]:
+    """Return the configurations that are harmed, by name; to compose them takes seconds."""
     found = {
         f"generate {k}": composed("generate", *v, *SMALL[:3], SMALL[4]) for k, v in SCENES.items()
     }
@@ -101,9 +104,6 @@ def _bases() -> dict[str, dict]:
         found[f"train {name}"] = composed("train", *TINY, *sizes, *chosen, "folder=.", "run=here")
     needed = {"evaluate": ["run=here"], "results": ["name=x"]}
     return found | {name: composed(name, *needed.get(name, [])) for name in OTHERS}
-
-
-BASES = _bases()
 
 
 def places(node, path: tuple = ()) -> Iterator[tuple]:
@@ -128,10 +128,10 @@ def at(node, path: tuple):
 
 
 @st.composite
-def harmed(draw, names=tuple(BASES)):
+def harmed(draw):
     """Return a base, a changed configuration, the path of what is changed, and what was done."""
-    name = draw(st.sampled_from(names))
-    cfg = deepcopy(BASES[name])
+    name = draw(st.sampled_from(list(bases())))
+    cfg = deepcopy(bases()[name])
     path = draw(st.sampled_from(list(places(cfg))))
     done = draw(
         st.sampled_from(
@@ -276,8 +276,8 @@ FOREIGN = [  # what would do harm, and how it would be called
 @st.composite
 def poisoned(draw):
     """Return the configuration of a run that calls what is not ours somewhere."""
-    name = draw(st.sampled_from([name for name in BASES if name.startswith("train")]))
-    cfg = deepcopy(BASES[name])
+    name = draw(st.sampled_from([name for name in bases() if name.startswith("train")]))
+    cfg = deepcopy(bases()[name])
     path = draw(st.sampled_from(list(places(cfg))))
     call = deepcopy(draw(st.sampled_from(FOREIGN)))
     call |= draw(st.sampled_from([{}, {"_partial_": True}, {"_recursive_": False}]))
