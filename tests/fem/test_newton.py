@@ -254,6 +254,24 @@ def test_load_without_an_answer_is_reported_with_the_part_that_has_one(beam, pul
     check_defeat(problem, solver, pull(problem, q))
 
 
+@pytest.mark.parametrize("most", [3, 4])
+def test_a_load_step_is_at_most_twice_the_one_before(most):
+    """With few iterations a step a load is applied in many; those that succeed are doubled."""
+    problem = Problem.build(box([4.0, 1.0, 1.0], [9, 3, 3]), NH, fixed=Plane(0, "min"))
+    force = Traction(Plane(0, "max"), [0.0, 0.0, -2e-2]).on(problem)[None]
+    states = list(newton(problem, max_iter=most, mixed=False).iterate(load_of(force)))
+    assert states[-1].converged.all()
+    factors = list(dict.fromkeys(state.load_factor.item() for state in states))
+    parts = [b - a for a, b in pairwise(factors)]
+    assert len(parts) >= 5
+    assert all(0 < following <= 2 * part for part, following in pairwise(parts))
+    assert any(following == 2 * part for part, following in pairwise(parts))
+    assert factors[0] == 0
+    assert factors[-1] == 1
+    whole = solve(newton(problem), load_of(force))
+    assert_close(states[-1].displacement, whole.displacement, rtol=0, atol=1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("q", [160.0, 400.0, 1000.0])
 def test_load_without_an_answer_on_the_finer_mesh_is_reported(beam, pull, mixed, q):
@@ -341,6 +359,29 @@ def test_useless_but_uninverted_guess_still_ends_at_the_answer(wrong):
         *_, end = newton(problem).iterate(load, guess=guess)
         assert end.converged.all()
         assert_close(end.displacement, answer.displacement, rtol=0, atol=1e-8)
+
+
+def test_newton_takes_whole_steps_from_a_guess_or_gives_it_up(wrong):
+    """A guess of which a step must be shortened is none: its steps solve the linearised system."""
+    problem, load, answer = wrong
+    random = torch.Generator().manual_seed(0)
+    noise = torch.randn(load.force.shape, generator=random, dtype=torch.float64)
+    kept = given_up = 0
+    for size in (1e-4, 1e-3, 3e-3, 1e-2, 2e-2, 3e-2):
+        guess = answer.displacement + size * torch.where(problem.free, noise, 0.0)
+        states = list(newton(problem, mixed=False, reuse=0.0).iterate(load, guess=guess))
+        assert states[-1].converged.all()
+        for state, end in pairwise(states):
+            if not (state.from_guess and end.from_guess):
+                given_up += int(state.from_guess.item() and not end.from_guess.item())
+                continue
+            u, step = state.displacement, end.displacement - state.displacement
+            before = problem.residual(u, load.force)
+            after = before + problem.tangent_product(u, step)
+            assert after[:, problem.free].norm() < 1e-2 * before.norm()
+            kept += 1
+    assert kept > 10
+    assert given_up > 0
 
 
 def test_exact_guess_costs_nothing(wrong, monkeypatch):
