@@ -5,12 +5,14 @@
     python tests/matrix.py --busy 0 4          each alone, and beside four busy processes
     python tests/matrix.py avx2 -- -k pod      further arguments go to pytest
 
-Each configuration leaves a JUnit file below build/matrix. A configuration whose file is newer than
-all sources is not run again, so that a matrix that was interrupted continues where it stopped.
+Each configuration leaves a JUnit file below build/matrix, in a folder for each set of arguments
+of pytest. A configuration whose file is newer than all sources is not run again, so that a matrix
+that was interrupted continues where it stopped.
 The exit status is 1 if a test failed or a configuration gave no result.
 """
 
 import argparse
+import hashlib
 import itertools
 import os
 import platform
@@ -165,7 +167,8 @@ def main(arguments: Sequence[str]) -> int:
     """Run what is asked for, print the table and the differences, and return the exit status."""
     options, more = asked(arguments)
     names = options.names or possible()
-    folder = ROOT / "build/matrix" / ("_".join(more).replace("/", "-") or "all")
+    digest = hashlib.sha256("\0".join(more).encode()).hexdigest()[:12]
+    folder = ROOT / "build/matrix" / (digest if more else "all")
     folder.mkdir(parents=True, exist_ok=True)
     print(f"{platform.machine()}, {os.cpu_count()} cores")
     for name in sorted(set(CONFIGURATIONS) - set(possible())):
