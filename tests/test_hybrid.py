@@ -569,3 +569,16 @@ def test_the_network_alone_converges_where_its_own_tolerance_is_met(scene, loads
     for tol, met in ((1.01 * ratio, True), (0.99 * ratio, False)):
         answer = solve(Direct(lambda load: guess, scene.problem, tol), loads)
         assert bool(answer.converged.all()) is met
+
+
+def test_a_prediction_alone_is_reported_as_from_a_guess(scene, batch):
+    (answer,) = Direct(lambda load: 0 * load.force, scene.problem).iterate(batch.load)
+    assert answer.from_guess.all()
+
+
+def test_the_hybrid_that_suits_a_scene_starts_from_the_prediction(scene, batch):
+    load = batch.load.singles()[0]
+    exact = solve(scene.solver, load).displacement
+    first = next(best(lambda _: exact, scene, tol=1e-6).iterate(load))
+    assert first.converged.all()
+    assert torch.equal(first.displacement, exact)
