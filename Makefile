@@ -1,6 +1,6 @@
 # make train: environment, installation and the main job on the small default scene.
 # make test:  installation and the checks that CI makes; WORKERS processes share the tests.
-# make mutants: changes of the source that no test notices; ARGS="dpl/metrics.py --sample 60".
+# make mutants: changes of the source that no test notices; ARGS="dpl/training/metrics.py --sample 60".
 # make matrix: the tests under other processor features and thread numbers; see tests/matrix.py.
 # make docs:  the documentation into site/; NOTEBOOKS=false leaves them unexecuted.
 PYTHON ?= python3

@@ -16,7 +16,7 @@ from dpl.version import __version__
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from dpl.simulator import Simulator
+    from dpl.inference.simulator import Simulator
 
 __all__ = ["__version__", "load"]
 
@@ -35,8 +35,8 @@ def load(folder: "str | Path", *, trust: bool = False, corrected: bool = False) 
         ValueError: There is no finished run, its checkpoint is of another scene, it names what is
             not trusted, or its network has no modes.
     """
-    from dpl.run import load_data, load_run
-    from dpl.simulator import Simulator
+    from dpl.config.run_folder import load_data, load_run
+    from dpl.inference.simulator import Simulator
 
     config, surrogate = load_run(folder, trust=trust)
     if not corrected:

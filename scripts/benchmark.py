@@ -1,6 +1,10 @@
 """The mechanics against public codes: python scripts/benchmark.py."""
 
+import sys
+from pathlib import Path
+
 if __name__ == "__main__":
-    from dpl.commands.benchmark import main
+    sys.path.insert(0, str(Path(__file__).parents[1]))  # `benchmarks` is not installed
+    from benchmarks.commands.benchmark import main
 
     main()

@@ -1,6 +1,10 @@
 """All methods on one experiment side by side: python scripts/results.py name=beam_svk."""
 
+import sys
+from pathlib import Path
+
 if __name__ == "__main__":
-    from dpl.commands.results import main
+    sys.path.insert(0, str(Path(__file__).parents[1]))  # `benchmarks` is not installed
+    from benchmarks.commands.results import main
 
     main()

@@ -1,6 +1,10 @@
 """What grows, slows down or is left behind: python scripts/soak.py minutes=30; 1 if anything is."""
 
+import sys
+from pathlib import Path
+
 if __name__ == "__main__":
-    from dpl.commands.soak import main
+    sys.path.insert(0, str(Path(__file__).parents[1]))  # `benchmarks` is not installed
+    from benchmarks.commands.soak import main
 
     main()

@@ -1,6 +1,10 @@
 """What the package does where it is hard: python scripts/stress.py."""
 
+import sys
+from pathlib import Path
+
 if __name__ == "__main__":
-    from dpl.commands.stress import main
+    sys.path.insert(0, str(Path(__file__).parents[1]))  # `benchmarks` is not installed
+    from benchmarks.commands.stress import main
 
     main()

@@ -1,6 +1,10 @@
 """The mechanics against known answers: python scripts/verify.py writes docs/verification.md."""
 
+import sys
+from pathlib import Path
+
 if __name__ == "__main__":
-    from dpl.commands.verify import main
+    sys.path.insert(0, str(Path(__file__).parents[1]))  # `benchmarks` is not installed
+    from benchmarks.commands.verify import main
 
     main()

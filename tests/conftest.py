@@ -18,13 +18,14 @@ from hypothesis import HealthCheck, settings
 from omegaconf import DictConfig
 from threadpoolctl import threadpool_limits
 
-from dpl import run
+from dpl.config import build
 from dpl.data.datamodule import OfflineData
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import Plane, box
-from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Newton
+from dpl.fem.loads.modal import ModalLoads
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
+from dpl.fem.solvers.newton import Newton
 from dpl.scene import Sample, Scene
 
 THREADS = int(os.environ.get("DPL_TEST_THREADS", "1"))  # see tests/matrix.py
@@ -149,8 +150,8 @@ def scene_of(compose) -> Callable[..., Scene]:
 
     def scene_of(*overrides: str) -> Scene:
         cfg = compose(*overrides)
-        run.check(cfg)
-        return run.build_scene(cfg)
+        build.check(cfg)
+        return build.build_scene(cfg)
 
     return scene_of
 

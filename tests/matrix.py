@@ -26,7 +26,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-SOURCES = ("dpl/**/*.py", "tests/**/*.py", "conf/**/*.yaml", "scripts/*.py", "pyproject.toml")
+SOURCES = (
+    "dpl/**/*.py",
+    "benchmarks/**/*.py",
+    "tests/**/*.py",
+    "conf/**/*.yaml",
+    "scripts/*.py",
+    "pyproject.toml",
+)
 # these read documents, pages and packages, and compare neither numbers nor processes
 LEFT_OUT = ("test_docs.py", "test_notebooks.py", "test_packaging.py", "test_readme.py")
 AVX512 = "avx512f"  # the flag in /proc/cpuinfo

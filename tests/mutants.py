@@ -1,8 +1,8 @@
 """Change the source one operator at a time, and report which changes no test notices.
 
     python tests/mutants.py                                  # all modules of [tool.mutants]
-    python tests/mutants.py dpl/metrics.py --sample 60       # one module, 60 of its mutants
-    python tests/mutants.py dpl/metrics.py --survivors       # only those that survived last time
+    python tests/mutants.py dpl/training/metrics.py --sample 60   # one module, 60 of its mutants
+    python tests/mutants.py dpl/training/metrics.py --survivors   # those that survived last time
 
 The mutants are made by the operators of mutmut. mutmut itself replaces each function by a
 trampoline, which numba cannot compile, and skips properties and class bodies; here a mutant is the

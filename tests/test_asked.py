@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from dpl import run
-from dpl.commands import asked, generate, train
-from dpl.commands.entry import CONF
-from dpl.run import ConfigError
+from dpl.commands import dry_run, generate, train
+from dpl.commands.cli import CONF
+from dpl.config import build
+from dpl.config.validation import ConfigError
 
 OPTIONS = "model is one of cnn, fcnn, gnn, latent, pod"
 EXPERIMENTS = "experiment is one of beam_nh_loss, beam_poisson, beam_svk, "
@@ -77,7 +77,7 @@ def ask(monkeypatch, tmp_path):
     GlobalHydra.instance().clear()
 
     def ask(command, *arguments):
-        asked.check(command, CONF, arguments, PARTS.get(command))
+        dry_run.check(command, CONF, arguments, PARTS.get(command))
 
     return ask
 
@@ -148,7 +148,7 @@ def test_a_single_job_builds_its_own_parts_only(ask, monkeypatch):
 
 def test_configurations_beside_those_of_the_package_are_checked_too(ask, tmp_path):
     (tmp_path / "mine/material").mkdir(parents=True)
-    soft = "_target_: dpl.fem.materials.NeoHookeanLn\npoisson: 0.1\n"
+    soft = "_target_: dpl.fem.materials.neo_hookean.NeoHookeanLn\npoisson: 0.1\n"
     (tmp_path / "mine/material/soft.yaml").write_text(soft)
     ask("generate", "--config-dir", "mine", "material=soft")
     with pytest.raises(ConfigError, match=r"did you mean soft\?"):
@@ -158,8 +158,8 @@ def test_configurations_beside_those_of_the_package_are_checked_too(ask, tmp_pat
 def test_a_folder_that_is_there_and_what_is_in_it_are_left_alone(tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run/kept").touch()
-    asked.try_folder(tmp_path / "run")
-    asked.try_folder(tmp_path / "run/new/deep")
+    dry_run.try_folder(tmp_path / "run")
+    dry_run.try_folder(tmp_path / "run/new/deep")
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["kept"]
 
 
@@ -167,7 +167,7 @@ def test_a_folder_that_is_there_and_what_is_in_it_are_left_alone(tmp_path):
 def test_a_folder_that_is_read_only_is_refused(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(ConfigError, match="cannot be written: Permission denied"):
-        asked.try_folder(tmp_path / "run")
+        dry_run.try_folder(tmp_path / "run")
 
 
 @pytest.mark.parametrize(
@@ -199,8 +199,9 @@ def test_a_region_may_be_left_out_where_supports_hold_the_body(scene_of, tiny):
     with pytest.raises(ConfigError, match="6 rigid modes are unconstrained"):
         scene_of(*tiny, "~clamped")
     held = (
-        "+supports.end={_target_: dpl.fem.supports.Displacement, value: [0, 0, 0], "
-        "region: {_target_: dpl.fem.mesh.Plane, axis: 0, at: min}}"
+        "+supports.end={_target_: dpl.fem.assembly.boundary_conditions.Displacement, "
+        "value: [0, 0, 0], "
+        "region: {_target_: dpl.fem.mesh.regions.Plane, axis: 0, at: min}}"
     )
     usual, scene = scene_of(*tiny), scene_of(*tiny, "~clamped", held)
     assert bool((scene.problem.free == usual.problem.free).all())
@@ -208,7 +209,8 @@ def test_a_region_may_be_left_out_where_supports_hold_the_body(scene_of, tiny):
 
 LAST = "{_target_:lightning.pytorch.callbacks.ModelCheckpoint,dirpath:./checkpoints,filename:last}"
 BEST = (
-    "{_target_:dpl.checkpoints.BestWeights,dirpath:./checkpoints,filename:best,monitor:val/e_mean}"
+    "{_target_:dpl.training.checkpoints.BestWeights,dirpath:./checkpoints,"
+    "filename:best,monitor:val/e_mean}"
 )
 OFTEN = "trainer.check_val_every_n_epoch=1"
 OTHER = LAST.replace("last", "other")
@@ -229,7 +231,7 @@ CALLBACKS = {  # what keeps weights from which a run can be loaded, and what doe
 def test_a_training_that_would_keep_no_weights_is_refused(compose, tiny_training, line):
     sizes = [one for one in tiny_training if "check_val" not in one]
     cfg = compose("folder=.", *sizes, "trainer.max_epochs=2", *line.split(), command="train")
-    run.check(cfg)
+    build.check(cfg)
     if CALLBACKS[line]:
         train.parts(cfg)
         return

@@ -26,24 +26,18 @@ from tensorboard.plugins.hparams import api_pb2, get_experiment, list_session_gr
 from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.util import tensor_util
 
-from dpl.board import (
-    LearningRate,
-    SampleRates,
-    Session,
-    WorstCases,
-    beside,
-    judge,
-    resident,
-)
 from dpl.data.datamodule import OnlineData
-from dpl.fem.mesh import box, rectangle
-from dpl.figures import surface
-from dpl.guard import Diverged
-from dpl.losses import MSE
-from dpl.metrics import Judged, median, metrics
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.postprocess.surface import surface
 from dpl.models.fcnn import FCNN
-from dpl.module import Surrogate
 from dpl.scene import Sample
+from dpl.training.callbacks.hparams import LearningRate, Session
+from dpl.training.callbacks.nonfinite_gradients import Diverged
+from dpl.training.callbacks.throughput import SampleRates, resident
+from dpl.training.callbacks.worst_cases import WorstCases, beside, judge
+from dpl.training.losses.supervised import MSE
+from dpl.training.metrics import Judged, median, metrics
+from dpl.training.surrogate import Surrogate
 
 BATCHES = 3  # an epoch of the tiny data set
 

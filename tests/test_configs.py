@@ -10,11 +10,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 
-from dpl import run
-from dpl.data.outcome import Job, outcome
-from dpl.fem.materials import Hookean
-from dpl.fem.mesh import box
-from dpl.fem.solution import solve
+from dpl.config import build
+from dpl.data.solving.solve import Job, outcome
+from dpl.fem.materials.material import Hookean
+from dpl.fem.mesh.generators import box
+from dpl.fem.solvers.solution import solve
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -100,7 +100,7 @@ def test_laws_share_young_and_poisson_at_rest(material):
 @pytest.mark.parametrize("name", options("experiment"))
 def test_an_experiment_composes_and_passes_the_check(compose, name):
     cfg = compose(f"experiment={name}", "folder=.", command="train")
-    run.check(cfg)
+    build.check(cfg)
     assert_holds(cfg, "experiment", name)
 
 
@@ -111,7 +111,7 @@ def test_a_sweep_composes_passes_the_check_and_searches_among_what_there_is(
 ):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
     choices = [f"sweep={name}", *([f"experiment={experiment}"] if experiment else []), "folder=."]
-    run.check(compose(*choices, command="train"))
+    build.check(compose(*choices, command="train"))
     search = OmegaConf.load(CONF / "sweep" / f"{name}.yaml").hydra.sweeper.params
     spaces = OverridesParser.create().parse_overrides(
         [f"{k}={space}" for k, space in search.items()]
@@ -124,7 +124,7 @@ def test_a_sweep_composes_passes_the_check_and_searches_among_what_there_is(
             values[one.key_or_group] = among[end]
         cfg = compose(*choices, *(f"{k}={v}" for k, v in values.items()), command="train")
         assert {key: OmegaConf.select(cfg, key) for key in values} == values
-        run.check(cfg)
+        build.check(cfg)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_a_sweep_composes_passes_the_check_and_searches_among_what_there_is(
 )
 def test_every_option_composes_and_passes_the_check(compose, overrides, group, name):
     cfg = compose(*overrides(group, name), "folder=.", command="train")
-    run.check(cfg)
+    build.check(cfg)
     assert_holds(cfg, group, name)
 
 
@@ -206,7 +206,7 @@ def test_yaml_says_nothing_that_python_says_already_except_by_intent():
 @pytest.mark.parametrize("name", ["latent", "pod"])
 def test_a_network_may_bring_an_optimiser_and_a_loss_of_its_own(compose, name):
     cfg = compose(f"model={name}", "folder=.", command="train")
-    run.check(cfg)
+    build.check(cfg)
     assert cfg.optimizer._target_.endswith("Muon")
     assert cfg.optimizer.lr == 5e-3
     assert cfg.optimizer.momentum == 0.95, "the rest is that of conf/optimizer"
@@ -226,7 +226,7 @@ def test_what_is_asked_for_wins_over_what_a_network_brings(compose):
     assert (cfg.optimizer.lr, cfg.data.batch_size, cfg.loss.relative) == (1e-3, 8, 0.5)
     cfg = compose("model=latent", "optimizer=adamw", "folder=.", command="train")
     assert cfg.optimizer._target_.endswith("AdamW")
-    run.check(cfg)
+    build.check(cfg)
 
 
 def test_a_network_leaves_a_rate_alone_that_is_meant_for_its_own_optimiser_only(compose):
@@ -248,7 +248,7 @@ def test_networks_that_bring_nothing_keep_the_defaults(compose, name):
 def test_a_network_that_brings_its_own_joins_an_experiment(compose, name):
     experiment = compose("experiment=beam_nh_loss", "folder=.", command="train")
     cfg = compose("experiment=beam_nh_loss", f"model={name}", "folder=.", command="train")
-    run.check(cfg)
+    build.check(cfg)
     assert cfg.mesh == experiment.mesh
     assert cfg.data.train == experiment.data.train == 4095
     assert cfg.loss._target_.endswith("MeanNorm")
@@ -258,7 +258,7 @@ def test_loads_of_different_seeds_are_different_data(compose, scene, tmp_path):
     folders = set()
     for seed in (0, 1):
         cfg = compose("folder=.", f"data.seed={seed}", command="train")
-        folders.add(run.make(cfg, "data", scene=scene).store.folder)
+        folders.add(build.make(cfg, "data", scene=scene).store.folder)
     assert len(folders) == 2
 
 
@@ -283,8 +283,8 @@ def test_small_loads_are_small_in_force_and_in_area(scene_of):
 
 def test_options_of_the_loads_can_be_changed_one_by_one(scene_of):
     usual = scene_of(*SMALL["beam"])
-    changes = ["spectrum=1", "sampling=sobol", "radius._target_=dpl.fem.sampling.one"]
-    for change in [*changes, "distribution._target_=dpl.fem.sampling.normal"]:
+    changes = ["spectrum=1", "sampling=sobol", "radius._target_=dpl.fem.loads.sampling.one"]
+    for change in [*changes, "distribution._target_=dpl.fem.loads.sampling.normal"]:
         assert scene_of(*SMALL["beam"], f"loads.{change}").fingerprint != usual.fingerprint
 
 

@@ -17,11 +17,13 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import OmegaConf
 
-from dpl.commands import entry
-from dpl.run import ConfigError
+from dpl.commands import cli
+from dpl.config.validation import ConfigError
 
 ROOT = Path(__file__).parents[1]
-SCHEDULED = OmegaConf.create({"scheduler": {"_target_": "dpl.module.warmup_cosine"}, "folder": "."})
+SCHEDULED = OmegaConf.create(
+    {"scheduler": {"_target_": "dpl.training.schedules.warmup_cosine"}, "folder": "."}
+)
 TWO = ["trainer.accelerator=cpu", "trainer.devices=2", "++trainer.strategy=ddp"]
 
 
@@ -141,7 +143,7 @@ def sweeping(monkeypatch):
 
     def sweeping(mode=RunMode.MULTIRUN):
         config = SimpleNamespace(initialized=lambda: True, get=lambda: SimpleNamespace(mode=mode))
-        monkeypatch.setattr(entry, "HydraConfig", config)
+        monkeypatch.setattr(cli, "HydraConfig", config)
 
     return sweeping
 
@@ -177,7 +179,7 @@ def test_a_refused_sweep_ends_with_one_line_and_makes_nothing(script, tiny, tmp_
 def test_processes_that_run_the_command_again_are_refused_in_a_sweep(sweeping, strategy):
     sweeping()
     with pytest.raises(ConfigError, match=r"trainer\.strategy: .* -m") as refusal:
-        entry.check_trainer(trainer(devices=2, strategy=strategy), SCHEDULED)
+        cli.check_trainer(trainer(devices=2, strategy=strategy), SCHEDULED)
     assert "\n" not in str(refusal.value)
 
 
@@ -188,19 +190,19 @@ def test_processes_that_run_the_command_again_are_refused_in_a_sweep(sweeping, s
 )
 def test_what_does_not_run_the_command_again_is_not_refused_in_a_sweep(sweeping, options):
     sweeping()
-    assert entry.check_trainer(trainer(**options), SCHEDULED) is None
+    assert cli.check_trainer(trainer(**options), SCHEDULED) is None
     with pytest.raises(ConfigError):
-        entry.check_trainer(trainer(**{**options, "devices": 2, "strategy": "ddp"}), SCHEDULED)
+        cli.check_trainer(trainer(**{**options, "devices": 2, "strategy": "ddp"}), SCHEDULED)
 
 
 def test_without_a_sweep_nothing_is_refused(sweeping):
     two = trainer(devices=2, strategy="ddp")
-    assert entry.check_trainer(two, SCHEDULED) is None
+    assert cli.check_trainer(two, SCHEDULED) is None
     sweeping(RunMode.RUN)
-    assert entry.check_trainer(two, SCHEDULED) is None
+    assert cli.check_trainer(two, SCHEDULED) is None
     sweeping()
     with pytest.raises(ConfigError):
-        entry.check_trainer(two, SCHEDULED)
+        cli.check_trainer(two, SCHEDULED)
 
 
 class Outside(LightningEnvironment):
@@ -212,4 +214,4 @@ class Outside(LightningEnvironment):
 def test_the_remedies_that_the_refusal_names_are_not_refused(sweeping):
     sweeping()
     outside = trainer(devices=2, strategy="ddp", plugins=[Outside()])
-    assert entry.check_trainer(outside, SCHEDULED) is None
+    assert cli.check_trainer(outside, SCHEDULED) is None

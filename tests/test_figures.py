@@ -8,10 +8,12 @@ import skfem
 import torch
 from matplotlib.figure import Figure
 
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import Plane, box, rectangle
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.regions import Plane
+from dpl.fem.postprocess.surface import coarse, surface, triangles
 from dpl.fem.problem import Problem
-from dpl.figures import body, coarse, colours, deformed, spread, surface, triangles
+from dpl.visualization.figures import body, colours, deformed, spread
 
 
 def edges(polygons):

@@ -6,8 +6,8 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader
 
-from dpl.guard import Diverged, Guard
-from dpl.optimizers import Muon
+from dpl.training.callbacks.nonfinite_gradients import Diverged, Guard
+from dpl.training.muon import Muon
 
 
 class Line(L.LightningModule):

@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from dpl.fem.accelerated import Accelerated
-from dpl.fem.linear import SuperLU
-from dpl.fem.newton import Newton
+from dpl.fem.linear.superlu import SuperLU
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, Status, solve
-from dpl.hybrid import RULES, Direct, Hybrid, best, pick
+from dpl.fem.solvers.anderson import Accelerated
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, Solution, Status, solve
+from dpl.inference.hybrid import RULES, Direct, Hybrid, best, pick
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from dpl.losses import MSE
 from dpl.models.fcnn import FCNN
-from dpl.module import Surrogate
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate
 
 PAGE = Path(__file__).parents[1] / "docs" / "inverse.md"
 

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from dpl.fem.problem import Problem
-from dpl.metrics import (
+from dpl.scene import Sample
+from dpl.training.metrics import (
     Judged,
     MaxError,
     MeanError,
@@ -16,7 +17,6 @@ from dpl.metrics import (
     median,
     metrics,
 )
-from dpl.scene import Sample
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def prediction(scene, batch):
 
 
 def by_hand(problem: Problem, prediction, batch):
-    """Return every number, load by load, without a line of `dpl.metrics`."""
+    """Return every number, load by load, without a line of `dpl.training.metrics`."""
     u, v, f = (x.numpy() for x in (prediction, batch.displacement, batch.force))
     loads, nodes, dim = u.shape
     whole = [np.linalg.norm(u[s] - v[s]) for s in range(loads)]

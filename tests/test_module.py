@@ -14,18 +14,15 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
-from dpl.checkpoints import WholeCheckpoints, read
 from dpl.data.datamodule import OfflineData, OnlineData
-from dpl.fem.solution import Load
-from dpl.losses import MSE, LrPlus, LrStar
+from dpl.fem.solvers.solution import Load
 from dpl.models.fcnn import FCNN
-from dpl.module import (
-    Surrogate,
-    random_states,
-    scales,
-    set_random_states,
-    warmup_cosine,
-)
+from dpl.training.checkpoints import WholeCheckpoints, read
+from dpl.training.losses.residual import LrPlus, LrStar
+from dpl.training.losses.supervised import MSE
+from dpl.training.rng_state import random_states, set_random_states
+from dpl.training.schedules import warmup_cosine
+from dpl.training.surrogate import Surrogate, scales
 
 CONF = Path(__file__).parents[1] / "conf"
 METRICS = {

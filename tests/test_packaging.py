@@ -12,6 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 METADATA = tomllib.loads((ROOT / "pyproject.toml").read_text())
+INTERNAL = ("cli", "dry_run", "overrides")  # modules that commands share
 COMMANDS = METADATA["project"]["scripts"]
 
 
@@ -58,11 +59,12 @@ def run_from(
 
 def test_every_script_is_a_door_to_a_command_and_has_a_console_script():
     doors = {path.stem for path in (ROOT / "scripts").glob("*.py")}
-    commands = {path.stem for path in (ROOT / "dpl/commands").glob("*.py")} - {
-        *("__init__", "entry", "asked", "overrides")
-    }
-    assert doors == commands
-    assert {f"dpl-{name}": f"dpl.commands.{name}:main" for name in commands} == COMMANDS
+    installed, ours = (
+        {path.stem for path in (ROOT / folder).glob("*.py")} - {"__init__", *INTERNAL}
+        for folder in ("dpl/commands", "benchmarks/commands")
+    )
+    assert doors == installed | ours
+    assert {f"dpl-{name}": f"dpl.commands.{name}:main" for name in installed} == COMMANDS
 
 
 def test_the_wheel_holds_all_configurations_and_says_that_it_is_typed(wheel):
@@ -94,7 +96,9 @@ def test_a_command_of_the_wheel_runs_in_an_empty_folder(installed, tmp_path, tin
 def test_a_configuration_of_ones_own_stands_beside_those_of_the_wheel(installed, tmp_path):
     own = tmp_path / "mine/material"
     own.mkdir(parents=True)
-    (own / "soft.yaml").write_text("_target_: dpl.fem.materials.NeoHookeanLn\npoisson: 0.7\n")
+    (own / "soft.yaml").write_text(
+        "_target_: dpl.fem.materials.neo_hookean.NeoHookeanLn\npoisson: 0.7\n"
+    )
     asked = ["--config-dir", "mine", "material=soft"]
     refused = run_from(installed, "generate", *asked, cwd=tmp_path)
     assert refused.stderr.startswith("error: material: poisson = 0.7 must")

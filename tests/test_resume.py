@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from dpl.checkpoints import read
+from dpl.training.checkpoints import read
 
 ROOT = Path(__file__).parents[1]
 EPOCHS = 6  # of two steps each
@@ -52,7 +52,7 @@ KILLER = textwrap.dedent(
     """
     import contextlib, io, os, runpy, signal, sys
     from dpl import checkpoints
-    from dpl.module import Surrogate
+    from dpl.training.surrogate import Surrogate
 
     script, where, at = sys.argv[1], sys.argv[2], int(sys.argv[3])
     sys.argv = [script, *sys.argv[4:]]

@@ -18,9 +18,10 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import OmegaConf
 from safetensors.torch import save_file
 
-from dpl import checkpoints, run, schema
-from dpl.commands import entry
-from dpl.run import ConfigError
+from dpl.commands import cli
+from dpl.config import build, run_folder, validation
+from dpl.config.validation import ConfigError
+from dpl.training import checkpoints
 
 ROOT = Path(__file__).parents[1]
 BAD = {  # override -> what the message must name
@@ -32,7 +33,7 @@ BAD = {  # override -> what the message must name
     "material.poisson=null": r"material\.poisson = None must be a number",
     "+material.e=1": r"material\.e: .* has no such option",
     "+material.poison=1": r"material\.poison: .* did you mean material\.poisson\?",
-    "material._target_=dpl.fem.materials.Rubber": r"material\._target_ = .*Rubber' does not exist",
+    "material._target_=dpl.fem.mesh.regions.Rubber": r"material\._target_ = .*Rubber' does not",
     "material._target_=nowhere.Rubber": r"material\._target_ = .*nowhere\.Rubber' does not exist",
     "young=-1": r"young = -1",
     "young=0": r"young = 0",
@@ -78,7 +79,7 @@ BAD = {  # override -> what the message must name
     "loads.deflection=nan": r"loads\.deflection = nan",
     "loads.patch=[0.5,0.1]": r"loads: patch = \[0\.5, 0\.1\]",
     "loads.patch=[0.5]": r"loads: patch = \[0\.5\]",
-    "loads.distribution._target_=dpl.fem.modes.cauchy": r"loads\.distribution\._target_",
+    "loads.distribution._target_=dpl.fem.materials.tensors.hooke": r"loads\.distribution\._target_",
     "loads.deflection=1e-300": r"loads: deflection = 1e-300",
     "loads.n_modes=1000000000000000000000": r"loads\.n_modes = 10+ does not fit into 64 bits",
     "loads.distribution=uniform": r"loads\.distribution = 'uniform' must be",
@@ -105,8 +106,8 @@ def test_what_cannot_work_is_refused_by_its_key(compose, override, tmp_path):
     cfg = compose("mesh.nodes=[5,3,3]", *words) if "mesh" not in override else compose(*words)
 
     def start():
-        run.check(cfg)
-        run.show_plan(run.build_scene(cfg))
+        build.check(cfg)
+        build.show_plan(build.build_scene(cfg))
 
     with pytest.raises(ConfigError, match=BAD[override]) as refusal:
         start()
@@ -153,7 +154,7 @@ BAD_TRAINING = {
     "seed=nan": r"^seed = nan is not a finite number",
     "~scheduler": r"scheduler is missing",
     "optimizer.betas=[0.9]": r"optimizer\.betas = \[0\.9\] must be",
-    "optimizer._target_=dpl.module.warmup_cosine": r"optimizer\.",
+    "optimizer._target_=dpl.training.schedules.warmup_cosine": r"optimizer\.",
     "trainer=[]": r"trainer is missing",
     "data.train=1000000000000": r"data\.train = 10+ must lie between 1 and 10000000",
     "data.workers=1000000000": r"data: workers = 10+ must be 0 or more and at most 1,024",
@@ -192,7 +193,7 @@ BAD_COMMANDS = {
 def test_what_a_command_is_told_is_held_to_what_it_must_be(compose, line):
     command, *overrides = line.split()
     with pytest.raises(ConfigError, match=BAD_COMMANDS[line]):
-        run.check(compose(*overrides, command=command))
+        build.check(compose(*overrides, command=command))
 
 
 @pytest.mark.parametrize("override", BAD_TRAINING)
@@ -201,10 +202,10 @@ def test_what_cannot_train_is_refused_by_its_key(compose, override, scene, tmp_p
     cfg = compose("folder=.", *words, command="train")
 
     def start():
-        run.check(cfg)
-        run.make(cfg, "data", scene=scene)
-        run.build_surrogate(cfg, scene)
-        run.make(cfg, "trainer")
+        build.check(cfg)
+        build.make(cfg, "data", scene=scene)
+        build.build_surrogate(cfg, scene)
+        build.make(cfg, "trainer")
 
     with pytest.raises(ConfigError, match=BAD_TRAINING[override]):
         start()
@@ -218,7 +219,7 @@ def test_what_cannot_train_is_refused_by_its_key(compose, override, scene, tmp_p
 def test_what_works_is_not_refused(compose, override):
     cfg = compose("folder=.", override, command="train")
     before = OmegaConf.to_yaml(cfg)
-    run.check(cfg)
+    build.check(cfg)
     assert OmegaConf.to_yaml(cfg) == before, "a check changes nothing"
 
 
@@ -231,31 +232,34 @@ def test_what_works_is_not_refused(compose, override):
 )
 def test_a_body_whose_stiffness_is_no_matrix_is_refused(compose, tiny, law):
     cfg = compose(*tiny, *law)
-    run.check(cfg)
+    build.check(cfg)
     with pytest.raises(ConfigError, match=r"material, mesh, .*K\(0\) cannot be used"):
-        run.build_scene(cfg)
+        build.build_scene(cfg)
 
 
 def test_a_body_that_is_held_everywhere_is_refused(compose, tiny):
     cfg = compose(*tiny)
-    cfg.clamped = {"_target_": "dpl.fem.mesh.Sphere", "centre": [0, 0, 0], "radius": 1e3}
+    cfg.clamped = {"_target_": "dpl.fem.mesh.regions.Sphere", "centre": [0, 0, 0], "radius": 1e3}
     with pytest.raises(ConfigError, match="clamped or supports: every node is held"):
-        run.build_scene(cfg)
+        build.build_scene(cfg)
 
 
-@pytest.mark.parametrize("made", ["dpl.losses.LrStar", "skfem.MeshHex", "dpl.fem.mesh.propeller"])
+@pytest.mark.parametrize(
+    "made",
+    ["dpl.training.losses.residual.LrStar", "skfem.MeshHex", "dpl.fem.mesh.propeller.propeller"],
+)
 def test_what_a_key_gives_must_be_of_its_kind(compose, tiny, made):
     cfg = compose(*tiny)
     cfg.material = {"_target_": made}
-    run.check(cfg)
+    build.check(cfg)
     with pytest.raises(ConfigError, match=r"material gives an object of .*; it must give Material"):
-        run.build_scene(cfg)
+        build.build_scene(cfg)
     cfg = compose(*tiny)
     cfg.forces = {"weight": {"_target_": made}}
     with pytest.raises(
         ConfigError, match=r"forces\.weight gives .*; it must give BodyForce or Tra"
     ):
-        run.build_scene(cfg)
+        build.build_scene(cfg)
 
 
 @pytest.mark.parametrize("value", [{}, None, [], {"a": 1}])
@@ -264,22 +268,26 @@ def test_what_must_be_a_call_is_refused_where_it_is_none(compose, tiny, value):
         cfg = compose(*tiny)
         cfg[key] = value
         with pytest.raises(ConfigError, match=f"{key} = .* must be a call"):
-            run.check(cfg)
+            build.check(cfg)
 
 
 def test_no_configuration_may_leave_the_body_loose(compose, tiny):
     cfg = compose(*tiny)
-    cfg.clamped = {"_target_": "dpl.fem.mesh.Box", "lower": [0, 0, 0], "upper": [0, 0, 0]}
+    cfg.clamped = {
+        "_target_": "dpl.fem.mesh.regions.Box",
+        "lower": [0, 0, 0],
+        "upper": [0, 0, 0],
+    }
     with pytest.raises(ConfigError, match="3 rigid modes are unconstrained: rotation"):
-        run.build_scene(cfg)
+        build.build_scene(cfg)
 
 
 def test_checking_calls_nothing(compose, monkeypatch):
     called = []
-    monkeypatch.setattr("dpl.fem.mesh.load", lambda path: called.append(path))
+    monkeypatch.setattr("dpl.fem.mesh.reading.load", lambda path: called.append(path))
     cfg = compose("mesh=file", "mesh.path=part.msh")
-    cfg.mesh._target_ = "dpl.fem.mesh.load"
-    run.check(cfg)
+    cfg.mesh._target_ = "dpl.fem.mesh.reading.load"
+    build.check(cfg)
     assert called == []
 
 
@@ -350,14 +358,14 @@ def test_a_command_computes_nothing_before_all_is_known_to_work(
 
 
 def test_an_interrupt_ends_a_command_with_130(capsys):
-    with pytest.raises(SystemExit) as end, entry.readable_errors():
+    with pytest.raises(SystemExit) as end, cli.readable_errors():
         raise KeyboardInterrupt
     assert end.value.code == 130
     assert capsys.readouterr().err == "interrupted\n"
 
 
 def test_a_fault_of_ours_keeps_its_traceback():
-    with pytest.raises(ZeroDivisionError), entry.readable_errors():
+    with pytest.raises(ZeroDivisionError), cli.readable_errors():
         raise ZeroDivisionError
 
 
@@ -404,7 +412,7 @@ def test_a_sweep_without_optuna_says_in_one_line_what_to_install(
 
 def test_hyperparameters_are_flat_and_a_call_goes_by_its_name(compose):
     cfg = compose("folder=.", "model=latent", "young=[1e6,2e11]", command="train")
-    flat = run.hyperparameters(cfg)
+    flat = build.hyperparameters(cfg)
     assert flat["model"] == "Latent"
     assert (flat["model.width"], flat["optimizer.lr"], flat["loss"]) == (256, 5e-3, "MeanNorm")
     assert flat["young"] == "[1000000.0, 200000000000.0]"
@@ -420,7 +428,7 @@ def test_the_best_error_is_the_score_of_the_checkpoint_that_is_kept_for_it(score
     best, last = ModelCheckpoint(monitor="val/e_mean"), ModelCheckpoint()
     best.best_model_score, last.best_model_score = torch.tensor(score), torch.tensor(1e-9)
     trainer = L.Trainer(logger=False, callbacks=[last, best], accelerator="cpu")
-    assert entry.best_error(trainer) == pytest.approx(told)
+    assert cli.best_error(trainer) == pytest.approx(told)
 
 
 # ------------------------------------------------------------------ runs
@@ -439,11 +447,11 @@ def _trained(folder, *overrides):
     ]
     cfg.trainer.callbacks = kept
     cfg.trainer.max_epochs = 1
-    scene = run.build_scene(cfg)
-    surrogate = run.build_surrogate(cfg, scene)
-    trainer: L.Trainer = run.make(cfg, "trainer")
-    run.save_config(cfg, folder)
-    trainer.fit(surrogate, datamodule=run.make(cfg, "data", scene=scene))
+    scene = build.build_scene(cfg)
+    surrogate = build.build_surrogate(cfg, scene)
+    trainer: L.Trainer = build.make(cfg, "trainer")
+    run_folder.save_config(cfg, folder)
+    trainer.fit(surrogate, datamodule=build.make(cfg, "data", scene=scene))
     return surrogate
 
 
@@ -462,7 +470,7 @@ def copied(trained, tmp_path):
 
 def test_a_run_comes_back_as_it_was(trained):
     folder, surrogate = trained
-    cfg, again = run.load_run(folder)
+    cfg, again = run_folder.load_run(folder)
     assert again.scene.fingerprint == surrogate.scene.fingerprint
     load = surrogate.scene.loads.sample((0, 2), range(4))
     with torch.no_grad():
@@ -476,7 +484,7 @@ def test_a_run_over_a_range_of_moduli_with_e_as_an_input_comes_back_as_it_was(
 ):
     wide = ["young=[1e6,2.03e11]", "model.young=true"]
     surrogate = _trained(tmp_path, *tiny_training, *wide)
-    _, again = run.load_run(tmp_path)
+    _, again = run_folder.load_run(tmp_path)
     load = surrogate.scene.loads.sample((0, 2), range(4))
     assert load.young.max() > 2 * load.young.min()
     with torch.no_grad():
@@ -497,20 +505,20 @@ def test_a_run_is_not_overwritten(trained, compose):
     before = (folder / "config.yaml").read_text()
     cfg = compose("folder=.", "young=1", command="train")
     with pytest.raises(ConfigError, match="resume it with ckpt_path=last"):
-        run.save_config(cfg, folder)
+        run_folder.save_config(cfg, folder)
     assert (folder / "config.yaml").read_text() == before
 
 
 def test_a_missing_run_is_refused_by_name(tmp_path):
     with pytest.raises(ConfigError, match=r"nowhere has no config\.yaml"):
-        run.load_run(tmp_path / "nowhere")
+        run_folder.load_run(tmp_path / "nowhere")
 
 
 def test_a_run_without_a_checkpoint_is_refused(copied):
     for path in (copied / "checkpoints").iterdir():
         path.unlink()
     with pytest.raises(ConfigError, match=r"has no checkpoints/"):
-        run.load_run(copied)
+        run_folder.load_run(copied)
 
 
 @pytest.mark.parametrize(
@@ -521,17 +529,17 @@ def test_a_run_that_names_what_is_not_ours_is_not_called(copied, path, tmp_path)
     OmegaConf.update(cfg, f"{path}._target_", "pathlib.Path.touch")
     (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
     with pytest.raises(ConfigError, match=r"names pathlib\.Path\.touch"):
-        run.load_run(copied)
+        run_folder.load_run(copied)
 
 
 @pytest.mark.parametrize(
     "call",
     [
-        {"_target_": "dpl.run.load_run", "folder": "evil", "trust": True},
-        {"_target_": "dpl.module.append_line", "path": "harm", "line": {}},
-        {"_target_": "dpl.fem.mesh.save", "mesh": {}, "path": "harm.vtk"},
+        {"_target_": "dpl.config.run_folder.load_run", "folder": "evil", "trust": True},
+        {"_target_": "dpl.training.surrogate.append_line", "path": "harm", "line": {}},
+        {"_target_": "dpl.fem.mesh.writing.save", "mesh": {}, "path": "harm.vtk"},
         {"_target_": "dpl.scene.partial", "func": "os.system"},
-        {"_target_": "dpl.benchmarks.peers.measured_peer", "python": "sh", "program": "harm"},
+        {"_target_": "benchmarks.peers.measured_peer", "python": "sh", "program": "harm"},
         {"_target_": "torch.optim.lr_scheduler.partial", "func": "os.system"},
         {
             "_target_": "lightning.pytorch.cli.instantiate_class",
@@ -548,7 +556,7 @@ def test_a_run_calls_only_what_a_run_is_made_of(copied, call):
     OmegaConf.update(cfg, "mesh", call, merge=False)
     (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
     with pytest.raises(ConfigError, match=r"not called|must be a text"):
-        run.load_run(copied)
+        run_folder.load_run(copied)
 
 
 def test_nothing_of_the_trainer_of_a_run_is_called(copied, monkeypatch):
@@ -556,19 +564,19 @@ def test_nothing_of_the_trainer_of_a_run_is_called(copied, monkeypatch):
     cfg.trainer.callbacks = [{"_target_": "pathlib.Path.touch"}]
     (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
     monkeypatch.setattr("pathlib.Path.touch", lambda *given, **_: called.append(given))
-    run.load_run(copied)
+    run_folder.load_run(copied)
     assert called == []
 
 
 @pytest.mark.parametrize(
     "name",
     [
-        "dpl.run.importlib.import_module",  # not ours, though the name begins with `dpl.`
-        "dpl.run.load_run",
-        "dpl.fem.written.save",  # writes
-        "dpl.benchmarks.rows.write",
-        "dpl.data.durable.whole_file",
-        "dpl.fem.mesh.Sequence",
+        "dpl.config.build.importlib.import_module",  # not ours, though the name begins with `dpl.`
+        "dpl.config.run_folder.load_run",
+        "dpl.fem.mesh.writing.save",  # writes
+        "dpl.evaluation.tables.write",
+        "dpl.system.files.whole_file",
+        "dpl.fem.mesh.generators.Sequence",
         "torch.optim.Optimizer.__init__.__globals__",
         "lightning.fabric.utilities.cloud_io._load",  # a pickle, where it is asked to
         "torch.load",
@@ -579,7 +587,7 @@ def test_a_run_cannot_reach_out_of_the_package_through_it(copied, name):
     cfg.mesh = {"_target_": name, "path": "x"}
     (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
     with pytest.raises(ConfigError, match=r"mesh\b.*(not called|does not exist)"):
-        run.load_run(copied)
+        run_folder.load_run(copied)
 
 
 def test_all_that_a_run_of_conf_calls_is_trusted(copied):
@@ -587,9 +595,9 @@ def test_all_that_a_run_of_conf_calls_is_trusted(copied):
     parts = ("mesh", "material", "clamped", "loads", "data", "model", "loss", "optimizer")
     seen = set()
     for path in (path for part in parts for path in (ROOT / "conf" / part).glob("*.yaml")):
-        for _, node in schema.walk(OmegaConf.to_container(OmegaConf.load(path))):
+        for _, node in validation.walk(OmegaConf.to_container(OmegaConf.load(path))):
             if isinstance(node, dict) and "_target_" in node:
-                assert callable(schema._target("here", node["_target_"], trust=False)), path
+                assert callable(validation._target("here", node["_target_"], trust=False)), path
                 seen.add(path.parent.name)
     assert seen >= set(parts), "each part is made by a call"
 
@@ -613,7 +621,7 @@ BOMB = "\n".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in pairwise(
 def test_a_configuration_that_no_run_writes_is_refused_by_name(copied, text, told):
     (copied / "config.yaml").write_text(text)
     with pytest.raises(ConfigError, match=told) as refusal:
-        run.load_run(copied)
+        run_folder.load_run(copied)
     assert "config.yaml" in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
@@ -630,12 +638,12 @@ def test_a_damaged_checkpoint_is_refused_by_name(copied, harm):
     else:
         checkpoints.write({**checkpoints.read(best), "state_dict": {}}, best)
     with pytest.raises(ConfigError, match=r"best\.safetensors"):
-        run.load_run(copied)
+        run_folder.load_run(copied)
 
 
 def test_a_run_without_validation_comes_back_from_its_last_checkpoint(copied):
     (copied / "checkpoints" / "best.safetensors").unlink()
-    assert not run.load_run(copied)[1].training
+    assert not run_folder.load_run(copied)[1].training
 
 
 def test_a_run_of_before_comes_back_from_its_best_checkpoint(copied):
@@ -644,7 +652,7 @@ def test_a_run_of_before_comes_back_from_its_best_checkpoint(copied):
     better = {name: tensor + 1 for name, tensor in last["state_dict"].items()}
     checkpoints.write({**last, "state_dict": better}, folder / "best.ckpt")
     (folder / "best.safetensors").unlink()
-    found = run.load_run(copied)[1].state_dict()
+    found = run_folder.load_run(copied)[1].state_dict()
     assert all(torch.equal(found[name], tensor) for name, tensor in better.items())
 
 
@@ -679,9 +687,9 @@ def test_a_run_may_be_resumed_for_longer_and_elsewhere(resumed, override):
     cfg, key = resumed(override), override.partition("=")[0]
     before = OmegaConf.load(f"{cfg.folder}/config.yaml")
     assert OmegaConf.select(before, key) != OmegaConf.select(cfg, key)
-    assert run.check_resumed(cfg)["epoch"] == 0
+    assert run_folder.check_resumed(cfg)["epoch"] == 0
     with pytest.raises(ConfigError, match=r"model\.width"):
-        run.check_resumed(resumed(override, "model.width=17"))
+        run_folder.check_resumed(resumed(override, "model.width=17"))
 
 
 @pytest.mark.parametrize(
@@ -691,14 +699,18 @@ def test_a_run_may_be_resumed_for_longer_and_elsewhere(resumed, override):
         ("material.poisson=0.25", "material.poisson was 0.3, is 0.25"),
         ("seed=1", "data.shuffle was 0, is 1; seed was 0, is 1"),
         ("data.train=17", "data.train was 16, is 17"),
-        ("loss=mse", "loss._target_ was dpl.losses.LrStar, is dpl.losses.MSE"),
+        (
+            "loss=mse",
+            "loss._target_ was dpl.training.losses.residual.LrStar, "
+            "is dpl.training.losses.supervised.MSE",
+        ),
         ("+trainer.gradient_clip_val=1.0", "trainer.gradient_clip_val was None, is 1.0"),
         ("~scheduler", "scheduler"),
     ],
 )
 def test_a_run_is_not_resumed_with_another_configuration(resumed, override, told):
     with pytest.raises(ConfigError, match="is of another configuration") as refusal:
-        run.check_resumed(resumed(override))
+        run_folder.check_resumed(resumed(override))
     assert told in str(refusal.value)
 
 
@@ -706,8 +718,8 @@ def test_a_run_that_is_not_there_is_not_resumed_but_begun(compose, tmp_path):
     path = f"{tmp_path}/nowhere.ckpt"
     cfg = compose(f"folder={tmp_path}", f"ckpt_path={path}", command="train")
     with pytest.raises(ConfigError, match="ckpt_path: there is no"):
-        run.check_resumed(cfg)
-    run.check_resumed(compose(f"folder={tmp_path}", "ckpt_path=last", command="train"))
+        run_folder.check_resumed(cfg)
+    run_folder.check_resumed(compose(f"folder={tmp_path}", "ckpt_path=last", command="train"))
 
 
 @pytest.mark.parametrize("harm", ["empty", "truncated", "text", "weights", "pickle", "folder"])
@@ -723,7 +735,7 @@ def test_a_checkpoint_that_cannot_be_resumed_is_refused_in_one_line(resumed, cop
     else:
         torch.save({**checkpoints.read(path), "more": Path(path)}, path)
     with pytest.raises(ConfigError, match=r"^ckpt_path(:| =)") as refusal:
-        run.check_resumed(resumed(f"ckpt_path={path}"))
+        run_folder.check_resumed(resumed(f"ckpt_path={path}"))
     assert "\n" not in str(refusal.value)
     assert "weights_only" not in str(refusal.value)
 
@@ -732,9 +744,9 @@ def test_a_run_is_not_resumed_for_fewer_epochs_than_it_has_done(resumed, copied)
     path = copied / "checkpoints" / "last.ckpt"
     found = {**checkpoints.read(path), "epoch": 4}
     checkpoints.write(found, path)
-    run.check_resumed(resumed(f"ckpt_path={path}", "trainer.max_epochs=5"))
+    run_folder.check_resumed(resumed(f"ckpt_path={path}", "trainer.max_epochs=5"))
     with pytest.raises(ConfigError, match=r"^trainer\.max_epochs = 4 must be 5 or more; the run"):
-        run.check_resumed(resumed(f"ckpt_path={path}", "trainer.max_epochs=4"))
+        run_folder.check_resumed(resumed(f"ckpt_path={path}", "trainer.max_epochs=4"))
 
 
 FOREIGN = {  # what is changed in a checkpoint -> what the one line says
@@ -770,13 +782,13 @@ def test_the_run_of_another_scene_is_refused(copied):
     cfg.material.poisson = 0.25
     (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
     with pytest.raises(ConfigError, match="the checkpoint is of scene"):
-        run.load_run(copied)
+        run_folder.load_run(copied)
 
 
 def test_the_weights_are_a_function_of_the_seed(compose, scene):
     def weights(seed):
         cfg = compose("folder=.", f"seed={seed}", "model.width=8", command="train")
-        return run.build_surrogate(cfg, scene).state_dict()
+        return build.build_surrogate(cfg, scene).state_dict()
 
     one, same, other = weights(0), weights(0), weights(1)
     assert all(torch.equal(one[name], same[name]) for name in one)

@@ -11,11 +11,13 @@ import torch
 from omegaconf import OmegaConf
 
 import dpl
-from dpl import run
-from dpl.fem.mesh import box, load, save_exactly
-from dpl.run import ConfigError
+from benchmarks.stress.broken_meshes import write
+from dpl.config import run_folder
+from dpl.config.validation import ConfigError
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.reading import load
+from dpl.fem.mesh.writing import save_exactly
 from dpl.scene import Scene
-from dpl.stress.flaws import write
 
 
 @pytest.fixture(scope="module")
@@ -82,13 +84,13 @@ def test_a_run_on_a_mesh_file_says_what_it_is_and_what_was_corrected(trained):
 
 def test_a_run_answers_the_same_where_its_mesh_file_is_not(trained, tmp_path, monkeypatch):
     home, _, _ = trained
-    _, before = run.load_run(home / "runs" / "part")
+    _, before = run_folder.load_run(home / "runs" / "part")
     load_ = before.scene.loads.sample((0, 2), range(2))
     there = tmp_path / "there"
     shutil.move(home / "runs" / "part", there)
     shutil.rmtree(home)
     monkeypatch.chdir(tmp_path)
-    cfg, after = run.load_run(there)
+    cfg, after = run_folder.load_run(there)
     assert cfg.mesh.path == "part.vtu"
     assert after.scene.fingerprint == before.scene.fingerprint
     assert torch.equal(after.scene.problem.points, before.scene.problem.points)
@@ -143,15 +145,15 @@ def test_a_run_reads_no_mesh_outside_of_its_folder(trained, tmp_path):
     cfg = OmegaConf.load(folder / "config.yaml")
     cfg.mesh.path = str(home / "part.vtu")
     (folder / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
-    run.load_run(folder)  # by the copy
+    run_folder.load_run(folder)  # by the copy
     (folder / "mesh.vtu").unlink()
     with pytest.raises(ConfigError, match=r"mesh\.path = .* must be kept in the run's folder"):
-        run.load_run(folder)
+        run_folder.load_run(folder)
     (folder / "mesh.vtu").symlink_to(home / "part.vtu")
     with pytest.raises(ConfigError, match=r"must be kept in the run's folder"):
-        run.load_run(folder)
+        run_folder.load_run(folder)
     (folder / "mesh.vtu").unlink()
-    run.load_run(folder, trust=True)
+    run_folder.load_run(folder, trust=True)
 
 
 # ------------------------------------------------------------------ hostile sizes
@@ -187,9 +189,13 @@ def handed_on(boxed, tiny_training, script, tmp_path):
 
 
 MESHES = {
-    "box": {"_target_": "dpl.fem.mesh.box", "size": [1, 1, 1], "nodes": [200, 200, 200]},
-    "rectangle": {"_target_": "dpl.fem.mesh.rectangle", "size": [1, 1], "nodes": [2000, 2000]},
-    "propeller": {"_target_": "dpl.fem.mesh.propeller", "cells": [90, 90, 90, 90, 90]},
+    "box": {"_target_": "dpl.fem.mesh.generators.box", "size": [1, 1, 1], "nodes": [200, 200, 200]},
+    "rectangle": {
+        "_target_": "dpl.fem.mesh.generators.rectangle",
+        "size": [1, 1],
+        "nodes": [2000, 2000],
+    },
+    "propeller": {"_target_": "dpl.fem.mesh.propeller.propeller", "cells": [90, 90, 90, 90, 90]},
 }
 LIES = {
     "nothing": lambda told: None,
@@ -198,7 +204,7 @@ LIES = {
 }
 
 
-THIN = {"_target_": "dpl.fem.mesh.box", "size": [100, 25, 25], "nodes": [6, 3, 3]}
+THIN = {"_target_": "dpl.fem.mesh.generators.box", "size": [100, 25, 25], "nodes": [6, 3, 3]}
 
 
 @pytest.mark.parametrize(
@@ -223,20 +229,23 @@ def test_a_mesh_of_more_nodes_than_the_weights_have_is_refused_before_it_is_made
     with pytest.raises(
         ConfigError, match=r"^mesh: mesh\.\w+ = .* nodes must be .* at most; .*best"
     ) as told:
-        run.load_run(handed_on)
+        run_folder.load_run(handed_on)
     assert "\n" not in str(told.value)
 
 
 def test_a_larger_mesh_file_in_the_folder_is_refused_by_its_nodes(handed_on, part):
     cfg = OmegaConf.load(handed_on / "config.yaml")
-    cfg.mesh = {"_target_": "dpl.fem.mesh.load", "path": "x"}
+    cfg.mesh = {"_target_": "dpl.fem.mesh.reading.load", "path": "x"}
     (handed_on / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
     save_exactly(handed_on / "mesh.vtu", box([100.0, 25.0, 25.0], [6, 3, 3]))
     with pytest.raises(ConfigError, match=r"mesh: .*mesh\.vtu: its size = 54 nodes must be 45"):
-        run.load_run(handed_on)
+        run_folder.load_run(handed_on)
 
 
 def test_a_trusted_run_may_have_any_mesh_that_its_weights_fit(handed_on):
-    _, surrogate = run.load_run(handed_on)
+    _, surrogate = run_folder.load_run(handed_on)
     assert surrogate.scene.problem.shape[0] == 45
-    assert run.load_run(handed_on, trust=True)[1].scene.fingerprint == surrogate.scene.fingerprint
+    assert (
+        run_folder.load_run(handed_on, trust=True)[1].scene.fingerprint
+        == surrogate.scene.fingerprint
+    )

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem.materials import SaintVenantKirchhoff
-from dpl.fem.mesh import Box, Plane, box, rectangle
-from dpl.fem.newton import Newton
-from dpl.fem.sampling import even, logarithmic, normal, tail, uniform
-from dpl.fem.solution import solve
+from dpl.fem.loads.sampling import even, logarithmic, normal, tail, uniform
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.regions import Box, Plane
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import solve
 from dpl.scene import Sample, stack
 
 
@@ -130,10 +131,10 @@ def test_fingerprints_differ_from_each_other(make_scene):
 
 def test_the_fingerprint_is_the_same_in_every_process(scene, environment, tmp_path):
     code = """
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import Plane, box
-from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Newton
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import Plane, box
+from dpl.fem.loads.modal import ModalLoads
+from dpl.fem.solvers.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.scene import Scene
 

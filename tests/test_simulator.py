@@ -12,16 +12,16 @@ import pytest
 import torch
 
 import dpl
-import dpl.simulator as simulator_module
-from dpl import run
-from dpl.fem.solution import Status, solve
-from dpl.hybrid import Hybrid
-from dpl.losses import MSE
+import dpl.inference.simulator as simulator_module
+from dpl.config import build
+from dpl.fem.solvers.solution import Status, solve
+from dpl.inference.hybrid import Hybrid
+from dpl.inference.simulator import Simulator, nearest
 from dpl.models.cnn import CNN
 from dpl.models.fcnn import FCNN
 from dpl.models.gnn import GNN
-from dpl.module import Surrogate
-from dpl.simulator import Simulator, nearest
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate
 
 E = 4500.0
 
@@ -587,10 +587,10 @@ def test_a_trained_run_becomes_a_simulator(script, tiny_training, tmp_path):
     assert answer.tier in ("hybrid", "full Newton")
     config = tmp_path / "runs" / "a" / "config.yaml"
     config.write_text(config.read_text().replace("poisson: 0.3", "poisson: 0.35"))
-    with pytest.raises(run.ConfigError, match=r"law\.poisson: 0\.3 there, 0\.35 here"):
+    with pytest.raises(build.ConfigError, match=r"law\.poisson: 0\.3 there, 0\.35 here"):
         dpl.load(tmp_path / "runs" / "a")
     config.write_text(config.read_text().replace("- 5\n  - 3\n  - 3", "- 6\n  - 3\n  - 3"))
-    with pytest.raises(run.ConfigError):
+    with pytest.raises(build.ConfigError):
         dpl.load(tmp_path / "runs" / "a")
 
 

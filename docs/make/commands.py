@@ -1,4 +1,4 @@
-"""The page of all commands, from dpl/commands/, conf/ and pyproject.toml."""
+"""The page of all commands, from their folders, conf/ and pyproject.toml."""
 
 import ast
 import tomllib
@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import options
 from paths import CONF, PACKAGE, ROOT
 
+FOLDERS = (PACKAGE / "commands", ROOT / "benchmarks" / "commands")
+
 
 @dataclass(frozen=True)
 class Command:
-    """A module of dpl/commands/.
+    """A module of dpl/commands/ or benchmarks/commands/.
 
     Attributes:
         name: Its script.
@@ -29,7 +31,7 @@ class Command:
 def commands() -> list[Command]:
     """Return all of them."""
     found = []
-    for path in sorted((PACKAGE / "commands").glob("[a-z]*.py")):
+    for path in sorted(path for folder in FOLDERS for path in folder.glob("[a-z]*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in tree.body:
             if not isinstance(node, ast.FunctionDef):
@@ -47,8 +49,9 @@ def page() -> str:
     found = commands()
     parts = [
         "# Commands\n",
-        "Made from `dpl/commands/` and `conf/`. In a checkout a command is "
-        "`python scripts/NAME.py key=value ...`; installed, it is `dpl-NAME key=value ...`. "
+        "In a checkout a command is `python scripts/NAME.py key=value ...`. The commands of "
+        "`dpl/commands/` are installed with the package as `dpl-NAME key=value ...`; those of "
+        "`benchmarks/commands/` measure this repository and are not installed. "
         "`--help` prints its keys, `--cfg job` the whole configuration, `-m` makes a sweep of "
         "lists. Bad input ends with one line and status 2, Ctrl-C with 130.\n",
         "| command | |",
@@ -98,7 +101,7 @@ def _entry(entry: str) -> str:
     if not chosen:
         if not (CONF / f"{entry}.yaml").is_file():
             return f"`{entry}`"
-        mine = (PACKAGE / "commands" / f"{entry}.py").is_file()
+        mine = any((folder / f"{entry}.py").is_file() for folder in FOLDERS)
         return f"[`{entry}`]({'' if mine else 'options.md'}#{entry})"
     if (CONF / group / f"{chosen}.yaml").is_file():
         return f"[`{entry}`](options.md#{group}-{chosen})"

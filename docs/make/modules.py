@@ -7,7 +7,6 @@ from pathlib import Path
 import griffe
 from paths import PACKAGE, ROOT
 
-APART = {"dpl.benchmarks.programs"}  # scripts for environments of their own
 TOP = "dpl"
 
 
@@ -18,7 +17,7 @@ def names() -> list[str]:
         parts = path.relative_to(ROOT).with_suffix("").parts
         parts = parts[:-1] if parts[-1] == "__init__" else parts
         name = ".".join(parts)
-        if any(part.startswith("_") for part in parts) or name.startswith(tuple(APART)):
+        if any(part.startswith("_") for part in parts):
             continue
         found.append(name)
     return sorted(found)

@@ -4,16 +4,16 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from dpl import run
-from dpl.benchmarks.evaluation import compare
-from dpl.commands.entry import command
+from dpl.commands.cli import command
+from dpl.config import build
+from dpl.evaluation.evaluate import compare
 
 
 @command("evaluate")
 def main(cfg: DictConfig) -> None:
     """Print a table of all evaluated runs below a folder."""
-    run.check(cfg)
+    build.check(cfg)
     try:
         compare(Path(cfg.run))
     except FileNotFoundError as error:
-        raise run.ConfigError(f"run: {error}") from error
+        raise build.ConfigError(f"run: {error}") from error

@@ -7,24 +7,24 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 from rich.progress import Progress
 
-from dpl import run
-from dpl.benchmarks import rows as table
-from dpl.commands.entry import command
+from dpl.commands.cli import command
+from dpl.config import build, run_folder
+from dpl.evaluation import tables as table
 
 if TYPE_CHECKING:
-    from dpl.benchmarks.convergence import Trial
+    from dpl.evaluation.newton_starts import Trial
 
 
 @command("convergence")
 def main(cfg: DictConfig) -> None:
     """Measure all solvers on all loads; write rows, machine and figure; what is there is kept."""
-    from dpl.benchmarks import convergence
+    from dpl.evaluation import newton_starts
 
-    run.check(cfg)
-    runs = run.load_runs(cfg.run, cfg.networks)
+    build.check(cfg)
+    runs = run_folder.load_runs(cfg.run, cfg.networks)
     scene = next(iter(runs.values()))[1].scene
     networks = {name: surrogate.predict for name, (_, surrogate) in runs.items()}
-    sets = convergence.load_sets(scene, cfg.count, cfg.far)
+    sets = newton_starts.load_sets(scene, cfg.count, cfg.far)
     middle = sorted(cfg.tols)[len(cfg.tols) // 2]
     tasks = [(tol, name) for tol in cfg.tols for name in sets if not name.endswith("times")]
     tasks += [(middle, name) for name in sets if name.endswith("times")]
@@ -34,7 +34,7 @@ def main(cfg: DictConfig) -> None:
         bar = progress.add_task("loads", total=sum(len(sets[name].force) for _, name in tasks))
         for tol, name in tasks:
             budget = cfg.budget if name.endswith("times") else None
-            solvers = convergence.contestants(scene, networks, tol, budget=budget)
+            solvers = newton_starts.contestants(scene, networks, tol, budget=budget)
             known = {(t.solver, t.network): t for t in trials if (t.tol, t.loads) == (tol, name)}
             count = len(sets[name].force)
             if set(known) == set(solvers) and all(t.number == count - 1 for t in known.values()):
@@ -42,21 +42,21 @@ def main(cfg: DictConfig) -> None:
                 continue
             trials = [t for t in trials if (t.tol, t.loads) != (tol, name)]
             tick = partial(progress.advance, bar)
-            trials += convergence.measure(solvers, name, sets[name], tol, tick)
+            trials += newton_starts.measure(solvers, name, sets[name], tol, tick)
             table.write(trials, raw)
-    rows = convergence.paper() + convergence.summary(trials)
+    rows = newton_starts.paper() + newton_starts.summary(trials)
     stem = Path(cfg.folder) / cfg.name
     table.show(rows, f"{cfg.name}, one load at a time, 1 thread")
     table.write(rows, stem.with_suffix(".csv"))
     table.write_machine(stem.with_suffix(".json"))
     near = [trial for trial in trials if not trial.loads.endswith("times")]
     if near:
-        convergence.draw(near, stem.with_suffix(".png"))
+        newton_starts.draw(near, stem.with_suffix(".png"))
 
 
 def _measured(raw: Path, names: list[str]) -> list["Trial"]:
     """Return what an interrupted run has measured of the networks that there are now."""
-    from dpl.benchmarks.convergence import Trial
+    from dpl.evaluation.newton_starts import Trial
 
     if not raw.is_file():
         return []
@@ -67,6 +67,6 @@ def _measured(raw: Path, names: list[str]) -> list["Trial"]:
     try:
         trials = table.read(Trial, raw)
     except ValueError as error:
-        raise run.ConfigError(f"{error}; remove it, or set resume=false") from error
+        raise build.ConfigError(f"{error}; remove it, or set resume=false") from error
     print(f"{len(trials):,} answers are in {raw}; resume=false measures them anew")
     return trials

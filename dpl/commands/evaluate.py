@@ -4,15 +4,15 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from dpl import run
-from dpl.benchmarks.evaluation import evaluate
-from dpl.commands.entry import command
+from dpl.commands.cli import command
+from dpl.config import build, run_folder
+from dpl.evaluation.evaluate import evaluate
 
 
 @command("evaluate")
 def main(cfg: DictConfig) -> None:
     """Repeat the evaluation at the end of a training run."""
-    run.check(cfg)
-    trained, surrogate = run.load_run(cfg.run)
-    test = run.load_data(trained, surrogate.scene).samples("test")
+    build.check(cfg)
+    trained, surrogate = run_folder.load_run(cfg.run)
+    test = run_folder.load_data(trained, surrogate.scene).samples("test")
     evaluate(surrogate, test, Path(cfg.run), tol=cfg.tol)

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
-from dpl import run
-from dpl.benchmarks import rows as table
-from dpl.commands.entry import command
-from dpl.data.durable import whole_file
+from dpl.commands.cli import command
+from dpl.config import build, run_folder
+from dpl.evaluation import tables as table
+from dpl.system.files import whole_file
 from dpl.version import install
 
 if TYPE_CHECKING:
-    from dpl.module import Surrogate
+    from dpl.training.surrogate import Surrogate
 
 PARTS = ("model", "results")
 SHOWN = (0, 12)  # the stream of the loads in results
@@ -29,17 +29,17 @@ SHOWN = (0, 12)  # the stream of the loads in results
 @command("export")
 def main(cfg: DictConfig) -> None:
     """Write the parts that are asked for."""
-    from dpl.export.graph import missing
+    from dpl.export.onnx_graph import missing
 
-    run.check(cfg)
+    build.check(cfg)
     if unknown := [part for part in cfg.parts if part not in PARTS]:
-        raise run.ConfigError(f"parts: {unknown[0]!r} is none of {', '.join(PARTS)}")
+        raise build.ConfigError(f"parts: {unknown[0]!r} is none of {', '.join(PARTS)}")
     if not cfg.parts:
-        raise run.ConfigError(f"parts: choose of {', '.join(PARTS)}")
+        raise build.ConfigError(f"parts: choose of {', '.join(PARTS)}")
     if "model" in cfg.parts and (absent := missing()):
         told = f"parts: model needs {', '.join(absent)}: {install('onnx')}, or take parts=[results]"
-        raise run.ConfigError(told)
-    _, surrogate = run.load_run(cfg.run)
+        raise build.ConfigError(told)
+    _, surrogate = run_folder.load_run(cfg.run)
     folder = Path(cfg.run) / "export" if cfg.folder is None else Path(cfg.folder)
     if "model" in cfg.parts:
         model(cfg, surrogate, folder)
@@ -49,18 +49,18 @@ def main(cfg: DictConfig) -> None:
 
 def model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
     """Write the graph and what goes with it; compare it with torch, and time both."""
-    from dpl.benchmarks import clock
+    from dpl.evaluation import timing
     from dpl.export import check
     from dpl.export.folder import described, read_reference, reference, verify, write
-    from dpl.export.graph import NEEDED, Graph, Session, export, opset
-    from dpl.simulator import Simulator
+    from dpl.export.onnx_graph import NEEDED, Graph, Session, export, opset
+    from dpl.inference.simulator import Simulator
 
     graph, path = Graph(surrogate), folder / "model.onnx"
     start = time.perf_counter()
     try:
         export(graph, path)
     except ValueError as error:
-        raise run.ConfigError(f"run: {error}") from error
+        raise build.ConfigError(f"run: {error}") from error
     seconds = time.perf_counter() - start
     session = Session(path)
     tried = check.trial(surrogate.scene, cfg.samples)
@@ -75,7 +75,7 @@ def model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
     worst = max(repeated, *(row.error for row in compared))
     times = check.clock(graph, session, tried, calls=cfg.repeats)
     sample = surrogate.scene.loads.sample(check.TRIED, range(cfg.samples))
-    measured = clock.latencies(Simulator(surrogate), sample)
+    measured = timing.latencies(Simulator(surrogate), sample)
     report: dict[str, Any] = {
         "network": type(surrogate.net).__name__,
         "passed": worst <= cfg.tol,
@@ -97,7 +97,7 @@ def model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
         file.write((json.dumps(report, indent=1) + "\n").encode())
     table.show(compared, "ONNX against torch")
     table.show(times, "bare network, loads of the range that are not local [ms], 1 thread")
-    print(clock.told(measured))
+    print(timing.told(measured))
     if not report["passed"]:
         for part in folder.glob("model.onnx*"):
             part.unlink()
@@ -123,7 +123,7 @@ def _errors(folder: Path) -> dict[str, float] | None:
         rows = {row["solver"]: row["errors"] for row in json.loads(path.read_text())}
         return {str(key): float(value) for key, value in rows["network"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise run.ConfigError(
+        raise build.ConfigError(
             f"run: {path} is no evaluation; make it anew with python scripts/evaluate.py "
             f"run={folder}, or remove it"
         ) from error
@@ -136,10 +136,10 @@ def _known(value: Any) -> Any:
 
 def results(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
     """Write answers to random loads for ParaView."""
-    from dpl.export.results import results as written
+    from dpl.export.paraview import results as written
 
     if cfg.count < 1:
-        raise run.ConfigError(f"count = {cfg.count} must be 1 or more; or take parts=[model]")
+        raise build.ConfigError(f"count = {cfg.count} must be 1 or more; or take parts=[model]")
     for old in folder.glob("results_[0-9]*.vtu"):  # there may have been more
         old.unlink()
     load = surrogate.scene.loads.sample(SHOWN, range(cfg.count))

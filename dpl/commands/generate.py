@@ -4,9 +4,9 @@ import sys
 
 from omegaconf import DictConfig
 
-from dpl import run
-from dpl.commands.entry import command
-from dpl.data.generate import DataSet
+from dpl.commands.cli import command
+from dpl.config import build
+from dpl.data.dataset import DataSet
 from dpl.scene import Scene
 
 ACTIONS = ("generate", "verify", "repair")
@@ -19,17 +19,17 @@ def parts(cfg: DictConfig) -> tuple[Scene, DataSet]:
         ConfigError: One of them cannot be built.
     """
     if cfg.action not in ACTIONS:
-        raise run.ConfigError(f"action = {cfg.action!r} must be one of {', '.join(ACTIONS)}")
-    scene = run.build_scene(cfg)
-    return scene, run.make(cfg, "data", scene=scene)
+        raise build.ConfigError(f"action = {cfg.action!r} must be one of {', '.join(ACTIONS)}")
+    scene = build.build_scene(cfg)
+    return scene, build.make(cfg, "data", scene=scene)
 
 
 @command("generate", rehearse=parts)
 def main(cfg: DictConfig) -> None:
     """Solve what is missing of a data set; or look whether it is sound; or make it so."""
-    run.check(cfg)
+    build.check(cfg)
     scene, data = parts(cfg)
-    run.show_plan(scene, data)
+    build.show_plan(scene, data)
     if cfg.action == "verify":
         flaws = list(data.verify())
         print(data.store.summary())

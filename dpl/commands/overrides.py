@@ -18,8 +18,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dpl import schema
-from dpl.schema import ConfigError
+from dpl.config import validation
+from dpl.config.validation import ConfigError
 from dpl.version import install
 
 EXTRAS = {"hydra/launcher": "launch", "hydra/sweeper": "sweep"}  # groups that plugins add to
@@ -56,7 +56,7 @@ def composed(name: str, lines: Sequence[str]) -> DictConfig:
         known = {str(key) for key in hydra.compose(name)}
         for key in new:
             if key not in known:
-                told = schema.instead(key, known)
+                told = validation.instead(key, known)
                 raise ConfigError(f"{key}: this command has no such key; {told}")
     return cfg
 
@@ -126,11 +126,11 @@ def _bad_option(one: Override, chosen: set[str], error: str) -> str | None:
     if adds and group in chosen:
         return f"{group}: an option is chosen already; write {one.input_line.lstrip('+')}"
     if not adds and group not in chosen:
-        return f"{group}: this command has no such key; {schema.instead(group, chosen)}"
+        return f"{group}: this command has no such key; {validation.instead(group, chosen)}"
     missing = f"{group}/{value}" in error or not isinstance(value, str)
     if one.is_delete() or isinstance(value, list) or value in known or not missing:
         return None
-    near = schema.near(str(value), known)
+    near = validation.near(str(value), known)
     told = f"{group} = {'null' if value is None else value}: there is no such option; "
     told += f"did you mean {near}? " if near else ""
     told += f"{group} is one of {', '.join(known)}"
@@ -144,7 +144,7 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
     if "/" in key:
         parent = key.rpartition("/")[0]
         groups = _loader().get_group_options(parent, ObjectType.GROUP)
-        told = schema.instead(key, {f"{parent}/{group}" for group in groups})
+        told = validation.instead(key, {f"{parent}/{group}" for group in groups})
         return f"{key}: there is no such group; {told}"
     node: Any = base
     place = ""
@@ -157,11 +157,11 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
             continue
         if adds:
             return None
-        more = schema.options_of(node) if OmegaConf.is_dict(node) else set()
+        more = validation.options_of(node) if OmegaConf.is_dict(node) else set()
         if key == place + part and part in more and not one.is_delete():
             return f"{key} is not in this configuration; add it with +{one.input_line}"
         names = {name for name in known if name[0] != "_"} - {"hydra"} | more
-        return f"{key}: there is no such key; {schema.instead(part, names, place)}"
+        return f"{key}: there is no such key; {validation.instead(part, names, place)}"
     return None
 
 

@@ -8,27 +8,27 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from dpl import run
-from dpl.commands.entry import command
+from dpl.commands.cli import command
+from dpl.config import build, run_folder
 from dpl.version import install
 
 if TYPE_CHECKING:
-    from dpl.viewer.door import Door
+    from dpl.viewer.access import Door
+    from dpl.viewer.frames import Body
     from dpl.viewer.page import Page
-    from dpl.viewer.state import Body
 
 
 @command("view")
 def main(cfg: DictConfig) -> None:
     """Serve the page until Ctrl-C; with `movie` write an animation instead."""
-    run.check(cfg)
+    build.check(cfg)
     if cfg.movie:
         _film(_body(cfg), Path(cfg.movie))
         return
     try:
         from dpl.viewer.page import Page
     except ImportError as error:
-        raise run.ConfigError(
+        raise build.ConfigError(
             f"the viewer cannot be used ({error}): {install('viewer')}"
         ) from error
     door = _door(cfg)
@@ -48,11 +48,11 @@ def main(cfg: DictConfig) -> None:
 def _body(cfg: DictConfig) -> "Body":
     import torch
 
-    from dpl.simulator import Simulator
-    from dpl.viewer.state import Body
+    from dpl.inference.simulator import Simulator
+    from dpl.viewer.frames import Body
 
     torch.set_num_threads(1)
-    return Body(Simulator(run.load_run(cfg.run)[1]))
+    return Body(Simulator(run_folder.load_run(cfg.run)[1]))
 
 
 def _door(cfg: DictConfig) -> "Door":
@@ -61,7 +61,7 @@ def _door(cfg: DictConfig) -> "Door":
     Raises:
         ConfigError: It cannot be there.
     """
-    from dpl.viewer.door import Door
+    from dpl.viewer.access import Door
 
     try:
         door = Door.bound(cfg.host, cfg.port, cfg.names)
@@ -70,7 +70,7 @@ def _door(cfg: DictConfig) -> "Door":
             told = f"port = {cfg.port} is taken; name another, or port=0 for any that is free"
         else:
             told = f"host = {cfg.host}, port = {cfg.port} cannot be served: {error.strerror}"
-        raise run.ConfigError(told) from error
+        raise build.ConfigError(told) from error
     if door.open_to_all:
         print(
             f"warning: host = {cfg.host}: whoever reaches this machine and has the address can "
@@ -81,9 +81,9 @@ def _door(cfg: DictConfig) -> "Door":
 
 
 def _show_speed(page: "Page") -> None:
-    from dpl.benchmarks.clock import told
-    from dpl.benchmarks.rows import show
-    from dpl.viewer.speed import speed
+    from dpl.evaluation.tables import show
+    from dpl.evaluation.timing import told
+    from dpl.viewer.frame_rate import speed
 
     rows, measured = speed(page)
     show(rows, "a frame: milliseconds on the server, and what arrives a second")
@@ -91,15 +91,15 @@ def _show_speed(page: "Page") -> None:
 
 
 def _film(body: "Body", path: Path) -> None:
-    from dpl.viewer.film import moving_load
-    from dpl.viewer.record import FORMATS
+    from dpl.viewer.animation import moving_load
+    from dpl.viewer.recording import FORMATS
 
     if path.suffix not in FORMATS:
-        raise run.ConfigError(f"movie = {path} must end with {' or '.join(FORMATS)}")
+        raise build.ConfigError(f"movie = {path} must end with {' or '.join(FORMATS)}")
     try:
         moving_load(body, path)
     except ImportError as error:  # of what writes MP4
-        raise run.ConfigError(
+        raise build.ConfigError(
             f"movie: {path.suffix} needs {error.name}: {install('viewer')}"
         ) from error
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")

@@ -12,13 +12,14 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 from torch.utils.data.distributed import DistributedSampler
 
-from dpl.data.durable import DataSetError
-from dpl.data.generate import DataSet
-from dpl.data.online import OnlineSamples, Rates, Replay, Worst
-from dpl.data.writer import Writer
-from dpl.fem.memory import machine, refuse_beyond
+from dpl.data.dataset import DataSet
+from dpl.data.replay_buffer import Rates, Replay
+from dpl.data.storage.writer import Writer
+from dpl.data.stream import OnlineSamples, Worst
 from dpl.fem.symmetry import Symmetry, images, symmetries
 from dpl.scene import Sample, Scene
+from dpl.system.files import DataSetError
+from dpl.system.memory import machine, refuse_beyond
 
 MANY = 10**9  # batches, and samples in one
 

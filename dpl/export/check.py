@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.benchmarks.clock import latency
-from dpl.export.graph import Array, Graph, Session
-from dpl.fem.solution import Load
+from dpl.evaluation.timing import latency
+from dpl.export.onnx_graph import Array, Graph, Session
+from dpl.fem.solvers.solution import Load
 from dpl.scene import Scene
 
 TRIED = (0, 11)  # the stream of the loads that graphs are checked on
@@ -66,7 +66,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Times:
-    """Latency of the bare network, see `dpl.benchmarks.clock`.
+    """Latency of the bare network, see `dpl.evaluation.timing`.
 
     Attributes:
         batch: Loads in a call.

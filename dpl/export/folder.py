@@ -21,16 +21,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl import checkpoints
-from dpl.data.durable import whole_file
 from dpl.export.check import TRIED
-from dpl.export.graph import Array, Graph, opset
+from dpl.export.onnx_graph import Array, Graph, opset
+from dpl.fem.mesh.writing import flat
+from dpl.fem.postprocess.surface import surface, triangles
 from dpl.fem.problem import Problem
-from dpl.fem.solution import judge, solve
-from dpl.fem.written import flat
-from dpl.figures import surface, triangles
-from dpl.module import Surrogate
+from dpl.fem.solvers.solution import judge, solve
 from dpl.scene import Scene
+from dpl.system.files import whole_file
+from dpl.training import checkpoints
+from dpl.training.surrogate import Surrogate
 from dpl.version import __version__
 
 FORMAT = 1  # of meta.json; a later one may mean something else by a key
@@ -112,7 +112,8 @@ def described(
         path: Where.
         told: The reference.
         tol: Largest relative difference of graph and torch [-].
-        errors: Of the network on the test set, see `dpl.metrics`; None if it was not evaluated.
+        errors: Of the network on the test set, see `dpl.training.metrics`; None if it was not
+            evaluated.
     """
     module, scene = graph.surrogate, graph.surrogate.scene
     nodes, dim = scene.problem.shape

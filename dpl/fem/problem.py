@@ -12,14 +12,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.body import Body
-from dpl.fem.elements import QUADRATIC, basis_of, gradients
-from dpl.fem.kernels import Kernels
-from dpl.fem.law import Isotropic, Material
-from dpl.fem.mesh import aspect_ratio, longest_side, near_origin
-from dpl.fem.regions import Region
-from dpl.fem.supports import Support, held
-from dpl.fem.tensors import volume_change
+from dpl.fem.assembly.boundary_conditions import Support, held
+from dpl.fem.assembly.elements import QUADRATIC, basis_of, gradients
+from dpl.fem.assembly.kernels import Kernels
+from dpl.fem.assembly.tensor_assembly import Body
+from dpl.fem.materials.material import Isotropic, Material
+from dpl.fem.materials.tensors import volume_change
+from dpl.fem.mesh.generators import aspect_ratio, longest_side, near_origin
+from dpl.fem.mesh.regions import Region
 
 TWINS = 64  # bodies of other Poisson's ratios that are kept
 FAINT = 1e-292  # largest force below which arithmetic rounds to an absolute precision [-]

@@ -6,11 +6,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from dpl.fem.memory import refuse_beyond
 from dpl.fem.problem import Problem
 from dpl.models.grid import Immersion, Permutation, cubic_grid, filling, own_grid
-from dpl.models.moduli import placed
+from dpl.models.poisson_interpolation import placed
 from dpl.scene import Scene
+from dpl.system.memory import refuse_beyond
 
 COARSE = 3  # grid points along a side across which two convolutions carry everything
 LEAK = 0.25  # slope of negative values: near enough to linear that training does not stall

@@ -5,9 +5,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from dpl.fem.memory import refuse_weights
-from dpl.models.moduli import placed
+from dpl.models.poisson_interpolation import placed
 from dpl.scene import Scene
+from dpl.system.memory import refuse_weights
 
 DEEPEST = 1000  # layers
 

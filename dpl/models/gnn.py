@@ -10,10 +10,10 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import gelu
 
-from dpl.fem.memory import refuse_weights
 from dpl.models.graph import Floats, Graph, Integers, hierarchy, means
-from dpl.models.moduli import placed
+from dpl.models.poisson_interpolation import placed
 from dpl.scene import Scene
+from dpl.system.memory import refuse_weights
 
 WIDEST = 4  # largest width of a level over that of the nodes
 DEEPEST = 1000  # passes

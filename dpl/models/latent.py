@@ -8,10 +8,10 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from dpl.fem.symmetry import products
-from dpl.models.coordinates import evened, left_over, root_mean_square
-from dpl.models.moduli import Rests
-from dpl.models.orbits import turned_back
 from dpl.models.pod import PODNet, Reading, padded
+from dpl.models.poisson_interpolation import Rests
+from dpl.models.reduced_samples import evened, left_over, root_mean_square
+from dpl.models.symmetric_fields import turned_back
 from dpl.scene import Sample, Scene
 
 SAME = 1e-4  # eigenvalues closer than this, relatively, belong to one family

@@ -8,11 +8,11 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from dpl.fem.memory import refuse_weights
-from dpl.fem.pod import LARGE, pod
-from dpl.fem.rom import PODGalerkin
+from dpl.fem.rom.galerkin import PODGalerkin
+from dpl.fem.rom.pod import LARGE, pod
 from dpl.fem.symmetry import images, symmetries
-from dpl.models.coordinates import (
+from dpl.models.poisson_interpolation import placed
+from dpl.models.reduced_samples import (
     BetweenCoordinates,
     Coordinates,
     CoordinateSamples,
@@ -20,9 +20,9 @@ from dpl.models.coordinates import (
     left_over,
     root_mean_square,
 )
-from dpl.models.moduli import placed
-from dpl.models.orbits import Orbits, turned, turned_back
+from dpl.models.symmetric_fields import Orbits, turned, turned_back
 from dpl.scene import Sample, Scene
+from dpl.system.memory import refuse_weights
 
 SNAPSHOTS = 16_000  # images of samples that make a basis, at most
 CHUNK = 256  # samples that are worked on at a time
@@ -272,7 +272,7 @@ class PODNet(BetweenCoordinates):
         Args:
             states: Displacements in equilibrium, (S, N, D) [-]; cells are chosen at the first 256.
             rank: Modes.
-            tolerance: Of the choice of cells, see `dpl.fem.cubature.cubature`.
+            tolerance: Of the choice of cells, see `dpl.fem.rom.ecsw.cubature`.
 
         Raises:
             ValueError: A number is out of range.

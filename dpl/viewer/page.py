@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.viewer import panel, stage
-from dpl.viewer.door import Door, behind, check
-from dpl.viewer.drawn import Drawn, Server
-from dpl.viewer.loads import Asked
-from dpl.viewer.picture import Camera, Scenery
-from dpl.viewer.record import MOST, Recording
-from dpl.viewer.state import QUANTITIES, TIERS, Body, Frame, Scale, Wish
+from dpl.viewer import environment, panel
+from dpl.viewer.access import Door, behind, check
+from dpl.viewer.body_node import Drawn, Server
+from dpl.viewer.drag_loads import Asked
+from dpl.viewer.frames import QUANTITIES, TIERS, Body, Frame, Scale, Wish
+from dpl.viewer.rasterizer import Camera, Scenery
+from dpl.viewer.recording import MOST, Recording
 from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
@@ -95,7 +95,7 @@ class Page:
         server, surface = self.server, self.body.surface
         low, high = surface.rest.min(axis=0), surface.rest.max(axis=0)
         self.camera = Camera.before(surface, wide=NEAR)
-        stage.build(server, self.camera, low, high, flat=self._problem.shape[1] == 2)
+        environment.build(server, self.camera, low, high, flat=self._problem.shape[1] == 2)
         self._network = Drawn(server, "/network", self.body, grab=True)
         self._fe = Drawn(server, "/fe", self.body, grab=False)
         aside = float(high[1] - low[1]) + 0.7

@@ -2,8 +2,8 @@
 
 import html
 
-from dpl.viewer.picture import BANDS, colours
-from dpl.viewer.state import QUANTITIES, Frame
+from dpl.viewer.frames import QUANTITIES, Frame
+from dpl.viewer.rasterizer import BANDS, colours
 
 GOOD, DOUBT, BAD = "#15803d", "#b45309", "#b91c1c"
 ROW = (

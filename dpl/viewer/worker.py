@@ -6,8 +6,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from dpl.viewer.loads import Asked
-from dpl.viewer.state import Body, Frame, Wish, between
+from dpl.viewer.drag_loads import Asked
+from dpl.viewer.frames import Body, Frame, Wish, between
 
 Make = Callable[[], Asked]
 NEAR = 1e-3  # part of the way at which a load has arrived

@@ -6,10 +6,10 @@ import itertools
 import pytest
 import torch
 
-from dpl.benchmarks import accuracy, meshes
-from dpl.benchmarks.rows import write
-from dpl.fem.solution import solve
-from dpl.hybrid import Direct, Hybrid
+from dpl.evaluation import pareto
+from dpl.evaluation.tables import write
+from dpl.fem.solvers.solution import solve
+from dpl.inference.hybrid import Direct, Hybrid
 from dpl.scene import Sample
 
 
@@ -34,7 +34,7 @@ def solvers(scene):
 
 @pytest.fixture(scope="module")
 def rows(solvers, batch):
-    return accuracy.points(solvers, batch)
+    return pareto.points(solvers, batch)
 
 
 def test_every_iterate_has_a_row_and_time_goes_on(rows, solvers):
@@ -67,17 +67,17 @@ def test_threads_are_set_and_given_back(solvers, batch):
             seen.append(torch.get_num_threads())
             return solvers["near"].iterate(load)
 
-    (row,) = accuracy.points({"spy": Spy()}, batch, threads=2)
+    (row,) = pareto.points({"spy": Spy()}, batch, threads=2)
     assert set(seen) == {2}
     assert row.threads == 2
     assert torch.get_num_threads() == before
 
 
 def test_the_figure_and_the_rows_are_written(rows, tmp_path):
-    others = [meshes.Discretisation((4, 1, 1), 1, 60, 3.0, -18.8, 0.34)]
+    others = [pareto.Discretisation((4, 1, 1), 1, 60, 3.0, -18.8, 0.34)]
     write(rows, tmp_path / "a.csv")
-    accuracy.draw(rows, others, 0.01, tmp_path / "a.png")
-    accuracy.draw(rows, [], None, tmp_path / "b.png")
+    pareto.draw(rows, others, 0.01, tmp_path / "a.png")
+    pareto.draw(rows, [], None, tmp_path / "b.png")
     sizes = [(tmp_path / name).stat().st_size for name in ("a.png", "b.png")]
     assert sizes[0] > sizes[1] > 10_000
     written = list(csv.DictReader((tmp_path / "a.csv").open()))

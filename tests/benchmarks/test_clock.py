@@ -5,18 +5,18 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from dpl.benchmarks import clock
-from dpl.losses import MSE
+from dpl.evaluation import timing
+from dpl.inference.simulator import Simulator
 from dpl.models.fcnn import FCNN
-from dpl.module import Surrogate
-from dpl.simulator import Simulator
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate
 
 
 @pytest.fixture
 def watch(monkeypatch):
     """A clock that only goes on where it is told to [s]."""
     watch = SimpleNamespace(now=0.0)
-    monkeypatch.setattr(clock, "time", SimpleNamespace(perf_counter=lambda: watch.now))
+    monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: watch.now))
     return watch
 
 
@@ -25,11 +25,11 @@ def test_percentiles_are_those_of_the_calls_after_the_warm_up(watch):
 
     def answer(load):
         asked.append(load)
-        warm = len(asked) > clock.WARM_UP
+        warm = len(asked) > timing.WARM_UP
         watch.now += 1e-3 * (load + 1) if warm else 100.0
 
-    found = clock.latency(answer, range(101), repeats=2)
-    assert asked == [*range(clock.WARM_UP), *range(101), *range(101)]
+    found = timing.latency(answer, range(101), repeats=2)
+    assert asked == [*range(timing.WARM_UP), *range(101), *range(101)]
     assert found.loads == 101
     assert found.p50 == pytest.approx(51.0)
     assert found.p99 == pytest.approx(100.0)
@@ -37,7 +37,7 @@ def test_percentiles_are_those_of_the_calls_after_the_warm_up(watch):
 
 def test_the_median_of_an_even_number_of_times_is_the_mean_of_the_two_in_the_middle():
     times = torch.tensor([4.0, 1.0, 2.0, 3.0], dtype=torch.float64)
-    assert clock.percentiles(times)[0] == 2.5
+    assert timing.percentiles(times)[0] == 2.5
 
 
 def test_calls_are_timed_on_one_thread(monkeypatch):
@@ -45,7 +45,7 @@ def test_calls_are_timed_on_one_thread(monkeypatch):
     torch.set_num_threads(2)
     try:
         seen = set()
-        clock.latency(lambda load: seen.add(torch.get_num_threads()), range(3))
+        timing.latency(lambda load: seen.add(torch.get_num_threads()), range(3))
         assert seen == {1}
         assert torch.get_num_threads() == 2
     finally:
@@ -70,11 +70,11 @@ def test_the_simulator_with_its_checks_and_the_bare_network_are_asked_the_same_l
 
     monkeypatch.setattr(Simulator, "__call__", told("simulator", Simulator.__call__))
     monkeypatch.setattr(Surrogate, "forward", told("network", Surrogate.forward))
-    found = clock.latencies(simulator, batch.load)
+    found = timing.latencies(simulator, batch.load)
     assert list(found) == ["sim(force)", "bare network"]
     assert [one.loads for one in found.values()] == [12, 12]
     unit = scene.force_unit * 4500.0
-    newtons = [*range(clock.WARM_UP), *range(12)]
+    newtons = [*range(timing.WARM_UP), *range(12)]
     for pairs in asked.values():
         assert len(pairs) == len(newtons)
         for (force, _), k in zip(pairs, newtons, strict=True):
@@ -88,10 +88,10 @@ def test_the_simulator_with_its_checks_and_the_bare_network_are_asked_the_same_l
 
 def test_a_line_names_both_latencies():
     measured = {
-        "sim(force)": clock.Latency(100, 4.61, 112.0),
-        "bare network": clock.Latency(100, 1.13, 5.04),
+        "sim(force)": timing.Latency(100, 4.61, 112.0),
+        "bare network": timing.Latency(100, 1.13, 5.04),
     }
-    assert clock.told(measured) == (
+    assert timing.told(measured) == (
         "latency, 1 thread, 100 loads: sim(force) p50 4.6 ms, p99 110 ms; "
         "bare network p50 1.1 ms, p99 5 ms"
     )

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dpl.benchmarks import convergence
-from dpl.benchmarks.convergence import (
+from dpl.evaluation import newton_starts
+from dpl.evaluation.newton_starts import (
     PlainNewton,
     Trial,
     contestants,
@@ -16,9 +16,9 @@ from dpl.benchmarks.convergence import (
     measure,
     summary,
 )
-from dpl.benchmarks.rows import read, write
-from dpl.fem.newton import Newton
-from dpl.fem.solution import solve
+from dpl.evaluation.tables import read, write
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import solve
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_each_solver_has_a_row(scene, loads, networks, tol):
     rows = [row for row in summary(trials) if row.loads == "in range"]
     assert [(row.solver, row.network) for row in rows] == list(solvers)
     by = {(row.solver, row.network): row for row in rows}
-    reference = by[convergence.REFERENCE, ""]
+    reference = by[newton_starts.REFERENCE, ""]
     assert reference.ratio == 1.0
     assert reference.picked is None
     best, useless = by["hybrid, best rule", "near"], by["hybrid, best rule", "nan"]
@@ -92,7 +92,7 @@ def test_each_solver_has_a_row(scene, loads, networks, tol):
 
 
 def trial(solver, number, converged, ms, iterations=3, apart=0.0):
-    network = "" if solver == convergence.REFERENCE else "net"
+    network = "" if solver == newton_starts.REFERENCE else "net"
     return Trial(
         solver, network, "in range", 1e-6, number, converged, True, iterations, 1, ms, apart
     )
@@ -101,7 +101,7 @@ def trial(solver, number, converged, ms, iterations=3, apart=0.0):
 def test_rows_count_what_converged_and_compare_where_both_did():
     """Of four loads, robust Newton answers three, the hybrid three, both of them two."""
     trials = [
-        trial(convergence.REFERENCE, k, converged, ms)
+        trial(newton_starts.REFERENCE, k, converged, ms)
         for k, (converged, ms) in enumerate([(True, 10), (True, 30), (True, 99), (False, 999)])
     ]
     hybrid = [(True, 5, 1, 1e-7), (True, 15, 2, 1e-9), (False, 7, 40, 0.5), (True, 8, 6, 0.3)]
@@ -114,7 +114,7 @@ def test_rows_count_what_converged_and_compare_where_both_did():
     assert len(rows) == 6
     both = rows["in range and twice", "hybrid"]
     assert (both.count, both.converged, both.ratio, both.ms) == (8, 75, 20 / 40, 15)
-    reference, row = rows["in range", convergence.REFERENCE], rows["in range", "hybrid"]
+    reference, row = rows["in range", newton_starts.REFERENCE], rows["in range", "hybrid"]
     assert (reference.converged, reference.picked, reference.ratio) == (75, None, 1)
     assert (row.converged, row.picked, row.iterations, row.worst) == (75, 100, 3, 6)
     assert (row.ms, row.ratio, row.apart) == (8, 20 / 40, 1e-7)
@@ -123,7 +123,7 @@ def test_rows_count_what_converged_and_compare_where_both_did():
 def test_what_does_not_converge_has_no_iterations_and_no_time(scene, loads):
     hard = loads._replace(force=1e5 * loads.force)
     solver = Newton(scene.problem, smallest_step=0.9, max_iter=2)
-    trials = measure({(convergence.REFERENCE, ""): solver}, "in range", hard, 1e-8)
+    trials = measure({(newton_starts.REFERENCE, ""): solver}, "in range", hard, 1e-8)
     row, same = summary(trials)
     assert (row.loads, same.loads) == ("in range and twice", "in range")
     assert row.converged == 0
@@ -138,8 +138,8 @@ def test_answers_rows_and_figure_are_written(scene, loads, networks, tmp_path):
         replace(t, ms=0.0, apart=0.0) for t in trials
     ]
     assert [t.ms for t in again] == pytest.approx([t.ms for t in trials], rel=1e-3)
-    write(convergence.paper() + summary(trials), tmp_path / "a.csv")
-    convergence.draw(trials, tmp_path / "a.png")
+    write(newton_starts.paper() + summary(trials), tmp_path / "a.csv")
+    newton_starts.draw(trials, tmp_path / "a.png")
     written = list(csv.DictReader((tmp_path / "a.csv").open()))
     assert len(written) == 2 + 2 * (4 + 2 * 4)
     assert written[1]["picked"] == "66"

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.benchmarks import deflections, peers
-from dpl.benchmarks.rows import read, write
-from dpl.fem.materials import SaintVenantKirchhoff
+from benchmarks import deflections, peers
+from dpl.evaluation.tables import read, write
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
 
 
 @pytest.fixture(scope="module")

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.benchmarks import clock as timing
-from dpl.benchmarks.evaluation import Row, clock, compare, evaluate, save, show
-from dpl.fem.solution import Load, Solution, judge
-from dpl.losses import MSE
-from dpl.metrics import RelativeL2
+from dpl.evaluation import timing
+from dpl.evaluation.evaluate import Row, clock, compare, evaluate, save, show
+from dpl.fem.solvers.solution import Load, Solution, judge
 from dpl.models.fcnn import FCNN
-from dpl.module import Surrogate
 from dpl.scene import Sample
+from dpl.training.losses.supervised import MSE
+from dpl.training.metrics import RelativeL2
+from dpl.training.surrogate import Surrogate
 
 
 @pytest.fixture(scope="module")

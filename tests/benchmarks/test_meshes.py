@@ -5,20 +5,21 @@ from dataclasses import replace
 
 import pytest
 
-from dpl.benchmarks import meshes
-from dpl.benchmarks.peers import beam_scene, propeller_scene
-from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
+from benchmarks import discretisation
+from benchmarks.peers import beam_scene, propeller_scene
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
 
 
 def test_values_on_meshes_twice_as_fine_tend_to_the_limit():
     values = [3.0 + 0.5 * 4.0**-k for k in range(3)]
-    assert meshes.limit(*values) == pytest.approx(3.0, rel=1e-12)
+    assert discretisation.limit(*values) == pytest.approx(3.0, rel=1e-12)
 
 
 def test_finer_meshes_are_nearer_to_the_limit_and_quadratic_ones_nearer_still():
     """The tips are those of the verification dossier, 1.8e: Saint Venant-Kirchhoff, q = 20 Pa."""
-    family = replace(meshes.FAMILIES["beam"], linear=((4, 1, 1), (8, 2, 2), (16, 4, 4)))
-    rows = meshes.discretisations(family, SaintVenantKirchhoff(0.3), repeats=1)
+    family = replace(discretisation.FAMILIES["beam"], linear=((4, 1, 1), (8, 2, 2), (16, 4, 4)))
+    rows = discretisation.discretisations(family, SaintVenantKirchhoff(0.3), repeats=1)
     tips = [mesh.value for mesh in rows]
     known = [-18.7537, -24.79226, -27.28787, -27.72827, -28.2134, -28.3413]
     assert tips == pytest.approx(known, abs=5e-5)
@@ -32,8 +33,8 @@ def test_finer_meshes_are_nearer_to_the_limit_and_quadratic_ones_nearer_still():
 
 def test_where_there_is_no_limit_the_finest_quadratic_mesh_stands_for_it():
     few = ((1, 1, 1, 2, 4), (1, 1, 1, 3, 8))
-    family = replace(meshes.FAMILIES["propeller"], linear=few, quadratic=few)
-    rows = meshes.discretisations(family, NeoHookeanLn(0.3), repeats=1)
+    family = replace(discretisation.FAMILIES["propeller"], linear=few, quadratic=few)
+    rows = discretisation.discretisations(family, NeoHookeanLn(0.3), repeats=1)
     assert [(mesh.cells, mesh.degree) for mesh in rows] == [(few[0], 1), (few[1], 1), (few[0], 2)]
     assert rows[0].error > rows[1].error > rows[2].error > 0
     assert rows[2].value == pytest.approx(5.1e-3, rel=0.1)  # the blades bend, tips by 0.05 L
@@ -41,6 +42,8 @@ def test_where_there_is_no_limit_the_finest_quadratic_mesh_stands_for_it():
 
 def test_the_paper_s_bodies_are_known_by_their_meshes(scene):
     beam = beam_scene(SaintVenantKirchhoff(0.3)).problem
-    assert meshes.family_of(beam) is meshes.FAMILIES["beam"]
-    assert meshes.family_of(propeller_scene().problem) is meshes.FAMILIES["propeller"]
-    assert meshes.family_of(scene.problem) is None
+    assert discretisation.family_of(beam) is discretisation.FAMILIES["beam"]
+    assert (
+        discretisation.family_of(propeller_scene().problem) is discretisation.FAMILIES["propeller"]
+    )
+    assert discretisation.family_of(scene.problem) is None

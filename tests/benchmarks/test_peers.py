@@ -7,8 +7,8 @@ import textwrap
 
 import pytest
 
-from dpl.benchmarks import blas, peers
-from dpl.fem.solution import solve
+from benchmarks import blas_detection, peers
+from dpl.fem.solvers.solution import solve
 
 
 def test_cases_are_the_fields_scenes():
@@ -85,19 +85,19 @@ REFERENCE = "/usr/lib/x86_64-linux-gnu/blas/libblas.so.3.11.0"
     ],
 )
 def test_a_blas_is_named_after_its_file_and_folder(libraries, told):
-    assert blas.name(libraries) == told
+    assert blas_detection.name(libraries) == told
 
 
 def test_a_folder_with_openblas_as_the_blas_is_found(tmp_path):
-    assert blas.optimised(f"{tmp_path}/*/openblas*/libblas.so.3") is None
+    assert blas_detection.optimised(f"{tmp_path}/*/openblas*/libblas.so.3") is None
     file = tmp_path / "lib/openblas-pthread/libblas.so.3"
     file.parent.mkdir(parents=True)
     file.touch()
-    assert blas.optimised(f"{tmp_path}/*/openblas*/libblas.so.3") == str(file.parent)
+    assert blas_detection.optimised(f"{tmp_path}/*/openblas*/libblas.so.3") == str(file.parent)
 
 
 def test_a_peer_with_the_reference_blas_is_given_openblas_which_its_note_names(peer, monkeypatch):
-    monkeypatch.setattr(blas, "optimised", lambda: "/opt/openblas-pthread")
+    monkeypatch.setattr(blas_detection, "optimised", lambda: "/opt/openblas-pthread")
     times = peers.measured_peer(sys.executable, peer(libraries=[REFERENCE]), 1)
     assert times["S1"].note == "tip to 0e+00 L, a note, OpenBLAS"
 
@@ -106,7 +106,7 @@ def test_a_peer_with_the_reference_blas_is_given_openblas_which_its_note_names(p
     ("libraries", "flaw"), [([REFERENCE], "the reference BLAS"), ([], "no known BLAS")]
 )
 def test_a_peer_without_an_optimised_blas_is_not_compared(peer, monkeypatch, libraries, flaw):
-    monkeypatch.setattr(blas, "optimised", lambda: None)
+    monkeypatch.setattr(blas_detection, "optimised", lambda: None)
     with pytest.raises(OSError, match=f"it uses {flaw}.* libopenblas0") as refused:
         peers.measured_peer(sys.executable, peer(libraries=libraries), 1)
     assert "\n" not in str(refused.value)

@@ -6,20 +6,21 @@ import json
 import pytest
 import torch
 
-from dpl.benchmarks import results
-from dpl.fem.solution import solve
-from dpl.losses import MSE
-from dpl.metrics import metrics
+from benchmarks import paper_tables
+from dpl.evaluation import methods
+from dpl.fem.solvers.solution import solve
 from dpl.models.latent import Latent
 from dpl.models.pod import PODNet
-from dpl.module import Surrogate
+from dpl.training.losses.supervised import MSE
+from dpl.training.metrics import metrics
+from dpl.training.surrogate import Surrogate
 
 SMALL = {"width": 16, "blocks": 1}
 
 
 @pytest.fixture(scope="module")
 def sets(scene, batch):
-    return results.load_sets(scene, batch, 6)
+    return paper_tables.load_sets(scene, batch, 6)
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +33,8 @@ def rows(scene, batch, sets):
     def cheat(load):
         return torch.stack([known[tuple(f.flatten().tolist())] for f in load.force])
 
-    methods = {"linear": results.linear(scene), "truth": results.Method(cheat, 12, 1.5, 7)}
-    found = results.measure(methods, sets, scene.solver, generation_minutes=3.0, repeats=1)
+    compared = {"linear": methods.linear(scene), "truth": methods.Method(cheat, 12, 1.5, 7)}
+    found = paper_tables.measure(compared, sets, scene.solver, generation_minutes=3.0, repeats=1)
     return {(row.method, row.loads): (row, errors) for row, errors in found}
 
 
@@ -44,7 +45,7 @@ def sizes(field):
 def test_sets_are_in_range_beyond_it_and_far_below(scene, batch, sets):
     assert list(sets) == ["in range", "twice", "small"]
     assert sets["in range"] is batch
-    drawn = {k: scene.loads.sample((0, s), range(6)).force for k, s in results.STREAMS.items()}
+    drawn = {k: scene.loads.sample((0, s), range(6)).force for k, s in paper_tables.STREAMS.items()}
     for name, (low, high) in {"twice": (1, 2), "small": (0.01, 0.1)}.items():
         factor = sizes(sets[name].force) / sizes(drawn[name])
         assert float(factor[0]) == pytest.approx(low)
@@ -66,8 +67,8 @@ def test_loads_without_an_answer_are_left_out(scene, batch, monkeypatch):
         answer.status[1] = 2
         return answer
 
-    monkeypatch.setattr(results, "solve", fails)
-    found = results.load_sets(scene, batch, 4)
+    monkeypatch.setattr(paper_tables, "solve", fails)
+    found = paper_tables.load_sets(scene, batch, 4)
     assert [len(found[name].force) for name in ("twice", "small")] == [3, 3]
 
 
@@ -113,8 +114,8 @@ def test_corrections_bring_answers_nearer_and_leave_the_network_alone(scene, bat
     with torch.no_grad():
         for parameter in module.net.parameters():
             parameter.mul_(0.3)
-    plain = results.Method(module.predict, len(batch.force), 2.0, 5)
-    tier = results.corrected(module, plain, batch, rank=20, tolerance=1e-4, steps=2)
+    plain = methods.Method(module.predict, len(batch.force), 2.0, 5)
+    tier = methods.corrected(module, plain, batch, rank=20, tolerance=1e-4, steps=2)
     with torch.no_grad():
         first, after, again = (m.predict(batch.load) for m in (plain, tier, plain))
     assert torch.equal(first, again)
@@ -130,25 +131,25 @@ def test_corrections_bring_answers_nearer_and_leave_the_network_alone(scene, bat
 
 
 def test_the_rom_comes_near_the_truth(scene, batch):
-    found = results.pod_galerkin(scene, batch, rank=10, tolerance=1e-4)
+    found = methods.pod_galerkin(scene, batch, rank=10, tolerance=1e-4)
     far = sizes(found.predict(batch.load) - batch.displacement) / sizes(batch.displacement)
     assert float(far.max()) < 1e-2
     assert found.samples == len(batch.force)
 
 
 def test_minutes_are_summed_over_sessions(tmp_path):
-    assert results.training_minutes(tmp_path) is None
+    assert methods.training_minutes(tmp_path) is None
     (tmp_path / "training.jsonl").write_text('{"seconds": 30.0}\n{"seconds": 90.0}\n')
-    assert results.training_minutes(tmp_path) == 2.0
+    assert methods.training_minutes(tmp_path) == 2.0
 
 
 def test_rows_of_the_paper_are_marked_as_such():
-    (row,) = results.paper("beam_svk")
+    (row,) = paper_tables.paper("beam_svk")
     assert (row.method, row.e_mean, row.SNR_min, row.ms) == ("paper", 8e-6, 8.4, None)
     assert row.rel_L2_worst == pytest.approx(0.38, abs=0.005), "the paper's text: 38 %"
-    both = results.paper("beam_young")
+    both = paper_tables.paper("beam_young")
     assert [(row.method, row.samples) for row in both] == [("paper", 10650), ("paper, 3b", None)]
-    assert results.paper("mine") == []
+    assert paper_tables.paper("mine") == []
 
 
 # ------------------------------------------------------------------ the command

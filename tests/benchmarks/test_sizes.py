@@ -4,8 +4,8 @@ import csv
 
 import pytest
 
-from dpl.benchmarks import sizes as beams
-from dpl.benchmarks.rows import write
+from benchmarks import sizes as beams
+from dpl.evaluation.tables import write
 
 
 @pytest.mark.slow

@@ -8,11 +8,11 @@ import pytest
 import torch
 from safetensors.torch import load_file, save
 
-from dpl.data import audit
-from dpl.data.audit import flaw_of_modes, repair, verify
-from dpl.data.generate import DataSet
-from dpl.data.store import Store
-from dpl.fem.modes import Modes
+from dpl.data.dataset import DataSet
+from dpl.data.storage import integrity
+from dpl.data.storage.integrity import flaw_of_modes, repair, verify
+from dpl.data.storage.store import Store
+from dpl.fem.loads.eigenmodes import Modes
 
 SIZES = {"train": 12, "val": 4, "test": 4}
 
@@ -94,7 +94,7 @@ def test_loads_that_are_wanted_and_not_there_are_noticed(copy, lost, told):
 
 
 def test_a_part_of_a_data_set_answers_for_its_own_loads_alone(copy, monkeypatch):
-    monkeypatch.setattr("dpl.data.store.SHARD", 12)
+    monkeypatch.setattr("dpl.data.storage.store.SHARD", 12)
     found = [list(wanted(copy, train=24, shard=k, shards=2).verify()) for k in range(2)]
     assert found[0] == []
     assert [line.split()[1:3] for line in found[1]] == [["lacks", "12"]]
@@ -335,4 +335,4 @@ def test_the_command_fails_where_loads_that_it_asks_for_are_not_there(script, ma
 
 
 def test_the_reasons_that_lie_with_the_machine_are_those_that_are_recorded():
-    assert audit.MACHINE == ("timed out", "its worker died")
+    assert integrity.MACHINE == ("timed out", "its worker died")

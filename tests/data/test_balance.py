@@ -1,9 +1,9 @@
-"""Laws of `dpl.data.balance`: every load in one bin, and a biased set is called so."""
+"""Laws of `dpl.data.storage.acceptance`: every load in one bin, and a biased set is called so."""
 
 import numpy as np
 import pytest
 
-from dpl.data.balance import BINS, Bin, bins, table, warning
+from dpl.data.storage.acceptance import BINS, Bin, bins, table, warning
 
 
 def test_every_load_lies_in_one_bin_and_every_bin_holds_the_loads_between_its_ends():

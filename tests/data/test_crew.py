@@ -1,4 +1,4 @@
-"""Laws of `dpl.data.crew`: the same samples from any crew, whatever happens to its workers."""
+"""Laws of the worker pool: the same samples from any crew, whatever happens to its workers."""
 
 import multiprocessing
 import os
@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpl.data import crew
-from dpl.data.crew import Stop, outcomes
-from dpl.data.outcome import Job
-from dpl.fem.modes import ModalLoads
+from dpl.data.solving import worker_pool
+from dpl.data.solving.solve import Job
+from dpl.data.solving.worker_pool import Stop, outcomes
+from dpl.fem.loads.modal import ModalLoads
 from dpl.scene import Scene
 
 SEED = (5, 0)
@@ -115,7 +115,7 @@ def test_loads_are_solved_in_the_order_of_the_jobs_without_workers(scene, jobs, 
 
 
 def test_no_jobs_cost_no_process(scene, monkeypatch):
-    monkeypatch.setattr(crew, "spawning", lambda: None)  # nothing can be started
+    monkeypatch.setattr(worker_pool, "spawning", lambda: None)  # nothing can be started
     assert list(outcomes(scene, [], workers=2)) == []
 
 
@@ -149,7 +149,7 @@ def test_a_crew_closed_early_leaves_no_process_and_has_no_more_than_there_are_lo
 
 @pytest.mark.parametrize("tries", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_load_that_kills_every_worker_is_given_up_with_a_reason(scene, here, monkeypatch, tries):
-    monkeypatch.setattr(crew, "TRIES", tries)
+    monkeypatch.setattr(worker_pool, "TRIES", tries)
     victim = fragile(scene, victim=1)
     found = {one.job.number: one for one in outcomes(victim, _jobs(1, 0), workers=1)}
     assert content(found[0]) == here[0]
@@ -162,7 +162,7 @@ def test_a_load_that_kills_every_worker_is_given_up_with_a_reason(scene, here, m
 
 def test_a_load_that_hangs_is_recorded_and_the_others_are_solved(scene, here, monkeypatch):
     """A worker has more time for its first load, once: or else this test would not end."""
-    monkeypatch.setattr(crew, "GRACE", 1e6)
+    monkeypatch.setattr(worker_pool, "GRACE", 1e6)
     victim = fragile(scene, victim=1, harm="hang")
     found = {
         one.job.number: one for one in outcomes(victim, _jobs(0, 1, 2), workers=1, timeout=0.5)
@@ -176,13 +176,13 @@ def test_a_load_that_hangs_is_recorded_and_the_others_are_solved(scene, here, mo
 
 
 def test_workers_that_never_begin_are_replaced_too(scene, monkeypatch):
-    monkeypatch.setattr(crew, "GRACE", 0.0)
+    monkeypatch.setattr(worker_pool, "GRACE", 0.0)
     found = list(outcomes(scene, _jobs(0, 1, 2), workers=2, timeout=0.1))
     assert [one.reason for one in found] == 3 * ["timed out after 0.1 s"]
 
 
 def test_workers_that_all_die_end_the_run(scene, monkeypatch, capfd):
-    monkeypatch.setattr(crew, "HOPELESS", 1)
+    monkeypatch.setattr(worker_pool, "HOPELESS", 1)
     victim = fragile(scene, harm="raise")
     with pytest.raises(RuntimeError, match="1 workers died one after the other"):
         list(outcomes(victim, _jobs(0, 1), workers=1))
@@ -286,12 +286,12 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 import test_crew
-from dpl.data.crew import outcomes
-from dpl.data.outcome import Job
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import Plane, box
-from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Newton
+from dpl.data.solving.worker_pool import outcomes
+from dpl.data.solving.solve import Job
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import Plane, box
+from dpl.fem.loads.modal import ModalLoads
+from dpl.fem.solvers.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.scene import Scene
 

@@ -1,4 +1,4 @@
-"""Laws of `dpl.data.durable`: files are whole or not there, and a folder has one writer."""
+"""Laws of `dpl.system.files`: files are whole or not there, and a folder has one writer."""
 
 import errno
 import fcntl
@@ -12,13 +12,13 @@ from contextlib import contextmanager
 
 import pytest
 
-from dpl.data import durable
-from dpl.data.durable import DataSetError, append_line, read_lines, sole_writer, whole_file
+from dpl.system import files
+from dpl.system.files import DataSetError, append_line, read_lines, sole_writer, whole_file
 
 WRITER = """
 import sys, time
 from pathlib import Path
-from dpl.data.durable import sole_writer
+from dpl.system.files import sole_writer
 with sole_writer(Path(sys.argv[1])):
     print("writing", flush=True)
     time.sleep(600)
@@ -223,5 +223,5 @@ def test_a_writer_that_ends_while_it_is_asked_for_its_name_is_no_crash(tmp_path,
 
     with path.open("w") as holder:
         real(holder, fcntl.LOCK_EX)
-        monkeypatch.setattr(durable.fcntl, "flock", flock)
+        monkeypatch.setattr(files.fcntl, "flock", flock)
         assert held(tmp_path) in (True, False)

@@ -1,4 +1,4 @@
-"""Laws of `dpl.data.generate`: what is wanted, what is missing, and what is told of it."""
+"""Laws of `dpl.data.dataset`: what is wanted, what is missing, and what is told of it."""
 
 import json
 import os
@@ -7,11 +7,11 @@ import signal
 
 import pytest
 
-from dpl.data.generate import DataSet
-from dpl.data.outcome import lost, outcome
-from dpl.data.spool import Spool
-from dpl.data.writer import Writer
-from dpl.fem.materials import SaintVenantKirchhoff
+from dpl.data.dataset import DataSet
+from dpl.data.solving.solve import lost, outcome
+from dpl.data.storage.pending import Spool
+from dpl.data.storage.writer import Writer
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
 
 SIZES = {"train": 6, "val": 2, "test": 2}
 
@@ -35,7 +35,7 @@ def solved(monkeypatch):
         found.append((job.seed[1], job.number))
         return outcome(scene, job)
 
-    monkeypatch.setattr("dpl.data.crew.outcome", counted)
+    monkeypatch.setattr("dpl.data.solving.solve.outcome", counted)
     return found
 
 
@@ -118,7 +118,7 @@ def test_nothing_is_written_where_nothing_is_wanted(wanted):
 
 
 def test_parts_share_all_loads_among_them(wanted, monkeypatch):
-    monkeypatch.setattr("dpl.data.store.SHARD", 2)
+    monkeypatch.setattr("dpl.data.storage.store.SHARD", 2)
     parts = [wanted(shard=k, shards=3).missing() for k in range(3)]
     for split, size in SIZES.items():
         together = sorted(index for part in parts for index in part[split])
@@ -262,7 +262,7 @@ def test_a_biased_set_is_warned_of_on_one_line(wanted, monkeypatch, capsys):
         one = outcome(scene, job)
         return lost(scene, job, "not converged") if one.amplitude > 0.1 else one
 
-    monkeypatch.setattr("dpl.data.crew.outcome", picky)
+    monkeypatch.setattr("dpl.data.solving.solve.outcome", picky)
     store = wanted(train=80).fill()
     err = capsys.readouterr().err
     poor = [part for part in store.acceptance() if part.biased]

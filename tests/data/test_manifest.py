@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from dpl.data.manifest import MOST, is_number, kept_in, lines_of, place, torn_lines
+from dpl.data.storage.manifest import MOST, is_number, kept_in, lines_of, place, torn_lines
 
 LINE = {
     "file": "val-000064.safetensors",

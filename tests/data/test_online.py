@@ -18,9 +18,10 @@ import pytest
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
-from dpl.data.online import NEAR, Drawn, OnlineSamples, Rates, Replay, Worst
-from dpl.data.outcome import Job, outcome
-from dpl.fem.newton import Newton
+from dpl.data.replay_buffer import Rates, Replay
+from dpl.data.solving.solve import Job, outcome
+from dpl.data.stream import NEAR, Drawn, OnlineSamples, Worst
+from dpl.fem.solvers.newton import Newton
 from dpl.scene import Sample, stack
 
 SEED = (0, 0)
@@ -133,7 +134,7 @@ def test_rejected_loads_do_not_enter_the_stream(scene, drawn, monkeypatch):
     def choosy(scene, job, **options):
         return outcome(scene, job, **options)._replace(accepted=job.number % 3 == 1)
 
-    monkeypatch.setattr("dpl.data.online.outcome", choosy)
+    monkeypatch.setattr("dpl.data.solving.solve.outcome", choosy)
     first = itertools.islice(OnlineSamples(scene, SEED), 3)
     assert [one.sample.force.numpy().tobytes() for one in first] == [drawn[1], drawn[4], drawn[7]]
 
@@ -370,7 +371,7 @@ class Clocked(Numbers):
 def clocked(monkeypatch):
     """A stream whose clock is that of the replay."""
     stream = Clocked()
-    monkeypatch.setattr("dpl.data.online.time", stream)
+    monkeypatch.setattr("dpl.data.stream.time", stream)
     return stream
 
 
@@ -475,7 +476,7 @@ def unsolved(monkeypatch):
             job=job, point=point.numpy(), force=none, displacement=none, accepted=True
         )
 
-    monkeypatch.setattr("dpl.data.online.outcome", fake)
+    monkeypatch.setattr("dpl.data.solving.solve.outcome", fake)
     loads = SimpleNamespace(
         young_at=lambda points: points[:, -1], poisson_at=lambda points: points[:, :0]
     )
@@ -610,7 +611,7 @@ def test_a_load_that_hangs_is_timed_out_in_a_worker_and_left_out(
 ):
     """In this process, that says it is a worker."""
     monkeypatch.setattr(
-        "dpl.data.online.get_worker_info", lambda: SimpleNamespace(id=0, num_workers=1)
+        "dpl.data.stream.get_worker_info", lambda: SimpleNamespace(id=0, num_workers=1)
     )
     before = signal.getsignal(signal.SIGALRM)
     kept = []
@@ -751,7 +752,7 @@ PARENT = textwrap.dedent(
     import json, multiprocessing, sys, time
     sys.path.insert(0, sys.argv[1])
     from test_online import Busy
-    from dpl.data.online import Replay
+    from dpl.data.stream import Replay
 
     if __name__ == "__main__":
         stream = Replay(

@@ -1,4 +1,4 @@
-"""Laws of `dpl.data.outcome`: a load solved is a function of scene, stream and number."""
+"""Laws of `dpl.data.solving.solve`: a load solved is a function of scene, stream and number."""
 
 import pickle
 import subprocess
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.data.outcome import Job, lost, outcome
-from dpl.fem.materials import SaintVenantKirchhoff
+from dpl.data.solving.solve import Job, lost, outcome
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
 
 SEED = (5, 0)
 CLOCK = "seconds"
@@ -130,11 +130,11 @@ def test_a_change_of_the_number_of_threads_between_loads_is_survived(tmp_path, e
     code = """
 import torch
 from threadpoolctl import threadpool_limits
-from dpl.data.outcome import Job, outcome
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import Plane, box
-from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Newton
+from dpl.data.solving.solve import Job, outcome
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import Plane, box
+from dpl.fem.loads.modal import ModalLoads
+from dpl.fem.solvers.newton import Newton
 from dpl.fem.problem import Problem
 from dpl.scene import Scene
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 
 import pytest
 
-from dpl.data.processes import spawning
+from dpl.system.processes import spawning
 
 LONG = 120  # no test waits so long, unless a process is left behind [s]
 
@@ -35,11 +35,11 @@ PROGRAM = textwrap.dedent(
 )
 STARTS = {
     "a worker of a crew": """
-        from dpl.data.processes import spawning
+        from dpl.system.processes import spawning
         spawning().Process(target=task, daemon=True).start()
     """,
     "a worker of a stream": """
-        from dpl.data.online import Replay
+        from dpl.data.stream import Replay
         from torch.utils.data import IterableDataset
 
         class Source(IterableDataset):

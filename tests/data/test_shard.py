@@ -5,10 +5,10 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
-from dpl.data import store as store_module
-from dpl.data.outcome import Job, Outcome
-from dpl.data.shard import closed, opened, packed, taken, unpacked
-from dpl.data.store import runs
+from dpl.data.solving.solve import Job, Outcome
+from dpl.data.storage import store as store_module
+from dpl.data.storage.shard import closed, opened, packed, taken, unpacked
+from dpl.data.storage.store import runs
 
 SHAPE, DIMENSION = (4, 3), 2
 

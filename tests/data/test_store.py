@@ -15,19 +15,19 @@ import pytest
 import torch
 from safetensors.torch import load_file, save
 
-from dpl.data import crew
-from dpl.data import store as store_module
-from dpl.data import writer as writer_module
-from dpl.data.audit import MACHINE, repair, verify
-from dpl.data.crew import Stop
-from dpl.data.durable import DataSetError
-from dpl.data.outcome import Job, lost, outcome
-from dpl.data.shard import compact, spread
-from dpl.data.spool import Spool
-from dpl.data.store import Store
-from dpl.data.writer import Writer
-from dpl.fem.materials import SaintVenantKirchhoff
-from dpl.fem.mesh import rectangle
+from dpl.data.solving import worker_pool
+from dpl.data.solving.solve import Job, lost, outcome
+from dpl.data.solving.worker_pool import Stop
+from dpl.data.storage import store as store_module
+from dpl.data.storage import writer as writer_module
+from dpl.data.storage.integrity import MACHINE, repair, verify
+from dpl.data.storage.pending import Spool
+from dpl.data.storage.shard import compact, spread
+from dpl.data.storage.store import Store
+from dpl.data.storage.writer import Writer
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.mesh.generators import rectangle
+from dpl.system.files import DataSetError
 
 SIZES = {"train": 12, "val": 4, "test": 4}
 WANTED = {split: range(size) for split, size in SIZES.items()}
@@ -56,7 +56,7 @@ def solved(monkeypatch):
         found.append((*job.seed, job.number))
         return outcome(scene, job)
 
-    monkeypatch.setattr("dpl.data.crew.outcome", counted)
+    monkeypatch.setattr("dpl.data.solving.solve.outcome", counted)
     return found
 
 
@@ -199,7 +199,9 @@ def test_rejected_loads_are_recorded_with_reason_and_load_factor(hard, tmp_path)
 
 
 def test_a_shard_of_rejects_alone_is_a_shard(scene, fresh, monkeypatch):
-    monkeypatch.setattr("dpl.data.crew.outcome", lambda scene, job: lost(scene, job, "never"))
+    monkeypatch.setattr(
+        "dpl.data.solving.solve.outcome", lambda scene, job: lost(scene, job, "never")
+    )
     fill(fresh, {"train": range(3)})
     assert fresh.missing("train", 4) == [3]
     assert flaws(fresh) == {}
@@ -271,7 +273,7 @@ def test_the_bytes_do_not_depend_on_the_number_of_workers(data, fresh, workers):
 
 def test_the_bytes_do_not_depend_on_the_order_in_which_loads_are_solved(data, fresh, monkeypatch):
     def backwards(scene, jobs, **more):
-        return crew.outcomes(scene, list(jobs)[::-1], **more)
+        return worker_pool.outcomes(scene, list(jobs)[::-1], **more)
 
     monkeypatch.setattr(writer_module, "outcomes", backwards)
     fill(fresh, WANTED)
@@ -616,10 +618,10 @@ def test_an_empty_split_is_refused(copy):
 def test_a_folder_that_may_only_be_read_is_read(copy, environment):
     """Root may write everywhere, so it is mounted so."""
     code = (
-        "import sys; from dpl.data.durable import read_lines; from pathlib import Path; "
+        "import sys; from dpl.system.files import read_lines; from pathlib import Path; "
         "folder = Path(sys.argv[1]); "
         "assert len(read_lines(folder / 'manifest.jsonl')) == 3; "
-        "from dpl.data.store import Store; from dpl.data.writer import Writer; "
+        "from dpl.data.storage.store import Store; from dpl.data.storage.writer import Writer; "
         "from types import SimpleNamespace as N; import json; "
         "card = json.loads((folder / 'scene.json').read_text()); "
         "scene = N(fingerprint=card['fingerprint'], identity=lambda: card['scene'], "
@@ -916,10 +918,10 @@ def test_repair_retries_loads_that_the_machine_lost_and_no_others(hard, tmp_path
 
     monkeypatch.setattr(store_module, "SHARD", 3)
     fill(sound, {"train": range(9)})
-    monkeypatch.setattr("dpl.data.crew.outcome", unlucky)
+    monkeypatch.setattr("dpl.data.solving.solve.outcome", unlucky)
     fill(store, {"train": range(9)})
     assert store.digest("train", 9) != sound.digest("train", 9)
-    monkeypatch.setattr("dpl.data.crew.outcome", outcome)
+    monkeypatch.setattr("dpl.data.solving.solve.outcome", outcome)
     assert mended(store) == ["train-000000.safetensors", "train-000003.safetensors"]
     assert fill(store, {"train": store.missing("train", 9)}) == 6
     assert store.digest("train", 9) == sound.digest("train", 9)

@@ -7,9 +7,9 @@ import meshio
 import numpy as np
 import pytest
 
-from dpl.export import graph
+from dpl.export import onnx_graph
 
-MISSING = graph.missing()
+MISSING = onnx_graph.missing()
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_bad_input_ends_with_one_line(script, trained, arguments, told):
 
 
 def test_without_onnx_the_way_to_install_it_is_named(script, trained, monkeypatch):
-    monkeypatch.setattr(graph, "missing", lambda: ["onnx"])
+    monkeypatch.setattr(onnx_graph, "missing", lambda: ["onnx"])
     ended = script("export", "run=runs/first", cwd=trained)
     assert ended.status == 2
     assert "error: parts: model needs onnx: pip install" in ended.err

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from dpl.export import check
-from dpl.export import graph as graphs
+from dpl.export import onnx_graph as graphs
 from dpl.export.check import compare, distance, trial
 from dpl.export.folder import (
     described,
@@ -22,18 +22,18 @@ from dpl.export.folder import (
     verify,
     write,
 )
-from dpl.export.graph import Graph, Session, export
-from dpl.fem.mesh import rectangle
-from dpl.fem.solution import Load, solve
-from dpl.figures import surface, triangles
-from dpl.losses import MSE
+from dpl.export.onnx_graph import Graph, Session, export
+from dpl.fem.mesh.generators import rectangle
+from dpl.fem.postprocess.surface import surface, triangles
+from dpl.fem.solvers.solution import Load, solve
 from dpl.models.cnn import CNN
 from dpl.models.fcnn import FCNN
 from dpl.models.gnn import GNN
 from dpl.models.latent import Latent
 from dpl.models.pod import PODNet
-from dpl.module import Surrogate
 from dpl.scene import Sample
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate
 
 pytestmark = pytest.mark.skipif(
     bool(graphs.missing()), reason=f"{', '.join(graphs.missing())} not installed (extra onnx)"

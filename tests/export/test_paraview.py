@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.export.results import results
-from dpl.fem.fields import fields
-from dpl.fem.mesh import box, load, rectangle, save
-from dpl.fem.written import save_series
-from dpl.losses import MSE
+from dpl.export.paraview import results
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.reading import load
+from dpl.fem.mesh.writing import save, save_series
+from dpl.fem.postprocess.stress import fields
 from dpl.models.fcnn import FCNN
-from dpl.module import Surrogate
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate
 
 BODIES = {
     "hexahedron": (1, "hexahedron", 8),

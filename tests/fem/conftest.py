@@ -8,21 +8,22 @@ import skfem
 import torch
 from torch import Tensor
 
-from dpl.fem.forces import traction
-from dpl.fem.linear import SuperLU
-from dpl.fem.materials import (
-    LinearElastic,
-    Material,
-    MooneyRivlinK2,
+from dpl.fem.linear.superlu import SuperLU
+from dpl.fem.loads.forces import traction
+from dpl.fem.materials.linear_elastic import LinearElastic
+from dpl.fem.materials.material import Material
+from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
+from dpl.fem.materials.neo_hookean import (
     NeoHookeanIsoK2,
     NeoHookeanIsoK4,
     NeoHookeanLn,
-    OgdenK2,
-    SaintVenantKirchhoff,
     StableNeoHookean,
-    YeohK2,
 )
-from dpl.fem.mesh import Plane, box, rectangle
+from dpl.fem.materials.ogden import OgdenK2
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.materials.yeoh import YeohK2
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
 
 YOUNG, LENGTH = 4500.0, 100.0  # of the beam of VERIFICATION 1.8e [Pa], [m]

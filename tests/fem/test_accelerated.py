@@ -3,14 +3,16 @@
 import pytest
 import torch
 
-from dpl.fem.accelerated import Accelerated
-from dpl.fem.forces import Traction
-from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
-from dpl.fem.mesh import Plane, box, rectangle
-from dpl.fem.newton import Newton
+from dpl.fem.assembly.boundary_conditions import Displacement
+from dpl.fem.loads.forces import Traction
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, solve
-from dpl.fem.supports import Displacement
+from dpl.fem.solvers.anderson import Accelerated
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, solve
 
 
 def case(dim=3, law=None, degree=1, **more):

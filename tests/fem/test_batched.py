@@ -4,14 +4,16 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.fem.batched import BatchedNewton
-from dpl.fem.materials import NeoHookeanLn, YeohK2
-from dpl.fem.mesh import Plane, box
-from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Newton
+from dpl.fem.assembly.boundary_conditions import Displacement
+from dpl.fem.loads.modal import ModalLoads
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.materials.yeoh import YeohK2
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Status, solve
-from dpl.fem.supports import Displacement
+from dpl.fem.solvers.batched_newton import BatchedNewton
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, Status, solve
 
 
 @pytest.fixture(scope="module", params=[NeoHookeanLn(0.3), YeohK2(0.2, -0.02, 0.005, 2.0)])

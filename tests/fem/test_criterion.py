@@ -12,22 +12,24 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.data.outcome import Job, lost, outcome
-from dpl.fem.accelerated import Accelerated
-from dpl.fem.batched import BatchedNewton
-from dpl.fem.compliance import Linear
-from dpl.fem.forces import Traction
-from dpl.fem.krylov import conjugate_gradients
-from dpl.fem.materials import LinearElastic, NeoHookeanLn
-from dpl.fem.mesh import Plane, box
-from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Newton
+from dpl.data.solving.solve import Job, lost, outcome
+from dpl.fem.linear.krylov import conjugate_gradients
+from dpl.fem.loads.forces import Traction
+from dpl.fem.loads.modal import ModalLoads
+from dpl.fem.materials.linear_elastic import LinearElastic
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
-from dpl.fem.rom import PODGalerkin
-from dpl.fem.solution import Load, Solution, Status, judge, solve
-from dpl.fem.stability import branches
-from dpl.hybrid import RULES, Direct, Hybrid
-from dpl.viewer.state import Wish
+from dpl.fem.rom.galerkin import PODGalerkin
+from dpl.fem.solvers.anderson import Accelerated
+from dpl.fem.solvers.batched_newton import BatchedNewton
+from dpl.fem.solvers.bifurcation import branches
+from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, Solution, Status, judge, solve
+from dpl.inference.hybrid import RULES, Direct, Hybrid
+from dpl.viewer.frames import Wish
 
 ONE = torch.ones(1, dtype=torch.float64)
 

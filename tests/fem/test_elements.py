@@ -7,9 +7,11 @@ import pytest
 import skfem
 import torch
 
-from dpl.fem.elements import CURVED, basis_of
-from dpl.fem.materials import LinearElastic, NeoHookeanLn
-from dpl.fem.mesh import box, check, rectangle
+from dpl.fem.assembly.elements import CURVED, basis_of
+from dpl.fem.materials.linear_elastic import LinearElastic
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.validation import check
 from dpl.fem.problem import Problem
 
 H = np.array([[0.02, 0.05, -0.01], [0.03, -0.04, 0.02], [-0.02, 0.01, 0.03]])

@@ -10,15 +10,18 @@ import skfem
 import torch
 from torch.testing import assert_close
 
-from dpl.fem.compliance import Linear
-from dpl.fem.forces import BodyForce, Traction, body_force, traction
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import Box, Cylinder, Plane, Sphere, box, check, propeller
-from dpl.fem.modes import eigenmodes
-from dpl.fem.newton import Newton
+from dpl.fem.assembly.boundary_conditions import Displacement, Spring
+from dpl.fem.loads.eigenmodes import eigenmodes
+from dpl.fem.loads.forces import BodyForce, Traction, body_force, traction
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.propeller import propeller
+from dpl.fem.mesh.regions import Box, Cylinder, Plane, Sphere
+from dpl.fem.mesh.validation import check
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, solve
-from dpl.fem.supports import Displacement, Spring
+from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, solve
 from dpl.fem.symmetry import symmetries
 
 NH, EPS = NeoHookeanLn(0.3), np.finfo(float).eps

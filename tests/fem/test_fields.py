@@ -7,9 +7,10 @@ import pytest
 import torch
 from scipy.optimize import brentq
 
-from dpl.fem.fields import at_nodes, cauchy, fields, von_mises
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import Plane, box, rectangle
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.regions import Plane
+from dpl.fem.postprocess.stress import at_nodes, cauchy, fields, von_mises
 from dpl.fem.problem import Problem
 
 LAME, SHEAR = 0.3 / (1.3 * 0.4), 1 / 2.6  # of nu = 0.3, over E

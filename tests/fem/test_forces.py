@@ -7,11 +7,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.fem.compliance import Linear
-from dpl.fem.forces import BodyForce, Traction, body_force, traction
-from dpl.fem.materials import LinearElastic, NeoHookeanLn
-from dpl.fem.mesh import Plane, box, rectangle
+from dpl.fem.loads.forces import BodyForce, Traction, body_force, traction
+from dpl.fem.materials.linear_elastic import LinearElastic
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
+from dpl.fem.solvers.linear import Linear
 
 
 @pytest.fixture(params=[1.0, 4.0])

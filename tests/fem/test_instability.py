@@ -7,19 +7,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from dpl.fem.forces import Traction
-from dpl.fem.linear import SuperLU
-from dpl.fem.materials import (
-    Material,
-    NeoHookeanIsoK2,
-    NeoHookeanLn,
-    SaintVenantKirchhoff,
-)
-from dpl.fem.mesh import Plane, box
-from dpl.fem.newton import Newton
+from benchmarks.stress.fixtures import RUBBER, bowed, column, cube, load_of, stretched, swollen
+from dpl.fem.linear.superlu import SuperLU
+from dpl.fem.loads.forces import Traction
+from dpl.fem.materials.material import Material
+from dpl.fem.materials.neo_hookean import NeoHookeanIsoK2, NeoHookeanLn
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Solution, Status, judge, solve
-from dpl.stress.shapes import RUBBER, bowed, column, cube, load_of, stretched, swollen
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Solution, Status, judge, solve
 
 # a cell that is uniformly strained does not lock
 pytestmark = [

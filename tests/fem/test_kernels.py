@@ -14,13 +14,14 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from dpl.fem.lanes import WIDTH, load, sqrt, store
-from dpl.fem.materials import Hookean, Isotropic, NeoHookeanLn
-from dpl.fem.mesh import Plane
+from dpl.fem.assembly.boundary_conditions import Spring
+from dpl.fem.assembly.numba_laws import Law
+from dpl.fem.assembly.simd import WIDTH, load, sqrt, store
+from dpl.fem.materials.material import Hookean, Isotropic
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.materials.tensors import green_lagrange, invariants, trace
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
-from dpl.fem.slopes import Law
-from dpl.fem.supports import Spring
-from dpl.fem.tensors import green_lagrange, invariants, trace
 
 CLOSE = 1e-13  # of the largest entry
 LAWS = ["linear", "SVK", "NH-ln", "NHiso-k2", "NHiso-k4", "SNH", "MR", "Yeoh"]
@@ -250,7 +251,7 @@ def test_problem_sent_to_another_process_keeps_its_arrays(grid, bend):
 LAW = """
 from dataclasses import dataclass
 
-from dpl.fem.materials import Hookean, Isotropic
+from dpl.fem.materials.neo_hookean import Hookean, Isotropic
 
 FACTOR = {factor}
 

@@ -11,24 +11,17 @@ import torch
 from scipy.linalg.lapack import dpbtrs
 from scipy.sparse import csr_array
 
-from dpl.fem import linear
-from dpl.fem.band import Band32Factor, band_layout, substituted
-from dpl.fem.krylov import conjugate_gradients, multigrid_installed
-from dpl.fem.linear import (
-    BACKENDS,
-    Backend,
-    SingularMatrix,
-    backend,
-    chosen,
-    full_matrix,
-    installed,
-    slow_blas,
-)
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import Plane, box
+from dpl.fem.assembly.boundary_conditions import Spring
+from dpl.fem.linear import backends
+from dpl.fem.linear.backends import BACKENDS, backend, chosen, installed
+from dpl.fem.linear.banded import Band32Factor, band_layout, substituted
+from dpl.fem.linear.interface import Backend, Pattern, SingularMatrix, SymmetricProduct, full_matrix
+from dpl.fem.linear.krylov import conjugate_gradients, multigrid_installed
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
-from dpl.fem.sparse import Pattern, SymmetricProduct
-from dpl.fem.supports import Spring
+from dpl.system.blas import slow_blas
 
 KNOWN = ["band", "band32", "pardiso", "superlu", "cg"]
 DIRECT = ["band", "band32", "pardiso", "superlu"]  # those that solve indefinite matrices too
@@ -590,7 +583,7 @@ def test_compact_body_gets_a_sparse_factor(hide):
 def test_very_large_body_gets_multigrid_where_its_rigid_motions_are_known(monkeypatch, hide):
     pytest.importorskip("pyamg")
     wide, fields = of_band(800, 400), np.ones((800, 6))
-    monkeypatch.setattr(linear, "MULTIGRID", {"pardiso": 799, "superlu": 799})
+    monkeypatch.setattr(backends, "MULTIGRID", {"pardiso": 799, "superlu": 799})
     assert chosen("auto", wide, fields) == "cg"
     assert chosen("auto", wide) != "cg"
     assert chosen("auto", of_band(800, 40), fields) == "band"
@@ -602,7 +595,7 @@ def test_factor_that_lasts_is_direct_for_longer_and_never_in_float32(monkeypatch
     pytest.importorskip("pyamg")
     wide, fields = of_band(800, 400), np.ones((800, 6))
     for largest, name in ((799, "direct"), (266, "cg")):  # three times 266 is below 800
-        monkeypatch.setattr(linear, "MULTIGRID", {"pardiso": largest, "superlu": largest})
+        monkeypatch.setattr(backends, "MULTIGRID", {"pardiso": largest, "superlu": largest})
         assert chosen("auto", wide, fields) == "cg"
         assert (chosen("auto", wide, fields, lasting=True) == "cg") == (name == "cg")
     assert chosen("auto", of_band(8000, 300), lasting=True) == "band"
@@ -611,7 +604,7 @@ def test_factor_that_lasts_is_direct_for_longer_and_never_in_float32(monkeypatch
 
 
 def test_choice_is_between_the_backends_that_are_installed(monkeypatch):
-    monkeypatch.setattr(linear, "installed", lambda: ["superlu"])
+    monkeypatch.setattr(backends, "installed", lambda: ["superlu"])
     assert chosen("auto", of_band(200, 5)) == "superlu"
     assert type(backend(of_band(200, 5))).__name__ == "SuperLU"
 
@@ -669,8 +662,8 @@ def test_slow_kernels_on_a_fast_cpu_are_pointed_out(monkeypatch, tmp_path, flags
     (tmp_path / "cpuinfo").write_text(f"processor : 0\nflags : {flags}\n")
     library = {"internal_api": "openblas", "architecture": kernels}
     monkeypatch.delenv("OPENBLAS_CORETYPE", raising=False)
-    monkeypatch.setattr(linear, "CPUINFO", tmp_path / "cpuinfo")
-    monkeypatch.setattr(linear, "threadpool_info", lambda: [{"internal_api": "mkl"}, library])
+    monkeypatch.setattr(backends, "CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(backends, "threadpool_info", lambda: [{"internal_api": "mkl"}, library])
     said = slow_blas()
     assert said is None if advice is None else advice in said
     monkeypatch.setenv("OPENBLAS_CORETYPE", "Prescott")  # what the user has set is meant

@@ -11,21 +11,7 @@ import numpy as np
 import pytest
 import skfem
 
-from dpl.fem.mesh import (
-    Cylinder,
-    Tag,
-    aspect_ratio,
-    box,
-    check,
-    load,
-    longest_side,
-    nodes_in,
-    propeller,
-    rectangle,
-    save,
-    save_exactly,
-)
-from dpl.stress.flaws import (
+from benchmarks.stress.broken_meshes import (
     BAD,
     CORNERS,
     FAN,
@@ -35,6 +21,12 @@ from dpl.stress.flaws import (
     TWO_HEXES,
     write,
 )
+from dpl.fem.mesh.generators import aspect_ratio, box, longest_side, rectangle
+from dpl.fem.mesh.propeller import propeller
+from dpl.fem.mesh.reading import load
+from dpl.fem.mesh.regions import Cylinder, Tag, nodes_in
+from dpl.fem.mesh.validation import check
+from dpl.fem.mesh.writing import save, save_exactly
 
 
 def volumes(mesh: skfem.Mesh) -> np.ndarray:
@@ -688,7 +680,7 @@ def test_a_mesh_that_is_saved_exactly_is_loaded_to_the_last_bit(tmp_path, mesh):
 def test_the_propeller_s_nodes_have_one_order_on_all_processors():
     """NumPy sorts ties in one way on AVX-512, in others on AVX2 and without both."""
     program = (
-        "import numpy as np; from dpl.fem.mesh import propeller; m = propeller();"
+        "import numpy as np; from dpl.fem.mesh.generators import propeller; m = propeller();"
         "print(m.t.ravel()[:99].tolist(), np.round(m.p[:, :9], 9).tolist())"
     )
     printed = set()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.pattern import Pattern
+from dpl.fem.assembly.sparsity import Pattern
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
 from dpl.fem.problem import Problem
 
 KEPT = {"all": 1.0, "most": 0.8, "few": 0.1}

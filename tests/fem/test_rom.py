@@ -9,18 +9,21 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.fem.compliance import Linear
-from dpl.fem.cubature import Cubature, nonnegative
-from dpl.fem.materials import LinearElastic, NeoHookeanLn, SaintVenantKirchhoff
-from dpl.fem.mesh import Plane, box
-from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Newton
-from dpl.fem.pod import pod
+from dpl.fem.assembly.boundary_conditions import Displacement, Spring
+from dpl.fem.assembly.rigid_body_modes import rigid_motions
+from dpl.fem.loads.modal import ModalLoads
+from dpl.fem.materials.linear_elastic import LinearElastic
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
-from dpl.fem.rigid import rigid_motions
-from dpl.fem.rom import PODGalerkin
-from dpl.fem.solution import Load, Status, solve
-from dpl.fem.supports import Displacement, Spring
+from dpl.fem.rom.ecsw import Cubature, nonnegative
+from dpl.fem.rom.galerkin import PODGalerkin
+from dpl.fem.rom.pod import pod
+from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, Status, solve
 
 NH = NeoHookeanLn(0.3)
 
@@ -116,7 +119,7 @@ def test_rank_out_of_range_is_refused(rank):
 
 @pytest.mark.parametrize("large", [5, 2000], ids=["sketched", "exact"])
 def test_snapshots_that_are_not_finite_are_refused(monkeypatch, large):
-    monkeypatch.setattr("dpl.fem.pod.LARGE", large)
+    monkeypatch.setattr("dpl.fem.rom.pod.LARGE", large)
     with pytest.raises(ValueError, match="finite"):
         pod(noise(150, 400).log(), 2)
 
@@ -126,7 +129,7 @@ def test_snapshots_that_are_not_finite_are_refused(monkeypatch, large):
 def test_sketches_leave_hardly_more_than_the_best_basis(monkeypatch, shape, dtype):
     fields = (noise(*shape) @ torch.diag(0.8 ** torch.arange(shape[1]).double())).to(dtype)
     best = pod(fields, 6)
-    monkeypatch.setattr("dpl.fem.pod.LARGE", 100)
+    monkeypatch.setattr("dpl.fem.rom.pod.LARGE", 100)
     before = torch.get_rng_state()
     vectors, values = pod(fields, 6)
     assert torch.equal(before, torch.get_rng_state())

@@ -9,8 +9,8 @@ from scipy import stats
 from scipy.spatial import cKDTree
 from scipy.stats import qmc
 
-from dpl.fem import sampling
-from dpl.fem.sampling import (
+from dpl.fem.loads import sampling
+from dpl.fem.loads.sampling import (
     SAMPLINGS,
     even,
     independent,

@@ -3,13 +3,14 @@
 import pytest
 import torch
 
-from dpl.fem.forces import Traction
-from dpl.fem.materials import SaintVenantKirchhoff
-from dpl.fem.mesh import Plane, box
-from dpl.fem.newton import Newton
+from dpl.fem.loads.forces import Traction
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, Status, solve
-from dpl.fem.stability import branches, unstable_directions
+from dpl.fem.solvers.bifurcation import branches, unstable_directions
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, Solution, Status, solve
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 """Stress tests of VERIFICATION 2.2: what is said of bodies and loads that are hard or hopeless.
 
 T9 is in tests/test_run.py, T12, T14 and T15 are in test_mesh.py; T18 to T23 are the surrogates'.
-All of them, watched, are in `dpl.stress` too, whose bodies these are.
+All of them, watched, are in `benchmarks.stress` too, whose bodies these are.
 """
 
 import math
@@ -11,17 +11,29 @@ from functools import cache
 import pytest
 import torch
 
-from dpl.fem.compliance import Linear
-from dpl.fem.forces import Traction
-from dpl.fem.linear import installed
-from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
-from dpl.fem.mesh import Plane, box, check
-from dpl.fem.modes import eigenmodes
-from dpl.fem.newton import Newton
+from benchmarks.stress.fixtures import (
+    LOOSE,
+    column,
+    folded,
+    load_of,
+    loose,
+    nearest_node,
+    plate,
+    slivers,
+)
+from benchmarks.stress.invalid_input import NOWHERE, USES
+from dpl.fem.linear.backends import installed
+from dpl.fem.loads.eigenmodes import eigenmodes
+from dpl.fem.loads.forces import Traction
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.regions import Plane
+from dpl.fem.mesh.validation import check
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Solution, Status, judge, solve
-from dpl.stress.refusals import NOWHERE, USES
-from dpl.stress.shapes import LOOSE, column, folded, load_of, loose, nearest_node, plate, slivers
+from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Solution, Status, judge, solve
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
 DIRECT = [name for name in installed() if name != "cg"]

@@ -8,15 +8,17 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from dpl.fem.compliance import Linear
+from dpl.fem.assembly.boundary_conditions import Displacement
 from dpl.fem.dofs import gather
-from dpl.fem.forces import Traction
-from dpl.fem.materials import NeoHookeanLn, SaintVenantKirchhoff
-from dpl.fem.mesh import Plane, box, rectangle
-from dpl.fem.newton import Newton
+from dpl.fem.loads.forces import Traction
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Status, solve
-from dpl.fem.supports import Displacement
+from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, Status, solve
 
 NH, SVK = NeoHookeanLn(0.3), SaintVenantKirchhoff(0.3)
 

@@ -12,16 +12,16 @@ import meshio
 import numpy as np
 import pytest
 
-from dpl.fem import formats, untrusted
-from dpl.fem.files import _body
-from dpl.fem.mesh import box, load, rectangle
-from dpl.stress.flaws import CORNERS, FAN, PATCH, TETS, TWO_CUBES, TWO_HEXES, write
+from benchmarks.stress.broken_meshes import CORNERS, FAN, PATCH, TETS, TWO_CUBES, TWO_HEXES, write
+from dpl.fem.mesh import sandbox, sandbox_checks
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.reading import _body, load
 
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch):
     """The limit of a reader is more than any file here takes on a busy machine."""
-    monkeypatch.setattr(untrusted, "SECONDS", (60.0, 0.0))
+    monkeypatch.setattr(sandbox, "SECONDS", (60.0, 0.0))
 
 
 def refused(path, match: str) -> None:
@@ -251,17 +251,17 @@ def test_a_binary_count_is_read_too(tmp_path):
 def test_numbers_that_cost_memory_or_time_end_the_reader_only(tmp_path, name, text, monkeypatch):
     (tmp_path / name).write_text(text)
     with monkeypatch.context() as patch:
-        patch.setattr(untrusted, "SECONDS", (4.0, 0.0))
+        patch.setattr(sandbox, "SECONDS", (4.0, 0.0))
         refused(tmp_path / name, "more memory|ends too early|longer than")
     assert load(cube(tmp_path)).t.shape[0] == 4
 
 
 def test_a_reader_that_loops_is_ended(tmp_path, monkeypatch):
-    monkeypatch.setattr(untrusted, "SECONDS", (0.5, 0.0))
+    monkeypatch.setattr(sandbox, "SECONDS", (0.5, 0.0))
     path = cube(tmp_path, "slow.msh", file_format="gmsh22", binary=False)
     replaced(path, "$Elements", "$Periodic\n" + "99999999\n" + "0 0 0\n0\n" * 3_000_000)
     refused(path, "longer than")
-    monkeypatch.setattr(untrusted, "SECONDS", (60.0, 0.0))
+    monkeypatch.setattr(sandbox, "SECONDS", (60.0, 0.0))
     assert load(cube(tmp_path)).t.shape[0] == 4
 
 
@@ -314,7 +314,7 @@ def test_pipes_and_devices_are_refused_and_folders_are_no_files(tmp_path, suffix
 def test_files_of_more_than_four_gigabytes_are_refused(tmp_path):
     path = tmp_path / "large.vtu"
     with path.open("wb") as file:
-        file.truncate(formats.MOST_BYTES + 1)  # takes no room
+        file.truncate(sandbox_checks.MOST_BYTES + 1)  # takes no room
     refused(path, "GiB")
 
 
@@ -327,7 +327,7 @@ def test_a_link_to_a_good_file_is_read(tmp_path):
 @pytest.mark.parametrize("suffix", ["h5m", "med", "cgns", "hmf", "e", "vtu"])
 def test_hdf5_is_refused_without_h5py(tmp_path, suffix, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
-    (tmp_path / f"a.{suffix}").write_bytes(formats.HDF5 + bytes(100))
+    (tmp_path / f"a.{suffix}").write_bytes(sandbox_checks.HDF5 + bytes(100))
     refused(tmp_path / f"a.{suffix}", "h5py")
 
 
@@ -367,12 +367,12 @@ def _virtual(h5py):
 def test_a_reader_that_was_killed_is_started_again(tmp_path):
     path = cube(tmp_path)
     load(path)
-    untrusted.READER._process.kill()
-    untrusted.READER._process.wait()
+    sandbox.READER._process.kill()
+    sandbox.READER._process.wait()
     assert load(path).t.shape[0] == 4
-    first = untrusted.READER._process.pid
+    first = sandbox.READER._process.pid
     load(path)
-    assert untrusted.READER._process.pid == first
+    assert sandbox.READER._process.pid == first
 
 
 def test_a_path_from_the_working_folder_is_found_from_wherever_the_reader_started(

@@ -13,20 +13,18 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.testing import assert_close
 
-from dpl.fem.compliance import Linear
-from dpl.fem.forces import Traction, body_force, traction
-from dpl.fem.materials import (
-    LinearElastic,
-    Material,
-    NeoHookeanIsoK4,
-    NeoHookeanLn,
-    SaintVenantKirchhoff,
-)
-from dpl.fem.mesh import Plane, box
-from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Newton
+from dpl.fem.loads.forces import Traction, body_force, traction
+from dpl.fem.loads.modal import ModalLoads
+from dpl.fem.materials.linear_elastic import LinearElastic
+from dpl.fem.materials.material import Material
+from dpl.fem.materials.neo_hookean import NeoHookeanIsoK4, NeoHookeanLn
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, solve
+from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, Solution, solve
 from dpl.scene import Scene
 
 FIELDS = Path(__file__).parents[3] / "shared" / "reference" / "fields"

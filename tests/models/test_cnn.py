@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem.mesh import rectangle
-from dpl.fem.solution import solve
-from dpl.hybrid import Direct, Hybrid
-from dpl.losses import MSE
+from dpl.fem.mesh.generators import rectangle
+from dpl.fem.solvers.solution import solve
+from dpl.inference.hybrid import Direct, Hybrid
 from dpl.models import cnn
 from dpl.models.cnn import CNN
 from dpl.models.grid import Immersion, Permutation, filling, own_grid
-from dpl.module import Surrogate
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate
 
 
 def shaken(mesh, size=0.1):

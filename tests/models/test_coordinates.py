@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from dpl.fem.symmetry import images
-from dpl.losses import MSE, LrStar, MeanNorm
-from dpl.models.coordinates import Coordinates, CoordinateSamples
 from dpl.models.fcnn import FCNN
 from dpl.models.latent import Latent
 from dpl.models.pod import PODNet
-from dpl.module import Surrogate, scales
+from dpl.models.reduced_samples import Coordinates, CoordinateSamples
 from dpl.scene import Sample
+from dpl.training.losses.residual import LrStar
+from dpl.training.losses.supervised import MSE, MeanNorm
+from dpl.training.surrogate import Surrogate, scales
 
 SMALL = {"width": 16, "blocks": 1}
 KINDS = {
@@ -29,7 +30,7 @@ CASES = pytest.mark.parametrize(("kind", "options"), KINDS.values(), ids=KINDS)
 def scales_of_a_scene_once():
     """They are a function of the scene and take longer than all the rest."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dpl.module.scales", functools.cache(scales))
+        patch.setattr("dpl.training.surrogate.scales", functools.cache(scales))
         yield
 
 

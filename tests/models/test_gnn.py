@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import box, rectangle
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import box, rectangle
 from dpl.fem.problem import Problem
-from dpl.losses import MSE
 from dpl.models import gnn
 from dpl.models.gnn import GNN, Filtered
 from dpl.models.graph import COARSEST, coarser, mesh_graph
-from dpl.module import Surrogate
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate
 
 BODIES = {
     "hexahedra": {"nodes": (9, 4, 4)},

@@ -7,13 +7,13 @@ import shutil
 import pytest
 import torch
 
-from dpl import run
-from dpl.checkpoints import read
+from dpl.config import build, run_folder
 from dpl.data.datamodule import OnlineData
-from dpl.fem.solution import Load, solve
-from dpl.losses import MSE
+from dpl.fem.solvers.solution import Load, solve
 from dpl.models.latent import Latent
-from dpl.module import Surrogate, scales
+from dpl.training.checkpoints import read
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate, scales
 
 SMALL = {"width": 16, "blocks": 1}
 
@@ -22,7 +22,7 @@ SMALL = {"width": 16, "blocks": 1}
 def scales_of_a_scene_once():
     """They are a function of the scene and take longer than all the rest."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dpl.module.scales", functools.cache(scales))
+        patch.setattr("dpl.training.surrogate.scales", functools.cache(scales))
         yield
 
 
@@ -340,13 +340,13 @@ def alike(one, other):
 
 def test_a_run_comes_back_as_it_was(trained, home, monkeypatch):
     monkeypatch.chdir(home)
-    cfg, module = run.load_run(trained)
+    cfg, module = run_folder.load_run(trained)
     saved = checkpoint(trained, "best.safetensors")["state_dict"]
     assert cfg.model._target_.endswith("Latent")
     assert module.net.prepared
     assert alike(saved, dict(module.state_dict()))
-    again = run.load_run(trained)[1]
-    test = run.make(cfg, "data", scene=module.scene).samples("test")
+    again = run_folder.load_run(trained)[1]
+    test = build.make(cfg, "data", scene=module.scene).samples("test")
     with torch.no_grad():
         found = module.predict(test.load)
         assert torch.equal(found, again.predict(test.load))
@@ -359,9 +359,9 @@ def test_a_run_comes_back_as_it_was(trained, home, monkeypatch):
 
 def test_a_run_makes_its_bases_from_the_training_samples(trained, home, monkeypatch):
     monkeypatch.chdir(home)
-    cfg, module = run.load_run(trained)
-    train = run.make(cfg, "data", scene=module.scene).samples("train")
-    expected = run.build_surrogate(cfg, module.scene)
+    cfg, module = run_folder.load_run(trained)
+    train = build.make(cfg, "data", scene=module.scene).samples("train")
+    expected = build.build_surrogate(cfg, module.scene)
     expected.prepare(train)
     buffers = dict(expected.net.named_buffers())
     assert buffers["modes"].any()
@@ -426,10 +426,10 @@ def test_a_stream_trains_it_on_bases_of_the_validation_loads(script, overrides, 
     more = ["data=online", "data.batches=2", "data.fresh=4", "trainer.max_epochs=2"]
     ended = script("train", *kept, *more, cwd=home)
     assert ended.status == 0, ended.err
-    cfg, module = run.load_run(home / "stream")
-    data = run.make(cfg, "data", scene=module.scene)
+    cfg, module = run_folder.load_run(home / "stream")
+    data = build.make(cfg, "data", scene=module.scene)
     assert isinstance(data, OnlineData)
-    expected = run.build_surrogate(cfg, module.scene)
+    expected = build.build_surrogate(cfg, module.scene)
     expected.prepare(data.samples("val"))
     assert alike(dict(expected.net.named_buffers()), dict(module.net.named_buffers()))
     weights = [dict(one.net.named_parameters()) for one in (expected, module)]
@@ -478,5 +478,5 @@ def test_a_run_of_another_rank_is_refused(trained, home, monkeypatch, tmp_path):
     text = (tmp_path / "config.yaml").read_text()
     assert "rank: 160" in text
     (tmp_path / "config.yaml").write_text(text.replace("rank: 160", "rank: 20"))
-    with pytest.raises(run.ConfigError, match=r"best\.safetensors cannot be used"):
-        run.load_run(tmp_path)
+    with pytest.raises(build.ConfigError, match=r"best\.safetensors cannot be used"):
+        run_folder.load_run(tmp_path)

@@ -7,14 +7,14 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from dpl.fem.memory import refuse_weights
-from dpl.fem.solution import Load
-from dpl.losses import MSE
+from dpl.fem.solvers.solution import Load
 from dpl.models.fcnn import FCNN, _parameters
 from dpl.models.gnn import GNN
 from dpl.models.latent import Latent
 from dpl.models.pod import PODNet
-from dpl.module import Surrogate
+from dpl.system.memory import refuse_weights
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate
 
 MODELS = sorted((Path(__file__).parents[2] / "conf" / "model").glob("*.yaml"))
 

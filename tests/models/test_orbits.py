@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from dpl.fem.mesh import box
+from dpl.fem.mesh.generators import box
 from dpl.fem.symmetry import symmetries
-from dpl.models.orbits import Orbits, turned, turned_back
+from dpl.models.symmetric_fields import Orbits, turned, turned_back
 
 
 @pytest.fixture(scope="module", params=["even", "odd", "skew"])

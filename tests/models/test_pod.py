@@ -9,18 +9,19 @@ from contextlib import suppress
 import pytest
 import torch
 
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import Plane, box, rectangle
-from dpl.fem.modes import ModalLoads
-from dpl.fem.newton import Newton
+from dpl.fem.assembly.boundary_conditions import Displacement
+from dpl.fem.loads.modal import ModalLoads
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.regions import Plane
 from dpl.fem.problem import Problem
-from dpl.fem.solution import solve
-from dpl.fem.supports import Displacement
-from dpl.losses import MSE
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import solve
 from dpl.models.latent import Latent
 from dpl.models.pod import PODNet
-from dpl.module import Surrogate, scales
 from dpl.scene import Sample, Scene
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate, scales
 
 SMALL = {"width": 16, "blocks": 1}
 WHOLE = {"rank": 1000, "coordinates": 1000, **SMALL}  # no mode is left out
@@ -31,7 +32,7 @@ NETWORKS = pytest.mark.parametrize("kind", [PODNet, Latent])
 def scales_of_a_scene_once():
     """They are a function of the scene and take longer than all the rest."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dpl.module.scales", functools.cache(scales))
+        patch.setattr("dpl.training.surrogate.scales", functools.cache(scales))
         yield
 
 

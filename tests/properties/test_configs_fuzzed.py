@@ -23,9 +23,9 @@ from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
 from tried import at_most, counted
 
-from dpl import run
-from dpl.data.durable import DataSetError
-from dpl.fem.solution import solve
+from dpl.config import build, run_folder
+from dpl.fem.solvers.solution import solve
+from dpl.system.files import DataSetError
 
 CONF = Path(__file__).parents[2] / "conf"
 TINY = ["mesh.nodes=[5,3,3]", "loads.n_modes=3", "solver.linear=superlu"]
@@ -34,11 +34,12 @@ BLADES = ["mesh=propeller", "mesh.cells=[1,1,1,2,3]", "clamped=cylinder", "clamp
 SMALL = ["data.train=4", "data.val=2", "data.test=2", "data.batch_size=2", "data.workers=0"]
 DRAWN = ["loads=modal_small", "loads.radius.low=0.1"]
 HELD = [
-    "+supports.end={_target_: dpl.fem.supports.Displacement, value: [0.0, null, null], "
-    "region: {_target_: dpl.fem.mesh.Plane, axis: 0, at: max}}",
-    "+supports.soil={_target_: dpl.fem.supports.Spring, stiffness: 0.01, "
-    "region: {_target_: dpl.fem.mesh.Box, lower: [0, 0, 0], upper: [50, 25, 0]}}",
-    "+forces.weight={_target_: dpl.fem.forces.BodyForce, value: [0.0, 0.0, -1e-5]}",
+    "+supports.end={_target_: dpl.fem.assembly.boundary_conditions.Displacement, "
+    "value: [0.0, null, null], "
+    "region: {_target_: dpl.fem.mesh.regions.Plane, axis: 0, at: max}}",
+    "+supports.soil={_target_: dpl.fem.assembly.boundary_conditions.Spring, stiffness: 0.01, "
+    "region: {_target_: dpl.fem.mesh.regions.Box, lower: [0, 0, 0], upper: [50, 25, 0]}}",
+    "+forces.weight={_target_: dpl.fem.loads.forces.BodyForce, value: [0.0, 0.0, -1e-5]}",
 ]
 SCENES = {  # overrides of conf/generate.yaml
     "beam": TINY,
@@ -166,16 +167,16 @@ def harmed(draw):
 
 def works(cfg: DictConfig, folder: Path) -> None:
     """Make what a command makes before it computes, and let it answer a load."""
-    run.check(cfg)
+    build.check(cfg)
     if "mesh" not in cfg:
         return
-    scene = run.build_scene(cfg)
-    data = run.make(cfg, "data", scene=scene)
+    scene = build.build_scene(cfg)
+    data = build.make(cfg, "data", scene=scene)
     load = scene.loads.sample((0, 0), [0])
     surrogate = None
     if "model" in cfg:
-        surrogate = run.build_surrogate(cfg, scene)
-        trainer = run.make(cfg, "trainer")
+        surrogate = build.build_surrogate(cfg, scene)
+        trainer = build.make(cfg, "trainer")
         assert isinstance(trainer, L.Trainer)
     scene.plan()
     data.plan()
@@ -197,7 +198,7 @@ def refused(cfg: dict, folder: Path) -> str:
         with bounded(), warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # honest ones: thin cells, say
             works(made, folder)
-    except (run.ConfigError, DataSetError) as error:
+    except (build.ConfigError, DataSetError) as error:
         line = str(error)
         assert line
         assert "\n" not in line, line
@@ -244,15 +245,19 @@ FOREIGN = [  # what would do harm, and how it would be called
     {"_target_": "subprocess.Popen", "args": ["touch", "harm"]},
     {"_target_": "pathlib.Path.touch", "self": "harm"},
     {"_target_": "hydra.utils.call", "config": {"_target_": "os.system", "command": "touch harm"}},
-    {"_target_": "dpl.run.sys.exit", "_args_": [3]},
-    {"_target_": "dpl.run.make", "cfg": {"x": {"_target_": "os.getcwd"}}, "key": "x"},
-    {"_target_": "dpl.run.load_run", "folder": "evil", "trust": True},
-    {"_target_": "dpl.run.importlib", "name": "antigravity"},
+    {"_target_": "dpl.config.build.sys.exit", "_args_": [3]},
+    {"_target_": "dpl.config.build.make", "cfg": {"x": {"_target_": "os.getcwd"}}, "key": "x"},
+    {"_target_": "dpl.config.run_folder.load_run", "folder": "evil", "trust": True},
+    {"_target_": "dpl.config.build.importlib", "name": "antigravity"},
     {"_target_": "dpl.scene.partial", "func": "os.system"},
-    {"_target_": "dpl.module.append_line", "path": "harm", "line": {"a": 1}},
-    {"_target_": "dpl.data.durable.whole_file", "path": "harm"},
-    {"_target_": "dpl.fem.mesh.save", "mesh": {"_target_": "dpl.fem.mesh.box"}, "path": "harm.vtk"},
-    {"_target_": "dpl.benchmarks.peers.measured_peer", "python": "touch", "program": "harm"},
+    {"_target_": "dpl.training.surrogate.append_line", "path": "harm", "line": {"a": 1}},
+    {"_target_": "dpl.system.files.whole_file", "path": "harm"},
+    {
+        "_target_": "dpl.fem.mesh.writing.save",
+        "mesh": {"_target_": "dpl.fem.mesh.generators.box"},
+        "path": "harm.vtk",
+    },
+    {"_target_": "benchmarks.peers.measured_peer", "python": "touch", "program": "harm"},
     {
         "_target_": "lightning.pytorch.cli.instantiate_class",
         "args": ["touch harm"],
@@ -282,7 +287,11 @@ def poisoned(draw):
     call = deepcopy(draw(st.sampled_from(FOREIGN)))
     call |= draw(st.sampled_from([{}, {"_partial_": True}, {"_recursive_": False}]))
     deep = draw(st.sampled_from([None, "a", "_args_", "first"]))
-    put(cfg, path, call if deep is None else {"_target_": "dpl.losses.MSE", deep: [call]})
+    put(
+        cfg,
+        path,
+        call if deep is None else {"_target_": "dpl.training.losses.supervised.MSE", deep: [call]},
+    )
     return cfg
 
 
@@ -308,11 +317,11 @@ def tripwires(monkeypatch, elsewhere):
 def test_a_runs_folder_calls_nothing_but_the_objects_of_a_run(tripwires, cfg):
     made = OmegaConf.create(cfg)
     with bounded():
-        with pytest.raises(run.ConfigError):
-            run.check(made, trust=False)
+        with pytest.raises(build.ConfigError):
+            build.check(made, trust=False)
         (tripwires / "run" / "config.yaml").write_text(OmegaConf.to_yaml(made))
-        with pytest.raises(run.ConfigError) as refusal:
-            run.load_run(tripwires / "run")
+        with pytest.raises(build.ConfigError) as refusal:
+            run_folder.load_run(tripwires / "run")
     assert "best.ckpt" not in str(refusal.value), "it was built"
 
 
@@ -347,8 +356,8 @@ def test_what_a_runs_folder_may_name_is_of_a_kind_that_a_run_is_made_of(name, ke
     cfg = OmegaConf.create({"trainer": {"_target_": "lightning.Trainer"}})
     OmegaConf.update(cfg, key, {"_target_": name}, merge=False)
     try:
-        run.check(cfg, trust=False)
-    except run.ConfigError:
+        build.check(cfg, trust=False)
+    except build.ConfigError:
         return
     module, _, attribute = name.rpartition(".")
     found = getattr(sys.modules[module], attribute)

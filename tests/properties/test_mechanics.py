@@ -25,15 +25,16 @@ from hypothesis import strategies as st
 from torch import Tensor
 from tried import at_most, counted
 
-from dpl.fem.compliance import Linear
 from dpl.fem.dofs import gather
-from dpl.fem.forces import body_force, traction
-from dpl.fem.linear import full_matrix, installed
-from dpl.fem.materials import LinearElastic
-from dpl.fem.modes import eigenmodes
-from dpl.fem.newton import Newton
+from dpl.fem.linear.backends import installed
+from dpl.fem.linear.interface import full_matrix
+from dpl.fem.loads.eigenmodes import eigenmodes
+from dpl.fem.loads.forces import body_force, traction
+from dpl.fem.materials.linear_elastic import LinearElastic
 from dpl.fem.problem import Problem
-from dpl.fem.solution import Load, Solution, Status, joined, judge, solve
+from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, Solution, Status, joined, judge, solve
 from dpl.fem.symmetry import symmetries
 
 # Very thin, nearly incompressible cells: said in words, and answers are held to what it says.

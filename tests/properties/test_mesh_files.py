@@ -19,8 +19,10 @@ from hypothesis import strategies as st
 from skfem.io.meshio import to_meshio
 from tried import counted
 
-from dpl.fem import untrusted
-from dpl.fem.mesh import box, check, load, rectangle
+from dpl.fem.mesh import sandbox
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.reading import load
+from dpl.fem.mesh.validation import check
 
 BODIES = {
     "hexahedron": box([2.0, 1.0, 1.0], [3, 2, 2]),
@@ -150,7 +152,7 @@ CHANGES = st.tuples(
 def _soon():
     """The limit of a reader is more than any file here takes on a busy machine."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(untrusted, "SECONDS", (60.0, 0.0))
+        patch.setattr(sandbox, "SECONDS", (60.0, 0.0))
         yield
 
 

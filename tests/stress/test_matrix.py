@@ -7,15 +7,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from dpl import stress
-from dpl.fem.solution import solve
-from dpl.losses import MSE
+from benchmarks import stress
+from benchmarks.stress import Case, Verdict, matrix, perform
+from benchmarks.stress.auditor import Watch
+from benchmarks.stress.case import graded
+from benchmarks.stress.trained_run import Ladder, cases, hybrid, newton, simulated
+from dpl.fem.solvers.solution import solve
 from dpl.models.fcnn import FCNN
-from dpl.module import Surrogate
-from dpl.stress import Case, Verdict, matrix, perform
-from dpl.stress.case import graded
-from dpl.stress.surrogate import Ladder, cases, hybrid, newton, simulated
-from dpl.stress.watch import Watch
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate
 
 LONG = {"T1", "T2", "T8", "ladder"}  # seconds each
 

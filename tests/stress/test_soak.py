@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from dpl.losses import MSE
+from benchmarks import soak
+from dpl.inference.simulator import Simulator
 from dpl.models.fcnn import FCNN
-from dpl.module import Surrogate
-from dpl.simulator import Simulator
-from dpl.stress import soak
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate
 
 EVEN = [soak.Vitals("work", 5.0 * k, 100 * k, 500.0, 20, 3, 4) for k in range(50)]
 

@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dpl.fem.newton import Newton
-from dpl.fem.solution import Status, solve
-from dpl.stress import Case, Verdict, perform
-from dpl.stress.case import all_of, graded, refused
-from dpl.stress.shapes import column, load_of, pulled
-from dpl.stress.stability import SVK
-from dpl.stress.watch import Watch
-from dpl.verification.report import Row
+from benchmarks.stress import Case, Verdict, perform
+from benchmarks.stress.auditor import Watch
+from benchmarks.stress.case import all_of, graded, refused
+from benchmarks.stress.fixtures import column, load_of, pulled
+from benchmarks.stress.stability import SVK
+from benchmarks.verification.report import Row
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Status, solve
 
 
 class Liar:

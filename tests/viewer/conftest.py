@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from dpl.fem.solution import solve
-from dpl.losses import MSE
+from dpl.fem.solvers.solution import solve
+from dpl.inference.simulator import Simulator
 from dpl.models.fcnn import FCNN
-from dpl.module import Surrogate
-from dpl.simulator import Simulator
-from dpl.viewer.state import Body
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate
+from dpl.viewer.frames import Body
 
 
 def body_of(scene) -> Body:
@@ -34,7 +34,7 @@ def body(scene):
 def page(body, tmp_path):
     """A page of the tiny beam, at any free port."""
     pytest.importorskip("viser", reason="the extra viewer is not installed")
-    from dpl.viewer.door import Door
+    from dpl.viewer.access import Door
     from dpl.viewer.page import Page
 
     page = Page(body, Door.bound("127.0.0.1", 0), title="tiny", folder=tmp_path / "view")

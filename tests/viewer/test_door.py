@@ -15,8 +15,8 @@ import viser
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from dpl.viewer.complaints import LONGEST, PERIOD, Complaints
-from dpl.viewer.door import LARGEST, Door, check, status_of
+from dpl.viewer.access import LARGEST, Door, check, status_of
+from dpl.viewer.rate_limited_log import LONGEST, PERIOD, Complaints
 
 LONG = 120  # no test waits so long, unless what it waits for does not come [s]
 UPGRADE = {
@@ -319,7 +319,7 @@ def test_a_door_that_answers_one_request_wrongly_is_not_served(door, monkeypatch
         found = status_of(door, path, **headers)
         return 500 if len(asked) == which + 1 else found
 
-    monkeypatch.setattr("dpl.viewer.door.status_of", status)
+    monkeypatch.setattr("dpl.viewer.access.status_of", status)
     must = (200, 403, 421, 403, 403)[which]
     with pytest.raises(RuntimeError, match=f"not safe: 500 where {must} must be; not served"):
         check(door)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dpl.viewer.film import moving_load
-from dpl.viewer.picture import Camera, Scenery
-from dpl.viewer.record import MOST, RATE, Recording, evenly
-from dpl.viewer.state import Wish
+from dpl.viewer.animation import moving_load
+from dpl.viewer.frames import Wish
+from dpl.viewer.rasterizer import Camera, Scenery
+from dpl.viewer.recording import MOST, RATE, Recording, evenly
 
 
 @pytest.fixture

@@ -2,11 +2,11 @@
 
 import pytest
 
-from dpl.viewer.state import QUANTITIES, Wish
+from dpl.viewer.frames import QUANTITIES, Wish
 
 
 def test_frames_are_timed_for_each_quantity_and_answers_by_their_usual_names(page, monkeypatch):
-    speed = pytest.importorskip("dpl.viewer.speed", reason="the extra viewer is not installed")
+    speed = pytest.importorskip("dpl.viewer.frame_rate", reason="the extra viewer is not installed")
 
     def few(body, **options):
         return [body.answer(body.sample(k), Wish()) for k in range(3)]

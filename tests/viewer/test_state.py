@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem.fields import fields
-from dpl.fem.materials import NeoHookeanLn
-from dpl.fem.mesh import rectangle
-from dpl.viewer.state import Body, Scale, Wish, between, round_up
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.mesh.generators import rectangle
+from dpl.fem.postprocess.stress import fields
+from dpl.viewer.frames import Body, Scale, Wish, between, round_up
 from dpl.viewer.surface import Surface, bands
 
 STRESS, ERROR = "von Mises stress", "error against FE"

@@ -9,7 +9,7 @@ import sys
 import pytest
 from PIL import Image
 
-from dpl.viewer.record import RATE
+from dpl.viewer.recording import RATE
 
 
 @pytest.fixture(scope="module")

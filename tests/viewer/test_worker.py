@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from dpl.viewer.state import Wish
+from dpl.viewer.frames import Wish
 from dpl.viewer.worker import Worker
 
 LONG = 240.0  # no test waits so long, unless what it waits for does not come [s]

@@ -1,0 +1,273 @@
+"""The mechanics against public codes: python scripts/benchmark.py.
+
+Long parts on demand: parts=[large] (run alone, it reports its memory), parts=[robustness],
+parts=[generation]; run time against error: parts=[accuracy] run=runs/beam_svk, parts=[sizes];
+how far test loads move the bodies: parts=[deflections] count=100.
+"""
+
+import json
+import statistics
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from benchmarks import generation as ways
+from benchmarks import peers
+from dpl.commands.cli import command
+from dpl.config import build, run_folder
+from dpl.evaluation.tables import machine, write, write_machine
+from dpl.fem.linear.backends import BACKENDS, installed
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.solvers.solution import Solver
+from dpl.scene import Sample, Scene
+from dpl.system.threads import one_thread
+
+if TYPE_CHECKING:
+    from benchmarks.sizes import Size
+    from dpl.evaluation.pareto import Point
+
+
+CONSOLE = Console(width=150)
+PARTS = (
+    *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
+    *("accuracy", "sizes", "deflections"),
+)
+
+
+@command("benchmark")
+def main(cfg: DictConfig) -> None:
+    """Time the parts that are asked for, print tables and write them down."""
+    build.check(cfg)
+    if unknown := [part for part in cfg.parts if part not in PARTS]:
+        raise build.ConfigError(f"parts: {unknown[0]!r} is none of {', '.join(PARTS)}")
+    if unknown := [name for name in cfg.linear if name not in ("auto", *BACKENDS)]:
+        known = ", ".join(("auto", *BACKENDS))
+        raise build.ConfigError(f"linear: {unknown[0]!r} is none of {known}")
+    backends = [name for name in cfg.linear if name == "auto" or name in installed()]
+    if not backends:
+        raise build.ConfigError(
+            f"linear = {list(cfg.linear)} must name one that is installed: auto"
+        )
+    CONSOLE.print(f"{machine()}, 1 thread, medians of {cfg.repeats}")
+    folder = Path(cfg.folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for part in cfg.parts:
+        with one_thread() if part != "accuracy" else nullcontext():  # which sets its own
+            results = globals()[part](cfg, backends)
+        if results is None:  # written by itself
+            continue
+        text = json.dumps({"machine": machine(), part: results}, indent=1, default=asdict)
+        (folder / f"{part}.json").write_text(text + "\n")
+    print(f"written to {folder}")
+
+
+def scenes(cfg: DictConfig, backends: list[str]) -> list[dict[str, peers.Time]]:
+    """Return the field's scenes, a row for each code measured here."""
+    rows = [peers.beams(name, cfg.repeats) for name in backends]
+    programs = Path(peers.__file__).parent / "programs"
+    for name, python in cfg.peers.items():
+        if python:
+            program = programs / f"{name}_beam.py"
+            try:
+                rows.append(peers.measured_peer(python, program, cfg.repeats))
+            except OSError as error:
+                raise build.ConfigError(f"peers.{name}: {error}") from error
+    table = Table("seconds (Newton iterations)", *peers.CASES, "residual, tip against the field")
+    for row in rows:
+        cells = [f"{t.seconds:.3f} ({t.iterations})" for t in row.values()]
+        table.add_row(row["S1"].what, *cells, row["S1"].note)
+    table.add_section()
+    for name, seconds in peers.PUBLISHED.items():
+        table.add_row(f"published: {name}", *(f"{s:.3f}" for s in seconds), "on a Zen 5 core")
+    CONSOLE.print(table)
+    return rows
+
+
+def pieces(cfg: DictConfig, backends: list[str]) -> list[peers.Time]:
+    """Return what an iteration on the beam is made of."""
+    return _listed(peers.pieces(3 * cfg.repeats), "beam of 12,000 degrees of freedom")
+
+
+def propeller(cfg: DictConfig, backends: list[str]) -> list[peers.Time]:
+    """Return the time of a random load on the propeller."""
+    rows = [peers.propellers(name, 4 * cfg.repeats) for name in backends if name != "band"]
+    return _listed(rows, "propeller of 12,075 degrees of freedom, one load")
+
+
+def large(cfg: DictConfig, backends: list[str]) -> list[peers.Time]:
+    """Return the time of an iteration on 100,548 degrees of freedom with the first backend."""
+    return _listed([peers.large(backends[0])], "beam of 100,548 degrees of freedom")
+
+
+def robustness(cfg: DictConfig, backends: list[str]) -> dict[str, dict[str, float]]:
+    """Return how many random loads are solved in one step and how many at all."""
+    builders: dict[str, Callable[[], Scene]] = {
+        "beam, NH-ln": partial(peers.beam_scene, NeoHookeanLn(0.3)),
+        "beam, SVK": partial(peers.beam_scene, SaintVenantKirchhoff(0.3)),
+        "propeller, NH-ln": peers.propeller_scene,
+    }
+    results = peers.robustness(builders, cfg.count, cfg.workers)
+    table = Table("random loads", *next(iter(results.values())))
+    for name, row in results.items():
+        table.add_row(name, *(f"{value:.4g}" for value in row.values()))
+    CONSOLE.print(table)
+    return results
+
+
+def generation(cfg: DictConfig, backends: list[str]) -> dict[str, list[ways.Cost]]:
+    """Return what a sample costs on one core, with and without what makes it faster."""
+    scenes = {
+        "paper's beam, NH-ln": peers.beam_scene(NeoHookeanLn(0.3)),
+        "paper's propeller, NH-ln": peers.propeller_scene(),
+    }
+    guess = None
+    if cfg.run is not None:
+        surrogate = run_folder.load_run(cfg.run)[1]
+        scenes, guess = {cfg.run: surrogate.scene}, surrogate.predict
+    results = {}
+    for name, scene in scenes.items():
+        rows = results[name] = ways.costs(scene, cfg.samples, surrogate=guess)
+        table = Table(name, "ms", "samples/s on a core", "iterations", "factors", "accepted")
+        for row in rows:
+            count = f"{row.iterations:.2f}", f"{row.factorisations:.2f}"
+            done = f"{row.accepted}/{cfg.samples}"
+            table.add_row(row.way, f"{1e3 * row.seconds:.1f}", f"{row.rate:.2f}", *count, done)
+        CONSOLE.print(table)
+    return results
+
+
+def accuracy(cfg: DictConfig, backends: list[str]) -> None:
+    """Write how wrong every solver is and when, with the networks of a folder of runs."""
+    from benchmarks import discretisation
+    from dpl.evaluation import pareto as clock
+
+    if cfg.run is None:
+        raise build.ConfigError("run: name a folder of runs, for example runs/beam_svk")
+    title = Path(cfg.run).name
+    scene, solvers, batch = _solvers(cfg)
+    rows: list[Point] = []
+    for threads in cfg.threads:
+        count = threads or clock.all_threads()
+        with Progress() as progress:
+            bar = progress.add_task(f"solvers, {count} threads", total=len(solvers))
+            tick = partial(progress.advance, bar)
+            rows += clock.points(solvers, batch, threads=count, tick=tick)
+    table = Table(title, "iterate", "threads", "ms", "p99", "error", "worst", "||R||/||f||")
+    for row in rows:
+        table.add_row("" if row.iterate else row.solver, *_numbers(row))
+    CONSOLE.print(table)
+    stem = Path(cfg.folder) / f"accuracy_{title}"
+    write(rows, stem.with_suffix(".csv"))
+    family = discretisation.family_of(scene.problem)
+    others, floor = [], None
+    if family is not None:  # a body on which discretisation errors are known
+        with one_thread():
+            law = scene.problem.material
+            others = discretisation.discretisations(family, law, repeats=cfg.repeats)
+        floor = next(mesh.error for mesh in others if (mesh.cells, mesh.degree) == (family.own, 1))
+        table = Table("Newton to 1e-6 on", "DOFs", "ms", "value", "error against the limit")
+        for mesh in others:
+            name = f"{'x'.join(map(str, mesh.cells))}, degree {mesh.degree}"
+            numbers = f"{mesh.ms:.1f}", f"{mesh.value:.6g}", f"{mesh.error:.1e}"
+            table.add_row(name, f"{mesh.dofs:,}", *numbers)
+        CONSOLE.print(table)
+        write(others, Path(cfg.folder) / f"accuracy_{title}_meshes.csv")
+    first = [row for row in rows if row.threads == rows[0].threads]
+    clock.draw(first, others, floor, stem.with_suffix(".png"))
+    write_machine(stem.with_suffix(".json"), threads=rows[0].threads)
+
+
+def _numbers(row: "Point") -> list[str]:
+    times = f"{row.ms:.2f}", f"{row.ms_p99:.2f}"
+    errors = f"{row.error:.1e}", f"{row.worst:.1e}", f"{row.residual:.1e}"
+    return [str(row.iterate), str(row.threads), *times, *errors]
+
+
+def _solvers(cfg: DictConfig) -> tuple[Scene, dict[str, Solver], Sample]:
+    """Return the scene of some runs, every solver there is with their networks, and test loads."""
+    from dpl.evaluation import methods
+    from dpl.evaluation import pareto as accuracy
+    from dpl.inference.hybrid import Direct, best
+    from dpl.models.pod import PODNet
+
+    runs = run_folder.load_runs(cfg.run)
+    first, surrogate = next(iter(runs.values()))
+    scene = surrogate.scene
+    data = run_folder.load_data(first, scene)
+    train = data.samples("train")
+    robust = scene.solver
+    solvers: dict[str, Solver] = {"linear": scene.linear}
+    solvers |= {f"Newton to {tol:g}": robust.but(tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
+    if cfg.galerkin:
+        model = build.make(cfg, "galerkin")(scene, train)
+        solvers["POD-Galerkin"] = Direct(model.predict, scene.problem)
+    for name, (trained, surrogate) in runs.items():
+        predict = surrogate.predict
+        solvers[name] = Direct(predict, scene.problem)
+        if cfg.corrected and isinstance(surrogate.net, PODNet):
+            row = methods.network(surrogate, Path(cfg.run) / name, trained.data.train)
+            tier = build.make(cfg, "corrected")(surrogate, row, train)
+            solvers[f"{name}, corrected"] = Direct(tier.predict, scene.problem)
+        solvers[f"{name}, hybrid"] = best(predict, scene)
+        if torch.cuda.is_available():
+            copy = run_folder.load_run(Path(cfg.run) / name, scene=scene)[1]
+            solvers[f"{name}, GPU"] = Direct(accuracy.on_gpu(copy), scene.problem)
+    return scene, solvers, data.samples("test")
+
+
+def sizes(cfg: DictConfig, backends: list[str]) -> None:
+    """Write what solvers and networks cost on beams of growing size."""
+    from benchmarks import sizes as beams
+
+    rows: list[Size] = []
+    table = Table("beam", "DOFs", "ms", "parameters", "memory [MB]", "peak [MB]")
+    with Progress() as progress:
+        bar = progress.add_task("beams", total=len(cfg.across))
+        for part in beams.sizes(cfg.across, loads=cfg.repeats):
+            rows += part
+            write(rows, Path(cfg.folder) / "sizes.csv")
+            progress.advance(bar)
+    for row in rows:
+        kept = "" if row.memory is None else f"{row.memory:.1f}"
+        count = "" if row.parameters is None else f"{row.parameters:,}"
+        table.add_row(row.what, f"{row.dofs:,}", f"{row.ms:.2f}", count, kept, f"{row.peak:.0f}")
+    CONSOLE.print(table)
+    beams.draw(rows, Path(cfg.folder) / "sizes.png")
+    write_machine(Path(cfg.folder) / "sizes.json")
+
+
+def deflections(cfg: DictConfig, backends: list[str]) -> None:
+    """Write how far test loads move the paper's beam and propeller, as rows and as histograms."""
+    from benchmarks import deflections as sizes
+
+    scenes = {
+        "beam_svk": peers.beam_scene(SaintVenantKirchhoff(0.3)),
+        "propeller_nh": peers.propeller_scene(),
+    }
+    rows = sizes.deflections(scenes, cfg.count, cfg.workers)
+    table = Table("largest nodal displacement / L", "loads", "smallest", "median", "largest")
+    for name, values in sizes.by_body(rows).items():
+        numbers = min(values), statistics.median(values), max(values)
+        table.add_row(name, f"{len(values)}", *(f"{number:.2g}" for number in numbers))
+    CONSOLE.print(table)
+    write(rows, Path(cfg.folder) / "deflections.csv")
+    sizes.draw(rows, Path(cfg.folder) / "deflections.png")
+
+
+def _listed(rows: list[peers.Time], title: str) -> list[peers.Time]:
+    table = Table(title, "ms", "iterations", "")
+    for row in rows:
+        count = f"{row.iterations:.1f}" if row.iterations == row.iterations else ""
+        table.add_row(row.what, f"{1e3 * row.seconds:.2f}", count, row.note)
+    CONSOLE.print(table)
+    return rows

@@ -1,0 +1,50 @@
+"""All methods on one experiment side by side: python scripts/results.py name=beam_svk."""
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from dpl.commands.cli import command
+from dpl.config import build, run_folder
+
+
+@command("results")
+def main(cfg: DictConfig) -> None:
+    """Measure every run of an experiment; write rows, machine and figure."""
+    from benchmarks import paper_tables
+    from dpl.evaluation import methods
+    from dpl.evaluation.tables import show
+    from dpl.models.pod import PODNet
+
+    build.check(cfg)
+    runs = run_folder.load_runs(cfg.run)
+    first, surrogate = next(iter(runs.values()))
+    scene = surrogate.scene
+    data = run_folder.load_data(first, scene)
+    train = data.samples("train")
+
+    def made(key: str, *parts: object) -> methods.Method:
+        try:
+            return build.make(cfg, key)(*parts)
+        except ValueError as error:
+            raise build.ConfigError(f"{key}: {error}; {key}=null leaves it out") from error
+
+    compared = {"linear": methods.linear(scene)}
+    if cfg.galerkin:
+        compared["POD-Galerkin"] = made("galerkin", scene, train)
+    for name, (trained, surrogate) in runs.items():
+        method = methods.network(surrogate, Path(cfg.run) / name, trained.data.train)
+        compared[name] = method
+        if cfg.corrected and isinstance(surrogate.net, PODNet):
+            compared[name + paper_tables.CORRECTED] = made("corrected", surrogate, method, train)
+    sets = paper_tables.load_sets(scene, data.samples("test"), cfg.count)
+    rows, errors = paper_tables.paper(cfg.name), {}
+    a_load = data.store.seconds_a_load()
+    minutes = None if a_load is None else a_load * sum(data.wanted.sizes.values()) / 60
+    for row, error in paper_tables.measure(
+        compared, sets, scene.solver, generation_minutes=minutes
+    ):
+        rows.append(row)
+        errors[row.method, row.loads] = error
+    show(rows, f"{cfg.name}, one load at a time, 1 thread")
+    paper_tables.save(rows, errors, Path(cfg.folder) / cfg.name)

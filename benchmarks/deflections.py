@@ -1,0 +1,82 @@
+"""How far test loads move the bodies of the paper: largest nodal displacement of each load."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from dpl.data.solving.solve import Job
+from dpl.data.solving.worker_pool import outcomes
+from dpl.data.storage.manifest import STREAMS
+from dpl.scene import Scene
+
+BINS = 20
+
+
+@dataclass(frozen=True)
+class Deflection:
+    """How far one test load moves a body.
+
+    Attributes:
+        body: Name of the body.
+        load: Number of the load in the test stream.
+        deflection: Largest nodal displacement over L, the longest side of the body [-].
+    """
+
+    body: str
+    load: int
+    deflection: float
+
+
+def deflections(scenes: Mapping[str, Scene], count: int, workers: int) -> list[Deflection]:
+    """Return the deflection of each test load that a data set of seed 0 accepts.
+
+    Args:
+        scenes: Named.
+        count: Test loads of each scene.
+        workers: Processes that solve.
+    """
+    rows = []
+    for name, scene in scenes.items():
+        jobs = [Job((0, STREAMS["test"]), k) for k in range(count)]
+        for found in outcomes(scene, jobs, workers=workers):
+            if found.accepted:
+                largest = float(np.linalg.norm(found.displacement, axis=1).max())
+                rows.append(Deflection(name, found.job.number, largest))
+    order = list(scenes)
+    return sorted(rows, key=lambda row: (order.index(row.body), row.load))
+
+
+def by_body(rows: Sequence[Deflection]) -> dict[str, list[float]]:
+    """Return the deflections [-] of each body."""
+    names = dict.fromkeys(row.body for row in rows)
+    return {name: [row.deflection for row in rows if row.body == name] for name in names}
+
+
+def draw(rows: Sequence[Deflection], file: Path) -> None:
+    """Draw a histogram of the deflections of each body, with the median.
+
+    Args:
+        rows: Deflections of one body or several.
+        file: Of the picture.
+    """
+    from matplotlib.figure import Figure
+
+    bodies = by_body(rows)
+    figure = Figure(figsize=(4.2 * len(bodies), 3.2), layout="constrained")
+    axes = figure.subplots(1, len(bodies), squeeze=False)[0]
+    for ax, (name, values) in zip(axes, bodies.items(), strict=True):
+        top = max(values)
+        ax.hist(values, bins=BINS, range=(0, top), color="C0", edgecolor="white", lw=0.5)
+        ax.axvline(median(values), color="0.2", ls="--", lw=1)
+        ax.set_title(
+            f"{name}: {len(values)} test loads\nmedian {median(values):.3f} L, largest {top:.3f} L",
+            fontsize=10,
+        )
+        ax.set_xlabel("largest nodal displacement / L")
+        ax.set_xlim(0, 1.05 * top)
+        ax.yaxis.get_major_locator().set_params(integer=True)
+    axes[0].set_ylabel("loads")
+    figure.savefig(file, dpi=130)

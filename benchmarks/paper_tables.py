@@ -1,0 +1,213 @@
+"""All methods on one scene side by side: how wrong on three sets of loads, how slow, how large."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from dpl.evaluation.methods import Method
+from dpl.evaluation.tables import write, write_machine
+from dpl.evaluation.timing import latency
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, Status, solve
+from dpl.scene import Sample, Scene
+from dpl.system.threads import one_thread
+from dpl.training.metrics import RelativeL2, metrics
+
+# Odot, Haferssas, Cotin (2022), tables 1 to 3: e_mean, e_max, SNR_min [dB], samples. Experiments 3
+# and 3b are one here: they differ in the range of Young's modulus, which no answer depends on.
+PAPER: dict[str, dict[str, tuple[float, float | None, float | None, int | None]]] = {
+    "beam_svk": {"paper": (8.0e-6, 0.03, 8.4, 4095)},
+    "propeller_nh": {"paper": (2.7e-6, 0.01, 18.9, 4095)},
+    "beam_nh_loss": {"paper": (7.7e-6, 0.03, 2.7, 4095)},
+    "beam_young": {
+        "paper": (4.6e-5, 0.09, -2.6, 10650),
+        "paper, 3b": (1e-4, None, None, None),
+    },
+}
+STREAMS = {"twice": 4, "small": 5}  # of loads; those of samples and scales are below
+CORRECTED = " corrected"  # ends the name of a network that is corrected
+TITLES = {
+    "in range": "loads in range",
+    "twice": "one to two times the range",
+    "small": "1 to 10 % of the range",
+}
+
+
+@dataclass(frozen=True)
+class Result:
+    """One method on one set of loads.
+
+    Attributes:
+        method: Its name.
+        loads: Name of the set: "in range", "twice" (one to two times the amplitude) or "small" (1
+            to 10 % of it).
+        count: Loads in the set.
+        samples: Solved loads that it learnt from.
+        generation_minutes: Wall time in which those were solved.
+        training_minutes: Wall time of the training, or of the making of a basis.
+        parameters: Numbers that were trained.
+        e_mean, e_max, SNR_min, rel_L2_median, rel_L2_worst, residual, min_det_F: See
+            `dpl.training.metrics`.
+        ms: Median latency of the bare network, see `dpl.evaluation.timing`: force in, displacement
+            out, nothing checked [ms].
+        ms_p99: 99th percentile of the same [ms].
+        newton_iterations: Mean iterations of Newton from it to the scene's tolerance, in range.
+    """
+
+    method: str
+    loads: str
+    count: int
+    samples: int | None = None
+    generation_minutes: float | None = None
+    training_minutes: float | None = None
+    parameters: int | None = None
+    e_mean: float | None = None
+    e_max: float | None = None
+    SNR_min: float | None = None
+    rel_L2_median: float | None = None
+    rel_L2_worst: float | None = None
+    residual: float | None = None
+    min_det_F: float | None = None
+    ms: float | None = None
+    ms_p99: float | None = None
+    newton_iterations: float | None = None
+
+
+def load_sets(scene: Scene, test: Sample, count: int = 50) -> dict[str, Sample]:
+    """Return the test loads in range, and more of them outside, solved here.
+
+    Loads that have no stable answer are left out.
+
+    Args:
+        scene: What is simulated.
+        test: Loads in range with the truth.
+        count: Loads of each other set.
+    """
+    sets = {"in range": test}
+    part = torch.linspace(0, 1, count, dtype=torch.float64)
+    factors = {"twice": 1 + part, "small": 10.0 ** (part - 2)}
+    for name, factor in factors.items():
+        drawn = scene.loads.sample((0, STREAMS[name]), range(count))
+        load = drawn._replace(force=factor[:, None, None] * drawn.force)
+        answer = solve(scene.solver, load)
+        sound = answer.status == int(Status.CONVERGED)
+        sample = Sample(load.force, answer.displacement, load.young, load.poisson)
+        sets[name] = Sample(*(column[sound] for column in sample))
+    return sets
+
+
+def measure(
+    methods: Mapping[str, Method],
+    sets: Mapping[str, Sample],
+    newton: Newton,
+    *,
+    generation_minutes: float | None = None,
+    repeats: int = 3,
+) -> Iterator[tuple[Result, Tensor]]:
+    """Yield a row and the relative L2 errors of the loads (S,), for each method and set of loads.
+
+    Every load is asked alone, on one thread; each method has all loads of a set in a row, as in
+    use, so that its weights stay in the cache.
+
+    Args:
+        methods: Named.
+        sets: Loads with the truth, named.
+        newton: What goes on from each prediction.
+        generation_minutes: Wall time of the samples.
+        repeats: Times that each load is asked.
+    """
+    for title, batch in sets.items():
+        singles = batch.load.singles()
+        with one_thread(), torch.inference_mode():
+            for name, method in methods.items():
+                answer = torch.cat([method.predict(load) for load in singles])
+                taken = latency(method.predict, singles, repeats=repeats)
+                iterations = None if title in STREAMS else _iterations(newton, singles, answer)
+                errors = metrics(newton.problem)
+                errors.update(answer, batch)
+                known = {field.name for field in fields(Result)}
+                numbers = {k: float(v) for k, v in errors.compute().items() if k in known}
+                row = Result(
+                    method=name,
+                    loads=title,
+                    count=len(singles),
+                    samples=method.samples,
+                    generation_minutes=generation_minutes if method.samples else None,
+                    training_minutes=method.training_minutes,
+                    parameters=method.parameters,
+                    ms=taken.p50,
+                    ms_p99=taken.p99,
+                    newton_iterations=iterations,
+                    **numbers,
+                )
+                yield row, RelativeL2().measure(answer, batch)
+
+
+def _iterations(newton: Newton, loads: Sequence[Load], guesses: Tensor) -> float:
+    """Return the mean number of Newton's iterations from guesses (S, N, D)."""
+    total = 0
+    for load, guess in zip(loads, guesses, strict=True):
+        *_, last = newton.iterate(load, guess=guess[None])
+        total += int(last.iterations[0])
+    return total / len(loads)
+
+
+def paper(experiment: str) -> list[Result]:
+    """Return the paper's rows of an experiment; none if it has none."""
+    rows = []
+    for name, (e_mean, e_max, snr, samples) in PAPER.get(experiment, {}).items():
+        worst = None if snr is None else 10 ** (-snr / 20)
+        rows.append(
+            Result(
+                name, "in range", 100, samples, e_mean=e_mean, e_max=e_max, SNR_min=snr,
+                rel_L2_worst=worst,
+            )
+        )  # fmt: skip
+    return rows
+
+
+def save(rows: Sequence[Result], errors: Mapping[tuple[str, str], Tensor], stem: Path) -> None:
+    """Write rows as CSV, the machine as JSON, and a figure of the errors of all loads as PNG."""
+    write(rows, stem.with_suffix(".csv"))
+    write_machine(stem.with_suffix(".json"))
+    draw(errors, stem.with_suffix(".png"))
+
+
+def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
+    """Draw the relative errors of all loads, sorted, a panel for each set of loads.
+
+    Args:
+        errors: Relative L2 errors (S,) by method and set.
+        path: Of the picture.
+    """
+    from matplotlib.figure import Figure
+
+    sets = list(dict.fromkeys(title for _, title in errors))
+    methods = list(dict.fromkeys(method for method, _ in errors))
+    colours = list(dict.fromkeys(method.removesuffix(CORRECTED) for method in methods))
+    figure = Figure(figsize=(4 * len(sets) + 1.6, 3.8), layout="constrained")
+    axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
+    for ax, title in zip(axes, sets, strict=True):
+        for method in methods:
+            name = method.removesuffix(CORRECTED)
+            values = errors[method, title].sort().values.clamp(min=1e-9)
+            ax.semilogy(
+                torch.linspace(0, 100, len(values)),
+                values,
+                color=f"C{colours.index(name)}",
+                ls="-" if method == name else "--",
+                label=method,
+            )
+        aim = 50 if title == "small" else 60  # [dB]
+        ax.axhline(10 ** (-aim / 20), color="0.7", ls=":")
+        ax.annotate(f"{aim} dB", (0, 10 ** (-aim / 20)), fontsize=7, color="0.4", va="bottom")
+        ax.set_title(TITLES.get(title, title), fontsize=10)
+        ax.set_xlabel("part of the loads [%]")
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("relative L2 error, no more than")
+    handles, names = axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside right center", fontsize=8)
+    figure.savefig(path, dpi=130)

@@ -1,0 +1,342 @@
+"""Scenes on which public finite-element codes were timed, what they needed, and what dpl needs.
+
+A clamped beam of 39 x 9 x 9 trilinear hexahedra (12,000 degrees of freedom) under a dead load
+spread evenly over the 100 nodes of its end face; a propeller of the same size; a beam of 100,000
+degrees of freedom; and thousands of random loads.
+"""
+
+import json
+import math
+import os
+import resource
+import statistics
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks import blas_detection
+from dpl.data.solving.solve import Job
+from dpl.data.solving.worker_pool import outcomes
+from dpl.fem.dofs import gather
+from dpl.fem.linear.backends import backend, chosen
+from dpl.fem.loads.modal import ModalLoads
+from dpl.fem.materials.material import Material
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.propeller import propeller
+from dpl.fem.mesh.regions import Plane, Tag
+from dpl.fem.problem import Problem
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, Solution, solve
+from dpl.scene import Scene
+
+
+@dataclass(frozen=True)
+class Case:
+    """A load on the beam.
+
+    Attributes:
+        law: Its material.
+        size: Of the beam [m].
+        young: [Pa]
+        force: Total on the end face, against z [N].
+        tip: Displacement of the end face's centre along x and z [m], agreed on by nine codes.
+    """
+
+    law: Material
+    size: tuple[float, float, float]
+    young: float
+    force: float
+    tip: tuple[float, float]
+
+    def build(self) -> tuple[Problem, Load]:
+        """Return the beam and its load."""
+        mesh = box(self.size, [40, 10, 10])
+        problem = Problem.build(mesh, self.law, fixed=Plane(0, "min"))
+        end = self.end(problem)
+        force = torch.zeros(1, *problem.shape, dtype=torch.float64)
+        force[0, end, 2] = -self.force / (len(end) * self.young * problem.length**2)
+        return problem, Load(force, torch.tensor([self.young], dtype=torch.float64))
+
+    @staticmethod
+    def end(problem: Problem) -> torch.Tensor:
+        """Return the nodes of the end face."""
+        x = problem.points[:, 0]
+        return torch.nonzero(x > x.max() - 1e-9).ravel()
+
+    def error(self, problem: Problem, solution: Solution) -> float:
+        """Return how far the tip is from where the codes agree it is, over L [-]."""
+        tip = solution.displacement[0, self.end(problem)].mean(dim=0) * problem.length
+        return self.miss(tip.tolist())
+
+    def miss(self, tip: Sequence[float]) -> float:
+        """Return how far a tip, x, y and z [m], is from where the codes agree it is, over L [-]."""
+        return math.dist((tip[0], tip[2]), self.tip) / self.size[0]
+
+
+LONG, SHORT = (100.0, 25.0, 25.0), (1.0, 0.25, 0.25)
+CASES = {
+    "S1": Case(NeoHookeanLn(0.3), LONG, 4500.0, 20100.0, (-9.441053465963, -39.987831598531)),
+    "S1s": Case(NeoHookeanLn(0.3), LONG, 4500.0, 430.0, (-0.005639797755, -1.000492546995)),
+    "S2": Case(
+        SaintVenantKirchhoff(0.3), LONG, 4500.0, 20100.0, (-10.060386181979, -40.012725689017)
+    ),
+    "S3": Case(NeoHookeanLn(0.3), SHORT, 2.03e11, 1.95e7, (-0.005615149126, -0.099693236807)),
+}
+
+# Seconds on one core of an AMD Zen 5, set-up and compilation excluded, median of 3; measured for
+# this project in 2026. Another machine, another number: compare ratios, best with a code that is
+# measured beside dpl.
+PUBLISHED = {
+    "dolfinx 0.5.2, MUMPS": (0.682, 0.320, 0.614, 0.422),
+    "felupe 11.3, PARDISO wrapped": (0.727, 0.323, 0.764, 0.407),
+    "Kratos 10.4, AMGCL": (0.909, 0.460, 0.770, 0.579),
+    "NGSolve 6.2.2608": (1.145, 0.560, 1.004, 0.721),
+    "felupe 11.3 as shipped": (1.370, 0.496, 1.308, 0.731),
+    "SfePy 2026.3, PARDISO wrapped": (1.412, 0.694, 1.245, 0.916),
+    "warp.fem 1.19 on CPU, PARDISO": (2.463, 1.187, 2.037, 1.471),
+    "torch-fem 0.14, CG + AMG": (2.683, 1.140, 2.091, 1.380),
+    "GetFEM 5.4.2, MUMPS": (3.782, 1.779, 3.408, 2.245),
+    "JAX-FEM 0.0.11, MUMPS": (4.221, 1.945, 3.667, 2.558),
+    "torch-fem 0.14, direct": (4.941, 2.452, 4.292, 3.106),
+}
+
+
+@dataclass(frozen=True)
+class Time:
+    """How long something takes.
+
+    Attributes:
+        what: A name.
+        seconds: Median [s].
+        iterations: Of Newton, mean; NaN where there are none.
+        note: What else is to be said.
+    """
+
+    what: str
+    seconds: float
+    iterations: float = float("nan")
+    note: str = ""
+
+
+def median(task: Callable[[], object], repeats: int) -> float:
+    """Return the median wall time of a task [s], once warmed up."""
+    task()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        task()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def beams(linear: str, repeats: int) -> dict[str, Time]:
+    """Return the time of each case with a backend, the answer checked."""
+    rows = {}
+    for name, case in CASES.items():
+        problem, load = case.build()
+        newton = Newton(problem, linear=linear)
+        answer = solve(newton, load)
+        if not answer.converged or (error := case.error(problem, answer)) > 1e-8:
+            raise ArithmeticError(f"{name}: residual {float(answer.residual):.1e}, not the answer")
+        seconds = median(partial(solve, newton, load), repeats)
+        note = f"tip to {error:.0e} L, residual {float(answer.residual):.0e}"
+        rows[name] = Time(f"dpl, {linear}", seconds, int(answer.iterations), note)
+    return rows
+
+
+def measured_peer(python: str, program: Path, repeats: int) -> dict[str, Time]:
+    """Return the time of each case in another code, run by the Python that has it.
+
+    The program is first asked for its shared libraries. Where its BLAS is the reference one and
+    Debian's OpenBLAS is installed, the program is given that; the notes name the BLAS.
+
+    Args:
+        python: The interpreter.
+        program: What it runs, see `benchmarks.programs`.
+        repeats: Timed solves of each case.
+
+    Raises:
+        OSError: There is no such Python, the program failed, its answer is wrong, or its BLAS is
+            the reference one or cannot be told.
+    """
+    cases = {
+        name: {
+            "size": case.size,
+            "cells": [39, 9, 9],
+            "young": case.young,
+            "poisson": 0.3,
+            "law": type(case.law).__name__,
+            "force": case.force,
+            "repeats": repeats,
+        }
+        for name, case in CASES.items()
+    }
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")} | threads
+    used = blas_detection.name(_asked(python, program, {}, environment)["libraries"])
+    if used == blas_detection.REFERENCE and (folder := blas_detection.optimised()):
+        before = environment.get("LD_LIBRARY_PATH")
+        environment["LD_LIBRARY_PATH"] = f"{folder}:{before}" if before else folder
+        used = blas_detection.name(_asked(python, program, {}, environment)["libraries"])
+    if used in (None, blas_detection.REFERENCE):
+        flaw = "the reference BLAS, several times slower than others" if used else "no known BLAS"
+        raise OSError(
+            f"{program.name} with {python}: it uses {flaw}, and is not compared; install OpenBLAS "
+            "for it (Debian: libopenblas0-pthread)"
+        )
+    rows = {}
+    for name, row in _asked(python, program, cases, environment)["times"].items():
+        error = CASES[name].miss(row["tip"])
+        if not error <= 1e-8:
+            raise OSError(f"{program.name} with {python}: {name}: tip {error:.1e} L off")
+        note = ", ".join(filter(None, [f"tip to {error:.0e} L", row.get("note"), used]))
+        rows[name] = Time(program.stem, row["seconds"], row["iterations"], note)
+    return rows
+
+
+def _asked(
+    python: str, program: Path, cases: Mapping[str, object], environment: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return what a program answers to cases: its shared libraries, and times by case.
+
+    Raises:
+        OSError: There is no such Python, or the program failed.
+    """
+    done = subprocess.run(
+        [python, str(program)],
+        input=json.dumps(cases),
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
+    )
+    if done.returncode:
+        reason = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+        raise OSError(f"{program.name} with {python}: {reason[-1]}")
+    return dict(json.loads(done.stdout.strip().splitlines()[-1]))
+
+
+def pieces(repeats: int) -> list[Time]:
+    """Return the times of what a Newton iteration of case S1 is made of."""
+    problem, load = CASES["S1"].build()
+    u = solve(Newton(problem, tol=1e-4), load).displacement
+    gap = problem.widened(None, 1.0, 0.1 * u)
+    values = problem.linearise(u).tangent[0].numpy()
+    right = gather(load.force[0], problem)
+    rows = [
+        Time("residual and min det F, compiled", median(partial(problem.evaluate, u), repeats)),
+        Time("residual, tensors", median(partial(problem.internal_force, u), repeats)),
+        Time("tangent and residual, compiled", median(partial(problem.linearise, u), repeats)),
+        Time("the same, mixed points", median(partial(problem.linearise, u, gap), repeats)),
+        Time("tangent, tensors", median(partial(problem.tangent, u), repeats)),
+    ]
+    for name in ("band32", "band", "pardiso", "superlu"):
+        try:
+            solver = backend(problem.pattern, name)
+        except ValueError:  # not installed
+            continue
+        factor = solver.factorise(values)
+        seconds = median(partial(solver.factorise, values), repeats)
+        rows.append(Time(f"factorisation, {name}", seconds))
+        seconds = median(partial(factor.solve, right), repeats)
+        rows.append(Time(f"solve to 1e-12, {name}", seconds))
+    return rows
+
+
+def propeller_scene(linear: str = "auto", deflection: float = 0.055) -> Scene:
+    """Return the propeller, NH-ln, held at its bore, its blades bent to a tenth of L."""
+    problem = Problem.build(propeller(), NeoHookeanLn(0.3), fixed=Tag("bore"))
+    newton = Newton(problem, linear=linear)
+    return Scene(problem, ModalLoads(newton.rest, n_modes=10, deflection=deflection), newton)
+
+
+def beam_scene(law: Material) -> Scene:
+    """Return the paper's beam with its loads, deflections to 0.4 L."""
+    problem = Problem.build(box(LONG, [40, 10, 10]), law, fixed=Plane(0, "min"))
+    newton = Newton(problem)
+    return Scene(problem, ModalLoads(newton.rest, deflection=0.4, young=4500.0), newton)
+
+
+def propellers(linear: str, loads: int) -> Time:
+    """Return the time of one random load on the propeller, median of several."""
+    scene = propeller_scene(linear)
+    batch = scene.loads.sample(0, range(loads))
+    singles = [Load(batch.force[k : k + 1], batch.young[k : k + 1]) for k in range(loads)]
+    solve(scene.solver, singles[0])
+    answers = [solve(scene.solver, load) for load in singles]
+    seconds = statistics.median(float(answer.seconds) for answer in answers)
+    reached = sorted(float(a.displacement.norm(dim=-1).max()) for a in answers)
+    good = sum(bool(a.converged) for a in answers)
+    name = chosen(linear, scene.problem.pattern)
+    note = f"{good}/{loads} converged, deflections {reached[0]:.3f} to {reached[-1]:.3f} L"
+    iterations = statistics.mean(int(a.iterations) for a in answers)
+    return Time(f"propeller, {name}", seconds, iterations, note)
+
+
+def large(linear: str) -> Time:
+    """Return the time of one Newton iteration on 100,548 degrees of freedom, and its memory."""
+    mesh = box([1.0, 0.25, 0.25], [76, 21, 21])
+    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"))
+    newton = Newton(problem, linear=linear, tol=1e-8)
+    force = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    end = Case.end(problem)
+    force[0, end, 2] = -1e-4 / len(end)
+    states = newton.iterate(Load(force, torch.ones(1, dtype=torch.float64)))
+    start = time.perf_counter()
+    next(states), next(states)
+    first = time.perf_counter() - start
+    times = []
+    while True:
+        start = time.perf_counter()
+        if (state := next(states, None)) is None:
+            break
+        times.append(time.perf_counter() - start)
+        last = state
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    note = (
+        f"first one, with analysis and K(0), {first:.1f} s; peak {peak:.1f} GB; "
+        f"residual {float(last.residual):.0e} after {int(last.iterations)}"
+    )
+    return Time(f"100,548 degrees of freedom, {linear}: one iteration", max(times), note=note)
+
+
+def robustness(
+    scenes: Mapping[str, Callable[[], Scene]], loads: int, workers: int
+) -> dict[str, dict[str, float]]:
+    """Return how many random loads are solved in one step, and how many at all.
+
+    Args:
+        scenes: Named builders.
+        loads: Of each scene.
+        workers: Processes.
+    """
+    results = {}
+    for name, build in scenes.items():
+        scene = build()
+        once = replace(scene, solver=replace(scene.solver, smallest_step=0.9))
+        jobs = [Job((0, 0), k) for k in range(loads)]
+        first = {o.job.number: o for o in outcomes(once, jobs, workers=workers)}
+        failed = [o.job for o in first.values() if not o.accepted]
+        second = list(outcomes(scene, failed, workers=workers)) if failed else []
+        done = [o for o in first.values() if o.accepted]
+        results[name] = {
+            "loads": loads,
+            "in one step": len(done),
+            "with load steps": len(done) + sum(o.accepted for o in second),
+            "iterations": statistics.mean(o.iterations for o in done),
+            "seconds": statistics.median(o.seconds for o in done),
+            "min det F": min(o.volume_ratio for o in done),
+            "largest deflection": max(
+                float(np.linalg.norm(o.displacement, axis=1).max()) for o in done
+            ),
+        }
+    return results

@@ -1,0 +1,300 @@
+"""Networks and what stands for them, in front of the mechanics: T18 to T21, T23, and a ladder."""
+
+from collections.abc import Callable
+from functools import cache, partial
+
+import torch
+from torch import Tensor
+
+from benchmarks.stress.auditor import Watch
+from benchmarks.stress.case import Case, Outcome, Rung, graded, refused
+from benchmarks.stress.fixtures import LARGEST, YOUNG, load_of, pulled
+from benchmarks.stress.loads import LADDER, rung, words
+from benchmarks.verification.bodies import paper_beam
+from benchmarks.verification.report import Row
+from dpl.evaluation.newton_starts import PlainNewton
+from dpl.fem.loads.modal import ModalLoads
+from dpl.fem.materials.neo_hookean import NeoHookeanLn
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.mesh.generators import box
+from dpl.fem.mesh.regions import Plane
+from dpl.fem.problem import Problem
+from dpl.fem.solvers.anderson import Accelerated
+from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.newton import Newton
+from dpl.fem.solvers.solution import Load, Solver, solve
+from dpl.inference.hybrid import Direct, Hybrid, Predict, pick
+from dpl.models.fcnn import FCNN
+from dpl.scene import Scene
+from dpl.training.losses.supervised import MSE
+from dpl.training.surrogate import Surrogate
+
+SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
+USELESS = ("not a number", "one not a number", "infinite", "inverted")
+# VERIFICATION 2.2 T20: rms noise over L -> residual ratio of the prediction, plain iterations
+NOISE = {1e-2: ("592", "14"), 1e-3: ("53.6", "5"), 1e-4: ("5.47", "3"), 1e-5: (".534", "2")}
+SCALED = {1e-1: "8.96", 1e-2: ".818", 1e-3: ".081"}  # T21: error of a uniform factor -> ||R||/||f||
+FLOAT32 = 1.5e-4  # T18: residual ratio of an exact answer, rounded to float32, 1275 DOF
+
+
+@cache
+def scene() -> Scene:
+    """Return the beam of 8 x 2 x 2 cells of NH-ln with three modes."""
+    problem = paper_beam(NH, (8, 2, 2))
+    newton = Newton(problem)
+    return Scene(problem, ModalLoads(newton.rest, n_modes=3, young=YOUNG), newton)
+
+
+@cache
+def bent() -> tuple[Newton, Load, Tensor]:
+    """Return the beam of 16 x 4 x 4 cells of SVK, q = 20 Pa and the exact answer (1, N, 3)."""
+    problem = paper_beam(SVK, (16, 4, 4))
+    load = load_of(pulled(problem, 20.0))
+    newton = Newton(problem, linear="auto")
+    return newton, load, solve(newton.but(tol=1e-12), load).displacement
+
+
+def known(displacement: Tensor) -> Predict:
+    """Return a network that has one answer, (1, N, D) [-]."""
+    return lambda load: displacement
+
+
+def ways(newton: Newton) -> dict[str, Callable[[Tensor], Solver]]:
+    """Return hybrids by name, as functions of what is predicted (1, N, D)."""
+    return {
+        "best": lambda guess: Hybrid(known(guess), newton),
+        "paper": lambda guess: Hybrid(known(guess), newton, "paper"),
+        "steps": lambda guess: Hybrid(known(guess), newton, steps=Accelerated(newton)),
+    }
+
+
+def _useless(problem: Problem, truth: Tensor) -> dict[str, Tensor]:
+    """Return predictions (1, N, D) that are worth nothing, by name."""
+    one = truth.clone()
+    one[:, -1, 0] = torch.nan
+    return {
+        "not a number": torch.full_like(truth, torch.nan),
+        "one not a number": one,
+        "infinite": torch.where(problem.free, torch.inf, torch.zeros_like(truth)),
+        "inverted": torch.where(problem.free, -1.5 * problem.points, 0.0)[None],
+    }
+
+
+def useless(name: str, watch: Watch) -> Outcome:
+    """Start the hybrid from a useless prediction: the answer is the classic one, bit for bit."""
+    newton, load, truth = bent()
+    problem, guess = newton.problem, _useless(newton.problem, truth)[name]
+    classic, rows = solve(newton, load), []
+    for way, hybrid in ways(newton).items():
+        state = watch.solve(hybrid(guess), problem, load)
+        same = torch.equal(state.displacement, classic.displacement)
+        rows += [
+            Row(f"{way}: classic answer, bit for bit", "1", float(same), 0),
+            Row(f"{way}: picked", "0", float(state.from_guess), 0),
+            Row(
+                f"{way}: iterations over the classic ones",
+                *("0", float(state.iterations - classic.iterations), 0),
+            ),
+        ]
+    (alone,) = Direct(known(guess), problem).iterate(load)
+    rows.append(Row("network alone: converged", "0", float(alone.converged), 0))
+    return graded(f"classic answer in {int(classic.iterations)} iterations, not picked", rows)
+
+
+def misled(name: str, watch: Watch) -> Outcome:
+    """Start the hybrid from a prediction that is finite and far off."""
+    newton, load, truth = bent()
+    guess = {"huge": 1e6 * truth, "minus": -truth, "half": 0.5 * truth, "zero": 0 * truth}[name]
+    rows, fails, told = [], [], []
+    for way, hybrid in ways(newton).items():
+        state = watch.solve(hybrid(guess), newton.problem, load)
+        told.append(f"{way} {int(state.iterations)}")
+        if not state.converged.all():
+            fails.append(f"{way}: {words(state)}")
+            continue
+        off = float((state.displacement - truth).abs().max())
+        rows.append(Row(f"{way}: off Newton's answer, over L", "< 1e-8", off))
+    return graded(f"Newton's answer; iterations: {', '.join(told)}", rows, fails=fails)
+
+
+def noisy(size: float, watch: Watch) -> Outcome:
+    """Start from the exact answer with noise; picked exactly where its residual is smaller."""
+    newton, load, truth = bent()
+    problem, random = newton.problem, torch.Generator().manual_seed(0)
+    noise = size * torch.randn(truth.shape, generator=random, dtype=torch.float64)
+    guess = truth + torch.where(problem.free, noise, 0.0)
+    printed, count = NOISE[size]
+    plain = PlainNewton(newton)
+    *_, first = (state for state, _ in zip(plain.iterate(load), range(2), strict=False))
+    *_, corrected = plain.iterate(load, guess=guess)
+    (alone,) = Direct(known(guess), problem).iterate(load)
+    rows = [
+        Row("||R|| / ||f|| of the prediction", printed, float(alone.residual), 0.1),
+        Row("the same after one step from rest", "95.6", float(first.residual), 1e-3),
+        Row("network alone: converged", "0", float(alone.converged), 0),
+    ]
+    fails = []
+    for way, hybrid in ways(newton).items():
+        states = list(watch.over(hybrid(guess), problem, newton.tol).iterate(load))
+        if not states[-1].converged.all():
+            fails.append(f"{way}: {words(states[-1])}")
+            continue
+        off = float((states[-1].displacement - truth).abs().max())
+        rows.append(Row(f"{way}: off Newton's answer, over L", "< 1e-8", off))
+        if way == "paper":
+            wanted = bool(alone.volume_ratio > 0) and float(alone.residual) < float(first.residual)
+            rows.append(Row("paper: picked", f"{int(wanted)}", float(pick(*states[:2])), 0))
+    taken = int(corrected.iterations)
+    if taken > int(count) if size < 1e-2 else taken <= 6:  # at 1e-2 the draw decides how many
+        fails.append(f"plain Newton takes {taken} iterations, printed {count}")
+    told = f"|R|/|f| {float(alone.residual):.3g}, plain Newton from it {taken} iterations"
+    return graded(told, rows, fails=fails)
+
+
+def factored(watch: Watch) -> Outcome:
+    """Multiply the exact answer by a factor: a small error of a stiff kind."""
+    newton, load, truth = bent()
+    rows = []
+    for error, printed in SCALED.items():
+        (alone,) = Direct(known((1 + error) * truth), newton.problem).iterate(load)
+        rows.append(Row(f"{error:.1%} too long: ||R|| / ||f||", printed, float(alone.residual)))
+        rows.append(Row(f"{error:.1%}: converged", "0", float(alone.converged), 0))
+    return graded(", ".join(f"{row.value:.3g}" for row in rows[::2]), rows)
+
+
+def rounded(watch: Watch) -> Outcome:
+    """Round an exact answer to float32 and bfloat16: how small a residual a network can have."""
+    newton, load, truth = bent()
+    rows, told = [], []
+    for dtype, bound in ((torch.float32, FLOAT32), (torch.bfloat16, None)):
+        guess, name = truth.to(dtype).double(), str(dtype).removeprefix("torch.")
+        (alone,) = Direct(known(guess), newton.problem).iterate(load)
+        state = watch.solve(Hybrid(known(guess), newton), newton.problem, load)
+        ratio = float(alone.residual)
+        told.append(f"{name} {ratio:.2g}, then {int(state.iterations)} iterations")
+        if bound is not None:
+            rows.append(Row(f"{name}: ||R|| / ||f||", f"{bound}", ratio, 0.5))
+        off = float((state.displacement - truth).abs().max())
+        rows += [
+            Row(f"{name}: converged alone", "0", float(alone.converged), 0),
+            Row(f"{name}: off Newton's answer, over L", "< 1e-8", off),
+        ]
+    return graded("; ".join(told), rows)
+
+
+def precise(dtype: torch.dtype, device: str, watch: Watch) -> Outcome:
+    """Ask a network of another precision: what it says is float64, and judged in float64."""
+    own = scene()
+    torch.manual_seed(0)
+    surrogate = Surrogate(FCNN(own, width=64), MSE(), own).to(device, dtype)
+    drawn = own.loads.sample((0, 9), range(4))
+
+    def predict(load: Load) -> Tensor:
+        return surrogate.predict(Load(*(column.to(device) for column in load))).cpu()
+
+    with torch.inference_mode():
+        said = predict(drawn)
+        state = watch.solve(Hybrid(predict, own.solver), own.problem, drawn)
+    exact = solve(own.solver.but(tol=1e-12), drawn).displacement
+    off = float((state.displacement - exact).abs().max())
+    rows = [
+        Row("the prediction is float64", "1", float(said.dtype == torch.float64), 0),
+        Row("the answer is float64", "1", float(state.displacement.dtype == torch.float64), 0),
+        Row("off Newton's answers, over L", "< 1e-6", off),
+    ]
+    fails = [] if state.converged.all() else [words(state)]
+    return graded(f"4 loads, {int(state.iterations.sum())} iterations", rows, fails=fails)
+
+
+def single_precision(watch: Watch) -> Outcome:
+    """Give Newton forces in float32: no answer may be of that precision."""
+    newton, load, truth = bent()
+    try:
+        state = solve(newton, Load(load.force.float(), load.young, load.poisson))
+    except (RuntimeError, TypeError, ValueError) as error:
+        return graded(f"{type(error).__name__}: {error}")
+    off = float((state.displacement.double() - truth).abs().max())
+    rows = [Row("off the answer of float64, over L", "< 1e-6", off)]
+    return graded(f"answer in {state.displacement.dtype}, off {off:.0e} L", rows)
+
+
+def climbed(watch: Watch) -> Outcome:
+    """Climb the ladder of loads with hybrids that start from the linear answer."""
+    own, rungs, fails = scene(), [], []
+    problem, unit, rows = own.problem, pulled(own.problem, LARGEST), list[Row]()
+    for way in ("best", "paper", "steps"):
+        for amplitude in LADDER:
+            load = load_of(amplitude * unit)
+            guess = solve(Linear(problem), load).displacement
+            exact = solve(own.solver, load)
+            hybrid = ways(own.solver)[way](guess)
+            states = list(watch.over(hybrid, problem, own.solver.tol).iterate(load))
+            last = states[-1]
+            apart = float((last.displacement - exact.displacement).norm())
+            error = apart / float(exact.displacement.norm())
+            smallest = min(float(s.volume_ratio) for s in states if s.iterations > 0 or s is last)
+            rungs.append(rung(f"hybrid, {way}", amplitude, last, smallest, error))
+            if not last.converged.all():
+                fails.append(f"{way}, {amplitude:g}: {words(last)}")
+            elif amplitude <= 1:
+                rows.append(Row(f"{way}, {amplitude:g}: off Newton", "< 1e-6", error))
+    return graded(_told(rungs), rows, fails=fails, rungs=rungs)
+
+
+def _told(rungs: list[Rung]) -> str:
+    done = sum(rung.status in ("converged", "unstable") for rung in rungs)
+    most = max(rung.iterations for rung in rungs)
+    return f"{done} of {len(rungs)} answered, at most {most} iterations"
+
+
+def too_large(watch: Watch) -> Outcome:
+    """Ask for the paper's network on a mesh of more than 100,000 degrees of freedom."""
+    mesh = box([1.0, 1.0, 1.0], [33, 33, 33])
+    problem = Problem.build(mesh, NH, fixed=Plane(0, "min"))
+    newton = Newton(problem)
+    own = Scene(problem, ModalLoads(newton.rest, n_modes=1, young=YOUNG), newton)
+    size = problem.points.numel()
+    words = f"{4 * size**2 + 7 * size:,} parameters"
+    build = partial(FCNN, own, all_dofs=True, memory_limit=128.0)
+    return refused(f"{size:,} degrees of freedom", build, words)
+
+
+def cases() -> list[Case]:
+    """Return the cases of this theme."""
+    floor = f"{FLOAT32:g} in float32; never converged; the hybrid exact to 1e-8 L"
+    found = [Case("T18", "exact answer, rounded to float32 and bfloat16", floor, rounded)]
+    expected = "predictions and answers in float64, answers Newton's to 1e-6 L"
+    places = [("float32", torch.float32, "cpu"), ("bfloat16", torch.bfloat16, "cpu")]
+    if torch.cuda.is_available():
+        places.append(("float32 with TF32, on the GPU", torch.float32, "cuda"))
+    for name, dtype, device in places:
+        run = partial(_with_tf32 if device == "cuda" else precise, dtype, device)
+        found.append(Case("T18", f"network in {name}", expected, run))
+    expected = "an error, or the answer of float64; none in float32"
+    found.append(Case("T18", "Newton, given forces in float32", expected, single_precision))
+    for name in USELESS:
+        expected = "the classic answer bit for bit, at its cost; not picked"
+        found.append(Case("T19", f"prediction {name}", expected, partial(useless, name)))
+    for name in ("huge", "minus", "half", "zero"):
+        found.append(
+            Case("T19", f"prediction {name}", "Newton's answer to 1e-8 L", partial(misled, name))
+        )
+    for size, (printed, count) in NOISE.items():
+        expected = f"|R|/|f| {printed}, {count} plain iterations; picked where below 95.6"
+        found.append(Case("T20", f"noise of {size:g} L", expected, partial(noisy, size)))
+    expected = "|R|/|f| 8.96, .818, .081: none converged"
+    found.append(Case("T21", "exact answer, 10 %, 1 %, 0.1 % too long", expected, factored))
+    expected = "refused with its parameters, before any memory is taken"
+    found.append(Case("T23", "the paper's network, 107,811 DOF, 128 GB", expected, too_large))
+    expected = "Newton's answers in range; beyond, an answer or a status"
+    what = "hybrids from the linear answer, 1e-9 to 25 times the range"
+    return [*found, Case("ladder", what, expected, climbed)]
+
+
+def _with_tf32(dtype: torch.dtype, device: str, watch: Watch) -> Outcome:
+    before = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = True
+    try:
+        return precise(dtype, device, watch)
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = before

@@ -1,0 +1,82 @@
+"""Cases whose answers are known, solved again: the sections of docs/verification.md.
+
+A case solves, draws and returns a `Section`; its references stand beside it, typed as their source
+prints them. Sources: closed forms and elliptic integrals; public codes, by name; and "an
+independent code": a finite-element program in NumPy, written for these numbers, that shares no line
+with this package.
+"""
+
+import json
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from benchmarks.verification.beams import balance, beam
+from benchmarks.verification.refinement import cook, locking, order
+from benchmarks.verification.report import Row, Section, summary, table
+from benchmarks.verification.rods import buckling, elastica
+from benchmarks.verification.twisted import twist
+from benchmarks.verification.uniaxial import laws
+
+__all__ = ["CASES", "Row", "Section", "measure", "page"]
+
+CASES: dict[str, Callable[[Path], Section]] = {
+    "laws": laws,
+    "order": order,
+    "cook": cook,
+    "elastica": elastica,
+    "twist": twist,
+    "locking": locking,
+    "beam": beam,
+    "buckling": buckling,
+    "balance": balance,
+}
+
+
+def measure(name: str, folder: Path) -> Section:
+    """Return a case's section; its figures and its numbers are written into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # some of these bodies lock on purpose
+        section = CASES[name](folder)
+    section = replace(section, seconds=time.perf_counter() - start)
+    (folder / f"{name}.json").write_text(json.dumps(asdict(section), indent=1) + "\n")
+    return section
+
+
+def page(folder: Path) -> str:
+    """Return the page of all sections whose numbers lie in a folder, in Markdown."""
+    sections = {}
+    for name in CASES:
+        if (path := folder / f"{name}.json").is_file():
+            data = json.loads(path.read_text())
+            data["rows"] = [Row(**row) for row in data["rows"]]
+            sections[name] = Section(**data)
+    lines = [
+        "# Verification",
+        "",
+        "Written by `python scripts/verify.py`; every number in the columns *dpl* and *difference*",
+        "is measured by that run, in float64 on one thread. The references are typed in as their",
+        "sources print them. A difference is relative and must lie within one unit of the last",
+        "digit printed or, where a section says so, within the tolerance given there; what does",
+        "not is set in **bold** and explained below its table. *An independent code* is a small",
+        "finite-element program written in NumPy for these references; it shares nothing with dpl.",
+        "In the figures, black is the reference and colour is dpl.",
+        "",
+        *table(
+            ("case", "values", "as they should be", "largest relative difference", "seconds"),
+            [summary(k, s) for k, s in enumerate(sections.values(), 1)],
+        ),
+    ]
+    for k, section in enumerate(sections.values(), 1):
+        lines += ["", f"## {k}. {section.title}", "", section.text]
+        for file, caption in section.figures:
+            lines += ["", f"![{caption}](verification/{file})", "", f"*{caption}*"]
+        header = ("quantity", "reference", "dpl", "difference")
+        lines += ["", *table(header, [row.cells() for row in section.rows])]
+        for note in section.notes:
+            lines += ["", note]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,122 @@
+"""Figures of one style: black is the reference, colour is dpl; readable without colour."""
+
+import io
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from benchmarks.verification.bodies import Array, lattice
+from dpl.fem.problem import Problem
+from dpl.visualization.style import COLOURS, STYLE
+
+MARKS = "osD^vP"
+
+
+@contextmanager
+def picture(path: Path, height: float = 3.1) -> Iterator[Any]:
+    """Lend an empty figure as wide as a page, written to a file at the end."""
+    import matplotlib
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7.4, height))
+        figure.set_layout_engine("constrained", w_pad=0.06, wspace=0.05)
+        yield figure
+        drawn = io.BytesIO()
+        figure.savefig(drawn, dpi=150)
+    palette = Image.open(drawn).convert("RGB").quantize(128)  # a third of the bytes
+    palette.save(path, optimize=True)
+
+
+def panel(figure: Any, place: int, x: str, y: str, title: str = "", **options: Any) -> Any:
+    """Return one of a figure's axes, labelled."""
+    ax = figure.add_subplot(1, options.pop("columns", 2), place)
+    ax.set(xlabel=x, ylabel=y, **options)
+    ax.set_title(title, loc="left")
+    ax.grid(True)
+    return ax
+
+
+def measured(ax: Any, x: Any, y: Any, k: int, label: str | None = None, **style: Any) -> None:
+    """Draw measured values, the k-th series."""
+    how = {"color": COLOURS[k], "marker": MARKS[k], "markersize": 3.8, "linewidth": 1.0}
+    ax.plot(x, y, **{**how, "label": label, **style})
+
+
+def reference(ax: Any, x: Any, y: Any, label: str | None = None) -> None:
+    """Draw printed values: open circles, measured ones show inside."""
+    ax.plot(
+        *(x, y, "o"),
+        **{"markersize": 6.5, "markerfacecolor": "none", "markeredgecolor": "black"},
+        **{"markeredgewidth": 0.8, "label": label, "zorder": 5},
+    )
+
+
+def triangle(ax: Any, x: float, y: float, order: int, *, rise: float = 2.0) -> None:
+    """Draw a triangle of a given order into a logarithmic plot, its right angle lower right."""
+    left, low = x / rise, y / rise**order
+    ax.fill([left, x, x], [low, low, y], facecolor="none", edgecolor="black", linewidth=0.7)
+    ax.annotate(
+        f"{order}", (x, math.sqrt(low * y)), (3, 0), textcoords="offset points", va="center"
+    )
+
+
+def side(ax: Any, places: Array, nodes: NDArray[np.int_], colour: str, step: int = 1) -> None:
+    """Draw a grid in a plane.
+
+    Args:
+        ax: Where.
+        places: Of the nodes, (N, 2).
+        nodes: By their places in the grid, see `lattice`, (n1, n2).
+        colour: Of cells and edges.
+        step: Nodes from one cell to the next, the degree of the displacement.
+    """
+    from matplotlib.collections import LineCollection
+
+    seen = places[nodes]
+    outline = np.concatenate([seen[:, 0], seen[-1], seen[::-1, -1], seen[0, ::-1]])
+    ax.fill(*outline.T, facecolor=colour, alpha=0.3, linewidth=0)
+    lines = [*seen[::step], *seen.swapaxes(0, 1)[::step]]
+    ax.add_collection(LineCollection(lines, colors=colour, linewidths=0.6))
+
+
+def solid(ax: Any, problem: Problem, displacement: Tensor, colour: str) -> None:
+    """Draw the faces of a block of a grid, deformed and lit, its cells outlined."""
+    from matplotlib.colors import to_rgb
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+    nodes = lattice(problem.points.numpy())
+    places = (problem.points + displacement).numpy()
+    light = np.array([-0.3, -0.85, 0.45])
+    for axis in range(3):
+        for end, outward in ((0, -1), (-1, 1)):
+            face = np.moveaxis(nodes, axis, 0)[end]
+            quad = np.stack([face[:-1, :-1], face[1:, :-1], face[1:, 1:], face[:-1, 1:]], axis=-1)
+            quads = places[quad.reshape(-1, 4)]
+            normals = np.cross(quads[:, 1] - quads[:, 0], quads[:, 3] - quads[:, 0])
+            normals *= outward * (1 if axis != 1 else -1) / np.linalg.norm(normals, axis=1)[:, None]
+            shade = 0.45 + 0.55 * np.maximum(normals @ light, 0.0)
+            colours = shade[:, None] * to_rgb(colour)
+            ax.add_collection3d(
+                Poly3DCollection(quads, facecolors=colours, edgecolors=colours, clip_on=False)
+            )
+            lines = [places[row] for row in (*face[:: problem.degree], *face.T[:: problem.degree])]
+            style = {"colors": "black", "linewidths": 0.25, "clip_on": False}
+            ax.add_collection3d(Line3DCollection(lines, **style))
+    low, high = places.min(axis=0), places.max(axis=0)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    ax.set_box_aspect(high - low, zoom=1.45)
+    ax.view_init(elev=18, azim=-65)
+    ax.set_axis_off()
+
+
+def curve(ax: Any, x: Any, y: Any, label: str | None = None, linestyle: str = "-") -> None:
+    """Draw a known curve."""
+    ax.plot(x, y, color="black", linewidth=0.8, linestyle=linestyle, label=label, zorder=4)

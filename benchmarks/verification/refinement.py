@@ -1,0 +1,289 @@
+"""Elements under refinement and near incompressibility: errors, Cook's membrane, locking."""
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import skfem
+import torch
+from torch import Tensor
+
+from benchmarks.verification.bodies import NAMES, Array, balanced, lattice
+from benchmarks.verification.drawing import measured, panel, picture, reference, side, triangle
+from benchmarks.verification.report import Row, Section
+from dpl.fem.loads.forces import Traction, body_force
+from dpl.fem.materials.material import Material
+from dpl.fem.materials.neo_hookean import NeoHookeanIsoK4, NeoHookeanLn
+from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem.mesh.generators import box, rectangle
+from dpl.fem.mesh.regions import Plane
+from dpl.fem.problem import Problem
+from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.newton import Newton
+from dpl.visualization.style import COLOURS
+
+# cell, degree: cells a side, error in L2, error in the H1-seminorm; NH-ln, A = 0.1
+ERRORS: dict[tuple[str, int], tuple[list[int], str, str]] = {
+    ("hexahedron", 1): (
+        [2, 4, 8, 16],
+        "1.7844e-2 4.6365e-3 1.1694e-3 2.9296e-4",
+        "1.1184e-1 5.6220e-2 2.8064e-2 1.4022e-2",
+    ),
+    ("hexahedron", 2): (
+        [1, 2, 4, 8],
+        "2.8187e-3 1.6993e-3 2.1432e-4 2.6811e-5",
+        "3.3631e-2 2.2007e-2 5.5546e-3 1.3900e-3",
+    ),
+    ("tetra", 1): ([2, 4, 8, 16], "2.1458e-2 6.0357e-3 1.6041e-3 4.1073e-4", "2.0664e-2"),
+    ("tetra", 2): ([1, 2, 4, 8], "1.5808e-2 2.6990e-3 3.4504e-4 4.2559e-5", "2.4995e-3"),
+}
+
+
+def manufactured(x: Tensor) -> Tensor:
+    """Return the displacement (3,) chosen for the unit cube at a point (3,)."""
+    X, Y, Z = math.pi * x
+    u = (X.sin() * (Y / 2).cos(), (Y / 2).cos() * Z.sin(), x[1] * (X / 2).sin() * Z.sin())
+    return 0.1 * torch.stack(u)
+
+
+def errors(cell: str, degree: int, n: int) -> tuple[float, float]:
+    """Return the errors of the manufactured answer on n^3 cells, L2 and H1-seminorm [-]."""
+    law = NeoHookeanLn(0.3)
+    gradient = torch.func.jacrev(manufactured)
+
+    def load(x: Tensor) -> Tensor:  # -Div P
+        return -torch.einsum(
+            "ijkl,klj->i", law.tangent(gradient(x)), torch.func.jacfwd(gradient)(x)
+        )
+
+    def at(what: Callable[[Tensor], Tensor], x: Array) -> Array:
+        """Evaluate a field of one point at (3, E, Q); its components come first."""
+        values = torch.func.vmap(what)(torch.from_numpy(x.reshape(3, -1).T.copy()))
+        return np.moveaxis(values.numpy(), 0, -1).reshape(*values.shape[1:], *x.shape[1:])
+
+    mesh = box([1.0] * 3, [n + 1] * 3, cell)
+    bare = Problem.build(mesh, law, degree=degree, length=1.0)
+    given = torch.func.vmap(manufactured)(bare.points).numpy()
+    problem = Problem.build(
+        mesh, law, fixed=bare.boundary.numpy(), prescribed=given, degree=degree, length=1.0
+    )
+    force = body_force(problem, lambda x: at(load, x))
+    answer = balanced(Newton(problem), force).displacement[0].numpy()
+    fine = skfem.Basis(mesh, problem.basis.elem, intorder=7)
+    x = np.asarray(fine.global_coordinates())
+    u, slope = at(manufactured, x), at(gradient, x)
+    found = [fine.interpolate(component) for component in answer.T]
+    off = sum((np.asarray(f) - u[i]) ** 2 for i, f in enumerate(found))
+    off_slope = sum(((f.grad - slope[i]) ** 2).sum(axis=0) for i, f in enumerate(found))
+    return math.sqrt((off * fine.dx).sum()), math.sqrt((off_slope * fine.dx).sum())
+
+
+def order(folder: Path) -> Section:
+    """Measure the order of accuracy of the four solid elements."""
+    rows, found = [], {}
+    for (cell, degree), (counts, L2, H1) in ERRORS.items():
+        found[cell, degree] = values = np.array([errors(cell, degree, n) for n in counts])
+        rates = np.log2(values[-2] / values[-1])
+        name, last = NAMES[cell, degree], f"{counts[-1]}³ cells"
+        within = 5e-4 if cell == "hexahedron" else 0.1
+        rows += [
+            Row(f"{name}, L2 error, {last}", L2.split()[-1], values[-1, 0], within),
+            Row(f"{name}, H1 error, {last}", H1.split()[-1], values[-1, 1], within),
+            Row(f"{name}, order in L2, last pair", f"> {degree + 0.9}", rates[0]),
+            Row(f"{name}, order in H1, last pair", f"> {degree - 0.05:.2f}", rates[1]),
+        ]
+    _draw_errors(folder / "order.png", found)
+    return Section(
+        "Order of accuracy",
+        "Manufactured solution on the unit cube (NH-ln, ν = 0.3): u₁ = A sin πx cos πy/2, "
+        "u₂ = A cos πy/2 sin πz, u₃ = A y sin πx/2 sin πz with A = 0.1 on the whole boundary, the "
+        "body force −Div P by automatic differentiation. References: errors of an independent "
+        "code, to 5e-4 for hexahedra; its tetrahedra lie along another diagonal of the cube, so "
+        "within 10 % for them. Orders must exceed p + 0.9 in L2 and p − 0.05 in H1.",
+        rows,
+        [("order.png", "Errors against cell size, with triangles of the theoretical slopes.")],
+    )
+
+
+def _draw_errors(path: Path, found: dict[tuple[str, int], Array]) -> None:
+    panels = (
+        ("L2 error of u [-]", ((0.125, 5.5e-4, 2), (0.21, 4.2e-5, 3))),
+        ("H1 error of u (seminorm) [-]", ((0.14, 9e-3, 1), (0.3, 2e-3, 2))),
+    )
+    sizes = {"1": 1, "1/2": 1 / 2, "1/4": 1 / 4, "1/8": 1 / 8, "1/16": 1 / 16}
+    log = {"xscale": "log", "yscale": "log"}
+    with picture(path, 3.4) as figure:
+        for place, (what, triangles) in enumerate(panels):
+            ax = panel(figure, place + 1, "cell size h/L [-]", what, f"({'ab'[place]})", **log)
+            for k, (kind, (counts, *printed)) in enumerate(ERRORS.items()):
+                h, values = 1 / np.array(counts), [float(text) for text in printed[place].split()]
+                measured(ax, h, found[kind][:, place], k, NAMES[kind])
+                label = "independent code" if k == 3 else None
+                reference(ax, h[-len(values) :], values, label)
+            for x, y, power in triangles:
+                triangle(ax, x, y, power)
+            ax.set_xticks([*sizes.values()], [*sizes])
+            ax.minorticks_off()
+            if place == 0:
+                ax.legend(loc="lower right")
+
+
+SIDES = (2, 4, 8, 16, 32, 64)
+COOK = {  # displacement u_y at (48, 52) [mm] on SIDES cells a side: deal.II
+    1: "8.638 12.07 13.86 14.49 14.67 14.72",
+    2: "14.30 14.65 14.71 14.73 14.74 14.74",
+}
+FINER = {1: "8.6384 12.0712 13.8632 14.4853", 2: "14.3018 14.6494 14.7139"}  # independent code
+OTHERS: list[tuple[str, Material, int, str]] = [  # 8 x 8 cells, independent code
+    ("NH-ln", NeoHookeanLn(0.3), 1, "13.700585"),
+    ("NH-ln", NeoHookeanLn(0.3), 2, "14.4831"),
+    ("SVK", SaintVenantKirchhoff(0.3), 2, "13.6261"),
+]
+
+
+def membrane(law: Material, n: int, degree: int) -> tuple[Problem, Tensor]:
+    """Return Cook's membrane of n^2 cells in plane strain with its displacement [mm]."""
+    mesh = rectangle([1.0, 1.0], [n + 1, n + 1])
+    x, y = mesh.p
+    mesh = type(mesh)(np.stack([48 * x, 44 * x + y * (44 - 28 * x)]), mesh.t)
+    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
+    young = 0.4225 * 2.6  # [N/mm2], of mu = 0.4225 and nu = 0.3
+    force = Traction(Plane(0, "max"), [0.0, 1 / 16 / young]).on(problem)
+    return problem, balanced(Newton(problem), force).displacement[0] * problem.length
+
+
+def at(problem: Problem, field: Tensor, place: Sequence[float]) -> tuple[float, ...]:
+    """Return a nodal field (N, D) at the node nearest a place [of the unit of `length`]."""
+    away = problem.points * problem.length - torch.tensor(place, dtype=torch.float64)
+    return tuple(field[int(away.norm(dim=1).argmin())].tolist())
+
+
+def cook(folder: Path) -> Section:
+    """Refine Cook's membrane."""
+    found = {(d, n): membrane(NeoHookeanIsoK4(0.3), n, d) for d in COOK for n in SIDES}
+    tips = {case: at(*body, (48, 52))[1] for case, body in found.items()}
+    rows = []
+    for source, table in (("deal.II", COOK), ("independent code", FINER)):
+        for degree, printed in table.items():
+            for n, text in zip(SIDES, printed.split(), strict=False):
+                name = f"Q{degree}, {n} × {n}: u_y(48, 52) [mm], {source}"
+                rows.append(Row(name, text, tips[degree, n]))
+    for k, text in enumerate(("-13.8264", "13.7505")):
+        name = f"Q2, 8 × 8: u_{'xy'[k]}(48, 60) [mm], independent code"
+        rows.append(Row(name, text, at(*found[2, 8], (48, 60))[k]))
+    for law_name, law, degree, text in OTHERS:
+        name = f"{law_name}, Q{degree}, 8 × 8: u_y(48, 52) [mm], independent code"
+        rows.append(Row(name, text, at(*membrane(law, 8, degree), (48, 52))[1]))
+    _draw_membrane(folder / "cook.png", tips, *found[2, 8])
+    return Section(
+        "Cook's membrane",
+        "A tapered panel (corners (0, 0), (48, 44), (48, 60), (0, 44) mm), clamped on the left, "
+        "under a dead shear traction of 1/16 N/mm² on the right, in plane strain at finite strain; "
+        "NHiso-k4, μ = 0.4225 N/mm², ν = 0.3. References: the tables of deal.II's code gallery "
+        "(*Quasi-static finite-strain compressible elasticity*, as corrected in 2021), whose mesh "
+        "is one hexahedron thick with no displacement across it, which is the same; more digits "
+        "and the other laws by an independent code (NH-ln on Q1 by felupe 11.3.0 as well).",
+        rows,
+        [("cook.png", "(a) Tip displacement against refinement, (b) rest and deformed mesh.")],
+    )
+
+
+def _draw_membrane(
+    path: Path, tips: dict[tuple[int, int], float], problem: Problem, u: Tensor
+) -> None:
+    with picture(path, 3.3) as figure:
+        ax = panel(figure, 1, "cells a side [-]", "u$_y$ at (48, 52) [mm]", "(a)", xscale="log")
+        for k, (degree, printed) in enumerate(COOK.items()):
+            measured(ax, SIDES, [tips[degree, n] for n in SIDES], k, f"Q{degree}")
+            known = [float(text) for text in printed.split()]
+            reference(ax, SIDES, known, "deal.II" if k else None)
+        ax.set_xticks(SIDES, map(str, SIDES))
+        ax.minorticks_off()
+        ax.legend(loc="lower right")
+        ax = panel(figure, 2, "x [mm]", "y [mm]", "(b) Q2, 8 × 8 cells", aspect="equal")
+        ax.grid(False)
+        X = problem.points.numpy() * problem.length
+        x, y = X.T
+        nodes = lattice(np.stack([x / 48, (y - 44 / 48 * x) / (44 - 28 / 48 * x)], axis=1))
+        side(ax, X, nodes, "0.6", 2)
+        side(ax, X + u.numpy(), nodes, COLOURS[1], 2)
+        tip = np.array([48.0, 52.0])
+        ends = np.stack([tip, tip + at(problem, u, (48, 52))])
+        ax.plot(*ends.T, "k.-", markersize=5, linewidth=0.8, zorder=5)
+        ax.annotate("(48, 52)", ends[0], (5, -3), textcoords="offset points")
+        ax.set(xticks=range(0, 61, 15), yticks=range(0, 76, 15), xlim=(-3, 66), ylim=(-3, 78))
+
+
+POISSON = (0.3, 0.45, 0.49, 0.499, 0.4999)
+LOCKING = {  # compliance over that of hex27, 16 x 4 x 4: cells, cell, degree, values
+    "hex8, 16 × 4 × 4": ((16, 4, 4), "hexahedron", 1, ".960 .901 .753 .467 .209"),
+    "tet4, 16 × 4 × 4": ((16, 4, 4), "tetra", 1, ".795 .615 .323 .103 .067"),
+    "tet10, 8 × 2 × 2": ((8, 2, 2), "tetra", 2, ".991 .973 .957 .947 .945"),
+    "hex27, 8 × 2 × 2": ((8, 2, 2), "hexahedron", 2, ".996 .981 .963 .954 .952"),
+    "hex8 with mean dilatation, 16 × 4 × 4": ((16, 4, 4), "hexahedron", 1, ""),
+}
+
+
+def compliance(
+    nu: float, cells: Sequence[int], cell: str, degree: int, mean: bool = False
+) -> float:
+    """Return f u of the paper's beam under a small dead load across its end."""
+    mesh = box([4.0, 1.0, 1.0], [n + 1 for n in cells], cell)
+    law = NeoHookeanLn(nu)
+    problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree, mean_dilatation=mean)
+    force = Traction(Plane(0, "max"), [0.0, 0.0, -1.0]).on(problem)
+    return float((force * Linear(problem).respond(force)).sum())
+
+
+def locking(folder: Path) -> Section:
+    """Approach incompressibility with every element."""
+    best = [compliance(nu, (16, 4, 4), "hexahedron", 2) for nu in POISSON]
+    found, rows = {}, []
+    for name, (cells, cell, degree, printed) in LOCKING.items():
+        mean = not printed
+        values = [compliance(nu, cells, cell, degree, mean) for nu in POISSON]
+        found[name] = [value / right for value, right in zip(values, best, strict=True)]
+        texts = printed.split() or ["> 0.94"] * len(POISSON)
+        rows += [
+            Row(f"{name}, ν = {nu}", text, value)
+            for nu, text, value in zip(POISSON, texts, found[name], strict=True)
+        ]
+    _draw_locking(folder / "locking.png", found)
+    return Section(
+        "Nearly incompressible bodies",
+        "Compliance f·u of the paper's beam (4 × 1 × 1) under a small load across its end, over "
+        "that of hex27 on 16 × 4 × 4 cells, as ν approaches ½. References: an independent code. "
+        "Elements that do not lock must stay above 0.94.",
+        rows,
+        [("locking.png", "Compliance ratio against Poisson's ratio; 1 is right, 0 is locked.")],
+        [
+            "hex8 and tet4 lock, as they must: dpl warns when it builds such a body "
+            "(ν ≥ 0.45). With `mean_dilatation` hex8 does not; it ends up slightly softer "
+            "than the hex27 that it is compared with, which is not exact either."
+        ],
+    )
+
+
+def _draw_locking(path: Path, found: dict[str, list[float]]) -> None:
+    with picture(path, 2.9) as figure:
+        what = "compliance / that of fine hex27 [-]"
+        ax = panel(
+            figure,
+            1,
+            "Poisson's ratio ν [-], its distance from ½ in logarithmic scale",
+            what,
+            columns=1,
+            xscale="log",
+        )
+        away = 0.5 - np.array(POISSON)
+        for k, (name, values) in enumerate(found.items()):
+            measured(ax, away, values, k, name)
+            if known := [float(text) for text in LOCKING[name][3].split()]:
+                reference(ax, away, known)
+        reference(ax, [], [], "independent code")
+        ax.set_xticks(away, map(str, POISSON))
+        ax.minorticks_off()
+        ax.invert_xaxis()
+        ax.set(ylim=(0, 1.08))
+        ax.legend(loc="upper left", bbox_to_anchor=(1, 1))

@@ -1,1 +1,0 @@
-"""What is measured: solvers, networks, meshes and codes, against each other on one machine."""

@@ -1,0 +1,1 @@
+"""Configurations: checked, built into scenes and networks, kept in the folder of a run."""

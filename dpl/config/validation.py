@@ -1,0 +1,327 @@
+"""What a configuration may hold: keys, kinds, spans, and what it may name to be called.
+
+Signatures are the schema: options and their types are those of the classes and functions named.
+"""
+
+import contextlib
+import difflib
+import importlib
+import inspect
+import math
+import types
+import typing
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+WHOLE, NAMES = Sequence[int], Sequence[str] | None
+KEYS: dict[str, Any] = {  # what a configuration may hold at its top, and of which kind
+    **dict.fromkeys(("mesh", "material", "loads", "solver"), dict),
+    **dict.fromkeys(("clamped", "supports", "forces"), dict | None),
+    **{"degree": int, "mean_dilatation": bool, "young": float | Sequence[float]},
+    **dict.fromkeys(("data", "model", "loss", "optimizer", "trainer"), dict),
+    **{"scheduler": dict | None, "seed": int, "ckpt_path": str | None},
+    **{"run": str | None, "folder": str, "tol": float},
+    **{"action": str, "shard": int, "shards": int},
+    **{"parts": Sequence[str], "linear": Sequence[str], "peers": dict},
+    **dict.fromkeys(("repeats", "count", "workers", "samples", "far"), int),
+    **{"name": str, "galerkin": dict | None, "corrected": dict | None},
+    **{"networks": NAMES, "tols": Sequence[float], "resume": bool, "cases": NAMES},
+    **{"exact": bool},
+    **{"threads": Sequence[int | None], "across": WHOLE, "budget": int},
+    **{"minutes": float, "works": Sequence[str]},
+    **{"host": str, "port": int, "names": Sequence[str], "movie": str | None, "speed": bool},
+}
+SPANS = {  # smallest and largest of them
+    **{"repeats": (1, 10**6), "samples": (1, 10**6), "shards": (1, math.inf)},
+    **{"count": (0, 10**6), "far": (0, 10**6), "workers": (0, 1024), "seed": (0, 2**32 - 1)},
+    **{"budget": (1, 10**6), "minutes": (1e-2, 1e6), "port": (0, 65535)},
+    **{"tol": (1e-15, 1), "tols": (1e-15, 1), "across": (1, 10**3), "threads": (1, 10**4)},
+    **{"young": (1e-30, 1e30)},  # [Pa]
+}
+TRAINED = {  # smallest and largest of what only a training must keep to; 1e-30 is "above 0"
+    **{"data.train": (1, 10**7), "optimizer.lr": (1e-30, 1e6)},
+    **{f"trainer.{key}": (1, 10**9) for key in ("max_epochs", "max_steps")},
+    **{"trainer.check_val_every_n_epoch": (1, 10**9), "trainer.log_every_n_steps": (0, 10**9)},
+    **{"trainer.limit_train_batches": (1e-30, 10**9)},
+}
+ENDLESS = {"trainer.max_epochs", "trainer.max_steps"}  # -1 of these stands for no limit
+KINDS = {  # what the call under a key must give: one of these, or of a class derived from them
+    "mesh": {"skfem.mesh.mesh.Mesh"},
+    "material": {"dpl.fem.materials.material.Material"},
+    "clamped": {f"dpl.fem.mesh.regions.{n}" for n in ("Plane", "Box", "Sphere", "Cylinder", "Tag")},
+    "supports": {
+        "dpl.fem.assembly.boundary_conditions.Displacement",
+        "dpl.fem.assembly.boundary_conditions.Spring",
+    },
+    "forces": {"dpl.fem.loads.forces.Traction", "dpl.fem.loads.forces.BodyForce"},
+    "solver": {"dpl.fem.solvers.newton.Newton"},
+    "loads": {"dpl.fem.loads.modal.ModalLoads"},
+    "data": {"dpl.data.dataset.DataSet", "dpl.data.datamodule.OfflineData"},
+    "model": {"torch.nn.modules.module.Module"},
+    "loss": {"dpl.training.losses.loss.Loss"},
+    "optimizer": {"torch.optim.optimizer.Optimizer"},
+    "scheduler": {"torch.optim.lr_scheduler.LRScheduler"},
+    "trainer": {"lightning.pytorch.trainer.trainer.Trainer"},
+}
+SEVERAL = ("supports", "forces")  # keys that hold calls by name
+TRUSTED = {  # functions that a run's folder may name without being asked; classes are in KINDS
+    *(f"dpl.fem.mesh.generators.{name}" for name in ("box", "rectangle", "propeller", "load")),
+    *(f"dpl.fem.loads.sampling.{name}" for name in ("uniform", "normal", "even", "one")),
+    *(f"dpl.fem.loads.sampling.{name}" for name in ("logarithmic", "tail")),
+    "dpl.training.schedules.warmup_cosine",
+}
+OURS = ("dpl.", "torch.optim.")  # where those classes are
+OWN = {"_target_", "_partial_", "_recursive_", "_convert_"}  # Hydra's own options of a call
+
+ASIDE = {  # where a run lies and how it is watched, not what it is
+    *("run", "folder", "ckpt_path", "data.folder"),
+    *("trainer.callbacks", "trainer.logger", "trainer.plugins"),
+}
+RESUMED = {  # what may change where a run is resumed: how long it is, and the machine's part
+    *(f"trainer.max_{unit}" for unit in ("epochs", "steps", "time")),
+    *(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy")),
+    *("trainer.log_every_n_steps", "trainer.check_val_every_n_epoch", "trainer.profiler"),
+    *("trainer.enable_progress_bar", "trainer.enable_model_summary"),
+    *("data.workers", "data.timeout"),
+}
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot work: which key, what is wrong, what to do, in one line."""
+
+    def __init__(self, told: str) -> None:
+        """Fold what is told into a line."""
+        super().__init__(" ".join(filter(None, map(str.strip, told.splitlines()))))
+
+
+def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = True) -> None:
+    """Hold a configuration against the signatures that it calls, before anything is called.
+
+    Args:
+        written: The configuration, with interpolations as they are written.
+        resolved: The same without them.
+        trust: Whether it may name any object to call, or only what the keys of a run stand for:
+            classes of this package and of PyTorch's optimisers, and the functions of `TRUSTED`.
+
+    Raises:
+        ConfigError: A key that its object does not know, a value of another type, a number that is
+            not finite or out of range, or an object that does not exist or is not trusted.
+    """
+    if unknown := sorted({str(key) for key in resolved} - set(KEYS)):
+        raise ConfigError(f"{unknown[0]}: there is no such key; {instead(unknown[0], KEYS)}")
+    for node in (written, resolved):  # first where a value is written
+        for path, value in walk(node):
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ConfigError(f"{path} = {value} is not a finite number")
+            if isinstance(value, int) and not -(2**63) <= value < 2**63:
+                raise ConfigError(f"{path} = {value} does not fit into 64 bits")
+    for key, value in resolved.items():
+        _check_top(key, value)
+    trained = TRAINED if "trainer" in resolved else {}
+    for path, node in walk(resolved):
+        if path in trained and not (path in ENDLESS and node == -1):
+            least, most = trained[path]
+            _check_span(path, node, least, most, " or be -1" * (path in ENDLESS))
+        if isinstance(node, dict) and "_target_" in node:
+            _check_call(path, node, _target(path, node["_target_"], trust=trust))
+        elif _is_call(path) and node is not None:
+            raise ConfigError(f"{path} = {node!r} must be a call: its _target_ is missing")
+
+
+def _is_call(path: str) -> bool:
+    """Return whether what lies at a path must be a call."""
+    key, *below = path.split(".")
+    return len(below) == (key in SEVERAL) and key in KINDS
+
+
+def _check_top(key: str, value: Any) -> None:
+    """Hold the value of a key against what it must be."""
+    if key == "folder" and value is None:  # of scripts that write nothing
+        return
+    plain = {} if isinstance(value, dict) else value  # only some keys may be calls
+    if not fits(plain, KEYS[key]):
+        raise ConfigError(f"{key} = {value!r} must be {_words(KEYS[key])}")
+    _check_span(key, value, *SPANS.get(key, (-math.inf, math.inf)))
+
+
+def _check_span(key: str, value: Any, least: float, most: float, more: str = "") -> None:
+    """Hold a number, or those in a list, against the smallest and the largest."""
+    for one in value if isinstance(value, list) else [value]:
+        if isinstance(one, int | float) and not least <= one <= most:
+            span = f"between {least:g} and {most:.10g}"
+            raise ConfigError(f"{key} = {value} must lie {span}{more}")
+
+
+def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
+    """Return what a call names.
+
+    Raises:
+        ConfigError: It does not exist, cannot be called or is not trusted.
+    """
+    foreign = f"{path} names {name}, which is none of this package's; not called"
+    if not isinstance(name, str):
+        raise ConfigError(f"{path}._target_ = {name!r} must be a text")
+    if not trust and not name.startswith(OURS):
+        raise ConfigError(foreign)
+    try:
+        module, _, attribute = name.rpartition(".")
+        target = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError):
+        raise ConfigError(f"{path}._target_ = {name!r} does not exist") from None
+    if not callable(target):
+        raise ConfigError(f"{path}._target_ = {name!r} cannot be called")
+    if not trust and name not in TRUSTED:
+        own = inspect.isclass(target) and f"{target.__module__}.".startswith(OURS)
+        if not own or not is_a(target, set().union(*KINDS.values())):
+            raise ConfigError(foreign)
+    return typing.cast("Callable[..., Any]", target)
+
+
+def is_a(kind: type, names: set[str]) -> bool:
+    """Return whether a class is one of these or derived from them, none of them imported."""
+    return not names.isdisjoint(f"{base.__module__}.{base.__qualname__}" for base in kind.__mro__)
+
+
+def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> None:
+    try:
+        known, hints = _signature(target)
+    except (TypeError, ValueError):  # of what is written in C
+        raise ConfigError(f"{path}._target_ = {node['_target_']!r} has no known options") from None
+    for key, value in node.items():
+        if key in OWN:
+            if key.endswith(("partial_", "recursive_")) and not isinstance(value, bool):
+                raise ConfigError(f"{path}.{key} = {value!r} must be true or false")
+            continue
+        if key not in known:
+            told = instead(str(key), known, f"{path}.")
+            raise ConfigError(f"{path}.{key}: {node['_target_']} has no such option; {told}")
+        if key in hints and not fits(value, hints[key]):
+            raise ConfigError(f"{path}.{key} = {value!r} must be {_words(hints[key])}")
+
+
+def options_of(node: Mapping[str, Any]) -> set[str]:
+    """Return the options of what a call names; none where it is no call or names nothing."""
+    with contextlib.suppress(ConfigError, TypeError, ValueError):
+        return _signature(_target("", node.get("_target_"), trust=True))[0]
+    return set()
+
+
+def near(name: str, known: Collection[str]) -> str | None:
+    """Return the known name that is most like another one; None if none is."""
+    return next(iter(difflib.get_close_matches(name, known, 1)), None)
+
+
+def instead(name: str, known: Collection[str], place: str = "") -> str:
+    """Return which known name may be meant, or all of them.
+
+    Args:
+        name: The unknown name.
+        known: The known names.
+        place: What stands before the name that is meant.
+    """
+    if found := near(name, known):
+        return f"did you mean {place}{found}?"
+    return f"there are {', '.join(sorted(known))}"
+
+
+def _signature(target: Callable[..., Any]) -> tuple[set[str], dict[str, Any]]:
+    """Return the keywords of a call and their types; **kwargs stand for those of the parents."""
+    classes = inspect.getmro(target) if inspect.isclass(target) else ()
+    levels = [vars(c)["__init__"] for c in classes if "__init__" in vars(c)]
+    known: set[str] = set()
+    hints: dict[str, Any] = {}
+    for level in levels or [target]:
+        parameters = inspect.signature(level).parameters
+        known |= set(parameters)
+        with contextlib.suppress(NameError, TypeError):
+            hints = typing.get_type_hints(level) | hints
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+            break
+    return known - {"self", "args", "kwargs"}, hints
+
+
+def fits(value: Any, hint: Any) -> bool:
+    """Return whether a plain value can be what a type hint says; hints of objects accept all."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        return any(fits(value, argument) for argument in arguments)
+    if isinstance(value, dict) and "_target_" in value:
+        return True  # another call
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if origin is typing.Literal:
+        return value in arguments
+    if origin is tuple and Ellipsis not in arguments:
+        many = isinstance(value, list) and len(value) == len(arguments)
+        return many and all(map(fits, value, arguments))
+    if origin in (Sequence, Iterable, list, tuple):
+        return isinstance(value, list) and all(fits(item, arguments[0]) for item in value)
+    if origin is Callable:
+        return False
+    if hint is Path:
+        return isinstance(value, str)
+    if isinstance(origin or hint, type) and hint is not object:
+        return isinstance(value, origin or hint)
+    return True
+
+
+def _words(hint: Any) -> str:
+    names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
+    names |= {Path: "a path", types.NoneType: "null", dict: "a call or several by name"}
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        return " or ".join(_words(argument) for argument in arguments)
+    if origin is Sequence:
+        return f"a list, each {_words(arguments[0])}"
+    return names.get(hint, str(hint))
+
+
+def walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield a node and all below it with their paths."""
+    yield path, node
+    entries: Any = ()
+    if isinstance(node, dict):
+        entries = node.items()
+    elif isinstance(node, list):
+        entries = enumerate(node)
+    for key, value in entries:
+        yield from walk(value, f"{path}.{key}" if path else str(key))
+
+
+def columns(node: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield what makes one run differ from another, flat: numbers, truth values and texts.
+
+    Under the keys of the command line (`model.width`). A call stands under its own key by the name
+    of what it calls (`model`: FCNN). Left out are null and `ASIDE`.
+    """
+    for key, value in node.items():
+        place = f"{path}.{key}" if path else key
+        if value is None or place in ASIDE:
+            continue
+        if isinstance(value, dict):
+            yield from columns(value, place)
+        elif key == "_target_":
+            yield path, value.rpartition(".")[2]
+        elif not key.startswith("_"):
+            yield place, str(value) if isinstance(value, list) else value
+
+
+def changes(theirs: dict[str, Any], ours: dict[str, Any]) -> list[str]:
+    """Return in what two configurations differ that one run must not, a line each."""
+    before, now = dict(_leaves(theirs)), dict(_leaves(ours))
+    free = tuple(f"{key}." for key in (*ASIDE, *RESUMED))
+    return [
+        f"{key} was {before.get(key)}, is {now.get(key)}"
+        for key in sorted(before.keys() | now.keys())
+        if before.get(key) != now.get(key) and not f"{key}.".startswith(free)
+    ]
+
+
+def _leaves(node: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the values of plain data that hold no others, and their paths."""
+    for path, value in walk(node):
+        if not isinstance(value, dict | list):
+            yield path, value

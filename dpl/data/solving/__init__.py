@@ -1,0 +1,1 @@
+"""One load solved, and worker processes that solve many."""

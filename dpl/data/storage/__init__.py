@@ -1,0 +1,1 @@
+"""Data sets on disk: shards, their manifest, their acceptance and their integrity."""

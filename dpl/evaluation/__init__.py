@@ -1,0 +1,1 @@
+"""Solvers timed and compared: errors, run times, Newton started from predictions."""

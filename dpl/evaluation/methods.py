@@ -1,0 +1,129 @@
+"""The methods that one experiment compares: linear, POD-Galerkin, network, corrected network."""
+
+import copy
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from dpl.fem.rom.galerkin import PODGalerkin
+from dpl.fem.solvers.solution import Load
+from dpl.inference.hybrid import Predict
+from dpl.models.latent import Latent
+from dpl.models.pod import PODNet
+from dpl.scene import Sample, Scene
+from dpl.training.surrogate import Surrogate
+
+
+@dataclass(frozen=True)
+class Method:
+    """Something that predicts, and what it has cost to make.
+
+    Attributes:
+        predict: From a load to displacements.
+        samples: Solved loads that it learnt from.
+        training_minutes: Wall time of its making.
+        parameters: Numbers that were trained.
+    """
+
+    predict: Predict
+    samples: int | None = None
+    training_minutes: float | None = None
+    parameters: int | None = None
+
+
+def linear(scene: Scene) -> Method:
+    """Return K(0)^-1 f."""
+
+    def predict(load: Load) -> Tensor:
+        pairs = zip(load.force, load.poisson, strict=True)
+        return torch.stack([scene.linear.at(nu[None]).respond(force) for force, nu in pairs])
+
+    return Method(predict)
+
+
+def pod_galerkin(scene: Scene, train: Sample, *, rank: int, tolerance: float) -> Method:
+    """Return the hyper-reduced model of the training samples, on the linear answer.
+
+    Args:
+        scene: What is simulated.
+        train: The samples.
+        rank: Modes of what is beyond linear.
+        tolerance: Of the choice of cells, see `dpl.fem.rom.ecsw.cubature`.
+
+    Raises:
+        ValueError: A number is out of range.
+    """
+    start = time.perf_counter()
+    solver = PODGalerkin.fit(
+        scene.problem, train.displacement, rank, tolerance=tolerance, lift=scene.linear
+    )
+    minutes = (time.perf_counter() - start) / 60
+
+    def predict(load: Load) -> Tensor:
+        return torch.stack([solver.reduced(force).displacement for force in load.force])
+
+    return Method(predict, len(train.force), minutes)
+
+
+def network(surrogate: Surrogate, folder: Path, samples: int) -> Method:
+    """Return the network of a run's folder."""
+    return Method(
+        surrogate.predict,
+        samples,
+        training_minutes(folder),
+        sum(p.numel() for p in surrogate.net.parameters()),
+    )
+
+
+def corrected(
+    surrogate: Surrogate,
+    method: Method,
+    train: Sample,
+    *,
+    rank: int,
+    tolerance: float,
+    steps: int,
+) -> Method:
+    """Return a network whose answers are corrected by equilibrium in its own first modes.
+
+    The linear part of a latent network is the exact one here.
+
+    Args:
+        surrogate: The network, one between coordinates.
+        method: Its row.
+        train: Its samples.
+        rank: Modes of its basis in which to correct.
+        tolerance: Of the choice of cells, see `dpl.fem.rom.ecsw.cubature`.
+        steps: Corrections, see `PODGalerkin.correct`.
+
+    Raises:
+        ValueError: A number is out of range.
+    """
+    net = cast(PODNet, surrogate.net)
+    start = time.perf_counter()
+    solver = net.galerkin(train.displacement, rank=rank, tolerance=tolerance)
+    minutes = (method.training_minutes or 0.0) + (time.perf_counter() - start) / 60
+    tier = copy.copy(surrogate)
+    tier._modules = {**surrogate._modules, "net": copy.copy(net)}
+    if isinstance(tier.net, Latent):
+        tier.net.linear_tol = 0.0
+
+    def predict(load: Load) -> Tensor:
+        pairs = zip(load.force, tier.predict(load), strict=True)
+        return torch.stack([solver.correct(f, u, steps=steps) for f, u in pairs])
+
+    return Method(predict, method.samples, minutes, method.parameters)
+
+
+def training_minutes(folder: Path) -> float | None:
+    """Return the wall time of a run's training, all its sessions together; None if not known."""
+    path = folder / "training.jsonl"
+    if not path.is_file():
+        return None
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    return sum(float(line["seconds"]) for line in lines) / 60

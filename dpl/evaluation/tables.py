@@ -1,0 +1,83 @@
+"""Results as rows: frozen dataclasses, shown as tables and written as CSV."""
+
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+from rich.console import Console
+from rich.table import Table
+
+from dpl.system.files import whole_file
+
+Row = TypeVar("Row")
+READERS: dict[Any, Callable[[str], Any]] = {
+    str: str,
+    int: int,
+    float: lambda cell: float(cell or "nan"),
+    bool: lambda cell: cell == "True",
+}
+
+
+def show(rows: Sequence[Any], title: str) -> None:
+    """Print rows of one dataclass, a column for each field."""
+    table = Table(title=title, title_justify="left")
+    for field in fields(rows[0]):
+        table.add_column(field.name.replace("_", " "))
+    for row in rows:
+        table.add_row(*(text(value, 3) for value in asdict(row).values()))
+    Console(width=max(Console().width, 200)).print(table)
+
+
+def write(rows: Sequence[Any], path: Path) -> None:
+    """Write rows of one dataclass as CSV, a file that is whole or not there; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = io.StringIO(newline="")
+    writer = csv.writer(lines)
+    writer.writerow([field.name for field in fields(rows[0])])
+    writer.writerows([text(value, 4) for value in asdict(row).values()] for row in rows)
+    with whole_file(path) as file:
+        file.write(lines.getvalue().encode())
+
+
+def read(kind: type[Row], path: Path) -> list[Row]:
+    """Return the rows of a CSV file that `write` wrote.
+
+    Args:
+        kind: Their dataclass, of texts, numbers and truth values.
+        path: Of the file.
+
+    Raises:
+        ValueError: It holds other columns.
+    """
+    readers = {name: READERS[hint] for name, hint in get_type_hints(kind).items()}
+    with path.open(newline="") as file:
+        lines = csv.DictReader(file)
+        if lines.fieldnames != list(readers):
+            raise ValueError(f"{path} has not the columns {', '.join(readers)}")
+        return [kind(**{name: readers[name](cell) for name, cell in row.items()}) for row in lines]
+
+
+def machine() -> str:
+    """Return what a table of times must say of the machine."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{models[0] if models else 'unknown processor'}, {os.cpu_count()} cores"
+
+
+def write_machine(path: Path, *, threads: int = 1) -> None:
+    """Write on what rows were measured, as JSON."""
+    path.write_text(json.dumps({"machine": machine(), "threads": threads}) + "\n")
+
+
+def text(value: object, digits: int) -> str:
+    """Return a value as text, a float to so many digits; what is not known is empty."""
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.{digits}g}"
+    return "" if value is None else str(value)

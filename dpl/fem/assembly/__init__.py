@@ -1,0 +1,1 @@
+"""Elements, boundary conditions, and the assembly of forces and tangents."""

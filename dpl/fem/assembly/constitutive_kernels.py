@@ -1,0 +1,147 @@
+"""Strain, stress and moduli at a point, in Voigt notation, WIDTH points side by side.
+
+Strains and stresses are 6 numbers, 11 22 33 12 23 13, strains as e = 2 E. All of it is compiled
+into the loops of `dpl.fem.assembly.kernels`.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from dpl.fem.assembly.numba_laws import slopes_of
+from dpl.fem.assembly.simd import WIDTH, load, store
+
+VOIGT = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2]])
+FIRST = np.array([0, 1, 2, 0, 1, 0])  # the two indices of each of the 6
+SECOND = np.array([0, 1, 2, 1, 2, 2])
+
+
+@njit
+def quadratic(H, scale, e):
+    """Add scale * H^T H to e."""
+    for v in range(6):
+        i, j = FIRST[v], SECOND[v]
+        square = (
+            load(H, i) * load(H, j)
+            + load(H, 3 + i) * load(H, 3 + j)
+            + load(H, 6 + i) * load(H, 6 + j)
+        )
+        store(e, v, load(e, v) + scale * square)
+
+
+@njit
+def strain(H, finite, e):
+    """Set e to 2 E = H + H^T + H^T H, without the last term where `finite` is 0."""
+    for v in range(6):
+        store(e, v, load(H, 3 * FIRST[v] + SECOND[v]) + load(H, 3 * SECOND[v] + FIRST[v]))
+    quadratic(H, finite, e)
+
+
+@njit
+def volume_change(H):
+    """Return det(I + H) - 1."""
+    a, b, c = load(H, 0), load(H, 1), load(H, 2)
+    d, e, f = load(H, 3), load(H, 4), load(H, 5)
+    g, h, i = load(H, 6), load(H, 7), load(H, 8)
+    minors = a * e - b * d + e * i - f * h + a * i - c * g
+    return a + e + i + minors + a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
+@njit
+def square(e):
+    """Return det C - 1 of C = I + e."""
+    e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
+    e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
+    m0, m1, m2 = e1 * e2 - e4 * e4, e0 * e2 - e5 * e5, e0 * e1 - e3 * e3
+    third = e0 * m0 - e3 * (e3 * e2 - e4 * e5) + e5 * (e3 * e4 - e1 * e5)
+    return e0 + e1 + e2 + m0 + m1 + m2 + third
+
+
+@njit
+def stress(law, c, needs, e, j, X, S, scratch, D, moduli):
+    """Set S and X = C^-1, and with `moduli` D = dS/dE (rows 6 I + J), at e with det F = 1 + j.
+
+    Where det F is negative a law of ln J has no stress (NaN).
+    """
+    e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
+    e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
+    i1 = e0 + e1 + e2
+    m0, m1, m2 = e1 * e2 - e4 * e4, e0 * e2 - e5 * e5, e0 * e1 - e3 * e3
+    second = m0 + m1 + m2
+    if needs > 0:
+        inverse = 1.0 / (1.0 + square(e))
+        store(X, 0, (1.0 + e1 + e2 + m0) * inverse)
+        store(X, 1, (1.0 + e0 + e2 + m1) * inverse)
+        store(X, 2, (1.0 + e0 + e1 + m2) * inverse)
+        store(X, 3, (e4 * e5 - e3 - e3 * e2) * inverse)
+        store(X, 4, (e3 * e5 - e4 - e0 * e4) * inverse)
+        store(X, 5, (e3 * e4 - e5 - e1 * e5) * inverse)
+    store(scratch, 0, j)
+    if needs > 1:
+        for lane in range(WIDTH):
+            scratch[0, lane] = math.log1p(scratch[0, lane])
+            if needs > 2:
+                scratch[1, lane] = math.expm1(-2 / 3 * scratch[0, lane])
+    i2 = 2.0 * i1 + second
+    slopes = slopes_of(law, c, i1, i2, j, load(scratch, 0), load(scratch, 1))
+    rest, W2, p, W11, W12, W22, W1J, W2J, pJ = slopes
+    pressure = rest + 2.0 * W2 * i1
+    for v in range(6):
+        stress = -2.0 * W2 * load(e, v)
+        if v < 3:
+            stress = stress + pressure
+        if needs > 0:  # - p e X
+            i, k = 3 * FIRST[v], SECOND[v]
+            turned = 0.0 * i1
+            for n in range(3):
+                turned = turned + load(e, VOIGT[FIRST[v], n]) * load(X, VOIGT[n, k])
+            stress = stress - p * turned
+        store(S, v, stress)
+    if moduli:
+        for v in range(6):
+            normal = 2.0 if v < 3 else 0.0
+            t2 = normal * (2.0 + i1) - 2.0 * load(e, v)
+            x = load(X, v)
+            store(scratch, 2 + v, t2)
+            store(scratch, 8 + v, W11 * normal + W12 * t2 + W1J * x)
+            store(scratch, 14 + v, W12 * normal + W22 * t2 + W2J * x)
+            store(scratch, 20 + v, W1J * normal + W2J * t2 + pJ * x)
+        for v in range(6):
+            i, k = FIRST[v], SECOND[v]
+            for w in range(v, 6):
+                m, n = FIRST[w], SECOND[w]
+                d = load(scratch, 8 + v) * (2.0 if w < 3 else 0.0)
+                d = d + load(scratch, 14 + v) * load(scratch, 2 + w)
+                d = d + load(scratch, 20 + v) * load(X, w)
+                d = d - p * (
+                    load(X, VOIGT[i, m]) * load(X, VOIGT[k, n])
+                    + load(X, VOIGT[i, n]) * load(X, VOIGT[k, m])
+                )
+                if v == w and v > 2:
+                    d = d - 2.0 * W2
+                if v != w and w < 3:
+                    d = d + 4.0 * W2
+                store(D, 6 * v + w, d)
+                store(D, 6 * w + v, d)
+
+
+@njit
+def push_forward(F, D, S, weight, finite, T, A):
+    """Set A (rows ((i 3 + k) 3 + J) 3 + L) to dP_iJ/dF_kL times the volume of the point."""
+    for J in range(3):
+        d0, d1, d2 = 6 * VOIGT[0, J], 6 * VOIGT[1, J], 6 * VOIGT[2, J]
+        for i in range(3):
+            f0, f1, f2 = load(F, 3 * i), load(F, 3 * i + 1), load(F, 3 * i + 2)
+            for v in range(6):
+                t = f0 * load(D, d0 + v) + f1 * load(D, d1 + v) + f2 * load(D, d2 + v)
+                store(T, v, weight * t)
+            for k in range(3):
+                f0, f1, f2 = load(F, 3 * k), load(F, 3 * k + 1), load(F, 3 * k + 2)
+                for L in range(3):
+                    a = load(T, VOIGT[0, L]) * f0
+                    a = a + load(T, VOIGT[1, L]) * f1
+                    a = a + load(T, VOIGT[2, L]) * f2
+                    if i == k:
+                        a = a + finite * weight * load(S, VOIGT[J, L])
+                    store(A, ((3 * i + k) * 3 + J) * 3 + L, a)

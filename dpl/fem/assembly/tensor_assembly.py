@@ -1,0 +1,264 @@
+"""Body = mesh + law + supports: energy, forces and tangent as tensor operations, batched."""
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import skfem
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dpl.fem.assembly.boundary_conditions import Springs
+from dpl.fem.assembly.elements import basis_of
+from dpl.fem.assembly.fbar import dilated, dilated_stress
+from dpl.fem.assembly.rigid_body_modes import loose_motions, rigid_motions
+from dpl.fem.assembly.sparsity import Pattern
+from dpl.fem.materials.material import Material
+from dpl.fem.materials.tensors import green_lagrange, volume_change
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A hyperelastic body on its supports, cut into cells.
+
+    All quantities are dimensionless. Methods take displacements (B, N, D) in float64 and return
+    values on the same device; none of them loops over cells in Python. They are tensor operations,
+    differentiable, on any device.
+
+    Attributes:
+        mesh: Geometry, coordinates from `origin`, over `length`.
+        degree: Polynomial degree of the displacement, 1 or 2.
+        material: The law.
+        length: L, longest side of the body [m].
+        origin: Where coordinates have their origin, over `length`, (D,) [-]. It is zero unless the
+            body lies farther from zero than its size. Nodes are at L (origin + points) [m].
+        points: Nodes (N, D) [-]; for degree 2 those of edges, faces and cells too.
+        cells: Nodes of each cell, (E, A).
+        dN: Gradients of the shape functions, (E, Q, A, D) [-]; (1, Q, A, D) if all cells are equal.
+        dV: Volumes of the quadrature points, (E, Q) [-]; (1, Q) if all cells are equal.
+        free: Degrees of freedom that may move, (N, D).
+        prescribed: Displacement of the others at full load, (N, D) [-]; zero where free.
+        boundary: Nodes on the boundary, (N,).
+        springs: Robin conditions; None if there are none.
+        mean_dilatation: Whether a cell's points share its mean volume ratio.
+    """
+
+    mesh: skfem.Mesh
+    degree: int
+    material: Material
+    length: float
+    origin: NDArray[np.float64]
+    points: Tensor
+    cells: Tensor
+    dN: Tensor
+    dV: Tensor
+    free: Tensor
+    prescribed: Tensor
+    boundary: Tensor
+    springs: Springs | None = None
+    mean_dilatation: bool = False
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the same body with its tensors on a device."""
+        tensors: dict[str, Any] = {
+            field.name: value.to(device)
+            for field in fields(self)
+            if isinstance(value := getattr(self, field.name), Tensor)
+        }
+        if self.springs is not None:
+            tensors["springs"] = Springs(*(part.to(device) for part in self.springs))
+        return replace(self, **tensors)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Pickle without what is computed from the rest."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @cached_property
+    def basis(self) -> skfem.Basis:
+        """scikit-fem's basis of one displacement component."""
+        return basis_of(self.mesh, self.degree)
+
+    @property
+    def mesh_in_metres(self) -> skfem.Mesh:
+        """The mesh where the body lies [m]."""
+        return self.mesh.scaled(self.length).translated(self.length * self.origin)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """N and D."""
+        return self.points.shape[0], self.points.shape[1]
+
+    @property
+    def equal_cells(self) -> bool:
+        """Whether all cells share one set of gradients."""
+        return len(self.dN) == 1
+
+    @property
+    def mixes(self) -> bool:
+        """Whether the strains of its points can be unknowns of their own, see `mixed_system`."""
+        return self.material.has_response and not self.mean_dilatation
+
+    @property
+    def near_null(self) -> NDArray[np.float64]:
+        """Fields that cost no energy were nothing held: rigid motions where free, (n, k)."""
+        return rigid_motions(self.points)[0][self.free].numpy()
+
+    def loose_modes(self) -> list[str]:
+        """Return the rigid motions that the supports leave free, named; none of them if held."""
+        return loose_motions(self.points, self.free, self.springs)
+
+    def energy(self, displacement: Tensor) -> Tensor:
+        """Return the strain energy over E L^D, that of springs included, (B,) [-]."""
+        H = self.gradient(displacement)
+        if self.mean_dilatation:
+            H = dilated(self.material, H, self.dV, self.shape[1])
+        energy = (self.material.energy(H) * self.dV).sum((-2, -1))
+        if self.springs is not None:
+            pull = self.springs.force(displacement)
+            energy = energy + (pull * displacement).sum((-2, -1)) / 2
+        return energy
+
+    def internal_force(self, displacement: Tensor) -> Tensor:
+        """Return f_int, the slope of the energy, (B, N, D) [-]; on held nodes the reactions."""
+        stress = self._effective_stress(self.gradient(displacement))
+        return self._with_springs(self._spread(stress), displacement)
+
+    def tangent(self, displacement: Tensor) -> Tensor:
+        """Return the entries of K = d f_int / du on `pattern`, (B, nnz) [-]."""
+        if self.mean_dilatation:
+            return self._with_spring_entries(self._entries(self._cell_tangents(displacement)))
+        moduli = self.material.tangent(self.gradient(displacement))
+        return self._with_spring_entries(self._assembled(moduli))
+
+    def strain(self, displacement: Tensor) -> Tensor:
+        """Return the Green-Lagrange strain at the quadrature points, (B, E, Q, 3, 3) [-]."""
+        return green_lagrange(self.gradient(displacement))
+
+    def bending(self, update: Tensor) -> Tensor:
+        """Return what a step's strain is beyond linear, dH^T dH / 2, (B, E, Q, 3, 3) [-]."""
+        dH = self.gradient(update)
+        return dH.mT @ dH / 2
+
+    def mixed_system(self, displacement: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
+        """Return force (B, N, D) and tangent (B, nnz) of Newton with mixed integration points.
+
+        The strain at the quadrature points is an unknown of its own that each point eliminates:
+        stress and moduli are those at the strain of u less `gap`, (B, E, Q, 3, 3), moved to the
+        strain of u by one linear step. Without a gap these are `internal_force` and `tangent`.
+
+        Source: Magisano, Leonetti, Garcea (2017), CMAME 313, section 3.
+        """
+        H = self.gradient(displacement)
+        response = self.material.response(green_lagrange(H) - gap)
+        stress = response.stress + response.product(gap)
+        force = self._with_springs(self._spread(stress + H @ stress), displacement)
+        return force, self._with_spring_entries(self._assembled(response.tangent(H)))
+
+    def tangent_product(self, displacement: Tensor, direction: Tensor) -> Tensor:
+        """Return K(u) v, (B, N, D) [-], on all degrees of freedom, without K."""
+        return torch.func.jvp(self.internal_force, (displacement,), (direction,))[1]
+
+    def volume_ratio(self, displacement: Tensor) -> Tensor:
+        """Return min det F over the quadrature points, (B,) [-]; not above 0: inverted."""
+        change = volume_change(self.gradient(displacement))
+        return 1 + torch.nan_to_num(change, nan=-torch.inf).flatten(1).amin(dim=1)
+
+    def stress(self, displacement: Tensor) -> Tensor:
+        """Return the first Piola-Kirchhoff stress over E at the quadrature points, (B,E,Q,3,3)."""
+        H = self.gradient(displacement)
+        if self.mean_dilatation:
+            H = dilated(self.material, H, self.dV, self.shape[1])
+        return self.material.stress(H)
+
+    @cached_property
+    def pattern(self) -> Pattern:
+        """The tangent's sparsity, analysed once."""
+        return Pattern.build(self.cells.cpu().numpy(), self.free.cpu().numpy())
+
+    @cached_property
+    def _operator(self) -> Tensor:
+        """Gradients as matrices (E or 1, A, Q D); a plain matrix (A, Q D) where cells are equal."""
+        operator = self.dN.transpose(1, 2).flatten(-2).contiguous()
+        return operator[0] if self.equal_cells else operator
+
+    def gradient(self, displacement: Tensor) -> Tensor:
+        """Return H = du/dX, (B, E, Q, 3, 3) [-]; in 2D with zeros out of the plane."""
+        return self._cell_gradient(displacement[:, self.cells].mT)
+
+    def _cell_gradient(self, at_cells: Tensor) -> Tensor:
+        """Return H, (B, E, Q, 3, 3) [-], of the displacements of each cell's nodes (B, E, D, A)."""
+        dim = self.shape[1]
+        gradient = (at_cells @ self._operator).unflatten(-1, (-1, dim))  # (B, E, D, Q, D)
+        # components first in memory: laws work on long rows and not on 3 x 3
+        gradient = gradient.permute(2, 4, 0, 1, 3).contiguous().permute(2, 3, 4, 0, 1)
+        return gradient if dim == 3 else torch.nn.functional.pad(gradient, (0, 1, 0, 1))
+
+    def _spread(self, stress: Tensor) -> Tensor:
+        """Return the nodal forces (B, N, D) of first Piola-Kirchhoff stresses (B, E, Q, 3, 3)."""
+        return self._gathered(self._cell_forces(stress))
+
+    def _cell_forces(self, stress: Tensor) -> Tensor:
+        """Return what each cell has at its nodes, (B, E, A, D), of stresses (B, E, Q, 3, 3)."""
+        dim = self.shape[1]
+        weighted = stress[..., :dim, :dim] * self.dV[..., None, None]
+        weighted = weighted.transpose(-3, -2).flatten(-2)  # (B, E, D, QD)
+        return (weighted @ self._operator.mT).mT
+
+    def _gathered(self, per_cell: Tensor) -> Tensor:
+        """Return the nodal sums (B, N, D) of what each cell has at its nodes (B, E, A, D)."""
+        force = per_cell.new_zeros(len(per_cell), *self.shape)
+        return force.index_add(1, self.cells.flatten(), per_cell.flatten(1, 2))
+
+    def _with_springs(self, internal: Tensor, displacement: Tensor) -> Tensor:
+        """Return forces (B, N, D) with those of the springs."""
+        if self.springs is None:
+            return internal
+        return internal + self.springs.force(displacement)
+
+    def _with_spring_entries(self, tangent: Tensor) -> Tensor:
+        """Return a tangent's entries (B, nnz) with those of the springs."""
+        if self.springs is None:
+            return tangent
+        rows, columns, stiffness = (part.cpu().numpy() for part in self.springs)
+        places = self.pattern.between(rows, columns)
+        added = np.bincount(places.ravel(), stiffness.ravel(), len(self.pattern.indices) + 1)
+        return tangent + torch.from_numpy(added[:-1]).to(tangent.device)
+
+    def _effective_stress(self, H: Tensor) -> Tensor:
+        """Return the stress that does work on H, (B, E, Q, 3, 3) [-]."""
+        if not self.mean_dilatation:
+            return self.material.stress(H)
+        return dilated_stress(self.material, H, self.dV, self.shape[1])
+
+    def _cell_tangents(self, displacement: Tensor) -> Tensor:
+        """Return the cell matrices (B, E A D D A), laid out aikb, by derivatives of cell forces."""
+        at_cells = displacement[:, self.cells]  # (B, E, A, D)
+        nodes, dim = at_cells.shape[-2:]
+
+        def forces(local: Tensor) -> Tensor:
+            return self._cell_forces(self._effective_stress(self._cell_gradient(local.mT)))
+
+        def along(direction: Tensor) -> Tensor:
+            return torch.func.jvp(forces, (at_cells,), (direction.expand_as(at_cells),))[1]
+
+        directions = torch.eye(nodes * dim, dtype=displacement.dtype, device=displacement.device)
+        columns = torch.func.vmap(along)(directions.view(-1, nodes, dim))  # (bk, B, E, A, D)
+        columns = columns.unflatten(0, (nodes, dim))
+        return columns.permute(2, 3, 4, 5, 1, 0).flatten(1)
+
+    def _assembled(self, moduli: Tensor) -> Tensor:
+        """Return the tangent's entries (B, nnz) of dP/dF (B, E, Q, 3, 3, 3, 3)."""
+        samples, dim = len(moduli), self.shape[1]
+        A = moduli[..., :dim, :dim, :dim, :dim] * self.dV[..., None, None, None, None]
+        A = A.transpose(-4, -3)  # (B, E, Q, j, i, k, l)
+        right = A.flatten(-4, -2) @ self.dN.mT  # (B, E, Q, jik, A)
+        right = right.unflatten(-2, (dim, dim * dim)).flatten(-2).flatten(-3, -2)  # (B, E, Qj, ikA)
+        return self._entries((self._operator @ right).reshape(samples, -1))
+
+    def _entries(self, matrices: Tensor) -> Tensor:
+        """Return the tangent's entries (B, nnz) of cell matrices (B, E A D D A), laid out aikb."""
+        kept = matrices[:, self.pattern.source.to(matrices.device)]
+        values = kept.new_zeros(len(kept), len(self.pattern.indices))
+        return values.index_add(1, self.pattern.target.to(matrices.device), kept)

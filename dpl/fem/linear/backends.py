@@ -1,0 +1,102 @@
+"""K x = r for the sparse symmetric tangents of a problem: several backends behind one function.
+
+The symbolic work (ordering, structure) is done once per backend object, the numbers per call.
+"""
+
+import importlib.util
+from collections.abc import Callable
+
+from dpl.fem.linear.banded import Band, Band32, band_layout
+from dpl.fem.linear.interface import (
+    Array,
+    Backend,
+    Pattern,
+)
+from dpl.fem.linear.krylov import CG, multigrid_installed
+from dpl.fem.linear.pardiso import Pardiso
+from dpl.fem.linear.superlu import SuperLU
+from dpl.version import install
+
+
+def installed() -> list[str]:
+    """Return the names of the backends that can be used here."""
+    missing = set() if importlib.util.find_spec("pypardiso") else {"pardiso"}
+    return [name for name in BACKENDS if name not in missing]
+
+
+def backend(pattern: Pattern, name: str = "auto", near_null: Array | None = None) -> Backend:
+    """Return a backend for matrices of a pattern.
+
+    Args:
+        pattern: Structure of the matrices.
+        name: "band", "band32", "pardiso", "superlu", "cg", or "auto", see `chosen`.
+        near_null: Fields that cost no energy, (n, k), see `Body.near_null`; "cg" wants them.
+
+    Raises:
+        ValueError: No such backend, or it is not installed.
+    """
+    return BACKENDS[chosen(name, pattern, near_null)](pattern, near_null)
+
+
+def chosen(
+    name: str,
+    pattern: Pattern | None = None,
+    near_null: Array | None = None,
+    *,
+    lasting: bool = False,
+) -> str:
+    """Return the name of the backend that a name stands for.
+
+    "auto" depends on the pattern and on what is installed, never on a clock: it stays "auto"
+    where no pattern is given.
+
+    Args:
+        name: As for `backend`.
+        pattern: Structure of the matrices.
+        near_null: Fields that cost no energy, (n, k), see `Body.near_null`.
+        lasting: One factor is to answer many right-hand sides: it may cost more if they cost less.
+
+    Raises:
+        ValueError: No such backend, or it is not installed.
+    """
+    if name not in (*BACKENDS, "auto"):
+        raise ValueError(f"linear = {name!r} must be auto, {', '.join(BACKENDS)}")
+    if name != "auto" and name not in installed():
+        raise ValueError(f"linear = {name!r} is not installed: {install(name)}")
+    return name if name != "auto" or pattern is None else _automatic(pattern, near_null, lasting)
+
+
+# Measured on beams, cubes, stars, plates of 1,000 to 100,000 degrees of freedom: a band costs n b^2
+# operations, a sparse factor of a solid about n^2 slower ones, so b^2 / n decides.
+PAYS = {"pardiso": 22, "superlu": 100, "cg": 10}  # b^2 / n below which a band is faster
+MULTIGRID = {"pardiso": 100_000, "superlu": 30_000}  # n from which on multigrid is faster
+LASTING = 3.0  # times that where one factor answers many right-hand sides: it must fit in memory
+WIDE = 250  # b from which on float32 saves more than the iterations on it cost
+
+
+def _automatic(pattern: Pattern, near_null: Array | None, lasting: bool) -> str:
+    names = installed()
+    sparse = "pardiso" if "pardiso" in names else "superlu"
+    multigrid = "cg" in names and near_null is not None and multigrid_installed()
+    large = MULTIGRID[sparse] * (LASTING if lasting else 1)
+    best = "cg" if multigrid and pattern.size > large else sparse
+    if "band" in names:
+        half = band_layout(pattern).half
+        if half**2 < PAYS[best] * pattern.size:
+            # In float32 factorising is faster, a solve to all digits is not.
+            return "band32" if half >= WIDE and not lasting else "band"
+    return best
+
+
+def _indefinite(pattern: Pattern) -> Backend:
+    """Return the best backend for matrices that are not positive definite."""
+    return Pardiso(pattern) if "pardiso" in installed() else SuperLU(pattern)
+
+
+BACKENDS: dict[str, Callable[[Pattern, Array | None], Backend]] = {
+    "band": lambda pattern, near_null: Band(pattern, _indefinite),
+    "band32": lambda pattern, near_null: Band32(pattern, _indefinite),
+    "pardiso": lambda pattern, near_null: Pardiso(pattern),
+    "superlu": lambda pattern, near_null: SuperLU(pattern),
+    "cg": CG,
+}

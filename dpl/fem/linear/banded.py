@@ -1,0 +1,308 @@
+"""Banded Cholesky (LAPACK): the fastest direct solver for slender bodies, with SciPy alone."""
+
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import float32, float64, njit
+from numba.types import Array as Typed
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpbtrf, spbtrf
+from scipy.sparse import csr_matrix
+
+from dpl.fem.linear.interface import (
+    Array,
+    Backend,
+    Factor,
+    Pattern,
+    SingularMatrix,
+    SymmetricProduct,
+    require_finite,
+    row_numbers,
+)
+from dpl.fem.linear.krylov import conjugate_gradients
+from dpl.fem.linear.ordering import narrow
+from dpl.system.threads import blas
+
+
+class Layout(NamedTuple):
+    """Where a pattern's entries lie in the storage of a band, (n, half + 1), row after row.
+
+    Row j holds the lower triangle's column j from the diagonal down, as LAPACK wants it.
+
+    Attributes:
+        order: Old number of each new unknown, (n,); None: as they are.
+        half: Half-bandwidth b, the farthest that an entry lies from the diagonal.
+        place: For each entry its flat place, (nnz,).
+    """
+
+    order: NDArray[np.int32] | None
+    half: int
+    place: NDArray[np.intp]
+
+
+def band_layout(pattern: Pattern, sweeps: int = 50) -> Layout:
+    """Return the layout in the pattern's own order or in a new one, whichever is narrower.
+
+    Reverse Cuthill-McKee (George 1971), then sweeps in which each unknown moves to the middle of
+    its farthest neighbours (node centroids, Lim, Rodrigues, Xiao 2006), until ten gain nothing.
+    """
+    n = pattern.size
+    rows, columns = row_numbers(pattern), pattern.indices
+    order, half = None, int((columns - rows).max(initial=0))
+    ones = np.ones(len(rows), dtype=np.int8)
+    upper = csr_matrix((ones, columns, pattern.indptr), shape=(n, n))
+    graph = upper + upper.T
+    trial, idle = narrow(graph), 0
+    for _ in range(sweeps):
+        rank = _inverse(trial)
+        neighbours = rank[graph.indices]
+        last = np.maximum.reduceat(neighbours, graph.indptr[:-1])
+        first = np.minimum.reduceat(neighbours, graph.indptr[:-1])
+        width = int(max((last - rank).max(), (rank - first).max()))
+        idle += 1
+        if width < half:
+            order, half, idle = trial, width, 0
+        if order is None or idle > 10:
+            break
+        trial = np.argsort(last + first, kind="stable").astype(np.int32)
+    if order is not None:
+        rank = _inverse(order)
+        rows, columns = rank[rows], rank[columns]
+    column = np.minimum(rows, columns).astype(np.intp)
+    return Layout(order, half, column * half + np.maximum(rows, columns))
+
+
+def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order), dtype=order.dtype)
+    return rank
+
+
+@njit(
+    [
+        float64[::1](Typed(float64, 2, "C", readonly=True), Typed(float64, 1, "C", readonly=True)),
+        float32[::1](Typed(float32, 2, "C", readonly=True), Typed(float32, 1, "C", readonly=True)),
+    ],
+    cache=True,
+    fastmath={"reassoc", "contract"},  # sums in vector registers, one for each lane
+)
+def substituted(L, right):  # type: ignore[no-untyped-def]
+    """Return x, (n,), with L L^T x = right, four columns of L at a time.
+
+    LAPACK's xPBTRS calls xTBSV, which calls a vector operation for each column and reads and writes
+    the answer each time; this does so once for four.
+
+    Args:
+        L: See `Cholesky`; zero where a column ends below the last row.
+        right: (n,), of the same dtype.
+    """
+    n, w = L.shape
+    x = np.zeros(n + w + 3, L.dtype)
+    x[:n] = right
+    whole = n - n % 4 if w > 3 else 0
+    for j in range(0, whole, 4):
+        p, q, r, s = L[j], L[j + 1], L[j + 2], L[j + 3]
+        a = x[j] / p[0]
+        b = (x[j + 1] - p[1] * a) / q[0]
+        c = (x[j + 2] - p[2] * a - q[1] * b) / r[0]
+        d = (x[j + 3] - p[3] * a - q[2] * b - r[1] * c) / s[0]
+        x[j], x[j + 1], x[j + 2], x[j + 3] = a, b, c, d
+        below = x[j + 4 :]
+        for k in range(w - 4):
+            below[k] -= p[k + 4] * a + q[k + 3] * b + r[k + 2] * c + s[k + 1] * d
+        for k in range(max(w - 4, 0), w - 1):
+            below[k] -= s[k + 1] * d
+            if k + 2 < w:
+                below[k] -= r[k + 2] * c
+            if k + 3 < w:
+                below[k] -= q[k + 3] * b
+    for j in range(whole, n):
+        x[j] /= L[j, 0]
+        for k in range(1, w):
+            x[j + k] -= L[j, k] * x[j]
+    x[n:] = 0
+    for j in range(n - 1, whole - 1, -1):
+        for k in range(1, w):
+            x[j] -= L[j, k] * x[j + k]
+        x[j] /= L[j, 0]
+    for j in range(whole - 4, -1, -4):
+        p, q, r, s = L[j], L[j + 1], L[j + 2], L[j + 3]
+        a, b, c, d = x[j], x[j + 1], x[j + 2], x[j + 3]
+        below = x[j + 4 :]
+        for k in range(w - 4):
+            a -= p[k + 4] * below[k]
+            b -= q[k + 3] * below[k]
+            c -= r[k + 2] * below[k]
+            d -= s[k + 1] * below[k]
+        for k in range(max(w - 4, 0), w - 1):
+            d -= s[k + 1] * below[k]
+            if k + 2 < w:
+                c -= r[k + 2] * below[k]
+            if k + 3 < w:
+                b -= q[k + 3] * below[k]
+        d /= s[0]
+        c = (c - r[1] * d) / r[0]
+        b = (b - q[1] * c - q[2] * d) / q[0]
+        a = (a - p[1] * b - p[2] * c - p[3] * d) / p[0]
+        x[j], x[j + 1], x[j + 2], x[j + 3] = a, b, c, d
+    return x[:n].copy()
+
+
+@dataclass(frozen=True, eq=False)
+class Cholesky:
+    """Banded Cholesky factor; in float64 it is a backend's factor as it is.
+
+    Attributes:
+        storage: L, (n, b + 1), see `Layout`.
+        order: See `Layout`.
+        negative_pivots: 0.
+    """
+
+    storage: NDArray[Any]
+    order: NDArray[np.int32] | None
+    negative_pivots: int = 0
+
+    def solve(self, right: Array, rtol: float = 1e-12) -> Array:
+        """Return x, (n,), with K x = right, to the rounding of the storage."""
+        ordered = right if self.order is None else right[self.order]
+        answer = substituted(self.storage, np.ascontiguousarray(ordered, self.storage.dtype))
+        x = np.empty_like(right)
+        x[slice(None) if self.order is None else self.order] = answer
+        return x
+
+    def apply(self, right: Array) -> Array:
+        """Return `solve`."""
+        return self.solve(right)
+
+    def rounded(self) -> "Cholesky":
+        """Return the factor in float32, half as long to read."""
+        return replace(self, storage=self.storage.astype(np.float32))
+
+
+class Band:
+    """Banded Cholesky in float64; a matrix that is not positive definite goes to another backend.
+
+    Source: Anderson et al. (1999), LAPACK Users' Guide, xPBTRF.
+    """
+
+    dtype: type[np.floating[Any]] = np.float64
+
+    def __init__(self, pattern: Pattern, indefinite: Callable[[Pattern], Backend]) -> None:
+        """Prepare.
+
+        Args:
+            pattern: Structure of the matrices.
+            indefinite: Makes the backend for matrices that are not positive definite.
+        """
+        self.pattern, self.indefinite = pattern, indefinite
+        self._storage: NDArray[Any] | None = None
+        self._last: Callable[[], Cholesky | None] = lambda: None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle without storage."""
+        return type(self), (self.pattern, self.indefinite)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Order and places, found once."""
+        return band_layout(self.pattern)
+
+    @cached_property
+    def other(self) -> Backend:
+        """The backend for matrices that are not positive definite."""
+        return self.indefinite(self.pattern)
+
+    def factorise(self, values: Array) -> Factor:
+        """Return the factor, see `Backend.factorise`."""
+        require_finite(values)
+        return self._cholesky(values) or self.other.factorise(values)
+
+    def _cholesky(self, values: Array) -> Cholesky | None:
+        """Return the factor; None: not positive definite, or not for sure."""
+        layout = self.layout
+        if self._storage is None or self._last() is not None:  # a living factor keeps its storage
+            self._storage = np.empty((self.pattern.size, layout.half + 1), self.dtype)
+        storage = self._storage
+        storage.fill(0)  # all of it: the last factor has filled the band
+        storage.ravel()[layout.place] = values.astype(self.dtype, copy=False)  # cast, then scatter
+        diagonal = storage[:, 0].copy()
+        factorise = dpbtrf if self.dtype == np.float64 else spbtrf
+        with blas().limit(limits=1):
+            lower, info = factorise(storage.T, lower=1, overwrite_ab=1)
+        if info or (storage[:, 0] ** 2 <= 4 * np.finfo(self.dtype).eps * diagonal).any():
+            return None
+        factor = Cholesky(lower.T, layout.order)
+        self._last = weakref.ref(factor)
+        return factor
+
+
+class Band32(Band):
+    """Banded Cholesky in float32 as preconditioner of conjugate gradients in float64.
+
+    Half the time and memory of `Band`, which takes over where float32 does not do. Diagonal
+    scaling would save nothing: what Cholesky loses to rounding does not depend on it (Demmel
+    1989), and float32 holds stiffnesses 70 orders of magnitude apart.
+    """
+
+    dtype = np.float32
+
+    @cached_property
+    def other(self) -> Backend:
+        """The same in float64."""
+        exact = Band(self.pattern, self.indefinite)
+        exact.__dict__["layout"] = self.layout
+        return exact
+
+    def factorise(self, values: Array) -> Factor:
+        """Return the factor, see `Backend.factorise`."""
+        require_finite(values)
+        diagonal = np.abs(values[self.pattern.indptr[:-1]])
+        scale = float(np.sqrt(diagonal.max(initial=0)) * np.sqrt(diagonal.min(initial=np.inf)))
+        if not 0 < scale < np.inf:
+            return self.other.factorise(values)
+        with np.errstate(over="ignore"):
+            rough = self._cholesky(values / scale)
+        if rough is None:
+            return self.other.factorise(values)
+        return Band32Factor(self, values.copy(), rough, scale)
+
+
+class Band32Factor:
+    """A matrix with its factor in float32, and in float64 once a solve has needed that.
+
+    Attributes:
+        negative_pivots: 0, or what the float64 factor counts once a solve has asked for it.
+    """
+
+    MAX_ITER = 25  # beyond, a float64 factor is cheaper
+
+    def __init__(self, parent: Band32, values: Array, rough: Cholesky, scale: float) -> None:
+        """Take entries (nnz,) and the factor of entries / scale."""
+        self.parent, self.values, self.rough, self.scale = parent, values, rough, scale
+        self.product = SymmetricProduct(parent.pattern, values)
+        self.exact: Factor | None = None
+
+    @property
+    def negative_pivots(self) -> int:
+        """Number of negative eigenvalues, as far as known."""
+        return 0 if self.exact is None else self.exact.negative_pivots
+
+    def solve(self, right: Array, rtol: float = 1e-12) -> Array:
+        """Return x, (n,), see `Factor.solve`."""
+        if self.exact is None:
+            try:
+                return conjugate_gradients(self.product, self.apply, right, rtol, self.MAX_ITER)
+            except SingularMatrix:
+                self.exact = self.parent.other.factorise(self.values)
+        return self.exact.solve(right)
+
+    def apply(self, right: Array) -> Array:
+        """Return K^-1 right, (n,), to float32, see `Factor.apply`."""
+        size = np.abs(right).max() or 1.0  # of order one, so that float32 holds it
+        return self.rough.solve((right / size).astype(np.float32)).astype(np.float64) * (
+            size / self.scale
+        )

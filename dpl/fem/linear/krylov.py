@@ -1,0 +1,235 @@
+"""Conjugate gradients, alone or with algebraic multigrid: little memory, for very large bodies."""
+
+import importlib
+import importlib.util
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.linalg import eigvalsh_tridiagonal
+from scipy.sparse import csr_matrix
+
+from dpl.fem.linear.interface import (
+    Array,
+    Pattern,
+    SingularMatrix,
+    SymmetricProduct,
+    full_matrix,
+    require_finite,
+    row_numbers,
+)
+
+Map = Callable[[Array], Array]  # (n,) -> (n,)
+SEEN = 1e-6  # relative residual of noise below which every eigenvalue has been met
+
+
+class NotDefinite(SingularMatrix):
+    """A matrix that is known to have an eigenvalue that is not above zero."""
+
+
+def conjugate_gradients(
+    product: Map,
+    precondition: Map,
+    right: Array,
+    rtol: float,
+    max_iter: int,
+    *,
+    doubtful: bool = False,
+) -> Array:
+    """Return x, (n,), with ||right - K x|| <= rtol ||right||.
+
+    Source: Hestenes, Stiefel (1952); Saad (2003), Iterative Methods, algorithm 9.1. The residual
+    is the one that the recursion carries: the true one ends where rounding ends it.
+
+    Args:
+        product: x -> K x.
+        precondition: r -> approximately K^-1 r, symmetric positive definite.
+        right: Right-hand side, (n,).
+        rtol: Where to stop [-].
+        max_iter: Products to spend at most.
+        doubtful: Give up as soon as the residual, shrinking as it has on average, would not be
+            there in time.
+
+    Raises:
+        SingularMatrix: K is not positive definite, or `max_iter` is not enough.
+    """
+    x = np.zeros_like(right)
+    largest = float(np.abs(right).max(initial=0.0))
+    if largest == 0:
+        return x
+    unit = 2.0 ** np.clip(np.frexp(largest)[1], -1021, 1023)  # else squares under- or overflow
+    residual = right / unit
+    before_all = np.linalg.norm(residual)
+    enough = rtol * before_all
+    z = precondition(residual)
+    direction, rz = z.copy(), residual @ z
+    for k in range(1, max_iter + 1):
+        image = product(direction)
+        curvature = direction @ image
+        if not (curvature > 0 and rz > 0):
+            raise NotDefinite("the matrix is not positive definite: negative curvature")
+        length = rz / curvature
+        x += length * direction
+        residual -= length * image
+        left = np.linalg.norm(residual)
+        if left <= enough:
+            return unit * x
+        if doubtful and k >= 3 and (left / before_all) ** (max_iter / k) > rtol:
+            break
+        z = precondition(residual)
+        rz, before = residual @ z, rz
+        direction *= rz / before
+        direction += z
+    raise SingularMatrix(f"no convergence to {rtol:g} in {max_iter} conjugate gradient steps")
+
+
+def lowest(product: Map, precondition: Map, size: int, steps: int = 8) -> float:
+    """Return about the lowest eigenvalue of M^-1 K, -inf where it is certainly not positive.
+
+    M^-1 is the preconditioner, of a matrix near K: all eigenvalues but a few are near 1, and those
+    show in a few Lanczos steps from a fixed vector of noise. More than three are taken only where
+    the lowest is below 1/2.
+
+    Source: Saad (2003), Iterative Methods, section 6.7.3 (Ritz values from conjugate gradients).
+
+    Args:
+        product: x -> K x.
+        precondition: r -> M^-1 r, symmetric positive definite.
+        size: n.
+        steps: Steps at most.
+    """
+    residual = np.random.default_rng(0).standard_normal(size)
+    z = precondition(residual)
+    direction, rz = z.copy(), float(residual @ z)
+    diagonal: list[float] = []
+    beside: list[float] = []
+    least, carried = float("inf"), 0.0
+    for k in range(min(steps, size)):
+        image = product(direction)
+        curvature = float(direction @ image)
+        if not curvature > 0:
+            return -np.inf
+        length = rz / curvature
+        diagonal.append(1 / length + carried)
+        least = float(eigvalsh_tridiagonal(diagonal, beside)[0])
+        if k >= 2 and least > 0.5:
+            break
+        residual -= length * image
+        z = precondition(residual)
+        rz, before = float(residual @ z), rz
+        if not rz > 0:
+            break
+        ratio = rz / before
+        carried = ratio / length
+        beside.append(math.sqrt(ratio) / length)
+        direction *= ratio
+        direction += z
+    return least
+
+
+@dataclass(frozen=True, eq=False)
+class CGFactor:
+    """A matrix and its preconditioner.
+
+    Attributes:
+        product: x -> K x.
+        precondition: r -> approximately K^-1 r.
+        max_iter: Conjugate gradient steps a solve may take.
+        negative_pivots: -1, not counted; `examined` tells none from some.
+    """
+
+    product: SymmetricProduct
+    precondition: Map
+    max_iter: int
+    negative_pivots: int = -1
+
+    @cached_property
+    def examined(self) -> int:
+        """0 if the matrix is positive definite, 1 if it is not, -1 if that did not show in time.
+
+        A solve may miss directions that its right-hand side does not hold, noise holds all: a
+        residual polynomial that is 1 at zero and has only positive roots exceeds 1 at a negative
+        eigenvalue, so that none can be left where the residual of noise is small.
+        """
+        noise = np.random.default_rng(0).standard_normal(len(self.product.diagonal))
+        try:
+            self.solve(noise, SEEN)
+        except NotDefinite:
+            return 1
+        except SingularMatrix:
+            return -1
+        return 0
+
+    def apply(self, right: Array) -> Array:
+        """Return the preconditioner's answer, (n,)."""
+        return self.precondition(right)
+
+    def solve(self, right: Array, rtol: float = 1e-12) -> Array:
+        """Return x, (n,), see `Factor.solve`."""
+        try:
+            return conjugate_gradients(self.product, self.precondition, right, rtol, self.max_iter)
+        except np.linalg.LinAlgError as error:  # from the coarsest grid's Cholesky
+            raise NotDefinite(f"the matrix is not positive definite: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class CG:
+    """Conjugate gradients for positive definite matrices; others raise, in `solve` if not before.
+
+    With the near-nullspace and pyamg: preconditioned by smoothed aggregation (Vanek, Mandel,
+    Brezina 1996), whose steps hardly grow with the body. Otherwise by the diagonal.
+
+    Attributes:
+        pattern: Structure of the matrices.
+        near_null: Fields that cost no energy, (n, k), see `Body.near_null`.
+    """
+
+    pattern: Pattern
+    near_null: Array | None = None
+
+    def factorise(self, values: Array) -> CGFactor:
+        """Return the factor, see `Backend.factorise`."""
+        require_finite(values)
+        product = SymmetricProduct(self.pattern, values.copy())
+        if not (product.diagonal > 0).all():
+            raise SingularMatrix("the matrix is not positive definite: its diagonal is not")
+        if self.near_null is not None and multigrid_installed():
+            return CGFactor(product, self._multigrid(values, self.near_null), max_iter=300)
+        inverse = 1 / product.diagonal
+        return CGFactor(product, lambda residual: inverse * residual, max_iter=5000)
+
+    def _multigrid(self, values: Array, near_null: Array) -> Map:
+        pyamg: Any = importlib.import_module("pyamg")
+        whole = csr_matrix(full_matrix(self.pattern, values))  # pyamg wants SciPy's older classes
+        hierarchy = pyamg.smoothed_aggregation_solver(
+            whole.tobsr((self._block, self._block)),
+            B=near_null,
+            symmetry="symmetric",
+            strength=("symmetric", {"theta": 0.0}),
+            smooth=("jacobi", {"weighting": "local"}),  # other weightings draw random numbers
+            presmoother=("gauss_seidel", {"sweep": "forward"}),
+            postsmoother=("gauss_seidel", {"sweep": "backward"}),
+            improve_candidates=None,
+            max_coarse=300,
+            coarse_solver="cholesky",
+        )
+        return hierarchy.aspreconditioner().matvec
+
+    @cached_property
+    def _block(self) -> int:
+        """D where all nodes have D degrees of freedom that couple in full, else 1."""
+        n, nnz = self.pattern.size, len(self.pattern.indices)
+        dim = {6: 3, 3: 2}.get(0 if self.near_null is None else self.near_null.shape[1], 1)
+        if n % dim:
+            return 1
+        blocks = row_numbers(self.pattern).astype(np.int64) // dim * n + self.pattern.indices // dim
+        filled = len(np.unique(blocks)) * dim**2 - n // dim * (dim * (dim - 1) // 2)
+        return dim if filled == nnz else 1
+
+
+def multigrid_installed() -> bool:
+    """Return whether pyamg is there."""
+    return importlib.util.find_spec("pyamg") is not None

@@ -1,0 +1,322 @@
+"""What a hyperelastic law is: an energy density of the displacement gradient, and what follows.
+
+Laws take the displacement gradient H = F - I and not F: for |H| near 1e-10 the strain is lost in
+the rounding of 1 + H, and with it the equilibrium of small loads. For the same reason no law forms
+its stress as a difference of terms that cancel at rest.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Self, cast
+
+import torch
+from torch import Tensor
+
+from dpl.fem.materials.tensors import (
+    dyad,
+    green_lagrange,
+    invariants,
+    inverse_transpose,
+    symmetric_product,
+    volume_change,
+)
+
+
+class Response(NamedTuple):
+    """Stress and moduli at a strain.
+
+    Attributes:
+        stress: Second Piola-Kirchhoff stress S over Young's modulus, (..., 3, 3) [-].
+        moduli: dS/dE, (..., 3, 3, 3, 3) [-], with minor and major symmetry.
+    """
+
+    stress: Tensor
+    moduli: Tensor
+
+    def product(self, change: Tensor) -> Tensor:
+        """Return dS/dE : change, (..., 3, 3) [-], of a symmetric change of strain."""
+        return torch.einsum("...ijkl,...kl->...ij", self.moduli, change)
+
+    def tangent(self, H: Tensor) -> Tensor:
+        """Return dP/dF, (..., 3, 3, 3, 3) [-], indexed iJkL, of a body deformed by F = I + H."""
+        eye = torch.eye(3, dtype=H.dtype, device=H.device)
+        F = H + eye
+        A = torch.einsum("...iM,...MJNL,...kN->...iJkL", F, self.moduli, F)
+        return A + torch.einsum("ik,...JL->...iJkL", eye, self.stress)
+
+
+class Material:
+    """Isotropic hyperelastic law, its moduli over Young's modulus E.
+
+    A law is its `energy`; `stress` and `tangent` follow by automatic differentiation. A subclass
+    may give its `response` to strains as well: the two then follow from that, and Newton can take
+    strains as unknowns. A law of the invariants (`Isotropic`) is compiled too.
+    """
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density over E, (...,) [-], of H (..., 3, 3) [-]."""
+        raise NotImplementedError(f"{type(self).__name__} has no energy")
+
+    def response(self, E: Tensor) -> Response:
+        """Return stress and moduli at Green-Lagrange strains E, (..., 3, 3) [-].
+
+        Raises:
+            NotImplementedError: The law is its energy alone, see `has_response`.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no stress as a function of strain")
+
+    @property
+    def has_response(self) -> bool:
+        """Whether the law gives its stress as a function of strain."""
+        return type(self).response is not Material.response
+
+    def stress(self, H: Tensor) -> Tensor:
+        """Return the first Piola-Kirchhoff stress P = dW/dF over E, (..., 3, 3) [-]."""
+        if self.has_response:
+            S = self.response(green_lagrange(H)).stress
+            return S + H @ S
+        if self.several:
+            return torch.func.grad(lambda G: self.energy(G).sum())(H)
+        gradient = torch.func.vmap(torch.func.grad(self.energy))
+        return gradient(H.reshape(-1, 3, 3)).reshape(H.shape)
+
+    def tangent(self, H: Tensor) -> Tensor:
+        """Return dP/dF over E, (..., 3, 3, 3, 3) [-], indexed iJkL."""
+        if self.has_response:
+            return self.response(green_lagrange(H)).tangent(H)
+        hessian = torch.func.vmap(torch.func.hessian(self.energy))
+        return hessian(H.reshape(-1, 3, 3)).reshape(*H.shape, 3, 3)
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus at rest over Young's modulus [-]."""
+        return float(self._at_rest[0, 1, 0, 1])
+
+    @property
+    def lam(self) -> float:
+        """First Lame parameter at rest over Young's modulus [-]."""
+        return float(self._at_rest[0, 0, 1, 1])
+
+    @property
+    def poisson_ratio(self) -> float:
+        """Poisson's ratio at rest [-]."""
+        return self.lam / (2 * (self.lam + self.mu))
+
+    @property
+    def _at_rest(self) -> Tensor:
+        return self.tangent(torch.zeros(1, 3, 3, dtype=torch.float64))[0]
+
+    @property
+    def poisson_range(self) -> tuple[float, float] | None:
+        """Smallest and largest Poisson's ratio [-] of a law with a range of them; None: it is one.
+
+        A law with a range has no moduli: it answers nothing before `at` has made it one.
+        """
+        return None
+
+    @property
+    def several(self) -> bool:
+        """Whether each member of a batch has moduli of its own, see `at`."""
+        return False
+
+    def at(self, poisson: float | Tensor) -> Self:
+        """Return the law with another Poisson's ratio.
+
+        Args:
+            poisson: Poisson's ratio [-]; or those of the members of a batch, (B,), which strains
+                (B, E, Q, 3, 3) are then taken for.
+
+        Raises:
+            ValueError: The law has none, or it lies outside (-1, 0.5).
+        """
+        raise ValueError(f"poisson: {type(self).__name__} has no Poisson's ratio among its moduli")
+
+
+@dataclass(frozen=True)
+class Hookean(Material):
+    """Law that at rest is Hooke's, with Young's modulus 1: such laws can be swapped fairly.
+
+    Attributes:
+        poisson: Poisson's ratio at rest [-], in (-1, 0.5); or a range [low, high], of which each
+            load has its own.
+    """
+
+    poisson: float | Sequence[float]
+
+    def __post_init__(self) -> None:
+        """Check the range.
+
+        Raises:
+            ValueError: `poisson` lies outside (-1, 0.5), is no finite number, or no range.
+        """
+        if isinstance(self.poisson, Tensor):
+            if not ((self.poisson > -1.0) & (self.poisson < 0.5)).all():
+                raise ValueError("poisson must lie between -1 and 0.5 (both excluded) throughout")
+            return
+        if isinstance(self.poisson, Sequence):
+            low, high = self.poisson if len(self.poisson) == 2 else (math.nan, math.nan)
+            if not -1.0 < low < high < 0.5:
+                raise ValueError(
+                    f"poisson = {list(self.poisson)} must be a range [low, high], low below high, "
+                    "between -1 and 0.5 (both excluded)"
+                )
+            object.__setattr__(self, "poisson", (float(low), float(high)))
+            return
+        if not (math.isfinite(self.poisson) and -1.0 < self.poisson < 0.5):
+            raise ValueError(
+                f"poisson = {self.poisson} must lie between -1 and 0.5 (both excluded)"
+            )
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus over Young's modulus [-]."""
+        return 1.0 / (2.0 * (1.0 + self._one))
+
+    @property
+    def lam(self) -> float:
+        """First Lame parameter over Young's modulus [-]."""
+        return self._one / ((1.0 + self._one) * (1.0 - 2.0 * self._one))
+
+    @property
+    def bulk(self) -> float:
+        """Bulk modulus over Young's modulus [-]."""
+        return self.lam + 2 / 3 * self.mu
+
+    @property
+    def poisson_range(self) -> tuple[float, float] | None:
+        """See `Material.poisson_range`."""
+        return self.poisson if isinstance(self.poisson, tuple) else None
+
+    @property
+    def several(self) -> bool:
+        """See `Material.several`."""
+        return isinstance(self.poisson, Tensor)
+
+    def at(self, poisson: float | Tensor) -> Self:
+        """See `Material.at`."""
+        # beside cells and points, so that numbers of a point, (B, E, Q), take their own
+        own: Any = poisson.view(-1, 1, 1) if isinstance(poisson, Tensor) else poisson
+        return replace(self, poisson=own)
+
+    @property
+    def _one(self) -> float:
+        """Poisson's ratio; (B, 1, 1) of a batch, which goes through the same arithmetic.
+
+        Raises:
+            ValueError: It is a range.
+        """
+        if isinstance(self.poisson, tuple):
+            raise ValueError(
+                f"poisson = {list(self.poisson)} is a range, and this needs one: each load brings "
+                "its own (Load.poisson), a body of one is Problem.at"
+            )
+        return cast(float, self.poisson)
+
+
+class Isotropic(Material):
+    """Law of the invariants, W(I1, I2, J) of C = F^T F, given by its `slopes` as well.
+
+    The slopes are plain arithmetic on numbers of any kind: tensors here, lanes of a processor in
+    `dpl.fem.assembly.kernels`. With X = C^-1, the stress they stand for is
+
+        S = (rest + 2 W2 i1) I - 4 W2 E - p (I - X),   I - X = 2 E X,
+
+    in which nothing cancels at rest.
+
+    Attributes:
+        finite: False for the one law whose strain is the symmetric part of H.
+    """
+
+    finite: ClassVar[bool] = True
+
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """Moduli that the slopes take."""
+        raise NotImplementedError
+
+    @staticmethod
+    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
+        """Return (rest, W2, p, W11, W12, W22, J W1J, J W2J, J p_J).
+
+        Indices are derivatives, p = J W_J, and rest = p + 2 W1 + 4 W2, which is zero at rest and
+        must be given in a form that is small there.
+
+        Args:
+            c: `constants`.
+            i1, i2, j: I1 - 3, I2 - 3, J - 1.
+            log_j: ln J.
+            m1: J^(-2/3) - 1.
+        """
+        raise NotImplementedError
+
+    def response(self, E: Tensor) -> Response:
+        """Return stress and moduli, see `Material.response`."""
+        square = invariants(2 * E)[2]
+        return self._response(E, square / (1 + (1 + square).sqrt()))
+
+    def tangent(self, H: Tensor) -> Tensor:
+        """Return dP/dF, see `Material.tangent`; J is that of H, with its sign."""
+        return self._response(green_lagrange(H), volume_change(H)).tangent(H)
+
+    def _response(self, E: Tensor, j: Tensor) -> Response:
+        """Return stress and moduli at strains E where J = 1 + j."""
+        e = 2 * E
+        i1, second, square = invariants(e)
+        eye = torch.eye(3, dtype=E.dtype, device=E.device)
+        X = inverse_transpose(e, square)
+        slopes = self._slopes(i1, 2 * i1 + second, j)
+        S = _stress(e, square, i1, slopes)
+        _, W2, p, *curvatures = (
+            s[..., None, None, None, None] if isinstance(s, Tensor) else s for s in slopes
+        )
+        W11, W12, W22, W1J, W2J, pJ = curvatures
+        T1, T2 = 2 * eye.expand_as(e), 2 * ((2 + i1)[..., None, None] * eye - e)
+        D = W11 * dyad(T1, T1) + W22 * dyad(T2, T2) + pJ * dyad(X, X)
+        for factor, A, B in ((W12, T1, T2), (W1J, T1, X), (W2J, T2, X)):
+            D = D + factor * (dyad(A, B) + dyad(B, A))
+        D = D + 4 * W2 * (dyad(eye, eye) - symmetric_product(eye)) - 2 * p * symmetric_product(X)
+        return Response(S, D)
+
+    def stress(self, H: Tensor) -> Tensor:
+        """Return the first Piola-Kirchhoff stress, see `Material.stress`.
+
+        J is that of H, with its sign: inverted, a law with ln J has no stress (NaN).
+        """
+        e = 2 * green_lagrange(H)
+        i1, second, square = invariants(e)
+        slopes = self._slopes(i1, 2 * i1 + second, volume_change(H))
+        S = _stress(e, square, i1, slopes)
+        return S + H @ S
+
+    def _slopes(self, i1: Tensor, i2: Tensor, j: Tensor) -> tuple[Tensor | float, ...]:
+        log_j = torch.log1p(j)
+        m1 = torch.expm1(-2 / 3 * log_j)
+        return self.slopes(self.constants, i1, i2, j, log_j, m1)
+
+
+def _stress(e: Tensor, square: Tensor, i1: Tensor, slopes: tuple[Tensor | float, ...]) -> Tensor:
+    """Return S (..., 3, 3) of `Isotropic` at e = 2 E = C - I with det C = 1 + square."""
+    rest, W2, p = (s[..., None, None] if isinstance(s, Tensor) else s for s in slopes[:3])
+    eye = torch.eye(3, dtype=e.dtype, device=e.device)
+    S = (rest + 2 * W2 * i1[..., None, None]) * eye
+    if isinstance(W2, Tensor) or W2:
+        S = S - 2 * W2 * e
+    if isinstance(p, Tensor) or p:  # else a collapsed body, C singular, has a stress too
+        S = S - p * (e @ inverse_transpose(e, square))
+    return S
+
+
+def check_moduli(name: str, shear: float, bulk: float, constants: Iterable[float]) -> None:
+    """Check the constants of a law, and the moduli at rest that follow.
+
+    Raises:
+        ValueError: A constant is no finite number, or the shear modulus, called `name`, or the bulk
+            modulus is not above 0.
+    """
+    if not 0 < shear < math.inf:
+        raise ValueError(f"{name} = {shear} must be above 0: it is the shear modulus at rest")
+    if not 0 < bulk < math.inf:
+        raise ValueError(f"bulk = {bulk} must be above 0")
+    if not all(math.isfinite(constant) for constant in constants):
+        raise ValueError(f"moduli = {list(constants)} must be finite numbers")

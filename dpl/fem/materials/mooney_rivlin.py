@@ -1,0 +1,49 @@
+"""Mooney-Rivlin with isochoric invariants."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from dpl.fem.materials.isochoric import _isochoric, polynomial_slopes
+from dpl.fem.materials.material import Isotropic, check_moduli
+
+
+@dataclass(frozen=True)
+class MooneyRivlinK2(Isotropic):
+    """Mooney-Rivlin solid: c10 (Ib1 - 3) + c01 (Ib2 - 3) + bulk/2 (J - 1)^2.
+
+    Ib1 = J^(-2/3) I1 and Ib2 = J^(-4/3) I2. Shear modulus at rest 2 (c10 + c01).
+
+    Source: Rivlin (1948); the volumetric term is that of Abaqus (D1 = 2/bulk).
+
+    Attributes:
+        c10, c01, bulk: Moduli over E [-].
+    """
+
+    c10: float
+    c01: float
+    bulk: float
+
+    def __post_init__(self) -> None:
+        """Check the range.
+
+        Raises:
+            ValueError: The body would not resist shear or compression.
+        """
+        check_moduli("2 (c10 + c01)", 2 * (self.c10 + self.c01), self.bulk, vars(self).values())
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        i1, i2, j = _isochoric(H)
+        return self.c10 * i1 + self.c01 * i2 + self.bulk / 2 * j.square()
+
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """Return c10, 0, 0, c01 and bulk."""
+        return self.c10, 0.0, 0.0, self.c01, self.bulk
+
+    @staticmethod
+    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
+        """Return the slopes, see `Isotropic.slopes`."""
+        return polynomial_slopes(c, i1, i2, m1, c[4] * j * (1 + j), c[4] * (1 + j) * (1 + 2 * j))

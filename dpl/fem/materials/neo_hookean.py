@@ -1,0 +1,120 @@
+"""The laws, their moduli over Young's modulus; names say the volumetric term."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dpl.fem.materials.isochoric import _isochoric, polynomial_slopes
+from dpl.fem.materials.material import Hookean, Isotropic
+from dpl.fem.materials.tensors import (
+    trace,
+    volume_change,
+)
+
+
+@dataclass(frozen=True)
+class NeoHookeanLn(Hookean, Isotropic):
+    """Compressible neo-Hookean solid NH-ln: mu/2 (I1 - 3 - 2 ln J) + lambda/2 (ln J)^2.
+
+    Source: Bonet, Wood (2008), eq. 6.27. Infinite at J = 0; undefined (NaN) below.
+    """
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        log_J = torch.log1p(volume_change(H))
+        I1_minus_3 = 2 * trace(H) + H.square().sum((-2, -1))
+        return self.mu / 2 * (I1_minus_3 - 2 * log_J) + self.lam / 2 * log_J.square()
+
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """Return lambda and mu."""
+        return self.lam, self.mu
+
+    @staticmethod
+    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
+        """Return the slopes, see `Isotropic.slopes`."""
+        rest = c[0] * log_j
+        return rest, 0.0, rest - c[1], 0.0, 0.0, 0.0, 0.0, 0.0, c[0]
+
+
+@dataclass(frozen=True)
+class NeoHookeanIsoK2(Hookean, Isotropic):
+    """Neo-Hookean solid NHiso-k2: mu/2 (J^(-2/3) I1 - 3) + kappa/2 (J - 1)^2.
+
+    Source: Simo, Hughes (1998), section 9.2; the volumetric term is that of Abaqus (D1 = 2/kappa).
+    """
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        i1, _, j = _isochoric(H)
+        return self.mu / 2 * i1 + self.bulk / 2 * j.square()
+
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """Return mu/2, 0, 0, 0 and kappa."""
+        return self.mu / 2, 0.0, 0.0, 0.0, self.bulk
+
+    @staticmethod
+    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
+        """Return the slopes, see `Isotropic.slopes`."""
+        return polynomial_slopes(c, i1, i2, m1, c[4] * j * (1 + j), c[4] * (1 + j) * (1 + 2 * j))
+
+
+@dataclass(frozen=True)
+class NeoHookeanIsoK4(NeoHookeanIsoK2):
+    """Neo-Hookean solid NHiso-k4: mu/2 (J^(-2/3) I1 - 3) + kappa/4 (J^2 - 1 - 2 ln J).
+
+    Source: Simo, Taylor (1991), CMAME 85, eq. 2.5; the law of deal.II's step-44.
+    """
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        i1, _, j = _isochoric(H)
+        return self.mu / 2 * i1 + self.bulk / 4 * (j * (2 + j) - 2 * torch.log1p(j))
+
+    @staticmethod
+    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
+        """Return the slopes, see `Isotropic.slopes`."""
+        return polynomial_slopes(c, i1, i2, m1, c[4] / 2 * j * (2 + j), c[4] * (1 + j) * (1 + j))
+
+
+@dataclass(frozen=True)
+class StableNeoHookean(Hookean, Isotropic):
+    """Stable neo-Hookean solid: m/2 (I1 - 3) + l/2 (J - a)^2 - m/2 ln(I1 + 1).
+
+    With m = 4 mu/3, l = lambda + 5 mu/6 and a = 1 + 3 m/(4 l). The energy is finite for any F,
+    inverted or not (a body may rest inverted), the stress for any F that is not singular. The
+    energy at rest is not zero.
+
+    Source: Smith, de Goes, Kim (2018), ACM TOG 37(2), eq. 14.
+    """
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        m, stiffness = self.constants
+        i1 = 2 * trace(H) + H.square().sum((-2, -1))
+        volume = (volume_change(H) - 3 * m / (4 * stiffness)).square()
+        return m / 2 * (i1 - torch.log(4 + i1)) + stiffness / 2 * volume
+
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """Return m and l."""
+        return 4 / 3 * self.mu, self.lam + 5 / 6 * self.mu
+
+    @staticmethod
+    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
+        """Return the slopes, see `Isotropic.slopes`."""
+        near = 1 / (4 + i1)
+        J = 1 + j
+        volume = c[1] * j * J - 3 / 4 * c[0] * j
+        rest = volume + c[0] / 4 * i1 * near
+        p = volume - 3 / 4 * c[0]
+        W11 = c[0] / 2 * near * near
+        return rest, 0.0, p, W11, 0.0, 0.0, 0.0, 0.0, J * (c[1] * (1 + 2 * j) - 3 / 4 * c[0])
+
+
+def beside(modulus: float, axes: int) -> Any:
+    """Return a modulus as a factor on tensors with so many components at each point."""
+    return modulus[(..., *[None] * axes)] if isinstance(modulus, Tensor) else modulus

@@ -1,0 +1,137 @@
+"""Ogden's law, in principal stretches."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dpl.fem.materials.material import Material, Response, check_moduli
+from dpl.fem.materials.tensors import green_lagrange, volume_change
+
+
+@dataclass(frozen=True)
+class OgdenK2(Material):
+    """Ogden's solid: sum 2 mu_i/alpha_i^2 (lb1^alpha_i + lb2^alpha_i + lb3^alpha_i - 3)
+    + bulk/2 (J - 1)^2, lb = J^(-1/3) lambda the isochoric principal stretches.
+
+    The shear modulus at rest is sum mu_i, as Abaqus defines them; in Ogden's own paper it is
+    sum mu_i alpha_i / 2.
+
+    Source: Ogden (1972), Proc. R. Soc. A 326; moduli by Simo, Taylor (1991), CMAME 85, section 2.
+
+    Attributes:
+        shear: mu_i over E [-].
+        exponents: alpha_i [-], as many.
+        bulk: Over E [-].
+    """
+
+    shear: Sequence[float]
+    exponents: Sequence[float]
+    bulk: float
+
+    def __post_init__(self) -> None:
+        """Check the range.
+
+        Raises:
+            ValueError: Not as many exponents as moduli, an exponent of 0, or a body that would not
+                resist shear or compression.
+        """
+        if len(self.shear) != len(self.exponents) or not all(self.exponents):
+            raise ValueError(
+                f"exponents = {list(self.exponents)} must be {len(self.shear)} numbers other than 0"
+            )
+        constants = [*self.shear, *self.exponents, self.bulk]
+        check_moduli("sum of shear", sum(self.shear), self.bulk, constants)
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        j = volume_change(H)
+        logs = torch.log1p(2 * _spectrum(green_lagrange(H))[0]) / 2
+        logs = logs - torch.log1p(j)[..., None] / 3
+        terms = [
+            2 * mu / a**2 * torch.expm1(a * logs).sum(-1)
+            for mu, a in zip(self.shear, self.exponents, strict=True)
+        ]
+        return sum(terms) + self.bulk / 2 * j.square()
+
+    def stress(self, H: Tensor) -> Tensor:
+        """Return the first Piola-Kirchhoff stress, see `Material.stress`; NaN where inverted."""
+        S = _SpectralStress.apply(green_lagrange(H), self)
+        S = torch.where((volume_change(H) > -1)[..., None, None], S, torch.nan)
+        return S + H @ S
+
+    def response(self, E: Tensor) -> Response:
+        """Return stress and moduli, see `Material.response`."""
+        strain, axes = _spectrum(E)
+        stress, slopes = self._principal(strain)
+        gap = strain[..., :, None] - strain[..., None, :]
+        same = gap.abs() < 1e-6  # there the quotient is its limit, to within as much
+        limit = slopes.diagonal(dim1=-2, dim2=-1)
+        limit = (limit[..., :, None] + limit[..., None, :]) / 2 - slopes
+        quotient = (stress[..., :, None] - stress[..., None, :]) / torch.where(same, 1.0, gap)
+        shear = torch.where(same, limit, quotient)
+        shear = shear - torch.diag_embed(shear.diagonal(dim1=-2, dim2=-1))
+        S = (axes * stress[..., None, :]) @ axes.mT
+        normal = axes[..., :, None, :] * axes[..., None, :, :]  # (..., i, j, a)
+        D = torch.einsum("...ija,...ab,...klb->...ijkl", normal, slopes, normal)
+        pair = torch.einsum("...ia,...jb->...ijab", axes, axes)
+        pair = (pair + pair.transpose(-4, -3)) / 2
+        return Response(S, D + torch.einsum("...ijab,...ab,...klab->...ijkl", pair, shear, pair))
+
+    def _principal(self, strain: Tensor) -> tuple[Tensor, Tensor]:
+        """Return principal stresses S_a (..., 3) and dS_a/dE_b (..., 3, 3) at principal strains."""
+        logs = torch.log1p(2 * strain) / 2
+        log_J = logs.sum(-1, keepdim=True)
+        j = torch.expm1(log_J)
+        eye = torch.eye(3, dtype=strain.dtype, device=strain.device)
+        T = self.bulk * (1 + j) * j + torch.zeros_like(logs)
+        dT = (self.bulk * (1 + j) * (1 + 2 * j))[..., None] + torch.zeros_like(eye)
+        for mu, a in zip(self.shear, self.exponents, strict=True):
+            grown = torch.expm1(a * (logs - log_J / 3))  # lb^a - 1
+            mean = grown.mean(-1, keepdim=True)
+            T = T + 2 * mu / a * (grown - mean)
+            power, third = 1 + grown, (1 + mean) / 3
+            dT = dT + 2 * mu * (
+                power[..., :, None] * eye
+                - (power[..., :, None] + power[..., None, :]) / 3
+                + third[..., None]
+            )
+        stretch = 1 + 2 * strain
+        slopes = (dT - 2 * T[..., :, None] * eye) / (stretch[..., :, None] * stretch[..., None, :])
+        return T / stretch, slopes
+
+
+def _spectrum(E: Tensor) -> tuple[Tensor, Tensor]:
+    """Return eigenvalues (..., 3), NaN where E is not finite (LAPACK stops there), and axes."""
+    finite = E.isfinite().all(-1).all(-1)
+    values, axes = torch.linalg.eigh(torch.where(finite[..., None, None], E, 0.0))
+    return torch.where(finite[..., None], values, torch.nan), axes
+
+
+class _SpectralStress(torch.autograd.Function):
+    """S(E) of a law, differentiated by its moduli: those of eigenvectors are infinite at rest."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(E: Tensor, law: OgdenK2) -> Tensor:
+        return law.response(E).stress
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, OgdenK2], output: Tensor) -> None:
+        E, law = inputs
+        ctx.law = law
+        ctx.save_for_backward(E)
+        ctx.save_for_forward(E)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        (E,) = ctx.saved_tensors
+        return ctx.law.response(E).product((gradient + gradient.mT) / 2), None
+
+    @staticmethod
+    def jvp(ctx: Any, change: Tensor, _: None) -> Tensor:
+        (E,) = ctx.saved_tensors
+        return ctx.law.response(E).product(change)

@@ -1,0 +1,1 @@
+"""Meshes: made, read from files, checked and written; regions of a body."""

@@ -1,0 +1,1 @@
+"""What is derived from a displacement: stresses, energies, the surface."""

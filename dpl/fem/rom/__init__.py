@@ -1,0 +1,1 @@
+"""Reduced-order models: POD, cubature of cells (ECSW), Galerkin projection."""

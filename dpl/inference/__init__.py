@@ -1,0 +1,1 @@
+"""A trained network in use: the hybrid solver and the simulator."""

@@ -1,0 +1,1 @@
+"""Losses: supervised, from residuals, from energies."""
