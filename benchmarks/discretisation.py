@@ -10,7 +10,6 @@ from torch import Tensor
 from dpl.evaluation.pareto import Cells, Discretisation
 from dpl.fem.loads.forces import BodyForce, Traction
 from dpl.fem.materials.material import Material
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
 from dpl.fem.mesh.generators import box
 from dpl.fem.mesh.propeller import propeller
 from dpl.fem.mesh.regions import Plane, Tag
@@ -80,16 +79,6 @@ FAMILIES = {
         halved=False,
     ),
 }
-
-
-def family_of(problem: Problem) -> Family | None:
-    """Return the family of whose own mesh a body is; None if there is none."""
-    for family in FAMILIES.values():
-        own = family.build(SaintVenantKirchhoff(0.3), family.own, 1)[0]
-        same = own.shape == problem.shape and own.degree == problem.degree
-        if same and torch.allclose(own.points, problem.points):
-            return family
-    return None
 
 
 def discretisations(family: Family, law: Material, *, repeats: int = 5) -> list[Discretisation]:

@@ -47,6 +47,7 @@ settings.load_profile("few")
 ROOT = Path(__file__).parents[1]
 LONG = "tests/test_notebooks.py"  # few tests that take minutes
 CONF = ROOT / "conf"
+os.environ["DPL_CONF"] = str(CONF)  # as each command does
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -130,6 +131,18 @@ def batch(scene, _solved) -> Sample:
     )
 
 
+def _folder_of(command: str) -> Path:
+    """Return the folder of a command's configuration."""
+    folders = CONF, ROOT / "benchmarks" / "conf"
+    return next(folder for folder in folders if (folder / f"{command}.yaml").is_file())
+
+
+@pytest.fixture(scope="session")
+def folder_of() -> Callable[[str], Path]:
+    """Finds the folder of a command's configuration."""
+    return _folder_of
+
+
 @pytest.fixture
 def compose(monkeypatch, tmp_path) -> Iterator[Callable[..., DictConfig]]:
     """Composes a command's configuration as its script does, in a folder of its own."""
@@ -137,7 +150,7 @@ def compose(monkeypatch, tmp_path) -> Iterator[Callable[..., DictConfig]]:
 
     def compose(*overrides: str, command: str = "generate") -> DictConfig:
         GlobalHydra.instance().clear()
-        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        with hydra.initialize_config_dir(str(_folder_of(command)), version_base="1.3"):
             return hydra.compose(command, overrides=list(overrides))
 
     yield compose

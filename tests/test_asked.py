@@ -70,14 +70,14 @@ PARTS = {"train": train.parts, "generate": generate.parts}
 
 
 @pytest.fixture
-def ask(monkeypatch, tmp_path):
+def ask(monkeypatch, tmp_path, folder_of):
     """Checks a command line as its command does, in a folder of its own."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     GlobalHydra.instance().clear()
 
     def ask(command, *arguments):
-        dry_run.check(command, CONF, arguments, PARTS.get(command))
+        dry_run.check(command, folder_of(command), arguments, PARTS.get(command))
 
     return ask
 

@@ -17,7 +17,7 @@ from hydra.core.global_hydra import GlobalHydra
 from dpl.config import build as run
 
 ROOT = Path(__file__).parents[1]
-DOCS, CONF, RESULTS = ROOT / "docs", ROOT / "conf", ROOT / "results"
+DOCS, CONF, RESULTS = ROOT / "docs", ROOT / "conf", ROOT / "benchmarks" / "results"
 MAKE = DOCS / "make"
 WRITTEN = [*sorted(DOCS.glob("*.md")), *sorted(ROOT.glob("*.md"))]
 BLOCK = re.compile(r"^```(python|yaml)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.M | re.S)
@@ -105,7 +105,7 @@ def test_every_command_stands_there_with_all_its_keys(make):
         assert f"python scripts/{command.name}.py" in section
         installed = (ROOT / "dpl/commands" / f"{command.name}.py").is_file()
         assert (f"dpl-{command.name}" in section) == installed
-        config = CONF / f"{command.config}.yaml"
+        config = ROOT / command.config
         node = yaml.safe_load(config.read_text(encoding="utf-8"))
         node.pop("defaults", None)
         for key in keys_of(node):
@@ -190,7 +190,7 @@ def generated_page(make, target):
 
 def test_links_out_of_docs_lead_to_pages_of_the_site(make):
     rewritten = make("links").rewritten
-    text = "![a](../results/soak.png), [b](../DESIGN.md#rules), [c](options.md#x), [d](../LICENSE)"
+    text = "![a](../benchmarks/results/soak.png), [b](../DESIGN.md#rules), [c](options.md#x), [d](../LICENSE)"
     assert rewritten(text, "docs/stress.md", "stress.md") == (
         "![a](results/soak.png), [b](house.md#rules), [c](options.md#x), d"
     )

@@ -1,4 +1,4 @@
-"""The tables of README are those of `results/`."""
+"""The tables of README are those of `benchmarks/results/`."""
 
 import csv
 import re
@@ -20,7 +20,7 @@ def table(heading: str) -> list[list[str]]:
 
 def measured(experiment: str, method: str) -> dict[str, str]:
     """Return the row of a method on the loads in range."""
-    with (ROOT / "results" / f"{experiment}.csv").open(newline="") as file:
+    with (ROOT / "benchmarks/results" / f"{experiment}.csv").open(newline="") as file:
         rows = {(row["method"], row["loads"]): row for row in csv.DictReader(file)}
     return rows[method, "in range"]
 
@@ -52,7 +52,7 @@ def test_all_four_experiments_stand_against_the_paper():
 
 
 def test_what_is_said_of_run_time_against_error_is_in_its_table():
-    with (ROOT / "results/accuracy_beam_svk.csv").open(newline="") as file:
+    with (ROOT / "benchmarks/results/pareto_beam_svk.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["threads"] == "1"]
     text = README.split("## Run time against error", 1)[1]
     hybrid, newton = re.search(
@@ -87,7 +87,7 @@ def test_a_row_that_is_worse_than_the_network_alone_says_why():
 
 
 def test_what_is_said_of_experiment_4_is_in_its_table():
-    with (ROOT / "results/hybrid_newton.csv").open(newline="") as file:
+    with (ROOT / "benchmarks/results/hybrid_newton.csv").open(newline="") as file:
         rows = {
             (row["solver"], row["network"], row["loads"]): row
             for row in csv.DictReader(file)
@@ -117,7 +117,7 @@ def test_what_is_said_of_experiment_4_is_in_its_table():
 
 
 def test_what_is_said_of_deflections_is_in_their_table():
-    with (ROOT / "results/deflections.csv").open(newline="") as file:
+    with (ROOT / "benchmarks/results/deflections.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     found = re.findall(
         r"median of (\S+) L and a maximum of (\S+) L on the (beam|propeller)", README

@@ -1,1 +1,5 @@
-"""Commands of this repository: what `scripts/` calls to judge the package; not in the wheel."""
+"""Commands that judge this repository: what `scripts/` call in a checkout."""
+
+from pathlib import Path
+
+CONF = Path(__file__).parents[1] / "conf"

@@ -1,20 +1,18 @@
 """The mechanics against public codes: python scripts/benchmark.py.
 
 Long parts on demand: parts=[large] (run alone, it reports its memory), parts=[robustness],
-parts=[generation]; run time against error: parts=[accuracy] run=runs/beam_svk, parts=[sizes];
-how far test loads move the bodies: parts=[deflections] count=100.
+parts=[generation], parts=[sizes]; errors of other meshes: parts=[discretisation]; how far test
+loads move the bodies: parts=[deflections] count=100.
 """
 
 import json
 import statistics
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import Progress
@@ -22,29 +20,28 @@ from rich.table import Table
 
 from benchmarks import generation as ways
 from benchmarks import peers
+from benchmarks.commands import CONF
 from dpl.commands.cli import command
 from dpl.config import build, run_folder
 from dpl.evaluation.tables import machine, write, write_machine
 from dpl.fem.linear.backends import BACKENDS, installed
 from dpl.fem.materials.neo_hookean import NeoHookeanLn
 from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.solvers.solution import Solver
-from dpl.scene import Sample, Scene
+from dpl.scene import Scene
 from dpl.system.threads import one_thread
 
 if TYPE_CHECKING:
     from benchmarks.sizes import Size
-    from dpl.evaluation.pareto import Point
 
 
 CONSOLE = Console(width=150)
 PARTS = (
     *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
-    *("accuracy", "sizes", "deflections"),
+    *("discretisation", "sizes", "deflections"),
 )
 
 
-@command("benchmark")
+@command("benchmark", conf=CONF)
 def main(cfg: DictConfig) -> None:
     """Time the parts that are asked for, print tables and write them down."""
     build.check(cfg)
@@ -62,7 +59,7 @@ def main(cfg: DictConfig) -> None:
     folder = Path(cfg.folder)
     folder.mkdir(parents=True, exist_ok=True)
     for part in cfg.parts:
-        with one_thread() if part != "accuracy" else nullcontext():  # which sets its own
+        with one_thread():
             results = globals()[part](cfg, backends)
         if results is None:  # written by itself
             continue
@@ -146,83 +143,22 @@ def generation(cfg: DictConfig, backends: list[str]) -> dict[str, list[ways.Cost
     return results
 
 
-def accuracy(cfg: DictConfig, backends: list[str]) -> None:
-    """Write how wrong every solver is and when, with the networks of a folder of runs."""
-    from benchmarks import discretisation
-    from dpl.evaluation import pareto as clock
+def discretisation(cfg: DictConfig, backends: list[str]) -> None:
+    """Write the errors of coarser, finer and quadratic meshes of the beam and of the propeller."""
+    from benchmarks import discretisation as meshes
 
-    if cfg.run is None:
-        raise build.ConfigError("run: name a folder of runs, for example runs/beam_svk")
-    title = Path(cfg.run).name
-    scene, solvers, batch = _solvers(cfg)
-    rows: list[Point] = []
-    for threads in cfg.threads:
-        count = threads or clock.all_threads()
-        with Progress() as progress:
-            bar = progress.add_task(f"solvers, {count} threads", total=len(solvers))
-            tick = partial(progress.advance, bar)
-            rows += clock.points(solvers, batch, threads=count, tick=tick)
-    table = Table(title, "iterate", "threads", "ms", "p99", "error", "worst", "||R||/||f||")
-    for row in rows:
-        table.add_row("" if row.iterate else row.solver, *_numbers(row))
-    CONSOLE.print(table)
-    stem = Path(cfg.folder) / f"accuracy_{title}"
-    write(rows, stem.with_suffix(".csv"))
-    family = discretisation.family_of(scene.problem)
-    others, floor = [], None
-    if family is not None:  # a body on which discretisation errors are known
-        with one_thread():
-            law = scene.problem.material
-            others = discretisation.discretisations(family, law, repeats=cfg.repeats)
-        floor = next(mesh.error for mesh in others if (mesh.cells, mesh.degree) == (family.own, 1))
-        table = Table("Newton to 1e-6 on", "DOFs", "ms", "value", "error against the limit")
-        for mesh in others:
-            name = f"{'x'.join(map(str, mesh.cells))}, degree {mesh.degree}"
-            numbers = f"{mesh.ms:.1f}", f"{mesh.value:.6g}", f"{mesh.error:.1e}"
-            table.add_row(name, f"{mesh.dofs:,}", *numbers)
+    for name, law in (("beam_svk", SaintVenantKirchhoff(0.3)), ("propeller_nh", NeoHookeanLn(0.3))):
+        family = meshes.FAMILIES[name.partition("_")[0]]
+        rows = meshes.discretisations(family, law, repeats=cfg.repeats)
+        table = Table(
+            f"{name}: Newton to 1e-6 on", "DOFs", "ms", "value", "error against the limit"
+        )
+        for row in rows:
+            cells = f"{'x'.join(map(str, row.cells))}, degree {row.degree}"
+            numbers = f"{row.ms:.1f}", f"{row.value:.6g}", f"{row.error:.1e}"
+            table.add_row(cells, f"{row.dofs:,}", *numbers)
         CONSOLE.print(table)
-        write(others, Path(cfg.folder) / f"accuracy_{title}_meshes.csv")
-    first = [row for row in rows if row.threads == rows[0].threads]
-    clock.draw(first, others, floor, stem.with_suffix(".png"))
-    write_machine(stem.with_suffix(".json"), threads=rows[0].threads)
-
-
-def _numbers(row: "Point") -> list[str]:
-    times = f"{row.ms:.2f}", f"{row.ms_p99:.2f}"
-    errors = f"{row.error:.1e}", f"{row.worst:.1e}", f"{row.residual:.1e}"
-    return [str(row.iterate), str(row.threads), *times, *errors]
-
-
-def _solvers(cfg: DictConfig) -> tuple[Scene, dict[str, Solver], Sample]:
-    """Return the scene of some runs, every solver there is with their networks, and test loads."""
-    from dpl.evaluation import methods
-    from dpl.evaluation import pareto as accuracy
-    from dpl.inference.hybrid import Direct, best
-    from dpl.models.pod import PODNet
-
-    runs = run_folder.load_runs(cfg.run)
-    first, surrogate = next(iter(runs.values()))
-    scene = surrogate.scene
-    data = run_folder.load_data(first, scene)
-    train = data.samples("train")
-    robust = scene.solver
-    solvers: dict[str, Solver] = {"linear": scene.linear}
-    solvers |= {f"Newton to {tol:g}": robust.but(tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
-    if cfg.galerkin:
-        model = build.make(cfg, "galerkin")(scene, train)
-        solvers["POD-Galerkin"] = Direct(model.predict, scene.problem)
-    for name, (trained, surrogate) in runs.items():
-        predict = surrogate.predict
-        solvers[name] = Direct(predict, scene.problem)
-        if cfg.corrected and isinstance(surrogate.net, PODNet):
-            row = methods.network(surrogate, Path(cfg.run) / name, trained.data.train)
-            tier = build.make(cfg, "corrected")(surrogate, row, train)
-            solvers[f"{name}, corrected"] = Direct(tier.predict, scene.problem)
-        solvers[f"{name}, hybrid"] = best(predict, scene)
-        if torch.cuda.is_available():
-            copy = run_folder.load_run(Path(cfg.run) / name, scene=scene)[1]
-            solvers[f"{name}, GPU"] = Direct(accuracy.on_gpu(copy), scene.problem)
-    return scene, solvers, data.samples("test")
+        write(rows, Path(cfg.folder) / f"discretisation_{name}.csv")
 
 
 def sizes(cfg: DictConfig, backends: list[str]) -> None:

@@ -4,11 +4,12 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from benchmarks.commands import CONF
 from dpl.commands.cli import command
 from dpl.config import build, run_folder
 
 
-@command("results")
+@command("results", conf=CONF)
 def main(cfg: DictConfig) -> None:
     """Measure every run of an experiment; write rows, machine and figure."""
     from benchmarks import paper_tables

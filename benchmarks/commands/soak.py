@@ -11,6 +11,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from benchmarks.commands import CONF
 from dpl.commands import cli
 from dpl.config import build, run_folder
 
@@ -18,7 +19,7 @@ LOOKS = 360  # at each work
 WORKS = ("training", "simulator")
 
 
-@cli.command("soak")
+@cli.command("soak", conf=CONF)
 def main(cfg: DictConfig) -> None:
     """Train, simulate, and look at both."""
     # here and not above: worker processes import this file, and need none of it

@@ -9,6 +9,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 from rich.console import Console
 
+from benchmarks.commands import CONF
 from dpl.commands.cli import command
 from dpl.config import build, run_folder
 from dpl.evaluation import tables as table
@@ -16,7 +17,7 @@ from dpl.evaluation import tables as table
 COLOURS = {"as expected": "green", "reported": "yellow", "silently wrong": "bold red"}
 
 
-@command("stress")
+@command("stress", conf=CONF)
 def main(cfg: DictConfig) -> None:
     """Run the matrix; rows are written after each case, the figure at the end."""
     from benchmarks import stress

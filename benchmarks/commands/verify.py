@@ -9,12 +9,13 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from benchmarks import verification
+from benchmarks.commands import CONF
 from dpl.commands.cli import command
 from dpl.config import build
 from dpl.system.threads import one_thread
 
 
-@command("verify")
+@command("verify", conf=CONF)
 def main(cfg: DictConfig) -> None:
     """Solve the cases that are asked for, and write the page of all that there are."""
     build.check(cfg)

@@ -6,9 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import options
-from paths import CONF, PACKAGE, ROOT
-
-FOLDERS = (PACKAGE / "commands", ROOT / "benchmarks" / "commands")
+from paths import COMMANDS, CONF, ROOT
 
 
 @dataclass(frozen=True)
@@ -19,7 +17,7 @@ class Command:
         name: Its script.
         about: Docstring of the module.
         does: Docstring of its main function.
-        config: Its configuration in conf/, without suffix.
+        config: Path of its configuration in the repository.
     """
 
     name: str
@@ -31,7 +29,7 @@ class Command:
 def commands() -> list[Command]:
     """Return all of them."""
     found = []
-    for path in sorted(path for folder in FOLDERS for path in folder.glob("[a-z]*.py")):
+    for path in sorted(path for folder in COMMANDS for path in folder.glob("[a-z]*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in tree.body:
             if not isinstance(node, ast.FunctionDef):
@@ -40,7 +38,9 @@ def commands() -> list[Command]:
                 name = ast.unparse(mark.func) if isinstance(mark, ast.Call) else ""
                 if name.rpartition(".")[2] == "command":
                     about, does = ast.get_docstring(tree) or "", ast.get_docstring(node) or ""
-                    found.append(Command(path.stem, about, does, mark.args[0].value))
+                    config = COMMANDS[path.parent] / f"{mark.args[0].value}.yaml"
+                    where = config.relative_to(ROOT)
+                    found.append(Command(path.stem, about, does, str(where)))
     return found
 
 
@@ -83,12 +83,12 @@ def section(one: Command) -> Iterator[str]:
     yield f"{options.code_links(one.about)}\n"
     if one.does:
         yield f"{options.code_links(one.does)}\n"
-    path = CONF / f"{one.config}.yaml"
+    path = ROOT / one.config
     if not path.is_file():
         return
     config = options.read(path)
     own = [row for row in config.rows if row.key != "defaults"]
-    yield f"Configuration: `conf/{one.config}.yaml`. {options.code_links(config.about)}\n"
+    yield f"Configuration: `{one.config}`. {options.code_links(config.about)}\n"
     if config.composed:
         yield f"Composed of {', '.join(_entry(entry) for entry in config.composed)}.\n"
     yield from options.table(own, config.calls)
@@ -101,7 +101,7 @@ def _entry(entry: str) -> str:
     if not chosen:
         if not (CONF / f"{entry}.yaml").is_file():
             return f"`{entry}`"
-        mine = any((folder / f"{entry}.py").is_file() for folder in FOLDERS)
+        mine = any((folder / f"{entry}.py").is_file() for folder in COMMANDS)
         return f"[`{entry}`]({'' if mine else 'options.md'}#{entry})"
     if (CONF / group / f"{chosen}.yaml").is_file():
         return f"[`{entry}`](options.md#{group}-{chosen})"

@@ -11,7 +11,7 @@ LINK = re.compile(r"(?P<mark>!?)\[(?P<text>[^\]]*)\]\((?P<target>[^)\s]+)\)")
 NAME = re.compile(r"(?<![\[`])`(?P<name>dpl(?:\.\w+)+)`(?![\]`])")
 MADE = re.compile(r"(?P<linked><(?:autoref|a) [^>]*>)?<code>(?P<name>dpl(?:\.\w+)+)</code>")
 ELSEWHERE = re.compile(r"[a-z]+:|#|//")
-PLACES = {"conf": "options.md", "results": "results.md", "scripts": "commands.md"}
+PLACES = {"conf": "options.md", "benchmarks": "results.md", "scripts": "commands.md"}
 
 
 def outside_code(text: str, change: Callable[[str], str]) -> str:
@@ -47,8 +47,8 @@ def place(path: str) -> str | None:
         if inside in GENERATED or (inside in INCLUDED and (ROOT / INCLUDED[inside]).is_file()):
             return inside
         return inside if (DOCS / inside).is_file() else None
-    if pure.parts[0] == "results" and pure.suffix:
-        return path
+    if path.startswith("benchmarks/results/"):
+        return path.removeprefix("benchmarks/")
     if pure.parts[0] == "notebooks":
         if pure.parent.name.endswith("_files"):  # figures, see `executed.pages`
             return path

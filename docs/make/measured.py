@@ -1,4 +1,4 @@
-"""The page of results, from results/: every table and figure with the command that makes it."""
+"""The page of results, from benchmarks/results/: every table and figure with the command that makes it."""
 
 import csv
 import json
@@ -34,7 +34,7 @@ VALUE = re.compile(r"\{\{ *(?P<stem>\w+):(?P<which>[^{}]*): *(?P<column>\w+) *\}
 
 @dataclass(frozen=True)
 class Part:
-    """Some files of results/.
+    """Some files of benchmarks/results/.
 
     Attributes:
         pattern: Their stem, whole.
@@ -92,7 +92,8 @@ PARTS = (
     Part(
         "hybrid_newton",
         "Newton from predictions",
-        "python scripts/convergence.py run=runs/beam_svk networks=[latent,fcnn] far=0",
+        "python scripts/convergence.py run=runs/beam_svk networks=[latent,fcnn] far=0 "
+        "folder=benchmarks/results",
         "The paper's experiment 4: 50 loads in range, 50 of one to two times the range, one at a "
         "time on one thread.",
         split="tol",
@@ -102,33 +103,34 @@ PARTS = (
         "hybrid_newton_far",
         "Newton from predictions, far out",
         "python scripts/convergence.py name=hybrid_newton_far run=runs/beam_svk networks=[latent] "
-        "count=0 far=8 tols=[1e-6]",
+        "count=0 far=8 tols=[1e-6] folder=benchmarks/results",
         "Loads of three and of five times the range.",
         split="loads",
     ),
     Part(
-        r"accuracy_(beam_svk|propeller_nh)",
+        r"pareto_(beam_svk|propeller_nh)",
         "Run time against error on `{0}`",
-        "python scripts/benchmark.py parts=[accuracy] run=runs/{0} folder=results",
+        "python scripts/pareto.py run=runs/{0} folder=benchmarks/results "
+        "discretisation=benchmarks/results/discretisation_{0}.csv",
         "The table has what each solver ends with; the figure and the file have every iterate.",
         keep=_ends,
     ),
     Part(
-        r"accuracy_(beam_svk|propeller_nh)_meshes",
+        r"discretisation_(beam_svk|propeller_nh)",
         "Discretisation error on `{0}`",
-        "python scripts/benchmark.py parts=[accuracy] run=runs/{0} folder=results",
+        "python scripts/benchmark.py parts=[discretisation] folder=benchmarks/results",
         "One load on ever finer meshes, against the limit by Richardson's extrapolation.",
     ),
     Part(
         "sizes",
         "Cost against degrees of freedom",
-        "python scripts/benchmark.py parts=[sizes] repeats=3 folder=results",
+        "python scripts/benchmark.py parts=[sizes] repeats=3 folder=benchmarks/results",
         "Beams from 4 to 20 cells across, each in a process of its own, random weights.",
     ),
     Part(
         "deflections",
         "How far test loads move the bodies",
-        "python scripts/benchmark.py parts=[deflections] count=100 folder=results",
+        "python scripts/benchmark.py parts=[deflections] count=100 folder=benchmarks/results",
         "The largest nodal displacement of each test load of `beam_svk` and of `propeller_nh`, "
         "over the longest side of the body. The table has the loads that move each body least and "
         "most.",
@@ -189,7 +191,7 @@ def page() -> str:
     parts = [
         "---\nhide: [navigation]\n---\n",
         "# Results\n",
-        "Tables and figures are those of `results/`, read when this page was made. What they mean "
+        "Tables and figures are those of `benchmarks/results/`, read when this page was made. What they mean "
         "is told in [Measurements](measurements.md). Times differ from machine to "
         "machine.\n",
     ]
@@ -280,7 +282,7 @@ def value(stem: str, which: str, column: str) -> str:
     """Return one number of a file.
 
     Args:
-        stem: Of the file in results/.
+        stem: Of the file in benchmarks/results/.
         which: `column=value` that its row has, apart by semicolons.
         column: Where it stands.
 
@@ -295,5 +297,5 @@ def value(stem: str, which: str, column: str) -> str:
 
 
 def files() -> list[Path]:
-    """Return all files of results/."""
+    """Return all files of benchmarks/results/."""
     return sorted(path for path in RESULTS.iterdir() if path.is_file())

@@ -73,7 +73,7 @@ def read(path: Path) -> Option:
         head.append(line.lstrip("# ").rstrip())
     whole = any(line.startswith("@package _global_") for line in head)
     about = " ".join(line for line in head if not line.startswith("@package"))
-    relative = path.relative_to(CONF)
+    relative = path.relative_to(CONF if path.is_relative_to(CONF) else path.parent)
     prefix = "" if whole or len(relative.parts) == 1 else relative.parts[0]
     rows: list[Row] = []
     calls: dict[str, str] = {}

@@ -5,7 +5,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 CONF = ROOT / "conf"
-RESULTS = ROOT / "results"
+RESULTS = ROOT / "benchmarks" / "results"
+COMMANDS = {  # folders of commands: folder of their configurations
+    ROOT / "dpl" / "commands": CONF,
+    ROOT / "benchmarks" / "commands": ROOT / "benchmarks" / "conf",
+}
 NOTEBOOKS = ROOT / "notebooks"
 PACKAGE = ROOT / "dpl"
 

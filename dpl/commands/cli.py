@@ -6,6 +6,7 @@ import functools
 import importlib
 import logging
 import math
+import os
 import sys
 import typing
 from collections.abc import Callable, Iterator, Sequence
@@ -33,15 +34,17 @@ FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
 def command(
-    name: str, rehearse: Callable[[DictConfig], Any] | None = None
+    name: str, rehearse: Callable[[DictConfig], Any] | None = None, conf: Path = CONF
 ) -> Callable[[Callable[[DictConfig], R]], Callable[[], R]]:
-    """Return what makes a command of a task: its configuration is `conf/NAME.yaml`.
+    """Return what makes a command of a task: its configuration is `NAME.yaml`.
 
     Bad input ends it with one line and a status of 2, Ctrl-C with 130.
 
     Args:
         name: Name of the configuration.
         rehearse: Builds what a job needs before it computes, see `dpl.commands.dry_run.check`.
+        conf: Folder of the configuration. It may name `${oc.env:DPL_CONF}`, the folder of the
+            package's own configurations, in `hydra.searchpath`.
     """
 
     def decorate(task: Callable[[DictConfig], R]) -> Callable[[], R]:
@@ -50,13 +53,14 @@ def command(
             with readable_errors():
                 return task(cfg)
 
-        started = hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(guarded)
+        started = hydra.main(version_base="1.3", config_path=str(conf), config_name=name)(guarded)
 
         @functools.wraps(task)
         def main() -> R:
+            os.environ["DPL_CONF"] = str(CONF)
             check_sweep(sys.argv[1:])
             with readable_errors():
-                dry_run.check(name, CONF, sys.argv[1:], rehearse)
+                dry_run.check(name, conf, sys.argv[1:], rehearse)
             return started()
 
         return main

@@ -21,6 +21,7 @@ READERS: dict[Any, Callable[[str], Any]] = {
     int: int,
     float: lambda cell: float(cell or "nan"),
     bool: lambda cell: cell == "True",
+    tuple[int, ...]: lambda cell: tuple(int(part) for part in cell.strip("()").split(",") if part),
 }
 
 
@@ -49,7 +50,7 @@ def read(kind: type[Row], path: Path) -> list[Row]:
     """Return the rows of a CSV file that `write` wrote.
 
     Args:
-        kind: Their dataclass, of texts, numbers and truth values.
+        kind: Their dataclass, of texts, numbers, truth values and tuples of whole numbers.
         path: Of the file.
 
     Raises:

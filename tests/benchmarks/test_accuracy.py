@@ -87,14 +87,19 @@ def test_the_figure_and_the_rows_are_written(rows, tmp_path):
 def test_the_script_measures_the_runs_of_a_folder(script, tiny_training, tmp_path):
     ended = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/e/a", cwd=tmp_path)
     assert ended.status == 0, ended.err[-2000:]
-    few = ["parts=[accuracy]", "run=runs/e", "galerkin.rank=3", "repeats=1"]
-    ended = script("benchmark", *few, cwd=tmp_path)
+    others = tmp_path / "meshes.csv"
+    write([pareto.Discretisation((4, 1, 1), 1, 135, 3.0, -18.8, 0.34)], others)
+    few = ["run=runs/e", "galerkin.rank=3", f"discretisation={others}"]
+    ended = script("pareto", *few, cwd=tmp_path)
     assert ended.status == 0, ended.err[-2000:]
-    folder = tmp_path / "runs" / "benchmark"
-    assert (folder / "accuracy_e.png").is_file()
-    assert not (folder / "accuracy_e_meshes.csv").exists()  # another body than the paper's
-    written = list(csv.DictReader((folder / "accuracy_e.csv").open()))
+    folder = tmp_path / "runs" / "pareto"
+    assert (folder / "pareto_e.png").is_file()
+    written = list(csv.DictReader((folder / "pareto_e.csv").open()))
     assert {row["solver"] for row in written} >= {"linear", "POD-Galerkin", "a", "a, hybrid"}
-    refused = script("benchmark", "parts=[accuracy]", "run=runs/none", cwd=tmp_path)
+    refused = script("pareto", "run=runs/none", cwd=tmp_path)
     assert refused.status == 2
     assert "holds no runs" in refused.err
+    refused = script("pareto", "run=runs/e", "discretisation=none.csv", cwd=tmp_path)
+    assert refused.status == 2
+    assert refused.err.startswith("error: discretisation: ")
+    assert refused.err.count("\n") == 1

@@ -155,7 +155,7 @@ def test_the_script_measures_the_runs_of_a_folder_and_goes_on(script, tiny_train
     few = ["run=runs/e", "tols=[1e-3,1e-6,1e-8]", "count=2", "far=1"]
     ended = script("convergence", *few, cwd=tmp_path)
     assert ended.status == 0, ended.err[-2000:]
-    results, raw = tmp_path / "results", tmp_path / "runs" / "e" / "hybrid_newton.csv"
+    results, raw = tmp_path / "runs" / "convergence", tmp_path / "runs" / "e" / "hybrid_newton.csv"
     whole = list(csv.DictReader((results / "hybrid_newton.csv").open()))
     assert len(whole) == 2 + (3 * 3 + 2) * 8
     assert (results / "hybrid_newton.png").is_file()

@@ -38,12 +38,3 @@ def test_where_there_is_no_limit_the_finest_quadratic_mesh_stands_for_it():
     assert [(mesh.cells, mesh.degree) for mesh in rows] == [(few[0], 1), (few[1], 1), (few[0], 2)]
     assert rows[0].error > rows[1].error > rows[2].error > 0
     assert rows[2].value == pytest.approx(5.1e-3, rel=0.1)  # the blades bend, tips by 0.05 L
-
-
-def test_the_paper_s_bodies_are_known_by_their_meshes(scene):
-    beam = beam_scene(SaintVenantKirchhoff(0.3)).problem
-    assert discretisation.family_of(beam) is discretisation.FAMILIES["beam"]
-    assert (
-        discretisation.family_of(propeller_scene().problem) is discretisation.FAMILIES["propeller"]
-    )
-    assert discretisation.family_of(scene.problem) is None

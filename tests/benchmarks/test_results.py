@@ -177,7 +177,7 @@ QUICK = ["name=tiny", "count=3", "galerkin.rank=5", "corrected.rank=8"]
 def test_one_command_writes_rows_machine_and_figure(trained, script):
     ended = script("results", *QUICK, cwd=trained)
     assert ended.status == 0, ended.err
-    with (trained / "results" / "tiny.csv").open() as file:
+    with (trained / "benchmarks" / "results" / "tiny.csv").open() as file:
         rows = list(csv.DictReader(file))
     names = ["linear", "POD-Galerkin", "fcnn", "latent", "latent corrected"]
     assert [row["method"] for row in rows] == names * 3
@@ -188,9 +188,9 @@ def test_one_command_writes_rows_machine_and_figure(trained, script):
     assert (told["fcnn"]["samples"], told["linear"]["samples"]) == ("16", "")
     assert float(told["latent"]["training_minutes"]) > 0
     assert float(told["latent"]["e_mean"]) < float(told["linear"]["e_mean"])
-    machine = json.loads((trained / "results" / "tiny.json").read_text())
+    machine = json.loads((trained / "benchmarks" / "results" / "tiny.json").read_text())
     assert machine["threads"] == 1
-    assert (trained / "results" / "tiny.png").read_bytes().startswith(b"\x89PNG")
+    assert (trained / "benchmarks" / "results" / "tiny.png").read_bytes().startswith(b"\x89PNG")
     rows = json.loads((trained / "runs" / "tiny" / "fcnn" / "evaluation.json").read_text())
     (network,) = (row for row in rows if row["solver"] == "network")
     assert float(told["fcnn"]["e_mean"]) == pytest.approx(network["errors"]["e_mean"], rel=1e-3)

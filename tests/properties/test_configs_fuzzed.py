@@ -58,7 +58,7 @@ NETWORKS = {  # of conf/train.yaml
     "gnn": ["model=gnn", "model.width=4", "loss=energy"],
     "online": ["data=online", "model.width=8", "loss=annealed"],
 }
-OTHERS = ("evaluate", "benchmark", "convergence", "results", "verify", "stress")
+OTHERS = ("evaluate", "benchmark", "convergence", "pareto", "results", "verify", "stress")
 
 TEXTS = ("no such thing", "", "1e30", "-", "a\nb")
 OTHER_KINDS = (None, True, False, [], [None], ["a", {}], {}, {"a": 1}, [[1.0]], *TEXTS)
@@ -88,7 +88,9 @@ SHARED = {  # keys that others refer to
 def composed(command: str, *overrides: str) -> dict:
     """Return a configuration as plain data, its interpolations as they are."""
     GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+    folders = CONF, CONF.parent / "benchmarks" / "conf"
+    folder = next(path for path in folders if (path / f"{command}.yaml").is_file())
+    with hydra.initialize_config_dir(str(folder), version_base="1.3"):
         cfg = hydra.compose(command, overrides=list(overrides))
     GlobalHydra.instance().clear()
     return OmegaConf.to_container(cfg)
@@ -103,7 +105,7 @@ def bases() -> dict[str, dict]:
     for name, chosen in NETWORKS.items():
         sizes = [o for o in SMALL if not (name == "online" and o.startswith("data.train"))]
         found[f"train {name}"] = composed("train", *TINY, *sizes, *chosen, "folder=.", "run=here")
-    needed = {"evaluate": ["run=here"], "results": ["name=x"]}
+    needed = {"evaluate": ["run=here"], "pareto": ["run=here"], "results": ["name=x"]}
     return found | {name: composed(name, *needed.get(name, [])) for name in OTHERS}
 
 

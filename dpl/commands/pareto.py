@@ -1,0 +1,104 @@
+"""Run time against error of every solver: python scripts/pareto.py run=runs/beam_svk."""
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from dpl.commands.cli import command
+from dpl.config import build, run_folder
+from dpl.evaluation import tables
+
+if TYPE_CHECKING:
+    from dpl.evaluation.pareto import Discretisation, Point
+    from dpl.fem.solvers.solution import Solver
+    from dpl.scene import Sample, Scene
+
+
+@command("pareto")
+def main(cfg: DictConfig) -> None:
+    """Measure every solver, and the networks of a folder of runs; write rows and a figure."""
+    from dpl.evaluation import pareto
+
+    build.check(cfg)
+    others = _discretisations(cfg)
+    scene, solvers, batch = _solvers(cfg)
+    rows: list[Point] = []
+    for threads in cfg.threads:
+        count = threads or pareto.all_threads()
+        with Progress() as progress:
+            bar = progress.add_task(f"solvers, {count} threads", total=len(solvers))
+            tick = partial(progress.advance, bar)
+            rows += pareto.points(solvers, batch, threads=count, tick=tick)
+    title = Path(cfg.run).name
+    _show(title, rows)
+    stem = Path(cfg.folder) / f"pareto_{title}"
+    tables.write(rows, stem.with_suffix(".csv"))
+    degree, dofs = scene.problem.degree, scene.problem.free.numel()
+    floor = next((m.error for m in others if (m.degree, m.dofs) == (degree, dofs)), None)
+    first = [row for row in rows if row.threads == rows[0].threads]
+    pareto.draw(first, others, floor, stem.with_suffix(".png"))
+    tables.write_machine(stem.with_suffix(".json"), threads=rows[0].threads)
+    print(f"written to {stem}.csv and {stem}.png")
+
+
+def _discretisations(cfg: DictConfig) -> list["Discretisation"]:
+    """Return the errors of other meshes that are drawn beside.
+
+    Raises:
+        ConfigError: Their file is not there or has other columns.
+    """
+    from dpl.evaluation.pareto import Discretisation
+
+    if cfg.discretisation is None:
+        return []
+    try:
+        return tables.read(Discretisation, Path(cfg.discretisation))
+    except (OSError, ValueError) as error:
+        raise build.ConfigError(f"discretisation: {error}") from error
+
+
+def _show(title: str, rows: list["Point"]) -> None:
+    table = Table(title, "iterate", "threads", "ms", "p99", "error", "worst", "||R||/||f||")
+    for row in rows:
+        times = f"{row.ms:.2f}", f"{row.ms_p99:.2f}"
+        errors = f"{row.error:.1e}", f"{row.worst:.1e}", f"{row.residual:.1e}"
+        name = "" if row.iterate else row.solver
+        table.add_row(name, str(row.iterate), str(row.threads), *times, *errors)
+    Console(width=150).print(table)
+
+
+def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
+    """Return the scene of some runs, every solver there is with their networks, and test loads."""
+    from dpl.evaluation import methods, pareto
+    from dpl.inference.hybrid import Direct, best
+    from dpl.models.pod import PODNet
+
+    runs = run_folder.load_runs(cfg.run)
+    first, surrogate = next(iter(runs.values()))
+    scene = surrogate.scene
+    data = run_folder.load_data(first, scene)
+    train = data.samples("train")
+    robust = scene.solver
+    solvers: dict[str, Solver] = {"linear": scene.linear}
+    solvers |= {f"Newton to {tol:g}": robust.but(tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
+    if cfg.galerkin:
+        model = build.make(cfg, "galerkin")(scene, train)
+        solvers["POD-Galerkin"] = Direct(model.predict, scene.problem)
+    for name, (trained, surrogate) in runs.items():
+        predict = surrogate.predict
+        solvers[name] = Direct(predict, scene.problem)
+        if cfg.corrected and isinstance(surrogate.net, PODNet):
+            row = methods.network(surrogate, Path(cfg.run) / name, trained.data.train)
+            tier = build.make(cfg, "corrected")(surrogate, row, train)
+            solvers[f"{name}, corrected"] = Direct(tier.predict, scene.problem)
+        solvers[f"{name}, hybrid"] = best(predict, scene)
+        if torch.cuda.is_available():
+            copy = run_folder.load_run(Path(cfg.run) / name, scene=scene)[1]
+            solvers[f"{name}, GPU"] = Direct(pareto.on_gpu(copy), scene.problem)
+    return scene, solvers, data.samples("test")
