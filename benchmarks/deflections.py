@@ -7,10 +7,10 @@ from statistics import median
 
 import numpy as np
 
+from dpl import Scene
 from dpl.data.solving.solve import Job
 from dpl.data.solving.worker_pool import outcomes
 from dpl.data.storage.manifest import STREAMS
-from dpl.scene import Scene
 
 BINS = 20
 

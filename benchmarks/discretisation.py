@@ -8,14 +8,19 @@ import torch
 from torch import Tensor
 
 from dpl.evaluation.pareto import Cells, Discretisation
-from dpl.fem.loads.forces import BodyForce, Traction
-from dpl.fem.materials.material import Material
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.propeller import propeller
-from dpl.fem.mesh.regions import Plane, Tag
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, solve
+from dpl.fem import (
+    BodyForce,
+    Load,
+    Material,
+    Newton,
+    Plane,
+    Problem,
+    Tag,
+    Traction,
+    box,
+    propeller,
+    solve,
+)
 
 BEAM = (100.0, 25.0, 25.0)  # [m]
 YOUNG = 4500.0  # [Pa]

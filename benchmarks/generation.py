@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dpl.fem.solvers.solution import Load, solve
-from dpl.fem.symmetry import symmetries
-from dpl.scene import Scene
+from dpl import Scene
+from dpl.fem import Load, solve, symmetries
 
 Guess = Callable[[Load], Tensor]  # loads to displacements (B, N, D) [-]
 

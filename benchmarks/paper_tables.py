@@ -7,14 +7,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dpl.evaluation.methods import Method
+from dpl import Sample, Scene
+from dpl.evaluation import Method, latency
 from dpl.evaluation.tables import write, write_machine
-from dpl.evaluation.timing import latency
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Status, solve
-from dpl.scene import Sample, Scene
+from dpl.fem import Load, Newton, Status, solve
 from dpl.system.threads import one_thread
-from dpl.training.metrics import RelativeL2, metrics
+from dpl.training import RelativeL2
+from dpl.training.metrics import metrics
 
 # Odot, Haferssas, Cotin (2022), tables 1 to 3: e_mean, e_max, SNR_min [dB], samples. Experiments 3
 # and 3b are one here: they differ in the range of Young's modulus, which no answer depends on.

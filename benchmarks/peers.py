@@ -22,21 +22,26 @@ import numpy as np
 import torch
 
 from benchmarks import blas_detection
+from dpl import Scene
 from dpl.data.solving.solve import Job
 from dpl.data.solving.worker_pool import outcomes
+from dpl.fem import (
+    Load,
+    Material,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Solution,
+    Tag,
+    box,
+    propeller,
+    solve,
+)
 from dpl.fem.dofs import gather
-from dpl.fem.linear.backends import backend, chosen
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.propeller import propeller
-from dpl.fem.mesh.regions import Plane, Tag
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, solve
-from dpl.scene import Scene
+from dpl.fem.linear import backend, chosen
 
 
 @dataclass(frozen=True)

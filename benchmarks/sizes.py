@@ -13,22 +13,13 @@ import numpy as np
 import torch
 
 from benchmarks.discretisation import BEAM, YOUNG
-from dpl.evaluation.timing import latency
-from dpl.fem.linear.backends import chosen
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, solve
-from dpl.models.fcnn import FCNN
-from dpl.models.latent import Latent
-from dpl.scene import Sample, Scene
+from dpl import Sample, Scene
+from dpl.evaluation import latency
+from dpl.fem import Linear, Load, ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, solve
+from dpl.fem.linear import chosen
+from dpl.models import FCNN, Latent
 from dpl.system.threads import one_thread
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.training import MSE, Surrogate
 
 
 @dataclass(frozen=True)

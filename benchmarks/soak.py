@@ -11,8 +11,8 @@ from pathlib import Path
 import lightning as L
 import torch
 
-from dpl.inference.simulator import Simulator
-from dpl.scene import Scene
+from dpl import Scene
+from dpl.inference import Simulator
 
 SHARED = Path("/dev/shm")
 STREAM = (0, 13)  # of the simulator's loads
@@ -223,7 +223,7 @@ def told(rows: Sequence[Vitals]) -> str:
 def draw(rows: Sequence[Vitals], path: Path) -> None:
     """Draw memory, rate, and open files and processes against time, a line for each work."""
     from benchmarks.verification.drawing import panel, picture
-    from dpl.visualization.style import COLOURS
+    from dpl.visualization import COLOURS
 
     works = list(dict.fromkeys(row.what for row in rows))
     with picture(path, 3.4) as figure:

@@ -1,4 +1,4 @@
-"""From a mesh, a hyperelastic law and a range of loads to a real-time simulator with a proof.
+"""Neural surrogates of hyperelastic finite-element models, corrected by Newton iterations.
 
 Axis letters used in every docstring:
 
@@ -6,41 +6,31 @@ Axis letters used in every docstring:
     Q quadrature points per cell   M modes   n free degrees of freedom
 
 Inside the package everything is dimensionless: lengths / L, forces / (E L^2) (E L in 2D, per unit
-thickness), Young's modulus 1. SI units live at the border, in `dpl.scene.Scene`.
+thickness), Young's modulus 1. SI units are used at the border, in `dpl.Scene`.
 """
 
 from typing import TYPE_CHECKING
 
+from dpl.system.lazy import public_names
 from dpl.version import __version__
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from dpl.inference.simulator import Simulator
-
-__all__ = ["__version__", "load"]
-
-
-def load(folder: "str | Path", *, trust: bool = False, corrected: bool = False) -> "Simulator":
-    """Return the simulator of a training run.
-
-    Args:
-        folder: The run's, as `runs/...`.
-        trust: Whether its configuration may name objects outside this package, such as your own
-            law: they are imported and called.
-        corrected: Put equilibrium in the network's modes between it and Newton; for `pod` and
-            `latent`, and it needs the run's data set.
-
-    Raises:
-        ValueError: There is no finished run, its checkpoint is of another scene, it names what is
-            not trusted, or its network has no modes.
-    """
-    from dpl.config.run_folder import load_data, load_run
-    from dpl.inference.simulator import Simulator
-
-    config, surrogate = load_run(folder, trust=trust)
-    if not corrected:
-        return Simulator(surrogate)
-    return Simulator.corrected(
-        surrogate, load_data(config, surrogate.scene).snapshots().displacement
-    )
+    from dpl.config.run_folder import load
+    from dpl.config.validation import ConfigError
+    from dpl.data.datamodule import OfflineData, OnlineData
+    from dpl.data.dataset import DataSet
+    from dpl.evaluation.report import evaluate
+    from dpl.inference.hybrid import Direct, Hybrid
+    from dpl.inference.simulator import Answer, Simulator
+    from dpl.models.cnn import CNN
+    from dpl.models.fcnn import FCNN
+    from dpl.models.gnn import GNN
+    from dpl.models.latent import Latent
+    from dpl.models.pod import PODNet
+    from dpl.scene import Sample, Scene
+    from dpl.system.files import DataSetError
+    from dpl.training.losses.loss import Loss
+    from dpl.training.surrogate import Surrogate
+else:
+    __all__, __getattr__, __dir__ = public_names(__name__)
+    __all__ += ["__version__"]

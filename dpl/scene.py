@@ -12,11 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, beside, solve
+from dpl.fem import Linear, Load, ModalLoads, Newton, Problem, solve
+from dpl.fem.solvers.solution import beside
 
 TYPICAL = 6  # the stream of the loads that the corrector is chosen on
 CELLS = {  # scikit-fem's names of shapes and those of bodies, in the plural

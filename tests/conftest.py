@@ -18,15 +18,10 @@ from hypothesis import HealthCheck, settings
 from omegaconf import DictConfig
 from threadpoolctl import threadpool_limits
 
+from dpl import Sample, Scene
 from dpl.config import build
-from dpl.data.datamodule import OfflineData
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.newton import Newton
-from dpl.scene import Sample, Scene
+from dpl.data import OfflineData
+from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box
 
 THREADS = int(os.environ.get("DPL_TEST_THREADS", "1"))  # see tests/matrix.py
 torch.set_num_threads(THREADS)

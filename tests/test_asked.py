@@ -7,9 +7,7 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 from dpl.commands import dry_run, generate, train
-from dpl.commands.cli import CONF
-from dpl.config import build
-from dpl.config.validation import ConfigError
+from dpl.config import ConfigError, build
 
 OPTIONS = "model is one of cnn, fcnn, gnn, latent, pod"
 EXPERIMENTS = "experiment is one of beam_nh_loss, beam_poisson, beam_svk, "
@@ -148,7 +146,7 @@ def test_a_single_job_builds_its_own_parts_only(ask, monkeypatch):
 
 def test_configurations_beside_those_of_the_package_are_checked_too(ask, tmp_path):
     (tmp_path / "mine/material").mkdir(parents=True)
-    soft = "_target_: dpl.fem.materials.neo_hookean.NeoHookeanLn\npoisson: 0.1\n"
+    soft = "_target_: dpl.fem.NeoHookeanLn\npoisson: 0.1\n"
     (tmp_path / "mine/material/soft.yaml").write_text(soft)
     ask("generate", "--config-dir", "mine", "material=soft")
     with pytest.raises(ConfigError, match=r"did you mean soft\?"):
@@ -199,19 +197,16 @@ def test_a_region_may_be_left_out_where_supports_hold_the_body(scene_of, tiny):
     with pytest.raises(ConfigError, match="6 rigid modes are unconstrained"):
         scene_of(*tiny, "~clamped")
     held = (
-        "+supports.end={_target_: dpl.fem.assembly.boundary_conditions.Displacement, "
+        "+supports.end={_target_: dpl.fem.Displacement, "
         "value: [0, 0, 0], "
-        "region: {_target_: dpl.fem.mesh.regions.Plane, axis: 0, at: min}}"
+        "region: {_target_: dpl.fem.Plane, axis: 0, at: min}}"
     )
     usual, scene = scene_of(*tiny), scene_of(*tiny, "~clamped", held)
     assert bool((scene.problem.free == usual.problem.free).all())
 
 
 LAST = "{_target_:lightning.pytorch.callbacks.ModelCheckpoint,dirpath:./checkpoints,filename:last}"
-BEST = (
-    "{_target_:dpl.training.checkpoints.BestWeights,dirpath:./checkpoints,"
-    "filename:best,monitor:val/e_mean}"
-)
+BEST = "{_target_:dpl.training.BestWeights,dirpath:./checkpoints,filename:best,monitor:val/e_mean}"
 OFTEN = "trainer.check_val_every_n_epoch=1"
 OTHER = LAST.replace("last", "other")
 CALLBACKS = {  # what keeps weights from which a run can be loaded, and what does not

@@ -26,18 +26,14 @@ from tensorboard.plugins.hparams import api_pb2, get_experiment, list_session_gr
 from tensorboard.plugins.hparams.backend_context import Context
 from tensorboard.util import tensor_util
 
-from dpl.data.datamodule import OnlineData
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.postprocess.surface import surface
-from dpl.models.fcnn import FCNN
-from dpl.scene import Sample
-from dpl.training.callbacks.hparams import LearningRate, Session
-from dpl.training.callbacks.nonfinite_gradients import Diverged
-from dpl.training.callbacks.throughput import SampleRates, resident
-from dpl.training.callbacks.worst_cases import WorstCases, beside, judge
-from dpl.training.losses.supervised import MSE
+from dpl import Sample
+from dpl.data import OnlineData
+from dpl.fem import box, rectangle, surface
+from dpl.models import FCNN
+from dpl.training import MSE, Diverged, LearningRate, SampleRates, Session, Surrogate, WorstCases
+from dpl.training.callbacks.throughput import resident
+from dpl.training.callbacks.worst_cases import beside, judge
 from dpl.training.metrics import Judged, median, metrics
-from dpl.training.surrogate import Surrogate
 
 BATCHES = 3  # an epoch of the tiny data set
 

@@ -12,7 +12,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from dpl.training.checkpoints import BestWeights, WholeCheckpoints, epochs, read, write
+from dpl.training import BestWeights, WholeCheckpoints
+from dpl.training.checkpoints import epochs, read, write
 
 WEIGHTS = {"net.a": torch.arange(6.0).reshape(2, 3), "scale": torch.tensor(2.0).double()}
 CHECKPOINT = {

@@ -12,9 +12,7 @@ from omegaconf import OmegaConf
 
 from dpl.config import build
 from dpl.data.solving.solve import Job, outcome
-from dpl.fem.materials.material import Hookean
-from dpl.fem.mesh.generators import box
-from dpl.fem.solvers.solution import solve
+from dpl.fem import Hookean, box, solve
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -283,8 +281,8 @@ def test_small_loads_are_small_in_force_and_in_area(scene_of):
 
 def test_options_of_the_loads_can_be_changed_one_by_one(scene_of):
     usual = scene_of(*SMALL["beam"])
-    changes = ["spectrum=1", "sampling=sobol", "radius._target_=dpl.fem.loads.sampling.one"]
-    for change in [*changes, "distribution._target_=dpl.fem.loads.sampling.normal"]:
+    changes = ["spectrum=1", "sampling=sobol", "radius._target_=dpl.fem.loads.one"]
+    for change in [*changes, "distribution._target_=dpl.fem.loads.normal"]:
         assert scene_of(*SMALL["beam"], f"loads.{change}").fingerprint != usual.fingerprint
 
 

@@ -18,11 +18,11 @@ from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import OmegaConf
 
 from dpl.commands import cli
-from dpl.config.validation import ConfigError
+from dpl.config import ConfigError
 
 ROOT = Path(__file__).parents[1]
 SCHEDULED = OmegaConf.create(
-    {"scheduler": {"_target_": "dpl.training.schedules.warmup_cosine"}, "folder": "."}
+    {"scheduler": {"_target_": "dpl.training.warmup_cosine"}, "folder": "."}
 )
 TWO = ["trainer.accelerator=cpu", "trainer.devices=2", "++trainer.strategy=ddp"]
 

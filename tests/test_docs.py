@@ -190,7 +190,10 @@ def generated_page(make, target):
 
 def test_links_out_of_docs_lead_to_pages_of_the_site(make):
     rewritten = make("links").rewritten
-    text = "![a](../benchmarks/results/soak.png), [b](../DESIGN.md#rules), [c](options.md#x), [d](../LICENSE)"
+    text = (
+        "![a](../benchmarks/results/soak.png), [b](../DESIGN.md#rules), [c](options.md#x), "
+        "[d](../LICENSE)"
+    )
     assert rewritten(text, "docs/stress.md", "stress.md") == (
         "![a](results/soak.png), [b](house.md#rules), [c](options.md#x), d"
     )

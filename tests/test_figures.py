@@ -8,12 +8,9 @@ import skfem
 import torch
 from matplotlib.figure import Figure
 
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.postprocess.surface import coarse, surface, triangles
-from dpl.fem.problem import Problem
-from dpl.visualization.figures import body, colours, deformed, spread
+from dpl.fem import NeoHookeanLn, Plane, Problem, box, rectangle, surface
+from dpl.fem.postprocess import coarse, triangles
+from dpl.visualization import body, colours, deformed, spread
 
 
 def edges(polygons):

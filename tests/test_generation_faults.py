@@ -21,7 +21,7 @@ from pathlib import Path
 import pytest
 
 from dpl.data.storage.manifest import lines_of
-from dpl.fem.loads.modal import ModalLoads
+from dpl.fem import ModalLoads
 
 HERE = Path(__file__)
 LONG = 240.0  # no test waits so long, unless what it waits for does not come [s]

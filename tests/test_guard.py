@@ -6,8 +6,7 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader
 
-from dpl.training.callbacks.nonfinite_gradients import Diverged, Guard
-from dpl.training.muon import Muon
+from dpl.training import Diverged, Guard, Muon
 
 
 class Line(L.LightningModule):

@@ -8,12 +8,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from dpl.fem.linear.superlu import SuperLU
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.anderson import Accelerated
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Status, solve
-from dpl.inference.hybrid import RULES, Direct, Hybrid, best, pick
+from dpl.fem import Accelerated, Load, Newton, Problem, Solution, Status, solve
+from dpl.fem.linear import SuperLU
+from dpl.inference import Direct, Hybrid, best, pick
+from dpl.inference.hybrid import RULES
 
 
 @pytest.fixture(scope="module")

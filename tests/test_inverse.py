@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from dpl.models.fcnn import FCNN
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.models import FCNN
+from dpl.training import MSE, Surrogate
 
 PAGE = Path(__file__).parents[1] / "docs" / "inverse.md"
 

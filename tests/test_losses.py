@@ -10,23 +10,33 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from dpl.fem.assembly.boundary_conditions import Spring
-from dpl.fem.materials.neo_hookean import StableNeoHookean
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.postprocess.energy import Rest, tangent_product
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, solve
-from dpl.models.fcnn import FCNN
-from dpl.scene import Sample
-from dpl.training.losses.energy import Energy, Stiffness
-from dpl.training.losses.loss import Loss, Physics, floored
-from dpl.training.losses.residual import LrPlus, LrStar, residual_norm
-from dpl.training.losses.schedule import Annealed
-from dpl.training.losses.supervised import MSE, MeanNorm
-from dpl.training.surrogate import Surrogate
+from dpl import Sample
+from dpl.fem import (
+    Load,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Spring,
+    StableNeoHookean,
+    box,
+    solve,
+)
+from dpl.fem.postprocess import Rest, tangent_product
+from dpl.models import FCNN
+from dpl.training import (
+    MSE,
+    Annealed,
+    Energy,
+    Loss,
+    LrPlus,
+    LrStar,
+    MeanNorm,
+    Physics,
+    Stiffness,
+    Surrogate,
+)
+from dpl.training.losses import floored, residual_norm
 
 LOSSES = sorted((Path(__file__).parents[1] / "conf" / "loss").glob("*.yaml"))
 

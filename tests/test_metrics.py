@@ -4,19 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem.problem import Problem
-from dpl.scene import Sample
-from dpl.training.metrics import (
-    Judged,
-    MaxError,
-    MeanError,
-    MinSNR,
-    MinVolumeRatio,
-    RelativeL2,
-    ResidualRatio,
-    median,
-    metrics,
-)
+from dpl import Sample
+from dpl.fem import Problem
+from dpl.training import MaxError, MeanError, MinSNR, MinVolumeRatio, RelativeL2, ResidualRatio
+from dpl.training.metrics import Judged, median, metrics
 
 
 @pytest.fixture(scope="module")

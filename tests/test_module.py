@@ -14,15 +14,13 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
-from dpl.data.datamodule import OfflineData, OnlineData
-from dpl.fem.solvers.solution import Load
-from dpl.models.fcnn import FCNN
-from dpl.training.checkpoints import WholeCheckpoints, read
-from dpl.training.losses.residual import LrPlus, LrStar
-from dpl.training.losses.supervised import MSE
+from dpl.data import OfflineData, OnlineData
+from dpl.fem import Load
+from dpl.models import FCNN
+from dpl.training import MSE, LrPlus, LrStar, Surrogate, WholeCheckpoints, warmup_cosine
+from dpl.training.checkpoints import read
 from dpl.training.rng_state import random_states, set_random_states
-from dpl.training.schedules import warmup_cosine
-from dpl.training.surrogate import Surrogate, scales
+from dpl.training.surrogate import scales
 
 CONF = Path(__file__).parents[1] / "conf"
 METRICS = {

@@ -12,8 +12,8 @@ from omegaconf import OmegaConf
 from torch import nn
 from torch.utils.data import DataLoader, TensorDataset
 
-from dpl.training.muon import Muon, orthogonal
-from dpl.training.schedules import warmup_cosine
+from dpl.training import Muon, warmup_cosine
+from dpl.training.muon import orthogonal
 
 
 def network(seed=0):

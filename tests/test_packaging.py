@@ -96,9 +96,7 @@ def test_a_command_of_the_wheel_runs_in_an_empty_folder(installed, tmp_path, tin
 def test_a_configuration_of_ones_own_stands_beside_those_of_the_wheel(installed, tmp_path):
     own = tmp_path / "mine/material"
     own.mkdir(parents=True)
-    (own / "soft.yaml").write_text(
-        "_target_: dpl.fem.materials.neo_hookean.NeoHookeanLn\npoisson: 0.7\n"
-    )
+    (own / "soft.yaml").write_text("_target_: dpl.fem.NeoHookeanLn\npoisson: 0.7\n")
     asked = ["--config-dir", "mine", "material=soft"]
     refused = run_from(installed, "generate", *asked, cwd=tmp_path)
     assert refused.stderr.startswith("error: material: poisson = 0.7 must")

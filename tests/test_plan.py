@@ -3,15 +3,12 @@
 import pytest
 import torch
 
-from dpl.data.datamodule import OfflineData, OnlineData
+from dpl.data import OfflineData, OnlineData
 from dpl.data.solving.solve import Job, outcome
-from dpl.fem.linear.superlu import SuperLU
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.solution import Load, solve
-from dpl.models.fcnn import FCNN
-from dpl.training.losses.residual import LrPlus, LrStar
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.fem import Load, Problem, solve
+from dpl.fem.linear import SuperLU
+from dpl.models import FCNN
+from dpl.training import MSE, LrPlus, LrStar, Surrogate
 
 
 @pytest.fixture

@@ -9,44 +9,44 @@ import numpy as np
 import pytest
 import torch
 
+from dpl import DataSetError, Sample
 from dpl.config import build as run
-from dpl.data.datamodule import OfflineData, OnlineData
+from dpl.data import OfflineData, OnlineData, Store
 from dpl.data.storage.integrity import verify
 from dpl.data.storage.shard import opened
-from dpl.data.storage.store import Store
-from dpl.evaluation.evaluate import evaluate
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import (
+from dpl.evaluation import evaluate
+from dpl.fem import (
+    BatchedNewton,
+    Equilibrium,
+    LinearElastic,
+    Load,
+    Material,
     NeoHookeanIsoK2,
     NeoHookeanIsoK4,
     NeoHookeanLn,
+    Newton,
+    PODGalerkin,
+    Problem,
+    SaintVenantKirchhoff,
     StableNeoHookean,
+    YeohK2,
+    solve,
 )
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.materials.yeoh import YeohK2
-from dpl.fem.postprocess.energy import Rest
-from dpl.fem.problem import Problem
-from dpl.fem.rom.galerkin import PODGalerkin
-from dpl.fem.solvers.batched_newton import BatchedNewton
-from dpl.fem.solvers.differentiable import Equilibrium
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, solve
-from dpl.inference.hybrid import Hybrid
-from dpl.models.cnn import CNN
-from dpl.models.fcnn import FCNN
-from dpl.models.gnn import GNN
-from dpl.models.latent import Latent
-from dpl.models.pod import PODNet
+from dpl.fem.postprocess import Rest
+from dpl.inference import Hybrid
+from dpl.models import CNN, FCNN, GNN, Latent, PODNet
 from dpl.models.poisson_interpolation import Rests
-from dpl.scene import Sample
-from dpl.system.files import DataSetError
-from dpl.training.losses.energy import Energy, Stiffness
-from dpl.training.losses.loss import Physics
-from dpl.training.losses.residual import LrPlus, LrStar
-from dpl.training.losses.supervised import MSE
-from dpl.training.metrics import RelativeL2, ResidualRatio
-from dpl.training.surrogate import Surrogate
+from dpl.training import (
+    MSE,
+    Energy,
+    LrPlus,
+    LrStar,
+    Physics,
+    RelativeL2,
+    ResidualRatio,
+    Stiffness,
+    Surrogate,
+)
 
 SPAN = [0.2, 0.4]
 LAWS = [
@@ -147,8 +147,8 @@ def test_a_law_that_is_its_energy_alone_has_batches_too(make_scene):
 def test_nothing_is_compiled_or_analysed_again(wide, monkeypatch):
     loads = wide.loads.sample((0, 0), range(6))
     solve(wide.solver, Load(*(column[:1] for column in loads)))
-    monkeypatch.setattr("dpl.fem.assembly.sparsity.Pattern.build", None)
-    monkeypatch.setattr("dpl.fem.linear.backends.backend", None)
+    monkeypatch.setattr("dpl.fem.assembly.Pattern.build", None)
+    monkeypatch.setattr("dpl.fem.linear.backend", None)
     monkeypatch.setattr("dpl.fem.assembly.kernels.Kernels.__init__", None)
     monkeypatch.setattr("dpl.fem.assembly.kernels._alone", None)
     assert solve(wide.solver, loads).converged.all()

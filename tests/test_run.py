@@ -19,8 +19,7 @@ from omegaconf import OmegaConf
 from safetensors.torch import save_file
 
 from dpl.commands import cli
-from dpl.config import build, run_folder, validation
-from dpl.config.validation import ConfigError
+from dpl.config import ConfigError, build, run_folder, validation
 from dpl.training import checkpoints
 
 ROOT = Path(__file__).parents[1]
@@ -154,7 +153,7 @@ BAD_TRAINING = {
     "seed=nan": r"^seed = nan is not a finite number",
     "~scheduler": r"scheduler is missing",
     "optimizer.betas=[0.9]": r"optimizer\.betas = \[0\.9\] must be",
-    "optimizer._target_=dpl.training.schedules.warmup_cosine": r"optimizer\.",
+    "optimizer._target_=dpl.training.warmup_cosine": r"optimizer\.",
     "trainer=[]": r"trainer is missing",
     "data.train=1000000000000": r"data\.train = 10+ must lie between 1 and 10000000",
     "data.workers=1000000000": r"data: workers = 10+ must be 0 or more and at most 1,024",
@@ -239,14 +238,14 @@ def test_a_body_whose_stiffness_is_no_matrix_is_refused(compose, tiny, law):
 
 def test_a_body_that_is_held_everywhere_is_refused(compose, tiny):
     cfg = compose(*tiny)
-    cfg.clamped = {"_target_": "dpl.fem.mesh.regions.Sphere", "centre": [0, 0, 0], "radius": 1e3}
+    cfg.clamped = {"_target_": "dpl.fem.Sphere", "centre": [0, 0, 0], "radius": 1e3}
     with pytest.raises(ConfigError, match="clamped or supports: every node is held"):
         build.build_scene(cfg)
 
 
 @pytest.mark.parametrize(
     "made",
-    ["dpl.training.losses.residual.LrStar", "skfem.MeshHex", "dpl.fem.mesh.propeller.propeller"],
+    ["dpl.training.LrStar", "skfem.MeshHex", "dpl.fem.propeller"],
 )
 def test_what_a_key_gives_must_be_of_its_kind(compose, tiny, made):
     cfg = compose(*tiny)
@@ -274,7 +273,7 @@ def test_what_must_be_a_call_is_refused_where_it_is_none(compose, tiny, value):
 def test_no_configuration_may_leave_the_body_loose(compose, tiny):
     cfg = compose(*tiny)
     cfg.clamped = {
-        "_target_": "dpl.fem.mesh.regions.Box",
+        "_target_": "dpl.fem.Box",
         "lower": [0, 0, 0],
         "upper": [0, 0, 0],
     }
@@ -284,9 +283,9 @@ def test_no_configuration_may_leave_the_body_loose(compose, tiny):
 
 def test_checking_calls_nothing(compose, monkeypatch):
     called = []
-    monkeypatch.setattr("dpl.fem.mesh.reading.load", lambda path: called.append(path))
+    monkeypatch.setattr("dpl.fem.load", lambda path: called.append(path))
     cfg = compose("mesh=file", "mesh.path=part.msh")
-    cfg.mesh._target_ = "dpl.fem.mesh.reading.load"
+    cfg.mesh._target_ = "dpl.fem.load"
     build.check(cfg)
     assert called == []
 
@@ -535,9 +534,9 @@ def test_a_run_that_names_what_is_not_ours_is_not_called(copied, path, tmp_path)
 @pytest.mark.parametrize(
     "call",
     [
-        {"_target_": "dpl.config.run_folder.load_run", "folder": "evil", "trust": True},
+        {"_target_": "dpl.config.load_run", "folder": "evil", "trust": True},
         {"_target_": "dpl.training.surrogate.append_line", "path": "harm", "line": {}},
-        {"_target_": "dpl.fem.mesh.writing.save", "mesh": {}, "path": "harm.vtk"},
+        {"_target_": "dpl.fem.save", "mesh": {}, "path": "harm.vtk"},
         {"_target_": "dpl.scene.partial", "func": "os.system"},
         {"_target_": "benchmarks.peers.measured_peer", "python": "sh", "program": "harm"},
         {"_target_": "torch.optim.lr_scheduler.partial", "func": "os.system"},
@@ -572,8 +571,8 @@ def test_nothing_of_the_trainer_of_a_run_is_called(copied, monkeypatch):
     "name",
     [
         "dpl.config.build.importlib.import_module",  # not ours, though the name begins with `dpl.`
-        "dpl.config.run_folder.load_run",
-        "dpl.fem.mesh.writing.save",  # writes
+        "dpl.config.load_run",
+        "dpl.fem.save",  # writes
         "dpl.evaluation.tables.write",
         "dpl.system.files.whole_file",
         "dpl.fem.mesh.generators.Sequence",
@@ -701,8 +700,7 @@ def test_a_run_may_be_resumed_for_longer_and_elsewhere(resumed, override):
         ("data.train=17", "data.train was 16, is 17"),
         (
             "loss=mse",
-            "loss._target_ was dpl.training.losses.residual.LrStar, "
-            "is dpl.training.losses.supervised.MSE",
+            "loss._target_ was dpl.training.LrStar, is dpl.training.MSE",
         ),
         ("+trainer.gradient_clip_val=1.0", "trainer.gradient_clip_val was None, is 1.0"),
         ("~scheduler", "scheduler"),

@@ -12,12 +12,9 @@ from omegaconf import OmegaConf
 
 import dpl
 from benchmarks.stress.broken_meshes import write
-from dpl.config import run_folder
-from dpl.config.validation import ConfigError
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.reading import load
-from dpl.fem.mesh.writing import save_exactly
-from dpl.scene import Scene
+from dpl import Scene
+from dpl.config import ConfigError, run_folder
+from dpl.fem import box, load, save_exactly
 
 
 @pytest.fixture(scope="module")
@@ -189,13 +186,13 @@ def handed_on(boxed, tiny_training, script, tmp_path):
 
 
 MESHES = {
-    "box": {"_target_": "dpl.fem.mesh.generators.box", "size": [1, 1, 1], "nodes": [200, 200, 200]},
+    "box": {"_target_": "dpl.fem.box", "size": [1, 1, 1], "nodes": [200, 200, 200]},
     "rectangle": {
-        "_target_": "dpl.fem.mesh.generators.rectangle",
+        "_target_": "dpl.fem.rectangle",
         "size": [1, 1],
         "nodes": [2000, 2000],
     },
-    "propeller": {"_target_": "dpl.fem.mesh.propeller.propeller", "cells": [90, 90, 90, 90, 90]},
+    "propeller": {"_target_": "dpl.fem.propeller", "cells": [90, 90, 90, 90, 90]},
 }
 LIES = {
     "nothing": lambda told: None,
@@ -204,7 +201,7 @@ LIES = {
 }
 
 
-THIN = {"_target_": "dpl.fem.mesh.generators.box", "size": [100, 25, 25], "nodes": [6, 3, 3]}
+THIN = {"_target_": "dpl.fem.box", "size": [100, 25, 25], "nodes": [6, 3, 3]}
 
 
 @pytest.mark.parametrize(
@@ -235,7 +232,7 @@ def test_a_mesh_of_more_nodes_than_the_weights_have_is_refused_before_it_is_made
 
 def test_a_larger_mesh_file_in_the_folder_is_refused_by_its_nodes(handed_on, part):
     cfg = OmegaConf.load(handed_on / "config.yaml")
-    cfg.mesh = {"_target_": "dpl.fem.mesh.reading.load", "path": "x"}
+    cfg.mesh = {"_target_": "dpl.fem.load", "path": "x"}
     (handed_on / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
     save_exactly(handed_on / "mesh.vtu", box([100.0, 25.0, 25.0], [6, 3, 3]))
     with pytest.raises(ConfigError, match=r"mesh: .*mesh\.vtu: its size = 54 nodes must be 45"):

@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem.loads.sampling import even, logarithmic, normal, tail, uniform
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Box, Plane
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import solve
-from dpl.scene import Sample, stack
+from dpl import Sample
+from dpl.fem import Box, Newton, Plane, SaintVenantKirchhoff, box, rectangle, solve
+from dpl.fem.loads import even, logarithmic, normal, tail, uniform
+from dpl.scene import stack
 
 
 def mild(t, *, factor):

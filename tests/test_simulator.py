@@ -14,14 +14,10 @@ import torch
 import dpl
 import dpl.inference.simulator as simulator_module
 from dpl.config import build
-from dpl.fem.solvers.solution import Status, solve
-from dpl.inference.hybrid import Hybrid
-from dpl.inference.simulator import Simulator, nearest
-from dpl.models.cnn import CNN
-from dpl.models.fcnn import FCNN
-from dpl.models.gnn import GNN
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.fem import Status, solve
+from dpl.inference import Hybrid, Simulator, nearest
+from dpl.models import CNN, FCNN, GNN
+from dpl.training import MSE, Surrogate
 
 E = 4500.0
 

@@ -21,13 +21,12 @@ from rich.table import Table
 from benchmarks import generation as ways
 from benchmarks import peers
 from benchmarks.commands import CONF
+from dpl import Scene
 from dpl.commands.cli import command
 from dpl.config import build, run_folder
 from dpl.evaluation.tables import machine, write, write_machine
-from dpl.fem.linear.backends import BACKENDS, installed
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.scene import Scene
+from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, installed
+from dpl.fem.linear import BACKENDS
 from dpl.system.threads import one_thread
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ def main(cfg: DictConfig) -> None:
     from benchmarks import paper_tables
     from dpl.evaluation import methods
     from dpl.evaluation.tables import show
-    from dpl.models.pod import PODNet
+    from dpl.models import PODNet
 
     build.check(cfg)
     runs = run_folder.load_runs(cfg.run)

@@ -25,7 +25,7 @@ def main(cfg: DictConfig) -> None:
     # here and not above: worker processes import this file, and need none of it
     from benchmarks import soak
     from dpl.evaluation import tables as table
-    from dpl.inference.simulator import Simulator
+    from dpl.inference import Simulator
 
     build.check(cfg)
     if not cfg.minutes > 0:

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dpl.fem.assembly.sparsity import Pattern
-from dpl.fem.linear.backends import backend, installed
-from dpl.fem.linear.interface import Backend, SingularMatrix
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.solution import Load, Solution, Solver, Status
+from dpl.fem import Load, Problem, SingularMatrix, Solution, Solver, Status, installed
+from dpl.fem.assembly import Pattern
+from dpl.fem.linear import Backend, backend
 
 EXACT = "pardiso" if "pardiso" in installed() else "superlu"  # both count negative pivots
 NEAR = 1e-4  # of a critical load [-]
@@ -102,7 +100,7 @@ class Watch:
         """Return the negative eigenvalues of the tangent, by elimination.
 
         Those within `NEAR` of K(0) in their direction are let pass: a load as near to a critical
-        one may be taken for stable, see `dpl.fem.solvers.newton.Newton`.
+        one may be taken for stable, see `dpl.fem.Newton`.
         """
         pattern = body.pattern
         factoriser = self._backends.setdefault(pattern, backend(pattern, EXACT))

@@ -12,19 +12,21 @@ from benchmarks.stress.fixtures import load_of
 from benchmarks.stress.loads import kinds, words
 from benchmarks.verification.refinement import LOCKING, POISSON, compliance
 from benchmarks.verification.report import Row
-from dpl.fem.linear.backends import installed
-from dpl.fem.loads.forces import Traction
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import solve
-from dpl.scene import Scene
+from dpl import Scene
+from dpl.fem import (
+    Linear,
+    Material,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Traction,
+    box,
+    installed,
+    solve,
+)
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
 DIRECT = [name for name in installed() if name != "cg"]

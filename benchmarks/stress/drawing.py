@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.stress.case import Rung
 from benchmarks.verification.drawing import MARKS, panel, picture
-from dpl.visualization.style import COLOURS
+from dpl.visualization import COLOURS
 
 LABELS = {
     "volume_ratio": "smallest min det F [-]",

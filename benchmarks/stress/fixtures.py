@@ -7,15 +7,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.verification.bodies import Array
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.yeoh import YeohK2
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Box, Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.solution import Load
+from dpl.fem import (
+    Box,
+    LinearElastic,
+    Load,
+    Material,
+    NeoHookeanLn,
+    Plane,
+    Problem,
+    Traction,
+    YeohK2,
+    box,
+    rectangle,
+)
 
 YOUNG = 4500.0  # of the paper's beam [Pa]
 LARGEST = 40.0  # traction on its end that counts as the end of the training range [Pa]

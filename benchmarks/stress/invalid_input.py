@@ -13,20 +13,25 @@ from benchmarks.stress.auditor import Watch
 from benchmarks.stress.case import Case, Outcome, all_of, graded, refused
 from benchmarks.stress.fixtures import load_of
 from benchmarks.verification.report import Row
-from dpl.fem.assembly.boundary_conditions import Displacement, Spring
-from dpl.fem.linear.backends import installed
-from dpl.fem.loads.eigenmodes import eigenmodes
-from dpl.fem.loads.forces import Traction
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.reading import load
-from dpl.fem.mesh.regions import Box, Plane, Tag
-from dpl.fem.mesh.validation import check
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Status
+from dpl.fem import (
+    Box,
+    Displacement,
+    Linear,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    Spring,
+    Status,
+    Tag,
+    Traction,
+    box,
+    eigenmodes,
+    installed,
+    load,
+)
+from dpl.fem.mesh import check
 
 NH = NeoHookeanLn(0.3)
 APART = ["two pieces", "crack"]  # T14; the rest of the flaws are T15's

@@ -13,18 +13,23 @@ from benchmarks.stress.fixtures import KINDS, LARGEST, beam_of, load_of, pulled
 from benchmarks.verification.bodies import NAMES, mean, paper_beam, slender
 from benchmarks.verification.report import Row
 from benchmarks.verification.uniaxial import LAWS
+from dpl import Scene
 from dpl.data.solving.solve import Job, outcome
-from dpl.fem.loads.forces import Traction
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Solution, Status, judge, solve
-from dpl.scene import Scene
+from dpl.fem import (
+    Linear,
+    Material,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Solution,
+    Status,
+    Traction,
+    judge,
+    solve,
+)
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
 CELLS = (16, 4, 4)

@@ -12,22 +12,26 @@ from benchmarks.stress.fixtures import LARGEST, YOUNG, load_of, pulled
 from benchmarks.stress.loads import LADDER, rung, words
 from benchmarks.verification.bodies import paper_beam
 from benchmarks.verification.report import Row
+from dpl import Scene
 from dpl.evaluation.newton_starts import PlainNewton
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.anderson import Accelerated
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solver, solve
-from dpl.inference.hybrid import Direct, Hybrid, Predict, pick
-from dpl.models.fcnn import FCNN
-from dpl.scene import Scene
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.fem import (
+    Accelerated,
+    Linear,
+    Load,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Solver,
+    box,
+    solve,
+)
+from dpl.inference import Direct, Hybrid, pick
+from dpl.inference.hybrid import Predict
+from dpl.models import FCNN
+from dpl.training import MSE, Surrogate
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
 USELESS = ("not a number", "one not a number", "infinite", "inverted")

@@ -11,12 +11,17 @@ from benchmarks.stress.case import Case, Outcome, graded
 from benchmarks.stress.fixtures import load_of
 from benchmarks.stress.loads import kinds, words
 from benchmarks.verification.report import Row
-from dpl.fem.linear.backends import installed
-from dpl.fem.materials.neo_hookean import NeoHookeanIsoK2, NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.solvers.bifurcation import branches
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Solution, Status, judge
+from dpl.fem import (
+    NeoHookeanIsoK2,
+    NeoHookeanLn,
+    Newton,
+    SaintVenantKirchhoff,
+    Solution,
+    Status,
+    branches,
+    installed,
+    judge,
+)
 
 DIRECT = [name for name in installed() if name != "cg"]
 SVK = SaintVenantKirchhoff(0.0)

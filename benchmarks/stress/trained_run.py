@@ -11,11 +11,11 @@ from benchmarks.stress.auditor import Watch
 from benchmarks.stress.case import Case, Outcome, Rung, graded
 from benchmarks.stress.loads import rung
 from benchmarks.verification.report import Row
-from dpl.fem.solvers.solution import Load, Solution
-from dpl.inference.hybrid import best
-from dpl.inference.simulator import SLACK, Answer, Simulator
-from dpl.scene import Scene
-from dpl.training.surrogate import Surrogate
+from dpl import Scene
+from dpl.fem import Load, Solution
+from dpl.inference import Answer, Simulator, best
+from dpl.inference.simulator import SLACK
+from dpl.training import Surrogate
 
 LADDER = (1e-9, 1e-6, 1e-3, 0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 25.0)  # times the range
 STREAM = (0, 11)  # of these loads

@@ -13,13 +13,7 @@ from benchmarks import peers
 from benchmarks.verification.bodies import NAMES, Array, balanced, paper_beam
 from benchmarks.verification.drawing import curve, measured, panel, picture, reference, triangle
 from benchmarks.verification.report import Row, Section
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.newton import Newton
+from dpl.fem import Material, NeoHookeanLn, Newton, Plane, Problem, SaintVenantKirchhoff, Traction
 
 # u_z of the corner (100, 25, 25) [m]: SVK at q = 5, 20, 40 Pa, NH-ln at q = 40 Pa
 BEAM: dict[tuple[str, tuple[int, int, int], int], str] = {

@@ -7,12 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.materials.material import Material
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Status
+from dpl.fem import Load, Material, Newton, Plane, Problem, Solution, Status, box
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.verification.bodies import Array, lattice
-from dpl.fem.problem import Problem
-from dpl.visualization.style import COLOURS, STYLE
+from dpl.fem import Problem
+from dpl.visualization import COLOURS, STYLE
 
 MARKS = "osD^vP"
 

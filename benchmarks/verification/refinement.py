@@ -12,16 +12,21 @@ from torch import Tensor
 from benchmarks.verification.bodies import NAMES, Array, balanced, lattice
 from benchmarks.verification.drawing import measured, panel, picture, reference, side, triangle
 from benchmarks.verification.report import Row, Section
-from dpl.fem.loads.forces import Traction, body_force
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import NeoHookeanIsoK4, NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.visualization.style import COLOURS
+from dpl.fem import (
+    Linear,
+    Material,
+    NeoHookeanIsoK4,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Traction,
+    box,
+    rectangle,
+)
+from dpl.fem.loads import body_force
+from dpl.visualization import COLOURS
 
 # cell, degree: cells a side, error in L2, error in the H1-seminorm; NH-ln, A = 0.1
 ERRORS: dict[tuple[str, int], tuple[list[int], str, str]] = {

@@ -14,16 +14,18 @@ from torch import Tensor
 from benchmarks.verification.bodies import Array, balanced, lattice, mean, slender
 from benchmarks.verification.drawing import curve, measured, panel, picture, reference, side
 from benchmarks.verification.report import Row, Section
-from dpl.fem.linear.backends import backend
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Status
-from dpl.visualization.style import COLOURS
+from dpl.fem import (
+    Material,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Status,
+    Traction,
+)
+from dpl.fem.linear import backend
+from dpl.visualization import COLOURS
 
 SVK = SaintVenantKirchhoff(0.0)
 BENT = {  # P L^2 / EI: w / L and u / L of the tip, by elliptic integrals

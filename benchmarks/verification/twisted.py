@@ -11,13 +11,8 @@ from torch import Tensor
 from benchmarks.verification.bodies import Array, balanced
 from benchmarks.verification.drawing import curve, measured, panel, picture, reference, solid
 from benchmarks.verification.report import Row, Section
-from dpl.fem.assembly.boundary_conditions import Displacement
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.newton import Newton
-from dpl.visualization.style import COLOURS
+from dpl.fem import Displacement, NeoHookeanLn, Newton, Plane, Problem, box
+from dpl.visualization import COLOURS
 
 TWIST = {  # cells, degree: torque [N m], axial force [N], energy [J] at 90 degrees
     ((4, 4, 20), 1): ("18024.62786229", "-800.53818109", "14151.84978085"),

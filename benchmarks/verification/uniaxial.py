@@ -11,21 +11,21 @@ import torch
 from benchmarks.verification.bodies import Array, balanced
 from benchmarks.verification.drawing import measured, panel, picture, reference
 from benchmarks.verification.report import Row, Section
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
-from dpl.fem.materials.neo_hookean import (
+from dpl.fem import (
+    LinearElastic,
+    Material,
+    MooneyRivlinK2,
     NeoHookeanIsoK2,
     NeoHookeanIsoK4,
     NeoHookeanLn,
+    Newton,
+    OgdenK2,
+    Problem,
+    SaintVenantKirchhoff,
     StableNeoHookean,
+    YeohK2,
+    box,
 )
-from dpl.fem.materials.ogden import OgdenK2
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.materials.yeoh import YeohK2
-from dpl.fem.mesh.generators import box
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.newton import Newton
 
 LAWS = {
     "linear": LinearElastic(0.3),

@@ -1,4 +1,4 @@
-"""The page of results, from benchmarks/results/: every table and figure with the command that makes it."""
+"""The page of benchmarks/results/: every table and figure with the command that makes it."""
 
 import csv
 import json
@@ -191,8 +191,8 @@ def page() -> str:
     parts = [
         "---\nhide: [navigation]\n---\n",
         "# Results\n",
-        "Tables and figures are those of `benchmarks/results/`, read when this page was made. What they mean "
-        "is told in [Measurements](measurements.md). Times differ from machine to "
+        "Tables and figures are those of `benchmarks/results/`, read when this page was made. "
+        "What they mean is told in [Measurements](measurements.md). Times differ from machine to "
         "machine.\n",
     ]
     for stem in there:

@@ -19,16 +19,12 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from dpl.commands import dry_run
-from dpl.config.validation import ConfigError
+from dpl.config import CONF, ConfigError
 from dpl.system.files import DataSetError
 from dpl.version import install
 
 R = typing.TypeVar("R")
 
-PACKAGE = Path(__file__).parents[1]
-CONF = next(  # in a wheel inside the package, in a checkout beside it
-    path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if path.is_dir()
-)
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 

@@ -6,7 +6,7 @@ from omegaconf import DictConfig
 
 from dpl.commands.cli import command
 from dpl.config import build
-from dpl.evaluation.evaluate import compare
+from dpl.evaluation import compare
 
 
 @command("evaluate")

@@ -18,8 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dpl.commands import overrides
-from dpl.config import build
-from dpl.config.validation import ConfigError
+from dpl.config import ConfigError, build
 
 BASIC = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
 REMOTE = "submitit"  # launchers of other machines, which can do what this one may not

@@ -6,7 +6,7 @@ from omegaconf import DictConfig
 
 from dpl.commands.cli import command
 from dpl.config import build, run_folder
-from dpl.evaluation.evaluate import evaluate
+from dpl.evaluation import evaluate
 
 
 @command("evaluate")

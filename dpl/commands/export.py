@@ -20,7 +20,7 @@ from dpl.system.files import whole_file
 from dpl.version import install
 
 if TYPE_CHECKING:
-    from dpl.training.surrogate import Surrogate
+    from dpl.training import Surrogate
 
 PARTS = ("model", "results")
 SHOWN = (0, 12)  # the stream of the loads in results
@@ -50,10 +50,10 @@ def main(cfg: DictConfig) -> None:
 def model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
     """Write the graph and what goes with it; compare it with torch, and time both."""
     from dpl.evaluation import timing
-    from dpl.export import check
-    from dpl.export.folder import described, read_reference, reference, verify, write
-    from dpl.export.onnx_graph import NEEDED, Graph, Session, export, opset
-    from dpl.inference.simulator import Simulator
+    from dpl.export import check, export, opset, read_reference, verify, write
+    from dpl.export.folder import described, reference
+    from dpl.export.onnx_graph import NEEDED, Graph, Session
+    from dpl.inference import Simulator
 
     graph, path = Graph(surrogate), folder / "model.onnx"
     start = time.perf_counter()
@@ -136,7 +136,7 @@ def _known(value: Any) -> Any:
 
 def results(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
     """Write answers to random loads for ParaView."""
-    from dpl.export.paraview import results as written
+    from dpl.export import results as written
 
     if cfg.count < 1:
         raise build.ConfigError(f"count = {cfg.count} must be 1 or more; or take parts=[model]")

@@ -6,7 +6,7 @@ from omegaconf import DictConfig
 
 from dpl.commands.cli import command
 from dpl.config import build
-from dpl.data.dataset import DataSet
+from dpl.data import DataSet
 from dpl.scene import Scene
 
 ACTIONS = ("generate", "verify", "repair")

@@ -18,8 +18,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dpl.config import validation
-from dpl.config.validation import ConfigError
+from dpl.config import ConfigError, validation
 from dpl.version import install
 
 EXTRAS = {"hydra/launcher": "launch", "hydra/sweeper": "sweep"}  # groups that plugins add to

@@ -16,7 +16,7 @@ from dpl.evaluation import tables
 
 if TYPE_CHECKING:
     from dpl.evaluation.pareto import Discretisation, Point
-    from dpl.fem.solvers.solution import Solver
+    from dpl.fem import Solver
     from dpl.scene import Sample, Scene
 
 
@@ -76,8 +76,8 @@ def _show(title: str, rows: list["Point"]) -> None:
 def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
     """Return the scene of some runs, every solver there is with their networks, and test loads."""
     from dpl.evaluation import methods, pareto
-    from dpl.inference.hybrid import Direct, best
-    from dpl.models.pod import PODNet
+    from dpl.inference import Direct, best
+    from dpl.models import PODNet
 
     runs = run_folder.load_runs(cfg.run)
     first, surrogate = next(iter(runs.values()))

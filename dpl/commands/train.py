@@ -13,7 +13,7 @@ from dpl.system.files import DataSetError
 
 if TYPE_CHECKING:
     from dpl.scene import Scene
-    from dpl.training.surrogate import Surrogate
+    from dpl.training import Surrogate
 
 
 def parts(cfg: DictConfig) -> tuple["Scene", Any, "Surrogate", Any]:
@@ -39,9 +39,9 @@ def main(cfg: DictConfig) -> float | None:
     # here and not above: worker processes import this file, and need none of it
     import torch
 
-    from dpl.evaluation.evaluate import evaluate
+    from dpl.evaluation import evaluate
+    from dpl.training import Diverged
     from dpl.training.callbacks import hparams
-    from dpl.training.callbacks.nonfinite_gradients import Diverged
 
     build.check(cfg)
     folder = Path(cfg.folder)

@@ -13,9 +13,7 @@ from dpl.config import build, run_folder
 from dpl.version import install
 
 if TYPE_CHECKING:
-    from dpl.viewer.access import Door
-    from dpl.viewer.frames import Body
-    from dpl.viewer.page import Page
+    from dpl.viewer import Body, Door, Page
 
 
 @command("view")
@@ -26,7 +24,7 @@ def main(cfg: DictConfig) -> None:
         _film(_body(cfg), Path(cfg.movie))
         return
     try:
-        from dpl.viewer.page import Page
+        from dpl.viewer import Page
     except ImportError as error:
         raise build.ConfigError(
             f"the viewer cannot be used ({error}): {install('viewer')}"
@@ -48,8 +46,8 @@ def main(cfg: DictConfig) -> None:
 def _body(cfg: DictConfig) -> "Body":
     import torch
 
-    from dpl.inference.simulator import Simulator
-    from dpl.viewer.frames import Body
+    from dpl.inference import Simulator
+    from dpl.viewer import Body
 
     torch.set_num_threads(1)
     return Body(Simulator(run_folder.load_run(cfg.run)[1]))
@@ -61,7 +59,7 @@ def _door(cfg: DictConfig) -> "Door":
     Raises:
         ConfigError: It cannot be there.
     """
-    from dpl.viewer.access import Door
+    from dpl.viewer import Door
 
     try:
         door = Door.bound(cfg.host, cfg.port, cfg.names)

@@ -1,1 +1,29 @@
 """Configurations: checked, built into scenes and networks, kept in the folder of a run."""
+
+from typing import TYPE_CHECKING
+
+from dpl.system.lazy import public_names
+
+if TYPE_CHECKING:
+    from dpl.config.build import (
+        build_scene,
+        build_surrogate,
+        check,
+        hyperparameters,
+        make,
+        plain,
+        show_plan,
+    )
+    from dpl.config.folder import CONF
+    from dpl.config.run_folder import (
+        check_resumed,
+        check_weights,
+        load_data,
+        load_run,
+        load_runs,
+        save_config,
+        with_mesh_of_resumed,
+    )
+    from dpl.config.validation import ConfigError
+else:
+    __all__, __getattr__, __dir__ = public_names(__name__)

@@ -19,13 +19,13 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from dpl.config import validation
 from dpl.config.validation import ConfigError
-from dpl.fem.linear.interface import SingularMatrix
+from dpl.fem import SingularMatrix
 from dpl.scene import Scene
 from dpl.system.blas import slow_blas
 
 if typing.TYPE_CHECKING:
-    from dpl.fem.problem import Problem
-    from dpl.training.surrogate import Surrogate
+    from dpl.fem import Problem
+    from dpl.training import Surrogate
 
 
 SCENE = (  # keys that make a scene, and those that make a surrogate of it
@@ -125,7 +125,7 @@ def build_scene(cfg: DictConfig) -> Scene:
     Raises:
         ConfigError: Something in it cannot work.
     """
-    from dpl.fem.problem import Problem
+    from dpl.fem import Problem
 
     _need(cfg, *SCENE)
     material = make(cfg, "material")
@@ -213,7 +213,7 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
     Raises:
         ConfigError: Something in it cannot work.
     """
-    from dpl.training.surrogate import Surrogate
+    from dpl.training import Surrogate
 
     _need(cfg, *NETWORK)
     # both are tried on one number, so that their errors come before any solve

@@ -6,26 +6,27 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import hydra
 import torch
 import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dpl.config import validation
+from dpl.config.build import SCENE, _need, build_scene, build_surrogate, check, make, plain
 from dpl.config.validation import ConfigError
-from dpl.fem.mesh.writing import save_exactly
+from dpl.fem import load as load_mesh
+from dpl.fem import save_exactly
 from dpl.scene import Scene
 from dpl.system.files import whole_file
 from dpl.system.memory import at_most
 
 if typing.TYPE_CHECKING:
-    from dpl.data.datamodule import OfflineData
-    from dpl.training.surrogate import Surrogate
+    from dpl.data import OfflineData
+    from dpl.inference import Simulator
+    from dpl.training import Surrogate
 
-from dpl.config.build import SCENE, _need, build_scene, build_surrogate, check, make, plain
-
-READ = "dpl.fem.mesh.reading.load"  # of a mesh that is a file, of which a run keeps a copy:
-MESH = "mesh.vtu"
+MESH = "mesh.vtu"  # copy of the mesh file in the folder of a run
 LONGEST = 100_000  # bytes of a run's configuration
 
 
@@ -48,13 +49,18 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
 def _keep_mesh(cfg: DictConfig, folder: Path) -> None:
     """Write the mesh file of a configuration into a run's folder, as `MESH`."""
     cfg = with_mesh_of_resumed(cfg)
-    if cfg.mesh._target_ != READ or Path(cfg.mesh.path) == folder / MESH:
+    if not _is_file(cfg) or Path(cfg.mesh.path) == folder / MESH:
         return
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # it was read before, and they were shown
         mesh = make(cfg, "mesh")
     with whole_file(folder / MESH) as file:
         save_exactly(Path(file.name), mesh)
+
+
+def _is_file(cfg: DictConfig) -> bool:
+    """Return whether the mesh of a configuration is read from a file."""
+    return hydra.utils.get_object(cfg.mesh._target_) is load_mesh
 
 
 def _with_mesh(cfg: DictConfig, path: Path) -> DictConfig:
@@ -75,7 +81,7 @@ def with_mesh_of_resumed(cfg: DictConfig) -> DictConfig:
 
     The original may have been moved or changed.
     """
-    if cfg.mesh._target_ != READ or (checkpoint := _resumed(cfg)) is None:
+    if not _is_file(cfg) or (checkpoint := _resumed(cfg)) is None:
         return cfg
     own = checkpoint.parent.parent / MESH
     return _with_mesh(cfg, own) if own.is_file() else cfg
@@ -223,7 +229,7 @@ def _scene_of_run(
         ConfigError: The run has no copy of its mesh file, or the mesh has too many nodes.
     """
     _need(cfg, *SCENE)
-    if cfg.mesh._target_ == READ:
+    if _is_file(cfg):
         folder = weights.parent.parent
         own = folder / MESH
         if own.resolve().parent == folder.resolve() and own.is_file():
@@ -231,7 +237,7 @@ def _scene_of_run(
         elif not trust:
             raise ConfigError(
                 f"mesh.path = {cfg.mesh.path} must be kept in the run's folder as {own}; write it "
-                "there (dpl.fem.mesh.writing.save_exactly), or load the run with trust=True"
+                "there (dpl.fem.save_exactly), or load the run with trust=True"
             )
     if trust:
         return build_scene(cfg)
@@ -240,6 +246,30 @@ def _scene_of_run(
     most = min(nodes, values) if isinstance(nodes, int) else values
     with at_most(most, f"{weights} is of no larger body"):
         return build_scene(cfg)
+
+
+def load(folder: str | Path, *, trust: bool = False, corrected: bool = False) -> "Simulator":
+    """Return the simulator of a training run.
+
+    Args:
+        folder: The run's, as `runs/...`.
+        trust: Whether its configuration may name objects outside this package, such as your own
+            law: they are imported and called.
+        corrected: Put equilibrium in the network's modes between it and Newton; for `pod` and
+            `latent`, and it needs the run's data set.
+
+    Raises:
+        ValueError: There is no finished run, its checkpoint is of another scene, it names what is
+            not trusted, or its network has no modes.
+    """
+    from dpl.inference import Simulator
+
+    config, surrogate = load_run(folder, trust=trust)
+    if not corrected:
+        return Simulator(surrogate)
+    return Simulator.corrected(
+        surrogate, load_data(config, surrogate.scene).snapshots().displacement
+    )
 
 
 def load_runs(

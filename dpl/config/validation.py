@@ -48,18 +48,18 @@ TRAINED = {  # smallest and largest of what only a training must keep to; 1e-30 
 ENDLESS = {"trainer.max_epochs", "trainer.max_steps"}  # -1 of these stands for no limit
 KINDS = {  # what the call under a key must give: one of these, or of a class derived from them
     "mesh": {"skfem.mesh.mesh.Mesh"},
-    "material": {"dpl.fem.materials.material.Material"},
+    "material": {"dpl.fem.Material"},
     "clamped": {f"dpl.fem.mesh.regions.{n}" for n in ("Plane", "Box", "Sphere", "Cylinder", "Tag")},
     "supports": {
-        "dpl.fem.assembly.boundary_conditions.Displacement",
-        "dpl.fem.assembly.boundary_conditions.Spring",
+        "dpl.fem.Displacement",
+        "dpl.fem.Spring",
     },
-    "forces": {"dpl.fem.loads.forces.Traction", "dpl.fem.loads.forces.BodyForce"},
-    "solver": {"dpl.fem.solvers.newton.Newton"},
-    "loads": {"dpl.fem.loads.modal.ModalLoads"},
-    "data": {"dpl.data.dataset.DataSet", "dpl.data.datamodule.OfflineData"},
+    "forces": {"dpl.fem.Traction", "dpl.fem.BodyForce"},
+    "solver": {"dpl.fem.Newton"},
+    "loads": {"dpl.fem.ModalLoads"},
+    "data": {"dpl.data.DataSet", "dpl.data.OfflineData"},
     "model": {"torch.nn.modules.module.Module"},
-    "loss": {"dpl.training.losses.loss.Loss"},
+    "loss": {"dpl.training.Loss"},
     "optimizer": {"torch.optim.optimizer.Optimizer"},
     "scheduler": {"torch.optim.lr_scheduler.LRScheduler"},
     "trainer": {"lightning.pytorch.trainer.trainer.Trainer"},
@@ -69,7 +69,7 @@ TRUSTED = {  # functions that a run's folder may name without being asked; class
     *(f"dpl.fem.mesh.generators.{name}" for name in ("box", "rectangle", "propeller", "load")),
     *(f"dpl.fem.loads.sampling.{name}" for name in ("uniform", "normal", "even", "one")),
     *(f"dpl.fem.loads.sampling.{name}" for name in ("logarithmic", "tail")),
-    "dpl.training.schedules.warmup_cosine",
+    "dpl.training.warmup_cosine",
 }
 OURS = ("dpl.", "torch.optim.")  # where those classes are
 OWN = {"_target_", "_partial_", "_recursive_", "_convert_"}  # Hydra's own options of a call

@@ -16,7 +16,8 @@ from dpl.data.dataset import DataSet
 from dpl.data.replay_buffer import Rates, Replay
 from dpl.data.storage.writer import Writer
 from dpl.data.stream import OnlineSamples, Worst
-from dpl.fem.symmetry import Symmetry, images, symmetries
+from dpl.fem import symmetries
+from dpl.fem.symmetry import Symmetry, images
 from dpl.scene import Sample, Scene
 from dpl.system.files import DataSetError
 from dpl.system.memory import machine, refuse_beyond

@@ -1,1 +1,12 @@
 """Solvers timed and compared: errors, run times, Newton started from predictions."""
+
+from typing import TYPE_CHECKING
+
+from dpl.system.lazy import public_names
+
+if TYPE_CHECKING:
+    from dpl.evaluation.methods import Method, corrected, pod_galerkin
+    from dpl.evaluation.report import compare, evaluate
+    from dpl.evaluation.timing import Latency, latencies, latency
+else:
+    __all__, __getattr__, __dir__ = public_names(__name__)

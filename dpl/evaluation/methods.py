@@ -10,13 +10,11 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from dpl.fem.rom.galerkin import PODGalerkin
-from dpl.fem.solvers.solution import Load
+from dpl.fem import Load, PODGalerkin
 from dpl.inference.hybrid import Predict
-from dpl.models.latent import Latent
-from dpl.models.pod import PODNet
+from dpl.models import Latent, PODNet
 from dpl.scene import Sample, Scene
-from dpl.training.surrogate import Surrogate
+from dpl.training import Surrogate
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ def pod_galerkin(scene: Scene, train: Sample, *, rank: int, tolerance: float) ->
         scene: What is simulated.
         train: The samples.
         rank: Modes of what is beyond linear.
-        tolerance: Of the choice of cells, see `dpl.fem.rom.ecsw.cubature`.
+        tolerance: Of the choice of cells, see `dpl.fem.rom.cubature`.
 
     Raises:
         ValueError: A number is out of range.
@@ -98,7 +96,7 @@ def corrected(
         method: Its row.
         train: Its samples.
         rank: Modes of its basis in which to correct.
-        tolerance: Of the choice of cells, see `dpl.fem.rom.ecsw.cubature`.
+        tolerance: Of the choice of cells, see `dpl.fem.rom.cubature`.
         steps: Corrections, see `PODGalerkin.correct`.
 
     Raises:

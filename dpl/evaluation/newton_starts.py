@@ -14,13 +14,11 @@ import torch
 from torch import Tensor
 
 from dpl.evaluation.timing import in_turn
+from dpl.fem import Accelerated, Load, Newton, Problem, SingularMatrix, Solution, Solver, judge
 from dpl.fem.dofs import gather, scatter
-from dpl.fem.linear.interface import SingularMatrix
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.anderson import Accelerated
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Solver, in_step, judge
-from dpl.inference.hybrid import Hybrid, Predict
+from dpl.fem.solvers import in_step
+from dpl.inference import Hybrid
+from dpl.inference.hybrid import Predict
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from dpl.evaluation.timing import WARM_UP, path, percentiles
-from dpl.fem.solvers.solution import Load, Solver, solve
+from dpl.fem import Load, Solver, solve
 from dpl.scene import Sample
 from dpl.system.threads import one_thread
-from dpl.training.metrics import RelativeL2, median
-from dpl.training.surrogate import Surrogate
+from dpl.training import RelativeL2, Surrogate
+from dpl.training.metrics import median
 
 Cells = tuple[int, ...]
 COLOURS = [f"C{k}" for k in range(10) if k != 7]  # grey is for what is beside
@@ -25,7 +25,7 @@ class Discretisation:
     """A mesh under a load that all meshes of its body have.
 
     Attributes:
-        cells: Along the edges of the beam, or as `dpl.fem.mesh.propeller.propeller` counts them.
+        cells: Along the edges of the beam, or as `dpl.fem.propeller` counts them.
         degree: Of the elements.
         dofs: Degrees of freedom, held ones included.
         ms: Median wall time of Newton to 1e-6 [ms].

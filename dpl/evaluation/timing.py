@@ -8,8 +8,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from dpl.fem.solvers.solution import Load, Solution, Solver, joined, solve
-from dpl.inference.simulator import Simulator
+from dpl.fem import Load, Solution, Solver, solve
+from dpl.fem.solvers import joined
+from dpl.inference import Simulator
 from dpl.system.threads import one_thread
 
 K = TypeVar("K", bound=Hashable)

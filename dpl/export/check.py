@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.evaluation.timing import latency
+from dpl.evaluation import latency
 from dpl.export.onnx_graph import Array, Graph, Session
-from dpl.fem.solvers.solution import Load
+from dpl.fem import Load
 from dpl.scene import Scene
 
 TRIED = (0, 11)  # the stream of the loads that graphs are checked on

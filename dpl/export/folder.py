@@ -23,14 +23,12 @@ from torch import Tensor
 
 from dpl.export.check import TRIED
 from dpl.export.onnx_graph import Array, Graph, opset
+from dpl.fem import Problem, judge, solve, surface
 from dpl.fem.mesh.writing import flat
-from dpl.fem.postprocess.surface import surface, triangles
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.solution import judge, solve
+from dpl.fem.postprocess import triangles
 from dpl.scene import Scene
 from dpl.system.files import whole_file
-from dpl.training import checkpoints
-from dpl.training.surrogate import Surrogate
+from dpl.training import Surrogate, checkpoints
 from dpl.version import __version__
 
 FORMAT = 1  # of meta.json; a later one may mean something else by a key

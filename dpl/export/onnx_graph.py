@@ -18,8 +18,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from dpl.models.latent import Latent
-from dpl.training.surrogate import Surrogate
+from dpl.models import Latent
+from dpl.training import Surrogate
 
 NEEDED = ("onnx", "onnxscript", "onnxruntime")
 TALKERS = ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")  # while they write

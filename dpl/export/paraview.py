@@ -6,11 +6,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dpl.fem.mesh.writing import save_series
-from dpl.fem.postprocess.stress import fields
-from dpl.fem.solvers.solution import Load, solve
+from dpl.fem import Load, fields, save_series, solve
 from dpl.scene import Scene
-from dpl.training.surrogate import Surrogate
+from dpl.training import Surrogate
 
 
 @dataclass(frozen=True)

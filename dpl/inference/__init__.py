@@ -1,1 +1,11 @@
 """A trained network in use: the hybrid solver and the simulator."""
+
+from typing import TYPE_CHECKING
+
+from dpl.system.lazy import public_names
+
+if TYPE_CHECKING:
+    from dpl.inference.hybrid import Corrector, Direct, Hybrid, best, pick
+    from dpl.inference.simulator import Answer, Simulator, nearest
+else:
+    __all__, __getattr__, __dir__ = public_names(__name__)

@@ -7,9 +7,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.anderson import Accelerated
-from dpl.fem.solvers.solution import Load, Solution, check_tol, in_step, judge
+from dpl.fem import Accelerated, Load, Problem, Solution, judge
+from dpl.fem.solvers import check_tol, in_step
 from dpl.scene import Scene
 
 Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]

@@ -12,15 +12,15 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from dpl.fem import Load, Newton, Solution, Status, judge
 from dpl.fem.dofs import gather
 from dpl.fem.problem import FAINT
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Status, check_tol, joined, judge
+from dpl.fem.solvers import check_tol, joined
 from dpl.inference.hybrid import best
-from dpl.models.pod import PODNet
+from dpl.models import PODNet
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
-from dpl.training.surrogate import Surrogate
+from dpl.training import Surrogate
 
 Correct = Callable[[Tensor, Tensor], Tensor]  # force (N, D), displacement (N, D) -> displacement
 SMALL = 0.05  # amplitude below which the linear answer is worth a look
@@ -96,7 +96,7 @@ class Simulator:
             surrogate: On the CPU, with a network between coordinates.
             states: Displacements of training samples, (S, N, D) [-].
             rank: Modes in which to correct.
-            tolerance: Of the choice of cells, see `dpl.fem.rom.ecsw.cubature`.
+            tolerance: Of the choice of cells, see `dpl.fem.rom.cubature`.
 
         Raises:
             ValueError: The network has no modes, or a number is out of range.

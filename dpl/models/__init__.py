@@ -2,3 +2,16 @@
 
 Each is built from a scene and its own options, and is float32 throughout.
 """
+
+from typing import TYPE_CHECKING
+
+from dpl.system.lazy import public_names
+
+if TYPE_CHECKING:
+    from dpl.models.cnn import CNN
+    from dpl.models.fcnn import FCNN
+    from dpl.models.gnn import GNN
+    from dpl.models.latent import Latent
+    from dpl.models.pod import PODNet
+else:
+    __all__, __getattr__, __dir__ = public_names(__name__)

@@ -6,7 +6,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from dpl.fem.problem import Problem
+from dpl.fem import Problem
 from dpl.models.grid import Immersion, Permutation, cubic_grid, filling, own_grid
 from dpl.models.poisson_interpolation import placed
 from dpl.scene import Scene

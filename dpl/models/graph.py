@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dpl.fem.problem import Problem
+from dpl.fem import Problem
 
 COARSEST = 24  # clusters of the last level, which all hear each other
 

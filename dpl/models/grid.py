@@ -6,7 +6,7 @@ from itertools import product
 import torch
 from torch import Tensor, nn
 
-from dpl.fem.problem import Problem
+from dpl.fem import Problem
 
 SAME = 1e-4  # nodes this close to a grid point, in spacings, are at it; files in float32 are
 

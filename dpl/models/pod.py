@@ -8,9 +8,9 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from dpl.fem.rom.galerkin import PODGalerkin
+from dpl.fem import PODGalerkin, symmetries
 from dpl.fem.rom.pod import LARGE, pod
-from dpl.fem.symmetry import images, symmetries
+from dpl.fem.symmetry import images
 from dpl.models.poisson_interpolation import placed
 from dpl.models.reduced_samples import (
     BetweenCoordinates,
@@ -272,7 +272,7 @@ class PODNet(BetweenCoordinates):
         Args:
             states: Displacements in equilibrium, (S, N, D) [-]; cells are chosen at the first 256.
             rank: Modes.
-            tolerance: Of the choice of cells, see `dpl.fem.rom.ecsw.cubature`.
+            tolerance: Of the choice of cells, see `dpl.fem.rom.cubature`.
 
         Raises:
             ValueError: A number is out of range.

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dpl.fem.solvers.linear import Linear
+from dpl.fem import Linear
 
 EXACT = 1e-5  # aimed at between the nodes of `Rests`, relative error of a linear answer [-]
 MOST = 16  # nodes, whatever the range

@@ -60,7 +60,7 @@ class CoordinateSamples(Dataset):
 class BetweenCoordinates(nn.Module, ABC):
     """A network that works between few coordinates of loads and of displacements.
 
-    `dpl.training.surrogate.Surrogate` lets it make its bases before training starts and, where the
+    `dpl.training.Surrogate` lets it make its bases before training starts and, where the
     loss is a function of squared errors, trains it on samples in coordinates.
 
     Attributes:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchmetrics import Metric, MetricCollection
 from torchmetrics.utilities import dim_zero_cat
 
-from dpl.fem.problem import Problem
+from dpl.fem import Problem
 from dpl.scene import Sample
 
 ORDINALS = {1: "worst", 2: "2nd worst", 3: "3rd worst"}

@@ -7,7 +7,7 @@ import lightning as L
 import torch
 from torch import Tensor, nn
 
-from dpl.fem.solvers.solution import Load
+from dpl.fem import Load
 from dpl.models.reduced_samples import BetweenCoordinates, Coordinates, CoordinateSamples
 from dpl.scene import Sample, Scene
 from dpl.training.losses.loss import Loss, Physics

@@ -1,1 +1,12 @@
-"""The trained body in the browser: state, worker and pictures first, the page is a thin layer."""
+"""The trained body in the browser."""
+
+from typing import TYPE_CHECKING
+
+from dpl.system.lazy import public_names
+
+if TYPE_CHECKING:
+    from dpl.viewer.access import Door
+    from dpl.viewer.frames import Body
+    from dpl.viewer.page import Page
+else:
+    __all__, __getattr__, __dir__ = public_names(__name__)

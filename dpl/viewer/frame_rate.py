@@ -14,7 +14,7 @@ import zstandard
 from websockets.typing import Origin, Subprotocol
 
 from dpl.evaluation import timing
-from dpl.fem.solvers.solution import Load
+from dpl.fem import Load
 from dpl.viewer.animation import answers
 from dpl.viewer.drag_loads import Asked
 from dpl.viewer.frames import QUANTITIES, Body, Wish

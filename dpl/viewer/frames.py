@@ -10,8 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.solvers.solution import Load, Solution, check_tol
-from dpl.inference.simulator import Answer, Simulator
+from dpl.fem import Load, Solution
+from dpl.fem.solvers import check_tol
+from dpl.inference import Answer, Simulator
 from dpl.system.threads import one_thread
 from dpl.viewer.drag_loads import Asked, Patch
 from dpl.viewer.surface import Surface

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dpl.export.paraview import shown
-from dpl.fem.mesh.writing import save, save_collection
+from dpl.fem import save
+from dpl.fem.mesh import save_collection
 from dpl.system.files import whole_file
 from dpl.viewer.frames import Body, Frame, Scale
 from dpl.viewer.rasterizer import INK, PAPER, Scenery, colours

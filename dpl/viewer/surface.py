@@ -8,10 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.postprocess.stress import fields
-from dpl.fem.postprocess.surface import surface
-from dpl.fem.postprocess.surface import triangles as fans
-from dpl.fem.problem import Problem
+from dpl.fem import Problem, fields, surface
+from dpl.fem.postprocess import triangles as fans
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -7,13 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.problem import Problem
+from dpl.fem import Problem
 
 if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
-from dpl.fem.postprocess.surface import coarse, surface
+from dpl.fem import surface
+from dpl.fem.postprocess import coarse
 
 CARD = 140  # resolution of what TensorBoard shows small [dots per inch]
 

@@ -6,11 +6,11 @@ import itertools
 import pytest
 import torch
 
+from dpl import Sample
 from dpl.evaluation import pareto
 from dpl.evaluation.tables import write
-from dpl.fem.solvers.solution import solve
-from dpl.inference.hybrid import Direct, Hybrid
-from dpl.scene import Sample
+from dpl.fem import solve
+from dpl.inference import Direct, Hybrid
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from dpl.evaluation import timing
-from dpl.inference.simulator import Simulator
-from dpl.models.fcnn import FCNN
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.inference import Simulator
+from dpl.models import FCNN
+from dpl.training import MSE, Surrogate
 
 
 @pytest.fixture

@@ -17,8 +17,7 @@ from dpl.evaluation.newton_starts import (
     summary,
 )
 from dpl.evaluation.tables import read, write
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import solve
+from dpl.fem import Newton, solve
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import torch
 
 from benchmarks import deflections, peers
 from dpl.evaluation.tables import read, write
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem import SaintVenantKirchhoff
 
 
 @pytest.fixture(scope="module")

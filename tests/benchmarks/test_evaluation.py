@@ -11,14 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.evaluation import timing
-from dpl.evaluation.evaluate import Row, clock, compare, evaluate, save, show
-from dpl.fem.solvers.solution import Load, Solution, judge
-from dpl.models.fcnn import FCNN
-from dpl.scene import Sample
-from dpl.training.losses.supervised import MSE
-from dpl.training.metrics import RelativeL2
-from dpl.training.surrogate import Surrogate
+from dpl import Sample
+from dpl.evaluation import compare, evaluate, timing
+from dpl.evaluation.report import Row, clock, save, show
+from dpl.fem import Load, Solution, judge
+from dpl.models import FCNN
+from dpl.training import MSE, RelativeL2, Surrogate
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,7 @@ from dataclasses import replace
 import pytest
 
 from benchmarks import discretisation
-from benchmarks.peers import beam_scene, propeller_scene
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff
 
 
 def test_values_on_meshes_twice_as_fine_tend_to_the_limit():

@@ -8,7 +8,7 @@ import textwrap
 import pytest
 
 from benchmarks import blas_detection, peers
-from dpl.fem.solvers.solution import solve
+from dpl.fem import solve
 
 
 def test_cases_are_the_fields_scenes():

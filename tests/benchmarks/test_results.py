@@ -8,12 +8,10 @@ import torch
 
 from benchmarks import paper_tables
 from dpl.evaluation import methods
-from dpl.fem.solvers.solution import solve
-from dpl.models.latent import Latent
-from dpl.models.pod import PODNet
-from dpl.training.losses.supervised import MSE
+from dpl.fem import solve
+from dpl.models import Latent, PODNet
+from dpl.training import MSE, Surrogate
 from dpl.training.metrics import metrics
-from dpl.training.surrogate import Surrogate
 
 SMALL = {"width": 16, "blocks": 1}
 

@@ -8,11 +8,10 @@ import pytest
 import torch
 from safetensors.torch import load_file, save
 
-from dpl.data.dataset import DataSet
+from dpl.data import DataSet, Store
 from dpl.data.storage import integrity
 from dpl.data.storage.integrity import flaw_of_modes, repair, verify
-from dpl.data.storage.store import Store
-from dpl.fem.loads.eigenmodes import Modes
+from dpl.fem import Modes
 
 SIZES = {"train": 12, "val": 4, "test": 4}
 

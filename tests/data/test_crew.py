@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpl import Scene
 from dpl.data.solving import worker_pool
 from dpl.data.solving.solve import Job
 from dpl.data.solving.worker_pool import Stop, outcomes
-from dpl.fem.loads.modal import ModalLoads
-from dpl.scene import Scene
+from dpl.fem import ModalLoads
 
 SEED = (5, 0)
 CLOCK = "seconds"

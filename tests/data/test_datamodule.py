@@ -10,19 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.data.datamodule import OfflineData, OnlineData, Samples
-from dpl.data.dataset import DataSet
+from dpl import Sample
+from dpl.data import DataSet, OfflineData, OnlineData, Samples, Writer
 from dpl.data.replay_buffer import Rates
 from dpl.data.solving.solve import Job, outcome
 from dpl.data.storage.integrity import verify
 from dpl.data.storage.store import SHARD
-from dpl.data.storage.writer import Writer
-from dpl.fem.symmetry import symmetries
-from dpl.models.fcnn import FCNN
-from dpl.scene import Sample
+from dpl.fem import symmetries
+from dpl.models import FCNN
 from dpl.system.files import sole_writer
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.training import MSE, Surrogate
 
 SIZES = {"val": 4, "test": 4, "workers": 0, "batch_size": 4}
 STREAM = {"batches": 3, "fresh": 4, "reuse": 1, "capacity": 64}

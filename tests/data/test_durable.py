@@ -12,8 +12,9 @@ from contextlib import contextmanager
 
 import pytest
 
+from dpl import DataSetError
 from dpl.system import files
-from dpl.system.files import DataSetError, append_line, read_lines, sole_writer, whole_file
+from dpl.system.files import append_line, read_lines, sole_writer, whole_file
 
 WRITER = """
 import sys, time

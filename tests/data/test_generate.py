@@ -7,11 +7,10 @@ import signal
 
 import pytest
 
-from dpl.data.dataset import DataSet
+from dpl.data import DataSet, Writer
 from dpl.data.solving.solve import lost, outcome
 from dpl.data.storage.pending import Spool
-from dpl.data.storage.writer import Writer
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem import SaintVenantKirchhoff
 
 SIZES = {"train": 6, "val": 2, "test": 2}
 

@@ -18,11 +18,13 @@ import pytest
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
-from dpl.data.replay_buffer import Rates, Replay
+from dpl import Sample
+from dpl.data import OnlineSamples, Replay
+from dpl.data.replay_buffer import Rates
 from dpl.data.solving.solve import Job, outcome
-from dpl.data.stream import NEAR, Drawn, OnlineSamples, Worst
-from dpl.fem.solvers.newton import Newton
-from dpl.scene import Sample, stack
+from dpl.data.stream import NEAR, Drawn, Worst
+from dpl.fem import Newton
+from dpl.scene import stack
 
 SEED = (0, 0)
 

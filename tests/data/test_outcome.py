@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dpl.data.solving.solve import Job, lost, outcome
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+from dpl.fem import SaintVenantKirchhoff
 
 SEED = (5, 0)
 CLOCK = "seconds"

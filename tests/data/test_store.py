@@ -15,6 +15,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save
 
+from dpl import DataSetError
+from dpl.data import Store, Writer
 from dpl.data.solving import worker_pool
 from dpl.data.solving.solve import Job, lost, outcome
 from dpl.data.solving.worker_pool import Stop
@@ -23,11 +25,7 @@ from dpl.data.storage import writer as writer_module
 from dpl.data.storage.integrity import MACHINE, repair, verify
 from dpl.data.storage.pending import Spool
 from dpl.data.storage.shard import compact, spread
-from dpl.data.storage.store import Store
-from dpl.data.storage.writer import Writer
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import rectangle
-from dpl.system.files import DataSetError
+from dpl.fem import SaintVenantKirchhoff, rectangle
 
 SIZES = {"train": 12, "val": 4, "test": 4}
 WANTED = {split: range(size) for split, size in SIZES.items()}

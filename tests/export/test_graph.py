@@ -10,30 +10,16 @@ import pytest
 import torch
 from torch import nn
 
-from dpl.export import check
+from dpl import Sample
+from dpl.export import check, compare, export, read_meta, read_reference, verify, write
 from dpl.export import onnx_graph as graphs
-from dpl.export.check import compare, distance, trial
-from dpl.export.folder import (
-    described,
-    read_meta,
-    read_raw,
-    read_reference,
-    reference,
-    verify,
-    write,
-)
-from dpl.export.onnx_graph import Graph, Session, export
-from dpl.fem.mesh.generators import rectangle
-from dpl.fem.postprocess.surface import surface, triangles
-from dpl.fem.solvers.solution import Load, solve
-from dpl.models.cnn import CNN
-from dpl.models.fcnn import FCNN
-from dpl.models.gnn import GNN
-from dpl.models.latent import Latent
-from dpl.models.pod import PODNet
-from dpl.scene import Sample
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.export.check import distance, trial
+from dpl.export.folder import described, read_raw, reference
+from dpl.export.onnx_graph import Graph, Session
+from dpl.fem import Load, rectangle, solve, surface
+from dpl.fem.postprocess import triangles
+from dpl.models import CNN, FCNN, GNN, Latent, PODNet
+from dpl.training import MSE, Surrogate
 
 pytestmark = pytest.mark.skipif(
     bool(graphs.missing()), reason=f"{', '.join(graphs.missing())} not installed (extra onnx)"

@@ -7,14 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.export.paraview import results
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.reading import load
-from dpl.fem.mesh.writing import save, save_series
-from dpl.fem.postprocess.stress import fields
-from dpl.models.fcnn import FCNN
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.export import results
+from dpl.fem import box, fields, load, rectangle, save, save_series
+from dpl.models import FCNN
+from dpl.training import MSE, Surrogate
 
 BODIES = {
     "hexahedron": (1, "hexahedron", 8),

@@ -8,23 +8,24 @@ import skfem
 import torch
 from torch import Tensor
 
-from dpl.fem.linear.superlu import SuperLU
-from dpl.fem.loads.forces import traction
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
-from dpl.fem.materials.neo_hookean import (
+from dpl.fem import (
+    LinearElastic,
+    Material,
+    MooneyRivlinK2,
     NeoHookeanIsoK2,
     NeoHookeanIsoK4,
     NeoHookeanLn,
+    OgdenK2,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
     StableNeoHookean,
+    YeohK2,
+    box,
+    rectangle,
 )
-from dpl.fem.materials.ogden import OgdenK2
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.materials.yeoh import YeohK2
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
+from dpl.fem.linear import SuperLU
+from dpl.fem.loads import traction
 
 YOUNG, LENGTH = 4500.0, 100.0  # of the beam of VERIFICATION 1.8e [Pa], [m]
 LAWS = {  # VERIFICATION 1.1 with its constants

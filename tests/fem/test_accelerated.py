@@ -3,16 +3,20 @@
 import pytest
 import torch
 
-from dpl.fem.assembly.boundary_conditions import Displacement
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.anderson import Accelerated
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, solve
+from dpl.fem import (
+    Accelerated,
+    Displacement,
+    Load,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Traction,
+    box,
+    rectangle,
+    solve,
+)
 
 
 def case(dim=3, law=None, degree=1, **more):

@@ -4,16 +4,20 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.fem.assembly.boundary_conditions import Displacement
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.yeoh import YeohK2
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.batched_newton import BatchedNewton
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Status, solve
+from dpl.fem import (
+    BatchedNewton,
+    Displacement,
+    Load,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    Status,
+    YeohK2,
+    box,
+    solve,
+)
 
 
 @pytest.fixture(scope="module", params=[NeoHookeanLn(0.3), YeohK2(0.2, -0.02, 0.005, 2.0)])

@@ -8,17 +8,24 @@ import pytest
 import torch
 from torch import Tensor
 
-from dpl.fem.loads.eigenmodes import eigenmodes
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import NeoHookeanIsoK4, NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Status, solve
+from dpl.fem import (
+    Linear,
+    Load,
+    Material,
+    NeoHookeanIsoK4,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Solution,
+    Status,
+    Traction,
+    box,
+    eigenmodes,
+    rectangle,
+    solve,
+)
 
 # these benchmarks are about elements that lock
 pytestmark = pytest.mark.filterwarnings("ignore:linear .* lock")

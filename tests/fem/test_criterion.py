@@ -13,22 +13,29 @@ import torch
 from torch.testing import assert_close
 
 from dpl.data.solving.solve import Job, lost, outcome
-from dpl.fem.linear.krylov import conjugate_gradients
-from dpl.fem.loads.forces import Traction
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.rom.galerkin import PODGalerkin
-from dpl.fem.solvers.anderson import Accelerated
-from dpl.fem.solvers.batched_newton import BatchedNewton
-from dpl.fem.solvers.bifurcation import branches
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Status, judge, solve
-from dpl.inference.hybrid import RULES, Direct, Hybrid
+from dpl.fem import (
+    Accelerated,
+    BatchedNewton,
+    Linear,
+    LinearElastic,
+    Load,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    PODGalerkin,
+    Problem,
+    Solution,
+    Status,
+    Traction,
+    box,
+    branches,
+    judge,
+    solve,
+)
+from dpl.fem.linear import conjugate_gradients
+from dpl.inference import Direct, Hybrid
+from dpl.inference.hybrid import RULES
 from dpl.viewer.frames import Wish
 
 ONE = torch.ones(1, dtype=torch.float64)

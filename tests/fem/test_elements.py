@@ -7,12 +7,10 @@ import pytest
 import skfem
 import torch
 
-from dpl.fem.assembly.elements import CURVED, basis_of
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.validation import check
-from dpl.fem.problem import Problem
+from dpl.fem import LinearElastic, NeoHookeanLn, Problem, box, rectangle
+from dpl.fem.assembly import basis_of
+from dpl.fem.assembly.elements import CURVED
+from dpl.fem.mesh import check
 
 H = np.array([[0.02, 0.05, -0.01], [0.03, -0.04, 0.02], [-0.02, 0.01, 0.03]])
 ISOPARAMETRIC = {

@@ -10,19 +10,28 @@ import skfem
 import torch
 from torch.testing import assert_close
 
-from dpl.fem.assembly.boundary_conditions import Displacement, Spring
-from dpl.fem.loads.eigenmodes import eigenmodes
-from dpl.fem.loads.forces import BodyForce, Traction, body_force, traction
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.propeller import propeller
-from dpl.fem.mesh.regions import Box, Cylinder, Plane, Sphere
-from dpl.fem.mesh.validation import check
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, solve
-from dpl.fem.symmetry import symmetries
+from dpl.fem import (
+    BodyForce,
+    Box,
+    Cylinder,
+    Displacement,
+    Linear,
+    Load,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    Sphere,
+    Spring,
+    Traction,
+    box,
+    eigenmodes,
+    propeller,
+    solve,
+    symmetries,
+)
+from dpl.fem.loads import body_force, traction
+from dpl.fem.mesh import check
 
 NH, EPS = NeoHookeanLn(0.3), np.finfo(float).eps
 CELLS = 3  # along the sides of the grids

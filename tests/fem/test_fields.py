@@ -7,11 +7,8 @@ import pytest
 import torch
 from scipy.optimize import brentq
 
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.postprocess.stress import at_nodes, cauchy, fields, von_mises
-from dpl.fem.problem import Problem
+from dpl.fem import NeoHookeanLn, Plane, Problem, box, fields, rectangle
+from dpl.fem.postprocess import at_nodes, cauchy, von_mises
 
 LAME, SHEAR = 0.3 / (1.3 * 0.4), 1 / 2.6  # of nu = 0.3, over E
 

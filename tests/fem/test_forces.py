@@ -7,13 +7,18 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.fem.loads.forces import BodyForce, Traction, body_force, traction
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
+from dpl.fem import (
+    BodyForce,
+    Linear,
+    LinearElastic,
+    NeoHookeanLn,
+    Plane,
+    Problem,
+    Traction,
+    box,
+    rectangle,
+)
+from dpl.fem.loads import body_force, traction
 
 
 @pytest.fixture(params=[1.0, 4.0])

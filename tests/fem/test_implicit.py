@@ -5,17 +5,22 @@ import pickle
 import pytest
 import torch
 
-from dpl.fem.assembly.boundary_conditions import Displacement, Spring
-from dpl.fem.linear.interface import SingularMatrix
-from dpl.fem.linear.superlu import SuperLU
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.differentiable import Equilibrium
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Status, solve
+from dpl.fem import (
+    Displacement,
+    Equilibrium,
+    LinearElastic,
+    Load,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SingularMatrix,
+    Spring,
+    Status,
+    box,
+    solve,
+)
+from dpl.fem.linear import SuperLU
 
 YOUNG, LENGTH = 4500.0, 100.0
 

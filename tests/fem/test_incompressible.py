@@ -10,23 +10,27 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from dpl.fem.linear.interface import full_matrix
-from dpl.fem.loads.forces import Traction, traction
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
-from dpl.fem.materials.neo_hookean import (
+from dpl.fem import (
+    Linear,
+    LinearElastic,
+    Load,
+    Material,
+    MooneyRivlinK2,
     NeoHookeanIsoK2,
     NeoHookeanIsoK4,
     NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    Solution,
     StableNeoHookean,
+    Status,
+    Traction,
+    YeohK2,
+    solve,
 )
-from dpl.fem.materials.yeoh import YeohK2
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Status, solve
+from dpl.fem.linear import full_matrix
+from dpl.fem.loads import traction
 
 
 def poisson(ratio: float) -> float:

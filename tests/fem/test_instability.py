@@ -8,16 +8,22 @@ import torch
 from torch import Tensor
 
 from benchmarks.stress.fixtures import RUBBER, bowed, column, cube, load_of, stretched, swollen
-from dpl.fem.linear.superlu import SuperLU
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import NeoHookeanIsoK2, NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Solution, Status, judge, solve
+from dpl.fem import (
+    Material,
+    NeoHookeanIsoK2,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Solution,
+    Status,
+    Traction,
+    box,
+    judge,
+    solve,
+)
+from dpl.fem.linear import SuperLU
 
 # a cell that is uniformly strained does not lock
 pytestmark = [

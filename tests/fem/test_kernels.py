@@ -14,14 +14,10 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from dpl.fem.assembly.boundary_conditions import Spring
+from dpl.fem import Hookean, Isotropic, NeoHookeanLn, Plane, Problem, Spring
 from dpl.fem.assembly.numba_laws import Law
 from dpl.fem.assembly.simd import WIDTH, load, sqrt, store
-from dpl.fem.materials.material import Hookean, Isotropic
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
 from dpl.fem.materials.tensors import green_lagrange, invariants, trace
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
 
 CLOSE = 1e-13  # of the largest entry
 LAWS = ["linear", "SVK", "NH-ln", "NHiso-k2", "NHiso-k4", "SNH", "MR", "Yeoh"]

@@ -11,16 +11,20 @@ import torch
 from scipy.linalg.lapack import dpbtrs
 from scipy.sparse import csr_array
 
-from dpl.fem.assembly.boundary_conditions import Spring
-from dpl.fem.linear import backends
-from dpl.fem.linear.backends import BACKENDS, backend, chosen, installed
+from dpl.fem import NeoHookeanLn, Plane, Problem, SingularMatrix, Spring, box, installed
+from dpl.fem.linear import (
+    BACKENDS,
+    Backend,
+    Pattern,
+    SymmetricProduct,
+    backend,
+    backends,
+    chosen,
+    conjugate_gradients,
+    full_matrix,
+    multigrid_installed,
+)
 from dpl.fem.linear.banded import Band32Factor, band_layout, substituted
-from dpl.fem.linear.interface import Backend, Pattern, SingularMatrix, SymmetricProduct, full_matrix
-from dpl.fem.linear.krylov import conjugate_gradients, multigrid_installed
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
 from dpl.system.blas import slow_blas
 
 KNOWN = ["band", "band32", "pardiso", "superlu", "cg"]

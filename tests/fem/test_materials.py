@@ -10,17 +10,20 @@ from scipy.optimize import brentq, minimize_scalar
 from torch import Tensor
 from torch.testing import assert_close
 
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.material import Hookean, Isotropic, Material
-from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
-from dpl.fem.materials.neo_hookean import (
+from dpl.fem import (
+    Hookean,
+    Isotropic,
+    LinearElastic,
+    Material,
+    MooneyRivlinK2,
     NeoHookeanIsoK2,
     NeoHookeanIsoK4,
     NeoHookeanLn,
+    OgdenK2,
+    SaintVenantKirchhoff,
     StableNeoHookean,
+    YeohK2,
 )
-from dpl.fem.materials.ogden import OgdenK2
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
 from dpl.fem.materials.tensors import (
     cofactor,
     green_lagrange,
@@ -28,7 +31,6 @@ from dpl.fem.materials.tensors import (
     inverse_transpose,
     volume_change,
 )
-from dpl.fem.materials.yeoh import YeohK2
 
 SVK, NH, SNH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3), StableNeoHookean(0.3)
 HOOKEAN = [

@@ -21,12 +21,9 @@ from benchmarks.stress.broken_meshes import (
     TWO_HEXES,
     write,
 )
-from dpl.fem.mesh.generators import aspect_ratio, box, longest_side, rectangle
-from dpl.fem.mesh.propeller import propeller
-from dpl.fem.mesh.reading import load
-from dpl.fem.mesh.regions import Cylinder, Tag, nodes_in
-from dpl.fem.mesh.validation import check
-from dpl.fem.mesh.writing import save, save_exactly
+from dpl.fem import Cylinder, Tag, box, load, propeller, rectangle, save, save_exactly
+from dpl.fem.mesh import check, nodes_in
+from dpl.fem.mesh.generators import aspect_ratio, longest_side
 
 
 def volumes(mesh: skfem.Mesh) -> np.ndarray:

@@ -10,18 +10,23 @@ import pytest
 import scipy.sparse.linalg
 import torch
 
-from dpl.fem.linear.interface import full_matrix
+from dpl.fem import (
+    Linear,
+    Load,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Problem,
+    SaintVenantKirchhoff,
+    box,
+    eigenmodes,
+    rectangle,
+    solve,
+)
+from dpl.fem.linear import full_matrix
+from dpl.fem.loads import even, logarithmic, normal, one, tail
 from dpl.fem.loads import modal as modes_module
-from dpl.fem.loads.eigenmodes import eigenmodes
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.loads.sampling import SAMPLINGS, even, logarithmic, normal, one, tail
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, solve
+from dpl.fem.loads.sampling import SAMPLINGS
 
 YOUNG, LENGTH = 4500.0, 100.0
 REFERENCE = {  # VERIFICATION 1.8e: eigenvalues of K(0) [N/m]

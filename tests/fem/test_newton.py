@@ -12,18 +12,24 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.fem.linear.backends import BACKENDS, installed
-from dpl.fem.linear.superlu import SuperLU
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.material import Hookean
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Status, judge, solve
+from dpl.fem import (
+    Hookean,
+    Linear,
+    Load,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Solution,
+    Status,
+    Traction,
+    box,
+    installed,
+    judge,
+    solve,
+)
+from dpl.fem.linear import BACKENDS, SuperLU
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
 LENGTH = 100.0  # of the beam of VERIFICATION 1.8e [m]
@@ -530,7 +536,7 @@ def test_solver_without_pardiso_solves_the_same(beam, pull, monkeypatch):
     problem = beam(NH, 4, 1)
     load = load_of(pull(problem, 20.0))
     expected = solve(newton(problem), load)
-    monkeypatch.setattr("dpl.fem.linear.backends.installed", lambda: ["superlu"])
+    monkeypatch.setattr("dpl.fem.installed", lambda: ["superlu"])
     assert torch.equal(solve(Newton(problem), load).displacement, expected.displacement)
 
 

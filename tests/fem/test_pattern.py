@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem.assembly.sparsity import Pattern
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.problem import Problem
+from dpl.fem import NeoHookeanLn, Problem
+from dpl.fem.assembly import Pattern
 
 KEPT = {"all": 1.0, "most": 0.8, "few": 0.1}
 

@@ -15,17 +15,22 @@ from scipy.sparse.linalg import eigsh
 from torch import Tensor
 from torch.testing import assert_close
 
-from dpl.fem.linear.interface import full_matrix
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Box, Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, solve
+from dpl.fem import (
+    Box,
+    Linear,
+    Load,
+    MooneyRivlinK2,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Traction,
+    box,
+    rectangle,
+    solve,
+)
+from dpl.fem.linear import full_matrix
 
 YOUNG, LENGTH = 4500.0, 100.0  # of the beam of VERIFICATION 1.8e [Pa], [m]
 NH = NeoHookeanLn(0.3)

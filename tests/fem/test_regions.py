@@ -8,11 +8,8 @@ import pytest
 import skfem
 from skfem.io.meshio import to_meshio
 
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.propeller import propeller
-from dpl.fem.mesh.reading import load
-from dpl.fem.mesh.regions import Box, Cylinder, Plane, Sphere, Tag, facets_in, nodes_in
-from dpl.fem.mesh.writing import save
+from dpl.fem import Box, Cylinder, Plane, Sphere, Tag, box, load, propeller, rectangle, save
+from dpl.fem.mesh import facets_in, nodes_in
 
 BAR = ([4.0, 1.0, 2.0], [5, 2, 3])
 ELEMENTS = {

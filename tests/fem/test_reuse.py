@@ -11,22 +11,25 @@ import pytest
 import torch
 from torch import Tensor
 
-from dpl.fem.linear.backends import installed
-from dpl.fem.linear.banded import Band
-from dpl.fem.linear.interface import SingularMatrix
-from dpl.fem.linear.krylov import multigrid_installed
-from dpl.fem.linear.pardiso import Pardiso
-from dpl.fem.linear.superlu import SuperLU, SuperLUFactor
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
+from dpl.fem import (
+    Load,
+    Material,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    SingularMatrix,
+    Solution,
+    Status,
+    Traction,
+    box,
+    installed,
+    solve,
+)
+from dpl.fem.linear import Band, Pardiso, SuperLU, multigrid_installed
+from dpl.fem.linear.superlu import SuperLUFactor
 from dpl.fem.solvers import factor_reuse as reuse_module
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Status, solve
 
 NH, SVK = NeoHookeanLn(0.3), SaintVenantKirchhoff(0.3)
 
@@ -357,7 +360,7 @@ def test_factor_with_negative_pivots_is_never_used_again(monkeypatch, P, linear)
         return factor
 
     monkeypatch.setattr(SuperLU, "factorise", watched)
-    monkeypatch.setattr("dpl.fem.linear.backends.installed", lambda: ["band", "superlu"])
+    monkeypatch.setattr("dpl.fem.installed", lambda: ["band", "superlu"])
     monkeypatch.setattr(
         SuperLUFactor, "apply", lambda self, r: used.append(self.negative_pivots) or self.solve(r)
     )

@@ -9,21 +9,27 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.fem.assembly.boundary_conditions import Displacement, Spring
+from dpl.fem import (
+    Displacement,
+    Linear,
+    LinearElastic,
+    Load,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    PODGalerkin,
+    Problem,
+    SaintVenantKirchhoff,
+    Spring,
+    Status,
+    box,
+    solve,
+)
 from dpl.fem.assembly.rigid_body_modes import rigid_motions
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.rom.ecsw import Cubature, nonnegative
-from dpl.fem.rom.galerkin import PODGalerkin
+from dpl.fem.rom import Cubature
+from dpl.fem.rom.ecsw import nonnegative
 from dpl.fem.rom.pod import pod
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Status, solve
 
 NH = NeoHookeanLn(0.3)
 

@@ -9,18 +9,18 @@ from scipy import stats
 from scipy.spatial import cKDTree
 from scipy.stats import qmc
 
-from dpl.fem.loads import sampling
-from dpl.fem.loads.sampling import (
-    SAMPLINGS,
+from dpl.fem.loads import (
     even,
     independent,
     logarithmic,
     normal,
     one,
+    sampling,
     sobol,
     tail,
     uniform,
 )
+from dpl.fem.loads.sampling import SAMPLINGS
 
 GRID = (np.arange(10_000) + 0.5) / 10_000  # of the unit interval
 LAST = 1 - 2.0**-53  # the largest number below 1

@@ -3,14 +3,20 @@
 import pytest
 import torch
 
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.bifurcation import branches, unstable_directions
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Status, solve
+from dpl.fem import (
+    Load,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Solution,
+    Status,
+    Traction,
+    box,
+    branches,
+    solve,
+)
+from dpl.fem.solvers import unstable_directions
 
 
 @pytest.fixture(scope="module")

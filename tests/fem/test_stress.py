@@ -22,18 +22,23 @@ from benchmarks.stress.fixtures import (
     slivers,
 )
 from benchmarks.stress.invalid_input import NOWHERE, USES
-from dpl.fem.linear.backends import installed
-from dpl.fem.loads.eigenmodes import eigenmodes
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.mesh.validation import check
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Solution, Status, judge, solve
+from dpl.fem import (
+    Linear,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Solution,
+    Status,
+    Traction,
+    box,
+    eigenmodes,
+    installed,
+    judge,
+    solve,
+)
+from dpl.fem.mesh import check
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
 DIRECT = [name for name in installed() if name != "cg"]

@@ -9,17 +9,23 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.fem.assembly.boundary_conditions import Displacement, Spring
-from dpl.fem.linear.interface import full_matrix
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Box, Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, solve
+from dpl.fem import (
+    Box,
+    Displacement,
+    LinearElastic,
+    Load,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Spring,
+    Traction,
+    box,
+    rectangle,
+    solve,
+)
+from dpl.fem.linear import full_matrix
 
 NH = NeoHookeanLn(0.3)
 LEFT, RIGHT = Plane(0, "min"), Plane(0, "max")

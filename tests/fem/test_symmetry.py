@@ -10,20 +10,28 @@ import skfem
 import torch
 from torch.testing import assert_close
 
-from dpl.fem.assembly.boundary_conditions import Displacement, Spring
-from dpl.fem.loads.forces import Traction
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.propeller import propeller
-from dpl.fem.mesh.regions import Box, Plane, Tag
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, solve
-from dpl.fem.symmetry import products, symmetries
+from dpl.fem import (
+    Box,
+    Displacement,
+    Linear,
+    LinearElastic,
+    Load,
+    Material,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    Spring,
+    Tag,
+    Traction,
+    box,
+    propeller,
+    rectangle,
+    solve,
+    symmetries,
+)
+from dpl.fem.symmetry import products
 
 NH = NeoHookeanLn(0.3)
 LEFT, RIGHT = Plane(0, "min"), Plane(0, "max")

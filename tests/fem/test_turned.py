@@ -8,17 +8,22 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from dpl.fem.assembly.boundary_conditions import Displacement
+from dpl.fem import (
+    Displacement,
+    Linear,
+    Load,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Status,
+    Traction,
+    box,
+    rectangle,
+    solve,
+)
 from dpl.fem.dofs import gather
-from dpl.fem.loads.forces import Traction
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Status, solve
 
 NH, SVK = NeoHookeanLn(0.3), SaintVenantKirchhoff(0.3)
 

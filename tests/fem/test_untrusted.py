@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from benchmarks.stress.broken_meshes import CORNERS, FAN, PATCH, TETS, TWO_CUBES, TWO_HEXES, write
+from dpl.fem import box, load, rectangle
 from dpl.fem.mesh import sandbox, sandbox_checks
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.reading import _body, load
+from dpl.fem.mesh.reading import _body
 
 
 @pytest.fixture(autouse=True)

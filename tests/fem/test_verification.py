@@ -13,19 +13,25 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.testing import assert_close
 
-from dpl.fem.loads.forces import Traction, body_force, traction
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.neo_hookean import NeoHookeanIsoK4, NeoHookeanLn
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.mesh.generators import box
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, solve
-from dpl.scene import Scene
+from dpl import Scene
+from dpl.fem import (
+    Linear,
+    LinearElastic,
+    Load,
+    Material,
+    ModalLoads,
+    NeoHookeanIsoK4,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Solution,
+    Traction,
+    box,
+    solve,
+)
+from dpl.fem.loads import body_force, traction
 
 FIELDS = Path(__file__).parents[3] / "shared" / "reference" / "fields"
 SVK, NH = SaintVenantKirchhoff(0.25), NeoHookeanLn(0.25)

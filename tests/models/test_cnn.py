@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem.mesh.generators import rectangle
-from dpl.fem.solvers.solution import solve
-from dpl.inference.hybrid import Direct, Hybrid
-from dpl.models import cnn
-from dpl.models.cnn import CNN
+from dpl.fem import rectangle, solve
+from dpl.inference import Direct, Hybrid
+from dpl.models import CNN, cnn
 from dpl.models.grid import Immersion, Permutation, filling, own_grid
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.training import MSE, Surrogate
 
 
 def shaken(mesh, size=0.1):

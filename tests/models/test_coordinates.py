@@ -5,15 +5,12 @@ import functools
 import pytest
 import torch
 
+from dpl import Sample
 from dpl.fem.symmetry import images
-from dpl.models.fcnn import FCNN
-from dpl.models.latent import Latent
-from dpl.models.pod import PODNet
+from dpl.models import FCNN, Latent, PODNet
 from dpl.models.reduced_samples import Coordinates, CoordinateSamples
-from dpl.scene import Sample
-from dpl.training.losses.residual import LrStar
-from dpl.training.losses.supervised import MSE, MeanNorm
-from dpl.training.surrogate import Surrogate, scales
+from dpl.training import MSE, LrStar, MeanNorm, Surrogate
+from dpl.training.surrogate import scales
 
 SMALL = {"width": 16, "blocks": 1}
 KINDS = {

@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.problem import Problem
-from dpl.models import gnn
-from dpl.models.gnn import GNN, Filtered
+from dpl.fem import NeoHookeanLn, Problem, box, rectangle
+from dpl.models import GNN, gnn
+from dpl.models.gnn import Filtered
 from dpl.models.graph import COARSEST, coarser, mesh_graph
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.training import MSE, Surrogate
 
 BODIES = {
     "hexahedra": {"nodes": (9, 4, 4)},

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from dpl.config import build, run_folder
-from dpl.data.datamodule import OnlineData
-from dpl.fem.solvers.solution import Load, solve
-from dpl.models.latent import Latent
+from dpl.data import OnlineData
+from dpl.fem import Load, solve
+from dpl.models import Latent
+from dpl.training import MSE, Surrogate
 from dpl.training.checkpoints import read
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate, scales
+from dpl.training.surrogate import scales
 
 SMALL = {"width": 16, "blocks": 1}
 
@@ -453,7 +453,7 @@ def test_the_plan_of_a_stream_promises_coordinates_from_disk_only(script, overri
         ("model.blocks=-1", "model: blocks = -1 must be 0 or more"),
         ("model.symmetry=3", "model.symmetry = 3 must be true or false"),
         ("model.rank=1.5", "model.rank = 1.5 must be a whole number"),
-        ("+model.modes=3", "model.modes: dpl.models.latent.Latent has no such option"),
+        ("+model.modes=3", "model.modes: dpl.models.Latent has no such option"),
         ("optimizer.momentum=1.5", "optimizer: momentum = 1.5 must be"),
         ("optimizer.lr=-1", "optimizer.lr = -1 must lie between"),
         ("loss.relative=2", "loss: relative = 2 must lie between 0 and 1"),

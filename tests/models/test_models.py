@@ -7,14 +7,11 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from dpl.fem.solvers.solution import Load
-from dpl.models.fcnn import FCNN, _parameters
-from dpl.models.gnn import GNN
-from dpl.models.latent import Latent
-from dpl.models.pod import PODNet
+from dpl.fem import Load
+from dpl.models import FCNN, GNN, Latent, PODNet
+from dpl.models.fcnn import _parameters
 from dpl.system.memory import refuse_weights
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.training import MSE, Surrogate
 
 MODELS = sorted((Path(__file__).parents[2] / "conf" / "model").glob("*.yaml"))
 

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from dpl.fem.mesh.generators import box
-from dpl.fem.symmetry import symmetries
+from dpl.fem import box, symmetries
 from dpl.models.symmetric_fields import Orbits, turned, turned_back
 
 

@@ -9,19 +9,21 @@ from contextlib import suppress
 import pytest
 import torch
 
-from dpl.fem.assembly.boundary_conditions import Displacement
-from dpl.fem.loads.modal import ModalLoads
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.regions import Plane
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import solve
-from dpl.models.latent import Latent
-from dpl.models.pod import PODNet
-from dpl.scene import Sample, Scene
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate, scales
+from dpl import Sample, Scene
+from dpl.fem import (
+    Displacement,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    box,
+    rectangle,
+    solve,
+)
+from dpl.models import Latent, PODNet
+from dpl.training import MSE, Surrogate
+from dpl.training.surrogate import scales
 
 SMALL = {"width": 16, "blocks": 1}
 WHOLE = {"rank": 1000, "coordinates": 1000, **SMALL}  # no mode is left out

@@ -10,24 +10,26 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dpl.fem.assembly.boundary_conditions import Displacement, Spring
-from dpl.fem.loads.forces import body_force, traction
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.material import Material
-from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
-from dpl.fem.materials.neo_hookean import (
+from dpl.fem import (
+    Displacement,
+    Linear,
+    LinearElastic,
+    Load,
+    Material,
+    MooneyRivlinK2,
     NeoHookeanIsoK2,
     NeoHookeanIsoK4,
     NeoHookeanLn,
+    OgdenK2,
+    Problem,
+    SaintVenantKirchhoff,
+    Spring,
     StableNeoHookean,
+    YeohK2,
+    box,
+    rectangle,
 )
-from dpl.fem.materials.ogden import OgdenK2
-from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
-from dpl.fem.materials.yeoh import YeohK2
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.solution import Load
+from dpl.fem.loads import body_force, traction
 
 CUBOID = {"hexahedron": box, "tetra": box, "quad": rectangle, "triangle": rectangle}
 HOOKEAN = (

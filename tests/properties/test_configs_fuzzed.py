@@ -23,9 +23,9 @@ from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
 from tried import at_most, counted
 
+from dpl import DataSetError
 from dpl.config import build, run_folder
-from dpl.fem.solvers.solution import solve
-from dpl.system.files import DataSetError
+from dpl.fem import solve
 
 CONF = Path(__file__).parents[2] / "conf"
 TINY = ["mesh.nodes=[5,3,3]", "loads.n_modes=3", "solver.linear=superlu"]
@@ -34,12 +34,12 @@ BLADES = ["mesh=propeller", "mesh.cells=[1,1,1,2,3]", "clamped=cylinder", "clamp
 SMALL = ["data.train=4", "data.val=2", "data.test=2", "data.batch_size=2", "data.workers=0"]
 DRAWN = ["loads=modal_small", "loads.radius.low=0.1"]
 HELD = [
-    "+supports.end={_target_: dpl.fem.assembly.boundary_conditions.Displacement, "
+    "+supports.end={_target_: dpl.fem.Displacement, "
     "value: [0.0, null, null], "
-    "region: {_target_: dpl.fem.mesh.regions.Plane, axis: 0, at: max}}",
-    "+supports.soil={_target_: dpl.fem.assembly.boundary_conditions.Spring, stiffness: 0.01, "
-    "region: {_target_: dpl.fem.mesh.regions.Box, lower: [0, 0, 0], upper: [50, 25, 0]}}",
-    "+forces.weight={_target_: dpl.fem.loads.forces.BodyForce, value: [0.0, 0.0, -1e-5]}",
+    "region: {_target_: dpl.fem.Plane, axis: 0, at: max}}",
+    "+supports.soil={_target_: dpl.fem.Spring, stiffness: 0.01, "
+    "region: {_target_: dpl.fem.Box, lower: [0, 0, 0], upper: [50, 25, 0]}}",
+    "+forces.weight={_target_: dpl.fem.BodyForce, value: [0.0, 0.0, -1e-5]}",
 ]
 SCENES = {  # overrides of conf/generate.yaml
     "beam": TINY,
@@ -248,15 +248,15 @@ FOREIGN = [  # what would do harm, and how it would be called
     {"_target_": "pathlib.Path.touch", "self": "harm"},
     {"_target_": "hydra.utils.call", "config": {"_target_": "os.system", "command": "touch harm"}},
     {"_target_": "dpl.config.build.sys.exit", "_args_": [3]},
-    {"_target_": "dpl.config.build.make", "cfg": {"x": {"_target_": "os.getcwd"}}, "key": "x"},
-    {"_target_": "dpl.config.run_folder.load_run", "folder": "evil", "trust": True},
+    {"_target_": "dpl.config.make", "cfg": {"x": {"_target_": "os.getcwd"}}, "key": "x"},
+    {"_target_": "dpl.config.load_run", "folder": "evil", "trust": True},
     {"_target_": "dpl.config.build.importlib", "name": "antigravity"},
     {"_target_": "dpl.scene.partial", "func": "os.system"},
     {"_target_": "dpl.training.surrogate.append_line", "path": "harm", "line": {"a": 1}},
     {"_target_": "dpl.system.files.whole_file", "path": "harm"},
     {
-        "_target_": "dpl.fem.mesh.writing.save",
-        "mesh": {"_target_": "dpl.fem.mesh.generators.box"},
+        "_target_": "dpl.fem.save",
+        "mesh": {"_target_": "dpl.fem.box"},
         "path": "harm.vtk",
     },
     {"_target_": "benchmarks.peers.measured_peer", "python": "touch", "program": "harm"},
@@ -292,7 +292,7 @@ def poisoned(draw):
     put(
         cfg,
         path,
-        call if deep is None else {"_target_": "dpl.training.losses.supervised.MSE", deep: [call]},
+        call if deep is None else {"_target_": "dpl.training.MSE", deep: [call]},
     )
     return cfg
 

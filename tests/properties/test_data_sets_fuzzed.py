@@ -18,14 +18,12 @@ from hypothesis import strategies as st
 from safetensors.torch import load, save
 from tried import counted
 
-from dpl.data.datamodule import OfflineData
+from dpl import DataSetError
+from dpl.data import OfflineData, Store, Writer
 from dpl.data.solving.solve import Job, outcome
 from dpl.data.storage import store as store_module
 from dpl.data.storage.integrity import repair, verify
 from dpl.data.storage.manifest import STREAMS
-from dpl.data.storage.store import Store
-from dpl.data.storage.writer import Writer
-from dpl.system.files import DataSetError
 
 SIZES = {"train": 12, "val": 4, "test": 4}
 SPOOLED = (10, 11)  # loads of training whose shard is not complete

@@ -25,17 +25,24 @@ from hypothesis import strategies as st
 from torch import Tensor
 from tried import at_most, counted
 
+from dpl.fem import (
+    Linear,
+    LinearElastic,
+    Load,
+    Newton,
+    Problem,
+    Solution,
+    Status,
+    eigenmodes,
+    installed,
+    judge,
+    solve,
+    symmetries,
+)
 from dpl.fem.dofs import gather
-from dpl.fem.linear.backends import installed
-from dpl.fem.linear.interface import full_matrix
-from dpl.fem.loads.eigenmodes import eigenmodes
-from dpl.fem.loads.forces import body_force, traction
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, Status, joined, judge, solve
-from dpl.fem.symmetry import symmetries
+from dpl.fem.linear import full_matrix
+from dpl.fem.loads import body_force, traction
+from dpl.fem.solvers import joined
 
 # Very thin, nearly incompressible cells: said in words, and answers are held to what it says.
 pytestmark = pytest.mark.filterwarnings("ignore:.*rounding allows no less:UserWarning")

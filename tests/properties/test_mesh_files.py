@@ -19,10 +19,8 @@ from hypothesis import strategies as st
 from skfem.io.meshio import to_meshio
 from tried import counted
 
-from dpl.fem.mesh import sandbox
-from dpl.fem.mesh.generators import box, rectangle
-from dpl.fem.mesh.reading import load
-from dpl.fem.mesh.validation import check
+from dpl.fem import box, load, rectangle
+from dpl.fem.mesh import check, sandbox
 
 BODIES = {
     "hexahedron": box([2.0, 1.0, 1.0], [3, 2, 2]),

@@ -12,10 +12,9 @@ from benchmarks.stress import Case, Verdict, matrix, perform
 from benchmarks.stress.auditor import Watch
 from benchmarks.stress.case import graded
 from benchmarks.stress.trained_run import Ladder, cases, hybrid, newton, simulated
-from dpl.fem.solvers.solution import solve
-from dpl.models.fcnn import FCNN
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.fem import solve
+from dpl.models import FCNN
+from dpl.training import MSE, Surrogate
 
 LONG = {"T1", "T2", "T8", "ladder"}  # seconds each
 

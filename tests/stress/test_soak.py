@@ -7,10 +7,9 @@ from dataclasses import replace
 import pytest
 
 from benchmarks import soak
-from dpl.inference.simulator import Simulator
-from dpl.models.fcnn import FCNN
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
+from dpl.inference import Simulator
+from dpl.models import FCNN
+from dpl.training import MSE, Surrogate
 
 EVEN = [soak.Vitals("work", 5.0 * k, 100 * k, 500.0, 20, 3, 4) for k in range(50)]
 

@@ -11,8 +11,7 @@ from benchmarks.stress.case import all_of, graded, refused
 from benchmarks.stress.fixtures import column, load_of, pulled
 from benchmarks.stress.stability import SVK
 from benchmarks.verification.report import Row
-from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Status, solve
+from dpl.fem import Newton, Status, solve
 
 
 class Liar:

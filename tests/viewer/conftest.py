@@ -3,12 +3,11 @@
 import pytest
 import torch
 
-from dpl.fem.solvers.solution import solve
-from dpl.inference.simulator import Simulator
-from dpl.models.fcnn import FCNN
-from dpl.training.losses.supervised import MSE
-from dpl.training.surrogate import Surrogate
-from dpl.viewer.frames import Body
+from dpl.fem import solve
+from dpl.inference import Simulator
+from dpl.models import FCNN
+from dpl.training import MSE, Surrogate
+from dpl.viewer import Body
 
 
 def body_of(scene) -> Body:
@@ -34,8 +33,7 @@ def body(scene):
 def page(body, tmp_path):
     """A page of the tiny beam, at any free port."""
     pytest.importorskip("viser", reason="the extra viewer is not installed")
-    from dpl.viewer.access import Door
-    from dpl.viewer.page import Page
+    from dpl.viewer import Door, Page
 
     page = Page(body, Door.bound("127.0.0.1", 0), title="tiny", folder=tmp_path / "view")
     yield page

@@ -15,7 +15,8 @@ import viser
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from dpl.viewer.access import LARGEST, Door, check, status_of
+from dpl.viewer import Door
+from dpl.viewer.access import LARGEST, check, status_of
 from dpl.viewer.rate_limited_log import LONGEST, PERIOD, Complaints
 
 LONG = 120  # no test waits so long, unless what it waits for does not come [s]

@@ -14,8 +14,9 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from dpl.viewer import Door
 from dpl.viewer import access as module
-from dpl.viewer.access import LARGEST, Door, behind, check, status_of
+from dpl.viewer.access import LARGEST, behind, check, status_of
 
 PORT, TOKEN = 8123, "Token-7_x"
 HOME = f"127.0.0.1:{PORT}"

@@ -9,9 +9,8 @@ import torch
 
 pytest.importorskip("viser", reason="the extra viewer is not installed")
 
-from dpl.fem.mesh.generators import rectangle
-from dpl.viewer.access import Door
-from dpl.viewer.page import Page
+from dpl.fem import rectangle
+from dpl.viewer import Door, Page
 
 BODIES = {
     "hexahedra": {},

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import rectangle
-from dpl.fem.postprocess.stress import fields
-from dpl.viewer.frames import Body, Scale, Wish, between, round_up
+from dpl.fem import NeoHookeanLn, fields, rectangle
+from dpl.viewer import Body
+from dpl.viewer.frames import Scale, Wish, between, round_up
 from dpl.viewer.surface import Surface, bands
 
 STRESS, ERROR = "von Mises stress", "error against FE"

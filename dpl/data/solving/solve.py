@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.solvers.solution import Load, Status, solve
+from dpl.fem import Load, Status, solve
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from dpl.data.storage.manifest import STREAMS, lines_of, torn_lines
 from dpl.data.storage.store import MODES, SHARD, Store
 from dpl.data.storage.writer import rewrite
-from dpl.fem.loads.eigenmodes import Modes
+from dpl.fem import Modes
 from dpl.scene import Scene
 from dpl.system.files import DataSetError, own_file, sole_writer, sync_folder, write_file
 

@@ -33,7 +33,7 @@ from dpl.data.storage import acceptance as balance
 from dpl.data.storage.manifest import STREAMS, is_number, kept_in, lines_of, place
 from dpl.data.storage.pending import Spool
 from dpl.data.storage.shard import opened, taken
-from dpl.fem.loads.eigenmodes import Modes
+from dpl.fem import Modes
 from dpl.scene import Sample, Scene
 from dpl.system.files import DataSetError, own_file, read_lines
 

@@ -1,1 +1,22 @@
 """Families of loads: eigenmodes, modal forces and their sampling, tractions and body forces."""
+
+from typing import TYPE_CHECKING
+
+from dpl.system.lazy import public_names
+
+if TYPE_CHECKING:
+    from dpl.fem.loads.eigenmodes import Modes, eigenmodes
+    from dpl.fem.loads.forces import BodyForce, Traction, body_force, traction
+    from dpl.fem.loads.modal import ModalLoads
+    from dpl.fem.loads.sampling import (
+        even,
+        independent,
+        logarithmic,
+        normal,
+        one,
+        sobol,
+        tail,
+        uniform,
+    )
+else:
+    __all__, __getattr__, __dir__ = public_names(__name__)

@@ -82,7 +82,7 @@ def traction(problem: Problem, region: Region, stress: Field, scale: float = 1.0
 
     Args:
         problem: Where it acts.
-        region: Which boundary facets, see `dpl.fem.mesh.regions.facets_in`.
+        region: Which boundary facets, see `dpl.fem.mesh.facets_in`.
         stress: Traction over E [-] at dimensionless points; (D, ...) to (D, ...).
         scale: Length of which the region's coordinates are multiples [m]; 1 for a region that
             takes dimensionless points.

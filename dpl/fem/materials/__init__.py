@@ -1,1 +1,21 @@
 """Hyperelastic laws."""
+
+from typing import TYPE_CHECKING
+
+from dpl.system.lazy import public_names
+
+if TYPE_CHECKING:
+    from dpl.fem.materials.linear_elastic import LinearElastic
+    from dpl.fem.materials.material import Hookean, Isotropic, Material, Response
+    from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
+    from dpl.fem.materials.neo_hookean import (
+        NeoHookeanIsoK2,
+        NeoHookeanIsoK4,
+        NeoHookeanLn,
+        StableNeoHookean,
+    )
+    from dpl.fem.materials.ogden import OgdenK2
+    from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+    from dpl.fem.materials.yeoh import YeohK2
+else:
+    __all__, __getattr__, __dir__ = public_names(__name__)

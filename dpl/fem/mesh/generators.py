@@ -11,7 +11,7 @@ import numpy as np
 import skfem
 from numpy.typing import NDArray
 
-from dpl.fem.mesh.propeller import propeller
+from dpl.fem.mesh.propeller_mesh import propeller
 from dpl.fem.mesh.reading import load
 from dpl.fem.mesh.regions import Box, Cylinder, Plane, Region, Sphere, Tag, facets_in, nodes_in
 from dpl.fem.mesh.validation import check

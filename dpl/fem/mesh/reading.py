@@ -64,7 +64,7 @@ def load(path: str | Path) -> skfem.Mesh:
     inside out: they are read as if they did not. Those of a plane body may all be clockwise.
 
     The file's names for parts are kept as scikit-fem's `mesh.boundaries` (facets) and
-    `mesh.subdomains` (cells), where `dpl.fem.mesh.regions.Tag` finds them:
+    `mesh.subdomains` (cells), where `dpl.fem.Tag` finds them:
 
     - Gmsh's physical groups, by name; by number ("7") if they have none;
     - sets of cells or nodes (.inp and others), by name;

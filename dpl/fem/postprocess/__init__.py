@@ -1,1 +1,19 @@
 """What is derived from a displacement: stresses, energies, the surface."""
+
+from typing import TYPE_CHECKING
+
+from dpl.system.lazy import public_names
+
+if TYPE_CHECKING:
+    from dpl.fem.postprocess.energy import Rest, potential, tangent_product
+    from dpl.fem.postprocess.stress import (
+        Fields,
+        at_nodes,
+        cauchy,
+        deformation_gradient,
+        fields,
+        von_mises,
+    )
+    from dpl.fem.postprocess.surface import coarse, triangles
+else:
+    __all__, __getattr__, __dir__ = public_names(__name__)

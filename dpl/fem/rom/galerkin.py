@@ -174,7 +174,7 @@ class PODGalerkin:
             ValueError: Loads bring Poisson's ratios of their own.
         """
         if load.poisson.shape[-1]:
-            raise ValueError("poisson: loads with their own need dpl.fem.solvers.newton.Newton")
+            raise ValueError("poisson: loads with their own need dpl.fem.Newton")
         found, seconds = [], []
         for force in load.force:
             start = time.perf_counter()

@@ -170,7 +170,7 @@ def refuse_range(problem: Problem) -> None:
     if (span := problem.material.poisson_range) is not None:
         raise ValueError(
             f"poisson: reduced stiffness and cells are those of one, not of a range, {list(span)}; "
-            "take Problem.at or dpl.fem.solvers.newton.Newton"
+            "take Problem.at or dpl.fem.Newton"
         )
 
 

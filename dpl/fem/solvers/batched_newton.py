@@ -48,14 +48,12 @@ class BatchedNewton:
             ValueError: An attribute is out of range, supports are moved, or the law is not one.
         """
         if self.problem.material.poisson_range is not None:
-            raise ValueError("poisson: a range of them needs dpl.fem.solvers.newton.Newton")
+            raise ValueError("poisson: a range of them needs dpl.fem.Newton")
         check_tol(self.tol)
         if not 0 < self.keep < 1:
             raise ValueError(f"keep = {self.keep} must lie between 0 and 1")
         if self.problem.moved_supports:
-            raise ValueError(
-                "prescribed displacements other than zero need dpl.fem.solvers.newton.Newton"
-            )
+            raise ValueError("prescribed displacements other than zero need dpl.fem.Newton")
 
     @torch.no_grad()
     def iterate(self, load: Load) -> Iterator[Solution]:
@@ -65,7 +63,7 @@ class BatchedNewton:
             ValueError: Loads bring Poisson's ratios of their own.
         """
         if load.poisson.shape[-1]:
-            raise ValueError("poisson: loads with their own need dpl.fem.solvers.newton.Newton")
+            raise ValueError("poisson: loads with their own need dpl.fem.Newton")
         problem, start = self.problem, time.perf_counter()
         force = load.force.to(self.inverse.device)
         u, gap = torch.zeros_like(force), None

@@ -27,7 +27,7 @@ class Linear:
     Attributes:
         problem: The body.
         tol: Residual ratio below which the answer counts as converged [-]; at least 1e-15, below 1.
-        linear: Backend of the sparse solves, see `dpl.fem.linear.backends.backend`.
+        linear: Backend of the sparse solves, see `dpl.fem.linear.backend`.
     """
 
     problem: Problem

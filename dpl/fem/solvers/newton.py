@@ -51,7 +51,7 @@ class Newton:
         smallest_step: Load step, as a part of the load, below which to give up [-].
         loose: Residual ratio at intermediate load factors [-].
         keep: Part of det F that one step may leave of the smallest one [-].
-        linear: Backend of the sparse solves, see `dpl.fem.linear.backends.backend`.
+        linear: Backend of the sparse solves, see `dpl.fem.linear.backend`.
         mixed: Let the strains at the quadrature points be unknowns of their own (Magisano,
             Leonetti, Garcea 2017), for laws that can: fewer iterations, far larger steps.
         reuse: Residual ratio below which the last factor, as preconditioner of conjugate gradients

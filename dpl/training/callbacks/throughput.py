@@ -11,7 +11,7 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from dpl.data.datamodule import OnlineData
+from dpl.data import OnlineData
 
 
 class SampleRates(L.Callback):

@@ -14,10 +14,11 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
-from dpl.fem.postprocess.surface import coarse, surface, triangles
+from dpl.fem import surface
+from dpl.fem.postprocess import coarse, triangles
 from dpl.scene import Sample, Scene
 from dpl.training.metrics import Judged, MaxError, RelativeL2
-from dpl.visualization.figures import colours, deformed, spread
+from dpl.visualization import colours, deformed, spread
 
 GREY = 160  # of a true shape
 LOOK = {  # of meshes in the browser, in the words of three.js
@@ -147,7 +148,7 @@ def beside(scene: Scene, prediction: Tensor, truth: Tensor, most: int) -> dict[s
         scene: Whose body it is.
         prediction: Finite.
         truth: (N, D) [-].
-        most: Polygons, see `dpl.fem.postprocess.surface.coarse`.
+        most: Polygons, see `dpl.fem.postprocess.coarse`.
 
     Returns:
         vertices: (1, V, 3) [m].

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from dpl.fem.postprocess.energy import Rest, potential
+from dpl.fem.postprocess import Rest, potential
 from dpl.scene import Sample
 from dpl.training.losses.loss import Loss, Physics, _checked, floored
 from dpl.training.losses.supervised import _Known

@@ -6,7 +6,7 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from dpl.fem.problem import Problem
+from dpl.fem import Problem
 from dpl.scene import Sample
 
 

@@ -4,7 +4,7 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from dpl.fem.postprocess.energy import tangent_product
+from dpl.fem.postprocess import tangent_product
 from dpl.scene import Sample
 from dpl.training.losses.loss import Loss, Physics, squared_error
 from dpl.training.losses.supervised import _Known

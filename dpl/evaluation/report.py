@@ -12,16 +12,14 @@ from rich.table import Table
 from torch import Tensor
 
 from dpl.evaluation.timing import Latency, in_turn, latencies, percentiles, told
-from dpl.fem.mesh.writing import save as write_mesh
-from dpl.fem.problem import Problem
-from dpl.fem.solvers.solution import Solution, Solver
-from dpl.inference.hybrid import Direct, Hybrid, best
-from dpl.inference.simulator import Simulator
+from dpl.fem import Problem, Solution, Solver
+from dpl.fem import save as write_mesh
+from dpl.inference import Direct, Hybrid, Simulator, best
 from dpl.scene import Sample
 from dpl.system.threads import one_thread
-from dpl.training.metrics import RelativeL2, median, metrics
-from dpl.training.surrogate import Surrogate
-from dpl.visualization.figures import deformed
+from dpl.training import RelativeL2, Surrogate
+from dpl.training.metrics import median, metrics
+from dpl.visualization import deformed
 
 
 @dataclass(frozen=True)
