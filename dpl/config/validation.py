@@ -48,28 +48,27 @@ TRAINED = {  # smallest and largest of what only a training must keep to; 1e-30 
 ENDLESS = {"trainer.max_epochs", "trainer.max_steps"}  # -1 of these stands for no limit
 KINDS = {  # what the call under a key must give: one of these, or of a class derived from them
     "mesh": {"skfem.mesh.mesh.Mesh"},
-    "material": {"dpl.fem.Material"},
+    "material": {"dpl.fem.materials.material.Material"},
     "clamped": {f"dpl.fem.mesh.regions.{n}" for n in ("Plane", "Box", "Sphere", "Cylinder", "Tag")},
     "supports": {
-        "dpl.fem.Displacement",
-        "dpl.fem.Spring",
+        "dpl.fem.assembly.boundary_conditions.Displacement",
+        "dpl.fem.assembly.boundary_conditions.Spring",
     },
-    "forces": {"dpl.fem.Traction", "dpl.fem.BodyForce"},
-    "solver": {"dpl.fem.Newton"},
-    "loads": {"dpl.fem.ModalLoads"},
-    "data": {"dpl.data.DataSet", "dpl.data.OfflineData"},
+    "forces": {"dpl.fem.loads.forces.Traction", "dpl.fem.loads.forces.BodyForce"},
+    "solver": {"dpl.fem.solvers.newton.Newton"},
+    "loads": {"dpl.fem.loads.modal.ModalLoads"},
+    "data": {"dpl.data.dataset.DataSet", "dpl.data.datamodule.OfflineData"},
     "model": {"torch.nn.modules.module.Module"},
-    "loss": {"dpl.training.Loss"},
+    "loss": {"dpl.training.losses.loss.Loss"},
     "optimizer": {"torch.optim.optimizer.Optimizer"},
     "scheduler": {"torch.optim.lr_scheduler.LRScheduler"},
     "trainer": {"lightning.pytorch.trainer.trainer.Trainer"},
 }
 SEVERAL = ("supports", "forces")  # keys that hold calls by name
-TRUSTED = {  # functions that a run's folder may name without being asked; classes are in KINDS
-    *(f"dpl.fem.mesh.generators.{name}" for name in ("box", "rectangle", "propeller", "load")),
-    *(f"dpl.fem.loads.sampling.{name}" for name in ("uniform", "normal", "even", "one")),
-    *(f"dpl.fem.loads.sampling.{name}" for name in ("logarithmic", "tail")),
-    "dpl.training.warmup_cosine",
+TRUSTED = {  # modules whose functions a run's folder may name; classes are in KINDS
+    *(f"dpl.fem.mesh.{name}" for name in ("generators", "propeller_mesh", "reading")),
+    "dpl.fem.loads.sampling",
+    "dpl.training.schedules",
 }
 OURS = ("dpl.", "torch.optim.")  # where those classes are
 OWN = {"_target_", "_partial_", "_recursive_", "_convert_"}  # Hydra's own options of a call
@@ -102,7 +101,8 @@ def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = Tr
         written: The configuration, with interpolations as they are written.
         resolved: The same without them.
         trust: Whether it may name any object to call, or only what the keys of a run stand for:
-            classes of this package and of PyTorch's optimisers, and the functions of `TRUSTED`.
+            classes of this package and of PyTorch's optimisers, and the functions of the modules
+            in `TRUSTED`.
 
     Raises:
         ConfigError: A key that its object does not know, a value of another type, a number that is
@@ -171,9 +171,13 @@ def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
         raise ConfigError(f"{path}._target_ = {name!r} does not exist") from None
     if not callable(target):
         raise ConfigError(f"{path}._target_ = {name!r} cannot be called")
-    if not trust and name not in TRUSTED:
-        own = inspect.isclass(target) and f"{target.__module__}.".startswith(OURS)
-        if not own or not is_a(target, set().union(*KINDS.values())):
+    if not trust:
+        if inspect.isclass(target):
+            kinds = set().union(*KINDS.values())
+            ours = f"{target.__module__}.".startswith(OURS) and is_a(target, kinds)
+        else:
+            ours = target.__module__ in TRUSTED and not target.__name__.startswith("_")
+        if not ours:
             raise ConfigError(foreign)
     return typing.cast("Callable[..., Any]", target)
 
