@@ -1,6 +1,9 @@
 """The wheel holds all that the commands need, and they run from it outside the checkout."""
 
+import importlib
+import inspect
 import os
+import pkgutil
 import re
 import subprocess
 import sys
@@ -108,3 +111,27 @@ def test_the_version_is_said_once_more_where_tools_look_for_it():
     assert f'__version__ = "{version}"' in code
     assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
     assert re.search(rf"^## {re.escape(version)} - ", (ROOT / "CHANGELOG.md").read_text(), re.M)
+
+
+PACKAGES = [
+    ".".join(path.parent.relative_to(ROOT).parts)
+    for path in sorted(ROOT.glob("dpl/**/__init__.py"))
+]
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_every_public_name_is_there_and_is_not_the_name_of_a_module(name):
+    package = importlib.import_module(name)
+    modules = {module.name for module in pkgutil.iter_modules(package.__path__)}
+    assert modules.isdisjoint(getattr(package, "__all__", ()))
+    for public in getattr(package, "__all__", ()):
+        assert not inspect.ismodule(getattr(package, public))
+    assert set(dir(package)) >= set(getattr(package, "__all__", ()))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        package.nothing  # noqa: B018
+
+
+def test_to_import_the_package_imports_neither_torch_nor_scipy():
+    code = "import dpl, sys; print({'torch', 'scipy', 'numpy'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"

@@ -30,7 +30,7 @@ def calls(monkeypatch):
     watch(Problem, "linearise", "tangent")
     for name in ("internal_force", "residual", "evaluate"):
         watch(Problem, name, "residual")
-    monkeypatch.setattr("dpl.fem.linear.backends.splu", _counting_splu(counts))
+    monkeypatch.setattr("dpl.fem.linear.superlu.splu", _counting_splu(counts))
     return counts
 
 
@@ -186,7 +186,7 @@ def test_lr_star_sends_no_gradient_through_the_residual(scene, batch, monkeypatc
 
 def test_a_data_set_that_is_there_is_not_solved_again(data, calls, monkeypatch):
     solved = []
-    monkeypatch.setattr("dpl.data.solving.solve.outcome", lambda *job: solved.append(job))
+    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", lambda *job: solved.append(job))
     assert data.plan() == [
         "one data set for every size and Young's modulus of this body: "
         f"{data.store.folder}, of scene {data.scene.fingerprint[:12]}",
@@ -230,7 +230,7 @@ def test_images_under_symmetries_are_not_solved(scene, folder, data, calls, monk
     line = module.plan()[-1]
     count = int(line.split()[0])
     assert line == f"{count} samples of each load solved: symmetries of the body"
-    monkeypatch.setattr("dpl.data.solving.solve.outcome", lambda *job: pytest.fail("solved"))
+    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", lambda *job: pytest.fail("solved"))
     module.prepare_data()
     calls.clear()
     assert sum(len(batch.force) for batch in module.train_dataloader()) == 12 * count

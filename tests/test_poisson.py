@@ -147,9 +147,9 @@ def test_a_law_that_is_its_energy_alone_has_batches_too(make_scene):
 def test_nothing_is_compiled_or_analysed_again(wide, monkeypatch):
     loads = wide.loads.sample((0, 0), range(6))
     solve(wide.solver, Load(*(column[:1] for column in loads)))
-    monkeypatch.setattr("dpl.fem.assembly.Pattern.build", None)
-    monkeypatch.setattr("dpl.fem.linear.backend", None)
-    monkeypatch.setattr("dpl.fem.assembly.kernels.Kernels.__init__", None)
+    monkeypatch.setattr("dpl.fem.assembly.sparsity.Pattern.build", None)
+    monkeypatch.setattr("dpl.fem.solvers.linear.backend", None)
+    monkeypatch.setattr("dpl.fem.problem.Kernels.__init__", None)
     monkeypatch.setattr("dpl.fem.assembly.kernels._alone", None)
     assert solve(wide.solver, loads).converged.all()
 

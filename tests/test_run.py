@@ -283,7 +283,7 @@ def test_no_configuration_may_leave_the_body_loose(compose, tiny):
 
 def test_checking_calls_nothing(compose, monkeypatch):
     called = []
-    monkeypatch.setattr("dpl.fem.load", lambda path: called.append(path))
+    monkeypatch.setattr("dpl.fem.mesh.reading.load", lambda path: called.append(path))
     cfg = compose("mesh=file", "mesh.path=part.msh")
     cfg.mesh._target_ = "dpl.fem.load"
     build.check(cfg)
@@ -535,7 +535,7 @@ def test_a_run_that_names_what_is_not_ours_is_not_called(copied, path, tmp_path)
     "call",
     [
         {"_target_": "dpl.config.load_run", "folder": "evil", "trust": True},
-        {"_target_": "dpl.training.surrogate.append_line", "path": "harm", "line": {}},
+        {"_target_": "dpl.system.files.append_line", "path": "harm", "line": {}},
         {"_target_": "dpl.fem.save", "mesh": {}, "path": "harm.vtk"},
         {"_target_": "dpl.scene.partial", "func": "os.system"},
         {"_target_": "benchmarks.peers.measured_peer", "python": "sh", "program": "harm"},

@@ -8,9 +8,9 @@ if TYPE_CHECKING:
     from dpl.fem.assembly.boundary_conditions import Displacement, Spring
     from dpl.fem.linear.backends import installed
     from dpl.fem.linear.interface import SingularMatrix
-    from dpl.fem.loads.eigenmodes import Modes, eigenmodes
     from dpl.fem.loads.forces import BodyForce, Traction
     from dpl.fem.loads.modal import ModalLoads
+    from dpl.fem.loads.modal_basis import Modes, eigenmodes
     from dpl.fem.materials.linear_elastic import LinearElastic
     from dpl.fem.materials.material import Hookean, Isotropic, Material
     from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2

@@ -136,7 +136,7 @@ def test_rejected_loads_do_not_enter_the_stream(scene, drawn, monkeypatch):
     def choosy(scene, job, **options):
         return outcome(scene, job, **options)._replace(accepted=job.number % 3 == 1)
 
-    monkeypatch.setattr("dpl.data.solving.solve.outcome", choosy)
+    monkeypatch.setattr("dpl.data.stream.outcome", choosy)
     first = itertools.islice(OnlineSamples(scene, SEED), 3)
     assert [one.sample.force.numpy().tobytes() for one in first] == [drawn[1], drawn[4], drawn[7]]
 
@@ -373,7 +373,7 @@ class Clocked(Numbers):
 def clocked(monkeypatch):
     """A stream whose clock is that of the replay."""
     stream = Clocked()
-    monkeypatch.setattr("dpl.data.stream.time", stream)
+    monkeypatch.setattr("dpl.data.replay_buffer.time", stream)
     return stream
 
 
@@ -478,7 +478,7 @@ def unsolved(monkeypatch):
             job=job, point=point.numpy(), force=none, displacement=none, accepted=True
         )
 
-    monkeypatch.setattr("dpl.data.solving.solve.outcome", fake)
+    monkeypatch.setattr("dpl.data.stream.outcome", fake)
     loads = SimpleNamespace(
         young_at=lambda points: points[:, -1], poisson_at=lambda points: points[:, :0]
     )

@@ -54,7 +54,7 @@ def solved(monkeypatch):
         found.append((*job.seed, job.number))
         return outcome(scene, job)
 
-    monkeypatch.setattr("dpl.data.solving.solve.outcome", counted)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", counted)
     return found
 
 
@@ -198,7 +198,7 @@ def test_rejected_loads_are_recorded_with_reason_and_load_factor(hard, tmp_path)
 
 def test_a_shard_of_rejects_alone_is_a_shard(scene, fresh, monkeypatch):
     monkeypatch.setattr(
-        "dpl.data.solving.solve.outcome", lambda scene, job: lost(scene, job, "never")
+        "dpl.data.solving.worker_pool.outcome", lambda scene, job: lost(scene, job, "never")
     )
     fill(fresh, {"train": range(3)})
     assert fresh.missing("train", 4) == [3]
@@ -916,10 +916,10 @@ def test_repair_retries_loads_that_the_machine_lost_and_no_others(hard, tmp_path
 
     monkeypatch.setattr(store_module, "SHARD", 3)
     fill(sound, {"train": range(9)})
-    monkeypatch.setattr("dpl.data.solving.solve.outcome", unlucky)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", unlucky)
     fill(store, {"train": range(9)})
     assert store.digest("train", 9) != sound.digest("train", 9)
-    monkeypatch.setattr("dpl.data.solving.solve.outcome", outcome)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", outcome)
     assert mended(store) == ["train-000000.safetensors", "train-000003.safetensors"]
     assert fill(store, {"train": store.missing("train", 9)}) == 6
     assert store.digest("train", 9) == sound.digest("train", 9)

@@ -666,8 +666,10 @@ def test_slow_kernels_on_a_fast_cpu_are_pointed_out(monkeypatch, tmp_path, flags
     (tmp_path / "cpuinfo").write_text(f"processor : 0\nflags : {flags}\n")
     library = {"internal_api": "openblas", "architecture": kernels}
     monkeypatch.delenv("OPENBLAS_CORETYPE", raising=False)
-    monkeypatch.setattr(backends, "CPUINFO", tmp_path / "cpuinfo")
-    monkeypatch.setattr(backends, "threadpool_info", lambda: [{"internal_api": "mkl"}, library])
+    monkeypatch.setattr("dpl.system.blas.CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(
+        "dpl.system.blas.threadpool_info", lambda: [{"internal_api": "mkl"}, library]
+    )
     said = slow_blas()
     assert said is None if advice is None else advice in said
     monkeypatch.setenv("OPENBLAS_CORETYPE", "Prescott")  # what the user has set is meant

@@ -24,8 +24,7 @@ from dpl.fem import (
     solve,
 )
 from dpl.fem.linear import full_matrix
-from dpl.fem.loads import even, logarithmic, normal, one, tail
-from dpl.fem.loads import modal as modes_module
+from dpl.fem.loads import even, logarithmic, modal_basis, normal, one, tail
 from dpl.fem.loads.sampling import SAMPLINGS
 
 YOUNG, LENGTH = 4500.0, 100.0
@@ -105,7 +104,7 @@ def test_modes_do_not_depend_on_the_start_of_the_iteration(beam, monkeypatch, ce
             start = np.random.default_rng(seed).uniform(-1, 1, len(v0))
             return original(matrix, count, v0=start, **options)
 
-        monkeypatch.setattr(modes_module, "eigsh", restarted)
+        monkeypatch.setattr(modal_basis, "eigsh", restarted)
         again = eigenmodes(Linear(problem, linear="superlu"), 5)
         assert torch.allclose(again.vectors, first.vectors, rtol=0, atol=1e-8)
 

@@ -536,7 +536,7 @@ def test_solver_without_pardiso_solves_the_same(beam, pull, monkeypatch):
     problem = beam(NH, 4, 1)
     load = load_of(pull(problem, 20.0))
     expected = solve(newton(problem), load)
-    monkeypatch.setattr("dpl.fem.installed", lambda: ["superlu"])
+    monkeypatch.setattr("dpl.fem.linear.backends.installed", lambda: ["superlu"])
     assert torch.equal(solve(Newton(problem), load).displacement, expected.displacement)
 
 

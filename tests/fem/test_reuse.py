@@ -360,7 +360,7 @@ def test_factor_with_negative_pivots_is_never_used_again(monkeypatch, P, linear)
         return factor
 
     monkeypatch.setattr(SuperLU, "factorise", watched)
-    monkeypatch.setattr("dpl.fem.installed", lambda: ["band", "superlu"])
+    monkeypatch.setattr("dpl.fem.linear.backends.installed", lambda: ["band", "superlu"])
     monkeypatch.setattr(
         SuperLUFactor, "apply", lambda self, r: used.append(self.negative_pivots) or self.solve(r)
     )

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.fem.loads.eigenmodes import Modes, eigenmodes
     from dpl.fem.loads.forces import BodyForce, Traction, body_force, traction
     from dpl.fem.loads.modal import ModalLoads
+    from dpl.fem.loads.modal_basis import Modes, eigenmodes
     from dpl.fem.loads.sampling import (
         even,
         independent,

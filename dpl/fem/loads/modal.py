@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.loads.eigenmodes import Array, Modes, eigenmodes
+from dpl.fem.loads.modal_basis import Array, Modes, eigenmodes
 from dpl.fem.loads.sampling import SAMPLINGS, Quantile, even, one, uniform
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.linear import Linear

@@ -104,7 +104,7 @@ class _Reader:
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._process is None or self._process.poll() is not None:
-            program = Path(__file__).with_name("reader.py")
+            program = Path(__file__).with_name("sandbox_worker.py")
             self._process = subprocess.Popen(
                 [sys.executable, "-P", str(program)],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
