@@ -39,7 +39,7 @@ STARTS = {
         spawning().Process(target=task, daemon=True).start()
     """,
     "a worker of a stream": """
-        from dpl.data.stream import Replay
+        from dpl.data.replay_buffer import Replay
         from torch.utils.data import IterableDataset
 
         class Source(IterableDataset):
