@@ -51,7 +51,7 @@ class Noisy(nn.Module):
 KILLER = textwrap.dedent(
     """
     import contextlib, io, os, runpy, signal, sys
-    from dpl import checkpoints
+    from dpl.training import checkpoints
     from dpl.training.surrogate import Surrogate
 
     script, where, at = sys.argv[1], sys.argv[2], int(sys.argv[3])
@@ -201,7 +201,7 @@ def assert_same(one, other):
 LIMITED = textwrap.dedent(
     """
     import resource, runpy, sys
-    from dpl import checkpoints
+    from dpl.training import checkpoints
     script, name, most = sys.argv[1:4]
     sys.argv = [script, *sys.argv[4:]]
     write = checkpoints.write
