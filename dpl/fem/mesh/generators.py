@@ -11,33 +11,7 @@ import numpy as np
 import skfem
 from numpy.typing import NDArray
 
-from dpl.fem.mesh.propeller_mesh import propeller
-from dpl.fem.mesh.reading import load
-from dpl.fem.mesh.regions import Box, Cylinder, Plane, Region, Sphere, Tag, facets_in, nodes_in
-from dpl.fem.mesh.validation import check
-from dpl.fem.mesh.writing import save, save_exactly
 from dpl.system.memory import refuse_mesh
-
-__all__ = [
-    "Box",
-    "Cylinder",
-    "Plane",
-    "Region",
-    "Sphere",
-    "Tag",
-    "aspect_ratio",
-    "box",
-    "check",
-    "facets_in",
-    "load",
-    "longest_side",
-    "near_origin",
-    "nodes_in",
-    "propeller",
-    "rectangle",
-    "save",
-    "save_exactly",
-]
 
 SMALLEST, LARGEST = 1e-12, 1e12  # sides of a body [m]
 THINNEST = 1e6  # longest over shortest side
