@@ -8,8 +8,8 @@ from statistics import median
 import numpy as np
 
 from dpl import Scene
-from dpl.data.solving.solve import Job
-from dpl.data.solving.worker_pool import outcomes
+from dpl.data.solving.solve import LoadKey
+from dpl.data.solving.worker_pool import solve_loads
 from dpl.data.storage.manifest import STREAMS
 
 BINS = 20
@@ -40,8 +40,8 @@ def deflections(scenes: Mapping[str, Scene], count: int, workers: int) -> list[D
     """
     rows = []
     for name, scene in scenes.items():
-        jobs = [Job((0, STREAMS["test"]), k) for k in range(count)]
-        for found in outcomes(scene, jobs, workers=workers):
+        jobs = [LoadKey((0, STREAMS["test"]), k) for k in range(count)]
+        for found in solve_loads(scene, jobs, workers=workers):
             if found.accepted:
                 largest = float(np.linalg.norm(found.displacement, axis=1).max())
                 rows.append(Deflection(name, found.job.number, largest))

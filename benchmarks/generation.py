@@ -105,7 +105,7 @@ def _nearest(scene: Scene, pool: int) -> Guess:
     Near is what has a near linear answer; to it the linear answer to the difference is added.
     """
     loads = scene.loads.sample((2, 0), range(pool))
-    answers = [solve(scene.solver, single) for single in loads.singles()]
+    answers = [solve(scene.solver, single) for single in loads.unbatch()]
     displacement = torch.cat([answer.displacement for answer in answers])
     linear = torch.stack([scene.linear.respond(force) for force in loads.force])
 

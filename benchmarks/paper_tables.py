@@ -13,7 +13,7 @@ from dpl.evaluation.tables import write, write_machine
 from dpl.fem import Load, Newton, Status, solve
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2
-from dpl.training.metrics import metrics
+from dpl.training.metrics import default_metrics
 
 # Odot, Haferssas, Cotin (2022), tables 1 to 3: e_mean, e_max, SNR_min [dB], samples. Experiments 3
 # and 3b are one here: they differ in the range of Young's modulus, which no answer depends on.
@@ -119,13 +119,13 @@ def measure(
         repeats: Times that each load is asked.
     """
     for title, batch in sets.items():
-        singles = batch.load.singles()
+        singles = batch.load.unbatch()
         with one_thread(), torch.inference_mode():
             for name, method in methods.items():
                 answer = torch.cat([method.predict(load) for load in singles])
                 taken = latency(method.predict, singles, repeats=repeats)
                 iterations = None if title in STREAMS else _iterations(newton, singles, answer)
-                errors = metrics(newton.problem)
+                errors = default_metrics(newton.problem)
                 errors.update(answer, batch)
                 known = {field.name for field in fields(Result)}
                 numbers = {k: float(v) for k, v in errors.compute().items() if k in known}

@@ -23,8 +23,8 @@ import torch
 
 from benchmarks import blas_detection
 from dpl import Scene
-from dpl.data.solving.solve import Job
-from dpl.data.solving.worker_pool import outcomes
+from dpl.data.solving.solve import LoadKey
+from dpl.data.solving.worker_pool import solve_loads
 from dpl.fem import (
     Load,
     Material,
@@ -41,7 +41,7 @@ from dpl.fem import (
     solve,
 )
 from dpl.fem.dofs import gather
-from dpl.fem.linear import backend, chosen
+from dpl.fem.linear import make_backend, select_backend
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ def pieces(repeats: int) -> list[Time]:
     """Return the times of what a Newton iteration of case S1 is made of."""
     problem, load = CASES["S1"].build()
     u = solve(Newton(problem, tol=1e-4), load).displacement
-    gap = problem.widened(None, 1.0, 0.1 * u)
+    gap = problem.update_strain_gap(None, 1.0, 0.1 * u)
     values = problem.linearise(u).tangent[0].numpy()
     right = gather(load.force[0], problem)
     rows = [
@@ -246,7 +246,7 @@ def pieces(repeats: int) -> list[Time]:
     ]
     for name in ("band32", "band", "pardiso", "superlu"):
         try:
-            solver = backend(problem.pattern, name)
+            solver = make_backend(problem.pattern, name)
         except ValueError:  # not installed
             continue
         factor = solver.factorise(values)
@@ -281,7 +281,7 @@ def propellers(linear: str, loads: int) -> Time:
     seconds = statistics.median(float(answer.seconds) for answer in answers)
     reached = sorted(float(a.displacement.norm(dim=-1).max()) for a in answers)
     good = sum(bool(a.converged) for a in answers)
-    name = chosen(linear, scene.problem.pattern)
+    name = select_backend(linear, scene.problem.pattern)
     note = f"{good}/{loads} converged, deflections {reached[0]:.3f} to {reached[-1]:.3f} L"
     iterations = statistics.mean(int(a.iterations) for a in answers)
     return Time(f"propeller, {name}", seconds, iterations, note)
@@ -328,10 +328,10 @@ def robustness(
     for name, build in scenes.items():
         scene = build()
         once = replace(scene, solver=replace(scene.solver, smallest_step=0.9))
-        jobs = [Job((0, 0), k) for k in range(loads)]
-        first = {o.job.number: o for o in outcomes(once, jobs, workers=workers)}
+        jobs = [LoadKey((0, 0), k) for k in range(loads)]
+        first = {o.job.number: o for o in solve_loads(once, jobs, workers=workers)}
         failed = [o.job for o in first.values() if not o.accepted]
-        second = list(outcomes(scene, failed, workers=workers)) if failed else []
+        second = list(solve_loads(scene, failed, workers=workers)) if failed else []
         done = [o for o in first.values() if o.accepted]
         results[name] = {
             "loads": loads,

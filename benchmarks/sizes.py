@@ -15,8 +15,8 @@ import torch
 from benchmarks.discretisation import BEAM, YOUNG
 from dpl import Sample, Scene
 from dpl.evaluation import latency
-from dpl.fem import Linear, Load, ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, solve
-from dpl.fem.linear import chosen
+from dpl.fem import LinearSolver, Load, ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, solve
+from dpl.fem.linear import select_backend
 from dpl.models import FCNN, Latent
 from dpl.system.threads import one_thread
 from dpl.training import MSE, Surrogate
@@ -74,20 +74,20 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     scene = Scene(problem, ModalLoads(newton.rest, deflection=0.4, young=YOUNG), newton)
     dofs = problem.free.numel()
     batch = scene.loads.sample((0, 2), range(max(loads, 3)))
-    singles = batch.singles()[:loads]
+    singles = batch.unbatch()[:loads]
 
     def row(what: str, call: Callable[[Load], object], **more: float | int) -> Size:
         return Size(what, dofs, latency(call, singles).p50, **more)  # type: ignore[arg-type]
 
     start = time.perf_counter()
-    Linear(problem).factor  # noqa: B018
+    LinearSolver(problem).factor  # noqa: B018
     first = 1e3 * (time.perf_counter() - start)
-    name = chosen("auto", problem.pattern, problem.near_null, lasting=True)
+    name = select_backend("auto", problem.pattern, problem.near_null, many_rhs=True)
     yield Size(f"factor of K(0), analysis included ({name})", dofs, first)
     yield row("linear answer", lambda load: newton.rest.respond(load.force[0]))
     answers = {float(load.force.norm()): solve(newton, load).displacement for load in singles}
     yield row("Newton", lambda load: solve(newton, load))
-    turned = newton.but(turned=True)
+    turned = newton.replace(turned=True)
 
     def hybrid(load: Load) -> None:
         guess = 1.001 * answers[float(load.force.norm())]
@@ -100,7 +100,7 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     drawn = scene.loads.sample((0, 0), range(64))
     linear = torch.stack([newton.rest.respond(force) for force in drawn.force])
     bent = linear + linear * linear.norm(dim=-1, keepdim=True)
-    surrogate.prepare(Sample(drawn.force, bent, drawn.young))
+    surrogate.fit_bases(Sample(drawn.force, bent, drawn.young))
     kept = sum(t.nbytes for t in surrogate.state_dict().values()) / 1e6
     count = sum(p.numel() for p in net.parameters())
     yield row("latent", surrogate.predict, parameters=count, memory=kept)

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem import Linear, Load, ModalLoads, Newton, Problem, solve
-from dpl.fem.solvers.solution import beside
+from dpl.fem import LinearSolver, Load, ModalLoads, Newton, Problem, solve
+from dpl.fem.solvers.solution import as_column
 
 TYPICAL = 6  # the stream of the loads that the corrector is chosen on
 CELLS = {  # scikit-fem's names of shapes and those of bodies, in the plural
@@ -49,7 +49,7 @@ class Sample(_Sample):
         cls, force: Tensor, displacement: Tensor, young: Tensor, poisson: Tensor | None = None
     ) -> "Sample":
         """Take the columns; Poisson's ratios (B,) too."""
-        return super().__new__(cls, force, displacement, young, beside(young, poisson))
+        return super().__new__(cls, force, displacement, young, as_column(young, poisson))
 
     @property
     def load(self) -> Load:
@@ -72,7 +72,7 @@ class Scene:
     solver: Newton
 
     @property
-    def linear(self) -> Linear:
+    def linear(self) -> LinearSolver:
         """The linear answer, with the scene's one factor of K(0)."""
         return self.solver.rest
 
@@ -84,12 +84,12 @@ class Scene:
         conjugate gradients short: on compact bodies, seldom on thin ones. A few loads, the first of
         a stream of their own, tell.
         """
-        drawn = self.loads.sample((0, TYPICAL), range(3)).singles()
+        drawn = self.loads.sample((0, TYPICAL), range(3)).unbatch()
         answers = [solve(self.solver, load) for load in drawn]
         bodies = [self.linear.at(load.poisson) for load in drawn]
         pairs = zip(bodies, answers, strict=True)
-        steps = [linear.turning.steps(answer.displacement) for linear, answer in pairs]
-        return self.solver.but(turned=sum(steps) <= SHORT * len(steps))
+        steps = [linear.corotational.steps(answer.displacement) for linear, answer in pairs]
+        return self.solver.replace(turned=sum(steps) <= SHORT * len(steps))
 
     @property
     def length(self) -> float:
@@ -178,7 +178,7 @@ class Scene:
             f"{problem.points.numel():,} degrees of freedom"
         )
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """Return what this scene does not need and what is therefore skipped, a line each."""
         problem, loads = self.problem, self.loads
         cells, points = len(problem.cells), problem.dV.shape[1]

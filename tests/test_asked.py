@@ -197,7 +197,7 @@ def test_a_region_may_be_left_out_where_supports_hold_the_body(scene_of, tiny):
     with pytest.raises(ConfigError, match="6 rigid modes are unconstrained"):
         scene_of(*tiny, "~clamped")
     held = (
-        "+supports.end={_target_: dpl.fem.Displacement, "
+        "+supports.end={_target_: dpl.fem.DirichletBC, "
         "value: [0, 0, 0], "
         "region: {_target_: dpl.fem.Plane, axis: 0, at: min}}"
     )

@@ -30,10 +30,18 @@ from dpl import Sample
 from dpl.data import OnlineData
 from dpl.fem import box, rectangle, surface
 from dpl.models import FCNN
-from dpl.training import MSE, Diverged, LearningRate, SampleRates, Session, Surrogate, WorstCases
-from dpl.training.callbacks.throughput import resident
-from dpl.training.callbacks.worst_cases import beside, judge
-from dpl.training.metrics import Judged, median, metrics
+from dpl.training import (
+    MSE,
+    Diverged,
+    LogHyperparameters,
+    LogLearningRate,
+    Surrogate,
+    ThroughputMonitor,
+    WorstCasePlots,
+)
+from dpl.training.callbacks.throughput import resident_memory
+from dpl.training.callbacks.worst_cases import per_sample_errors, side_by_side_mesh
+from dpl.training.metrics import PerLoadErrors, default_metrics, median
 
 BATCHES = 3  # an epoch of the tiny data set
 
@@ -100,7 +108,7 @@ class Fails(L.Callback):
 
 
 def test_pictures_come_after_ever_more_validations_and_at_the_end(scene, data, tmp_path):
-    tutor = trainer(tmp_path, WorstCases(every=1), epochs=6)
+    tutor = trainer(tmp_path, WorstCasePlots(every=1), epochs=6)
     tutor.fit(surrogate(scene), datamodule=data)
     found, wanted = events(tmp_path), [BATCHES * epoch - 1 for epoch in (1, 2, 4, 6)]
     assert set(found.Tags()["images"]) == {"validation/shapes", "validation/errors"}
@@ -112,12 +120,12 @@ def test_pictures_come_after_ever_more_validations_and_at_the_end(scene, data, t
 
 
 def test_a_picture_of_the_end_is_not_drawn_twice(scene, data, tmp_path):
-    trainer(tmp_path, WorstCases(every=2), epochs=2).fit(surrogate(scene), datamodule=data)
+    trainer(tmp_path, WorstCasePlots(every=2), epochs=2).fit(surrogate(scene), datamodule=data)
     assert steps(events(tmp_path).Images("validation/shapes")) == [2 * BATCHES - 1]
 
 
 def test_pictures_are_of_a_size_that_can_be_read(scene, data, tmp_path):
-    trainer(tmp_path, WorstCases()).fit(surrogate(scene), datamodule=data)
+    trainer(tmp_path, WorstCasePlots()).fit(surrogate(scene), datamodule=data)
     for tag in ("validation/shapes", "validation/errors"):
         (event,) = events(tmp_path).Images(tag)
         picture = np.asarray(Image.open(io.BytesIO(event.encoded_image_string)).convert("L"))
@@ -127,7 +135,7 @@ def test_pictures_are_of_a_size_that_can_be_read(scene, data, tmp_path):
 
 
 def test_meshes_can_be_left_out(scene, data, tmp_path):
-    trainer(tmp_path, WorstCases(meshes=False)).fit(surrogate(scene), datamodule=data)
+    trainer(tmp_path, WorstCasePlots(meshes=False)).fit(surrogate(scene), datamodule=data)
     found = events(tmp_path)
     assert len(found.Images("validation/shapes")) == 1
     assert not found.Tags()["tensors"]
@@ -136,14 +144,14 @@ def test_meshes_can_be_left_out(scene, data, tmp_path):
 @pytest.mark.parametrize("option", ["every", "loads", "most"])
 def test_less_than_one_of_anything_is_refused(option):
     with pytest.raises(ValueError, match=f"{option} = 0 must be 1 or more"):
-        WorstCases(**{option: 0})
+        WorstCasePlots(**{option: 0})
 
 
 def test_judged_loads_have_the_errors_of_the_metrics(scene, batch):
     module = surrogate(scene).eval()
     with torch.no_grad():
         prediction = module.predict(batch.load)
-    judged, collection = judge(module, batch, 5), metrics(scene.problem)
+    judged, collection = per_sample_errors(module, batch, 5), default_metrics(scene.problem)
     collection.update(prediction, batch)
     wanted = collection.compute()
     assert float(judged.relative.max()) == pytest.approx(float(wanted["rel_L2_worst"]))
@@ -155,7 +163,7 @@ def test_judged_loads_have_the_errors_of_the_metrics(scene, batch):
 def test_the_loads_with_the_largest_errors_of_either_kind_are_chosen_and_a_typical_one():
     relative = torch.tensor([0.1, 0.5, 0.2, 0.9, 0.3, 0.4, 0.15])
     largest = torch.tensor([0.7, 0.1, 0.8, 0.3, 0.9, 0.0, 0.05])
-    judged = Judged(relative, largest, torch.full((7,), 0.25))
+    judged = PerLoadErrors(relative, largest, torch.full((7,), 0.25))
     assert judged.chosen(1) == [3, 4, 2], "2 is the third of the five that are left"
     assert judged.chosen(2) == [3, 1, 4, 2, 6], "neither twice"
     assert judged.title(3) == (
@@ -165,7 +173,7 @@ def test_the_loads_with_the_largest_errors_of_either_kind_are_chosen_and_a_typic
 
 def test_a_load_that_is_worst_in_both_ways_is_shown_once_and_the_next_beside_it():
     worst = torch.tensor([0.1, 0.9, 0.2, 0.3, 0.05])
-    judged = Judged(worst, worst, worst)
+    judged = PerLoadErrors(worst, worst, worst)
     assert judged.chosen(1) == [1, 3, 0]
     assert judged.title(3).count("2nd worst") == 2
     assert judged.chosen(3) == [1, 3, 2, 0, 4]
@@ -173,14 +181,14 @@ def test_a_load_that_is_worst_in_both_ways_is_shown_once_and_the_next_beside_it(
 
 def test_an_answer_that_is_no_number_is_worst_of_all():
     errors = torch.tensor([0.1, torch.inf, torch.nan, 0.3])
-    judged = Judged(errors, errors, torch.ones(4))
+    judged = PerLoadErrors(errors, errors, torch.ones(4))
     assert set(judged.chosen(1)[:2]) == {1, 2}
 
 
 def test_one_load_is_enough(scene, data, tmp_path):
     whole = data.samples("val")
     data._loaded["val"] = Sample(*(column[:1] for column in whole))
-    trainer(tmp_path, WorstCases()).fit(surrogate(scene), datamodule=data)
+    trainer(tmp_path, WorstCasePlots()).fit(surrogate(scene), datamodule=data)
     assert len(events(tmp_path).Images("validation/shapes")) == 1
 
 
@@ -189,7 +197,7 @@ def test_a_network_that_answers_with_no_number_is_drawn_without_its_mesh(scene, 
     with torch.no_grad():
         for parameter in module.parameters():
             parameter.fill_(torch.nan)
-    tutor = trainer(tmp_path, WorstCases())
+    tutor = trainer(tmp_path, WorstCasePlots())
     tutor.fit(module, datamodule=data)
     found = events(tmp_path)
     assert len(found.Images("validation/errors")) == 1
@@ -199,7 +207,10 @@ def test_a_network_that_answers_with_no_number_is_drawn_without_its_mesh(scene, 
 def test_pictures_do_not_change_what_is_learnt(scene, data, tmp_path):
     """To the bit, with a network that draws random numbers in training."""
     learnt = []
-    for name, callbacks in (("with", [WorstCases(every=1), SampleRates()]), ("without", [])):
+    for name, callbacks in (
+        ("with", [WorstCasePlots(every=1), ThroughputMonitor()]),
+        ("without", []),
+    ):
         module = surrogate(scene)
         module.net = torch.nn.Sequential(module.net, torch.nn.Dropout(0.2))
         torch.manual_seed(1)
@@ -210,7 +221,9 @@ def test_pictures_do_not_change_what_is_learnt(scene, data, tmp_path):
 
 
 def test_the_part_of_the_time_that_pictures_take_is_told(scene, data, tmp_path):
-    trainer(tmp_path, WorstCases(every=1), Slow(), epochs=2).fit(surrogate(scene), datamodule=data)
+    trainer(tmp_path, WorstCasePlots(every=1), Slow(), epochs=2).fit(
+        surrogate(scene), datamodule=data
+    )
     listed = events(tmp_path).Scalars("time/pictures")
     assert steps(listed) == [2, 5]
     assert all(0 < event.value < 1 for event in listed)
@@ -236,7 +249,7 @@ def test_a_mesh_is_where_the_network_puts_the_surface(make_scene, name):
         for _ in range(2)
     )
     prediction = truth + 0.1 * noise
-    pair = beside(scene, prediction, truth, 5000)
+    pair = side_by_side_mesh(scene, prediction, truth, 5000)
     (vertices,), (colors,), (faces,) = pair["vertices"], pair["colors"], pair["faces"]
     polygons = surface(scene.problem.mesh)
     used, dim = np.unique(polygons), scene.problem.shape[1]
@@ -267,12 +280,12 @@ def test_a_mesh_is_where_the_network_puts_the_surface(make_scene, name):
 
 def test_a_mesh_in_the_file_is_that_of_the_load_with_the_largest_error(scene, data, tmp_path):
     module = surrogate(scene)
-    trainer(tmp_path, WorstCases(), epochs=2).fit(module, datamodule=data)
+    trainer(tmp_path, WorstCasePlots(), epochs=2).fit(module, datamodule=data)
     truth = data.samples("val")
     with torch.no_grad():
         prediction = module.eval().predict(truth.load)
     worst = int((prediction - truth.displacement).norm(dim=2).amax(dim=1).argmax())
-    pair = beside(scene, prediction[worst], truth.displacement[worst], 5000)
+    pair = side_by_side_mesh(scene, prediction[worst], truth.displacement[worst], 5000)
     found = events(tmp_path)
     for part, name in (("VERTEX", "vertices"), ("FACE", "faces"), ("COLOR", "colors")):
         (event,) = found.Tensors(f"validation/worst_{part}")
@@ -287,7 +300,7 @@ def test_a_mesh_in_the_file_is_that_of_the_load_with_the_largest_error(scene, da
 def test_the_mesh_of_a_large_body_is_coarser(make_scene):
     scene = make_scene(nodes=(13, 5, 5), n_modes=2)
     field = torch.zeros(scene.problem.shape, dtype=torch.float64)
-    fine, rough = (beside(scene, field, field, most) for most in (5000, 60))
+    fine, rough = (side_by_side_mesh(scene, field, field, most) for most in (5000, 60))
     assert fine["faces"].shape[1] == 2 * 2 * (4 * 4 * 12 + 2 * 16)
     assert 10 < rough["faces"].shape[1] <= 2 * 2 * 60
     spans = [pair["vertices"][0, :, 0].max() - pair["vertices"][0, :, 0].min()
@@ -299,7 +312,7 @@ def test_the_mesh_of_a_large_body_is_coarser(make_scene):
 
 
 def test_rates_are_those_of_the_steps_without_validation(scene, data, tmp_path):
-    tutor = trainer(tmp_path, SampleRates(), Slow(), epochs=3)
+    tutor = trainer(tmp_path, ThroughputMonitor(), Slow(), epochs=3)
     start = time.perf_counter()
     tutor.fit(surrogate(scene), datamodule=data)
     wall = time.perf_counter() - start
@@ -313,14 +326,14 @@ def test_rates_are_those_of_the_steps_without_validation(scene, data, tmp_path):
     training = sum(BATCHES / rate for rate in pace)
     assert 9 * 0.02 < training < wall - 3 * 0.3, "a validation takes 0.3 s"
     assert not [tag for tag in found.Tags()["scalars"] if tag.startswith("online/")]
-    assert last(found, "memory/process") == pytest.approx(resident(), rel=0.5)
+    assert last(found, "memory/process") == pytest.approx(resident_memory(), rel=0.5)
 
 
 def test_a_stream_shows_what_it_makes_and_how_full_its_buffer_is(scene, folder, data, tmp_path):
     options = {"val": 4, "test": 4, "workers": 0, "batch_size": 4, "batches": 3}
     module = OnlineData(scene, folder=str(folder), fresh=4, reuse=1, capacity=64, **options)
     threads = torch.get_num_threads()
-    tutor = trainer(tmp_path, SampleRates(), epochs=3)
+    tutor = trainer(tmp_path, ThroughputMonitor(), epochs=3)
     tutor.fit(surrogate(scene), datamodule=module)
     module.teardown("fit")
     torch.set_num_threads(threads)
@@ -337,8 +350,8 @@ def test_a_stream_shows_what_it_makes_and_how_full_its_buffer_is(scene, folder, 
 
 
 def test_a_run_without_a_logger_runs(scene, data, tmp_path):
-    session = Session({"model": "FCNN"})
-    callbacks = WorstCases(every=1), SampleRates(), LearningRate(), session
+    session = LogHyperparameters({"model": "FCNN"})
+    callbacks = WorstCasePlots(every=1), ThroughputMonitor(), LogLearningRate(), session
     tutor = trainer(tmp_path, *callbacks, logger=False, epochs=2)
     tutor.fit(surrogate(scene), datamodule=data)
     session.finish(tutor, {"e_mean": 0.1})
@@ -347,8 +360,8 @@ def test_a_run_without_a_logger_runs(scene, data, tmp_path):
 
 def test_another_logger_has_the_scalars_hyperparameters_and_errors(scene, data, tmp_path):
     logger = CSVLogger(tmp_path, name="", version="")
-    session = Session({"model": "FCNN", "optimizer.lr": 1e-3})
-    callbacks = WorstCases(every=1), SampleRates(), LearningRate(), session
+    session = LogHyperparameters({"model": "FCNN", "optimizer.lr": 1e-3})
+    callbacks = WorstCasePlots(every=1), ThroughputMonitor(), LogLearningRate(), session
     tutor = trainer(tmp_path, *callbacks, logger=logger, epochs=2)
     tutor.fit(surrogate(scene), datamodule=data)
     session.finish(tutor, {"e_mean": 0.125})
@@ -364,7 +377,7 @@ def test_of_two_loggers_each_has_its_part(scene, data, tmp_path):
         CSVLogger(tmp_path, name="csv", version=""),
         TensorBoardLogger(tmp_path, name="board", version=""),
     ]
-    tutor = trainer(tmp_path, WorstCases(), SampleRates(), logger=loggers)
+    tutor = trainer(tmp_path, WorstCasePlots(), ThroughputMonitor(), logger=loggers)
     tutor.fit(surrogate(scene), datamodule=data)
     assert (tmp_path / "csv" / "metrics.csv").exists()
     assert len(events(tmp_path / "board").Images("validation/shapes")) == 1
@@ -377,7 +390,7 @@ def resumable(folder, *callbacks, **options):
     kept = ModelCheckpoint(
         folder, "last", save_on_train_epoch_end=True, enable_version_counter=False
     )
-    pictures = WorstCases(every=2), SampleRates()
+    pictures = WorstCasePlots(every=2), ThroughputMonitor()
     return trainer(folder, *pictures, kept, *callbacks, enable_checkpointing=True, **options)
 
 
@@ -386,19 +399,21 @@ def broken(scene, data, tmp_path):
     """A run of five epochs that ended in the midst of the fourth and was resumed; its folder."""
     folder = tmp_path / "broken"
     with pytest.raises(RuntimeError, match="power"):
-        resumable(folder, Session({}), Fails(11, RuntimeError("power")), epochs=5).fit(
+        resumable(folder, LogHyperparameters({}), Fails(11, RuntimeError("power")), epochs=5).fit(
             surrogate(scene), datamodule=data
         )
     assert steps(events(folder).Scalars("loss/train"))[-1] >= 9, "beyond the checkpoint"
     kept = {"ckpt_path": str(folder / "last.ckpt"), "weights_only": True}
-    resumable(folder, Session({}), epochs=5).fit(surrogate(scene), datamodule=data, **kept)
+    resumable(folder, LogHyperparameters({}), epochs=5).fit(
+        surrogate(scene), datamodule=data, **kept
+    )
     return folder
 
 
 def test_a_resumed_run_goes_on_in_the_same_curves(scene, data, tmp_path, broken):
     """As if nothing had been: neither a step twice nor one left out, and the same values."""
     straight = tmp_path / "straight"
-    resumable(straight, Session({}), epochs=5).fit(surrogate(scene), datamodule=data)
+    resumable(straight, LogHyperparameters({}), epochs=5).fit(surrogate(scene), datamodule=data)
     one, other = events(broken), events(straight)
     assert set(one.Tags()["scalars"]) == set(other.Tags()["scalars"])
     for tag in one.Tags()["scalars"]:
@@ -455,7 +470,7 @@ def test_runs_that_ended_otherwise_stand_beside_those_that_did_not(scene, data, 
         "diverged": Fails(4, Diverged("no finite gradients")),
     }
     for name, end in ends.items():
-        session = Session({"name": name, "optimizer.lr": 1e-3, "wide": True})
+        session = LogHyperparameters({"name": name, "optimizer.lr": 1e-3, "wide": True})
         tutor = trainer(tmp_path / name, session, *filter(None, [end]), epochs=3)
         try:
             tutor.fit(surrogate(scene), datamodule=data)
@@ -478,7 +493,7 @@ def test_runs_that_ended_otherwise_stand_beside_those_that_did_not(scene, data, 
 
 
 def test_a_run_that_is_resumed_after_an_interruption_succeeds(scene, data, tmp_path):
-    folder, session = tmp_path / "run", Session({"name": "run"})
+    folder, session = tmp_path / "run", LogHyperparameters({"name": "run"})
     with pytest.raises(SystemExit):
         resumable(folder, session, Fails(4, KeyboardInterrupt()), epochs=3).fit(
             surrogate(scene), datamodule=data

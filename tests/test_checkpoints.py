@@ -12,7 +12,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from dpl.training import BestWeights, WholeCheckpoints
+from dpl.training import AtomicCheckpointIO, BestWeights
 from dpl.training.checkpoints import epochs, read, write
 
 WEIGHTS = {"net.a": torch.arange(6.0).reshape(2, 3), "scale": torch.tensor(2.0).double()}
@@ -63,7 +63,7 @@ def test_weights_that_are_views_of_others_are_kept(tmp_path):
 
 
 def test_lightning_writes_and_reads_through_it(tmp_path):
-    files = WholeCheckpoints()
+    files = AtomicCheckpointIO()
     files.save_checkpoint(CHECKPOINT, str(tmp_path / "last.ckpt"))
     assert files.load_checkpoint(str(tmp_path / "last.ckpt"))["epoch"] == 3
     (tmp_path / "last.ckpt").write_bytes(b"hello")

@@ -6,7 +6,7 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader
 
-from dpl.training import Diverged, Guard, Muon
+from dpl.training import Diverged, Muon, SkipNonFiniteGradients
 
 
 class Line(L.LightningModule):
@@ -38,7 +38,7 @@ OPTIMIZERS = {
 
 def fit(tmp_path, batches, *, optimizer="adam", kind="loss", epochs=1, guard=None, ckpt_path=None):
     torch.manual_seed(0)
-    module, guard = Line(OPTIMIZERS[optimizer], kind), guard or Guard(patience=3)
+    module, guard = Line(OPTIMIZERS[optimizer], kind), guard or SkipNonFiniteGradients(patience=3)
     trainer = L.Trainer(
         max_epochs=epochs, logger=False, enable_progress_bar=False, enable_model_summary=False,
         callbacks=[guard], default_root_dir=tmp_path, accelerator="cpu", log_every_n_steps=1,
@@ -77,7 +77,7 @@ def test_skipped_steps_that_are_not_in_a_row_do_not_end_it(tmp_path):
 
 
 def test_the_count_goes_on_in_a_resumed_run():
-    guard, other = Guard(), Guard()
+    guard, other = SkipNonFiniteGradients(), SkipNonFiniteGradients()
     guard.skipped = 7
     other.load_state_dict(guard.state_dict())
     assert other.skipped == 7
@@ -86,7 +86,7 @@ def test_the_count_goes_on_in_a_resumed_run():
 @pytest.mark.parametrize("patience", [0, -1])
 def test_a_patience_out_of_range_is_refused(patience):
     with pytest.raises(ValueError, match=f"patience = {patience} must be 1 or more"):
-        Guard(patience=patience)
+        SkipNonFiniteGradients(patience=patience)
 
 
 @pytest.mark.parametrize(("error", "said"), [(1.7, True), (torch.nan, True), (0.4, False)])

@@ -7,7 +7,7 @@ import torch
 from dpl import Sample
 from dpl.fem import Problem
 from dpl.training import MaxError, MeanError, MinSNR, MinVolumeRatio, RelativeL2, ResidualRatio
-from dpl.training.metrics import Judged, median, metrics
+from dpl.training.metrics import PerLoadErrors, default_metrics, median
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def by_hand(problem: Problem, prediction, batch):
 
 
 def test_metrics_are_the_formulas(scene, prediction, batch):
-    found = metrics(scene.problem)
+    found = default_metrics(scene.problem)
     found.update(prediction, batch)
     expected = by_hand(scene.problem, prediction, batch)
     numbers = {name: float(value) for name, value in found.compute().items()}
@@ -65,7 +65,7 @@ def test_the_median_of_endless_values_is_endless_and_of_no_number_is_none():
 
 
 def test_batches_accumulate_to_the_same_as_one(scene, prediction, batch):
-    whole, parts = metrics(scene.problem), metrics(scene.problem)
+    whole, parts = default_metrics(scene.problem), default_metrics(scene.problem)
     whole.update(prediction, batch)
     for start, end in ((0, 5), (5, 6), (6, 12)):
         parts.update(prediction[start:end], Sample(*(column[start:end] for column in batch)))
@@ -75,7 +75,7 @@ def test_batches_accumulate_to_the_same_as_one(scene, prediction, batch):
 
 
 def test_metrics_forget_on_reset(scene, prediction, batch):
-    found = metrics(scene.problem)
+    found = default_metrics(scene.problem)
     found.update(batch.displacement + 1.0, batch)
     found.reset()
     found.update(prediction, batch)
@@ -84,7 +84,7 @@ def test_metrics_forget_on_reset(scene, prediction, batch):
 
 
 def test_single_precision_predictions_are_judged_in_double(scene, prediction, batch):
-    found = metrics(scene.problem)
+    found = default_metrics(scene.problem)
     found.update(prediction.float(), batch)
     assert all(value.dtype == torch.float64 for value in found.compute().values())
 
@@ -121,7 +121,7 @@ def test_one_bad_node_of_one_load_is_the_largest_error(batch):
 
 
 def test_the_exact_answer_is_in_equilibrium_and_infinitely_clear(scene, batch):
-    found = metrics(scene.problem)
+    found = default_metrics(scene.problem)
     found.update(batch.displacement, batch)
     numbers = found.compute()
     assert float(numbers["e_mean"]) == float(numbers["e_max"]) == 0.0
@@ -143,7 +143,7 @@ def test_an_inverted_prediction_is_seen(scene, batch):
 
 def test_a_prediction_that_is_no_number_is_never_the_best(scene, batch):
     broken = torch.full_like(batch.displacement, torch.nan)
-    found = metrics(scene.problem)
+    found = default_metrics(scene.problem)
     found.update(broken, batch)
     numbers = {name: float(value) for name, value in found.compute().items()}
     assert numbers["residual"] == torch.inf
@@ -181,7 +181,7 @@ def test_numbers_of_several_processes_are_those_of_all_loads(prediction, batch):
 
 def test_metrics_that_agree_on_the_first_batch_are_still_measured_apart(scene, prediction, batch):
     """At the exact answer e_mean and e_max are both zero, and their states the same."""
-    found = metrics(scene.problem)
+    found = default_metrics(scene.problem)
     found.update(batch.displacement, batch)
     found.update(prediction, batch)
     expected = by_hand(scene.problem, prediction, batch)
@@ -197,7 +197,7 @@ def test_metrics_that_agree_on_the_first_batch_are_still_measured_apart(scene, p
 def test_a_load_is_told_by_its_size_its_errors_and_its_rank_in_each():
     relative = torch.tensor([0.012345, 0.04, 0.03, 0.02])
     largest = torch.tensor([0.4, 0.1, 0.2, 0.3])
-    judged = Judged(relative, largest, torch.tensor([0.2567, 0.1, 0.1, 0.1]))
+    judged = PerLoadErrors(relative, largest, torch.tensor([0.2567, 0.1, 0.1, 0.1]))
     assert judged.title(0) == (
         "load 0, moved by 0.26 L\nrelative L2 1.23 %: 3 of 4 are worse\nlargest error 0.4 L: worst"
     )
@@ -211,18 +211,18 @@ def test_a_load_is_told_by_its_size_its_errors_and_its_rank_in_each():
 
 def test_the_farthest_load_has_the_largest_absolute_error():
     relative, largest = torch.tensor([0.9, 0.1, 0.2]), torch.tensor([0.1, 0.8, 0.7])
-    assert Judged(relative, largest, largest).farthest == 1
-    assert Judged(relative, torch.tensor([0.1, 0.8, torch.nan]), largest).farthest == 2
+    assert PerLoadErrors(relative, largest, largest).farthest == 1
+    assert PerLoadErrors(relative, torch.tensor([0.1, 0.8, torch.nan]), largest).farthest == 2
 
 
 def test_equal_errors_are_in_the_order_of_the_loads():
     """Enough of them that a sort which is not stable would mix them."""
     same = torch.full((1000,), 0.5)
-    assert Judged(same, same, same).chosen(3) == [*range(6), 503]
+    assert PerLoadErrors(same, same, same).chosen(3) == [*range(6), 503]
 
 
 def test_few_loads_are_all_chosen_and_none_twice():
     one = torch.tensor([0.5])
-    assert Judged(one, one, one).chosen(2) == [0]
+    assert PerLoadErrors(one, one, one).chosen(2) == [0]
     two = torch.tensor([0.5, 0.7])
-    assert Judged(two, two, two).chosen(1) == [1, 0]
+    assert PerLoadErrors(two, two, two).chosen(1) == [1, 0]

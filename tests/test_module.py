@@ -17,7 +17,7 @@ from torch import nn
 from dpl.data import OfflineData, OnlineData
 from dpl.fem import Load
 from dpl.models import FCNN
-from dpl.training import MSE, LrPlus, LrStar, Surrogate, WholeCheckpoints, warmup_cosine
+from dpl.training import MSE, AtomicCheckpointIO, LrPlus, LrStar, Surrogate, warmup_cosine
 from dpl.training.checkpoints import read
 from dpl.training.rng_state import random_states, set_random_states
 from dpl.training.surrogate import scales
@@ -51,7 +51,7 @@ def trainer(folder, *callbacks, **options):
     ]
     return L.Trainer(
         callbacks=[*checkpoints, *callbacks],
-        plugins=[WholeCheckpoints()],
+        plugins=[AtomicCheckpointIO()],
         default_root_dir=folder,
         **{**defaults, **quiet, **options},
     )
@@ -137,7 +137,7 @@ def test_the_network_is_single_and_its_answer_double_precision(scene, batch):
 
 def test_scaled_forces_and_displacements_are_of_order_one(scene, batch):
     force_scale, displacement_scale = scales(scene)
-    reach, free = scene.loads.reach, scene.problem.free
+    reach, free = scene.loads.loadable_dofs, scene.problem.free
     force = (batch.force / force_scale)[:, reach]
     linear = torch.stack([scene.linear.respond(f) for f in batch.force]) / displacement_scale
     assert 0.3 < float(force.square().mean().sqrt()) < 3
@@ -508,5 +508,5 @@ def test_a_checkpoint_without_a_scene_is_refused(scene):
 
 def test_the_plan_is_that_of_network_and_loss(scene):
     module = surrogate(scene, MSE())
-    assert module.plan() == [*module.net.plan(), *module.loss.plan()]
-    assert Surrogate(nn.Identity(), LrPlus(), scene).plan() == []
+    assert module.skipped_work() == [*module.net.skipped_work(), *module.loss.skipped_work()]
+    assert Surrogate(nn.Identity(), LrPlus(), scene).skipped_work() == []

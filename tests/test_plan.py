@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dpl.data import OfflineData, OnlineData
-from dpl.data.solving.solve import Job, outcome
+from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.fem import Load, Problem, solve
 from dpl.fem.linear import SuperLU
 from dpl.models import FCNN
@@ -46,7 +46,7 @@ def _counting_splu(counts):
 
 
 def says(scene, words):
-    return any(words in line for line in scene.plan())
+    return any(words in line for line in scene.skipped_work())
 
 
 def small(scene, size):
@@ -139,15 +139,15 @@ def test_constant_gradients_have_one_quadrature_point(make_scene, scene):
 
 
 def test_young_is_no_input_and_changes_no_answer(make_scene, scene):
-    one = outcome(scene, Job((0, 0), 0))
+    one = solve_load(scene, LoadKey((0, 0), 0))
     wide = make_scene(young=[1e6, 2e11])
-    other = outcome(wide, Job((0, 0), 0))
+    other = solve_load(wide, LoadKey((0, 0), 0))
     moduli = [s.loads.young_at(torch.from_numpy(one.point)[None]) for s in (scene, wide)]
     assert moduli[0] != moduli[1]
     assert (one.force == other.force).all()
     assert (one.displacement == other.displacement).all()
     net = FCNN(scene)
-    assert net.stages[0].in_features == int(scene.loads.reach.sum())
+    assert net.stages[0].in_features == int(scene.loads.loadable_dofs.sum())
     assert says(scene, "no E input, no samples per E")
 
 
@@ -159,7 +159,10 @@ def test_mse_trains_without_finite_elements(scene, batch, calls, loss, evaluated
     calls.clear()
     loss(surrogate.predict(batch.load), batch, surrogate.physics).backward()
     assert ("residual" in calls) is evaluated
-    assert any("no finite-element evaluation" in line for line in surrogate.plan()) != evaluated
+    assert (
+        any("no finite-element evaluation" in line for line in surrogate.skipped_work())
+        != evaluated
+    )
 
 
 def test_lr_star_sends_no_gradient_through_the_residual(scene, batch, monkeypatch):
@@ -179,7 +182,7 @@ def test_lr_star_sends_no_gradient_through_the_residual(scene, batch, monkeypatc
     surrogate.loss(prediction, batch, surrogate.physics)
     assert tracked
     assert not any(tracked)
-    assert any("no backward pass through the residual" in line for line in surrogate.plan())
+    assert any("no backward pass through the residual" in line for line in surrogate.skipped_work())
     LrPlus()(prediction, batch, surrogate.physics)
     assert any(tracked)
 
@@ -187,7 +190,7 @@ def test_lr_star_sends_no_gradient_through_the_residual(scene, batch, monkeypatc
 def test_a_data_set_that_is_there_is_not_solved_again(data, calls, monkeypatch):
     solved = []
     monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", lambda *job: solved.append(job))
-    assert data.plan() == [
+    assert data.skipped_work() == [
         "one data set for every size and Young's modulus of this body: "
         f"{data.store.folder}, of scene {data.scene.fingerprint[:12]}",
         "20 of 20 loads not solved again: they are there",
@@ -202,15 +205,15 @@ def test_inputs_and_outputs_are_only_where_something_happens(scene):
     problem = scene.problem
     assert net.stages[0].in_features == int((problem.boundary[:, None] & problem.free).sum())
     assert net.stages[-1].out_features == int(problem.free.sum())
-    assert any("parameters" in line for line in net.plan())
+    assert any("parameters" in line for line in net.skipped_work())
 
 
 def test_a_plan_computes_no_sample(scene, tmp_path, calls):
     module = OfflineData(scene, folder=str(tmp_path / "none"), workers=0)
     scene.loads.modes  # noqa: B018
     calls.clear()
-    assert scene.plan()
-    (where,) = module.plan()
+    assert scene.skipped_work()
+    (where,) = module.skipped_work()
     assert where.startswith("one data set for every size and Young's modulus of this body")
     assert not (tmp_path / "none").exists()
     assert calls == {}
@@ -221,13 +224,13 @@ def test_one_data_set_serves_every_size_and_modulus(make_scene, scene, folder, d
     other = make_scene(size=(1.0, 0.25, 0.25), young=[1e6, 2e11])
     assert other.fingerprint == scene.fingerprint
     module = OfflineData(other, folder=str(folder), train=12, val=4, test=4, workers=0)
-    assert module.plan()[1] == "20 of 20 loads not solved again: they are there"
+    assert module.skipped_work()[1] == "20 of 20 loads not solved again: they are there"
 
 
 def test_images_under_symmetries_are_not_solved(scene, folder, data, calls, monkeypatch):
     sizes = {"train": 12, "val": 4, "test": 4, "workers": 0}
     module = OfflineData(scene, folder=str(folder), symmetry=True, **sizes)
-    line = module.plan()[-1]
+    line = module.skipped_work()[-1]
     count = int(line.split()[0])
     assert line == f"{count} samples of each load solved: symmetries of the body"
     monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", lambda *job: pytest.fail("solved"))
@@ -243,7 +246,7 @@ def test_a_stream_solves_nothing_that_the_data_set_has(scene, tmp_path, calls):
     made = OfflineData(scene, folder=str(tmp_path / "d"), train=8, val=1, test=1, workers=0)
     made.prepare_data()
     module = OnlineData(scene, folder=str(tmp_path / "d"), reuse=1, save=True, **options)
-    assert "8 loads of the stream not solved again: they are there" in module.plan()
+    assert "8 loads of the stream not solved again: they are there" in module.skipped_work()
     module.prepare_data()
     threads = torch.get_num_threads()
     calls.clear()

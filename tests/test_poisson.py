@@ -13,11 +13,11 @@ from dpl import DataSetError, Sample
 from dpl.config import build as run
 from dpl.data import OfflineData, OnlineData, Store
 from dpl.data.storage.integrity import verify
-from dpl.data.storage.shard import opened
+from dpl.data.storage.shard import decode_shard
 from dpl.evaluation import evaluate
 from dpl.fem import (
     BatchedNewton,
-    Equilibrium,
+    DifferentiableSolve,
     LinearElastic,
     Load,
     Material,
@@ -32,19 +32,19 @@ from dpl.fem import (
     YeohK2,
     solve,
 )
-from dpl.fem.postprocess import Rest
+from dpl.fem.postprocess import RestStiffness
 from dpl.inference import Hybrid
 from dpl.models import CNN, FCNN, GNN, Latent, PODNet
-from dpl.models.poisson_interpolation import Rests
+from dpl.models.poisson_interpolation import PoissonInterpolation
 from dpl.training import (
     MSE,
-    Energy,
+    EnergyNormLoss,
+    LossContext,
     LrPlus,
     LrStar,
-    Physics,
+    PotentialEnergyLoss,
     RelativeL2,
     ResidualRatio,
-    Stiffness,
     Surrogate,
 )
 
@@ -194,7 +194,7 @@ def test_poissons_ratio_is_a_function_of_stream_and_index_and_moves_no_other_num
     assert torch.equal(one.poisson[1:], other.poisson)
     fixed = scene.loads.points((3, 0), [0, 5])
     assert torch.equal(wide.loads.points((3, 0), [0, 5])[:, :-1], fixed)
-    assert torch.equal(wide.loads.young_at(torch.rand(2, wide.loads.dimension)), one.young)
+    assert torch.equal(wide.loads.young_at(torch.rand(2, wide.loads.n_random)), one.young)
 
 
 def test_every_solver_takes_each_load_with_its_own(wide, few):
@@ -233,13 +233,15 @@ def test_what_knows_one_body_only_refuses_a_range(wide, few):
 
 def test_gradients_of_exact_answers_are_those_of_the_body_of_each_load(wide, few, make_scene):
     force = few.force.clone().requires_grad_()
-    Equilibrium(wide.solver)(Load(force, few.young, few.poisson)).square().sum().backward()
+    DifferentiableSolve(wide.solver)(Load(force, few.young, few.poisson)).square().sum().backward()
     one = make_scene(poisson=float(few.poisson[1]))
     alone = few.force[1:2].clone().requires_grad_()
-    Equilibrium(one.solver)(Load(alone, few.young[1:2])).square().sum().backward()
+    DifferentiableSolve(one.solver)(Load(alone, few.young[1:2])).square().sum().backward()
     assert torch.allclose(force.grad[1], alone.grad[0], rtol=1e-6, atol=1e-12)
     with pytest.raises(ValueError, match="poisson"):
-        Equilibrium(wide.solver)(Load(few.force, few.young, few.poisson.clone().requires_grad_()))
+        DifferentiableSolve(wide.solver)(
+            Load(few.force, few.young, few.poisson.clone().requires_grad_())
+        )
 
 
 def test_a_scene_with_a_range_goes_to_another_process(wide):
@@ -289,21 +291,21 @@ def test_a_data_set_of_another_range_is_refused(sets, make_scene, scene):
 def test_a_shard_with_or_without_poissons_ratios_is_read_as_such_only(sets, data):
     content = (sets.store.folder / sets.store.shards()[0]["file"]).read_bytes()
     with pytest.raises(ValueError, match="holds Poisson's ratios"):
-        opened(content, (45, 3), 8)
+        decode_shard(content, (45, 3), 8)
     content = (data.store.folder / data.store.shards()[0]["file"]).read_bytes()
     with pytest.raises(ValueError, match="poisson"):
-        opened(content, (45, 3), 7, 1)
+        decode_shard(content, (45, 3), 7, 1)
 
 
 def test_an_audit_finds_other_poissons_ratios(sets):
-    from dpl.data.storage.integrity import flaw_of_shard
+    from dpl.data.storage.integrity import check_shard
 
     line = sets.store.shards()[0]
     shard = sets.store.sound(line)
     stream = sets.store.stream(line["split"])
-    assert flaw_of_shard(sets.scene, stream, shard) == ""
+    assert check_shard(sets.scene, stream, shard) == ""
     shard["poisson"] = shard["poisson"].flip(0)
-    assert "Poisson" in flaw_of_shard(sets.scene, stream, shard)
+    assert "Poisson" in check_shard(sets.scene, stream, shard)
 
 
 def test_images_and_streams_carry_poissons_ratios(wide, sets, tmp_path):
@@ -323,8 +325,8 @@ def test_images_and_streams_carry_poissons_ratios(wide, sets, tmp_path):
 PHYSICS = {
     "lr_star": lambda: LrStar(per_sample=True),
     "lr_plus": LrPlus,
-    "stiffness": lambda: Stiffness(floor=0.0),
-    "energy": lambda: Energy(floor=0.0),
+    "stiffness": lambda: EnergyNormLoss(floor=0.0),
+    "energy": lambda: PotentialEnergyLoss(floor=0.0),
 }
 
 
@@ -337,7 +339,7 @@ def test_a_physics_loss_judges_each_sample_as_the_body_that_it_is(few, wide, mak
     values, slopes = [], []
     for k in range(4):
         one = make_scene(poisson=float(few.poisson[k]))
-        body = Physics(one.problem, physics.largest_force)
+        body = LossContext(one.problem, physics.largest_force)
         alone = near[k : k + 1].detach().requires_grad_()
         sample = member(few, k)._replace(poisson=few.poisson[:1, :0])
         values.append(PHYSICS[name]()(alone, sample, body))
@@ -348,9 +350,9 @@ def test_a_physics_loss_judges_each_sample_as_the_body_that_it_is(few, wide, mak
 
 
 def test_the_rest_stiffness_of_a_batch_is_that_of_each_body(wide, few):
-    found = Rest(wide.problem).product(few.displacement, few.poisson)
+    found = RestStiffness(wide.problem).product(few.displacement, few.poisson)
     for k in range(4):
-        one = Rest(wide.problem.at(float(few.poisson[k])))
+        one = RestStiffness(wide.problem.at(float(few.poisson[k])))
         expected = one.product(few.displacement[k : k + 1])[0]
         assert torch.allclose(found[k], expected, rtol=1e-10, atol=1e-16)
 
@@ -399,12 +401,12 @@ def test_every_network_hears_poissons_ratio_and_a_batch_is_its_members(build, wi
     torch.manual_seed(0)
     module = Surrogate(build(wide), MSE(), wide).eval()
     if isinstance(module.net, PODNet):
-        module.prepare(sets.samples("train"))
+        module.fit_bases(sets.samples("train"))
     low, high = by_poisson(module, member(few, 0))
     assert (low - high).norm() > 1e-4 * low.norm()
     with torch.no_grad():
         whole = module.predict(few.load)
-        parts = torch.cat([module.predict(one) for one in few.load.singles()])
+        parts = torch.cat([module.predict(one) for one in few.load.unbatch()])
     assert torch.allclose(whole, parts, rtol=1e-4, atol=1e-6 * float(whole.abs().max()))
 
 
@@ -416,7 +418,7 @@ def test_a_network_that_takes_none_is_refused(wide):
 @pytest.mark.parametrize("span", [[0.2, 0.4], [0.0, 0.45], [0.1, 0.49]])
 def test_linear_answers_between_nodes_are_those_of_every_poissons_ratio(make_scene, span):
     scene = make_scene(poisson=span)
-    rests, free = Rests(scene.linear), scene.problem.free
+    rests, free = PoissonInterpolation(scene.linear), scene.problem.free
     force = scene.loads.sample((0, 0), [1]).force[0]
     right = force[free].numpy()
     answers = torch.cat([torch.from_numpy(one.factor.solve(right)) for one in rests.members])
@@ -433,7 +435,7 @@ def test_small_loads_are_answered_linearly_at_every_poissons_ratio(wide, sets, f
     torch.manual_seed(0)
     net = Latent(wide, rank=90, coordinates=8, width=16, blocks=1, linear_tol=tol, symmetry=False)
     module = Surrogate(net, MSE(), wide).eval()
-    module.prepare(sets.samples("train"))
+    module.fit_bases(sets.samples("train"))
     light = few._replace(force=1e-4 * few.force)
     exact = solve(wide.linear, light.load).displacement
     with torch.no_grad():
@@ -450,7 +452,7 @@ def test_small_loads_are_answered_linearly_at_every_poissons_ratio(wide, sets, f
 def test_encoded_samples_are_what_the_network_sees(wide, sets, few):
     net = Latent(wide, rank=20, coordinates=8, width=16, blocks=1, linear_tol=torch.inf)
     module = Surrogate(net, MSE(), wide).eval()
-    module.prepare(sets.samples("train"))
+    module.fit_bases(sets.samples("train"))
     encoded = module.encode(few).__getitems__(list(range(4)))
     seen = []
     net.learnt = lambda inputs: seen.append(inputs) or torch.zeros(len(inputs), 20)
@@ -516,7 +518,7 @@ def test_latent_trains_in_coordinates_and_is_evaluated(wide, sets, tmp_path):
 def test_a_range_is_an_option_of_the_law(scene_of):
     scene = scene_of("mesh.nodes=[5,3,3]", "material.poisson=[0.2,0.4]", "solver.linear=superlu")
     assert scene.loads.poisson_range == (0.2, 0.4)
-    assert any("0.2 to 0.4" in line for line in scene.plan())
+    assert any("0.2 to 0.4" in line for line in scene.skipped_work())
 
 
 @pytest.mark.parametrize(

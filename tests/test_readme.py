@@ -74,7 +74,7 @@ def test_the_row_of_a_loss_names_the_losses(compose):
     assert titles == ["paper, L_r^*", "latent, mean_norm", "latent corrected, mean_norm"]
     for experiment in ("beam_svk", "propeller_nh", "beam_nh_loss", "beam_young"):
         cfg = compose(f"experiment={experiment}", "model=latent", command="train")
-        assert cfg.loss._target_ == "dpl.training.MeanNorm"
+        assert cfg.loss._target_ == "dpl.training.RMSELoss"
 
 
 def test_a_row_that_is_worse_than_the_network_alone_says_why():

@@ -106,7 +106,7 @@ def test_what_cannot_work_is_refused_by_its_key(compose, override, tmp_path):
 
     def start():
         build.check(cfg)
-        build.show_plan(build.build_scene(cfg))
+        build.show_skipped_work(build.build_scene(cfg))
 
     with pytest.raises(ConfigError, match=BAD[override]) as refusal:
         start()
@@ -202,9 +202,9 @@ def test_what_cannot_train_is_refused_by_its_key(compose, override, scene, tmp_p
 
     def start():
         build.check(cfg)
-        build.make(cfg, "data", scene=scene)
+        build.instantiate(cfg, "data", scene=scene)
         build.build_surrogate(cfg, scene)
-        build.make(cfg, "trainer")
+        build.instantiate(cfg, "trainer")
 
     with pytest.raises(ConfigError, match=BAD_TRAINING[override]):
         start()
@@ -283,9 +283,9 @@ def test_no_configuration_may_leave_the_body_loose(compose, tiny):
 
 def test_checking_calls_nothing(compose, monkeypatch):
     called = []
-    monkeypatch.setattr("dpl.fem.mesh.reading.load", lambda path: called.append(path))
+    monkeypatch.setattr("dpl.fem.mesh.reading.read_mesh", lambda path: called.append(path))
     cfg = compose("mesh=file", "mesh.path=part.msh")
-    cfg.mesh._target_ = "dpl.fem.load"
+    cfg.mesh._target_ = "dpl.fem.read_mesh"
     build.check(cfg)
     assert called == []
 
@@ -448,9 +448,9 @@ def _trained(folder, *overrides):
     cfg.trainer.max_epochs = 1
     scene = build.build_scene(cfg)
     surrogate = build.build_surrogate(cfg, scene)
-    trainer: L.Trainer = build.make(cfg, "trainer")
+    trainer: L.Trainer = build.instantiate(cfg, "trainer")
     run_folder.save_config(cfg, folder)
-    trainer.fit(surrogate, datamodule=build.make(cfg, "data", scene=scene))
+    trainer.fit(surrogate, datamodule=build.instantiate(cfg, "data", scene=scene))
     return surrogate
 
 
@@ -535,8 +535,8 @@ def test_a_run_that_names_what_is_not_ours_is_not_called(copied, path, tmp_path)
     "call",
     [
         {"_target_": "dpl.config.load_run", "folder": "evil", "trust": True},
-        {"_target_": "dpl.system.files.append_line", "path": "harm", "line": {}},
-        {"_target_": "dpl.fem.save", "mesh": {}, "path": "harm.vtk"},
+        {"_target_": "dpl.system.files.append_jsonl", "path": "harm", "line": {}},
+        {"_target_": "dpl.fem.write_mesh", "mesh": {}, "path": "harm.vtk"},
         {"_target_": "dpl.scene.partial", "func": "os.system"},
         {"_target_": "benchmarks.peers.measured_peer", "python": "sh", "program": "harm"},
         {"_target_": "torch.optim.lr_scheduler.partial", "func": "os.system"},
@@ -572,9 +572,9 @@ def test_nothing_of_the_trainer_of_a_run_is_called(copied, monkeypatch):
     [
         "dpl.config.build.importlib.import_module",  # not ours, though the name begins with `dpl.`
         "dpl.config.load_run",
-        "dpl.fem.save",  # writes
+        "dpl.fem.write_mesh",  # writes
         "dpl.evaluation.tables.write",
-        "dpl.system.files.whole_file",
+        "dpl.system.files.atomic_write",
         "dpl.fem.mesh.generators.Sequence",
         "torch.optim.Optimizer.__init__.__globals__",
         "lightning.fabric.utilities.cloud_io._load",  # a pickle, where it is asked to
@@ -594,7 +594,7 @@ def test_all_that_a_run_of_conf_calls_is_trusted(copied):
     parts = ("mesh", "material", "clamped", "loads", "data", "model", "loss", "optimizer")
     seen = set()
     for path in (path for part in parts for path in (ROOT / "conf" / part).glob("*.yaml")):
-        for _, node in validation.walk(OmegaConf.to_container(OmegaConf.load(path))):
+        for _, node in validation.iter_nodes(OmegaConf.to_container(OmegaConf.load(path))):
             if isinstance(node, dict) and "_target_" in node:
                 assert callable(validation._target("here", node["_target_"], trust=False)), path
                 seen.add(path.parent.name)

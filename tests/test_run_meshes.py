@@ -14,7 +14,7 @@ import dpl
 from benchmarks.stress.broken_meshes import write
 from dpl import Scene
 from dpl.config import ConfigError, run_folder
-from dpl.fem import box, load, save_exactly
+from dpl.fem import box, read_mesh, write_mesh_exactly
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,9 @@ def test_a_run_whose_mesh_file_is_gone_is_resumed(trained, script):
     more = [o for o in more if not o.startswith("run=")]
     ended = script("train", *more, "run=runs/b", checkpoint, "trainer.max_epochs=3", cwd=home)
     assert ended.status == 0, ended.err
-    assert np.array_equal(load(home / "runs/b/mesh.vtu").t, load(home / "runs/part/mesh.vtu").t)
+    assert np.array_equal(
+        read_mesh(home / "runs/b/mesh.vtu").t, read_mesh(home / "runs/part/mesh.vtu").t
+    )
 
 
 def test_a_run_is_not_resumed_on_another_mesh_file(trained, script, part):
@@ -232,9 +234,9 @@ def test_a_mesh_of_more_nodes_than_the_weights_have_is_refused_before_it_is_made
 
 def test_a_larger_mesh_file_in_the_folder_is_refused_by_its_nodes(handed_on, part):
     cfg = OmegaConf.load(handed_on / "config.yaml")
-    cfg.mesh = {"_target_": "dpl.fem.load", "path": "x"}
+    cfg.mesh = {"_target_": "dpl.fem.read_mesh", "path": "x"}
     (handed_on / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
-    save_exactly(handed_on / "mesh.vtu", box([100.0, 25.0, 25.0], [6, 3, 3]))
+    write_mesh_exactly(handed_on / "mesh.vtu", box([100.0, 25.0, 25.0], [6, 3, 3]))
     with pytest.raises(ConfigError, match=r"mesh: .*mesh\.vtu: its size = 54 nodes must be 45"):
         run_folder.load_run(handed_on)
 

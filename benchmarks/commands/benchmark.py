@@ -25,7 +25,7 @@ from dpl import Scene
 from dpl.commands.cli import command
 from dpl.config import build, run_folder
 from dpl.evaluation.tables import machine, write, write_machine
-from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, installed
+from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, installed_backends
 from dpl.fem.linear import BACKENDS
 from dpl.system.threads import one_thread
 
@@ -49,7 +49,7 @@ def main(cfg: DictConfig) -> None:
     if unknown := [name for name in cfg.linear if name not in ("auto", *BACKENDS)]:
         known = ", ".join(("auto", *BACKENDS))
         raise build.ConfigError(f"linear: {unknown[0]!r} is none of {known}")
-    backends = [name for name in cfg.linear if name == "auto" or name in installed()]
+    backends = [name for name in cfg.linear if name == "auto" or name in installed_backends()]
     if not backends:
         raise build.ConfigError(
             f"linear = {list(cfg.linear)} must name one that is installed: auto"

@@ -26,7 +26,7 @@ def main(cfg: DictConfig) -> None:
 
     def made(key: str, *parts: object) -> methods.Method:
         try:
-            return build.make(cfg, key)(*parts)
+            return build.instantiate(cfg, key)(*parts)
         except ValueError as error:
             raise build.ConfigError(f"{key}: {error}; {key}=null leaves it out") from error
 

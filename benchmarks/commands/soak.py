@@ -70,9 +70,9 @@ def _trained(cfg: DictConfig, seconds: float) -> list:
     from benchmarks import soak
 
     scene = build.build_scene(cfg)
-    data = build.make(cfg, "data", scene=scene)
+    data = build.instantiate(cfg, "data", scene=scene)
     surrogate = build.build_surrogate(cfg, scene)
-    trainer = build.make(cfg, "trainer")
+    trainer = build.instantiate(cfg, "trainer")
     cli.check_trainer(trainer, cfg)
     pulse = soak.Pulse(seconds, every=seconds / LOOKS)
     trainer.callbacks.append(pulse)

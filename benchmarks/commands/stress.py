@@ -34,7 +34,7 @@ def main(cfg: DictConfig) -> None:
     folder, console = Path(cfg.folder), Console(highlight=False)
     lines: list[stress.Line] = []
     numbers: list[stress.Number] = []
-    rungs: list[stress.Rung] = []
+    rungs: list[stress.LoadLevel] = []
     for k, case in enumerate(cases, 1):
         print(f"{k}/{len(cases)} {case.name}: {case.what} ...", end="\r", file=sys.stderr)
         line, outcome = stress.perform(case)

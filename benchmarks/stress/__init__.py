@@ -8,7 +8,7 @@ Sources of the numbers: table 2.2 of the verification dossier, typed in beside t
 from collections.abc import Sequence
 
 from benchmarks.stress import bodies, invalid_input, loads, networks, stability, trained_run
-from benchmarks.stress.case import Case, Line, Number, Outcome, Rung, Verdict, numbers, perform
+from benchmarks.stress.case import Case, Line, LoadLevel, Number, Outcome, Verdict, numbers, perform
 
 __all__ = [
     "Case",

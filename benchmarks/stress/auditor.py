@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dpl.fem import Load, Problem, SingularMatrix, Solution, Solver, Status, installed
+from dpl.fem import Load, Problem, SingularMatrix, Solution, Solver, Status, installed_backends
 from dpl.fem.assembly import Pattern
-from dpl.fem.linear import Backend, backend
+from dpl.fem.linear import Backend, make_backend
 
-EXACT = "pardiso" if "pardiso" in installed() else "superlu"  # both count negative pivots
+EXACT = "pardiso" if "pardiso" in installed_backends() else "superlu"  # both count negative pivots
 NEAR = 1e-4  # of a critical load [-]
 
 
-class Watch:
+class Auditor:
     """Sees every state of every solve, evaluates it again, and remembers what was not true.
 
     What is held against a state is computed by tensor operations, not by the compiled loops that
@@ -45,7 +45,7 @@ class Watch:
         """
         return Watched(solver, problem, tol, loose, self)
 
-    def take(self, other: "Watch") -> None:
+    def take(self, other: "Auditor") -> None:
         """Add what another watch has seen."""
         self.lies += other.lies
         self.solves += other.solves
@@ -76,8 +76,8 @@ class Watch:
         body = problem.at(load.poisson)
         u, factor = state.displacement, state.load_factor[:, None, None]
         internal, volume = body.internal_force(u), body.volume_ratio(u)
-        good = body.balanced(u, internal, load.force, 1.01 * tol) & (volume > 0)
-        part = body.balanced(u, internal, factor * load.force, 1.01 * loose) & (volume > 0)
+        good = body.is_equilibrium(u, internal, load.force, 1.01 * tol) & (volume > 0)
+        part = body.is_equilibrium(u, internal, factor * load.force, 1.01 * loose) & (volume > 0)
         for k, status in enumerate(state.status.tolist()):
             stable = bool(state.converged[k]) and int(state.negative_pivots[k]) == 0
             if stable and (pivots := self._negative_pivots(body, u[k : k + 1])):
@@ -85,7 +85,7 @@ class Watch:
             said = f"{Status(status)}, residual {float(state.residual[k]):.1e}"
             held = torch.where(problem.free, 0.0, (u - problem.prescribed)[k]).abs().max()
             if bool(state.converged[k]) and not (good[k] and held < 1e-12):
-                ratio = float(body.imbalance(internal, load.force)[k])
+                ratio = float(body.relative_residual_of(internal, load.force)[k])
                 self.lies.append(f"said: {said}; residual is {ratio:.1e}, det F {volume[k]:.2g}")
             ended = status == Status.NO_VALID_EQUILIBRIUM and state.iterations[k] > 0
             if ended and not (part[k] and 0 <= float(factor[k]) < 1):
@@ -103,7 +103,7 @@ class Watch:
         one may be taken for stable, see `dpl.fem.Newton`.
         """
         pattern = body.pattern
-        factoriser = self._backends.setdefault(pattern, backend(pattern, EXACT))
+        factoriser = self._backends.setdefault(pattern, make_backend(pattern, EXACT))
         here, rest = (body.linearise(u).tangent[0] for u in (displacement, 0 * displacement))
         values = (here + NEAR * rest).numpy()
         try:
@@ -120,7 +120,7 @@ class Watched:
     problem: Problem
     tol: float
     loose: float
-    watch: Watch
+    watch: Auditor
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
         """Yield the solver's states."""

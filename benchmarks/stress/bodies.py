@@ -6,15 +6,15 @@ from functools import cache, partial
 import torch
 
 from benchmarks.stress import fixtures
-from benchmarks.stress.auditor import Watch
-from benchmarks.stress.case import Case, Outcome, graded
+from benchmarks.stress.auditor import Auditor
+from benchmarks.stress.case import Case, Outcome, classify
 from benchmarks.stress.fixtures import load_of
 from benchmarks.stress.loads import kinds, words
 from benchmarks.verification.refinement import LOCKING, POISSON, compliance
 from benchmarks.verification.report import Row
 from dpl import Scene
 from dpl.fem import (
-    Linear,
+    LinearSolver,
     Material,
     ModalLoads,
     NeoHookeanLn,
@@ -24,12 +24,12 @@ from dpl.fem import (
     SaintVenantKirchhoff,
     Traction,
     box,
-    installed,
+    installed_backends,
     solve,
 )
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
-DIRECT = [name for name in installed() if name != "cg"]
+DIRECT = [name for name in installed_backends() if name != "cg"]
 UNITS = [(4500.0, 25.0), (1.0, 1e-3), (1.0, 1e3), (1e12, 1e-3), (1e12, 1e3)]  # E [Pa], side [m]
 SCALED: list[tuple[str, Material, tuple[str, str, str]]] = [  # VERIFICATION 1.10: u/L of the corner
     ("SVK", SVK, ("8.023468838e-3", "-2.392426382e-4", "-.2479226415")),
@@ -46,7 +46,7 @@ SLIVERS = {1e-2: "-.2388289", 1e-4: "-.2386176", 1e-6: "-.2386155", 1e-8: "-.238
 ASPECTS = (1.0, 10.0, 100.0, 1000.0)
 
 
-def scaled(law: Material, printed: tuple[str, ...], watch: Watch) -> Outcome:
+def scaled(law: Material, printed: tuple[str, ...], watch: Auditor) -> Outcome:
     """Bend the same beam in all units, newtons in and metres out."""
     rows, fails, counts = [], [], []
     for young, side in UNITS:
@@ -67,10 +67,10 @@ def scaled(law: Material, printed: tuple[str, ...], watch: Watch) -> Outcome:
             rows.append(Row(name, known, float(metres[k]) / (4 * side), 1e-9))
     if len(set(counts)) > 1:
         fails.append("iterations differ")
-    return graded(f"iterations {', '.join(map(str, counts))}", rows, fails=fails)
+    return classify(f"iterations {', '.join(map(str, counts))}", rows, fails=fails)
 
 
-def locked(name: str, watch: Watch) -> Outcome:
+def locked(name: str, watch: Auditor) -> Outcome:
     """Measure how far an element locks towards incompressibility, and whether it says so."""
     cells, cell, degree, printed = LOCKING[name]
     mean, rows = "mean" in name, list[Row]()
@@ -88,7 +88,7 @@ def locked(name: str, watch: Watch) -> Outcome:
             rows.append(Row(f"nu = {nu:g}: compliance ratio", "> 0.94", ratio))
             rows.append(Row(f"nu = {nu:g}: compliance ratio", "< 1.02", ratio))
     shown = " ".join(f"{row.value:.3f}" for row in rows if "ratio" in row.quantity)
-    return graded(f"{shown}, warned of where due", rows)
+    return classify(f"{shown}, warned of where due", rows)
 
 
 @cache
@@ -96,23 +96,23 @@ def _reference(nu: float) -> float:
     return compliance(nu, (16, 4, 4), "hexahedron", 2)
 
 
-def flat(cells: tuple[int, int, int], watch: Watch) -> Outcome:
+def flat(cells: tuple[int, int, int], watch: Auditor) -> Outcome:
     """Bend a clamped plate, thin and thick."""
     rows = [
         Row(f"a/h = {slenderness}: w over Kirchhoff's", printed, _plate(cells, slenderness))
         for slenderness, printed in zip((100, 10), PLATES[cells], strict=True)
     ]
-    return graded(", ".join(f"{row.value:.3f}" for row in rows), rows)
+    return classify(", ".join(f"{row.value:.3f}" for row in rows), rows)
 
 
 def _plate(cells: tuple[int, int, int], slenderness: int) -> float:
     problem, force, known = fixtures.plate(*cells, slenderness)
-    answer = solve(Linear(problem), load_of(force))
+    answer = solve(LinearSolver(problem), load_of(force))
     below = fixtures.nearest_node(problem, [0.5, 0.5, 0.0])
     return -answer.displacement[0, below, 2].item() / known
 
 
-def flattest(watch: Watch) -> Outcome:
+def flattest(watch: Auditor) -> Outcome:
     """Bend a plate of a/h = 1000: linear cells must warn, quadratic ones stay below the limit."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
@@ -124,10 +124,10 @@ def flattest(watch: Watch) -> Outcome:
         Row("w over Kirchhoff's, degree 2", "> 0.8", quadratic),
         Row("w over Kirchhoff's, degree 2", "< 1.01", quadratic),
     ]
-    return graded(f"degree 1 {linear:.4f}, warned of; degree 2 {quadratic:.3f}", rows)
+    return classify(f"degree 1 {linear:.4f}, warned of; degree 2 {quadratic:.3f}", rows)
 
 
-def drawn_out(watch: Watch) -> Outcome:
+def drawn_out(watch: Auditor) -> Outcome:
     """Pull rods of ever longer cells to a stretch of 1.5; all cells stretch alike."""
     rows, fails = [], []
     for aspect in ASPECTS:
@@ -143,10 +143,10 @@ def drawn_out(watch: Watch) -> Outcome:
             rows.append(Row(f"1:{aspect:g}, {name}: stretch", "1.5", longest, 1e-7))
             thinner = 1 + aspect * float(state.displacement[..., 1].min())
             rows.append(Row(f"1:{aspect:g}, {name}: lateral", ".88017459", thinner, 1e-7))
-    return graded("stretches to 1e-7", rows, fails=fails)
+    return classify("stretches to 1e-7", rows, fails=fails)
 
 
-def sliver(part: float, watch: Watch) -> Outcome:
+def sliver(part: float, watch: Auditor) -> Outcome:
     """Bend the beam with a layer of slivers, by every direct backend."""
     rows, fails, worst = [], [], 0.0
     mesh = fixtures.slivers(part)
@@ -158,7 +158,7 @@ def sliver(part: float, watch: Watch) -> Outcome:
     end = int(problem.points.sum(dim=1).argmax())
     for name in DIRECT:
         for kind, newton in kinds(problem):
-            solver = newton.but(linear=name)
+            solver = newton.replace(linear=name)
             del solver.__dict__["rest"]
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", UserWarning)
@@ -173,7 +173,9 @@ def sliver(part: float, watch: Watch) -> Outcome:
             if ratio >= 1e-8:
                 said = any("rounding allows no less" in str(w.message) for w in caught)
                 rows.append(Row(f"{name}, {kind}: warnings of rounding", "1", float(said), 0))
-    return graded(f"{', '.join(DIRECT)}: largest |R|/|f| {worst:.0e}, warned of", rows, fails=fails)
+    return classify(
+        f"{', '.join(DIRECT)}: largest |R|/|f| {worst:.0e}, warned of", rows, fails=fails
+    )
 
 
 def cases() -> list[Case]:

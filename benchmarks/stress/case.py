@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from benchmarks.stress.auditor import Watch
+from benchmarks.stress.auditor import Auditor
 from benchmarks.verification.report import Row
 from dpl.system.threads import one_thread
 
@@ -21,7 +21,7 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True)
-class Rung:
+class LoadLevel:
     """One load of a ladder.
 
     Attributes:
@@ -57,7 +57,7 @@ class Outcome:
     happened: str
     verdict: Verdict
     rows: Sequence[Row] = ()
-    rungs: Sequence[Rung] = ()
+    rungs: Sequence[LoadLevel] = ()
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Case:
     name: str
     what: str
     expected: str
-    run: Callable[[Watch], Outcome]
+    run: Callable[[Auditor], Outcome]
 
 
 @dataclass(frozen=True)
@@ -114,12 +114,12 @@ class Number:
     holds: bool
 
 
-def graded(
+def classify(
     happened: str,
     rows: Sequence[Row] = (),
     *,
     fails: Sequence[str] = (),
-    rungs: Sequence[Rung] = (),
+    rungs: Sequence[LoadLevel] = (),
 ) -> Outcome:
     """Return an outcome: rows that miss are silently wrong, for nothing else said so.
 
@@ -146,7 +146,7 @@ def refused(what: str, action: Callable[[], object], words: str) -> Outcome:
         told = str(error)
         right = words in told and "\n" not in told
         happened = f"{type(error).__name__}: {told}"
-        return graded(happened, fails=() if right else [f"{what}: not {words!r}"])
+        return classify(happened, fails=() if right else [f"{what}: not {words!r}"])
     return Outcome(f"{what}: no error", Verdict.WRONG)
 
 
@@ -162,7 +162,7 @@ def all_of(outcomes: Sequence[Outcome]) -> Outcome:
 
 def perform(case: Case) -> tuple[Line, Outcome]:
     """Return what came of a case; whatever it raises is reported, whatever is not so is wrong."""
-    watch, start = Watch(), time.perf_counter()
+    watch, start = Auditor(), time.perf_counter()
     with warnings.catch_warnings(), one_thread():
         warnings.simplefilter("ignore", UserWarning)  # cases that are about warnings record them
         try:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.stress.case import Rung
+from benchmarks.stress.case import LoadLevel
 from benchmarks.verification.drawing import MARKS, panel, picture
 from dpl.visualization import COLOURS
 
@@ -16,7 +16,7 @@ LABELS = {
 }
 
 
-def draw(rungs: Sequence[Rung], path: Path) -> None:
+def draw(rungs: Sequence[LoadLevel], path: Path) -> None:
     """Draw ladders of loads, a panel for min det F and one for the residual.
 
     Where rungs have errors a third panel shows them; the range of the training is shaded. A cross
@@ -43,7 +43,7 @@ def draw(rungs: Sequence[Rung], path: Path) -> None:
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
 
-def _draw_series(ax: Any, rungs: Sequence[Rung], quantity: str, k: int) -> None:
+def _draw_series(ax: Any, rungs: Sequence[LoadLevel], quantity: str, k: int) -> None:
     """Draw one ladder, its unanswered loads crossed out."""
     colour = COLOURS[k % len(COLOURS)]
     style = {"marker": MARKS[k // len(COLOURS) % len(MARKS)], "markersize": 2.8, "linewidth": 0.8}

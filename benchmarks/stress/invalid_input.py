@@ -9,37 +9,37 @@ from typing import Any
 import numpy as np
 
 from benchmarks.stress import broken_meshes, fixtures
-from benchmarks.stress.auditor import Watch
-from benchmarks.stress.case import Case, Outcome, all_of, graded, refused
+from benchmarks.stress.auditor import Auditor
+from benchmarks.stress.case import Case, Outcome, all_of, classify, refused
 from benchmarks.stress.fixtures import load_of
 from benchmarks.verification.report import Row
 from dpl.fem import (
     Box,
-    Displacement,
-    Linear,
+    DirichletBC,
+    LinearSolver,
     ModalLoads,
     NeoHookeanLn,
     Newton,
     Plane,
     Problem,
-    Spring,
+    RobinBC,
     Status,
     Tag,
     Traction,
     box,
     eigenmodes,
-    installed,
-    load,
+    installed_backends,
+    read_mesh,
 )
-from dpl.fem.mesh import check
+from dpl.fem.mesh import check_mesh
 
 NH = NeoHookeanLn(0.3)
 APART = ["two pieces", "crack"]  # T14; the rest of the flaws are T15's
 NOWHERE = {"plane": Plane(0, 0.3), "box": Box([2, 2, 2], [3, 3, 3]), "tag": Tag("end")}
 USES: dict[str, Callable[[Any, Any], Any]] = {  # what takes a region: of mesh and region
     "fixed": lambda mesh, region: Problem.build(mesh, NH, fixed=region),
-    "moved": lambda mesh, region: Problem.build(mesh, NH, supports=[Displacement(region)]),
-    "spring": lambda mesh, region: Problem.build(mesh, NH, supports=[Spring(region, 1.0)]),
+    "moved": lambda mesh, region: Problem.build(mesh, NH, supports=[DirichletBC(region)]),
+    "spring": lambda mesh, region: Problem.build(mesh, NH, supports=[RobinBC(region, 1.0)]),
     "loaded": lambda mesh, region: Traction(region, [0, 0, 1.0]).on(Problem.build(mesh, NH)),
 }
 
@@ -47,7 +47,7 @@ USES: dict[str, Callable[[Any, Any], Any]] = {  # what takes a region: of mesh a
 def of_modulus(young: float) -> ModalLoads:
     """Return loads on the beam of a Young's modulus [Pa]."""
     problem = fixtures.beam_of("hexahedron", 1, NH)
-    return ModalLoads(Linear(problem), n_modes=1, young=young)
+    return ModalLoads(LinearSolver(problem), n_modes=1, young=young)
 
 
 IMPOSSIBLE: dict[str, tuple[Callable[[], Any], str]] = {  # T9: call, words
@@ -62,12 +62,14 @@ IMPOSSIBLE: dict[str, tuple[Callable[[], Any], str]] = {  # T9: call, words
 }
 
 
-def inverted(watch: Watch) -> Outcome:
+def inverted(watch: Auditor) -> Outcome:
     """Check a mesh of which four cells are inverted."""
-    return refused("folded", lambda: check(fixtures.folded()), "4 cells are inverted: 2, 3, 6, 7")
+    return refused(
+        "folded", lambda: check_mesh(fixtures.folded()), "4 cells are inverted: 2, 3, 6, 7"
+    )
 
 
-def impossible(watch: Watch) -> Outcome:
+def impossible(watch: Auditor) -> Outcome:
     """Build what cannot be."""
     found = [refused(name, call, said) for name, (call, said) in IMPOSSIBLE.items()]
     return _counted(found)
@@ -81,32 +83,32 @@ def _counted(found: list[Outcome]) -> Outcome:
     return Outcome(f"{len(found)} errors, such as {found[0].happened}", whole.verdict)
 
 
-def held_too_little(support: str, watch: Watch) -> Outcome:
+def held_too_little(support: str, watch: Auditor) -> Outcome:
     """Load a body that can move as a whole: by every backend, and ask for its modes."""
     problem = fixtures.loose(support)
-    linear = Linear(problem)
+    linear = LinearSolver(problem)
     outcome = refused(support, lambda: eigenmodes(linear, 3), fixtures.LOOSE[support][1])
     force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
     rows = [Row("factors before the error", "0", float("factor" in linear.__dict__))]
-    for name in installed():
+    for name in installed_backends():
         state = watch.solve(Newton(problem, linear=name), problem, load_of(force))
         rows.append(Row(f"{name}: converged", "< 0.5", float(state.converged)))
         rows.append(Row(f"{name}: |u|/L", "0", float(state.displacement.abs().max())))
-    return all_of([outcome, graded(f"{Status(int(state.status))}, at rest", rows)])
+    return all_of([outcome, classify(f"{Status(int(state.status))}, at rest", rows)])
 
 
-def read_flawed(names: list[str], watch: Watch) -> Outcome:
+def read_flawed(names: list[str], watch: Auditor) -> Outcome:
     """Read files of meshes that cannot be solved."""
     found = []
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
             said, points, cells = broken_meshes.BAD[name]
             path = broken_meshes.write(Path(folder) / "bad.vtu", np.asarray(points, float), **cells)
-            found.append(refused(name, partial(load, path), said))
+            found.append(refused(name, partial(read_mesh, path), said))
     return _counted([_without(outcome, folder) for outcome in found])
 
 
-def read_broken(watch: Watch) -> Outcome:
+def read_broken(watch: Auditor) -> Outcome:
     """Read half a file, an empty one, one of nonsense, and none."""
     found = []
     with tempfile.TemporaryDirectory() as folder:
@@ -116,8 +118,8 @@ def read_broken(watch: Watch) -> Outcome:
         for name, content in (("half", whole[: len(whole) // 2]), ("empty", b""), ("text", b"no")):
             path = Path(folder) / f"{name}.vtu"
             path.write_bytes(content)
-            found.append(refused(name, partial(load, path), f"{name}.vtu"))
-        found.append(refused("none", partial(load, Path(folder) / "none.vtu"), "none.vtu"))
+            found.append(refused(name, partial(read_mesh, path), f"{name}.vtu"))
+        found.append(refused("none", partial(read_mesh, Path(folder) / "none.vtu"), "none.vtu"))
     return _counted([_without(outcome, folder) for outcome in found])
 
 
@@ -126,7 +128,7 @@ def _without(outcome: Outcome, folder: str) -> Outcome:
     return Outcome(outcome.happened.replace(folder, "..."), outcome.verdict)
 
 
-def nowhere(watch: Watch) -> Outcome:
+def nowhere(watch: Auditor) -> Outcome:
     """Hold and load bodies where they have no node."""
     mesh = box([1.0, 1.0, 1.0], [3, 3, 3])
     found = []

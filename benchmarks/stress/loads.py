@@ -7,16 +7,16 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from benchmarks.stress.auditor import Watch
-from benchmarks.stress.case import Case, Outcome, Rung, graded
+from benchmarks.stress.auditor import Auditor
+from benchmarks.stress.case import Case, LoadLevel, Outcome, classify
 from benchmarks.stress.fixtures import KINDS, LARGEST, beam_of, load_of, pulled
 from benchmarks.verification.bodies import NAMES, mean, paper_beam, slender
 from benchmarks.verification.report import Row
 from benchmarks.verification.uniaxial import LAWS
 from dpl import Scene
-from dpl.data.solving.solve import Job, outcome
+from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.fem import (
-    Linear,
+    LinearSolver,
     Material,
     ModalLoads,
     NeoHookeanLn,
@@ -27,7 +27,7 @@ from dpl.fem import (
     Solution,
     Status,
     Traction,
-    judge,
+    evaluate_solution,
     solve,
 )
 
@@ -48,7 +48,7 @@ LADDER = (1e-9, 1e-6, 1e-3, 0.1, 1.0, 4.0, 10.0, 25.0)  # times the largest load
 
 def kinds(problem: Problem) -> Iterator[tuple[str, Newton]]:
     """Yield Newton without and with mixed integration points, where that differs."""
-    for mixed in (False, True) if problem.mixes else (False,):
+    for mixed in (False, True) if problem.supports_mip else (False,):
         yield ("mixed" if mixed else "plain"), Newton(problem, mixed=mixed)
 
 
@@ -58,7 +58,7 @@ def words(state: Solution) -> str:
     return f"{said}, |R|/|f| {float(state.residual):.0e}, min J {float(state.volume_ratio):.3f}"
 
 
-def answered(law: Material, q: float, volume: str, deepest: str, watch: Watch) -> Outcome:
+def answered(law: Material, q: float, volume: str, deepest: str, watch: Auditor) -> Outcome:
     """Ask for a load that has an answer, whole."""
     problem, rows, fails, told = paper_beam(law, CELLS), [], [], []
     for name, newton in kinds(problem):
@@ -71,10 +71,10 @@ def answered(law: Material, q: float, volume: str, deepest: str, watch: Watch) -
         if deepest:
             lowest = float(state.displacement[..., 2].min())
             rows.append(Row(f"{name}: min u_z/L", deepest, lowest))
-    return graded("; ".join(told), rows, fails=fails)
+    return classify("; ".join(told), rows, fails=fails)
 
 
-def hopeless(q: float, watch: Watch) -> Outcome:
+def hopeless(q: float, watch: Auditor) -> Outcome:
     """Ask for a load that has no valid answer."""
     problem, told, rows, fails = paper_beam(SVK, CELLS), [], [], []
     for name, newton in kinds(problem):
@@ -84,19 +84,19 @@ def hopeless(q: float, watch: Watch) -> Outcome:
         rows.append(Row(f"{name}: converged", "< 0.5", float(state.converged)))
         if state.status != Status.NO_VALID_EQUILIBRIUM or not 130 < part < q:
             fails.append(f"{name}: not the status, or not the part of the load")
-    return graded("; ".join(told), rows, fails=fails)
+    return classify("; ".join(told), rows, fails=fails)
 
 
-def stored(watch: Watch) -> Outcome:
+def stored(watch: Auditor) -> Outcome:
     """Make data of loads up to 25 times the usual ones: what is accepted is evaluated again."""
     problem = paper_beam(SVK, (8, 2, 2))
     newton = Newton(problem)
     scene = Scene(problem, ModalLoads(newton.rest, n_modes=3, deflection=25 * 0.4), newton)
     rows, accepted = list[Row](), 0
     for number in range(8):
-        made = outcome(scene, Job((0, 0), number))
+        made = solve_load(scene, LoadKey((0, 0), number))
         u = torch.from_numpy(made.displacement)[None]
-        sound = judge(problem, u, load_of(torch.from_numpy(made.force)), newton.tol)
+        sound = evaluate_solution(problem, u, load_of(torch.from_numpy(made.force)), newton.tol)
         kept = f"load {number}"
         if made.accepted:
             accepted += 1
@@ -105,10 +105,10 @@ def stored(watch: Watch) -> Outcome:
             rows.append(Row(f"{kept}: pivots", "0", float(newton.negative_pivots(u)), 0))
         else:
             rows.append(Row(f"{kept}: rejected, and why", "1", float(bool(made.reason)), 0))
-    return graded(f"{accepted} of 8 accepted, the others rejected with their reason", rows)
+    return classify(f"{accepted} of 8 accepted, the others rejected with their reason", rows)
 
 
-def slender_beam(watch: Watch) -> Outcome:
+def slender_beam(watch: Auditor) -> Outcome:
     """Bend a slender beam by the whole load at once."""
     problem = slender(NeoHookeanLn(0.0), (20, 1, 1))
     force = Traction(Plane(0, "max"), [0.0, 0.0, -1 / 12 / 400]).on(problem)
@@ -122,10 +122,10 @@ def slender_beam(watch: Watch) -> Outcome:
         told.append(f"{name}: {int(states[-1].iterations)} iterations, {len(parts)} parts of load")
         tip = -mean(states[-1].displacement[0, :, 2], force[:, 2])
         rows.append(Row(f"{name}: w/L", ".302130893", tip))
-    return graded("; ".join(told), rows, fails=fails)
+    return classify("; ".join(told), rows, fails=fails)
 
 
-def tiny(name: str, watch: Watch) -> Outcome:
+def tiny(name: str, watch: Auditor) -> Outcome:
     """Ask for loads near nothing, and for none."""
     problem, rows, fails = paper_beam(LAWS[name], (8, 2, 2)), [], []
     corner, most = int(problem.points.sum(dim=1).argmax()), 0
@@ -136,16 +136,16 @@ def tiny(name: str, watch: Watch) -> Outcome:
         if not state.stable.all():
             fails.append(f"q = {q:g}: {words(state)}")
             continue
-        linear = solve(Linear(problem), load).displacement[0, corner, 2]
+        linear = solve(LinearSolver(problem), load).displacement[0, corner, 2]
         ratio = float(state.displacement[0, corner, 2] / linear)
         rows.append(Row(f"q = {q:g} Pa: u_z over the linear one", "1", ratio, max(1e-2 * q, 1e-6)))
     none = watch.solve(Newton(problem), problem, load_of(0 * pulled(problem, 1.0)))
     rows.append(Row("no load: |u|/L", "0", float(none.displacement.abs().max())))
     rows.append(Row("no load: iterations", "0", float(none.iterations)))
-    return graded(f"linear within 1e-6, at most {most} iterations", rows, fails=fails)
+    return classify(f"linear within 1e-6, at most {most} iterations", rows, fails=fails)
 
 
-def climbed(series: str, build: Callable[[], Problem], watch: Watch) -> Outcome:
+def climbed(series: str, build: Callable[[], Problem], watch: Auditor) -> Outcome:
     """Climb a ladder of loads."""
     problem = build()
     unit, newton = pulled(problem, LARGEST), Newton(problem)
@@ -156,24 +156,24 @@ def climbed(series: str, build: Callable[[], Problem], watch: Watch) -> Outcome:
         if amplitude <= 1 and not state.converged.all():
             fails.append(f"{amplitude:g} of the range: {words(state)}")
         if amplitude <= 1e-3 and state.converged.all():
-            linear = solve(Linear(problem), load_of(amplitude * unit)).displacement
+            linear = solve(LinearSolver(problem), load_of(amplitude * unit)).displacement
             apart = float((state.displacement - linear).norm() / linear.norm())
             rows.append(
                 Row(f"{series}, {amplitude:g}: off linear", f"< {max(amplitude, 1e-6)}", apart)
             )
     beyond = [f"{r.amplitude:g}: {r.status} ({r.iterations})" for r in rungs if r.amplitude > 1]
-    return graded("in range all; " + ", ".join(beyond), rows, fails=fails, rungs=rungs)
+    return classify("in range all; " + ", ".join(beyond), rows, fails=fails, rungs=rungs)
 
 
 def rung(
     series: str, amplitude: float, state: Solution, smallest: float, error: float = math.nan
-) -> Rung:
-    """Return one load of a ladder with its answer, see `Rung`."""
+) -> LoadLevel:
+    """Return one load of a ladder with its answer, see `LoadLevel`."""
     status, iterations = str(Status(int(state.status))), int(state.iterations)
-    return Rung(series, amplitude, float(state.residual), smallest, iterations, status, error)
+    return LoadLevel(series, amplitude, float(state.residual), smallest, iterations, status, error)
 
 
-def _climbed(watch: Watch, newton: Newton, force: Tensor) -> tuple[Solution, float]:
+def _climbed(watch: Auditor, newton: Newton, force: Tensor) -> tuple[Solution, float]:
     """Return the answer to a force and the smallest min det F on the way to it."""
     states = list(watch.over(newton, newton.problem, newton.tol).iterate(load_of(force)))
     return states[-1], min(float(state.volume_ratio) for state in states)

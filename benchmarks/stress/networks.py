@@ -6,8 +6,8 @@ from functools import cache, partial
 import torch
 from torch import Tensor
 
-from benchmarks.stress.auditor import Watch
-from benchmarks.stress.case import Case, Outcome, Rung, graded, refused
+from benchmarks.stress.auditor import Auditor
+from benchmarks.stress.case import Case, LoadLevel, Outcome, classify, refused
 from benchmarks.stress.fixtures import LARGEST, YOUNG, load_of, pulled
 from benchmarks.stress.loads import LADDER, rung, words
 from benchmarks.verification.bodies import paper_beam
@@ -15,8 +15,8 @@ from benchmarks.verification.report import Row
 from dpl import Scene
 from dpl.evaluation.newton_starts import PlainNewton
 from dpl.fem import (
-    Accelerated,
-    Linear,
+    AndersonSolver,
+    LinearSolver,
     Load,
     ModalLoads,
     NeoHookeanLn,
@@ -28,7 +28,7 @@ from dpl.fem import (
     box,
     solve,
 )
-from dpl.inference import Direct, Hybrid, pick
+from dpl.inference import Direct, Hybrid, prefer_prediction
 from dpl.inference.hybrid import Predict
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
@@ -55,7 +55,7 @@ def bent() -> tuple[Newton, Load, Tensor]:
     problem = paper_beam(SVK, (16, 4, 4))
     load = load_of(pulled(problem, 20.0))
     newton = Newton(problem, linear="auto")
-    return newton, load, solve(newton.but(tol=1e-12), load).displacement
+    return newton, load, solve(newton.replace(tol=1e-12), load).displacement
 
 
 def known(displacement: Tensor) -> Predict:
@@ -68,7 +68,7 @@ def ways(newton: Newton) -> dict[str, Callable[[Tensor], Solver]]:
     return {
         "best": lambda guess: Hybrid(known(guess), newton),
         "paper": lambda guess: Hybrid(known(guess), newton, "paper"),
-        "steps": lambda guess: Hybrid(known(guess), newton, steps=Accelerated(newton)),
+        "steps": lambda guess: Hybrid(known(guess), newton, steps=AndersonSolver(newton)),
     }
 
 
@@ -84,7 +84,7 @@ def _useless(problem: Problem, truth: Tensor) -> dict[str, Tensor]:
     }
 
 
-def useless(name: str, watch: Watch) -> Outcome:
+def useless(name: str, watch: Auditor) -> Outcome:
     """Start the hybrid from a useless prediction: the answer is the classic one, bit for bit."""
     newton, load, truth = bent()
     problem, guess = newton.problem, _useless(newton.problem, truth)[name]
@@ -102,10 +102,10 @@ def useless(name: str, watch: Watch) -> Outcome:
         ]
     (alone,) = Direct(known(guess), problem).iterate(load)
     rows.append(Row("network alone: converged", "0", float(alone.converged), 0))
-    return graded(f"classic answer in {int(classic.iterations)} iterations, not picked", rows)
+    return classify(f"classic answer in {int(classic.iterations)} iterations, not picked", rows)
 
 
-def misled(name: str, watch: Watch) -> Outcome:
+def misled(name: str, watch: Auditor) -> Outcome:
     """Start the hybrid from a prediction that is finite and far off."""
     newton, load, truth = bent()
     guess = {"huge": 1e6 * truth, "minus": -truth, "half": 0.5 * truth, "zero": 0 * truth}[name]
@@ -118,10 +118,10 @@ def misled(name: str, watch: Watch) -> Outcome:
             continue
         off = float((state.displacement - truth).abs().max())
         rows.append(Row(f"{way}: off Newton's answer, over L", "< 1e-8", off))
-    return graded(f"Newton's answer; iterations: {', '.join(told)}", rows, fails=fails)
+    return classify(f"Newton's answer; iterations: {', '.join(told)}", rows, fails=fails)
 
 
-def noisy(size: float, watch: Watch) -> Outcome:
+def noisy(size: float, watch: Auditor) -> Outcome:
     """Start from the exact answer with noise; picked exactly where its residual is smaller."""
     newton, load, truth = bent()
     problem, random = newton.problem, torch.Generator().manual_seed(0)
@@ -147,15 +147,17 @@ def noisy(size: float, watch: Watch) -> Outcome:
         rows.append(Row(f"{way}: off Newton's answer, over L", "< 1e-8", off))
         if way == "paper":
             wanted = bool(alone.volume_ratio > 0) and float(alone.residual) < float(first.residual)
-            rows.append(Row("paper: picked", f"{int(wanted)}", float(pick(*states[:2])), 0))
+            rows.append(
+                Row("paper: picked", f"{int(wanted)}", float(prefer_prediction(*states[:2])), 0)
+            )
     taken = int(corrected.iterations)
     if taken > int(count) if size < 1e-2 else taken <= 6:  # at 1e-2 the draw decides how many
         fails.append(f"plain Newton takes {taken} iterations, printed {count}")
     told = f"|R|/|f| {float(alone.residual):.3g}, plain Newton from it {taken} iterations"
-    return graded(told, rows, fails=fails)
+    return classify(told, rows, fails=fails)
 
 
-def factored(watch: Watch) -> Outcome:
+def factored(watch: Auditor) -> Outcome:
     """Multiply the exact answer by a factor: a small error of a stiff kind."""
     newton, load, truth = bent()
     rows = []
@@ -163,10 +165,10 @@ def factored(watch: Watch) -> Outcome:
         (alone,) = Direct(known((1 + error) * truth), newton.problem).iterate(load)
         rows.append(Row(f"{error:.1%} too long: ||R|| / ||f||", printed, float(alone.residual)))
         rows.append(Row(f"{error:.1%}: converged", "0", float(alone.converged), 0))
-    return graded(", ".join(f"{row.value:.3g}" for row in rows[::2]), rows)
+    return classify(", ".join(f"{row.value:.3g}" for row in rows[::2]), rows)
 
 
-def rounded(watch: Watch) -> Outcome:
+def rounded(watch: Auditor) -> Outcome:
     """Round an exact answer to float32 and bfloat16: how small a residual a network can have."""
     newton, load, truth = bent()
     rows, told = [], []
@@ -183,10 +185,10 @@ def rounded(watch: Watch) -> Outcome:
             Row(f"{name}: converged alone", "0", float(alone.converged), 0),
             Row(f"{name}: off Newton's answer, over L", "< 1e-8", off),
         ]
-    return graded("; ".join(told), rows)
+    return classify("; ".join(told), rows)
 
 
-def precise(dtype: torch.dtype, device: str, watch: Watch) -> Outcome:
+def precise(dtype: torch.dtype, device: str, watch: Auditor) -> Outcome:
     """Ask a network of another precision: what it says is float64, and judged in float64."""
     own = scene()
     torch.manual_seed(0)
@@ -199,7 +201,7 @@ def precise(dtype: torch.dtype, device: str, watch: Watch) -> Outcome:
     with torch.inference_mode():
         said = predict(drawn)
         state = watch.solve(Hybrid(predict, own.solver), own.problem, drawn)
-    exact = solve(own.solver.but(tol=1e-12), drawn).displacement
+    exact = solve(own.solver.replace(tol=1e-12), drawn).displacement
     off = float((state.displacement - exact).abs().max())
     rows = [
         Row("the prediction is float64", "1", float(said.dtype == torch.float64), 0),
@@ -207,29 +209,29 @@ def precise(dtype: torch.dtype, device: str, watch: Watch) -> Outcome:
         Row("off Newton's answers, over L", "< 1e-6", off),
     ]
     fails = [] if state.converged.all() else [words(state)]
-    return graded(f"4 loads, {int(state.iterations.sum())} iterations", rows, fails=fails)
+    return classify(f"4 loads, {int(state.iterations.sum())} iterations", rows, fails=fails)
 
 
-def single_precision(watch: Watch) -> Outcome:
+def single_precision(watch: Auditor) -> Outcome:
     """Give Newton forces in float32: no answer may be of that precision."""
     newton, load, truth = bent()
     try:
         state = solve(newton, Load(load.force.float(), load.young, load.poisson))
     except (RuntimeError, TypeError, ValueError) as error:
-        return graded(f"{type(error).__name__}: {error}")
+        return classify(f"{type(error).__name__}: {error}")
     off = float((state.displacement.double() - truth).abs().max())
     rows = [Row("off the answer of float64, over L", "< 1e-6", off)]
-    return graded(f"answer in {state.displacement.dtype}, off {off:.0e} L", rows)
+    return classify(f"answer in {state.displacement.dtype}, off {off:.0e} L", rows)
 
 
-def climbed(watch: Watch) -> Outcome:
+def climbed(watch: Auditor) -> Outcome:
     """Climb the ladder of loads with hybrids that start from the linear answer."""
     own, rungs, fails = scene(), [], []
     problem, unit, rows = own.problem, pulled(own.problem, LARGEST), list[Row]()
-    for way in ("best", "paper", "steps"):
+    for way in ("natural_monotonicity", "paper", "steps"):
         for amplitude in LADDER:
             load = load_of(amplitude * unit)
-            guess = solve(Linear(problem), load).displacement
+            guess = solve(LinearSolver(problem), load).displacement
             exact = solve(own.solver, load)
             hybrid = ways(own.solver)[way](guess)
             states = list(watch.over(hybrid, problem, own.solver.tol).iterate(load))
@@ -242,16 +244,16 @@ def climbed(watch: Watch) -> Outcome:
                 fails.append(f"{way}, {amplitude:g}: {words(last)}")
             elif amplitude <= 1:
                 rows.append(Row(f"{way}, {amplitude:g}: off Newton", "< 1e-6", error))
-    return graded(_told(rungs), rows, fails=fails, rungs=rungs)
+    return classify(_told(rungs), rows, fails=fails, rungs=rungs)
 
 
-def _told(rungs: list[Rung]) -> str:
+def _told(rungs: list[LoadLevel]) -> str:
     done = sum(rung.status in ("converged", "unstable") for rung in rungs)
     most = max(rung.iterations for rung in rungs)
     return f"{done} of {len(rungs)} answered, at most {most} iterations"
 
 
-def too_large(watch: Watch) -> Outcome:
+def too_large(watch: Auditor) -> Outcome:
     """Ask for the paper's network on a mesh of more than 100,000 degrees of freedom."""
     mesh = box([1.0, 1.0, 1.0], [33, 33, 33])
     problem = Problem.build(mesh, NH, fixed=Plane(0, "min"))
@@ -295,7 +297,7 @@ def cases() -> list[Case]:
     return [*found, Case("ladder", what, expected, climbed)]
 
 
-def _with_tf32(dtype: torch.dtype, device: str, watch: Watch) -> Outcome:
+def _with_tf32(dtype: torch.dtype, device: str, watch: Auditor) -> Outcome:
     before = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = True
     try:

@@ -6,8 +6,8 @@ from functools import partial
 import torch
 
 from benchmarks.stress import fixtures
-from benchmarks.stress.auditor import Watch
-from benchmarks.stress.case import Case, Outcome, graded
+from benchmarks.stress.auditor import Auditor
+from benchmarks.stress.case import Case, Outcome, classify
 from benchmarks.stress.fixtures import load_of
 from benchmarks.stress.loads import kinds, words
 from benchmarks.verification.report import Row
@@ -18,12 +18,12 @@ from dpl.fem import (
     SaintVenantKirchhoff,
     Solution,
     Status,
-    branches,
-    installed,
-    judge,
+    evaluate_solution,
+    installed_backends,
+    post_buckling_branches,
 )
 
-DIRECT = [name for name in installed() if name != "cg"]
+DIRECT = [name for name in installed_backends() if name != "cg"]
 SVK = SaintVenantKirchhoff(0.0)
 # VERIFICATION 1.8g: P [N], angle of the guess, w/L and u/L of the end's centre, hex27 20 x 2 x 2
 BUCKLED = [(2.5, 1.2, ".6873", ".3885"), (4.0, 2.0, ".7925", ".9731")]
@@ -34,7 +34,7 @@ BARRIER = [(-1, ".4835138104"), (-10, ".1073321638"), (1, "2.780359487"), (10, "
 SINGULAR = (2.0397, 2.039763, 2.0398, 2.5)  # P [N] about the critical load 2.039763
 
 
-def straight(watch: Watch) -> Outcome:
+def straight(watch: Auditor) -> Outcome:
     """Push a column beyond its critical load, from rest."""
     problem, force = fixtures.column(SVK, (10, 1, 1))
     rows, fails = [], []
@@ -51,10 +51,10 @@ def straight(watch: Watch) -> Outcome:
                 Row(f"{backend}, {name}: negative pivots", "2", float(state.negative_pivots)),
                 Row(f"{backend}, {name}: status", "1", float(state.status), 0),
             ]
-    return graded(f"unstable, 2 negative pivots, with {', '.join(DIRECT)}", rows, fails=fails)
+    return classify(f"unstable, 2 negative pivots, with {', '.join(DIRECT)}", rows, fails=fails)
 
 
-def buckled(P: float, angle: float, printed: tuple[str, str], watch: Watch) -> Outcome:
+def buckled(P: float, angle: float, printed: tuple[str, str], watch: Auditor) -> Outcome:
     """Start beyond buckling from bent guesses, to either side."""
     problem, force = fixtures.column(SVK, (20, 2, 2))
     centre = fixtures.nearest_node(problem, [1.0, 0.05, 0.05])
@@ -72,15 +72,15 @@ def buckled(P: float, angle: float, printed: tuple[str, str], watch: Watch) -> O
             Row(f"side {side:+g}: w/L", printed[0], float(side * end[2])),
             Row(f"side {side:+g}: u/L", printed[1], -float(end[0])),
         ]
-    return graded("both sides found, stable", rows, fails=fails)
+    return classify("both sides found, stable", rows, fails=fails)
 
 
-def gives_way(watch: Watch) -> Outcome:
+def gives_way(watch: Auditor) -> Outcome:
     """Ask what an unstable column gives way to."""
     problem, force = fixtures.column(SVK, (10, 1, 1))
     solver, load = Newton(problem), load_of(2.5 * force)
     state = watch.solve(solver, problem, load)
-    found = branches(solver, load, state)
+    found = post_buckling_branches(solver, load, state)
     centre = fixtures.nearest_node(problem, [1.0, 0.05, 0.05])
     fails, told = [], []
     for side in found:
@@ -94,14 +94,16 @@ def gives_way(watch: Watch) -> Outcome:
         Row("mirror images: difference", "< 1e-6", float((left + right).norm() / left.norm())),
         Row("deflection/L", "> 0.1", float(left.norm())),
     ]
-    return graded(f"deflection {float(left.norm()):.3f} L; {' and '.join(told)}", rows, fails=fails)
+    return classify(
+        f"deflection {float(left.norm()):.3f} L; {' and '.join(told)}", rows, fails=fails
+    )
 
 
-def singular(watch: Watch) -> Outcome:
+def singular(watch: Auditor) -> Outcome:
     """Push a column at its critical load and about it, by every backend."""
     problem, force = fixtures.column(SVK, (10, 1, 1))
     rows, fails, told = [], [], []
-    for backend in installed():
+    for backend in installed_backends():
         ended = []
         for P in SINGULAR:
             solver = Newton(problem, linear=backend)
@@ -113,7 +115,7 @@ def singular(watch: Watch) -> Outcome:
             if not definite and not states[-1].converged.all():
                 fails.append(f"{backend}, P = {P}: {words(states[-1])}")
         told.append(f"{backend}: {', '.join(dict.fromkeys(ended))}")
-    return graded("; ".join(told), rows, fails=fails)
+    return classify("; ".join(told), rows, fails=fails)
 
 
 def _finite(state: Solution) -> bool:
@@ -121,7 +123,7 @@ def _finite(state: Solution) -> bool:
     return all(bool(value.isfinite().all()) for value in state)
 
 
-def peak(watch: Watch) -> Outcome:
+def peak(watch: Auditor) -> Outcome:
     """Pull Yeoh's rubber beyond its peak load, from rest; then from a guess beyond the gap."""
     problem, unit = fixtures.cube(fixtures.RUBBER)
     solver = Newton(problem, linear="superlu", loose=1e-9, smallest_step=2.0**-17, budget=2000)
@@ -141,10 +143,10 @@ def peak(watch: Watch) -> Outcome:
         stretch = 1 + float(snapped.displacement[..., 0].max())
         rows.append(Row("beyond the gap: stretch", "2.836546", stretch, 2e-6))
     told = f"{Status(int(state.status))}, answered up to P = {part:.5f}; beyond: stretch as printed"
-    return graded(told, rows, fails=fails)
+    return classify(told, rows, fails=fails)
 
 
-def collapsed(watch: Watch) -> Outcome:
+def collapsed(watch: Auditor) -> Outcome:
     """Press a bar of SVK beyond its largest load; hold its mirror image to be no answer."""
     law = SaintVenantKirchhoff(0.3)
     problem, unit = fixtures.cube(law, 2)
@@ -153,7 +155,7 @@ def collapsed(watch: Watch) -> Outcome:
     part = 0.2 * float(state.load_factor)
     mirrored = (problem.points * torch.tensor([-2.0, 0.0, 0.0]))[None]
     rest = load_of(0 * unit)
-    verdict = judge(problem, mirrored, rest, 1e-8)
+    verdict = evaluate_solution(problem, mirrored, rest, 1e-8)
     rows = [
         Row("converged", "< 0.5", float(state.converged)),
         Row("|P|/E of the last answer", ".1924500897", part, 6e-5),
@@ -165,14 +167,14 @@ def collapsed(watch: Watch) -> Outcome:
         Row("mirror image: converged", "< 0.5", float(verdict.converged)),
     ]
     told = f"{Status(int(state.status))}, answered up to {part:.5f}; mirror image not accepted"
-    return graded(told, rows)
+    return classify(told, rows)
 
 
 def _shortest(state: Solution) -> float:
     return 1 + float(state.displacement[..., 0].min())
 
 
-def barrier(watch: Watch) -> Outcome:
+def barrier(watch: Auditor) -> Outcome:
     """Press and pull a bar of NH-ln, whose barrier holds any load."""
     problem, unit = fixtures.cube(NeoHookeanLn(0.3), 2)
     rows, fails = [], []
@@ -186,10 +188,10 @@ def barrier(watch: Watch) -> Outcome:
                 continue
             stretch = 1 + float(state.displacement[0, end, 0].mean())
             rows.append(Row(f"P/E = {P}, {name}: stretch", printed, stretch, 1e-8))
-    return graded("stretches to 1e-8", rows, fails=fails)
+    return classify("stretches to 1e-8", rows, fails=fails)
 
 
-def pressed(watch: Watch) -> Outcome:
+def pressed(watch: Auditor) -> Outcome:
     """Press a cube of NHiso-k2, which is no barrier: kappa s^2 (1 - s^3) at most, s^3 = 2/5."""
     law = NeoHookeanIsoK2(0.3)
     problem, unit = fixtures.cube(law, 1, (0, 1, 2))
@@ -204,10 +206,10 @@ def pressed(watch: Watch) -> Outcome:
             Row(f"{name}, 1.02 of the limit: converged", "< 0.5", float(above.converged)),
             Row(f"{name}, part of the limit that is reached", "1", reached, 0.02),
         ]
-    return graded(f"answered below, {Status(int(above.status))} above", rows)
+    return classify(f"answered below, {Status(int(above.status))} above", rows)
 
 
-def symmetric(nu: float, stretch: float, printed: str, watch: Watch) -> Outcome:
+def symmetric(nu: float, stretch: float, printed: str, watch: Auditor) -> Outcome:
     """Load Rivlin's cube below and above where it loses its symmetry."""
     problem, unit = fixtures.cube(NeoHookeanLn(nu), 1, (0, 1, 2))
     rows = [Row("T/E there", printed, fixtures.swollen(problem, stretch)[1], 1e-7)]
@@ -220,7 +222,7 @@ def symmetric(nu: float, stretch: float, printed: str, watch: Watch) -> Outcome:
             Row(f"{part}: negative pivots", pivots, float(state.negative_pivots)),
             Row(f"{part}: off the symmetric state", "< 1e-7", off),
         ]
-    return graded("stable below, unstable above", rows)
+    return classify("stable below, unstable above", rows)
 
 
 def cases() -> list[Case]:

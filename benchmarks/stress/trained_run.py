@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import torch
 
-from benchmarks.stress.auditor import Watch
-from benchmarks.stress.case import Case, Outcome, Rung, graded
+from benchmarks.stress.auditor import Auditor
+from benchmarks.stress.case import Case, LoadLevel, Outcome, classify
 from benchmarks.stress.loads import rung
 from benchmarks.verification.report import Row
 from dpl import Scene
 from dpl.fem import Load, Solution
-from dpl.inference import Answer, Simulator, best
+from dpl.inference import Answer, Simulator, default_hybrid
 from dpl.inference.simulator import SLACK
 from dpl.training import Surrogate
 
@@ -46,7 +46,7 @@ class Ladder:
     surrogate: Surrogate
     count: int = 2
     amplitudes: tuple[float, ...] = LADDER
-    watch: Watch = field(default_factory=Watch)
+    watch: Auditor = field(default_factory=Auditor)
     simulator: Simulator = field(init=False)
 
     def __post_init__(self) -> None:
@@ -70,7 +70,7 @@ class Ladder:
         for amplitude in self.amplitudes:
             force = (amplitude / places)[:, None, None] * own
             force = force if loads.always is None else force + loads.always
-            for load in drawn._replace(force=force).singles():
+            for load in drawn._replace(force=force).unbatch():
                 states = list(solver.iterate(load))
                 smallest = min(float(state.volume_ratio) for state in states)
                 found.append(Step(amplitude, load, states[-1], smallest))
@@ -84,17 +84,17 @@ class Ladder:
         return self.simulator(newtons, young=load.young, poisson=poisson, tol=tol)
 
 
-def simulated(ladder: Ladder, tol: float | None, watch: Watch) -> Outcome:
+def simulated(ladder: Ladder, tol: float | None, watch: Auditor) -> Outcome:
     """Ask the simulator, without or with a tolerance, and hold its answers to what they say."""
     series = "network" if tol is None else f"simulator to {tol:g}"
-    rows, fails, rungs, tiers = list[Row](), list[str](), list[Rung](), list[str]()
+    rows, fails, rungs, tiers = list[Row](), list[str](), list[LoadLevel](), list[str]()
     for step in ladder.steps:
         answer = ladder.asked(step, tol)
         u = answer.displacement[None] / ladder.scene.length
         error = _apart(u, step.exact)
-        tiers.append(answer.tier)
+        tiers.append(answer.method)
         rungs.append(
-            Rung(
+            LoadLevel(
                 *(series, step.amplitude, answer.residual, answer.volume_ratio),
                 *(answer.iterations, answer.verdict, error),
             )
@@ -109,7 +109,7 @@ def simulated(ladder: Ladder, tol: float | None, watch: Watch) -> Outcome:
                 fails.append(f"{place}: {answer.verdict}")
             elif step.exact.stable.all():
                 rows.append(Row(f"{place}: off Newton's answer", f"< {ERROR}", error))
-    return graded(_told(rungs, tiers), rows, fails=fails, rungs=rungs)
+    return classify(_told(rungs, tiers), rows, fails=fails, rungs=rungs)
 
 
 def _true(
@@ -118,13 +118,14 @@ def _true(
     """Yield what an answer says of itself, and whether it is so."""
     problem = ladder.scene.problem.at(step.load.poisson)
     internal, volume = problem.internal_force(u), float(problem.volume_ratio(u))
-    ratio = float(problem.imbalance(internal, step.load.force))
+    ratio = float(problem.relative_residual_of(internal, step.load.force))
     near = abs(answer.residual - ratio) <= 1e-3 * ratio + 1e-12
     yield "the residual is as said", near or not (ratio == ratio and ratio < float("inf"))
     yield "nothing is inverted where that is said", (answer.volume_ratio > 0) == (volume > 0)
     tol = TOL if answer.iterations else ladder.scene.solver.tol
     sound = volume > 0 and (
-        ratio < 1.01 * max(tol, TOL) or bool(problem.balanced(u, internal, step.load.force, TOL))
+        ratio < 1.01 * max(tol, TOL)
+        or bool(problem.is_equilibrium(u, internal, step.load.force, TOL))
     )
     yield "it converged where that is said", sound or not answer.converged
     words = answer.verdict
@@ -133,16 +134,21 @@ def _true(
         answer.converged or words.startswith(("NOT VALID", "an estimate")),
     )
     outside = step.amplitude > 1 + SLACK
-    yield "outside is said", bool(answer.outside) == outside or answer.strange > 1e-3
-    if outside and answer.strange <= 1e-3:
+    yield (
+        "outside is said",
+        bool(answer.out_of_distribution) == outside or answer.out_of_span > 1e-3,
+    )
+    if outside and answer.out_of_span <= 1e-3:
         yield "by how much is said", "times the training's largest" in words
 
 
-def hybrid(ladder: Ladder, watch: Watch) -> Outcome:
+def hybrid(ladder: Ladder, watch: Auditor) -> Outcome:
     """Start Newton from the network's predictions, by the rule that suits the scene."""
     scene = ladder.scene
-    solver = watch.over(best(ladder.surrogate.predict, scene), scene.problem, scene.solver.tol)
-    rows, fails, rungs = list[Row](), list[str](), list[Rung]()
+    solver = watch.over(
+        default_hybrid(ladder.surrogate.predict, scene), scene.problem, scene.solver.tol
+    )
+    rows, fails, rungs = list[Row](), list[str](), list[LoadLevel]()
     for step in ladder.steps:
         with torch.inference_mode():
             states = list(solver.iterate(step.load))
@@ -158,12 +164,12 @@ def hybrid(ladder: Ladder, watch: Watch) -> Outcome:
             rows.append(Row(f"{step.amplitude:g}: off Newton's answer", f"< {ERROR}", error))
     picked = f"{sum(r.status == 'converged' for r in rungs)} of {len(rungs)} converged"
     most = max(r.iterations for r in rungs)
-    return graded(f"{picked}, at most {most} iterations", rows, fails=fails, rungs=rungs)
+    return classify(f"{picked}, at most {most} iterations", rows, fails=fails, rungs=rungs)
 
 
-def newton(ladder: Ladder, watch: Watch) -> Outcome:
+def newton(ladder: Ladder, watch: Auditor) -> Outcome:
     """Solve the same loads from rest, for comparison."""
-    rungs, fails = list[Rung](), list[str]()
+    rungs, fails = list[LoadLevel](), list[str]()
     for step in ladder.steps:
         rungs.append(rung("Newton", step.amplitude, step.exact, step.smallest, 0.0))
         if step.amplitude <= 1 and not step.exact.converged.all():
@@ -171,7 +177,7 @@ def newton(ladder: Ladder, watch: Watch) -> Outcome:
     watch.take(ladder.watch)
     done = sum(r.status in ("converged", "unstable") for r in rungs)
     most = max(r.iterations for r in rungs)
-    return graded(
+    return classify(
         f"{done} of {len(rungs)} answered, at most {most} iterations", fails=fails, rungs=rungs
     )
 
@@ -183,7 +189,7 @@ def _apart(u: torch.Tensor, exact: Solution) -> float:
     return float((u - exact.displacement).norm() / exact.displacement.norm())
 
 
-def _told(rungs: list[Rung], tiers: list[str]) -> str:
+def _told(rungs: list[LoadLevel], tiers: list[str]) -> str:
     """Return errors by amplitude, and who answered."""
     errors: dict[float, list[float]] = {}
     for step in rungs:

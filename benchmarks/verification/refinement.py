@@ -13,7 +13,7 @@ from benchmarks.verification.bodies import NAMES, Array, balanced, lattice
 from benchmarks.verification.drawing import measured, panel, picture, reference, side, triangle
 from benchmarks.verification.report import Row, Section
 from dpl.fem import (
-    Linear,
+    LinearSolver,
     Material,
     NeoHookeanIsoK4,
     NeoHookeanLn,
@@ -238,7 +238,7 @@ def compliance(
     law = NeoHookeanLn(nu)
     problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree, mean_dilatation=mean)
     force = Traction(Plane(0, "max"), [0.0, 0.0, -1.0]).on(problem)
-    return float((force * Linear(problem).respond(force)).sum())
+    return float((force * LinearSolver(problem).respond(force)).sum())
 
 
 def locking(folder: Path) -> Section:

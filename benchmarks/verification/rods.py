@@ -24,7 +24,7 @@ from dpl.fem import (
     Status,
     Traction,
 )
-from dpl.fem.linear import backend
+from dpl.fem.linear import make_backend
 from dpl.visualization import COLOURS
 
 SVK = SaintVenantKirchhoff(0.0)
@@ -210,7 +210,7 @@ def critical(law: Material, cells: Sequence[int]) -> float:
     """Return the load P [N] at which the tangent of a straight column becomes singular."""
     problem = slender(law, cells)
     newton, unit = Newton(problem, tol=1e-10), pushed(problem, 1.0)
-    tangents, low, high = backend(problem.pattern), 2.0, 2.1
+    tangents, low, high = make_backend(problem.pattern), 2.0, 2.1
     while high - low > 2e-7:
         middle = (low + high) / 2
         u = balanced(newton, middle * unit).displacement

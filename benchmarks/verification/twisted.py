@@ -11,7 +11,7 @@ from torch import Tensor
 from benchmarks.verification.bodies import Array, balanced
 from benchmarks.verification.drawing import curve, measured, panel, picture, reference, solid
 from benchmarks.verification.report import Row, Section
-from dpl.fem import Displacement, NeoHookeanLn, Newton, Plane, Problem, box
+from dpl.fem import DirichletBC, NeoHookeanLn, Newton, Plane, Problem, box
 from dpl.visualization import COLOURS
 
 TWIST = {  # cells, degree: torque [N m], axial force [N], energy [J] at 90 degrees
@@ -31,7 +31,7 @@ def twisted(
     Each solve is started by the uniform twist, so that no load steps are needed.
     """
     mesh = box([1.0, 1.0, HEIGHT], [n + 1 for n in cells])
-    ends = [Displacement(Plane(2, "min")), Displacement(Plane(2, "max"))]
+    ends = [DirichletBC(Plane(2, "min")), DirichletBC(Plane(2, "max"))]
     rest = Problem.build(mesh, NeoHookeanLn(0.3), supports=ends, degree=degree)
     X = rest.points - torch.tensor([0.5, 0.5, 0.0], dtype=torch.float64) / HEIGHT
     top, found, u = X[:, 2] > 1 - 1e-9, [], torch.zeros_like(X)

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from dpl.commands.cli import command
 from dpl.config import build, run_folder
 from dpl.evaluation import tables as table
-from dpl.system.files import whole_file
+from dpl.system.files import atomic_write
 from dpl.version import install
 
 if TYPE_CHECKING:
@@ -93,11 +93,11 @@ def model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
         "machine": table.machine(),
         "versions": {name: version(name) for name in ("torch", *NEEDED)},
     }
-    with whole_file(folder / "report.json") as file:
+    with atomic_write(folder / "report.json") as file:
         file.write((json.dumps(report, indent=1) + "\n").encode())
     table.show(compared, "ONNX against torch")
     table.show(times, "bare network, loads of the range that are not local [ms], 1 thread")
-    print(timing.told(measured))
+    print(timing.describe(measured))
     if not report["passed"]:
         for part in folder.glob("model.onnx*"):
             part.unlink()

@@ -21,7 +21,7 @@ def parts(cfg: DictConfig) -> tuple[Scene, DataSet]:
     if cfg.action not in ACTIONS:
         raise build.ConfigError(f"action = {cfg.action!r} must be one of {', '.join(ACTIONS)}")
     scene = build.build_scene(cfg)
-    return scene, build.make(cfg, "data", scene=scene)
+    return scene, build.instantiate(cfg, "data", scene=scene)
 
 
 @command("generate", rehearse=parts)
@@ -29,7 +29,7 @@ def main(cfg: DictConfig) -> None:
     """Solve what is missing of a data set; or look whether it is sound; or make it so."""
     build.check(cfg)
     scene, data = parts(cfg)
-    build.show_plan(scene, data)
+    build.show_skipped_work(scene, data)
     if cfg.action == "verify":
         flaws = list(data.verify())
         print(data.store.summary())

@@ -55,7 +55,7 @@ def composed(name: str, lines: Sequence[str]) -> DictConfig:
         known = {str(key) for key in hydra.compose(name)}
         for key in new:
             if key not in known:
-                told = validation.instead(key, known)
+                told = validation.suggestion(key, known)
                 raise ConfigError(f"{key}: this command has no such key; {told}")
     return cfg
 
@@ -125,11 +125,11 @@ def _bad_option(one: Override, chosen: set[str], error: str) -> str | None:
     if adds and group in chosen:
         return f"{group}: an option is chosen already; write {one.input_line.lstrip('+')}"
     if not adds and group not in chosen:
-        return f"{group}: this command has no such key; {validation.instead(group, chosen)}"
+        return f"{group}: this command has no such key; {validation.suggestion(group, chosen)}"
     missing = f"{group}/{value}" in error or not isinstance(value, str)
     if one.is_delete() or isinstance(value, list) or value in known or not missing:
         return None
-    near = validation.near(str(value), known)
+    near = validation.nearest_name(str(value), known)
     told = f"{group} = {'null' if value is None else value}: there is no such option; "
     told += f"did you mean {near}? " if near else ""
     told += f"{group} is one of {', '.join(known)}"
@@ -143,7 +143,7 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
     if "/" in key:
         parent = key.rpartition("/")[0]
         groups = _loader().get_group_options(parent, ObjectType.GROUP)
-        told = validation.instead(key, {f"{parent}/{group}" for group in groups})
+        told = validation.suggestion(key, {f"{parent}/{group}" for group in groups})
         return f"{key}: there is no such group; {told}"
     node: Any = base
     place = ""
@@ -160,7 +160,7 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
         if key == place + part and part in more and not one.is_delete():
             return f"{key} is not in this configuration; add it with +{one.input_line}"
         names = {name for name in known if name[0] != "_"} - {"hydra"} | more
-        return f"{key}: there is no such key; {validation.instead(part, names, place)}"
+        return f"{key}: there is no such key; {validation.suggestion(part, names, place)}"
     return None
 
 

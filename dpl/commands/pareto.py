@@ -76,7 +76,7 @@ def _show(title: str, rows: list["Point"]) -> None:
 def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
     """Return the scene of some runs, every solver there is with their networks, and test loads."""
     from dpl.evaluation import methods, pareto
-    from dpl.inference import Direct, best
+    from dpl.inference import Direct, default_hybrid
     from dpl.models import PODNet
 
     runs = run_folder.load_runs(cfg.run)
@@ -86,18 +86,18 @@ def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
     train = data.samples("train")
     robust = scene.solver
     solvers: dict[str, Solver] = {"linear": scene.linear}
-    solvers |= {f"Newton to {tol:g}": robust.but(tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
+    solvers |= {f"Newton to {tol:g}": robust.replace(tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
     if cfg.galerkin:
-        model = build.make(cfg, "galerkin")(scene, train)
+        model = build.instantiate(cfg, "galerkin")(scene, train)
         solvers["POD-Galerkin"] = Direct(model.predict, scene.problem)
     for name, (trained, surrogate) in runs.items():
         predict = surrogate.predict
         solvers[name] = Direct(predict, scene.problem)
         if cfg.corrected and isinstance(surrogate.net, PODNet):
             row = methods.network(surrogate, Path(cfg.run) / name, trained.data.train)
-            tier = build.make(cfg, "corrected")(surrogate, row, train)
+            tier = build.instantiate(cfg, "corrected")(surrogate, row, train)
             solvers[f"{name}, corrected"] = Direct(tier.predict, scene.problem)
-        solvers[f"{name}, hybrid"] = best(predict, scene)
+        solvers[f"{name}, hybrid"] = default_hybrid(predict, scene)
         if torch.cuda.is_available():
             copy = run_folder.load_run(Path(cfg.run) / name, scene=scene)[1]
             solvers[f"{name}, GPU"] = Direct(pareto.on_gpu(copy), scene.problem)

@@ -24,11 +24,11 @@ def parts(cfg: DictConfig) -> tuple["Scene", Any, "Surrogate", Any]:
     """
     resumed = run_folder.check_resumed(cfg)
     scene = build.build_scene(run_folder.with_mesh_of_resumed(cfg))
-    data = build.make(cfg, "data", scene=scene)
+    data = build.instantiate(cfg, "data", scene=scene)
     surrogate = build.build_surrogate(cfg, scene)
     if resumed is not None:
         run_folder.check_weights(surrogate, resumed)
-    trainer = build.make(cfg, "trainer")
+    trainer = build.instantiate(cfg, "trainer")
     cli.check_trainer(trainer, cfg)
     return scene, data, surrogate, trainer
 
@@ -46,10 +46,10 @@ def main(cfg: DictConfig) -> float | None:
     build.check(cfg)
     folder = Path(cfg.folder)
     scene, data, surrogate, trainer = parts(cfg)
-    session = hparams.Session(build.hyperparameters(cfg))
+    session = hparams.LogHyperparameters(build.hyperparameters(cfg))
     trainer.callbacks.append(session)
     if trainer.is_global_zero:
-        build.show_plan(scene, data, surrogate)
+        build.show_skipped_work(scene, data, surrogate)
         run_folder.save_config(cfg, folder)
     try:
         trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path or None, weights_only=True)

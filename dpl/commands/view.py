@@ -13,7 +13,7 @@ from dpl.config import build, run_folder
 from dpl.version import install
 
 if TYPE_CHECKING:
-    from dpl.viewer import Body, Door, Page
+    from dpl.viewer import AccessPolicy, Body, Page
 
 
 @command("view")
@@ -53,22 +53,22 @@ def _body(cfg: DictConfig) -> "Body":
     return Body(Simulator(run_folder.load_run(cfg.run)[1]))
 
 
-def _door(cfg: DictConfig) -> "Door":
+def _door(cfg: DictConfig) -> "AccessPolicy":
     """Return where the page will be, bound already.
 
     Raises:
         ConfigError: It cannot be there.
     """
-    from dpl.viewer import Door
+    from dpl.viewer import AccessPolicy
 
     try:
-        door = Door.bound(cfg.host, cfg.port, cfg.names)
+        door = AccessPolicy.bound(cfg.host, cfg.port, cfg.names)
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            told = f"port = {cfg.port} is taken; name another, or port=0 for any that is free"
+            describe = f"port = {cfg.port} is taken; name another, or port=0 for any that is free"
         else:
-            told = f"host = {cfg.host}, port = {cfg.port} cannot be served: {error.strerror}"
-        raise build.ConfigError(told) from error
+            describe = f"host = {cfg.host}, port = {cfg.port} cannot be served: {error.strerror}"
+        raise build.ConfigError(describe) from error
     if door.open_to_all:
         print(
             f"warning: host = {cfg.host}: whoever reaches this machine and has the address can "
@@ -80,22 +80,22 @@ def _door(cfg: DictConfig) -> "Door":
 
 def _show_speed(page: "Page") -> None:
     from dpl.evaluation.tables import show
-    from dpl.evaluation.timing import told
+    from dpl.evaluation.timing import describe
     from dpl.viewer.frame_rate import speed
 
     rows, measured = speed(page)
     show(rows, "a frame: milliseconds on the server, and what arrives a second")
-    print(told(measured))
+    print(describe(measured))
 
 
 def _film(body: "Body", path: Path) -> None:
-    from dpl.viewer.animation import moving_load
+    from dpl.viewer.animation import animate_load
     from dpl.viewer.recording import FORMATS
 
     if path.suffix not in FORMATS:
         raise build.ConfigError(f"movie = {path} must end with {' or '.join(FORMATS)}")
     try:
-        moving_load(body, path)
+        animate_load(body, path)
     except ImportError as error:  # of what writes MP4
         raise build.ConfigError(
             f"movie: {path.suffix} needs {error.name}: {install('viewer')}"

@@ -10,9 +10,9 @@ if TYPE_CHECKING:
         build_surrogate,
         check,
         hyperparameters,
-        make,
-        plain,
-        show_plan,
+        instantiate,
+        show_skipped_work,
+        to_container,
     )
     from dpl.config.folder import CONF
     from dpl.config.run_folder import (

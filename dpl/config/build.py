@@ -35,7 +35,7 @@ SCENE = (  # keys that make a scene, and those that make a surrogate of it
 NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")
 
 
-def plain(cfg: DictConfig) -> dict[str, Any]:
+def to_container(cfg: DictConfig) -> dict[str, Any]:
     """Return a configuration as plain data, interpolations resolved.
 
     Raises:
@@ -58,7 +58,7 @@ def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
     Raises:
         ConfigError: A value is missing.
     """
-    return dict(validation.columns(plain(cfg)))
+    return dict(validation.columns(to_container(cfg)))
 
 
 def check(cfg: DictConfig, *, trust: bool = True) -> None:
@@ -68,10 +68,10 @@ def check(cfg: DictConfig, *, trust: bool = True) -> None:
         ConfigError: See `dpl.config.validation.check`.
     """
     written = typing.cast("dict[str, Any]", OmegaConf.to_container(cfg))
-    validation.check(written, plain(cfg), trust=trust)
+    validation.check(written, to_container(cfg), trust=trust)
 
 
-def make(cfg: DictConfig, key: str, /, **more: Any) -> Any:
+def instantiate(cfg: DictConfig, key: str, /, **more: Any) -> Any:
     """Return the object of one node; `more` goes into the call (of a partial: into the second).
 
     Raises:
@@ -83,11 +83,13 @@ def make(cfg: DictConfig, key: str, /, **more: Any) -> Any:
     own = callable(made) and key == "clamped"  # a region may be any function of points
     partial = own or (not more and isinstance(made, functools.partial))
     if (
-        key in validation.KINDS
+        key in validation.EXPECTED_TYPES
         and not partial
-        and not validation.is_a(type(made), validation.KINDS[key])
+        and not validation.is_instance_of(type(made), validation.EXPECTED_TYPES[key])
     ):
-        raise ConfigError(f"{key} gives {_a(made)}; it must give {_named(validation.KINDS[key])}")
+        raise ConfigError(
+            f"{key} gives {_a(made)}; it must give {_named(validation.EXPECTED_TYPES[key])}"
+        )
     return made
 
 
@@ -128,10 +130,10 @@ def build_scene(cfg: DictConfig) -> Scene:
     from dpl.fem import Problem
 
     _need(cfg, *SCENE)
-    material = make(cfg, "material")
+    material = instantiate(cfg, "material")
     with _shown_warnings():
-        mesh = make(cfg, "mesh")
-    clamped = make(cfg, "clamped") if cfg.get("clamped") is not None else None
+        mesh = instantiate(cfg, "mesh")
+    clamped = instantiate(cfg, "clamped") if cfg.get("clamped") is not None else None
     if cfg.degree not in (1, 2):
         raise ConfigError(f"degree = {cfg.degree} must be 1 or 2")
     if not isinstance(cfg.mean_dilatation, bool):
@@ -153,15 +155,15 @@ def build_scene(cfg: DictConfig) -> Scene:
             raise ConfigError(f"{key}: {told.removeprefix('mean_dilatation: ')}") from error
     if not problem.free.any():
         raise ConfigError("clamped or supports: every node is held; hold fewer of them")
-    if loose := problem.loose_modes():
+    if loose := problem.unconstrained_rigid_body_modes():
         raise ConfigError(
             f"clamped: {len(loose)} rigid modes are unconstrained: {', '.join(loose)}"
         )
-    solver = make(cfg, "solver", problem=problem)
+    solver = instantiate(cfg, "solver", problem=problem)
     young = OmegaConf.to_container(cfg.young) if isinstance(cfg.young, ListConfig) else cfg.young
-    if not validation.fits(young, float | Sequence[float]):
+    if not validation.matches_type(young, float | Sequence[float]):
         raise ConfigError(f"young = {young!r} must be a modulus [Pa] or a range [low, high]")
-    loads = make(cfg, "loads", linear=solver.rest, young=young, always=_always(cfg, problem))
+    loads = instantiate(cfg, "loads", linear=solver.rest, young=young, always=_always(cfg, problem))
     try:
         loads.modes  # noqa: B018  # which says whether there are so many
     except ValueError as error:
@@ -191,10 +193,9 @@ def _parts(cfg: DictConfig, key: str) -> list[Any]:
         raise ConfigError(f"{key} = {node!r} must name its parts: {key}: {{name: {{...}}}}")
     parts = {str(name): _made(node[name], f"{key}.{name}", {}) for name in node if node[name]}
     for name, part in parts.items():
-        if not validation.is_a(type(part), validation.KINDS[key]):
-            raise ConfigError(
-                f"{key}.{name} gives {_a(part)}; it must give {_named(validation.KINDS[key])}"
-            )
+        if not validation.is_instance_of(type(part), validation.EXPECTED_TYPES[key]):
+            kinds = _named(validation.EXPECTED_TYPES[key])
+            raise ConfigError(f"{key}.{name} gives {_a(part)}; it must give {kinds}")
     return list(parts.values())
 
 
@@ -217,22 +218,22 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
 
     _need(cfg, *NETWORK)
     # both are tried on one number, so that their errors come before any solve
-    trial = make(cfg, "optimizer", params=[torch.nn.Parameter(torch.zeros(1))])
+    trial = instantiate(cfg, "optimizer", params=[torch.nn.Parameter(torch.zeros(1))])
     if cfg.scheduler:
-        make(cfg, "scheduler", optimizer=trial, total_steps=1)
+        instantiate(cfg, "scheduler", optimizer=trial, total_steps=1)
     torch.manual_seed(cfg.seed)
-    parts = make(cfg, "model", scene=scene), make(cfg, "loss")
-    optimizer = make(cfg, "optimizer")
-    scheduler = make(cfg, "scheduler") if cfg.scheduler else None
+    parts = instantiate(cfg, "model", scene=scene), instantiate(cfg, "loss")
+    optimizer = instantiate(cfg, "optimizer")
+    scheduler = instantiate(cfg, "scheduler") if cfg.scheduler else None
     try:
         return Surrogate(*parts, scene, optimizer=optimizer, scheduler=scheduler)
     except ValueError as error:
         raise ConfigError(f"model: {error}") from error
 
 
-def show_plan(scene: Scene, *parts: Any) -> None:
+def show_skipped_work(scene: Scene, *parts: Any) -> None:
     """Print the size of the body, and what a scene and the parts of a run do not need and skip."""
-    lines = [line for part in (scene, *parts) for line in part.plan()]
+    lines = [line for part in (scene, *parts) for line in part.skipped_work()]
     print(scene.body())
     print("plan: skipped, because this scene does not need it")
     print("\n".join(f"  - {line}" for line in lines), flush=True)

@@ -13,12 +13,20 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dpl.config import validation
-from dpl.config.build import SCENE, _need, build_scene, build_surrogate, check, make, plain
+from dpl.config.build import (
+    SCENE,
+    _need,
+    build_scene,
+    build_surrogate,
+    check,
+    instantiate,
+    to_container,
+)
 from dpl.config.validation import ConfigError
-from dpl.fem import load as load_mesh
-from dpl.fem import save_exactly
+from dpl.fem import read_mesh as load_mesh
+from dpl.fem import write_mesh_exactly
 from dpl.scene import Scene
-from dpl.system.files import whole_file
+from dpl.system.files import atomic_write
 from dpl.system.memory import at_most
 
 if typing.TYPE_CHECKING:
@@ -43,7 +51,7 @@ def save_config(cfg: DictConfig, folder: Path) -> None:
         )
     folder.mkdir(parents=True, exist_ok=True)
     _keep_mesh(cfg, folder)
-    there.write_text(OmegaConf.to_yaml(OmegaConf.create(plain(cfg))))
+    there.write_text(OmegaConf.to_yaml(OmegaConf.create(to_container(cfg))))
 
 
 def _keep_mesh(cfg: DictConfig, folder: Path) -> None:
@@ -53,9 +61,9 @@ def _keep_mesh(cfg: DictConfig, folder: Path) -> None:
         return
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # it was read before, and they were shown
-        mesh = make(cfg, "mesh")
-    with whole_file(folder / MESH) as file:
-        save_exactly(Path(file.name), mesh)
+        mesh = instantiate(cfg, "mesh")
+    with atomic_write(folder / MESH) as file:
+        write_mesh_exactly(Path(file.name), mesh)
 
 
 def _is_file(cfg: DictConfig) -> bool:
@@ -101,7 +109,9 @@ def check_resumed(cfg: DictConfig) -> dict[str, Any] | None:
     if not path.is_file():
         raise ConfigError(f"ckpt_path: there is no {path} to resume; leave it out to begin anew")
     before = path.parent.parent / "config.yaml"
-    if before.is_file() and (changed := validation.changes(_read_config(before), plain(cfg))):
+    if before.is_file() and (
+        changed := validation.changes(_read_config(before), to_container(cfg))
+    ):
         raise ConfigError(
             f"ckpt_path: {path} is of another configuration: {'; '.join(changed)}; "
             "set them back, or begin a run of another name"
@@ -159,7 +169,9 @@ def _read_config(path: Path) -> dict[str, Any]:
         found: Any = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
         if not isinstance(found, dict):
             raise ValueError("is no list of keys and values")
-        if any(isinstance(value, str) and "${" in value for _, value in validation.walk(found)):
+        if any(
+            isinstance(value, str) and "${" in value for _, value in validation.iter_nodes(found)
+        ):
             raise ValueError("holds an interpolation, which no saved run does")
     except (ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
         reason = " ".join(str(error).split())
@@ -237,7 +249,7 @@ def _scene_of_run(
         elif not trust:
             raise ConfigError(
                 f"mesh.path = {cfg.mesh.path} must be kept in the run's folder as {own}; write it "
-                "there (dpl.fem.save_exactly), or load the run with trust=True"
+                "there (dpl.fem.write_mesh_exactly), or load the run with trust=True"
             )
     if trust:
         return build_scene(cfg)
@@ -306,6 +318,6 @@ def load_data(cfg: DictConfig, scene: Scene) -> "OfflineData":
     Raises:
         ConfigError: It cannot be made.
     """
-    data = make(cfg, "data", scene=scene)
+    data = instantiate(cfg, "data", scene=scene)
     data.prepare_data()
     return data

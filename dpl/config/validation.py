@@ -32,7 +32,7 @@ KEYS: dict[str, Any] = {  # what a configuration may hold at its top, and of whi
     **{"minutes": float, "works": Sequence[str]},
     **{"host": str, "port": int, "names": Sequence[str], "movie": str | None, "speed": bool},
 }
-SPANS = {  # smallest and largest of them
+RANGES = {  # smallest and largest of them
     **{"repeats": (1, 10**6), "samples": (1, 10**6), "shards": (1, math.inf)},
     **{"count": (0, 10**6), "far": (0, 10**6), "workers": (0, 1024), "seed": (0, 2**32 - 1)},
     **{"budget": (1, 10**6), "minutes": (1e-2, 1e6), "port": (0, 65535)},
@@ -46,13 +46,13 @@ TRAINED = {  # smallest and largest of what only a training must keep to; 1e-30 
     **{"trainer.limit_train_batches": (1e-30, 10**9)},
 }
 ENDLESS = {"trainer.max_epochs", "trainer.max_steps"}  # -1 of these stands for no limit
-KINDS = {  # what the call under a key must give: one of these, or of a class derived from them
+EXPECTED_TYPES = {  # of what the call under a key gives: one of these, or derived from them
     "mesh": {"skfem.mesh.mesh.Mesh"},
     "material": {"dpl.fem.materials.material.Material"},
     "clamped": {f"dpl.fem.mesh.regions.{n}" for n in ("Plane", "Box", "Sphere", "Cylinder", "Tag")},
     "supports": {
-        "dpl.fem.assembly.boundary_conditions.Displacement",
-        "dpl.fem.assembly.boundary_conditions.Spring",
+        "dpl.fem.assembly.boundary_conditions.DirichletBC",
+        "dpl.fem.assembly.boundary_conditions.RobinBC",
     },
     "forces": {"dpl.fem.loads.forces.Traction", "dpl.fem.loads.forces.BodyForce"},
     "solver": {"dpl.fem.solvers.newton.Newton"},
@@ -70,14 +70,14 @@ TRUSTED = {  # modules whose functions a run's folder may name; classes are in K
     "dpl.fem.loads.sampling",
     "dpl.training.schedules",
 }
-OURS = ("dpl.", "torch.optim.")  # where those classes are
-OWN = {"_target_", "_partial_", "_recursive_", "_convert_"}  # Hydra's own options of a call
+OWN_PACKAGES = ("dpl.", "torch.optim.")  # where those classes are
+HYDRA_KEYS = {"_target_", "_partial_", "_recursive_", "_convert_"}  # Hydra's own options of a call
 
-ASIDE = {  # where a run lies and how it is watched, not what it is
+NOT_IDENTITY = {  # where a run lies and how it is watched, not what it is
     *("run", "folder", "ckpt_path", "data.folder"),
     *("trainer.callbacks", "trainer.logger", "trainer.plugins"),
 }
-RESUMED = {  # what may change where a run is resumed: how long it is, and the machine's part
+MAY_CHANGE_ON_RESUME = {  # keys of a run's length and of the machine
     *(f"trainer.max_{unit}" for unit in ("epochs", "steps", "time")),
     *(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy")),
     *("trainer.log_every_n_steps", "trainer.check_val_every_n_epoch", "trainer.profiler"),
@@ -109,9 +109,9 @@ def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = Tr
             not finite or out of range, or an object that does not exist or is not trusted.
     """
     if unknown := sorted({str(key) for key in resolved} - set(KEYS)):
-        raise ConfigError(f"{unknown[0]}: there is no such key; {instead(unknown[0], KEYS)}")
+        raise ConfigError(f"{unknown[0]}: there is no such key; {suggestion(unknown[0], KEYS)}")
     for node in (written, resolved):  # first where a value is written
-        for path, value in walk(node):
+        for path, value in iter_nodes(node):
             if isinstance(value, float) and not math.isfinite(value):
                 raise ConfigError(f"{path} = {value} is not a finite number")
             if isinstance(value, int) and not -(2**63) <= value < 2**63:
@@ -119,7 +119,7 @@ def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = Tr
     for key, value in resolved.items():
         _check_top(key, value)
     trained = TRAINED if "trainer" in resolved else {}
-    for path, node in walk(resolved):
+    for path, node in iter_nodes(resolved):
         if path in trained and not (path in ENDLESS and node == -1):
             least, most = trained[path]
             _check_span(path, node, least, most, " or be -1" * (path in ENDLESS))
@@ -132,7 +132,7 @@ def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = Tr
 def _is_call(path: str) -> bool:
     """Return whether what lies at a path must be a call."""
     key, *below = path.split(".")
-    return len(below) == (key in SEVERAL) and key in KINDS
+    return len(below) == (key in SEVERAL) and key in EXPECTED_TYPES
 
 
 def _check_top(key: str, value: Any) -> None:
@@ -140,9 +140,9 @@ def _check_top(key: str, value: Any) -> None:
     if key == "folder" and value is None:  # of scripts that write nothing
         return
     plain = {} if isinstance(value, dict) else value  # only some keys may be calls
-    if not fits(plain, KEYS[key]):
+    if not matches_type(plain, KEYS[key]):
         raise ConfigError(f"{key} = {value!r} must be {_words(KEYS[key])}")
-    _check_span(key, value, *SPANS.get(key, (-math.inf, math.inf)))
+    _check_span(key, value, *RANGES.get(key, (-math.inf, math.inf)))
 
 
 def _check_span(key: str, value: Any, least: float, most: float, more: str = "") -> None:
@@ -162,7 +162,7 @@ def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
     foreign = f"{path} names {name}, which is none of this package's; not called"
     if not isinstance(name, str):
         raise ConfigError(f"{path}._target_ = {name!r} must be a text")
-    if not trust and not name.startswith(OURS):
+    if not trust and not name.startswith(OWN_PACKAGES):
         raise ConfigError(foreign)
     try:
         module, _, attribute = name.rpartition(".")
@@ -173,8 +173,10 @@ def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
         raise ConfigError(f"{path}._target_ = {name!r} cannot be called")
     if not trust:
         if inspect.isclass(target):
-            kinds = set().union(*KINDS.values())
-            ours = f"{target.__module__}.".startswith(OURS) and is_a(target, kinds)
+            kinds = set().union(*EXPECTED_TYPES.values())
+            ours = f"{target.__module__}.".startswith(OWN_PACKAGES) and is_instance_of(
+                target, kinds
+            )
         else:
             ours = target.__module__ in TRUSTED and not target.__name__.startswith("_")
         if not ours:
@@ -182,7 +184,7 @@ def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
     return typing.cast("Callable[..., Any]", target)
 
 
-def is_a(kind: type, names: set[str]) -> bool:
+def is_instance_of(kind: type, names: set[str]) -> bool:
     """Return whether a class is one of these or derived from them, none of them imported."""
     return not names.isdisjoint(f"{base.__module__}.{base.__qualname__}" for base in kind.__mro__)
 
@@ -193,14 +195,14 @@ def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> 
     except (TypeError, ValueError):  # of what is written in C
         raise ConfigError(f"{path}._target_ = {node['_target_']!r} has no known options") from None
     for key, value in node.items():
-        if key in OWN:
+        if key in HYDRA_KEYS:
             if key.endswith(("partial_", "recursive_")) and not isinstance(value, bool):
                 raise ConfigError(f"{path}.{key} = {value!r} must be true or false")
             continue
         if key not in known:
-            told = instead(str(key), known, f"{path}.")
+            told = suggestion(str(key), known, f"{path}.")
             raise ConfigError(f"{path}.{key}: {node['_target_']} has no such option; {told}")
-        if key in hints and not fits(value, hints[key]):
+        if key in hints and not matches_type(value, hints[key]):
             raise ConfigError(f"{path}.{key} = {value!r} must be {_words(hints[key])}")
 
 
@@ -211,12 +213,12 @@ def options_of(node: Mapping[str, Any]) -> set[str]:
     return set()
 
 
-def near(name: str, known: Collection[str]) -> str | None:
+def nearest_name(name: str, known: Collection[str]) -> str | None:
     """Return the known name that is most like another one; None if none is."""
     return next(iter(difflib.get_close_matches(name, known, 1)), None)
 
 
-def instead(name: str, known: Collection[str], place: str = "") -> str:
+def suggestion(name: str, known: Collection[str], place: str = "") -> str:
     """Return which known name may be meant, or all of them.
 
     Args:
@@ -224,7 +226,7 @@ def instead(name: str, known: Collection[str], place: str = "") -> str:
         known: The known names.
         place: What stands before the name that is meant.
     """
-    if found := near(name, known):
+    if found := nearest_name(name, known):
         return f"did you mean {place}{found}?"
     return f"there are {', '.join(sorted(known))}"
 
@@ -245,11 +247,11 @@ def _signature(target: Callable[..., Any]) -> tuple[set[str], dict[str, Any]]:
     return known - {"self", "args", "kwargs"}, hints
 
 
-def fits(value: Any, hint: Any) -> bool:
+def matches_type(value: Any, hint: Any) -> bool:
     """Return whether a plain value can be what a type hint says; hints of objects accept all."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
-        return any(fits(value, argument) for argument in arguments)
+        return any(matches_type(value, argument) for argument in arguments)
     if isinstance(value, dict) and "_target_" in value:
         return True  # another call
     if hint is float:
@@ -260,9 +262,9 @@ def fits(value: Any, hint: Any) -> bool:
         return value in arguments
     if origin is tuple and Ellipsis not in arguments:
         many = isinstance(value, list) and len(value) == len(arguments)
-        return many and all(map(fits, value, arguments))
+        return many and all(map(matches_type, value, arguments))
     if origin in (Sequence, Iterable, list, tuple):
-        return isinstance(value, list) and all(fits(item, arguments[0]) for item in value)
+        return isinstance(value, list) and all(matches_type(item, arguments[0]) for item in value)
     if origin is Callable:
         return False
     if hint is Path:
@@ -283,7 +285,7 @@ def _words(hint: Any) -> str:
     return names.get(hint, str(hint))
 
 
-def walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+def iter_nodes(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield a node and all below it with their paths."""
     yield path, node
     entries: Any = ()
@@ -292,18 +294,18 @@ def walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     elif isinstance(node, list):
         entries = enumerate(node)
     for key, value in entries:
-        yield from walk(value, f"{path}.{key}" if path else str(key))
+        yield from iter_nodes(value, f"{path}.{key}" if path else str(key))
 
 
 def columns(node: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield what makes one run differ from another, flat: numbers, truth values and texts.
 
     Under the keys of the command line (`model.width`). A call stands under its own key by the name
-    of what it calls (`model`: FCNN). Left out are null and `ASIDE`.
+    of what it calls (`model`: FCNN). Left out are null and `NOT_IDENTITY`.
     """
     for key, value in node.items():
         place = f"{path}.{key}" if path else key
-        if value is None or place in ASIDE:
+        if value is None or place in NOT_IDENTITY:
             continue
         if isinstance(value, dict):
             yield from columns(value, place)
@@ -316,7 +318,7 @@ def columns(node: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
 def changes(theirs: dict[str, Any], ours: dict[str, Any]) -> list[str]:
     """Return in what two configurations differ that one run must not, a line each."""
     before, now = dict(_leaves(theirs)), dict(_leaves(ours))
-    free = tuple(f"{key}." for key in (*ASIDE, *RESUMED))
+    free = tuple(f"{key}." for key in (*NOT_IDENTITY, *MAY_CHANGE_ON_RESUME))
     return [
         f"{key} was {before.get(key)}, is {now.get(key)}"
         for key in sorted(before.keys() | now.keys())
@@ -326,6 +328,6 @@ def changes(theirs: dict[str, Any], ours: dict[str, Any]) -> list[str]:
 
 def _leaves(node: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield the values of plain data that hold no others, and their paths."""
-    for path, value in walk(node):
+    for path, value in iter_nodes(node):
         if not isinstance(value, dict | list):
             yield path, value

@@ -7,7 +7,7 @@ from dpl.system.lazy import public_names
 if TYPE_CHECKING:
     from dpl.data.datamodule import OfflineData, OnlineData, Samples
     from dpl.data.dataset import DataSet
-    from dpl.data.replay_buffer import Replay
+    from dpl.data.replay_buffer import ReplayBuffer
     from dpl.data.storage.store import Store
     from dpl.data.storage.writer import Writer
     from dpl.data.stream import OnlineSamples

@@ -13,9 +13,9 @@ from torch.utils.data import DataLoader, Dataset
 from torch.utils.data.distributed import DistributedSampler
 
 from dpl.data.dataset import DataSet
-from dpl.data.replay_buffer import Rates, Replay
+from dpl.data.replay_buffer import ReplayBuffer, StreamRates
 from dpl.data.storage.writer import Writer
-from dpl.data.stream import OnlineSamples, Worst
+from dpl.data.stream import HardExamples, OnlineSamples
 from dpl.fem import symmetries
 from dpl.fem.symmetry import Symmetry, images
 from dpl.scene import Sample, Scene
@@ -111,9 +111,9 @@ class OfflineData(L.LightningDataModule):
         always = self.scene.loads.always
         return symmetries(self.scene.problem, also=[] if always is None else [always])
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """Return what of the data set need not be solved, a line each."""
-        lines = self.wanted.plan()
+        lines = self.wanted.skipped_work()
         if self.symmetry:
             lines.append(f"{len(self.group)} samples of each load solved: symmetries of the body")
         return lines
@@ -138,7 +138,7 @@ class OfflineData(L.LightningDataModule):
         trainer = self.trainer
         return (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
 
-    def train_dataloader(self) -> DataLoader | Replay:
+    def train_dataloader(self) -> DataLoader | ReplayBuffer:
         """Return shuffled batches, in an order that (shuffle, epoch) decides: a run can resume.
 
         Batches of samples and their images, or of what the module encodes them as.
@@ -229,19 +229,19 @@ class OnlineData(OfflineData):
         super().__init__(scene, train=0, workers=workers, batch_size=batch_size, **kwargs)  # type: ignore[arg-type]
         self._options = {"batches": batches, "fresh": fresh, "reuse": reuse, "capacity": capacity}
         self._save, self._worst = save, worst
-        self.rates: Rates | None = None
-        self._replay: Replay | None = None
+        self.rates: StreamRates | None = None
+        self._replay: ReplayBuffer | None = None
         self._produced = self._first = 0  # what earlier runs took that this one resumes
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """Return what need not be solved, a line each."""
-        lines = super().plan()
+        lines = super().skipped_work()
         known = sum(line["tried"] for line in self.store.shards() if line["split"] == "train")
         if self._save and known:
             lines.append(f"{known} loads of the stream not solved again: they are there")
         return lines
 
-    def train_dataloader(self) -> Replay:
+    def train_dataloader(self) -> ReplayBuffer:
         """Return the stream, an epoch at a time; training keeps to the cores that are left."""
         # threads of one operation wait for each other: none of them may wait for a solving worker
         left = max(1, cores() - self.workers)
@@ -254,11 +254,11 @@ class OnlineData(OfflineData):
             lane=rank,
             lanes=processes,
             store=self.store if self._save else None,
-            worst=Worst(self.scene.loads.dimension) if self._worst else None,
+            worst=HardExamples(self.scene.loads.n_random) if self._worst else None,
             near=self._worst,
             timeout=self.wanted.timeout,
         )
-        self._replay = Replay(
+        self._replay = ReplayBuffer(
             stream,
             workers=self.workers,
             batch_size=self.batch_size,
@@ -274,7 +274,7 @@ class OnlineData(OfflineData):
         module = self.trainer.lightning_module if self.trainer is not None else None
         return getattr(module, "batch_errors", None)
 
-    def _report(self, rates: Rates) -> None:
+    def _report(self, rates: StreamRates) -> None:
         """Keep an epoch's rates; write what makes whole shards."""
         self.rates = rates
         if self._save and self.place[0] == 0:

@@ -20,14 +20,14 @@ from rich.progress import (
     track,
 )
 
-from dpl.data.solving.solve import Job
-from dpl.data.solving.worker_pool import Stop
+from dpl.data.solving.solve import LoadKey
+from dpl.data.solving.worker_pool import GracefulShutdown
 from dpl.data.storage import acceptance
 from dpl.data.storage.integrity import repair, verify
 from dpl.data.storage.store import Store
 from dpl.data.storage.writer import Writer
 from dpl.scene import Scene
-from dpl.system.files import append_line
+from dpl.system.files import append_jsonl
 from dpl.version import __version__
 
 MOST = 10**7  # loads in a split
@@ -100,7 +100,7 @@ class DataSet:
             for split, size in self.sizes.items()
         }
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """Return what need not be solved, a line each."""
         wanted = sum(self.sizes.values())
         there = wanted - sum(len(self.store.missing(*split)) for split in self.sizes.items())
@@ -124,7 +124,7 @@ class DataSet:
         missing = self.missing()
         if any(missing.values()):
             self._solve(missing)
-        if told := acceptance.warning(self.store.acceptance()):
+        if told := acceptance.bias_warning(self.store.acceptance()):
             print(f"warning: {told}", file=sys.stderr)
         return self.store
 
@@ -138,13 +138,13 @@ class DataSet:
             TimeRemainingColumn(),
         )
         jobs = {
-            Job(self.store.stream(split), number)
+            LoadKey(self.store.stream(split), number)
             for split, numbers in missing.items()
             for number in numbers
         }
-        found = len(jobs & self.store.spool.files().keys())
+        found = len(jobs & self.store.pending.files().keys())
         done = _Session(workers=self.workers)
-        with Stop() as stop, Progress(*columns, refresh_per_second=2) as progress:
+        with GracefulShutdown() as stop, Progress(*columns, refresh_per_second=2) as progress:
             bar = progress.add_task("loads", total=len(jobs), completed=found, news="")
             writer = Writer(self.store, self.shard, self.shards)
             solving = writer.fill(missing, workers=self.workers, timeout=self.timeout, stop=stop)
@@ -155,7 +155,7 @@ class DataSet:
                         progress.update(bar, advance=1, news=news)
             finally:
                 done.write(self.store.folder)
-            stop.leave()
+            stop.exit()
 
     def verify(self) -> Iterator[str]:
         """Yield what is wrong with the data set, a line for each flaw.
@@ -225,4 +225,4 @@ class _Session:
                 "seconds": round(time.perf_counter() - self.begin, 3),
                 "core_seconds": round(self.core_seconds, 3),
             }
-            append_line(folder / "journal.jsonl", line)
+            append_jsonl(folder / "journal.jsonl", line)

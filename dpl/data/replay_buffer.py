@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from dpl.data.solving.worker_pool import HOPELESS, TRIES
-from dpl.data.stream import Drawn, OnlineSamples
+from dpl.data.solving.worker_pool import MAX_CONSECUTIVE_CRASHES, MAX_RETRIES
+from dpl.data.stream import DrawnSample, OnlineSamples
 from dpl.fem.symmetry import Symmetry, images
 from dpl.scene import Sample, stack
-from dpl.system.processes import spawning, unsignalled
+from dpl.system.processes import block_signals, spawn_context
 
 
-class Rates(NamedTuple):
+class StreamRates(NamedTuple):
     """How fast an epoch's samples were made and used.
 
     Attributes:
@@ -36,7 +36,7 @@ class Rates(NamedTuple):
     buffer: int
 
 
-class Replay:
+class ReplayBuffer:
     """Batches from a stream and from what it has given so far: a slow solver, a busy optimiser.
 
     Every `fresh` new samples enter a buffer (the oldest leave a full one), and batches are drawn
@@ -65,7 +65,7 @@ class Replay:
         capacity: int,
         group: Sequence[Symmetry] = (),
         errors: Callable[[], Tensor | None] = lambda: None,
-        report: Callable[[Rates], None] = lambda rates: None,
+        report: Callable[[StreamRates], None] = lambda rates: None,
     ) -> None:
         """Keep the arguments, see the class; nothing starts before the first pass.
 
@@ -83,7 +83,7 @@ class Replay:
             report: Is told the rates at the end of each pass.
         """
         self.produced = self.following = 0
-        self.rates: Rates | None = None
+        self.rates: StreamRates | None = None
         self._source, self._workers, self._group = stream, workers, group
         self._batches, self._batch_size = batches, batch_size
         self._fresh, self._reuse = fresh, reuse
@@ -108,7 +108,7 @@ class Replay:
             if k == self._batches:  # before the last batch: nobody may ask for one more
                 used += self._batch_size if k > 1 else 0  # which is not used yet
                 seconds = max(time.monotonic() - begin, 1e-9)
-                self.rates = Rates(
+                self.rates = StreamRates(
                     produced=(self.produced - produced) / seconds,
                     consumed=(self._used - used) / seconds,
                     waiting=(self._waited - waited) / seconds,
@@ -125,12 +125,12 @@ class Replay:
             batch_size=1 if self._restarts else self._fresh,
             num_workers=self._workers,
             collate_fn=_batch,
-            multiprocessing_context=spawning() if self._workers else None,
+            multiprocessing_context=spawn_context() if self._workers else None,
             worker_init_fn=_begin,
             generator=torch.Generator(),  # none of the training's random numbers
         )
         before = signal.getsignal(signal.SIGCHLD)
-        with unsignalled(signal.SIGINT):
+        with block_signals(signal.SIGINT):
             self._stream = iter(loader)
         if threading.current_thread() is threading.main_thread():
             # torch would raise wherever training is when a worker dies; `_next` finds out
@@ -168,7 +168,7 @@ class Replay:
         force, displacement = (images(field, self._group, which) for field in batch[:2])
         return batch._replace(force=force, displacement=displacement)
 
-    def _next(self) -> Drawn | None:
+    def _next(self) -> DrawnSample | None:
         """Return new samples; None at the end of a stream that has one."""
         start = time.monotonic()
         try:
@@ -179,9 +179,9 @@ class Replay:
             self._restarts += 1
             died = "DataLoader worker" in str(error)
             died |= bool(self._workers) and not isinstance(error, RuntimeError)
-            if not died or self._restarts > HOPELESS:
+            if not died or self._restarts > MAX_CONSECUTIVE_CRASHES:
                 raise
-            if self._restarts % TRIES == 0:  # some load kills worker after worker
+            if self._restarts % MAX_RETRIES == 0:  # some load kills worker after worker
                 lane, first = self._source.lane * self._workers, self._source.first
                 for place in range(lane, lane + self._workers):
                     following = self._source.starts.get(place, first + place)
@@ -221,7 +221,7 @@ class _Buffer:
         """Uses that are left in all."""
         return int(self._left.sum())
 
-    def put(self, news: Drawn) -> None:
+    def put(self, news: DrawnSample) -> None:
         """Put samples in the place of the oldest ones."""
         if not self._count:  # memory is taken as it is written to
             self.sample = Sample(*(c.new_empty(self._capacity, *c.shape[1:]) for c in news.sample))
@@ -259,8 +259,8 @@ def _begin(worker: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _batch(drawn: list[Drawn]) -> Drawn:
-    return Drawn(
+def _batch(drawn: list[DrawnSample]) -> DrawnSample:
+    return DrawnSample(
         stack([one.sample for one in drawn]),
         torch.stack([one.number for one in drawn]),
         torch.stack([one.point for one in drawn]),

@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from dpl.data.solving.solve import Job, Outcome, lost, outcome
-from dpl.data.solving.worker_pool import GRACE
+from dpl.data.solving.solve import LoadKey, SolvedLoad, failed_load, solve_load
+from dpl.data.solving.worker_pool import STARTUP_GRACE
 from dpl.data.storage.store import Store
 from dpl.scene import Sample, Scene
 
 NEAR = 0.05  # deviation from a bad load, in the unit cube, of the loads that are drawn near it
 
 
-class Drawn(NamedTuple):
+class DrawnSample(NamedTuple):
     """A sample (or a batch of them) and its place in the stream.
 
     Attributes:
@@ -33,7 +33,7 @@ class Drawn(NamedTuple):
     point: Tensor
 
 
-class Worst:
+class HardExamples:
     """Where the surrogate is worst at present: written by the trainer, read by all workers.
 
     Attributes:
@@ -86,7 +86,7 @@ class OnlineSamples(IterableDataset):
         lane: int = 0,
         lanes: int = 1,
         store: Store | None = None,
-        worst: Worst | None = None,
+        worst: HardExamples | None = None,
         near: float = 0.0,
         timeout: float | None = None,
     ) -> None:
@@ -96,39 +96,39 @@ class OnlineSamples(IterableDataset):
         self.lane, self.lanes = lane, lanes
         self.store, self.worst, self.near, self.timeout = store, worst, near, timeout
 
-    def __iter__(self) -> Iterator[Drawn]:
+    def __iter__(self) -> Iterator[DrawnSample]:
         """Yield samples (N, D), one at a time."""
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
         place = self.lane * workers + worker
         first = self.starts.get(place, self.first + place)
         known = self.store.reader("train") if self.store else None
-        grace = GRACE
+        grace = STARTUP_GRACE
         for index in itertools.count(first, workers * self.lanes):
             one = known(index) if known else None
             if one is None:
                 limit = self.timeout + grace if self.timeout and info is not None else None
                 one, grace = self._solved(index, limit), 0.0
                 if self.store:
-                    self.store.spool.put(one)
+                    self.store.pending.put(one)
             if one.accepted:
                 point = torch.from_numpy(one.point)
                 loads, where = self.scene.loads, point[None]
                 moduli = loads.young_at(where)[0], loads.poisson_at(where)[0]
                 fields = torch.from_numpy(one.force), torch.from_numpy(one.displacement)
-                yield Drawn(Sample(*fields, *moduli), torch.tensor(index), point)
+                yield DrawnSample(Sample(*fields, *moduli), torch.tensor(index), point)
 
-    def _solved(self, index: int, limit: float | None) -> Outcome:
+    def _solved(self, index: int, limit: float | None) -> SolvedLoad:
         """Return a load, solved within so many seconds, or recorded as lost."""
-        job, point = Job(self.seed, index), None
+        job, point = LoadKey(self.seed, index), None
         if self.worst is not None:
             rng = np.random.default_rng(np.random.SeedSequence((*self.seed, 1), spawn_key=(index,)))
             point = self.worst.near(rng) if rng.random() < self.near else None
         try:
             with _within(limit):
-                return outcome(self.scene, job, point=point)
+                return solve_load(self.scene, job, point=point)
         except TimeoutError as error:
-            return lost(self.scene, job, str(error))
+            return failed_load(self.scene, job, str(error))
 
 
 @contextmanager

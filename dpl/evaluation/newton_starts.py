@@ -13,10 +13,19 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dpl.evaluation.timing import in_turn
-from dpl.fem import Accelerated, Load, Newton, Problem, SingularMatrix, Solution, Solver, judge
+from dpl.evaluation.timing import time_interleaved
+from dpl.fem import (
+    AndersonSolver,
+    Load,
+    Newton,
+    Problem,
+    SingularMatrix,
+    Solution,
+    Solver,
+    evaluate_solution,
+)
 from dpl.fem.dofs import gather, scatter
-from dpl.fem.solvers import in_step
+from dpl.fem.solvers import run_lockstep
 from dpl.inference import Hybrid
 from dpl.inference.hybrid import Predict
 from dpl.scene import Scene
@@ -53,10 +62,10 @@ class PlainNewton:
             guess: Where to start, (B, N, D) [-]; zero if left out.
         """
         guesses = torch.zeros_like(load.force) if guess is None else guess
-        yield from in_step(
+        yield from run_lockstep(
             [
                 self._member(single, u[None], guess is not None)
-                for single, u in zip(load.singles(), guesses, strict=True)
+                for single, u in zip(load.unbatch(), guesses, strict=True)
             ]
         )
 
@@ -73,7 +82,7 @@ class PlainNewton:
     def _member(self, load: Load, u: Tensor, guessed: bool) -> Iterator[Solution]:
         problem, start = self.solver.problem, time.perf_counter()
         for k in range(self.max_iter + 1):
-            state = judge(problem, u, load, self.tol, iterations=k, from_guess=guessed)
+            state = evaluate_solution(problem, u, load, self.tol, iterations=k, from_guess=guessed)
             yield state._replace(
                 factorisations=torch.tensor([k]),
                 seconds=torch.tensor([time.perf_counter() - start], dtype=torch.float64),
@@ -184,19 +193,21 @@ def contestants(
     """
     settings: dict[str, float] = {"tol": tol}
     settings |= {} if budget is None else {"budget": budget}
-    robust, quick = scene.solver.but(**settings), scene.corrector.but(**settings)
+    robust, quick = scene.solver.replace(**settings), scene.corrector.replace(**settings)
     plain = PlainNewton(robust)
     solvers: dict[tuple[str, str], Solver] = {
         ("plain Newton", ""): plain,
-        ("plain Newton, load steps", ""): robust.but(mixed=False, reuse=0.0),
+        ("plain Newton, load steps", ""): robust.replace(mixed=False, reuse=0.0),
         (REFERENCE, ""): robust,
-        ("robust Newton, K(0) turned", ""): robust.but(turned=True),
+        ("robust Newton, K(0) turned", ""): robust.replace(turned=True),
     }
     for name, predict in networks.items():
         solvers["hybrid, paper's rule", name] = Hybrid(predict, plain, "paper")
         solvers["hybrid, best rule, factors", name] = Hybrid(predict, robust)
         solvers["hybrid, best rule", name] = Hybrid(predict, quick)
-        solvers["hybrid, without tangents", name] = Hybrid(predict, quick, steps=Accelerated(quick))
+        solvers["hybrid, without tangents", name] = Hybrid(
+            predict, quick, steps=AndersonSolver(quick)
+        )
     return solvers
 
 
@@ -217,7 +228,7 @@ def measure(
         tick: Called after each load.
     """
     with one_thread(), torch.inference_mode():
-        whole = in_turn(solvers, load, tick)
+        whole = time_interleaved(solvers, load, tick)
     exact = whole[REFERENCE, ""][0].displacement.flatten(1)
     trials = []
     for (name, network), (answer, times) in whole.items():

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dpl.evaluation.timing import WARM_UP, path, percentiles
+from dpl.evaluation.timing import WARM_UP, percentiles, time_iterates
 from dpl.fem import Load, Solver, solve
 from dpl.scene import Sample
 from dpl.system.threads import one_thread
@@ -91,13 +91,13 @@ def points(
         device: Where networks run, for the record.
         tick: Called after each solver.
     """
-    singles = batch.load.singles()
+    singles = batch.load.unbatch()
     found = []
     with _threads(threads), torch.inference_mode():
         for name, solver in solvers.items():
             for load in singles[:WARM_UP]:
                 solve(solver, load)
-            paths = [path(solver, load) for load in singles]
+            paths = [time_iterates(solver, load) for load in singles]
             count = max(map(len, paths))
             for k in range(count):
                 now = [states[min(k, len(states) - 1)] for states in paths]

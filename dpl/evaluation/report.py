@@ -11,14 +11,14 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from dpl.evaluation.timing import Latency, in_turn, latencies, percentiles, told
+from dpl.evaluation.timing import Latency, describe, latencies, percentiles, time_interleaved
 from dpl.fem import Problem, Solution, Solver
-from dpl.fem import save as write_mesh
-from dpl.inference import Direct, Hybrid, Simulator, best
+from dpl.fem import write_mesh as write_mesh
+from dpl.inference import Direct, Hybrid, Simulator, default_hybrid
 from dpl.scene import Sample
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2, Surrogate
-from dpl.training.metrics import median, metrics
+from dpl.training.metrics import default_metrics, median
 from dpl.visualization import deformed
 
 
@@ -54,20 +54,20 @@ def clock(
 ) -> tuple[list[Row], dict[str, Tensor]]:
     """Return a row for each solver, and the displacements (B, N, D) [-] that it answered.
 
-    Loads are asked one at a time, see `dpl.evaluation.timing.in_turn`.
+    Loads are asked one at a time, see `dpl.evaluation.timing.time_interleaved`.
 
     Args:
         solvers: Named.
         batch: The loads with the truth.
         problem: The body.
     """
-    whole = in_turn(solvers, batch.load)
+    whole = time_interleaved(solvers, batch.load)
     rows = [_row(name, *taken, batch, problem) for name, taken in whole.items()]
     return rows, {name: answer.displacement for name, (answer, _) in whole.items()}
 
 
 def _row(name: str, answer: Solution, times: Tensor, batch: Sample, problem: Problem) -> Row:
-    errors = metrics(problem)
+    errors = default_metrics(problem)
     errors.update(answer.displacement, batch)
     median, slowest = percentiles(times)
     return Row(
@@ -163,7 +163,7 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
         tol: Residual ratio of Newton and the hybrid [-].
     """
     scene = surrogate.scene
-    newton = scene.solver.but(tol=tol)
+    newton = scene.solver.replace(tol=tol)
     # with Poisson's ratios of their own, loads have their own K(0): each solver makes it for itself
     shared = scene.loads.poisson_range is None
     own = scene if shared else replace(scene, solver=replace(scene.solver))
@@ -171,7 +171,7 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
         "linear": replace(newton.rest, tol=tol),
         "network": Direct(surrogate.predict, scene.problem, tol),
         "hybrid Newton": Hybrid(surrogate.predict, newton if shared else replace(newton), "paper"),
-        "hybrid, best rule": best(surrogate.predict, own, tol),
+        "hybrid, best rule": default_hybrid(surrogate.predict, own, tol),
         "Newton from zero": newton,
     }
     with one_thread():
@@ -179,7 +179,7 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
     measured = latencies(Simulator(surrogate), test.load)
     rows = [replace(row, latency=measured) if row.solver == "network" else row for row in rows]
     show(rows, f"{len(test.force)} fresh loads, one at a time, 1 thread, tol {tol:g}")
-    print(told(measured))
+    print(describe(measured))
     save(rows, folder / "evaluation.json")
     _picture(surrogate, test, answers, folder)
     return rows

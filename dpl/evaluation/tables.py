@@ -13,7 +13,7 @@ from typing import Any, TypeVar, get_type_hints
 from rich.console import Console
 from rich.table import Table
 
-from dpl.system.files import whole_file
+from dpl.system.files import atomic_write
 
 Row = TypeVar("Row")
 READERS: dict[Any, Callable[[str], Any]] = {
@@ -42,7 +42,7 @@ def write(rows: Sequence[Any], path: Path) -> None:
     writer = csv.writer(lines)
     writer.writerow([field.name for field in fields(rows[0])])
     writer.writerows([text(value, 4) for value in asdict(row).values()] for row in rows)
-    with whole_file(path) as file:
+    with atomic_write(path) as file:
         file.write(lines.getvalue().encode())
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem import Load, Solution, Solver, solve
-from dpl.fem.solvers import joined
+from dpl.fem.solvers import concatenate
 from dpl.inference import Simulator
 from dpl.system.threads import one_thread
 
@@ -91,14 +91,14 @@ def latencies(simulator: Simulator, load: Load) -> dict[str, Latency]:
     }
 
 
-def told(measured: Mapping[str, Latency]) -> str:
+def describe(measured: Mapping[str, Latency]) -> str:
     """Return latencies as one line."""
     loads = next(iter(measured.values())).loads
     words = "; ".join(f"{name} {one}" for name, one in measured.items())
     return f"latency, 1 thread, {loads} loads: {words}"
 
 
-def in_turn(
+def time_interleaved(
     solvers: Mapping[K, Solver], load: Load, tick: Callable[[], None] = lambda: None
 ) -> dict[K, tuple[Solution, Tensor]]:
     """Return the answers and the wall times (B,) [ms] of each solver.
@@ -113,7 +113,7 @@ def in_turn(
     """
     answers: dict[K, list[Solution]] = {name: [] for name in solvers}
     times: dict[K, list[float]] = {name: [] for name in solvers}
-    singles = load.singles()
+    singles = load.unbatch()
     for solver in solvers.values():
         solve(solver, singles[0])
     for single in singles:
@@ -123,12 +123,12 @@ def in_turn(
             times[name].append(1e3 * (time.perf_counter() - start))
         tick()
     return {
-        name: (joined(answers[name]), torch.tensor(times[name], dtype=torch.float64))
+        name: (concatenate(answers[name]), torch.tensor(times[name], dtype=torch.float64))
         for name in solvers
     }
 
 
-def path(solver: Solver, load: Load) -> list[tuple[float, Solution]]:
+def time_iterates(solver: Solver, load: Load) -> list[tuple[float, Solution]]:
     """Return every iterate with the time at which it was there [ms]."""
     found = []
     start = time.perf_counter()

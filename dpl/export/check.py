@@ -97,7 +97,7 @@ def trial(scene: Scene, count: int) -> Trial:
     some = loads.sample(TRIED, range(FEW))
     parts.append(("zero", some._replace(force=torch.zeros_like(some.force))))
     random = torch.Generator().manual_seed(11)
-    places = loads.reach.any(dim=1).nonzero()[:, 0]
+    places = loads.loadable_dofs.any(dim=1).nonzero()[:, 0]
     point = torch.zeros_like(some.force)
     for k in range(FEW):
         node = places[int(torch.randint(len(places), (1,), generator=random))]

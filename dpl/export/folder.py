@@ -23,11 +23,11 @@ from torch import Tensor
 
 from dpl.export.check import TRIED
 from dpl.export.onnx_graph import Array, Graph, opset
-from dpl.fem import Problem, judge, solve, surface
-from dpl.fem.mesh.writing import flat
+from dpl.fem import Problem, evaluate_solution, solve, surface
+from dpl.fem.mesh.writing import flat_cells
 from dpl.fem.postprocess import triangles
 from dpl.scene import Scene
-from dpl.system.files import whole_file
+from dpl.system.files import atomic_write
 from dpl.training import Surrogate, checkpoints
 from dpl.version import __version__
 
@@ -86,7 +86,7 @@ def reference(graph: Graph, *, most: int = 16) -> Reference:
         exact = solve(scene.solver, load)
         if bool(exact.converged) and not any(map(bool, local)):
             break
-    answer = judge(scene.problem, metres.clone() / scene.length, load, scene.solver.tol)
+    answer = evaluate_solution(scene.problem, metres.clone() / scene.length, load, scene.solver.tol)
     apart = (answer.displacement - exact.displacement).norm() / exact.displacement.norm()
     return Reference(
         {name: one.numpy() for name, one in zip(graph.inputs, given, strict=True)},
@@ -148,7 +148,7 @@ def described(
             "count": nodes * dim,
             "order": "node-major: D * node + component; components x, y, z",
             "held": _numbers(~scene.problem.free),
-            "acting": _numbers(loads.reach),
+            "acting": _numbers(loads.loadable_dofs),
         },
         "scales": {
             "length": scene.length,
@@ -197,7 +197,7 @@ def _range(scene: Scene) -> dict[str, Any]:
 
 
 def _mesh(problem: Problem) -> dict[str, Any]:
-    kind, cells = flat(problem.mesh, len(problem.points))
+    kind, cells = flat_cells(problem.mesh, len(problem.points))
     return {
         "points": (problem.length * (problem.points.numpy() + problem.origin)).tolist(),
         "cell_type": kind,
@@ -220,19 +220,19 @@ def write(folder: Path, surrogate: Surrogate, told: Reference, meta: Mapping[str
     (folder / "reference").mkdir(parents=True, exist_ok=True)
     for name, field in told.fields().items():
         write_raw(folder / "reference" / f"{name}.f64", field)
-    modes = torch.where(loads.reach[..., None], loads.modes.vectors, 0.0) * loads.q_max
+    modes = torch.where(loads.loadable_dofs[..., None], loads.modes.vectors, 0.0) * loads.q_max
     write_raw(folder / "modes.f64", modes.numpy())
     checkpoint: dict[str, Any] = {"state_dict": surrogate.state_dict()}
     checkpoint |= {"scene": scene.fingerprint, "identity": scene.identity()}
     checkpoints.write(checkpoint, folder / "weights.safetensors")
     lines = (f" {json.dumps(key)}: {json.dumps(value)}" for key, value in meta.items())
-    with whole_file(folder / "meta.json") as file:
+    with atomic_write(folder / "meta.json") as file:
         file.write(("{\n" + ",\n".join(lines) + "\n}\n").encode())
 
 
 def write_raw(path: Path, field: Array) -> None:
     """Write numbers as they lie in memory, float64, little-endian."""
-    with whole_file(path) as file:
+    with atomic_write(path) as file:
         file.write(np.ascontiguousarray(field, dtype=RAW).tobytes())
 
 

@@ -82,11 +82,11 @@ class Graph(nn.Module):
         """
         module = self.surrogate
         load = module.scene.load_of(force, young, poisson)
-        scaled, more = module.entering(load)
+        scaled, more = module.scale_inputs(load)
         if not self.basis:
-            return (module.scene.length * module.leaving(module.net(scaled, **more)),)
+            return (module.scene.length * module.unscale_outputs(module.net(scaled, **more)),)
         answer, local = module.net.within(scaled, **more)
-        metres = module.scene.length * module.leaving(answer)
+        metres = module.scene.length * module.unscale_outputs(answer)
         loaded = (force != 0).flatten(1).any(dim=1)  # at rest the basis misses nothing
         return (metres, local & loaded) if self.flags else (metres,)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dpl.fem import Load, fields, save_series, solve
+from dpl.fem import Load, fields, solve, write_series
 from dpl.scene import Scene
 from dpl.training import Surrogate
 
@@ -49,7 +49,7 @@ def results(
     """
     scene = surrogate.scene
     rows, steps = [], []
-    for k, single in enumerate(load.singles()):
+    for k, single in enumerate(load.unbatch()):
         with torch.no_grad():
             answer = surrogate.predict(single)[0]
         truth = None
@@ -69,7 +69,7 @@ def results(
                 error,
             )
         )
-    return rows, save_series(path, scene.problem.mesh_in_metres, steps)
+    return rows, write_series(path, scene.problem.mesh_in_metres, steps)
 
 
 def shown(

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.fem.assembly.boundary_conditions import Displacement, Spring
-    from dpl.fem.linear.backends import installed
+    from dpl.fem.assembly.boundary_conditions import DirichletBC, RobinBC
+    from dpl.fem.linear.backends import installed_backends
     from dpl.fem.linear.interface import SingularMatrix
     from dpl.fem.loads.forces import BodyForce, Traction
     from dpl.fem.loads.modal import ModalLoads
     from dpl.fem.loads.modal_basis import Modes, eigenmodes
     from dpl.fem.materials.linear_elastic import LinearElastic
-    from dpl.fem.materials.material import Hookean, Isotropic, Material
+    from dpl.fem.materials.material import InvariantBasedMaterial, Material, YoungPoissonMaterial
     from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
     from dpl.fem.materials.neo_hookean import (
         NeoHookeanIsoK2,
@@ -25,20 +25,20 @@ if TYPE_CHECKING:
     from dpl.fem.materials.yeoh import YeohK2
     from dpl.fem.mesh.generators import box, rectangle
     from dpl.fem.mesh.propeller_mesh import propeller
-    from dpl.fem.mesh.reading import load
+    from dpl.fem.mesh.reading import read_mesh
     from dpl.fem.mesh.regions import Box, Cylinder, Plane, Sphere, Tag
-    from dpl.fem.mesh.writing import save, save_exactly, save_series
+    from dpl.fem.mesh.writing import write_mesh, write_mesh_exactly, write_series
     from dpl.fem.postprocess.stress import Fields, fields
     from dpl.fem.postprocess.surface import surface
     from dpl.fem.problem import Problem
     from dpl.fem.rom.galerkin import PODGalerkin
-    from dpl.fem.solvers.anderson import Accelerated
+    from dpl.fem.solvers.anderson import AndersonSolver
     from dpl.fem.solvers.batched_newton import BatchedNewton
-    from dpl.fem.solvers.bifurcation import branches
-    from dpl.fem.solvers.differentiable import Equilibrium
-    from dpl.fem.solvers.linear import Linear
+    from dpl.fem.solvers.bifurcation import post_buckling_branches
+    from dpl.fem.solvers.differentiable import DifferentiableSolve
+    from dpl.fem.solvers.linear import LinearSolver
     from dpl.fem.solvers.newton import Newton
-    from dpl.fem.solvers.solution import Load, Solution, Solver, Status, judge, solve
+    from dpl.fem.solvers.solution import Load, Solution, Solver, Status, evaluate_solution, solve
     from dpl.fem.symmetry import symmetries
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -12,16 +12,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.assembly.boundary_conditions import Support, held
+from dpl.fem.assembly.boundary_conditions import Support, assemble_constraints
 from dpl.fem.assembly.elements import QUADRATIC, basis_of, gradients
 from dpl.fem.assembly.kernels import Kernels
 from dpl.fem.assembly.tensor_assembly import Body
-from dpl.fem.materials.material import Isotropic, Material
+from dpl.fem.materials.material import InvariantBasedMaterial, Material
 from dpl.fem.materials.tensors import volume_change
 from dpl.fem.mesh.generators import aspect_ratio, longest_side, near_origin
 from dpl.fem.mesh.regions import Region
 
-TWINS = 64  # bodies of other Poisson's ratios that are kept
+MAX_CLONES = 64  # bodies of other Poisson's ratios that are kept
 FAINT = 1e-292  # largest force below which arithmetic rounds to an absolute precision [-]
 
 
@@ -54,8 +54,8 @@ class System(NamedTuple):
 class Problem(Body):
     """Static equilibrium of one body, see `Body`; build it with `Problem.build`.
 
-    `evaluate`, `linearise` and `widened` say what its tensor operations say, without derivatives,
-    by compiled loops where body and law have them.
+    `evaluate`, `linearise` and `update_strain_gap` say what its tensor operations say, without
+    derivatives, by compiled loops where body and law have them.
     """
 
     @classmethod
@@ -109,7 +109,7 @@ class Problem(Body):
                 "mean_dilatation: is for linear quadrilaterals and hexahedra; "
                 "set degree=2 instead, quadratic elements hardly lock"
             )
-        given, springs = held(
+        given, springs = assemble_constraints(
             basis, length, supports, origin=origin, fixed=fixed, prescribed=prescribed
         )
         dN, dV = gradients(basis)
@@ -170,15 +170,15 @@ class Problem(Body):
                 )
             return self
         if isinstance(poisson, Tensor) and len(poisson) != 1:
-            return self._twin(poisson.detach().to(self.points.device, torch.float64))
+            return self._clone(poisson.detach().to(self.points.device, torch.float64))
         one = float(poisson)
-        if one not in self._twins:
-            if len(self._twins) >= TWINS:
-                self._twins.clear()
-            self._twins[one] = self._twin(one)
-        return self._twins[one]
+        if one not in self._clones:
+            if len(self._clones) >= MAX_CLONES:
+                self._clones.clear()
+            self._clones[one] = self._clone(one)
+        return self._clones[one]
 
-    def _twin(self, poisson: Tensor | float) -> Self:
+    def _clone(self, poisson: Tensor | float) -> Self:
         twin = replace(self, material=self.material.at(poisson))
         for name in ("pattern", "moved_supports", "_operator"):
             twin.__dict__[name] = getattr(self, name)
@@ -189,7 +189,7 @@ class Problem(Body):
         return twin
 
     @cached_property
-    def _twins(self) -> dict[float, Self]:
+    def _clones(self) -> dict[float, Self]:
         return {}
 
     @property
@@ -231,11 +231,11 @@ class Problem(Body):
         """
         return force * self.free
 
-    def residual_ratio(self, displacement: Tensor, force: Tensor) -> Tensor:
-        """Return ||R_free|| / ||f||, (B,) [-], see `imbalance`."""
-        return self.imbalance(self.evaluate(displacement).internal, force)
+    def relative_residual(self, displacement: Tensor, force: Tensor) -> Tensor:
+        """Return ||R_free|| / ||f||, (B,) [-], see `relative_residual_of`."""
+        return self.relative_residual_of(self.evaluate(displacement).internal, force)
 
-    def imbalance(self, internal: Tensor, force: Tensor) -> Tensor:
+    def relative_residual_of(self, internal: Tensor, force: Tensor) -> Tensor:
         """Return ||R_free|| / ||f||, (B,) [-]: the one criterion by which answers are judged.
 
         ||f|| is the norm of the forces on free degrees of freedom. Forces on held ones do no work
@@ -257,13 +257,17 @@ class Problem(Body):
         """
         return self._measured(internal, force)[0]
 
-    def balanced(self, displacement: Tensor, internal: Tensor, force: Tensor, tol: float) -> Tensor:
-        """Return whether `imbalance` is below tol, or as small as rounding lets it be, (B,)."""
+    def is_equilibrium(
+        self, displacement: Tensor, internal: Tensor, force: Tensor, tol: float
+    ) -> Tensor:
+        """Return whether the relative residual is below tol or below its roundoff bound, (B,)."""
         ratio, scale = self._measured(internal, force)
-        return (ratio < tol) | ((ratio < 1e-4) & (ratio * scale <= self.rounding(displacement)))
+        return (ratio < tol) | (
+            (ratio < 1e-4) & (ratio * scale <= self.roundoff_bound(displacement))
+        )
 
     def _measured(self, internal: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `imbalance` and the ||f|| that it is relative to, (B,) [-]."""
+        """Return `relative_residual_of` and the ||f|| that it is relative to, (B,) [-]."""
         loads = [self.acting(force).flatten(1)]
         if self.moved_supports:
             loads.append((internal * (self.prescribed != 0)).flatten(1))
@@ -275,7 +279,7 @@ class Problem(Body):
         residual = self.acting(internal - force).flatten(1)
         return (residual / unit[:, None]).norm(dim=1) / size, size * unit
 
-    def rounding(self, displacement: Tensor) -> Tensor:
+    def roundoff_bound(self, displacement: Tensor) -> Tensor:
         """Return what rounding alone can make of ||R_free||, (B,) [-].
 
         A bound from magnitudes: every nodal force is a sum of products of displacement, gradient,
@@ -291,9 +295,9 @@ class Problem(Body):
             moduli, each = 1.0, moduli.flatten()
         terms = moduli * (self.dV[..., None] * size * size.sum(-1, keepdim=True)).sum(1)
         terms = terms.expand(len(self.cells), -1)[None, ..., None]
-        held = ~self.free.any(dim=1)
+        assemble_constraints = ~self.free.any(dim=1)
         summed = self._gathered(terms.expand(-1, -1, -1, self.shape[1]))[0, :, 0]
-        summed = torch.where(held, 0.0, summed)
+        summed = torch.where(assemble_constraints, 0.0, summed)
         return torch.finfo(torch.float64).eps * float(summed.norm()) * each
 
     @cached_property
@@ -306,7 +310,7 @@ class Problem(Body):
 
         Args:
             displacement: u.
-            gap: What `widened` returned; None for plain Newton.
+            gap: What `update_strain_gap` returned; None for plain Newton.
         """
         if (kernels := self._kernels(displacement)) is None:
             return self._reference_system(displacement, gap)
@@ -325,7 +329,7 @@ class Problem(Body):
         lowest = 1 + volume_change(2 * (self.strain(displacement) - gap)).flatten(1).amin(1)
         return System(*self.mixed_system(displacement, gap), lowest > 1e-3)
 
-    def widened(self, gap: Any, length: float, update: Tensor) -> Any:
+    def update_strain_gap(self, gap: Any, length: float, update: Tensor) -> Any:
         """Return the gap between the strain of u and that of mixed points after a step.
 
         Points move with the strain's linear change along length * update and close as much of the
@@ -337,8 +341,8 @@ class Problem(Body):
             update: The full step, (1, N, D) [-].
         """
         if (kernels := self._kernels(update)) is not None:
-            return kernels.widened(gap, length, update[0].contiguous().numpy())
-        wider = length**2 * self.bending(update)
+            return kernels.update_strain_gap(gap, length, update[0].contiguous().numpy())
+        wider = length**2 * self.quadratic_strain(update)
         return wider if gap is None else (1 - length) * gap + wider
 
     def _kernels(self, displacement: Tensor) -> Kernels | None:
@@ -358,7 +362,7 @@ class Problem(Body):
     @cached_property
     def _compiled(self) -> Kernels | None:
         law = self.material
-        if self.mean_dilatation or not isinstance(law, Isotropic):
+        if self.mean_dilatation or not isinstance(law, InvariantBasedMaterial):
             return None
         if (first := self.__dict__.get("_first")) is not None and first._compiled is not None:
             return first._compiled.under(law)

@@ -7,12 +7,12 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from dpl.fem import Accelerated, Load, Problem, Solution, judge
-from dpl.fem.solvers import check_tol, in_step
+from dpl.fem import AndersonSolver, Load, Problem, Solution, evaluate_solution
+from dpl.fem.solvers import check_tol, run_lockstep
 from dpl.scene import Scene
 
 Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]
-RULES = ("best", "paper")
+RULES = ("natural_monotonicity", "paper")
 SECOND = 0.1  # part of the displacement that the second correction may be in any case
 
 
@@ -59,7 +59,7 @@ class Direct:
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield the prediction."""
         prediction = _prediction(self.predict, load)
-        yield judge(self.problem, prediction, load, self.tol, from_guess=True)
+        yield evaluate_solution(self.problem, prediction, load, self.tol, from_guess=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +72,12 @@ class Hybrid:
     `rule="paper"`: one classic step is taken from rest, and Newton goes on from the prediction
     where its residual is smaller than that after the step, else from the step.
 
-    `rule="best"`: Newton goes on from the prediction as long as its corrections contract. The
-    first must be less than half of the displacement that it leads to, ||du|| < ||u + du|| / 2,
-    where from rest the two are equal; each that follows, less than half of the one before. The
-    second may also be a tenth of the displacement: the first removes what stiff directions resist
-    and shows only then what soft ones lack. If not, Newton starts again from rest. Corrections,
-    unlike residuals, do not depend on how stiff the body is against an error.
+    `rule="natural_monotonicity"`: Newton goes on from the prediction as long as its corrections
+    contract. The first must be less than half of the displacement that it leads to, ||du|| < ||u +
+    du|| / 2, where from rest the two are equal; each that follows, less than half of the one
+    before. The second may also be a tenth of the displacement: the first removes what stiff
+    directions resist and shows only then what soft ones lack. If not, Newton starts again from
+    rest. Corrections, unlike residuals, do not depend on how stiff the body is against an error.
 
     With `steps`, those are tried first from a prediction, and Newton goes on from the best of them.
 
@@ -93,8 +93,8 @@ class Hybrid:
 
     predict: Predict
     newton: Corrector
-    rule: str = "best"
-    steps: Accelerated | None = None
+    rule: str = "natural_monotonicity"
+    steps: AndersonSolver | None = None
 
     def __post_init__(self) -> None:
         """Check the rule.
@@ -113,16 +113,18 @@ class Hybrid:
         """
         guesses = _prediction(self.predict, load)
         member = self._by_paper if self.rule == "paper" else self._by_corrections
-        yield from in_step(
+        yield from run_lockstep(
             [
                 member(single, guess[None])
-                for single, guess in zip(load.singles(), guesses, strict=True)
+                for single, guess in zip(load.unbatch(), guesses, strict=True)
             ]
         )
 
     def _by_paper(self, load: Load, guess: Tensor) -> Iterator[Solution]:
         """Yield the states under one load."""
-        predicted = judge(self.newton.problem, guess, load, self.newton.tol, from_guess=True)
+        predicted = evaluate_solution(
+            self.newton.problem, guess, load, self.newton.tol, from_guess=True
+        )
         yield predicted
         if predicted.converged:
             return
@@ -132,7 +134,7 @@ class Hybrid:
         yield first
         if first.converged:
             return
-        if not pick(predicted, first):
+        if not prefer_prediction(predicted, first):
             yield from classic
             return
         yield from _after(first, self.newton.iterate(load, guess=guess))
@@ -175,7 +177,7 @@ class Hybrid:
             last, before = state, size
 
 
-def best(predict: Predict, scene: Scene, tol: float | None = None) -> Hybrid:
+def default_hybrid(predict: Predict, scene: Scene, tol: float | None = None) -> Hybrid:
     """Return the hybrid that suits a scene.
 
     Where K(0)'s factor, turned, stands for those of tangents, steps without tangents come first.
@@ -185,11 +187,11 @@ def best(predict: Predict, scene: Scene, tol: float | None = None) -> Hybrid:
         scene: What is simulated.
         tol: Residual ratio [-]; the scene's if left out.
     """
-    newton = scene.corrector if tol is None else scene.corrector.but(tol=tol)
-    return Hybrid(predict, newton, steps=Accelerated(newton) if newton.turned else None)
+    newton = scene.corrector if tol is None else scene.corrector.replace(tol=tol)
+    return Hybrid(predict, newton, steps=AndersonSolver(newton) if newton.turned else None)
 
 
-def pick(predicted: Solution, first: Solution) -> bool:
+def prefer_prediction(predicted: Solution, first: Solution) -> bool:
     """Return whether Newton goes on from the prediction: ||R(u_p)|| < ||R(u_1)||, nothing inverted.
 
     Written so that a residual that is not a number never picks.

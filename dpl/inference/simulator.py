@@ -12,11 +12,11 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from dpl.fem import Load, Newton, Solution, Status, judge
+from dpl.fem import Load, Newton, Solution, Status, evaluate_solution
 from dpl.fem.dofs import gather
 from dpl.fem.problem import FAINT
-from dpl.fem.solvers import check_tol, joined
-from dpl.inference.hybrid import best
+from dpl.fem.solvers import check_tol, concatenate
+from dpl.inference.hybrid import default_hybrid
 from dpl.models import PODNet
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
@@ -34,7 +34,8 @@ class Answer:
 
     Attributes:
         displacement: (N, D) [m]; of the kind that the force was, NumPy or torch.
-        residual: ||R_free|| / ||f||, evaluated at the displacement [-], see `Problem.imbalance`.
+        residual: ||R_free|| / ||f||, evaluated at the displacement [-], see
+            `Problem.relative_residual_of`.
         volume_ratio: min det F there [-]; at 0 or below an element is inverted.
         converged: Whether the residual is below the tolerance that was asked for (without one, the
             scene's) and nothing is inverted. False too where rounding does not allow it.
@@ -54,9 +55,9 @@ class Answer:
     converged: Any
     negative_pivots: Any
     amplitude: Any
-    strange: Any
-    outside: Any
-    tier: Any
+    out_of_span: Any
+    out_of_distribution: Any
+    method: Any
     iterations: Any
     milliseconds: Any
     verdict: Any
@@ -156,7 +157,7 @@ class Simulator:
             amplitude, strange = self.scene.loads.place(load.force)
             shared = (time.perf_counter() - begin) / count
             found = []
-            for k, single in enumerate(load.singles()):
+            for k, single in enumerate(load.unbatch()):
                 ask = _Ask(tol, budget_ms, warm, time.perf_counter() - shared)
                 tier, state = self._best(single, predictions[k : k + 1], float(amplitude[k]), ask)
                 if stability:
@@ -164,7 +165,7 @@ class Simulator:
                 self._before = single.poisson, state.displacement
                 found.append((tier, state, 1e3 * (time.perf_counter() - ask.begin)))
         tiers, states, times = zip(*found, strict=True)
-        state = joined(states)
+        state = concatenate(states)
         kept = state.converged & (state.residual < wanted)
         outside = (amplitude > 1 + SLACK) | (strange > STRANGE) | self._elsewhere(load)
         words = [
@@ -245,7 +246,7 @@ class Simulator:
         scene = self.scene
         tol = scene.solver.tol if ask.tol is None else ask.tol
         if not load.force.any() and not scene.problem.moved_supports:
-            return "rest", judge(scene.problem, torch.zeros_like(prediction), load, tol)
+            return "rest", evaluate_solution(scene.problem, torch.zeros_like(prediction), load, tol)
         found: tuple[str, Solution] | None = None
         for tier, last in self._tiers(load, prediction, amplitude, tol, ask):
             if found is None or _rank(last) <= _rank(found[1]):
@@ -261,23 +262,23 @@ class Simulator:
     ) -> Iterator[tuple[str, Solution]]:
         """Yield ever better answers, each with who gave it."""
         problem = self.scene.problem
-        yield "network", judge(problem, prediction, load, tol, from_guess=True)
+        yield "network", evaluate_solution(problem, prediction, load, tol, from_guess=True)
         if ask.tol is None and ask.budget_ms is None:
             return
         if amplitude < SMALL:
             answer = self.scene.linear.at(load.poisson).respond(load.force[0])[None]
-            yield "linear", judge(problem, answer, load, tol)
+            yield "linear", evaluate_solution(problem, answer, load, tol)
         guess = prediction
         if self.correct is not None and bool(guess.isfinite().all()):
             guess = self.correct(load.force[0], guess[0])[None]
-            yield "corrected", judge(problem, guess, load, tol, from_guess=True)
-        newton = self.scene.corrector.but(tol=tol)
+            yield "corrected", evaluate_solution(problem, guess, load, tol, from_guess=True)
+        newton = self.scene.corrector.replace(tol=tol)
         guesses = [guess] if guess is prediction else [guess, prediction]
         if ask.warm and self._before is not None and torch.equal(self._before[0], load.poisson):
             guesses.append(self._before[1])
         start = guess if len(guesses) == 1 else nearest(newton, load, guesses)
         clock = time.perf_counter()
-        for state in best(lambda load: start, self.scene, tol).iterate(load):
+        for state in default_hybrid(lambda load: start, self.scene, tol).iterate(load):
             if int(state.iterations):
                 now = time.perf_counter()
                 self._pace, clock = now - clock, now
@@ -319,7 +320,7 @@ def nearest(newton: Newton, load: Load, guesses: list[Tensor]) -> Tensor:
     correction, and not how stiff the body is against an error. One that inverts an element or is
     not finite is not taken unless all are like that.
     """
-    turning = newton.at(load.poisson).rest.turning
+    turning = newton.at(load.poisson).rest.corotational
 
     def distance(guess: Tensor) -> float:
         internal, volume = turning.problem.evaluate(guess)

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from dpl.fem import Problem
 from dpl.models.grid import Immersion, Permutation, cubic_grid, filling, own_grid
-from dpl.models.poisson_interpolation import placed
+from dpl.models.poisson_interpolation import normalise_poisson
 from dpl.scene import Scene
 from dpl.system.memory import refuse_beyond
 
@@ -75,8 +75,8 @@ class CNN(nn.Module):
         constant = self._constant(problem, shape)
         self.register_buffer("constant", constant, persistent=False)
         self.poisson_range = scene.loads.poisson_range
-        self.takes = () if self.poisson_range is None else ("poisson",)
-        self.net = UNet(dim + len(constant) + len(self.takes), dim, sizes, widths)
+        self.extra_inputs = () if self.poisson_range is None else ("poisson",)
+        self.net = UNet(dim + len(constant) + len(self.extra_inputs), dim, sizes, widths)
 
     def _constant(self, problem: Problem, shape: tuple[int, ...]) -> Tensor:
         """Return the channels that no load changes and that are not the same everywhere."""
@@ -102,12 +102,12 @@ class CNN(nn.Module):
         constant = self.constant.expand(force.shape[0], *self.constant.shape)
         fields = [self.immersion.spread(force), constant]
         if self.poisson_range is not None:
-            place = placed(poisson, self.poisson_range, force)
+            place = normalise_poisson(poisson, self.poisson_range, force)
             sides = fields[0].shape[2:]
             fields.append(place.view(-1, 1, *[1] * len(sides)).expand(-1, -1, *sides))
         return self.immersion.read(self.net(torch.cat(fields, 1)))
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """Return what the network leaves out, a line each."""
         lines = []
         if isinstance(self.immersion, Permutation):

@@ -5,7 +5,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from dpl.models.poisson_interpolation import placed
+from dpl.models.poisson_interpolation import normalise_poisson
 from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 
@@ -58,15 +58,15 @@ class FCNN(nn.Module):
         if width is not None and width < 1:
             raise ValueError(f"width = {width} must be 1 or more")
         everything = torch.ones(scene.problem.shape, dtype=torch.bool)
-        inputs = everything if all_dofs else scene.loads.reach
+        inputs = everything if all_dofs else scene.loads.loadable_dofs
         outputs = everything if all_dofs else scene.problem.free
         low, high = scene.loads.young_range
         self.largest, self.middle = high, (low + high) / 2  # [Pa]
         self.spread = (high - low) / 2 or high  # of one modulus, itself: others are not far away
         self.poisson_range = scene.loads.poisson_range
         varying = {"young": young, "poisson": self.poisson_range is not None}
-        self.takes = tuple(name for name, enters in varying.items() if enters)
-        ends = int(inputs.sum()) + len(self.takes), int(outputs.sum())
+        self.extra_inputs = tuple(name for name, enters in varying.items() if enters)
+        ends = int(inputs.sum()) + len(self.extra_inputs), int(outputs.sum())
         hidden = width or ends[1]
         sizes = [ends[0], *[hidden] * (layers - 1), ends[1]]
         self.parameters_needed = _parameters(sizes)
@@ -98,18 +98,20 @@ class FCNN(nn.Module):
             ValueError: It is wanted and not there.
         """
         entering = force.flatten(1).index_select(1, self.entries)
-        if "young" in self.takes:
+        if "young" in self.extra_inputs:
             if young is None:
                 raise ValueError("young is an input of this network: give E, (B,) [Pa]")
             size = (young / self.largest).to(force.dtype)[:, None]
             place = ((young - self.middle) / self.spread).to(force.dtype)[:, None]
             entering = torch.cat([size * entering, place], dim=1)
         if self.poisson_range is not None:
-            entering = torch.cat([entering, placed(poisson, self.poisson_range, force)], dim=1)
+            entering = torch.cat(
+                [entering, normalise_poisson(poisson, self.poisson_range, force)], dim=1
+            )
         whole = torch.zeros_like(force).flatten(1)
         return whole.index_copy(1, self.exits, self.stages(entering)).view_as(force)
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """Return what the network leaves out, a line."""
         if self.parameters_saved <= 0:
             return []

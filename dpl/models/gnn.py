@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import gelu
 
 from dpl.models.graph import Floats, Graph, Integers, hierarchy, means
-from dpl.models.poisson_interpolation import placed
+from dpl.models.poisson_interpolation import normalise_poisson
 from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 
@@ -80,8 +80,8 @@ class GNN(nn.Module):
         self.sizes = [len(graph.points) for graph in graphs]
         self.whole = graphs[-1].whole
         self.poisson_range = scene.loads.poisson_range
-        self.takes = () if self.poisson_range is None else ("poisson",)
-        self.moduli = nn.ModuleList(nn.Linear(1, wide) for wide in widths if self.takes)
+        self.extra_inputs = () if self.poisson_range is None else ("poisson",)
+        self.moduli = nn.ModuleList(nn.Linear(1, wide) for wide in widths if self.extra_inputs)
         self.passes = nn.ModuleList(Pass(dim, widths) for _ in range(passes))
         self.decode = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, dim))
 
@@ -96,7 +96,7 @@ class GNN(nn.Module):
             level(*load) for level, load in zip(self.levels, self.resultants(force), strict=True)
         ]
         if self.poisson_range is not None:
-            place = placed(poisson, self.poisson_range, force)
+            place = normalise_poisson(poisson, self.poisson_range, force)
             pairs = zip(states, self.moduli, strict=True)
             states = [state + encoder(place)[None] for state, encoder in pairs]
         for one in self.passes:
@@ -116,7 +116,7 @@ class GNN(nn.Module):
             loads.append(step(*loads[-1]))
         return loads
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """Return what the network leaves out, a line each."""
         lines = ["no positions, only relative ones: the answer moves with the body"]
         if len(self.sizes) > 1:

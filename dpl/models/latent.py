@@ -9,8 +9,8 @@ from torch.autograd.function import once_differentiable
 
 from dpl.fem.symmetry import products
 from dpl.models.pod import PODNet, Reading, padded
-from dpl.models.poisson_interpolation import Rests
-from dpl.models.reduced_samples import evened, left_over, root_mean_square
+from dpl.models.poisson_interpolation import PoissonInterpolation
+from dpl.models.reduced_samples import partial_whitening, projection_error, root_mean_square
 from dpl.models.symmetric_fields import turned_back
 from dpl.scene import Sample, Scene
 
@@ -77,7 +77,7 @@ class Latent(PODNet):
             blocks=blocks,
             symmetry=symmetry,
         )
-        self.linear_tol, self.rests = linear_tol, Rests(scene.linear)
+        self.linear_tol, self.rests = linear_tol, PoissonInterpolation(scene.linear)
         self.register_buffer("unit", torch.tensor(0.0, dtype=torch.float64))
         members = len(self.turns)
         columns = -(-PROBES // members) * members
@@ -92,12 +92,12 @@ class Latent(PODNet):
         self.product = nn.Linear(width, len(self.modes), bias=False)
 
     def _weights(self, coordinates: int, rank: int, width: int) -> int:
-        bent = coordinates * (1 + len(self.takes))
+        bent = coordinates * (1 + len(self.extra_inputs))
         return super()._weights(coordinates, rank, width) + width * (coordinates + bent + rank)
 
     def _reading(self, rank: int, coordinates: int) -> Reading:
         """Return how linear answers are read: in the basis of the displacement."""
-        return Reading(rank, Rests(self.scene.linear).count, own=False)
+        return Reading(rank, PoissonInterpolation(self.scene.linear).count, own=False)
 
     def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
         """See `PODNet.forward`."""
@@ -164,9 +164,9 @@ class Latent(PODNet):
         curved = self.spread * self.product(self.left(x) * self.right(bent))
         return curved / (1 + square) + (square / (1 + square)) ** 1.5 * super().network(inputs)
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """Return what the network leaves out, a line each."""
-        lines = super().plan()
+        lines = super().skipped_work()
         lines.append("nothing linear learnt: K(0)^-1 f is exact to the rank of the basis")
         if self.linear_tol < torch.inf:
             lines.append(
@@ -180,8 +180,8 @@ class Latent(PODNet):
             )
         return lines
 
-    def prepare(self, samples: Sample, unit: float) -> None:
-        """Make the basis; see `PODNet.prepare`."""
+    def fit_bases(self, samples: Sample, unit: float) -> None:
+        """Make the basis; see `PODNet.fit_bases`."""
         self.unit.fill_(unit)
         force, displacement = self._columns(samples)
         linear = self.linear(force, samples.poisson, rtol=1e-12)
@@ -232,7 +232,7 @@ class Latent(PODNet):
             count -= 1  # a family is kept whole or not at all
         axes = padded(axes[:, :count], self.scaled.shape[1])
         size = ((axes.T @ spread(read)) * axes.T).sum(dim=1).clamp(min=0).sqrt()
-        self.scaled.zero_()[: len(axes)] = (axes / evened(size)).to(self.scaled)
+        self.scaled.zero_()[: len(axes)] = (axes / partial_whitening(size)).to(self.scaled)
         size = root_mean_square(targets)
         self.spread.zero_()[: len(size)] = (size * size.max()).sqrt().to(self.spread)
 
@@ -240,13 +240,13 @@ class Latent(PODNet):
         """See `PODNet._split`; of the linear answer the basis has its part, unless it is exact."""
         seen = self.inlet.seen(samples.force)
         linear, whole = self.reading(seen, samples.poisson), self.coordinates(samples.displacement)
-        missed = left_over(samples.displacement, whole)
+        missed = projection_error(samples.displacement, whole)
         local = self._local(seen, linear, samples.poisson)
         if local.any():
             acting = samples.force[local][:, self.acting]
             exact = self._fields(self.linear(acting, samples.poisson[local]), self.moving)
             beyond = samples.displacement[local] - exact
-            missed[local] = left_over(beyond, self.coordinates(beyond))
+            missed[local] = projection_error(beyond, self.coordinates(beyond))
         return linear, whole - linear, missed
 
     def linear(self, acting: Tensor, poisson: Tensor, rtol: float = RESPONSE) -> Tensor:

@@ -1,6 +1,6 @@
 """A network between few coordinates: those of the load, and those of the displacement in a basis.
 
-The basis comes from the training samples (`prepare`) and is kept in the network's buffers.
+The basis comes from the training samples (`fit_bases`) and is kept in the network's buffers.
 """
 
 from typing import NamedTuple, cast
@@ -11,13 +11,13 @@ from torch import Tensor, nn
 from dpl.fem import PODGalerkin, symmetries
 from dpl.fem.rom.pod import LARGE, pod
 from dpl.fem.symmetry import images
-from dpl.models.poisson_interpolation import placed
+from dpl.models.poisson_interpolation import normalise_poisson
 from dpl.models.reduced_samples import (
-    BetweenCoordinates,
-    Coordinates,
-    CoordinateSamples,
-    evened,
-    left_over,
+    ReducedDataset,
+    ReducedOrderNet,
+    ReducedSamples,
+    partial_whitening,
+    projection_error,
     root_mean_square,
 )
 from dpl.models.symmetric_fields import Orbits, turned, turned_back
@@ -66,7 +66,7 @@ class Reading(NamedTuple):
     own: bool = True
 
 
-class PODNet(BetweenCoordinates):
+class PODNet(ReducedOrderNet):
     """POD basis of the displacements, a residual network from coordinates of the load to its own.
 
     The load is read in the POD basis of the training loads. Where the body has symmetries, both
@@ -108,7 +108,7 @@ class PODNet(BetweenCoordinates):
         blocks: int = 4,
         symmetry: bool = True,
     ) -> None:
-        """Build the network; its bases are zero until `prepare`.
+        """Build the network; its bases are zero until `fit_bases`.
 
         Args:
             scene: What it is to answer.
@@ -132,7 +132,7 @@ class PODNet(BetweenCoordinates):
         always = scene.loads.always
         also = [] if always is None else [always]
         self.group = symmetries(scene.problem, also=also) if symmetry else []
-        self.register_buffer("acting", scene.loads.reach, persistent=False)
+        self.register_buffer("acting", scene.loads.loadable_dofs, persistent=False)
         self.register_buffer("moving", scene.problem.free, persistent=False)
         self.inlet, self.outlet = (Orbits(self.group, w) for w in (self.acting, self.moving))
         inputs, outputs = int(self.acting.sum()), int(self.moving.sum())
@@ -142,8 +142,8 @@ class PODNet(BetweenCoordinates):
         read = reading.coordinates
         coordinates = min(coordinates, read)
         self.poisson_range = scene.loads.poisson_range
-        self.takes = () if self.poisson_range is None else ("poisson",)
-        entering = coordinates + len(self.takes)
+        self.extra_inputs = () if self.poisson_range is None else ("poisson",)
+        entering = coordinates + len(self.extra_inputs)
         weights = self._weights(coordinates, rank, width) + 2 * blocks * width * (width + 1)
         refuse_weights(weights, None, "take a smaller model.width or model.blocks")
         for name, shape in {
@@ -163,7 +163,7 @@ class PODNet(BetweenCoordinates):
 
     def _weights(self, coordinates: int, rank: int, width: int) -> int:
         """Return the parameters outside the residual blocks."""
-        return width * (coordinates + len(self.takes) + 1) + (width + 1) * rank
+        return width * (coordinates + len(self.extra_inputs) + 1) + (width + 1) * rank
 
     def _reading(self, rank: int, coordinates: int) -> Reading:
         """Return how loads are read, for R modes and so many inputs."""
@@ -188,7 +188,7 @@ class PODNet(BetweenCoordinates):
         """Return inputs (B, M) with the place of Poisson's ratio, where there is a range."""
         if self.poisson_range is None:
             return inputs
-        return torch.cat([inputs, placed(poisson, self.poisson_range, inputs)], dim=1)
+        return torch.cat([inputs, normalise_poisson(poisson, self.poisson_range, inputs)], dim=1)
 
     def field(self, coordinates: Tensor, like: Tensor) -> Tensor:
         """Return displacements (B, N, D), shaped like forces, of coordinates (B, R)."""
@@ -216,7 +216,7 @@ class PODNet(BetweenCoordinates):
         hidden = nn.functional.gelu(self.blocks(self.enter(inputs)))
         return cast(Tensor, self.spread * self.leave(hidden))
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """Return what the network leaves out, a line each."""
         rank, outputs = len(self.modes), int(self.moving.sum())
         lines = [f"{rank} coordinates learnt instead of {outputs} displacements"]
@@ -226,7 +226,7 @@ class PODNet(BetweenCoordinates):
 
     # ------------------------------------------------------------------ bases
 
-    def prepare(self, samples: Sample, unit: float) -> None:
+    def fit_bases(self, samples: Sample, unit: float) -> None:
         """Make the bases.
 
         Args:
@@ -302,7 +302,7 @@ class PODNet(BetweenCoordinates):
             motions: What symmetries do to coordinates of loads, (G, C, C).
         """
         size = root_mean_square(read)
-        self.scaled.copy_(torch.diag(1 / evened(size)))
+        self.scaled.copy_(torch.diag(1 / partial_whitening(size)))
         size = root_mean_square(targets)
         self.spread.copy_((size * size.max()).sqrt())
 
@@ -365,7 +365,7 @@ class PODNet(BetweenCoordinates):
         members = range(max(1, len(self.group)))
         return torch.stack([self._image(basis.T, where, k) @ basis for k in members])
 
-    def encode(self, samples: Sample) -> CoordinateSamples:
+    def encode(self, samples: Sample) -> ReducedDataset:
         """Return scaled samples (S, N, D), float64, in coordinates."""
         samples = samples._replace(
             displacement=torch.where(self.moving.cpu(), samples.displacement, 0.0)
@@ -373,18 +373,18 @@ class PODNet(BetweenCoordinates):
         device = self.spread.device
         parts = zip(*(column.split(CHUNK) for column in samples), strict=True)
         encoded = [self._encoded(Sample(*(one.to(device) for one in part))) for part in parts]
-        whole = Coordinates(*map(torch.cat, zip(*encoded, strict=True)))
-        return CoordinateSamples(whole, self.turns.cpu(), self.returns.mT.cpu())
+        whole = ReducedSamples(*map(torch.cat, zip(*encoded, strict=True)))
+        return ReducedDataset(whole, self.turns.cpu(), self.returns.mT.cpu())
 
-    def _encoded(self, samples: Sample) -> Coordinates:
+    def _encoded(self, samples: Sample) -> ReducedSamples:
         read, targets, missed = self._split(samples)
-        encoded = Coordinates(
+        encoded = ReducedSamples(
             inputs=self.beside(read @ self.scaled.to(read), samples.poisson).float(),
             targets=targets.float(),
             rest=missed.clamp(min=0),
             size=samples.displacement.flatten(1).square().sum(1) / self.acting.numel(),
         )
-        return Coordinates(*(column.cpu() for column in encoded))
+        return ReducedSamples(*(column.cpu() for column in encoded))
 
     def _split(self, samples: Sample) -> tuple[Tensor, Tensor, Tensor]:
         """Return what of samples (S, N, D) is read, to be learnt, and out of reach.
@@ -395,4 +395,4 @@ class PODNet(BetweenCoordinates):
         """
         targets = self.coordinates(samples.displacement)
         read = self.reading(self.inlet.seen(samples.force), samples.poisson)
-        return read, targets, left_over(samples.displacement, targets)
+        return read, targets, projection_error(samples.displacement, targets)

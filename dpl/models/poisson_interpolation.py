@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dpl.fem import Linear
+from dpl.fem import LinearSolver
 
-EXACT = 1e-5  # aimed at between the nodes of `Rests`, relative error of a linear answer [-]
+EXACT = 1e-5  # aimed at between the nodes, relative error of a linear answer [-]
 MOST = 16  # nodes, whatever the range
 
 
-def placed(poisson: Tensor | None, span: tuple[float, float], like: Tensor) -> Tensor:
+def normalise_poisson(poisson: Tensor | None, span: tuple[float, float], like: Tensor) -> Tensor:
     """Return where in a range Poisson's ratios lie, -1 at its low end, 1 at its high one, (B, 1).
 
     Args:
@@ -32,7 +32,7 @@ def placed(poisson: Tensor | None, span: tuple[float, float], like: Tensor) -> T
 
 
 @dataclass(frozen=True, eq=False)
-class Rests:
+class PoissonInterpolation:
     """K(0)^-1 at a few Poisson's ratios, the polynomial between them for all of a range.
 
     K(0)^-1 is an analytic function of z = (1 + nu)/(1 - 2 nu), 3/2 of bulk over shear modulus, but
@@ -46,7 +46,7 @@ class Rests:
         linear: The linear answer of the body.
     """
 
-    linear: Linear
+    linear: LinearSolver
 
     @cached_property
     def nodes(self) -> list[float]:
@@ -81,7 +81,7 @@ class Rests:
         return max(1, len(self.nodes))
 
     @cached_property
-    def members(self) -> list[Linear]:
+    def members(self) -> list[LinearSolver]:
         """The linear answers, each with its factor when first asked."""
         problem = self.linear.problem
         if not self.nodes:
@@ -118,6 +118,6 @@ class Rests:
 
 
 def _stretched(poisson: Any, centre: float) -> Any:
-    """Return w of Poisson's ratios, see `Rests`."""
+    """Return w of Poisson's ratios, see `PoissonInterpolation`."""
     z = (1 + poisson) / (1 - 2 * poisson)
     return (z - centre) / (z + centre)

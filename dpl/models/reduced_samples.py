@@ -12,7 +12,7 @@ from dpl.fem.symmetry import Symmetry
 from dpl.scene import Sample
 
 
-class Coordinates(NamedTuple):
+class ReducedSamples(NamedTuple):
     """Samples in coordinates; a batch is the same with a leading B.
 
     Attributes:
@@ -28,10 +28,10 @@ class Coordinates(NamedTuple):
     size: Tensor
 
 
-class CoordinateSamples(Dataset):
+class ReducedDataset(Dataset):
     """Samples in coordinates with their images under symmetries, fetched a batch at a time."""
 
-    def __init__(self, samples: Coordinates, inputs: Tensor, targets: Tensor) -> None:
+    def __init__(self, samples: ReducedSamples, inputs: Tensor, targets: Tensor) -> None:
         """Make the images.
 
         Args:
@@ -40,7 +40,7 @@ class CoordinateSamples(Dataset):
             targets: What it does to the targets, (G, R, R).
         """
         images = len(inputs)
-        self.samples = Coordinates(
+        self.samples = ReducedSamples(
             inputs=(samples.inputs @ inputs).flatten(0, 1),
             targets=(samples.targets @ targets).flatten(0, 1),
             rest=samples.rest.repeat(images),
@@ -51,13 +51,13 @@ class CoordinateSamples(Dataset):
         """Return S times the number of symmetries."""
         return len(self.samples.rest)
 
-    def __getitems__(self, indices: list[int]) -> Coordinates:
+    def __getitems__(self, indices: list[int]) -> ReducedSamples:
         """Return a batch."""
         chosen = torch.tensor(indices)
-        return Coordinates(*(column[chosen] for column in self.samples))
+        return ReducedSamples(*(column[chosen] for column in self.samples))
 
 
-class BetweenCoordinates(nn.Module, ABC):
+class ReducedOrderNet(nn.Module, ABC):
     """A network that works between few coordinates of loads and of displacements.
 
     `dpl.training.Surrogate` lets it make its bases before training starts and, where the
@@ -72,11 +72,11 @@ class BetweenCoordinates(nn.Module, ABC):
     group: Sequence[Symmetry]
 
     @abstractmethod
-    def prepare(self, samples: Sample, unit: float) -> None:
+    def fit_bases(self, samples: Sample, unit: float) -> None:
         """Make the bases of training samples, scaled; `unit`: scale of forces over that of u."""
 
     @abstractmethod
-    def encode(self, samples: Sample) -> CoordinateSamples:
+    def encode(self, samples: Sample) -> ReducedDataset:
         """Return training samples, scaled, in coordinates, with their images."""
 
     @abstractmethod
@@ -84,7 +84,7 @@ class BetweenCoordinates(nn.Module, ABC):
         """Return coordinates (B, R) of displacements from those of loads (B, M)."""
 
 
-def left_over(field: Tensor, coordinates: Tensor) -> Tensor:
+def projection_error(field: Tensor, coordinates: Tensor) -> Tensor:
     """Return squares (B,) of what of fields (B, N, D) an orthonormal basis does not hold.
 
     Args:
@@ -94,7 +94,7 @@ def left_over(field: Tensor, coordinates: Tensor) -> Tensor:
     return field.flatten(1).square().sum(dim=1) - coordinates.square().sum(dim=1)
 
 
-def evened(size: Tensor) -> Tensor:
+def partial_whitening(size: Tensor) -> Tensor:
     """Return what coordinates of sizes (n,) are divided by, (n,).
 
     Between whitened and as they are: small ones matter less, but not nothing, and rounding least.

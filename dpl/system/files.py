@@ -23,7 +23,7 @@ class DataSetError(ValueError):
 
 
 @contextmanager
-def whole_file(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
+def atomic_write(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
     """Open a file to write that will be there whole or not at all.
 
     Args:
@@ -52,7 +52,7 @@ def write_file(path: Path, content: bytes) -> None:
         DataSetError: A folder is in its place.
     """
     try:
-        with whole_file(path) as file:
+        with atomic_write(path) as file:
             file.write(content)
     except IsADirectoryError:
         raise DataSetError(
@@ -69,7 +69,7 @@ def sync_folder(path: Path) -> None:
         os.close(folder)
 
 
-def append_line(path: Path, line: dict[str, Any]) -> None:
+def append_jsonl(path: Path, line: dict[str, Any]) -> None:
     """Add a line of JSON, synced; after a line that a crash has torn, on a line of its own.
 
     Raises:
@@ -91,7 +91,7 @@ def append_line(path: Path, line: dict[str, Any]) -> None:
             raise
 
 
-def own_file(path: Path, most: float = TEXT) -> bytes:
+def read_regular_file(path: Path, most: float = TEXT) -> bytes:
     """Return the content of a file of a data set.
 
     Raises:
@@ -116,11 +116,11 @@ def _refuse_foreign(path: Path, most: float) -> None:
         )
 
 
-def read_lines(path: Path) -> list[dict[str, Any]]:
+def read_jsonl(path: Path) -> list[dict[str, Any]]:
     """Return the lines of JSON in a file, those left out that a crash has torn.
 
     Raises:
-        DataSetError: It is no file of its own, see `own_file`.
+        DataSetError: It is no file of its own, see `read_regular_file`.
     """
     return [line for line in parsed_lines(path) if line is not None]
 
@@ -129,11 +129,11 @@ def parsed_lines(path: Path) -> list[dict[str, Any] | None]:
     """Return what each line of a file holds, None for a line that is not a JSON object.
 
     Raises:
-        DataSetError: It is no file of its own, see `own_file`.
+        DataSetError: It is no file of its own, see `read_regular_file`.
     """
     content = b""
     with suppress(FileNotFoundError):
-        content = own_file(path)
+        content = read_regular_file(path)
     return [_parsed(line) for line in content.splitlines()]
 
 
@@ -145,7 +145,7 @@ def _parsed(line: bytes) -> dict[str, Any] | None:
 
 
 @contextmanager
-def sole_writer(folder: Path, shard: int = 0, shards: int = 1) -> Iterator[None]:
+def exclusive_lock(folder: Path, shard: int = 0, shards: int = 1) -> Iterator[None]:
     """Be the only writer of shard `shard` of `shards` of a folder; a dead writer does not count.
 
     The kernel keeps the locks (flock), so none outlives its process.

@@ -83,7 +83,7 @@ class _Context(SpawnContext):
     Process = _Process
 
 
-def spawning() -> SpawnContext:
+def spawn_context() -> SpawnContext:
     """Return the way to start workers: anew, and tied to the life of this process.
 
     Forking a process with BLAS threads can hang it. A process of joblib's has a way of its own,
@@ -95,7 +95,7 @@ def spawning() -> SpawnContext:
 
 
 @contextlib.contextmanager
-def unsignalled(*numbers: signal.Signals) -> Iterator[None]:
+def block_signals(*numbers: signal.Signals) -> Iterator[None]:
     """Start processes that these signals do not reach: they are their parent's to handle."""
     resource_tracker.ensure_running()  # which would unblock them
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)

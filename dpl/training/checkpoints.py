@@ -21,7 +21,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from safetensors import safe_open
 from safetensors.torch import save
 
-from dpl.system.files import whole_file
+from dpl.system.files import atomic_write
 
 WEIGHTS = ".safetensors"
 # what stands beside the weights, as JSON
@@ -40,7 +40,7 @@ def write(checkpoint: dict[str, Any], path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     for part in path.parent.glob(f".{path.name}.*.part"):
         part.unlink(missing_ok=True)
-    with whole_file(path) as file:
+    with atomic_write(path) as file:
         if path.suffix != WEIGHTS:
             torch.save(checkpoint, file)
             return
@@ -103,7 +103,7 @@ def _weights(path: Path) -> dict[str, Any]:
     return {**{name: header[name] for name in HEADER if name in header}, "state_dict": state}
 
 
-class WholeCheckpoints(TorchCheckpointIO):
+class AtomicCheckpointIO(TorchCheckpointIO):
     """Lightning's way to `write` and `read`.
 
     Its own goes through the default temporary folder; where that is another file system, a kill

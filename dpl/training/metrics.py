@@ -127,7 +127,7 @@ class ResidualRatio(_PerLoad):
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
         """See `_PerLoad`."""
-        ratio = self.problem.at(batch.poisson).residual_ratio(prediction, batch.force)
+        ratio = self.problem.at(batch.poisson).relative_residual(prediction, batch.force)
         return torch.nan_to_num(ratio, nan=torch.inf)
 
     def reduce(self, values: Tensor) -> Tensor:
@@ -151,7 +151,7 @@ class MinVolumeRatio(_PerLoad):
         return values.min()
 
 
-def metrics(problem: Problem) -> MetricCollection:
+def default_metrics(problem: Problem) -> MetricCollection:
     """Return all of them, named as in the tables."""
     return MetricCollection(
         {
@@ -172,7 +172,7 @@ def _error(prediction: Tensor, batch: Sample) -> Tensor:
     return (prediction - batch.displacement).flatten(1)
 
 
-class Judged(NamedTuple):
+class PerLoadErrors(NamedTuple):
     """How wrong the answers to some loads are.
 
     Attributes:

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from dpl.fem import Load
-from dpl.models.reduced_samples import BetweenCoordinates, Coordinates, CoordinateSamples
+from dpl.models.reduced_samples import ReducedDataset, ReducedOrderNet, ReducedSamples
 from dpl.scene import Sample, Scene
-from dpl.training.losses.loss import Loss, Physics
+from dpl.training.losses.loss import Loss, LossContext
 from dpl.training.losses.supervised import MSE
-from dpl.training.metrics import metrics
+from dpl.training.metrics import default_metrics
 from dpl.training.rng_state import random_states, set_random_states
 
 SCALES = 3  # the stream of the loads that give the scales; those of samples are below
@@ -27,7 +27,7 @@ class Surrogate(L.LightningModule):
 
     Attributes:
         net: Scaled force (B, N, D) to scaled displacement (B, N, D). What it takes besides of a
-            load, by name, its `takes` says: "young", "poisson".
+            load, by name, its `extra_inputs` says: "young", "poisson".
         scene: What it answers for.
         loss: What it is trained with.
         batch_errors: Relative L2 errors on the last training batch, (B,); None before the first.
@@ -62,7 +62,7 @@ class Surrogate(L.LightningModule):
         self._optimizer, self._scheduler = optimizer, scheduler
         span = scene.loads.poisson_range
         self._own = int(span is not None)
-        if span is not None and "poisson" not in getattr(net, "takes", ()):
+        if span is not None and "poisson" not in getattr(net, "extra_inputs", ()):
             raise ValueError(
                 f"{type(net).__name__} takes no Poisson's ratio, and the law has a range of them, "
                 f"{list(span)}; take one of them (material.poisson) or another model"
@@ -73,9 +73,9 @@ class Surrogate(L.LightningModule):
         self.register_buffer(
             "largest_force", torch.tensor(scene.loads.largest_force, dtype=torch.float64)
         )
-        self.physics = Physics(scene.problem, self.largest_force)
-        self.val_metrics = metrics(scene.problem).clone(prefix="val/")
-        self.test_metrics = metrics(scene.problem).clone(prefix="test/")
+        self.physics = LossContext(scene.problem, self.largest_force)
+        self.val_metrics = default_metrics(scene.problem).clone(prefix="val/")
+        self.test_metrics = default_metrics(scene.problem).clone(prefix="test/")
 
     def forward(self, force: Tensor, young: Tensor, poisson: Tensor | None = None) -> Tensor:
         """Return displacements (B, N, D) [m] under nodal forces (B, N, D) [N].
@@ -89,10 +89,10 @@ class Surrogate(L.LightningModule):
 
     def predict(self, load: Load) -> Tensor:
         """Return displacements over L, (B, N, D), float64."""
-        scaled, more = self.entering(load)
-        return self.leaving(self.net(scaled, **more))
+        scaled, more = self.scale_inputs(load)
+        return self.unscale_outputs(self.net(scaled, **more))
 
-    def entering(self, load: Load) -> tuple[Tensor, dict[str, Tensor]]:
+    def scale_inputs(self, load: Load) -> tuple[Tensor, dict[str, Tensor]]:
         """Return what the network takes of loads: scaled forces (B, N, D), and more by name."""
         scaled = (self._felt(load.force) / self.force_scale).to(self.dtype)
         if load.poisson.shape[-1] != self._own:
@@ -101,7 +101,7 @@ class Surrogate(L.LightningModule):
                 if self._own
                 else "poisson: the law has one for all loads, and this load brings its own"
             )
-        return scaled, {name: getattr(load, name) for name in getattr(self.net, "takes", ())}
+        return scaled, {name: getattr(load, name) for name in getattr(self.net, "extra_inputs", ())}
 
     def _felt(self, force: Tensor) -> Tensor:
         """Return forces (B, N, D) that are on held degrees of freedom as they were in training.
@@ -114,21 +114,21 @@ class Surrogate(L.LightningModule):
             return force
         return force + torch.where(problem.free, 0.0, always.to(force.device))
 
-    def leaving(self, answer: Tensor) -> Tensor:
+    def unscale_outputs(self, answer: Tensor) -> Tensor:
         """Return displacements over L, float64, of the network's answers, (B, N, D)."""
         displacement = answer.double() * self.displacement_scale
         return torch.where(self.physics.problem.free, displacement, 0.0)
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """Return what network and loss leave out, a line each."""
-        lines = [*getattr(self.net, "plan", list)(), *self.loss.plan()]
-        if isinstance(self.net, BetweenCoordinates) and isinstance(self.loss, MSE):
+        lines = [*getattr(self.net, "skipped_work", list)(), *self.loss.skipped_work()]
+        if isinstance(self.net, ReducedOrderNet) and isinstance(self.loss, MSE):
             lines.append("no field in training from disk: squared errors are those of coordinates")
         return lines
 
-    def training_step(self, batch: Sample | Coordinates, batch_idx: int) -> Tensor:
+    def training_step(self, batch: Sample | ReducedSamples, batch_idx: int) -> Tensor:
         """Return the loss."""
-        if isinstance(batch, Coordinates):
+        if isinstance(batch, ReducedSamples):
             loss = self._loss_of_coordinates(batch)
         else:
             prediction = self.predict(batch.load)
@@ -139,15 +139,15 @@ class Surrogate(L.LightningModule):
         self.log("loss/train", loss, prog_bar=True, batch_size=len(batch[0]))
         return loss
 
-    def _loss_of_coordinates(self, batch: Coordinates) -> Tensor:
+    def _loss_of_coordinates(self, batch: ReducedSamples) -> Tensor:
         """Return the loss of a batch in coordinates: of its mean squared errors alone."""
-        net = cast(BetweenCoordinates, self.net)
+        net = cast(ReducedOrderNet, self.net)
         missed = (net.network(batch.inputs) - batch.targets).square().sum(dim=1) + batch.rest
         square = self.displacement_scale**2
         error = square * missed / self.scene.problem.free.numel()
-        return cast(MSE, self.loss).of_squares(error, square * batch.size)
+        return cast(MSE, self.loss).from_squared_errors(error, square * batch.size)
 
-    def encode(self, samples: Sample, *, images: bool = False) -> CoordinateSamples | None:
+    def encode(self, samples: Sample, *, images: bool = False) -> ReducedDataset | None:
         """Return training samples (S, N, D) in the coordinates of the network; None if it has none.
 
         With their images if the network knows the symmetries; None if only the caller does.
@@ -155,7 +155,7 @@ class Surrogate(L.LightningModule):
         In an orthonormal basis the squared error of a displacement is that of its coordinates: a
         loss that is a function of squared errors needs no field.
         """
-        if not (isinstance(self.net, BetweenCoordinates) and isinstance(self.loss, MSE)):
+        if not (isinstance(self.net, ReducedOrderNet) and isinstance(self.loss, MSE)):
             return None
         if images and not self.net.group:
             return None
@@ -167,10 +167,10 @@ class Surrogate(L.LightningModule):
             displacement=samples.displacement / self.displacement_scale.cpu(),
         )
 
-    def prepare(self, samples: Sample) -> None:
+    def fit_bases(self, samples: Sample) -> None:
         """Let the network make its bases from training samples (S, N, D)."""
         unit = float(self.force_scale / self.displacement_scale)
-        cast(BetweenCoordinates, self.net).prepare(self._scaled(samples), unit)
+        cast(ReducedOrderNet, self.net).fit_bases(self._scaled(samples), unit)
 
     def validation_step(self, batch: Sample, batch_idx: int) -> None:
         """Update the metrics."""
@@ -190,10 +190,10 @@ class Surrogate(L.LightningModule):
         problem = self.scene.problem
         if problem.points.device != self.device:
             problem = problem.to(self.device)
-        self.physics = Physics(problem, self.largest_force)
+        self.physics = LossContext(problem, self.largest_force)
         # here: schedules ask for the batches, which want the bases, before any later hook
-        if stage == "fit" and isinstance(self.net, BetweenCoordinates) and not self.net.prepared:
-            self.prepare(self.trainer.datamodule.snapshots())
+        if stage == "fit" and isinstance(self.net, ReducedOrderNet) and not self.net.prepared:
+            self.fit_bases(self.trainer.datamodule.snapshots())
         for collection in (self.val_metrics, self.test_metrics):
             for metric in collection.values():
                 if hasattr(metric, "problem"):
@@ -253,5 +253,5 @@ def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:
     """
     force = scene.loads.sample((0, SCALES), range(count)).force
     displacement = torch.stack([scene.linear.reference.respond(one) for one in force])
-    acting, moving = force[:, scene.loads.reach], displacement[:, scene.problem.free]
+    acting, moving = force[:, scene.loads.loadable_dofs], displacement[:, scene.problem.free]
     return acting.square().mean().sqrt(), moving.square().mean().sqrt()

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.viewer.access import Door
+    from dpl.viewer.access import AccessPolicy
     from dpl.viewer.frames import Body
     from dpl.viewer.page import Page
 else:

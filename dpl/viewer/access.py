@@ -21,7 +21,7 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from dpl.viewer.rate_limited_log import Complaints
+from dpl.viewer.rate_limited_log import RateLimitedHandler
 
 Handle = Callable[[Any, Request], Response | None]
 LARGEST = 2**18  # bytes of a message from the browser
@@ -43,7 +43,7 @@ HEADERS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Door:
+class AccessPolicy:
     """A bound socket and the rule of who may come through it.
 
     Attributes:
@@ -58,10 +58,10 @@ class Door:
     host: str
     names: tuple[str, ...] = ()
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
-    complaints: Complaints = field(default_factory=Complaints, repr=False)
+    complaints: RateLimitedHandler = field(default_factory=RateLimitedHandler, repr=False)
 
     @classmethod
-    def bound(cls, host: str, port: int, names: Sequence[str] = ()) -> "Door":
+    def bound(cls, host: str, port: int, names: Sequence[str] = ()) -> "AccessPolicy":
         """Return the door at a port of a host, 0: any that is free.
 
         Raises:
@@ -154,7 +154,7 @@ def _answer(status: http.HTTPStatus, words: str) -> Response:
 
 
 @contextlib.contextmanager
-def behind(door: Door) -> Iterator[None]:
+def serve_with(door: AccessPolicy) -> Iterator[None]:
     """Let a server that is started in here take its requests through a door.
 
     viser starts `websockets.asyncio.server.serve` itself and has no option for who may connect.
@@ -177,7 +177,7 @@ def behind(door: Door) -> Iterator[None]:
         websockets.asyncio.server.serve = genuine
 
 
-def status_of(door: Door, path: str, **headers: str) -> int:
+def status_for(door: AccessPolicy, path: str, **headers: str) -> int:
     """Return the status that a door answers a request of this machine with."""
     lines = [f"GET {path} HTTP/1.1"]
     lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
@@ -187,7 +187,7 @@ def status_of(door: Door, path: str, **headers: str) -> int:
         return int(call.recv(64).split()[1])
 
 
-def check(door: Door) -> None:
+def check(door: AccessPolicy) -> None:
     """Try a door from outside.
 
     Raises:
@@ -204,5 +204,5 @@ def check(door: Door) -> None:
         (403, path, {"Host": home, **socket_of}),
     ]
     for status, path, headers in cases:
-        if (found := status_of(door, path, **headers)) != status:
+        if (found := status_for(door, path, **headers)) != status:
             raise RuntimeError(f"the page is not safe: {found} where {status} must be; not served")

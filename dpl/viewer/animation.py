@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dpl.viewer.frames import Body, Frame, Wish
-from dpl.viewer.rasterizer import Camera, Scenery
+from dpl.viewer.frames import Body, Frame, ViewSettings
+from dpl.viewer.rasterizer import Camera, Renderer
 from dpl.viewer.recording import RATE, film
 
 SECONDS = 5
 
 
-def moving_load(
+def animate_load(
     body: Body,
     path: Path,
     *,
@@ -47,12 +47,12 @@ def moving_load(
         ]
 
     camera = Camera.before(body.surface, wide=0.82)
-    film(path, frames, Scenery(body.surface, camera, size), words)
+    film(path, frames, Renderer(body.surface, camera, size), words)
 
 
 def difference(body: Body, frame: Frame) -> float:
     """Return ||u - u_FE|| / ||u_FE|| of an answer, u_FE to the scene's tolerance."""
-    wish = Wish(tol=body.scene.solver.tol)
+    wish = ViewSettings(tol=body.scene.solver.tol)
     exact = body.answer(frame.asked, wish).displacement
     return float((frame.displacement - exact).norm() / exact.norm().clamp(min=1e-300))
 
@@ -67,7 +67,7 @@ def answers(body: Body, *, radius: float, deflection: float) -> list[Frame]:
     node = int(body.surface.nodes[int((points - tip.mean(dim=0)).norm(dim=1).argmin())])
     patch = body.patch(node, radius)
     across = np.argsort(np.ptp(problem.points.numpy(), axis=0))  # the thinnest first
-    wish = Wish(quantity="von Mises stress")
+    wish = ViewSettings(quantity="von Mises stress")
     found = []
     for k in range(SECONDS * RATE):
         angle = 2 * math.pi * k / (SECONDS * RATE)

@@ -17,7 +17,7 @@ class Server(viser.ViserServer):
         """Refuse: a browser may ask for a tunnel to this machine."""
 
 
-class Drawn:
+class BodyNode:
     """One body in the browser: bands of one colour, lines, and what is grabbed.
 
     Attributes:

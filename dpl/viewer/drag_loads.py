@@ -12,7 +12,7 @@ from dpl.scene import Scene
 RIDGE = 1e-2  # of the compliance squared: what only stiff modes would give is hardly asked for
 
 
-class Asked(NamedTuple):
+class LoadRequest(NamedTuple):
     """A load as an engineer says it.
 
     Attributes:
@@ -47,7 +47,7 @@ class Patch:
         """Nodes that loads act on, (N,)."""
         problem = self.scene.problem
         distance = (problem.points - problem.points[self.node]).norm(dim=1)
-        acting = (distance <= self.radius * (1 + 1e-9)) & self.scene.loads.reach.any(dim=1)
+        acting = (distance <= self.radius * (1 + 1e-9)) & self.scene.loads.loadable_dofs.any(dim=1)
         acting[self.node] = True
         return acting
 
@@ -55,7 +55,7 @@ class Patch:
     def fields(self) -> Tensor:
         """Loads of the largest size each, (M, N, D) [-]: of modes, or along the axes."""
         loads = self.scene.loads
-        kept = self.inside[:, None] & loads.reach
+        kept = self.inside[:, None] & loads.loadable_dofs
         if self.uniform:
             size = loads.largest_force / float(kept.any(dim=1).sum()) ** 0.5
             axes = torch.eye(kept.shape[1], dtype=torch.float64)

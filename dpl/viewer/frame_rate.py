@@ -16,8 +16,8 @@ from websockets.typing import Origin, Subprotocol
 from dpl.evaluation import timing
 from dpl.fem import Load
 from dpl.viewer.animation import answers
-from dpl.viewer.drag_loads import Asked
-from dpl.viewer.frames import QUANTITIES, Body, Wish
+from dpl.viewer.drag_loads import LoadRequest
+from dpl.viewer.frames import QUANTITIES, Body, ViewSettings
 from dpl.viewer.page import Page
 from dpl.viewer.rasterizer import BANDS
 from dpl.viewer.surface import bands
@@ -55,7 +55,7 @@ def speed(page: Page, seconds: float = 4.0) -> tuple[list[Row], dict[str, timing
     measured = timing.latencies(body.simulator, Load(*map(torch.cat, columns)))
     rows = []
     for quantity in QUANTITIES:
-        wish = Wish(quantity=quantity)
+        wish = ViewSettings(quantity=quantity)
         coloured, cut = map(statistics.median, zip(*_times(body, loads, wish), strict=True))
         page.worker.ask(wish=wish)
         arrived, size = _arrived(page, loads, seconds)
@@ -63,7 +63,9 @@ def speed(page: Page, seconds: float = 4.0) -> tuple[list[Row], dict[str, timing
     return rows, measured
 
 
-def _times(body: Body, loads: list[Asked], wish: Wish) -> Iterator[tuple[float, float]]:
+def _times(
+    body: Body, loads: list[LoadRequest], wish: ViewSettings
+) -> Iterator[tuple[float, float]]:
     """Yield of each load how long the answer with its colours and the bands took [ms]."""
     for load in loads[:40]:
         begin = time.perf_counter()
@@ -75,7 +77,7 @@ def _times(body: Body, loads: list[Asked], wish: Wish) -> Iterator[tuple[float, 
         yield 1e3 * (shown - begin), 1e3 * (end - shown)
 
 
-def _arrived(page: Page, loads: list[Asked], seconds: float) -> tuple[int, int]:
+def _arrived(page: Page, loads: list[LoadRequest], seconds: float) -> tuple[int, int]:
     """Return frames and bytes that arrive while the load goes round."""
     address = page.address.replace("http", "ws", 1)
     origin = Origin("/".join(page.address.split("/")[:3]))

@@ -14,7 +14,7 @@ from dpl.fem import Load, Solution
 from dpl.fem.solvers import check_tol
 from dpl.inference import Answer, Simulator
 from dpl.system.threads import one_thread
-from dpl.viewer.drag_loads import Asked, Patch
+from dpl.viewer.drag_loads import LoadRequest, Patch
 from dpl.viewer.surface import Surface
 
 Floats = NDArray[np.float64]
@@ -24,7 +24,7 @@ WIDER = 4.0  # by how much E may be changed where the scene has one
 
 
 @dataclass(frozen=True)
-class Wish:
+class ViewSettings:
     """How a load is to be answered and shown.
 
     Attributes:
@@ -69,7 +69,7 @@ class Frame(NamedTuple):
         converged: Whether it is in balance to what was asked for.
     """
 
-    asked: Asked
+    asked: LoadRequest
     displacement: Tensor
     points: Floats
     values: Floats
@@ -112,7 +112,9 @@ class Body:
         """Force of a dimensionless 1 at the usual E [N], in 2D [N/m]."""
         return self.young * self.scene.force_unit
 
-    def asked(self, force: Tensor, young: float | None, poisson: float | None = None) -> Asked:
+    def asked(
+        self, force: Tensor, young: float | None, poisson: float | None = None
+    ) -> LoadRequest:
         """Return a dimensionless force (N, D), and what every load holds besides, as a load.
 
         The force is that of the usual E, so that a softer body is moved further by it.
@@ -133,20 +135,20 @@ class Body:
                 raise ValueError(f"Poisson's ratio {poisson:g} must lie in {list(span)}")
         always = self.scene.loads.always
         whole = force if always is None else force + always
-        return Asked(whole * self.force_unit, young, poisson)
+        return LoadRequest(whole * self.force_unit, young, poisson)
 
-    def rest(self, young: float | None = None, poisson: float | None = None) -> Asked:
+    def rest(self, young: float | None = None, poisson: float | None = None) -> LoadRequest:
         """Return the load of no hand."""
         return self.asked(
             torch.zeros(self.scene.problem.shape, dtype=torch.float64), young, poisson
         )
 
-    def sample(self, index: int) -> Asked:
+    def sample(self, index: int) -> LoadRequest:
         """Return a random load like those of the training."""
         load = self.scene.loads.sample((0, 11), [index])
         young = float(load.young)
         ratio = float(load.poisson) if load.poisson.numel() else None
-        return Asked(load.force[0] * young * self.scene.force_unit, young, ratio)
+        return LoadRequest(load.force[0] * young * self.scene.force_unit, young, ratio)
 
     def patch(self, node: int, radius: float, *, uniform: bool = False) -> Patch:
         """Return the loads of an area; the last is kept, for it takes a few solves.
@@ -164,12 +166,12 @@ class Body:
             self._patch = kept = Patch(self.scene, node, radius, uniform)
         return kept
 
-    def load(self, asked: Asked) -> Load:
+    def load(self, asked: LoadRequest) -> Load:
         """Return a load as solvers take it."""
         ratio = None if asked.poisson is None else torch.tensor([asked.poisson]).double()
         return self.scene.load_of(asked.force[None], torch.tensor([asked.young]).double(), ratio)
 
-    def answer(self, asked: Asked, wish: Wish) -> Frame:
+    def answer(self, asked: LoadRequest, wish: ViewSettings) -> Frame:
         """Return the answer to a load, and what it is worth, as it is shown."""
         answer = self._ask(asked, tol=wish.tol, budget_ms=wish.budget_ms)
         over_length = answer.displacement / self.scene.length
@@ -190,17 +192,19 @@ class Body:
             answer.converged,
         )
 
-    def _ask(self, asked: Asked, **options: Any) -> Answer:
+    def _ask(self, asked: LoadRequest, **options: Any) -> Answer:
         return self.simulator(asked.force, young=asked.young, poisson=asked.poisson, **options)
 
-    def newton(self, asked: Asked, wish: Wish, beside: Frame) -> Iterator[Frame]:
+    def newton(self, asked: LoadRequest, wish: ViewSettings, beside: Frame) -> Iterator[Frame]:
         """Yield Newton's iterates from rest as they are shown; errors are those of `beside`."""
         answer = beside.displacement / self.scene.length
         with one_thread():
             for state in self.scene.solver.iterate(self.load(asked)):
                 yield self._iterate(state, answer, asked, wish)
 
-    def _iterate(self, state: Solution, answer: Tensor, asked: Asked, wish: Wish) -> Frame:
+    def _iterate(
+        self, state: Solution, answer: Tensor, asked: LoadRequest, wish: ViewSettings
+    ) -> Frame:
         u = state.displacement[0]
         return Frame(
             asked,
@@ -215,7 +219,7 @@ class Body:
             bool(state.converged),
         )
 
-    def _values(self, u: Tensor, other: Tensor | None, asked: Asked, quantity: str) -> Floats:
+    def _values(self, u: Tensor, other: Tensor | None, asked: LoadRequest, quantity: str) -> Floats:
         """Return what colours show of a displacement (N, D) [-], at the surface, (S,)."""
         if quantity == "von Mises stress":
             with torch.inference_mode():
@@ -249,7 +253,7 @@ def round_up(number: float) -> float:
     return power * next((step for step in steps if number <= step * power * (1 + 1e-9)), 10.0)
 
 
-def between(old: Asked, new: Asked, share: float) -> Asked:
+def between(old: LoadRequest, new: LoadRequest, share: float) -> LoadRequest:
     """Return the load that lies so far, from 0 to 1, on the way from one to another."""
     if share >= 1:
         return new

@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 
 from dpl.viewer import environment, panel
-from dpl.viewer.access import Door, behind, check
-from dpl.viewer.body_node import Drawn, Server
-from dpl.viewer.drag_loads import Asked
-from dpl.viewer.frames import QUANTITIES, TIERS, Body, Frame, Scale, Wish
-from dpl.viewer.rasterizer import Camera, Scenery
+from dpl.viewer.access import AccessPolicy, check, serve_with
+from dpl.viewer.body_node import BodyNode, Server
+from dpl.viewer.drag_loads import LoadRequest
+from dpl.viewer.frames import QUANTITIES, TIERS, Body, Frame, Scale, ViewSettings
+from dpl.viewer.rasterizer import Camera, Renderer
 from dpl.viewer.recording import MOST, Recording
 from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
-Hold = Callable[[float | None, float | None], Asked]  # E, Poisson's ratio -> load
+Hold = Callable[[float | None, float | None], LoadRequest]  # E, Poisson's ratio -> load
 ALONE, BUDGET = "network alone", "as far as the budget"
 ANSWERS = (ALONE, *(f"corrected to {tol:.0e}" for tol in TIERS), BUDGET)
 NEAR = 0.8  # distance of the camera from one body
@@ -40,7 +40,7 @@ class Page:
         camera: Where a browser begins.
     """
 
-    def __init__(self, body: Body, door: Door, *, title: str, folder: Path) -> None:
+    def __init__(self, body: Body, door: AccessPolicy, *, title: str, folder: Path) -> None:
         """Serve behind a door.
 
         Args:
@@ -54,7 +54,7 @@ class Page:
         """
         self.body, self._door, self._folder = body, door, folder
         self._problem = body.scene.problem
-        with behind(door), contextlib.redirect_stdout(io.StringIO()):
+        with serve_with(door), contextlib.redirect_stdout(io.StringIO()):
             self.server = Server(host=door.host, port=door.port, label="dpl", verbose=False)
         try:
             check(door)
@@ -96,8 +96,8 @@ class Page:
         low, high = surface.rest.min(axis=0), surface.rest.max(axis=0)
         self.camera = Camera.before(surface, wide=NEAR)
         environment.build(server, self.camera, low, high, flat=self._problem.shape[1] == 2)
-        self._network = Drawn(server, "/network", self.body, grab=True)
-        self._fe = Drawn(server, "/fe", self.body, grab=False)
+        self._network = BodyNode(server, "/network", self.body, grab=True)
+        self._fe = BodyNode(server, "/fe", self.body, grab=False)
         aside = float(high[1] - low[1]) + 0.7
         self._aside = np.array([0.0, aside, 0.0])
         self._fe.frame.position = self._aside
@@ -159,7 +159,7 @@ class Page:
         """Load an area so that its centre goes to a displacement over L (D,)."""
         radius, uniform, free = self._radius.value, self._uniform.value, self._beyond.value
 
-        def hold(young: float | None, poisson: float | None) -> Asked:
+        def hold(young: float | None, poisson: float | None) -> LoadRequest:
             patch = self.body.patch(node, radius, uniform=uniform)
             most = None if free else 1.0
             return self.body.asked(patch.towards(target, most=most), young, poisson)
@@ -174,7 +174,7 @@ class Page:
         way = torch.tensor(self._direction.value[: self._problem.shape[1]]).double()
         amplitude = self._amplitude.value
 
-        def hold(young: float | None, poisson: float | None) -> Asked:
+        def hold(young: float | None, poisson: float | None) -> LoadRequest:
             patch = self.body.patch(node, radius, uniform=uniform)
             return self.body.asked(patch.along(way, amplitude), young, poisson)
 
@@ -286,7 +286,7 @@ class Page:
                 client.camera.position = camera.position + middle
                 client.camera.look_at = camera.look_at + middle
         try:
-            self.worker.ask(wish=Wish(self._quantity.value, tol, budget, compare))
+            self.worker.ask(wish=ViewSettings(self._quantity.value, tol, budget, compare))
         except ValueError as error:
             self._trouble(str(error))
 
@@ -298,7 +298,7 @@ class Page:
         if self._poisson is not None and asked.poisson is not None:
             self._poisson.value = asked.poisson
 
-        def hold(young: float | None, poisson: float | None) -> Asked:
+        def hold(young: float | None, poisson: float | None) -> LoadRequest:
             return asked._replace(
                 young=asked.young if young is None else young,
                 poisson=None if asked.poisson is None else poisson,
@@ -330,7 +330,7 @@ class Page:
             if kind == "VTU":
                 path = self.recording.save_series(self._folder)
             else:
-                scenery = Scenery(self.body.surface, Camera.before(self.body.surface))
+                scenery = Renderer(self.body.surface, Camera.before(self.body.surface))
                 path = self.recording.save_film(self._folder, scenery, f".{kind.lower()}")
                 if event.client is not None:
                     event.client.send_file_download(path.name, path.read_bytes())

@@ -20,9 +20,9 @@ def readout(frame: Frame, rate: float) -> str:
     assert answer is not None
     good = frame.converged
     tone = GOOD if good else BAD if not frame.volume_ratio > 0 else DOUBT
-    away = answer.outside
+    away = answer.out_of_distribution
     rows = [
-        _row("answered by", str(answer.tier), "font-weight:600"),
+        _row("answered by", str(answer.method), "font-weight:600"),
         _row("in", f"{answer.milliseconds:.1f} ms", "font-weight:600"),
         _row("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{tone}"),
         _row("min det F", f"{frame.volume_ratio:.3f}"),

@@ -74,7 +74,7 @@ class Camera:
 
 
 @dataclass(frozen=True, eq=False)
-class Scenery:
+class Renderer:
     """What every picture of one body shares.
 
     Attributes:

@@ -13,7 +13,7 @@ PERIOD = 1.0  # shortest time between two lines [s]
 LONGEST = 200  # characters of what is told
 
 
-class Complaints(logging.Handler):
+class RateLimitedHandler(logging.Handler):
     """A handler of log records that prints one line for a record, without a traceback.
 
     A browser decides how often a request fails, and often what the error says. So lines that come

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dpl.export.paraview import shown
-from dpl.fem import save
-from dpl.fem.mesh import save_collection
-from dpl.system.files import whole_file
+from dpl.fem import write_mesh
+from dpl.fem.mesh import write_collection
+from dpl.system.files import atomic_write
 from dpl.viewer.frames import Body, Frame, Scale
-from dpl.viewer.rasterizer import INK, PAPER, Scenery, colours
+from dpl.viewer.rasterizer import INK, PAPER, Renderer, colours
 
 MOST = 900  # frames of a recording, 30 s at 30 a second
 RATE = 20  # frames of a film a second
@@ -78,12 +78,12 @@ class Recording:
             with torch.inference_mode():
                 found = shown(scene, load, frame.displacement / scene.length)
             name = f"{place.stem}/frame_{number:04d}.vtu"
-            save(folder / name, mesh, {key: field.numpy() for key, field in found.items()})
+            write_mesh(folder / name, mesh, {key: field.numpy() for key, field in found.items()})
             files.append((time, name))
-        save_collection(place, files)
+        write_collection(place, files)
         return place
 
-    def save_film(self, folder: Path, scenery: Scenery, kind: str) -> Path:
+    def save_film(self, folder: Path, scenery: Renderer, kind: str) -> Path:
         """Write frames as a film, ".gif" or ".mp4", as long as it took; return it.
 
         Raises:
@@ -111,7 +111,7 @@ def evenly(frames: list[tuple[float, Frame]]) -> list[Frame]:
 def film(
     path: Path,
     frames: list[Frame],
-    scenery: Scenery,
+    scenery: Renderer,
     words: Callable[[Frame], list[str]] | None = None,
 ) -> None:
     """Write frames, `RATE` a second, as a film; a GIF runs in a loop.
@@ -137,7 +137,7 @@ def film(
         Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
         for picture in pictures
     ]
-    with whole_file(path) as file:
+    with atomic_write(path) as file:
         flat[0].save(
             file,
             format="GIF",
@@ -179,7 +179,7 @@ def _palette(quantities: set[str]) -> Image.Image:
 
 
 def _pictures(
-    frames: list[Frame], scenery: Scenery, words: Callable[[Frame], list[str]]
+    frames: list[Frame], scenery: Renderer, words: Callable[[Frame], list[str]]
 ) -> Iterator[NDArray[np.uint8]]:
     """Yield the pictures of frames; colours span what the whole film holds."""
     largest = np.concatenate([frame.values for frame in frames])
@@ -198,7 +198,7 @@ def caption(frame: Frame) -> list[str]:
     if answer is None:
         return [f"Newton from rest: iteration {frame.iteration}", f"residual {frame.residual:.1e}"]
     return [
-        f"{answer.tier} · {answer.milliseconds:.1f} ms",
+        f"{answer.method} · {answer.milliseconds:.1f} ms",
         f"residual {frame.residual:.1e} of the load",
         f"min det F {frame.volume_ratio:.2f}",
     ]

@@ -6,10 +6,10 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from dpl.viewer.drag_loads import Asked
-from dpl.viewer.frames import Body, Frame, Wish, between
+from dpl.viewer.drag_loads import LoadRequest
+from dpl.viewer.frames import Body, Frame, ViewSettings, between
 
-Make = Callable[[], Asked]
+Make = Callable[[], LoadRequest]
 NEAR = 1e-3  # part of the way at which a load has arrived
 
 
@@ -32,8 +32,8 @@ class Worker(threading.Thread):
         beside: Callable[[Frame | None], None] = lambda frame: None,
         trouble: Callable[[str], None] = lambda words: None,
         rate: float = 60.0,
-        glide: float = 0.06,
-        pace: float = 0.35,
+        smoothing_time: float = 0.06,
+        min_frame_time: float = 0.35,
     ) -> None:
         """Take where answers go.
 
@@ -48,14 +48,14 @@ class Worker(threading.Thread):
         """
         super().__init__(name="viewer", daemon=True)
         self.body, self._show, self._beside, self._trouble = body, show, beside, trouble
-        self._rate, self._glide, self._pace = rate, glide, pace
+        self._rate, self._glide, self._pace = rate, smoothing_time, min_frame_time
         self._news = threading.Condition()
         self._make: Make = body.rest
-        self._wish = Wish()
+        self._wish = ViewSettings()
         self._asked, self._done, self._ended = 1, 0, False  # numbers of wishes
         self._times: deque[float] = deque(maxlen=240)
 
-    def ask(self, make: Make | None = None, wish: Wish | None = None) -> None:
+    def ask(self, make: Make | None = None, wish: ViewSettings | None = None) -> None:
         """Replace load, wish or both; `make` is called by this thread."""
         with self._news:
             self._make = self._make if make is None else make
@@ -64,7 +64,7 @@ class Worker(threading.Thread):
             self._news.notify_all()
 
     @property
-    def wish(self) -> Wish:
+    def wish(self) -> ViewSettings:
         """The newest."""
         return self._wish
 
@@ -89,7 +89,7 @@ class Worker(threading.Thread):
 
     def run(self) -> None:
         """Answer until `stop`."""
-        here: Asked | None = None
+        here: LoadRequest | None = None
         while True:
             with self._news:
                 self._news.wait_for(lambda: self._ended or self._done != self._asked)
@@ -102,7 +102,9 @@ class Worker(threading.Thread):
                 self._trouble(" ".join(str(error).split()) or type(error).__name__)
                 self._finish(number)
 
-    def _serve(self, number: int, make: Make, wish: Wish, here: Asked | None) -> Asked:
+    def _serve(
+        self, number: int, make: Make, wish: ViewSettings, here: LoadRequest | None
+    ) -> LoadRequest:
         """Go to a load, and return where the newer one found it."""
         goal = make()
         here = goal if here is None or self._glide <= 0 else here
@@ -137,7 +139,7 @@ class Worker(threading.Thread):
         return 1 - math.exp(-since / self._glide)
 
     @staticmethod
-    def _left(here: Asked, goal: Asked, size: float) -> float:
+    def _left(here: LoadRequest, goal: LoadRequest, size: float) -> float:
         """Return how far a load is from another, in parts of the larger force and of E."""
         way = float((goal.force - here.force).norm()) / size
         return max(way, abs(goal.young - here.young) / goal.young)

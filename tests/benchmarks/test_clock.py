@@ -82,7 +82,7 @@ def test_the_simulator_with_its_checks_and_the_bare_network_are_asked_the_same_l
         assert torch.allclose(answer.displacement, bare, rtol=1e-12)
         assert answer.residual.isfinite().all()
         assert answer.volume_ratio.isfinite().all()
-        assert len(answer.outside) == 1
+        assert len(answer.out_of_distribution) == 1
 
 
 def test_a_line_names_both_latencies():
@@ -90,7 +90,7 @@ def test_a_line_names_both_latencies():
         "sim(force)": timing.Latency(100, 4.61, 112.0),
         "bare network": timing.Latency(100, 1.13, 5.04),
     }
-    assert timing.told(measured) == (
+    assert timing.describe(measured) == (
         "latency, 1 thread, 100 loads: sim(force) p50 4.6 ms, p99 110 ms; "
         "bare network p50 1.1 ms, p99 5 ms"
     )

@@ -33,7 +33,7 @@ def networks(scene):
 
 
 def test_plain_newton_takes_whole_steps_until_it_balances(scene, loads):
-    load = loads.singles()[0]
+    load = loads.unbatch()[0]
     states = list(PlainNewton(scene.solver).iterate(load))
     assert states[-1].converged
     assert [int(s.iterations) for s in states] == list(range(len(states)))
@@ -43,7 +43,7 @@ def test_plain_newton_takes_whole_steps_until_it_balances(scene, loads):
 
 
 def test_plain_newton_may_fail_and_says_so(scene, loads):
-    load = loads.singles()[0]
+    load = loads.unbatch()[0]
     hard = load._replace(force=200 * load.force)
     end = solve(PlainNewton(scene.solver), hard)
     assert not end.converged
@@ -51,7 +51,7 @@ def test_plain_newton_may_fail_and_says_so(scene, loads):
 
 
 def test_plain_newton_is_quadratic_from_a_guess(scene, loads, networks):
-    load = loads.singles()[0]
+    load = loads.unbatch()[0]
     states = list(PlainNewton(scene.solver).iterate(load, guess=networks["near"](load)))
     assert states[0].from_guess
     assert len(states) <= 4

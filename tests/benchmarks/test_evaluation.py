@@ -14,7 +14,7 @@ import torch
 from dpl import Sample
 from dpl.evaluation import compare, evaluate, timing
 from dpl.evaluation.report import Row, clock, save, show
-from dpl.fem import Load, Solution, judge
+from dpl.fem import Load, Solution, evaluate_solution
 from dpl.models import FCNN
 from dpl.training import MSE, RelativeL2, Surrogate
 
@@ -35,9 +35,9 @@ class Known:
         assert len(load.force) == 1, "one load at a time"
         (k,) = [k for k, force in enumerate(self.batch.force) if torch.equal(force, load.force[0])]
         self.asked.append(k)
-        yield judge(self.problem, torch.zeros_like(load.force), load, 1e-8)
+        yield evaluate_solution(self.problem, torch.zeros_like(load.force), load, 1e-8)
         answer = self.answers[k : k + 1]
-        yield judge(self.problem, answer, load, 1e-8, iterations=self.counts[k])
+        yield evaluate_solution(self.problem, answer, load, 1e-8, iterations=self.counts[k])
 
 
 def test_rows_count_what_the_solvers_did(scene, few):
@@ -229,5 +229,5 @@ def test_the_written_case_is_in_equilibrium(evaluated, scene):
     metres = torch.from_numpy(case.point_data["displacement [m]"])[None]
     load = scene.load_of(force, torch.tensor([4500.0]))
     assert isinstance(load, Load)
-    answer: Solution = judge(scene.problem, metres / scene.length, load, 1e-7)
+    answer: Solution = evaluate_solution(scene.problem, metres / scene.length, load, 1e-7)
     assert answer.converged

@@ -11,7 +11,7 @@ from dpl.evaluation import methods
 from dpl.fem import solve
 from dpl.models import Latent, PODNet
 from dpl.training import MSE, Surrogate
-from dpl.training.metrics import metrics
+from dpl.training.metrics import default_metrics
 
 SMALL = {"width": 16, "blocks": 1}
 
@@ -80,7 +80,7 @@ def test_every_method_is_measured_on_every_set(rows, sets):
 def test_errors_are_those_of_the_metrics(scene, rows, sets):
     for name, sample in sets.items():
         answer = torch.stack([scene.linear.respond(f) for f in sample.force])
-        expected = metrics(scene.problem)
+        expected = default_metrics(scene.problem)
         expected.update(answer, sample)
         row, errors = rows["linear", name]
         for key in ("e_mean", "e_max", "SNR_min", "rel_L2_worst", "residual", "min_det_F"):
@@ -108,7 +108,7 @@ def test_only_what_has_learnt_costs_samples(rows):
 def test_corrections_bring_answers_nearer_and_leave_the_network_alone(scene, batch, kind):
     torch.manual_seed(0)
     module = Surrogate(kind(scene, **SMALL), MSE(), scene).eval()
-    module.prepare(batch)
+    module.fit_bases(batch)
     with torch.no_grad():
         for parameter in module.net.parameters():
             parameter.mul_(0.3)

@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save
 
 from dpl.data import DataSet, Store
 from dpl.data.storage import integrity
-from dpl.data.storage.integrity import flaw_of_modes, repair, verify
+from dpl.data.storage.integrity import check_modes, repair, verify
 from dpl.fem import Modes
 
 SIZES = {"train": 12, "val": 4, "test": 4}
@@ -256,7 +256,7 @@ def test_a_number_of_one_load_that_is_a_little_off_is_noticed(copy, column, erro
 def test_an_answer_whose_volume_is_not_positive_is_noticed(copy, monkeypatch):
     """However well it balances its load."""
     body = type(copy.scene.problem)
-    monkeypatch.setattr(body, "balanced", lambda *_: torch.tensor(True))
+    monkeypatch.setattr(body, "is_equilibrium", lambda *_: torch.tensor(True))
     assert flaws(copy) == {}
     genuine = body.evaluate
 
@@ -271,13 +271,13 @@ def test_an_answer_whose_volume_is_not_positive_is_noticed(copy, monkeypatch):
 @pytest.mark.parametrize("which", ["values", "vectors"])
 def test_modes_are_compared_to_six_digits_with_their_signs(scene, which):
     modes = scene.loads.modes
-    assert flaw_of_modes(scene, modes) == ""
+    assert check_modes(scene, modes) == ""
     column = getattr(modes, which)
     for factor, sound in ((1 + 1e-9, True), (1 + 1e-4, False), (-1.0, False)):
-        found = flaw_of_modes(scene, modes._replace(**{which: column * factor}))
+        found = check_modes(scene, modes._replace(**{which: column * factor}))
         assert found == ("" if sound else "holds other modes than this scene has")
     fewer = Modes(modes.values[:-1], modes.vectors[:-1])
-    assert flaw_of_modes(scene, fewer) == "holds other modes than this scene has"
+    assert check_modes(scene, fewer) == "holds other modes than this scene has"
 
 
 # ------------------------------------------------------------------ the command

@@ -3,14 +3,20 @@
 import numpy as np
 import pytest
 
-from dpl.data.storage.acceptance import BINS, Bin, bins, table, warning
+from dpl.data.storage.acceptance import (
+    BINS,
+    AmplitudeBin,
+    acceptance_table,
+    amplitude_bins,
+    bias_warning,
+)
 
 
 def test_every_load_lies_in_one_bin_and_every_bin_holds_the_loads_between_its_ends():
     rng = np.random.default_rng(0)
     amplitudes = rng.random(500) ** 2
     accepted = rng.random(500) < 0.7
-    parts = bins(amplitudes.tolist(), accepted.tolist())
+    parts = amplitude_bins(amplitudes.tolist(), accepted.tolist())
     assert sum(part.tried for part in parts) == 500
     assert sum(part.accepted for part in parts) == accepted.sum()
     assert len(parts) == BINS
@@ -24,20 +30,20 @@ def test_every_load_lies_in_one_bin_and_every_bin_holds_the_loads_between_its_en
 
 
 def test_the_largest_load_lies_in_the_last_bin():
-    (*_, last) = bins([0.1, 3.0, 3.0], [True, False, True])
-    assert last == Bin(pytest.approx(2.7), 3.0, 2, 1)
+    (*_, last) = amplitude_bins([0.1, 3.0, 3.0], [True, False, True])
+    assert last == AmplitudeBin(pytest.approx(2.7), 3.0, 2, 1)
 
 
 def test_ranges_without_a_load_are_left_out():
-    assert [(part.tried, part.accepted) for part in bins([0.05, 1.0], [True, True])] == [
+    assert [(part.tried, part.accepted) for part in amplitude_bins([0.05, 1.0], [True, True])] == [
         (1, 1),
         (1, 1),
     ]
 
 
 def test_no_loads_make_no_bins_and_loads_of_nothing_make_one():
-    assert bins([], []) == []
-    (only,) = bins([0.0, 0.0], [True, False])
+    assert amplitude_bins([], []) == []
+    (only,) = amplitude_bins([0.0, 0.0], [True, False])
     assert (only.tried, only.accepted) == (2, 1)
 
 
@@ -53,26 +59,30 @@ def test_no_loads_make_no_bins_and_loads_of_nothing_make_one():
     ],
 )
 def test_a_range_is_biased_below_nine_in_ten_of_at_least_ten_loads(tried, accepted, biased):
-    assert Bin(0.0, 1.0, tried, accepted).biased == biased
+    assert AmplitudeBin(0.0, 1.0, tried, accepted).biased == biased
 
 
 def test_a_fair_set_is_not_warned_of():
-    assert warning([]) == ""
-    assert warning([Bin(0.0, 0.5, 100, 95), Bin(0.5, 1.0, 9, 0)]) == ""
+    assert bias_warning([]) == ""
+    assert bias_warning([AmplitudeBin(0.0, 0.5, 100, 95), AmplitudeBin(0.5, 1.0, 9, 0)]) == ""
 
 
 def test_the_warning_names_the_worst_range_and_what_to_do():
-    parts = [Bin(0.0, 0.5, 100, 85), Bin(0.5, 1.0, 40, 10), Bin(1.0, 1.5, 9, 0)]
-    told = warning(parts)
+    parts = [
+        AmplitudeBin(0.0, 0.5, 100, 85),
+        AmplitudeBin(0.5, 1.0, 40, 10),
+        AmplitudeBin(1.0, 1.5, 9, 0),
+    ]
+    told = bias_warning(parts)
     assert "of 40 loads with amplitudes 0.50 to 1.00 only 10 were accepted" in told
     assert "loads.deflection" in told
     assert "\n" not in told
 
 
 def test_the_table_has_a_column_for_each_range():
-    assert table([]) == []
-    parts = [Bin(0.0, 0.5, 1000, 850), Bin(0.5, 1.0, 4, 1)]
-    heads, cells = table(parts)
+    assert acceptance_table([]) == []
+    parts = [AmplitudeBin(0.0, 0.5, 1000, 850), AmplitudeBin(0.5, 1.0, 4, 1)]
+    heads, cells = acceptance_table(parts)
     assert heads.split() == ["amplitude", "up", "to", "0.50", "1.00"]
     assert cells.split() == ["accepted", "850/1000", "1/4"]
     assert len(heads) == len(cells), "columns stand below each other"

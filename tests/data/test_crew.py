@@ -15,8 +15,8 @@ import pytest
 
 from dpl import Scene
 from dpl.data.solving import worker_pool
-from dpl.data.solving.solve import Job
-from dpl.data.solving.worker_pool import Stop, outcomes
+from dpl.data.solving.solve import LoadKey
+from dpl.data.solving.worker_pool import GracefulShutdown, solve_loads
 from dpl.fem import ModalLoads
 
 SEED = (5, 0)
@@ -53,7 +53,7 @@ class Fragile(ModalLoads):
         return super().points(seed, indices)
 
 
-class Asked(Stop):
+class Asked(GracefulShutdown):
     """Is asked to stop after so many looks."""
 
     def __init__(self, looks):
@@ -88,13 +88,13 @@ def children():
 
 @pytest.fixture(scope="module")
 def jobs():
-    return [Job(SEED, index) for index in range(8)]
+    return [LoadKey(SEED, index) for index in range(8)]
 
 
 @pytest.fixture(scope="module")
 def here(scene, jobs):
     """What this process finds."""
-    return by_index(outcomes(scene, jobs, workers=0))
+    return by_index(solve_loads(scene, jobs, workers=0))
 
 
 @pytest.fixture(autouse=True)
@@ -109,14 +109,14 @@ def _nothing_left():
 
 
 def test_loads_are_solved_in_the_order_of_the_jobs_without_workers(scene, jobs, here):
-    found = list(outcomes(scene, jobs[::-1], workers=0))
+    found = list(solve_loads(scene, jobs[::-1], workers=0))
     assert [one.job for one in found] == jobs[::-1]
     assert by_index(found) == here
 
 
 def test_no_jobs_cost_no_process(scene, monkeypatch):
     monkeypatch.setattr(worker_pool, "spawning", lambda: None)  # nothing can be started
-    assert list(outcomes(scene, [], workers=2)) == []
+    assert list(solve_loads(scene, [], workers=2)) == []
 
 
 def test_a_killed_worker_is_replaced_and_every_crew_finds_the_same_bytes(
@@ -124,7 +124,7 @@ def test_a_killed_worker_is_replaced_and_every_crew_finds_the_same_bytes(
 ):
     mark = tmp_path / "killed"
     found = list(
-        outcomes(fragile(scene, victim=2, harm="die once", mark=str(mark)), jobs, workers=2)
+        solve_loads(fragile(scene, victim=2, harm="die once", mark=str(mark)), jobs, workers=2)
     )
     assert mark.exists()
     assert sorted(one.job.number for one in found) == list(range(8))
@@ -135,7 +135,7 @@ def test_a_crew_closed_early_leaves_no_process_and_has_no_more_than_there_are_lo
     scene, jobs, here
 ):
     before = children()
-    running = outcomes(scene, jobs[:2], workers=64)
+    running = solve_loads(scene, jobs[:2], workers=64)
     first = next(running)
     members = children() - before
     assert len(members) == 2
@@ -149,9 +149,9 @@ def test_a_crew_closed_early_leaves_no_process_and_has_no_more_than_there_are_lo
 
 @pytest.mark.parametrize("tries", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_load_that_kills_every_worker_is_given_up_with_a_reason(scene, here, monkeypatch, tries):
-    monkeypatch.setattr(worker_pool, "TRIES", tries)
+    monkeypatch.setattr(worker_pool, "MAX_RETRIES", tries)
     victim = fragile(scene, victim=1)
-    found = {one.job.number: one for one in outcomes(victim, _jobs(1, 0), workers=1)}
+    found = {one.job.number: one for one in solve_loads(victim, _jobs(1, 0), workers=1)}
     assert content(found[0]) == here[0]
     one = found[1]
     assert one.reason == f"its worker died {tries} times"
@@ -162,10 +162,10 @@ def test_a_load_that_kills_every_worker_is_given_up_with_a_reason(scene, here, m
 
 def test_a_load_that_hangs_is_recorded_and_the_others_are_solved(scene, here, monkeypatch):
     """A worker has more time for its first load, once: or else this test would not end."""
-    monkeypatch.setattr(worker_pool, "GRACE", 1e6)
+    monkeypatch.setattr(worker_pool, "STARTUP_GRACE", 1e6)
     victim = fragile(scene, victim=1, harm="hang")
     found = {
-        one.job.number: one for one in outcomes(victim, _jobs(0, 1, 2), workers=1, timeout=0.5)
+        one.job.number: one for one in solve_loads(victim, _jobs(0, 1, 2), workers=1, timeout=0.5)
     }
     assert [content(found[k]) for k in (0, 2)] == [here[0], here[2]]
     one = found[1]
@@ -176,38 +176,38 @@ def test_a_load_that_hangs_is_recorded_and_the_others_are_solved(scene, here, mo
 
 
 def test_workers_that_never_begin_are_replaced_too(scene, monkeypatch):
-    monkeypatch.setattr(worker_pool, "GRACE", 0.0)
-    found = list(outcomes(scene, _jobs(0, 1, 2), workers=2, timeout=0.1))
+    monkeypatch.setattr(worker_pool, "STARTUP_GRACE", 0.0)
+    found = list(solve_loads(scene, _jobs(0, 1, 2), workers=2, timeout=0.1))
     assert [one.reason for one in found] == 3 * ["timed out after 0.1 s"]
 
 
 def test_workers_that_all_die_end_the_run(scene, monkeypatch, capfd):
-    monkeypatch.setattr(worker_pool, "HOPELESS", 1)
+    monkeypatch.setattr(worker_pool, "MAX_CONSECUTIVE_CRASHES", 1)
     victim = fragile(scene, harm="raise")
     with pytest.raises(RuntimeError, match="1 workers died one after the other"):
-        list(outcomes(victim, _jobs(0, 1), workers=1))
+        list(solve_loads(victim, _jobs(0, 1), workers=1))
     assert "no load can be drawn" in capfd.readouterr().err
 
 
 def _jobs(*numbers):
-    return [Job(SEED, number) for number in numbers]
+    return [LoadKey(SEED, number) for number in numbers]
 
 
 # ------------------------------------------------------------------ being asked to stop
 
 
 def test_nobody_asking_does_not_stop():
-    with Stop() as stop:
+    with GracefulShutdown() as stop:
         assert not stop
-        stop.leave()
+        stop.exit()
 
 
 def test_a_stop_that_is_asked_once_lets_the_program_finish_and_then_leave(capfd):
-    with Stop() as stop:
+    with GracefulShutdown() as stop:
         os.kill(os.getpid(), signal.SIGINT)
         assert stop
         with pytest.raises(KeyboardInterrupt):
-            stop.leave()
+            stop.exit()
     assert "once more to stop at once" in capfd.readouterr().err
 
 
@@ -221,7 +221,7 @@ def test_a_stop_that_is_asked_once_lets_the_program_finish_and_then_leave(capfd)
     ],
 )
 def test_a_stop_that_is_asked_twice_raises_at_once(first, second, raised):
-    with Stop() as stop:
+    with GracefulShutdown() as stop:
         os.kill(os.getpid(), first)
         with pytest.raises(raised) as end:
             os.kill(os.getpid(), second)
@@ -232,7 +232,7 @@ def test_a_stop_that_is_asked_twice_raises_at_once(first, second, raised):
 
 def test_a_stop_gives_the_signals_back_even_if_it_ends_badly():
     before = [signal.getsignal(number) for number in SIGNALS]
-    with suppress(RuntimeError), Stop():
+    with suppress(RuntimeError), GracefulShutdown():
         assert [signal.getsignal(number) for number in SIGNALS] != before
         raise RuntimeError
     assert [signal.getsignal(number) for number in SIGNALS] == before
@@ -243,7 +243,7 @@ def test_a_stop_in_another_thread_leaves_the_signals_alone():
 
     def enter():
         before = signal.getsignal(signal.SIGINT)
-        with Stop() as stop:
+        with GracefulShutdown() as stop:
             found.append((signal.getsignal(signal.SIGINT) is before, bool(stop)))
 
     thread = threading.Thread(target=enter)
@@ -253,8 +253,8 @@ def test_a_stop_in_another_thread_leaves_the_signals_alone():
 
 
 def test_after_a_stop_no_load_is_begun_in_this_process(scene, jobs, here):
-    with Stop() as stop:
-        running = outcomes(scene, jobs, workers=0, stop=stop)
+    with GracefulShutdown() as stop:
+        running = solve_loads(scene, jobs, workers=0, stop=stop)
         found = [next(running), next(running)]
         os.kill(os.getpid(), signal.SIGTERM)
         found += running
@@ -262,8 +262,8 @@ def test_after_a_stop_no_load_is_begun_in_this_process(scene, jobs, here):
 
 
 def test_after_a_stop_the_loads_at_work_are_finished_and_no_more(scene, jobs, here):
-    with Stop() as stop:
-        running = outcomes(scene, jobs, workers=2, stop=stop)
+    with GracefulShutdown() as stop:
+        running = solve_loads(scene, jobs, workers=2, stop=stop)
         found = [next(running)]
         os.kill(os.getpid(), signal.SIGINT)
         found += running
@@ -274,7 +274,7 @@ def test_after_a_stop_the_loads_at_work_are_finished_and_no_more(scene, jobs, he
 @pytest.mark.parametrize("looks", [0, 1, 2])
 def test_a_stop_may_come_at_any_moment_before_the_first_load(scene, jobs, looks):
     """It is looked at before a load is taken, and before it is given to a worker."""
-    running = outcomes(scene, jobs[:2], workers=1, stop=Asked(looks), timeout=60.0)
+    running = solve_loads(scene, jobs[:2], workers=1, stop=Asked(looks), timeout=60.0)
     found = [one.job.number for one in running]
     assert found == ([] if looks < 2 else [0])
 

@@ -12,13 +12,13 @@ import torch
 
 from dpl import Sample
 from dpl.data import DataSet, OfflineData, OnlineData, Samples, Writer
-from dpl.data.replay_buffer import Rates
-from dpl.data.solving.solve import Job, outcome
+from dpl.data.replay_buffer import StreamRates
+from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.data.storage.integrity import verify
 from dpl.data.storage.store import SHARD
 from dpl.fem import symmetries
 from dpl.models import FCNN
-from dpl.system.files import sole_writer
+from dpl.system.files import exclusive_lock
 from dpl.training import MSE, Surrogate
 
 SIZES = {"val": 4, "test": 4, "workers": 0, "batch_size": 4}
@@ -150,12 +150,12 @@ def test_a_batch_is_a_copy(offline):
 
 
 def test_the_plan_counts_what_is_there(offline, scene, folder, tmp_path):
-    where, line = offline().plan()
+    where, line = offline().skipped_work()
     assert str(folder) in where
     assert scene.fingerprint[:12] in where
     assert line.startswith("20 of 20 loads not solved again")
-    assert offline(train=30).plan()[1].startswith("20 of 38 loads not solved again")
-    (where,) = OfflineData(scene, folder=str(tmp_path / "new"), workers=0).plan()
+    assert offline(train=30).skipped_work()[1].startswith("20 of 38 loads not solved again")
+    (where,) = OfflineData(scene, folder=str(tmp_path / "new"), workers=0).skipped_work()
     assert str(tmp_path / "new") in where
     assert not (tmp_path / "new").exists(), "a plan computes nothing and writes nothing"
 
@@ -220,7 +220,7 @@ def test_images_balance_as_well_as_their_samples(scene, offline):
     for batch in offline(symmetry=True).train_dataloader():
         internal, volume = scene.problem.evaluate(batch.displacement)
         assert (volume > 0).all()
-        worst = max(worst, float(scene.problem.imbalance(internal, batch.force).max()))
+        worst = max(worst, float(scene.problem.relative_residual_of(internal, batch.force).max()))
     assert 0 < worst < 1e-8
 
 
@@ -259,14 +259,14 @@ def test_images_of_a_sample_are_spread_over_the_epoch(offline):
 def test_the_plan_says_how_many_samples_a_load_makes(scene, offline):
     count = len(symmetries(scene.problem))
     line = f"{count} samples of each load solved: symmetries of the body"
-    assert line in offline(symmetry=True).plan()
-    assert not any("symmetr" in line for line in offline().plan())
+    assert line in offline(symmetry=True).skipped_work()
+    assert not any("symmetr" in line for line in offline().skipped_work())
 
 
 def test_a_force_in_every_load_breaks_the_symmetries_that_turn_it(make_scene, tmp_path):
     scene = make_scene()
     down = torch.zeros(scene.problem.shape, dtype=torch.float64)
-    down[:, 2] = torch.where(scene.loads.reach[:, 2], -1e-7, 0.0)
+    down[:, 2] = torch.where(scene.loads.loadable_dofs[:, 2], -1e-7, 0.0)
     weighted = make_scene(always=down)
     free = OfflineData(scene, folder=str(tmp_path), symmetry=True, **SIZES)
     held = OfflineData(weighted, folder=str(tmp_path), symmetry=True, **SIZES)
@@ -282,12 +282,12 @@ def test_samples_without_symmetries_are_handed_out_as_they_are(batch):
 
 def test_a_stream_makes_images_too(online, scene):
     module = online(symmetry=True, batch_size=12, fresh=12, batches=4, capacity=1000)
-    assert [line for line in module.plan() if "samples of each load" in line]
+    assert [line for line in module.skipped_work() if "samples of each load" in line]
     batches = list(module.train_dataloader())
     own = set(forces([module._replay._buffer.sample]))
     assert len(set(forces(batches)) - own) > 24, "seven of eight are images"
     for batch in batches:
-        ratio = scene.problem.residual_ratio(batch.displacement, batch.force)
+        ratio = scene.problem.relative_residual(batch.displacement, batch.force)
         assert ratio.max() < scene.solver.tol
 
 
@@ -365,7 +365,7 @@ def test_preparing_a_stream_solves_no_training_load(scene, tmp_path, monkeypatch
 
     def counted(scene, job):
         seen.append(job.seed)
-        return outcome(scene, job)
+        return solve_load(scene, job)
 
     monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", counted)
     module = OnlineData(scene, folder=str(tmp_path / "d"), val=2, test=3, workers=0)
@@ -422,7 +422,7 @@ def test_a_resumed_stream_goes_on_where_it_was_left(online):
 
 def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, monkeypatch):
     def choosy(scene, job, **options):
-        return outcome(scene, job, **options)._replace(accepted=job.number % 3 == 1)
+        return solve_load(scene, job, **options)._replace(accepted=job.number % 3 == 1)
 
     monkeypatch.setattr("dpl.data.stream.outcome", choosy)
     module = online()
@@ -492,11 +492,11 @@ def test_what_the_data_set_has_is_read_and_not_solved(scene, saving, tmp_path, m
 
     def counted(scene, job, **options):
         solved.append(job.number)
-        return outcome(scene, job, **options)
+        return solve_load(scene, job, **options)
 
     monkeypatch.setattr("dpl.data.stream.outcome", counted)
     module = saving(batches=6)
-    assert "20 loads of the stream not solved again: they are there" in module.plan()
+    assert "20 loads of the stream not solved again: they are there" in module.skipped_work()
     batches = list(module.train_dataloader())
     assert solved == [20, 21, 22, 23]
     assert sorted(forces(batches)) == sorted(drawn(scene, 24))
@@ -539,7 +539,7 @@ def test_a_load_solved_twice_leaves_nothing_in_the_spool(scene, saving, tmp_path
 
 def test_rejected_loads_are_kept_as_rejected(scene, saving, tmp_path, monkeypatch):
     def choosy(scene, job, **options):
-        one = outcome(scene, job, **options)
+        one = solve_load(scene, job, **options)
         return one._replace(accepted=False, reason="a whim") if job.number % 3 == 0 else one
 
     monkeypatch.setattr("dpl.data.stream.outcome", choosy)
@@ -566,7 +566,7 @@ def test_a_data_set_without_a_rejected_point_gives_samples_of_finite_numbers(sav
     """What a rejected load leaves, NaN, does not reach training."""
 
     def choosy(scene, job, **options):
-        one = outcome(scene, job, **options)
+        one = solve_load(scene, job, **options)
         bad = one._replace(accepted=False, reason="x", displacement=np.nan * one.displacement)
         return bad if job.number % 2 else one
 
@@ -596,7 +596,7 @@ def test_only_the_first_of_several_processes_writes_shards(saving, tmp_path):
 def test_another_writer_does_not_end_a_training_run(saving, tmp_path):
     """Shards can wait for the next epoch; hours of training cannot be had again."""
     stream = saving(batches=16).train_dataloader()
-    with sole_writer(tmp_path / "d"):
+    with exclusive_lock(tmp_path / "d"):
         list(stream)
     assert len(list((tmp_path / "d" / "spool").iterdir())) == 64
     list(stream)
@@ -638,7 +638,7 @@ def test_the_rates_of_an_epoch_are_there_at_its_end(online):
     module = online(reuse=2)
     assert module.rates is None
     list(module.train_dataloader())
-    assert isinstance(module.rates, Rates)
+    assert isinstance(module.rates, StreamRates)
     assert module.rates.uses == pytest.approx(12 / 12)
     assert module.rates.buffer == 12
 
@@ -676,6 +676,6 @@ def test_a_stream_does_not_take_more_threads_than_it_was_given(online):
 def test_the_job_of_a_stream_is_that_of_the_training_split(online):
     stream = online().train_dataloader()._source
     assert stream.seed == (0, 0)
-    truth = outcome(stream.scene, Job((0, 0), 0))
+    truth = solve_load(stream.scene, LoadKey((0, 0), 0))
     one = next(iter(stream))
     assert torch.equal(one.sample.displacement, torch.from_numpy(truth.displacement))

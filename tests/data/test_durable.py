@@ -14,7 +14,7 @@ import pytest
 
 from dpl import DataSetError
 from dpl.system import files
-from dpl.system.files import append_line, read_lines, sole_writer, whole_file
+from dpl.system.files import append_jsonl, atomic_write, exclusive_lock, read_jsonl
 
 WRITER = """
 import sys, time
@@ -50,7 +50,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, sync):
     path.write_bytes(b"old")
 
     def write_and_fail():
-        with whole_file(path, sync=sync) as file:
+        with atomic_write(path, sync=sync) as file:
             file.write(b"new")
             file.flush()
             assert path.read_bytes() == b"old"
@@ -60,7 +60,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, sync):
         write_and_fail()
     assert path.read_bytes() == b"old"
     assert names(tmp_path) == ["file"]
-    with whole_file(path, sync=sync) as file:
+    with atomic_write(path, sync=sync) as file:
         file.write(b"new")
     assert path.read_bytes() == b"new"
     assert names(tmp_path) == ["file"]
@@ -68,7 +68,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, sync):
 
 def test_a_file_for_which_there_is_no_space_leaves_nothing(tmp_path):
     def write():
-        with whole_file(tmp_path / "file") as file:
+        with atomic_write(tmp_path / "file") as file:
             file.write(bytes(5000))
 
     with largest_file(1000), pytest.raises(OSError, match="too large") as full:
@@ -82,39 +82,39 @@ def test_a_file_for_which_there_is_no_space_leaves_nothing(tmp_path):
 
 def test_lines_come_back_in_the_order_in_which_they_were_added(tmp_path):
     path = tmp_path / "lines"
-    assert read_lines(path) == []
+    assert read_jsonl(path) == []
     for k in range(3):
-        append_line(path, {"k": k})
+        append_jsonl(path, {"k": k})
     assert path.read_bytes() == b'{"k": 0}\n{"k": 1}\n{"k": 2}\n'
-    assert read_lines(path) == [{"k": 0}, {"k": 1}, {"k": 2}]
+    assert read_jsonl(path) == [{"k": 0}, {"k": 1}, {"k": 2}]
 
 
 @pytest.mark.parametrize("torn", [b'{"k": 1, "l', b'{"k"', b"{", b'{"name": "\xc3', b"\x00\x00"])
 def test_a_torn_line_is_left_out_and_does_not_spoil_the_next(tmp_path, torn):
     path = tmp_path / "lines"
-    append_line(path, {"k": 0})
+    append_jsonl(path, {"k": 0})
     with path.open("ab") as file:
         file.write(torn)
-    assert read_lines(path) == [{"k": 0}]
-    append_line(path, {"k": 2})
-    append_line(path, {"k": 3})
-    assert read_lines(path) == [{"k": 0}, {"k": 2}, {"k": 3}]
+    assert read_jsonl(path) == [{"k": 0}]
+    append_jsonl(path, {"k": 2})
+    append_jsonl(path, {"k": 3})
+    assert read_jsonl(path) == [{"k": 0}, {"k": 2}, {"k": 3}]
 
 
 def test_a_line_torn_to_something_shorter_that_is_json_too_is_left_out(tmp_path):
     path = tmp_path / "lines"
     path.write_bytes(b'{"k": 0}\n1\n[]\nnull\n"text"\n')
-    assert read_lines(path) == [{"k": 0}]
+    assert read_jsonl(path) == [{"k": 0}]
 
 
 def test_a_line_for_which_there_is_no_space_is_taken_back_whole(tmp_path):
     path = tmp_path / "lines"
-    append_line(path, {"k": 0})
+    append_jsonl(path, {"k": 0})
     before = path.read_bytes()
     with largest_file(len(before) + 20), pytest.raises(OSError, match="too large"):
-        append_line(path, {"text": 100 * "x"})
+        append_jsonl(path, {"text": 100 * "x"})
     assert path.read_bytes() == before
-    append_line(path, {"k": 1})
+    append_jsonl(path, {"k": 1})
     assert path.read_bytes() == before + b'{"k": 1}\n'
 
 
@@ -124,14 +124,14 @@ def test_a_line_for_which_there_is_no_space_is_taken_back_whole(tmp_path):
 def held(folder, *part):
     """Return whether somebody else may not write such a part now."""
     try:
-        with sole_writer(folder, *part):
+        with exclusive_lock(folder, *part):
             return False
     except DataSetError:
         return True
 
 
 def test_a_second_writer_is_refused_naming_process_and_machine(tmp_path):
-    with sole_writer(tmp_path), pytest.raises(DataSetError) as refusal, sole_writer(tmp_path):
+    with exclusive_lock(tmp_path), pytest.raises(DataSetError) as refusal, exclusive_lock(tmp_path):
         pass
     told = str(refusal.value)
     assert f"process {os.getpid()} on {socket.gethostname()}" in told
@@ -140,17 +140,17 @@ def test_a_second_writer_is_refused_naming_process_and_machine(tmp_path):
 
 
 def test_a_folder_is_free_again_after_its_writer_however_it_ended(tmp_path):
-    with sole_writer(tmp_path):
+    with exclusive_lock(tmp_path):
         assert held(tmp_path)
     assert not held(tmp_path)
-    with pytest.raises(RuntimeError), sole_writer(tmp_path):
+    with pytest.raises(RuntimeError), exclusive_lock(tmp_path):
         raise RuntimeError
     assert not held(tmp_path)
     assert not list(tmp_path.glob(".writer-*"))
 
 
 def test_a_refusal_does_not_free_the_folder(tmp_path):
-    with sole_writer(tmp_path):
+    with exclusive_lock(tmp_path):
         assert held(tmp_path)
         assert held(tmp_path)
 
@@ -169,7 +169,7 @@ def test_a_refusal_does_not_free_the_folder(tmp_path):
 def test_parts_have_a_writer_each_if_they_are_parts_of_the_same_division(
     tmp_path, mine, other, refused
 ):
-    with sole_writer(tmp_path, *mine):
+    with exclusive_lock(tmp_path, *mine):
         assert held(tmp_path, *other) == refused
     assert not held(tmp_path, *other)
 
@@ -180,7 +180,10 @@ def test_a_killed_writer_does_not_count(tmp_path, environment):
     )
     try:
         assert writer.stdout.readline() == b"writing\n"
-        with pytest.raises(DataSetError, match=f"process {writer.pid} on "), sole_writer(tmp_path):
+        with (
+            pytest.raises(DataSetError, match=f"process {writer.pid} on "),
+            exclusive_lock(tmp_path),
+        ):
             pass
     finally:
         writer.send_signal(signal.SIGKILL)
@@ -199,7 +202,7 @@ def test_lines_are_neither_read_from_nor_added_to_what_is_no_file(tmp_path):
     (tmp_path / "outside").write_text("mine\n")
     (tmp_path / "link").symlink_to("outside")
     for name in ("folder", "link"):
-        for use in (read_lines, lambda path: append_line(path, {"k": 0})):
+        for use in (read_jsonl, lambda path: append_jsonl(path, {"k": 0})):
             with pytest.raises(DataSetError, match=f"{name} is no file of its own"):
                 use(tmp_path / name)
     assert (tmp_path / "outside").read_text() == "mine\n"
@@ -208,7 +211,7 @@ def test_lines_are_neither_read_from_nor_added_to_what_is_no_file(tmp_path):
 def test_a_line_that_is_nested_without_end_is_left_out(tmp_path):
     path = tmp_path / "lines"
     path.write_text("[" * 99_999 + '\n{"k": 1}\n')
-    assert read_lines(path) == [{"k": 1}]
+    assert read_jsonl(path) == [{"k": 1}]
 
 
 def test_a_writer_that_ends_while_it_is_asked_for_its_name_is_no_crash(tmp_path, monkeypatch):

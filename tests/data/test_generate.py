@@ -8,8 +8,8 @@ import signal
 import pytest
 
 from dpl.data import DataSet, Writer
-from dpl.data.solving.solve import lost, outcome
-from dpl.data.storage.pending import Spool
+from dpl.data.solving.solve import failed_load, solve_load
+from dpl.data.storage.pending import PendingSamples
 from dpl.fem import SaintVenantKirchhoff
 
 SIZES = {"train": 6, "val": 2, "test": 2}
@@ -32,7 +32,7 @@ def solved(monkeypatch):
 
     def counted(scene, job):
         found.append((job.seed[1], job.number))
-        return outcome(scene, job)
+        return solve_load(scene, job)
 
     monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", counted)
     return found
@@ -44,7 +44,7 @@ def interrupted(monkeypatch):
 
     def interrupted(after, *signals):
         count = 0
-        real = Spool.put
+        real = PendingSamples.put
 
         def keep(self, one):
             nonlocal count
@@ -55,7 +55,7 @@ def interrupted(monkeypatch):
                     os.kill(os.getpid(), number)
             return path
 
-        monkeypatch.setattr(Spool, "put", keep)
+        monkeypatch.setattr(PendingSamples, "put", keep)
 
     return interrupted
 
@@ -103,12 +103,14 @@ def test_the_folder_is_named_after_scene_and_seed_if_left_out(scene, monkeypatch
 
 
 def test_the_plan_says_what_is_there_and_writes_nothing(wanted, scene, tmp_path):
-    (line,) = wanted().plan()
+    (line,) = wanted().skipped_work()
     assert scene.fingerprint[:12] in line
     assert not list(tmp_path.iterdir())
     wanted(train=4, test=0).fill()
-    assert "6 of 10 loads not solved again: they are there" in wanted().plan()
-    assert "6 of 10 loads not solved again: they are there" in wanted(shard=1, shards=2).plan()
+    assert "6 of 10 loads not solved again: they are there" in wanted().skipped_work()
+    assert (
+        "6 of 10 loads not solved again: they are there" in wanted(shard=1, shards=2).skipped_work()
+    )
 
 
 def test_nothing_is_written_where_nothing_is_wanted(wanted):
@@ -217,7 +219,7 @@ def test_once_asked_to_stop_it_finishes_the_load_at_work_and_leaves(
     if raised is SystemExit:
         assert end.value.code == 143
     store = wanted().store
-    assert len(store.spool.files()) == 3
+    assert len(store.pending.files()) == 3
     assert sessions(store)[0]["loads"] == 3
 
 
@@ -258,8 +260,8 @@ def test_a_set_whose_large_loads_are_rejected_is_warned_of(make_scene, tmp_path,
 
 def test_a_biased_set_is_warned_of_on_one_line(wanted, monkeypatch, capsys):
     def picky(scene, job):
-        one = outcome(scene, job)
-        return lost(scene, job, "not converged") if one.amplitude > 0.1 else one
+        one = solve_load(scene, job)
+        return failed_load(scene, job, "not converged") if one.amplitude > 0.1 else one
 
     monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", picky)
     store = wanted(train=80).fill()

@@ -19,10 +19,10 @@ import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
 from dpl import Sample
-from dpl.data import OnlineSamples, Replay
-from dpl.data.replay_buffer import Rates
-from dpl.data.solving.solve import Job, outcome
-from dpl.data.stream import NEAR, Drawn, Worst
+from dpl.data import OnlineSamples, ReplayBuffer
+from dpl.data.replay_buffer import StreamRates
+from dpl.data.solving.solve import LoadKey, solve_load
+from dpl.data.stream import NEAR, DrawnSample, HardExamples
 from dpl.fem import Newton
 from dpl.scene import stack
 
@@ -61,7 +61,7 @@ class Numbers(IterableDataset):
         field = torch.full(self.shape, float(place), dtype=torch.float64)
         young = torch.tensor(float(place), dtype=torch.float64)
         point = torch.tensor([place / 1e6], dtype=torch.float64)
-        return Drawn(Sample(field, -field, young), torch.tensor(place), point)
+        return DrawnSample(Sample(field, -field, young), torch.tensor(place), point)
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def replay():
             "reuse": 6,
             "capacity": 100,
         }
-        made.append(Replay(stream or Numbers(), **{**defaults, **options}))
+        made.append(ReplayBuffer(stream or Numbers(), **{**defaults, **options}))
         return made[-1]
 
     yield replay
@@ -115,7 +115,7 @@ def test_the_stream_is_the_accepted_loads_in_order(scene, drawn):
     first = list(itertools.islice(OnlineSamples(scene, SEED), 6))
     assert [one.sample.force.numpy().tobytes() for one in first] == drawn[:6]
     assert [int(one.number) for one in first] == list(range(6))
-    truth = outcome(scene, Job(SEED, 3))
+    truth = solve_load(scene, LoadKey(SEED, 3))
     assert torch.equal(first[3].sample.displacement, torch.from_numpy(truth.displacement))
     assert torch.equal(first[3].point, torch.from_numpy(truth.point))
 
@@ -134,7 +134,7 @@ def test_the_stream_can_begin_anywhere(scene, drawn):
 
 def test_rejected_loads_do_not_enter_the_stream(scene, drawn, monkeypatch):
     def choosy(scene, job, **options):
-        return outcome(scene, job, **options)._replace(accepted=job.number % 3 == 1)
+        return solve_load(scene, job, **options)._replace(accepted=job.number % 3 == 1)
 
     monkeypatch.setattr("dpl.data.stream.outcome", choosy)
     first = itertools.islice(OnlineSamples(scene, SEED), 3)
@@ -384,7 +384,7 @@ def test_the_rates_of_each_epoch_are_reported(replay, clocked):
         for _ in stream:
             pass
         assert len(told) == epoch + 1
-    assert all(isinstance(rates, Rates) for rates in told)
+    assert all(isinstance(rates, StreamRates) for rates in told)
     assert stream.rates is told[-1]
     for rates in told:
         assert rates.produced == pytest.approx(1 / 0.005)
@@ -413,7 +413,7 @@ def test_an_epoch_left_early_reports_nothing_false(replay):
 
 
 def test_points_near_the_worst_lie_in_the_unit_cube():
-    worst, rng = Worst(3), np.random.default_rng(0)
+    worst, rng = HardExamples(3), np.random.default_rng(0)
     corners = torch.tensor(list(itertools.product([0.0, 1 - 2.0**-53], repeat=3)))
     worst.put(corners.double())
     points = torch.stack([worst.near(rng) for _ in range(2000)])
@@ -426,7 +426,7 @@ def test_points_near_the_worst_lie_in_the_unit_cube():
 
 
 def test_nothing_is_near_the_worst_while_there_is_none():
-    worst = Worst(3)
+    worst = HardExamples(3)
     assert worst.near(np.random.default_rng(0)) is None
     worst.put(torch.rand(5, 3, dtype=torch.float64))
     assert worst.near(np.random.default_rng(0)) is not None
@@ -435,7 +435,7 @@ def test_nothing_is_near_the_worst_while_there_is_none():
 
 
 def test_more_points_than_there_is_room_for_leave_the_worst_ones():
-    worst = Worst(1, size=4)
+    worst = HardExamples(1, size=4)
     worst.put(torch.arange(10, dtype=torch.float64)[:, None] / 10)
     near = {round(float(worst.near(np.random.default_rng(k))) / 0.1) for k in range(200)}
     assert near <= set(range(6))
@@ -444,8 +444,8 @@ def test_more_points_than_there_is_room_for_leave_the_worst_ones():
 
 
 def test_new_loads_are_drawn_near_the_worst_ones_as_often_as_asked(scene):
-    worst = Worst(scene.loads.dimension)
-    centre = torch.full((1, scene.loads.dimension), 0.5, dtype=torch.float64)
+    worst = HardExamples(scene.loads.n_random)
+    centre = torch.full((1, scene.loads.n_random), 0.5, dtype=torch.float64)
     worst.put(centre)
     for part in (0.0, 0.5, 1.0):
         stream = OnlineSamples(scene, SEED, worst=worst, near=part)
@@ -455,15 +455,15 @@ def test_new_loads_are_drawn_near_the_worst_ones_as_often_as_asked(scene):
 
 
 def test_a_load_drawn_near_the_worst_is_an_answer_to_its_own_point(scene):
-    worst = Worst(scene.loads.dimension)
-    worst.put(torch.full((1, scene.loads.dimension), 0.5, dtype=torch.float64))
+    worst = HardExamples(scene.loads.n_random)
+    worst.put(torch.full((1, scene.loads.n_random), 0.5, dtype=torch.float64))
     one = next(iter(OnlineSamples(scene, SEED, worst=worst, near=1.0)))
     load = scene.loads.at(one.point[None])
     assert torch.equal(one.sample.force, load.force[0])
     assert torch.equal(one.sample.young, load.young[0])
     internal, volume = scene.problem.evaluate(one.sample.displacement[None])
     assert bool(volume > 0)
-    assert float(scene.problem.imbalance(internal, load.force)) < 1e-8
+    assert float(scene.problem.relative_residual_of(internal, load.force)) < 1e-8
 
 
 @pytest.fixture
@@ -492,7 +492,7 @@ def test_new_loads_concentrate_where_the_errors_are_largest(unsolved, replay):
     def errors():
         return torch.exp(-8 * (last["points"] - corner).norm(dim=1))
 
-    stream = OnlineSamples(unsolved, SEED, worst=Worst(2), near=0.5)
+    stream = OnlineSamples(unsolved, SEED, worst=HardExamples(2), near=0.5)
     stream.scene.loads.young_at = lambda points: points[:, 0] + 10 * (points[:, 1] * 1e6).round()
     told = replay(stream, errors=errors, batches=1, fresh=16, reuse=4, capacity=256, batch_size=16)
     buffer = told._buffer
@@ -521,7 +521,7 @@ def test_new_loads_concentrate_where_the_errors_are_largest(unsolved, replay):
 def test_errors_are_those_of_the_batch_before(replay):
     """The largest errors name their points, of those that have been seen alone."""
 
-    class Watched(Worst):
+    class Watched(HardExamples):
         def __init__(self, dimension):
             super().__init__(dimension)
             self.puts = []
@@ -567,7 +567,7 @@ class Watching(Numbers):
 
 def test_spawned_workers_see_where_the_surrogate_is_worst_at_once(replay):
     stream = Watching(pause=[0.01])
-    stream.worst = Worst(2)
+    stream.worst = HardExamples(2)
     told = replay(stream, workers=1, fresh=1, reuse=1, batch_size=1, batches=1, capacity=8)
     assert next(iter(told)).force[0, 0].tolist() == [0.0, 0.0, 0.0]
     stream.worst.put(torch.tensor([[0.25, 0.75]], dtype=torch.float64))
@@ -662,7 +662,7 @@ def test_no_load_is_left_out_where_a_worker_died(replay, monkeypatch):
     def two():  # workers, of which the second dies in its first chunk
         drawn = [source.drawn(0), source.drawn(2)]
         numbers, points = (torch.stack([getattr(d, k) for d in drawn]) for k in ("number", "point"))
-        yield Drawn(stack([one.sample for one in drawn]), numbers, points)
+        yield DrawnSample(stack([one.sample for one in drawn]), numbers, points)
         raise RuntimeError("DataLoader worker (pid 1) is killed by signal: Killed.")
 
     begun = []

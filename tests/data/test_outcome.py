@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.data.solving.solve import Job, lost, outcome
+from dpl.data.solving.solve import LoadKey, failed_load, solve_load
 from dpl.fem import SaintVenantKirchhoff
 
 SEED = (5, 0)
@@ -23,7 +23,7 @@ def content(one):
 
 @pytest.fixture(scope="module")
 def jobs():
-    return [Job(SEED, index) for index in range(8)]
+    return [LoadKey(SEED, index) for index in range(8)]
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +33,8 @@ def hard(make_scene):
 
 
 def test_an_outcome_does_not_depend_on_what_was_solved_before(scene, jobs):
-    forwards = [content(outcome(scene, job)) for job in jobs]
-    backwards = [content(outcome(scene, job)) for job in jobs[::-1]]
+    forwards = [content(solve_load(scene, job)) for job in jobs]
+    backwards = [content(solve_load(scene, job)) for job in jobs[::-1]]
     assert backwards[::-1] == forwards
 
 
@@ -42,13 +42,15 @@ def test_an_outcome_does_not_depend_on_the_scene_object_its_size_and_stiffness(
     scene, make_scene, jobs
 ):
     twin = make_scene(size=(1.0, 0.25, 0.25), young=2e11)
-    assert content(outcome(make_scene(), jobs[3])) == content(outcome(scene, jobs[3]))
-    assert content(outcome(twin, jobs[3]))["force"] == content(outcome(scene, jobs[3]))["force"]
+    assert content(solve_load(make_scene(), jobs[3])) == content(solve_load(scene, jobs[3]))
+    assert (
+        content(solve_load(twin, jobs[3]))["force"] == content(solve_load(scene, jobs[3]))["force"]
+    )
 
 
 def test_streams_and_numbers_name_different_loads(scene):
     forces = {
-        outcome(scene, Job((seed, stream), number)).force.tobytes()
+        solve_load(scene, LoadKey((seed, stream), number)).force.tobytes()
         for seed in (0, 1)
         for stream in (0, 1)
         for number in (0, 1)
@@ -58,9 +60,9 @@ def test_streams_and_numbers_name_different_loads(scene):
 
 def test_an_outcome_is_judged_at_the_state_that_it_holds(scene, jobs):
     for job in jobs:
-        one = outcome(scene, job)
+        one = solve_load(scene, job)
         force, displacement = torch.from_numpy(one.force), torch.from_numpy(one.displacement)
-        ratio = scene.problem.residual_ratio(displacement[None], force[None])
+        ratio = scene.problem.relative_residual(displacement[None], force[None])
         assert one.job == job
         assert one.accepted
         assert float(ratio) == pytest.approx(one.residual, rel=1e-6, abs=1e-14)
@@ -73,7 +75,7 @@ def test_an_outcome_is_judged_at_the_state_that_it_holds(scene, jobs):
 
 
 def test_an_outcome_holds_the_load_of_its_point_and_its_size(scene, jobs):
-    one = outcome(scene, jobs[2])
+    one = solve_load(scene, jobs[2])
     load = scene.loads.sample(SEED, [2])
     assert torch.equal(torch.from_numpy(one.force), load.force[0])
     assert torch.equal(torch.from_numpy(one.point), scene.loads.points(SEED, [2])[0])
@@ -83,13 +85,13 @@ def test_an_outcome_holds_the_load_of_its_point_and_its_size(scene, jobs):
 
 def test_a_point_that_is_given_takes_the_place_of_the_streams_own(scene, jobs):
     point = scene.loads.points(SEED, [7])[0]
-    given, drawn = outcome(scene, jobs[0], point=point), outcome(scene, jobs[7])
+    given, drawn = solve_load(scene, jobs[0], point=point), solve_load(scene, jobs[7])
     assert given.job == jobs[0]
     assert content(given) | {"job": jobs[7]} == content(drawn)
 
 
 def test_a_load_without_an_answer_is_rejected_with_the_part_that_has_one(hard):
-    found = [outcome(hard, Job(SEED, index)) for index in range(6)]
+    found = [solve_load(hard, LoadKey(SEED, index)) for index in range(6)]
     rejected = [one for one in found if not one.accepted]
     assert rejected, "SVK bears six loads of ten times L: choose harder ones"
     for one in rejected:
@@ -98,12 +100,15 @@ def test_a_load_without_an_answer_is_rejected_with_the_part_that_has_one(hard):
         displacement = torch.from_numpy(one.displacement)[None]
         part = one.load_factor * torch.from_numpy(one.force)[None]
         if one.load_factor:
-            assert hard.problem.residual_ratio(displacement, part) < hard.solver.loose
+            assert hard.problem.relative_residual(displacement, part) < hard.solver.loose
             assert hard.problem.volume_ratio(displacement) > 0
 
 
 def test_a_load_that_the_machine_lost_is_the_load_without_an_answer(scene, jobs):
-    one, solved = lost(scene, jobs[1], "the lights went out", seconds=3.0), outcome(scene, jobs[1])
+    one, solved = (
+        failed_load(scene, jobs[1], "the lights went out", seconds=3.0),
+        solve_load(scene, jobs[1]),
+    )
     assert one.job == jobs[1]
     assert one.reason == "the lights went out"
     assert one.seconds == 3.0
@@ -116,9 +121,9 @@ def test_a_load_that_the_machine_lost_is_the_load_without_an_answer(scene, jobs)
 
 
 def test_outcomes_cross_between_processes_without_tensors(scene, jobs):
-    for one in (outcome(scene, jobs[0]), lost(scene, jobs[0], "gone")):
+    for one in (solve_load(scene, jobs[0]), failed_load(scene, jobs[0], "gone")):
         for value in one:
-            assert isinstance(value, Job | np.ndarray | float | int | str)
+            assert isinstance(value, LoadKey | np.ndarray | float | int | str)
         assert repr(content(pickle.loads(pickle.dumps(one)))) == repr(
             content(one)
         )  # nan is not nan

@@ -9,7 +9,7 @@ from contextlib import suppress
 
 import pytest
 
-from dpl.system.processes import spawning
+from dpl.system.processes import spawn_context
 
 LONG = 120  # no test waits so long, unless a process is left behind [s]
 
@@ -122,7 +122,7 @@ def test_other_processes_are_started_as_ever():
     from multiprocessing import spawn
 
     before = spawn.get_command_line
-    context = spawning()
+    context = spawn_context()
     worker = context.Process(target=os.getpid)
     worker.start()
     worker.join()

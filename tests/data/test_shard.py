@@ -5,9 +5,9 @@ import pytest
 import torch
 from safetensors.torch import load, save
 
-from dpl.data.solving.solve import Job, Outcome
+from dpl.data.solving.solve import LoadKey, SolvedLoad
 from dpl.data.storage import store as store_module
-from dpl.data.storage.shard import closed, opened, packed, taken, unpacked
+from dpl.data.storage.shard import decode_shard, deserialize, encode_shard, select, serialize
 from dpl.data.storage.store import runs
 
 SHAPE, DIMENSION = (4, 3), 2
@@ -18,8 +18,8 @@ def solved(number, *, nodes=(0, 3), accepted=True):
     rng = np.random.default_rng(number)
     force = np.zeros(SHAPE)
     force[list(nodes)] = rng.normal(size=(len(nodes), SHAPE[1]))
-    return Outcome(
-        job=Job((7, 1), number),
+    return SolvedLoad(
+        job=LoadKey((7, 1), number),
         point=rng.random(DIMENSION),
         force=force,
         displacement=rng.normal(size=SHAPE),
@@ -35,7 +35,7 @@ def solved(number, *, nodes=(0, 3), accepted=True):
 
 
 def content(*kept, poisson=None):
-    return closed(kept, SHAPE, DIMENSION, poisson)
+    return encode_shard(kept, SHAPE, DIMENSION, poisson)
 
 
 def same(one, other):
@@ -55,22 +55,22 @@ def line(*tried, rejected=()):
 
 def test_loads_come_out_as_they_were_put_in():
     loads = [solved(5), solved(6, nodes=(0, 1, 2, 3)), solved(7, nodes=())]
-    shard = opened(content(*loads), SHAPE, DIMENSION)
+    shard = decode_shard(content(*loads), SHAPE, DIMENSION)
     for one in loads:
-        assert same(taken(shard, one.job, line(*loads)), one)
+        assert same(select(shard, one.job, line(*loads)), one)
     assert shard["poisson"].shape == (3, 0)
     assert shard["iterations"].tolist() == [8, 9, 10]
 
 
 def test_a_rejected_load_comes_out_with_its_reason():
     loads = [solved(5), solved(6, accepted=False), solved(7)]
-    shard = opened(content(loads[0], loads[2]), SHAPE, DIMENSION)
-    found = taken(shard, loads[1].job, line(*loads, rejected=[6]))
+    shard = decode_shard(content(loads[0], loads[2]), SHAPE, DIMENSION)
+    found = select(shard, loads[1].job, line(*loads, rejected=[6]))
     assert (found.accepted, found.reason, found.load_factor) == (False, "diverged", 0.5)
     assert found.amplitude == loads[1].amplitude
     assert (found.iterations, found.seconds, len(found.force)) == (0, 0.0, 0)
     assert np.isnan([found.residual, found.volume_ratio]).all()
-    assert same(taken(shard, loads[2].job, line(*loads, rejected=[6])), loads[2])
+    assert same(select(shard, loads[2].job, line(*loads, rejected=[6])), loads[2])
 
 
 def test_poissons_ratios_are_kept_where_loads_have_their_own():
@@ -78,16 +78,16 @@ def test_poissons_ratios_are_kept_where_loads_have_their_own():
     ratio = lambda points: points[:, -1:]  # noqa: E731
     whole = content(*loads, poisson=ratio)
     points = torch.from_numpy(np.stack([one.point for one in loads]))
-    assert torch.equal(opened(whole, SHAPE, DIMENSION, 1)["poisson"], ratio(points))
+    assert torch.equal(decode_shard(whole, SHAPE, DIMENSION, 1)["poisson"], ratio(points))
     with pytest.raises(ValueError, match="this scene has one for all loads"):
-        opened(whole, SHAPE, DIMENSION, 0)
+        decode_shard(whole, SHAPE, DIMENSION, 0)
     with pytest.raises(ValueError, match="is damaged"):
-        opened(content(*loads), SHAPE, DIMENSION, 1)
+        decode_shard(content(*loads), SHAPE, DIMENSION, 1)
 
 
 def test_a_load_of_the_spool_comes_out_as_it_was_put_in():
     for one in (solved(3), solved(4, nodes=()), solved(5, accepted=False)):
-        assert same(unpacked(packed(one)), one)
+        assert same(deserialize(serialize(one)), one)
 
 
 def change(name, values):
@@ -108,10 +108,10 @@ def change(name, values):
 )
 def test_forces_act_on_nodes_that_are_there(name, values, sound):
     if sound:
-        assert opened(change(name, values), SHAPE, DIMENSION)["force"].shape == (2, *SHAPE)
+        assert decode_shard(change(name, values), SHAPE, DIMENSION)["force"].shape == (2, *SHAPE)
         return
     with pytest.raises(ValueError, match="is damaged"):
-        opened(change(name, values), SHAPE, DIMENSION)
+        decode_shard(change(name, values), SHAPE, DIMENSION)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
@@ -120,7 +120,7 @@ def test_numbers_of_a_sample_are_finite(name, value):
     columns = load(content(solved(5)))
     columns[name].view(-1)[-1] = value
     with pytest.raises(ValueError, match=f"is damaged: {name} is not finite"):
-        opened(save(columns), SHAPE, DIMENSION)
+        decode_shard(save(columns), SHAPE, DIMENSION)
 
 
 @pytest.mark.parametrize("name", sorted(load(content(solved(5)))))
@@ -130,9 +130,9 @@ def test_each_column_has_its_shape_and_kind(name):
     other = torch.int16 if column.dtype != torch.int64 else torch.int32
     for wrong in (column[:-1].clone(), column[None].clone(), column.to(other)):
         with pytest.raises(ValueError, match="is damaged"):
-            opened(save(genuine | {name: wrong}), SHAPE, DIMENSION)
+            decode_shard(save(genuine | {name: wrong}), SHAPE, DIMENSION)
     with pytest.raises(ValueError, match="is damaged"):
-        opened(
+        decode_shard(
             save({key: value for key, value in genuine.items() if key != name}), SHAPE, DIMENSION
         )
 
@@ -166,14 +166,14 @@ def test_blocks_of_loads_fall_to_writers_in_turn(scene, tmp_path, monkeypatch):
 def test_the_largest_shard_is_one_whose_loads_act_on_every_node(scene):
     store = store_module.Store(None, scene, 0)
     nodes, dim = scene.problem.shape
-    every = Outcome(
-        *(Job((0, 0), 0), np.zeros(scene.loads.dimension), np.ones((nodes, dim))),
+    every = SolvedLoad(
+        *(LoadKey((0, 0), 0), np.zeros(scene.loads.n_random), np.ones((nodes, dim))),
         *(np.ones((nodes, dim)), 1.0, True, 0.0, 1.0, 1.0, 1, 0.0, ""),
     )
     sizes = []
     for count in (1, 2):
-        kept = [every._replace(job=Job((0, 0), k)) for k in range(count)]
-        sizes.append(len(closed(kept, (nodes, dim), scene.loads.dimension, None)))
+        kept = [every._replace(job=LoadKey((0, 0), k)) for k in range(count)]
+        sizes.append(len(encode_shard(kept, (nodes, dim), scene.loads.n_random, None)))
     load_size = store.largest(2) - store.largest(1)
     assert sizes[1] - sizes[0] <= load_size <= 2 * (sizes[1] - sizes[0])
     assert store.largest(0) == store_module.HEADER

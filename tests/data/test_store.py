@@ -18,13 +18,13 @@ from safetensors.torch import load_file, save
 from dpl import DataSetError
 from dpl.data import Store, Writer
 from dpl.data.solving import worker_pool
-from dpl.data.solving.solve import Job, lost, outcome
-from dpl.data.solving.worker_pool import Stop
+from dpl.data.solving.solve import LoadKey, failed_load, solve_load
+from dpl.data.solving.worker_pool import GracefulShutdown
 from dpl.data.storage import store as store_module
 from dpl.data.storage import writer as writer_module
 from dpl.data.storage.integrity import MACHINE, repair, verify
-from dpl.data.storage.pending import Spool
-from dpl.data.storage.shard import compact, spread
+from dpl.data.storage.pending import PendingSamples
+from dpl.data.storage.shard import to_dense, to_sparse
 from dpl.fem import SaintVenantKirchhoff, rectangle
 
 SIZES = {"train": 12, "val": 4, "test": 4}
@@ -52,7 +52,7 @@ def solved(monkeypatch):
 
     def counted(scene, job):
         found.append((*job.seed, job.number))
-        return outcome(scene, job)
+        return solve_load(scene, job)
 
     monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", counted)
     return found
@@ -120,7 +120,7 @@ def test_stored_samples_meet_the_tolerance_and_invert_nothing(data, scene):
         sample = data.store.load(split, size)
         assert len(sample.force) == size
         assert sample.force.dtype == sample.displacement.dtype == torch.float64
-        ratio = scene.problem.residual_ratio(sample.displacement, sample.force)
+        ratio = scene.problem.relative_residual(sample.displacement, sample.force)
         assert ratio.max() < scene.solver.tol
         assert scene.problem.volume_ratio(sample.displacement).min() > 0
         assert not sample.displacement[:, ~scene.problem.free].any()
@@ -161,7 +161,7 @@ def test_the_data_set_carries_fingerprint_seed_and_versions(data, scene):
 def test_the_reader_gives_each_load_as_it_was_solved(data, scene):
     read = data.store.reader("val")
     for number in (3, 0, 1):
-        one, again = read(number), outcome(scene, Job(data.store.stream("val"), number))
+        one, again = read(number), solve_load(scene, LoadKey(data.store.stream("val"), number))
         for name, value in again._asdict().items():
             if name == "amplitude":
                 assert one.amplitude == pytest.approx(value, abs=1e-6)
@@ -198,7 +198,7 @@ def test_rejected_loads_are_recorded_with_reason_and_load_factor(hard, tmp_path)
 
 def test_a_shard_of_rejects_alone_is_a_shard(scene, fresh, monkeypatch):
     monkeypatch.setattr(
-        "dpl.data.solving.worker_pool.outcome", lambda scene, job: lost(scene, job, "never")
+        "dpl.data.solving.worker_pool.outcome", lambda scene, job: failed_load(scene, job, "never")
     )
     fill(fresh, {"train": range(3)})
     assert fresh.missing("train", 4) == [3]
@@ -221,8 +221,8 @@ def test_forces_come_back_from_their_compact_form(shape):
     force[torch.rand(6, shape[0], generator=generator) < 0.6] = 0.0
     force[0, 2], force[0, 2, 1] = 0.0, 1e-300  # one component of a node is a node that carries
     force[3] = 0.0
-    packed = compact(force)
-    assert torch.equal(spread(packed, shape), force)
+    packed = to_sparse(force)
+    assert torch.equal(to_dense(packed, shape), force)
     assert len(packed["nodal_force"]) == len(packed["node"]) == packed["carried"].sum()
     assert packed["carried"][3] == 0
     assert packed["node"].dtype == torch.int32
@@ -231,7 +231,7 @@ def test_forces_come_back_from_their_compact_form(shape):
 
 def test_no_forces_come_back_as_none():
     force = torch.zeros(0, 7, 3, dtype=torch.float64)
-    assert spread(compact(force), (7, 3)).shape == (0, 7, 3)
+    assert to_dense(to_sparse(force), (7, 3)).shape == (0, 7, 3)
 
 
 def test_shards_hold_forces_of_loaded_nodes_alone(data):
@@ -271,7 +271,7 @@ def test_the_bytes_do_not_depend_on_the_number_of_workers(data, fresh, workers):
 
 def test_the_bytes_do_not_depend_on_the_order_in_which_loads_are_solved(data, fresh, monkeypatch):
     def backwards(scene, jobs, **more):
-        return worker_pool.outcomes(scene, list(jobs)[::-1], **more)
+        return worker_pool.solve_loads(scene, list(jobs)[::-1], **more)
 
     monkeypatch.setattr(writer_module, "outcomes", backwards)
     fill(fresh, WANTED)
@@ -472,7 +472,7 @@ def test_a_load_of_another_part_that_vanishes_from_the_spool_is_no_crash(data, f
     spool.mkdir()
     gone = spool / "train-000099.load"
     gone.symlink_to(spool / "nothing")  # listed, and then not there
-    assert fresh.spool.files() == {}
+    assert fresh.pending.files() == {}
     gone.unlink()
 
 
@@ -480,7 +480,7 @@ def test_a_load_of_another_part_that_vanishes_from_the_spool_is_no_crash(data, f
 
 
 def test_a_stop_keeps_what_is_solved(fresh):
-    stop = Stop()
+    stop = GracefulShutdown()
     found = 0
     for _ in Writer(fresh).fill(WANTED, workers=0, stop=stop):
         found += 1
@@ -497,7 +497,7 @@ def test_an_error_in_writing_ends_the_workers_even_while_it_is_held(fresh, monke
     def keep(self, one):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Spool, "put", keep)
+    monkeypatch.setattr(PendingSamples, "put", keep)
     with pytest.raises(OSError, match="No space left") as held:
         fill(fresh, WANTED, workers=1)
     try:
@@ -839,11 +839,11 @@ def test_two_lines_of_one_shard_are_both_held_against_it(copy):
 
 def test_a_load_under_the_name_of_another_is_solved_again(fresh, data, scene):
     Writer(fresh).create()
-    paths = [fresh.spool.put(outcome(scene, Job((0, 0), number))) for number in (0, 1)]
+    paths = [fresh.pending.put(solve_load(scene, LoadKey((0, 0), number))) for number in (0, 1)]
     paths[1].write_bytes(paths[0].read_bytes())
     (paths[0].parent / "train-one.load").write_bytes(b"mine")
     (paths[0].parent / "rain-000001.load").write_bytes(b"mine")
-    assert [job.number for job in fresh.spool.files()] == [0]
+    assert [job.number for job in fresh.pending.files()] == [0]
     assert fill(fresh) == 19
     assert fresh.digest("train", 12) == data.store.digest("train", 12)
 
@@ -911,15 +911,15 @@ def test_repair_retries_loads_that_the_machine_lost_and_no_others(hard, tmp_path
 
     def unlucky(scene, job):
         if job.number in reasons:
-            return lost(scene, job, reasons[job.number])
-        return outcome(scene, job)
+            return failed_load(scene, job, reasons[job.number])
+        return solve_load(scene, job)
 
     monkeypatch.setattr(store_module, "SHARD", 3)
     fill(sound, {"train": range(9)})
     monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", unlucky)
     fill(store, {"train": range(9)})
     assert store.digest("train", 9) != sound.digest("train", 9)
-    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", outcome)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", solve_load)
     assert mended(store) == ["train-000000.safetensors", "train-000003.safetensors"]
     assert fill(store, {"train": store.missing("train", 9)}) == 6
     assert store.digest("train", 9) == sound.digest("train", 9)
@@ -973,11 +973,11 @@ def test_kept_loads_make_shards_when_they_make_whole_ones(data, fresh, scene, mo
     monkeypatch.setattr(store_module, "SHARD", 4)
     Writer(fresh).create()
     for number in (5, 1, 0, 2, 7, 6, 4):
-        fresh.spool.put(outcome(scene, Job((0, 0), number)))
+        fresh.pending.put(solve_load(scene, LoadKey((0, 0), number)))
     Writer(fresh).collect("train")
     assert [line["first"] for line in lines(fresh)] == [4]
-    assert len(fresh.spool.files()) == 3
-    fresh.spool.put(outcome(scene, Job((0, 0), 3)))
+    assert len(fresh.pending.files()) == 3
+    fresh.pending.put(solve_load(scene, LoadKey((0, 0), 3)))
     Writer(fresh).collect("train")
-    assert fresh.spool.files() == {}
+    assert fresh.pending.files() == {}
     assert fresh.digest("train", 8) == data.store.digest("train", 8)

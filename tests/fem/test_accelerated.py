@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from dpl.fem import (
-    Accelerated,
-    Displacement,
+    AndersonSolver,
+    DirichletBC,
     Load,
     NeoHookeanLn,
     Newton,
@@ -42,7 +42,7 @@ def end(solver, load, guess):
         {"dim": 2},
         {"degree": 2},
         {"mean_dilatation": True},
-        {"supports": [Displacement(Plane(1, "min"), [None, 0.0, None])]},
+        {"supports": [DirichletBC(Plane(1, "min"), [None, 0.0, None])]},
     ],
     ids=str,
 )
@@ -50,7 +50,7 @@ def test_from_a_good_guess_the_answer_is_newtons(options):
     newton, load = case(**options)
     exact = solve(newton, load).displacement
     assert exact.norm(dim=-1).max() > 0.05, "or it would prove nothing"
-    answer = end(Accelerated(newton), load, 1.003 * exact)
+    answer = end(AndersonSolver(newton), load, 1.003 * exact)
     assert answer.converged.all()
     assert (answer.residual < newton.tol).all()
     assert torch.allclose(answer.displacement, exact, rtol=0, atol=1e-8)
@@ -61,7 +61,7 @@ def test_from_a_good_guess_the_answer_is_newtons(options):
 def test_on_a_linear_problem_one_step_is_enough():
     newton, load = case()
     tiny = load._replace(force=1e-7 * load.force)
-    answer = end(Accelerated(newton.but(tol=1e-4)), tiny, torch.zeros_like(load.force))
+    answer = end(AndersonSolver(newton.replace(tol=1e-4)), tiny, torch.zeros_like(load.force))
     assert answer.converged.all()
     assert int(answer.iterations) == 1
 
@@ -75,17 +75,17 @@ def test_from_a_useless_guess_it_ends_soon_and_unconverged(kind):
         "inverted": -1.5 * newton.problem.points[None] * newton.problem.free,
         "far": -exact,
     }[kind]
-    states = list(Accelerated(newton).iterate(load, guess=guess))
+    states = list(AndersonSolver(newton).iterate(load, guess=guess))
     assert not states[-1].converged.any() or kind == "far"
     assert len(states) <= 31
     assert len(states) == 1 or kind == "far"
 
 
 def test_supports_are_moved_whatever_is_guessed():
-    newton, load = case(supports=[Displacement(Plane(0, "max"), [0.0, 0.0, -0.3])])
+    newton, load = case(supports=[DirichletBC(Plane(0, "max"), [0.0, 0.0, -0.3])])
     exact = solve(newton, load).displacement
     guess = exact + 1e-4 * torch.randn(exact.shape, generator=torch.Generator().manual_seed(0))
-    answer = end(Accelerated(newton), load, guess.double())
+    answer = end(AndersonSolver(newton), load, guess.double())
     held = ~newton.problem.free
     assert torch.equal(answer.displacement[:, held], newton.problem.prescribed[None][:, held])
     assert answer.converged.all()
@@ -95,9 +95,9 @@ def test_a_batch_is_its_members():
     newton, load = case()
     both = Load(torch.cat([load.force, 0.5 * load.force]), torch.ones(2, dtype=torch.float64))
     guess = 1.002 * solve(newton, both).displacement
-    whole = end(Accelerated(newton), both, guess)
-    for k, single in enumerate(both.singles()):
-        alone = end(Accelerated(newton), single, guess[k : k + 1])
+    whole = end(AndersonSolver(newton), both, guess)
+    for k, single in enumerate(both.unbatch()):
+        alone = end(AndersonSolver(newton), single, guess[k : k + 1])
         assert torch.equal(whole.displacement[k], alone.displacement[0])
         assert int(whole.iterations[k]) == int(alone.iterations)
 
@@ -105,6 +105,6 @@ def test_a_batch_is_its_members():
 def test_a_memory_of_nothing_contracts_more_slowly():
     newton, load = case()
     guess = 1.003 * solve(newton, load).displacement
-    long, short = (end(Accelerated(newton, memory=memory), load, guess) for memory in (12, 1))
+    long, short = (end(AndersonSolver(newton, memory=memory), load, guess) for memory in (12, 1))
     assert long.converged.all()
     assert int(long.iterations) <= int(short.iterations)

@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from dpl.fem import (
     BatchedNewton,
-    Displacement,
+    DirichletBC,
     Load,
     ModalLoads,
     NeoHookeanLn,
@@ -67,7 +67,7 @@ def test_moved_supports_and_ranges_are_refused(body):
     pulled = Problem.build(
         problem.mesh,
         problem.material,
-        supports=[Displacement(Plane(0, "min")), Displacement(Plane(0, "max"), [0.1, 0, 0])],
+        supports=[DirichletBC(Plane(0, "min")), DirichletBC(Plane(0, "max"), [0.1, 0, 0])],
     )
     with pytest.raises(ValueError, match="prescribed"):
         BatchedNewton(pulled)

@@ -12,12 +12,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from dpl.data.solving.solve import Job, lost, outcome
+from dpl.data.solving.solve import LoadKey, failed_load, solve_load
 from dpl.fem import (
-    Accelerated,
+    AndersonSolver,
     BatchedNewton,
-    Linear,
     LinearElastic,
+    LinearSolver,
     Load,
     ModalLoads,
     NeoHookeanLn,
@@ -29,14 +29,14 @@ from dpl.fem import (
     Status,
     Traction,
     box,
-    branches,
-    judge,
+    evaluate_solution,
+    post_buckling_branches,
     solve,
 )
 from dpl.fem.linear import conjugate_gradients
 from dpl.inference import Direct, Hybrid
 from dpl.inference.hybrid import RULES
-from dpl.viewer.frames import Wish
+from dpl.viewer.frames import ViewSettings
 
 ONE = torch.ones(1, dtype=torch.float64)
 
@@ -64,11 +64,11 @@ def solvers(newton, load):
     snapshots = torch.cat([part * exact for part in (0.5, 0.8, 1.0)])
     reduced = PODGalerkin.fit(problem, snapshots, 3, tolerance=None, lift=newton.rest)
     hybrids = {rule: Hybrid(lambda load: guess, newton, rule) for rule in RULES}
-    hybrids["steps"] = Hybrid(lambda load: guess, newton, steps=Accelerated(newton))
+    hybrids["steps"] = Hybrid(lambda load: guess, newton, steps=AndersonSolver(newton))
     return {
         "newton": partial(solve, newton),
         "newton from a guess": lambda load: [*newton.iterate(load, guess=guess)][-1],
-        "accelerated": lambda load: [*Accelerated(newton).iterate(load, guess=guess)][-1],
+        "accelerated": lambda load: [*AndersonSolver(newton).iterate(load, guess=guess)][-1],
         "linear": partial(solve, newton.rest),
         "batched": partial(solve, BatchedNewton(problem)),
         "reduced": partial(solve, reduced),
@@ -136,15 +136,15 @@ def test_loads_that_arithmetic_cannot_resolve_are_never_answered(load, solvers, 
 
 TAKERS = {
     "newton": lambda newton, tol: Newton(newton.problem, tol=tol),
-    "changed newton": lambda newton, tol: newton.but(tol=tol),
-    "linear": lambda newton, tol: Linear(newton.problem, tol=tol),
+    "changed newton": lambda newton, tol: newton.replace(tol=tol),
+    "linear": lambda newton, tol: LinearSolver(newton.problem, tol=tol),
     "batched": lambda newton, tol: BatchedNewton(newton.problem, tol=tol),
     "direct": lambda newton, tol: Direct(lambda load: load.force, newton.problem, tol),
     "reduced": lambda newton, tol: PODGalerkin(
         newton.problem, torch.zeros(*newton.problem.shape, 1), tol=tol
     ),
-    "wish": lambda newton, tol: Wish(tol=tol),
-    "judge": lambda newton, tol: judge(
+    "wish": lambda newton, tol: ViewSettings(tol=tol),
+    "judge": lambda newton, tol: evaluate_solution(
         newton.problem,
         torch.zeros(1, *newton.problem.shape, dtype=torch.float64),
         Load(torch.zeros(1, *newton.problem.shape, dtype=torch.float64), ONE),
@@ -168,12 +168,15 @@ def test_a_tolerance_in_range_is_taken(newton, name, tol):
 
 def test_only_newton_takes_for_balance_what_rounding_leaves(newton, load):
     """It has tried; of a prediction whose residual is small no one knows that it is the least."""
-    exact = solve(newton.but(tol=1e-11), load).displacement
+    exact = solve(newton.replace(tol=1e-11), load).displacement
     problem, tol = newton.problem, 1e-15
-    for ratio in (judge(problem, exact, load, tol), solve(Linear(problem, tol), load)):
+    for ratio in (
+        evaluate_solution(problem, exact, load, tol),
+        solve(LinearSolver(problem, tol), load),
+    ):
         assert not ratio.converged.any()
     with pytest.warns(UserWarning, match="rounding allows no less"):
-        ended = [*newton.but(tol=tol).iterate(load, guess=exact)][-1]
+        ended = [*newton.replace(tol=tol).iterate(load, guess=exact)][-1]
     assert ended.converged.all()
     assert int(ended.iterations) >= 1
 
@@ -212,11 +215,11 @@ def test_where_a_load_lies_scales_with_it(newton, power):
 def test_the_size_of_a_load_in_a_data_set_is_that_on_free_nodes(make_scene):
     weight = torch.full((45, 3), -1e-5, dtype=torch.float64)
     scene = make_scene(always=weight)
-    job = Job((0, 0), 1)
+    job = LoadKey((0, 0), 1)
     force = scene.loads.sample(job.seed, [job.number]).force
     wanted = float(force[:, scene.problem.free].norm()) / scene.loads.largest_force
-    assert outcome(scene, job).amplitude == pytest.approx(wanted, rel=1e-12)
-    assert lost(scene, job, "lost").amplitude == pytest.approx(wanted, rel=1e-12)
+    assert solve_load(scene, job).amplitude == pytest.approx(wanted, rel=1e-12)
+    assert failed_load(scene, job, "lost").amplitude == pytest.approx(wanted, rel=1e-12)
 
 
 def test_forces_on_held_nodes_do_not_bend_a_column(make_scene):
@@ -231,7 +234,9 @@ def test_forces_on_held_nodes_do_not_bend_a_column(make_scene):
     straight = solve(newton, plain)
     assert straight.status[0] == Status.UNSTABLE
     for one, other in zip(
-        branches(newton, held, straight), branches(newton, plain, straight), strict=True
+        post_buckling_branches(newton, held, straight),
+        post_buckling_branches(newton, plain, straight),
+        strict=True,
     ):
         assert torch.equal(one.displacement, other.displacement)
 

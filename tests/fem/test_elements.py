@@ -10,7 +10,7 @@ import torch
 from dpl.fem import LinearElastic, NeoHookeanLn, Problem, box, rectangle
 from dpl.fem.assembly import basis_of
 from dpl.fem.assembly.elements import CURVED
-from dpl.fem.mesh import check
+from dpl.fem.mesh import check_mesh
 
 H = np.array([[0.02, 0.05, -0.01], [0.03, -0.04, 0.02], [-0.02, 0.01, 0.03]])
 ISOPARAMETRIC = {
@@ -34,14 +34,14 @@ def moved(element: str, size: float = 0.04) -> skfem.Mesh:
 @pytest.mark.parametrize("element", ISOPARAMETRIC)
 def test_curved_elements_pass_the_patch_test(element, law):
     """A homogeneous strain is in balance at every inner node, up to rounding."""
-    mesh = check(moved(element))
+    mesh = check_mesh(moved(element))
     problem = Problem.build(mesh, law, length=1.0)
     assert not problem.boundary.all()
     strain = torch.from_numpy(H[: mesh.dim(), : mesh.dim()])
     field = (problem.points @ strain.T)[None]
     force = problem.internal_force(field)[0]
-    assert force[~problem.boundary].norm() < problem.rounding(field)
-    assert force[problem.boundary].norm() > 1e6 * problem.rounding(field)
+    assert force[~problem.boundary].norm() < problem.roundoff_bound(field)
+    assert force[problem.boundary].norm() > 1e6 * problem.roundoff_bound(field)
 
 
 @pytest.mark.parametrize("element", ISOPARAMETRIC)

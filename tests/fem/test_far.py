@@ -14,15 +14,15 @@ from dpl.fem import (
     BodyForce,
     Box,
     Cylinder,
-    Displacement,
-    Linear,
+    DirichletBC,
+    LinearSolver,
     Load,
     NeoHookeanLn,
     Newton,
     Plane,
     Problem,
+    RobinBC,
     Sphere,
-    Spring,
     Traction,
     box,
     eigenmodes,
@@ -31,7 +31,7 @@ from dpl.fem import (
     symmetries,
 )
 from dpl.fem.loads import body_force, traction
-from dpl.fem.mesh import check
+from dpl.fem.mesh import check_mesh
 
 NH, EPS = NeoHookeanLn(0.3), np.finfo(float).eps
 CELLS = 3  # along the sides of the grids
@@ -70,12 +70,12 @@ def test_a_far_body_is_written_where_it_lies(kind, grid, distance):
 def test_far_elements_pass_the_patch_test_as_near_ones_do(kind, grid, distance):
     """The geometry is that of the rounded coordinates: inner nodes are in balance to rounding."""
     mesh = away(grid(kind[0], CELLS, 0.15), distance)
-    problem = Problem.build(check(mesh), NH, degree=kind[1], length=1.0)
+    problem = Problem.build(check_mesh(mesh), NH, degree=kind[1], length=1.0)
     dim = problem.shape[1]
     H = torch.tensor([[0.02, 0.05, -0.01], [0.03, -0.04, 0.02], [-0.02, 0.01, 0.03]]).double()
     field = (problem.points @ H[:dim, :dim].T)[None]
     force = problem.internal_force(field)[0]
-    assert force[~problem.boundary].norm() < problem.rounding(field)
+    assert force[~problem.boundary].norm() < problem.roundoff_bound(field)
 
 
 def test_loads_and_springs_on_a_far_body_are_those_on_a_near_one(kind, grid, distance):
@@ -83,7 +83,7 @@ def test_loads_and_springs_on_a_far_body_are_those_on_a_near_one(kind, grid, dis
     values = []
     for d in (0.0, distance):
         mesh = away(grid(kind[0], CELLS, 0.15, inside=True), d)
-        problem = Problem.build(mesh, NH, degree=kind[1], supports=[Spring(Plane(0, "min"), 0.3)])
+        problem = Problem.build(mesh, NH, degree=kind[1], supports=[RobinBC(Plane(0, "min"), 0.3)])
         dim = problem.shape[1]
         stress = Traction(Plane(0, "max"), [0.3, -2.0, 0.7][:dim]).on(problem)
         values.append((stress, BodyForce([0.3, -2.0, 0.7][:dim]).on(problem)))
@@ -119,7 +119,7 @@ def test_regions_in_absolute_coordinates_hold_the_same_nodes(distance):
         lambda at: Cylinder(0, 0.25, at),
     ):
         held = [
-            ~Problem.build(m, NH, supports=[Displacement(region(at))]).free
+            ~Problem.build(m, NH, supports=[DirichletBC(region(at))]).free
             for m, at in ((near, np.zeros(3)), (mesh, shift))
         ]
         assert held[0].any()
@@ -137,7 +137,7 @@ def test_modes_of_a_far_body_are_those_of_a_near_one(distance):
     found = []
     for d in (0.0, distance):
         mesh = away(box([4.0, 1.1, 1.0], [9, 3, 3]), 4 * d)
-        found.append(eigenmodes(Linear(Problem.build(mesh, NH, fixed=Plane(0, "min"))), 4))
+        found.append(eigenmodes(LinearSolver(Problem.build(mesh, NH, fixed=Plane(0, "min"))), 4))
     near, far = found
     allowed = tolerance(distance, 8)
     assert far.values.numpy() == pytest.approx(near.values.numpy(), rel=allowed)

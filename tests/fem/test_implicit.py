@@ -6,16 +6,16 @@ import pytest
 import torch
 
 from dpl.fem import (
-    Displacement,
-    Equilibrium,
+    DifferentiableSolve,
+    DirichletBC,
     LinearElastic,
     Load,
     NeoHookeanLn,
     Newton,
     Plane,
     Problem,
+    RobinBC,
     SingularMatrix,
-    Spring,
     Status,
     box,
     solve,
@@ -32,7 +32,7 @@ def problem(beam):
 
 @pytest.fixture(scope="module")
 def equilibrium(problem):
-    return Equilibrium(Newton(problem, tol=1e-12, linear="superlu"))
+    return DifferentiableSolve(Newton(problem, tol=1e-12, linear="superlu"))
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_forces_on_held_nodes_change_nothing(problem, equilibrium, force):
 
 def test_the_gradient_by_young_and_by_newtons_is_that_of_whole_solves(scene, batch):
     """Through `Scene.load_of`: u/L depends on f/(E L^2) alone, so f df + E dE = 0 as well."""
-    equilibrium = Equilibrium(Newton(scene.problem, tol=1e-12, linear="superlu"))
+    equilibrium = DifferentiableSolve(Newton(scene.problem, tol=1e-12, linear="superlu"))
     young = torch.tensor([4500.0, 9000.0], dtype=torch.float64)
     newtons = batch.force[:2] * (young * scene.force_unit)[:, None, None]
 
@@ -132,7 +132,7 @@ def test_a_gradient_costs_one_factor_however_often_it_is_asked_for(equilibrium, 
 
 def test_linear_bodies_have_the_same_gradient_everywhere(beam, pull):
     problem = beam(LinearElastic(0.3), n=4, m=1)
-    equilibrium = Equilibrium(Newton(problem, linear="superlu"))
+    equilibrium = DifferentiableSolve(Newton(problem, linear="superlu"))
     force = torch.cat([pull(problem, 0.01), pull(problem, 1.0)]).requires_grad_()
     weight = noise(*problem.shape)
     (slope,) = torch.autograd.grad((equilibrium(loaded(force)) * weight).sum(), force)
@@ -143,12 +143,12 @@ def test_linear_bodies_have_the_same_gradient_everywhere(beam, pull):
 
 def test_moved_supports_and_springs_take_part(pull):
     ends = [
-        Displacement(Plane(0, "max"), [5.0, None, None]),
-        Spring(Plane(2, "min"), 1e-4),
+        DirichletBC(Plane(0, "max"), [5.0, None, None]),
+        RobinBC(Plane(2, "min"), 1e-4),
     ]
     mesh = box([LENGTH, 25.0, 25.0], [5, 2, 2])
     problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), supports=ends)
-    equilibrium = Equilibrium(Newton(problem, tol=1e-12, linear="superlu"))
+    equilibrium = DifferentiableSolve(Newton(problem, tol=1e-12, linear="superlu"))
     force, way = pull(problem, 5.0), noise(1, *problem.shape, seed=3)
     inner = force.clone().requires_grad_()
     answer = equilibrium(loaded(inner))
@@ -162,7 +162,7 @@ def test_moved_supports_and_springs_take_part(pull):
 def test_a_balanced_column_beyond_its_critical_load_has_a_gradient(beam):
     """Its tangent is indefinite, and yet the way in which it answers is a matter of one solve."""
     problem = beam(NeoHookeanLn(0.3), n=8, m=1)
-    equilibrium = Equilibrium(Newton(problem, tol=1e-12, linear="superlu"))
+    equilibrium = DifferentiableSolve(Newton(problem, tol=1e-12, linear="superlu"))
     tip = (problem.points[:, 0] == problem.points[:, 0].max()).double()
     axial = torch.zeros(1, *problem.shape, dtype=torch.float64)
     axial[0, :, 0] = -tip / tip.sum()
@@ -195,7 +195,7 @@ def test_a_guess_shortens_the_solve_and_changes_neither_answer_nor_gradient(equi
 
 
 def test_loads_without_an_answer_are_refused_by_number(problem, force):
-    equilibrium = Equilibrium(Newton(problem, linear="superlu", budget=2))
+    equilibrium = DifferentiableSolve(Newton(problem, linear="superlu", budget=2))
     hopeless = torch.cat([0 * force[:1], 100 * force[1:]]).requires_grad_()
     with pytest.raises(ValueError, match="of 2 loads, load 1: not converged"):
         equilibrium(loaded(hopeless))

@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from dpl.fem import (
-    Linear,
     LinearElastic,
+    LinearSolver,
     Load,
     Material,
     MooneyRivlinK2,
@@ -205,7 +205,7 @@ def bore(nu: float, cells: tuple[int, int], **options) -> float:
         lambda x: np.linalg.norm(x, axis=1) < 3 + 1e-6,
         lambda x: x / np.linalg.norm(x, axis=0) / 1000,
     )
-    answer = solve(Linear(problem), Load(force[None], torch.ones(1)))
+    answer = solve(LinearSolver(problem), Load(force[None], torch.ones(1)))
     return answer.displacement[0, np.abs(points - [3, 0]).sum(axis=1).argmin(), 0].item()
 
 

@@ -20,7 +20,7 @@ from dpl.fem import (
     Status,
     Traction,
     box,
-    judge,
+    evaluate_solution,
     solve,
 )
 from dpl.fem.linear import SuperLU
@@ -248,7 +248,9 @@ def test_mirror_image_of_a_body_at_rest_is_no_answer():
     problem, _ = bar(SaintVenantKirchhoff(0.3))
     mirrored = (problem.points * torch.tensor([-2.0, 0.0, 0.0]))[None]
     assert problem.internal_force(mirrored).abs().max() < 1e-15
-    verdict = judge(problem, mirrored, load_of(torch.zeros(problem.shape).double()), 1e-8)
+    verdict = evaluate_solution(
+        problem, mirrored, load_of(torch.zeros(problem.shape).double()), 1e-8
+    )
     assert verdict.volume_ratio.item() == pytest.approx(-1.0)
     assert verdict.status.item() == Status.NOT_CONVERGED
 

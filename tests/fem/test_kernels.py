@@ -14,9 +14,16 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from dpl.fem import Hookean, Isotropic, NeoHookeanLn, Plane, Problem, Spring
+from dpl.fem import (
+    InvariantBasedMaterial,
+    NeoHookeanLn,
+    Plane,
+    Problem,
+    RobinBC,
+    YoungPoissonMaterial,
+)
 from dpl.fem.assembly.numba_laws import Law
-from dpl.fem.assembly.simd import WIDTH, load, sqrt, store
+from dpl.fem.assembly.simd import SIMD_WIDTH, load, sqrt, store
 from dpl.fem.materials.tensors import green_lagrange, invariants, trace
 
 CLOSE = 1e-13  # of the largest entry
@@ -30,7 +37,7 @@ def cubed(x):
 
 
 @dataclass(frozen=True)
-class Coupled(Hookean, Isotropic):
+class Coupled(YoungPoissonMaterial, InvariantBasedMaterial):
     """NH-ln + (I1 - 3)^3 / 50 + (I1 - 3)(I2 - 3) / 20 + (I2 - 3)^2 / 40: all slopes of I1, I2."""
 
     def energy(self, H):
@@ -46,7 +53,7 @@ class Coupled(Hookean, Isotropic):
         return self.lam, self.mu, 1 / 50, 1 / 20, 1 / 40
 
     @staticmethod
-    def slopes(c, i1, i2, j, log_j, m1):
+    def invariant_derivatives(c, i1, i2, j, log_j, m1):
         """Return the slopes."""
         rest, p = c[0] * log_j, c[0] * log_j - c[1]
         W1 = c[2] * 3 * (cubed(i1) - (i1 - 1) * i1 * i1) + c[3] * i2  # of what NH-ln has not
@@ -56,7 +63,7 @@ class Coupled(Hookean, Isotropic):
 
 
 @pytest.fixture(params=[*LAWS, "own"])
-def law(request, laws) -> Isotropic:
+def law(request, laws) -> InvariantBasedMaterial:
     """Each law of invariants, and one that is written here."""
     return Coupled(0.3) if request.param == "own" else laws[request.param]
 
@@ -65,10 +72,10 @@ def law(request, laws) -> Isotropic:
 def body(request, law, kind, grid, chain) -> Problem:
     """Bodies of each kind of element, of a number of cells that fills no whole block of lanes."""
     cell, degree = kind
-    mesh = chain(cell, 2 * WIDTH + 3) if request.param == "equal" else grid(cell, 3, 0.12)
+    mesh = chain(cell, 2 * SIMD_WIDTH + 3) if request.param == "equal" else grid(cell, 3, 0.12)
     problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
     assert problem.equal_cells == (request.param == "equal")
-    assert len(problem.cells) % WIDTH
+    assert len(problem.cells) % SIMD_WIDTH
     return problem
 
 
@@ -125,12 +132,12 @@ def test_force_and_tangent_are_those_of_the_tensors(body, bend):
 
 def test_system_of_mixed_points_is_that_of_the_tensors(body, bend):
     """Two steps of points, and the system at the strains where they end."""
-    if not body.mixes:
+    if not body.supports_mip:
         pytest.skip("strains are no unknowns of the linear law")
     u, v, w = (0.7 * bend(body.points, seed=seed) for seed in range(3))
-    gap = body.widened(body.widened(None, 1.0, v), 0.25, w)
+    gap = body.update_strain_gap(body.update_strain_gap(None, 1.0, v), 0.25, w)
     plain = reference(body)
-    wide = plain.widened(plain.widened(None, 1.0, v), 0.25, w)
+    wide = plain.update_strain_gap(plain.update_strain_gap(None, 1.0, v), 0.25, w)
     check_equal(as_tensor(gap, len(body.cells)), wide)
     assert wide.abs().max() > 1e-3
     found, expected = body.linearise(u, gap), plain.linearise(u, wide)
@@ -188,7 +195,7 @@ def test_inverted_body_is_seen(body):
     assert body.evaluate(flat).volume_ratio.item() == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("count", range(1, 2 * WIDTH + 2))
+@pytest.mark.parametrize("count", range(1, 2 * SIMD_WIDTH + 2))
 def test_number_of_cells_does_not_matter(chain, bend, count):
     """Blocks of lanes that are full, almost full, almost empty; equal cells and unequal ones."""
     body = Problem.build(chain("quad", count), NeoHookeanLn(0.3), length=1.0)
@@ -198,8 +205,8 @@ def test_number_of_cells_does_not_matter(chain, bend, count):
         plain = reference(problem)
         check_equal(problem.evaluate(u).internal, plain.evaluate(u).internal)
         check_equal(problem.linearise(u).tangent, plain.linearise(u).tangent)
-        gap = as_tensor(problem.widened(None, 1.0, u), count)
-        check_equal(gap, plain.widened(None, 1.0, u))
+        gap = as_tensor(problem.update_strain_gap(None, 1.0, u), count)
+        check_equal(gap, plain.update_strain_gap(None, 1.0, u))
 
 
 def test_order_of_axes_in_memory_does_not_matter(grid, bend):
@@ -214,7 +221,7 @@ def test_order_of_axes_in_memory_does_not_matter(grid, bend):
 
 
 def test_springs_pull_in_compiled_and_tensor_loops_alike(kind, grid, bend):
-    spring = Spring(Plane(0, "max"), 0.7)
+    spring = RobinBC(Plane(0, "max"), 0.7)
     body = Problem.build(grid(kind[0]), NeoHookeanLn(0.3), supports=[spring], degree=kind[1])
     u, plain = bend(body.points), reference(body)
     check_equal(body.evaluate(u).internal, plain.evaluate(u).internal)
@@ -338,15 +345,15 @@ def _arithmetic(a, b, out):
 
 def test_lanes_add_multiply_and_divide_like_numbers():
     random = np.random.default_rng(0)
-    a, b = random.uniform(0.5, 2.0, (2, 2, WIDTH))
+    a, b = random.uniform(0.5, 2.0, (2, 2, SIMD_WIDTH))
     a[:, ::2] *= -1
-    out = np.full((24, WIDTH), np.nan)
+    out = np.full((24, SIMD_WIDTH), np.nan)
     _arithmetic(a, b, out)
     x, y = a[0], b[0]
     expected = [
         *(x + y, x - y, x * y, x / y, -x, np.sqrt(y)),
         *(x + 2, 2 + x, x - 2, 2 - x, x * 3, 3 * x, x / 4, 4 / x) * 2,
-        *(np.full(WIDTH, 7.5), a[1]),
+        *(np.full(SIMD_WIDTH, 7.5), a[1]),
     ]
     assert out == pytest.approx(np.array(expected), rel=1e-15)
 
@@ -358,8 +365,8 @@ def _copy(rows, out):
 
 
 def test_rows_are_loaded_and_stored_where_they_are():
-    rows = np.arange(5.0 * WIDTH).reshape(5, WIDTH)
-    out = np.zeros((7, WIDTH))
+    rows = np.arange(5.0 * SIMD_WIDTH).reshape(5, SIMD_WIDTH)
+    out = np.zeros((7, SIMD_WIDTH))
     _copy(rows, out[1:6])
     assert np.array_equal(out[1:6], rows[::-1])
     assert not out[[0, 6]].any()
@@ -374,7 +381,7 @@ def _quotients(a, b, out):
 
 def test_lanes_know_infinity_and_nan():
     """Inverted cells are found by them."""
-    a, b, out = np.full((1, WIDTH), -1.0), np.zeros((1, WIDTH)), np.zeros((3, WIDTH))
+    a, b, out = np.full((1, SIMD_WIDTH), -1.0), np.zeros((1, SIMD_WIDTH)), np.zeros((3, SIMD_WIDTH))
     a[0, 0], a[0, 1] = math.nan, math.inf
     _quotients(a, b, out)
     assert np.isnan(out[0, 0])
@@ -388,7 +395,7 @@ def test_trace_of_a_gap_is_that_of_its_six_numbers(grid, bend):
     """Strains in the kernels are 2 E: 11 22 33 12 23 13."""
     body = Problem.build(grid("hexahedron"), NeoHookeanLn(0.3), length=1.0)
     stretch = 0.2 * body.points[None] * torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    gap = body.widened(None, 1.0, stretch)
+    gap = body.update_strain_gap(None, 1.0, stretch)
     assert gap[0, 0, :, 0] == pytest.approx([0.04, 0.16, 0.36, 0, 0, 0], abs=1e-14)
     E = as_tensor(gap, len(body.cells))
     assert trace(E) == pytest.approx(torch.full_like(trace(E), 0.28), abs=1e-14)

@@ -11,8 +11,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from dpl.fem import (
-    Hookean,
-    Isotropic,
+    InvariantBasedMaterial,
     LinearElastic,
     Material,
     MooneyRivlinK2,
@@ -23,6 +22,7 @@ from dpl.fem import (
     SaintVenantKirchhoff,
     StableNeoHookean,
     YeohK2,
+    YoungPoissonMaterial,
 )
 from dpl.fem.materials.tensors import (
     cofactor,
@@ -207,7 +207,7 @@ def uniaxial(law: Material, stretch: float, low: float = 0.05, high: float = 5.0
 
 
 @pytest.fixture(params=HOOKEAN)
-def hookean(request) -> type[Hookean]:
+def hookean(request) -> type[YoungPoissonMaterial]:
     """Each law that at rest is Hooke's."""
     return request.param
 
@@ -557,20 +557,20 @@ def test_yeoh_of_one_term_is_mooney_rivlin_without_its_second(gradients):
 
 
 @pytest.fixture
-def isotropic(law) -> Isotropic:
+def isotropic(law) -> InvariantBasedMaterial:
     """Each law that is given by slopes of its own."""
-    if not isinstance(law, Isotropic) or not law.finite:
+    if not isinstance(law, InvariantBasedMaterial) or not law.finite:
         pytest.skip("has no slopes of its own")
     return law
 
 
-def slopes_at(law: Isotropic, logs: Tensor) -> tuple[Tensor, ...]:
+def slopes_at(law: InvariantBasedMaterial, logs: Tensor) -> tuple[Tensor, ...]:
     """Return I1, all slopes and the three squared stretches at log stretches (..., 3)."""
     squares = (2 * logs).exp()
     I1, log_J = squares.sum(-1), logs.sum(-1)
     I2 = (I1**2 - (squares**2).sum(-1)) / 2
     m1 = torch.expm1(-2 / 3 * log_J)
-    found = law.slopes(law.constants, I1 - 3, I2 - 3, torch.expm1(log_J), log_J, m1)
+    found = law.invariant_derivatives(law.constants, I1 - 3, I2 - 3, torch.expm1(log_J), log_J, m1)
     return I1, squares, *(s + torch.zeros_like(I1) for s in found)
 
 
@@ -620,7 +620,7 @@ def test_second_slopes_are_those_of_the_energy_over_the_invariants(isotropic, lo
 
 def test_slopes_at_rest_are_those_of_a_body_without_stress(isotropic):
     """The sum that is zero at rest is so to the last bit."""
-    rest = isotropic.slopes(isotropic.constants, 0.0, 0.0, 0.0, 0.0, 0.0)[0]
+    rest = isotropic.invariant_derivatives(isotropic.constants, 0.0, 0.0, 0.0, 0.0, 0.0)[0]
     assert rest == 0
 
 
@@ -789,14 +789,14 @@ def test_law_without_energy_says_so():
 
 def test_law_of_invariants_without_slopes_says_so():
     with pytest.raises(NotImplementedError):
-        Isotropic().stress(0.1 * EYE)
+        InvariantBasedMaterial().stress(0.1 * EYE)
 
 
 # ------------------------------------------------------------------ a batch of Poisson's ratios
 
 
 @dataclass(frozen=True)
-class SoleEnergy(Hookean):
+class SoleEnergy(YoungPoissonMaterial):
     """The energy of NH-ln with a Poisson's ratio for each member of a batch, and nothing else."""
 
     def energy(self, H):
@@ -811,8 +811,8 @@ def test_members_of_a_batch_answer_as_bodies_with_their_own_poissons_ratio(kind,
     """H is (B, E, Q, 3, 3), and each member's ratio holds in all of its cells and points."""
     H = gradients.reshape(5, 2, 2, 3, 3)
     whole = kind(0.1).at(RATIOS)
-    assert whole.several
-    assert not kind(0.1).several
+    assert whole.is_batched
+    assert not kind(0.1).is_batched
     for k, ratio in enumerate(RATIOS.tolist()):
         one = kind(0.1).at(ratio)
         assert one == kind(ratio)
@@ -840,7 +840,7 @@ def test_a_law_with_a_range_says_so_and_has_no_moduli(hookean, span):
     law = hookean(span)
     assert law.poisson_range == tuple(span)
     assert all(isinstance(end, float) for end in law.poisson_range)
-    assert not law.several
+    assert not law.is_batched
     for moduli in (lambda: law.mu, lambda: law.lam, lambda: law.bulk):
         with pytest.raises(ValueError, match="is a range"):
             moduli()
@@ -860,7 +860,7 @@ def test_a_range_that_holds_no_ratios_is_an_error(hookean, span):
 
 def test_a_law_of_one_poissons_ratio_has_no_range(law):
     assert law.poisson_range is None
-    assert law.several is False
+    assert law.is_batched is False
 
 
 @pytest.mark.parametrize("name", ["MR", "Yeoh", "Ogden3"])

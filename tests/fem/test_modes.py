@@ -11,7 +11,7 @@ import scipy.sparse.linalg
 import torch
 
 from dpl.fem import (
-    Linear,
+    LinearSolver,
     Load,
     ModalLoads,
     NeoHookeanLn,
@@ -24,7 +24,7 @@ from dpl.fem import (
     solve,
 )
 from dpl.fem.linear import full_matrix
-from dpl.fem.loads import even, logarithmic, modal_basis, normal, one, tail
+from dpl.fem.loads import constant, log_tail_mixture, logarithmic, modal_basis, normal, uniform01
 from dpl.fem.loads.sampling import SAMPLINGS
 
 YOUNG, LENGTH = 4500.0, 100.0
@@ -37,7 +37,7 @@ REFERENCE = {  # VERIFICATION 1.8e: eigenvalues of K(0) [N/m]
 @pytest.fixture(scope="module")
 def linear(beam):
     """The beam of 8 x 2 x 2 hexahedra with its factor."""
-    return Linear(beam(NeoHookeanLn(0.3)), linear="superlu")
+    return LinearSolver(beam(NeoHookeanLn(0.3)), linear="superlu")
 
 
 @pytest.fixture(scope="module")
@@ -63,13 +63,15 @@ def free_vectors(modes, problem):
 @pytest.mark.parametrize("cells", REFERENCE, ids=lambda cells: f"{cells[0]}x{cells[1]}x{cells[1]}")
 def test_eigenvalues_are_those_of_the_verification_dossier(beam, law, cells):
     expected = REFERENCE[cells]
-    found = eigenmodes(Linear(beam(law, *cells), linear="superlu"), len(expected)).values
+    found = eigenmodes(LinearSolver(beam(law, *cells), linear="superlu"), len(expected)).values
     assert found[: len(expected)].numpy() * YOUNG * LENGTH == pytest.approx(expected, rel=1e-6)
 
 
 def test_tetrahedra_split_the_pair(beam):
     problem = beam(NeoHookeanLn(0.3), 8, 2, cell="tetra")
-    found = eigenmodes(Linear(problem, linear="superlu"), 2).values[:2].numpy() * YOUNG * LENGTH
+    found = (
+        eigenmodes(LinearSolver(problem, linear="superlu"), 2).values[:2].numpy() * YOUNG * LENGTH
+    )
     assert found == pytest.approx([30.27082, 41.36540], rel=1e-6)
 
 
@@ -96,7 +98,7 @@ def test_modes_vanish_where_the_body_is_held(linear):
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
 def test_modes_do_not_depend_on_the_start_of_the_iteration(beam, monkeypatch, cell):
     problem = beam(NeoHookeanLn(0.3), 8, 2, cell=cell)
-    first = eigenmodes(Linear(problem, linear="superlu"), 5)
+    first = eigenmodes(LinearSolver(problem, linear="superlu"), 5)
     original = scipy.sparse.linalg.eigsh
     for seed in (1, 2, 3):
 
@@ -105,14 +107,14 @@ def test_modes_do_not_depend_on_the_start_of_the_iteration(beam, monkeypatch, ce
             return original(matrix, count, v0=start, **options)
 
         monkeypatch.setattr(modal_basis, "eigsh", restarted)
-        again = eigenmodes(Linear(problem, linear="superlu"), 5)
+        again = eigenmodes(LinearSolver(problem, linear="superlu"), 5)
         assert torch.allclose(again.vectors, first.vectors, rtol=0, atol=1e-8)
 
 
 def test_modes_do_not_depend_on_the_backend(linear):
     pytest.importorskip("pypardiso")
     ours = eigenmodes(linear, 5)
-    theirs = eigenmodes(Linear(linear.problem, linear="pardiso"), 5)
+    theirs = eigenmodes(LinearSolver(linear.problem, linear="pardiso"), 5)
     assert torch.allclose(ours.vectors, theirs.vectors, rtol=0, atol=1e-8)
 
 
@@ -123,7 +125,7 @@ def test_modes_do_not_depend_on_size(beam):
         problem = Problem.build(
             box(size, [9, 3, 3]), NeoHookeanLn(0.3), fixed=lambda points: points[:, 0] == 0
         )
-        shapes.append(eigenmodes(Linear(problem, linear="superlu"), 5).vectors)
+        shapes.append(eigenmodes(LinearSolver(problem, linear="superlu"), 5).vectors)
     assert torch.allclose(shapes[0], shapes[1], rtol=0, atol=1e-8)
     assert torch.allclose(shapes[0], shapes[2], rtol=0, atol=1e-8)
 
@@ -137,7 +139,7 @@ def test_neighbouring_eigenvalues_are_one_family(monkeypatch):
     """A bar of nearly square section: its two bending planes differ by 2 %, both are excited."""
     mesh = box([4.0, 1.0, 1.01], [9, 3, 3])
     problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=lambda points: points[:, 0] == 0)
-    modes = eigenmodes(Linear(problem, linear="superlu"), 1)
+    modes = eigenmodes(LinearSolver(problem, linear="superlu"), 1)
     assert len(modes.values) == 2
     assert 1e-3 < float(modes.values[1] / modes.values[0] - 1) < 0.05
 
@@ -185,7 +187,7 @@ def test_a_load_is_a_function_of_its_seed_and_index(linear, sampling):
     assert torch.equal(mixed.young, whole.young[[4, 1, 4]])
     loads.sample((3, 1), range(9))
     assert torch.equal(loads.sample((3, 0), [5]).force[0], whole.force[5])
-    fresh = Linear(linear.problem, linear="superlu")
+    fresh = LinearSolver(linear.problem, linear="superlu")
     again = ModalLoads(fresh, n_modes=5, sampling=sampling, young=[1.0, 2.0])
     assert torch.equal(again.sample((3, 0), range(6)).force, whole.force)
 
@@ -221,10 +223,10 @@ def test_samplings_are_different_streams(linear):
 def test_samples_are_the_loads_of_points(linear, sampling):
     loads = ModalLoads(linear, n_modes=3, sampling=sampling, young=[1.0, 2.0])
     points = loads.points((3, 0), [2, 5])
-    assert points.shape == (2, loads.dimension)
+    assert points.shape == (2, loads.n_random)
     assert points.dtype == torch.float64
-    assert loads.dimension == len(loads.modes.values) + 4
-    direct = SAMPLINGS[sampling]((3, 0), 5, loads.dimension)
+    assert loads.n_random == len(loads.modes.values) + 4
+    direct = SAMPLINGS[sampling]((3, 0), 5, loads.n_random)
     assert np.array_equal(points[1].numpy(), direct)
     at, sample = loads.at(points), loads.sample((3, 0), [2, 5])
     assert torch.equal(at.force, sample.force)
@@ -234,7 +236,7 @@ def test_samples_are_the_loads_of_points(linear, sampling):
 
 def point_of(loads, *q, centre=0.0, radius=0.0, amplitude=0.0, young=0.0):
     """Return a point of the unit cube (1, d); the modal loads left out are 0."""
-    q = [*q, *[0.5] * (loads.dimension - 4 - len(q))]
+    q = [*q, *[0.5] * (loads.n_random - 4 - len(q))]
     return torch.tensor([[*q, centre, radius, amplitude, young]], dtype=torch.float64)
 
 
@@ -244,14 +246,19 @@ def test_coordinates_of_a_point_are_the_modal_loads_in_their_order(linear):
         for t, share in ((0.0, -1.0), (0.5, 0.0), (0.75, 0.5)):
             force = loads.at(point_of(loads, *[0.5] * k, t)).force[0]
             expected = share * loads.q_max[k] * loads.modes.vectors[..., k]
-            expected = torch.where(loads.reach, expected, 0.0)
+            expected = torch.where(loads.loadable_dofs, expected, 0.0)
             assert torch.allclose(force, expected, rtol=1e-14, atol=0)
 
 
 def test_coordinates_besides_are_centre_radius_amplitude_and_modulus(linear):
     """Each of them changes what it is for, and nothing else."""
     loads = ModalLoads(
-        linear, n_modes=2, patch=(0.1, 1.0), amplitude=even, young=[1.0, 3.0], distribution=one
+        linear,
+        n_modes=2,
+        patch=(0.1, 1.0),
+        amplitude=uniform01,
+        young=[1.0, 3.0],
+        distribution=constant,
     )
     middle = {"centre": 0.5, "radius": 0.3, "amplitude": 0.5, "young": 0.5}
     usual = loads.at(point_of(loads, **middle))
@@ -275,7 +282,7 @@ def test_every_point_of_the_closed_cube_below_one_has_a_load(linear):
     last = 1 - 2.0**-53
     loads = ModalLoads(linear, n_modes=2, young=[1.0, 3.0], distribution=normal, radius=logarithmic)
     for value in (0.0, last):
-        load = loads.at(torch.full((1, loads.dimension), value, dtype=torch.float64))
+        load = loads.at(torch.full((1, loads.n_random), value, dtype=torch.float64))
         assert load.force.isfinite().all()
         assert load.force.any()
         assert 1.0 <= load.young.item() <= 3.0
@@ -288,7 +295,7 @@ def test_forces_act_on_free_boundary_nodes_within_the_patch_only(loads):
     force = loads.sample((0, 0), range(40)).force
     assert not force[:, ~problem.free].any()
     assert not force[:, inner].any()
-    assert not force[:, ~loads.reach].any()
+    assert not force[:, ~loads.loadable_dofs].any()
     assert (force != 0).any(dim=2).any(dim=0)[problem.boundary & problem.free.any(dim=1)].all()
 
 
@@ -308,7 +315,7 @@ def test_the_loaded_area_has_the_radius_of_the_patch(linear, radius):
 def test_a_patch_over_the_whole_body_keeps_the_modal_force(linear):
     loads = ModalLoads(linear, n_modes=3, patch=(2.0, 2.0))
     force = loads.sample((0, 0), [0]).force[0]
-    reach = loads.reach
+    reach = loads.loadable_dofs
     basis = loads.modes.vectors[reach].numpy()
     q, *_ = np.linalg.lstsq(basis, force[reach].numpy(), rcond=None)
     assert basis @ q == pytest.approx(force[reach].numpy(), abs=1e-12)
@@ -317,7 +324,7 @@ def test_a_patch_over_the_whole_body_keeps_the_modal_force(linear):
 
 def test_modal_loads_are_uniform_up_to_their_largest(linear, sampling):
     loads = ModalLoads(linear, n_modes=2, patch=(2.0, 2.0), sampling=sampling)
-    reach = loads.reach
+    reach = loads.loadable_dofs
     basis = np.linalg.pinv(loads.modes.vectors[reach].numpy())
     drawn = loads.sample((0, 0), range(400)).force[:, reach].numpy() @ basis.T
     share = drawn / loads.q_max.numpy()
@@ -333,9 +340,9 @@ def test_radii_and_centres_vary(loads):
 
 
 def test_other_distributions_can_be_plugged_in(linear):
-    loads = ModalLoads(linear, n_modes=3, patch=(2.0, 2.0), distribution=one)
+    loads = ModalLoads(linear, n_modes=3, patch=(2.0, 2.0), distribution=constant)
     force = loads.sample((0, 0), [0]).force[0]
-    expected = torch.where(loads.reach, loads.modes.vectors @ loads.q_max, 0.0)
+    expected = torch.where(loads.loadable_dofs, loads.modes.vectors @ loads.q_max, 0.0)
     assert torch.allclose(force, expected, rtol=1e-12, atol=0)
 
     def scaled(t, *, factor):
@@ -359,7 +366,7 @@ def test_a_range_of_moduli_is_drawn_from_and_changes_no_force(linear, loads):
 @pytest.mark.parametrize("young", [[1e9, 2e11], [0.1, 0.3], [1e-3, 1e12], [5.0, 5.0]])
 def test_moduli_stay_in_their_range(linear, young):
     loads = ModalLoads(linear, n_modes=2, young=young)
-    ends = torch.tensor([[0.0] * loads.dimension, [1 - 2.0**-53] * loads.dimension])
+    ends = torch.tensor([[0.0] * loads.n_random, [1 - 2.0**-53] * loads.n_random])
     drawn = loads.young_at(torch.cat([ends.double(), loads.points(0, range(200))]))
     assert drawn.min() == young[0]
     assert drawn.max() <= young[1]
@@ -385,9 +392,9 @@ def test_one_modulus_is_that_of_every_load(linear):
 
 
 def test_the_amplitude_is_a_factor_on_the_forces(loads):
-    one, twice = (loads.sample((0, 0), range(4), amplitude=a) for a in (1.0, 2.0))
-    assert torch.equal(twice.force, 2 * one.force)
-    assert torch.equal(twice.young, one.young)
+    constant, twice = (loads.sample((0, 0), range(4), amplitude=a) for a in (1.0, 2.0))
+    assert torch.equal(twice.force, 2 * constant.force)
+    assert torch.equal(twice.young, constant.young)
 
 
 def test_spectrum_says_how_large_stiffer_modes_become(linear):
@@ -419,26 +426,30 @@ def test_radius_makes_areas_small_down_to_one_node(linear):
     points = linear.problem.points
     places = points[linear.problem.boundary & linear.problem.free.any(dim=1)]
     counts = {}
-    for name, radius in {"even": even, "log": logarithmic}.items():
+    for name, radius in {"even": uniform01, "log": logarithmic}.items():
         loads = ModalLoads(linear, n_modes=2, radius=radius, sampling="sobol")
         sizes = loads.sample(0, range(128)).force.any(dim=2).sum(dim=1)
         assert sizes.min() == 1
         counts[name] = int((sizes == 1).sum())
-    assert counts["even"] < 25
+    assert counts["uniform01"] < 25
     assert 55 < counts["log"] < 80
-    loads = ModalLoads(linear, n_modes=2, patch=(0.0, 2.0), radius=logarithmic, distribution=one)
+    loads = ModalLoads(
+        linear, n_modes=2, patch=(0.0, 2.0), radius=logarithmic, distribution=constant
+    )
     for t in (0.0, 0.3, 0.6, 0.9):
         force = loads.at(point_of(loads, centre=0.7, radius=t)).force[0]
         middle = places[int(0.7 * len(places))]
         reach = (points - middle).norm(dim=1) <= 2 * 1e-2 ** (1 - t)
-        inside = reach[:, None] & loads.reach
+        inside = reach[:, None] & loads.loadable_dofs
         assert torch.equal(force != 0, inside & (loads.modes.vectors @ loads.q_max != 0))
 
 
 def test_amplitude_is_one_factor_on_a_whole_load(linear):
-    plain, scaled = (ModalLoads(linear, n_modes=3, amplitude=a) for a in (one, tail))
+    plain, scaled = (
+        ModalLoads(linear, n_modes=3, amplitude=a) for a in (constant, log_tail_mixture)
+    )
     points = plain.points((0, 0), range(64))
-    factors = torch.from_numpy(tail(points[:, -2].numpy()))
+    factors = torch.from_numpy(log_tail_mixture(points[:, -2].numpy()))
     expected = factors[:, None, None] * plain.at(points).force
     rounding = 1e-15 * float(plain.q_max.max())
     assert torch.allclose(scaled.at(points).force, expected, rtol=1e-12, atol=rounding)
@@ -448,9 +459,14 @@ def test_amplitude_is_one_factor_on_a_whole_load(linear):
 def test_tail_of_the_amplitude_makes_small_loads(linear):
     """A quarter of the loads is smaller than the others ever are, down to a thousandth."""
     loads = ModalLoads(
-        linear, n_modes=2, patch=(2.0, 2.0), distribution=one, amplitude=tail, sampling="sobol"
+        linear,
+        n_modes=2,
+        patch=(2.0, 2.0),
+        distribution=constant,
+        amplitude=log_tail_mixture,
+        sampling="sobol",
     )
-    largest = torch.where(loads.reach, loads.modes.vectors @ loads.q_max, 0.0).norm()
+    largest = torch.where(loads.loadable_dofs, loads.modes.vectors @ loads.q_max, 0.0).norm()
     share = loads.sample(0, range(256)).force.flatten(1).norm(dim=1) / largest
     assert int((share < 1 - 1e-9).sum()) == pytest.approx(64, abs=2)
     assert int((share < 10**-1.5).sum()) == pytest.approx(32, abs=2)
@@ -459,8 +475,8 @@ def test_tail_of_the_amplitude_makes_small_loads(linear):
 
 def test_what_always_acts_has_no_amplitude(linear):
     weight = torch.full((linear.problem.shape), -1e-3, dtype=torch.float64)
-    none = ModalLoads(linear, n_modes=2, amplitude=tail)
-    loads = ModalLoads(linear, n_modes=2, amplitude=tail, always=weight)
+    none = ModalLoads(linear, n_modes=2, amplitude=log_tail_mixture)
+    loads = ModalLoads(linear, n_modes=2, amplitude=log_tail_mixture, always=weight)
     with_, without = (kind.sample(0, range(20)).force for kind in (loads, none))
     assert torch.allclose(with_ - weight, without, rtol=0, atol=1e-16)
     nothing = ModalLoads(linear, n_modes=2, amplitude=np.zeros_like, always=weight)
@@ -471,7 +487,7 @@ def test_sobol_loads_cover_what_few_independent_ones_leave_out(linear):
     """32 centres of a sequence are spread over the nodes; 32 of any others are not."""
     spread = {}
     for name in SAMPLINGS:
-        loads = ModalLoads(linear, patch=(0.0, 0.0), distribution=one, sampling=name)
+        loads = ModalLoads(linear, patch=(0.0, 0.0), distribution=constant, sampling=name)
         forces = loads.sample(1, range(32)).force.any(dim=2)
         spread[name] = len({int(row.nonzero()) for row in forces})
     assert spread["sobol"] >= 30  # of 65 nodes
@@ -515,7 +531,7 @@ def test_plane_bodies_have_modal_loads_too():
         ({"radius": lambda t: 1 + t}, "radius draws"),
         ({"amplitude": normal}, r"amplitude draws numbers outside \[0, 1\]"),
         ({"amplitude": lambda t: 1 + t}, "amplitude draws"),
-        ({"amplitude": partial(tail, part=1.5)}, r"part = 1\.5"),
+        ({"amplitude": partial(log_tail_mixture, part=1.5)}, r"part = 1\.5"),
         ({"radius": partial(logarithmic, low=0.0)}, r"low = 0\.0"),
     ],
 )
@@ -528,12 +544,12 @@ def test_options_out_of_range_are_refused_by_name(linear, options, named):
 def test_a_number_of_modes_that_the_body_does_not_have_is_refused(beam, count):
     problem = beam(NeoHookeanLn(0.3), 4, 1)
     with pytest.raises(ValueError, match=f"n_modes = {count} must lie between 1 and 16"):
-        eigenmodes(Linear(problem, linear="superlu"), count)
+        eigenmodes(LinearSolver(problem, linear="superlu"), count)
 
 
 def test_a_loose_body_is_refused_before_anything_is_factorised(monkeypatch):
     problem = Problem.build(box([1.0, 1.0, 1.0], [4, 4, 4]), NeoHookeanLn(0.3))
-    linear = Linear(problem, linear="superlu")
+    linear = LinearSolver(problem, linear="superlu")
     with pytest.raises(ValueError, match="6 rigid modes are unconstrained"):
         eigenmodes(linear, 3)
     assert "factor" not in linear.__dict__

@@ -8,7 +8,18 @@ import pytest
 import skfem
 from skfem.io.meshio import to_meshio
 
-from dpl.fem import Box, Cylinder, Plane, Sphere, Tag, box, load, propeller, rectangle, save
+from dpl.fem import (
+    Box,
+    Cylinder,
+    Plane,
+    Sphere,
+    Tag,
+    box,
+    propeller,
+    read_mesh,
+    rectangle,
+    write_mesh,
+)
 from dpl.fem.mesh import facets_in, nodes_in
 
 BAR = ([4.0, 1.0, 2.0], [5, 2, 3])
@@ -250,7 +261,7 @@ $EndElements
 def test_physical_groups_of_gmsh_are_tags_by_name_or_by_number(tmp_path):
     """MSH 4.1 as Gmsh writes it, with a node that no cell uses: two cubes, x from 0 to 2."""
     (tmp_path / "bar.msh").write_text(GMSH_41)
-    mesh = load(tmp_path / "bar.msh")
+    mesh = read_mesh(tmp_path / "bar.msh")
     assert mesh.p.shape == (3, 12)
     assert mesh.p[0, mesh.facets[:, facets_in(Tag("held end"), mesh)]].tolist() == [[0]] * 4
     (between,) = mesh.boundaries["7"]
@@ -290,7 +301,7 @@ def test_physical_groups_of_msh_2_are_tags_too(tmp_path, cell, named):
         field_data={name: np.array(key) for name, key in names.items()},
     )
     meshio.write(tmp_path / "bar.msh", file, file_format="gmsh22")
-    again = load(tmp_path / "bar.msh")
+    again = read_mesh(tmp_path / "bar.msh")
     assert again.p.shape == mesh.p.shape
     end = again.boundaries["end" if named else "5"]
     assert len(end) == len(ends)
@@ -314,7 +325,7 @@ def test_sets_of_cells_and_nodes_are_tags(tmp_path):
         flat.points, flat.cells, point_sets=sets, cell_sets={"half": [mesh.subdomains["half"]]}
     )
     meshio.write(tmp_path / "bar.inp", file)
-    again = load(tmp_path / "bar.inp")
+    again = read_mesh(tmp_path / "bar.inp")
     basis = skfem.Basis(again, skfem.ElementHex1())
     assert np.array_equal(again.subdomains["half"], mesh.subdomains["half"])
     assert np.array_equal(nodes_in(Tag("end"), basis), nodes_in(Plane(0, "max"), basis))
@@ -347,7 +358,7 @@ def test_whole_numbered_fields_are_tags(tmp_path, cell, suffix):
         },
     )
     meshio.write(tmp_path / f"bar{suffix}", file)
-    again = load(tmp_path / f"bar{suffix}")
+    again = read_mesh(tmp_path / f"bar{suffix}")
     assert set(again.subdomains) == {"half", "half=0", "half=1", "material=3", "material=8"}
     assert set(again.boundaries) == {"end", "end=0", "end=1", *(f"plane={k}" for k in range(5))}
     for name in ("half", "half=1", "material=3"):
@@ -370,7 +381,7 @@ def test_numbers_of_cells_and_nodes_are_no_tags(tmp_path):
         point_data={"id": np.arange(mesh.nvertices)},
     )
     meshio.write(tmp_path / "cube.vtu", file)
-    again = load(tmp_path / "cube.vtu")
+    again = read_mesh(tmp_path / "cube.vtu")
     assert not again.boundaries
     assert not again.subdomains
 
@@ -387,8 +398,8 @@ def test_tags_survive_save_and_load(tmp_path, cell, suffix, quadratic):
             kind.from_mesh(mesh).with_boundaries(mesh.boundaries).with_subdomains(mesh.subdomains)
         )
     path = Path(tmp_path / f"bar{suffix}")
-    save(path, mesh, {"x": mesh.p[0]})
-    again = load(path)
+    write_mesh(path, mesh, {"x": mesh.p[0]})
+    again = read_mesh(path)
     for old, new in ((mesh.boundaries, again.boundaries), (mesh.subdomains, again.subdomains)):
         assert set(old) == set(new)
         for name in old:

@@ -24,10 +24,10 @@ from dpl.fem import (
     Status,
     Traction,
     box,
-    installed,
+    installed_backends,
     solve,
 )
-from dpl.fem.linear import Band, Pardiso, SuperLU, multigrid_installed
+from dpl.fem.linear import BandedCholesky, Pardiso, SuperLU, multigrid_installed
 from dpl.fem.linear.superlu import SuperLUFactor
 from dpl.fem.solvers import factor_reuse as reuse_module
 
@@ -95,7 +95,7 @@ def test_answer_on_any_element_does_not_depend_on_reuse(grid, cell, degree, size
     check(every, few)
 
 
-@pytest.mark.parametrize("name", installed())
+@pytest.mark.parametrize("name", installed_backends())
 @pytest.mark.parametrize(("cells", "q"), [((8, 2), 5.0), ((8, 2), 160.0), ((16, 4), 40.0)])
 def test_answer_of_any_backend_does_not_depend_on_reuse(beam, pull, name, cells, q):
     problem = beam(NH, *cells)
@@ -244,7 +244,7 @@ def test_batch_with_reuse_solves_like_its_members(beam, pull):
     assert len(set(batch.factorisations.tolist())) > 2
 
 
-@pytest.mark.skipif("pardiso" not in installed(), reason="pardiso is not installed")
+@pytest.mark.skipif("pardiso" not in installed_backends(), reason="pardiso is not installed")
 def test_members_of_a_batch_do_not_factorise_behind_the_count(beam, pull, monkeypatch):
     calls, original = [], Pardiso._factorise
 
@@ -265,7 +265,7 @@ def test_storage_of_a_factor_that_is_not_used_again_is_that_of_the_next(
     beam, pull, monkeypatch, reuse
 ):
     """A band is the largest thing that a solve holds: two of them are twice the memory."""
-    problem, places, original = beam(NH), [], Band._cholesky
+    problem, places, original = beam(NH), [], BandedCholesky._cholesky
 
     def watched(self, values):
         factor = original(self, values)
@@ -274,7 +274,7 @@ def test_storage_of_a_factor_that_is_not_used_again_is_that_of_the_next(
 
     solver = Newton(problem, linear="band", reuse=reuse)
     solver.rest.factor  # noqa: B018
-    monkeypatch.setattr(Band, "_cholesky", watched)
+    monkeypatch.setattr(BandedCholesky, "_cholesky", watched)
     answer = solve(solver, load_of(pull(problem, 40.0)[0]))
     assert answer.factorisations.item() == len(places) >= 3
     assert len(set(places)) == 1
@@ -324,7 +324,7 @@ BEYOND = (1.0005, 1.001, 1.002, 1.01, 1.05)
 )
 def test_load_beyond_a_critical_one_is_unstable_whatever_is_reused(name, part, linear, reuse):
     """VERIFICATION 1.8g, 1.8i."""
-    if linear not in installed():
+    if linear not in installed_backends():
         pytest.skip(f"{linear} is not installed")
     (build, critical), options = BODIES[name], {"tol": 1e-10, "linear": linear, "reuse": reuse}
     problem, unit = build()
@@ -360,7 +360,7 @@ def test_factor_with_negative_pivots_is_never_used_again(monkeypatch, P, linear)
         return factor
 
     monkeypatch.setattr(SuperLU, "factorise", watched)
-    monkeypatch.setattr("dpl.fem.linear.backends.installed", lambda: ["band", "superlu"])
+    monkeypatch.setattr("dpl.fem.linear.backends.installed_backends", lambda: ["band", "superlu"])
     monkeypatch.setattr(
         SuperLUFactor, "apply", lambda self, r: used.append(self.negative_pivots) or self.solve(r)
     )

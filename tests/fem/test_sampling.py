@@ -10,15 +10,15 @@ from scipy.spatial import cKDTree
 from scipy.stats import qmc
 
 from dpl.fem.loads import (
-    even,
+    constant,
     independent,
+    log_tail_mixture,
     logarithmic,
     normal,
-    one,
     sampling,
     sobol,
-    tail,
-    uniform,
+    symmetric_uniform,
+    uniform01,
 )
 from dpl.fem.loads.sampling import SAMPLINGS
 
@@ -41,18 +41,23 @@ def stream(draw, seed, size, count=3):
 
 
 def mixed(x, part=0.25, low=1e-3):
-    """Return the part of the draws of `tail` that lie below x < 1."""
+    """Return the part of the draws of `log_tail_mixture` that lie below x < 1."""
     return part * stats.loguniform(low, 1).cdf(x)
 
 
 LAWS = {  # quantiles, cumulative distribution, smallest, largest
-    "uniform": (uniform, stats.uniform(-1, 2).cdf, -1, 1),
+    "uniform": (symmetric_uniform, stats.uniform(-1, 2).cdf, -1, 1),
     "normal": (normal, stats.norm(0, 1 / 3).cdf, -1, 1),
-    "even": (even, stats.uniform(0, 1).cdf, 0, 1),
+    "even": (uniform01, stats.uniform(0, 1).cdf, 0, 1),
     "logarithmic": (logarithmic, stats.loguniform(1e-2, 1).cdf, 1e-2, 1),
     "four decades": (partial(logarithmic, low=1e-4), stats.loguniform(1e-4, 1).cdf, 1e-4, 1),
-    "tail": (tail, mixed, 1e-3, 1),
-    "long tail": (partial(tail, part=0.6, low=1e-5), partial(mixed, part=0.6, low=1e-5), 1e-5, 1),
+    "tail": (log_tail_mixture, mixed, 1e-3, 1),
+    "long tail": (
+        partial(log_tail_mixture, part=0.6, low=1e-5),
+        partial(mixed, part=0.6, low=1e-5),
+        1e-5,
+        1,
+    ),
 }
 
 
@@ -115,19 +120,19 @@ def test_every_decade_holds_as_many_logarithmic_numbers(low):
 
 @pytest.mark.parametrize("part", [0.1, 0.25, 0.9])
 def test_tail_makes_that_part_of_the_draws_small(part):
-    values = tail(GRID, part, 1e-3)
+    values = log_tail_mixture(GRID, part, 1e-3)
     assert (values < 1).mean() == pytest.approx(part, abs=2e-4)
     assert (values < 1e-3 * 1e3**0.5).mean() == pytest.approx(part / 2, abs=2e-4)
 
 
 def test_one_is_one():
-    assert np.array_equal(one(GRID), np.ones(len(GRID)))
+    assert np.array_equal(constant(GRID), np.ones(len(GRID)))
 
 
 @pytest.mark.parametrize("name", [*LAWS, "one"])
 @pytest.mark.parametrize("shape", [(), (1,), (0,), (3, 4)])
 def test_quantiles_keep_the_shape(name, shape):
-    quantile = LAWS[name][0] if name in LAWS else one
+    quantile = LAWS[name][0] if name in LAWS else constant
     t = np.full(shape, 0.3)
     assert np.shape(quantile(t)) == shape
     assert np.array_equal(t, np.full(shape, 0.3))
@@ -136,11 +141,11 @@ def test_quantiles_keep_the_shape(name, shape):
 def test_a_small_part_with_a_long_tail_is_no_overflow():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert (tail(GRID, 1e-3, 1e-3) <= 1).all()
+        assert (log_tail_mixture(GRID, 1e-3, 1e-3) <= 1).all()
 
 
 @pytest.mark.parametrize("low", [0.0, 1.0, -0.1, 2.0, float("nan")])
-@pytest.mark.parametrize("quantile", [logarithmic, tail])
+@pytest.mark.parametrize("quantile", [logarithmic, log_tail_mixture])
 def test_low_out_of_range_is_refused_by_name(quantile, low):
     with pytest.raises(ValueError, match=f"low = {low} must lie between 0 and 1"):
         quantile(GRID, low=low)
@@ -149,7 +154,7 @@ def test_low_out_of_range_is_refused_by_name(quantile, low):
 @pytest.mark.parametrize("part", [0.0, 1.0, -0.1, float("nan")])
 def test_part_out_of_range_is_refused_by_name(part):
     with pytest.raises(ValueError, match=f"part = {part} must lie between 0 and 1"):
-        tail(GRID, part=part)
+        log_tail_mixture(GRID, part=part)
 
 
 # ---- points

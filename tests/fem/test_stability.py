@@ -13,7 +13,7 @@ from dpl.fem import (
     Status,
     Traction,
     box,
-    branches,
+    post_buckling_branches,
     solve,
 )
 from dpl.fem.solvers import unstable_directions
@@ -63,7 +63,7 @@ def test_unstable_directions_lower_the_energy(column, pressed):
 
 def test_column_gives_way_to_either_side(column, pressed):
     load, straight = pressed
-    left, right = branches(column, load, straight)
+    left, right = post_buckling_branches(column, load, straight)
     problem = column.problem
     for answer in (left, right):
         assert answer.status[0] == Status.CONVERGED
@@ -86,4 +86,4 @@ def test_stable_answer_has_no_unstable_direction(column):
     with pytest.raises(ValueError, match="no unstable direction"):
         unstable_directions(column, answer)
     with pytest.raises(ValueError, match="no unstable direction"):
-        branches(column, load, answer)
+        post_buckling_branches(column, load, answer)

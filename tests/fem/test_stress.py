@@ -23,7 +23,7 @@ from benchmarks.stress.fixtures import (
 )
 from benchmarks.stress.invalid_input import NOWHERE, USES
 from dpl.fem import (
-    Linear,
+    LinearSolver,
     NeoHookeanLn,
     Newton,
     Plane,
@@ -34,14 +34,14 @@ from dpl.fem import (
     Traction,
     box,
     eigenmodes,
-    installed,
-    judge,
+    evaluate_solution,
+    installed_backends,
     solve,
 )
-from dpl.fem.mesh import check
+from dpl.fem.mesh import check_mesh
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
-DIRECT = [name for name in installed() if name != "cg"]
+DIRECT = [name for name in installed_backends() if name != "cg"]
 
 
 @pytest.fixture(params=[False, True], ids=["plain", "mixed"])
@@ -107,7 +107,9 @@ def test_load_beyond_all_answers_is_refused_with_the_part_that_has_one(beam, pul
     assert str(Status(state.status.item())) == "no valid equilibrium"
     assert state.residual.item() > solver.tol
     assert 130 < q * state.load_factor.item() < q
-    part = judge(problem, state.displacement, load_of(state.load_factor * force), solver.loose)
+    part = evaluate_solution(
+        problem, state.displacement, load_of(state.load_factor * force), solver.loose
+    )
     assert part.converged.all()
 
 
@@ -116,7 +118,7 @@ def test_tiny_load_of_any_law_ends_at_the_linear_answer(beam, pull, corner, any_
     """VERIFICATION 2.2 T6: u / q within 1e-6 of the linear one; no law stalls above 1e-8."""
     problem = beam(any_law)
     load = load_of(pull(problem, q)[0])
-    answer, linear = (solve(kind(problem), load) for kind in (Newton, Linear))
+    answer, linear = (solve(kind(problem), load) for kind in (Newton, LinearSolver))
     assert answer.status.item() == Status.CONVERGED
     assert answer.iterations.item() <= 3
     assert answer.residual.item() < 1e-8
@@ -158,7 +160,7 @@ def compliance(beam, pull):
         options = {"cell": cell, "degree": degree, "mean_dilatation": mean}
         problem = beam(NeoHookeanLn(nu), *cells, **options)
         force = pull(problem, 1e-3)
-        return (force * solve(Linear(problem), load_of(force[0])).displacement).sum().item()
+        return (force * solve(LinearSolver(problem), load_of(force[0])).displacement).sum().item()
 
     return compliance
 
@@ -215,7 +217,7 @@ PLATES = {
 def deflection(sides: int, layers: int, degree: int, slenderness: int) -> float:
     """Return the deflection of a clamped square plate over Kirchhoff's, under an even load."""
     problem, force, known = plate(sides, layers, degree, slenderness)
-    answer = solve(Linear(problem), load_of(force))
+    answer = solve(LinearSolver(problem), load_of(force))
     below = nearest_node(problem, [0.5, 0.5, 0.0])
     return -answer.displacement[0, below, 2].item() / known
 
@@ -264,20 +266,20 @@ def test_slivers_are_warned_of_and_change_nothing(pull, name, mixed, part):
 def test_body_folded_at_rest_is_refused_by_the_numbers_of_its_cells():
     """VERIFICATION 2.2 T12."""
     with pytest.raises(ValueError, match="4 cells are inverted: 2, 3, 6, 7"):
-        check(folded())
+        check_mesh(folded())
 
 
 @pytest.mark.parametrize("support", LOOSE)
 def test_loose_body_is_refused_by_its_motions(support):
     """VERIFICATION 2.2 T13: before any factorisation."""
-    linear = Linear(loose(support))
+    linear = LinearSolver(loose(support))
     with pytest.raises(ValueError, match=LOOSE[support][1]):
         eigenmodes(linear, 3)
     assert "factor" not in linear.__dict__
 
 
 @pytest.mark.parametrize("support", LOOSE)
-@pytest.mark.parametrize("name", installed())
+@pytest.mark.parametrize("name", installed_backends())
 def test_loose_body_never_moves_far(support, name):
     """VERIFICATION 2.2 T13: Newton does not take the rounding of a zero pivot for an answer."""
     problem = loose(support)
@@ -312,7 +314,7 @@ def test_column_beyond_buckling_is_in_balance_and_flagged(mixed, name):
 
 
 @pytest.mark.parametrize("P", [2.0397, 2.039763, 2.0398, 2.5])
-@pytest.mark.parametrize("name", installed())
+@pytest.mark.parametrize("name", installed_backends())
 def test_singular_tangent_ends_in_words_and_not_in_nan(name, P):
     """VERIFICATION 2.2 T22: at the critical load 2.039763 and about it, with any backend."""
     problem, force = column(SaintVenantKirchhoff(0.0), (10, 1, 1))

@@ -11,15 +11,15 @@ from torch.testing import assert_close
 
 from dpl.fem import (
     Box,
-    Displacement,
+    DirichletBC,
     LinearElastic,
     Load,
     NeoHookeanLn,
     Newton,
     Plane,
     Problem,
+    RobinBC,
     SaintVenantKirchhoff,
-    Spring,
     Traction,
     box,
     rectangle,
@@ -58,7 +58,7 @@ def answer_of(problem: Problem, force: torch.Tensor | None = None, **options):
 
 def test_clamp_holds_all_components_of_its_nodes(held):
     """The default value, the same as `fixed`."""
-    clamped, fixed = held(Displacement(LEFT)), held(fixed=LEFT)
+    clamped, fixed = held(DirichletBC(LEFT)), held(fixed=LEFT)
     assert torch.equal(clamped.free, fixed.free)
     assert (~clamped.free).sum() > 0
     assert not clamped.prescribed.any()
@@ -69,7 +69,7 @@ def test_component_without_a_value_stays_free(held, dim):
     for axis in range(dim):
         value = [None] * dim
         value[axis] = 0.0
-        problem = held(Displacement(LEFT, value))
+        problem = held(DirichletBC(LEFT, value))
         on_plane = problem.points[:, 0] < 1e-9
         expected = torch.zeros(dim, dtype=torch.bool)
         expected[axis] = True
@@ -78,7 +78,7 @@ def test_component_without_a_value_stays_free(held, dim):
 
 def test_value_is_a_length_in_metres(held, dim):
     value = [0.4, None, -0.2][:dim]
-    problem = held(Displacement(RIGHT, value))
+    problem = held(DirichletBC(RIGHT, value))
     right = problem.points[:, 0] > 1 - 1e-9
     assert problem.length == pytest.approx(4.0)
     assert problem.moved_supports
@@ -92,13 +92,13 @@ def test_value_is_a_length_in_metres(held, dim):
 
 
 def test_whole_number_of_metres_is_a_value_too(held, dim):
-    problem = held(Displacement(RIGHT, [2, *[None] * (dim - 1)]))
+    problem = held(DirichletBC(RIGHT, [2, *[None] * (dim - 1)]))
     assert problem.prescribed.max().item() == pytest.approx(0.5, rel=1e-14)
 
 
 def test_of_two_values_for_one_component_the_later_counts(held, dim):
-    first = Displacement(LEFT, [0.4] * dim)
-    second = Displacement(LEFT, [-0.8, *[None] * (dim - 1)])
+    first = DirichletBC(LEFT, [0.4] * dim)
+    second = DirichletBC(LEFT, [-0.8, *[None] * (dim - 1)])
     left = held().points[:, 0] < 1e-9
     for supports, value in (((first, second), -0.2), ((second, first), 0.1)):
         problem = held(*supports)
@@ -107,7 +107,7 @@ def test_of_two_values_for_one_component_the_later_counts(held, dim):
 
 
 def test_support_counts_more_than_what_is_fixed(held, dim):
-    problem = held(Displacement(LEFT, [0.4, *[None] * (dim - 1)]), fixed=LEFT)
+    problem = held(DirichletBC(LEFT, [0.4, *[None] * (dim - 1)]), fixed=LEFT)
     left = problem.points[:, 0] < 1e-9
     assert not problem.free[left].any()
     assert_close(problem.prescribed[left][:, 0].unique(), torch.tensor([0.1]).double())
@@ -115,12 +115,12 @@ def test_support_counts_more_than_what_is_fixed(held, dim):
 
 
 def test_support_that_leaves_a_component_free_does_not_free_what_is_fixed(held, dim):
-    problem = held(Displacement(LEFT, [*[None] * (dim - 1), 0.0]), fixed=LEFT)
+    problem = held(DirichletBC(LEFT, [*[None] * (dim - 1), 0.0]), fixed=LEFT)
     assert torch.equal(problem.free, held(fixed=LEFT).free)
 
 
 def test_supports_on_different_regions_add_up(held):
-    both = held(Displacement(LEFT), Displacement(RIGHT))
+    both = held(DirichletBC(LEFT), DirichletBC(RIGHT))
     assert torch.equal(both.free, held(fixed=LEFT).free & held(fixed=RIGHT).free)
 
 
@@ -129,17 +129,17 @@ def test_supports_on_different_regions_add_up(held):
 )
 def test_value_of_the_wrong_length_is_an_error(grid, value):
     with pytest.raises(ValueError, match="must be 3 lengths"):
-        Problem.build(grid("hexahedron"), NH, supports=[Displacement(LEFT, value)])
+        Problem.build(grid("hexahedron"), NH, supports=[DirichletBC(LEFT, value)])
 
 
 def test_value_for_space_is_an_error_in_the_plane(grid):
     with pytest.raises(ValueError, match="must be 2 lengths"):
-        Problem.build(grid("quad"), NH, supports=[Displacement(LEFT, [0.0, 0.0, 0.0])])
+        Problem.build(grid("quad"), NH, supports=[DirichletBC(LEFT, [0.0, 0.0, 0.0])])
 
 
 @pytest.mark.parametrize(
     ("support", "what"),
-    [(Displacement(NOTHING), "no node"), (Spring(NOTHING, 1.0), "no facet of the boundary")],
+    [(DirichletBC(NOTHING), "no node"), (RobinBC(NOTHING, 1.0), "no facet of the boundary")],
 )
 def test_empty_region_is_an_error(held, support, what):
     with pytest.raises(ValueError, match=what):
@@ -153,17 +153,17 @@ def test_empty_region_is_an_error(held, support, what):
 )
 def test_stiffness_out_of_range_is_an_error(grid, stiffness):
     with pytest.raises(ValueError, match="stiffness"):
-        Problem.build(grid("hexahedron"), NH, supports=[Spring(LEFT, stiffness)])
+        Problem.build(grid("hexahedron"), NH, supports=[RobinBC(LEFT, stiffness)])
 
 
 def test_moved_supports_pull_the_body_along():
     """A bar stretched by 50 % of its length has the lateral stretch of VERIFICATION 1.2."""
     mesh = box([2.0, 2.0, 2.0], [3, 3, 3])
     rails = [
-        Displacement(Plane(axis, "min"), [0.0 if k == axis else None for k in range(3)])
+        DirichletBC(Plane(axis, "min"), [0.0 if k == axis else None for k in range(3)])
         for axis in range(3)
     ]
-    pulled = Displacement(RIGHT, [1.0, None, None])
+    pulled = DirichletBC(RIGHT, [1.0, None, None])
     for law, lateral in ((SaintVenantKirchhoff(0.3), 0.79056942), (NH, 0.88017459)):
         problem = Problem.build(mesh, law, supports=[*rails, pulled])
         answer = answer_of(problem, tol=1e-12)
@@ -175,7 +175,7 @@ def test_moved_supports_pull_the_body_along():
 def test_supports_move_with_the_load():
     """An equilibrium under half the load has half the displacement at the supports."""
     mesh = rectangle([4.0, 1.0], [9, 3])
-    ends = [Displacement(LEFT), Displacement(RIGHT, [4.0, 1.0])]
+    ends = [DirichletBC(LEFT), DirichletBC(RIGHT, [4.0, 1.0])]
     problem = Problem.build(mesh, NH, supports=ends)
     right = problem.points[:, 0] > 1 - 1e-9
     for budget, factor in ((10, 0.5), (30, 1.0)):  # three iterations are too few for the whole
@@ -202,7 +202,7 @@ def bar(kind, count: int, stiffness) -> Problem:
     shift[0, (mesh.p[0] > 0) & (mesh.p[0] < 4)] = 0.3 / count  # cells of two lengths
     mesh = type(mesh)(mesh.p + shift, mesh.t)
     law = SaintVenantKirchhoff(0.0)
-    return Problem.build(mesh, law, supports=[Spring(LEFT, stiffness)], degree=degree)
+    return Problem.build(mesh, law, supports=[RobinBC(LEFT, stiffness)], degree=degree)
 
 
 def check_bar(problem: Problem) -> None:
@@ -226,7 +226,7 @@ def test_closed_form_of_the_robin_bar_is_consistent():
 def test_bar_on_springs_is_exact_on_every_mesh(kind, count):
     """VERIFICATION 1.6e, tolerance 1e-10."""
     problem = bar(kind, count, 0.5)
-    assert problem.loose_modes() == []
+    assert problem.unconstrained_rigid_body_modes() == []
     check_bar(problem)
 
 
@@ -235,7 +235,7 @@ def test_bar_on_springs_does_not_care_for_the_unit_of_length(kind):
     problem = bar(kind, 3, 0.5)
     mesh = problem.mesh.scaled(0.004)
     small = Problem.build(
-        mesh, problem.material, supports=[Spring(LEFT, 500.0)], degree=problem.degree
+        mesh, problem.material, supports=[RobinBC(LEFT, 500.0)], degree=problem.degree
     )
     assert small.length == pytest.approx(0.004)
     assert_close(small.springs.stiffness, problem.springs.stiffness, rtol=1e-12, atol=1e-15)
@@ -253,7 +253,7 @@ def test_springs_in_one_direction_leave_the_others_free(kind, dim, axis):
     stiffness = [0.0] * dim
     stiffness[axis] = 0.5
     problem = bar(kind, 2, stiffness)
-    names = problem.loose_modes()
+    names = problem.unconstrained_rigid_body_modes()
     assert f"translation along {'xyz'[axis]}" not in names
     others = [f"translation along {'xyz'[k]}" for k in range(dim) if k != axis]
     assert set(others) <= set(names)
@@ -269,29 +269,29 @@ def test_loose_motions_on_springs_are_the_zero_modes(kind, dim):
         rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
         K = full_matrix(problem.pattern, problem.tangent(rest)[0].numpy()).toarray()
         values = np.linalg.eigvalsh(K)
-        assert (values < 1e-10 * values[-1]).sum() == len(problem.loose_modes())
+        assert (values < 1e-10 * values[-1]).sum() == len(problem.unconstrained_rigid_body_modes())
 
 
 def test_springs_and_clamps_hold_together(held, dim):
     """A hinge line or point leaves rotations; springs at the other end take them."""
     corner = Box([0.0] * dim, [0.0] * dim)
-    pinned = held(Displacement(corner))
-    assert len(pinned.loose_modes()) == {2: 1, 3: 3}[dim]
-    assert held(Displacement(corner), Spring(RIGHT, 1e-3)).loose_modes() == []
+    pinned = held(DirichletBC(corner))
+    assert len(pinned.unconstrained_rigid_body_modes()) == {2: 1, 3: 3}[dim]
+    assert held(DirichletBC(corner), RobinBC(RIGHT, 1e-3)).unconstrained_rigid_body_modes() == []
 
 
 def test_soft_springs_hold_as_well_as_stiff_ones(kind):
     for stiffness in (1e-9, 1.0, 1e9):
-        assert bar(kind, 2, stiffness).loose_modes() == []
+        assert bar(kind, 2, stiffness).unconstrained_rigid_body_modes() == []
 
 
 @pytest.fixture
 def sprung(held, dim) -> Problem:
     """Unequal cells, held in part, two beds of springs on neighbouring faces."""
     return held(
-        Displacement(Box([0.0] * dim, [4.0, *[0.0] * (dim - 1)]), [None, 0.0, None][:dim]),
-        Spring(LEFT, [0.3, 0.1, 0.7][:dim]),
-        Spring(Plane(1, "max"), 0.2),
+        DirichletBC(Box([0.0] * dim, [4.0, *[0.0] * (dim - 1)]), [None, 0.0, None][:dim]),
+        RobinBC(LEFT, [0.3, 0.1, 0.7][:dim]),
+        RobinBC(Plane(1, "max"), 0.2),
     )
 
 
@@ -322,7 +322,7 @@ def test_mixed_points_on_springs_see_the_springs(sprung, bend):
 def test_springs_pull_with_stiffness_times_displacement_times_area(held, dim):
     """A body moved as a whole: the pull is -alpha u, on an area of 4 m by 4 m."""
     stiffness = np.array([0.3, 0.1, 0.7][:dim])
-    problem = held(Spring(LEFT, stiffness.tolist()))
+    problem = held(RobinBC(LEFT, stiffness.tolist()))
     shift = torch.tensor([0.05, -0.02, 0.01][:dim], dtype=torch.float64)
     u = shift.expand(1, *problem.shape)
     total = problem.internal_force(u).sum(dim=1)[0]
@@ -332,14 +332,14 @@ def test_springs_pull_with_stiffness_times_displacement_times_area(held, dim):
 
 
 def test_beds_of_springs_on_one_face_add_up(held, bend):
-    one, two = held(Spring(LEFT, 0.3), Spring(LEFT, 0.2)), held(Spring(LEFT, 0.5))
+    one, two = held(RobinBC(LEFT, 0.3), RobinBC(LEFT, 0.2)), held(RobinBC(LEFT, 0.5))
     u = bend(one.points)
     assert_close(one.internal_force(u), two.internal_force(u), rtol=1e-12, atol=1e-15)
     assert_close(one.tangent(u), two.tangent(u), rtol=1e-12, atol=1e-15)
 
 
 def test_body_without_springs_has_none(held):
-    assert held(Displacement(LEFT)).springs is None
+    assert held(DirichletBC(LEFT)).springs is None
 
 
 def test_very_stiff_springs_clamp(kind):
@@ -358,7 +358,7 @@ def test_very_stiff_springs_clamp(kind):
         return (answer.displacement[0] * force).sum().item()
 
     clamped = sag(fixed=LEFT)
-    softer, stiffer = (sag(supports=[Spring(LEFT, a)]) / clamped - 1 for a in (1e3, 1e4))
+    softer, stiffer = (sag(supports=[RobinBC(LEFT, a)]) / clamped - 1 for a in (1e3, 1e4))
     assert 0 < stiffer < 1e-2
     assert softer / stiffer == pytest.approx(10, rel=0.05)
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from benchmarks.stress.broken_meshes import CORNERS, FAN, PATCH, TETS, TWO_CUBES, TWO_HEXES, write
-from dpl.fem import box, load, rectangle
+from dpl.fem import box, read_mesh, rectangle
 from dpl.fem.mesh import sandbox, sandbox_checks
 from dpl.fem.mesh.reading import _body
 
@@ -25,13 +25,13 @@ def _soon(monkeypatch):
 
 
 def refused(path, match: str) -> None:
-    """Hold `load` to one line that names the file, and to little memory.
+    """Hold `read_mesh` to one line that names the file, and to little memory.
 
     The end of a reader at its limit of time has a line of its own, which `match` does not allow.
     """
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(ValueError, match=match) as error:
-        load(path)
+        read_mesh(path)
     text = str(error.value)
     assert text.startswith(f"{path}: ")
     assert text.isprintable()
@@ -71,7 +71,7 @@ def test_xml_with_entities_is_refused(tmp_path, suffix, text, code):
 def test_cell_data_beside_a_dolfin_file_is_held_to_the_same(tmp_path):
     path = tmp_path / "cube.xml"
     meshio.write(path, meshio.Mesh(CORNERS, [("tetra", TETS)]), file_format="dolfin-xml")
-    load(path)
+    read_mesh(path)
     (tmp_path / "cube_part.xml").write_text(f"{LAUGHS}<dolfin/>")
     refused(path, "document type or entities")
     (tmp_path / "cube_part.xml").unlink()
@@ -126,13 +126,13 @@ def test_a_compressed_bomb_costs_the_process_nothing(tmp_path, kind, compressor)
     path = tmp_path / "bomb.vtu"
     path.write_text(VTU.format(**values))
     refused(path, "unpack to more than")
-    assert load(cube(tmp_path)).t.shape[0] == 4
+    assert read_mesh(cube(tmp_path)).t.shape[0] == 4
 
 
 def test_the_vtu_of_the_bombs_is_good_without_one(tmp_path):
     path = tmp_path / "good.vtu"
     path.write_text(VTU.format(**GOOD, here=packed(CORNERS.astype("<f8").tobytes())))
-    assert load(path).nelements == 1
+    assert read_mesh(path).nelements == 1
 
 
 @pytest.mark.parametrize(
@@ -253,7 +253,7 @@ def test_numbers_that_cost_memory_or_time_end_the_reader_only(tmp_path, name, te
     with monkeypatch.context() as patch:
         patch.setattr(sandbox, "SECONDS", (4.0, 0.0))
         refused(tmp_path / name, "more memory|ends too early|longer than")
-    assert load(cube(tmp_path)).t.shape[0] == 4
+    assert read_mesh(cube(tmp_path)).t.shape[0] == 4
 
 
 def test_a_reader_that_loops_is_ended(tmp_path, monkeypatch):
@@ -262,7 +262,7 @@ def test_a_reader_that_loops_is_ended(tmp_path, monkeypatch):
     replaced(path, "$Elements", "$Periodic\n" + "99999999\n" + "0 0 0\n0\n" * 3_000_000)
     refused(path, "longer than")
     monkeypatch.setattr(sandbox, "SECONDS", (60.0, 0.0))
-    assert load(cube(tmp_path)).t.shape[0] == 4
+    assert read_mesh(cube(tmp_path)).t.shape[0] == 4
 
 
 @pytest.mark.parametrize("name", ["a.nas", "a.ele", "a.mdpa", "a.dat", "a.msh"])
@@ -288,7 +288,7 @@ def test_abaqus_files_that_include_others_are_refused(tmp_path, line):
     path.write_text(path.read_text() + line + "\n")
     refused(path, "includes another file")
     path.write_text(path.read_text().replace(line, "** INCLUDE, this is a comment"))
-    assert load(path).t.shape[0] == 4
+    assert read_mesh(path).t.shape[0] == 4
 
 
 @pytest.mark.parametrize("magic", [b"\x1f\x8b\x08", b"PK\x03\x04", b"BZh9", b"\xfd7zXZ\x00"])
@@ -306,9 +306,9 @@ def test_pipes_and_devices_are_refused_and_folders_are_no_files(tmp_path, suffix
     refused(tmp_path / f"zero.{suffix}", "device")
     (tmp_path / f"folder.{suffix}").mkdir()
     with pytest.raises(FileNotFoundError, match="folder"):
-        load(tmp_path / f"folder.{suffix}")
+        read_mesh(tmp_path / f"folder.{suffix}")
     with pytest.raises(FileNotFoundError, match="no such"):
-        load(tmp_path / f"no\0ne.{suffix}")
+        read_mesh(tmp_path / f"no\0ne.{suffix}")
 
 
 def test_files_of_more_than_four_gigabytes_are_refused(tmp_path):
@@ -321,7 +321,7 @@ def test_files_of_more_than_four_gigabytes_are_refused(tmp_path):
 def test_a_link_to_a_good_file_is_read(tmp_path):
     cube(tmp_path)
     (tmp_path / "link.vtu").symlink_to(tmp_path / "cube.vtu")
-    assert load(tmp_path / "link.vtu").t.shape[0] == 4
+    assert read_mesh(tmp_path / "link.vtu").t.shape[0] == 4
 
 
 @pytest.mark.parametrize("suffix", ["h5m", "med", "cgns", "hmf", "e", "vtu"])
@@ -366,12 +366,12 @@ def _virtual(h5py):
 
 def test_a_reader_that_was_killed_is_started_again(tmp_path):
     path = cube(tmp_path)
-    load(path)
+    read_mesh(path)
     sandbox.READER._process.kill()
     sandbox.READER._process.wait()
-    assert load(path).t.shape[0] == 4
+    assert read_mesh(path).t.shape[0] == 4
     first = sandbox.READER._process.pid
-    load(path)
+    read_mesh(path)
     assert sandbox.READER._process.pid == first
 
 
@@ -381,7 +381,7 @@ def test_a_path_from_the_working_folder_is_found_from_wherever_the_reader_starte
     cube(tmp_path)
     for folder in (tmp_path, tmp_path.parent):
         monkeypatch.chdir(folder)
-        assert load((tmp_path / "cube.vtu").relative_to(folder)).t.shape[0] == 4
+        assert read_mesh((tmp_path / "cube.vtu").relative_to(folder)).t.shape[0] == 4
 
 
 # What damaged files taught: tests/properties/test_mesh_files.py found them
@@ -441,7 +441,7 @@ def test_xdmf_may_have_its_data_beside_it(tmp_path, form, monkeypatch):
     monkeypatch.chdir(tmp_path.parent)
     if form.get("data_format") == "Binary":
         path.write_text(path.read_text().replace(f"{tmp_path}/", ""))
-    assert load(path).t.shape[0] == 4
+    assert read_mesh(path).t.shape[0] == 4
 
 
 def test_nodes_that_gmsh_declares_and_does_not_list_are_not_made_up(tmp_path):
@@ -465,7 +465,7 @@ def test_many_nodes_in_one_place_are_told_without_listing_their_pairs(tmp_path):
     corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float)
     path = write(tmp_path / "crowd.vtu", np.tile(corners, (number, 1)), hexahedron=cells)
     with pytest.raises(ValueError, match="30000 nodes coincide in one place: 0, 8, 16"):
-        load(path)
+        read_mesh(path)
 
 
 def test_sets_name_nodes_and_cells_that_there_are(tmp_path):

@@ -15,8 +15,8 @@ from torch.testing import assert_close
 
 from dpl import Scene
 from dpl.fem import (
-    Linear,
     LinearElastic,
+    LinearSolver,
     Load,
     Material,
     ModalLoads,
@@ -369,7 +369,7 @@ def test_answer_knows_no_units(corner, mixed, law):
         problem = Problem.build(mesh, law(0.3), fixed=Plane(0, "min"))
         shape = Traction(Plane(0, "max"), [0.0, 0.0, -1.0]).on(problem)
         newtons = 20 / 4500 * young * length**2 * shape[None]
-        scene = Scene(problem, ModalLoads(Linear(problem)), Newton(problem, mixed=mixed))
+        scene = Scene(problem, ModalLoads(LinearSolver(problem)), Newton(problem, mixed=mixed))
         answer = solve(
             scene.solver, scene.load_of(newtons, torch.tensor([young], dtype=torch.float64))
         )

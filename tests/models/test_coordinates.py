@@ -8,8 +8,8 @@ import torch
 from dpl import Sample
 from dpl.fem.symmetry import images
 from dpl.models import FCNN, Latent, PODNet
-from dpl.models.reduced_samples import Coordinates, CoordinateSamples
-from dpl.training import MSE, LrStar, MeanNorm, Surrogate
+from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
+from dpl.training import MSE, LrStar, RMSELoss, Surrogate
 from dpl.training.surrogate import scales
 
 SMALL = {"width": 16, "blocks": 1}
@@ -39,7 +39,7 @@ def build(scene, batch, monkeypatch):
     def build(kind, options, loss=None):
         torch.manual_seed(0)
         module = Surrogate(kind(scene, **SMALL, **options), loss or MSE(), scene)
-        module.prepare(batch)
+        module.fit_bases(batch)
         return module.train()
 
     return build
@@ -95,7 +95,7 @@ def test_targets_are_the_best_coordinates(build, batch, kind, options):
 def test_squared_errors_are_right_with_fewer_snapshots_than_modes(build, scene, batch, kind, count):
     module = build(kind, {"symmetry": False})
     few = Sample(*(column[:count] for column in batch))
-    module.prepare(few)
+    module.fit_bases(few)
     part = encoded(module, batch)
     with torch.no_grad():
         field = (module.predict(batch.load) - batch.displacement) / module.displacement_scale
@@ -108,7 +108,7 @@ def test_squared_errors_are_right_with_fewer_snapshots_than_modes(build, scene, 
 
 
 @CASES
-@pytest.mark.parametrize("loss", [MSE(), MSE(relative=0.5), MeanNorm(relative=0.8, floor=1e-4)])
+@pytest.mark.parametrize("loss", [MSE(), MSE(relative=0.5), RMSELoss(relative=0.8, floor=1e-4)])
 def test_the_loss_of_coordinates_is_that_of_fields(build, batch, kind, options, loss):
     module = build(kind, options, loss)
     with torch.no_grad():
@@ -128,7 +128,7 @@ def test_the_gradient_of_coordinates_is_that_of_fields(build, batch, kind, optio
 
 @CASES
 def test_the_gradient_of_a_norm_is_that_of_fields_too(build, batch, kind, options):
-    module = build(kind, options, MeanNorm())
+    module = build(kind, options, RMSELoss())
     (_, found), (_, expected) = (
         gradients(module, part) for part in (encoded(module, batch), batch)
     )
@@ -150,14 +150,14 @@ def test_a_step_in_coordinates_evaluates_no_field(build, batch, kind, monkeypatc
 def test_only_losses_of_squared_errors_are_found_in_coordinates(build, scene, batch):
     assert build(Latent, {}, LrStar()).encode(batch) is None
     assert Surrogate(FCNN(scene, width=8), MSE(), scene).encode(batch) is None
-    assert isinstance(build(Latent, {}, MeanNorm()).encode(batch), CoordinateSamples)
+    assert isinstance(build(Latent, {}, RMSELoss()).encode(batch), ReducedDataset)
 
 
 def test_the_plan_tells_of_coordinates_where_they_are_used(build):
     told = "no field in training from disk: squared errors are those of coordinates"
-    assert told in build(PODNet, {}).plan()
-    assert told in build(Latent, {}, MeanNorm()).plan()
-    assert told not in build(Latent, {}, LrStar()).plan()
+    assert told in build(PODNet, {}).skipped_work()
+    assert told in build(Latent, {}, RMSELoss()).skipped_work()
+    assert told not in build(Latent, {}, LrStar()).skipped_work()
 
 
 # ------------------------------------------------------------------ images
@@ -174,7 +174,7 @@ def test_images_of_coordinates_are_coordinates_of_images(make_scene):
         torch.manual_seed(0)
         net = kind(scene, rank=48, coordinates=48, **SMALL)
         module = Surrogate(net, MSE(), scene)
-        module.prepare(samples)
+        module.fit_bases(samples)
         whole = module.encode(samples)
         assert len(whole) == 8 * 16
         for k in range(8):
@@ -205,8 +205,8 @@ def test_batches_are_fetched_in_any_order():
     parts = [torch.randn(3, 2, generator=random), torch.randn(3, 4, generator=random)]
     numbers = torch.arange(3.0), torch.arange(3.0, 6.0)
     turn = torch.stack([torch.eye(2), torch.tensor([[0.0, 1.0], [-1.0, 0.0]])])
-    samples = CoordinateSamples(
-        Coordinates(*parts, *numbers), turn, torch.stack([torch.eye(4), -torch.eye(4)])
+    samples = ReducedDataset(
+        ReducedSamples(*parts, *numbers), turn, torch.stack([torch.eye(4), -torch.eye(4)])
     )
     assert len(samples) == 6
     batch = samples.__getitems__([5, 0, 3])

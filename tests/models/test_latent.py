@@ -30,7 +30,7 @@ def prepared(scene, samples, *, seed=0, **options):
     """Return a surrogate in double precision and evaluation, with random weights."""
     torch.manual_seed(seed)
     module = Surrogate(Latent(scene, **{**SMALL, **options}), MSE(), scene)
-    module.prepare(samples)
+    module.fit_bases(samples)
     return module.double().eval()
 
 
@@ -69,7 +69,7 @@ def sparse(scene, dofs, count=6, seed=0):
     """Return forces (count, N, D) on so many degrees of freedom, as large as those of loads."""
     random = torch.Generator().manual_seed(seed)
     force = torch.zeros(count, *scene.problem.shape, dtype=torch.float64)
-    places = scene.loads.reach.nonzero()
+    places = scene.loads.loadable_dofs.nonzero()
     for one in force:
         chosen = places[torch.randperm(len(places), generator=random)[:dofs]]
         one[chosen[:, 0], chosen[:, 1]] = torch.randn(dofs, generator=random, dtype=torch.float64)
@@ -282,8 +282,10 @@ def test_a_network_without_bases_answers_nothing(scene, batch):
 
 
 def test_the_plan_tells_of_near_fields_only_where_they_are_exact(scene):
-    assert any("0.0005" in line and "near field" in line for line in Latent(scene, **SMALL).plan())
-    lines = Latent(scene, linear_tol=torch.inf, **SMALL).plan()
+    assert any(
+        "0.0005" in line and "near field" in line for line in Latent(scene, **SMALL).skipped_work()
+    )
+    lines = Latent(scene, linear_tol=torch.inf, **SMALL).skipped_work()
     assert not any("near field" in line for line in lines)
     assert any("nothing linear learnt" in line for line in lines)
 
@@ -346,7 +348,7 @@ def test_a_run_comes_back_as_it_was(trained, home, monkeypatch):
     assert module.net.prepared
     assert alike(saved, dict(module.state_dict()))
     again = run_folder.load_run(trained)[1]
-    test = build.make(cfg, "data", scene=module.scene).samples("test")
+    test = build.instantiate(cfg, "data", scene=module.scene).samples("test")
     with torch.no_grad():
         found = module.predict(test.load)
         assert torch.equal(found, again.predict(test.load))
@@ -360,9 +362,9 @@ def test_a_run_comes_back_as_it_was(trained, home, monkeypatch):
 def test_a_run_makes_its_bases_from_the_training_samples(trained, home, monkeypatch):
     monkeypatch.chdir(home)
     cfg, module = run_folder.load_run(trained)
-    train = build.make(cfg, "data", scene=module.scene).samples("train")
+    train = build.instantiate(cfg, "data", scene=module.scene).samples("train")
     expected = build.build_surrogate(cfg, module.scene)
-    expected.prepare(train)
+    expected.fit_bases(train)
     buffers = dict(expected.net.named_buffers())
     assert buffers["modes"].any()
     assert alike(buffers, dict(module.net.named_buffers()))
@@ -400,9 +402,9 @@ def test_a_run_that_was_interrupted_ends_bit_for_bit_like_one_that_was_not(
     strict=True, reason="Lightning names the checkpoint after setup: made, then lost"
 )
 def test_a_run_that_resumes_makes_no_bases_again(trained, script, overrides, home, monkeypatch):
-    made, prepare = [], Surrogate.prepare
+    made, prepare = [], Surrogate.fit_bases
     monkeypatch.setattr(
-        Surrogate, "prepare", lambda module, samples: made.append(0) or prepare(module, samples)
+        Surrogate, "fit_bases", lambda module, samples: made.append(0) or prepare(module, samples)
     )
     shutil.copytree(trained, home / "longer")
     more = ("ckpt_path=last", "trainer.max_epochs=5")
@@ -427,10 +429,10 @@ def test_a_stream_trains_it_on_bases_of_the_validation_loads(script, overrides, 
     ended = script("train", *kept, *more, cwd=home)
     assert ended.status == 0, ended.err
     cfg, module = run_folder.load_run(home / "stream")
-    data = build.make(cfg, "data", scene=module.scene)
+    data = build.instantiate(cfg, "data", scene=module.scene)
     assert isinstance(data, OnlineData)
     expected = build.build_surrogate(cfg, module.scene)
-    expected.prepare(data.samples("val"))
+    expected.fit_bases(data.samples("val"))
     assert alike(dict(expected.net.named_buffers()), dict(module.net.named_buffers()))
     weights = [dict(one.net.named_parameters()) for one in (expected, module)]
     assert not alike(*weights), "it has learnt"

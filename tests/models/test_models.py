@@ -25,7 +25,7 @@ def build(request, scene, batch):
         torch.manual_seed(seed)
         net = instantiate(node.get("model", node), _convert_="all")(scene=scene)
         if isinstance(net, PODNet):
-            Surrogate(net, MSE(), scene).prepare(batch)
+            Surrogate(net, MSE(), scene).fit_bases(batch)
         return net
 
     return build
@@ -73,7 +73,7 @@ def test_samples_without_variance_do_no_harm(build, scene, batch, kind):
     even = batch._replace(force=force, displacement=displacement, young=batch.young[:6])
     surrogate = Surrogate(build(), MSE(), scene)
     if isinstance(surrogate.net, PODNet):
-        surrogate.prepare(even)
+        surrogate.fit_bases(even)
     optimizer = torch.optim.Adam(surrogate.parameters(), lr=1e-3)
     for _ in range(3):
         loss = surrogate.loss(surrogate.predict(even.load), even, surrogate.physics)
@@ -144,7 +144,7 @@ def test_the_papers_network_has_4_n2_plus_7_n_parameters(make_scene):
     net = FCNN(scene, all_dofs=True)
     assert count(net) == 4 * 243**2 + 7 * 243 == 237_897
     assert net.parameters_needed == 237_897
-    assert net.plan() == []
+    assert net.skipped_work() == []
 
 
 def test_the_papers_beam_has_576_million_parameters():
@@ -160,20 +160,20 @@ def test_parameters_are_counted_before_they_are_made(scene, options):
 def test_inputs_are_where_loads_can_act_and_outputs_where_the_body_can_move(scene, batch):
     torch.manual_seed(0)
     net = FCNN(scene)
-    inputs, outputs = int(scene.loads.reach.sum()), int(scene.problem.free.sum())
+    inputs, outputs = int(scene.loads.loadable_dofs.sum()), int(scene.problem.free.sum())
     assert net.stages[0].in_features == inputs < scene.problem.free.numel()
     assert net.stages[-1].out_features == outputs
     force = batch.force.float()
     with torch.no_grad():
         answer = net(force)
-        blind = net(force + torch.where(scene.loads.reach, 0.0, 1.0))
+        blind = net(force + torch.where(scene.loads.loadable_dofs, 0.0, 1.0))
     assert torch.equal(answer, blind)
     assert not answer[:, ~scene.problem.free].any()
 
 
 def test_the_plan_counts_the_parameters_that_are_saved(scene):
     net, whole = FCNN(scene), FCNN(scene, all_dofs=True)
-    (line,) = net.plan()
+    (line,) = net.skipped_work()
     assert line.startswith(f"{count(whole) - count(net):,} of {count(whole):,} parameters")
 
 
@@ -285,7 +285,7 @@ def test_youngs_modulus_enters_between_minus_one_and_one_and_forces_as_newtons_a
     assert inputs[:, -1].tolist() == pytest.approx([-1.0, -0.99015, 0.0, 1.0], abs=1e-4)
     newtons = inputs[:, :-1].norm(dim=1) / moduli
     assert torch.allclose(newtons, newtons[:1].expand(4))
-    scaled = (force / surrogate.force_scale).float()[-1:, surrogate.scene.loads.reach]
+    scaled = (force / surrogate.force_scale).float()[-1:, surrogate.scene.loads.loadable_dofs]
     assert torch.allclose(inputs[-1:, :-1], scaled), "the stiffest body's are those over E L^2"
 
 

@@ -11,7 +11,7 @@ import torch
 
 from dpl import Sample, Scene
 from dpl.fem import (
-    Displacement,
+    DirichletBC,
     ModalLoads,
     NeoHookeanLn,
     Newton,
@@ -42,7 +42,7 @@ def prepared(kind, scene, samples, *, seed=0, **options):
     """Return a surrogate in evaluation, random weights, bases made."""
     torch.manual_seed(seed)
     module = Surrogate(kind(scene, **{**SMALL, **options}), MSE(), scene)
-    module.prepare(samples)
+    module.fit_bases(samples)
     return module.eval()
 
 
@@ -66,7 +66,7 @@ def some(batch, count):
 def bar(make_scene):
     """A beam of 48 degrees of freedom, that loads all reach, with as many modes in its loads."""
     scene = make_scene(nodes=(5, 2, 2))
-    assert torch.equal(scene.loads.reach, scene.problem.free)
+    assert torch.equal(scene.loads.loadable_dofs, scene.problem.free)
     return scene, solved(scene, 16)
 
 
@@ -74,7 +74,7 @@ def noise(scene, count=4, seed=0):
     """Return forces (count, N, D) of no symmetry, on all that loads can act on."""
     random = torch.Generator().manual_seed(seed)
     force = torch.randn(count, *scene.problem.shape, generator=random, dtype=torch.float64)
-    return torch.where(scene.loads.reach, force, 0.0)
+    return torch.where(scene.loads.loadable_dofs, force, 0.0)
 
 
 def asymmetry(net, force):
@@ -198,7 +198,7 @@ def test_the_basis_of_loads_is_orthonormal_and_holds_them(scene, batch):
     kept = read(prepared(PODNet, scene, batch, **WHOLE).net)
     kept = kept[:, kept.abs().amax(dim=0) > 1e-5]
     assert torch.allclose(kept.T @ kept, eye(kept.shape[1]), rtol=0, atol=1e-6)
-    force = batch.force[:, scene.loads.reach]
+    force = batch.force[:, scene.loads.loadable_dofs]
     assert float((force - force @ kept @ kept.T).norm() / force.norm()) < 1e-5
 
 
@@ -286,7 +286,7 @@ def test_a_rank_that_leaves_no_mode_is_told(scene, batch):
     """Of twins, bending to both sides, one is none: refused by name, or not left out."""
     module = Surrogate(PODNet(scene, rank=1, **SMALL), MSE(), scene)
     with suppress(ValueError):
-        module.prepare(batch)
+        module.fit_bases(batch)
         assert module.net.basis.any()
 
 
@@ -307,12 +307,12 @@ def test_symmetry_false_respects_none(kind, bar):
         assert torch.equal(answer, net.train()(force))
         far = group[3].image(answer) - net(group[3].image(force))
     assert float(far.norm() / answer.norm()) > 1e-4
-    assert len(net.plan()) == len(kind(scene, **SMALL).plan()) - 1
+    assert len(net.skipped_work()) == len(kind(scene, **SMALL).skipped_work()) - 1
 
 
 @NETWORKS
 def test_the_plan_counts_coordinates_and_symmetries(kind, scene):
-    lines = kind(scene, rank=20, **SMALL).plan()
+    lines = kind(scene, rank=20, **SMALL).skipped_work()
     assert lines[0] == f"20 coordinates learnt instead of {int(scene.problem.free.sum())} " + (
         "displacements"
     )
@@ -355,7 +355,7 @@ def test_a_body_without_symmetry_is_answered(kind, skew):
     net = exact(prepared(kind, scene, samples, rank=5, coordinates=4))
     assert len(net.group) == 1
     assert net.turns.shape == (1, 4, 4)
-    assert len(net.plan()) == (1 if kind is PODNet else 3)
+    assert len(net.skipped_work()) == (1 if kind is PODNet else 3)
     basis = net.basis
     assert torch.allclose(basis @ basis.T, eye(5), rtol=0, atol=1e-6)
     with torch.no_grad():
@@ -369,7 +369,7 @@ def test_a_body_without_symmetry_is_answered(kind, skew):
 def test_a_body_that_is_held_in_some_directions_only_is_answered(kind):
     """Rails: a node moves in some directions and not in others."""
     ends = [(0, [0.0, None, None]), (1, [None, 0.0, None]), (2, [None, None, 0.0])]
-    rails = [Displacement(Plane(axis, "min"), value) for axis, value in ends]
+    rails = [DirichletBC(Plane(axis, "min"), value) for axis, value in ends]
     mesh = box([100.0, 25.0, 25.0], [5, 2, 2])
     problem = Problem.build(mesh, NeoHookeanLn(0.3), supports=rails)
     solver = Newton(problem, linear="superlu")
@@ -417,7 +417,7 @@ def test_a_sample_that_does_not_move_changes_nothing(kind, scene, batch):
 @NETWORKS
 def test_ranks_beyond_what_moves_and_acts_are_cut(kind, scene, batch):
     net = prepared(kind, scene, batch, **WHOLE).net
-    outputs, inputs = int(scene.problem.free.sum()), int(scene.loads.reach.sum())
+    outputs, inputs = int(scene.problem.free.sum()), int(scene.loads.loadable_dofs.sum())
     assert net.basis.shape == (outputs, outputs)
     assert net.leave.out_features == outputs
     assert net.enter.in_features == inputs
@@ -457,7 +457,7 @@ def test_slopes_with_respect_to_forces_are_those_of_differences(kind, scene, bat
     found = float((slope * way).sum())
     assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(found, rel=1e-6)
     assert found != 0
-    assert not slope[:, ~scene.loads.reach].any()
+    assert not slope[:, ~scene.loads.loadable_dofs].any()
 
 
 # ------------------------------------------------------------------ options

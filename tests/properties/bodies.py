@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from dpl.fem import (
-    Displacement,
-    Linear,
+    DirichletBC,
     LinearElastic,
+    LinearSolver,
     Load,
     Material,
     MooneyRivlinK2,
@@ -22,8 +22,8 @@ from dpl.fem import (
     NeoHookeanLn,
     OgdenK2,
     Problem,
+    RobinBC,
     SaintVenantKirchhoff,
-    Spring,
     StableNeoHookean,
     YeohK2,
     box,
@@ -123,18 +123,18 @@ class Body:
         """Return the problem; `options` of `Problem.build` come on top."""
         supports = []
         if self.support in ("clamp", "clamps", "moved"):
-            supports.append(Displacement(self.face(0, "min")))
+            supports.append(DirichletBC(self.face(0, "min")))
         if self.support in ("clamps", "moved"):
             by = np.random.default_rng(self.seed).uniform(-0.1, 0.1, self.dim)
             by = by * min(self.sides) * (self.support == "moved")
             way = (self.size * self.rotation @ by).tolist()
-            supports.append(Displacement(self.face(0, "max"), way))
+            supports.append(DirichletBC(self.face(0, "max"), way))
         if self.support == "bed":
-            supports.append(Spring(self.face(0, "min"), 0.5 / self.size))
+            supports.append(RobinBC(self.face(0, "min"), 0.5 / self.size))
         if self.support == "rollers":
             for axis in range(self.dim):
                 value = [0.0 if i == axis else None for i in range(self.dim)]
-                supports.append(Displacement(self.face(axis, "min"), value))
+                supports.append(DirichletBC(self.face(axis, "min"), value))
         options = {"mean_dilatation": self.mean_dilatation, "degree": self.degree} | options
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # linear elements may lock: not what is asked here
@@ -156,7 +156,7 @@ class Push:
     size: float
     seed: int
 
-    def on(self, body: Body, linear: Linear) -> Load:
+    def on(self, body: Body, linear: LinearSolver) -> Load:
         """Return the load on a body."""
         problem, random = linear.problem, np.random.default_rng(self.seed)
         way = random.standard_normal(body.dim)

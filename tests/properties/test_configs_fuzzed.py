@@ -34,10 +34,10 @@ BLADES = ["mesh=propeller", "mesh.cells=[1,1,1,2,3]", "clamped=cylinder", "clamp
 SMALL = ["data.train=4", "data.val=2", "data.test=2", "data.batch_size=2", "data.workers=0"]
 DRAWN = ["loads=modal_small", "loads.radius.low=0.1"]
 HELD = [
-    "+supports.end={_target_: dpl.fem.Displacement, "
+    "+supports.end={_target_: dpl.fem.DirichletBC, "
     "value: [0.0, null, null], "
     "region: {_target_: dpl.fem.Plane, axis: 0, at: max}}",
-    "+supports.soil={_target_: dpl.fem.Spring, stiffness: 0.01, "
+    "+supports.soil={_target_: dpl.fem.RobinBC, stiffness: 0.01, "
     "region: {_target_: dpl.fem.Box, lower: [0, 0, 0], upper: [50, 25, 0]}}",
     "+forces.weight={_target_: dpl.fem.BodyForce, value: [0.0, 0.0, -1e-5]}",
 ]
@@ -173,20 +173,20 @@ def works(cfg: DictConfig, folder: Path) -> None:
     if "mesh" not in cfg:
         return
     scene = build.build_scene(cfg)
-    data = build.make(cfg, "data", scene=scene)
+    data = build.instantiate(cfg, "data", scene=scene)
     load = scene.loads.sample((0, 0), [0])
     surrogate = None
     if "model" in cfg:
         surrogate = build.build_surrogate(cfg, scene)
-        trainer = build.make(cfg, "trainer")
+        trainer = build.instantiate(cfg, "trainer")
         assert isinstance(trainer, L.Trainer)
-    scene.plan()
-    data.plan()
+    scene.skipped_work()
+    data.skipped_work()
     answer = solve(scene.solver, load)
     assert answer.displacement.isfinite().all() or not answer.converged.all()
     assert bool((answer.volume_ratio > 0).all()) or not answer.converged.all()
     if surrogate is not None:
-        surrogate.plan()
+        surrogate.skipped_work()
         if getattr(surrogate.net, "prepared", True):
             with torch.no_grad():
                 assert surrogate.predict(load).isfinite().all()
@@ -248,14 +248,14 @@ FOREIGN = [  # what would do harm, and how it would be called
     {"_target_": "pathlib.Path.touch", "self": "harm"},
     {"_target_": "hydra.utils.call", "config": {"_target_": "os.system", "command": "touch harm"}},
     {"_target_": "dpl.config.build.sys.exit", "_args_": [3]},
-    {"_target_": "dpl.config.make", "cfg": {"x": {"_target_": "os.getcwd"}}, "key": "x"},
+    {"_target_": "dpl.config.instantiate", "cfg": {"x": {"_target_": "os.getcwd"}}, "key": "x"},
     {"_target_": "dpl.config.load_run", "folder": "evil", "trust": True},
     {"_target_": "dpl.config.build.importlib", "name": "antigravity"},
     {"_target_": "dpl.scene.partial", "func": "os.system"},
     {"_target_": "dpl.training.surrogate.append_line", "path": "harm", "line": {"a": 1}},
-    {"_target_": "dpl.system.files.whole_file", "path": "harm"},
+    {"_target_": "dpl.system.files.atomic_write", "path": "harm"},
     {
-        "_target_": "dpl.fem.save",
+        "_target_": "dpl.fem.write_mesh",
         "mesh": {"_target_": "dpl.fem.box"},
         "path": "harm.vtk",
     },

@@ -20,7 +20,7 @@ from tried import counted
 
 from dpl import DataSetError
 from dpl.data import OfflineData, Store, Writer
-from dpl.data.solving.solve import Job, outcome
+from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.data.storage import store as store_module
 from dpl.data.storage.integrity import repair, verify
 from dpl.data.storage.manifest import STREAMS
@@ -54,7 +54,7 @@ def sound(scene, tmp_path_factory):
         patch.setattr(store_module, "SHARD", 4)
         list(Writer(store).fill(wanted, workers=0))
     for number in SPOOLED:
-        store.spool.put(outcome(scene, Job((0, 0), number)))
+        store.pending.put(solve_load(scene, LoadKey((0, 0), number)))
     session = {"loads": 18, "seconds": 1.0, "core_seconds": 1.0}
     (folder / "journal.jsonl").write_text(json.dumps(session) + "\n")
     assert sorted(FILES) == sorted(
@@ -86,7 +86,7 @@ def opened(scene, folder: Path) -> OfflineData:
 def samples(scene, folder: Path) -> dict:
     """Return all samples, what is missing solved as every command does."""
     data = opened(scene, folder)
-    data.plan()
+    data.skipped_work()
     data.prepare_data()
     assert data.store.summary()
     return {split: data.samples(split) for split in SIZES}

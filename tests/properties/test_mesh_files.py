@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from skfem.io.meshio import to_meshio
 from tried import counted
 
-from dpl.fem import box, load, rectangle
-from dpl.fem.mesh import check, sandbox
+from dpl.fem import box, read_mesh, rectangle
+from dpl.fem.mesh import check_mesh, sandbox
 
 BODIES = {
     "hexahedron": box([2.0, 1.0, 1.0], [3, 2, 2]),
@@ -95,7 +95,7 @@ def good(kind: str, cell: str) -> bytes | None:
                 meshio.write(path, made, file_format=name, **options)
             except (meshio.WriteError, KeyError, AssertionError):
                 return None
-        again = load(path)
+        again = read_mesh(path)
         assert sorted(map(tuple, again.p.T)) == sorted(map(tuple, body.p.T))
         return path.read_bytes()
 
@@ -155,7 +155,7 @@ def _soon():
 
 
 def tried(path: Path) -> skfem.Mesh | None:
-    """Return the mesh, or None after an error in one line; hold `load` to how it may fail."""
+    """Return the mesh, or None after an error in one line; hold `read_mesh` to how it may fail."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     files = sorted(os.listdir(path.parent))
     said = io.StringIO()
@@ -166,7 +166,7 @@ def tried(path: Path) -> skfem.Mesh | None:
     ):
         warnings.simplefilter("always")
         try:
-            mesh = load(path)
+            mesh = read_mesh(path)
         except ValueError as error:
             mesh = None
             text = str(error)
@@ -183,7 +183,7 @@ def tried(path: Path) -> skfem.Mesh | None:
 
 def sound(mesh: skfem.Mesh) -> bool:
     """Tell whether a mesh can be solved."""
-    check(mesh)
+    check_mesh(mesh)
     used = np.unique(mesh.t)
     tags = [*(mesh.boundaries or {}).values(), *(mesh.subdomains or {}).values()]
     volumes = skfem.Basis(mesh, mesh.elem(), intorder=4).dx.sum(axis=1)

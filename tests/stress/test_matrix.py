@@ -9,8 +9,8 @@ import torch
 
 from benchmarks import stress
 from benchmarks.stress import Case, Verdict, matrix, perform
-from benchmarks.stress.auditor import Watch
-from benchmarks.stress.case import graded
+from benchmarks.stress.auditor import Auditor
+from benchmarks.stress.case import classify
 from benchmarks.stress.trained_run import Ladder, cases, hybrid, newton, simulated
 from dpl.fem import solve
 from dpl.models import FCNN
@@ -97,16 +97,16 @@ def test_ladders_are_drawn(script, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("outcome", "status"),
     [
-        (graded("well"), 0),
-        (graded("no answer", fails=["it said so"]), 0),
-        (replace(graded(""), verdict=Verdict.WRONG), 1),
+        (classify("well"), 0),
+        (classify("no answer", fails=["it said so"]), 0),
+        (replace(classify(""), verdict=Verdict.WRONG), 1),
     ],
 )
 def test_only_what_is_silently_wrong_ends_the_command_with_1(
     script, tmp_path, monkeypatch, outcome, status
 ):
     first = Case("T0", "a liar", "nothing", lambda watch: outcome)
-    second = Case("T0", "the next one", "nothing", lambda watch: graded("well"))
+    second = Case("T0", "the next one", "nothing", lambda watch: classify("well"))
     monkeypatch.setattr(stress, "matrix", lambda wanted: [first, second])
     ended = script("stress", cwd=tmp_path)
     assert ended.status == status
@@ -119,7 +119,7 @@ def test_rows_are_there_before_the_next_case_begins(script, tmp_path, monkeypatc
         raise KeyboardInterrupt
 
     found = [
-        Case("T0", "done", "", lambda watch: graded("well")),
+        Case("T0", "done", "", lambda watch: classify("well")),
         Case("T0", "interrupted", "", interrupted),
     ]
     monkeypatch.setattr(stress, "matrix", lambda wanted: found)
@@ -153,7 +153,7 @@ def test_loads_of_a_ladder_have_their_amplitudes(ladder, scene):
 
 
 def test_an_untrained_surrogate_says_what_it_is(ladder):
-    watch = Watch()
+    watch = Auditor()
     alone, exact = simulated(ladder, None, watch), simulated(ladder, 1e-6, watch)
     assert alone.verdict == Verdict.EXPECTED, alone.happened
     assert exact.verdict == Verdict.EXPECTED, exact.happened
@@ -184,7 +184,7 @@ def test_a_simulator_that_says_what_is_not_so_is_seen(ladder, lie):
         return replace(real(step, tol), **LIES[lie])
 
     liar = SimpleNamespace(steps=ladder.steps, scene=ladder.scene, asked=asked)
-    assert simulated(liar, None, Watch()).verdict == Verdict.WRONG
+    assert simulated(liar, None, Auditor()).verdict == Verdict.WRONG
 
 
 def test_a_surrogate_has_four_cases(ladder):

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from benchmarks.stress import Case, Verdict, perform
-from benchmarks.stress.auditor import Watch
-from benchmarks.stress.case import all_of, graded, refused
+from benchmarks.stress.auditor import Auditor
+from benchmarks.stress.case import all_of, classify, refused
 from benchmarks.stress.fixtures import column, load_of, pulled
 from benchmarks.stress.stability import SVK
 from benchmarks.verification.report import Row
@@ -29,7 +29,7 @@ class Liar:
 
 
 def lies_of(newton, load, change):
-    watch = Watch()
+    watch = Auditor()
     watch.solve(Liar(newton, change), newton.problem, load, tol=newton.tol)
     return watch.lies
 
@@ -51,7 +51,7 @@ def test_an_honest_answer_has_no_lies(bent):
 
 def test_every_state_is_seen(bent):
     newton, load = bent
-    watch = Watch()
+    watch = Auditor()
     states = list(watch.over(newton, newton.problem, newton.tol).iterate(load))
     assert watch.iterates == len(states)
     assert watch.solves == 1
@@ -75,7 +75,7 @@ def test_an_inverted_iterate_is_seen_whatever_is_said_of_it(scene, bent):
 def test_an_inverted_start_is_no_iterate(scene, bent):
     newton, _ = bent
     guess = folded(scene)
-    watch, (state, *_) = Watch(), newton.iterate(bent[1])
+    watch, (state, *_) = Auditor(), newton.iterate(bent[1])
     watch.see(
         newton.problem,
         state._replace(displacement=guess, volume_ratio=newton.problem.volume_ratio(guess)),
@@ -129,13 +129,13 @@ def test_a_lie_makes_a_case_silently_wrong_whatever_the_case_says(scene, bent):
     def run(watch):
         liar = Liar(newton, lambda last: last._replace(displacement=0.999 * last.displacement))
         watch.solve(liar, newton.problem, load, tol=newton.tol)
-        return graded("all is well")
+        return classify("all is well")
 
     case = Case("T0", "a liar", "nothing", run)
     line, outcome = perform(case)
     assert line.verdict == outcome.verdict == Verdict.WRONG
     assert "residual is" in line.happened
-    assert perform(replace(case, run=lambda watch: graded("well")))[0].verdict == Verdict.EXPECTED
+    assert perform(replace(case, run=lambda watch: classify("well")))[0].verdict == Verdict.EXPECTED
 
 
 def test_what_a_case_raises_is_reported():
@@ -149,12 +149,12 @@ def test_what_a_case_raises_is_reported():
 
 def test_numbers_that_miss_are_silently_wrong_and_failures_that_say_so_are_not():
     good, bad = Row("x", "1.00", 1.001), Row("x", "1.00", 1.2)
-    assert graded("", [good]).verdict == Verdict.EXPECTED
-    assert graded("", [good], fails=["slow"]).verdict == Verdict.REPORTED
-    wrong = graded("", [good, bad], fails=["slow"])
+    assert classify("", [good]).verdict == Verdict.EXPECTED
+    assert classify("", [good], fails=["slow"]).verdict == Verdict.REPORTED
+    wrong = classify("", [good, bad], fails=["slow"])
     assert wrong.verdict == Verdict.WRONG
     assert "x is 1.2 and not 1.00" in wrong.happened
-    worst = all_of([graded("fine", [good]), wrong])
+    worst = all_of([classify("fine", [good]), wrong])
     assert worst.verdict == Verdict.WRONG
     assert "fine" not in worst.happened
     assert len(worst.rows) == 3

@@ -33,8 +33,8 @@ def body(scene):
 def page(body, tmp_path):
     """A page of the tiny beam, at any free port."""
     pytest.importorskip("viser", reason="the extra viewer is not installed")
-    from dpl.viewer import Door, Page
+    from dpl.viewer import AccessPolicy, Page
 
-    page = Page(body, Door.bound("127.0.0.1", 0), title="tiny", folder=tmp_path / "view")
+    page = Page(body, AccessPolicy.bound("127.0.0.1", 0), title="tiny", folder=tmp_path / "view")
     yield page
     page.close()

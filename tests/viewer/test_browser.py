@@ -90,7 +90,7 @@ def seen(page):
 
 def test_the_mouse_bends_the_body(seen, page, tmp_path):
     before = seen.picture(tmp_path / "before.png")
-    assert page._frame.answer.tier == "rest"
+    assert page._frame.answer.method == "rest"
     x, y = seen.body()
     seen.view.mouse.move(x, y)
     time.sleep(1)
@@ -99,11 +99,11 @@ def test_the_mouse_bends_the_body(seen, page, tmp_path):
         seen.view.mouse.move(x, y - 8 * k)
         seen.view.wait_for_timeout(80)
     seen.view.mouse.up()
-    seen.until(lambda: page._frame.answer.tier == "network")
+    seen.until(lambda: page._frame.answer.method == "network")
     assert page.worker.settle(240)
     moved = page._frame.points - page.body.surface.rest
     assert moved[:, 2].max() > 0.03, "it went up with the mouse"
-    assert not page._frame.answer.outside
+    assert not page._frame.answer.out_of_distribution
     seen.changed(before, tmp_path / "after.png")
 
 
@@ -124,7 +124,7 @@ def test_controls_change_colours_loads_and_what_stands_beside(seen, page, tmp_pa
     seen.until(lambda: page._beside[0] is not None and page._beside[0].converged)
     seen.reads("in balance")
     seen.view.get_by_text("Reset", exact=True).click()
-    seen.until(lambda: page._frame.answer.tier == "rest")
+    seen.until(lambda: page._frame.answer.method == "rest")
 
 
 def test_a_recording_is_written_and_downloaded(seen, page):

@@ -15,9 +15,9 @@ import viser
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from dpl.viewer import Door
-from dpl.viewer.access import LARGEST, check, status_of
-from dpl.viewer.rate_limited_log import LONGEST, PERIOD, Complaints
+from dpl.viewer import AccessPolicy
+from dpl.viewer.access import LARGEST, check, status_for
+from dpl.viewer.rate_limited_log import LONGEST, PERIOD, RateLimitedHandler
 
 LONG = 120  # no test waits so long, unless what it waits for does not come [s]
 UPGRADE = {
@@ -42,20 +42,20 @@ def home(door):
 def test_the_page_is_served_to_who_has_its_address(door):
     path = f"/{door.token}/"
     for host in (home(door), f"localhost:{door.port}"):
-        assert status_of(door, path, Host=host) == 200
-    assert status_of(door, path + "nothing-here.js", Host=home(door)) == 404
+        assert status_for(door, path, Host=host) == 200
+    assert status_for(door, path + "nothing-here.js", Host=home(door)) == 404
 
 
 @pytest.mark.parametrize("path", ["/", "/x/", "/?token=x", "//", "/%2e%2e/", "/index.html"])
 def test_without_the_token_there_is_no_page_and_no_socket(door, path):
-    assert status_of(door, path, Host=home(door)) == 403
+    assert status_for(door, path, Host=home(door)) == 403
     origin = f"http://{home(door)}"
-    assert status_of(door, path, Host=home(door), Origin=origin, **UPGRADE) == 403
+    assert status_for(door, path, Host=home(door), Origin=origin, **UPGRADE) == 403
 
 
 def test_a_token_that_is_nearly_right_is_wrong(door):
     for wrong in (door.token[:-1], door.token + "x", door.token.swapcase()):
-        assert status_of(door, f"/{wrong}/", Host=home(door)) == 403
+        assert status_for(door, f"/{wrong}/", Host=home(door)) == 403
 
 
 @pytest.mark.parametrize(
@@ -67,9 +67,9 @@ def test_a_token_that_is_nearly_right_is_wrong(door):
 )
 def test_a_host_that_is_not_this_one_is_refused(door, host):
     named = host.format(port=door.port)
-    assert status_of(door, f"/{door.token}/", Host=named) == 421
+    assert status_for(door, f"/{door.token}/", Host=named) == 421
     headers = {"Host": named, "Origin": f"http://{named}", **UPGRADE}
-    assert status_of(door, f"/{door.token}/", **headers) == 421
+    assert status_for(door, f"/{door.token}/", **headers) == 421
 
 
 @pytest.mark.parametrize(
@@ -81,12 +81,12 @@ def test_a_host_that_is_not_this_one_is_refused(door, host):
 )
 def test_a_socket_from_another_page_is_refused(door, origin):
     more = {} if origin is None else {"Origin": origin.format(port=door.port)}
-    assert status_of(door, f"/{door.token}/", Host=home(door), **more, **UPGRADE) == 403
+    assert status_for(door, f"/{door.token}/", Host=home(door), **more, **UPGRADE) == 403
 
 
 def test_the_pages_own_socket_is_opened(door):
     headers = {"Host": home(door), "Origin": f"http://{home(door)}", **UPGRADE}
-    assert status_of(door, f"/{door.token}", **headers) == 101
+    assert status_for(door, f"/{door.token}", **headers) == 101
 
 
 def test_only_this_machine_can_reach_it(door):
@@ -208,7 +208,7 @@ def test_garbage_ends_its_connection_with_one_line(door, told, capfd, message):
     assert line.isascii()
     assert line.isprintable()
     assert len(line) < LONGEST + 60
-    assert status_of(door, f"/{door.token}/", Host=home(door)) == 200, "others are served"
+    assert status_for(door, f"/{door.token}/", Host=home(door)) == 200, "others are served"
 
 
 def test_garbage_again_and_again_is_one_line(door, told, capfd, monkeypatch):
@@ -259,15 +259,15 @@ def test_errors_of_callbacks_are_told_whether_they_are_awaited_or_not(capfd):
     def called(event):
         raise ZeroDivisionError(event)
 
-    asyncio.run(Complaints().caught(awaited)("far\naway"))
-    Complaints().caught(called)("far\naway")
+    asyncio.run(RateLimitedHandler().caught(awaited)("far\naway"))
+    RateLimitedHandler().caught(called)("far\naway")
     told = "warning: a request of a browser failed: a control: ZeroDivisionError: far away"
     assert capfd.readouterr().err.splitlines() == [told, told]
 
 
 def test_one_line_a_second_is_printed_and_the_others_are_counted(capfd):
     now = 5.0
-    complaints = Complaints(lambda: now)
+    complaints = RateLimitedHandler(lambda: now)
     lines = []
     for step in (0.0, 0.25, PERIOD - 0.25 - 2**-20, 2**-20, 0.5, 3.0, 0.0):
         now += step
@@ -281,7 +281,7 @@ def test_one_line_a_second_is_printed_and_the_others_are_counted(capfd):
 
 
 def test_warnings_are_no_complaints(capfd):
-    Complaints().logger.warning("slow")
+    RateLimitedHandler().logger.warning("slow")
     assert capfd.readouterr().err == ""
 
 
@@ -296,7 +296,7 @@ def test_the_answer_forbids_to_fetch_from_elsewhere(door):
 
 
 def test_a_door_to_all_takes_addresses_and_its_names_but_no_others():
-    door = Door.bound("0.0.0.0", 0, ["Lab-7"])
+    door = AccessPolicy.bound("0.0.0.0", 0, ["Lab-7"])
     try:
         assert door.open_to_all
         hosts = {"192.168.0.7": True, "lab-7": True, "LAB-7": True, "rebound.example": False}
@@ -317,10 +317,10 @@ def test_a_door_that_answers_one_request_wrongly_is_not_served(door, monkeypatch
 
     def status(door, path, **headers):
         asked.append((path, headers))
-        found = status_of(door, path, **headers)
+        found = status_for(door, path, **headers)
         return 500 if len(asked) == which + 1 else found
 
-    monkeypatch.setattr("dpl.viewer.access.status_of", status)
+    monkeypatch.setattr("dpl.viewer.access.status_for", status)
     must = (200, 403, 421, 403, 403)[which]
     with pytest.raises(RuntimeError, match=f"not safe: 500 where {must} must be; not served"):
         check(door)
@@ -330,7 +330,7 @@ def test_a_door_that_answers_one_request_wrongly_is_not_served(door, monkeypatch
 
 def test_a_host_without_a_port_is_that_of_port_80(door):
     bound = SimpleNamespace(getsockname=lambda: ("127.0.0.1", 80))
-    other = Door(bound, "127.0.0.1", ("lab",))
+    other = AccessPolicy(bound, "127.0.0.1", ("lab",))
     for host in ("127.0.0.1", "localhost", "[::1]", "LAB", "127.0.0.1:80", "localhost:00080"):
         assert other._ours(host), host
     for host in (
@@ -360,22 +360,22 @@ def test_a_host_without_a_port_is_that_of_port_80(door):
 )
 def test_the_address_is_what_a_browser_can_open(host, open_to_all, address):
     bound = SimpleNamespace(getsockname=lambda: (host, 81))
-    door = Door(bound, host, (), "t")
+    door = AccessPolicy(bound, host, (), "t")
     assert (door.open_to_all, door.address) == (open_to_all, address)
 
 
 def test_a_door_to_all_takes_its_own_names_too():
     bound = SimpleNamespace(getsockname=lambda: ("0.0.0.0", 81))
     name = socket.gethostname().lower()
-    assert Door(bound, "0.0.0.0")._ours(f"{name}:81")
-    assert Door(bound, "Lab-7.example")._ours("lab-7.EXAMPLE:81")
-    assert not Door(bound, "127.0.0.1")._ours(f"{name}.example:81")
-    assert Door(bound, "0.0.0.0")._ours("[fe80::7]:81")
-    assert not Door(bound, "127.0.0.1")._ours("[fe80::7]:81")
+    assert AccessPolicy(bound, "0.0.0.0")._ours(f"{name}:81")
+    assert AccessPolicy(bound, "Lab-7.example")._ours("lab-7.EXAMPLE:81")
+    assert not AccessPolicy(bound, "127.0.0.1")._ours(f"{name}.example:81")
+    assert AccessPolicy(bound, "0.0.0.0")._ours("[fe80::7]:81")
+    assert not AccessPolicy(bound, "127.0.0.1")._ours("[fe80::7]:81")
 
 
 def test_two_pages_have_two_tokens():
-    first, second = Door.bound("127.0.0.1", 0), Door.bound("127.0.0.1", 0)
+    first, second = AccessPolicy.bound("127.0.0.1", 0), AccessPolicy.bound("127.0.0.1", 0)
     assert first.token != second.token
     assert len(first.token) >= 32
     assert first.token not in repr(first)

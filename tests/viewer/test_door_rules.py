@@ -14,9 +14,9 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from dpl.viewer import Door
+from dpl.viewer import AccessPolicy
 from dpl.viewer import access as module
-from dpl.viewer.access import LARGEST, behind, check, status_of
+from dpl.viewer.access import LARGEST, check, serve_with, status_for
 
 PORT, TOKEN = 8123, "Token-7_x"
 HOME = f"127.0.0.1:{PORT}"
@@ -25,7 +25,7 @@ LONG = 120  # no test waits so long, unless what it waits for does not come [s]
 
 def door_at(host="127.0.0.1", port=PORT, names=()):
     """Return a door whose socket only knows its address."""
-    return Door(SimpleNamespace(getsockname=lambda: (host, port)), host, names, TOKEN)
+    return AccessPolicy(SimpleNamespace(getsockname=lambda: (host, port)), host, names, TOKEN)
 
 
 def request(path=f"/{TOKEN}/", *pairs, host=HOME):
@@ -228,7 +228,7 @@ def test_every_answer_forbids_other_pages_to_use_it():
 )
 def test_a_door_is_bound_where_it_is_asked_to_be(host, family):
     try:
-        door = Door.bound(host, 0, ["Lab-7", "x"])
+        door = AccessPolicy.bound(host, 0, ["Lab-7", "x"])
     except OSError:
         pytest.skip(f"this machine has no {host}")
     with door.socket as bound:
@@ -240,8 +240,8 @@ def test_a_door_is_bound_where_it_is_asked_to_be(host, family):
 
 
 def test_a_door_has_no_names_and_a_long_token_of_its_own_unless_told():
-    with Door.bound("127.0.0.1", 0).socket as bound:
-        doors = [Door(bound, "127.0.0.1") for _ in range(2)]
+    with AccessPolicy.bound("127.0.0.1", 0).socket as bound:
+        doors = [AccessPolicy(bound, "127.0.0.1") for _ in range(2)]
     assert [door.names for door in doors] == [(), ()]
     assert doors[0].token != doors[1].token
     assert all(len(door.token) == 32 for door in doors)  # 24 bytes in base 64
@@ -258,7 +258,7 @@ def test_a_port_that_is_taken_is_an_error_and_its_socket_is_closed(monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as other:
         monkeypatch.setattr(socket, "socket", Recorded)
         with pytest.raises(OSError, match="in use"):
-            Door.bound("127.0.0.1", other.getsockname()[1])
+            AccessPolicy.bound("127.0.0.1", other.getsockname()[1])
     assert made[0].fileno() == -1
 
 
@@ -276,7 +276,7 @@ def test_a_server_that_starts_behind_a_door_takes_its_socket_and_its_rules(monke
             "handler", "0.0.0.0", 1, process_request=lambda *_: "passed", compression=None
         )
 
-    with behind(door):
+    with serve_with(door):
         assert asyncio.run(start()) == "server"
     assert websockets.asyncio.server.serve is genuine
     ((handler, options),) = calls
@@ -294,7 +294,7 @@ def test_an_error_behind_a_door_leaves_servers_as_they_were():
     genuine = websockets.asyncio.server.serve
 
     def fail():
-        with behind(door_at()):
+        with serve_with(door_at()):
             assert websockets.asyncio.server.serve is not genuine
             raise RuntimeError("stop")
 
@@ -322,7 +322,7 @@ def answered(listening, answer):
 def test_the_status_of_a_request_is_that_of_the_answer(host):
     with socket.create_server((host, 0)) as listening:
         thread, seen = answered(listening, b"HTTP/1.1 418 I'm a teapot\r\n\r\n")
-        found = status_of(Door(listening, host), "/a?b", Host="x:1", Sec_WebSocket_Key="k")
+        found = status_for(AccessPolicy(listening, host), "/a?b", Host="x:1", Sec_WebSocket_Key="k")
         thread.join(LONG)
     assert found == 418
     assert seen == [b"GET /a?b HTTP/1.1\r\nHost: x:1\r\nSec-WebSocket-Key: k\r\n\r\n"]
@@ -339,7 +339,7 @@ def test_a_door_to_all_addresses_is_asked_at_the_loopback(monkeypatch):
     monkeypatch.setattr(socket, "create_connection", refused)
     for host in ("::", "0.0.0.0", "10.0.0.1"):
         with pytest.raises(ConnectionRefusedError):
-            status_of(door_at(host), "/")
+            status_for(door_at(host), "/")
     assert asked == [("::1", PORT), ("127.0.0.1", PORT), ("10.0.0.1", PORT)]
 
 
@@ -358,7 +358,7 @@ def tried(monkeypatch, wrong=None):
             return 403 if status == 200 else 200
         return status
 
-    monkeypatch.setattr(module, "status_of", by_rule)
+    monkeypatch.setattr(module, "status_for", by_rule)
     check(door_at())
     return asked
 

@@ -10,7 +10,7 @@ import torch
 pytest.importorskip("viser", reason="the extra viewer is not installed")
 
 from dpl.fem import rectangle
-from dpl.viewer import Door, Page
+from dpl.viewer import AccessPolicy, Page
 
 BODIES = {
     "hexahedra": {},
@@ -25,7 +25,7 @@ BODIES = {
 def any_page(request, make_scene, make_body, tmp_path):
     """A page of each kind of body."""
     body = make_body(make_scene(**BODIES[request.param]))
-    page = Page(body, Door.bound("127.0.0.1", 0), title="t", folder=tmp_path)
+    page = Page(body, AccessPolicy.bound("127.0.0.1", 0), title="t", folder=tmp_path)
     assert page.worker.settle(240)
     yield page
     page.close()
@@ -64,10 +64,10 @@ def test_controls_load_the_patch(any_page):
     assert page._frame.answer.amplitude == pytest.approx(0.5, abs=0.5)
     page._sampled(None)
     assert page.worker.settle(240)
-    assert not page._frame.answer.outside
+    assert not page._frame.answer.out_of_distribution
     page._reset(None)
     assert page.worker.settle(240)
-    assert page._frame.answer.tier == "rest"
+    assert page._frame.answer.method == "rest"
 
 
 def test_a_click_places_the_patch_on_the_near_side(page):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dpl.viewer.animation import moving_load
-from dpl.viewer.frames import Wish
-from dpl.viewer.rasterizer import Camera, Scenery
+from dpl.viewer.animation import animate_load
+from dpl.viewer.frames import ViewSettings
+from dpl.viewer.rasterizer import Camera, Renderer
 from dpl.viewer.recording import MOST, RATE, Recording, evenly
 
 
@@ -19,7 +19,9 @@ def recording(body):
     recording = Recording(body)
     recording.start()
     for index, now in ((1, 10.0), (2, 10.2), (3, 10.5)):
-        recording.take(body.answer(body.sample(index), Wish(quantity="von Mises stress")), now)
+        recording.take(
+            body.answer(body.sample(index), ViewSettings(quantity="von Mises stress")), now
+        )
     recording.stop()
     return recording
 
@@ -46,7 +48,7 @@ def test_a_series_holds_forces_displacements_stress_and_volumes(recording, body,
 def test_a_film_is_as_long_as_it_took(recording, body, tmp_path, kind):
     if kind == ".mp4":
         pytest.importorskip("imageio_ffmpeg", reason="the extra viewer is not installed")
-    scenery = Scenery(body.surface, Camera.before(body.surface), (320, 180))
+    scenery = Renderer(body.surface, Camera.before(body.surface), (320, 180))
     path = recording.save_film(tmp_path, scenery, kind)
     if kind == ".gif":
         image = Image.open(path)
@@ -89,8 +91,8 @@ def test_nothing_is_not_written(body, tmp_path):
 
 
 def test_a_picture_shows_the_body_where_the_camera_sees_it(body):
-    scenery = Scenery(body.surface, Camera.before(body.surface), (320, 180))
-    frame = body.answer(body.sample(1), Wish())
+    scenery = Renderer(body.surface, Camera.before(body.surface), (320, 180))
+    frame = body.answer(body.sample(1), ViewSettings())
     picture = np.asarray(scenery.draw(frame.points, frame.values, 1.0, frame.quantity, []))
     paper = picture[0, 0].astype(int)
     drawn = np.abs(picture.astype(int) - paper).sum(axis=2) > 30
@@ -102,7 +104,7 @@ def test_a_picture_shows_the_body_where_the_camera_sees_it(body):
 @pytest.mark.slow
 def test_the_moving_load_becomes_a_loop(body, tmp_path):
     path = tmp_path / "live.gif"
-    moving_load(body, path, size=(320, 180))
+    animate_load(body, path, size=(320, 180))
     image = Image.open(path)
     assert image.n_frames == 5 * RATE
     assert image.info["loop"] == 0

@@ -2,14 +2,14 @@
 
 import pytest
 
-from dpl.viewer.frames import QUANTITIES, Wish
+from dpl.viewer.frames import QUANTITIES, ViewSettings
 
 
 def test_frames_are_timed_for_each_quantity_and_answers_by_their_usual_names(page, monkeypatch):
     speed = pytest.importorskip("dpl.viewer.frame_rate", reason="the extra viewer is not installed")
 
     def few(body, **options):
-        return [body.answer(body.sample(k), Wish()) for k in range(3)]
+        return [body.answer(body.sample(k), ViewSettings()) for k in range(3)]
 
     monkeypatch.setattr(speed, "answers", few)
     rows, measured = speed.speed(page, seconds=0.1)

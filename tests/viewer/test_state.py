@@ -6,7 +6,7 @@ import torch
 
 from dpl.fem import NeoHookeanLn, fields, rectangle
 from dpl.viewer import Body
-from dpl.viewer.frames import Scale, Wish, between, round_up
+from dpl.viewer.frames import Scale, ViewSettings, between, round_up
 from dpl.viewer.surface import Surface, bands
 
 STRESS, ERROR = "von Mises stress", "error against FE"
@@ -93,11 +93,11 @@ def test_stress_at_the_surface_is_that_of_the_whole_body(body, make_scene):
 
 def test_a_pulled_point_goes_where_the_hand_is(body, pushed):
     node, asked = pushed
-    frame = body.answer(asked, Wish(tol=1e-8))
+    frame = body.answer(asked, ViewSettings(tol=1e-8))
     moved = frame.displacement[node] / body.scene.length
     assert moved[2] == pytest.approx(0.2, rel=0.25), "but for the body's nonlinearity"
     assert abs(moved[1]) < 0.02
-    assert not frame.answer.outside
+    assert not frame.answer.out_of_distribution
 
 
 def test_a_pull_is_held_within_the_training(body, pushed):
@@ -127,29 +127,29 @@ def test_an_even_force_is_said_to_be_unlike_the_training(body, pushed):
     node, _ = pushed
     patch = body.patch(node, 0.4, uniform=True)
     force = patch.along(torch.tensor([0.0, 0.0, 1.0]).double(), 0.5)
-    acting = force[patch.inside & body.scene.loads.reach.any(dim=1)]
+    acting = force[patch.inside & body.scene.loads.loadable_dofs.any(dim=1)]
     assert torch.allclose(acting, acting[:1].expand_as(acting))
-    assert body.answer(body.asked(force, None), Wish()).answer.outside
+    assert body.answer(body.asked(force, None), ViewSettings()).answer.out_of_distribution
 
 
 def test_colours_are_what_they_are_called(body, pushed):
     _, asked = pushed
     surface = body.surface
-    frame = body.answer(asked, Wish())
+    frame = body.answer(asked, ViewSettings())
     moved = frame.displacement.norm(dim=1).numpy()[surface.nodes]
     assert frame.values == pytest.approx(moved)
     assert frame.points == pytest.approx(surface.moved(frame.displacement / body.scene.length))
-    stress = body.answer(asked, Wish(quantity=STRESS)).values
+    stress = body.answer(asked, ViewSettings(quantity=STRESS)).values
     assert stress.max() > 0
-    error = body.answer(asked, Wish(quantity=ERROR)).values
+    error = body.answer(asked, ViewSettings(quantity=ERROR)).values
     assert error.max() == pytest.approx(0.02 / 0.98 * moved.max(), rel=1e-4)
-    exact = body.answer(asked, Wish(quantity=ERROR, tol=1e-8)).values
+    exact = body.answer(asked, ViewSettings(quantity=ERROR, tol=1e-8)).values
     assert exact.max() < 1e-6 * moved.max()
 
 
 def test_a_softer_body_is_moved_further_and_stress_is_in_pascals(body, pushed):
     _, asked = pushed
-    wish = Wish(quantity=STRESS, tol=1e-8)
+    wish = ViewSettings(quantity=STRESS, tol=1e-8)
     stiff = body.answer(asked._replace(young=2 * asked.young), wish)
     soft = body.answer(asked, wish)
     assert stiff.displacement.norm() < 0.7 * soft.displacement.norm()
@@ -159,7 +159,7 @@ def test_a_softer_body_is_moved_further_and_stress_is_in_pascals(body, pushed):
 
 def test_newtons_iterates_begin_at_rest_and_end_in_balance(body, pushed):
     _, asked = pushed
-    wish = Wish(quantity=ERROR)
+    wish = ViewSettings(quantity=ERROR)
     frame = body.answer(asked, wish)
     iterates = list(body.newton(asked, wish, frame))
     assert iterates[0].points == pytest.approx(body.surface.rest)
@@ -171,8 +171,8 @@ def test_newtons_iterates_begin_at_rest_and_end_in_balance(body, pushed):
 
 def test_random_loads_are_the_trainings(body):
     for index in range(4):
-        answer = body.answer(body.sample(index), Wish()).answer
-        assert not answer.outside
+        answer = body.answer(body.sample(index), ViewSettings()).answer
+        assert not answer.out_of_distribution
     assert not torch.equal(body.sample(0).force, body.sample(1).force)
 
 
@@ -180,9 +180,9 @@ def test_what_cannot_be_asked_is_refused_in_words(body):
     with pytest.raises(ValueError, match="E = 1 Pa must lie between"):
         body.rest(young=1.0)
     with pytest.raises(ValueError, match="quantity = 'heat'"):
-        Wish(quantity="heat")
+        ViewSettings(quantity="heat")
     with pytest.raises(ValueError, match="tol = nan"):
-        Wish(tol=float("nan"))
+        ViewSettings(tol=float("nan"))
     with pytest.raises(ValueError, match="node = -1"):
         body.patch(-1, 0.4)
     with pytest.raises(ValueError, match="radius = nan"):
@@ -203,14 +203,18 @@ def test_a_range_of_poissons_ratios_is_asked_for(make_scene, make_body):
     node = int(body.surface.nodes[body.surface.rest[:, 0].argmax()])
     force = body.patch(node, 0.4).towards(torch.tensor([0.0, 0.0, 0.1]).double())
     values = [
-        body.answer(body.asked(force, None, nu), Wish(quantity=STRESS, tol=1e-8)).values.max()
+        body.answer(
+            body.asked(force, None, nu), ViewSettings(quantity=STRESS, tol=1e-8)
+        ).values.max()
         for nu in (0.2, 0.4)
     ]
     assert values[0] != pytest.approx(values[1], rel=1e-3)
     with pytest.raises(ValueError, match=r"Poisson's ratio 0.45 must lie in"):
         body.asked(force, None, 0.45)
     asked = body.asked(force, None, 0.25)
-    assert list(body.newton(asked, Wish(), body.answer(asked, Wish())))[-1].converged
+    assert list(body.newton(asked, ViewSettings(), body.answer(asked, ViewSettings())))[
+        -1
+    ].converged
 
 
 def test_a_body_in_the_plane_is_answered_and_shown(make_scene, make_body):
@@ -218,7 +222,7 @@ def test_a_body_in_the_plane_is_answered_and_shown(make_scene, make_body):
     body = make_body(make_scene(mesh=mesh, law=NeoHookeanLn))
     node = int(body.surface.nodes[body.surface.rest[:, 0].argmax()])
     force = body.patch(node, 0.4).towards(torch.tensor([0.0, 0.1]).double())
-    frame = body.answer(body.asked(force, None), Wish(quantity=STRESS, tol=1e-6))
+    frame = body.answer(body.asked(force, None), ViewSettings(quantity=STRESS, tol=1e-6))
     assert frame.points.shape == (36, 3)
     assert not frame.points[:, 2].any()
     assert frame.values.shape == (36,)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from dpl.viewer.frames import Wish
+from dpl.viewer.frames import ViewSettings
 from dpl.viewer.worker import Worker
 
 LONG = 240.0  # no test waits so long, unless what it waits for does not come [s]
@@ -41,7 +41,7 @@ def make_worker(body, shown, monkeypatch):
 
 
 def test_the_last_frame_is_of_the_newest_load(make_worker, body, shown):
-    worker = make_worker(glide=0.05)
+    worker = make_worker(smoothing_time=0.05)
     load = body.sample(1)
     worker.ask(lambda: load)
     assert worker.settle(LONG)
@@ -52,35 +52,35 @@ def test_the_last_frame_is_of_the_newest_load(make_worker, body, shown):
 
 
 def test_it_glides_to_no_load_in_a_moment(make_worker, body, shown):
-    worker = make_worker(glide=0.05)
+    worker = make_worker(smoothing_time=0.05)
     for make in (lambda: body.sample(1), body.rest):
         before = len(shown)
         worker.ask(make)
         assert worker.settle(LONG)
         assert 3 < len(shown) - before < 60
-    assert shown[-1].answer.tier == "rest"
+    assert shown[-1].answer.method == "rest"
 
 
 def test_another_wish_for_the_same_load_is_one_frame(make_worker, body, shown):
-    worker = make_worker(glide=0.05)
+    worker = make_worker(smoothing_time=0.05)
     worker.ask(lambda: body.sample(1))
     assert worker.settle(LONG)
     before = len(shown)
-    worker.ask(wish=Wish(tol=1e-6))
+    worker.ask(wish=ViewSettings(tol=1e-6))
     assert worker.settle(LONG)
     assert len(shown) == before + 1
     assert shown[-1].converged
 
 
 def test_without_a_glide_there_is_one_frame_for_a_load(make_worker, body, shown):
-    worker = make_worker(glide=0.0)
+    worker = make_worker(smoothing_time=0.0)
     worker.ask(lambda: body.sample(1))
     assert worker.settle(LONG)
     assert len(shown) == 2
 
 
 def test_of_many_wishes_only_the_newest_is_answered(make_worker, body, shown):
-    worker = make_worker(glide=0.0)
+    worker = make_worker(smoothing_time=0.0)
     asked, first = [], threading.Event()
 
     def make(index):
@@ -101,9 +101,9 @@ def test_of_many_wishes_only_the_newest_is_answered(make_worker, body, shown):
 
 def test_newton_is_shown_step_by_step_and_a_new_load_ends_it(make_worker, body, shown):
     beside = []
-    worker = make_worker(glide=0.0, pace=0.02, beside=beside.append)
+    worker = make_worker(smoothing_time=0.0, min_frame_time=0.02, beside=beside.append)
     load = body.sample(1)
-    worker.ask(lambda: load, Wish(compare=True))
+    worker.ask(lambda: load, ViewSettings(compare=True))
     assert worker.settle(LONG)
     iterates = [frame for frame in beside if frame is not None]
     assert len(iterates) > 3
@@ -113,14 +113,14 @@ def test_newton_is_shown_step_by_step_and_a_new_load_ends_it(make_worker, body, 
     worker.ask(lambda: body.sample(2))
     while not any(beside):
         time.sleep(0.01)
-    worker.ask(lambda: body.sample(3), Wish())
+    worker.ask(lambda: body.sample(3), ViewSettings())
     assert worker.settle(LONG)
     assert torch.equal(shown[-1].asked.force, body.sample(3).force)
 
 
 def test_trouble_is_told_and_the_next_load_is_answered(make_worker, body, shown):
     told = []
-    worker = make_worker(glide=0.0, trouble=told.append)
+    worker = make_worker(smoothing_time=0.0, trouble=told.append)
     worker.ask(lambda: body.rest(young=1.0))
     assert worker.settle(LONG)
     assert told

@@ -12,14 +12,14 @@ from dpl.scene import Scene
 from dpl.system.threads import one_thread
 
 
-class Job(NamedTuple):
+class LoadKey(NamedTuple):
     """A load to solve: which one of which stream."""
 
     seed: tuple[int, int]
     number: int
 
 
-class Outcome(NamedTuple):
+class SolvedLoad(NamedTuple):
     """One load, solved or not; arrays and numbers only, to cross between processes.
 
     Attributes:
@@ -36,7 +36,7 @@ class Outcome(NamedTuple):
         reason: Why it is rejected; empty if accepted.
     """
 
-    job: Job
+    job: LoadKey
     point: NDArray[np.float64]
     force: NDArray[np.float64]
     displacement: NDArray[np.float64]
@@ -50,7 +50,7 @@ class Outcome(NamedTuple):
     reason: str
 
 
-def outcome(scene: Scene, job: Job, *, point: Tensor | None = None) -> Outcome:
+def solve_load(scene: Scene, job: LoadKey, *, point: Tensor | None = None) -> SolvedLoad:
     """Return a load, solved.
 
     Args:
@@ -63,7 +63,7 @@ def outcome(scene: Scene, job: Job, *, point: Tensor | None = None) -> Outcome:
     with one_thread():
         solution = solve(scene.solver, load)
     accepted = bool(solution.stable)
-    return Outcome(
+    return SolvedLoad(
         job=job,
         point=where,
         force=load.force[0].numpy(),
@@ -79,11 +79,11 @@ def outcome(scene: Scene, job: Job, *, point: Tensor | None = None) -> Outcome:
     )
 
 
-def lost(scene: Scene, job: Job, reason: str, seconds: float = 0.0) -> Outcome:
+def failed_load(scene: Scene, job: LoadKey, reason: str, seconds: float = 0.0) -> SolvedLoad:
     """Return a load that the machine, and not mechanics, has left without an answer."""
     load, where = _drawn(scene, job, None)
     force = load.force[0].numpy()
-    return Outcome(
+    return SolvedLoad(
         *(job, where, force, 0 * force, _amplitude(scene, load), False, np.nan, np.nan),
         *(0.0, 0, seconds, reason),
     )
@@ -93,6 +93,6 @@ def _amplitude(scene: Scene, load: Load) -> float:
     return float(scene.problem.acting(load.force).norm()) / scene.loads.largest_force
 
 
-def _drawn(scene: Scene, job: Job, point: Tensor | None) -> tuple[Load, NDArray[np.float64]]:
+def _drawn(scene: Scene, job: LoadKey, point: Tensor | None) -> tuple[Load, NDArray[np.float64]]:
     points = scene.loads.points(job.seed, [job.number]) if point is None else point[None]
     return scene.loads.at(points), points[0].numpy()

@@ -19,16 +19,16 @@ from multiprocessing.process import BaseProcess
 from types import FrameType
 from typing import Any
 
-from dpl.data.solving.solve import Job, Outcome, lost, outcome
+from dpl.data.solving.solve import LoadKey, SolvedLoad, failed_load, solve_load
 from dpl.scene import Scene
-from dpl.system.processes import spawning, unsignalled
+from dpl.system.processes import block_signals, spawn_context
 
-TRIES = 3  # of a load whose worker died, before it is given up
-HOPELESS = 12  # deaths in a row after which the fault is not in the loads
-GRACE = 120.0  # more time for a worker's first load: imports, compilation [s]
+MAX_RETRIES = 3  # of a load whose worker died, before it is given up
+MAX_CONSECUTIVE_CRASHES = 12  # deaths in a row after which the fault is not in the loads
+STARTUP_GRACE = 120.0  # more time for a worker's first load: imports, compilation [s]
 
 
-class Stop:
+class GracefulShutdown:
     """Whether somebody wants to stop: a context that takes Ctrl-C and SIGTERM.
 
     Asked once, it is true. Asked twice, it raises at once where the program is: KeyboardInterrupt,
@@ -40,7 +40,7 @@ class Stop:
         self._asked = 0
         self._before: dict[int, Any] = {}
 
-    def __enter__(self) -> "Stop":
+    def __enter__(self) -> "GracefulShutdown":
         """Take the signals; threads other than the main one cannot."""
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
@@ -56,7 +56,7 @@ class Stop:
         if self._asked:
             for each in self._before:  # nothing may interrupt what ends the workers
                 signal.signal(each, signal.SIG_IGN)
-            self.leave()
+            self.exit()
         self._asked = number
         # not print: it may be what the signal has interrupted
         os.write(2, b"\nstopping when the loads at work are done; once more to stop at once\n")
@@ -65,7 +65,7 @@ class Stop:
         """Return whether somebody has asked."""
         return self._asked != 0
 
-    def leave(self) -> None:
+    def exit(self) -> None:
         """Raise what ends a program that was asked to stop; do nothing if nobody has asked."""
         if self._asked == signal.SIGTERM:
             sys.exit(128 + signal.SIGTERM)
@@ -73,14 +73,14 @@ class Stop:
             raise KeyboardInterrupt
 
 
-def outcomes(
+def solve_loads(
     scene: Scene,
-    jobs: Iterable[Job],
+    jobs: Iterable[LoadKey],
     *,
     workers: int,
     timeout: float | None = None,
-    stop: Stop | None = None,
-) -> Iterator[Outcome]:
+    stop: GracefulShutdown | None = None,
+) -> Iterator[SolvedLoad]:
     """Yield loads solved, in the order in which they are finished.
 
     Args:
@@ -93,50 +93,52 @@ def outcomes(
     Raises:
         RuntimeError: Workers die one after the other.
     """
-    todo, stop = list(jobs)[::-1], Stop() if stop is None else stop
+    todo, stop = list(jobs)[::-1], GracefulShutdown() if stop is None else stop
     if workers == 0:
         while todo and not stop:
-            yield outcome(scene, todo.pop())
+            yield solve_load(scene, todo.pop())
         return
-    with _Crew(scene, min(workers, len(todo)), timeout) as crew:
-        deaths: dict[Job, int] = {}
+    with WorkerPool(scene, min(workers, len(todo)), timeout) as crew:
+        deaths: dict[LoadKey, int] = {}
         in_a_row = 0
         while crew.busy or (todo and not stop):
             while todo and crew.idle and not stop:
-                crew.give(todo.pop())
+                crew.submit(todo.pop())
             if not crew.busy:  # asked to stop between the two looks
                 break
             done, dead, hung = crew.wait()
             yield from done
             for job in hung:
-                yield lost(scene, job, f"timed out after {timeout:g} s", seconds=timeout or 0.0)
+                yield failed_load(
+                    scene, job, f"timed out after {timeout:g} s", seconds=timeout or 0.0
+                )
             in_a_row = 0 if done else in_a_row + len(dead)
-            if in_a_row >= HOPELESS:
+            if in_a_row >= MAX_CONSECUTIVE_CRASHES:
                 raise RuntimeError(f"{in_a_row} workers died one after the other; see above why")
             for job in dead:
                 deaths[job] = deaths.get(job, 0) + 1
-                if deaths[job] < TRIES:
+                if deaths[job] < MAX_RETRIES:
                     todo.insert(max(0, len(todo) - 8), job)  # after others: is it the load?
                 else:
-                    yield lost(scene, job, f"its worker died {TRIES} times")
+                    yield failed_load(scene, job, f"its worker died {MAX_RETRIES} times")
 
 
-class _Crew:
+class WorkerPool:
     """Worker processes, each with a pipe; a context that leaves none of them behind."""
 
     def __init__(self, scene: Scene, size: int, timeout: float | None) -> None:
-        self._context = spawning()
+        self._context = spawn_context()
         self._scene, self._size, self._timeout = scene, size, timeout
         self._members: dict[Connection, BaseProcess] = {}
         self._deadlines: dict[Connection, float] = {}
         self._fresh: set[Connection] = set()
         self.idle: list[Connection] = []
-        self.busy: dict[Connection, Job] = {}
+        self.busy: dict[Connection, LoadKey] = {}
 
-    def __enter__(self) -> "_Crew":
+    def __enter__(self) -> "WorkerPool":
         atexit.register(self._end)  # before multiprocessing's, which would wait for workers
         for _ in range(self._size):
-            self._hire()
+            self._spawn()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -151,36 +153,36 @@ class _Crew:
             pipe.close()
         self._members.clear()
 
-    def _hire(self) -> None:
+    def _spawn(self) -> None:
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_work, args=(theirs, self._scene), daemon=True)
-        with unsignalled(signal.SIGINT, signal.SIGTERM):
+        with block_signals(signal.SIGINT, signal.SIGTERM):
             process.start()
         theirs.close()
         self._members[ours] = process
         self._fresh.add(ours)
         self.idle.append(ours)
 
-    def _replace(self, pipe: Connection) -> Job:
+    def _replace(self, pipe: Connection) -> LoadKey:
         """Put a new worker in the place of one; return its load."""
         process = self._members.pop(pipe)
         process.kill()
         process.join()
         pipe.close()
-        self._hire()
+        self._spawn()
         return self.busy.pop(pipe)
 
-    def give(self, job: Job) -> None:
+    def submit(self, job: LoadKey) -> None:
         """Hand a load to an idle worker."""
         pipe = self.idle.pop()
         self.busy[pipe] = job
         if self._timeout is not None:
-            grace = GRACE if pipe in self._fresh else 0.0
+            grace = STARTUP_GRACE if pipe in self._fresh else 0.0
             self._deadlines[pipe] = time.monotonic() + self._timeout + grace
         with contextlib.suppress(BrokenPipeError):  # it died idle: `wait` will see
             pipe.send(job)
 
-    def wait(self) -> tuple[list[Outcome], list[Job], list[Job]]:
+    def wait(self) -> tuple[list[SolvedLoad], list[LoadKey], list[LoadKey]]:
         """Return what was finished, the loads whose workers died, and those whose workers hang."""
         done, dead = [], []
         patience = None
@@ -208,4 +210,4 @@ def _work(pipe: Connection, scene: Scene) -> None:
         signal.signal(number, signal.SIG_IGN)
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
-            pipe.send(outcome(scene, pipe.recv()))
+            pipe.send(solve_load(scene, pipe.recv()))

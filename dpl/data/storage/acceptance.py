@@ -10,7 +10,7 @@ ENOUGH = 0.9  # accepted part of a bin below which the set is biased
 FEW = 10  # loads below which a bin says nothing
 
 
-class Bin(NamedTuple):
+class AmplitudeBin(NamedTuple):
     """Loads of one range of amplitudes.
 
     Attributes:
@@ -29,7 +29,7 @@ class Bin(NamedTuple):
         return self.tried >= FEW and self.accepted < ENOUGH * self.tried
 
 
-def bins(amplitudes: Sequence[float], accepted: Sequence[bool]) -> list[Bin]:
+def amplitude_bins(amplitudes: Sequence[float], accepted: Sequence[bool]) -> list[AmplitudeBin]:
     """Return ten equal ranges from 0 to the largest amplitude, those without a load left out."""
     if not len(amplitudes):
         return []
@@ -39,13 +39,13 @@ def bins(amplitudes: Sequence[float], accepted: Sequence[bool]) -> list[Bin]:
     tried = np.bincount(place, minlength=BINS)
     kept = np.bincount(place, weights=np.asarray(accepted, dtype=float), minlength=BINS)
     return [
-        Bin(float(edges[k]), float(edges[k + 1]), int(tried[k]), int(kept[k]))
+        AmplitudeBin(float(edges[k]), float(edges[k + 1]), int(tried[k]), int(kept[k]))
         for k in range(BINS)
         if tried[k]
     ]
 
 
-def table(parts: Sequence[Bin]) -> list[str]:
+def acceptance_table(parts: Sequence[AmplitudeBin]) -> list[str]:
     """Return the acceptance by amplitude, a line for the ranges, one for the parts."""
     if not parts:
         return []
@@ -59,7 +59,7 @@ def table(parts: Sequence[Bin]) -> list[str]:
     ]
 
 
-def warning(parts: Sequence[Bin]) -> str:
+def bias_warning(parts: Sequence[AmplitudeBin]) -> str:
     """Return what is wrong with a biased data set and what to do; empty if it is fair."""
     if not (poor := [part for part in parts if part.biased]):
         return ""

@@ -14,7 +14,13 @@ from dpl.data.storage.store import MODES, SHARD, Store
 from dpl.data.storage.writer import rewrite
 from dpl.fem import Modes
 from dpl.scene import Scene
-from dpl.system.files import DataSetError, own_file, sole_writer, sync_folder, write_file
+from dpl.system.files import (
+    DataSetError,
+    exclusive_lock,
+    read_regular_file,
+    sync_folder,
+    write_file,
+)
 
 MACHINE = ("timed out", "its worker died")  # reasons that lie with the machine: `repair` retries
 STRAY = re.compile(rf"({'|'.join(STREAMS)})-(\d{{6,18}})\.safetensors")
@@ -48,13 +54,13 @@ def verify(store: Store) -> Iterator[tuple[Part, str]]:
     if not (store.folder / "scene.json").exists():
         raise DataSetError(f"{store.folder} holds no data set yet; generate it first")
     try:
-        flaw = flaw_of_modes(store.scene, store.modes())
+        flaw = check_modes(store.scene, store.modes())
     except DataSetError as error:
         flaw = f"is damaged: {error}"
     yield Part(MODES), flaw
     for line in store.shards():
         try:
-            flaw = flaw_of_shard(store.scene, store.stream(line["split"]), store.sound(line))
+            flaw = check_shard(store.scene, store.stream(line["split"]), store.sound(line))
         except ValueError as error:
             flaw = str(error)
         yield _part(line), flaw
@@ -78,7 +84,7 @@ def repair(store: Store) -> list[tuple[Part, str]]:
     """
     if not (store.folder / "scene.json").exists():
         return []
-    with sole_writer(store.folder):
+    with exclusive_lock(store.folder):
         flaws = {part: flaw for part, flaw in verify(store) if flaw}
         for line in store.shards():
             if any(one["reason"].startswith(MACHINE) for one in line["rejected"]):
@@ -91,8 +97,8 @@ def repair(store: Store) -> list[tuple[Part, str]]:
         for path in [*_unnamed(store), *store.folder.rglob(".*.part")]:
             if path.is_symlink() or not path.is_dir():
                 path.unlink()
-        for path in store.spool.files().values():
-            if store.spool.get(path).reason.startswith(MACHINE):
+        for path in store.pending.files().values():
+            if store.pending.get(path).reason.startswith(MACHINE):
                 path.unlink()
         sync_folder(store.folder)
     return [(part, f"{flaw}; {_done(store, part)}") for part, flaw in flaws.items()]
@@ -124,7 +130,7 @@ def _stray(store: Store, path: Path) -> Part:
     loads: list[int] = []
     if name := STRAY.fullmatch(path.name):
         try:
-            shard = store.opened(own_file(path, store.largest(SHARD)))
+            shard = store.opened(read_regular_file(path, store.largest(SHARD)))
             numbers = range(int(name[2]), int(name[2]) + SHARD)
             loads = [number for number in shard["index"].tolist() if number in numbers]
         except ValueError:  # it is damaged: nobody knows which loads it held
@@ -132,7 +138,7 @@ def _stray(store: Store, path: Path) -> Part:
     return Part(path.name, name[1] if name else "", tuple(loads))
 
 
-def flaw_of_modes(scene: Scene, kept: Modes) -> str:
+def check_modes(scene: Scene, kept: Modes) -> str:
     """Return what is wrong with stored modes, their signs and bases included; empty if nothing."""
     near = [
         (a.shape, a.dtype) == (b.shape, b.dtype)
@@ -142,7 +148,7 @@ def flaw_of_modes(scene: Scene, kept: Modes) -> str:
     return "" if all(near) else "holds other modes than this scene has"
 
 
-def flaw_of_shard(scene: Scene, stream: tuple[int, int], shard: Mapping[str, Tensor]) -> str:
+def check_shard(scene: Scene, stream: tuple[int, int], shard: Mapping[str, Tensor]) -> str:
     """Return what is wrong with a shard; empty if nothing is.
 
     Args:
@@ -165,7 +171,7 @@ def flaw_of_shard(scene: Scene, stream: tuple[int, int], shard: Mapping[str, Ten
     for k, (u, force) in enumerate(zip(shard["displacement"], shard["force"], strict=True)):
         body = problem.at(shard["poisson"][k, None])
         internal, volume = body.evaluate(u[None])
-        balanced = body.balanced(u[None], internal, force[None], scene.solver.tol)
+        balanced = body.is_equilibrium(u[None], internal, force[None], scene.solver.tol)
         if not (bool(volume > 0) and bool(balanced)):
             return f"holds an answer out of balance: load {int(shard['index'][k])}"
     return ""

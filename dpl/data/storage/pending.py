@@ -7,9 +7,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from dpl.data.solving.solve import Job, Outcome
-from dpl.data.storage.shard import packed, unpacked
-from dpl.system.files import own_file, whole_file
+from dpl.data.solving.solve import LoadKey, SolvedLoad
+from dpl.data.storage.shard import deserialize, serialize
+from dpl.system.files import atomic_write, read_regular_file
 
 NAME = re.compile(r"([a-z]+)-(\d{6,18})\.load")
 DIGEST = 32  # bytes of SHA-256, of its name and itself, before a load
@@ -17,7 +17,7 @@ LEFT = 10.0  # age from which on a file that was not finished is a killed proces
 
 
 @dataclass(frozen=True)
-class Spool:
+class PendingSamples:
     """A folder of loads, each in a file of its own.
 
     Attributes:
@@ -28,22 +28,22 @@ class Spool:
     folder: Path
     streams: dict[str, tuple[int, int]]
 
-    def put(self, one: Outcome) -> Path:
+    def put(self, one: SolvedLoad) -> Path:
         """Write a load; return its file."""
         self.folder.mkdir(exist_ok=True)
         (split,) = (name for name, seed in self.streams.items() if seed == one.job.seed)
         path = self.folder / f"{split}-{one.job.number:06d}.load"
-        content = packed(one)
+        content = serialize(one)
         # not synced: what a crash of the machine damages, its digest tells
-        with whole_file(path, sync=False) as file:
+        with atomic_write(path, sync=False) as file:
             file.write(_digest(path, content) + content)
         return path
 
-    def get(self, path: Path) -> Outcome:
+    def get(self, path: Path) -> SolvedLoad:
         """Return the load in a file."""
-        return unpacked(path.read_bytes()[DIGEST:])
+        return deserialize(path.read_bytes()[DIGEST:])
 
-    def files(self) -> dict[Job, Path]:
+    def files(self) -> dict[LoadKey, Path]:
         """Return the loads that are there; damaged ones are removed.
 
         Raises:
@@ -56,14 +56,14 @@ class Spool:
             if path.is_symlink():  # not followed: its load is solved again
                 continue
             with suppress(FileNotFoundError):  # another writer has made a shard of it meanwhile
-                content = own_file(path)
+                content = read_regular_file(path)
                 if _digest(path, content[DIGEST:]) == content[:DIGEST]:
-                    found[Job(self.streams[name[1]], int(name[2]))] = path
+                    found[LoadKey(self.streams[name[1]], int(name[2]))] = path
                 else:
                     path.unlink()
         return found
 
-    def tidy(self) -> None:
+    def clean(self) -> None:
         """Remove the folder if nothing is in it."""
         with suppress(OSError):
             self.folder.rmdir()
@@ -74,7 +74,7 @@ def _digest(path: Path, content: bytes) -> bytes:
     return hashlib.sha256(path.name.encode() + content).digest()
 
 
-def sweep(folder: Path) -> None:
+def clean_partial_files(folder: Path) -> None:
     """Remove what killed processes were writing in a folder or below it."""
     for path in folder.rglob(".*.part"):
         with suppress(FileNotFoundError):

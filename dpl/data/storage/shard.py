@@ -10,15 +10,15 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from dpl.data.solving.solve import Job, Outcome
+from dpl.data.solving.solve import LoadKey, SolvedLoad
 
 WHOLE = dict.fromkeys(("index", "carried", "iterations"), torch.int64)  # columns of whole numbers
 WHOLE["node"] = torch.int32
 NUMBERS = {"point", "nodal_force", "displacement", "poisson"}  # what a sample is made of
 
 
-def closed(
-    kept: Sequence[Outcome],
+def encode_shard(
+    kept: Sequence[SolvedLoad],
     shape: tuple[int, ...],
     dimension: int,
     poisson: Callable[[Tensor], Tensor] | None = None,
@@ -42,7 +42,7 @@ def closed(
         {
             "index": torch.tensor([one.job.number for one in kept], dtype=torch.int64),
             "point": point,
-            **compact(column("force", *shape)),
+            **to_sparse(column("force", *shape)),
             "displacement": column("displacement", *shape),
             "residual": torch.tensor([one.residual for one in kept], dtype=torch.float64),
             "volume_ratio": torch.tensor([one.volume_ratio for one in kept], dtype=torch.float64),
@@ -52,7 +52,7 @@ def closed(
     )
 
 
-def opened(
+def decode_shard(
     content: bytes, shape: tuple[int, ...], dimension: int, own: int = 0
 ) -> dict[str, Tensor]:
     """Return the columns of such a file, and `force` (B, N, D) [-] and `poisson` (B, P) [-].
@@ -68,13 +68,13 @@ def opened(
     """
     try:
         shard = load(content)
-        count, carried = len(shard["index"]), int(shard["carried"].sum())
+        count, n_loaded_nodes = len(shard["index"]), int(shard["carried"].sum())
         shapes = {
             "index": (count,),
             "point": (count, dimension),
             "carried": (count,),
-            "node": (carried,),
-            "nodal_force": (carried, shape[1]),
+            "node": (n_loaded_nodes,),
+            "nodal_force": (n_loaded_nodes, shape[1]),
             "displacement": (count, *shape),
             "residual": (count,),
             "volume_ratio": (count,),
@@ -94,28 +94,31 @@ def opened(
                 raise ValueError(f"is damaged: {name} is not finite")
         if not ((shard["carried"] >= 0) & (shard["carried"] <= shape[0])).all():
             raise ValueError("is damaged: forces act on more or on fewer nodes than there are")
-        if carried and not 0 <= int(shard["node"].min()) <= int(shard["node"].max()) < shape[0]:
+        if (
+            n_loaded_nodes
+            and not 0 <= int(shard["node"].min()) <= int(shard["node"].max()) < shape[0]
+        ):
             raise ValueError("is damaged: there are no such nodes")
     except (SafetensorError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"is damaged: {error}") from None
-    shard["force"] = spread(shard, shape)
+    shard["force"] = to_dense(shard, shape)
     shard.setdefault("poisson", torch.zeros(count, 0, dtype=torch.float64))
     return shard
 
 
-def taken(shard: Mapping[str, Tensor], job: Job, line: Mapping[str, Any]) -> Outcome:
+def select(shard: Mapping[str, Tensor], job: LoadKey, line: Mapping[str, Any]) -> SolvedLoad:
     """Return a load from a shard that has tried it."""
     amplitude = line["amplitudes"][job.number - line["first"]]
     found = (shard["index"] == job.number).nonzero()
     if not len(found):
         (why,) = (one for one in line["rejected"] if one["index"] == job.number)
         none = np.zeros(0)
-        return Outcome(
+        return SolvedLoad(
             job, none, none, none, amplitude, False, np.nan, np.nan, why["load_factor"], 0, 0.0,
             why["reason"],
         )  # fmt: skip
     k = int(found[0])
-    return Outcome(
+    return SolvedLoad(
         job=job,
         point=shard["point"][k].numpy(),
         force=shard["force"][k].numpy(),
@@ -131,7 +134,7 @@ def taken(shard: Mapping[str, Tensor], job: Job, line: Mapping[str, Any]) -> Out
     )
 
 
-def compact(force: Tensor) -> dict[str, Tensor]:
+def to_sparse(force: Tensor) -> dict[str, Tensor]:
     """Return forces (B, N, D) as those of the nodes that carry any: they live on small areas."""
     carries = force.ne(0).any(dim=-1)
     return {
@@ -141,36 +144,36 @@ def compact(force: Tensor) -> dict[str, Tensor]:
     }
 
 
-def spread(compact: Mapping[str, Tensor], shape: tuple[int, ...]) -> Tensor:
+def to_dense(to_sparse: Mapping[str, Tensor], shape: tuple[int, ...]) -> Tensor:
     """Return forces (B, N, D) from their compact form."""
-    count = compact["carried"]
+    count = to_sparse["carried"]
     force = torch.zeros(len(count), *shape, dtype=torch.float64)
     sample = torch.repeat_interleave(torch.arange(len(count)), count)
-    force[sample, compact["node"].long()] = compact["nodal_force"]
+    force[sample, to_sparse["node"].long()] = to_sparse["nodal_force"]
     return force
 
 
-def packed(one: Outcome) -> bytes:
+def serialize(one: SolvedLoad) -> bytes:
     """Return a load as a file of the spool."""
     fields = one._asdict()
     plain = {k: v for k, v in fields.items() if not isinstance(v, np.ndarray)}
     arrays = {k: v for k, v in fields.items() if isinstance(v, np.ndarray)}
     text = json.dumps(plain).encode()
-    tensors = compact(torch.from_numpy(arrays.pop("force"))[None])
+    tensors = to_sparse(torch.from_numpy(arrays.pop("force"))[None])
     tensors |= {name: torch.from_numpy(array).contiguous() for name, array in arrays.items()}
     return save({**tensors, "plain": torch.frombuffer(bytearray(text), dtype=torch.uint8)})
 
 
-def unpacked(content: bytes) -> Outcome:
+def deserialize(content: bytes) -> SolvedLoad:
     """Return a load from the spool."""
     tensors = load(content)
     plain = json.loads(tensors["plain"].numpy().tobytes())
     displacement = tensors["displacement"]
     seed, number = plain.pop("job")
-    return Outcome(
-        job=Job((seed[0], seed[1]), number),
+    return SolvedLoad(
+        job=LoadKey((seed[0], seed[1]), number),
         point=tensors["point"].numpy(),
-        force=spread(tensors, tuple(displacement.shape))[0].numpy(),
+        force=to_dense(tensors, tuple(displacement.shape))[0].numpy(),
         displacement=displacement.numpy(),
         **plain,
     )

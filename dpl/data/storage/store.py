@@ -28,14 +28,14 @@ from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
 
-from dpl.data.solving.solve import Job, Outcome
+from dpl.data.solving.solve import LoadKey, SolvedLoad
 from dpl.data.storage import acceptance as balance
 from dpl.data.storage.manifest import STREAMS, is_number, kept_in, lines_of, place
-from dpl.data.storage.pending import Spool
-from dpl.data.storage.shard import opened, taken
+from dpl.data.storage.pending import PendingSamples
+from dpl.data.storage.shard import decode_shard, select
 from dpl.fem import Modes
 from dpl.scene import Sample, Scene
-from dpl.system.files import DataSetError, own_file, read_lines
+from dpl.system.files import DataSetError, read_jsonl, read_regular_file
 
 FORMAT = 2
 MODES = "modes.safetensors"
@@ -62,9 +62,9 @@ class Store:
         return self.seed, STREAMS[split]
 
     @property
-    def spool(self) -> Spool:
+    def pending(self) -> PendingSamples:
         """The loads that are solved and wait for their shard."""
-        return Spool(self.folder / "spool", {name: self.stream(name) for name in STREAMS})
+        return PendingSamples(self.folder / "spool", {name: self.stream(name) for name in STREAMS})
 
     def shards(self) -> list[dict[str, Any]]:
         """Return the lines of all manifests by first load; none if there is no data set yet.
@@ -83,7 +83,7 @@ class Store:
                 )
             return []
         try:
-            self._check(json.loads(own_file(card)))
+            self._check(json.loads(read_regular_file(card)))
         except DataSetError:
             raise
         except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
@@ -134,10 +134,10 @@ class Store:
         mine = (index for index in range(count) if index // SHARD % shards == shard)
         return [index for index in mine if index not in tried]
 
-    def tried(self) -> set[Job]:
+    def tried(self) -> set[LoadKey]:
         """Return the loads that are in a shard, or rejected there."""
         return {
-            Job(self.stream(line["split"]), index)
+            LoadKey(self.stream(line["split"]), index)
             for line in self.shards()
             for index in range(line["first"], line["first"] + line["tried"])
         }
@@ -200,16 +200,16 @@ class Store:
 
     def largest(self, loads: int) -> int:
         """Return the number of bytes that a shard of so many loads has at most."""
-        numbers = 3 * math.prod(self.scene.problem.shape) + self.scene.loads.dimension + 8
+        numbers = 3 * math.prod(self.scene.problem.shape) + self.scene.loads.n_random + 8
         return HEADER + 8 * numbers * loads
 
     def opened(self, content: bytes) -> dict[str, Tensor]:
-        """Return the columns of a shard of this scene, see `dpl.data.storage.shard.opened`."""
+        """Return the columns of a shard of this scene, see `decode_shard`."""
         loads = self.scene.loads
         own = int(loads.poisson_range is not None)
-        return opened(content, self.scene.problem.shape, loads.dimension, own)
+        return decode_shard(content, self.scene.problem.shape, loads.n_random, own)
 
-    def reader(self, split: str) -> Callable[[int], Outcome | None]:
+    def reader(self, split: str) -> Callable[[int], SolvedLoad | None]:
         """Return what gives a split's loads one at a time, None for those not there at present."""
         lines = {
             index: line
@@ -217,20 +217,20 @@ class Store:
             if line["split"] == split
             for index in range(line["first"], line["first"] + line["tried"])
         }
-        spooled = self.spool.files()
+        spooled = self.pending.files()
         shard: dict[str, Tensor] = {}
         held: dict[str, Any] | None = None
 
-        def read(index: int) -> Outcome | None:
+        def read(index: int) -> SolvedLoad | None:
             nonlocal shard, held
             if (line := lines.get(index)) is None:
-                path = spooled.get(Job(self.stream(split), index))
+                path = spooled.get(LoadKey(self.stream(split), index))
                 with suppress(FileNotFoundError):  # it is in a shard by now
-                    return self.spool.get(path) if path else None
+                    return self.pending.get(path) if path else None
                 return None
             if held is not line:
                 shard, held = self._read(line), line
-            return taken(shard, Job(self.stream(split), index), line)
+            return select(shard, LoadKey(self.stream(split), index), line)
 
         return read
 
@@ -250,14 +250,14 @@ class Store:
         path = self.folder / MODES
         most = HEADER + 16 * sum(column.numel() for column in self.scene.loads.modes)
         try:
-            found = load(own_file(path, most))
+            found = load(read_regular_file(path, most))
             return Modes(found["values"], found["vectors"])
         except (FileNotFoundError, KeyError, SafetensorError, ValueError) as error:
             raise DataSetError(
                 f"{path} is damaged: {error}; scripts/generate.py action=repair makes it again"
             ) from None
 
-    def acceptance(self) -> list[balance.Bin]:
+    def acceptance(self) -> list[balance.AmplitudeBin]:
         """Return how many loads of each amplitude were accepted, all splits together."""
         amplitudes: list[float] = []
         accepted: list[bool] = []
@@ -265,7 +265,7 @@ class Store:
             rejected = {one["index"] for one in line["rejected"]}
             amplitudes += line["amplitudes"]
             accepted += [line["first"] + k not in rejected for k in range(line["tried"])]
-        return balance.bins(amplitudes, accepted)
+        return balance.amplitude_bins(amplitudes, accepted)
 
     def summary(self) -> str:
         """Return how many loads were tried and accepted, by split and by amplitude."""
@@ -278,7 +278,7 @@ class Store:
                 lines.append(
                     f"  {split}: {accepted} of {tried} loads accepted, {mean:.1f} Newton iterations"
                 )
-        lines += [f"  {row}" for row in balance.table(self.acceptance())]
+        lines += [f"  {row}" for row in balance.acceptance_table(self.acceptance())]
         sessions = self._sessions()
         if loads := sum(one["loads"] for one in sessions):
             core = sum(one["core_seconds"] for one in sessions) / loads
@@ -294,7 +294,7 @@ class Store:
         """Return the lines of the journal that say how long."""
         return [
             line
-            for line in read_lines(self.folder / "journal.jsonl")
+            for line in read_jsonl(self.folder / "journal.jsonl")
             if all(is_number(line.get(key)) for key in ("loads", "seconds", "core_seconds"))
         ]
 

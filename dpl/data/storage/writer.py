@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
-from dpl.data.solving.solve import Job, Outcome
-from dpl.data.solving.worker_pool import Stop, outcomes
+from dpl.data.solving.solve import LoadKey, SolvedLoad
+from dpl.data.solving.worker_pool import GracefulShutdown, solve_loads
 from dpl.data.storage.manifest import STREAMS, lines_of, place
-from dpl.data.storage.pending import sweep
-from dpl.data.storage.shard import closed
+from dpl.data.storage.pending import clean_partial_files
+from dpl.data.storage.shard import encode_shard
 from dpl.data.storage.store import FORMAT, MODES, Store, runs
-from dpl.system.files import append_line, sole_writer, write_file
+from dpl.system.files import append_jsonl, exclusive_lock, write_file
 from dpl.version import __version__
 
 
@@ -73,8 +73,8 @@ class Writer:
         *,
         workers: int,
         timeout: float | None = None,
-        stop: Stop | None = None,
-    ) -> Generator[Outcome, None, None]:
+        stop: GracefulShutdown | None = None,
+    ) -> Generator[SolvedLoad, None, None]:
         """Solve loads that are missing, by split; yield each as it is done.
 
         Each is kept in the spool as soon as it is solved; a shard is written when it is complete,
@@ -91,40 +91,40 @@ class Writer:
         """
         self.create()
         store = self.store
-        with sole_writer(store.folder, self.shard, self.shards):
-            sweep(store.folder)
-            spooled, tried = store.spool.files(), store.tried()
+        with exclusive_lock(store.folder, self.shard, self.shards):
+            clean_partial_files(store.folder)
+            spooled, tried = store.pending.files(), store.tried()
             for job in [*spooled]:
                 if job in tried:  # killed between writing its shard and removing it
                     spooled.pop(job).unlink(missing_ok=True)
             wanted = {
-                split: [i for i in indices if Job(store.stream(split), i) not in tried]
+                split: [i for i in indices if LoadKey(store.stream(split), i) not in tried]
                 for split, indices in missing.items()
             }
             files = [
-                [Job(store.stream(split), index) for index in run]
+                [LoadKey(store.stream(split), index) for index in run]
                 for split, indices in wanted.items()
                 for run in runs(indices)
             ]
             jobs = [job for file in files for job in file if job not in spooled]
             self._flush(files, spooled)
-            for one in outcomes(store.scene, jobs, workers=workers, timeout=timeout, stop=stop):
-                spooled[one.job] = store.spool.put(one)
+            for one in solve_loads(store.scene, jobs, workers=workers, timeout=timeout, stop=stop):
+                spooled[one.job] = store.pending.put(one)
                 yield one
                 self._flush(files, spooled)
             rewrite(self.manifest, lines_of(self.manifest))
             if self.shards == 1:
-                store.spool.tidy()
+                store.pending.clean()
 
-    def _split(self, job: Job) -> str:
+    def _split(self, job: LoadKey) -> str:
         return {self.store.stream(name): name for name in STREAMS}[job.seed]
 
-    def _flush(self, files: list[list[Job]], spooled: dict[Job, Path]) -> None:
+    def _flush(self, files: list[list[LoadKey]], spooled: dict[LoadKey, Path]) -> None:
         """Write the first shards that are complete; take them off both lists."""
         while files and all(job in spooled for job in files[0]):
             jobs = files.pop(0)
             paths = [spooled.pop(job) for job in jobs]
-            self._append([self.store.spool.get(path) for path in paths])
+            self._append([self.store.pending.get(path) for path in paths])
             for path in paths:
                 path.unlink()
 
@@ -135,22 +135,22 @@ class Writer:
             DataSetError: Another process writes there.
         """
         store = self.store
-        with sole_writer(store.folder, self.shard, self.shards):
-            spooled = store.spool.files()
+        with exclusive_lock(store.folder, self.shard, self.shards):
+            spooled = store.pending.files()
             mine = {job for job in spooled if job.seed == store.stream(split)}
             count = max((job.number for job in mine), default=-1) + 1
             found = runs(store.missing(split, count), whole=True)
-            files = [[Job(store.stream(split), index) for index in run] for run in found]
+            files = [[LoadKey(store.stream(split), index) for index in run] for run in found]
             self._flush([file for file in files if mine.issuperset(file)], spooled)
 
-    def _append(self, tried: Sequence[Outcome]) -> None:
+    def _append(self, tried: Sequence[SolvedLoad]) -> None:
         """Write one shard, then its line of the manifest."""
         split, first = self._split(tried[0].job), tried[0].job.number
         kept = [one for one in tried if one.accepted]
         name = f"{split}-{first:06d}.safetensors"
         scene, loads = self.store.scene, self.store.scene.loads
         poisson = None if loads.poisson_range is None else loads.poisson_at
-        content = closed(kept, scene.problem.shape, loads.dimension, poisson)
+        content = encode_shard(kept, scene.problem.shape, loads.n_random, poisson)
         write_file(self.store.folder / name, content)
         line = {
             "file": name,
@@ -167,7 +167,7 @@ class Writer:
                 if not one.accepted
             ],
         }
-        append_line(self.manifest, line)
+        append_jsonl(self.manifest, line)
 
 
 def rewrite(manifest: Path, lines: Sequence[dict[str, Any]]) -> None:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.fem.assembly.boundary_conditions import Displacement, Spring
+    from dpl.fem.assembly.boundary_conditions import DirichletBC, RobinBC
     from dpl.fem.assembly.elements import basis_of, gradients
     from dpl.fem.assembly.sparsity import Pattern
 else:

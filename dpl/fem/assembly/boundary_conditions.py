@@ -15,7 +15,7 @@ from dpl.fem.mesh.regions import Origin, Region, facets_in, nodes_in
 
 
 @dataclass(frozen=True)
-class Displacement:
+class DirichletBC:
     """Dirichlet condition u = g, ramped with the load.
 
     Attributes:
@@ -47,7 +47,7 @@ class Displacement:
 
 
 @dataclass(frozen=True)
-class Spring:
+class RobinBC:
     """Robin condition: a bed of springs that pulls with the traction -alpha u.
 
     Attributes:
@@ -59,8 +59,8 @@ class Spring:
     region: Region
     stiffness: float | Sequence[float]
 
-    def on(self, basis: skfem.Basis, scale: float, origin: Origin = 0.0) -> "Springs":
-        """Return the springs' matrix over E L^(D - 2), see `Displacement.on`.
+    def on(self, basis: skfem.Basis, scale: float, origin: Origin = 0.0) -> "FoundationMatrix":
+        """Return the springs' matrix over E L^(D - 2), see `DirichletBC.on`.
 
         Raises:
             ValueError: The region holds no boundary facet, or `stiffness` is out of range.
@@ -76,14 +76,14 @@ class Spring:
         boundary = skfem.FacetBasis(basis.mesh, basis.elem, facets=facets, intorder=4)
         mass = skfem.BilinearForm(lambda u, v, _: u * v).assemble(boundary).tocoo()
         linked = np.abs(mass.data) > 1e-14 * np.abs(mass.data).max()
-        return Springs(
+        return FoundationMatrix(
             torch.from_numpy(mass.row[linked].astype(np.int64)),
             torch.from_numpy(mass.col[linked].astype(np.int64)),
             torch.from_numpy(np.outer(mass.data[linked], stiffness * scale)),
         )
 
 
-class Springs(NamedTuple):
+class FoundationMatrix(NamedTuple):
     """Matrix of springs: one between each two linked nodes, per direction.
 
     Attributes:
@@ -101,15 +101,15 @@ class Springs(NamedTuple):
         return torch.zeros_like(displacement).index_add(1, self.rows, pull)
 
 
-Support = Displacement | Spring
+Support = DirichletBC | RobinBC
 
 
-def joined(springs: Sequence[Springs]) -> Springs | None:
+def concatenate_foundations(springs: Sequence[FoundationMatrix]) -> FoundationMatrix | None:
     """Return several beds as one, None if there are none."""
-    return Springs(*map(torch.cat, zip(*springs, strict=True))) if springs else None
+    return FoundationMatrix(*map(torch.cat, zip(*springs, strict=True))) if springs else None
 
 
-def held(
+def assemble_constraints(
     basis: skfem.Basis,
     scale: float,
     supports: Sequence[Support],
@@ -117,7 +117,7 @@ def held(
     origin: Origin = 0.0,
     fixed: Region | NDArray[np.bool_] | None = None,
     prescribed: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.float64], Springs | None]:
+) -> tuple[NDArray[np.float64], FoundationMatrix | None]:
     """Return g over `scale`, (N, D) [-], NaN where free, and the springs; arguments as in a build.
 
     Args:
@@ -140,7 +140,9 @@ def held(
         everywhere = np.broadcast_to(where[:, None] if where.ndim == 1 else where, shape)
         given = np.where(everywhere, 0.0 if prescribed is None else prescribed, np.nan)
     for support in supports:
-        if isinstance(support, Displacement):
+        if isinstance(support, DirichletBC):
             value = support.on(basis, scale, origin)
             given = np.where(np.isnan(value), given, value)
-    return given, joined([s.on(basis, scale, origin) for s in supports if isinstance(s, Spring)])
+    return given, concatenate_foundations(
+        [s.on(basis, scale, origin) for s in supports if isinstance(s, RobinBC)]
+    )

@@ -9,8 +9,8 @@ import math
 import numpy as np
 from numba import njit
 
-from dpl.fem.assembly.numba_laws import slopes_of
-from dpl.fem.assembly.simd import WIDTH, load, store
+from dpl.fem.assembly.numba_laws import derivatives_of
+from dpl.fem.assembly.simd import SIMD_WIDTH, load, store
 
 VOIGT = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2]])
 FIRST = np.array([0, 1, 2, 0, 1, 0])  # the two indices of each of the 6
@@ -79,12 +79,12 @@ def stress(law, c, needs, e, j, X, S, scratch, D, moduli):
         store(X, 5, (e3 * e4 - e5 - e1 * e5) * inverse)
     store(scratch, 0, j)
     if needs > 1:
-        for lane in range(WIDTH):
+        for lane in range(SIMD_WIDTH):
             scratch[0, lane] = math.log1p(scratch[0, lane])
             if needs > 2:
                 scratch[1, lane] = math.expm1(-2 / 3 * scratch[0, lane])
     i2 = 2.0 * i1 + second
-    slopes = slopes_of(law, c, i1, i2, j, load(scratch, 0), load(scratch, 1))
+    slopes = derivatives_of(law, c, i1, i2, j, load(scratch, 0), load(scratch, 1))
     rest, W2, p, W11, W12, W22, W1J, W2J, pJ = slopes
     pressure = rest + 2.0 * W2 * i1
     for v in range(6):

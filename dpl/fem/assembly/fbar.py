@@ -6,11 +6,11 @@ Source: Nagtegaal, Parks, Rice (1974), CMAME 4; Simo, Taylor, Pister (1985), CMA
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.material import Isotropic, Material
+from dpl.fem.materials.material import InvariantBasedMaterial, Material
 from dpl.fem.materials.tensors import inverse_transpose, volume_change
 
 
-def dilated(material: Material, H: Tensor, dV: Tensor, dim: int) -> Tensor:
+def fbar_gradient(material: Material, H: Tensor, dV: Tensor, dim: int) -> Tensor:
     """Return the displacement gradient that a law sees, (B, E, Q, 3, 3) [-].
 
     Args:
@@ -24,7 +24,7 @@ def dilated(material: Material, H: Tensor, dV: Tensor, dim: int) -> Tensor:
 
 def finite(material: Material) -> bool:
     """Return whether a law is one of finite strain."""
-    return not isinstance(material, Isotropic) or material.finite
+    return not isinstance(material, InvariantBasedMaterial) or material.finite
 
 
 def _swollen(H: Tensor, dV: Tensor, dim: int) -> Tensor:
@@ -52,8 +52,8 @@ def _grown(H: Tensor, dV: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
     return H + growth[..., None, None] * F, 1 + growth, plane
 
 
-def dilated_stress(material: Material, H: Tensor, dV: Tensor, dim: int) -> Tensor:
-    """Return the stress that does work on H, (B, E, Q, 3, 3) [-]; arguments as in `dilated`."""
+def fbar_stress(material: Material, H: Tensor, dV: Tensor, dim: int) -> Tensor:
+    """Return the stress that does work on H, (B, E, Q, 3, 3) [-]; see `fbar_gradient`."""
     if not finite(material):
         stress = material.stress(_swollen(H, dV, dim))
         return _swollen(stress, dV, dim)  # the average is its own adjoint

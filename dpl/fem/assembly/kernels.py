@@ -18,9 +18,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from dpl.fem.assembly import constitutive_kernels, numba_laws, simd
-from dpl.fem.assembly.numba_laws import Law, needed
-from dpl.fem.assembly.simd import WIDTH, load, sqrt, store
-from dpl.fem.materials.material import Isotropic
+from dpl.fem.assembly.numba_laws import Law, required_terms
+from dpl.fem.assembly.simd import SIMD_WIDTH, load, sqrt, store
+from dpl.fem.materials.material import InvariantBasedMaterial
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ _SOURCES = "".join(
 @njit
 def _gather(field, cells, start, count, out):
     """Copy a nodal field (N, D) to rows 3 a + i of `out`, a cell in each lane."""
-    for lane in range(WIDTH):
+    for lane in range(SIMD_WIDTH):
         cell = start + min(lane, count - 1)
         for a in range(cells.shape[1]):
             for i in range(field.shape[1]):
@@ -47,10 +47,10 @@ def _shape(dN, dV, start, count, g, weight):
     Equal cells share one set, which is copied for the first block and for one that is not full.
     """
     several = dN.shape[0] > 1
-    if not several and start > 0 and count == WIDTH:
+    if not several and start > 0 and count == SIMD_WIDTH:
         return
     for q in range(dN.shape[1]):
-        for lane in range(WIDTH):
+        for lane in range(SIMD_WIDTH):
             cell = start + min(lane, count - 1) if several else 0
             weight[q, lane] = dV[cell, q] if lane < count else 0.0
             for a in range(dN.shape[2]):
@@ -134,12 +134,16 @@ def _scatter(fe, cells, start, count, force):
 def _force(law, c, needs, finite, u, cells, dN, dV, force):
     """Add the internal force of displacements u (N, D) to force (N, D); return min det F - 1."""
     rows, Q = 3 * cells.shape[1], dN.shape[1]
-    ue, fe, g = np.zeros((rows, WIDTH)), np.zeros((rows, WIDTH)), np.zeros((Q, rows, WIDTH))
-    H, P, D = np.zeros((9, WIDTH)), np.zeros((9, WIDTH)), np.zeros((36, WIDTH))
-    e, X, S = np.zeros((6, WIDTH)), np.zeros((6, WIDTH)), np.zeros((6, WIDTH))
-    weight, scratch, low = np.zeros((Q, WIDTH)), np.zeros((26, WIDTH)), np.inf
-    for start in range(0, len(cells), WIDTH):
-        count = min(WIDTH, len(cells) - start)
+    ue, fe, g = (
+        np.zeros((rows, SIMD_WIDTH)),
+        np.zeros((rows, SIMD_WIDTH)),
+        np.zeros((Q, rows, SIMD_WIDTH)),
+    )
+    H, P, D = np.zeros((9, SIMD_WIDTH)), np.zeros((9, SIMD_WIDTH)), np.zeros((36, SIMD_WIDTH))
+    e, X, S = np.zeros((6, SIMD_WIDTH)), np.zeros((6, SIMD_WIDTH)), np.zeros((6, SIMD_WIDTH))
+    weight, scratch, low = np.zeros((Q, SIMD_WIDTH)), np.zeros((26, SIMD_WIDTH)), np.inf
+    for start in range(0, len(cells), SIMD_WIDTH):
+        count = min(SIMD_WIDTH, len(cells) - start)
         _gather(u, cells, start, count, ue)
         _shape(dN, dV, start, count, g, weight)
         fe[:] = 0.0
@@ -166,18 +170,26 @@ def _system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values)
     without a gap.
     """
     n, Q, dim = cells.shape[1], dN.shape[1], dN.shape[3]
-    ue, fe, g = np.zeros((3 * n, WIDTH)), np.zeros((3 * n, WIDTH)), np.zeros((Q, 3 * n, WIDTH))
-    H, P, D = np.zeros((9, WIDTH)), np.zeros((9, WIDTH)), np.zeros((36, WIDTH))
-    e, X, S, T = (
-        np.zeros((6, WIDTH)),
-        np.zeros((6, WIDTH)),
-        np.zeros((6, WIDTH)),
-        np.zeros((6, WIDTH)),
+    ue, fe, g = (
+        np.zeros((3 * n, SIMD_WIDTH)),
+        np.zeros((3 * n, SIMD_WIDTH)),
+        np.zeros((Q, 3 * n, SIMD_WIDTH)),
     )
-    A, C, K = np.zeros((81, WIDTH)), np.zeros((27, WIDTH)), np.zeros((places.shape[1], WIDTH))
-    weight, scratch, low = np.zeros((Q, WIDTH)), np.zeros((26, WIDTH)), np.inf
-    for start in range(0, len(cells), WIDTH):
-        block, count = start // WIDTH, min(WIDTH, len(cells) - start)
+    H, P, D = np.zeros((9, SIMD_WIDTH)), np.zeros((9, SIMD_WIDTH)), np.zeros((36, SIMD_WIDTH))
+    e, X, S, T = (
+        np.zeros((6, SIMD_WIDTH)),
+        np.zeros((6, SIMD_WIDTH)),
+        np.zeros((6, SIMD_WIDTH)),
+        np.zeros((6, SIMD_WIDTH)),
+    )
+    A, C, K = (
+        np.zeros((81, SIMD_WIDTH)),
+        np.zeros((27, SIMD_WIDTH)),
+        np.zeros((places.shape[1], SIMD_WIDTH)),
+    )
+    weight, scratch, low = np.zeros((Q, SIMD_WIDTH)), np.zeros((26, SIMD_WIDTH)), np.inf
+    for start in range(0, len(cells), SIMD_WIDTH):
+        block, count = start // SIMD_WIDTH, min(SIMD_WIDTH, len(cells) - start)
         _gather(u, cells, start, count, ue)
         _shape(dN, dV, start, count, g, weight)
         fe[:] = 0.0
@@ -218,11 +230,11 @@ def _system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values)
 def _widen(law, gap, length, update, cells, dN, dV):
     """Return (1 - length) gap + length^2 dH^T dH, (blocks, Q, 6, WIDTH), of a step (N, D)."""
     rows, Q = 3 * cells.shape[1], dN.shape[1]
-    wider = np.zeros((-(-len(cells) // WIDTH), Q, 6, WIDTH))
-    ue, g = np.zeros((rows, WIDTH)), np.zeros((Q, rows, WIDTH))
-    H, weight = np.zeros((9, WIDTH)), np.zeros((Q, WIDTH))
-    for start in range(0, len(cells), WIDTH):
-        block, count = start // WIDTH, min(WIDTH, len(cells) - start)
+    wider = np.zeros((-(-len(cells) // SIMD_WIDTH), Q, 6, SIMD_WIDTH))
+    ue, g = np.zeros((rows, SIMD_WIDTH)), np.zeros((Q, rows, SIMD_WIDTH))
+    H, weight = np.zeros((9, SIMD_WIDTH)), np.zeros((Q, SIMD_WIDTH))
+    for start in range(0, len(cells), SIMD_WIDTH):
+        block, count = start // SIMD_WIDTH, min(SIMD_WIDTH, len(cells) - start)
         _gather(update, cells, start, count, ue)
         _shape(dN, dV, start, count, g, weight)
         for q in range(Q):
@@ -248,7 +260,7 @@ class Kernels:
 
     def __init__(
         self,
-        material: Isotropic,
+        material: InvariantBasedMaterial,
         cells: NDArray[np.int64],
         dN: Array,
         dV: Array,
@@ -259,13 +271,13 @@ class Kernels:
         self.places = _in_blocks(places)
         self._law = (
             Law(type(material), _SOURCES),
-            needed(material),
+            required_terms(material),
             float(material.finite),
         )
         self._constants = np.array([material.constants])  # (1 or B, constants)
-        self._nothing = np.zeros((0, 0, 0, WIDTH))
+        self._nothing = np.zeros((0, 0, 0, SIMD_WIDTH))
 
-    def under(self, material: Isotropic) -> "Kernels":
+    def under(self, material: InvariantBasedMaterial) -> "Kernels":
         """Return the loops of the same body with other moduli of the same law."""
         twin = copy.copy(self)
         constants = np.broadcast_arrays(*(np.ravel(c) for c in material.constants))
@@ -299,7 +311,7 @@ class Kernels:
         moduli = self._constants[0]
         return 1 + self._call(_system, law, moduli, needs, finite, u, gap, *arrays, out, values)
 
-    def widened(self, gap: Array | None, length: float, update: Array) -> Array:
+    def update_strain_gap(self, gap: Array | None, length: float, update: Array) -> Array:
         """Return the gap between the strain of u and that of mixed points after a step."""
         gap = self._nothing if gap is None else gap
         law, *_ = self._law
@@ -341,7 +353,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 def _in_blocks(places: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return (E, entries) as (blocks, entries, WIDTH)."""
-    blocks = -(-len(places) // WIDTH)
-    padded = np.zeros((blocks * WIDTH, places.shape[1]), dtype=np.int32)
+    blocks = -(-len(places) // SIMD_WIDTH)
+    padded = np.zeros((blocks * SIMD_WIDTH, places.shape[1]), dtype=np.int32)
     padded[: len(places)] = places
-    return np.ascontiguousarray(padded.reshape(blocks, WIDTH, -1).transpose(0, 2, 1))
+    return np.ascontiguousarray(padded.reshape(blocks, SIMD_WIDTH, -1).transpose(0, 2, 1))

@@ -17,7 +17,7 @@ from numba.extending import (
     unbox,
 )
 
-from dpl.fem.materials.material import Isotropic
+from dpl.fem.materials.material import InvariantBasedMaterial
 
 
 class _LawType(types.Type):
@@ -40,27 +40,27 @@ class Law:
         sources: The code of the kernel, for the digest.
     """
 
-    material: type[Isotropic]
+    material: type[InvariantBasedMaterial]
     sources: str
 
     @cached_property
     def kind(self) -> _LawType:
         """The law's type in numba."""
-        slopes = self.material.slopes
-        code = repr(_read(slopes)) + self.sources
+        invariant_derivatives = self.material.invariant_derivatives
+        code = repr(_read(invariant_derivatives)) + self.sources
         digest = hashlib.sha256(code.encode()).hexdigest()[:16]
         name = f"{self.material.__qualname__}{digest}"
         if name not in _SLOPES:
-            _SLOPES[name] = _jitted(slopes)
+            _SLOPES[name] = _jitted(invariant_derivatives)
         return _LawType(name)
 
 
-def needed(material: Isotropic) -> int:
+def required_terms(material: InvariantBasedMaterial) -> int:
     """Return what a law's slopes read: 0 nothing of C^-1, 1 no ln J, 2 ln J, 3 J^(-2/3) too."""
 
     def read(**values: float) -> tuple[float, ...]:
         arguments = dict.fromkeys(("i1", "i2", "j", "log_j", "m1"), 0.0) | values
-        return material.slopes(material.constants, **arguments)
+        return material.invariant_derivatives(material.constants, **arguments)
 
     if np.isnan(read(m1=np.nan)).any():
         return 3
@@ -110,11 +110,11 @@ def _unbox_law(kind: Any, value: Any, context: Any) -> NativeValue:
     return NativeValue(context.context.get_dummy_value())
 
 
-def slopes_of(law, c, i1, i2, j, log_j, m1):
+def derivatives_of(law, c, i1, i2, j, log_j, m1):
     raise NotImplementedError
 
 
-@overload(slopes_of)
+@overload(derivatives_of)
 def _overloaded(law, c, i1, i2, j, log_j, m1):
     function = _SLOPES[law.name]
     return lambda law, c, i1, i2, j, log_j, m1: function(c, i1, i2, j, log_j, m1)

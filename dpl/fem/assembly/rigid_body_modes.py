@@ -5,10 +5,10 @@ import torch
 from scipy.linalg import qr
 from torch import Tensor
 
-from dpl.fem.assembly.boundary_conditions import Springs
+from dpl.fem.assembly.boundary_conditions import FoundationMatrix
 
 
-def rigid_motions(points: Tensor) -> tuple[Tensor, list[str]]:
+def rigid_body_modes(points: Tensor) -> tuple[Tensor, list[str]]:
     """Return the rigid motions (N, D, 3 in 2D or 6) of points (N, D) about their centre, named."""
     points = points - points.mean(dim=0)
     dim = points.shape[1]
@@ -24,7 +24,9 @@ def rigid_motions(points: Tensor) -> tuple[Tensor, list[str]]:
     return torch.stack(motions, dim=-1), names
 
 
-def loose_motions(points: Tensor, free: Tensor, springs: Springs | None) -> list[str]:
+def unconstrained_modes(
+    points: Tensor, free: Tensor, springs: FoundationMatrix | None
+) -> list[str]:
     """Return the names of the rigid motions that supports leave free; none of them if held.
 
     Args:
@@ -32,7 +34,7 @@ def loose_motions(points: Tensor, free: Tensor, springs: Springs | None) -> list
         free: Degrees of freedom that may move, (N, D).
         springs: Those that hold it besides.
     """
-    motions, names = rigid_motions(points)
+    motions, names = rigid_body_modes(points)
     grip = motions[~free].numpy()  # (held, motions)
     held = grip.T @ grip
     if springs is not None:

@@ -1,7 +1,7 @@
 """Vectors of doubles as a number type for numba: one operation on WIDTH cells at once.
 
 LLVM does not vectorise loops over cells by itself here: it cannot know that workspaces do not
-overlap. A value of type `Lanes` is a vector register; `load` and `store` move rows of arrays
+overlap. A value of type `SIMDVector` is a vector register; `load` and `store` move rows of arrays
 (rows, WIDTH), and + - * / work on lanes and on numbers.
 """
 
@@ -13,23 +13,23 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, models, overload, register_model
 
-WIDTH = 8 if llvm.get_host_cpu_features().get("avx512f") else 4
-_VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
+SIMD_WIDTH = 8 if llvm.get_host_cpu_features().get("avx512f") else 4
+_VECTOR = ir.VectorType(ir.DoubleType(), SIMD_WIDTH)
 _FLAGS = ("contract", "reassoc", "nsz")  # fused multiply-adds; NaN and infinity stay themselves
 
 
-class Lanes(types.Type):
+class SIMDVector(types.Type):
     """numba's type of a vector register."""
 
     def __init__(self) -> None:
         """Name it."""
-        super().__init__(name=f"Lanes({WIDTH})")
+        super().__init__(name=f"Lanes({SIMD_WIDTH})")
 
 
-LANES = Lanes()
+SIMD_VECTOR = SIMDVector()
 
 
-@register_model(Lanes)
+@register_model(SIMDVector)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _VECTOR)
@@ -38,7 +38,7 @@ class _LanesModel(models.PrimitiveModel):
 def _pointer(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     array = context.make_array(signature.args[0])(context, builder, args[0])
     row = context.cast(builder, args[1], signature.args[1], types.intp)
-    first = builder.mul(row, ir.Constant(row.type, WIDTH))
+    first = builder.mul(row, ir.Constant(row.type, SIMD_WIDTH))
     return builder.bitcast(builder.gep(array.data, [first]), _VECTOR.as_pointer())
 
 
@@ -51,7 +51,7 @@ def load(typing: Any, array: Any, row: Any) -> Any:
         value.align = 8
         return value
 
-    return LANES(array, row), code
+    return SIMD_VECTOR(array, row), code
 
 
 @intrinsic
@@ -72,20 +72,20 @@ def sqrt(typing: Any, x: Any) -> Any:
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         kind = ir.FunctionType(_VECTOR, [_VECTOR])
-        name = f"llvm.sqrt.v{WIDTH}f64"
+        name = f"llvm.sqrt.v{SIMD_WIDTH}f64"
         return builder.call(builder.module.declare_intrinsic(name, (), kind), args)
 
-    return LANES(x), code
+    return SIMD_VECTOR(x), code
 
 
 def _lanes(context: Any, builder: Any, value: Any, kind: Any) -> Any:
     """Return a value as lanes; a number in each of them."""
-    if isinstance(kind, Lanes):
+    if isinstance(kind, SIMDVector):
         return value
     nothing = ir.Constant(_VECTOR, ir.Undefined)
     number = context.cast(builder, value, kind, types.float64)
     first = builder.insert_element(nothing, number, ir.Constant(ir.IntType(32), 0))
-    everywhere = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
+    everywhere = ir.Constant(ir.VectorType(ir.IntType(32), SIMD_WIDTH), [0] * SIMD_WIDTH)
     return builder.shuffle_vector(first, nothing, everywhere)
 
 
@@ -97,13 +97,13 @@ def _operator(function: Any, instruction: str) -> None:
             lanes = [_lanes(context, builder, value, kind) for value, kind in pair]
             return getattr(builder, instruction)(*lanes, flags=_FLAGS)
 
-        return LANES(x, y), code
+        return SIMD_VECTOR(x, y), code
 
     @overload(function)
     def of(x, y):
-        kinds = (types.Float, types.Integer, Lanes)
+        kinds = (types.Float, types.Integer, SIMDVector)
         both = isinstance(x, kinds) and isinstance(y, kinds)
-        if both and (isinstance(x, Lanes) or isinstance(y, Lanes)):
+        if both and (isinstance(x, SIMDVector) or isinstance(y, SIMDVector)):
             return lambda x, y: apply(x, y)
         return None
 
@@ -119,6 +119,6 @@ for _function, _instruction in (
 
 @overload(operator.neg)
 def _negative(x):
-    if isinstance(x, Lanes):
+    if isinstance(x, SIMDVector):
         return lambda x: 0.0 - x
     return None

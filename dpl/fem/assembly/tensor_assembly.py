@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.assembly.boundary_conditions import Springs
+from dpl.fem.assembly.boundary_conditions import FoundationMatrix
 from dpl.fem.assembly.elements import basis_of
-from dpl.fem.assembly.fbar import dilated, dilated_stress
-from dpl.fem.assembly.rigid_body_modes import loose_motions, rigid_motions
+from dpl.fem.assembly.fbar import fbar_gradient, fbar_stress
+from dpl.fem.assembly.rigid_body_modes import rigid_body_modes, unconstrained_modes
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.material import Material
 from dpl.fem.materials.tensors import green_lagrange, volume_change
@@ -57,7 +57,7 @@ class Body:
     free: Tensor
     prescribed: Tensor
     boundary: Tensor
-    springs: Springs | None = None
+    springs: FoundationMatrix | None = None
     mean_dilatation: bool = False
 
     def to(self, device: torch.device | str) -> Self:
@@ -68,7 +68,7 @@ class Body:
             if isinstance(value := getattr(self, field.name), Tensor)
         }
         if self.springs is not None:
-            tensors["springs"] = Springs(*(part.to(device) for part in self.springs))
+            tensors["springs"] = FoundationMatrix(*(part.to(device) for part in self.springs))
         return replace(self, **tensors)
 
     def __getstate__(self) -> dict[str, object]:
@@ -96,24 +96,24 @@ class Body:
         return len(self.dN) == 1
 
     @property
-    def mixes(self) -> bool:
+    def supports_mip(self) -> bool:
         """Whether the strains of its points can be unknowns of their own, see `mixed_system`."""
         return self.material.has_response and not self.mean_dilatation
 
     @property
     def near_null(self) -> NDArray[np.float64]:
         """Fields that cost no energy were nothing held: rigid motions where free, (n, k)."""
-        return rigid_motions(self.points)[0][self.free].numpy()
+        return rigid_body_modes(self.points)[0][self.free].numpy()
 
-    def loose_modes(self) -> list[str]:
+    def unconstrained_rigid_body_modes(self) -> list[str]:
         """Return the rigid motions that the supports leave free, named; none of them if held."""
-        return loose_motions(self.points, self.free, self.springs)
+        return unconstrained_modes(self.points, self.free, self.springs)
 
     def energy(self, displacement: Tensor) -> Tensor:
         """Return the strain energy over E L^D, that of springs included, (B,) [-]."""
         H = self.gradient(displacement)
         if self.mean_dilatation:
-            H = dilated(self.material, H, self.dV, self.shape[1])
+            H = fbar_gradient(self.material, H, self.dV, self.shape[1])
         energy = (self.material.energy(H) * self.dV).sum((-2, -1))
         if self.springs is not None:
             pull = self.springs.force(displacement)
@@ -136,7 +136,7 @@ class Body:
         """Return the Green-Lagrange strain at the quadrature points, (B, E, Q, 3, 3) [-]."""
         return green_lagrange(self.gradient(displacement))
 
-    def bending(self, update: Tensor) -> Tensor:
+    def quadratic_strain(self, update: Tensor) -> Tensor:
         """Return what a step's strain is beyond linear, dH^T dH / 2, (B, E, Q, 3, 3) [-]."""
         dH = self.gradient(update)
         return dH.mT @ dH / 2
@@ -169,7 +169,7 @@ class Body:
         """Return the first Piola-Kirchhoff stress over E at the quadrature points, (B,E,Q,3,3)."""
         H = self.gradient(displacement)
         if self.mean_dilatation:
-            H = dilated(self.material, H, self.dV, self.shape[1])
+            H = fbar_gradient(self.material, H, self.dV, self.shape[1])
         return self.material.stress(H)
 
     @cached_property
@@ -230,7 +230,7 @@ class Body:
         """Return the stress that does work on H, (B, E, Q, 3, 3) [-]."""
         if not self.mean_dilatation:
             return self.material.stress(H)
-        return dilated_stress(self.material, H, self.dV, self.shape[1])
+        return fbar_stress(self.material, H, self.dV, self.shape[1])
 
     def _cell_tangents(self, displacement: Tensor) -> Tensor:
         """Return the cell matrices (B, E A D D A), laid out aikb, by derivatives of cell forces."""

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.fem.linear.backends import BACKENDS, backend, chosen, installed
-    from dpl.fem.linear.banded import Band, Band32
+    from dpl.fem.linear.backends import BACKENDS, installed_backends, make_backend, select_backend
+    from dpl.fem.linear.banded import BandedCholesky, MixedPrecisionBandedCholesky
     from dpl.fem.linear.interface import (
         Backend,
         Factor,

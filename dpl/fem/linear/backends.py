@@ -6,7 +6,7 @@ The symbolic work (ordering, structure) is done once per backend object, the num
 import importlib.util
 from collections.abc import Callable
 
-from dpl.fem.linear.banded import Band, Band32, band_layout
+from dpl.fem.linear.banded import BandedCholesky, MixedPrecisionBandedCholesky, band_storage
 from dpl.fem.linear.interface import (
     Array,
     Backend,
@@ -18,32 +18,32 @@ from dpl.fem.linear.superlu import SuperLU
 from dpl.version import install
 
 
-def installed() -> list[str]:
+def installed_backends() -> list[str]:
     """Return the names of the backends that can be used here."""
     missing = set() if importlib.util.find_spec("pypardiso") else {"pardiso"}
     return [name for name in BACKENDS if name not in missing]
 
 
-def backend(pattern: Pattern, name: str = "auto", near_null: Array | None = None) -> Backend:
+def make_backend(pattern: Pattern, name: str = "auto", near_null: Array | None = None) -> Backend:
     """Return a backend for matrices of a pattern.
 
     Args:
         pattern: Structure of the matrices.
-        name: "band", "band32", "pardiso", "superlu", "cg", or "auto", see `chosen`.
+        name: "band", "band32", "pardiso", "superlu", "cg", or "auto", see `select_backend`.
         near_null: Fields that cost no energy, (n, k), see `Body.near_null`; "cg" wants them.
 
     Raises:
         ValueError: No such backend, or it is not installed.
     """
-    return BACKENDS[chosen(name, pattern, near_null)](pattern, near_null)
+    return BACKENDS[select_backend(name, pattern, near_null)](pattern, near_null)
 
 
-def chosen(
+def select_backend(
     name: str,
     pattern: Pattern | None = None,
     near_null: Array | None = None,
     *,
-    lasting: bool = False,
+    many_rhs: bool = False,
 ) -> str:
     """Return the name of the backend that a name stands for.
 
@@ -51,7 +51,7 @@ def chosen(
     where no pattern is given.
 
     Args:
-        name: As for `backend`.
+        name: As for `make_backend`.
         pattern: Structure of the matrices.
         near_null: Fields that cost no energy, (n, k), see `Body.near_null`.
         lasting: One factor is to answer many right-hand sides: it may cost more if they cost less.
@@ -61,41 +61,43 @@ def chosen(
     """
     if name not in (*BACKENDS, "auto"):
         raise ValueError(f"linear = {name!r} must be auto, {', '.join(BACKENDS)}")
-    if name != "auto" and name not in installed():
+    if name != "auto" and name not in installed_backends():
         raise ValueError(f"linear = {name!r} is not installed: {install(name)}")
-    return name if name != "auto" or pattern is None else _automatic(pattern, near_null, lasting)
+    return name if name != "auto" or pattern is None else _automatic(pattern, near_null, many_rhs)
 
 
 # Measured on beams, cubes, stars, plates of 1,000 to 100,000 degrees of freedom: a band costs n b^2
 # operations, a sparse factor of a solid about n^2 slower ones, so b^2 / n decides.
-PAYS = {"pardiso": 22, "superlu": 100, "cg": 10}  # b^2 / n below which a band is faster
+BAND_COST_RATIO = {"pardiso": 22, "superlu": 100, "cg": 10}  # b^2 / n below which a band is faster
 MULTIGRID = {"pardiso": 100_000, "superlu": 30_000}  # n from which on multigrid is faster
-LASTING = 3.0  # times that where one factor answers many right-hand sides: it must fit in memory
-WIDE = 250  # b from which on float32 saves more than the iterations on it cost
+MANY_RHS_FACTOR = (
+    3.0  # times that where one factor answers many right-hand sides: it must fit in memory
+)
+FLOAT32_BANDWIDTH = 250  # b from which on float32 saves more than the iterations on it cost
 
 
-def _automatic(pattern: Pattern, near_null: Array | None, lasting: bool) -> str:
-    names = installed()
+def _automatic(pattern: Pattern, near_null: Array | None, many_rhs: bool) -> str:
+    names = installed_backends()
     sparse = "pardiso" if "pardiso" in names else "superlu"
     multigrid = "cg" in names and near_null is not None and multigrid_installed()
-    large = MULTIGRID[sparse] * (LASTING if lasting else 1)
+    large = MULTIGRID[sparse] * (MANY_RHS_FACTOR if many_rhs else 1)
     best = "cg" if multigrid and pattern.size > large else sparse
     if "band" in names:
-        half = band_layout(pattern).half
-        if half**2 < PAYS[best] * pattern.size:
+        half = band_storage(pattern).half
+        if half**2 < BAND_COST_RATIO[best] * pattern.size:
             # In float32 factorising is faster, a solve to all digits is not.
-            return "band32" if half >= WIDE and not lasting else "band"
+            return "band32" if half >= FLOAT32_BANDWIDTH and not many_rhs else "band"
     return best
 
 
 def _indefinite(pattern: Pattern) -> Backend:
     """Return the best backend for matrices that are not positive definite."""
-    return Pardiso(pattern) if "pardiso" in installed() else SuperLU(pattern)
+    return Pardiso(pattern) if "pardiso" in installed_backends() else SuperLU(pattern)
 
 
 BACKENDS: dict[str, Callable[[Pattern, Array | None], Backend]] = {
-    "band": lambda pattern, near_null: Band(pattern, _indefinite),
-    "band32": lambda pattern, near_null: Band32(pattern, _indefinite),
+    "band": lambda pattern, near_null: BandedCholesky(pattern, _indefinite),
+    "band32": lambda pattern, near_null: MixedPrecisionBandedCholesky(pattern, _indefinite),
     "pardiso": lambda pattern, near_null: Pardiso(pattern),
     "superlu": lambda pattern, near_null: SuperLU(pattern),
     "cg": CG,

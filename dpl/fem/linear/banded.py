@@ -24,11 +24,11 @@ from dpl.fem.linear.interface import (
     row_numbers,
 )
 from dpl.fem.linear.krylov import conjugate_gradients
-from dpl.fem.linear.ordering import narrow
+from dpl.fem.linear.ordering import reduce_bandwidth
 from dpl.system.threads import blas
 
 
-class Layout(NamedTuple):
+class BandStorage(NamedTuple):
     """Where a pattern's entries lie in the storage of a band, (n, half + 1), row after row.
 
     Row j holds the lower triangle's column j from the diagonal down, as LAPACK wants it.
@@ -44,7 +44,7 @@ class Layout(NamedTuple):
     place: NDArray[np.intp]
 
 
-def band_layout(pattern: Pattern, sweeps: int = 50) -> Layout:
+def band_storage(pattern: Pattern, sweeps: int = 50) -> BandStorage:
     """Return the layout in the pattern's own order or in a new one, whichever is narrower.
 
     Reverse Cuthill-McKee (George 1971), then sweeps in which each unknown moves to the middle of
@@ -56,7 +56,7 @@ def band_layout(pattern: Pattern, sweeps: int = 50) -> Layout:
     ones = np.ones(len(rows), dtype=np.int8)
     upper = csr_matrix((ones, columns, pattern.indptr), shape=(n, n))
     graph = upper + upper.T
-    trial, idle = narrow(graph), 0
+    trial, idle = reduce_bandwidth(graph), 0
     for _ in range(sweeps):
         rank = _inverse(trial)
         neighbours = rank[graph.indices]
@@ -73,7 +73,7 @@ def band_layout(pattern: Pattern, sweeps: int = 50) -> Layout:
         rank = _inverse(order)
         rows, columns = rank[rows], rank[columns]
     column = np.minimum(rows, columns).astype(np.intp)
-    return Layout(order, half, column * half + np.maximum(rows, columns))
+    return BandStorage(order, half, column * half + np.maximum(rows, columns))
 
 
 def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -90,14 +90,14 @@ def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
     cache=True,
     fastmath={"reassoc", "contract"},  # sums in vector registers, one for each lane
 )
-def substituted(L, right):  # type: ignore[no-untyped-def]
+def banded_triangular_solve(L, right):  # type: ignore[no-untyped-def]
     """Return x, (n,), with L L^T x = right, four columns of L at a time.
 
     LAPACK's xPBTRS calls xTBSV, which calls a vector operation for each column and reads and writes
     the answer each time; this does so once for four.
 
     Args:
-        L: See `Cholesky`; zero where a column ends below the last row.
+        L: See `BandedFactor`; zero where a column ends below the last row.
         right: (n,), of the same dtype.
     """
     n, w = L.shape
@@ -153,12 +153,12 @@ def substituted(L, right):  # type: ignore[no-untyped-def]
 
 
 @dataclass(frozen=True, eq=False)
-class Cholesky:
+class BandedFactor:
     """Banded Cholesky factor; in float64 it is a backend's factor as it is.
 
     Attributes:
-        storage: L, (n, b + 1), see `Layout`.
-        order: See `Layout`.
+        storage: L, (n, b + 1), see `BandStorage`.
+        order: See `BandStorage`.
         negative_pivots: 0.
     """
 
@@ -169,7 +169,9 @@ class Cholesky:
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right, to the rounding of the storage."""
         ordered = right if self.order is None else right[self.order]
-        answer = substituted(self.storage, np.ascontiguousarray(ordered, self.storage.dtype))
+        answer = banded_triangular_solve(
+            self.storage, np.ascontiguousarray(ordered, self.storage.dtype)
+        )
         x = np.empty_like(right)
         x[slice(None) if self.order is None else self.order] = answer
         return x
@@ -178,12 +180,12 @@ class Cholesky:
         """Return `solve`."""
         return self.solve(right)
 
-    def rounded(self) -> "Cholesky":
+    def to_float32(self) -> "BandedFactor":
         """Return the factor in float32, half as long to read."""
         return replace(self, storage=self.storage.astype(np.float32))
 
 
-class Band:
+class BandedCholesky:
     """Banded Cholesky in float64; a matrix that is not positive definite goes to another backend.
 
     Source: Anderson et al. (1999), LAPACK Users' Guide, xPBTRF.
@@ -200,16 +202,16 @@ class Band:
         """
         self.pattern, self.indefinite = pattern, indefinite
         self._storage: NDArray[Any] | None = None
-        self._last: Callable[[], Cholesky | None] = lambda: None
+        self._last: Callable[[], BandedFactor | None] = lambda: None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle without storage."""
         return type(self), (self.pattern, self.indefinite)
 
     @cached_property
-    def layout(self) -> Layout:
+    def layout(self) -> BandStorage:
         """Order and places, found once."""
-        return band_layout(self.pattern)
+        return band_storage(self.pattern)
 
     @cached_property
     def other(self) -> Backend:
@@ -221,7 +223,7 @@ class Band:
         require_finite(values)
         return self._cholesky(values) or self.other.factorise(values)
 
-    def _cholesky(self, values: Array) -> Cholesky | None:
+    def _cholesky(self, values: Array) -> BandedFactor | None:
         """Return the factor; None: not positive definite, or not for sure."""
         layout = self.layout
         if self._storage is None or self._last() is not None:  # a living factor keeps its storage
@@ -235,17 +237,17 @@ class Band:
             lower, info = factorise(storage.T, lower=1, overwrite_ab=1)
         if info or (storage[:, 0] ** 2 <= 4 * np.finfo(self.dtype).eps * diagonal).any():
             return None
-        factor = Cholesky(lower.T, layout.order)
+        factor = BandedFactor(lower.T, layout.order)
         self._last = weakref.ref(factor)
         return factor
 
 
-class Band32(Band):
+class MixedPrecisionBandedCholesky(BandedCholesky):
     """Banded Cholesky in float32 as preconditioner of conjugate gradients in float64.
 
-    Half the time and memory of `Band`, which takes over where float32 does not do. Diagonal
-    scaling would save nothing: what Cholesky loses to rounding does not depend on it (Demmel
-    1989), and float32 holds stiffnesses 70 orders of magnitude apart.
+    Half the time and memory of `BandedCholesky`, which takes over where float32 does not do.
+    Diagonal scaling would save nothing: what Cholesky loses to rounding does not depend on it
+    (Demmel 1989), and float32 holds stiffnesses 70 orders of magnitude apart.
     """
 
     dtype = np.float32
@@ -253,7 +255,7 @@ class Band32(Band):
     @cached_property
     def other(self) -> Backend:
         """The same in float64."""
-        exact = Band(self.pattern, self.indefinite)
+        exact = BandedCholesky(self.pattern, self.indefinite)
         exact.__dict__["layout"] = self.layout
         return exact
 
@@ -268,10 +270,10 @@ class Band32(Band):
             rough = self._cholesky(values / scale)
         if rough is None:
             return self.other.factorise(values)
-        return Band32Factor(self, values.copy(), rough, scale)
+        return MixedPrecisionFactor(self, values.copy(), rough, scale)
 
 
-class Band32Factor:
+class MixedPrecisionFactor:
     """A matrix with its factor in float32, and in float64 once a solve has needed that.
 
     Attributes:
@@ -280,7 +282,9 @@ class Band32Factor:
 
     MAX_ITER = 25  # beyond, a float64 factor is cheaper
 
-    def __init__(self, parent: Band32, values: Array, rough: Cholesky, scale: float) -> None:
+    def __init__(
+        self, parent: MixedPrecisionBandedCholesky, values: Array, rough: BandedFactor, scale: float
+    ) -> None:
         """Take entries (nnz,) and the factor of entries / scale."""
         self.parent, self.values, self.rough, self.scale = parent, values, rough, scale
         self.product = SymmetricProduct(parent.pattern, values)

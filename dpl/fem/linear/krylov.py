@@ -23,7 +23,7 @@ from dpl.fem.linear.interface import (
 )
 
 Map = Callable[[Array], Array]  # (n,) -> (n,)
-SEEN = 1e-6  # relative residual of noise below which every eigenvalue has been met
+DEFINITENESS_TOL = 1e-6  # relative residual of noise below which every eigenvalue has been met
 
 
 class NotDefinite(SingularMatrix):
@@ -37,7 +37,7 @@ def conjugate_gradients(
     rtol: float,
     max_iter: int,
     *,
-    doubtful: bool = False,
+    abort_if_slow: bool = False,
 ) -> Array:
     """Return x, (n,), with ||right - K x|| <= rtol ||right||.
 
@@ -77,7 +77,7 @@ def conjugate_gradients(
         left = np.linalg.norm(residual)
         if left <= enough:
             return unit * x
-        if doubtful and k >= 3 and (left / before_all) ** (max_iter / k) > rtol:
+        if abort_if_slow and k >= 3 and (left / before_all) ** (max_iter / k) > rtol:
             break
         z = precondition(residual)
         rz, before = residual @ z, rz
@@ -86,7 +86,7 @@ def conjugate_gradients(
     raise SingularMatrix(f"no convergence to {rtol:g} in {max_iter} conjugate gradient steps")
 
 
-def lowest(product: Map, precondition: Map, size: int, steps: int = 8) -> float:
+def smallest_ritz_value(product: Map, precondition: Map, size: int, steps: int = 8) -> float:
     """Return about the lowest eigenvalue of M^-1 K, -inf where it is certainly not positive.
 
     M^-1 is the preconditioner, of a matrix near K: all eigenvalues but a few are near 1, and those
@@ -138,7 +138,7 @@ class CGFactor:
         product: x -> K x.
         precondition: r -> approximately K^-1 r.
         max_iter: Conjugate gradient steps a solve may take.
-        negative_pivots: -1, not counted; `examined` tells none from some.
+        negative_pivots: -1, not counted; `definiteness` tells none from some.
     """
 
     product: SymmetricProduct
@@ -147,7 +147,7 @@ class CGFactor:
     negative_pivots: int = -1
 
     @cached_property
-    def examined(self) -> int:
+    def definiteness(self) -> int:
         """0 if the matrix is positive definite, 1 if it is not, -1 if that did not show in time.
 
         A solve may miss directions that its right-hand side does not hold, noise holds all: a
@@ -156,7 +156,7 @@ class CGFactor:
         """
         noise = np.random.default_rng(0).standard_normal(len(self.product.diagonal))
         try:
-            self.solve(noise, SEEN)
+            self.solve(noise, DEFINITENESS_TOL)
         except NotDefinite:
             return 1
         except SingularMatrix:

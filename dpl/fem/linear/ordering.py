@@ -6,7 +6,7 @@ from scipy.sparse import block_array, csr_array
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 
 
-def narrow(graph: csr_array) -> NDArray[np.int32]:
+def reduce_bandwidth(graph: csr_array) -> NDArray[np.int32]:
     """Return the reverse Cuthill-McKee order (n,) of a symmetric graph (George 1971).
 
     SciPy's begins at the node of lowest degree which an unstable sort happens to put first: at

@@ -9,14 +9,14 @@ if TYPE_CHECKING:
     from dpl.fem.loads.modal import ModalLoads
     from dpl.fem.loads.modal_basis import Modes, eigenmodes
     from dpl.fem.loads.sampling import (
-        even,
+        constant,
         independent,
+        log_tail_mixture,
         logarithmic,
         normal,
-        one,
         sobol,
-        tail,
-        uniform,
+        symmetric_uniform,
+        uniform01,
     )
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

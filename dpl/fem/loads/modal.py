@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from dpl.fem.loads.modal_basis import Array, Modes, eigenmodes
-from dpl.fem.loads.sampling import SAMPLINGS, Quantile, even, one, uniform
+from dpl.fem.loads.sampling import SAMPLINGS, Quantile, constant, symmetric_uniform, uniform01
 from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
 
 LEAST = 1e-12  # deflection, below which rounding answers [-]
@@ -48,14 +48,14 @@ class ModalLoads:
         always: Force that every load holds besides, (N, D) [-]; none if left out.
     """
 
-    linear: Linear
+    linear: LinearSolver
     n_modes: int = 5
     deflection: float = 0.4
     patch: Sequence[float] = (0.0, 1.0)
-    distribution: Quantile = uniform
+    distribution: Quantile = symmetric_uniform
     spectrum: float = 0.5
-    radius: Quantile = even
-    amplitude: Quantile = one
+    radius: Quantile = uniform01
+    amplitude: Quantile = constant
     sampling: str = "independent"
     young: float | Sequence[float] = 1.0
     always: Tensor | None = None
@@ -116,12 +116,12 @@ class ModalLoads:
         return float(moduli[0]), float(moduli[-1])
 
     @property
-    def reach(self) -> Tensor:
+    def loadable_dofs(self) -> Tensor:
         """Degrees of freedom that these loads can act on and that can move, (N, D)."""
         return self.problem.boundary[:, None] & self.problem.free
 
     @property
-    def dimension(self) -> int:
+    def n_random(self) -> int:
         """d, numbers that a load is made of: M for q, then centre, radius, amplitude, modulus.
 
         And Poisson's ratio where the law has a range of them.
@@ -140,7 +140,7 @@ class ModalLoads:
 
     def points(self, seed: int | Sequence[int], indices: Sequence[int]) -> Tensor:
         """Return the points of the unit cube that loads stand for, (B, d)."""
-        drawn = [SAMPLINGS[self.sampling](seed, index, self.dimension) for index in indices]
+        drawn = [SAMPLINGS[self.sampling](seed, index, self.n_random) for index in indices]
         return torch.from_numpy(np.stack(drawn))
 
     def at(self, points: Tensor) -> Load:
@@ -181,7 +181,7 @@ class ModalLoads:
         count, see `Problem.acting`.
         """
         own = self.problem.acting(force if self.always is None else force - self.always)
-        fields = torch.where(self.reach[..., None], self.modes.vectors, 0.0) * self.q_max
+        fields = torch.where(self.loadable_dofs[..., None], self.modes.vectors, 0.0) * self.q_max
         amplitudes, strange = [], []
         for f in own:
             unit = float(f.abs().max())
@@ -203,12 +203,12 @@ class ModalLoads:
         q = self.q_max * torch.from_numpy(self.distribution(point[:modes]))
         q = float(self.amplitude(np.asarray(amplitude))) * q
         points = self.problem.points
-        places = points[self.reach.any(dim=1)]
+        places = points[self.loadable_dofs.any(dim=1)]
         low, high = self.patch
         distance = low + (high - low) * float(self.radius(np.asarray(radius)))
         middle = places[int(centre * len(places))]
         inside = (points - middle).norm(dim=1) <= distance * (1 + 1e-9)
-        force = torch.where(inside[:, None] & self.reach, self.modes.vectors @ q, 0.0)
+        force = torch.where(inside[:, None] & self.loadable_dofs, self.modes.vectors @ q, 0.0)
         return force if self.always is None else force + self.always
 
     def __getstate__(self) -> dict[str, object]:

@@ -12,7 +12,7 @@ from torch import Tensor
 from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear.interface import SingularMatrix, full_matrix
 from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.linear import LinearSolver
 
 Array = NDArray[np.float64]
 SAME = 1e-6  # eigenvalues closer than this, relatively, are one eigenspace
@@ -31,7 +31,7 @@ class Modes(NamedTuple):
     vectors: Tensor
 
 
-def eigenmodes(linear: Linear, count: int) -> Modes:
+def eigenmodes(linear: LinearSolver, count: int) -> Modes:
     """Return the lowest modes, those of the last family all: `count` or a few more.
 
     Shift-invert Lanczos around zero with the stored factor of K(0). The same problem gives the
@@ -52,7 +52,7 @@ def eigenmodes(linear: Linear, count: int) -> Modes:
     size = problem.pattern.size
     if not 1 <= count <= size // 3:
         raise ValueError(f"n_modes = {count} must lie between 1 and {size // 3}")
-    if loose := problem.loose_modes():
+    if loose := problem.unconstrained_rigid_body_modes():
         raise ValueError(f"{len(loose)} rigid modes are unconstrained: {', '.join(loose)}")
     rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
     stiffness = full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())

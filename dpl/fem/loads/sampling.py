@@ -44,7 +44,7 @@ def _sobol(seed: tuple[int, ...], count: int) -> qmc.Sobol:
 SAMPLINGS = {"independent": independent, "sobol": sobol}
 
 
-def uniform(t: Array) -> Array:
+def symmetric_uniform(t: Array) -> Array:
     """Return numbers uniform in [-1, 1]: the paper's modal loads."""
     return 2 * t - 1
 
@@ -54,12 +54,12 @@ def normal(t: Array) -> Array:
     return np.clip(ndtri(t) / 3, -1.0, 1.0)
 
 
-def even(t: Array) -> Array:
+def uniform01(t: Array) -> Array:
     """Return numbers uniform in [0, 1)."""
     return t
 
 
-def one(t: Array) -> Array:
+def constant(t: Array) -> Array:
     """Return 1."""
     return np.ones_like(t)
 
@@ -75,7 +75,7 @@ def logarithmic(t: Array, low: float = 1e-2) -> Array:
     return low ** (1 - t)
 
 
-def tail(t: Array, part: float = 0.25, low: float = 1e-3) -> Array:
+def log_tail_mixture(t: Array, part: float = 0.25, low: float = 1e-3) -> Array:
     """Return 1, but for a part of the draws that is logarithmic in [low, 1): small loads.
 
     Raises:

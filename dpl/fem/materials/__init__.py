@@ -6,7 +6,12 @@ from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
     from dpl.fem.materials.linear_elastic import LinearElastic
-    from dpl.fem.materials.material import Hookean, Isotropic, Material, Response
+    from dpl.fem.materials.material import (
+        InvariantBasedMaterial,
+        Material,
+        Response,
+        YoungPoissonMaterial,
+    )
     from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
     from dpl.fem.materials.neo_hookean import (
         NeoHookeanIsoK2,

@@ -12,12 +12,12 @@ from dpl.fem.materials.tensors import (
 )
 
 
-def polynomial_slopes(c: Any, i1: Any, i2: Any, m1: Any, q: Any, qJ: Any) -> tuple[Any, ...]:
+def polynomial_derivatives(c: Any, i1: Any, i2: Any, m1: Any, q: Any, qJ: Any) -> tuple[Any, ...]:
     """Return the slopes of c0 x + c1 x^2 + c2 x^3 + c3 y + U(J), x = Ib1 - 3, y = Ib2 - 3.
 
     Args:
         c: Moduli.
-        i1, i2, m1: As in `Isotropic.slopes`.
+        i1, i2, m1: As in `InvariantBasedMaterial.slopes`.
         q, qJ: J U' and J (J U')'.
     """
     m = 1 + m1

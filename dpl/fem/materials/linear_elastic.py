@@ -6,7 +6,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.neo_hookean import beside
+from dpl.fem.materials.neo_hookean import as_column
 from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
 from dpl.fem.materials.tensors import (
     dyad,
@@ -35,13 +35,13 @@ class LinearElastic(SaintVenantKirchhoff):
     def stress(self, H: Tensor) -> Tensor:
         """Return lambda tr eps I + 2 mu eps, see `Material.stress`."""
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        return (self.lam * trace(H))[..., None, None] * eye + beside(self.mu, 2) * (H + H.mT)
+        return (self.lam * trace(H))[..., None, None] * eye + as_column(self.mu, 2) * (H + H.mT)
 
     def tangent(self, H: Tensor) -> Tensor:
         """Return Hooke's moduli, see `Material.tangent`."""
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        hooke = beside(self.lam, 4) * dyad(eye, eye)
-        hooke = hooke + 2 * beside(self.mu, 4) * symmetric_product(eye)
+        hooke = as_column(self.lam, 4) * dyad(eye, eye)
+        hooke = hooke + 2 * as_column(self.mu, 4) * symmetric_product(eye)
         return hooke.expand(*H.shape, 3, 3)
 
     @property

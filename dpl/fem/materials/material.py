@@ -51,7 +51,7 @@ class Material:
 
     A law is its `energy`; `stress` and `tangent` follow by automatic differentiation. A subclass
     may give its `response` to strains as well: the two then follow from that, and Newton can take
-    strains as unknowns. A law of the invariants (`Isotropic`) is compiled too.
+    strains as unknowns. A law of the invariants (`InvariantBasedMaterial`) is compiled too.
     """
 
     def energy(self, H: Tensor) -> Tensor:
@@ -76,7 +76,7 @@ class Material:
         if self.has_response:
             S = self.response(green_lagrange(H)).stress
             return S + H @ S
-        if self.several:
+        if self.is_batched:
             return torch.func.grad(lambda G: self.energy(G).sum())(H)
         gradient = torch.func.vmap(torch.func.grad(self.energy))
         return gradient(H.reshape(-1, 3, 3)).reshape(H.shape)
@@ -116,7 +116,7 @@ class Material:
         return None
 
     @property
-    def several(self) -> bool:
+    def is_batched(self) -> bool:
         """Whether each member of a batch has moduli of its own, see `at`."""
         return False
 
@@ -134,7 +134,7 @@ class Material:
 
 
 @dataclass(frozen=True)
-class Hookean(Material):
+class YoungPoissonMaterial(Material):
     """Law that at rest is Hooke's, with Young's modulus 1: such laws can be swapped fairly.
 
     Attributes:
@@ -189,8 +189,8 @@ class Hookean(Material):
         return self.poisson if isinstance(self.poisson, tuple) else None
 
     @property
-    def several(self) -> bool:
-        """See `Material.several`."""
+    def is_batched(self) -> bool:
+        """See `Material.is_batched`."""
         return isinstance(self.poisson, Tensor)
 
     def at(self, poisson: float | Tensor) -> Self:
@@ -214,8 +214,8 @@ class Hookean(Material):
         return cast(float, self.poisson)
 
 
-class Isotropic(Material):
-    """Law of the invariants, W(I1, I2, J) of C = F^T F, given by its `slopes` as well.
+class InvariantBasedMaterial(Material):
+    """Law of the invariants, W(I1, I2, J) of C = F^T F, with its `invariant_derivatives`.
 
     The slopes are plain arithmetic on numbers of any kind: tensors here, lanes of a processor in
     `dpl.fem.assembly.kernels`. With X = C^-1, the stress they stand for is
@@ -236,7 +236,9 @@ class Isotropic(Material):
         raise NotImplementedError
 
     @staticmethod
-    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
         """Return (rest, W2, p, W11, W12, W22, J W1J, J W2J, J p_J).
 
         Indices are derivatives, p = J W_J, and rest = p + 2 W1 + 4 W2, which is zero at rest and
@@ -265,10 +267,11 @@ class Isotropic(Material):
         i1, second, square = invariants(e)
         eye = torch.eye(3, dtype=E.dtype, device=E.device)
         X = inverse_transpose(e, square)
-        slopes = self._slopes(i1, 2 * i1 + second, j)
-        S = _stress(e, square, i1, slopes)
+        invariant_derivatives = self._invariant_derivatives(i1, 2 * i1 + second, j)
+        S = _stress(e, square, i1, invariant_derivatives)
         _, W2, p, *curvatures = (
-            s[..., None, None, None, None] if isinstance(s, Tensor) else s for s in slopes
+            s[..., None, None, None, None] if isinstance(s, Tensor) else s
+            for s in invariant_derivatives
         )
         W11, W12, W22, W1J, W2J, pJ = curvatures
         T1, T2 = 2 * eye.expand_as(e), 2 * ((2 + i1)[..., None, None] * eye - e)
@@ -285,19 +288,25 @@ class Isotropic(Material):
         """
         e = 2 * green_lagrange(H)
         i1, second, square = invariants(e)
-        slopes = self._slopes(i1, 2 * i1 + second, volume_change(H))
-        S = _stress(e, square, i1, slopes)
+        invariant_derivatives = self._invariant_derivatives(i1, 2 * i1 + second, volume_change(H))
+        S = _stress(e, square, i1, invariant_derivatives)
         return S + H @ S
 
-    def _slopes(self, i1: Tensor, i2: Tensor, j: Tensor) -> tuple[Tensor | float, ...]:
+    def _invariant_derivatives(
+        self, i1: Tensor, i2: Tensor, j: Tensor
+    ) -> tuple[Tensor | float, ...]:
         log_j = torch.log1p(j)
         m1 = torch.expm1(-2 / 3 * log_j)
-        return self.slopes(self.constants, i1, i2, j, log_j, m1)
+        return self.invariant_derivatives(self.constants, i1, i2, j, log_j, m1)
 
 
-def _stress(e: Tensor, square: Tensor, i1: Tensor, slopes: tuple[Tensor | float, ...]) -> Tensor:
-    """Return S (..., 3, 3) of `Isotropic` at e = 2 E = C - I with det C = 1 + square."""
-    rest, W2, p = (s[..., None, None] if isinstance(s, Tensor) else s for s in slopes[:3])
+def _stress(
+    e: Tensor, square: Tensor, i1: Tensor, invariant_derivatives: tuple[Tensor | float, ...]
+) -> Tensor:
+    """Return S (..., 3, 3) at e = 2 E = C - I with det C = 1 + square."""
+    rest, W2, p = (
+        s[..., None, None] if isinstance(s, Tensor) else s for s in invariant_derivatives[:3]
+    )
     eye = torch.eye(3, dtype=e.dtype, device=e.device)
     S = (rest + 2 * W2 * i1[..., None, None]) * eye
     if isinstance(W2, Tensor) or W2:

@@ -5,12 +5,12 @@ from typing import Any
 
 from torch import Tensor
 
-from dpl.fem.materials.isochoric import _isochoric, polynomial_slopes
-from dpl.fem.materials.material import Isotropic, check_moduli
+from dpl.fem.materials.isochoric import _isochoric, polynomial_derivatives
+from dpl.fem.materials.material import InvariantBasedMaterial, check_moduli
 
 
 @dataclass(frozen=True)
-class MooneyRivlinK2(Isotropic):
+class MooneyRivlinK2(InvariantBasedMaterial):
     """Mooney-Rivlin solid: c10 (Ib1 - 3) + c01 (Ib2 - 3) + bulk/2 (J - 1)^2.
 
     Ib1 = J^(-2/3) I1 and Ib2 = J^(-4/3) I2. Shear modulus at rest 2 (c10 + c01).
@@ -44,6 +44,10 @@ class MooneyRivlinK2(Isotropic):
         return self.c10, 0.0, 0.0, self.c01, self.bulk
 
     @staticmethod
-    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
-        """Return the slopes, see `Isotropic.slopes`."""
-        return polynomial_slopes(c, i1, i2, m1, c[4] * j * (1 + j), c[4] * (1 + j) * (1 + 2 * j))
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
+        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
+        return polynomial_derivatives(
+            c, i1, i2, m1, c[4] * j * (1 + j), c[4] * (1 + j) * (1 + 2 * j)
+        )

@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.isochoric import _isochoric, polynomial_slopes
-from dpl.fem.materials.material import Hookean, Isotropic
+from dpl.fem.materials.isochoric import _isochoric, polynomial_derivatives
+from dpl.fem.materials.material import InvariantBasedMaterial, YoungPoissonMaterial
 from dpl.fem.materials.tensors import (
     trace,
     volume_change,
@@ -15,7 +15,7 @@ from dpl.fem.materials.tensors import (
 
 
 @dataclass(frozen=True)
-class NeoHookeanLn(Hookean, Isotropic):
+class NeoHookeanLn(YoungPoissonMaterial, InvariantBasedMaterial):
     """Compressible neo-Hookean solid NH-ln: mu/2 (I1 - 3 - 2 ln J) + lambda/2 (ln J)^2.
 
     Source: Bonet, Wood (2008), eq. 6.27. Infinite at J = 0; undefined (NaN) below.
@@ -33,14 +33,16 @@ class NeoHookeanLn(Hookean, Isotropic):
         return self.lam, self.mu
 
     @staticmethod
-    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
-        """Return the slopes, see `Isotropic.slopes`."""
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
+        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
         rest = c[0] * log_j
         return rest, 0.0, rest - c[1], 0.0, 0.0, 0.0, 0.0, 0.0, c[0]
 
 
 @dataclass(frozen=True)
-class NeoHookeanIsoK2(Hookean, Isotropic):
+class NeoHookeanIsoK2(YoungPoissonMaterial, InvariantBasedMaterial):
     """Neo-Hookean solid NHiso-k2: mu/2 (J^(-2/3) I1 - 3) + kappa/2 (J - 1)^2.
 
     Source: Simo, Hughes (1998), section 9.2; the volumetric term is that of Abaqus (D1 = 2/kappa).
@@ -57,9 +59,13 @@ class NeoHookeanIsoK2(Hookean, Isotropic):
         return self.mu / 2, 0.0, 0.0, 0.0, self.bulk
 
     @staticmethod
-    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
-        """Return the slopes, see `Isotropic.slopes`."""
-        return polynomial_slopes(c, i1, i2, m1, c[4] * j * (1 + j), c[4] * (1 + j) * (1 + 2 * j))
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
+        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
+        return polynomial_derivatives(
+            c, i1, i2, m1, c[4] * j * (1 + j), c[4] * (1 + j) * (1 + 2 * j)
+        )
 
 
 @dataclass(frozen=True)
@@ -75,13 +81,17 @@ class NeoHookeanIsoK4(NeoHookeanIsoK2):
         return self.mu / 2 * i1 + self.bulk / 4 * (j * (2 + j) - 2 * torch.log1p(j))
 
     @staticmethod
-    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
-        """Return the slopes, see `Isotropic.slopes`."""
-        return polynomial_slopes(c, i1, i2, m1, c[4] / 2 * j * (2 + j), c[4] * (1 + j) * (1 + j))
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
+        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
+        return polynomial_derivatives(
+            c, i1, i2, m1, c[4] / 2 * j * (2 + j), c[4] * (1 + j) * (1 + j)
+        )
 
 
 @dataclass(frozen=True)
-class StableNeoHookean(Hookean, Isotropic):
+class StableNeoHookean(YoungPoissonMaterial, InvariantBasedMaterial):
     """Stable neo-Hookean solid: m/2 (I1 - 3) + l/2 (J - a)^2 - m/2 ln(I1 + 1).
 
     With m = 4 mu/3, l = lambda + 5 mu/6 and a = 1 + 3 m/(4 l). The energy is finite for any F,
@@ -104,8 +114,10 @@ class StableNeoHookean(Hookean, Isotropic):
         return 4 / 3 * self.mu, self.lam + 5 / 6 * self.mu
 
     @staticmethod
-    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
-        """Return the slopes, see `Isotropic.slopes`."""
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
+        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
         near = 1 / (4 + i1)
         J = 1 + j
         volume = c[1] * j * J - 3 / 4 * c[0] * j
@@ -115,6 +127,6 @@ class StableNeoHookean(Hookean, Isotropic):
         return rest, 0.0, p, W11, 0.0, 0.0, 0.0, 0.0, J * (c[1] * (1 + 2 * j) - 3 / 4 * c[0])
 
 
-def beside(modulus: float, axes: int) -> Any:
+def as_column(modulus: float, axes: int) -> Any:
     """Return a modulus as a factor on tensors with so many components at each point."""
     return modulus[(..., *[None] * axes)] if isinstance(modulus, Tensor) else modulus

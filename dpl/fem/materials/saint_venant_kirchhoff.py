@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor
 
-from dpl.fem.materials.material import Hookean, Isotropic
+from dpl.fem.materials.material import InvariantBasedMaterial, YoungPoissonMaterial
 from dpl.fem.materials.tensors import (
     green_lagrange,
     trace,
@@ -13,7 +13,7 @@ from dpl.fem.materials.tensors import (
 
 
 @dataclass(frozen=True)
-class SaintVenantKirchhoff(Hookean, Isotropic):
+class SaintVenantKirchhoff(YoungPoissonMaterial, InvariantBasedMaterial):
     """Saint Venant-Kirchhoff solid SVK: lambda/2 (tr E)^2 + mu E:E, E = (F^T F - I)/2.
 
     Source: Bonet, Wood (2008), eq. 6.28. It softens in compression: no answer need exist there.
@@ -30,7 +30,9 @@ class SaintVenantKirchhoff(Hookean, Isotropic):
         return self.lam, self.mu
 
     @staticmethod
-    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
-        """Return the slopes, see `Isotropic.slopes`."""
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
+        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
         rest = (c[0] / 2 + c[1]) * i1
         return rest, -c[1] / 2, 0.0, c[0] / 4 + c[1] / 2, 0.0, 0.0, 0.0, 0.0, 0.0

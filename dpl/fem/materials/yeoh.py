@@ -5,12 +5,12 @@ from typing import Any
 
 from torch import Tensor
 
-from dpl.fem.materials.isochoric import _isochoric, polynomial_slopes
-from dpl.fem.materials.material import Isotropic, check_moduli
+from dpl.fem.materials.isochoric import _isochoric, polynomial_derivatives
+from dpl.fem.materials.material import InvariantBasedMaterial, check_moduli
 
 
 @dataclass(frozen=True)
-class YeohK2(Isotropic):
+class YeohK2(InvariantBasedMaterial):
     """Yeoh's solid: c10 (Ib1 - 3) + c20 (Ib1 - 3)^2 + c30 (Ib1 - 3)^3 + bulk/2 (J - 1)^2.
 
     Source: Yeoh (1993), Rubber Chem. Technol. 66; the volumetric term is that of Abaqus.
@@ -43,6 +43,10 @@ class YeohK2(Isotropic):
         return self.c10, self.c20, self.c30, 0.0, self.bulk
 
     @staticmethod
-    def slopes(c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any) -> tuple[Any, ...]:
-        """Return the slopes, see `Isotropic.slopes`."""
-        return polynomial_slopes(c, i1, i2, m1, c[4] * j * (1 + j), c[4] * (1 + j) * (1 + 2 * j))
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
+        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
+        return polynomial_derivatives(
+            c, i1, i2, m1, c[4] * j * (1 + j), c[4] * (1 + j) * (1 + 2 * j)
+        )

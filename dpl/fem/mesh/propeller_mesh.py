@@ -9,9 +9,9 @@ import skfem
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 
-from dpl.fem.linear.ordering import narrow
+from dpl.fem.linear.ordering import reduce_bandwidth
 from dpl.fem.mesh.regions import Cylinder, facets_in
-from dpl.fem.mesh.validation import check
+from dpl.fem.mesh.validation import check_mesh
 from dpl.system.memory import refuse_mesh
 
 Points = NDArray[np.float64]  # (3, ...)
@@ -70,7 +70,7 @@ def propeller(
     blade = _blade(radii, hub_length, blades, pitch_angle, chord, thickness, cells)
     hub = _hub(radii, hub_length, blades, pitch_angle[0], thickness[0], cells)
     try:
-        mesh = check(_joined(hub, blade, blades))
+        mesh = check_mesh(_joined(hub, blade, blades))
     except ValueError as error:
         raise ValueError(f"pitch_angle, chord or thickness fold the blades: {error}") from None
     bore = facets_in(Cylinder(0, radii[0]), mesh)
@@ -189,7 +189,7 @@ def _joined(hub: Points, blade: Points, blades: int) -> skfem.Mesh:
     t = np.concatenate([_hexahedra(grid) for grid in grids], axis=1)
     rows, columns = (t[list(c)].ravel() for c in zip(*np.ndindex(8, 8), strict=True))
     graph = coo_array((np.ones(len(rows)), (rows, columns))).tocsr()
-    order = narrow(graph)
+    order = reduce_bandwidth(graph)
     return skfem.MeshHex(np.ascontiguousarray(points[:, order]), np.argsort(order)[t])
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from skfem.io.meshio import from_meshio
 
 from dpl.fem.mesh.sandbox import read
-from dpl.fem.mesh.validation import LARGEST, check, listed
+from dpl.fem.mesh.validation import LARGEST, check_mesh, listed
 from dpl.system.memory import refuse_mesh
 
 CELLS = {  # meshio's names of what can be solved, best first: dimension, nodes
@@ -56,7 +56,7 @@ Numbers = NDArray[np.int_]
 Array = NDArray[np.float64]
 
 
-def load(path: str | Path) -> skfem.Mesh:
+def read_mesh(path: str | Path) -> skfem.Mesh:
     """Return the mesh of any file that meshio reads, checked.
 
     The cells of the highest dimension are kept in their order, nodes that no cell uses are dropped,
@@ -133,7 +133,7 @@ def _body(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
     points = _flat(points, used) if dim == 2 else points[used]
     mesh = from_meshio(meshio.Mesh(points, [(kinds[0], compact)]))
     corners = np.unique(cells[:, : len(mesh.t)])  # vertex k is node corners[k] of the file
-    mesh = _tagged(check(mesh, numbers=corners), raw, kinds[0], corners)
+    mesh = _tagged(check_mesh(mesh, numbers=corners), raw, kinds[0], corners)
     return mesh, _repairs(kinds[0], points[compact], len(raw.points) - len(used))
 
 

@@ -138,7 +138,7 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Tag:
-    """Region: a part that the mesh knows by name; see `dpl.fem.load`.
+    """Region: a part that the mesh knows by name; see `dpl.fem.read_mesh`.
 
     Attributes:
         name: A key of scikit-fem's `mesh.boundaries` (facets) or `mesh.subdomains` (cells). Where

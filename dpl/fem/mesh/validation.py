@@ -15,7 +15,7 @@ LARGEST = 1e50  # of coordinates [m]; with more, volumes would overflow
 Numbers = NDArray[np.int_]
 
 
-def check(mesh: skfem.Mesh, *, numbers: Numbers | None = None) -> skfem.Mesh:
+def check_mesh(mesh: skfem.Mesh, *, numbers: Numbers | None = None) -> skfem.Mesh:
     """Return the mesh as it is, if it can be solved.
 
     Args:

@@ -21,7 +21,7 @@ Numbers = NDArray[np.int_]
 Array = NDArray[np.float64]
 
 
-def flat(mesh: skfem.Mesh, nodes: int) -> tuple[str, Numbers]:
+def flat_cells(mesh: skfem.Mesh, nodes: int) -> tuple[str, Numbers]:
     """Return the cells of a body as files list them: meshio's name, nodes in VTK's order (E, A).
 
     Tetrahedra are right-handed, as scikit-fem's need not be.
@@ -53,7 +53,7 @@ def _left(mesh: skfem.Mesh) -> NDArray[np.bool_]:
 
 
 def _tags(mesh: skfem.Mesh) -> dict[str, list[Array]]:
-    """Return the tags of a body as data of its cells, whose facets are numbered as `flat` does.
+    """Return the tags of a body as data of its cells, facets numbered as by `flat_cells`.
 
     Sets of facets are a bit for each side of each cell. Where the first two corners of a
     tetrahedron change places its last two sides do.
@@ -80,12 +80,12 @@ def _quadratic(mesh: skfem.Mesh) -> skfem.Mesh:
 
 
 def _written(mesh: skfem.Mesh, fields: Mapping[str, Array]) -> meshio.Mesh:
-    """Return a body with its fields as meshio writes them, see `save`."""
+    """Return a body with its fields as meshio writes them, see `write_mesh`."""
     counts = {len(field) for field in fields.values()} or {mesh.p.shape[1]}
     if len(counts) > 1:
         raise ValueError(f"fields at {', '.join(map(str, sorted(counts)))} nodes: of one body each")
     (nodes,) = counts
-    kind, cells = flat(mesh, nodes)
+    kind, cells = flat_cells(mesh, nodes)
     whole = mesh if nodes == mesh.p.shape[1] else _quadratic(mesh)
     data = {name: _spatial(field) for name, field in fields.items()}
     return meshio.Mesh(_spatial(whole.p.T), [(kind, cells)], point_data=data, cell_data=_tags(mesh))
@@ -98,7 +98,7 @@ def _spatial(field: Array) -> Array:
     return field if field.ndim == 1 else np.pad(field, ((0, 0), (0, 3 - field.shape[1])))
 
 
-def save(path: Path, mesh: skfem.Mesh, fields: Mapping[str, Array]) -> None:
+def write_mesh(path: Path, mesh: skfem.Mesh, fields: Mapping[str, Array]) -> None:
     """Write a mesh, its tags and fields at its nodes, in any format of meshio.
 
     Args:
@@ -114,10 +114,10 @@ def save(path: Path, mesh: skfem.Mesh, fields: Mapping[str, Array]) -> None:
     meshio.write(path, _written(mesh, fields))
 
 
-def save_exactly(path: Path, mesh: skfem.Mesh) -> None:
+def write_mesh_exactly(path: Path, mesh: skfem.Mesh) -> None:
     """Write a mesh and its tags as VTU, so that `load` returns it to the last bit.
 
-    Cells keep the sense in which they list their nodes, which `save` does not promise.
+    Cells keep the sense in which they list their nodes, which `write_mesh` does not promise.
 
     Args:
         path: A file, of any name.
@@ -135,7 +135,7 @@ def _quoted(name: str) -> str:
     return escape(name, marks).encode("ascii", "xmlcharrefreplace").decode()
 
 
-def save_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Array]]) -> list[Path]:
+def write_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Array]]) -> list[Path]:
     """Write the same fields of several loads for ParaView, the number of the load as its time.
 
     A VTU file for each beside `NAME.pvd`, which opens them as one, and all in `NAME.xdmf`: numbers
@@ -144,7 +144,7 @@ def save_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Array
     Args:
         path: Folder and NAME; the folder is made if there is none.
         mesh: The body.
-        steps: Fields of each load, see `save`.
+        steps: Fields of each load, see `write_mesh`.
 
     Returns:
         The files to open: collection and XDMF.
@@ -155,7 +155,7 @@ def save_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Array
     for name, body in zip(names, bodies, strict=True):
         meshio.write(path.with_name(name), body)
     collection, series = path.with_name(f"{path.name}.pvd"), path.with_name(f"{path.name}.xdmf")
-    save_collection(collection, list(enumerate(names)))
+    write_collection(collection, list(enumerate(names)))
     kept = "HDF" if importlib.util.find_spec("h5py") else "XML"
     with contextlib.chdir(path.parent), TimeSeriesWriter(series.name, data_format=kept) as file:
         file.write_points_cells(bodies[0].points, bodies[0].cells)
@@ -164,7 +164,7 @@ def save_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Array
     return [collection, series]
 
 
-def save_collection(path: Path, files: Sequence[tuple[float, str]]) -> None:
+def write_collection(path: Path, files: Sequence[tuple[float, str]]) -> None:
     """Write a PVD file, which opens VTU files as a series in ParaView.
 
     Args:

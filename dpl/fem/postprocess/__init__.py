@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.fem.postprocess.energy import Rest, potential, tangent_product
+    from dpl.fem.postprocess.energy import RestStiffness, potential_energy, tangent_product
     from dpl.fem.postprocess.stress import (
         Fields,
         at_nodes,

@@ -11,7 +11,7 @@ from torch import Tensor
 from dpl.fem.dofs import gather
 from dpl.fem.linear.interface import full_matrix
 from dpl.fem.problem import Problem
-from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
 
 ENTRIES = 16_000  # numbers of a displacement at once: few enough for their strains to fit a cache
@@ -21,7 +21,7 @@ STEP = 1e-5  # of the displacement gradient, where differences of forces stand f
 
 
 @dataclass(frozen=True, eq=False)
-class Rest:
+class RestStiffness:
     """A body at rest, made once, when first asked for.
 
     Attributes:
@@ -31,7 +31,7 @@ class Rest:
     problem: Problem
 
     @classmethod
-    def of(cls, problem: Problem, known: "Rest | None") -> "Rest":
+    def of(cls, problem: Problem, known: "RestStiffness | None") -> "RestStiffness":
         """Return the rest of a body: the known one if that is its."""
         return known if known is not None and known.problem is problem else cls(problem)
 
@@ -63,8 +63,8 @@ class Rest:
         return torch.einsum("kb,kbnd->bnd", shares, parts)
 
     @cached_property
-    def _spanning(self) -> "list[Rest]":
-        return [Rest(self.problem.at(nu)) for nu in SPANNING]
+    def _spanning(self) -> "list[RestStiffness]":
+        return [RestStiffness(self.problem.at(nu)) for nu in SPANNING]
 
     def work(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
         """Return f.K(0)^-1 f / 2, the work of f (B, N, D) on its linear answer, (B,) [-].
@@ -104,9 +104,9 @@ class Rest:
         return self.problem.energy(self.problem.points.new_zeros(1, *self.problem.shape))
 
     @cached_property
-    def _linear(self) -> Linear:
+    def _linear(self) -> LinearSolver:
         here = self.problem.points.device.type == "cpu"
-        return Linear(self.problem if here else self.problem.to("cpu"))
+        return LinearSolver(self.problem if here else self.problem.to("cpu"))
 
     @cached_property
     def _matrix(self) -> csr_array:
@@ -132,8 +132,8 @@ class Rest:
         return {"problem": self.problem}
 
 
-def potential(
-    displacement: Tensor, load: Load, problem: Problem, rest: Rest
+def potential_energy(
+    displacement: Tensor, load: Load, problem: Problem, rest: RestStiffness
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return W(u) - W(0) - f.u, (B,) [-], its slope (B, N, D), and whether all det F > 0, (B,)."""
     force, own = load.force, load.poisson.expand(len(displacement), -1)

@@ -8,6 +8,6 @@ if TYPE_CHECKING:
     from dpl.fem.rom.ecsw import Cubature, cubature
     from dpl.fem.rom.galerkin import PODGalerkin, Reduced
     from dpl.fem.rom.pod import POD
-    from dpl.fem.rom.reduced_problem import ReducedBody
+    from dpl.fem.rom.reduced_problem import ReducedProblem
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -53,7 +53,7 @@ def cubature(problem: Problem, vectors: Tensor, states: Tensor, tolerance: float
         raise ValueError(f"tolerance = {tolerance} must lie between 0 and 1")
     count, white = len(problem.cells), vectors @ whitening(problem, vectors)
     every = torch.arange(count)
-    cells = Cells(problem, white, every, torch.ones(count, dtype=torch.float64))
+    cells = ReducedMesh(problem, white, every, torch.ones(count, dtype=torch.float64))
     upper = cells.at_rest()
     rows = cells.basis.view(count, -1, vectors.shape[2])
     gram = torch.zeros(count, count, dtype=torch.float64)
@@ -151,7 +151,7 @@ def _solved(factor: Array, right: Array) -> Array:
     return solve_triangular(lower, half, lower=True, trans=1, check_finite=False)
 
 
-class Cells:
+class ReducedMesh:
     """Some cells of a body, each with nodes of its own, seen from a basis.
 
     Attributes:

@@ -16,9 +16,16 @@ from torch import Tensor
 from dpl.fem.problem import Problem
 from dpl.fem.rom.ecsw import Cubature, cubature
 from dpl.fem.rom.pod import pod
-from dpl.fem.rom.reduced_problem import ReducedBody, State, Task, beyond_linear, norm, refuse_range
-from dpl.fem.solvers.linear import Linear
-from dpl.fem.solvers.solution import Load, Solution, check_steps, judge
+from dpl.fem.rom.reduced_problem import (
+    ReducedLoad,
+    ReducedProblem,
+    ReducedState,
+    beyond_linear,
+    norm,
+    refuse_range,
+)
+from dpl.fem.solvers.linear import LinearSolver
+from dpl.fem.solvers.solution import Load, Solution, check_steps, evaluate_solution
 
 
 class Reduced(NamedTuple):
@@ -69,7 +76,7 @@ class PODGalerkin:
         cubature: The cells that stand for all; None: all of them.
         lift: The linear answer, if V is a basis of what is beyond it.
         tol: Residual ratio ||R_free|| / ||f|| below which an answer counts as converged [-], see
-            `Problem.imbalance`; at least 1e-15, below 1.
+            `Problem.relative_residual_of`; at least 1e-15, below 1.
         reduced_tol: Reduced residual ratio that ends the iterations [-].
         max_iter: Steps per load step before it is halved.
         budget: Steps in all before a load is given up.
@@ -85,7 +92,7 @@ class PODGalerkin:
     problem: Problem
     vectors: Tensor
     cubature: Cubature | None = None
-    lift: Linear | None = None
+    lift: LinearSolver | None = None
     tol: float = 1e-8
     reduced_tol: float = 1e-5
     max_iter: int = 30
@@ -103,7 +110,7 @@ class PODGalerkin:
         *,
         tolerance: float | None = 1e-3,
         states: int = 256,
-        lift: Linear | None = None,
+        lift: LinearSolver | None = None,
     ) -> Self:
         """Return the solver whose basis and cells are made from displacements in equilibrium.
 
@@ -137,7 +144,7 @@ class PODGalerkin:
         states: Tensor,
         *,
         tolerance: float,
-        lift: Linear | None = None,
+        lift: LinearSolver | None = None,
         **options: Any,
     ) -> Self:
         """Return the solver in a subspace that is there, with cells chosen at some states.
@@ -181,7 +188,7 @@ class PODGalerkin:
             found.append(self.reduced(force))
             seconds.append(time.perf_counter() - start)
         answer = torch.stack([one.displacement for one in found])
-        yield judge(self.problem, answer, load, self.tol)._replace(
+        yield evaluate_solution(self.problem, answer, load, self.tol)._replace(
             iterations=torch.tensor([one.iterations for one in found]),
             factorisations=torch.tensor([one.factorisations for one in found]),
             seconds=torch.tensor(seconds, dtype=torch.float64),
@@ -239,7 +246,7 @@ class PODGalerkin:
                 break
             unbalanced = model.load(torch.where(problem.free, force - internal[0], 0.0))
             at_cells = answer[model.cells.nodes].flatten()
-            task = Task(none, scale, True, answer, at_cells, none, none)
+            task = ReducedLoad(none, scale, True, answer, at_cells, none, none)
             state = model.state(task, none, 1.0)
             task = task._replace(load=state.internal + unbalanced)
             end = self._corrected(task, state, 1.0, _Count())
@@ -248,7 +255,9 @@ class PODGalerkin:
             answer = answer + model.whole(end.y)
         return answer
 
-    def _corrected(self, task: Task, state: State, target: float, count: "_Count") -> State | None:
+    def _corrected(
+        self, task: ReducedLoad, state: ReducedState, target: float, count: "_Count"
+    ) -> ReducedState | None:
         """Return the equilibrium under `target` times a load, None where steps do not lead."""
         model = self._model
         inverse, ratio, before = None, model.ratio(task, state, target), math.inf
@@ -274,15 +283,15 @@ class PODGalerkin:
             if count.iterations >= self.budget:
                 return None
             if ratio >= self.reuse:
-                new = model.widened(state, new)
+                new = model.update_strain_gap(state, new)
             elif not jump:
                 inverse = _broyden(inverse, new.y - state.y, new.internal - state.internal)
             state = new
         return None
 
     def _stepped(
-        self, task: Task, state: State, step: Tensor, jump: float, target: float
-    ) -> State | None:
+        self, task: ReducedLoad, state: ReducedState, step: Tensor, jump: float, target: float
+    ) -> ReducedState | None:
         """Return the state after the longest of the steps 1, 1/2, 1/4, ... that inverts nothing."""
         floor = self.keep * min(state.volume, 1.0)
         for length in (0.5 ** np.arange(10)).tolist():
@@ -293,8 +302,8 @@ class PODGalerkin:
         return None
 
     @cached_property
-    def _model(self) -> ReducedBody:
-        return ReducedBody(self.problem, self.vectors, self.cubature, self.lift)
+    def _model(self) -> ReducedProblem:
+        return ReducedProblem(self.problem, self.vectors, self.cubature, self.lift)
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle without what is computed from the rest."""

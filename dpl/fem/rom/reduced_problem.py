@@ -8,13 +8,13 @@ from torch import Tensor
 
 from dpl.fem.dofs import gather, scatter
 from dpl.fem.problem import Problem
-from dpl.fem.rom.ecsw import Cells, Cubature, whitening
-from dpl.fem.solvers.linear import Linear
+from dpl.fem.rom.ecsw import Cubature, ReducedMesh, whitening
+from dpl.fem.solvers.linear import LinearSolver
 
 LIFT = 1e-6  # residual ratio to which the linear answer is found where the subspace adds to it
 
 
-class Task(NamedTuple):
+class ReducedLoad(NamedTuple):
     """A load in reduced coordinates.
 
     Attributes:
@@ -36,7 +36,7 @@ class Task(NamedTuple):
     rest: Tensor
 
 
-class State(NamedTuple):
+class ReducedState(NamedTuple):
     """An iterate, evaluated once, and the part of the offset that is in it."""
 
     y: Tensor
@@ -53,7 +53,7 @@ class State(NamedTuple):
         return self.part == 0 and not self.y.any()
 
 
-class ReducedBody:
+class ReducedProblem:
     """A body seen from a subspace V by a few of its cells: what all loads share.
 
     Attributes:
@@ -67,7 +67,7 @@ class ReducedBody:
     """
 
     def __init__(
-        self, problem: Problem, vectors: Tensor, chosen: Cubature | None, lift: Linear | None
+        self, problem: Problem, vectors: Tensor, chosen: Cubature | None, lift: LinearSolver | None
     ) -> None:
         """Take the body, V (N, D, R), the cells that stand for all, and the linear answer."""
         self.problem, self.lift = problem, lift
@@ -75,7 +75,7 @@ class ReducedBody:
         white = vectors @ self._white
         every = torch.arange(len(problem.cells))
         cells, weights = (every, torch.ones(len(every))) if chosen is None else chosen[:2]
-        self.cells = Cells(problem, white, cells, weights.double())
+        self.cells = ReducedMesh(problem, white, cells, weights.double())
         self.stiffness = self.cells.product(self.cells.at_rest(), self.cells.basis)
         rank = vectors.shape[2]
         self.rest = torch.eye(rank, dtype=torch.float64) - self.cells.basis.T @ self.stiffness
@@ -99,7 +99,7 @@ class ReducedBody:
         """Return coordinates in V, (R,), of those in W."""
         return self._white @ y
 
-    def task(self, force: Tensor) -> Task:
+    def task(self, force: Tensor) -> ReducedLoad:
         """Return what a load (N, D) is in reduced coordinates."""
         problem = self.problem
         load, pull = self.load(force), self.pull
@@ -110,9 +110,9 @@ class ReducedBody:
             pull = load
         at_cells = offset[self.cells.nodes].flatten() if moves else offset
         rest = pull - at_cells @ self.stiffness if moves else pull
-        return Task(load, scale if scale > 0 else 1.0, moves, offset, at_cells, pull, rest)
+        return ReducedLoad(load, scale if scale > 0 else 1.0, moves, offset, at_cells, pull, rest)
 
-    def state(self, task: Task, y: Tensor, part: float) -> State:
+    def state(self, task: ReducedLoad, y: Tensor, part: float) -> ReducedState:
         """Return coordinates with what is known of them; `part` of the offset is there."""
         cells = self.cells
         values = cells.basis @ y
@@ -123,14 +123,14 @@ class ReducedBody:
         internal = self.internal(cells.project(force), y)
         if task.moves:
             internal += part * task.rest
-        return State(y, part, field, internal, float(volume))
+        return ReducedState(y, part, field, internal, float(volume))
 
-    def ratio(self, task: Task, state: State, target: float) -> float:
+    def ratio(self, task: ReducedLoad, state: ReducedState, target: float) -> float:
         """Return the reduced residual ratio under `target` times a load."""
         return norm(target * task.load - state.internal) / (target * task.scale)
 
     def tangent(
-        self, task: Task, state: State, target: float, jump: float
+        self, task: ReducedLoad, state: ReducedState, target: float, jump: float
     ) -> tuple[Tensor | None, Tensor]:
         """Return the tangent's inverse, None if it has none, and what a step has to balance."""
         cells = self.cells
@@ -148,13 +148,13 @@ class ReducedBody:
         inverse, failed = torch.linalg.inv_ex(cells.reduced(upper) + self.rest)
         return (None if failed else inverse), right
 
-    def widened(self, state: State, new: State) -> State:
+    def update_strain_gap(self, state: ReducedState, new: ReducedState) -> ReducedState:
         """Return the state after a step with the gap that its mixed points have."""
         problem = self.cells.problem
-        if not problem.mixes:
+        if not problem.supports_mip:
             return new
         update = (new.field - state.field) / new.length
-        return new._replace(gap=problem.widened(state.gap, new.length, update))
+        return new._replace(gap=problem.update_strain_gap(state.gap, new.length, update))
 
 
 def norm(vector: Tensor) -> float:
@@ -174,7 +174,7 @@ def refuse_range(problem: Problem) -> None:
         )
 
 
-def beyond_linear(problem: Problem, snapshots: Tensor, lift: Linear | None) -> Tensor:
+def beyond_linear(problem: Problem, snapshots: Tensor, lift: LinearSolver | None) -> Tensor:
     """Return what moves of displacements in equilibrium, less their linear answers, (S, n)."""
     rest = snapshots[:, problem.free].double()
     if lift is not None:
@@ -193,7 +193,7 @@ def _support_force(problem: Problem) -> Tensor:
     return problem.tangent_product(rest, problem.prescribed[None])[0]
 
 
-def _linear_answer(lift: Linear, force: Tensor) -> Tensor:
+def _linear_answer(lift: LinearSolver, force: Tensor) -> Tensor:
     """Return K(0)^-1 f, (N, D); what it is short of, the subspace adds."""
     problem = lift.problem
     return scatter(lift.factor.solve(gather(force, problem), LIFT), problem)

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.fem.solvers.anderson import Accelerated
+    from dpl.fem.solvers.anderson import AndersonSolver
     from dpl.fem.solvers.batched_newton import BatchedNewton
-    from dpl.fem.solvers.bifurcation import branches, unstable_directions
-    from dpl.fem.solvers.differentiable import Equilibrium
-    from dpl.fem.solvers.linear import Linear
+    from dpl.fem.solvers.bifurcation import post_buckling_branches, unstable_directions
+    from dpl.fem.solvers.differentiable import DifferentiableSolve
+    from dpl.fem.solvers.linear import LinearSolver
     from dpl.fem.solvers.newton import Newton
     from dpl.fem.solvers.solution import (
         Load,
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
         Status,
         check_force,
         check_tol,
-        in_step,
-        joined,
-        judge,
+        concatenate,
+        evaluate_solution,
+        run_lockstep,
         solve,
     )
 else:

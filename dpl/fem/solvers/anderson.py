@@ -11,15 +11,15 @@ from torch import Tensor
 from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear.interface import Array
 from dpl.fem.problem import Problem
-from dpl.fem.solvers.corotational import Turned
+from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.fem.solvers.newton import Newton
-from dpl.fem.solvers.solution import Load, Solution, in_step, judge
+from dpl.fem.solvers.solution import Load, Solution, evaluate_solution, run_lockstep
 
 WINDOW = 5  # steps in which the residual has to halve
 
 
 @dataclass(frozen=True, eq=False)
-class Accelerated:
+class AndersonSolver:
     """Fixed-point steps u + M R(u), M the inverse of K(0) in the guess's turned frame.
 
     Each costs a residual and a solve with a factor that is there. Among the mixtures of earlier
@@ -57,8 +57,8 @@ class Accelerated:
             load: What acts.
             guess: Where to start, (B, N, D) [-].
         """
-        pairs = zip(load.singles(), guess.split(1), strict=True)
-        yield from in_step([self._member(single, u) for single, u in pairs])
+        pairs = zip(load.unbatch(), guess.split(1), strict=True)
+        yield from run_lockstep([self._member(single, u) for single, u in pairs])
 
     def _member(self, load: Load, guess: Tensor) -> Iterator[Solution]:
         start = time.perf_counter()
@@ -69,7 +69,7 @@ class Accelerated:
         yield state
         if state.converged or not state.volume_ratio > 0:
             return
-        turned = newton.rest.turning.at(u)
+        turned = newton.rest.corotational.at(u)
         ratios = [float(state.residual)]
         past = _Past(self.memory, len(right))
         while count < self.max_iter:
@@ -88,7 +88,7 @@ class Accelerated:
         """Return a displacement as a solution, with what is out of balance there, (n,)."""
         problem = self.problem.at(load.poisson)
         internal, _ = evaluation = problem.evaluate(u)
-        state = judge(
+        state = evaluate_solution(
             problem, u, load, self.tol,
             iterations=count, seconds=time.perf_counter() - start, from_guess=True,
             evaluation=evaluation,
@@ -113,7 +113,7 @@ class _Past:
         kept = min(self.count, len(self.moves))
         self.gram[place, :kept] = self.gram[:kept, place] = self.changes[:kept] @ change
 
-    def step(self, right: Array, turned: Turned) -> Array:
+    def step(self, right: Array, turned: CorotatedFactor) -> Array:
         """Return the step (n,) from the mixture of iterates with the smallest residual.
 
         Args:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dpl.fem.materials.tensors import volume_change
 from dpl.fem.problem import Evaluation, Problem
-from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load, Solution, Status, check_tol
 
 
@@ -28,8 +28,8 @@ class BatchedNewton:
 
     Attributes:
         problem: The body, on the device that is to do the work.
-        tol: Residual ratio ||R_free|| / ||f|| of an answer [-], see `Problem.imbalance`; at least
-            1e-15, below 1.
+        tol: Residual ratio ||R_free|| / ||f|| of an answer [-], see
+            `Problem.relative_residual_of`; at least 1e-15, below 1.
         max_iter: Newton iterations.
         max_linear: Conjugate-gradient iterations in one of them.
         keep: Part of det F that one step may leave of the smallest one [-].
@@ -85,9 +85,9 @@ class BatchedNewton:
             length = self._lengths(u, step, state.volume_ratio)
             going &= length > 0
             step *= length[:, None, None]
-            if problem.mixes:
+            if problem.supports_mip:
                 rest = (1 - length)[:, None, None, None, None]
-                gap = problem.bending(step) + (0.0 if gap is None else rest * gap)
+                gap = problem.quadratic_strain(step) + (0.0 if gap is None else rest * gap)
                 strain = 2 * (problem.strain(u + step) - gap)
                 lowest = 1 + volume_change(strain).flatten(1).amin(dim=1)
                 gap = torch.where((lowest > 1e-3)[:, None, None, None, None], gap, 0.0)
@@ -146,7 +146,7 @@ class BatchedNewton:
     @cached_property
     def inverse(self) -> Tensor:
         """K(0)^-1, (n, n), on the problem's device."""
-        factor = Linear(self.problem.to("cpu"), linear="auto").factor
+        factor = LinearSolver(self.problem.to("cpu"), linear="auto").factor
         size = self.problem.pattern.size
         columns = [factor.solve(column, 1e-10) for column in np.eye(size)]
         return torch.from_numpy(np.stack(columns)).to(self.problem.points.device)
@@ -165,11 +165,11 @@ class BatchedNewton:
         self, u: Tensor, state: Evaluation, force: Tensor, count: Tensor, start: float
     ) -> Solution:
         problem = self.problem
-        good = problem.balanced(u, state.internal, force, self.tol) & (state.volume_ratio > 0)
+        good = problem.is_equilibrium(u, state.internal, force, self.tol) & (state.volume_ratio > 0)
         seconds = time.perf_counter() - start
         return Solution(
             displacement=u,
-            residual=problem.imbalance(state.internal, force),
+            residual=problem.relative_residual_of(state.internal, force),
             volume_ratio=state.volume_ratio,
             status=torch.where(good, int(Status.CONVERGED), int(Status.NOT_CONVERGED)),
             negative_pivots=torch.full_like(count, -1),

@@ -8,7 +8,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from torch import Tensor
 
 from dpl.fem.dofs import scatter
-from dpl.fem.linear.backends import backend
+from dpl.fem.linear.backends import make_backend
 from dpl.fem.linear.interface import full_matrix
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.solvers.solution import Load, Solution
@@ -31,7 +31,7 @@ def unstable_directions(newton: Newton, solution: Solution) -> Tensor:
         raise ValueError("the answer has no negative pivots: there is no unstable direction")
     problem = newton.problem
     values = problem.linearise(solution.displacement).tangent[0].numpy()
-    factor = backend(problem.pattern, newton.linear).factorise(values)
+    factor = make_backend(problem.pattern, newton.linear).factorise(values)
     size = problem.pattern.size
     inverse = LinearOperator((size, size), matvec=factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(size)
@@ -47,7 +47,7 @@ def unstable_directions(newton: Newton, solution: Solution) -> Tensor:
     return fields / fields.norm(dim=-1).amax(dim=1)[:, None, None]
 
 
-def branches(
+def post_buckling_branches(
     newton: Newton, load: Load, solution: Solution, *, imperfection: float = 0.02
 ) -> list[Solution]:
     """Return the answers that an unstable one gives way to, pushed in its first direction.

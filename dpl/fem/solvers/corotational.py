@@ -28,7 +28,7 @@ OUT = Typed(float64, 3, "A")
 
 
 @dataclass(frozen=True, eq=False)
-class Turning:
+class CorotationalPreconditioner:
     """How the nodes of a body have turned.
 
     Attributes:
@@ -39,7 +39,7 @@ class Turning:
     problem: Problem
     factor: Factor
 
-    def at(self, displacement: Tensor) -> "Turned":
+    def at(self, displacement: Tensor) -> "CorotatedFactor":
         """Return the factor of K(0), turned as the body is at a displacement (1, N, D) [-].
 
         A node turns by the rotation of its mean deformation gradient, one that is held in one
@@ -52,7 +52,7 @@ class Turning:
         rotations = np.zeros((*self.problem.shape, self.problem.shape[1]))
         _gradients(displacement[0].numpy(), cells, slopes, volumes, rotations)
         _rotations(rotations, self._places)
-        return Turned(self.factor, rotations, self._places)
+        return CorotatedFactor(self.factor, rotations, self._places)
 
     def steps(self, displacement: Tensor, *, rtol: float = 1e-3, most: int = 50) -> int:
         """Return the conjugate gradient steps that the tangent at a displacement (1, N, D) takes.
@@ -93,7 +93,7 @@ class Turning:
 
 
 @dataclass(frozen=True, eq=False)
-class Turned:
+class CorotatedFactor:
     """K(0)^-1 in a body's turned frame: symmetric and, as K(0) is, positive definite.
 
     Attributes:

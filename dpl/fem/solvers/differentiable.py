@@ -9,14 +9,14 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dpl.fem.dofs import gather, scatter
-from dpl.fem.linear.backends import backend
+from dpl.fem.linear.backends import make_backend
 from dpl.fem.linear.interface import Backend, Factor
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.solvers.solution import Load, Solution, Status
 
 
 @dataclass(frozen=True, eq=False)
-class Equilibrium:
+class DifferentiableSolve:
     """Displacement u(f) with f_int(u) = f, differentiable with respect to f.
 
     Forwards it is a Newton solve. Backwards, as K(u) du = df on free degrees of freedom, a gradient
@@ -83,7 +83,7 @@ class Equilibrium:
     @cached_property
     def _backend(self) -> Backend:
         problem = self.newton.problem
-        return backend(problem.pattern, self.newton.linear, problem.near_null)
+        return make_backend(problem.pattern, self.newton.linear, problem.near_null)
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle without what the backend has analysed."""
@@ -91,11 +91,11 @@ class Equilibrium:
 
 
 class _Answer(torch.autograd.Function):
-    """See `Equilibrium`."""
+    """See `DifferentiableSolve`."""
 
     @staticmethod
     def forward(
-        ctx: Any, force: Tensor, poisson: Tensor, guess: Tensor | None, parent: Equilibrium
+        ctx: Any, force: Tensor, poisson: Tensor, guess: Tensor | None, parent: DifferentiableSolve
     ) -> Tensor:
         guess = None if guess is None else guess.detach()
         load = Load(force.detach(), torch.ones(len(force), dtype=torch.float64), poisson)

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.linear.interface import Factor, SingularMatrix, SymmetricProduct
-from dpl.fem.linear.krylov import CGFactor, conjugate_gradients, lowest
+from dpl.fem.linear.krylov import CGFactor, conjugate_gradients, smallest_ritz_value
 from dpl.fem.problem import Problem
-from dpl.fem.solvers.corotational import Turned
-from dpl.fem.solvers.linear import Linear
+from dpl.fem.solvers.corotational import CorotatedFactor
+from dpl.fem.solvers.linear import LinearSolver
 
 Factorise = Callable[[NDArray[np.float64]], Factor]
 
@@ -20,7 +20,7 @@ PATIENCE = 8  # conjugate gradient steps with the factor of another tangent, the
 TURNS = 16  # of the same with K(0)'s, turned
 
 
-class Factors:
+class FactorCache:
     """The factors that one load needs on its way.
 
     The one at hand preconditions conjugate gradients on the next tangents until they take too many
@@ -30,7 +30,7 @@ class Factors:
         count: Tangents factorised so far; K(0) is not counted.
     """
 
-    def __init__(self, rest: Linear, factorise: Factorise, *, turned: bool) -> None:
+    def __init__(self, rest: LinearSolver, factorise: Factorise, *, turned: bool) -> None:
         """Begin with none.
 
         Args:
@@ -41,10 +41,10 @@ class Factors:
         self.rest, self.factorise, self.turned = rest, factorise, turned
         self.count = 0
         self._pivots = -1  # negative ones of the last tangent that was factorised
-        self._near: Factor | Turned | None = None  # the one at hand
+        self._near: Factor | CorotatedFactor | None = None  # the one at hand
         self._served: SymmetricProduct | None = None  # the last tangent, if an older factor did
 
-    def forget(self) -> None:
+    def invalidate(self) -> None:
         """Let the one at hand go: the next tangent is too far from its own."""
         self._near = None
 
@@ -55,7 +55,7 @@ class Factors:
             SingularMatrix: K(0) has no factor.
         """
         self._served, factor = None, self.rest.factor
-        self._pivots = pivots(factor)
+        self._pivots = count_negative_pivots(factor)
         return factor.solve(right, rtol)
 
     def solve(
@@ -74,18 +74,18 @@ class Factors:
         """
         self._served = None
         if self._near is None and self.turned:
-            self._near = self.rest.turning.at(u)
+            self._near = self.rest.corotational.at(u)
         if self._near is not None and self._near.negative_pivots <= 0:
             product = SymmetricProduct(self.rest.problem.pattern, tangent)
-            doubtful = isinstance(self._near, Turned)
-            steps = TURNS if doubtful else PATIENCE
+            abort_if_slow = isinstance(self._near, CorotatedFactor)
+            steps = TURNS if abort_if_slow else PATIENCE
             with suppress(SingularMatrix):
                 step = conjugate_gradients(
-                    product, self._near.apply, right, rtol, steps, doubtful=doubtful
+                    product, self._near.apply, right, rtol, steps, abort_if_slow=abort_if_slow
                 )
                 self._served = product
                 return step
-        self.turned &= not isinstance(self._near, Turned)
+        self.turned &= not isinstance(self._near, CorotatedFactor)
         self.count += 1
         self._near = None  # its storage serves the next one
         self._near = self.factorise(tangent)
@@ -100,33 +100,36 @@ class Factors:
         examined (conjugate gradients); or, where an older factor served for it, if it has an
         eigenvalue far below that factor's.
         """
-        if isinstance(self._near, Turned):
+        if isinstance(self._near, CorotatedFactor):
             return -1
         problem = self.rest.problem
         suspect = self._pivots > 0 or isinstance(self._near, CGFactor)
         if not suspect and self._served is not None and self._near is not None:
             with suppress(SingularMatrix):
-                suspect |= lowest(self._served, self._near.apply, problem.pattern.size) < DOUBT
+                suspect |= (
+                    smallest_ritz_value(self._served, self._near.apply, problem.pattern.size)
+                    < DOUBT
+                )
             self._served = None
         if suspect:
             self.count += 1
             self._near = None
-            self._pivots = pivots_at(problem, self.factorise, answer)
+            self._pivots = negative_pivots_at(problem, self.factorise, answer)
         return self._pivots
 
 
-def pivots(factor: Factor) -> int:
-    """Return the negative eigenvalues of what was factorised, see `pivots_at`."""
-    return factor.examined if isinstance(factor, CGFactor) else factor.negative_pivots
+def count_negative_pivots(factor: Factor) -> int:
+    """Return the negative eigenvalues of what was factorised, see `negative_pivots_at`."""
+    return factor.definiteness if isinstance(factor, CGFactor) else factor.negative_pivots
 
 
-def pivots_at(problem: Problem, factorise: Factorise, displacement: Tensor) -> int:
+def negative_pivots_at(problem: Problem, factorise: Factorise, displacement: Tensor) -> int:
     """Return the negative eigenvalues of the tangent at (1, N, D); 1 where it is singular.
 
     Conjugate gradients do not count them: 1 stands for some, -1 for not known.
     """
     tangent = problem.linearise(displacement).tangent
     try:
-        return pivots(factorise(tangent[0].numpy()))
+        return count_negative_pivots(factorise(tangent[0].numpy()))
     except SingularMatrix:  # at the critical load itself
         return 1

@@ -10,24 +10,24 @@ import torch
 from torch import Tensor
 
 from dpl.fem.dofs import gather, scatter
-from dpl.fem.linear.backends import backend, chosen
-from dpl.fem.linear.banded import Cholesky
+from dpl.fem.linear.backends import make_backend, select_backend
+from dpl.fem.linear.banded import BandedFactor
 from dpl.fem.linear.interface import Backend, Factor
 from dpl.fem.problem import Problem
-from dpl.fem.solvers.corotational import Turning
-from dpl.fem.solvers.solution import Load, Solution, check_force, check_tol, judge
+from dpl.fem.solvers.corotational import CorotationalPreconditioner
+from dpl.fem.solvers.solution import Load, Solution, check_force, check_tol, evaluate_solution
 
-TWINS = 4  # bodies of other Poisson's ratios whose factors are kept
+MAX_CLONES = 4  # bodies of other Poisson's ratios whose factors are kept
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
+class LinearSolver:
     """The linear answer K(0)^-1 f: exact for infinitesimal loads, one solve with a stored factor.
 
     Attributes:
         problem: The body.
         tol: Residual ratio below which the answer counts as converged [-]; at least 1e-15, below 1.
-        linear: Backend of the sparse solves, see `dpl.fem.linear.backend`.
+        linear: Backend of the sparse solves, see `dpl.fem.linear.make_backend`.
     """
 
     problem: Problem
@@ -50,38 +50,38 @@ class Linear:
         return self._backend.factorise(values)
 
     @cached_property
-    def turning(self) -> Turning:
+    def corotational(self) -> CorotationalPreconditioner:
         """What turns the factor of K(0) with the nodes; in float32 where it is a band."""
         factor = self.factor
-        rough = factor.rounded() if isinstance(factor, Cholesky) else factor
-        return Turning(self.problem, rough)
+        rough = factor.to_float32() if isinstance(factor, BandedFactor) else factor
+        return CorotationalPreconditioner(self.problem, rough)
 
     @cached_property
     def _backend(self) -> Backend:
-        return backend_of(self.problem, self.linear, lasting=True)
+        return backend_for(self.problem, self.linear, many_rhs=True)
 
-    def at(self, poisson: Tensor | float) -> "Linear":
+    def at(self, poisson: Tensor | float) -> "LinearSolver":
         """Return the linear answer of the body of another Poisson's ratio, see `Problem.at`."""
         return self.of(self.problem.at(poisson))
 
-    def of(self, problem: Problem) -> "Linear":
+    def of(self, problem: Problem) -> "LinearSolver":
         """Return the linear answer of a body that differs in Poisson's ratio only."""
-        return self if problem is self.problem else kept(self._twins, problem, self._twin)
+        return self if problem is self.problem else cached_clone(self._clones, problem, self._clone)
 
-    def _twin(self, problem: Problem) -> "Linear":
+    def _clone(self, problem: Problem) -> "LinearSolver":
         twin = replace(self, problem=problem)
         twin.__dict__["_backend"] = self._backend
         return twin
 
     @cached_property
-    def _twins(self) -> "dict[Problem, Linear]":
+    def _clones(self) -> "dict[Problem, LinearSolver]":
         return {}
 
     @cached_property
-    def reference(self) -> "Linear":
+    def reference(self) -> "LinearSolver":
         """The linear answer of the reference body, see `Problem.reference`."""
         problem = self.problem.reference
-        return self if problem is self.problem else self._twin(problem)
+        return self if problem is self.problem else self._clone(problem)
 
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield the linear answer.
@@ -94,7 +94,7 @@ class Linear:
         pairs = zip(load.force, load.poisson.expand(len(load.force), -1), strict=True)
         answer = torch.stack([self.at(nu[None]).respond(force) for force, nu in pairs])
         seconds = (time.perf_counter() - start) / len(answer)
-        yield judge(self.problem, answer, load, self.tol, iterations=1, seconds=seconds)
+        yield evaluate_solution(self.problem, answer, load, self.tol, iterations=1, seconds=seconds)
 
     def respond(self, force: Tensor) -> Tensor:
         """Return K(0)^-1 f, (N, D) [-], for f (N, D) [-]; zero where held."""
@@ -108,17 +108,19 @@ class Linear:
 Twin = TypeVar("Twin")
 
 
-def kept(twins: dict[Problem, Twin], problem: Problem, make: Callable[[Problem], Twin]) -> Twin:
+def cached_clone(
+    twins: dict[Problem, Twin], problem: Problem, make: Callable[[Problem], Twin]
+) -> Twin:
     """Return what belongs to a problem, made if it is not there; the oldest leaves for it."""
     if problem not in twins:
-        if len(twins) >= TWINS:
+        if len(twins) >= MAX_CLONES:
             twins.pop(next(iter(twins)))
         twins[problem] = make(problem)
     return twins[problem]
 
 
-def backend_of(problem: Problem, name: str, *, lasting: bool = False) -> Backend:
+def backend_for(problem: Problem, name: str, *, many_rhs: bool = False) -> Backend:
     """Return the backend for a problem's tangents, or for one whose factor answers many loads."""
     motions = problem.near_null
-    best = chosen(name, problem.pattern, motions, lasting=lasting)
-    return backend(problem.pattern, best, motions)
+    best = select_backend(name, problem.pattern, motions, many_rhs=many_rhs)
+    return make_backend(problem.pattern, best, motions)

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.dofs import gather, scatter
-from dpl.fem.linear.backends import chosen
+from dpl.fem.linear.backends import select_backend
 from dpl.fem.linear.interface import Backend, Factor, SingularMatrix
 from dpl.fem.problem import Problem
-from dpl.fem.solvers.factor_reuse import Factors, pivots_at
-from dpl.fem.solvers.linear import Linear, backend_of, kept
-from dpl.fem.solvers.solution import Load, Solution, Status, check_force, check_steps, in_step
+from dpl.fem.solvers.factor_reuse import FactorCache, negative_pivots_at
+from dpl.fem.solvers.linear import LinearSolver, backend_for, cached_clone
+from dpl.fem.solvers.solution import Load, Solution, Status, check_force, check_steps, run_lockstep
 
 CAREFUL = 2.0**-4  # load step from which on the end of the path may be near: full accuracy
 
@@ -43,15 +43,16 @@ class Newton:
 
     Attributes:
         problem: The body.
-        tol: Residual ratio ||R_free|| / ||f|| of an answer [-], see `Problem.imbalance`; at least
-            1e-15, below 1. Where rounding does not allow it, on very thin cells, an answer whose
-            residual no longer falls counts as converged, with a warning.
+        tol: Residual ratio ||R_free|| / ||f|| of an answer [-], see
+            `Problem.relative_residual_of`; at least 1e-15, below 1. Where
+            rounding does not allow it, on very thin cells, an answer whose residual no longer falls
+            counts as converged, with a warning.
         max_iter: Iterations per load step before it is halved.
         budget: Iterations in all before a load is given up.
         smallest_step: Load step, as a part of the load, below which to give up [-].
         loose: Residual ratio at intermediate load factors [-].
         keep: Part of det F that one step may leave of the smallest one [-].
-        linear: Backend of the sparse solves, see `dpl.fem.linear.backend`.
+        linear: Backend of the sparse solves, see `dpl.fem.linear.make_backend`.
         mixed: Let the strains at the quadrature points be unknowns of their own (Magisano,
             Leonetti, Garcea 2017), for laws that can: fewer iterations, far larger steps.
         reuse: Residual ratio below which the last factor, as preconditioner of conjugate gradients
@@ -80,7 +81,7 @@ class Newton:
             ValueError: An attribute is out of range, or the backend is not there.
         """
         check_steps(self, parts=("loose", "keep", "smallest_step"))
-        chosen(self.linear)
+        select_backend(self.linear)
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
         """Yield the state before the first update and after each one.
@@ -98,14 +99,14 @@ class Newton:
         check_force(self.problem, load)
         acting, own = self.problem.acting(load.force), load.poisson.expand(len(load.force), -1)
         guesses = [None] * len(own) if guess is None else guess.split(1)
-        yield from in_step(
+        yield from run_lockstep(
             [
                 self.at(nu[None])._member(force[None], start)
                 for force, nu, start in zip(acting, own, guesses, strict=True)
             ]
         )
 
-    def but(self, **changes: Any) -> "Newton":
+    def replace(self, **changes: Any) -> "Newton":
         """Return the solver with other attributes, those of its K(0) excepted: it keeps that."""
         other = replace(self, **changes)
         other.__dict__["rest"] = self.rest
@@ -117,22 +118,22 @@ class Newton:
         It has a K(0) of its own to factorise; those of the last few are kept.
         """
         problem = self.problem.at(poisson)
-        return self if problem is self.problem else kept(self._twins, problem, self._twin)
+        return self if problem is self.problem else cached_clone(self._clones, problem, self._clone)
 
-    def _twin(self, problem: Problem) -> "Newton":
+    def _clone(self, problem: Problem) -> "Newton":
         twin = replace(self, problem=problem)
         twin.__dict__["_backend"] = self._backend
         twin.__dict__["rest"] = self.rest.of(problem)
         return twin
 
     @cached_property
-    def _twins(self) -> "dict[Problem, Newton]":
+    def _clones(self) -> "dict[Problem, Newton]":
         return {}
 
     def _member(self, force: Tensor, guess: Tensor | None) -> Iterator[Solution]:
         """Yield the states under one load (1, N, D)."""
         problem = self.problem
-        count = _Count(Factors(self.rest, self.factorise, turned=self.turned))
+        count = _Count(FactorCache(self.rest, self.factorise, turned=self.turned))
         state = base = self._rest(force)
         guessed = guess is not None and bool(guess.any())
         guessed &= bool(force.any()) or problem.moved_supports
@@ -168,11 +169,11 @@ class Newton:
     ) -> Iterator["_State"]:
         """Yield iterates under `target` times a load until they balance it or cannot go on."""
         before = float("nan")
-        count.factors.forget()
+        count.factors.invalidate()
         for _ in range(self.max_iter):
             ratio = self._ratio(state, force, target)
             if not ratio < self.reuse:
-                count.factors.forget()
+                count.factors.invalidate()
             try:
                 update = self._update(state, target * force, count, self._forcing(ratio, before))
             except SingularMatrix:
@@ -234,19 +235,21 @@ class Newton:
             jump = (1 - length) * state.jump
             end = self._state(state.displacement + length * update, jump)
             if end.volume_ratio > floor:
-                if self.mixed and self.problem.mixes:
-                    return end._replace(gap=self.problem.widened(state.gap, length, update))
+                if self.mixed and self.problem.supports_mip:
+                    return end._replace(
+                        gap=self.problem.update_strain_gap(state.gap, length, update)
+                    )
                 return end
         return None
 
     @cached_property
-    def rest(self) -> Linear:
+    def rest(self) -> LinearSolver:
         """The linear answer, with the factor that every first step from zero uses."""
-        return Linear(self.problem, self.tol, self.linear)
+        return LinearSolver(self.problem, self.tol, self.linear)
 
     @cached_property
     def _backend(self) -> Backend:
-        return backend_of(self.problem, self.linear)
+        return backend_for(self.problem, self.linear)
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle without factors."""
@@ -263,7 +266,7 @@ class Newton:
     def _ratio(self, state: "_State", force: Tensor, target: float) -> float:
         """Return ||R_free|| / ||f|| under `target` times a load, evaluated once."""
         if target not in state.ratios:
-            ratio = self.problem.imbalance(state.internal, target * force)
+            ratio = self.problem.relative_residual_of(state.internal, target * force)
             state.ratios[target] = float(ratio)
         return state.ratios[target]
 
@@ -274,7 +277,7 @@ class Newton:
             return True
         u, internal = state.displacement, state.internal
         stuck = 0.1 * state.before < ratio < 1e-4
-        return stuck and bool(self.problem.balanced(u, internal, target * force, tol))
+        return stuck and bool(self.problem.is_equilibrium(u, internal, target * force, tol))
 
     def _report(
         self, state: "_State", force: Tensor, count: "_Count", end: Status | None = None
@@ -314,7 +317,7 @@ class Newton:
 
         Conjugate gradients do not count them: 1 stands for some, -1 for not known.
         """
-        return pivots_at(self.problem, self.factorise, displacement)
+        return negative_pivots_at(self.problem, self.factorise, displacement)
 
 
 class _State(NamedTuple):
@@ -333,7 +336,7 @@ class _State(NamedTuple):
 class _Count:
     """What one load has cost so far, and what is known of it."""
 
-    factors: Factors
+    factors: FactorCache
     iterations: int = 0
     known: float = 0.0
     guessed: bool = False  # whether the guess, if there was one, has not failed

@@ -33,15 +33,15 @@ class Load(_Load):
 
     def __new__(cls, force: Tensor, young: Tensor, poisson: Tensor | None = None) -> "Load":
         """Take the columns; Poisson's ratios (B,) too."""
-        return super().__new__(cls, force, young, beside(young, poisson))
+        return super().__new__(cls, force, young, as_column(young, poisson))
 
-    def singles(self) -> "list[Load]":
+    def unbatch(self) -> "list[Load]":
         """Return each load alone, B = 1."""
         parts = (slice(k, k + 1) for k in range(len(self.force)))
         return [Load(*(column[part] for column in self)) for part in parts]
 
 
-def beside(young: Tensor, poisson: Tensor | None) -> Tensor:
+def as_column(young: Tensor, poisson: Tensor | None) -> Tensor:
     """Return Poisson's ratios (B,) or (B, P) as (B, P), P = 0 if left out, of moduli (B,)."""
     if poisson is None:
         return young.new_zeros(*young.shape, 0)
@@ -67,7 +67,7 @@ class Solution(NamedTuple):
     Attributes:
         displacement: Over L, (B, N, D) [-].
         residual: ||R_free|| / ||f|| at `displacement` under the whole load, (B,) [-], see
-            `Problem.imbalance`.
+            `Problem.relative_residual_of`.
         volume_ratio: min det F at `displacement`, (B,) [-].
         status: `Status` as a number, (B,).
         negative_pivots: Negative eigenvalues of the tangent there, (B,); -1: not examined.
@@ -154,23 +154,23 @@ def solve(solver: Solver, load: Load) -> Solution:
     return last
 
 
-def joined(parts: Sequence[Solution]) -> Solution:
+def concatenate(parts: Sequence[Solution]) -> Solution:
     """Return solutions as one batch."""
     return Solution(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
-def in_step(members: Sequence[Iterator[Solution]]) -> Iterator[Solution]:
+def run_lockstep(members: Sequence[Iterator[Solution]]) -> Iterator[Solution]:
     """Yield the solutions of single loads as batches; a load that has ended repeats its end."""
     states = [next(member) for member in members]
     while True:
-        yield joined(states)
+        yield concatenate(states)
         news = [next(member, None) for member in members]
         if all(new is None for new in news):
             return
         states = [old if new is None else new for old, new in zip(states, news, strict=True)]
 
 
-def judge(
+def evaluate_solution(
     problem: Problem,
     displacement: Tensor,
     load: Load,
@@ -199,7 +199,7 @@ def judge(
     check_tol(tol)
     problem = problem.at(load.poisson)
     internal, volume = evaluation or problem.evaluate(displacement)
-    ratio = problem.imbalance(internal, load.force)
+    ratio = problem.relative_residual_of(internal, load.force)
     balanced = (ratio < tol) & (volume > 0)
     count = torch.full_like(volume, iterations, dtype=torch.int64)
     return Solution(

@@ -12,7 +12,7 @@ from dpl.training.callbacks.nonfinite_gradients import Diverged
 from dpl.training.callbacks.worst_cases import _boards, _step
 
 
-class LearningRate(LearningRateMonitor):
+class LogLearningRate(LearningRateMonitor):
     """Lightning's callback, which would end a training that has no logger."""
 
     def on_train_start(self, trainer: L.Trainer, *args: Any, **kwargs: Any) -> None:
@@ -31,7 +31,7 @@ class LearningRate(LearningRateMonitor):
             super().on_train_epoch_start(trainer, *args, **kwargs)
 
 
-class Session(L.Callback):
+class LogHyperparameters(L.Callback):
     """Tells loggers what makes this run differ from others, and how it ended.
 
     TensorBoard's HPARAMS tab shows a run from its first step on, with the last of all its scalars;

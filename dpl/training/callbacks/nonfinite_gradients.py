@@ -11,7 +11,7 @@ class Diverged(ArithmeticError):
     """A training that has no finite gradients any more, and what to do about it."""
 
 
-class Guard(L.Callback):
+class SkipNonFiniteGradients(L.Callback):
     """Skips the steps whose gradients are not finite, and ends a training that has no others.
 
     A sample, a loss or a slope that is infinite or not a number shows in the gradients; a step with

@@ -14,7 +14,7 @@ from torch import Tensor
 from dpl.data import OnlineData
 
 
-class SampleRates(L.Callback):
+class ThroughputMonitor(L.Callback):
     """Logs how fast samples are made and used, once an epoch, validation left out.
 
     `rate/steps` and `rate/consumed` (samples) a second; of a stream besides `rate/produced`
@@ -53,7 +53,7 @@ class SampleRates(L.Callback):
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Log the epoch; of several processes the sums."""
         seconds = max(self._seconds, 1e-9)
-        sums = {"rate/consumed": self._samples / seconds, "memory/process": resident()}
+        sums = {"rate/consumed": self._samples / seconds, "memory/process": resident_memory()}
         means = {"rate/steps": (trainer.global_step - self._steps) / seconds}
         data = getattr(trainer, "datamodule", None)
         if isinstance(data, OnlineData) and (rates := data.rates) is not None:
@@ -65,7 +65,7 @@ class SampleRates(L.Callback):
         pl_module.log_dict(means, sync_dist=True)
 
 
-def resident() -> float:
+def resident_memory() -> float:
     """Return the memory that this process holds [GB]; zero where the system does not say."""
     with suppress(OSError):
         pages = int(Path("/proc/self/statm").read_text().split()[1])

@@ -6,7 +6,7 @@ from pathlib import Path
 import lightning as L
 import torch
 
-from dpl.system.files import append_line
+from dpl.system.files import append_jsonl
 
 
 class TrainingTime(L.Callback):
@@ -41,5 +41,5 @@ class TrainingTime(L.Callback):
                 "threads": torch.get_num_threads(),
                 "device": str(module.device),
             }
-            append_line(self.path, line)
+            append_jsonl(self.path, line)
             self._start = 0.0

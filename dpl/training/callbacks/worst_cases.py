@@ -17,7 +17,7 @@ from torch import Tensor
 from dpl.fem import surface
 from dpl.fem.postprocess import coarse, triangles
 from dpl.scene import Sample, Scene
-from dpl.training.metrics import Judged, MaxError, RelativeL2
+from dpl.training.metrics import MaxError, PerLoadErrors, RelativeL2
 from dpl.visualization import colours, deformed, spread
 
 GREY = 160  # of a true shape
@@ -31,7 +31,7 @@ LOOK = {  # of meshes in the browser, in the words of three.js
 }
 
 
-class WorstCases(L.Callback):
+class WorstCasePlots(L.Callback):
     """Draws the validation loads on which the network is worst, for TensorBoard.
 
     Under `validation/shapes` the loads with the largest relative and the largest absolute error
@@ -100,7 +100,7 @@ class WorstCases(L.Callback):
         truth = trainer.datamodule.samples("val")
         training = module.training
         module.eval()
-        judged = judge(module, truth, trainer.datamodule.batch_size)
+        judged = per_sample_errors(module, truth, trainer.datamodule.batch_size)
         chosen = judged.chosen(self.loads)
         worst = chosen.index(judged.farthest)
         some = Sample(*(column[chosen] for column in truth))
@@ -116,7 +116,9 @@ class WorstCases(L.Callback):
             board.add_figure("validation/shapes", shapes, step)
             board.add_figure("validation/errors", errors, step)
             if self.meshes and predicted[worst].isfinite().all():
-                pair = beside(module.scene, predicted[worst], some.displacement[worst], self.most)
+                pair = side_by_side_mesh(
+                    module.scene, predicted[worst], some.displacement[worst], self.most
+                )
                 board.add_mesh("validation/worst", **pair, config_dict=LOOK, global_step=step)
         self._spent += time.perf_counter() - start
         part = self._spent / (time.perf_counter() - self._begin)
@@ -124,7 +126,7 @@ class WorstCases(L.Callback):
             board.add_scalar("time/pictures", part, step)
 
 
-def judge(module: Any, truth: Sample, batch_size: int) -> Judged:
+def per_sample_errors(module: Any, truth: Sample, batch_size: int) -> PerLoadErrors:
     """Return how wrong a surrogate is on loads with the truth, (B, ...)."""
     relative, largest = RelativeL2(), MaxError()
     parts = []
@@ -133,12 +135,16 @@ def judge(module: Any, truth: Sample, batch_size: int) -> Judged:
         prediction = _predict(module, batch)
         size = batch.displacement.norm(dim=2).amax(dim=1)
         parts.append(
-            Judged(relative.measure(prediction, batch), largest.measure(prediction, batch), size)
+            PerLoadErrors(
+                relative.measure(prediction, batch), largest.measure(prediction, batch), size
+            )
         )
-    return Judged(*(torch.cat(column) for column in zip(*parts, strict=True)))
+    return PerLoadErrors(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
-def beside(scene: Scene, prediction: Tensor, truth: Tensor, most: int) -> dict[str, Tensor]:
+def side_by_side_mesh(
+    scene: Scene, prediction: Tensor, truth: Tensor, most: int
+) -> dict[str, Tensor]:
     """Return a prediction (N, D) [-] and, below it, the truth as one mesh for TensorBoard.
 
     The surface in triangles. Its first half of vertices is where the prediction puts them, in

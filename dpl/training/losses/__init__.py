@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.training.losses.energy import Energy, Stiffness
-    from dpl.training.losses.loss import Loss, Physics, floored, squared_error
+    from dpl.training.losses.energy import EnergyNormLoss, PotentialEnergyLoss
+    from dpl.training.losses.loss import Loss, LossContext, clamp_scale, squared_error
     from dpl.training.losses.residual import LrPlus, LrStar, residual_norm
-    from dpl.training.losses.schedule import Annealed
-    from dpl.training.losses.supervised import MSE, MeanNorm
+    from dpl.training.losses.schedule import BlendedLoss
+    from dpl.training.losses.supervised import MSE, RMSELoss
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

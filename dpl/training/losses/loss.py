@@ -10,7 +10,7 @@ from dpl.fem import Problem
 from dpl.scene import Sample
 
 
-class Physics(NamedTuple):
+class LossContext(NamedTuple):
     """What a loss may know of the scene.
 
     Attributes:
@@ -30,7 +30,7 @@ class Loss(L.Callback):
         """Start with nothing to log."""
         self.terms: dict[str, Tensor] = {}
 
-    def __call__(self, prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
+    def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         """Return the loss of displacements (B, N, D) [-], float64, as a scalar."""
         raise NotImplementedError(f"{type(self).__name__} computes nothing")
 
@@ -38,7 +38,7 @@ class Loss(L.Callback):
         """Log the terms."""
         module.log_dict({f"loss/{name}": term.detach() for name, term in self.terms.items()})
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """Return what this loss leaves out, a line each."""
         return []
 
@@ -48,7 +48,7 @@ def squared_error(prediction: Tensor, batch: Sample) -> Tensor:
     return (prediction - batch.displacement).square().mean(dim=(1, 2))
 
 
-def floored(sizes: Tensor, floor: float) -> Tensor:
+def clamp_scale(sizes: Tensor, floor: float) -> Tensor:
     """Return what to divide samples by: their own sizes (B,), but no less than a part of the mean.
 
     Without a floor a load near zero, which no network answers to many digits, outweighs a batch.

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from dpl.fem.postprocess import tangent_product
 from dpl.scene import Sample
-from dpl.training.losses.loss import Loss, Physics, squared_error
-from dpl.training.losses.supervised import _Known
+from dpl.training.losses.loss import Loss, LossContext, squared_error
+from dpl.training.losses.supervised import _FixedGradient
 
 
 class LrStar(Loss):
@@ -26,7 +26,7 @@ class LrStar(Loss):
         super().__init__()
         self.per_sample = per_sample
 
-    def __call__(self, prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
+    def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         """See `Loss`."""
         error = squared_error(prediction, batch)
         weight = residual_norm(prediction.detach(), batch, physics)
@@ -34,7 +34,7 @@ class LrStar(Loss):
         self.terms = {"mse": error.mean(), "residual": weight.mean()}
         return (error * weight).mean()
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """See `Loss`."""
         return ["no backward pass through the residual: it is a weight"]
 
@@ -69,7 +69,7 @@ class LrPlus(Loss):
         if self._warmup:
             self.weight = self._final * min(1.0, trainer.current_epoch / self._warmup)
 
-    def __call__(self, prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
+    def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         """See `Loss`."""
         error = squared_error(prediction, batch).mean()
         residual = residual_norm(prediction, batch, physics).mean()
@@ -77,7 +77,7 @@ class LrPlus(Loss):
         return error + self.weight * residual
 
 
-def residual_norm(prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
+def residual_norm(prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
     """Return ||R_free(u)|| / ||Phi q_max||, (B,) [-].
 
     Its slope K R / ||R|| takes two more evaluations, see `tangent_product`. Where elements are
@@ -95,4 +95,4 @@ def residual_norm(prediction: Tensor, batch: Sample, physics: Physics) -> Tensor
     unit = residual / length.clamp(min=torch.finfo(length.dtype).tiny)[:, None, None]
     slope = tangent_product(problem, prediction.detach(), unit) / physics.largest_force
     slope = torch.where(slope.isfinite() & sound[:, None, None], slope, 0.0)
-    return _Known.apply(prediction, norm, slope)
+    return _FixedGradient.apply(prediction, norm, slope)

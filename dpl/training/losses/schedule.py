@@ -4,10 +4,10 @@ import lightning as L
 from torch import Tensor
 
 from dpl.scene import Sample
-from dpl.training.losses.loss import Loss, Physics
+from dpl.training.losses.loss import Loss, LossContext
 
 
-class Annealed(Loss):
+class BlendedLoss(Loss):
     """One loss that turns into another: (1 - weight) first + weight second.
 
     Attributes:
@@ -40,7 +40,7 @@ class Annealed(Loss):
         for loss in (self.first, self.second):
             loss.on_train_epoch_start(trainer, module)
 
-    def __call__(self, prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
+    def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         """See `Loss`; a part of weight 0 is not evaluated."""
         total = prediction.new_zeros(())
         self.terms = {"weight": total + self.weight}
@@ -53,6 +53,6 @@ class Annealed(Loss):
                 self.terms |= {f"{name}/{term}": what for term, what in loss.terms.items()}
         return total
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """Return what both leave out."""
-        return [line for line in self.first.plan() if line in self.second.plan()]
+        return [line for line in self.first.skipped_work() if line in self.second.skipped_work()]

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dpl.scene import Sample
-from dpl.training.losses.loss import Loss, Physics, _checked, floored, squared_error
+from dpl.training.losses.loss import Loss, LossContext, _checked, clamp_scale, squared_error
 
 TINY = 1e-24  # square of an error below which a norm has no slope [-]
 
@@ -28,7 +28,7 @@ class MSE(Loss):
         Args:
             relative: Power of the mean square of its own displacement that each sample's error is
                 divided by: at 1 small loads count as much as large ones, at 0 by their size.
-            floor: See `floored`; only where `relative` is above 0.
+            floor: See `clamp_scale`; only where `relative` is above 0.
 
         Raises:
             ValueError: A number is out of range.
@@ -38,35 +38,35 @@ class MSE(Loss):
             raise ValueError(f"relative = {relative} must lie between 0 and 1")
         self.relative, self.floor = relative, _checked(floor)
 
-    def __call__(self, prediction: Tensor, batch: Sample, physics: Physics) -> Tensor:
+    def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         """See `Loss`."""
         size = batch.displacement.square().mean(dim=(1, 2))
-        return self.of_squares(squared_error(prediction, batch), size)
+        return self.from_squared_errors(squared_error(prediction, batch), size)
 
-    def of_squares(self, error: Tensor, size: Tensor) -> Tensor:
+    def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
         """Return the loss of mean squared errors (B,) of displacements of mean squares (B,)."""
         return self._weighted(error, size).mean()
 
     def _weighted(self, error: Tensor, size: Tensor) -> Tensor:
-        return error / floored(size, self.floor) ** self.relative if self.relative else error
+        return error / clamp_scale(size, self.floor) ** self.relative if self.relative else error
 
-    def plan(self) -> list[str]:
+    def skipped_work(self) -> list[str]:
         """See `Loss`."""
         return ["no finite-element evaluation in training: the loss knows no residual"]
 
 
-class MeanNorm(MSE):
+class RMSELoss(MSE):
     """Mean over samples of the root mean square error of u/L: e_mean, but for a factor.
 
     Its slope does not fade as the error falls, and no sample with a large error outweighs a batch.
     """
 
-    def of_squares(self, error: Tensor, size: Tensor) -> Tensor:
+    def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
         """See `MSE`."""
         return (self._weighted(error, size) + TINY).sqrt().mean()
 
 
-class _Known(torch.autograd.Function):
+class _FixedGradient(torch.autograd.Function):
     """Values (B,) of displacements (B, N, D), their slope (B, N, D) found by other means."""
 
     @staticmethod
