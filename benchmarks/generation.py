@@ -46,7 +46,7 @@ def costs(
         surrogate: Another start.
     """
     newton = scene.solver
-    once = replace(newton, reuse=0.0)
+    once = replace(newton, factor_reuse_tol=0.0)
     starts: dict[str, tuple[object, Guess | None]] = {
         "a factor for every tangent": (once, None),
         "factors reused (the generator)": (newton, None),
@@ -107,10 +107,10 @@ def _nearest(scene: Scene, pool: int) -> Guess:
     loads = scene.loads.sample((2, 0), range(pool))
     answers = [solve(scene.solver, single) for single in loads.unbatch()]
     displacement = torch.cat([answer.displacement for answer in answers])
-    linear = torch.stack([scene.linear.respond(force) for force in loads.force])
+    linear = torch.stack([scene.linear.solve(force) for force in loads.force])
 
     def guess(load: Load) -> Tensor:
-        response = scene.linear.respond(load.force[0])
+        response = scene.linear.solve(load.force[0])
         distance = (linear - response).flatten(1).norm(dim=1)
         k = int(distance.argmin())
         return (displacement[k] + response - linear[k])[None]

@@ -84,10 +84,10 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     first = 1e3 * (time.perf_counter() - start)
     name = select_backend("auto", problem.pattern, problem.near_null, many_rhs=True)
     yield Size(f"factor of K(0), analysis included ({name})", dofs, first)
-    yield row("linear answer", lambda load: newton.rest.respond(load.force[0]))
+    yield row("linear answer", lambda load: newton.rest.solve(load.force[0]))
     answers = {float(load.force.norm()): solve(newton, load).displacement for load in singles}
     yield row("Newton", lambda load: solve(newton, load))
-    turned = newton.replace(turned=True)
+    turned = newton.replace(corotational=True)
 
     def hybrid(load: Load) -> None:
         guess = 1.001 * answers[float(load.force.norm())]
@@ -98,7 +98,7 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     net = Latent(scene)
     surrogate = Surrogate(net, MSE(), scene).eval()
     drawn = scene.loads.sample((0, 0), range(64))
-    linear = torch.stack([newton.rest.respond(force) for force in drawn.force])
+    linear = torch.stack([newton.rest.solve(force) for force in drawn.force])
     bent = linear + linear * linear.norm(dim=-1, keepdim=True)
     surrogate.fit_bases(Sample(drawn.force, bent, drawn.young))
     kept = sum(t.nbytes for t in surrogate.state_dict().values()) / 1e6

@@ -89,7 +89,7 @@ class Scene:
         bodies = [self.linear.at(load.poisson) for load in drawn]
         pairs = zip(bodies, answers, strict=True)
         steps = [linear.corotational.steps(answer.displacement) for linear, answer in pairs]
-        return self.solver.replace(turned=sum(steps) <= SHORT * len(steps))
+        return self.solver.replace(corotational=sum(steps) <= SHORT * len(steps))
 
     @property
     def length(self) -> float:
@@ -138,11 +138,13 @@ class Scene:
                 "deflection": float(loads.deflection),
                 "patch": [float(radius) for radius in loads.patch],
                 "distribution": _name(loads.distribution),
-                "spectrum": float(loads.spectrum),
+                "spectrum": float(loads.eigenvalue_exponent),
                 "radius": _name(loads.radius),
                 "amplitude": _name(loads.amplitude),
                 "sampling": loads.sampling,
-                "always": None if loads.always is None else _digest(loads.always.numpy()),
+                "always": None
+                if loads.constant_force is None
+                else _digest(loads.constant_force.numpy()),
             },
             "tol": float(self.solver.tol),
         }

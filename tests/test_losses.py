@@ -529,7 +529,7 @@ def test_the_energy_reads_no_answer(few, unanswered, physics, near):
 def test_the_energy_is_the_potential_over_the_work_of_the_linear_answer(scene, few, physics, near):
     problem = scene.problem
     total = problem.energy(near) - (few.force * near).sum(dim=(1, 2))
-    linear = torch.stack([scene.linear.respond(force) for force in few.force])
+    linear = torch.stack([scene.linear.solve(force) for force in few.force])
     work = (few.force * linear).sum(dim=(1, 2)) / 2
     found = float(PotentialEnergyLoss(floor=0.0)(near, few, physics))
     assert found == pytest.approx(float((total / work).mean()), rel=1e-9)
@@ -553,7 +553,7 @@ def test_light_loads_count_as_much_as_heavy_ones(scene, few, physics):
     energy, stiffness = PotentialEnergyLoss(floor=0.0), EnergyNormLoss(floor=0.0)
     for amplitude in (1e-3, 1e-5):
         force = amplitude * few.force
-        linear = torch.stack([scene.linear.respond(one) for one in force])
+        linear = torch.stack([scene.linear.solve(one) for one in force])
         light = Sample(force, linear, few.young)
         for u in (linear, 0.9 * linear, 0.5 * linear):
             expected = -1 + float(stiffness(u, light, physics))
@@ -572,7 +572,7 @@ def test_an_inverted_sample_has_the_energy_of_the_linear_body(scene, few, physic
     """Half of u^T K(0) u, over the work of the linear answer."""
     problem = scene.problem
     image = problem.tangent_product(torch.zeros_like(inverted), inverted)
-    linear = torch.stack([scene.linear.respond(force) for force in few.force])
+    linear = torch.stack([scene.linear.solve(force) for force in few.force])
     work = (few.force * linear).sum(dim=(1, 2)) / 2
     expected = (inverted * image).sum(dim=(1, 2)) / 2 / work
     found = float(PotentialEnergyLoss(floor=0.0)(inverted, few, physics))

@@ -61,7 +61,7 @@ def test_rest_stiffness_is_factorised_once_for_modes_answers_and_first_steps(mak
     assert calls["factorise"] == 1
     load = scene.loads.sample((0, 0), range(3))
     for force in load.force:
-        scene.linear.respond(force)
+        scene.linear.solve(force)
     solve(scene.linear, load)
     Surrogate(FCNN(scene, width=4), MSE(), scene)
     assert calls["factorise"] == 1

@@ -203,9 +203,9 @@ def test_every_solver_takes_each_load_with_its_own(wide, few):
         assert torch.allclose(solve(solver, few.load).displacement, exact, rtol=0, atol=1e-9)
     linear = solve(wide.linear, few.load).displacement
     for k in range(4):
-        one = wide.linear.at(float(few.poisson[k])).respond(few.force[k])
+        one = wide.linear.at(float(few.poisson[k])).solve(few.force[k])
         assert torch.equal(linear[k], one)
-    assert not torch.allclose(linear[0], wide.linear.reference.respond(few.force[0]), rtol=1e-3)
+    assert not torch.allclose(linear[0], wide.linear.reference.solve(few.force[0]), rtol=1e-3)
 
 
 def test_a_load_that_does_not_say_which_is_refused(wide, few):
@@ -424,7 +424,7 @@ def test_linear_answers_between_nodes_are_those_of_every_poissons_ratio(make_sce
     answers = torch.cat([torch.from_numpy(one.factor.solve(right)) for one in rests.members])
     assert all(span[0] <= nu <= span[1] for nu in rests.nodes)
     for nu in torch.linspace(*span, 7, dtype=torch.float64):
-        exact = scene.linear.at(float(nu)).respond(force)[free]
+        exact = scene.linear.at(float(nu)).solve(force)[free]
         found = rests.between(answers[None], nu.view(1, 1))[0]
         assert (found - exact).norm() < 1e-5 * exact.norm()
 
@@ -440,7 +440,7 @@ def test_small_loads_are_answered_linearly_at_every_poissons_ratio(wide, sets, f
     exact = solve(wide.linear, light.load).displacement
     with torch.no_grad():
         found = module.predict(light.load)
-    reference = torch.stack([wide.linear.reference.respond(force) for force in light.force])
+    reference = torch.stack([wide.linear.reference.solve(force) for force in light.force])
 
     def error(field):
         return float(((field - exact).flatten(1).norm(dim=1) / exact.flatten(1).norm(dim=1)).max())

@@ -111,7 +111,10 @@ def test_the_identity_names_the_options_of_the_loads_and_no_other(make_scene, sc
         *("name", "n_modes", "deflection", "patch", "distribution", "spectrum", "radius"),
         *("amplitude", "sampling", "always"),
     }
-    for options in ({"newton": partial(Newton, reuse=0.0)}, {"newton": partial(Newton, budget=9)}):
+    for options in (
+        {"newton": partial(Newton, factor_reuse_tol=0.0)},
+        {"newton": partial(Newton, max_total_iter=9)},
+    ):
         assert make_scene(**options).fingerprint == scene.fingerprint
 
 

@@ -71,8 +71,8 @@ def test_without_a_tolerance_the_network_answers_and_says_how_wrong_it_is(scene,
     assert torch.allclose(answer.displacement, 0.5 * truth)
     assert not answer.converged.any()
     assert not answer.iterations.any()
-    assert all("out of balance by" in words for words in answer.verdict)
-    assert not any("stab" in words for words in answer.verdict)
+    assert all("out of balance by" in words for words in answer.summary)
+    assert not any("stab" in words for words in answer.summary)
 
 
 def test_an_exact_prediction_needs_no_iteration(scene, forces):
@@ -105,7 +105,7 @@ def test_whatever_the_network_says_a_tolerance_is_kept(scene, forces, truth, nam
 
 def test_a_useless_network_alone_is_said_to_be_not_valid(scene, forces):
     answer = simulator_of(scene, lambda load: torch.full_like(load.force, torch.nan))(forces)
-    assert all(words.startswith("NOT VALID") for words in answer.verdict)
+    assert all(words.startswith("NOT VALID") for words in answer.summary)
     assert not answer.converged.any()
 
 
@@ -115,12 +115,12 @@ def test_numpy_in_numpy_out_and_one_load_gives_one_answer(scene, forces):
     assert isinstance(several.displacement, np.ndarray)
     assert several.displacement.shape == forces.shape
     assert isinstance(several.residual, np.ndarray)
-    assert several.method.shape == several.verdict.shape == (len(forces),)
+    assert several.method.shape == several.summary.shape == (len(forces),)
     assert isinstance(single.displacement, np.ndarray)
     assert single.displacement.shape == forces.shape[1:]
     assert isinstance(single.residual, float)
     assert isinstance(single.converged, bool)
-    assert isinstance(single.verdict, str)
+    assert isinstance(single.summary, str)
     assert isinstance(single.method, str)
     assert np.array_equal(single.displacement, several.displacement[1])
     tensors = sim(forces, tol=1e-6)
@@ -144,7 +144,7 @@ def test_a_body_without_load_is_at_rest(scene, forces):
     )
     assert (answer.method, answer.converged) == ("rest", True)
     assert not answer.displacement.any()
-    assert "at rest" in answer.verdict
+    assert "at rest" in answer.summary
 
 
 def test_small_loads_are_answered_linearly(scene, forces):
@@ -221,22 +221,22 @@ def test_how_far_a_load_lies_outside_is_said(scene):
     answer = sim(reach)
     assert answer.out_of_distribution
     assert answer.amplitude == pytest.approx(2.5)
-    assert "2.5 times the training's largest" in answer.verdict
+    assert "2.5 times the training's largest" in answer.summary
     inner = torch.zeros(scene.problem.shape, dtype=torch.float64)
     inner[~scene.problem.boundary] = 1.0
     strange = sim(inner)
     assert strange.out_of_distribution
     assert strange.out_of_span == pytest.approx(1.0)
-    assert "unlike the training's" in strange.verdict
+    assert "unlike the training's" in strange.summary
 
 
 def test_stability_is_examined_where_it_is_asked_for(scene, forces):
     sim = simulator_of(scene)
     plain, examined = sim(forces[0], tol=1e-8), sim(forces[0], tol=1e-8, stability=True)
     assert examined.negative_pivots == 0
-    assert examined.verdict.endswith(", stable")
+    assert examined.summary.endswith(", stable")
     if plain.negative_pivots < 0:
-        assert "not examined" in plain.verdict
+        assert "not examined" in plain.summary
 
 
 def test_an_unstable_answer_is_said_to_be_unstable(make_scene):
@@ -245,22 +245,22 @@ def test_an_unstable_answer_is_said_to_be_unstable(make_scene):
     force = torch.zeros(1, *scene.problem.shape, dtype=torch.float64)
     end = scene.problem.points[:, 0] == 1.0
     force[:, end, 0] = -2 * math.pi**2 / 4 * (0.1**4 / 12) / int(end.sum())
-    sim = simulator_of(scene, lambda load: scene.linear.respond(load.force[0])[None])
+    sim = simulator_of(scene, lambda load: scene.linear.solve(load.force[0])[None])
     answer = sim(force[0] * E * scene.force_unit, tol=1e-8, stability=True)
     assert answer.converged
     assert answer.negative_pivots > 0
-    assert "UNSTABLE" in answer.verdict
+    assert "UNSTABLE" in answer.summary
 
 
 def test_a_load_without_an_answer_is_said_to_have_none(scene, forces):
     answer = simulator_of(scene)(1e6 * forces[0], tol=1e-8)
     assert not answer.converged
-    assert "estimate" in answer.verdict or "NOT VALID" in answer.verdict
-    assert "times the training's largest" in answer.verdict
+    assert "estimate" in answer.summary or "NOT VALID" in answer.summary
+    assert "times the training's largest" in answer.summary
 
 
 def test_the_last_answer_starts_the_next_where_it_is_nearer(scene, forces, truth):
-    sim = simulator_of(scene, lambda load: 0.2 * scene.linear.respond(load.force[0])[None])
+    sim = simulator_of(scene, lambda load: 0.2 * scene.linear.solve(load.force[0])[None])
     first = sim(forces[0], tol=1e-8)
     again = sim(1.001 * forces[0], tol=1e-8, warm=True)
     cold = sim(1.001 * forces[0], tol=1e-8)
@@ -310,7 +310,7 @@ def test_forces_on_held_nodes_change_nothing(scene, forces):
             assert torch.equal(loaded.residual, plain.residual)
             assert torch.equal(loaded.amplitude, plain.amplitude)
             assert torch.equal(loaded.out_of_span, plain.out_of_span)
-            assert loaded.verdict == plain.verdict
+            assert loaded.summary == plain.summary
             assert loaded.method == plain.method
     assert not any(force[:, held].any() for force in seen)
     only = sim(1e10 * held.double(), tol=1e-6)
@@ -335,7 +335,7 @@ def test_a_wrong_answer_is_not_in_balance_because_of_forces_on_held_nodes(scene,
 def test_a_network_is_not_told_of_forces_on_held_nodes(make_scene, network):
     """With weight on all nodes in training it hears of that and of nothing else."""
     weight = torch.full((45, 3), -1e-5, dtype=torch.float64)
-    for scene in (make_scene(), make_scene(always=weight)):
+    for scene in (make_scene(), make_scene(constant_force=weight)):
         nets = {"fcnn": partial(FCNN, width=4), "gnn": partial(GNN, width=4), "cnn": CNN}
         torch.manual_seed(0)
         surrogate = Surrogate(nets[network](scene), MSE(), scene).eval()
@@ -351,7 +351,7 @@ def test_a_network_is_not_told_of_forces_on_held_nodes(make_scene, network):
 @pytest.mark.parametrize("tol", [1e-6, 1e-12])
 def test_tiny_forces_are_answered_as_small_ones_are(scene, forces, size, tol):
     """Their squares are 0 in float64, and so was once ||R|| / ||f||."""
-    linear = scene.length * scene.linear.respond(forces[0] / (E * scene.force_unit))
+    linear = scene.length * scene.linear.solve(forces[0] / (E * scene.force_unit))
     zero = simulator_of(scene, lambda load: 0 * load.force)
     answer = zero(size * forces[0], tol=tol)
     assert answer.converged
@@ -387,8 +387,8 @@ def test_a_tolerance_that_rounding_does_not_allow_is_said_not_to_be_kept(scene, 
         answer = simulator_of(scene)(forces[0], tol=1e-15, stability=True)
     assert not answer.converged
     assert 1e-15 <= answer.residual < 1e-11
-    assert "the least that rounding allows, stable" in answer.verdict
-    assert answer.verdict.startswith("an estimate, out of balance by")
+    assert "the least that rounding allows, stable" in answer.summary
+    assert answer.summary.startswith("an estimate, out of balance by")
     assert torch.allclose(answer.displacement, truth[0], rtol=0, atol=1e-6 * scene.length)
 
 

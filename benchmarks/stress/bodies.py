@@ -52,7 +52,7 @@ def scaled(law: Material, printed: tuple[str, ...], watch: Auditor) -> Outcome:
     for young, side in UNITS:
         mesh = box([4 * side, side, side], [9, 3, 3])
         problem = Problem.build(mesh, law, fixed=Plane(0, "min"))
-        newton = Newton(problem, mixed=False)
+        newton = Newton(problem, mixed_integration=False)
         scene = Scene(problem, ModalLoads(newton.rest, n_modes=1, young=young), newton)
         newtons = young * scene.force_unit * fixtures.pulled(problem, 20.0)
         given = scene.load_of(newtons[None], torch.tensor([young], dtype=torch.float64))

@@ -49,7 +49,7 @@ LADDER = (1e-9, 1e-6, 1e-3, 0.1, 1.0, 4.0, 10.0, 25.0)  # times the largest load
 def kinds(problem: Problem) -> Iterator[tuple[str, Newton]]:
     """Yield Newton without and with mixed integration points, where that differs."""
     for mixed in (False, True) if problem.supports_mip else (False,):
-        yield ("mixed" if mixed else "plain"), Newton(problem, mixed=mixed)
+        yield ("mixed" if mixed else "plain"), Newton(problem, mixed_integration=mixed)
 
 
 def words(state: Solution) -> str:

@@ -40,7 +40,7 @@ def straight(watch: Auditor) -> Outcome:
     rows, fails = [], []
     for backend in DIRECT:
         for name, newton in kinds(problem):
-            solver = Newton(problem, mixed=newton.mixed, linear=backend)
+            solver = Newton(problem, mixed_integration=newton.mixed_integration, linear=backend)
             state = watch.solve(solver, problem, load_of(2.5 * force))
             if not state.converged.all():
                 fails.append(f"{backend}, {name}: {words(state)}")
@@ -85,7 +85,7 @@ def gives_way(watch: Auditor) -> Outcome:
     fails, told = [], []
     for side in found:
         watch.see(problem, side)
-        watch.end(problem, load, side, solver.tol, solver.loose)
+        watch.end(problem, load, side, solver.tol, solver.intermediate_tol)
         told.append(str(Status(int(side.status))))
         if not side.converged.all():
             fails.append(words(side))
@@ -126,9 +126,15 @@ def _finite(state: Solution) -> bool:
 def peak(watch: Auditor) -> Outcome:
     """Pull Yeoh's rubber beyond its peak load, from rest; then from a guess beyond the gap."""
     problem, unit = fixtures.cube(fixtures.RUBBER)
-    solver = Newton(problem, linear="superlu", loose=1e-9, smallest_step=2.0**-17, budget=2000)
+    solver = Newton(
+        problem,
+        linear="superlu",
+        intermediate_tol=1e-9,
+        min_load_step=2.0**-17,
+        max_total_iter=2000,
+    )
     load = load_of(0.57 * unit)
-    *_, state = watch.over(solver, problem, solver.tol, solver.loose).iterate(load)
+    *_, state = watch.over(solver, problem, solver.tol, solver.intermediate_tol).iterate(load)
     part = 0.57 * float(state.load_factor)
     rows = [
         Row("from rest: converged", "< 0.5", float(state.converged)),
@@ -150,8 +156,16 @@ def collapsed(watch: Auditor) -> Outcome:
     """Press a bar of SVK beyond its largest load; hold its mirror image to be no answer."""
     law = SaintVenantKirchhoff(0.3)
     problem, unit = fixtures.cube(law, 2)
-    solver = Newton(problem, linear="superlu", loose=1e-9, smallest_step=2.0**-17, budget=2000)
-    *_, state = watch.over(solver, problem, solver.tol, solver.loose).iterate(load_of(-0.2 * unit))
+    solver = Newton(
+        problem,
+        linear="superlu",
+        intermediate_tol=1e-9,
+        min_load_step=2.0**-17,
+        max_total_iter=2000,
+    )
+    *_, state = watch.over(solver, problem, solver.tol, solver.intermediate_tol).iterate(
+        load_of(-0.2 * unit)
+    )
     part = 0.2 * float(state.load_factor)
     mirrored = (problem.points * torch.tensor([-2.0, 0.0, 0.0]))[None]
     rest = load_of(0 * unit)
@@ -181,7 +195,9 @@ def barrier(watch: Auditor) -> Outcome:
     end = problem.points[:, 0] == 1
     for P, printed in BARRIER:
         for name, newton in kinds(problem):
-            solver = Newton(problem, tol=1e-11, linear="superlu", mixed=newton.mixed)
+            solver = Newton(
+                problem, tol=1e-11, linear="superlu", mixed_integration=newton.mixed_integration
+            )
             state = watch.solve(solver, problem, load_of(P * unit), tol=1e-11)
             if not state.converged.all():
                 fails.append(f"P = {P}, {name}: {words(state)}")
@@ -197,7 +213,7 @@ def pressed(watch: Auditor) -> Outcome:
     problem, unit = fixtures.cube(law, 1, (0, 1, 2))
     limit, rows = float(law.bulk) * 0.4 ** (2 / 3) * 0.6, []
     for name, newton in kinds(problem):
-        solver = Newton(problem, linear="superlu", mixed=newton.mixed)
+        solver = Newton(problem, linear="superlu", mixed_integration=newton.mixed_integration)
         below = watch.solve(solver, problem, load_of(-0.99 * limit * unit))
         above = watch.solve(solver, problem, load_of(-1.02 * limit * unit))
         reached = 1.02 * float(above.load_factor)

@@ -64,12 +64,12 @@ class Ladder:
         loads, exact = self.scene.loads, self.scene.solver
         solver = self.watch.over(exact, self.scene.problem, exact.tol)
         drawn = loads.sample(STREAM, range(self.count))
-        own = drawn.force if loads.always is None else drawn.force - loads.always
-        places, _ = loads.place(drawn.force)
+        own = drawn.force if loads.constant_force is None else drawn.force - loads.constant_force
+        places, _ = loads.project(drawn.force)
         found = []
         for amplitude in self.amplitudes:
             force = (amplitude / places)[:, None, None] * own
-            force = force if loads.always is None else force + loads.always
+            force = force if loads.constant_force is None else force + loads.constant_force
             for load in drawn._replace(force=force).unbatch():
                 states = list(solver.iterate(load))
                 smallest = min(float(state.volume_ratio) for state in states)
@@ -96,7 +96,7 @@ def simulated(ladder: Ladder, tol: float | None, watch: Auditor) -> Outcome:
         rungs.append(
             LoadLevel(
                 *(series, step.amplitude, answer.residual, answer.volume_ratio),
-                *(answer.iterations, answer.verdict, error),
+                *(answer.iterations, answer.summary, error),
             )
         )
         place = f"{step.amplitude:g}"
@@ -106,7 +106,7 @@ def simulated(ladder: Ladder, tol: float | None, watch: Auditor) -> Outcome:
         ]
         if tol is not None and step.amplitude <= 1:
             if not answer.converged:
-                fails.append(f"{place}: {answer.verdict}")
+                fails.append(f"{place}: {answer.summary}")
             elif step.exact.stable.all():
                 rows.append(Row(f"{place}: off Newton's answer", f"< {ERROR}", error))
     return classify(_told(rungs, tiers), rows, fails=fails, rungs=rungs)
@@ -128,7 +128,7 @@ def _true(
         or bool(problem.is_equilibrium(u, internal, step.load.force, TOL))
     )
     yield "it converged where that is said", sound or not answer.converged
-    words = answer.verdict
+    words = answer.summary
     yield (
         "an estimate is called one",
         answer.converged or words.startswith(("NOT VALID", "an estimate")),

@@ -56,7 +56,7 @@ def beam(folder: Path) -> Section:
             rows.append(Row(f"{name}, {what}: u_z [m]", printed.split()[k], found[k], within))
     problem, load = peers.CASES["S1"].build()
     states = {
-        mixed: list(Newton(problem, tol=1e-10, mixed=mixed).iterate(load))
+        mixed: list(Newton(problem, tol=1e-10, mixed_integration=mixed).iterate(load))
         for mixed in (False, True)
     }
     end = states[True][-1].displacement[0, peers.Case.end(problem)].mean(dim=0) * problem.length

@@ -238,7 +238,7 @@ def compliance(
     law = NeoHookeanLn(nu)
     problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree, mean_dilatation=mean)
     force = Traction(Plane(0, "max"), [0.0, 0.0, -1.0]).on(problem)
-    return float((force * LinearSolver(problem).respond(force)).sum())
+    return float((force * LinearSolver(problem).solve(force)).sum())
 
 
 def locking(folder: Path) -> Section:

@@ -163,7 +163,9 @@ def build_scene(cfg: DictConfig) -> Scene:
     young = OmegaConf.to_container(cfg.young) if isinstance(cfg.young, ListConfig) else cfg.young
     if not validation.matches_type(young, float | Sequence[float]):
         raise ConfigError(f"young = {young!r} must be a modulus [Pa] or a range [low, high]")
-    loads = instantiate(cfg, "loads", linear=solver.rest, young=young, always=_always(cfg, problem))
+    loads = instantiate(
+        cfg, "loads", linear=solver.rest, young=young, constant_force=_always(cfg, problem)
+    )
     try:
         loads.modes  # noqa: B018  # which says whether there are so many
     except ValueError as error:

@@ -108,7 +108,7 @@ class OfflineData(L.LightningDataModule):
         """The symmetries that make images of the training samples; none if they are not wanted."""
         if not self.symmetry:
             return []
-        always = self.scene.loads.always
+        always = self.scene.loads.constant_force
         return symmetries(self.scene.problem, also=[] if always is None else [always])
 
     def skipped_work(self) -> list[str]:

@@ -16,7 +16,9 @@ from dpl.data.solving.worker_pool import STARTUP_GRACE
 from dpl.data.storage.store import Store
 from dpl.scene import Sample, Scene
 
-NEAR = 0.05  # deviation from a bad load, in the unit cube, of the loads that are drawn near it
+NEIGHBOURHOOD = (
+    0.05  # deviation from a bad load, in the unit cube, of the loads that are drawn near it
+)
 
 
 class DrawnSample(NamedTuple):
@@ -57,7 +59,9 @@ class HardExamples:
         if not (count := int(self.count)):
             return None
         centre = self.points[int(rng.integers(count))].numpy()
-        moved = np.abs(centre + NEAR * rng.standard_normal(len(centre))) % 2  # folded back at 0
+        moved = (
+            np.abs(centre + NEIGHBOURHOOD * rng.standard_normal(len(centre))) % 2
+        )  # folded back at 0
         return torch.from_numpy(np.minimum(moved, 2 - moved).clip(0, 1 - 2.0**-53))  # and at 1
 
 

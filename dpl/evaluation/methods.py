@@ -39,7 +39,7 @@ def linear(scene: Scene) -> Method:
 
     def predict(load: Load) -> Tensor:
         pairs = zip(load.force, load.poisson, strict=True)
-        return torch.stack([scene.linear.at(nu[None]).respond(force) for force, nu in pairs])
+        return torch.stack([scene.linear.at(nu[None]).solve(force) for force, nu in pairs])
 
     return Method(predict)
 

@@ -192,14 +192,16 @@ def contestants(
         budget: Iterations before a load is given up; the scene's if left out.
     """
     settings: dict[str, float] = {"tol": tol}
-    settings |= {} if budget is None else {"budget": budget}
+    settings |= {} if budget is None else {"max_total_iter": budget}
     robust, quick = scene.solver.replace(**settings), scene.corrector.replace(**settings)
     plain = PlainNewton(robust)
     solvers: dict[tuple[str, str], Solver] = {
         ("plain Newton", ""): plain,
-        ("plain Newton, load steps", ""): robust.replace(mixed=False, reuse=0.0),
+        ("plain Newton, load steps", ""): robust.replace(
+            mixed_integration=False, factor_reuse_tol=0.0
+        ),
         (REFERENCE, ""): robust,
-        ("robust Newton, K(0) turned", ""): robust.replace(turned=True),
+        ("robust Newton, K(0) turned", ""): robust.replace(corotational=True),
     }
     for name, predict in networks.items():
         solvers["hybrid, paper's rule", name] = Hybrid(predict, plain, "paper")

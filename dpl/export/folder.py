@@ -34,8 +34,8 @@ from dpl.version import __version__
 FORMAT = 1  # of meta.json; a later one may mean something else by a key
 RAW = np.dtype("<f8")
 RANGE = (
-    "f: a force over E L^(D-1), less `always`, and 0 where held. q: the least-squares fit of "
-    "`modes` to f on the nodes on which f acts. In range: max |q| is 1 or less, and "
+    "f: a force over E L^(D-1), less `constant_force`, and 0 where held. q: the least-squares fit "
+    "of `modes` to f on the nodes on which f acts. In range: max |q| is 1 or less, and "
     "|f - modes q| <= 1e-3 |f| there. Without a fit: |f| above `largest_force` is out of range."
 )
 
@@ -188,7 +188,7 @@ def _range(scene: Scene) -> dict[str, Any]:
     loads = scene.loads
     return {
         "modes": {"file": "modes.f64", "shape": [*scene.problem.shape, len(loads.q_max)]},
-        "always": None if loads.always is None else loads.always.flatten().tolist(),
+        "always": None if loads.constant_force is None else loads.constant_force.flatten().tolist(),
         "largest_force": loads.largest_force,
         "deflection": loads.deflection,
         "patch": [scene.length * float(radius) for radius in loads.patch],

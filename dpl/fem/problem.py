@@ -15,7 +15,7 @@ from torch import Tensor
 from dpl.fem.assembly.boundary_conditions import Support, assemble_constraints
 from dpl.fem.assembly.elements import QUADRATIC, basis_of, gradients
 from dpl.fem.assembly.kernels import Kernels
-from dpl.fem.assembly.tensor_assembly import Body
+from dpl.fem.assembly.tensor_assembly import TensorAssembly
 from dpl.fem.materials.material import InvariantBasedMaterial, Material
 from dpl.fem.materials.tensors import volume_change
 from dpl.fem.mesh.generators import aspect_ratio, longest_side, near_origin
@@ -51,8 +51,8 @@ class System(NamedTuple):
     valid: Tensor
 
 
-class Problem(Body):
-    """Static equilibrium of one body, see `Body`; build it with `Problem.build`.
+class Problem(TensorAssembly):
+    """Static equilibrium of one body, see `TensorAssembly`; build it with `Problem.build`.
 
     `evaluate`, `linearise` and `update_strain_gap` say what its tensor operations say, without
     derivatives, by compiled loops where body and law have them.

@@ -188,7 +188,7 @@ def default_hybrid(predict: Predict, scene: Scene, tol: float | None = None) -> 
         tol: Residual ratio [-]; the scene's if left out.
     """
     newton = scene.corrector if tol is None else scene.corrector.replace(tol=tol)
-    return Hybrid(predict, newton, steps=AndersonSolver(newton) if newton.turned else None)
+    return Hybrid(predict, newton, steps=AndersonSolver(newton) if newton.corotational else None)
 
 
 def prefer_prediction(predicted: Solution, first: Solution) -> bool:

@@ -40,9 +40,10 @@ class Answer:
         converged: Whether the residual is below the tolerance that was asked for (without one, the
             scene's) and nothing is inverted. False too where rounding does not allow it.
         negative_pivots: Negative eigenvalues of the tangent there; -1: not examined.
-        amplitude: Largest modal load over the largest of the training [-], see `ModalLoads.place`.
-        strange: Part of the force that is not made of the training's modes [-].
-        outside: Whether the load lies outside the range of the training.
+        amplitude: Largest modal load over the largest of the training [-], see
+            `ModalLoads.project`.
+        out_of_span: Part of the force that is not made of the training's modes [-].
+        out_of_distribution: Whether the load lies outside the range of the training.
         tier: Who answered: "rest", "linear", "network", "corrected", "hybrid" or "full Newton".
         iterations: Linear solves with a tangent.
         milliseconds: Wall time [ms]; of several loads, the share of each.
@@ -60,7 +61,7 @@ class Answer:
     method: Any
     iterations: Any
     milliseconds: Any
-    verdict: Any
+    summary: Any
 
 
 class Simulator:
@@ -154,7 +155,7 @@ class Simulator:
         count = len(load.force)
         with one_thread(), torch.inference_mode():
             predictions = self.surrogate.predict(load)
-            amplitude, strange = self.scene.loads.place(load.force)
+            amplitude, strange = self.scene.loads.project(load.force)
             shared = (time.perf_counter() - begin) / count
             found = []
             for k, single in enumerate(load.unbatch()):
@@ -266,7 +267,7 @@ class Simulator:
         if ask.tol is None and ask.budget_ms is None:
             return
         if amplitude < SMALL:
-            answer = self.scene.linear.at(load.poisson).respond(load.force[0])[None]
+            answer = self.scene.linear.at(load.poisson).solve(load.force[0])[None]
             yield "linear", evaluate_solution(problem, answer, load, tol)
         guess = prediction
         if self.correct is not None and bool(guess.isfinite().all()):

@@ -129,7 +129,7 @@ class PODNet(ReducedOrderNet):
         if not 0 <= blocks <= DEEPEST:
             raise ValueError(f"blocks = {blocks} must be 0 or more and at most {DEEPEST}")
         self.scene = scene
-        always = scene.loads.always
+        always = scene.loads.constant_force
         also = [] if always is None else [always]
         self.group = symmetries(scene.problem, also=also) if symmetry else []
         self.register_buffer("acting", scene.loads.loadable_dofs, persistent=False)

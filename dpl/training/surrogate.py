@@ -108,7 +108,7 @@ class Surrogate(L.LightningModule):
 
         Those have no effect on the body, so a network must not answer to them.
         """
-        problem, always = self.physics.problem, self.scene.loads.always
+        problem, always = self.physics.problem, self.scene.loads.constant_force
         force = problem.acting(force)
         if always is None:
             return force
@@ -252,6 +252,6 @@ def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:
     and displacements keep their proportions within the body.
     """
     force = scene.loads.sample((0, SCALES), range(count)).force
-    displacement = torch.stack([scene.linear.reference.respond(one) for one in force])
+    displacement = torch.stack([scene.linear.reference.solve(one) for one in force])
     acting, moving = force[:, scene.loads.loadable_dofs], displacement[:, scene.problem.free]
     return acting.square().mean().sqrt(), moving.square().mean().sqrt()

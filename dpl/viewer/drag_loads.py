@@ -67,7 +67,7 @@ class Patch:
     def compliance(self) -> Tensor:
         """Linear displacement of the centre under each of `fields`, (D, M) [-]."""
         linear = self.scene.linear.reference
-        return torch.stack([linear.respond(field)[self.node] for field in self.fields], dim=1)
+        return torch.stack([linear.solve(field)[self.node] for field in self.fields], dim=1)
 
     def towards(self, displacement: Tensor, *, most: float | None = 1.0) -> Tensor:
         """Return the force that, linearly, displaces the centre so, (N, D) [-].

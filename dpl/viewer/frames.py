@@ -133,7 +133,7 @@ class Body:
             poisson = sum(span) / 2 if poisson is None else poisson
             if not span[0] <= poisson <= span[1]:
                 raise ValueError(f"Poisson's ratio {poisson:g} must lie in {list(span)}")
-        always = self.scene.loads.always
+        always = self.scene.loads.constant_force
         whole = force if always is None else force + always
         return LoadRequest(whole * self.force_unit, young, poisson)
 

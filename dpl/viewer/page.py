@@ -199,13 +199,15 @@ class Page:
         gui, scene = self.server.gui, self.body.scene
         nodes, dim = self._problem.shape
         law = type(self._problem.material).__name__
-        gui.add_html(panel.told(f"{title} · {nodes * dim:,} degrees of freedom · {law}", "inherit"))
+        gui.add_html(
+            panel.message(f"{title} · {nodes * dim:,} degrees of freedom · {law}", "inherit")
+        )
         self._reading, self._colours = gui.add_html(""), gui.add_html("")
         self._newton = gui.add_html("", visible=False)
         self._told = gui.add_html("")
         with gui.add_folder("Load"):
             gui.add_html(
-                panel.told("Drag the body to pull it; click it to place the patch.", "inherit")
+                panel.message("Drag the body to pull it; click it to place the patch.", "inherit")
             )
             low, high = scene.loads.patch
             span = max(high, 0.05)
@@ -250,7 +252,7 @@ class Page:
             self._compare = gui.add_checkbox("Newton from rest beside it", False)
         with gui.add_folder("Record", expand_by_default=False):
             self._record = gui.add_button("Start recording", color="red")
-            self._state = gui.add_html(panel.told(f"Saved into {self._folder}", "inherit"))
+            self._state = gui.add_html(panel.message(f"Saved into {self._folder}", "inherit"))
             saves = gui.add_button_group("save as", ("VTU", "GIF", "MP4"))
         caught = self._door.complaints.caught
         for control in (self._direction, self._amplitude, self._uniform, self._radius):
@@ -325,7 +327,7 @@ class Page:
         """Write the recording into the folder; a film goes to the browser too."""
         self.recording.stop()
         kind = event.target.value
-        self._state.content = panel.told(f"Writing {len(self.recording)} frames ...")
+        self._state.content = panel.message(f"Writing {len(self.recording)} frames ...")
         try:
             if kind == "VTU":
                 path = self.recording.save_series(self._folder)
@@ -334,9 +336,9 @@ class Page:
                 path = self.recording.save_film(self._folder, scenery, f".{kind.lower()}")
                 if event.client is not None:
                     event.client.send_file_download(path.name, path.read_bytes())
-            self._state.content = panel.told(f"Written: {path}", panel.GOOD)
+            self._state.content = panel.message(f"Written: {path}", panel.GOOD)
         except (ValueError, OSError) as error:
-            self._state.content = panel.told(str(error), panel.BAD)
+            self._state.content = panel.message(str(error), panel.BAD)
 
     # --- what the worker brings
 
@@ -392,8 +394,8 @@ class Page:
         self._colours.content = panel.legend(frame.quantity, self._scale.top, low, high)
         if self.worker.wish.compare:
             self._newton.content = panel.newton(*self._beside)
-        self._told.content = panel.told(self._said, panel.BAD)
+        self._told.content = panel.message(self._said, panel.BAD)
         running, count = self.recording.running, len(self.recording)
         self._record.label = f"Stop ({count} of {MOST} frames)" if running else "Start recording"
         if running:
-            self._state.content = panel.told(f"{count} frames", "inherit")
+            self._state.content = panel.message(f"{count} frames", "inherit")

@@ -34,7 +34,7 @@ def readout(frame: Frame, rate: float) -> str:
         ),
         _row("answers a second", f"{rate:.0f}"),
     ]
-    words = html.escape(str(answer.verdict))
+    words = html.escape(str(answer.summary))
     verdict = (
         f'<div style="margin-top:6px;padding:6px 9px;border-radius:6px;border-left:3px solid '
         f'{tone};background:{tone}14;line-height:1.35">{words}</div>'
@@ -74,7 +74,7 @@ def legend(quantity: str, top: float, low: float, high: float) -> str:
     )
 
 
-def told(words: str, tone: str = DOUBT) -> str:
+def message(words: str, tone: str = DOUBT) -> str:
     """Return a line of words."""
     style = f"padding:2px 12px 6px;font-size:13px;color:{tone};line-height:1.35"
     return f'<div style="{style}">{html.escape(words)}</div>' if words else ""

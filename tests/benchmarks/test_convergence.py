@@ -121,7 +121,7 @@ def test_rows_count_what_converged_and_compare_where_both_did():
 
 def test_what_does_not_converge_has_no_iterations_and_no_time(scene, loads):
     hard = loads._replace(force=1e5 * loads.force)
-    solver = Newton(scene.problem, smallest_step=0.9, max_iter=2)
+    solver = Newton(scene.problem, min_load_step=0.9, max_iter=2)
     trials = measure({(newton_starts.REFERENCE, ""): solver}, "in range", hard, 1e-8)
     row, same = summary(trials)
     assert (row.loads, same.loads) == ("in range and twice", "in range")

@@ -267,7 +267,7 @@ def test_a_force_in_every_load_breaks_the_symmetries_that_turn_it(make_scene, tm
     scene = make_scene()
     down = torch.zeros(scene.problem.shape, dtype=torch.float64)
     down[:, 2] = torch.where(scene.loads.loadable_dofs[:, 2], -1e-7, 0.0)
-    weighted = make_scene(always=down)
+    weighted = make_scene(constant_force=down)
     free = OfflineData(scene, folder=str(tmp_path), symmetry=True, **SIZES)
     held = OfflineData(weighted, folder=str(tmp_path), symmetry=True, **SIZES)
     assert 1 < len(held.group) < len(free.group)

@@ -22,7 +22,7 @@ from dpl import Sample
 from dpl.data import OnlineSamples, ReplayBuffer
 from dpl.data.replay_buffer import StreamRates
 from dpl.data.solving.solve import LoadKey, solve_load
-from dpl.data.stream import NEAR, DrawnSample, HardExamples
+from dpl.data.stream import NEIGHBOURHOOD, DrawnSample, HardExamples
 from dpl.fem import Newton
 from dpl.scene import stack
 
@@ -421,7 +421,7 @@ def test_points_near_the_worst_lie_in_the_unit_cube():
     assert (points >= 0).all()
     assert (points < 1).all()
     distance = torch.cdist(points, corners.double()).amin(dim=1)
-    assert 0.5 * NEAR < distance.mean() < 3 * NEAR
+    assert 0.5 * NEIGHBOURHOOD < distance.mean() < 3 * NEIGHBOURHOOD
     assert not ((points == 0) | (points >= 1 - 2.0**-50)).any(), "folded back, not piled up"
 
 
@@ -450,7 +450,7 @@ def test_new_loads_are_drawn_near_the_worst_ones_as_often_as_asked(scene):
     for part in (0.0, 0.5, 1.0):
         stream = OnlineSamples(scene, SEED, worst=worst, near=part)
         points = torch.stack([one.point for one in itertools.islice(stream, 40)])
-        near = ((points - centre).abs().amax(dim=1) < 6 * NEAR).double().mean()
+        near = ((points - centre).abs().amax(dim=1) < 6 * NEIGHBOURHOOD).double().mean()
         assert near == pytest.approx(part, abs=0.25 if part < 1 else 0.0)
 
 

@@ -245,7 +245,7 @@ def test_shards_hold_forces_of_loaded_nodes_alone(data):
 def test_forces_that_every_load_holds_are_stored_and_verified(scene, make_scene, tmp_path):
     weight = torch.full(scene.problem.shape, 1e-7, dtype=torch.float64)
     weight[:, 1:] = 0.0
-    store = Store(tmp_path / "d", make_scene(always=weight), 0)
+    store = Store(tmp_path / "d", make_scene(constant_force=weight), 0)
     fill(store, {"train": range(3)})
     plain = scene.loads.sample((0, 0), range(3)).force
     assert torch.allclose(store.load("train", 3).force, plain + weight, rtol=0, atol=1e-18)

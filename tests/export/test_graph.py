@@ -262,7 +262,7 @@ def test_the_range_of_the_training_can_be_told_without_this_package(handed):
     modes = read_raw(folder / "modes.f64", meta["range"]["modes"]["shape"])
     load = scene.loads.sample((0, 13), range(6))
     load = Load(torch.cat([load.force, 3 * load.force, torch.ones_like(load.force)]), load.young)
-    amplitude, strange = scene.loads.place(load.force)
+    amplitude, strange = scene.loads.project(load.force)
     for k, force in enumerate(load.force.numpy()):
         force.reshape(-1)[meta["dofs"]["held"]] = 0.0
         acting = force.any(axis=1)

@@ -78,7 +78,9 @@ def load_steps(problem: Problem, force: Tensor) -> Iterator[tuple[list[float], T
     state = None
     for step in range(1, 6):
         part = step / 5 * force
-        solver = Newton(problem, tol=1e-15, mixed=False, linear="superlu", reuse=0.0)
+        solver = Newton(
+            problem, tol=1e-15, mixed_integration=False, linear="superlu", factor_reuse_tol=0.0
+        )
         norms = []
         for iterate in solver.iterate(load_of(part), guess=state):
             state = iterate.displacement
@@ -200,7 +202,7 @@ def test_beam_of_the_dolfinx_tutorial_bends_as_computed(degree, mixed):
     unit = Traction(Plane(0, "max"), [0.0, 0.0, -1.5 / 1e4]).on(problem)
     corner, state = node_at(problem, 20, 1, 1), None
     for n, count in enumerate(DOLFINX_ITERATIONS, 1):
-        answer = resumed(problem, n * unit, state, tol=1e-9, mixed=mixed)
+        answer = resumed(problem, n * unit, state, tol=1e-9, mixed_integration=mixed)
         assert answer.status.item() == Status.CONVERGED
         # theirs is over the first residual; a factor that is used again may cost one more
         assert answer.iterations.item() <= count + 2
@@ -243,7 +245,7 @@ def test_column_follows_the_rotation_of_its_end(degree, cells, mixed):
         given = torch.where(top[:, None], centred @ turn.T - centred, 0.0).numpy() / 5
         problem = Problem.build(mesh, NH, fixed=held, prescribed=given, degree=degree)
         none = torch.zeros(problem.shape, dtype=torch.float64)
-        answer = resumed(problem, none, state, tol=1e-10, mixed=mixed)
+        answer = resumed(problem, none, state, tol=1e-10, mixed_integration=mixed)
         assert answer.status.item() == Status.CONVERGED
         assert answer.iterations.item() <= 6
         state = answer.displacement

@@ -112,7 +112,7 @@ def test_forces_on_held_nodes_alone_leave_the_body_at_rest(newton, load, solvers
 def test_tiny_loads_are_answered_as_small_ones_are(newton, load, solvers, name, power):
     size = 10.0**power
     tiny = load._replace(force=size * load.force)
-    linear = newton.rest.respond(load.force[0])
+    linear = newton.rest.solve(load.force[0])
     answer = solvers[name](tiny)
     assert answer.converged.all()
     assert 0 < float(answer.residual) < 1e-8
@@ -194,10 +194,10 @@ def test_a_right_hand_side_of_any_size_is_solved_by_conjugate_gradients():
 def test_where_a_load_lies_does_not_depend_on_forces_on_held_nodes(newton):
     weight = torch.full(newton.problem.shape, -1e-5, dtype=torch.float64)
     for always in (None, weight):
-        loads = ModalLoads(newton.rest, n_modes=3, always=always)
+        loads = ModalLoads(newton.rest, n_modes=3, constant_force=always)
         force = loads.sample(0, range(3)).force
         held = torch.where(newton.problem.free, force, 1e10)
-        found, wanted = loads.place(held), loads.place(force)
+        found, wanted = loads.project(held), loads.project(force)
         for one, other in zip(found, wanted, strict=True):
             assert torch.equal(one, other)
         assert (wanted[1] < 1e-9).all()
@@ -207,14 +207,14 @@ def test_where_a_load_lies_does_not_depend_on_forces_on_held_nodes(newton):
 def test_where_a_load_lies_scales_with_it(newton, power):
     loads = ModalLoads(newton.rest, n_modes=3)
     force, size = loads.sample(0, range(3)).force, 10.0**power
-    amplitude, strange = loads.place(size * force)
-    assert_close(amplitude / size, loads.place(force)[0], rtol=1e-9, atol=0)
+    amplitude, strange = loads.project(size * force)
+    assert_close(amplitude / size, loads.project(force)[0], rtol=1e-9, atol=0)
     assert (strange < 1e-9).all()
 
 
 def test_the_size_of_a_load_in_a_data_set_is_that_on_free_nodes(make_scene):
     weight = torch.full((45, 3), -1e-5, dtype=torch.float64)
-    scene = make_scene(always=weight)
+    scene = make_scene(constant_force=weight)
     job = LoadKey((0, 0), 1)
     force = scene.loads.sample(job.seed, [job.number]).force
     wanted = float(force[:, scene.problem.free].norm()) / scene.loads.largest_force
@@ -246,7 +246,7 @@ def test_linear_elasticity_is_answered_in_one_step_as_long_as_no_cell_nearly_col
     problem = Problem.build(box([4.0, 1, 1], [7, 3, 3]), LinearElastic(0.3), fixed=Plane(0, "min"))
     solver = Newton(problem, linear="superlu")
     unit = Traction(Plane(0, "max"), [-1.0, 0.0, 0.0]).on(problem)[None]
-    straight = solver.rest.respond(unit[0])[None]
+    straight = solver.rest.solve(unit[0])[None]
 
     def pressed(volume: float) -> tuple[float, Solution]:
         low, high = 0.0, 2.0  # at which some point has det F of this volume ratio

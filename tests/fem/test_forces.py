@@ -185,7 +185,7 @@ def test_bar_hanging_in_its_own_weight_stretches_quadratically(kind):
     mesh = build([4.0, *[1.0] * (dim - 1)], [5, *[2] * (dim - 1)], cell)
     problem = Problem.build(mesh, LinearElastic(0.0), fixed=Plane(0, "min"), degree=degree)
     force = BodyForce([1e-3, *[0.0] * (dim - 1)]).on(problem)
-    u = LinearSolver(problem, linear="superlu").respond(force) * problem.length
+    u = LinearSolver(problem, linear="superlu").solve(force) * problem.length
     x = problem.points[:, 0] * problem.length
     expected = 1e-3 * x * (8 - x) / 2
     assert_close(u[:, 0], expected, rtol=0, atol=1e-13)

@@ -136,7 +136,7 @@ def test_linear_bodies_have_the_same_gradient_everywhere(beam, pull):
     force = torch.cat([pull(problem, 0.01), pull(problem, 1.0)]).requires_grad_()
     weight = noise(*problem.shape)
     (slope,) = torch.autograd.grad((equilibrium(loaded(force)) * weight).sum(), force)
-    adjoint = equilibrium.newton.rest.respond(weight)
+    adjoint = equilibrium.newton.rest.solve(weight)
     assert torch.allclose(slope[0], adjoint, rtol=1e-8, atol=1e-10)
     assert torch.allclose(slope[1], adjoint, rtol=1e-8, atol=1e-10)
 
@@ -195,7 +195,7 @@ def test_a_guess_shortens_the_solve_and_changes_neither_answer_nor_gradient(equi
 
 
 def test_loads_without_an_answer_are_refused_by_number(problem, force):
-    equilibrium = DifferentiableSolve(Newton(problem, linear="superlu", budget=2))
+    equilibrium = DifferentiableSolve(Newton(problem, linear="superlu", max_total_iter=2))
     hopeless = torch.cat([0 * force[:1], 100 * force[1:]]).requires_grad_()
     with pytest.raises(ValueError, match="of 2 loads, load 1: not converged"):
         equilibrium(loaded(hopeless))

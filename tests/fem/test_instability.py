@@ -97,7 +97,7 @@ BUCKLED += [(4.0, 2.0, (0.7925, 0.9731), (0.80022, 0.90518))]
 def test_buckled_column_is_found_from_a_bent_guess(mixed, side, P, angle, printed, elastica):
     """VERIFICATION 1.8g: a stable answer to either side, mirror images of each other."""
     problem, force = column(SVK, (20, 2, 2))
-    answer = squeezed(problem, force, P, guess=bowed(problem, angle, side), mixed=mixed)
+    answer = squeezed(problem, force, P, guess=bowed(problem, angle, side), mixed_integration=mixed)
     assert answer.status.item() == Status.CONVERGED
     assert inertia(problem, answer.displacement) == 0
     centre = torch.tensor([1.0, 0.05, 0.05], dtype=torch.float64)
@@ -147,7 +147,13 @@ def test_pull_on_yeohs_rubber_has_the_tabulated_extremes(stretch, printed, sign,
 def test_load_beyond_the_peak_is_reported_with_the_part_below_it():
     """VERIFICATION 1.8h: load control ends at P = .5696673896; the rest is no path from rest."""
     problem, unit = pulled()
-    solver = Newton(problem, linear="superlu", loose=1e-9, smallest_step=2.0**-17, budget=2000)
+    solver = Newton(
+        problem,
+        linear="superlu",
+        intermediate_tol=1e-9,
+        min_load_step=2.0**-17,
+        max_total_iter=2000,
+    )
     answer = solve(solver, load_of(0.57 * unit))
     assert answer.status.item() == Status.NO_VALID_EQUILIBRIUM
     assert 0.57 * answer.load_factor.item() == pytest.approx(0.5696673896, abs=2e-5)
@@ -220,7 +226,9 @@ def bar(law: Material) -> tuple[Problem, Tensor]:
 def test_neo_hookean_bar_answers_every_load(mixed, P, stretch):
     """VERIFICATION 1.11: its barrier holds; solved from rest, whatever steps it takes."""
     problem, unit = bar(NeoHookeanLn(0.3))
-    answer = solve(Newton(problem, tol=1e-11, linear="superlu", mixed=mixed), load_of(P * unit))
+    answer = solve(
+        Newton(problem, tol=1e-11, linear="superlu", mixed_integration=mixed), load_of(P * unit)
+    )
     assert answer.converged.all()
     found = 1 + answer.displacement[0, problem.points[:, 0] == 1, 0]
     assert found.tolist() == pytest.approx([stretch] * 9, rel=1e-8)
@@ -233,13 +241,15 @@ def test_quadratic_volume_term_is_no_barrier_under_pressure(mixed):
     problem, unit = rivlin(law)
     limit = law.bulk * 0.4 ** (2 / 3) * 0.6
     for part, status in ((0.99, Status.CONVERGED), (1.02, Status.NO_VALID_EQUILIBRIUM)):
-        solver = Newton(problem, linear="superlu", mixed=mixed)
+        solver = Newton(problem, linear="superlu", mixed_integration=mixed)
         answer = solve(solver, load_of(-part * limit * unit))
         assert answer.status.item() == status
         assert answer.volume_ratio.item() > 0
     assert answer.load_factor.item() == pytest.approx(1 / 1.02, abs=0.02)
     problem, unit = rivlin(NeoHookeanLn(0.3))
-    answer = solve(Newton(problem, linear="superlu", mixed=mixed), load_of(-3 * limit * unit))
+    answer = solve(
+        Newton(problem, linear="superlu", mixed_integration=mixed), load_of(-3 * limit * unit)
+    )
     assert answer.converged.all()
 
 
@@ -258,7 +268,13 @@ def test_mirror_image_of_a_body_at_rest_is_no_answer():
 def test_longest_load_of_a_saint_venant_bar_is_the_tabulated_one():
     """VERIFICATION 1.11: max |P| = E / (3 sqrt 3) = .1924500897 at a stretch of .57735."""
     problem, unit = bar(SaintVenantKirchhoff(0.3))
-    solver = Newton(problem, linear="superlu", loose=1e-9, smallest_step=2.0**-17, budget=2000)
+    solver = Newton(
+        problem,
+        linear="superlu",
+        intermediate_tol=1e-9,
+        min_load_step=2.0**-17,
+        max_total_iter=2000,
+    )
     answer = solve(solver, load_of(-0.2 * unit))
     assert answer.status.item() == Status.NO_VALID_EQUILIBRIUM
     assert 0.2 * answer.load_factor.item() == pytest.approx(0.1924500897, abs=1e-5)

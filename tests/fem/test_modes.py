@@ -164,13 +164,13 @@ def test_small_loads_along_a_mode_move_the_body_along_it(beam, law):
 @pytest.mark.parametrize("deflection", [0.1, 0.4, 1.0])
 def test_the_softest_mode_at_its_largest_reaches_the_deflection(linear, deflection):
     loads = ModalLoads(linear, n_modes=3, deflection=deflection)
-    answer = linear.respond(loads.q_max[0] * loads.modes.vectors[..., 0])
+    answer = linear.solve(loads.q_max[0] * loads.modes.vectors[..., 0])
     assert float(answer.norm(dim=1).max()) == pytest.approx(deflection, rel=1e-8)
 
 
 def test_largest_modal_loads_have_equal_energy(linear, loads):
     energies = [
-        float((force * linear.respond(force)).sum())
+        float((force * linear.solve(force)).sum())
         for force in (q * loads.modes.vectors[..., k] for k, q in enumerate(loads.q_max))
     ]
     assert energies == pytest.approx([energies[0]] * len(energies), rel=1e-8)
@@ -403,7 +403,7 @@ def test_spectrum_says_how_large_stiffer_modes_become(linear):
     def work(loads):
         vectors = loads.modes.vectors
         forces = [q * vectors[..., k] for k, q in enumerate(loads.q_max)]
-        answers = [linear.respond(force) for force in forces]
+        answers = [linear.solve(force) for force in forces]
         pairs = list(zip(forces, answers, strict=True))
         return [
             [float((f * u).sum()) for f, u in pairs],
@@ -412,12 +412,12 @@ def test_spectrum_says_how_large_stiffer_modes_become(linear):
         ]
 
     for equal, spectrum in enumerate((0.5, 1.0, 0.0)):
-        loads = ModalLoads(linear, n_modes=5, spectrum=spectrum)
+        loads = ModalLoads(linear, n_modes=5, eigenvalue_exponent=spectrum)
         found = work(loads)
         for kind, values in enumerate(found):
             spread = max(values) / min(values) - 1
             assert (spread < 1e-8) == (kind == equal)
-        reached = linear.respond(loads.q_max[0] * loads.modes.vectors[..., 0])
+        reached = linear.solve(loads.q_max[0] * loads.modes.vectors[..., 0])
         assert float(reached.norm(dim=1).max()) == pytest.approx(0.4, rel=1e-8)
 
 
@@ -476,10 +476,10 @@ def test_tail_of_the_amplitude_makes_small_loads(linear):
 def test_what_always_acts_has_no_amplitude(linear):
     weight = torch.full((linear.problem.shape), -1e-3, dtype=torch.float64)
     none = ModalLoads(linear, n_modes=2, amplitude=log_tail_mixture)
-    loads = ModalLoads(linear, n_modes=2, amplitude=log_tail_mixture, always=weight)
+    loads = ModalLoads(linear, n_modes=2, amplitude=log_tail_mixture, constant_force=weight)
     with_, without = (kind.sample(0, range(20)).force for kind in (loads, none))
     assert torch.allclose(with_ - weight, without, rtol=0, atol=1e-16)
-    nothing = ModalLoads(linear, n_modes=2, amplitude=np.zeros_like, always=weight)
+    nothing = ModalLoads(linear, n_modes=2, amplitude=np.zeros_like, constant_force=weight)
     assert torch.equal(nothing.sample(0, [3]).force[0], weight)
 
 

@@ -98,7 +98,9 @@ def test_beam_bends_as_tabulated(
     """VERIFICATION 1.8e to 1e-6, and the iterations of 1.10, which are those of plain Newton."""
     problem = beam(law, *cells, cell=cell, degree=degree)
     backend = "auto" if cells[0] * degree > 16 else "superlu"
-    answer = solve(newton(problem, linear=backend, mixed=mixed), load_of(pull(problem, q)))
+    answer = solve(
+        newton(problem, linear=backend, mixed_integration=mixed), load_of(pull(problem, q))
+    )
     assert answer.converged.all()
     end = corner(problem, answer.displacement) * LENGTH
     assert end[2].item() == pytest.approx(z, rel=1e-6)
@@ -143,7 +145,7 @@ def test_one_step_squares_the_error(law, beam, pull):
     answer = solve(newton(problem, tol=1e-12), load).displacement
     left = []
     for error in (1e-3, 5e-4, 2.5e-4):
-        states = newton(problem, mixed=False).iterate(load, guess=(1 + error) * answer)
+        states = newton(problem, mixed_integration=False).iterate(load, guess=(1 + error) * answer)
         next(states)
         left.append((next(states).displacement - answer).norm() / (error * answer.norm()))
     assert left[0] < 0.1
@@ -163,7 +165,9 @@ def test_answer_does_not_depend_on_the_size_of_the_body(pull, corner, law, print
     """VERIFICATION 1.10, last: same u/L in six iterations at q/E = 20/4500."""
     mesh = box([length, length / 4, length / 4], [9, 3, 3])
     problem = Problem.build(mesh, law, fixed=Plane(0, "min"))
-    answer = solve(newton(problem, mixed=False, reuse=0.0), load_of(pull(problem, 20.0)))
+    answer = solve(
+        newton(problem, mixed_integration=False, factor_reuse_tol=0.0), load_of(pull(problem, 20.0))
+    )
     assert problem.length == pytest.approx(length)
     assert corner(problem, answer.displacement).tolist() == pytest.approx(printed, rel=1e-9)
     assert answer.iterations.item() == 6
@@ -203,7 +207,7 @@ def test_no_load_costs_nothing(law, beam, monkeypatch):
 def test_four_times_the_training_load_converges(beam, pull, mixed, law, deepest, volume):
     """VERIFICATION 2.2 T1 and T3, q = 80 on hex8 16 x 4 x 4."""
     problem = beam(law, 16, 4)
-    answer = solve(newton(problem, mixed=mixed), load_of(pull(problem, 80.0)))
+    answer = solve(newton(problem, mixed_integration=mixed), load_of(pull(problem, 80.0)))
     assert answer.converged.all()
     assert answer.volume_ratio.item() == pytest.approx(volume, abs=5e-4)
     if deepest is not None:
@@ -221,7 +225,7 @@ def test_four_times_the_training_load_converges(beam, pull, mixed, law, deepest,
 def test_neo_hookean_beam_answers_any_load(beam, pull, mixed, q, deepest, volume):
     """VERIFICATION 2.2 T4."""
     problem = beam(NH, 16, 4)
-    for state in newton(problem, mixed=mixed).iterate(load_of(pull(problem, q))):
+    for state in newton(problem, mixed_integration=mixed).iterate(load_of(pull(problem, q))):
         assert state.volume_ratio.item() > 0
     assert state.converged.all()
     assert state.load_factor.item() == 1
@@ -251,7 +255,9 @@ def check_defeat(problem: Problem, solver: Newton, force: torch.Tensor) -> None:
     assert state.status.item() == Status.NO_VALID_EQUILIBRIUM
     factor = state.load_factor.item()
     assert 0 < factor < 1
-    rest = evaluate_solution(problem, state.displacement, load_of(factor * force), solver.loose)
+    rest = evaluate_solution(
+        problem, state.displacement, load_of(factor * force), solver.intermediate_tol
+    )
     assert rest.converged.all()
     assert state.residual.item() == problem.relative_residual(state.displacement, force).item()
 
@@ -260,7 +266,7 @@ def check_defeat(problem: Problem, solver: Newton, force: torch.Tensor) -> None:
 def test_load_without_an_answer_is_reported_with_the_part_that_has_one(beam, pull, mixed, q):
     """VERIFICATION 2.2 T2: SVK far beyond its limit."""
     problem = beam(SVK)
-    solver = newton(problem, smallest_step=2.0**-6, mixed=mixed)
+    solver = newton(problem, min_load_step=2.0**-6, mixed_integration=mixed)
     check_defeat(problem, solver, pull(problem, q))
 
 
@@ -269,7 +275,7 @@ def test_a_load_step_is_at_most_twice_the_one_before(most):
     """With few iterations a step a load is applied in many; those that succeed are doubled."""
     problem = Problem.build(box([4.0, 1.0, 1.0], [9, 3, 3]), NH, fixed=Plane(0, "min"))
     force = Traction(Plane(0, "max"), [0.0, 0.0, -2e-2]).on(problem)[None]
-    states = list(newton(problem, max_iter=most, mixed=False).iterate(load_of(force)))
+    states = list(newton(problem, max_iter=most, mixed_integration=False).iterate(load_of(force)))
     assert states[-1].converged.all()
     factors = list(dict.fromkeys(state.load_factor.item() for state in states))
     parts = [b - a for a, b in pairwise(factors)]
@@ -287,7 +293,7 @@ def test_a_load_step_is_at_most_twice_the_one_before(most):
 def test_load_without_an_answer_on_the_finer_mesh_is_reported(beam, pull, mixed, q):
     """VERIFICATION 2.2 T2 as printed there: hex8 16 x 4 x 4."""
     problem = beam(SVK, 16, 4)
-    check_defeat(problem, newton(problem, mixed=mixed), pull(problem, q))
+    check_defeat(problem, newton(problem, mixed_integration=mixed), pull(problem, q))
 
 
 def test_squeezed_block_fails_where_its_law_softens(mixed):
@@ -298,10 +304,10 @@ def test_squeezed_block_fails_where_its_law_softens(mixed):
     force = torch.zeros(1, 8, 3, dtype=torch.float64)
     force[0, torch.from_numpy(mesh.p[0] == 1), 0] = -1 / 4
     limit = 1 / (3 * math.sqrt(3))
-    below = solve(newton(problem, mixed=mixed), load_of(0.99 * limit * force))
+    below = solve(newton(problem, mixed_integration=mixed), load_of(0.99 * limit * force))
     assert below.converged.all()
     assert below.displacement[0, :, 0].min().item() + 1 > 1 / math.sqrt(3)
-    above = solve(newton(problem, mixed=mixed), load_of(1.05 * limit * force))
+    above = solve(newton(problem, mixed_integration=mixed), load_of(1.05 * limit * force))
     assert not above.converged.any()
     assert above.volume_ratio.item() > 0
     assert above.load_factor.item() == pytest.approx(1 / 1.05, abs=0.02)
@@ -311,7 +317,7 @@ def test_batch_solves_like_its_members(law, beam, pull):
     """Members that need 0, 2, 4, 7 or no end of iterations do not disturb each other."""
     problem = beam(law, 4, 1)
     force = torch.cat([pull(problem, q) for q in (0.0, 1e-3, 5.0, 40.0, 2000.0)])
-    solver = newton(problem, smallest_step=2.0**-4)
+    solver = newton(problem, min_load_step=2.0**-4)
     batch = solve(solver, load_of(force))
     for k, alone in enumerate(force):
         member = solve(solver, load_of(alone[None]))
@@ -379,7 +385,11 @@ def test_newton_takes_whole_steps_from_a_guess_or_gives_it_up(wrong):
     kept = given_up = 0
     for size in (1e-4, 1e-3, 3e-3, 1e-2, 2e-2, 3e-2):
         guess = answer.displacement + size * torch.where(problem.free, noise, 0.0)
-        states = list(newton(problem, mixed=False, reuse=0.0).iterate(load, guess=guess))
+        states = list(
+            newton(problem, mixed_integration=False, factor_reuse_tol=0.0).iterate(
+                load, guess=guess
+            )
+        )
         assert states[-1].converged.all()
         for state, end in pairwise(states):
             if not (state.from_guess and end.from_guess):
@@ -487,7 +497,7 @@ def test_unknown_backend_is_an_error(beam, pull):
 def test_rest_state_is_factorised_once_for_all_loads(law, beam, pull, counted):
     """VERIFICATION 2.3; the factor of the rest state is the scene's, not the load's."""
     problem = beam(law)
-    solver, load = newton(problem, reuse=0.0), load_of(pull(problem, 20.0))
+    solver, load = newton(problem, factor_reuse_tol=0.0), load_of(pull(problem, 20.0))
     first = solve(solver, load)
     assert first.factorisations.item() == first.iterations.item() - 1
     assert len(counted) == first.iterations.item()
@@ -545,7 +555,9 @@ def test_mixed_points_find_the_same_answer_in_fewer_iterations(law, beam, pull, 
     """Magisano, Leonetti, Garcea (2017)."""
     problem = beam(law)
     load = load_of(pull(problem, q))
-    plain, mixed = (solve(newton(problem, tol=1e-10, mixed=m), load) for m in (False, True))
+    plain, mixed = (
+        solve(newton(problem, tol=1e-10, mixed_integration=m), load) for m in (False, True)
+    )
     assert plain.converged.all()
     assert mixed.converged.all()
     assert_close(mixed.displacement, plain.displacement, rtol=0, atol=1e-9)
@@ -588,7 +600,7 @@ def test_moved_supports_pull_the_body_along(law, mixed):
     given = np.where(mesh.p[0] == 1, 0.5, 0.0)[:, None] * np.array([1, 0, 0])
     problem = Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0)
     none = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    answer = solve(newton(problem, tol=1e-12, mixed=mixed), load_of(none))
+    answer = solve(newton(problem, tol=1e-12, mixed_integration=mixed), load_of(none))
     assert answer.converged.all()
     assert answer.load_factor.item() == 1
     far = problem.points.sum(dim=1).argmax()
@@ -657,7 +669,7 @@ def test_status_reads_as_words():
 @pytest.mark.parametrize("budget", [1, 3])
 def test_load_is_given_up_where_the_budget_ends(beam, pull, budget):
     problem = beam(NH)
-    answer = solve(newton(problem, budget=budget), load_of(pull(problem, 40.0)))
+    answer = solve(newton(problem, max_total_iter=budget), load_of(pull(problem, 40.0)))
     assert answer.status.item() == Status.NOT_CONVERGED
     assert answer.iterations.item() == budget
     assert not answer.converged.any()
@@ -669,7 +681,7 @@ def test_answer_of_the_last_iteration_of_the_budget_counts(beam, pull):
     load = load_of(pull(problem, 20.0))
     answer = solve(newton(problem), load)
     assert answer.converged.all()
-    spent = solve(newton(problem, budget=answer.iterations.item()), load)
+    spent = solve(newton(problem, max_total_iter=answer.iterations.item()), load)
     assert differing(spent, answer) == []
 
 

@@ -223,8 +223,8 @@ def test_linear_answers_are_reciprocal(bent):
     linear = LinearSolver(problem, linear="superlu")
     random = torch.Generator().manual_seed(5)
     a, b = torch.randn(2, *problem.shape, generator=random, dtype=torch.float64)
-    work = (linear.respond(a) * b).sum()
-    assert_close(work, (linear.respond(b) * a).sum(), rtol=1e-12, atol=0.0)
+    work = (linear.solve(a) * b).sum()
+    assert_close(work, (linear.solve(b) * a).sum(), rtol=1e-12, atol=0.0)
 
 
 def test_free_body_has_exactly_the_rigid_zero_modes(bent):
@@ -796,7 +796,7 @@ def test_mean_dilatation_does_not_lock(cell):
             problem = Problem.build(mesh, law, fixed=Plane(0, "min"), **option)
         value = [0.0, -1e-6, 0.0][: len(size)]
         force = Traction(Plane(0, "max"), value).on(problem)
-        sags[name] = (LinearSolver(problem, linear="superlu").respond(force) * force).sum().item()
+        sags[name] = (LinearSolver(problem, linear="superlu").solve(force) * force).sum().item()
     assert sags["locked"] < 0.5 * sags["quadratic"]
     assert sags["dilated"] == pytest.approx(sags["quadratic"], rel=0.06)
 

@@ -42,7 +42,7 @@ def load_of(*forces: Tensor) -> Load:
 def pair(problem: Problem, load: Load, guess: Tensor | None = None, **options):
     """Return the answers with a factor for every tangent and with as few as usual."""
     answers = []
-    for reuse in (0.0, Newton(problem).reuse):
+    for reuse in (0.0, Newton(problem).factor_reuse_tol):
         solver = Newton(problem, **{"linear": "superlu", "reuse": reuse, **options})
         *_, last = solver.iterate(load, guess=guess)
         answers.append(last)
@@ -78,7 +78,7 @@ def mixed(request) -> bool:
 @pytest.mark.parametrize("q", [1.0, 20.0, 80.0])
 def test_answer_of_any_law_does_not_depend_on_reuse(beam, pull, any_law, mixed, q):
     problem = beam(any_law)
-    every, few = pair(problem, load_of(pull(problem, q)[0]), mixed=mixed)
+    every, few = pair(problem, load_of(pull(problem, q)[0]), mixed_integration=mixed)
     assert every.converged.all()
     check(every, few, fewer=every.iterations.item() > 2)
 
@@ -108,9 +108,13 @@ def test_answer_of_any_backend_does_not_depend_on_reuse(beam, pull, name, cells,
 def test_large_load_that_takes_steps_does_not_depend_on_reuse(beam, pull, mixed, q):
     problem = beam(NH)
     load = load_of(pull(problem, q)[0])
-    states = list(Newton(problem, linear="superlu", mixed=mixed, reuse=0.0).iterate(load))
+    states = list(
+        Newton(problem, linear="superlu", mixed_integration=mixed, factor_reuse_tol=0.0).iterate(
+            load
+        )
+    )
     steps = 1 + len({state.load_factor.item() for state in states})
-    every, few = pair(problem, load, mixed=mixed)
+    every, few = pair(problem, load, mixed_integration=mixed)
     assert every.converged.all()
     check(every, few, steps=steps, fewer=mixed)
 
@@ -134,7 +138,7 @@ def test_moved_supports_are_followed_with_reuse(law, mixed):
     problem = Problem.build(mesh, law, fixed=held, prescribed=given, length=1.0)
     sideways = Traction(Plane(2, "max"), [0.0, 0.0, 0.01]).on(problem)
     for force in (torch.zeros_like(sideways), sideways):
-        every, few = pair(problem, load_of(force), mixed=mixed)
+        every, few = pair(problem, load_of(force), mixed_integration=mixed)
         assert every.converged.all()
         check(every, few)
 
@@ -143,7 +147,9 @@ def test_moved_supports_are_followed_with_reuse(law, mixed):
 def test_guess_is_improved_to_the_same_answer_with_reuse(beam, pull, law, part):
     problem = beam(law)
     load = load_of(pull(problem, 20.0)[0])
-    answer = solve(Newton(problem, tol=1e-12, linear="superlu", reuse=0.0), load).displacement
+    answer = solve(
+        Newton(problem, tol=1e-12, linear="superlu", factor_reuse_tol=0.0), load
+    ).displacement
     every, few = pair(problem, load, guess=part * answer)
     assert every.converged.all()
     check(every, few, fewer=every.iterations.item() > 2)
@@ -155,7 +161,7 @@ def test_more_reuse_means_fewer_factors(beam, pull, reuse):
     problem = beam(NH, 16, 4)
     load = load_of(pull(problem, 20.0)[0])
     counts = {0.0: 4, 1e-3: 3, 0.1: 2, 1.0: 2, 1e6: 1}
-    answer = solve(Newton(problem, linear="superlu", reuse=reuse), load)
+    answer = solve(Newton(problem, linear="superlu", factor_reuse_tol=reuse), load)
     assert answer.converged.all()
     assert answer.iterations.item() == 5
     assert answer.factorisations.item() == counts[reuse]
@@ -176,7 +182,9 @@ def test_without_reuse_every_tangent_has_its_own_factor(beam, pull, monkeypatch)
     """And none serves as a preconditioner."""
     problem = beam(NH)
     monkeypatch.setattr(SuperLUFactor, "apply", None)
-    answer = solve(Newton(problem, linear="superlu", reuse=0.0), load_of(pull(problem, 40.0)[0]))
+    answer = solve(
+        Newton(problem, linear="superlu", factor_reuse_tol=0.0), load_of(pull(problem, 40.0)[0])
+    )
     assert answer.converged.all()
     assert answer.factorisations.item() == answer.iterations.item() - 1
 
@@ -184,7 +192,7 @@ def test_without_reuse_every_tangent_has_its_own_factor(beam, pull, monkeypatch)
 @pytest.mark.parametrize("reuse", [0.01, 0.1, 0.5])
 def test_factor_serves_only_below_the_residual_that_is_asked_for(beam, pull, reuse):
     problem = beam(NH)
-    solver = Newton(problem, linear="superlu", reuse=reuse)
+    solver = Newton(problem, linear="superlu", factor_reuse_tol=reuse)
     made, before = [], 1.0
     for state in solver.iterate(load_of(pull(problem, 80.0)[0])):
         made.append((before, state.factorisations.item()))
@@ -272,7 +280,7 @@ def test_storage_of_a_factor_that_is_not_used_again_is_that_of_the_next(
         places.append(self._storage.ctypes.data)
         return factor
 
-    solver = Newton(problem, linear="band", reuse=reuse)
+    solver = Newton(problem, linear="band", factor_reuse_tol=reuse)
     solver.rest.factor  # noqa: B018
     monkeypatch.setattr(BandedCholesky, "_cholesky", watched)
     answer = solve(solver, load_of(pull(problem, 40.0)[0]))
@@ -364,7 +372,7 @@ def test_factor_with_negative_pivots_is_never_used_again(monkeypatch, P, linear)
     monkeypatch.setattr(
         SuperLUFactor, "apply", lambda self, r: used.append(self.negative_pivots) or self.solve(r)
     )
-    solver = Newton(problem, tol=1e-10, linear=linear, reuse=1e6)
+    solver = Newton(problem, tol=1e-10, linear=linear, factor_reuse_tol=1e6)
     answer = solve(solver, load_of(P * unit))
     assert answer.status.item() == Status.UNSTABLE
     assert [count for count in met if count > 0][:2] == [2, 2]  # one would have been near
@@ -386,10 +394,10 @@ def test_straight_column_far_beyond_is_the_same_with_and_without_reuse():
 @pytest.mark.parametrize("reuse", [-0.1, -1e-300, math.nan, math.inf])
 def test_reuse_out_of_range_is_refused_by_name(beam, reuse):
     with pytest.raises(ValueError, match=f"reuse = {reuse} must be 0 or more"):
-        Newton(beam(NH, 4, 1), reuse=reuse)
+        Newton(beam(NH, 4, 1), factor_reuse_tol=reuse)
 
 
 def test_reuse_survives_pickling_and_replacing(beam):
-    solver = Newton(beam(NH, 4, 1), reuse=0.25)
-    assert pickle.loads(pickle.dumps(solver)).reuse == 0.25
-    assert replace(solver, mixed=False).reuse == 0.25
+    solver = Newton(beam(NH, 4, 1), factor_reuse_tol=0.25)
+    assert pickle.loads(pickle.dumps(solver)).factor_reuse_tol == 0.25
+    assert replace(solver, mixed_integration=False).factor_reuse_tol == 0.25

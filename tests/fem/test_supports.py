@@ -179,7 +179,7 @@ def test_supports_move_with_the_load():
     problem = Problem.build(mesh, NH, supports=ends)
     right = problem.points[:, 0] > 1 - 1e-9
     for budget, factor in ((10, 0.5), (30, 1.0)):  # three iterations are too few for the whole
-        answer = answer_of(problem, max_iter=3, budget=budget, mixed=False)
+        answer = answer_of(problem, max_iter=3, max_total_iter=budget, mixed_integration=False)
         assert answer.load_factor.item() == factor
         assert answer.converged.item() == (factor == 1.0)
         moved = answer.displacement[0, right]

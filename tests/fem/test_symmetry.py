@@ -352,10 +352,10 @@ def test_linear_answers_are_turned_with_their_loads(solver, bend):
     problem = solver.problem
     linear = LinearSolver(problem, linear="superlu")
     force = torch.where(problem.free, bend(problem.points)[0], 0.0)
-    answer = linear.respond(force)
+    answer = linear.solve(force)
     for symmetry in symmetries(problem):
         expected = symmetry.image(answer)
-        found = linear.respond(symmetry.image(force))
+        found = linear.solve(symmetry.image(force))
         assert (found - expected).abs().max() < 1e-10 * expected.abs().max()
 
 

@@ -131,8 +131,8 @@ def test_it_is_symmetric_and_positive(dim, backend):
 def test_newton_has_the_same_answer_with_it(options, mixed):
     problem = body(**options)
     load = bend(problem, 1e-4 if problem.shape[1] == 3 else 5e-4)
-    plain = Newton(problem, mixed=mixed)
-    ours, theirs = solve(plain.replace(turned=True), load), solve(plain, load)
+    plain = Newton(problem, mixed_integration=mixed)
+    ours, theirs = solve(plain.replace(corotational=True), load), solve(plain, load)
     assert theirs.displacement.norm(dim=-1).max() > 0.09, "or it would prove nothing"
     assert ours.converged.all()
     assert (ours.residual < 1e-8).all()
@@ -156,7 +156,7 @@ def test_where_it_does_not_contract_a_factor_takes_over():
     force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
     load = Load(force[None], torch.ones(1, dtype=torch.float64))
     plain = Newton(problem)
-    ours, theirs = solve(plain.replace(turned=True), load), solve(plain, load)
+    ours, theirs = solve(plain.replace(corotational=True), load), solve(plain, load)
     assert ours.factorisations.all()
     assert ours.converged.all()
     assert torch.allclose(ours.displacement, theirs.displacement, rtol=0, atol=1e-8)
@@ -165,7 +165,7 @@ def test_where_it_does_not_contract_a_factor_takes_over():
 def test_without_a_factor_stability_is_not_claimed():
     problem = body()
     load = bend(problem, 2e-4)
-    ours, theirs = solve(Newton(problem, turned=True), load), solve(Newton(problem), load)
+    ours, theirs = solve(Newton(problem, corotational=True), load), solve(Newton(problem), load)
     assert not ours.factorisations.any()
     assert ours.negative_pivots.tolist() == [-1]
     assert theirs.negative_pivots.tolist() == [0]
@@ -176,14 +176,14 @@ def test_moved_supports_go_with_it():
     shift = DirichletBC(Plane(0, "max"), [0.0, 0.0, -0.6])
     problem = body(supports=[shift])
     none = Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
-    ours, theirs = solve(Newton(problem, turned=True), none), solve(Newton(problem), none)
+    ours, theirs = solve(Newton(problem, corotational=True), none), solve(Newton(problem), none)
     assert ours.converged.all()
     assert torch.allclose(ours.displacement, theirs.displacement, rtol=0, atol=1e-8)
 
 
 def test_other_attributes_keep_the_factor_of_rest():
     newton = Newton(body())
-    other = newton.replace(tol=1e-3, turned=True)
+    other = newton.replace(tol=1e-3, corotational=True)
     assert (other.tol, other.turned) == (1e-3, True)
     assert other.rest is newton.rest
     assert other.rest.factor is newton.rest.factor

@@ -346,7 +346,7 @@ def test_newton_takes_the_printed_number_of_iterations(beam, pull, cells, law, q
     """VERIFICATION 1.10; with mixed integration points not more, and from 40 on fewer."""
     problem = beam(law(0.3), *cells)
     load = Load(pull(problem, q), torch.ones(1))
-    plain, mixed = (solve(Newton(problem, mixed=m), load) for m in (False, True))
+    plain, mixed = (solve(Newton(problem, mixed_integration=m), load) for m in (False, True))
     assert plain.iterations.item() in COUNTS[law, q]
     assert mixed.iterations.item() <= plain.iterations.item() - (q == 40)
 
@@ -369,7 +369,9 @@ def test_answer_knows_no_units(corner, mixed, law):
         problem = Problem.build(mesh, law(0.3), fixed=Plane(0, "min"))
         shape = Traction(Plane(0, "max"), [0.0, 0.0, -1.0]).on(problem)
         newtons = 20 / 4500 * young * length**2 * shape[None]
-        scene = Scene(problem, ModalLoads(LinearSolver(problem)), Newton(problem, mixed=mixed))
+        scene = Scene(
+            problem, ModalLoads(LinearSolver(problem)), Newton(problem, mixed_integration=mixed)
+        )
         answer = solve(
             scene.solver, scene.load_of(newtons, torch.tensor([young], dtype=torch.float64))
         )

@@ -178,7 +178,7 @@ class Push:
         else:
             axis = 0 if self.kind == "squeeze" else 1
             force = traction(problem, body.face(axis, "max"), stress, problem.length)
-        force = self.size * force / linear.respond(force).abs().max()
+        force = self.size * force / linear.solve(force).abs().max()
         return load_of(force[None])
 
 

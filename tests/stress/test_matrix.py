@@ -148,7 +148,7 @@ def ladder(scene) -> Ladder:
 
 def test_loads_of_a_ladder_have_their_amplitudes(ladder, scene):
     for step in ladder.steps:
-        amplitude, _ = scene.loads.place(step.load.force)
+        amplitude, _ = scene.loads.project(step.load.force)
         assert amplitude.item() == pytest.approx(step.amplitude, rel=1e-6)
 
 

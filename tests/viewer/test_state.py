@@ -104,7 +104,7 @@ def test_a_pull_is_held_within_the_training(body, pushed):
     node, _ = pushed
     far = torch.tensor([0.0, 0.0, 50.0]).double()
     amplitudes = [
-        float(body.scene.loads.place(body.patch(node, 0.4).towards(far, most=most)[None])[0])
+        float(body.scene.loads.project(body.patch(node, 0.4).towards(far, most=most)[None])[0])
         for most in (1.0, None)
     ]
     assert amplitudes[0] <= 1 + 1e-9
@@ -116,7 +116,7 @@ def test_the_controls_amplitude_is_that_of_the_training(body):
         if not body.scene.problem.free[node].any():
             continue
         force = body.patch(node, 0.4).along(torch.tensor([0.0, 1.0, 1.0]).double(), 0.7)
-        amplitude, strange = body.scene.loads.place(force[None])
+        amplitude, strange = body.scene.loads.project(force[None])
         assert float(amplitude) <= 0.7 + 1e-6
         assert float(strange) < 1e-9
     still = body.patch(node, 0.4).along(torch.zeros(3).double(), 0.7)

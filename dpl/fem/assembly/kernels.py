@@ -1,7 +1,7 @@
 """Compiled element loops: force, tangent and det F of a body under an isotropic law.
 
 WIDTH cells are worked on at once, one in each lane of the processor's vectors. The loops say the
-same as `Body`'s tensor operations, which stay the reference; tests hold the two together.
+same as `TensorAssembly`'s tensor operations, which stay the reference; tests hold the two together.
 What they do at a point is in `dpl.fem.assembly.constitutive_kernels`.
 """
 

@@ -20,7 +20,7 @@ from dpl.fem.materials.tensors import green_lagrange, volume_change
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class TensorAssembly:
     """A hyperelastic body on its supports, cut into cells.
 
     All quantities are dimensionless. Methods take displacements (B, N, D) in float64 and return

@@ -30,7 +30,8 @@ def make_backend(pattern: Pattern, name: str = "auto", near_null: Array | None =
     Args:
         pattern: Structure of the matrices.
         name: "band", "band32", "pardiso", "superlu", "cg", or "auto", see `select_backend`.
-        near_null: Fields that cost no energy, (n, k), see `Body.near_null`; "cg" wants them.
+        near_null: Fields that cost no energy, (n, k), see `TensorAssembly.near_null`; "cg" needs
+            them.
 
     Raises:
         ValueError: No such backend, or it is not installed.
@@ -53,7 +54,7 @@ def select_backend(
     Args:
         name: As for `make_backend`.
         pattern: Structure of the matrices.
-        near_null: Fields that cost no energy, (n, k), see `Body.near_null`.
+        near_null: Fields that cost no energy, (n, k), see `TensorAssembly.near_null`.
         lasting: One factor is to answer many right-hand sides: it may cost more if they cost less.
 
     Raises:

@@ -184,7 +184,7 @@ class CG:
 
     Attributes:
         pattern: Structure of the matrices.
-        near_null: Fields that cost no energy, (n, k), see `Body.near_null`.
+        near_null: Fields that cost no energy, (n, k), see `TensorAssembly.near_null`.
     """
 
     pattern: Pattern

@@ -28,8 +28,8 @@ class ModalLoads:
 
     Each mode's q is drawn by `distribution` times its largest value: for the softest mode the
     one whose linear answer moves some node by `deflection`, for the others that of equal energy
-    (`spectrum` 0.5). All of it is multiplied by the amplitude, then kept on the boundary nodes
-    within a random distance of a random one.
+    (`eigenvalue_exponent` 0.5). All of it is multiplied by the amplitude, then kept on the boundary
+    nodes within a random distance of a random one.
 
     A load is a function of a point of the unit cube, and that of (seed, index) alone.
 
@@ -53,12 +53,12 @@ class ModalLoads:
     deflection: float = 0.4
     patch: Sequence[float] = (0.0, 1.0)
     distribution: Quantile = symmetric_uniform
-    spectrum: float = 0.5
+    eigenvalue_exponent: float = 0.5
     radius: Quantile = uniform01
     amplitude: Quantile = constant
     sampling: str = "independent"
     young: float | Sequence[float] = 1.0
-    always: Tensor | None = None
+    constant_force: Tensor | None = None
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -74,8 +74,8 @@ class ModalLoads:
         low, high = self.patch if len(self.patch) == 2 else (1, 0)
         if not 0 <= low <= high < math.inf:
             raise ValueError(f"patch = {list(self.patch)} must be a smallest and a largest radius")
-        if not -1 <= self.spectrum <= 2:
-            raise ValueError(f"spectrum = {self.spectrum} must lie between -1 and 2")
+        if not -1 <= self.eigenvalue_exponent <= 2:
+            raise ValueError(f"spectrum = {self.eigenvalue_exponent} must lie between -1 and 2")
         if self.sampling not in SAMPLINGS:
             named = " or ".join(SAMPLINGS)
             raise ValueError(f"sampling = {self.sampling!r} must be {named}")
@@ -102,7 +102,7 @@ class ModalLoads:
         """Largest modal loads, (M,) [-]."""
         values, vectors = self.modes
         softest = self.deflection * values[0] / vectors[..., 0].norm(dim=1).max()
-        return softest * (values / values[0]) ** self.spectrum
+        return softest * (values / values[0]) ** self.eigenvalue_exponent
 
     @property
     def largest_force(self) -> float:
@@ -171,7 +171,7 @@ class ModalLoads:
         load = self.at(self.points(seed, indices))
         return load._replace(force=amplitude * load.force)
 
-    def place(self, force: Tensor) -> tuple[Tensor, Tensor]:
+    def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
         """Return where forces (B, N, D) [-] lie among these loads: amplitudes (B,), strangeness.
 
         The amplitude is the largest modal load over its largest value here, of the smallest modal
@@ -180,7 +180,9 @@ class ModalLoads:
         that is no ball counts as one of theirs. What acts on held degrees of freedom does not
         count, see `Problem.acting`.
         """
-        own = self.problem.acting(force if self.always is None else force - self.always)
+        own = self.problem.acting(
+            force if self.constant_force is None else force - self.constant_force
+        )
         fields = torch.where(self.loadable_dofs[..., None], self.modes.vectors, 0.0) * self.q_max
         amplitudes, strange = [], []
         for f in own:
@@ -209,7 +211,7 @@ class ModalLoads:
         middle = places[int(centre * len(places))]
         inside = (points - middle).norm(dim=1) <= distance * (1 + 1e-9)
         force = torch.where(inside[:, None] & self.loadable_dofs, self.modes.vectors @ q, 0.0)
-        return force if self.always is None else force + self.always
+        return force if self.constant_force is None else force + self.constant_force
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle with the modes, so that workers need not find them again."""

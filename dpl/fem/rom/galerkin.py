@@ -79,10 +79,10 @@ class PODGalerkin:
             `Problem.relative_residual_of`; at least 1e-15, below 1.
         reduced_tol: Reduced residual ratio that ends the iterations [-].
         max_iter: Steps per load step before it is halved.
-        budget: Steps in all before a load is given up.
-        smallest_step: Load step, as a part of the load, below which to give up [-].
-        keep: Part of det F that one step may leave of the smallest one [-].
-        reuse: Reduced residual ratio below which a tangent serves the next step too [-].
+        max_total_iter: Steps in all before a load is given up.
+        min_load_step: Load step, as a part of the load, below which to give up [-].
+        min_detF_ratio: Part of det F that one step may leave of the smallest one [-].
+        factor_reuse_tol: Reduced residual ratio below which a tangent serves the next step too [-].
 
     Raises:
         ValueError: V is none of this body, an attribute is out of range, or, at the first load, the
@@ -96,10 +96,10 @@ class PODGalerkin:
     tol: float = 1e-8
     reduced_tol: float = 1e-5
     max_iter: int = 30
-    budget: int = 400
-    smallest_step: float = 2.0**-10
-    keep: float = 0.2
-    reuse: float = 0.1
+    max_total_iter: int = 400
+    min_load_step: float = 2.0**-10
+    min_detF_ratio: float = 0.2
+    factor_reuse_tol: float = 0.1
 
     @classmethod
     def fit(
@@ -169,7 +169,7 @@ class PODGalerkin:
             ValueError: An attribute is out of range, or V is none of this body.
         """
         refuse_range(self.problem)
-        check_steps(self, parts=("reduced_tol", "keep", "smallest_step"))
+        check_steps(self, parts=("reduced_tol", "min_detF_ratio", "min_load_step"))
         if tuple(self.vectors.shape[:2]) != self.problem.shape:
             found, wanted = tuple(self.vectors.shape), (*self.problem.shape, "R")
             raise ValueError(f"vectors of shape {found} must have {wanted}")
@@ -205,7 +205,7 @@ class PODGalerkin:
         known, step = 0.0, 1.0
         if not task.moves and model.ratio(task, state, 1.0) < self.reduced_tol:
             known = 1.0
-        while known < 1 and step >= self.smallest_step and count.iterations < self.budget:
+        while known < 1 and step >= self.min_load_step and count.iterations < self.max_total_iter:
             target = min(known + step, 1.0)
             end = self._corrected(task, state, target, count)
             if end is None:
@@ -263,7 +263,7 @@ class PODGalerkin:
         inverse, ratio, before = None, model.ratio(task, state, target), math.inf
         for _ in range(self.max_iter):
             jump = target - state.part if task.moves else 0.0
-            if inverse is None or jump or not ratio < min(self.reuse, before / 2):
+            if inverse is None or jump or not ratio < min(self.factor_reuse_tol, before / 2):
                 count.factorisations += not state.at_rest
                 inverse, right = model.tangent(task, state, target, jump)
                 if inverse is None:
@@ -280,9 +280,9 @@ class PODGalerkin:
                 short = 1e-2 * self.reduced_tol * target * task.scale
                 if ratio < self.reduced_tol or (not jump and norm(step) < short):
                     return new
-            if count.iterations >= self.budget:
+            if count.iterations >= self.max_total_iter:
                 return None
-            if ratio >= self.reuse:
+            if ratio >= self.factor_reuse_tol:
                 new = model.update_strain_gap(state, new)
             elif not jump:
                 inverse = _broyden(inverse, new.y - state.y, new.internal - state.internal)
@@ -293,7 +293,7 @@ class PODGalerkin:
         self, task: ReducedLoad, state: ReducedState, step: Tensor, jump: float, target: float
     ) -> ReducedState | None:
         """Return the state after the longest of the steps 1, 1/2, 1/4, ... that inverts nothing."""
-        floor = self.keep * min(state.volume, 1.0)
+        floor = self.min_detF_ratio * min(state.volume, 1.0)
         for length in (0.5 ** np.arange(10)).tolist():
             part = target if jump and length == 1 else state.part + length * jump
             end = self._model.state(task, state.y + length * step, part)

@@ -32,14 +32,14 @@ class BatchedNewton:
             `Problem.relative_residual_of`; at least 1e-15, below 1.
         max_iter: Newton iterations.
         max_linear: Conjugate-gradient iterations in one of them.
-        keep: Part of det F that one step may leave of the smallest one [-].
+        min_detF_ratio: Part of det F that one step may leave of the smallest one [-].
     """
 
     problem: Problem
     tol: float = 1e-8
     max_iter: int = 15
     max_linear: int = 200
-    keep: float = 0.2
+    min_detF_ratio: float = 0.2
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -50,8 +50,8 @@ class BatchedNewton:
         if self.problem.material.poisson_range is not None:
             raise ValueError("poisson: a range of them needs dpl.fem.Newton")
         check_tol(self.tol)
-        if not 0 < self.keep < 1:
-            raise ValueError(f"keep = {self.keep} must lie between 0 and 1")
+        if not 0 < self.min_detF_ratio < 1:
+            raise ValueError(f"keep = {self.min_detF_ratio} must lie between 0 and 1")
         if self.problem.moved_supports:
             raise ValueError("prescribed displacements other than zero need dpl.fem.Newton")
 
@@ -106,7 +106,7 @@ class BatchedNewton:
         lengths = torch.zeros_like(before)
         for length in (0.5 ** np.arange(10)).tolist():
             after = self.problem.volume_ratio(u + length * step)
-            safe = (lengths == 0) & (after > self.keep * before.clamp(max=1.0))
+            safe = (lengths == 0) & (after > self.min_detF_ratio * before.clamp(max=1.0))
             lengths = torch.where(safe, length, lengths)
             if (lengths > 0).all():
                 break

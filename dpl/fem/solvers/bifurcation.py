@@ -66,7 +66,7 @@ def post_buckling_branches(
     Raises:
         ValueError: The answer is not known to be unstable.
     """
-    newton = replace(newton, mixed=True)  # plain Newton falls back to what gave way
+    newton = replace(newton, mixed_integration=True)  # plain Newton falls back to what gave way
     direction = unstable_directions(newton, solution)[:1]
     push = imperfection * newton.problem.acting(load.force).norm() * direction / direction.norm()
     answers = []

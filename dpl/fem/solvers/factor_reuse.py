@@ -30,7 +30,7 @@ class FactorCache:
         count: Tangents factorised so far; K(0) is not counted.
     """
 
-    def __init__(self, rest: LinearSolver, factorise: Factorise, *, turned: bool) -> None:
+    def __init__(self, rest: LinearSolver, factorise: Factorise, *, corotational: bool) -> None:
         """Begin with none.
 
         Args:
@@ -38,7 +38,7 @@ class FactorCache:
             factorise: From the entries of a tangent, (nnz,), to its factor.
             turned: Let the factor of K(0), turned with the nodes, be at hand where no other is.
         """
-        self.rest, self.factorise, self.turned = rest, factorise, turned
+        self.rest, self.factorise, self.corotational = rest, factorise, corotational
         self.count = 0
         self._pivots = -1  # negative ones of the last tangent that was factorised
         self._near: Factor | CorotatedFactor | None = None  # the one at hand
@@ -73,7 +73,7 @@ class FactorCache:
             SingularMatrix: It has no factor.
         """
         self._served = None
-        if self._near is None and self.turned:
+        if self._near is None and self.corotational:
             self._near = self.rest.corotational.at(u)
         if self._near is not None and self._near.negative_pivots <= 0:
             product = SymmetricProduct(self.rest.problem.pattern, tangent)
@@ -85,7 +85,7 @@ class FactorCache:
                 )
                 self._served = product
                 return step
-        self.turned &= not isinstance(self._near, CorotatedFactor)
+        self.corotational &= not isinstance(self._near, CorotatedFactor)
         self.count += 1
         self._near = None  # its storage serves the next one
         self._near = self.factorise(tangent)

@@ -92,11 +92,11 @@ class LinearSolver:
         check_force(self.problem, load)
         start = time.perf_counter()
         pairs = zip(load.force, load.poisson.expand(len(load.force), -1), strict=True)
-        answer = torch.stack([self.at(nu[None]).respond(force) for force, nu in pairs])
+        answer = torch.stack([self.at(nu[None]).solve(force) for force, nu in pairs])
         seconds = (time.perf_counter() - start) / len(answer)
         yield evaluate_solution(self.problem, answer, load, self.tol, iterations=1, seconds=seconds)
 
-    def respond(self, force: Tensor) -> Tensor:
+    def solve(self, force: Tensor) -> Tensor:
         """Return K(0)^-1 f, (N, D) [-], for f (N, D) [-]; zero where held."""
         return scatter(self.factor.solve(gather(force, self.problem)), self.problem)
 

@@ -29,10 +29,10 @@ class Newton:
     """Newton-Raphson that never accepts an inverted element, with load steps where it must.
 
     Full steps on the whole load first; a step that would bring det F at a quadrature point below
-    `keep` of its value is shortened until it does not. (No line search on the residual norm: on
-    the way to large rotations it rises a hundredfold before it falls.) Where that does not
+    `min_detF_ratio` of its value is shortened until it does not. (No line search on the residual
+    norm: on the way to large rotations it rises a hundredfold before it falls.) Where that does not
     converge, the load is applied in steps, each half the one that failed, twice the one that
-    succeeded; intermediate states need only `loose`.
+    succeeded; intermediate states need only `intermediate_tol`.
 
     An answer whose tangent has negative pivots is in balance but no minimum of the energy, a
     straight column beyond its critical load, for one: its status says so. The tangent at the
@@ -48,31 +48,31 @@ class Newton:
             rounding does not allow it, on very thin cells, an answer whose residual no longer falls
             counts as converged, with a warning.
         max_iter: Iterations per load step before it is halved.
-        budget: Iterations in all before a load is given up.
-        smallest_step: Load step, as a part of the load, below which to give up [-].
-        loose: Residual ratio at intermediate load factors [-].
-        keep: Part of det F that one step may leave of the smallest one [-].
+        max_total_iter: Iterations in all before a load is given up.
+        min_load_step: Load step, as a part of the load, below which to give up [-].
+        intermediate_tol: Residual ratio at intermediate load factors [-].
+        min_detF_ratio: Part of det F that one step may leave of the smallest one [-].
         linear: Backend of the sparse solves, see `dpl.fem.linear.make_backend`.
-        mixed: Let the strains at the quadrature points be unknowns of their own (Magisano,
-            Leonetti, Garcea 2017), for laws that can: fewer iterations, far larger steps.
-        reuse: Residual ratio below which the last factor, as preconditioner of conjugate gradients
-            on the new tangent, stands for a new one [-]; 0: a factor for every tangent.
-        turned: Let the factor of K(0), turned with the nodes, stand for those of tangents while
-            conjugate gradients with it are short. Whether an answer is stable is then known only
+        mixed_integration: Let the strains at the quadrature points be unknowns of their own
+            (Magisano, Leonetti, Garcea 2017), for laws that can: fewer iterations, far larger steps.
+        factor_reuse_tol: Residual ratio below which the last factor, as preconditioner of conjugate
+            gradients on the new tangent, stands for a new one [-]; 0: a factor for every tangent.
+        corotational: Let the factor of K(0), rotated with the nodes, stand for those of tangents
+            while conjugate gradients with it are short. Whether an answer is stable is then known only
             where they were not.
     """
 
     problem: Problem
     tol: float = 1e-8
     max_iter: int = 15
-    budget: int = 400
-    smallest_step: float = 2.0**-10
-    loose: float = 1e-2
-    keep: float = 0.2
+    max_total_iter: int = 400
+    min_load_step: float = 2.0**-10
+    intermediate_tol: float = 1e-2
+    min_detF_ratio: float = 0.2
     linear: str = "auto"
-    mixed: bool = True
-    reuse: float = 0.1
-    turned: bool = False
+    mixed_integration: bool = True
+    factor_reuse_tol: float = 0.1
+    corotational: bool = False
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -80,7 +80,7 @@ class Newton:
         Raises:
             ValueError: An attribute is out of range, or the backend is not there.
         """
-        check_steps(self, parts=("loose", "keep", "smallest_step"))
+        check_steps(self, parts=("intermediate_tol", "min_detF_ratio", "min_load_step"))
         select_backend(self.linear)
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
@@ -133,7 +133,7 @@ class Newton:
     def _member(self, force: Tensor, guess: Tensor | None) -> Iterator[Solution]:
         """Yield the states under one load (1, N, D)."""
         problem = self.problem
-        count = _Count(FactorCache(self.rest, self.factorise, turned=self.turned))
+        count = _Count(FactorCache(self.rest, self.factorise, corotational=self.corotational))
         state = base = self._rest(force)
         guessed = guess is not None and bool(guess.any())
         guessed &= bool(force.any()) or problem.moved_supports
@@ -146,7 +146,7 @@ class Newton:
         while not self._balanced(state, force, 1.0, self.tol):
             target = min(count.known + step, 1.0)
             whole = target == 1.0
-            tol = self.tol if whole or step < CAREFUL else self.loose
+            tol = self.tol if whole or step < CAREFUL else self.intermediate_tol
             for iterate in self._correct(state, force, target, tol, count):
                 state = iterate
                 yield self._report(state, force, count)
@@ -155,8 +155,8 @@ class Newton:
             else:  # a guess that failed costs no load step
                 step = step if count.guessed else (target - count.known) / 2
                 state, count.guessed = base, False
-            lost = step < self.smallest_step
-            spent = count.iterations >= self.budget
+            lost = step < self.min_load_step
+            spent = count.iterations >= self.max_total_iter
             if lost or (spent and not self._balanced(state, force, 1.0, self.tol)):
                 end = Status.NO_VALID_EQUILIBRIUM if lost else Status.NOT_CONVERGED
                 yield self._report(base, force, count, end)
@@ -172,7 +172,7 @@ class Newton:
         count.factors.invalidate()
         for _ in range(self.max_iter):
             ratio = self._ratio(state, force, target)
-            if not ratio < self.reuse:
+            if not ratio < self.factor_reuse_tol:
                 count.factors.invalidate()
             try:
                 update = self._update(state, target * force, count, self._forcing(ratio, before))
@@ -184,7 +184,7 @@ class Newton:
                 return
             state = stepped._replace(before=ratio)
             yield state
-            if self._balanced(state, force, target, tol) or count.iterations >= self.budget:
+            if self._balanced(state, force, target, tol) or count.iterations >= self.max_total_iter:
                 return
             before = ratio
 
@@ -197,7 +197,7 @@ class Newton:
         Source: Eisenstat, Walker (1996), SIAM J. Sci. Comput. 17, choice 2.
         """
         enough = 0.1 * self.tol / ratio if ratio > 0 else 0.0
-        unknown = 1e-3 if self.turned else 0.0
+        unknown = 1e-3 if self.corotational else 0.0
         earned = 0.01 * (ratio / before) ** 2 if before > 0 else unknown
         return max(1e-12, enough, min(1e-3, earned))
 
@@ -230,12 +230,12 @@ class Newton:
 
         Only the whole one unless it is to `shorten`: a guess is good, or it is given up.
         """
-        floor = self.keep * min(float(state.volume_ratio), 1.0)
+        floor = self.min_detF_ratio * min(float(state.volume_ratio), 1.0)
         for length in (0.5 ** np.arange(10 if shorten else 1)).tolist():
             jump = (1 - length) * state.jump
             end = self._state(state.displacement + length * update, jump)
             if end.volume_ratio > floor:
-                if self.mixed and self.problem.supports_mip:
+                if self.mixed_integration and self.problem.supports_mip:
                     return end._replace(
                         gap=self.problem.update_strain_gap(state.gap, length, update)
                     )

@@ -124,7 +124,8 @@ def check_tol(tol: float) -> None:
 
 
 def check_steps(solver: Any, parts: Sequence[str]) -> None:
-    """Check the numbers of a solver that steps: tol, `parts`, and reuse, max_iter, budget.
+    """Check the numbers of a solver that steps: tol, `parts`, and factor_reuse_tol,
+    max_iter, max_total_iter.
 
     Raises:
         ValueError: One is out of range.
@@ -133,9 +134,9 @@ def check_steps(solver: Any, parts: Sequence[str]) -> None:
     for name in parts:
         if not 0 < getattr(solver, name) < 1:
             raise ValueError(f"{name} = {getattr(solver, name)} must lie between 0 and 1")
-    if not 0 <= solver.reuse < math.inf:
-        raise ValueError(f"reuse = {solver.reuse} must be 0 or more")
-    for name in ("max_iter", "budget"):
+    if not 0 <= solver.factor_reuse_tol < math.inf:
+        raise ValueError(f"factor_reuse_tol = {solver.factor_reuse_tol} must be 0 or more")
+    for name in ("max_iter", "max_total_iter"):
         if getattr(solver, name) < 1:
             raise ValueError(f"{name} = {getattr(solver, name)} must be 1 or more")
 

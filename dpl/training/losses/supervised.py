@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from dpl.scene import Sample
 from dpl.training.losses.loss import Loss, LossContext, _checked, clamp_scale, squared_error
 
-TINY = 1e-24  # square of an error below which a norm has no slope [-]
+SMALLEST_SQUARE = 1e-24  # square of an error below which a norm has no slope [-]
 
 
 class MSE(Loss):
@@ -63,7 +63,7 @@ class RMSELoss(MSE):
 
     def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
         """See `MSE`."""
-        return (self._weighted(error, size) + TINY).sqrt().mean()
+        return (self._weighted(error, size) + SMALLEST_SQUARE).sqrt().mean()
 
 
 class _FixedGradient(torch.autograd.Function):
