@@ -948,3 +948,10 @@ def test_invariants_are_those_of_the_eigenvalues(gradients):
     assert_close(first, a + b + c, rtol=1e-11, atol=1e-13)
     assert_close(second, a * b + b * c + c * a, rtol=1e-11, atol=1e-13)
     assert_close(third, (1 + a) * (1 + b) * (1 + c) - 1, rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("J", [-0.5, -1e-3, -2.0])
+def test_ogdens_stress_is_not_a_number_where_a_body_is_inverted(J):
+    law = OgdenK2(shear=[0.4], exponents=[1.5], bulk=2.0)
+    inverted = torch.diag(torch.tensor([J, 1.0, 1.0], dtype=torch.float64)) - torch.eye(3).double()
+    assert law.stress(inverted).isnan().all()

@@ -710,3 +710,34 @@ def test_slivers_end_where_rounding_ends_them(pull, corner, part, deepest):
     assert told == bool(answer.residual > 1e-8) == (part == 1e-8)
     assert answer.converged.all()
     assert corner(problem, answer.displacement)[2].item() == pytest.approx(deepest, abs=6e-8)
+
+
+def test_linear_solves_are_as_exact_as_eisenstat_and_walker_ask(beam):
+    """Choice 2 of Eisenstat and Walker (1996), between 1e-12 and 1e-3."""
+    newton = Newton(beam(NH, 4, 1), tol=1e-15)
+    assert newton._forcing(1e-2, 1e-1) == pytest.approx(0.01 * (1e-2 / 1e-1) ** 2)
+    assert newton._forcing(1.0, 1e-3) == 1e-3
+    assert newton._forcing(1e-3, 1e3) == 1e-12
+    assert newton.replace(tol=1e-8)._forcing(1e-6, 1e3) == pytest.approx(1e-3)
+    first = float("nan")
+    assert newton._forcing(1.0, first) == 1e-12
+    assert newton.replace(corotational=True)._forcing(1.0, first) == 1e-3
+
+
+def test_stability_is_not_known_before_newton_ends(beam, pull):
+    problem = beam(NH, 4, 1)
+    states = list(Newton(problem, linear="superlu").iterate(load_of(pull(problem, 20.0))))
+    assert [int(state.negative_pivots) for state in states[:-1]] == [-1] * (len(states) - 1)
+    assert int(states[-1].negative_pivots) == 0
+
+
+def test_the_solver_of_another_poissons_ratio_shares_what_does_not_depend_on_it(beam, pull):
+    problem = beam(NeoHookeanLn([0.2, 0.4]), 4, 1)
+    newton = Newton(problem, linear="superlu", tol=1e-9)
+    clone = newton.at(0.25)
+    assert clone.tol == 1e-9
+    assert clone is newton.at(0.25)
+    assert clone.problem is problem.at(0.25)
+    assert clone.rest.problem is clone.problem
+    assert clone.rest is newton.rest.of(clone.problem)
+    assert clone._backend is newton._backend

@@ -9,6 +9,7 @@ import sys
 import pytest
 from PIL import Image
 
+import dpl.viewer
 from dpl.viewer.recording import RATE
 
 
@@ -81,7 +82,7 @@ def test_without_viser_it_says_how_to_get_it(script, home, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     for name in ("page", "body_node"):
         monkeypatch.delitem(sys.modules, f"dpl.viewer.{name}", raising=False)
-    monkeypatch.delattr("dpl.viewer.page", raising=False)
+    monkeypatch.delitem(vars(dpl.viewer), "Page", raising=False)
     ended = script("view", "run=runs/a", cwd=home)
     assert ended.status == 2
     assert ended.err.endswith("pip install -c constraints.txt -e '.[viewer]'\n")

@@ -65,17 +65,17 @@ class OgdenK2(Material):
     def response(self, E: Tensor) -> Response:
         """Return stress and moduli, see `Material.response`."""
         strain, axes = _spectrum(E)
-        stress, invariant_derivatives = self._principal(strain)
+        stress, moduli = self._principal(strain)
         gap = strain[..., :, None] - strain[..., None, :]
         same = gap.abs() < 1e-6  # there the quotient is its limit, to within as much
-        limit = invariant_derivatives.diagonal(dim1=-2, dim2=-1)
-        limit = (limit[..., :, None] + limit[..., None, :]) / 2 - invariant_derivatives
+        limit = moduli.diagonal(dim1=-2, dim2=-1)
+        limit = (limit[..., :, None] + limit[..., None, :]) / 2 - moduli
         quotient = (stress[..., :, None] - stress[..., None, :]) / torch.where(same, 1.0, gap)
         shear = torch.where(same, limit, quotient)
         shear = shear - torch.diag_embed(shear.diagonal(dim1=-2, dim2=-1))
         S = (axes * stress[..., None, :]) @ axes.mT
         normal = axes[..., :, None, :] * axes[..., None, :, :]  # (..., i, j, a)
-        D = torch.einsum("...ija,...ab,...klb->...ijkl", normal, invariant_derivatives, normal)
+        D = torch.einsum("...ija,...ab,...klb->...ijkl", normal, moduli, normal)
         pair = torch.einsum("...ia,...jb->...ijab", axes, axes)
         pair = (pair + pair.transpose(-4, -3)) / 2
         return Response(S, D + torch.einsum("...ijab,...ab,...klab->...ijkl", pair, shear, pair))
@@ -99,10 +99,8 @@ class OgdenK2(Material):
                 + third[..., None]
             )
         stretch = 1 + 2 * strain
-        invariant_derivatives = (dT - 2 * T[..., :, None] * eye) / (
-            stretch[..., :, None] * stretch[..., None, :]
-        )
-        return T / stretch, invariant_derivatives
+        moduli = (dT - 2 * T[..., :, None] * eye) / (stretch[..., :, None] * stretch[..., None, :])
+        return T / stretch, moduli
 
 
 def _spectrum(E: Tensor) -> tuple[Tensor, Tensor]:

@@ -54,12 +54,13 @@ class Newton:
         min_detF_ratio: Part of det F that one step may leave of the smallest one [-].
         linear: Backend of the sparse solves, see `dpl.fem.linear.make_backend`.
         mixed_integration: Let the strains at the quadrature points be unknowns of their own
-            (Magisano, Leonetti, Garcea 2017), for laws that can: fewer iterations, far larger steps.
+            (Magisano, Leonetti, Garcea 2017), for laws that can: fewer iterations and far larger
+            steps.
         factor_reuse_tol: Residual ratio below which the last factor, as preconditioner of conjugate
             gradients on the new tangent, stands for a new one [-]; 0: a factor for every tangent.
         corotational: Let the factor of K(0), rotated with the nodes, stand for those of tangents
-            while conjugate gradients with it are short. Whether an answer is stable is then known only
-            where they were not.
+            while conjugate gradients with it are short. Whether an answer is stable is then known
+            only where they were not.
     """
 
     problem: Problem
