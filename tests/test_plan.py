@@ -189,7 +189,7 @@ def test_lr_star_sends_no_gradient_through_the_residual(scene, batch, monkeypatc
 
 def test_a_data_set_that_is_there_is_not_solved_again(data, calls, monkeypatch):
     solved = []
-    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", lambda *job: solved.append(job))
+    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", lambda *job: solved.append(job))
     assert data.skipped_work() == [
         "one data set for every size and Young's modulus of this body: "
         f"{data.store.folder}, of scene {data.scene.fingerprint[:12]}",
@@ -233,7 +233,9 @@ def test_images_under_symmetries_are_not_solved(scene, folder, data, calls, monk
     line = module.skipped_work()[-1]
     count = int(line.split()[0])
     assert line == f"{count} samples of each load solved: symmetries of the body"
-    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", lambda *job: pytest.fail("solved"))
+    monkeypatch.setattr(
+        "dpl.data.solving.worker_pool.solve_load", lambda *job: pytest.fail("solved")
+    )
     module.prepare_data()
     calls.clear()
     assert sum(len(batch.force) for batch in module.train_dataloader()) == 12 * count

@@ -148,7 +148,7 @@ def test_nothing_is_compiled_or_analysed_again(wide, monkeypatch):
     loads = wide.loads.sample((0, 0), range(6))
     solve(wide.solver, Load(*(column[:1] for column in loads)))
     monkeypatch.setattr("dpl.fem.assembly.sparsity.Pattern.build", None)
-    monkeypatch.setattr("dpl.fem.solvers.linear.backend", None)
+    monkeypatch.setattr("dpl.fem.solvers.linear.make_backend", None)
     monkeypatch.setattr("dpl.fem.problem.Kernels.__init__", None)
     monkeypatch.setattr("dpl.fem.assembly.kernels._alone", None)
     assert solve(wide.solver, loads).converged.all()

@@ -135,7 +135,7 @@ def test_fingerprints_differ_from_each_other(make_scene):
 def test_the_fingerprint_is_the_same_in_every_process(scene, environment, tmp_path):
     code = """
 from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import Plane, box
+from dpl.fem import Plane, box
 from dpl.fem.loads.modal import ModalLoads
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.problem import Problem

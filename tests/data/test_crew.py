@@ -286,10 +286,10 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 import test_crew
-from dpl.data.solving.worker_pool import outcomes
-from dpl.data.solving.solve import Job
+from dpl.data.solving.worker_pool import solve_loads
+from dpl.data.solving.solve import LoadKey
 from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import Plane, box
+from dpl.fem import Plane, box
 from dpl.fem.loads.modal import ModalLoads
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.problem import Problem
@@ -301,7 +301,7 @@ if __name__ == "__main__":
     )
     newton = Newton(problem, linear="superlu")
     scene = Scene(problem, ModalLoads(newton.rest, n_modes=3), newton)
-    running = outcomes(scene, [Job((5, 0), k) for k in range(100000)], workers=1)
+    running = solve_loads(scene, [LoadKey((5, 0), k) for k in range(100000)], workers=1)
     print(next(running).accepted, flush=True)
     test_crew.kept = running  # as long as the program
 """

@@ -165,7 +165,9 @@ def test_preparing_twice_solves_nothing(offline, folder, monkeypatch):
         return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
     module, before, solved = offline(), written(), []
-    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", lambda *_, **__: solved.append(1))
+    monkeypatch.setattr(
+        "dpl.data.solving.worker_pool.solve_load", lambda *_, **__: solved.append(1)
+    )
     module.prepare_data()
     assert solved == []
     assert written() == before != {}
@@ -367,7 +369,7 @@ def test_preparing_a_stream_solves_no_training_load(scene, tmp_path, monkeypatch
         seen.append(job.seed)
         return solve_load(scene, job)
 
-    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", counted)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", counted)
     module = OnlineData(scene, folder=str(tmp_path / "d"), val=2, test=3, workers=0)
     module.prepare_data()
     assert sorted(seen) == [(0, 1)] * 2 + [(0, 2)] * 3
@@ -379,7 +381,7 @@ def test_a_stream_without_worst_has_nothing_of_it(online, monkeypatch):
     def forbidden(*_, **__):
         raise AssertionError("made")
 
-    monkeypatch.setattr("dpl.data.datamodule.Worst", forbidden)
+    monkeypatch.setattr("dpl.data.datamodule.HardExamples", forbidden)
     monkeypatch.setattr(OnlineData, "_errors", forbidden)
     assert len(list(online().train_dataloader())) == 3
     with pytest.raises(AssertionError, match="made"):
@@ -424,7 +426,7 @@ def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, mo
     def choosy(scene, job, **options):
         return solve_load(scene, job, **options)._replace(accepted=job.number % 3 == 1)
 
-    monkeypatch.setattr("dpl.data.stream.outcome", choosy)
+    monkeypatch.setattr("dpl.data.stream.solve_load", choosy)
     module = online()
     first = set(forces(module.train_dataloader()))
     resumed = online()
@@ -494,7 +496,7 @@ def test_what_the_data_set_has_is_read_and_not_solved(scene, saving, tmp_path, m
         solved.append(job.number)
         return solve_load(scene, job, **options)
 
-    monkeypatch.setattr("dpl.data.stream.outcome", counted)
+    monkeypatch.setattr("dpl.data.stream.solve_load", counted)
     module = saving(batches=6)
     assert "20 loads of the stream not solved again: they are there" in module.skipped_work()
     batches = list(module.train_dataloader())
@@ -525,7 +527,7 @@ def test_what_waits_in_the_spool_is_not_solved_again(saving, monkeypatch, tmp_pa
     def forbidden(*_, **__):
         raise AssertionError("solved again")
 
-    monkeypatch.setattr("dpl.data.stream.outcome", forbidden)
+    monkeypatch.setattr("dpl.data.stream.solve_load", forbidden)
     list(saving(batches=6).train_dataloader())
     assert sorted((tmp_path / "d" / "spool").iterdir()) == spooled
 
@@ -542,8 +544,8 @@ def test_rejected_loads_are_kept_as_rejected(scene, saving, tmp_path, monkeypatc
         one = solve_load(scene, job, **options)
         return one._replace(accepted=False, reason="a whim") if job.number % 3 == 0 else one
 
-    monkeypatch.setattr("dpl.data.stream.outcome", choosy)
-    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", choosy)
+    monkeypatch.setattr("dpl.data.stream.solve_load", choosy)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", choosy)
     module = saving(batches=12)  # 48 accepted of 71 or 72
     seen = forces(module.train_dataloader())
     loads = drawn(scene, 72)
@@ -555,7 +557,7 @@ def test_rejected_loads_are_kept_as_rejected(scene, saving, tmp_path, monkeypatc
     again = saving(batches=10)
     solved = []
     monkeypatch.setattr(
-        "dpl.data.stream.outcome", lambda *a, **k: solved.append(1) or choosy(*a, **k)
+        "dpl.data.stream.solve_load", lambda *a, **k: solved.append(1) or choosy(*a, **k)
     )
     first = forces(again.train_dataloader())
     assert not set(first) & {load for k, load in enumerate(loads) if not k % 3}
@@ -570,7 +572,7 @@ def test_a_data_set_without_a_rejected_point_gives_samples_of_finite_numbers(sav
         bad = one._replace(accepted=False, reason="x", displacement=np.nan * one.displacement)
         return bad if job.number % 2 else one
 
-    monkeypatch.setattr("dpl.data.stream.outcome", choosy)
+    monkeypatch.setattr("dpl.data.stream.solve_load", choosy)
     for batch in saving(batches=20).train_dataloader():
         assert all(torch.isfinite(column).all() for column in batch)
 

@@ -19,8 +19,8 @@ from dpl.system.files import append_jsonl, atomic_write, exclusive_lock, read_js
 WRITER = """
 import sys, time
 from pathlib import Path
-from dpl.system.files import sole_writer
-with sole_writer(Path(sys.argv[1])):
+from dpl.system.files import exclusive_lock
+with exclusive_lock(Path(sys.argv[1])):
     print("writing", flush=True)
     time.sleep(600)
 """

@@ -34,7 +34,7 @@ def solved(monkeypatch):
         found.append((job.seed[1], job.number))
         return solve_load(scene, job)
 
-    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", counted)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", counted)
     return found
 
 
@@ -263,7 +263,7 @@ def test_a_biased_set_is_warned_of_on_one_line(wanted, monkeypatch, capsys):
         one = solve_load(scene, job)
         return failed_load(scene, job, "not converged") if one.amplitude > 0.1 else one
 
-    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", picky)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", picky)
     store = wanted(train=80).fill()
     err = capsys.readouterr().err
     poor = [part for part in store.acceptance() if part.biased]

@@ -136,7 +136,7 @@ def test_rejected_loads_do_not_enter_the_stream(scene, drawn, monkeypatch):
     def choosy(scene, job, **options):
         return solve_load(scene, job, **options)._replace(accepted=job.number % 3 == 1)
 
-    monkeypatch.setattr("dpl.data.stream.outcome", choosy)
+    monkeypatch.setattr("dpl.data.stream.solve_load", choosy)
     first = itertools.islice(OnlineSamples(scene, SEED), 3)
     assert [one.sample.force.numpy().tobytes() for one in first] == [drawn[1], drawn[4], drawn[7]]
 
@@ -478,7 +478,7 @@ def unsolved(monkeypatch):
             job=job, point=point.numpy(), force=none, displacement=none, accepted=True
         )
 
-    monkeypatch.setattr("dpl.data.stream.outcome", fake)
+    monkeypatch.setattr("dpl.data.stream.solve_load", fake)
     loads = SimpleNamespace(
         young_at=lambda points: points[:, -1], poisson_at=lambda points: points[:, :0]
     )
@@ -754,7 +754,7 @@ PARENT = textwrap.dedent(
     import json, multiprocessing, sys, time
     sys.path.insert(0, sys.argv[1])
     from test_online import Busy
-    from dpl.data.stream import Replay
+    from dpl.data.replay_buffer import ReplayBuffer
 
     if __name__ == "__main__":
         stream = Replay(

@@ -135,9 +135,9 @@ def test_a_change_of_the_number_of_threads_between_loads_is_survived(tmp_path, e
     code = """
 import torch
 from threadpoolctl import threadpool_limits
-from dpl.data.solving.solve import Job, outcome
+from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.fem.materials.neo_hookean import NeoHookeanLn
-from dpl.fem.mesh.generators import Plane, box
+from dpl.fem import Plane, box
 from dpl.fem.loads.modal import ModalLoads
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.problem import Problem
@@ -147,9 +147,9 @@ torch.set_num_threads(2)
 mesh = box([4.0, 1.0, 1.0], [17, 5, 5])
 newton = Newton(Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min")), linear="pardiso")
 scene = Scene(newton.problem, ModalLoads(newton.rest, n_modes=3, deflection=0.01), newton)
-outcome(scene, Job((0, 0), 0))
+solve_load(scene, LoadKey((0, 0), 0))
 with threadpool_limits(1):
-    assert outcome(scene, Job((0, 0), 1)).accepted
+    assert solve_load(scene, LoadKey((0, 0), 1)).accepted
 """
     ended = subprocess.run(
         [sys.executable, "-c", code],

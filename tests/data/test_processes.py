@@ -35,11 +35,11 @@ PROGRAM = textwrap.dedent(
 )
 STARTS = {
     "a worker of a crew": """
-        from dpl.system.processes import spawning
-        spawning().Process(target=task, daemon=True).start()
+        from dpl.system.processes import spawn_context
+        spawn_context().Process(target=task, daemon=True).start()
     """,
     "a worker of a stream": """
-        from dpl.data.replay_buffer import Replay
+        from dpl.data.replay_buffer import ReplayBuffer
         from torch.utils.data import IterableDataset
 
         class Source(IterableDataset):
@@ -51,7 +51,7 @@ STARTS = {
         globals()["Source"] = Source
         Source.__qualname__ = "Source"
         sizes = {"batch_size": 1, "batches": 1, "fresh": 1, "reuse": 1, "capacity": 4}
-        replay = Replay(Source(), workers=1, **sizes)
+        replay = ReplayBuffer(Source(), workers=1, **sizes)
         replay._start()
     """,
 }

@@ -54,7 +54,7 @@ def solved(monkeypatch):
         found.append((*job.seed, job.number))
         return solve_load(scene, job)
 
-    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", counted)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", counted)
     return found
 
 
@@ -198,7 +198,8 @@ def test_rejected_loads_are_recorded_with_reason_and_load_factor(hard, tmp_path)
 
 def test_a_shard_of_rejects_alone_is_a_shard(scene, fresh, monkeypatch):
     monkeypatch.setattr(
-        "dpl.data.solving.worker_pool.outcome", lambda scene, job: failed_load(scene, job, "never")
+        "dpl.data.solving.worker_pool.solve_load",
+        lambda scene, job: failed_load(scene, job, "never"),
     )
     fill(fresh, {"train": range(3)})
     assert fresh.missing("train", 4) == [3]
@@ -616,9 +617,9 @@ def test_an_empty_split_is_refused(copy):
 def test_a_folder_that_may_only_be_read_is_read(copy, environment):
     """Root may write everywhere, so it is mounted so."""
     code = (
-        "import sys; from dpl.system.files import read_lines; from pathlib import Path; "
+        "import sys; from dpl.system.files import append_jsonl, read_jsonl; from pathlib import Path; "
         "folder = Path(sys.argv[1]); "
-        "assert len(read_lines(folder / 'manifest.jsonl')) == 3; "
+        "assert len(read_jsonl(folder / 'manifest.jsonl')) == 3; "
         "from dpl.data.storage.store import Store; from dpl.data.storage.writer import Writer; "
         "from types import SimpleNamespace as N; import json; "
         "card = json.loads((folder / 'scene.json').read_text()); "
@@ -916,10 +917,10 @@ def test_repair_retries_loads_that_the_machine_lost_and_no_others(hard, tmp_path
 
     monkeypatch.setattr(store_module, "SHARD", 3)
     fill(sound, {"train": range(9)})
-    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", unlucky)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", unlucky)
     fill(store, {"train": range(9)})
     assert store.digest("train", 9) != sound.digest("train", 9)
-    monkeypatch.setattr("dpl.data.solving.worker_pool.outcome", solve_load)
+    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", solve_load)
     assert mended(store) == ["train-000000.safetensors", "train-000003.safetensors"]
     assert fill(store, {"train": store.missing("train", 9)}) == 6
     assert store.digest("train", 9) == sound.digest("train", 9)
@@ -981,3 +982,16 @@ def test_kept_loads_make_shards_when_they_make_whole_ones(data, fresh, scene, mo
     Writer(fresh).collect("train")
     assert fresh.pending.files() == {}
     assert fresh.digest("train", 8) == data.store.digest("train", 8)
+
+
+def test_the_time_of_a_load_is_the_mean_over_all_sessions(copy):
+    (copy.folder / "journal.jsonl").unlink()
+    assert copy.seconds_a_load() is None
+    for line in (
+        {"loads": 10, "seconds": 4.0, "core_seconds": 8.0},
+        {"loads": 30, "seconds": 4.0, "core_seconds": 24.0},
+        {"loads": 30, "seconds": "long"},
+    ):
+        append_jsonl(copy.folder / "journal.jsonl", line)
+    assert copy.seconds_a_load() == pytest.approx(8.0 / 40)
+    assert "0.800 s a load on one core, 8 s of wall time in 2 sessions" in copy.summary()

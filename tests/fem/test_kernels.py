@@ -254,7 +254,7 @@ def test_problem_sent_to_another_process_keeps_its_arrays(grid, bend):
 LAW = """
 from dataclasses import dataclass
 
-from dpl.fem.materials.neo_hookean import Hookean, Isotropic
+from dpl.fem import InvariantBasedMaterial, YoungPoissonMaterial
 
 FACTOR = {factor}
 
@@ -265,13 +265,13 @@ def outer(x):
     return {outer} * x
 
 @dataclass(frozen=True)
-class Mine(Hookean, Isotropic):
+class Mine(YoungPoissonMaterial, InvariantBasedMaterial):
     @property
     def constants(self):
         return (self.mu,)
 
     @staticmethod
-    def slopes(c, i1, i2, j, log_j, m1):
+    def invariant_derivatives(c, i1, i2, j, log_j, m1):
         return outer(c[0] * i1), {slope}, 0.0, c[0], 0.0, 0.0, 0.0, 0.0, 0.0
 """
 

@@ -686,7 +686,7 @@ def test_a_mesh_that_is_saved_exactly_is_loaded_to_the_last_bit(tmp_path, mesh):
 def test_the_propeller_s_nodes_have_one_order_on_all_processors():
     """NumPy sorts ties in one way on AVX-512, in others on AVX2 and without both."""
     program = (
-        "import numpy as np; from dpl.fem.mesh.generators import propeller; m = propeller();"
+        "import numpy as np; from dpl.fem import propeller; m = propeller();"
         "print(m.t.ravel()[:99].tolist(), np.round(m.p[:, :9], 9).tolist())"
     )
     printed = set()

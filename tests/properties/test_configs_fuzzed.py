@@ -252,7 +252,7 @@ FOREIGN = [  # what would do harm, and how it would be called
     {"_target_": "dpl.config.load_run", "folder": "evil", "trust": True},
     {"_target_": "dpl.config.build.importlib", "name": "antigravity"},
     {"_target_": "dpl.scene.partial", "func": "os.system"},
-    {"_target_": "dpl.training.surrogate.append_line", "path": "harm", "line": {"a": 1}},
+    {"_target_": "dpl.system.files.append_jsonl", "path": "harm", "line": {"a": 1}},
     {"_target_": "dpl.system.files.atomic_write", "path": "harm"},
     {
         "_target_": "dpl.fem.write_mesh",

@@ -17,7 +17,7 @@ def polynomial_derivatives(c: Any, i1: Any, i2: Any, m1: Any, q: Any, qJ: Any) -
 
     Args:
         c: Moduli.
-        i1, i2, m1: As in `InvariantBasedMaterial.slopes`.
+        i1, i2, m1: As in `InvariantBasedMaterial.invariant_derivatives`.
         q, qJ: J U' and J (J U')'.
     """
     m = 1 + m1

@@ -47,7 +47,7 @@ class MooneyRivlinK2(InvariantBasedMaterial):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
+        """See `InvariantBasedMaterial.invariant_derivatives`."""
         return polynomial_derivatives(
             c, i1, i2, m1, c[4] * j * (1 + j), c[4] * (1 + j) * (1 + 2 * j)
         )

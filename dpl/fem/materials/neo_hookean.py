@@ -36,7 +36,7 @@ class NeoHookeanLn(YoungPoissonMaterial, InvariantBasedMaterial):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
+        """See `InvariantBasedMaterial.invariant_derivatives`."""
         rest = c[0] * log_j
         return rest, 0.0, rest - c[1], 0.0, 0.0, 0.0, 0.0, 0.0, c[0]
 
@@ -62,7 +62,7 @@ class NeoHookeanIsoK2(YoungPoissonMaterial, InvariantBasedMaterial):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
+        """See `InvariantBasedMaterial.invariant_derivatives`."""
         return polynomial_derivatives(
             c, i1, i2, m1, c[4] * j * (1 + j), c[4] * (1 + j) * (1 + 2 * j)
         )
@@ -84,7 +84,7 @@ class NeoHookeanIsoK4(NeoHookeanIsoK2):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
+        """See `InvariantBasedMaterial.invariant_derivatives`."""
         return polynomial_derivatives(
             c, i1, i2, m1, c[4] / 2 * j * (2 + j), c[4] * (1 + j) * (1 + j)
         )
@@ -117,7 +117,7 @@ class StableNeoHookean(YoungPoissonMaterial, InvariantBasedMaterial):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
+        """See `InvariantBasedMaterial.invariant_derivatives`."""
         near = 1 / (4 + i1)
         J = 1 + j
         volume = c[1] * j * J - 3 / 4 * c[0] * j

@@ -33,6 +33,6 @@ class SaintVenantKirchhoff(YoungPoissonMaterial, InvariantBasedMaterial):
     def invariant_derivatives(
         c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
     ) -> tuple[Any, ...]:
-        """Return the slopes, see `InvariantBasedMaterial.slopes`."""
+        """See `InvariantBasedMaterial.invariant_derivatives`."""
         rest = (c[0] / 2 + c[1]) * i1
         return rest, -c[1] / 2, 0.0, c[0] / 4 + c[1] / 2, 0.0, 0.0, 0.0, 0.0, 0.0
