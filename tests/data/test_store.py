@@ -26,6 +26,7 @@ from dpl.data.storage.integrity import MACHINE, repair, verify
 from dpl.data.storage.pending import PendingSamples
 from dpl.data.storage.shard import to_dense, to_sparse
 from dpl.fem import SaintVenantKirchhoff, rectangle
+from dpl.system.files import append_jsonl
 
 SIZES = {"train": 12, "val": 4, "test": 4}
 WANTED = {split: range(size) for split, size in SIZES.items()}
@@ -617,7 +618,7 @@ def test_an_empty_split_is_refused(copy):
 def test_a_folder_that_may_only_be_read_is_read(copy, environment):
     """Root may write everywhere, so it is mounted so."""
     code = (
-        "import sys; from dpl.system.files import append_jsonl, read_jsonl; from pathlib import Path; "
+        "import sys; from dpl.system.files import read_jsonl; from pathlib import Path; "
         "folder = Path(sys.argv[1]); "
         "assert len(read_jsonl(folder / 'manifest.jsonl')) == 3; "
         "from dpl.data.storage.store import Store; from dpl.data.storage.writer import Writer; "
