@@ -208,7 +208,7 @@ def test_a_network_may_bring_an_optimiser_and_a_loss_of_its_own(compose, name):
     assert cfg.optimizer._target_.endswith("Muon")
     assert cfg.optimizer.lr == 5e-3
     assert cfg.optimizer.momentum == 0.95, "the rest is that of conf/optimizer"
-    assert cfg.loss._target_.endswith("MeanNorm")
+    assert cfg.loss._target_.endswith("RMSELoss")
     assert (cfg.data.batch_size, cfg.trainer.max_epochs) == (512, 188)
     assert "defaults" not in cfg
 
@@ -249,7 +249,7 @@ def test_a_network_that_brings_its_own_joins_an_experiment(compose, name):
     build.check(cfg)
     assert cfg.mesh == experiment.mesh
     assert cfg.data.train == experiment.data.train == 4095
-    assert cfg.loss._target_.endswith("MeanNorm")
+    assert cfg.loss._target_.endswith("RMSELoss")
 
 
 def test_loads_of_different_seeds_are_different_data(compose, scene, tmp_path):
@@ -281,7 +281,7 @@ def test_small_loads_are_small_in_force_and_in_area(scene_of):
 
 def test_options_of_the_loads_can_be_changed_one_by_one(scene_of):
     usual = scene_of(*SMALL["beam"])
-    changes = ["spectrum=1", "sampling=sobol", "radius._target_=dpl.fem.loads.constant"]
+    changes = ["eigenvalue_exponent=1", "sampling=sobol", "radius._target_=dpl.fem.loads.constant"]
     for change in [*changes, "distribution._target_=dpl.fem.loads.normal"]:
         assert scene_of(*SMALL["beam"], f"loads.{change}").fingerprint != usual.fingerprint
 

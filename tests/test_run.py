@@ -413,7 +413,7 @@ def test_hyperparameters_are_flat_and_a_call_goes_by_its_name(compose):
     cfg = compose("folder=.", "model=latent", "young=[1e6,2e11]", command="train")
     flat = build.hyperparameters(cfg)
     assert flat["model"] == "Latent"
-    assert (flat["model.width"], flat["optimizer.lr"], flat["loss"]) == (256, 5e-3, "MeanNorm")
+    assert (flat["model.width"], flat["optimizer.lr"], flat["loss"]) == (256, 5e-3, "RMSELoss")
     assert flat["young"] == "[1000000.0, 200000000000.0]"
     assert all(isinstance(value, bool | int | float | str) for value in flat.values())
     noise = ("run", "folder", "ckpt_path", "trainer.callbacks", "trainer.logger")

@@ -32,7 +32,7 @@ def test_loads_that_are_not_accepted_are_left_out(scene, monkeypatch):
         for outcome in peers.outcomes(scene, jobs, workers=workers):
             yield outcome._replace(accepted=outcome.job.number != 1)
 
-    monkeypatch.setattr(deflections, "outcomes", answered)
+    monkeypatch.setattr(deflections, "solve_loads", answered)
     found = deflections.deflections({"a": scene}, 3, 0)
     assert [row.load for row in found] == [0, 2]
 

@@ -182,10 +182,14 @@ def test_the_loads_of_a_shard_whose_line_is_lost_are_solved_again_even_if_fewer_
     assert copy.digest("train", 12) == data.store.digest("train", 12)
 
 
-def test_a_folder_with_the_name_of_a_shard_is_left_alone(copy):
-    (copy.folder / "train-000064.safetensors").mkdir()
+def test_an_empty_folder_with_the_name_of_a_shard_is_removed_and_a_full_one_left_alone(copy):
+    empty, full = (copy.folder / f"train-{first:06d}.safetensors" for first in (64, 128))
+    empty.mkdir()
+    full.mkdir()
+    (full / "mine").touch()
     wanted(copy).repair()
-    assert (copy.folder / "train-000064.safetensors").is_dir()
+    assert not empty.exists()
+    assert (full / "mine").is_file()
 
 
 def flip_lowest_bit(path, column):

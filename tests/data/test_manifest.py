@@ -4,7 +4,15 @@ import json
 
 import pytest
 
-from dpl.data.storage.manifest import MOST, is_number, kept_in, lines_of, place, torn_lines
+from dpl.data.storage.manifest import (
+    MOST,
+    is_number,
+    kept_in,
+    lines_of,
+    place,
+    shard_name,
+    torn_lines,
+)
 
 LINE = {
     "file": "val-000064.safetensors",
@@ -40,7 +48,7 @@ def test_a_manifest_that_is_not_there_has_no_lines(tmp_path):
 POSSIBLE = [
     *({}, {"more": 1}, {"first": 63}, {"first": 65}, {"iterations": 0}, {"iterations": 2**53 - 1}),
     {"first": 2**53 - 1, "rejected": [REJECT | {"index": 2**53}]},
-    *({"split": "train"}, {"split": "test"}, {"file": "a"}, {"file": "a" * 200}),
+    *({"split": "train"}, {"split": "test"}),
     *({"amplitudes": [0, 0, 0]}, {"amplitudes": [1e14, 10**15 - 1, 0.0]}),
     {"tried": 0, "accepted": 0, "amplitudes": [], "rejected": []},
     {"accepted": 3, "rejected": []},
@@ -52,6 +60,7 @@ POSSIBLE = [
 @pytest.mark.parametrize("change", POSSIBLE, ids=str)
 def test_a_line_that_can_be_is_kept_as_it_is(manifest, change):
     line = LINE | change
+    line["file"] = shard_name(line["split"], line["first"])
     assert lines_of(manifest(line)) == [line]
     assert torn_lines(manifest(line)) == []
 
@@ -70,6 +79,10 @@ IMPOSSIBLE = {
     "has a number tried that cannot be": [{"tried": -3}, {"tried": 3.0}, {"tried": None}],
     "has a number accepted that cannot be": [{"accepted": -2}, {"accepted": 2.0}],
     "has a number iterations that cannot be": [{"iterations": -1}, {"iterations": 2**53}],
+    "names the file of another split or of another first load": [
+        *({"split": "train"}, {"first": 63}, {"first": 0}, {"file": "a"}, {"file": "a" * 200}),
+        {"file": "val-64.safetensors"},
+    ],
     "has amplitudes or rejected loads that are not lists": [
         *({"amplitudes": {}}, {"amplitudes": "abc"}, {"rejected": {}}, {"rejected": None}),
     ],

@@ -275,7 +275,7 @@ def test_the_bytes_do_not_depend_on_the_order_in_which_loads_are_solved(data, fr
     def backwards(scene, jobs, **more):
         return worker_pool.solve_loads(scene, list(jobs)[::-1], **more)
 
-    monkeypatch.setattr(writer_module, "outcomes", backwards)
+    monkeypatch.setattr(writer_module, "solve_loads", backwards)
     fill(fresh, WANTED)
     assert content(fresh) == content(data.store)
 
@@ -996,3 +996,11 @@ def test_the_time_of_a_load_is_the_mean_over_all_sessions(copy):
         append_jsonl(copy.folder / "journal.jsonl", line)
     assert copy.seconds_a_load() == pytest.approx(8.0 / 40)
     assert "0.800 s a load on one core, 8 s of wall time in 2 sessions" in copy.summary()
+
+
+def test_a_line_that_names_the_shard_of_another_split_gives_none_of_its_loads(copy, data):
+    first, other = (line for line in lines(copy) if line["first"] == 0 and line["split"] != "test")
+    line = other | {"split": first["split"]}
+    (copy.folder / "manifest.jsonl").write_text(json.dumps(line) + "\n")
+    assert [copy.reader(split)(0) for split in ("train", "val")] == [None, None]
+    assert "manifest.jsonl" in flaws(copy)

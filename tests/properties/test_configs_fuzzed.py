@@ -346,7 +346,7 @@ KINDS = {
 WATCHING = {"Trainer", "Callback", "Logger", "CheckpointIO"}
 FUNCTIONS = {
     *("box", "rectangle", "propeller", "load", "warmup_cosine"),
-    *("uniform", "normal", "even", "one", "logarithmic", "tail"),
+    *("symmetric_uniform", "normal", "uniform01", "constant", "logarithmic", "log_tail_mixture"),
 }
 
 

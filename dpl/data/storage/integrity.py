@@ -1,5 +1,6 @@
 """What is wrong with a data set, as far as its scene can tell, and making it sound again."""
 
+import contextlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -97,6 +98,9 @@ def repair(store: Store) -> list[tuple[Part, str]]:
         for path in [*_unnamed(store), *store.folder.rglob(".*.part")]:
             if path.is_symlink() or not path.is_dir():
                 path.unlink()
+            else:
+                with contextlib.suppress(OSError):  # it is not empty: somebody's own
+                    path.rmdir()
         for path in store.pending.files().values():
             if store.pending.get(path).reason.startswith(MACHINE):
                 path.unlink()

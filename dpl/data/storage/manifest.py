@@ -47,6 +47,8 @@ def _flaw_of(line: Mapping[str, Any]) -> str:
     for key in ("first", "tried", "accepted", "iterations"):
         if not (type(line[key]) is int and 0 <= line[key] < 2**53):
             return f"has a number {key} that cannot be"
+    if "/" not in line["file"] and line["file"] != shard_name(line["split"], line["first"]):
+        return "names the file of another split or of another first load"
     return _flaw_of_loads(line)
 
 
@@ -69,6 +71,16 @@ def _flaw_of_loads(line: Mapping[str, Any]) -> str:
         for one in rejected
     )
     return "" if possible else "has a rejected load that cannot be"
+
+
+def shard_name(split: str, first: int) -> str:
+    """Return the name of the file of a shard.
+
+    Args:
+        split: Split of its loads.
+        first: Number of its first load.
+    """
+    return f"{split}-{first:06d}.safetensors"
 
 
 def is_number(value: Any) -> bool:

@@ -13,7 +13,7 @@ from safetensors.torch import save
 
 from dpl.data.solving.solve import LoadKey, SolvedLoad
 from dpl.data.solving.worker_pool import GracefulShutdown, solve_loads
-from dpl.data.storage.manifest import STREAMS, lines_of, place
+from dpl.data.storage.manifest import STREAMS, lines_of, place, shard_name
 from dpl.data.storage.pending import clean_partial_files
 from dpl.data.storage.shard import encode_shard
 from dpl.data.storage.store import FORMAT, MODES, Store, runs
@@ -147,7 +147,7 @@ class Writer:
         """Write one shard, then its line of the manifest."""
         split, first = self._split(tried[0].job), tried[0].job.number
         kept = [one for one in tried if one.accepted]
-        name = f"{split}-{first:06d}.safetensors"
+        name = shard_name(split, first)
         scene, loads = self.store.scene, self.store.scene.loads
         poisson = None if loads.poisson_range is None else loads.poisson_at
         content = encode_shard(kept, scene.problem.shape, loads.n_random, poisson)

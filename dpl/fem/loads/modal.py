@@ -39,13 +39,13 @@ class ModalLoads:
         deflection: Largest linear deflection of the softest mode over L [-].
         patch: Smallest and largest radius of the area over L [-].
         distribution: Quantiles of q over its largest value, per mode, in [-1, 1].
-        spectrum: Largest q of a mode as a power of its eigenvalue: 0.5 for equal energies, 1 for
-            equal deflections, 0 for equal forces.
+        eigenvalue_exponent: Largest q of a mode as a power of its eigenvalue: 0.5 for equal
+            energies, 1 for equal deflections, 0 for equal forces.
         radius: Quantiles of the radius, from 0 (the smallest) to 1 (the largest).
         amplitude: Quantiles of a factor on the whole load, in [0, 1].
         sampling: How loads fill the cube: "independent" points or a "sobol" sequence.
         young: Young's modulus [Pa], or a range of which each load draws its own.
-        always: Force that every load holds besides, (N, D) [-]; none if left out.
+        constant_force: Force that every load holds besides, (N, D) [-]; none if left out.
     """
 
     linear: LinearSolver
@@ -75,7 +75,9 @@ class ModalLoads:
         if not 0 <= low <= high < math.inf:
             raise ValueError(f"patch = {list(self.patch)} must be a smallest and a largest radius")
         if not -1 <= self.eigenvalue_exponent <= 2:
-            raise ValueError(f"spectrum = {self.eigenvalue_exponent} must lie between -1 and 2")
+            raise ValueError(
+                f"eigenvalue_exponent = {self.eigenvalue_exponent} must lie between -1 and 2"
+            )
         if self.sampling not in SAMPLINGS:
             named = " or ".join(SAMPLINGS)
             raise ValueError(f"sampling = {self.sampling!r} must be {named}")
