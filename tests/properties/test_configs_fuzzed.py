@@ -340,12 +340,12 @@ NAMES = _names()
 
 KINDS = {
     *("Mesh", "Material", "Newton", "ModalLoads", "DataSet", "OfflineData", "Module", "Optimizer"),
-    *("LRScheduler", "Plane", "Box", "Sphere", "Cylinder", "Tag", "Displacement", "Spring"),
+    *("LRScheduler", "Plane", "Box", "Sphere", "Cylinder", "Tag", "DirichletBC", "RobinBC"),
     *("Traction", "BodyForce", "Loss"),
 }
 WATCHING = {"Trainer", "Callback", "Logger", "CheckpointIO"}
 FUNCTIONS = {
-    *("box", "rectangle", "propeller", "load", "warmup_cosine"),
+    *("box", "rectangle", "propeller", "read_mesh", "warmup_cosine"),
     *("symmetric_uniform", "normal", "uniform01", "constant", "logarithmic", "log_tail_mixture"),
 }
 
