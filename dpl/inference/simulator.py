@@ -44,10 +44,10 @@ class Answer:
             `ModalLoads.project`.
         out_of_span: Part of the force that is not made of the training's modes [-].
         out_of_distribution: Whether the load lies outside the range of the training.
-        tier: Who answered: "rest", "linear", "network", "corrected", "hybrid" or "full Newton".
+        method: What computed the result: "rest", "linear", "network", "corrected", "hybrid" or "full Newton".
         iterations: Linear solves with a tangent.
         milliseconds: Wall time [ms]; of several loads, the share of each.
-        verdict: All that in words.
+        summary: The fields above in words.
     """
 
     displacement: Any
@@ -184,12 +184,12 @@ class Simulator:
             "converged": kept,
             "negative_pivots": state.negative_pivots,
             "amplitude": amplitude,
-            "strange": strange,
-            "outside": outside,
-            "tier": list(tiers),
+            "out_of_span": strange,
+            "out_of_distribution": outside,
+            "method": list(tiers),
             "iterations": state.iterations,
             "milliseconds": torch.tensor(times, dtype=torch.float64),
-            "verdict": words,
+            "summary": words,
         }
         return _like(answer, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
 

@@ -79,7 +79,7 @@ def test_every_method_is_measured_on_every_set(rows, sets):
 
 def test_errors_are_those_of_the_metrics(scene, rows, sets):
     for name, sample in sets.items():
-        answer = torch.stack([scene.linear.respond(f) for f in sample.force])
+        answer = torch.stack([scene.linear.solve(f) for f in sample.force])
         expected = default_metrics(scene.problem)
         expected.update(answer, sample)
         row, errors = rows["linear", name]

@@ -115,7 +115,7 @@ def test_loads_are_solved_in_the_order_of_the_jobs_without_workers(scene, jobs, 
 
 
 def test_no_jobs_cost_no_process(scene, monkeypatch):
-    monkeypatch.setattr(worker_pool, "spawning", lambda: None)  # nothing can be started
+    monkeypatch.setattr(worker_pool, "spawn_context", lambda: None)  # nothing can be started
     assert list(solve_loads(scene, [], workers=2)) == []
 
 

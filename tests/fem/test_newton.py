@@ -478,8 +478,18 @@ def test_force_that_is_no_number_has_no_answer_even_on_a_held_node(beam, pull, b
 @pytest.mark.parametrize(
     "option",
     [
-        *({name: value} for name in ("tol", "loose", "keep", "smallest_step") for value in (0, 1)),
-        *({"tol": -1e-8}, {"tol": math.nan}, {"max_iter": 0}, {"max_iter": -3}, {"budget": 0}),
+        *(
+            {name: value}
+            for name in ("tol", "intermediate_tol", "min_detF_ratio", "min_load_step")
+            for value in (0, 1)
+        ),
+        *(
+            {"tol": -1e-8},
+            {"tol": math.nan},
+            {"max_iter": 0},
+            {"max_iter": -3},
+            {"max_total_iter": 0},
+        ),
     ],
     ids=str,
 )

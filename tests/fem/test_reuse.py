@@ -43,7 +43,7 @@ def pair(problem: Problem, load: Load, guess: Tensor | None = None, **options):
     """Return the answers with a factor for every tangent and with as few as usual."""
     answers = []
     for reuse in (0.0, Newton(problem).factor_reuse_tol):
-        solver = Newton(problem, **{"linear": "superlu", "reuse": reuse, **options})
+        solver = Newton(problem, **{"linear": "superlu", "factor_reuse_tol": reuse, **options})
         *_, last = solver.iterate(load, guess=guess)
         answers.append(last)
     return answers
@@ -122,7 +122,7 @@ def test_large_load_that_takes_steps_does_not_depend_on_reuse(beam, pull, mixed,
 @pytest.mark.parametrize("q", [400.0, 1000.0])
 def test_load_without_an_answer_has_none_with_reuse(beam, pull, mixed, q):
     problem = beam(SVK)
-    options = {"smallest_step": 2.0**-6, "mixed": mixed}
+    options = {"min_load_step": 2.0**-6, "mixed_integration": mixed}
     every, few = pair(problem, load_of(pull(problem, q)[0]), **options)
     assert every.status.item() == few.status.item() == Status.NO_VALID_EQUILIBRIUM
     assert 0 < few.load_factor.item() < 1
@@ -334,7 +334,10 @@ def test_load_beyond_a_critical_one_is_unstable_whatever_is_reused(name, part, l
     """VERIFICATION 1.8g, 1.8i."""
     if linear not in installed_backends():
         pytest.skip(f"{linear} is not installed")
-    (build, critical), options = BODIES[name], {"tol": 1e-10, "linear": linear, "reuse": reuse}
+    (build, critical), options = (
+        BODIES[name],
+        {"tol": 1e-10, "linear": linear, "factor_reuse_tol": reuse},
+    )
     problem, unit = build()
     answer = solve(Newton(problem, **options), load_of(part * critical * unit))
     assert answer.converged.all()
@@ -393,7 +396,7 @@ def test_straight_column_far_beyond_is_the_same_with_and_without_reuse():
 
 @pytest.mark.parametrize("reuse", [-0.1, -1e-300, math.nan, math.inf])
 def test_reuse_out_of_range_is_refused_by_name(beam, reuse):
-    with pytest.raises(ValueError, match=f"reuse = {reuse} must be 0 or more"):
+    with pytest.raises(ValueError, match=f"factor_reuse_tol = {reuse} must be 0 or more"):
         Newton(beam(NH, 4, 1), factor_reuse_tol=reuse)
 
 

@@ -399,10 +399,10 @@ def test_body_that_is_free_to_move_is_refused(unseen):
     [
         {"tol": 0},
         {"reduced_tol": 1},
-        {"keep": 0},
-        {"smallest_step": 2},
-        {"budget": 0},
-        {"reuse": -1},
+        {"min_detF_ratio": 0},
+        {"min_load_step": 2},
+        {"max_total_iter": 0},
+        {"factor_reuse_tol": -1},
     ],
     ids=str,
 )

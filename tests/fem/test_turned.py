@@ -184,7 +184,7 @@ def test_moved_supports_go_with_it():
 def test_other_attributes_keep_the_factor_of_rest():
     newton = Newton(body())
     other = newton.replace(tol=1e-3, corotational=True)
-    assert (other.tol, other.turned) == (1e-3, True)
+    assert (other.tol, other.corotational) == (1e-3, True)
     assert other.rest is newton.rest
     assert other.rest.factor is newton.rest.factor
 

@@ -259,7 +259,7 @@ def test_it_overfits_a_batch_on_plane_and_on_unstructured_bodies(request, name):
     load = scene.loads.sample((0, 0), range(4))
     scale = 1 / load.force.std()
     force = (load.force * scale).float()
-    truth = torch.stack([scene.linear.respond(one) for one in load.force]).float()
+    truth = torch.stack([scene.linear.solve(one) for one in load.force]).float()
     truth = truth / truth.std()
     net = network(scene, channels=8)
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)

@@ -167,7 +167,7 @@ def test_images_of_coordinates_are_coordinates_of_images(make_scene):
     """On a body whose modes are all kept, so that no family is cut."""
     scene = make_scene(nodes=(5, 2, 2))
     force = scene.loads.sample((0, 0), range(16)).force
-    linear = torch.stack([scene.linear.respond(one) for one in force])
+    linear = torch.stack([scene.linear.solve(one) for one in force])
     bent = linear + 0.1 * linear.roll(1, dims=0)  # what a law may answer; encoding knows none
     samples = Sample(force, bent, torch.full((16,), 4500.0, dtype=torch.float64))
     for kind in (PODNet, Latent):

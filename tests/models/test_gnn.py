@@ -92,7 +92,7 @@ def test_it_overfits_one_batch_of_tetrahedra(make_scene):
     """A hundred times smaller error on four linear answers within 300 steps."""
     scene = make_scene(**BODIES["tetrahedra"])
     load = scene.loads.sample((0, 0), range(4))
-    truth = torch.stack([scene.linear.respond(force) for force in load.force])
+    truth = torch.stack([scene.linear.solve(force) for force in load.force])
     surrogate = Surrogate(build(scene, width=16), MSE(), scene)
     truth, scale = truth.float(), float(surrogate.displacement_scale)
     optimizer = torch.optim.Adam(surrogate.parameters(), lr=3e-3)

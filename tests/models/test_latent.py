@@ -51,7 +51,7 @@ def answer_to(module, force, young=4500.0):
 
 
 def linear_of(scene, force):
-    return torch.stack([scene.linear.respond(one) for one in force])
+    return torch.stack([scene.linear.solve(one) for one in force])
 
 
 def sizes(field):

@@ -467,12 +467,12 @@ def test_ways_to_solve_change_the_way_and_not_the_answer(case, data):
     assume(answer.stable.all())
     for change in (
         {"linear": data.draw(st.sampled_from(installed_backends()))},
-        {"mixed": False},
-        {"reuse": data.draw(st.sampled_from([0.0, 1.0]))},
-        {"turned": True},
-        {"keep": 0.9},
+        {"mixed_integration": False},
+        {"factor_reuse_tol": data.draw(st.sampled_from([0.0, 1.0]))},
+        {"corotational": True},
+        {"min_detF_ratio": 0.9},
     ):
-        again = solve(Newton(problem, **({"budget": 200} | change)), load)
+        again = solve(Newton(problem, **({"max_total_iter": 200} | change)), load)
         assert again.stable.all()
         check_same(problem, load, again.displacement, answer.displacement)
 

@@ -86,7 +86,7 @@ def test_stress_at_the_surface_is_that_of_the_whole_body(body, make_scene):
     for scene in (body.scene, make_scene(cell="tetra", degree=2)):
         surface = Surface.of(scene.problem)
         load = scene.loads.sample((0, 4), [1])
-        u = scene.linear.respond(load.force[0])
+        u = scene.linear.solve(load.force[0])
         exact = fields(scene.problem, u[None]).von_mises[0].numpy()[surface.nodes]
         assert surface.von_mises(u, load.poisson) == pytest.approx(exact, rel=1e-12)
 
