@@ -258,7 +258,7 @@ def test_the_hybrid_that_suits_a_scene_has_its_tolerance(scene, stubs):
         suited = default_hybrid(lambda load: 0 * load.force, scene, tol)
         assert suited.newton.tol == wanted
         assert suited.newton.rest is scene.solver.rest
-        assert (suited.steps is not None) == scene.corrector.turned
+        assert (suited.steps is not None) == scene.corrector.corotational
 
 
 def test_the_discarded_classic_step_is_counted(scene, loads, stubs):
@@ -445,7 +445,7 @@ def test_steps_that_end_at_the_answer_need_no_newton(scene, loads):
 
 @pytest.mark.parametrize("rule", ["", "Best", "papers", None])
 def test_a_rule_that_there_is_not_is_refused(scene, rule):
-    with pytest.raises(ValueError, match="must be best or paper"):
+    with pytest.raises(ValueError, match="must be natural_monotonicity or paper"):
         Hybrid(lambda load: load.force, scene.solver, rule)
 
 
@@ -460,7 +460,7 @@ def test_it_is_said_what_goes_on_from_a_guess(scene, loads, stubs, rule):
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_steps_come_first_where_a_turned_factor_serves(scene, turned):
-    corrector = scene.solver.replace(turned=turned)
+    corrector = scene.solver.replace(corotational=turned)
     suited = default_hybrid(lambda load: load.force, SimpleNamespace(corrector=corrector))
     assert suited.newton is corrector
     assert (suited.steps is not None) == turned

@@ -44,7 +44,8 @@ class Answer:
             `ModalLoads.project`.
         out_of_span: Part of the force that is not made of the training's modes [-].
         out_of_distribution: Whether the load lies outside the range of the training.
-        method: What computed the result: "rest", "linear", "network", "corrected", "hybrid" or "full Newton".
+        method: What computed the result: "rest", "linear", "network", "corrected", "hybrid" or
+            "full Newton".
         iterations: Linear solves with a tangent.
         milliseconds: Wall time [ms]; of several loads, the share of each.
         summary: The fields above in words.
@@ -231,7 +232,7 @@ class Simulator:
 
     def _elsewhere(self, load: Load) -> Tensor:
         """Return for which loads a modulus that the network takes lies outside its range, (B,)."""
-        loads, takes = self.scene.loads, getattr(self.surrogate.net, "takes", ())
+        loads, takes = self.scene.loads, getattr(self.surrogate.net, "extra_inputs", ())
         spans = {"young": loads.young_range, "poisson": loads.poisson_range}
         outside = torch.zeros(len(load.force), dtype=torch.bool)
         for name in takes:

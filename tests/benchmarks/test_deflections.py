@@ -29,7 +29,7 @@ def test_deflections_are_those_of_the_test_loads_of_a_data_set(rows, data):
 
 def test_loads_that_are_not_accepted_are_left_out(scene, monkeypatch):
     def answered(scene, jobs, *, workers):
-        for outcome in peers.outcomes(scene, jobs, workers=workers):
+        for outcome in peers.solve_loads(scene, jobs, workers=workers):
             yield outcome._replace(accepted=outcome.job.number != 1)
 
     monkeypatch.setattr(deflections, "solve_loads", answered)
