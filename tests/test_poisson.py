@@ -122,7 +122,7 @@ def test_a_batch_is_its_members_each_a_body_of_its_own(make_scene, law):
     for k in range(3):
         one = make_scene(law=law, poisson=float(load.poisson[k])).problem
         alone = u[k : k + 1]
-        for name in ("energy", "internal_force", "rounding"):
+        for name in ("energy", "internal_force", "roundoff_bound"):
             found, expected = getattr(body, name)(u)[k], getattr(one, name)(alone)[0]
             assert torch.allclose(found, expected, rtol=1e-12, atol=1e-18), name
         assert torch.equal(body.evaluate(u).internal[k], one.evaluate(alone).internal[0])

@@ -56,7 +56,8 @@ KILLER = textwrap.dedent(
 
     script, where, at = sys.argv[1], sys.argv[2], int(sys.argv[3])
     sys.argv = [script, *sys.argv[4:]]
-    step, write, whole_file = Surrogate.training_step, checkpoints.write, checkpoints.whole_file
+    step, write = Surrogate.training_step, checkpoints.write
+    atomic_write = checkpoints.atomic_write
     epoch = None
 
     def die():
@@ -75,7 +76,7 @@ KILLER = textwrap.dedent(
 
     @contextlib.contextmanager
     def half_file(path):
-        with whole_file(path) as file:
+        with atomic_write(path) as file:
             content = io.BytesIO()
             yield content
             if epoch == at and where == path.name:
@@ -87,7 +88,7 @@ KILLER = textwrap.dedent(
     if where == "step":
         Surrogate.training_step = training_step
     else:
-        checkpoints.write, checkpoints.whole_file = writing, half_file
+        checkpoints.write, checkpoints.atomic_write = writing, half_file
     runpy.run_path(script, run_name="__main__")
     """
 )

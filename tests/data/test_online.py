@@ -617,8 +617,8 @@ def test_a_load_that_hangs_is_timed_out_in_a_worker_and_left_out(
     )
     before = signal.getsignal(signal.SIGALRM)
     kept = []
-    spool = SimpleNamespace(put=kept.append)
-    store = SimpleNamespace(reader=lambda split: lambda index: None, spool=spool)
+    pending = SimpleNamespace(put=kept.append)
+    store = SimpleNamespace(reader=lambda split: lambda index: None, pending=pending)
     assert good[:6] != list(range(6)), "one of the first hangs"
     assert numbers(OnlineSamples(hanging, SEED, store=store, timeout=240.0), 6) == good[:6]
     lost = [one for one in kept if not one.accepted]

@@ -110,7 +110,7 @@ def test_a_worker_that_is_still_importing_ends_with_its_parent(launched, start, 
 def test_a_worker_lives_as_long_as_its_parent_and_tells_it_how_it_ended(launched):
     text = program(
         STARTS["a worker of a crew"]
-        .replace("spawning().Process", "worker = spawning().Process")
+        .replace("spawn_context().Process", "worker = spawn_context().Process")
         .replace(").start()", ")\n        worker.start()"),
         "worker.join(); print(worker.exitcode, worker.pid != os.getpid())",
     ).replace('    print("importing", flush=True)\n    threading.Event().wait()', "    pass")

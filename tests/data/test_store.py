@@ -23,6 +23,7 @@ from dpl.data.solving.worker_pool import GracefulShutdown
 from dpl.data.storage import store as store_module
 from dpl.data.storage import writer as writer_module
 from dpl.data.storage.integrity import MACHINE, repair, verify
+from dpl.data.storage.manifest import shard_name
 from dpl.data.storage.pending import PendingSamples
 from dpl.data.storage.shard import to_dense, to_sparse
 from dpl.fem import SaintVenantKirchhoff, rectangle
@@ -625,7 +626,7 @@ def test_a_folder_that_may_only_be_read_is_read(copy, environment):
         "from types import SimpleNamespace as N; import json; "
         "card = json.loads((folder / 'scene.json').read_text()); "
         "scene = N(fingerprint=card['fingerprint'], identity=lambda: card['scene'], "
-        "problem=N(shape=(45, 3)), loads=N(dimension=7, poisson_range=None, "
+        "problem=N(shape=(45, 3)), loads=N(n_random=7, poisson_range=None, "
         "young_at=lambda point: point[:, -1])); "
         "store = Store(folder, scene, 0); "
         "assert len(store.load('train', 12).force) == 12; "
@@ -826,17 +827,17 @@ def test_a_line_of_the_journal_that_says_nothing_is_left_out(copy, line):
     assert (copy.summary(), copy.seconds_a_load()) == (told, a_load)
 
 
-def test_two_lines_of_one_shard_are_both_held_against_it(copy):
-    found = lines(copy)
-    found[1] |= {"file": found[0]["file"], "sha256": found[0]["sha256"]}
-    (copy.folder / "manifest.jsonl").write_text("".join(json.dumps(one) + "\n" for one in found))
-    first = found[0] | found[1] | {"split": "train", "first": 12}
+def test_a_shard_under_the_name_of_another_is_refused(copy):
+    (first, *_) = (line for line in lines(copy) if line["split"] == "train")
+    name = shard_name("train", 6400)
+    (copy.folder / name).write_bytes((copy.folder / first["file"]).read_bytes())
+    line = first | {"first": 6400, "file": name, "rejected": [], "accepted": first["tried"]}
     with (copy.folder / "manifest.jsonl").open("a") as file:
-        file.write(json.dumps(first) + "\n")
+        file.write(json.dumps(line) + "\n")
     read = copy.reader("train")
-    assert read(11) is not None
+    assert read(0) is not None
     with pytest.raises(DataSetError, match=r"holds other loads than the manifest says"):
-        read(12)
+        read(6400)
 
 
 def test_a_load_under_the_name_of_another_is_solved_again(fresh, data, scene):

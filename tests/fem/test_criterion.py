@@ -79,7 +79,7 @@ def solvers(newton, load):
 
 SOLVERS = [
     *("newton", "newton from a guess", "accelerated", "linear", "batched", "reduced", "direct"),
-    *("hybrid, best", "hybrid, paper", "hybrid, steps"),
+    *("hybrid, natural_monotonicity", "hybrid, paper", "hybrid, steps"),
 ]
 
 

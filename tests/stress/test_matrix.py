@@ -171,8 +171,8 @@ LIES = {
     "it converged": {"converged": True},
     "its residual": {"residual": 1e-9},
     "nothing is inverted": {"volume_ratio": -1.0},
-    "it is no estimate": {"verdict": "in balance"},
-    "it is in range": {"outside": False},
+    "it is no estimate": {"summary": "in balance"},
+    "it is in range": {"out_of_distribution": False},
 }
 
 
