@@ -33,8 +33,8 @@ def test_the_fingerprint_knows_not_how_matrices_are_solved(make_scene, scene):
 
 def test_whole_numbers_and_floats_make_one_scene(make_scene):
     """As YAML writes them: deflection: 1, factor: 1, poisson: 0."""
-    one = {"deflection": 1, "spectrum": 1, "poisson": 0}
-    other = {"deflection": 1.0, "spectrum": 1.0, "poisson": 0.0}
+    one = {"deflection": 1, "eigenvalue_exponent": 1, "poisson": 0}
+    other = {"deflection": 1.0, "eigenvalue_exponent": 1.0, "poisson": 0.0}
     whole = make_scene(**one, distribution=partial(mild, factor=1))
     real = make_scene(**other, distribution=partial(mild, factor=1.0))
     assert whole.fingerprint == real.fingerprint
