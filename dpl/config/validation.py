@@ -65,7 +65,7 @@ EXPECTED_TYPES = {  # of what the call under a key gives: one of these, or deriv
     "trainer": {"lightning.pytorch.trainer.trainer.Trainer"},
 }
 SEVERAL = ("supports", "forces")  # keys that hold calls by name
-TRUSTED = {  # modules whose functions a run's folder may name; classes are in KINDS
+TRUSTED = {  # modules whose public functions a run may name; classes: EXPECTED_TYPES
     *(f"dpl.fem.mesh.{name}" for name in ("generators", "propeller_mesh", "reading")),
     "dpl.fem.loads.sampling",
     "dpl.training.schedules",
@@ -178,7 +178,10 @@ def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
                 target, kinds
             )
         else:
-            ours = target.__module__ in TRUSTED and not target.__name__.startswith("_")
+            ours = getattr(target, "__module__", None) in TRUSTED
+            if ours:
+                folder = importlib.import_module(target.__module__.rpartition(".")[0])
+                ours = target.__name__ in folder.__all__
         if not ours:
             raise ConfigError(foreign)
     return typing.cast("Callable[..., Any]", target)

@@ -11,16 +11,14 @@ from scipy.stats import qmc
 
 from dpl.fem.loads import (
     constant,
-    independent,
     log_tail_mixture,
     logarithmic,
     normal,
     sampling,
-    sobol,
     symmetric_uniform,
     uniform01,
 )
-from dpl.fem.loads.sampling import SAMPLINGS
+from dpl.fem.loads.sampling import SAMPLINGS, independent, sobol
 
 GRID = (np.arange(10_000) + 0.5) / 10_000  # of the unit interval
 LAST = 1 - 2.0**-53  # the largest number below 1

@@ -10,11 +10,9 @@ if TYPE_CHECKING:
     from dpl.fem.loads.modal_basis import Modes, eigenmodes
     from dpl.fem.loads.sampling import (
         constant,
-        independent,
         log_tail_mixture,
         logarithmic,
         normal,
-        sobol,
         symmetric_uniform,
         uniform01,
     )
