@@ -40,7 +40,7 @@ settings.register_profile("many", max_examples=1000, print_blob=True, **_fixture
 settings.load_profile("few")
 
 ROOT = Path(__file__).parents[1]
-LONG = "tests/test_notebooks.py"  # few tests that take minutes
+LONG = "tests/repository/test_notebooks.py"  # few tests that take minutes
 CONF = ROOT / "conf"
 os.environ["DPL_CONF"] = str(CONF)  # as each command does
 

@@ -22,7 +22,7 @@ from dpl.commands import cli
 from dpl.config import ConfigError, build, run_folder, validation
 from dpl.training import checkpoints
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 BAD = {  # override -> what the message must name
     "material.poisson=0.7": r"poisson = 0\.7",
     "material.poisson=-1": r"poisson = -1",

@@ -9,7 +9,7 @@ import torch
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
 
-PAGE = Path(__file__).parents[1] / "docs" / "inverse.md"
+PAGE = Path(__file__).parents[2] / "docs" / "inverse.md"
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 METADATA = tomllib.loads((ROOT / "pyproject.toml").read_text())
 INTERNAL = ("cli", "dry_run", "overrides")  # modules that commands share
 COMMANDS = METADATA["project"]["scripts"]

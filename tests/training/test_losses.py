@@ -38,7 +38,7 @@ from dpl.training import (
 )
 from dpl.training.losses import clamp_scale, residual_norm
 
-LOSSES = sorted((Path(__file__).parents[1] / "conf" / "loss").glob("*.yaml"))
+LOSSES = sorted((Path(__file__).parents[2] / "conf" / "loss").glob("*.yaml"))
 
 
 @pytest.fixture(params=LOSSES, ids=lambda path: path.stem)

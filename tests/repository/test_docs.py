@@ -16,7 +16,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from dpl.config import build as run
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 DOCS, CONF, RESULTS = ROOT / "docs", ROOT / "conf", ROOT / "benchmarks" / "results"
 MAKE = DOCS / "make"
 WRITTEN = [*sorted(DOCS.glob("*.md")), *sorted(ROOT.glob("*.md"))]

@@ -1,6 +1,6 @@
 """Stress tests of VERIFICATION 2.2: what is said of bodies and loads that are hard or hopeless.
 
-T9 is in tests/test_run.py, T12, T14 and T15 are in test_mesh.py; T18 to T23 are the surrogates'.
+Further cases are in tests/config/test_run_folder.py and test_mesh.py.
 All of them, watched, are in `benchmarks.stress` too, whose bodies these are.
 """
 

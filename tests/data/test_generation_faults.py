@@ -26,7 +26,7 @@ from dpl.fem import ModalLoads
 HERE = Path(__file__)
 LONG = 240.0  # no test waits so long, unless what it waits for does not come [s]
 pytestmark = pytest.mark.timeout(1800)
-SCRIPT = HERE.parents[1] / "scripts" / "generate.py"
+SCRIPT = HERE.parents[2] / "scripts" / "generate.py"
 
 
 @dataclass(frozen=True, eq=False)

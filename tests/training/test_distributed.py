@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from dpl.commands import cli
 from dpl.config import ConfigError
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SCHEDULED = OmegaConf.create(
     {"scheduler": {"_target_": "dpl.training.warmup_cosine"}, "folder": "."}
 )

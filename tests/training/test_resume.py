@@ -19,7 +19,7 @@ import torch
 
 from dpl.training.checkpoints import read
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 EPOCHS = 6  # of two steps each
 ELSEWHERE = "/dev/shm"  # another file system: what is renamed from there to here is copied
 

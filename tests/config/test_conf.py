@@ -14,7 +14,7 @@ from dpl.config import build
 from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.fem import YoungPoissonMaterial, box, solve
 
-CONF = Path(__file__).parents[1] / "conf"
+CONF = Path(__file__).parents[2] / "conf"
 
 
 def options(group):

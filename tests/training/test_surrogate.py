@@ -22,7 +22,7 @@ from dpl.training.checkpoints import read
 from dpl.training.rng_state import random_states, set_random_states
 from dpl.training.surrogate import scales
 
-CONF = Path(__file__).parents[1] / "conf"
+CONF = Path(__file__).parents[2] / "conf"
 METRICS = {
     "e_mean", "e_max", "SNR_min", "SNR_min_printed",
     "rel_L2_median", "rel_L2_worst", "residual", "min_det_F",
