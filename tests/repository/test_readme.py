@@ -127,3 +127,11 @@ def test_what_is_said_of_deflections_is_in_their_table():
         values = [float(row["deflection"]) for row in rows if row["body"].startswith(body)]
         assert len(values) == 100
         assert (middle, largest) == (f"{statistics.median(values):.2g}", f"{max(values):.2g}")
+
+
+def test_the_two_networks_of_figure_and_table_have_the_errors_that_are_stated():
+    with (ROOT / "benchmarks/results/pareto_beam_svk.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["threads"] == "1"]
+    (figure,) = (float(row["error"]) for row in rows if row["solver"] == "latent")
+    older = float(measured("beam_svk", "latent")["rel_L2_median"])
+    assert f"are {figure:.1e} and {older:.1e}".replace("e-0", "e-") in README
