@@ -19,7 +19,7 @@ from dpl.scene import Sample
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2, Surrogate
 from dpl.training.metrics import default_metrics, median
-from dpl.visualization import deformed
+from dpl.visualization import plot_deformed
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ def _picture(
         for name, k in zip(("best", "median", "worst"), chosen, strict=True)
     ]
     shown = [(name, answers[name][chosen]) for name in ("network", "linear")]
-    figure = deformed(scene.problem, test.displacement[chosen], shown, names=names)
+    figure = plot_deformed(scene.problem, test.displacement[chosen], shown, names=names)
     figure.savefig(folder / "shapes.png", dpi=150)
     worst = int(order[-1])
     length, force_unit = scene.length, scene.force_unit * float(test.young[worst])

@@ -1,11 +1,11 @@
-"""Figures and their style."""
+"""Matplotlib figures and their style."""
 
 from typing import TYPE_CHECKING
 
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.visualization.figures import body, colours, deformed, spread
+    from dpl.visualization.figures import draw_body, error_colours, plot_deformed, plot_errors
     from dpl.visualization.style import COLOURS, STYLE
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -1,4 +1,4 @@
-"""Pictures of deformed bodies and of how wrong they are."""
+"""Figures of deformed bodies and of errors of predictions."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -7,85 +7,104 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem import Problem
+from dpl.fem import Problem, surface
+from dpl.fem.postprocess import coarse
 
 if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
-from dpl.fem import surface
-from dpl.fem.postprocess import coarse
+CARD_DPI = 140  # resolution of figures for TensorBoard, which shows them small [dots per inch]
+DECADES = 1e-3  # smallest over largest error of the colour scale
+SMALLEST_ERROR = 1e-12  # smallest upper end of the colour scale
 
-CARD = 140  # resolution of what TensorBoard shows small [dots per inch]
 
-
-def deformed(
+def plot_deformed(
     problem: Problem,
     truth: Tensor,
     predictions: Sequence[tuple[str, Tensor]],
     *,
     names: Sequence[str] = (),
     upright: bool = False,
-    most: int | None = None,
+    max_polygons: int | None = None,
 ) -> "Figure":
-    """Return a figure of deformed bodies coloured by the distance from where nodes should be.
+    """Return a figure of predicted shapes, coloured by the distance to the true positions.
 
-    One column a load, one row a prediction; the true shape as a grey net over each.
+    Columns are loads and rows are predictions. A grey wireframe shows the true shape.
 
     Args:
         problem: The body.
-        truth: (B, N, D) [-].
-        predictions: Named, (B, N, D) [-] each; one alone needs no name.
+        truth: Displacements over L, (B, N, D) [-].
+        predictions: Pairs of a name and displacements over L, (B, N, D) [-]. The name of a single
+            prediction may be empty.
         names: Titles of the loads.
-        upright: One row a load, one column a prediction, narrow: for TensorBoard's small cards.
-        most: Polygons of a body, see `coarse`; all if left out.
+        upright: Put loads in rows and predictions in columns, for TensorBoard's narrow cards.
+        max_polygons: Largest number of polygons per body, see `coarse`; None: all.
     """
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LogNorm
+    polygons, points = surface(problem.mesh), problem.points.cpu().numpy()
+    if max_polygons:
+        polygons = coarse(points, polygons, max_polygons)
+    true = truth.detach().cpu().numpy()
+    fields = [field.detach().cpu().numpy() for _, field in predictions]
+    errors = [np.linalg.norm(field - true, axis=2) for field in fields]
+    figure, axes = _grid(len(fields), len(true), points.shape[1], names, upright=upright)
+    scale = _error_scale(np.concatenate(errors))
+    extent = np.concatenate([points[None] + true, points[None]])
+    for row, (label, _) in enumerate(predictions):
+        for column in range(len(true)):
+            ax = axes[row, column]
+            error = errors[row][column][polygons].mean(axis=1)
+            colours = scale.to_rgba(np.maximum(error, scale.norm.vmin))
+            shape = (points + fields[row][column])[polygons]
+            _draw(ax, shape, facecolors=colours, edgecolors="none")
+            wireframe = (points + true[column])[polygons]
+            _draw(ax, wireframe, facecolors="none", edgecolors="0.4", linewidths=0.3)
+            _set_extent(ax, extent, zoom=1.4 if upright else 1.1)
+            title = [names[column]] if row == 0 and names else []
+            ax.set_title("\n".join(filter(None, [*title, label])), fontsize=9)
+    _add_colour_bar(figure, axes, scale, upright=upright)
+    return figure
+
+
+def _grid(
+    n_predictions: int, n_loads: int, dim: int, names: Sequence[str], *, upright: bool
+) -> tuple["Figure", Any]:
+    """Return a figure and its axes, (predictions, loads)."""
     from matplotlib.figure import Figure
 
-    polygons, points = surface(problem.mesh), problem.points.cpu().numpy()
-    polygons = coarse(points, polygons, most) if most else polygons
-    right = truth.detach().cpu().numpy()
-    fields = [(name, field.detach().cpu().numpy()) for name, field in predictions]
-    count, shown, dim = len(right), len(fields), points.shape[1]
-    rows, columns = (count, shown) if upright else (shown, count)
+    rows, columns = (n_loads, n_predictions) if upright else (n_predictions, n_loads)
     size = (3.6 * columns + 0.8, 2.5 * rows) if upright else (3.6 * columns + 1.2, 2.2 * rows + 0.4)
-    figure = Figure(figsize=size, dpi=CARD if upright else 100)
-    if upright:  # by hand: a layout that is computed takes longer than all the rest
-        more = 0.25 + 0.15 * max((name.count("\n") for name in names), default=0)
-        figure.subplots_adjust(0, 0.7 / size[1], 1, 1 - more / size[1], hspace=more / 2)
+    figure = Figure(figsize=size, dpi=CARD_DPI if upright else 100)
+    if upright:  # a constrained layout takes longer to compute than the rest of the figure
+        title = 0.25 + 0.15 * max((name.count("\n") for name in names), default=0)
+        figure.subplots_adjust(0, 0.7 / size[1], 1, 1 - title / size[1], hspace=title / 2)
     else:
         figure.set_layout_engine("constrained")
     kind = {"projection": "3d"} if dim == 3 else {}
     axes = figure.subplots(rows, columns, squeeze=False, subplot_kw=kind)
-    axes = axes.T if upright else axes
-    seen = np.concatenate([points[None] + right, points[None]])
-    errors = [np.linalg.norm(field - right, axis=2) for _, field in fields]
-    finite = [error[np.isfinite(error)] for error in errors]
-    top = max(1e-12, *(float(error.max(initial=0.0)) for error in finite))
-    scale = ScalarMappable(LogNorm(top * 1e-3, top), "viridis")
-    for row, (name, field) in enumerate(fields):
-        for column in range(count):
-            ax = axes[row, column]
-            error = errors[row][column][polygons].mean(axis=1)
-            colours = scale.to_rgba(np.maximum(error, top * 1e-3))
-            shape, true = (points + field[column])[polygons], (points + right[column])[polygons]
-            _draw(ax, shape, facecolors=colours, edgecolors="none")
-            _draw(ax, true, facecolors="none", edgecolors="0.4", linewidths=0.3)
-            _frame(ax, seen, zoom=1.4 if upright else 1.1)
-            title = [names[column]] if row == 0 and names else []
-            ax.set_title("\n".join(filter(None, [*title, name])), fontsize=9)
+    return figure, axes.T if upright else axes
+
+
+def _error_scale(error: NDArray[Any]) -> "ScalarMappable":
+    """Return a logarithmic colour scale whose upper end is the largest finite error."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LogNorm
+
+    largest = float(error[np.isfinite(error)].max(initial=SMALLEST_ERROR))
+    return ScalarMappable(LogNorm(largest * DECADES, largest), "viridis")
+
+
+def _add_colour_bar(figure: "Figure", axes: Any, scale: "ScalarMappable", *, upright: bool) -> None:
     label = "distance from the true position / L"
     if upright:
-        below = figure.add_axes((0.1, 0.45 / size[1], 0.8, 0.1 / size[1]))
+        height = figure.get_figheight()
+        below = figure.add_axes((0.1, 0.45 / height, 0.8, 0.1 / height))
         figure.colorbar(scale, cax=below, orientation="horizontal", label=label).minorticks_off()
     else:
         figure.colorbar(scale, ax=axes, label=label, shrink=0.8)
-    return figure
 
 
-def body(
+def draw_body(
     ax: Any,
     problem: Problem,
     displacement: Tensor | None = None,
@@ -93,31 +112,32 @@ def body(
     values: Tensor | None = None,
     limits: tuple[float, float] | None = None,
     colours: str = "viridis",
-    room: Sequence[Tensor] = (),
+    fit: Sequence[Tensor] = (),
 ) -> "ScalarMappable":
-    """Draw a body on matplotlib's axes, deformed, and return its colours, for a colour bar.
+    """Draw a body on matplotlib axes and return its colour scale, for a colour bar.
 
     Args:
-        ax: Of projection "3d" for a body in 3D.
+        ax: Axes; of projection "3d" for a body in 3D.
         problem: The body.
-        displacement: (N, D) [-]; at rest if left out.
-        values: What its colours show, (N,), each polygon the mean of its corners; grey if left out.
-        limits: Smallest and largest value of the colours; those of the values if left out.
-        colours: Name of a colour map of matplotlib.
-        room: Further displacements (N, D) that the axes are to have room for, so that pictures
-            side by side have one scale.
+        displacement: Over L, (N, D) [-]; None: the undeformed body.
+        values: Values at the nodes, (N,). Each polygon has the colour of the mean of its corners.
+            None: a grey body.
+        limits: Smallest and largest value of the colour scale; None: those of `values`.
+        colours: Name of a matplotlib colour map.
+        fit: Further displacements (N, D) that the axes limits must contain, so that several axes
+            have the same scale.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
     polygons, points = surface(problem.mesh), problem.points.cpu().numpy()
-    moved = [points + u.detach().cpu().numpy() for u in (displacement, *room) if u is not None]
-    places = points if displacement is None else moved[0]
-    shades = np.zeros(len(points)) if values is None else values.detach().cpu().numpy()
-    scale = ScalarMappable(Normalize(*(limits or (shades.min(), shades.max()))), colours)
-    faces: Any = "0.85" if values is None else scale.to_rgba(shades[polygons].mean(axis=1))
-    _draw(ax, places[polygons], facecolors=faces, edgecolors="0.3", linewidths=0.2)
-    _frame(ax, np.stack([points, *moved]), zoom=1.0)
+    deformed = [points + u.detach().cpu().numpy() for u in (displacement, *fit) if u is not None]
+    shape = points if displacement is None else deformed[0]
+    nodal = np.zeros(len(points)) if values is None else values.detach().cpu().numpy()
+    scale = ScalarMappable(Normalize(*(limits or (nodal.min(), nodal.max()))), colours)
+    faces: Any = "0.85" if values is None else scale.to_rgba(nodal[polygons].mean(axis=1))
+    _draw(ax, shape[polygons], facecolors=faces, edgecolors="0.3", linewidths=0.2)
+    _set_extent(ax, np.stack([points, *deformed]), zoom=1.0)
     return scale
 
 
@@ -131,8 +151,8 @@ def _draw(ax: Any, polygons: Any, **style: Any) -> None:
         ax.add_collection(PolyCollection(polygons, **style))
 
 
-def _frame(ax: Any, points: NDArray[np.float64], *, zoom: float) -> None:
-    """Show the box of all points, equal scales, no axes."""
+def _set_extent(ax: Any, points: NDArray[np.float64], *, zoom: float) -> None:
+    """Set limits that contain points (n, N, D), equal scales, and no visible axes."""
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
     ax.set_xlim(low[0], high[0])
     ax.set_ylim(low[1], high[1])
@@ -145,19 +165,19 @@ def _frame(ax: Any, points: NDArray[np.float64], *, zoom: float) -> None:
     ax.set_axis_off()
 
 
-def spread(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "Figure":
-    """Return a figure of errors: against the size of the answer, and how many loads are below each.
+def plot_errors(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "Figure":
+    """Return a figure of errors against displacement, and of their cumulative distribution.
 
     Loads without a finite error are left out and counted in the title.
 
     Args:
         relative: Relative L2 errors, (B,) [-].
         size: Largest true displacement of each load over L, (B,) [-].
-        marked: Loads to be named.
+        marked: Indices of loads to annotate.
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(4.4, 5.6), dpi=CARD)
+    figure = Figure(figsize=(4.4, 5.6), dpi=CARD_DPI)
     figure.subplots_adjust(left=0.15, right=0.96, bottom=0.09, top=0.94, hspace=0.25)
     upper, lower = figure.subplots(2, 1, sharey=True)
     error, amplitude = (np.maximum(part.cpu().numpy(), 1e-16) for part in (relative, size))
@@ -180,17 +200,14 @@ def spread(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "Figur
     missing = int((~finite).sum())
     for ax in (upper, lower):
         ax.grid(visible=True, axis="y", linewidth=0.4)
-        ax.minorticks_off()  # which take as long as the rest
+        ax.minorticks_off()  # drawing them takes as long as the rest
     title = f"{len(error)} validation loads"
     figure.suptitle(title + (f", {missing} without a finite error" if missing else ""), fontsize=11)
     return figure
 
 
-def colours(error: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the colours (N, 3) of distances (N,), as `deformed` has them: three decades."""
-    from matplotlib import colormaps
-    from matplotlib.colors import LogNorm
-
-    top = max(1e-12, float(error.max(initial=0.0)))
-    scaled = LogNorm(top * 1e-3, top)(np.maximum(error, top * 1e-3))
-    return (colormaps["viridis"](scaled)[:, :3] * 255).round().astype(np.uint8)
+def error_colours(error: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return RGB colours (N, 3) of distances (N,) on the colour scale of `plot_deformed`."""
+    scale = _error_scale(error)
+    rgba = scale.to_rgba(np.maximum(error, scale.norm.vmin))
+    return (rgba[:, :3] * 255).round().astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Colours and style of all figures."""
+"""Colour cycle and matplotlib parameters of all figures."""
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 STYLE = {

@@ -1,4 +1,4 @@
-"""Laws of the figures: a closed skin of a body, and pictures of what is wrong where."""
+"""Laws of figures: closed surfaces of bodies and colours that show errors."""
 
 from collections import Counter
 
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from dpl.fem import NeoHookeanLn, Plane, Problem, box, rectangle, surface
 from dpl.fem.postprocess import coarse, triangles
-from dpl.visualization import body, colours, deformed, spread
+from dpl.visualization import draw_body, error_colours, plot_deformed, plot_errors
 
 
 def edges(polygons):
@@ -23,7 +23,7 @@ def edges(polygons):
 
 
 def area(points, polygons):
-    """Return the area of polygons (P, corners) that turn around their middle."""
+    """Return the area of polygons (P, corners) whose corners go around their centre."""
     corners = points[polygons]
     middle = corners.mean(axis=1, keepdims=True)
     spokes, following = corners - middle, np.roll(corners, -1, axis=1) - middle
@@ -48,12 +48,12 @@ def test_the_surface_of_a_body_is_closed(name):
 
 @pytest.mark.parametrize("name", BODIES)
 def test_the_surface_has_the_area_of_the_body(name):
-    """Corners go around each facet: crossed quadrilaterals would have less."""
+    """Corners go around each facet; quadrilaterals with crossed sides would have less area."""
     mesh, *_ = BODIES[name]
     assert area(mesh.p.T, surface(mesh)) == pytest.approx(2 * (4 * 2 + 4 * 1 + 2 * 1))
 
 
-def test_the_surface_of_a_curved_body_is_that_of_its_vertices():
+def test_the_surface_of_a_curved_body_uses_its_vertices():
     mesh = skfem.MeshTet2.from_mesh(box([1.0, 1.0, 1.0], [3, 3, 3], "tetra"))
     polygons = surface(mesh)
     assert polygons.shape == (48, 3)
@@ -61,7 +61,7 @@ def test_the_surface_of_a_curved_body_is_that_of_its_vertices():
 
 
 @pytest.mark.parametrize(("cell", "count", "corners"), [("quad", 8, 4), ("triangle", 16, 3)])
-def test_a_plane_body_is_seen_as_its_cells(cell, count, corners):
+def test_the_surface_of_a_body_in_2d_is_its_cells(cell, count, corners):
     mesh = rectangle([4.0, 2.0], [5, 3], cell)
     polygons = surface(mesh)
     assert polygons.shape == (count, corners)
@@ -70,12 +70,12 @@ def test_a_plane_body_is_seen_as_its_cells(cell, count, corners):
 
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
-def test_a_figure_has_a_row_a_prediction_and_a_column_a_load(make_scene, cell):
+def test_a_figure_has_one_row_per_prediction_and_one_column_per_load(make_scene, cell):
     plane = {"mesh": rectangle([8.0, 2.0], [5, 3], cell)} if cell in ("quad", "triangle") else {}
     scene = make_scene(**(plane or {"cell": cell}), n_modes=2)
     truth = 0.01 * torch.randn(2, *scene.problem.shape, dtype=torch.float64)
     shown = [("network", truth * 0.9), ("linear", truth * 1.1), ("exact", truth)]
-    figure = deformed(scene.problem, truth, shown, names=["first", "second"])
+    figure = plot_deformed(scene.problem, truth, shown, names=["first", "second"])
     axes = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
     assert len(axes) == 6
     titles = [ax.get_title() for ax in axes]
@@ -85,31 +85,31 @@ def test_a_figure_has_a_row_a_prediction_and_a_column_a_load(make_scene, cell):
     figure.canvas.draw()
 
 
-def test_an_exact_prediction_can_be_drawn(scene, batch):
+def test_an_exact_prediction_has_one_colour(scene, batch):
     truth = batch.displacement[:1]
-    figure = deformed(scene.problem, truth, [("network", truth)])
+    figure = plot_deformed(scene.problem, truth, [("network", truth)])
     figure.canvas.draw()
     colours = np.asarray(figure.axes[0].collections[0].get_facecolor())
-    assert not np.ptp(colours, axis=0).any(), "no place is brighter than another"
+    assert not np.ptp(colours, axis=0).any(), "all polygons have the same colour"
 
 
-def test_a_prediction_that_is_no_number_can_be_drawn(scene, batch):
+def test_a_prediction_that_is_not_finite_is_drawn_without_colour(scene, batch):
     truth = batch.displacement[:1]
     broken = torch.full_like(truth, torch.nan)
-    figure = deformed(scene.problem, truth, [("network", broken), ("linear", truth)])
+    figure = plot_deformed(scene.problem, truth, [("network", broken), ("linear", truth)])
     figure.canvas.draw()
     colours = [np.asarray(ax.collections[0].get_facecolor()) for ax in figure.axes[:2]]
-    assert not colours[0][:, 3].any(), "of no colour"
+    assert not colours[0][:, 3].any(), "transparent"
     assert colours[1][:, 3].all()
 
 
-def test_a_wrong_place_is_brighter(make_scene):
-    """Colours grow with the distance from the true position."""
+def test_nodes_with_larger_errors_are_brighter(make_scene):
+    """Brightness increases with the distance from the true position."""
     scene = make_scene(mesh=rectangle([8.0, 2.0], [5, 3]), n_modes=2)
     truth = torch.zeros(1, *scene.problem.shape, dtype=torch.float64)
     end = scene.problem.points[:, 0] == scene.problem.points[:, 0].max()
     wrong = truth + 0.1 * end[:, None]
-    figure = deformed(scene.problem, truth, [("network", wrong)])
+    figure = plot_deformed(scene.problem, truth, [("network", wrong)])
     colours = np.asarray(figure.axes[0].collections[0].get_facecolor())
     touched = end.numpy()[surface(scene.problem.mesh)].any(axis=1)
     light = colours[:, :3] @ [0.3, 0.6, 0.1]
@@ -117,11 +117,11 @@ def test_a_wrong_place_is_brighter(make_scene):
     assert light[touched].min() > light[~touched].max() + 0.3
 
 
-def test_upright_figures_have_a_row_a_load(make_scene):
+def test_upright_figures_have_one_row_per_load(make_scene):
     scene = make_scene(n_modes=2)
     truth = 0.01 * torch.randn(3, *scene.problem.shape, dtype=torch.float64)
     shown = [("network", truth * 0.9), ("linear", truth * 1.1)]
-    figure = deformed(scene.problem, truth, shown, names=["a", "b", "c"], upright=True)
+    figure = plot_deformed(scene.problem, truth, shown, names=["a", "b", "c"], upright=True)
     titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
     assert sorted(titles) == sorted(["a\nnetwork", "b\nnetwork", "c\nnetwork", *["linear"] * 3])
     figure.canvas.draw()
@@ -130,7 +130,7 @@ def test_upright_figures_have_a_row_a_load(make_scene):
 
 
 @pytest.mark.parametrize("name", BODIES)
-def test_triangles_cover_what_polygons_do(name):
+def test_triangles_cover_the_same_area_as_polygons(name):
     mesh, facets, corners = BODIES[name]
     found = triangles(surface(mesh))
     assert found.shape == (facets * (corners - 2), 3)
@@ -140,7 +140,7 @@ def test_triangles_cover_what_polygons_do(name):
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra"])
 @pytest.mark.parametrize("most", [1000, 300, 100])
-def test_a_coarse_body_has_no_more_polygons_than_are_wanted_and_about_its_shape(cell, most):
+def test_a_coarse_body_has_at_most_the_requested_polygons_and_keeps_its_extent(cell, most):
     mesh = box([4.0, 2.0, 1.0], [17, 9, 5], cell)
     points, polygons = mesh.p.T, surface(mesh)
     found = coarse(points, polygons, most)
@@ -153,20 +153,20 @@ def test_a_coarse_body_has_no_more_polygons_than_are_wanted_and_about_its_shape(
     assert all(len(set(face)) == 3 for face in faces.tolist())
 
 
-def test_colours_grow_brighter_over_three_decades():
+def test_colours_become_brighter_over_three_decades():
     error = np.array([0.0, 1e-6, 1e-3, 1e-2, 1e-1, 1.0])
-    found = colours(error)
+    found = error_colours(error)
     light = found @ [0.3, 0.6, 0.1]
     assert found.dtype == np.uint8
     assert light[0] == light[1] == light[2]
     assert (np.diff(light[2:]) > 20).all()
-    assert (colours(np.zeros(3)) == colours(np.zeros(3))[0]).all()
+    assert (error_colours(np.zeros(3)) == error_colours(np.zeros(3))[0]).all()
 
 
-def test_errors_are_drawn_against_the_size_of_the_answer_and_sorted():
+def test_errors_are_plotted_against_displacement_and_as_a_distribution():
     relative = torch.tensor([0.5, 0.01, torch.nan, 0.1, torch.inf])
     size = torch.tensor([0.001, 0.2, 0.1, 0.05, 0.3])
-    figure = spread(relative, size, [0, 2])
+    figure = plot_errors(relative, size, [0, 2])
     upper, lower = figure.axes
     assert "5 validation loads, 2 without" in figure.get_suptitle()
     shown = np.asarray(upper.collections[0].get_offsets())
@@ -179,8 +179,8 @@ def test_errors_are_drawn_against_the_size_of_the_answer_and_sorted():
 
 
 @pytest.mark.parametrize("value", [0.0, torch.nan])
-def test_errors_that_are_all_zero_or_no_number_can_be_drawn(value):
-    figure = spread(torch.full((3,), value), torch.zeros(3), [0])
+def test_errors_that_are_all_zero_or_not_finite_can_be_plotted(value):
+    figure = plot_errors(torch.full((3,), value), torch.zeros(3), [0])
     figure.canvas.draw()
     missing = 3 if np.isnan(value) else 0
     assert ("3 without a finite error" in figure.get_suptitle()) == bool(missing)
@@ -189,13 +189,13 @@ def test_errors_that_are_all_zero_or_no_number_can_be_drawn(value):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_body_is_drawn_where_its_nodes_are_and_in_the_colours_of_their_values(dim):
+def test_a_body_is_drawn_at_its_deformed_nodes_in_the_colours_of_its_values(dim):
     shape = {2: rectangle([2.0, 1.0], [3, 2]), 3: box([2.0, 1.0, 1.0], [3, 2, 2])}[dim]
     problem = Problem.build(shape, NeoHookeanLn(0.3), fixed=Plane(0, "min"))
     moved = torch.zeros(problem.shape, dtype=torch.float64)
     moved[:, 0] = 0.3 * problem.points[:, 0]
     ax = Figure().add_subplot(projection="3d" if dim == 3 else None)
-    scale = body(ax, problem, moved, values=problem.points[:, 0], room=[-moved])
+    scale = draw_body(ax, problem, moved, values=problem.points[:, 0], fit=[-moved])
     (drawn,) = ax.collections
     faces = drawn.get_facecolor()
     if dim == 2:
@@ -206,10 +206,10 @@ def test_a_body_is_drawn_where_its_nodes_are_and_in_the_colours_of_their_values(
     assert len(np.unique(faces, axis=0)) > 1
 
 
-def test_a_body_without_values_is_grey_and_at_rest():
+def test_a_body_without_values_is_grey_and_undeformed():
     problem = Problem.build(rectangle([2.0, 1.0], [3, 2]), NeoHookeanLn(0.3), fixed=Plane(0, "min"))
     ax = Figure().add_subplot()
-    body(ax, problem)
+    draw_body(ax, problem)
     (drawn,) = ax.collections
     assert len(np.unique(drawn.get_facecolor()[:, :3])) == 1
     assert ax.get_xlim() == (0.0, 1.0)

@@ -18,7 +18,7 @@ from dpl.fem import surface
 from dpl.fem.postprocess import coarse, triangles
 from dpl.scene import Sample, Scene
 from dpl.training.metrics import MaxError, PerLoadErrors, RelativeL2
-from dpl.visualization import colours, deformed, spread
+from dpl.visualization import error_colours, plot_deformed, plot_errors
 
 GREY = 160  # of a true shape
 LOOK = {  # of meshes in the browser, in the words of three.js
@@ -108,10 +108,10 @@ class WorstCasePlots(L.Callback):
         module.train(training)
         problem, names = module.scene.problem, [judged.title(load) for load in chosen]
         shown = [("", predicted)]
-        shapes = deformed(
-            problem, some.displacement, shown, names=names, upright=True, most=self.most
+        shapes = plot_deformed(
+            problem, some.displacement, shown, names=names, upright=True, max_polygons=self.most
         )
-        errors = spread(judged.relative, judged.size, chosen)
+        errors = plot_errors(judged.relative, judged.size, chosen)
         for board in boards:
             board.add_figure("validation/shapes", shapes, step)
             board.add_figure("validation/errors", errors, step)
@@ -171,7 +171,7 @@ def side_by_side_mesh(
         shape[:, : points.shape[1]] = scene.length * (points + field.cpu().numpy())[used]
         shapes.append(shape)
     error = np.linalg.norm(shapes[0] - shapes[1], axis=1)
-    paint = np.concatenate([colours(error), np.full((len(used), 3), GREY, np.uint8)])
+    paint = np.concatenate([error_colours(error), np.full((len(used), 3), GREY, np.uint8)])
     both = np.concatenate(shapes)
     shapes[1][:, 1] -= 1.1 * np.ptp(both[:, 1])
     return {
