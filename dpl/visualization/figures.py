@@ -54,7 +54,7 @@ def plot_deformed(
         for column in range(len(true)):
             ax = axes[row, column]
             error = errors[row][column][polygons].mean(axis=1)
-            colours = scale.to_rgba(np.maximum(error, scale.norm.vmin))
+            colours = scale.to_rgba(error)
             shape = (points + fields[row][column])[polygons]
             _draw(ax, shape, facecolors=colours, edgecolors="none")
             wireframe = (points + true[column])[polygons]
@@ -91,7 +91,7 @@ def _error_scale(error: NDArray[Any]) -> "ScalarMappable":
     from matplotlib.colors import LogNorm
 
     largest = float(error[np.isfinite(error)].max(initial=SMALLEST_ERROR))
-    return ScalarMappable(LogNorm(largest * DECADES, largest), "viridis")
+    return ScalarMappable(LogNorm(largest * DECADES, largest, clip=True), "viridis")
 
 
 def _add_colour_bar(figure: "Figure", axes: Any, scale: "ScalarMappable", *, upright: bool) -> None:
@@ -209,5 +209,5 @@ def plot_errors(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "
 def error_colours(error: NDArray[Any]) -> NDArray[np.uint8]:
     """Return RGB colours (N, 3) of distances (N,) on the colour scale of `plot_deformed`."""
     scale = _error_scale(error)
-    rgba = scale.to_rgba(np.maximum(error, scale.norm.vmin))
+    rgba = scale.to_rgba(error)
     return (rgba[:, :3] * 255).round().astype(np.uint8)
