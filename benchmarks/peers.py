@@ -261,14 +261,16 @@ def propeller_scene(linear: str = "auto", deflection: float = 0.055) -> Scene:
     """Return the propeller, NH-ln, held at its bore, its blades bent to a tenth of L."""
     problem = Problem.build(propeller(), NeoHookeanLn(0.3), fixed=Tag("bore"))
     newton = Newton(problem, linear=linear)
-    return Scene(problem, ModalLoads(newton.rest, n_modes=10, deflection=deflection), newton)
+    return Scene(
+        problem, ModalLoads(newton.linear_solver, n_modes=10, deflection=deflection), newton
+    )
 
 
 def beam_scene(law: Material) -> Scene:
     """Return the paper's beam with its loads, deflections to 0.4 L."""
     problem = Problem.build(box(LONG, [40, 10, 10]), law, fixed=Plane(0, "min"))
     newton = Newton(problem)
-    return Scene(problem, ModalLoads(newton.rest, deflection=0.4, young=4500.0), newton)
+    return Scene(problem, ModalLoads(newton.linear_solver, deflection=0.4, young=4500.0), newton)
 
 
 def propellers(linear: str, loads: int) -> Time:

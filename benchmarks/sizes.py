@@ -71,7 +71,7 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     mesh = box(BEAM, [4 * cells + 1, cells + 1, cells + 1])
     problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"))
     newton = Newton(problem, tol=1e-6)
-    scene = Scene(problem, ModalLoads(newton.rest, deflection=0.4, young=YOUNG), newton)
+    scene = Scene(problem, ModalLoads(newton.linear_solver, deflection=0.4, young=YOUNG), newton)
     dofs = problem.free.numel()
     batch = scene.loads.sample((0, 2), range(max(loads, 3)))
     singles = batch.unbatch()[:loads]
@@ -84,7 +84,7 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     first = 1e3 * (time.perf_counter() - start)
     name = select_backend("auto", problem.pattern, problem.near_null, many_rhs=True)
     yield Size(f"factor of K(0), analysis included ({name})", dofs, first)
-    yield row("linear answer", lambda load: newton.rest.solve(load.force[0]))
+    yield row("linear answer", lambda load: newton.linear_solver.solve(load.force[0]))
     answers = {float(load.force.norm()): solve(newton, load).displacement for load in singles}
     yield row("Newton", lambda load: solve(newton, load))
     turned = newton.replace(corotational=True)
@@ -98,7 +98,7 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     net = Latent(scene)
     surrogate = Surrogate(net, MSE(), scene).eval()
     drawn = scene.loads.sample((0, 0), range(64))
-    linear = torch.stack([newton.rest.solve(force) for force in drawn.force])
+    linear = torch.stack([newton.linear_solver.solve(force) for force in drawn.force])
     bent = linear + linear * linear.norm(dim=-1, keepdim=True)
     surrogate.fit_bases(Sample(drawn.force, bent, drawn.young))
     kept = sum(t.nbytes for t in surrogate.state_dict().values()) / 1e6

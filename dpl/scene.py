@@ -74,7 +74,7 @@ class Scene:
     @property
     def linear(self) -> LinearSolver:
         """The linear answer, with the scene's one factor of K(0)."""
-        return self.solver.rest
+        return self.solver.linear_solver
 
     @cached_property
     def corrector(self) -> Newton:

@@ -84,7 +84,7 @@ def _tiny(
     held = Plane(0, "min") if fixed is None else fixed
     problem = Problem.build(mesh, law(poisson), fixed=held, degree=degree)
     solver = newton(problem, tol=tol, linear=linear)
-    loads = ModalLoads(solver.rest, n_modes=n_modes, young=young, **loads)
+    loads = ModalLoads(solver.linear_solver, n_modes=n_modes, young=young, **loads)
     return Scene(problem, loads, solver)
 
 

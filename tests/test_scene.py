@@ -143,7 +143,7 @@ from dpl.scene import Scene
 
 problem = Problem.build(box((1, 0.25, 0.25), (5, 3, 3)), NeoHookeanLn(0.3), fixed=Plane(0, "min"))
 newton = Newton(problem)
-print(Scene(problem, ModalLoads(newton.rest, n_modes=3), newton).fingerprint)
+print(Scene(problem, ModalLoads(newton.linear_solver, n_modes=3), newton).fingerprint)
 """
     ended = subprocess.run(
         [sys.executable, "-c", code],
@@ -184,7 +184,7 @@ def test_displacements_in_metres_do_not_depend_on_who_made_them_dimensionless(ma
 
 
 def test_a_scene_has_one_factor_of_its_rest_stiffness(scene):
-    assert scene.linear is scene.solver.rest is scene.loads.linear
+    assert scene.linear is scene.solver.linear_solver is scene.loads.linear
     assert scene.linear.factor is scene.linear.factor
 
 

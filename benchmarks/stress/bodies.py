@@ -53,7 +53,7 @@ def scaled(law: Material, printed: tuple[str, ...], watch: Auditor) -> Outcome:
         mesh = box([4 * side, side, side], [9, 3, 3])
         problem = Problem.build(mesh, law, fixed=Plane(0, "min"))
         newton = Newton(problem, mixed_integration=False)
-        scene = Scene(problem, ModalLoads(newton.rest, n_modes=1, young=young), newton)
+        scene = Scene(problem, ModalLoads(newton.linear_solver, n_modes=1, young=young), newton)
         newtons = young * scene.force_unit * fixtures.pulled(problem, 20.0)
         given = scene.load_of(newtons[None], torch.tensor([young], dtype=torch.float64))
         state = watch.solve(newton, problem, given)
@@ -159,7 +159,7 @@ def sliver(part: float, watch: Auditor) -> Outcome:
     for name in DIRECT:
         for kind, newton in kinds(problem):
             solver = newton.replace(linear=name)
-            del solver.__dict__["rest"]
+            del solver.__dict__["linear_solver"]
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", UserWarning)
                 state = watch.solve(solver, problem, load_of(fixtures.pulled(problem, 20.0)))

@@ -91,7 +91,7 @@ def stored(watch: Auditor) -> Outcome:
     """Make data of loads up to 25 times the usual ones: what is accepted is evaluated again."""
     problem = paper_beam(SVK, (8, 2, 2))
     newton = Newton(problem)
-    scene = Scene(problem, ModalLoads(newton.rest, n_modes=3, deflection=25 * 0.4), newton)
+    scene = Scene(problem, ModalLoads(newton.linear_solver, n_modes=3, deflection=25 * 0.4), newton)
     rows, accepted = list[Row](), 0
     for number in range(8):
         made = solve_load(scene, LoadKey((0, 0), number))

@@ -46,7 +46,7 @@ def scene() -> Scene:
     """Return the beam of 8 x 2 x 2 cells of NH-ln with three modes."""
     problem = paper_beam(NH, (8, 2, 2))
     newton = Newton(problem)
-    return Scene(problem, ModalLoads(newton.rest, n_modes=3, young=YOUNG), newton)
+    return Scene(problem, ModalLoads(newton.linear_solver, n_modes=3, young=YOUNG), newton)
 
 
 @cache
@@ -258,7 +258,7 @@ def too_large(watch: Auditor) -> Outcome:
     mesh = box([1.0, 1.0, 1.0], [33, 33, 33])
     problem = Problem.build(mesh, NH, fixed=Plane(0, "min"))
     newton = Newton(problem)
-    own = Scene(problem, ModalLoads(newton.rest, n_modes=1, young=YOUNG), newton)
+    own = Scene(problem, ModalLoads(newton.linear_solver, n_modes=1, young=YOUNG), newton)
     size = problem.points.numel()
     words = f"{4 * size**2 + 7 * size:,} parameters"
     build = partial(FCNN, own, all_dofs=True, memory_limit=128.0)

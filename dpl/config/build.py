@@ -164,7 +164,7 @@ def build_scene(cfg: DictConfig) -> Scene:
     if not validation.matches_type(young, float | Sequence[float]):
         raise ConfigError(f"young = {young!r} must be a modulus [Pa] or a range [low, high]")
     loads = instantiate(
-        cfg, "loads", linear=solver.rest, young=young, constant_force=_always(cfg, problem)
+        cfg, "loads", linear=solver.linear_solver, young=young, constant_force=_always(cfg, problem)
     )
     try:
         loads.modes  # noqa: B018  # which says whether there are so many

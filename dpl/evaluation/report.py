@@ -168,7 +168,7 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
     shared = scene.loads.poisson_range is None
     own = scene if shared else replace(scene, solver=replace(scene.solver))
     solvers: dict[str, Solver] = {
-        "linear": replace(newton.rest, tol=tol),
+        "linear": replace(newton.linear_solver, tol=tol),
         "network": Direct(surrogate.predict, scene.problem, tol),
         "hybrid Newton": Hybrid(surrogate.predict, newton if shared else replace(newton), "paper"),
         "hybrid, best rule": default_hybrid(surrogate.predict, own, tol),

@@ -322,7 +322,7 @@ def nearest(newton: Newton, load: Load, guesses: list[Tensor]) -> Tensor:
     correction, and not how stiff the body is against an error. One that inverts an element or is
     not finite is not taken unless all are like that.
     """
-    turning = newton.at(load.poisson).rest.corotational
+    turning = newton.at(load.poisson).linear_solver.corotational
 
     def distance(guess: Tensor) -> float:
         internal, volume = turning.problem.evaluate(guess)

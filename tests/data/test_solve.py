@@ -146,7 +146,7 @@ from dpl.scene import Scene
 torch.set_num_threads(2)
 mesh = box([4.0, 1.0, 1.0], [17, 5, 5])
 newton = Newton(Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min")), linear="pardiso")
-scene = Scene(newton.problem, ModalLoads(newton.rest, n_modes=3, deflection=0.01), newton)
+scene = Scene(newton.problem, ModalLoads(newton.linear_solver, n_modes=3, deflection=0.01), newton)
 solve_load(scene, LoadKey((0, 0), 0))
 with threadpool_limits(1):
     assert solve_load(scene, LoadKey((0, 0), 1)).accepted

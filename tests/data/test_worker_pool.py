@@ -66,7 +66,7 @@ class Asked(GracefulShutdown):
 
 
 def fragile(scene, **how):
-    linear, modes = scene.solver.rest, scene.loads.modes
+    linear, modes = scene.solver.linear_solver, scene.loads.modes
     loads = Fragile(linear, n_modes=3, young=4500.0, **how)
     loads.__dict__["modes"] = modes
     return Scene(scene.problem, loads, scene.solver)
@@ -300,7 +300,7 @@ if __name__ == "__main__":
         box([100.0, 25.0, 25.0], [5, 3, 3]), NeoHookeanLn(0.3), fixed=Plane(0, "min")
     )
     newton = Newton(problem, linear="superlu")
-    scene = Scene(problem, ModalLoads(newton.rest, n_modes=3), newton)
+    scene = Scene(problem, ModalLoads(newton.linear_solver, n_modes=3), newton)
     running = solve_loads(scene, [LoadKey((5, 0), k) for k in range(100000)], workers=1)
     print(next(running).accepted, flush=True)
     test_crew.kept = running  # as long as the program

@@ -24,7 +24,7 @@ from dpl.fem import (
 def body(request) -> tuple[Problem, Load]:
     """A beam under six random loads, one of them zero."""
     problem = Problem.build(box([4.0, 1, 1], [9, 3, 3]), request.param, fixed=Plane(0, "min"))
-    load = ModalLoads(Newton(problem).rest, n_modes=4, deflection=0.2).sample(3, range(6))
+    load = ModalLoads(Newton(problem).linear_solver, n_modes=4, deflection=0.2).sample(3, range(6))
     load.force[2] = 0
     return problem, load
 

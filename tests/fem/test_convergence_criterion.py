@@ -62,14 +62,14 @@ def solvers(newton, load):
     assert 0.05 < exact.norm(dim=-1).max() < 0.5
     problem, guess = newton.problem, 1.001 * exact
     snapshots = torch.cat([part * exact for part in (0.5, 0.8, 1.0)])
-    reduced = PODGalerkin.fit(problem, snapshots, 3, tolerance=None, lift=newton.rest)
+    reduced = PODGalerkin.fit(problem, snapshots, 3, tolerance=None, lift=newton.linear_solver)
     hybrids = {rule: Hybrid(lambda load: guess, newton, rule) for rule in RULES}
     hybrids["steps"] = Hybrid(lambda load: guess, newton, steps=AndersonSolver(newton))
     return {
         "newton": partial(solve, newton),
         "newton from a guess": lambda load: [*newton.iterate(load, guess=guess)][-1],
         "accelerated": lambda load: [*AndersonSolver(newton).iterate(load, guess=guess)][-1],
-        "linear": partial(solve, newton.rest),
+        "linear": partial(solve, newton.linear_solver),
         "batched": partial(solve, BatchedNewton(problem)),
         "reduced": partial(solve, reduced),
         "direct": partial(solve, Direct(lambda load: guess, problem)),
@@ -112,7 +112,7 @@ def test_forces_on_held_nodes_alone_leave_the_body_at_rest(newton, load, solvers
 def test_tiny_loads_are_answered_as_small_ones_are(newton, load, solvers, name, power):
     size = 10.0**power
     tiny = load._replace(force=size * load.force)
-    linear = newton.rest.solve(load.force[0])
+    linear = newton.linear_solver.solve(load.force[0])
     answer = solvers[name](tiny)
     assert answer.converged.all()
     assert 0 < float(answer.residual) < 1e-8
@@ -194,7 +194,7 @@ def test_a_right_hand_side_of_any_size_is_solved_by_conjugate_gradients():
 def test_where_a_load_lies_does_not_depend_on_forces_on_held_nodes(newton):
     weight = torch.full(newton.problem.shape, -1e-5, dtype=torch.float64)
     for always in (None, weight):
-        loads = ModalLoads(newton.rest, n_modes=3, constant_force=always)
+        loads = ModalLoads(newton.linear_solver, n_modes=3, constant_force=always)
         force = loads.sample(0, range(3)).force
         held = torch.where(newton.problem.free, force, 1e10)
         found, wanted = loads.project(held), loads.project(force)
@@ -205,7 +205,7 @@ def test_where_a_load_lies_does_not_depend_on_forces_on_held_nodes(newton):
 
 @pytest.mark.parametrize("power", [-290, -158, 0, 158])
 def test_where_a_load_lies_scales_with_it(newton, power):
-    loads = ModalLoads(newton.rest, n_modes=3)
+    loads = ModalLoads(newton.linear_solver, n_modes=3)
     force, size = loads.sample(0, range(3)).force, 10.0**power
     amplitude, strange = loads.project(size * force)
     assert_close(amplitude / size, loads.project(force)[0], rtol=1e-9, atol=0)
@@ -246,7 +246,7 @@ def test_linear_elasticity_is_answered_in_one_step_as_long_as_no_cell_nearly_col
     problem = Problem.build(box([4.0, 1, 1], [7, 3, 3]), LinearElastic(0.3), fixed=Plane(0, "min"))
     solver = Newton(problem, linear="superlu")
     unit = Traction(Plane(0, "max"), [-1.0, 0.0, 0.0]).on(problem)[None]
-    straight = solver.rest.solve(unit[0])[None]
+    straight = solver.linear_solver.solve(unit[0])[None]
 
     def pressed(volume: float) -> tuple[float, Solution]:
         low, high = 0.0, 2.0  # at which some point has det F of this volume ratio

@@ -185,8 +185,8 @@ def test_other_attributes_keep_the_factor_of_rest():
     newton = Newton(body())
     other = newton.replace(tol=1e-3, corotational=True)
     assert (other.tol, other.corotational) == (1e-3, True)
-    assert other.rest is newton.rest
-    assert other.rest.factor is newton.rest.factor
+    assert other.rest is newton.linear_solver
+    assert other.rest.factor is newton.linear_solver.factor
 
 
 def test_a_load_of_nothing_needs_no_tangent():
@@ -199,7 +199,7 @@ def test_a_load_of_nothing_needs_no_tangent():
 def test_frames_outlive_the_memory_of_the_problem():
     """Sending a problem to a process moves its tensors: what compiled loops read is a copy."""
     problem = body()
-    turning = Newton(problem).rest.corotational
+    turning = Newton(problem).linear_solver.corotational
     u = 0.1 * problem.points.roll(1, dims=1)[None] * problem.free
     before = turning.at(u).rotations.copy()
     kept = turning._means[2]

@@ -171,7 +171,7 @@ def test_more_reuse_means_fewer_factors(beam, pull, reuse):
 def test_factors_are_counted_as_they_are_made(beam, pull, counted, q):
     problem = beam(NH)
     solver, load = Newton(problem, linear="superlu"), load_of(pull(problem, q)[0])
-    solver.rest.factor  # noqa: B018  the scene's
+    solver.linear_solver.factor  # noqa: B018  the scene's
     counted.clear()
     answer = solve(solver, load)
     assert 0 < answer.factorisations.item() == len(counted)
@@ -263,7 +263,7 @@ def test_members_of_a_batch_do_not_factorise_behind_the_count(beam, pull, monkey
     problem = beam(NH)
     load = load_of(*(pull(problem, q)[0] for q in (5.0, 10.0, 20.0, 40.0)))
     solver = Newton(problem, linear="pardiso")
-    solver.rest.factor  # noqa: B018
+    solver.linear_solver.factor  # noqa: B018
     monkeypatch.setattr(Pardiso, "_factorise", count)
     assert int(solve(solver, load).factorisations.sum()) == len(calls)
 
@@ -281,7 +281,7 @@ def test_storage_of_a_factor_that_is_not_used_again_is_that_of_the_next(
         return factor
 
     solver = Newton(problem, linear="band", factor_reuse_tol=reuse)
-    solver.rest.factor  # noqa: B018
+    solver.linear_solver.factor  # noqa: B018
     monkeypatch.setattr(BandedCholesky, "_cholesky", watched)
     answer = solve(solver, load_of(pull(problem, 40.0)[0]))
     assert answer.factorisations.item() == len(places) >= 3

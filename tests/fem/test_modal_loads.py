@@ -148,7 +148,7 @@ def test_small_loads_along_a_mode_move_the_body_along_it(beam, law):
     """F = q phi_k gives q phi_k / lambda_k, but for a deviation that is linear in q."""
     problem = beam(law)
     newton = Newton(problem, tol=1e-10, linear="superlu")
-    modes = eigenmodes(newton.rest, 3)
+    modes = eigenmodes(newton.linear_solver, 3)
     for k, value in enumerate(modes.values):
         deviations = []
         for size in (1e-4, 1e-5):
@@ -498,7 +498,7 @@ def test_plane_bodies_have_modal_loads_too():
     mesh = rectangle([4.0, 1.0], [9, 3])
     problem = Problem.build(mesh, SaintVenantKirchhoff(0.3), fixed=lambda points: points[:, 0] == 0)
     newton = Newton(problem, linear="superlu")
-    loads = ModalLoads(newton.rest, n_modes=3)
+    loads = ModalLoads(newton.linear_solver, n_modes=3)
     answer = solve(newton, loads.sample((0, 0), range(3)))
     assert answer.converged.all()
 

@@ -458,7 +458,7 @@ def test_members_use_their_own_guess(law, beam, pull):
 def test_force_of_another_kind_or_shape_is_an_error_that_says_so(beam, pull, change, message):
     problem = beam(NH, 2, 1)
     solver, load = newton(problem), load_of(change(pull(problem, 20.0)))
-    for each in (solver, solver.rest):
+    for each in (solver, solver.linear_solver):
         with pytest.raises(ValueError, match=f"force: .*{message}"):
             solve(each, load)
 
@@ -471,7 +471,7 @@ def test_force_that_is_no_number_has_no_answer_even_on_a_held_node(beam, pull, b
     held = int((~problem.free).any(dim=1).nonzero()[0, 0])
     load.force[0, held, 0] = bad
     solver = newton(problem)
-    for each in (solver, solver.rest):
+    for each in (solver, solver.linear_solver):
         assert not solve(each, load).converged.any()
 
 
@@ -748,6 +748,6 @@ def test_the_solver_of_another_poissons_ratio_shares_what_does_not_depend_on_it(
     assert clone.tol == 1e-9
     assert clone is newton.at(0.25)
     assert clone.problem is problem.at(0.25)
-    assert clone.rest.problem is clone.problem
-    assert clone.rest is newton.rest.of(clone.problem)
+    assert clone.linear_solver.problem is clone.problem
+    assert clone.linear_solver is newton.linear_solver.of(clone.problem)
     assert clone._backend is newton._backend

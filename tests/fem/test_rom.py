@@ -67,13 +67,15 @@ def newton(beam) -> Newton:
 @pytest.fixture(scope="module")
 def snapshots(newton) -> torch.Tensor:
     """Sixty answers to random loads of three modes, deflections of up to 0.4 L."""
-    return solve(newton, ModalLoads(newton.rest, n_modes=3).sample(0, range(60))).displacement
+    return solve(
+        newton, ModalLoads(newton.linear_solver, n_modes=3).sample(0, range(60))
+    ).displacement
 
 
 @pytest.fixture(scope="module")
 def unseen(newton) -> Load:
     """Eight loads that are not among those of the snapshots."""
-    return ModalLoads(newton.rest, n_modes=3).sample(1, range(8))
+    return ModalLoads(newton.linear_solver, n_modes=3).sample(1, range(8))
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +87,7 @@ def truth(newton, unseen) -> torch.Tensor:
 @pytest.fixture(params=[False, True], ids=["alone", "lifted"])
 def lift(request, newton) -> LinearSolver | None:
     """Without and with the linear answer."""
-    return newton.rest if request.param else None
+    return newton.linear_solver if request.param else None
 
 
 @pytest.mark.parametrize("shape", [(7, 40), (40, 7), (12, 12)], ids=str)
@@ -203,7 +205,7 @@ def test_error_falls_with_the_rank(newton, snapshots, unseen, truth, lift):
 def test_lifted_answer_is_more_accurate(newton, snapshots, unseen, truth):
     alone, lifted = (
         PODGalerkin.fit(newton.problem, snapshots, 15, tolerance=None, lift=lift)
-        for lift in (None, newton.rest)
+        for lift in (None, newton.linear_solver)
     )
     ratio = errors(solve(lifted, unseen).displacement, truth) / errors(
         solve(alone, unseen).displacement, truth
@@ -365,7 +367,7 @@ def test_batch_is_its_members(newton, snapshots, unseen, lift):
 
 
 def test_pickled_solver_answers_the_same(newton, snapshots, unseen):
-    solver = PODGalerkin.fit(newton.problem, snapshots, 8, lift=newton.rest)
+    solver = PODGalerkin.fit(newton.problem, snapshots, 8, lift=newton.linear_solver)
     answer = solve(solver, unseen)
     copy = pickle.loads(pickle.dumps(solver))
     assert torch.equal(solve(copy, unseen).displacement, answer.displacement)

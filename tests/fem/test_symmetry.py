@@ -316,7 +316,7 @@ def test_forces_that_every_load_holds_keep_what_they_share(solver):
 
 def test_images_of_answers_balance_the_images_of_their_loads(solver):
     problem = solver.problem
-    load = ModalLoads(solver.rest, n_modes=5).sample(0, range(4))
+    load = ModalLoads(solver.linear_solver, n_modes=5).sample(0, range(4))
     load = Load(load.force * torch.tensor([1.0, 1.0, 1e-3, 1e-6])[:, None, None], load.young)
     answer = solve(solver, load)
     assert answer.converged.all()

@@ -233,7 +233,7 @@ def test_smaller_noise_costs_fewer_iterations(rule, scene, loads, stubs):
 
 @pytest.mark.parametrize("size", [1e-3, 1e-4, 1e-5])
 def test_from_a_good_prediction_no_tangent_is_needed(scene, loads, stubs, size, counted):
-    scene.solver.rest.corotational  # noqa: B018  # its factor is the scene's
+    scene.solver.linear_solver.corotational  # noqa: B018  # its factor is the scene's
     before = dict(counted)
     states = list(hybrid(scene, loads, stubs[f"noise {size:g}"], "steps").iterate(loads))
     assert counted == before
@@ -257,7 +257,7 @@ def test_the_hybrid_that_suits_a_scene_has_its_tolerance(scene, stubs):
     for tol, wanted in ((None, scene.solver.tol), (1e-3, 1e-3)):
         suited = default_hybrid(lambda load: 0 * load.force, scene, tol)
         assert suited.newton.tol == wanted
-        assert suited.newton.rest is scene.solver.rest
+        assert suited.newton.linear_solver is scene.solver.linear_solver
         assert (suited.steps is not None) == scene.corrector.corotational
 
 

@@ -373,7 +373,7 @@ def test_a_body_that_is_held_in_some_directions_only_is_answered(kind):
     mesh = box([100.0, 25.0, 25.0], [5, 2, 2])
     problem = Problem.build(mesh, NeoHookeanLn(0.3), supports=rails)
     solver = Newton(problem, linear="superlu")
-    scene = Scene(problem, ModalLoads(solver.rest, n_modes=3, young=4500.0), solver)
+    scene = Scene(problem, ModalLoads(solver.linear_solver, n_modes=3, young=4500.0), solver)
     assert (problem.free.any(dim=1) & ~problem.free.all(dim=1)).any()
     module = prepared(kind, scene, solved(scene, 30), **WHOLE)
     answer = exact(module)(noise(scene))

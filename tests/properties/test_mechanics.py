@@ -262,10 +262,10 @@ def test_linear_answers_are_reciprocal(case, other, data):
 def test_small_loads_have_an_answer_that_follows_the_linear_one(case):
     body, push = case
     newton = Newton(body.build())
-    problem, load = newton.problem, push.on(body, newton.rest)
+    problem, load = newton.problem, push.on(body, newton.linear_solver)
     answer = solve(newton, load)
     assert answer.status.item() == Status.CONVERGED
-    u, linear = answer.displacement, newton.rest.solve(load.force[0])
+    u, linear = answer.displacement, newton.linear_solver.solve(load.force[0])
     steep = gradients(problem, u).norm(dim=(-2, -1)).max()
     second = 100 * steep * problem.roundoff_bound(u) / EPS  # of force in |H|
     rest = torch.zeros_like(u)
@@ -338,7 +338,7 @@ def check_states(newton: Newton, load: Load, states: list[Solution]) -> None:
 def test_states_of_newton_are_not_inverted_and_say_what_they_are(case, mixed, budget):
     body, push = case
     newton = Newton(body.build(), mixed_integration=mixed, max_total_iter=budget)
-    load = push.on(body, newton.rest)
+    load = push.on(body, newton.linear_solver)
     check_states(newton, load, list(newton.iterate(load)))
 
 
@@ -347,7 +347,7 @@ def test_states_of_newton_are_not_inverted_and_say_what_they_are(case, mixed, bu
 def test_newton_says_the_same_of_states_from_any_guess(case, steepness, seed):
     body, push = case
     newton = Newton(body.build(), max_total_iter=40)
-    problem, load = newton.problem, push.on(body, newton.rest)
+    problem, load = newton.problem, push.on(body, newton.linear_solver)
     guess = bent(problem, steepness, seed)
     states = list(newton.iterate(load, guess=guess))
     check_states(newton, load, states)
@@ -364,7 +364,7 @@ def test_answer_is_in_balance_as_a_whole(case):
     """Reactions, springs and loads have neither sum nor moment in the deformed body."""
     body, push = case
     newton = Newton(body.build(), max_total_iter=60)
-    problem, load = newton.problem, push.on(body, newton.rest)
+    problem, load = newton.problem, push.on(body, newton.linear_solver)
     answer = solve(newton, load)
     assume(answer.converged.all())
     u, f = answer.displacement, load.force
@@ -394,7 +394,7 @@ def test_answer_that_counts_as_stable_is_a_minimum(case):
     """
     body, push = case
     newton = Newton(body.build(), max_total_iter=60)
-    problem, load = newton.problem, push.on(body, newton.rest)
+    problem, load = newton.problem, push.on(body, newton.linear_solver)
     answer = solve(newton, load)
     assume(answer.converged.all())
     u, count = answer.displacement, answer.negative_pivots.item()
@@ -422,7 +422,7 @@ def test_answer_that_counts_as_stable_is_a_minimum(case):
 def test_answer_depends_neither_on_the_size_of_the_body_nor_on_its_modulus(case, factor, young):
     body, push = case
     newton = Newton(body.build(), max_total_iter=60)
-    load = push.on(body, newton.rest)
+    load = push.on(body, newton.linear_solver)
     larger = Newton(replace(body, size=factor * body.size).build(), max_total_iter=60)
     answer = solve(newton, load)
     stiffer = Load(load.force, torch.tensor([young], dtype=torch.float64))
@@ -444,7 +444,7 @@ def test_answer_turns_with_body_supports_and_load(case, turn, shift):
         Newton(body.build(), max_total_iter=60),
         Newton(turned.build(), max_total_iter=60),
     )
-    load = push.on(body, first.rest)
+    load = push.on(body, first.linear_solver)
     answer = solve(first, load)
     assume(answer.stable.all())
     unit = first.problem.length / second.problem.length
@@ -462,7 +462,7 @@ def test_answer_turns_with_body_supports_and_load(case, turn, shift):
 def test_ways_to_solve_change_the_way_and_not_the_answer(case, data):
     body, push = case
     newton = Newton(body.build(), max_total_iter=60)
-    problem, load = newton.problem, push.on(body, newton.rest)
+    problem, load = newton.problem, push.on(body, newton.linear_solver)
     answer = solve(newton, load)
     assume(answer.stable.all())
     for change in (
@@ -487,7 +487,7 @@ def test_batch_is_solved_like_its_members(body, data):
     )
     newton = Newton(body.build(), max_total_iter=30, linear=backend)
     drawn = data.draw(st.lists(pushes(body, 1e-3), min_size=2, max_size=4))
-    loads = [push.on(body, newton.rest) for push in drawn]
+    loads = [push.on(body, newton.linear_solver) for push in drawn]
     batch = solve(newton, load_of(torch.cat([load.force for load in loads])))
     alone = concatenate([solve(newton, load) for load in loads])
     for name in ("displacement", "status", "residual", "iterations", "load_factor"):
@@ -507,7 +507,8 @@ def test_loads_with_their_own_poisson_ratio_are_solved_like_bodies_of_one(body, 
         replace(body, law=kind([-0.5, 0.46])).build(), max_total_iter=40, linear="superlu"
     )
     forces = [
-        data.draw(pushes(body, 1e-3, 0.5)).on(body, some.rest.reference).force for _ in ratios
+        data.draw(pushes(body, 1e-3, 0.5)).on(body, some.linear_solver.reference).force
+        for _ in ratios
     ]
     poisson = torch.tensor(ratios, dtype=torch.float64)
     load = Load(torch.cat(forces), torch.ones(len(ratios), dtype=torch.float64), poisson)
@@ -540,7 +541,7 @@ def test_images_of_an_answer_answer_the_images_of_its_load(case):
     body, push = case
     body = replace(body, grading=(1.0,) * body.dim, shaken=0.0)
     newton = Newton(body.build(), max_total_iter=60)
-    problem, load = newton.problem, push.on(body, newton.rest)
+    problem, load = newton.problem, push.on(body, newton.linear_solver)
     answer = solve(newton, load)
     group = symmetries(problem)
     mirrored = body.support not in ("moved", "rollers") and body.cell in ("quad", "hexahedron")
@@ -565,7 +566,7 @@ def test_images_of_an_answer_answer_the_images_of_its_load(case):
 def test_force_of_another_kind_or_shape_is_an_error_in_words(case, what):
     body, push = case
     newton = Newton(body.build())
-    force = push.on(body, newton.rest).force
+    force = push.on(body, newton.linear_solver).force
     wrong = {
         "float32": force.float(),
         "int": force.long(),
@@ -575,7 +576,7 @@ def test_force_of_another_kind_or_shape_is_an_error_in_words(case, what):
         "none": force[:0],
     }[what]
     load = Load(wrong, torch.ones(len(wrong), dtype=torch.float64))
-    for solver in (newton, newton.rest):
+    for solver in (newton, newton.linear_solver):
         with pytest.raises(ValueError, match="force"):
             solve(solver, load)
 
@@ -591,9 +592,9 @@ def test_force_that_is_no_number_is_in_balance_with_nothing(case, number, place)
     """On held nodes too, where no displacement feels it."""
     body, push = case
     newton = Newton(body.build(), max_total_iter=30)
-    load = push.on(body, newton.rest)
+    load = push.on(body, newton.linear_solver)
     load.force.view(-1)[int(place * load.force.numel())] = number
-    for solver in (newton, newton.rest):
+    for solver in (newton, newton.linear_solver):
         answer = solve(solver, load)
         assert not answer.converged.any()
         assert not answer.residual.isfinite().any()

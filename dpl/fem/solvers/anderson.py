@@ -69,7 +69,7 @@ class AndersonSolver:
         yield state
         if state.converged or not state.volume_ratio > 0:
             return
-        turned = newton.rest.corotational.at(u)
+        turned = newton.linear_solver.corotational.at(u)
         ratios = [float(state.residual)]
         past = _Past(self.memory, len(right))
         while count < self.max_iter:

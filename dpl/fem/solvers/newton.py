@@ -110,7 +110,7 @@ class Newton:
     def replace(self, **changes: Any) -> "Newton":
         """Return the solver with other attributes, those of its K(0) excepted: it keeps that."""
         other = replace(self, **changes)
-        other.__dict__["rest"] = self.rest
+        other.__dict__["linear_solver"] = self.linear_solver
         return other
 
     def at(self, poisson: Tensor | float) -> "Newton":
@@ -124,7 +124,7 @@ class Newton:
     def _clone(self, problem: Problem) -> "Newton":
         twin = replace(self, problem=problem)
         twin.__dict__["_backend"] = self._backend
-        twin.__dict__["rest"] = self.rest.of(problem)
+        twin.__dict__["linear_solver"] = self.linear_solver.of(problem)
         return twin
 
     @cached_property
@@ -134,7 +134,9 @@ class Newton:
     def _member(self, force: Tensor, guess: Tensor | None) -> Iterator[Solution]:
         """Yield the states under one load (1, N, D)."""
         problem = self.problem
-        count = _Count(FactorCache(self.rest, self.factorise, corotational=self.corotational))
+        count = _Count(
+            FactorCache(self.linear_solver, self.factorise, corotational=self.corotational)
+        )
         state = base = self._rest(force)
         guessed = guess is not None and bool(guess.any())
         guessed &= bool(force.any()) or problem.moved_supports
@@ -244,7 +246,7 @@ class Newton:
         return None
 
     @cached_property
-    def rest(self) -> LinearSolver:
+    def linear_solver(self) -> LinearSolver:
         """The linear answer, with the factor that every first step from zero uses."""
         return LinearSolver(self.problem, self.tol, self.linear)
 
