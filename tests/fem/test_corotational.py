@@ -185,8 +185,8 @@ def test_other_attributes_keep_the_factor_of_rest():
     newton = Newton(body())
     other = newton.replace(tol=1e-3, corotational=True)
     assert (other.tol, other.corotational) == (1e-3, True)
-    assert other.rest is newton.linear_solver
-    assert other.rest.factor is newton.linear_solver.factor
+    assert other.linear_solver is newton.linear_solver
+    assert other.linear_solver.factor is newton.linear_solver.factor
 
 
 def test_a_load_of_nothing_needs_no_tangent():

@@ -610,7 +610,7 @@ def test_a_run_between_coordinates_is_corrected_in_its_modes(script, tiny_traini
 
 
 def test_the_corrector_is_the_solver_with_the_same_stiffness(scene):
-    assert scene.corrector.rest is scene.solver.linear_solver
+    assert scene.corrector.linear_solver is scene.solver.linear_solver
     assert scene.corrector.tol == scene.solver.tol
     load = scene.loads.sample((0, 9), [3])
     ours, theirs = (
