@@ -5,8 +5,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from benchmarks.commands import CONF
+from dpl import config
 from dpl.commands.cli import command
-from dpl.config import build, run_folder
 
 
 @command("results", conf=CONF)
@@ -17,18 +17,18 @@ def main(cfg: DictConfig) -> None:
     from dpl.evaluation.tables import show
     from dpl.models import PODNet
 
-    build.check(cfg)
-    runs = run_folder.load_runs(cfg.run)
+    config.check(cfg)
+    runs = config.load_runs(cfg.run)
     first, surrogate = next(iter(runs.values()))
     scene = surrogate.scene
-    data = run_folder.load_data(first, scene)
+    data = config.load_data(first, scene)
     train = data.samples("train")
 
     def made(key: str, *parts: object) -> methods.Method:
         try:
-            return build.instantiate(cfg, key)(*parts)
+            return config.instantiate(cfg, key)(*parts)
         except ValueError as error:
-            raise build.ConfigError(f"{key}: {error}; {key}=null leaves it out") from error
+            raise config.ConfigError(f"{key}: {error}; {key}=null leaves it out") from error
 
     compared = {"linear": methods.linear(scene)}
     if cfg.galerkin:

@@ -12,8 +12,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from benchmarks.commands import CONF
+from dpl import config
 from dpl.commands import cli
-from dpl.config import build, run_folder
 
 LOOKS = 360  # at each work
 WORKS = ("training", "simulator")
@@ -27,11 +27,11 @@ def main(cfg: DictConfig) -> None:
     from dpl.evaluation import tables as table
     from dpl.inference import Simulator
 
-    build.check(cfg)
+    config.check(cfg)
     if not cfg.minutes > 0:
-        raise build.ConfigError(f"minutes = {cfg.minutes} must be above 0")
+        raise config.ConfigError(f"minutes = {cfg.minutes} must be above 0")
     if not cfg.works or not set(cfg.works) <= set(WORKS):
-        raise build.ConfigError(f"works = {cfg.works} must be some of {', '.join(WORKS)}")
+        raise config.ConfigError(f"works = {cfg.works} must be some of {', '.join(WORKS)}")
     folder, seconds = Path(cfg.folder), 60.0 * cfg.minutes
     rows: list = []
     wrong: list[str] = []
@@ -52,7 +52,7 @@ def main(cfg: DictConfig) -> None:
         after = soak.vitals("after", 0.0, 0)
         wrong += [f"after the training: {line}" for line in soak.left(before, after)]
     if "simulator" in cfg.works:
-        _, surrogate = run_folder.load_run(folder, trust=True)
+        _, surrogate = config.load_run(folder, trust=True)
         asked = []
         for row in soak.simulator(Simulator(surrogate), seconds, every=seconds / LOOKS):
             asked.append(row)
@@ -69,14 +69,14 @@ def _trained(cfg: DictConfig, seconds: float) -> list:
     """Train for so long and return what was seen."""
     from benchmarks import soak
 
-    scene = build.build_scene(cfg)
-    data = build.instantiate(cfg, "data", scene=scene)
-    surrogate = build.build_surrogate(cfg, scene)
-    trainer = build.instantiate(cfg, "trainer")
+    scene = config.build_scene(cfg)
+    data = config.instantiate(cfg, "data", scene=scene)
+    surrogate = config.build_surrogate(cfg, scene)
+    trainer = config.instantiate(cfg, "trainer")
     cli.check_trainer(trainer, cfg)
     pulse = soak.Pulse(seconds, every=seconds / LOOKS)
     trainer.callbacks.append(pulse)
-    run_folder.save_config(cfg, Path(cfg.folder))
+    config.save_config(cfg, Path(cfg.folder))
     try:
         trainer.fit(surrogate, datamodule=data)
     finally:

@@ -10,8 +10,8 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from benchmarks.commands import CONF
+from dpl import config
 from dpl.commands.cli import command
-from dpl.config import build, run_folder
 from dpl.evaluation import tables as table
 
 COLOURS = {"as expected": "green", "reported": "yellow", "silently wrong": "bold red"}
@@ -23,13 +23,13 @@ def main(cfg: DictConfig) -> None:
     from benchmarks import stress
     from benchmarks.stress.drawing import draw
 
-    build.check(cfg)
+    config.check(cfg)
     try:
         cases = stress.matrix(cfg.cases)
     except ValueError as error:
-        raise build.ConfigError(f"cases: {error}") from error
+        raise config.ConfigError(f"cases: {error}") from error
     if cfg.run is not None:
-        _, surrogate = run_folder.load_run(cfg.run)
+        _, surrogate = config.load_run(cfg.run)
         cases += stress.trained_run.cases(surrogate)
     folder, console = Path(cfg.folder), Console(highlight=False)
     lines: list[stress.Line] = []

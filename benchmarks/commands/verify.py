@@ -8,20 +8,21 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from benchmarks import verification
 from benchmarks.commands import CONF
+from dpl import config
 from dpl.commands.cli import command
-from dpl.config import build
-from dpl.system.threads import one_thread
 
 
 @command("verify", conf=CONF)
 def main(cfg: DictConfig) -> None:
     """Solve the cases that are asked for, and write the page of all that there are."""
-    build.check(cfg)
+    from benchmarks import verification
+    from dpl.system.threads import one_thread
+
+    config.check(cfg)
     if unknown := [part for part in cfg.parts if part not in verification.CASES]:
         known = ", ".join(verification.CASES)
-        raise build.ConfigError(f"parts: {unknown[0]!r} is none of {known}")
+        raise config.ConfigError(f"parts: {unknown[0]!r} is none of {known}")
     folder = Path(cfg.folder)
     begin = time.perf_counter()
     for name in cfg.parts:

@@ -86,11 +86,11 @@ def section(one: Command) -> Iterator[str]:
     path = ROOT / one.config
     if not path.is_file():
         return
-    config = options.read(path)
+    config = options.read(path, path.parent)
     own = [row for row in config.rows if row.key != "defaults"]
     yield f"Configuration: `{one.config}`. {options.code_links(config.about)}\n"
-    if config.composed:
-        yield f"Composed of {', '.join(_entry(entry) for entry in config.composed)}.\n"
+    if config.defaults:
+        yield f"Composed of {', '.join(_entry(entry) for entry in config.defaults)}.\n"
     yield from options.table(own, config.calls)
 
 

@@ -1,149 +1,36 @@
 """The page of all options, from conf/: keys, defaults, comments, and what their calls take."""
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import griffe
 import modules
-import yaml
 from paths import CONF, PACKAGE
+
+from dpl.config.comments import ConfigFile, Row, read
 
 GIVEN = {"self", "args", "kwargs"}
 
 
-@dataclass(frozen=True)
-class Row:
-    """One key of a file.
-
-    Attributes:
-        key: As it is written on the command line.
-        default: As it stands in the file.
-        comment: What stands behind it.
-    """
-
-    key: str
-    default: str
-    comment: str
+def title(file: ConfigFile) -> str:
+    """Return what chooses a file: group=option."""
+    return f"{file.path.parent.name}={file.path.stem}"
 
 
-@dataclass(frozen=True)
-class Option:
-    """One file of conf/.
-
-    Attributes:
-        path: Relative to conf/.
-        about: Comment at its beginning.
-        composed: Entries of its defaults list.
-        rows: Its keys.
-        calls: Key to dotted name, of what it calls.
-    """
-
-    path: Path
-    about: str
-    composed: list[str]
-    rows: list[Row]
-    calls: dict[str, str]
-
-    @property
-    def group(self) -> str:
-        """Its folder; none of what commands share."""
-        return self.path.parent.name
-
-    @property
-    def title(self) -> str:
-        """What chooses it: group=option."""
-        return f"{self.group}={self.path.stem}"
-
-    @property
-    def anchor(self) -> str:
-        """Where it stands in the page."""
-        return "-".join(self.path.with_suffix("").parts)
+def anchor(file: ConfigFile) -> str:
+    """Return the anchor of a file in the page."""
+    return "-".join(file.path.with_suffix("").parts)
 
 
-def read(path: Path) -> Option:
-    """Return a file of conf/."""
-    text = path.read_text(encoding="utf-8")
-    lines = text.splitlines()
-    head = []
-    for line in lines:
-        if not line.startswith("#"):
-            break
-        head.append(line.lstrip("# ").rstrip())
-    whole = any(line.startswith("@package _global_") for line in head)
-    about = " ".join(line for line in head if not line.startswith("@package"))
-    relative = path.relative_to(CONF if path.is_relative_to(CONF) else path.parent)
-    prefix = "" if whole or len(relative.parts) == 1 else relative.parts[0]
-    rows: list[Row] = []
-    calls: dict[str, str] = {}
-    composed: list[str] = []
-    node = yaml.compose(text)
-    if node is not None:
-        for key, value in node.value:
-            if key.value == "defaults":
-                composed = [_entry(item) for item in value.value]
-                rows.append(Row("defaults", ", ".join(composed), ""))
-                continue
-            _collect(f"{prefix}.{key.value}" if prefix else key.value, key, value, text, rows)
-    for row in rows:
-        owner, _, last = row.key.rpartition(".")
-        if last == "_target_":
-            calls[owner] = row.default
-    return Option(relative, about, composed, rows, calls)
-
-
-def _collect(path: str, key: yaml.Node, value: yaml.Node, text: str, rows: list[Row]) -> None:
-    """Add the rows of a key and of all below it."""
-    whole = isinstance(value, yaml.MappingNode) and not value.flow_style
-    comment = _comment(text, key if whole else value)
-    if isinstance(value, yaml.MappingNode) and value.value:
-        if comment:
-            rows.append(Row(path, "", comment))
-        for below, node in value.value:
-            _collect(f"{path}.{below.value}", below, node, text, rows)
-    elif isinstance(value, yaml.SequenceNode) and any(
-        isinstance(item, yaml.MappingNode) for item in value.value
-    ):
-        for k, item in enumerate(value.value):
-            for below, node in item.value:
-                _collect(f"{path}[{k}].{below.value}", below, node, text, rows)
-    else:
-        rows.append(Row(path, _source(value, text), comment))
-
-
-def _entry(item: yaml.Node) -> str:
-    """Return an entry of a defaults list."""
-    if isinstance(item, yaml.ScalarNode):
-        return str(item.value)
-    return ", ".join(f"{key.value}: {chosen.value}" for key, chosen in item.value)
-
-
-def _source(node: yaml.Node, text: str) -> str:
-    return " ".join(text[node.start_mark.index : node.end_mark.index].split())
-
-
-def _comment(text: str, node: yaml.Node) -> str:
-    """Return the comment behind a node and on the lines of comment that follow."""
-    behind, *below = text[node.end_mark.index :].split("\n")
-    found = re.search(r"(?:^|[\s:])#\s*(.*)", behind)
-    parts = [found[1]] if found else []
-    for line in below:
-        if not parts or not line.lstrip().startswith("#"):
-            break
-        parts.append(line.strip().lstrip("#").strip())
-    return " ".join(parts)
-
-
-def options() -> list[Option]:
+def options() -> list[ConfigFile]:
     """Return all files in groups."""
-    return [read(path) for path in sorted(CONF.glob("*/*.yaml"))]
+    return [read(path, CONF) for path in sorted(CONF.glob("*/*.yaml"))]
 
 
-def shared() -> list[Option]:
+def shared() -> list[ConfigFile]:
     """Return the files that commands are composed of and that are no command's own."""
     return [
-        read(path)
+        read(path, CONF)
         for path in sorted(CONF.glob("*.yaml"))
         if not (PACKAGE / "commands" / f"{path.stem}.py").is_file()
     ]
@@ -151,9 +38,9 @@ def shared() -> list[Option]:
 
 def page() -> str:
     """Return the page."""
-    groups: dict[str, list[Option]] = {}
+    groups: dict[str, list[ConfigFile]] = {}
     for option in options():
-        groups.setdefault(option.group, []).append(option)
+        groups.setdefault(option.path.parent.name, []).append(option)
     parts = [
         "# Options\n",
         "Every file of `conf/`, read when this page was made. An option of a group is chosen by "
@@ -164,22 +51,24 @@ def page() -> str:
         "| --- | --- |",
     ]
     for group, members in groups.items():
-        links = ", ".join(f"[{one.path.stem}](#{one.anchor})" for one in members)
+        links = ", ".join(f"[{one.path.stem}](#{anchor(one)})" for one in members)
         parts.append(f"| [{group}](#group-{group}) | {links} |")
     for option in shared():
-        parts.append(f"\n## Keys of every {option.path.stem} {{ #{option.anchor} }}\n")
+        parts.append(f"\n## Keys of every {option.path.stem} {{ #{anchor(option)} }}\n")
         parts += body(option)
     for group, members in groups.items():
         parts.append(f"\n## {group} {{ #group-{group} }}\n")
         for option in members:
-            parts.append(f"\n### `{option.title}` {{ #{option.anchor} }}\n")
+            parts.append(f"\n### `{title(option)}` {{ #{anchor(option)} }}\n")
             parts += body(option)
     return "\n".join(parts) + "\n"
 
 
-def body(option: Option) -> Iterator[str]:
+def body(option: ConfigFile) -> Iterator[str]:
     """Yield the lines of one file."""
     yield f"{code_links(option.about)}\n"
+    if option.defaults:
+        yield f"Defaults: {', '.join(f'`{entry}`' for entry in option.defaults)}.\n"
     yield from table(option.rows, option.calls)
     for key, target in option.calls.items():
         yield from _defaulted(option, key, target)
@@ -256,7 +145,7 @@ def _signature(found: griffe.Object) -> list[griffe.Parameter]:
     return list(found.parameters)
 
 
-def _defaulted(option: Option, key: str, target: str) -> Iterator[str]:
+def _defaulted(option: ConfigFile, key: str, target: str) -> Iterator[str]:
     """Yield what Python defaults and the file leaves out."""
     start = f"{key}." if key else ""
     written = {row.key.removeprefix(start).split(".")[0].split("[")[0] for row in option.rows}

@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from dpl.commands import dry_run
+from dpl.commands import dry_run, help_text
 from dpl.config import CONF, ConfigError
 from dpl.system.files import DataSetError
 from dpl.version import install
@@ -56,6 +56,10 @@ def command(
             os.environ["DPL_CONF"] = str(CONF)
             check_sweep(sys.argv[1:])
             with readable_errors():
+                if {"-h", "--help"} & set(sys.argv[1:]):
+                    about = sys.modules[task.__module__].__doc__ or ""
+                    print(help_text.page(name, conf, about, sys.argv[1:]))
+                    sys.exit()
                 dry_run.check(name, conf, sys.argv[1:], rehearse)
             return started()
 

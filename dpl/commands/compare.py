@@ -4,16 +4,15 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from dpl import config, evaluation
 from dpl.commands.cli import command
-from dpl.config import build
-from dpl.evaluation import compare
 
 
 @command("evaluate")
 def main(cfg: DictConfig) -> None:
     """Print a table of all evaluated runs below a folder."""
-    build.check(cfg)
+    config.check(cfg)
     try:
-        compare(Path(cfg.run))
+        evaluation.compare(Path(cfg.run))
     except FileNotFoundError as error:
-        raise build.ConfigError(f"run: {error}") from error
+        raise config.ConfigError(f"run: {error}") from error

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 from rich.progress import Progress
 
+from dpl import config
 from dpl.commands.cli import command
-from dpl.config import build, run_folder
 from dpl.evaluation import tables as table
 
 if TYPE_CHECKING:
@@ -20,8 +20,8 @@ def main(cfg: DictConfig) -> None:
     """Measure all solvers on all loads; write rows, machine and figure; what is there is kept."""
     from dpl.evaluation import newton_starts
 
-    build.check(cfg)
-    runs = run_folder.load_runs(cfg.run, cfg.networks)
+    config.check(cfg)
+    runs = config.load_runs(cfg.run, cfg.networks)
     scene = next(iter(runs.values()))[1].scene
     networks = {name: surrogate.predict for name, (_, surrogate) in runs.items()}
     sets = newton_starts.load_sets(scene, cfg.count, cfg.far)
@@ -67,6 +67,6 @@ def _measured(raw: Path, names: list[str]) -> list["Trial"]:
     try:
         trials = table.read(Trial, raw)
     except ValueError as error:
-        raise build.ConfigError(f"{error}; remove it, or set resume=false") from error
+        raise config.ConfigError(f"{error}; remove it, or set resume=false") from error
     print(f"{len(trials):,} answers are in {raw}; resume=false measures them anew")
     return trials

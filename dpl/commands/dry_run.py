@@ -5,6 +5,7 @@ import itertools
 import logging
 import tempfile
 import typing
+from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -17,8 +18,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from dpl import config
 from dpl.commands import overrides
-from dpl.config import ConfigError, build
+from dpl.config import ConfigError
 
 BASIC = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
 REMOTE = "submitit"  # launchers of other machines, which can do what this one may not
@@ -43,12 +45,10 @@ def check(
     Raises:
         ConfigError: An override cannot be applied, a job cannot work, or its folder cannot be made.
     """
-    parser = get_args_parser()
-    parser.error = _unreadable
-    args = parser.parse_args(arguments)
+    args = arguments_of(arguments)
     if args.help or args.hydra_help or args.shell_completion or args.experimental_rerun:
         return
-    with _initialized(args.config_path or conf, args.config_dir):
+    with initialized(args.config_path or conf, args.config_dir):
         first, jobs = _jobs(args.config_name or name, args.overrides, args.multirun)
         if args.cfg or args.info is not None:
             return
@@ -56,7 +56,7 @@ def check(
         place = _folder(first, "sweep" if sweep else "run")
         every = [_job(cfg) for cfg in jobs or [first]]
     for cfg in every:
-        build.check(cfg)
+        config.check(cfg)
     if sweep and rehearse is not None and REMOTE not in str(first.hydra.launcher):
         logging.disable(logging.INFO)  # what trainers say of the machine, each job says again
         try:
@@ -67,6 +67,17 @@ def check(
     try_folder(place)
 
 
+def arguments_of(line: Sequence[str]) -> Namespace:
+    """Return the flags and overrides of a command line.
+
+    Raises:
+        ConfigError: A flag does not exist.
+    """
+    parser = get_args_parser()
+    parser.error = _unreadable
+    return parser.parse_args(line)
+
+
 def _unreadable(message: str) -> NoReturn:
     raise ConfigError(
         f"{message}; flags such as -m stand before or after all KEY=VALUE, see --help"
@@ -74,7 +85,7 @@ def _unreadable(message: str) -> NoReturn:
 
 
 @contextlib.contextmanager
-def _initialized(conf: str | Path, beside: str | None) -> Iterator[None]:
+def initialized(conf: str | Path, beside: str | None) -> Iterator[None]:
     """Let Hydra find configurations in a folder, and in one beside it (`--config-dir`).
 
     Raises:

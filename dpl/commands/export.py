@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
+from dpl import config
 from dpl.commands.cli import command
-from dpl.config import build, run_folder
 from dpl.evaluation import tables as table
 from dpl.system.files import atomic_write
 from dpl.version import install
@@ -31,15 +31,15 @@ def main(cfg: DictConfig) -> None:
     """Write the parts that are asked for."""
     from dpl.export.onnx_graph import missing
 
-    build.check(cfg)
+    config.check(cfg)
     if unknown := [part for part in cfg.parts if part not in PARTS]:
-        raise build.ConfigError(f"parts: {unknown[0]!r} is none of {', '.join(PARTS)}")
+        raise config.ConfigError(f"parts: {unknown[0]!r} is none of {', '.join(PARTS)}")
     if not cfg.parts:
-        raise build.ConfigError(f"parts: choose of {', '.join(PARTS)}")
+        raise config.ConfigError(f"parts: choose of {', '.join(PARTS)}")
     if "model" in cfg.parts and (absent := missing()):
         told = f"parts: model needs {', '.join(absent)}: {install('onnx')}, or take parts=[results]"
-        raise build.ConfigError(told)
-    _, surrogate = run_folder.load_run(cfg.run)
+        raise config.ConfigError(told)
+    _, surrogate = config.load_run(cfg.run)
     folder = Path(cfg.run) / "export" if cfg.folder is None else Path(cfg.folder)
     if "model" in cfg.parts:
         model(cfg, surrogate, folder)
@@ -60,7 +60,7 @@ def model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
     try:
         export(graph, path)
     except ValueError as error:
-        raise build.ConfigError(f"run: {error}") from error
+        raise config.ConfigError(f"run: {error}") from error
     seconds = time.perf_counter() - start
     session = Session(path)
     tried = check.trial(surrogate.scene, cfg.samples)
@@ -123,7 +123,7 @@ def _errors(folder: Path) -> dict[str, float] | None:
         rows = {row["solver"]: row["errors"] for row in json.loads(path.read_text())}
         return {str(key): float(value) for key, value in rows["network"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise build.ConfigError(
+        raise config.ConfigError(
             f"run: {path} is no evaluation; make it anew with python scripts/evaluate.py "
             f"run={folder}, or remove it"
         ) from error
@@ -139,7 +139,7 @@ def results(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
     from dpl.export import results as written
 
     if cfg.count < 1:
-        raise build.ConfigError(f"count = {cfg.count} must be 1 or more; or take parts=[model]")
+        raise config.ConfigError(f"count = {cfg.count} must be 1 or more; or take parts=[model]")
     for old in folder.glob("results_[0-9]*.vtu"):  # there may have been more
         old.unlink()
     load = surrogate.scene.loads.sample(SHOWN, range(cfg.count))

@@ -1,35 +1,38 @@
 """The data set alone: python scripts/generate.py data.train=4000 data.workers=8."""
 
 import sys
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
+from dpl import config
 from dpl.commands.cli import command
-from dpl.config import build
-from dpl.data import DataSet
-from dpl.scene import Scene
+
+if TYPE_CHECKING:
+    from dpl.data import DataSet
+    from dpl.scene import Scene
 
 ACTIONS = ("generate", "verify", "repair")
 
 
-def parts(cfg: DictConfig) -> tuple[Scene, DataSet]:
+def parts(cfg: DictConfig) -> tuple["Scene", "DataSet"]:
     """Return the scene and the data set that is wanted; nothing is solved or written.
 
     Raises:
         ConfigError: One of them cannot be built.
     """
     if cfg.action not in ACTIONS:
-        raise build.ConfigError(f"action = {cfg.action!r} must be one of {', '.join(ACTIONS)}")
-    scene = build.build_scene(cfg)
-    return scene, build.instantiate(cfg, "data", scene=scene)
+        raise config.ConfigError(f"action = {cfg.action!r} must be one of {', '.join(ACTIONS)}")
+    scene = config.build_scene(cfg)
+    return scene, config.instantiate(cfg, "data", scene=scene)
 
 
 @command("generate", rehearse=parts)
 def main(cfg: DictConfig) -> None:
     """Solve what is missing of a data set; or look whether it is sound; or make it so."""
-    build.check(cfg)
+    config.check(cfg)
     scene, data = parts(cfg)
-    build.show_skipped_work(scene, data)
+    config.show_skipped_work(scene, data)
     if cfg.action == "verify":
         flaws = list(data.verify())
         print(data.store.summary())

@@ -7,6 +7,7 @@ initialised Hydra (`hydra.initialize_config_dir`).
 
 import contextlib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -92,6 +93,12 @@ def _loader() -> Any:
 def options(group: str) -> list[str]:
     """Return the options of a group; none where there is no such group."""
     return sorted(_loader().get_group_options(group.partition("@")[0], ObjectType.CONFIG))
+
+
+def folders() -> list[Path]:
+    """Return the folders in which Hydra searches for configurations."""
+    search = _loader().get_search_path().get_path()
+    return [Path(one.path.removeprefix("file://")) for one in search if "://" not in one.path[7:]]
 
 
 def _reason(name: str, asked: list[Override], error: Exception) -> str:

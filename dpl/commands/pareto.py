@@ -4,14 +4,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from dpl import config
 from dpl.commands.cli import command
-from dpl.config import build, run_folder
 from dpl.evaluation import tables
 
 if TYPE_CHECKING:
@@ -25,7 +24,7 @@ def main(cfg: DictConfig) -> None:
     """Measure every solver, and the networks of a folder of runs; write rows and a figure."""
     from dpl.evaluation import pareto
 
-    build.check(cfg)
+    config.check(cfg)
     others = _discretisations(cfg)
     scene, solvers, batch = _solvers(cfg)
     rows: list[Point] = []
@@ -60,7 +59,7 @@ def _discretisations(cfg: DictConfig) -> list["Discretisation"]:
     try:
         return tables.read(Discretisation, Path(cfg.discretisation))
     except (OSError, ValueError) as error:
-        raise build.ConfigError(f"discretisation: {error}") from error
+        raise config.ConfigError(f"discretisation: {error}") from error
 
 
 def _show(title: str, rows: list["Point"]) -> None:
@@ -75,30 +74,32 @@ def _show(title: str, rows: list["Point"]) -> None:
 
 def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
     """Return the scene of some runs, every solver there is with their networks, and test loads."""
+    import torch
+
     from dpl.evaluation import methods, pareto
     from dpl.inference import Direct, default_hybrid
     from dpl.models import PODNet
 
-    runs = run_folder.load_runs(cfg.run)
+    runs = config.load_runs(cfg.run)
     first, surrogate = next(iter(runs.values()))
     scene = surrogate.scene
-    data = run_folder.load_data(first, scene)
+    data = config.load_data(first, scene)
     train = data.samples("train")
     robust = scene.solver
     solvers: dict[str, Solver] = {"linear": scene.linear}
     solvers |= {f"Newton to {tol:g}": robust.replace(tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
     if cfg.galerkin:
-        model = build.instantiate(cfg, "galerkin")(scene, train)
+        model = config.instantiate(cfg, "galerkin")(scene, train)
         solvers["POD-Galerkin"] = Direct(model.predict, scene.problem)
     for name, (trained, surrogate) in runs.items():
         predict = surrogate.predict
         solvers[name] = Direct(predict, scene.problem)
         if cfg.corrected and isinstance(surrogate.net, PODNet):
             row = methods.network(surrogate, Path(cfg.run) / name, trained.data.train)
-            tier = build.instantiate(cfg, "corrected")(surrogate, row, train)
+            tier = config.instantiate(cfg, "corrected")(surrogate, row, train)
             solvers[f"{name}, corrected"] = Direct(tier.predict, scene.problem)
         solvers[f"{name}, hybrid"] = default_hybrid(predict, scene)
         if torch.cuda.is_available():
-            copy = run_folder.load_run(Path(cfg.run) / name, scene=scene)[1]
+            copy = config.load_run(Path(cfg.run) / name, scene=scene)[1]
             solvers[f"{name}, GPU"] = Direct(pareto.on_gpu(copy), scene.problem)
     return scene, solvers, data.samples("test")

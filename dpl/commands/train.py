@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
+from dpl import config
 from dpl.commands import cli
-from dpl.config import build, run_folder
 from dpl.system.files import DataSetError
 
 if TYPE_CHECKING:
@@ -22,13 +22,13 @@ def parts(cfg: DictConfig) -> tuple["Scene", Any, "Surrogate", Any]:
     Raises:
         ConfigError: One of them cannot be built, or the run cannot be resumed.
     """
-    resumed = run_folder.check_resumed(cfg)
-    scene = build.build_scene(run_folder.with_mesh_of_resumed(cfg))
-    data = build.instantiate(cfg, "data", scene=scene)
-    surrogate = build.build_surrogate(cfg, scene)
+    resumed = config.check_resumed(cfg)
+    scene = config.build_scene(config.with_mesh_of_resumed(cfg))
+    data = config.instantiate(cfg, "data", scene=scene)
+    surrogate = config.build_surrogate(cfg, scene)
     if resumed is not None:
-        run_folder.check_weights(surrogate, resumed)
-    trainer = build.instantiate(cfg, "trainer")
+        config.check_weights(surrogate, resumed)
+    trainer = config.instantiate(cfg, "trainer")
     cli.check_trainer(trainer, cfg)
     return scene, data, surrogate, trainer
 
@@ -43,14 +43,14 @@ def main(cfg: DictConfig) -> float | None:
     from dpl.training import Diverged
     from dpl.training.callbacks import hparams
 
-    build.check(cfg)
+    config.check(cfg)
     folder = Path(cfg.folder)
     scene, data, surrogate, trainer = parts(cfg)
-    session = hparams.LogHyperparameters(build.hyperparameters(cfg))
+    session = hparams.LogHyperparameters(config.hyperparameters(cfg))
     trainer.callbacks.append(session)
     if trainer.is_global_zero:
-        build.show_skipped_work(scene, data, surrogate)
-        run_folder.save_config(cfg, folder)
+        config.show_skipped_work(scene, data, surrogate)
+        config.save_config(cfg, folder)
     try:
         trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path or None, weights_only=True)
     except Diverged as error:
@@ -63,18 +63,18 @@ def main(cfg: DictConfig) -> float | None:
         if (
             session.begun
             or not cfg.ckpt_path
-            or isinstance(error, build.ConfigError | DataSetError)
+            or isinstance(error, config.ConfigError | DataSetError)
         ):
             raise
         told = f"ckpt_path = {cfg.ckpt_path} cannot be resumed: {type(error).__name__}: {error}"
-        raise build.ConfigError(told) from error
+        raise config.ConfigError(told) from error
     finally:
         data.teardown("fit")  # which Lightning leaves out on Ctrl-C
     if torch.distributed.is_initialized():  # the judging is the first process's alone
         torch.distributed.destroy_process_group()
     if not trainer.is_global_zero:
         return None
-    _, best = run_folder.load_run(folder, trust=True, scene=scene)
+    _, best = config.load_run(folder, trust=True, scene=scene)
     rows = evaluate(best, data.samples("test"), folder)
     network = next(row for row in rows if row.solver == "network")
     if not math.isfinite(network.errors["e_mean"]):

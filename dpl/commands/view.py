@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
+from dpl import config
 from dpl.commands.cli import command
-from dpl.config import build, run_folder
 from dpl.version import install
 
 if TYPE_CHECKING:
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 @command("view")
 def main(cfg: DictConfig) -> None:
     """Serve the page until Ctrl-C; with `movie` write an animation instead."""
-    build.check(cfg)
+    config.check(cfg)
     if cfg.movie:
         _film(_body(cfg), Path(cfg.movie))
         return
     try:
         from dpl.viewer import Page
     except ImportError as error:
-        raise build.ConfigError(
+        raise config.ConfigError(
             f"the viewer cannot be used ({error}): {install('viewer')}"
         ) from error
     door = _door(cfg)
@@ -50,7 +50,7 @@ def _body(cfg: DictConfig) -> "Body":
     from dpl.viewer import Body
 
     torch.set_num_threads(1)
-    return Body(Simulator(run_folder.load_run(cfg.run)[1]))
+    return Body(Simulator(config.load_run(cfg.run)[1]))
 
 
 def _door(cfg: DictConfig) -> "AccessPolicy":
@@ -68,7 +68,7 @@ def _door(cfg: DictConfig) -> "AccessPolicy":
             describe = f"port = {cfg.port} is taken; name another, or port=0 for any that is free"
         else:
             describe = f"host = {cfg.host}, port = {cfg.port} cannot be served: {error.strerror}"
-        raise build.ConfigError(describe) from error
+        raise config.ConfigError(describe) from error
     if door.open_to_all:
         print(
             f"warning: host = {cfg.host}: whoever reaches this machine and has the address can "
@@ -93,11 +93,11 @@ def _film(body: "Body", path: Path) -> None:
     from dpl.viewer.recording import FORMATS
 
     if path.suffix not in FORMATS:
-        raise build.ConfigError(f"movie = {path} must end with {' or '.join(FORMATS)}")
+        raise config.ConfigError(f"movie = {path} must end with {' or '.join(FORMATS)}")
     try:
         animate_load(body, path)
     except ImportError as error:  # of what writes MP4
-        raise build.ConfigError(
+        raise config.ConfigError(
             f"movie: {path.suffix} needs {error.name}: {install('viewer')}"
         ) from error
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")

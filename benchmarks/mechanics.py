@@ -1,0 +1,206 @@
+"""Parts of the comparison of the mechanics with public codes, see `benchmarks.commands.benchmark`.
+
+Each part is a function of the configuration and of the linear backends to measure. It prints tables
+and returns rows to write, or writes them itself and returns None.
+"""
+
+import json
+import statistics
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from benchmarks import generation as ways
+from benchmarks import peers
+from dpl import Scene, config
+from dpl.evaluation.tables import machine, write, write_machine
+from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, installed_backends
+from dpl.fem.linear import BACKENDS
+from dpl.system.threads import one_thread
+
+if TYPE_CHECKING:
+    from benchmarks.sizes import Size
+
+
+CONSOLE = Console(width=150)
+PARTS = (
+    *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
+    *("discretisation", "sizes", "deflections"),
+)
+
+
+def run(cfg: DictConfig) -> None:
+    """Time the chosen parts, print tables and write the rows to `folder`.
+
+    Raises:
+        ConfigError: A part or a backend does not exist, or no backend is installed.
+    """
+    if unknown := [part for part in cfg.parts if part not in PARTS]:
+        raise config.ConfigError(f"parts: {unknown[0]!r} is none of {', '.join(PARTS)}")
+    if unknown := [name for name in cfg.linear if name not in ("auto", *BACKENDS)]:
+        known = ", ".join(("auto", *BACKENDS))
+        raise config.ConfigError(f"linear: {unknown[0]!r} is none of {known}")
+    backends = [name for name in cfg.linear if name == "auto" or name in installed_backends()]
+    if not backends:
+        raise config.ConfigError(
+            f"linear = {list(cfg.linear)} must name one that is installed: auto"
+        )
+    CONSOLE.print(f"{machine()}, 1 thread, medians of {cfg.repeats}")
+    folder = Path(cfg.folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for part in cfg.parts:
+        with one_thread():
+            results = globals()[part](cfg, backends)
+        if results is None:  # written by itself
+            continue
+        text = json.dumps({"machine": machine(), part: results}, indent=1, default=asdict)
+        (folder / f"{part}.json").write_text(text + "\n")
+    print(f"written to {folder}")
+
+
+def scenes(cfg: DictConfig, backends: list[str]) -> list[dict[str, peers.Time]]:
+    """Return the field's scenes, a row for each code measured here."""
+    rows = [peers.beams(name, cfg.repeats) for name in backends]
+    programs = Path(peers.__file__).parent / "programs"
+    for name, python in cfg.peers.items():
+        if python:
+            program = programs / f"{name}_beam.py"
+            try:
+                rows.append(peers.measured_peer(python, program, cfg.repeats))
+            except OSError as error:
+                raise config.ConfigError(f"peers.{name}: {error}") from error
+    table = Table("seconds (Newton iterations)", *peers.CASES, "residual, tip against the field")
+    for row in rows:
+        cells = [f"{t.seconds:.3f} ({t.iterations})" for t in row.values()]
+        table.add_row(row["S1"].what, *cells, row["S1"].note)
+    table.add_section()
+    for name, seconds in peers.PUBLISHED.items():
+        table.add_row(f"published: {name}", *(f"{s:.3f}" for s in seconds), "on a Zen 5 core")
+    CONSOLE.print(table)
+    return rows
+
+
+def pieces(cfg: DictConfig, backends: list[str]) -> list[peers.Time]:
+    """Return what an iteration on the beam is made of."""
+    return _listed(peers.pieces(3 * cfg.repeats), "beam of 12,000 degrees of freedom")
+
+
+def propeller(cfg: DictConfig, backends: list[str]) -> list[peers.Time]:
+    """Return the time of a random load on the propeller."""
+    rows = [peers.propellers(name, 4 * cfg.repeats) for name in backends if name != "band"]
+    return _listed(rows, "propeller of 12,075 degrees of freedom, one load")
+
+
+def large(cfg: DictConfig, backends: list[str]) -> list[peers.Time]:
+    """Return the time of an iteration on 100,548 degrees of freedom with the first backend."""
+    return _listed([peers.large(backends[0])], "beam of 100,548 degrees of freedom")
+
+
+def robustness(cfg: DictConfig, backends: list[str]) -> dict[str, dict[str, float]]:
+    """Return how many random loads are solved in one step and how many at all."""
+    builders: dict[str, Callable[[], Scene]] = {
+        "beam, NH-ln": partial(peers.beam_scene, NeoHookeanLn(0.3)),
+        "beam, SVK": partial(peers.beam_scene, SaintVenantKirchhoff(0.3)),
+        "propeller, NH-ln": peers.propeller_scene,
+    }
+    results = peers.robustness(builders, cfg.count, cfg.workers)
+    table = Table("random loads", *next(iter(results.values())))
+    for name, row in results.items():
+        table.add_row(name, *(f"{value:.4g}" for value in row.values()))
+    CONSOLE.print(table)
+    return results
+
+
+def generation(cfg: DictConfig, backends: list[str]) -> dict[str, list[ways.Cost]]:
+    """Return what a sample costs on one core, with and without what makes it faster."""
+    scenes = {
+        "paper's beam, NH-ln": peers.beam_scene(NeoHookeanLn(0.3)),
+        "paper's propeller, NH-ln": peers.propeller_scene(),
+    }
+    guess = None
+    if cfg.run is not None:
+        surrogate = config.load_run(cfg.run)[1]
+        scenes, guess = {cfg.run: surrogate.scene}, surrogate.predict
+    results = {}
+    for name, scene in scenes.items():
+        rows = results[name] = ways.costs(scene, cfg.samples, surrogate=guess)
+        table = Table(name, "ms", "samples/s on a core", "iterations", "factors", "accepted")
+        for row in rows:
+            count = f"{row.iterations:.2f}", f"{row.factorisations:.2f}"
+            done = f"{row.accepted}/{cfg.samples}"
+            table.add_row(row.way, f"{1e3 * row.seconds:.1f}", f"{row.rate:.2f}", *count, done)
+        CONSOLE.print(table)
+    return results
+
+
+def discretisation(cfg: DictConfig, backends: list[str]) -> None:
+    """Write the errors of coarser, finer and quadratic meshes of the beam and of the propeller."""
+    from benchmarks import discretisation as meshes
+
+    for name, law in (("beam_svk", SaintVenantKirchhoff(0.3)), ("propeller_nh", NeoHookeanLn(0.3))):
+        family = meshes.FAMILIES[name.partition("_")[0]]
+        rows = meshes.discretisations(family, law, repeats=cfg.repeats)
+        table = Table(
+            f"{name}: Newton to 1e-6 on", "DOFs", "ms", "value", "error against the limit"
+        )
+        for row in rows:
+            cells = f"{'x'.join(map(str, row.cells))}, degree {row.degree}"
+            numbers = f"{row.ms:.1f}", f"{row.value:.6g}", f"{row.error:.1e}"
+            table.add_row(cells, f"{row.dofs:,}", *numbers)
+        CONSOLE.print(table)
+        write(rows, Path(cfg.folder) / f"discretisation_{name}.csv")
+
+
+def sizes(cfg: DictConfig, backends: list[str]) -> None:
+    """Write what solvers and networks cost on beams of growing size."""
+    from benchmarks import sizes as beams
+
+    rows: list[Size] = []
+    table = Table("beam", "DOFs", "ms", "parameters", "memory [MB]", "peak [MB]")
+    with Progress() as progress:
+        bar = progress.add_task("beams", total=len(cfg.across))
+        for part in beams.sizes(cfg.across, loads=cfg.repeats):
+            rows += part
+            write(rows, Path(cfg.folder) / "sizes.csv")
+            progress.advance(bar)
+    for row in rows:
+        kept = "" if row.memory is None else f"{row.memory:.1f}"
+        count = "" if row.parameters is None else f"{row.parameters:,}"
+        table.add_row(row.what, f"{row.dofs:,}", f"{row.ms:.2f}", count, kept, f"{row.peak:.0f}")
+    CONSOLE.print(table)
+    beams.draw(rows, Path(cfg.folder) / "sizes.png")
+    write_machine(Path(cfg.folder) / "sizes.json")
+
+
+def deflections(cfg: DictConfig, backends: list[str]) -> None:
+    """Write how far test loads move the paper's beam and propeller, as rows and as histograms."""
+    from benchmarks import deflections as sizes
+
+    scenes = {
+        "beam_svk": peers.beam_scene(SaintVenantKirchhoff(0.3)),
+        "propeller_nh": peers.propeller_scene(),
+    }
+    rows = sizes.deflections(scenes, cfg.count, cfg.workers)
+    table = Table("largest nodal displacement / L", "loads", "smallest", "median", "largest")
+    for name, values in sizes.by_body(rows).items():
+        numbers = min(values), statistics.median(values), max(values)
+        table.add_row(name, f"{len(values)}", *(f"{number:.2g}" for number in numbers))
+    CONSOLE.print(table)
+    write(rows, Path(cfg.folder) / "deflections.csv")
+    sizes.draw(rows, Path(cfg.folder) / "deflections.png")
+
+
+def _listed(rows: list[peers.Time], title: str) -> list[peers.Time]:
+    table = Table(title, "ms", "iterations", "")
+    for row in rows:
+        count = f"{row.iterations:.1f}" if row.iterations == row.iterations else ""
+        table.add_row(row.what, f"{1e3 * row.seconds:.2f}", count, row.note)
+    CONSOLE.print(table)
+    return rows

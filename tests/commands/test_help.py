@@ -1,0 +1,66 @@
+"""Laws of `--help` and `--cfg job`: they explain every key and import no torch."""
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+ROOT = Path(__file__).parents[2]
+SCRIPTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py"))
+
+PROGRAM = textwrap.dedent(
+    """
+    import contextlib, io, runpy, sys
+    from hydra.core.global_hydra import GlobalHydra
+
+    for script in sys.argv[1:]:
+        for flags in (["--help"], ["--cfg", "job"]):
+            sys.argv = [script, *flags]
+            GlobalHydra.instance().clear()
+            told = io.StringIO()
+            with contextlib.redirect_stdout(told), contextlib.suppress(SystemExit):
+                runpy.run_path(script, run_name="__main__")
+            assert told.getvalue().strip(), (script, flags)
+            heavy = {"torch", "lightning", "numba", "skfem", "scipy"} & set(sys.modules)
+            assert not heavy, (script, flags, heavy)
+    """
+)
+
+
+def test_help_and_the_configuration_of_every_command_import_no_torch(environment, tmp_path):
+    paths = [str(ROOT / "scripts" / f"{name}.py") for name in SCRIPTS]
+    command = [sys.executable, "-c", PROGRAM, *paths]
+    ended = subprocess.run(
+        command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr[-2000:]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_help_names_every_key_in_at_most_100_columns(script, compose, folder_of, name, tmp_path):
+    ended = script(name, "--help", cwd=tmp_path)
+    assert ended.status in (0, None)
+    assert max(map(len, ended.out.splitlines())) <= 100
+    config = "evaluate" if name == "compare" else name
+    cfg = OmegaConf.to_container(compose(command=config), resolve=False)
+    lines = "\n".join(line.strip() for line in ended.out.splitlines())
+    for key in cfg:
+        assert any(f"\n{key}{end}" in lines for end in (" = ", "=", ".")), key
+
+
+def test_help_follows_the_options_of_the_command_line(script, tmp_path):
+    ended = script("train", "--help", "mesh=propeller", "optimizer.lr=0.25", cwd=tmp_path)
+    assert "mesh.blades = 5" in ended.out
+    assert "optimizer.lr = 0.25" in ended.out
+    assert "beam, file, paper_beam, propeller*, rectangle" in ended.out
+    assert "circle of the tips [m]" in ended.out, "the comment of a key"
+
+
+def test_help_of_a_wrong_option_ends_with_one_line(script, tmp_path):
+    ended = script("train", "--help", "modle=3", cwd=tmp_path)
+    assert ended.status == 2
+    assert ended.err == "error: modle: there is no such key; did you mean model?\n"
