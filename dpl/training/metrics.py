@@ -1,6 +1,6 @@
-"""How wrong a batch of displacements is: the paper's three numbers and those that explain them.
+"""Error metrics of predicted displacements: the three of the paper and five others.
 
-Every metric is updated with (prediction, batch): displacements over L, (B, N, D), and the `Sample`.
+Every metric is updated with (prediction, batch): displacements over L, (B, N, D), and a `Sample`.
 
 Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 3.1.
 """
@@ -15,20 +15,20 @@ from torchmetrics.utilities import dim_zero_cat
 from dpl.fem import Problem
 from dpl.scene import Sample
 
-ORDINALS = {1: "worst", 2: "2nd worst", 3: "3rd worst"}
+ORDINALS = {1: "largest", 2: "2nd largest", 3: "3rd largest"}
 
 
 def median(values: Tensor) -> Tensor:
     """Return the median along the first axis of (S, ...): (...).
 
-    Of an even number of values it is the mean of the two in the middle, where `torch.median` gives
-    the smaller one. It is NaN where a value is NaN.
+    The median of an even number of values is the mean of the middle two; `torch.median` returns the
+    smaller one. The median is NaN where a value is NaN.
     """
     return (values.median(dim=0).values - (-values).median(dim=0).values) / 2
 
 
 class _PerLoad(Metric):
-    """Keeps one number a load and reduces them in the end."""
+    """Base class: stores one number per load and reduces them in `compute`."""
 
     full_state_update = False
     values: list[Tensor]
@@ -38,26 +38,26 @@ class _PerLoad(Metric):
         self.add_state("values", default=[], dist_reduce_fx="cat")
 
     def update(self, prediction: Tensor, batch: Sample) -> None:
-        """Take in a batch."""
+        """Add the numbers of a batch."""
         self.values.append(self.measure(prediction.double(), batch))
 
     def compute(self) -> Tensor:
-        """Return the number over all loads."""
+        """Return the metric over all loads, ()."""
         return self.reduce(dim_zero_cat(self.values))
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
-        """Return a number for each load, (B,)."""
+        """Return one number per load, (B,)."""
         raise NotImplementedError
 
     def reduce(self, values: Tensor) -> Tensor:
-        """Return the number over all loads of (S,)."""
+        """Return the metric () from the numbers of all loads (S,)."""
         raise NotImplementedError
 
 
 class MeanError(_PerLoad):
-    """e_mean = 1/(N S) sum_s ||u_s - v_s||, N degrees of freedom.
+    """e_mean = 1/(N S) sum_s ||u_s - v_s||, with N degrees of freedom and S loads.
 
-    It shrinks like 1/sqrt(N) under refinement: never compare it across meshes.
+    It decreases like 1/sqrt(N) under refinement and must not be compared across meshes.
     """
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
@@ -70,7 +70,7 @@ class MeanError(_PerLoad):
 
 
 class MaxError(_PerLoad):
-    """e_max: the largest distance of a node from where it should be, over L."""
+    """e_max: the largest nodal error ||u - v|| over all nodes and loads, over L."""
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
         """See `_PerLoad`."""
@@ -82,10 +82,9 @@ class MaxError(_PerLoad):
 
 
 class MinSNR(_PerLoad):
-    """SNR_min in dB: 20 log10 of ||u||/||u - v|| of the worst load.
+    """SNR_min: the minimum of 20 log10(||u|| / ||u - v||) over loads [dB].
 
-    The paper prints 10 log10, half of it, but its tables are in power dB; `printed` gives the
-    formula as it stands there.
+    The formula in the paper has a factor of 10, its tables have 20; `printed` selects 10.
     """
 
     def __init__(self, *, printed: bool = False, **kwargs: Any) -> None:
@@ -103,7 +102,7 @@ class MinSNR(_PerLoad):
 
 
 class RelativeL2(_PerLoad):
-    """||u - v|| / ||v||: median over loads, or the worst."""
+    """||u - v|| / ||v||: median over loads, or maximum if `worst`."""
 
     def __init__(self, *, worst: bool = False, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -119,7 +118,7 @@ class RelativeL2(_PerLoad):
 
 
 class ResidualRatio(_PerLoad):
-    """Median of ||R_free(u)|| / ||f||: how far from equilibrium."""
+    """Median over loads of the relative residual ||R_free(u)|| / ||f||."""
 
     def __init__(self, problem: Problem, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -136,7 +135,7 @@ class ResidualRatio(_PerLoad):
 
 
 class MinVolumeRatio(_PerLoad):
-    """min det F over quadrature points and loads; not above 0: something is inverted."""
+    """min det F over quadrature points and loads; 0 or less means an inverted element."""
 
     def __init__(self, problem: Problem, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -152,7 +151,7 @@ class MinVolumeRatio(_PerLoad):
 
 
 def default_metrics(problem: Problem) -> MetricCollection:
-    """Return all of them, named as in the tables."""
+    """Return all metrics, named as in the tables."""
     return MetricCollection(
         {
             "e_mean": MeanError(),
@@ -173,50 +172,51 @@ def _error(prediction: Tensor, batch: Sample) -> Tensor:
 
 
 class PerLoadErrors(NamedTuple):
-    """How wrong the answers to some loads are.
+    """Errors of the predictions for some loads.
 
     Attributes:
         relative: Relative L2 errors, (B,) [-].
-        largest: Largest distance of a node from where it should be, over L, (B,) [-].
-        size: Largest true displacement over L, (B,) [-].
+        largest: Largest nodal errors over L, (B,) [-].
+        size: Largest nodal displacements of the reference over L, (B,) [-].
     """
 
     relative: Tensor
     largest: Tensor
     size: Tensor
 
-    def chosen(self, loads: int) -> list[int]:
-        """Return so many with the largest relative error, so many others with the largest absolute.
+    def select(self, count: int) -> list[int]:
+        """Return the loads to draw: 2 `count` with large errors and a typical one.
 
-        And a typical one, the median of the rest.
+        These are `count` loads with the largest relative error, `count` others with the largest
+        absolute error, and the load with the median relative error of the remaining ones.
         """
         relative, largest = self._order(self.relative), self._order(self.largest)
-        most = relative[:loads]
-        most += [load for load in largest if load not in most][:loads]
-        rest = [load for load in relative if load not in most]
-        return [*most, *rest[len(rest) // 2 :][:1]]
+        selected = relative[:count]
+        selected += [load for load in largest if load not in selected][:count]
+        others = [load for load in relative if load not in selected]
+        return [*selected, *others[len(others) // 2 :][:1]]
 
     @property
-    def farthest(self) -> int:
+    def largest_absolute(self) -> int:
         """The load with the largest absolute error."""
         return self._order(self.largest)[0]
 
     def title(self, load: int) -> str:
-        """Return what is said of a load, and how many are worse."""
+        """Return the caption of a load: its errors and their ranks."""
         orders = self._order(self.relative), self._order(self.largest)
-        first, second = (_rank(order.index(load) + 1, len(order)) for order in orders)
+        first, second = (_describe_rank(order.index(load) + 1, len(order)) for order in orders)
         return (
-            f"load {load}, moved by {self.size[load]:.2g} L\n"
+            f"load {load}, max displacement {self.size[load]:.2g} L\n"
             f"relative L2 {100 * self.relative[load]:.3g} %: {first}\n"
-            f"largest error {self.largest[load]:.2g} L: {second}"
+            f"max error {self.largest[load]:.2g} L: {second}"
         )
 
     @staticmethod
     def _order(errors: Tensor) -> list[int]:
-        """Return loads, the worst first; what is no number is worst of all."""
+        """Return loads by descending error; NaN counts as infinite."""
         known = torch.nan_to_num(errors, nan=torch.inf)
         return known.argsort(descending=True, stable=True).tolist()
 
 
-def _rank(place: int, count: int) -> str:
-    return ORDINALS.get(place, f"{place - 1} of {count} are worse")
+def _describe_rank(rank: int, count: int) -> str:
+    return ORDINALS.get(rank, f"rank {rank} of {count}")

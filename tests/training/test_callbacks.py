@@ -141,7 +141,7 @@ def test_meshes_can_be_left_out(scene, data, tmp_path):
     assert not found.Tags()["tensors"]
 
 
-@pytest.mark.parametrize("option", ["every", "loads", "most"])
+@pytest.mark.parametrize("option", ["every", "loads", "max_polygons"])
 def test_less_than_one_of_anything_is_refused(option):
     with pytest.raises(ValueError, match=f"{option} = 0 must be 1 or more"):
         WorstCasePlots(**{option: 0})
@@ -164,25 +164,25 @@ def test_the_loads_with_the_largest_errors_of_either_kind_are_chosen_and_a_typic
     relative = torch.tensor([0.1, 0.5, 0.2, 0.9, 0.3, 0.4, 0.15])
     largest = torch.tensor([0.7, 0.1, 0.8, 0.3, 0.9, 0.0, 0.05])
     judged = PerLoadErrors(relative, largest, torch.full((7,), 0.25))
-    assert judged.chosen(1) == [3, 4, 2], "2 is the third of the five that are left"
-    assert judged.chosen(2) == [3, 1, 4, 2, 6], "neither twice"
+    assert judged.select(1) == [3, 4, 2], "2 is the third of the five that are left"
+    assert judged.select(2) == [3, 1, 4, 2, 6], "neither twice"
     assert judged.title(3) == (
-        "load 3, moved by 0.25 L\nrelative L2 90 %: worst\nlargest error 0.3 L: 3 of 7 are worse"
+        "load 3, max displacement 0.25 L\nrelative L2 90 %: largest\nmax error 0.3 L: rank 4 of 7"
     )
 
 
 def test_a_load_that_is_worst_in_both_ways_is_shown_once_and_the_next_beside_it():
     worst = torch.tensor([0.1, 0.9, 0.2, 0.3, 0.05])
     judged = PerLoadErrors(worst, worst, worst)
-    assert judged.chosen(1) == [1, 3, 0]
-    assert judged.title(3).count("2nd worst") == 2
-    assert judged.chosen(3) == [1, 3, 2, 0, 4]
+    assert judged.select(1) == [1, 3, 0]
+    assert judged.title(3).count("2nd largest") == 2
+    assert judged.select(3) == [1, 3, 2, 0, 4]
 
 
 def test_an_answer_that_is_no_number_is_worst_of_all():
     errors = torch.tensor([0.1, torch.inf, torch.nan, 0.3])
     judged = PerLoadErrors(errors, errors, torch.ones(4))
-    assert set(judged.chosen(1)[:2]) == {1, 2}
+    assert set(judged.select(1)[:2]) == {1, 2}
 
 
 def test_one_load_is_enough(scene, data, tmp_path):

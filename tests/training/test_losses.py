@@ -187,7 +187,7 @@ def test_mse_evaluates_no_finite_element(few, physics, near, evaluations):
     gradient(MSE(), near, few, physics)
     assert evaluations == []
     assert MSE().skipped_work() == [
-        "no finite-element evaluation in training: the loss knows no residual"
+        "no finite-element evaluation in training: the loss has no residual term"
     ]
 
 

@@ -199,30 +199,32 @@ def test_a_load_is_told_by_its_size_its_errors_and_its_rank_in_each():
     largest = torch.tensor([0.4, 0.1, 0.2, 0.3])
     judged = PerLoadErrors(relative, largest, torch.tensor([0.2567, 0.1, 0.1, 0.1]))
     assert judged.title(0) == (
-        "load 0, moved by 0.26 L\nrelative L2 1.23 %: 3 of 4 are worse\nlargest error 0.4 L: worst"
+        "load 0, max displacement 0.26 L\nrelative L2 1.23 %: rank 4 of 4\nmax error 0.4 L: largest"
     )
     ranks = [[line.split(": ")[1] for line in judged.title(k).split("\n")[1:]] for k in (1, 2, 3)]
     assert ranks == [
-        ["worst", "3 of 4 are worse"],
-        ["2nd worst", "3rd worst"],
-        ["3rd worst", "2nd worst"],
+        ["largest", "rank 4 of 4"],
+        ["2nd largest", "3rd largest"],
+        ["3rd largest", "2nd largest"],
     ]
 
 
 def test_the_farthest_load_has_the_largest_absolute_error():
     relative, largest = torch.tensor([0.9, 0.1, 0.2]), torch.tensor([0.1, 0.8, 0.7])
-    assert PerLoadErrors(relative, largest, largest).farthest == 1
-    assert PerLoadErrors(relative, torch.tensor([0.1, 0.8, torch.nan]), largest).farthest == 2
+    assert PerLoadErrors(relative, largest, largest).largest_absolute == 1
+    assert (
+        PerLoadErrors(relative, torch.tensor([0.1, 0.8, torch.nan]), largest).largest_absolute == 2
+    )
 
 
 def test_equal_errors_are_in_the_order_of_the_loads():
     """Enough of them that a sort which is not stable would mix them."""
     same = torch.full((1000,), 0.5)
-    assert PerLoadErrors(same, same, same).chosen(3) == [*range(6), 503]
+    assert PerLoadErrors(same, same, same).select(3) == [*range(6), 503]
 
 
 def test_few_loads_are_all_chosen_and_none_twice():
     one = torch.tensor([0.5])
-    assert PerLoadErrors(one, one, one).chosen(2) == [0]
+    assert PerLoadErrors(one, one, one).select(2) == [0]
     two = torch.tensor([0.5, 0.7])
-    assert PerLoadErrors(two, two, two).chosen(1) == [1, 0]
+    assert PerLoadErrors(two, two, two).select(1) == [1, 0]

@@ -58,8 +58,8 @@ def test_a_bad_step_changes_nothing_and_is_counted(tmp_path, capsys, optimizer, 
     clean, none, _ = fit(tmp_path, GOOD, optimizer=optimizer, kind=kind)
     poisoned = [*GOOD[:10], BAD, *GOOD[10:20], BAD, BAD, *GOOD[20:]]
     module, guard, trainer = fit(tmp_path, poisoned, optimizer=optimizer, kind=kind)
-    assert (none.skipped, guard.skipped) == (0, 3)
-    assert float(trainer.callback_metrics["skipped"]) == 3
+    assert (none.skipped_steps, guard.skipped_steps) == (0, 3)
+    assert float(trainer.callback_metrics["skipped_steps"]) == 3
     assert all(map(torch.equal, module.parameters(), clean.parameters()))
     told = capsys.readouterr().err
     assert "epoch 0, step 10: gradients are not finite; the step is skipped" in told
@@ -67,20 +67,20 @@ def test_a_bad_step_changes_nothing_and_is_counted(tmp_path, capsys, optimizer, 
 
 
 def test_a_training_without_finite_steps_ends_in_words(tmp_path):
-    with pytest.raises(Diverged, match=r"3 steps in a row, .*learning rate of 5.0e-02; lower opt"):
+    with pytest.raises(Diverged, match=r"3 consecutive steps .*learning rate of 5.0e-02; reduce opt"):
         fit(tmp_path, [*GOOD[:5], *[BAD] * 9])
 
 
 def test_skipped_steps_that_are_not_in_a_row_do_not_end_it(tmp_path):
     _, guard, _ = fit(tmp_path, [part for good in GOOD for part in (BAD, BAD, good)])
-    assert guard.skipped == 80
+    assert guard.skipped_steps == 80
 
 
 def test_the_count_goes_on_in_a_resumed_run():
     guard, other = SkipNonFiniteGradients(), SkipNonFiniteGradients()
-    guard.skipped = 7
+    guard.skipped_steps = 7
     other.load_state_dict(guard.state_dict())
-    assert other.skipped == 7
+    assert other.skipped_steps == 7
 
 
 @pytest.mark.parametrize("patience", [0, -1])
@@ -95,7 +95,7 @@ def test_a_network_that_has_learnt_nothing_is_told(tmp_path, capsys, error, said
     trainer.callback_metrics["val/rel_L2_median"] = torch.tensor(error)
     capsys.readouterr()
     guard.on_train_end(trainer, trainer.lightning_module)
-    assert ("no better than no answer at all" in capsys.readouterr().err) == said
+    assert ("no better than a prediction of zero" in capsys.readouterr().err) == said
 
 
 def test_a_rate_far_too_high_ends_with_one_line(script, tiny_training, tmp_path):
@@ -103,7 +103,7 @@ def test_a_rate_far_too_high_ends_with_one_line(script, tiny_training, tmp_path)
     ended = script("train", *tiny_training, *wild, cwd=tmp_path)
     assert ended.status == 2
     last = ended.err.strip().splitlines()[-1]
-    assert last.startswith("error: training has diverged: 20 steps in a row")
+    assert last.startswith("error: training has diverged: the gradients of 20 consecutive steps")
     assert "lower optimizer.lr" in last
     assert "Traceback" not in ended.err
 

@@ -9,11 +9,11 @@ from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from dpl.training.callbacks.nonfinite_gradients import Diverged
-from dpl.training.callbacks.worst_cases import _boards, _step
+from dpl.training.callbacks.tensorboard import last_step, tensorboard_writers
 
 
 class LogLearningRate(LearningRateMonitor):
-    """Lightning's callback, which would end a training that has no logger."""
+    """Lightning's callback, without its error where the trainer has no logger."""
 
     def on_train_start(self, trainer: L.Trainer, *args: Any, **kwargs: Any) -> None:
         """Find the optimisers, if there is a logger."""
@@ -21,40 +21,41 @@ class LogLearningRate(LearningRateMonitor):
             super().on_train_start(trainer, *args, **kwargs)
 
     def on_train_batch_start(self, trainer: L.Trainer, *args: Any, **kwargs: Any) -> None:
-        """Log the rate, if there is a logger."""
+        """Log the learning rate, if there is a logger."""
         if trainer.loggers:
             super().on_train_batch_start(trainer, *args, **kwargs)
 
     def on_train_epoch_start(self, trainer: L.Trainer, *args: Any, **kwargs: Any) -> None:
-        """Log the rate, if there is a logger."""
+        """Log the learning rate, if there is a logger."""
         if trainer.loggers:
             super().on_train_epoch_start(trainer, *args, **kwargs)
 
 
 class LogHyperparameters(L.Callback):
-    """Tells loggers what makes this run differ from others, and how it ended.
+    """Logs the hyperparameters of a run, its state and its final errors.
 
-    TensorBoard's HPARAMS tab shows a run from its first step on, with the last of all its scalars;
-    one that was interrupted stays open, one that diverged has failed, one that was judged
-    (`finish`) has succeeded. A resumed run goes on in the same curves: what was written beyond the
-    checkpoint by the session before is withdrawn.
+    TensorBoard's HPARAMS tab lists a run from its first step on, with the last value of each of its
+    scalars. An interrupted run keeps the state "running", a diverged run has failed, an evaluated
+    run (`finish`) has succeeded. A resumed run continues the same curves: TensorBoard drops the
+    scalars that the interrupted session wrote after the checkpoint.
 
     Attributes:
-        hyperparameters: Flat, numbers, truth values and texts.
+        hyperparameters: Flat mapping of names to numbers, truth values and strings.
         begun: Whether an epoch has begun in this session.
     """
 
     def __init__(self, hyperparameters: Mapping[str, bool | int | float | str]) -> None:
-        """Keep what to tell."""
+        """Store the hyperparameters."""
         self.hyperparameters = dict(hyperparameters)
         self.begun = False
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Remember that what is resumed has been restored."""
+        """Record that the checkpoint of a resumed run has been restored."""
         self.begun = True
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Tell what run this is."""
+        """Log the hyperparameters and the start of the session."""
+        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from torch.utils.tensorboard.summary import hparams
 
         if not trainer.is_global_zero:
@@ -62,52 +63,49 @@ class LogHyperparameters(L.Callback):
         for logger in trainer.loggers:
             if not isinstance(logger, TensorBoardLogger):
                 logger.log_hyperparams(self.hyperparameters)
-        # not the list of columns, which Lightning would write: it hides those of other runs
+        # without the list of columns that Lightning would write: it hides columns of other runs
         _, start, _ = hparams(self.hyperparameters, {})
-        for board in _boards(trainer):
-            writer = board._get_file_writer()
-            writer.add_event(_started(), trainer.global_step)  # readers count the second one
-            writer.add_summary(start)
+        # at the second start of a session readers drop events of later steps
+        session = Event(session_log=SessionLog(status=SessionLog.START))
+        for writer in tensorboard_writers(trainer):
+            events = writer._get_file_writer()
+            events.add_event(session, trainer.global_step)
+            events.add_summary(start)
 
     def on_exception(
         self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
     ) -> None:
-        """Tell that a training diverged; others can be resumed."""
+        """Log the failure of a diverged training; other exceptions leave the run resumable."""
         if isinstance(exception, Diverged):
-            for board in _boards(trainer):
-                board._get_file_writer().add_summary(_end(failed=True))
+            _log_end(trainer, failed=True)
 
     def finish(self, trainer: L.Trainer, errors: Mapping[str, float]) -> None:
-        """Tell the errors of the best weights on the test loads, as `best/NAME`.
+        """Log the errors of the best weights on the test loads as `best/NAME`.
 
-        So they come first in the HPARAMS tab, which sorts by name and shows a few.
+        The HPARAMS tab sorts its columns by name and shows the first ones, so these are visible.
         """
         if not trainer.is_global_zero:
             return
         named = {f"best/{name}": value for name, value in errors.items()}
         for logger in trainer.loggers:
-            logger.log_metrics(named, step=_step(trainer))
-        for board in _boards(trainer):
-            board._get_file_writer().add_summary(_end(failed=False))
+            logger.log_metrics(named, step=last_step(trainer))
+        _log_end(trainer, failed=False)
         for logger in trainer.loggers:
             logger.save()
             logger.finalize("success")
 
 
-def _started() -> Any:
-    """Return the event of a session's start: readers drop what they have of later steps."""
-    from tensorboard.compat.proto.event_pb2 import Event, SessionLog
-
-    return Event(session_log=SessionLog(status=SessionLog.START))
-
-
-def _end(*, failed: bool) -> Any:
-    """Return the summary that ends a session of the HPARAMS tab."""
+def _log_end(trainer: L.Trainer, *, failed: bool) -> None:
+    """Write the end of the session for the HPARAMS tab."""
+    # torch writes no failures, and tensorboard.plugins.hparams.summary imports TensorFlow
     from tensorboard.compat.proto.summary_pb2 import Summary
     from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 
     status = api_pb2.STATUS_FAILURE if failed else api_pb2.STATUS_SUCCESS
     info = plugin_data_pb2.SessionEndInfo(status=status, end_time_secs=time.time())
-    data = plugin_data_pb2.HParamsPluginData(session_end_info=info)
-    described = metadata.create_summary_metadata(data)
-    return Summary(value=[Summary.Value(tag=metadata.SESSION_END_INFO_TAG, metadata=described)])
+    data = metadata.create_summary_metadata(
+        plugin_data_pb2.HParamsPluginData(session_end_info=info)
+    )
+    end = Summary(value=[Summary.Value(tag=metadata.SESSION_END_INFO_TAG, metadata=data)])
+    for writer in tensorboard_writers(trainer):
+        writer._get_file_writer().add_summary(end)

@@ -1,4 +1,4 @@
-"""Steps that are not finite: skipped, counted, and the end of a training that has no others."""
+"""Skip and count optimiser steps with non-finite gradients; stop a training that diverged."""
 
 import sys
 from typing import Any
@@ -8,77 +8,80 @@ import torch
 
 
 class Diverged(ArithmeticError):
-    """A training that has no finite gradients any more, and what to do about it."""
+    """Raised when the gradients of many consecutive steps are not finite."""
 
 
 class SkipNonFiniteGradients(L.Callback):
-    """Skips the steps whose gradients are not finite, and ends a training that has no others.
+    """Skips optimiser steps with non-finite gradients and stops a training that diverged.
 
-    A sample, a loss or a slope that is infinite or not a number shows in the gradients; a step with
-    them would be the end of all weights. Such a step is left out (momenta and weights stay as they
-    are) and counted under `skipped`, and the count is kept in checkpoints.
+    Every infinite or NaN sample, loss or gradient makes the gradient norm non-finite, and a step
+    with it would make all weights NaN. Such a step changes neither weights nor momenta. The number
+    of skipped steps is logged as `skipped_steps` and stored in checkpoints.
 
     Attributes:
-        patience: Skipped steps one after the other that end the training.
-        skipped: All of them so far.
+        patience: Number of consecutive skipped steps that stops the training.
+        skipped_steps: Number of skipped steps so far.
     """
 
     def __init__(self, *, patience: int = 20) -> None:
-        """Choose when to give up.
+        """Choose the number of consecutive skipped steps that stops the training.
 
         Raises:
             ValueError: `patience` is less than 1.
         """
         if patience < 1:
             raise ValueError(f"patience = {patience} must be 1 or more")
-        self.patience, self.skipped, self._running = patience, 0, 0
+        self.patience = patience
+        self.skipped_steps = 0
+        self._consecutive = 0
 
     def on_before_optimizer_step(
         self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: torch.optim.Optimizer
     ) -> None:
-        """Take the gradients away if one of them is not finite.
+        """Remove the gradients, which skips the step, if one of them is not finite.
 
         Raises:
-            Diverged: So many steps in a row had such gradients.
+            Diverged: `patience` consecutive steps had non-finite gradients.
         """
         parameters = [p for group in optimizer.param_groups for p in group["params"]]
         norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
         if norm.isfinite():
-            self._running = 0
+            self._consecutive = 0
             return
         for parameter in parameters:
             parameter.grad = None
         where = f"epoch {trainer.current_epoch}, step {trainer.global_step}"
-        if not self._running:
+        if not self._consecutive:
             print(f"{where}: gradients are not finite; the step is skipped", file=sys.stderr)
-        self.skipped, self._running = self.skipped + 1, self._running + 1
-        pl_module.log("skipped", float(self.skipped))
-        if self._running >= self.patience:
+        self.skipped_steps += 1
+        self._consecutive += 1
+        pl_module.log("skipped_steps", float(self.skipped_steps))
+        if self._consecutive >= self.patience:
             rates = {group["lr"] for group in optimizer.param_groups}
             raise Diverged(
-                f"training has diverged: {self._running} steps in a row, up to {where}, had no "
-                f"finite gradients, at a learning rate of {max(rates):.1e}; lower optimizer.lr "
-                "(the best checkpoint so far, if there is one, is whole)"
+                f"training has diverged: the gradients of {self._consecutive} consecutive steps up "
+                f"to {where} were not finite at a learning rate of {max(rates):.1e}; reduce "
+                "optimizer.lr (an existing best checkpoint is still valid)"
             )
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Say how many steps were skipped, and if what was learnt is worth nothing."""
+        """Print the number of skipped steps, and a warning if the median error is 100 % or more."""
         if not trainer.is_global_zero:
             return
-        if self.skipped:
-            print(f"{self.skipped} steps were skipped: gradients not finite", file=sys.stderr)
+        if self.skipped_steps:
+            print(f"{self.skipped_steps} steps were skipped: gradients not finite", file=sys.stderr)
         error = trainer.callback_metrics.get("val/rel_L2_median")
         if error is not None and not error < 1:
             print(
-                f"the network is no better than no answer at all: its median relative error is "
-                f"{float(error):.1e}; a lower optimizer.lr or longer training may help",
+                f"the network is no better than a prediction of zero: its median relative error is "
+                f"{float(error):.1e}; reduce optimizer.lr or train for more epochs",
                 file=sys.stderr,
             )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the count."""
-        return {"skipped": self.skipped}
+        """Return the number of skipped steps."""
+        return {"skipped_steps": self.skipped_steps}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on counting."""
-        self.skipped = int(state_dict["skipped"])
+        """Restore the number of skipped steps."""
+        self.skipped_steps = int(state_dict["skipped_steps"])

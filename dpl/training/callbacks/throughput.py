@@ -1,4 +1,4 @@
-"""Log how many samples per second a training sees, and how much memory it holds."""
+"""Log the samples per second and the memory of a training."""
 
 import os
 import time
@@ -15,21 +15,28 @@ from dpl.data import OnlineData
 
 
 class ThroughputMonitor(L.Callback):
-    """Logs how fast samples are made and used, once an epoch, validation left out.
+    """Logs throughput and memory once per epoch; the time of validation does not count.
 
-    `rate/steps` and `rate/consumed` (samples) a second; of a stream besides `rate/produced`
-    (samples a second), `online/waiting` (part of the time in which the optimiser had nothing to
-    do), `online/uses` (of a sample, on average) and `online/buffer` (samples). `memory/process`
-    and, on a GPU, the most that was taken of it, `memory/gpu` [GB].
+    - `rate/steps`: Optimiser steps per second.
+    - `rate/consumed`: Samples per second that the optimiser reads.
+    - `memory/process`: Resident memory of this process [GB].
+    - `memory/gpu`: Peak memory on a GPU [GB].
+
+    With a stream of samples also:
+
+    - `rate/produced`: Samples per second that the workers solve.
+    - `online/waiting`: Fraction of the time in which the optimiser waits for samples.
+    - `online/uses`: Mean number of times that a sample is read.
+    - `online/buffer`: Samples in the replay buffer.
     """
 
     def __init__(self) -> None:
-        """Start with nothing counted."""
+        """Start with zero counts."""
         self._steps = self._samples = 0
         self._seconds = self._mark = 0.0
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Start counting."""
+        """Reset the counts."""
         self._steps, self._samples, self._seconds = trainer.global_step, 0, 0.0
         self._mark = time.perf_counter()
 
@@ -41,17 +48,17 @@ class ThroughputMonitor(L.Callback):
         batch: Sequence[Tensor],
         batch_idx: int,
     ) -> None:
-        """Count a batch and its time."""
+        """Add the samples and the time of a batch."""
         now = time.perf_counter()
         self._seconds, self._mark = self._seconds + now - self._mark, now
         self._samples += len(batch[0])
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Leave its time out."""
+        """Restart the clock after a validation."""
         self._mark = time.perf_counter()
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Log the epoch; of several processes the sums."""
+        """Log throughput and memory; rates of samples and memory are sums over processes."""
         seconds = max(self._seconds, 1e-9)
         sums = {"rate/consumed": self._samples / seconds, "memory/process": resident_memory()}
         means = {"rate/steps": (trainer.global_step - self._steps) / seconds}
@@ -66,7 +73,7 @@ class ThroughputMonitor(L.Callback):
 
 
 def resident_memory() -> float:
-    """Return the memory that this process holds [GB]; zero where the system does not say."""
+    """Return the resident memory of this process [GB]; 0 where /proc is not available."""
     with suppress(OSError):
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e9

@@ -1,4 +1,4 @@
-"""Keep the training time of a run in its checkpoints."""
+"""Record the wall time of a training."""
 
 import time
 from pathlib import Path
@@ -10,14 +10,16 @@ from dpl.system.files import append_jsonl
 
 
 class TrainingTime(L.Callback):
-    """Writes how long a training took, bases and validations included, the data set not.
+    """Appends a line to `training.jsonl` at the end of each session of a training.
 
-    A line of `training.jsonl` for each session: seconds, steps at its end, threads, device.
+    The line holds the wall time with bases and validations but without data generation
+    [s], the number of optimiser steps, the number of threads and the device.
     """
 
     def __init__(self, *, folder: str | Path) -> None:
-        """Choose where to write: the folder of the run."""
-        self.path, self._start = Path(folder) / "training.jsonl", 0.0
+        """Choose the folder of the run."""
+        self.path = Path(folder) / "training.jsonl"
+        self._start = 0.0
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         """Start the clock."""
@@ -30,7 +32,7 @@ class TrainingTime(L.Callback):
     def on_exception(
         self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
     ) -> None:
-        """Write the line of a session that was interrupted."""
+        """Write the line of an interrupted session."""
         self._write(trainer, pl_module)
 
     def _write(self, trainer: L.Trainer, module: L.LightningModule) -> None:

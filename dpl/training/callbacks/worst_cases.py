@@ -1,27 +1,28 @@
-"""What a run shows while it trains: its worst loads, its rates, and how it stands beside others.
+"""Write pictures and meshes of the validation loads with the largest errors for TensorBoard.
 
-Scalars go to whatever loggers there are; pictures, meshes and the HPARAMS tab to TensorBoard's.
-Steps are those of Lightning's scalars: the first is 0. docs/monitoring.md says what each tag means.
+docs/monitoring.md describes each tag.
 """
 
 import time
-from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import lightning as L
 import numpy as np
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from dpl.fem import surface
 from dpl.fem.postprocess import coarse, triangles
 from dpl.scene import Sample, Scene
+from dpl.training.callbacks.tensorboard import last_step, tensorboard_writers
 from dpl.training.metrics import MaxError, PerLoadErrors, RelativeL2
 from dpl.visualization import error_colours, plot_deformed, plot_errors
 
-GREY = 160  # of a true shape
-LOOK = {  # of meshes in the browser, in the words of three.js
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+REFERENCE_GREY = 160  # of reference shapes, 0 to 255
+MESH_STYLE = {  # three.js options of meshes in the browser
     "camera": {"cls": "PerspectiveCamera", "fov": 35},
     "lights": [
         {"cls": "AmbientLight", "color": "#ffffff", "intensity": 0.9},
@@ -32,105 +33,125 @@ LOOK = {  # of meshes in the browser, in the words of three.js
 
 
 class WorstCasePlots(L.Callback):
-    """Draws the validation loads on which the network is worst, for TensorBoard.
+    """Draws the validation loads with the largest errors for TensorBoard.
 
-    Under `validation/shapes` the loads with the largest relative and the largest absolute error
-    beside a typical one; under `validation/errors` the errors of all; as the mesh
-    `validation/worst` the load with the largest absolute error, to be turned: the prediction
-    coloured by its error (blue: a thousandth of the largest or less, yellow: the largest), the
-    truth below it in grey.
+    - `validation/shapes`: the loads with the largest relative and the largest absolute error, and
+      the load with the median relative error of the others.
+    - `validation/errors`: the errors of all loads.
+    - `validation/worst`: a mesh of the load with the largest absolute error. The prediction is
+      coloured by its error (yellow: the largest error; blue: a thousandth of it or less); the
+      reference is shown below it in grey.
+    - `time/pictures`: fraction of the training time that drawing took.
 
-    Pictures come after `every` validations, twice, four times as many and so on, and at the end of
-    the training; `time/pictures` is the part of the training's time that they took.
+    Pictures are drawn after `every`, 2 `every`, 4 `every`, ... validations and at the end of the
+    training.
     """
 
     def __init__(
-        self, *, every: int = 5, loads: int = 1, meshes: bool = True, most: int = 5000
+        self, *, every: int = 5, loads: int = 1, meshes: bool = True, max_polygons: int = 5000
     ) -> None:
-        """Choose how often and how much.
+        """Choose the frequency and the content of the pictures.
 
         Args:
-            every: Validations before the first picture.
-            loads: Shown of each kind of error.
-            meshes: Whether there are meshes.
-            most: Polygons of a body; larger bodies are drawn coarser.
+            every: Number of validations before the first picture.
+            loads: Number of loads drawn for each kind of error.
+            meshes: Also write meshes.
+            max_polygons: Maximum number of polygons of a surface; larger meshes are coarsened.
 
         Raises:
             ValueError: A number is less than 1.
         """
-        for name, number in (("every", every), ("loads", loads), ("most", most)):
+        numbers = {"every": every, "loads": loads, "max_polygons": max_polygons}
+        for name, number in numbers.items():
             if number < 1:
                 raise ValueError(f"{name} = {number} must be 1 or more")
-        self.loads, self.meshes, self.most = loads, meshes, most
-        self._seen, self._next, self._last = 0, every, -1
-        self._begin = self._spent = 0.0
+        self.loads = loads
+        self.meshes = meshes
+        self.max_polygons = max_polygons
+        self._validations, self._next, self._drawn_step = 0, every, -1
+        self._start = self._drawing_time = 0.0
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Start the clock."""
-        self._begin, self._spent = time.perf_counter(), 0.0
+        self._start = time.perf_counter()
+        self._drawing_time = 0.0
 
     def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
-        """Draw after so many validations."""
+        """Count validations and draw when the count reaches the next picture."""
         if trainer.sanity_checking or trainer.state.fn != "fit":
             return
-        self._seen += 1
-        if self._seen >= self._next:
+        self._validations += 1
+        if self._validations >= self._next:
             self._next *= 2
             self._draw(trainer, pl_module)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: Any) -> None:
-        """Draw the last state."""
-        if _step(trainer) != self._last:
+        """Draw the final state unless it has been drawn."""
+        if last_step(trainer) != self._drawn_step:
             self._draw(trainer, pl_module)
 
     def state_dict(self) -> dict[str, int]:
-        """Return how many validations there were, and when the next picture comes."""
-        return {"seen": self._seen, "next": self._next}
+        """Return the number of validations and that of the next picture."""
+        return {"validations": self._validations, "next": self._next}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Go on counting."""
-        self._seen, self._next = state_dict["seen"], state_dict["next"]
+        """Restore the counts."""
+        self._validations, self._next = state_dict["validations"], state_dict["next"]
 
     def _draw(self, trainer: L.Trainer, module: Any) -> None:
-        boards = list(_boards(trainer))
-        if not boards or getattr(trainer, "datamodule", None) is None:
+        writers = list(tensorboard_writers(trainer))
+        if not writers or getattr(trainer, "datamodule", None) is None:
             return
         start = time.perf_counter()
-        step = self._last = _step(trainer)
-        truth = trainer.datamodule.samples("val")
+        step = self._drawn_step = last_step(trainer)
         training = module.training
         module.eval()
-        judged = per_sample_errors(module, truth, trainer.datamodule.batch_size)
-        chosen = judged.chosen(self.loads)
-        worst = chosen.index(judged.farthest)
-        some = Sample(*(column[chosen] for column in truth))
-        predicted = _predict(module, some)
-        module.train(training)
-        problem, names = module.scene.problem, [judged.title(load) for load in chosen]
-        shown = [("", predicted)]
-        shapes = plot_deformed(
-            problem, some.displacement, shown, names=names, upright=True, max_polygons=self.most
+        shapes, errors, mesh = self._pictures(
+            module, trainer.datamodule.samples("val"), trainer.datamodule.batch_size
         )
-        errors = plot_errors(judged.relative, judged.size, chosen)
-        for board in boards:
-            board.add_figure("validation/shapes", shapes, step)
-            board.add_figure("validation/errors", errors, step)
-            if self.meshes and predicted[worst].isfinite().all():
-                pair = side_by_side_mesh(
-                    module.scene, predicted[worst], some.displacement[worst], self.most
+        module.train(training)
+        for writer in writers:
+            writer.add_figure("validation/shapes", shapes, step)
+            writer.add_figure("validation/errors", errors, step)
+            if mesh:
+                writer.add_mesh(
+                    "validation/worst", **mesh, config_dict=MESH_STYLE, global_step=step
                 )
-                board.add_mesh("validation/worst", **pair, config_dict=LOOK, global_step=step)
-        self._spent += time.perf_counter() - start
-        part = self._spent / (time.perf_counter() - self._begin)
-        for board in boards:
-            board.add_scalar("time/pictures", part, step)
+        self._drawing_time += time.perf_counter() - start
+        fraction = self._drawing_time / (time.perf_counter() - self._start)
+        for writer in writers:
+            writer.add_scalar("time/pictures", fraction, step)
+
+    def _pictures(
+        self, module: Any, samples: Sample, batch_size: int
+    ) -> tuple["Figure", "Figure", dict[str, Tensor] | None]:
+        """Return the figures of shapes and errors, and the mesh of the largest absolute error."""
+        errors = per_sample_errors(module, samples, batch_size)
+        selected = errors.select(self.loads)
+        some = Sample(*(column[selected] for column in samples))
+        predicted = _predict(module, some)
+        shapes = plot_deformed(
+            module.scene.problem,
+            some.displacement,
+            [("", predicted)],
+            names=[errors.title(load) for load in selected],
+            upright=True,
+            max_polygons=self.max_polygons,
+        )
+        worst = selected.index(errors.largest_absolute)
+        mesh = None
+        if self.meshes and predicted[worst].isfinite().all():
+            mesh = side_by_side_mesh(
+                module.scene, predicted[worst], some.displacement[worst], self.max_polygons
+            )
+        return shapes, plot_errors(errors.relative, errors.size, selected), mesh
 
 
-def per_sample_errors(module: Any, truth: Sample, batch_size: int) -> PerLoadErrors:
-    """Return how wrong a surrogate is on loads with the truth, (B, ...)."""
+def per_sample_errors(module: Any, samples: Sample, batch_size: int) -> PerLoadErrors:
+    """Return the errors of a surrogate on samples (S, N, D), evaluated in batches."""
     relative, largest = RelativeL2(), MaxError()
     parts = []
-    for columns in zip(*(column.split(batch_size) for column in truth), strict=True):
+    for columns in zip(*(column.split(batch_size) for column in samples), strict=True):
         batch = Sample(*columns)
         prediction = _predict(module, batch)
         size = batch.displacement.norm(dim=2).amax(dim=1)
@@ -143,35 +164,38 @@ def per_sample_errors(module: Any, truth: Sample, batch_size: int) -> PerLoadErr
 
 
 def side_by_side_mesh(
-    scene: Scene, prediction: Tensor, truth: Tensor, most: int
+    scene: Scene, prediction: Tensor, reference: Tensor, max_polygons: int
 ) -> dict[str, Tensor]:
-    """Return a prediction (N, D) [-] and, below it, the truth as one mesh for TensorBoard.
+    """Return a mesh for TensorBoard: the predicted surface, and the reference surface below it.
 
-    The surface in triangles. Its first half of vertices is where the prediction puts them, in
-    metres, its second half where they should be, moved down.
+    The first half of the vertices belongs to the prediction, the second half to the reference.
 
     Args:
-        scene: Whose body it is.
-        prediction: Finite.
-        truth: (N, D) [-].
-        most: Polygons, see `dpl.fem.postprocess.coarse`.
+        scene: The scene of both displacements.
+        prediction: Displacements over L, (N, D) [-], finite.
+        reference: Displacements over L, (N, D) [-].
+        max_polygons: Maximum number of polygons, see `dpl.fem.postprocess.coarse`.
 
     Returns:
-        vertices: (1, V, 3) [m].
-        colors: (1, V, 3), 0 to 255.
-        faces: (1, F, 3).
+        The arguments of `SummaryWriter.add_mesh`:
+
+        - vertices: (1, V, 3) [m].
+        - colors: (1, V, 3), 0 to 255.
+        - faces: Triangles, (1, F, 3).
     """
     points = scene.problem.points.cpu().numpy()
-    polygons = coarse(points, surface(scene.problem.mesh), most)
+    polygons = coarse(points, surface(scene.problem.mesh), max_polygons)
     used, flat = np.unique(triangles(polygons), return_inverse=True)
     faces = flat.reshape(-1, 3)
     shapes = []
-    for field in (prediction, truth):
+    for field in (prediction, reference):
         shape = np.zeros((len(used), 3))
         shape[:, : points.shape[1]] = scene.length * (points + field.cpu().numpy())[used]
         shapes.append(shape)
     error = np.linalg.norm(shapes[0] - shapes[1], axis=1)
-    paint = np.concatenate([error_colours(error), np.full((len(used), 3), GREY, np.uint8)])
+    paint = np.concatenate(
+        [error_colours(error), np.full((len(used), 3), REFERENCE_GREY, np.uint8)]
+    )
     both = np.concatenate(shapes)
     shapes[1][:, 1] -= 1.1 * np.ptp(both[:, 1])
     return {
@@ -181,21 +205,8 @@ def side_by_side_mesh(
     }
 
 
-def _boards(trainer: L.Trainer) -> Iterator[Any]:
-    """Yield TensorBoard's writers; none in any but the first process."""
-    if trainer.is_global_zero:
-        for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                yield logger.experiment
-
-
-def _step(trainer: L.Trainer) -> int:
-    """Return the step under which Lightning writes the scalars of the step before this moment."""
-    return max(0, trainer.global_step - 1)
-
-
 def _predict(module: Any, batch: Sample) -> Tensor:
-    """Return what a surrogate answers, on the CPU."""
+    """Return the displacements that a surrogate predicts, on the CPU."""
     with torch.no_grad():
         load = Sample(*(column.to(module.device) for column in batch)).load
         return module.predict(load).cpu()

@@ -1,4 +1,4 @@
-"""Losses: supervised, from residuals, from energies."""
+"""Losses of displacements: supervised, residual-based and energy-based."""
 
 from typing import TYPE_CHECKING
 

@@ -1,35 +1,41 @@
-"""Losses from the energy: in the norm of K(0), or the potential energy itself."""
+"""Energy-based losses: the energy norm of the error, and the potential energy."""
 
 import torch
 from torch import Tensor
 
 from dpl.fem.postprocess import RestStiffness, potential_energy
 from dpl.scene import Sample
-from dpl.training.losses.loss import Loss, LossContext, _checked, clamp_scale
-from dpl.training.losses.supervised import _FixedGradient
+from dpl.training.losses.loss import (
+    Loss,
+    LossContext,
+    PrescribedGradient,
+    check_floor,
+    clamp_scale,
+)
 
 
 class EnergyNormLoss(Loss):
-    """Squared energy norm of the error with the rest stiffness: e^T K(0) e / v^T K(0) v, e = u - v.
+    """Squared energy norm of the error, e^T K(0) e / v^T K(0) v with e = u - v.
 
-    The squared relative error of strains rather than of displacements: a rough error, harmless to
-    the eye and in the MSE, is stiff and costs Newton its first steps; here it weighs what it costs.
-    One sparse product with a matrix that is assembled once, and no finite element in training.
+    This is the squared relative error of strains. High-frequency errors are small in the MSE but
+    have a large stiffness-weighted norm and cost Newton its first iterations; this loss weights
+    them accordingly. An evaluation is one product with the sparse matrix K(0), assembled once.
     """
 
     def __init__(self, *, relative: bool = True, floor: float = 1e-2) -> None:
         """Choose the weighting.
 
         Args:
-            relative: Divide each sample's error by the energy of its own displacement; otherwise
-                all by the mean energy of the batch.
-            floor: See `clamp_scale`; only where `relative`.
+            relative: Divide the error of each sample by the energy of its displacement; otherwise
+                by the mean energy of the batch.
+            floor: See `clamp_scale`; has no effect without `relative`.
 
         Raises:
             ValueError: `floor` is out of range.
         """
         super().__init__()
-        self.relative, self.floor = relative, _checked(floor)
+        self.relative = relative
+        self.floor = check_floor(floor)
         self._rest: RestStiffness | None = None
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
@@ -41,7 +47,7 @@ class EnergyNormLoss(Loss):
             error, size = (fields * images).sum(dim=(1, 2)).chunk(2)
             size = clamp_scale(size, self.floor if self.relative else torch.inf)
             slope = 2 * images[: len(prediction)] / size[:, None, None]
-        return _FixedGradient.apply(prediction, error / size, slope).mean()
+        return PrescribedGradient.apply(prediction, error / size, slope).mean()
 
     def skipped_work(self) -> list[str]:
         """See `Loss`."""
@@ -49,19 +55,20 @@ class EnergyNormLoss(Loss):
 
 
 class PotentialEnergyLoss(Loss):
-    """Total potential energy (W(u) - W(0) - f.u) / (f.K(0)^-1 f / 2): equilibria without answers.
+    """Total potential energy (W(u) - W(0) - f.u) / (f.K(0)^-1 f / 2), without reference solutions.
 
-    Displacements of the batch are not read: stable equilibria are the minima. The scale is the work
-    of the linear answer, so that every load counts alike, a light one or one on a single node (a
-    scale of ||f||^2 would hardly see that one: nearly all of its norm lies in stiff modes). Near
-    rest the loss is -1 + the squared relative energy norm of the error. Its conditioning is that of
-    K(0): outputs in modes over the roots of their eigenvalues learn fast, free nodal values slowly,
-    as their noise is stiff; those begin better with another loss, see `BlendedLoss`.
+    Stable equilibria minimise the potential energy, so the displacements of the batch are not read.
+    The scale is the work of the linear solution, which weights all loads equally. (||f||^2 would
+    give little weight to a load on a single node, whose norm lies in stiff modes.) For small
+    displacements the loss is -1 plus the squared relative energy norm of the error. It is
+    conditioned like K(0). A network with modal outputs, scaled by the inverse roots of the
+    eigenvalues, therefore learns fast. A network with nodal outputs learns slowly and should start
+    with another loss, see `BlendedLoss`.
 
-    Where elements are inverted the energy is no number or leads to a body inside out. Such a sample
-    takes u^T K(0) u / 2 on the same scale instead, without its load: positive, and downhill to
-    rest, rough strains first, where nothing is inverted. (With the load it would lead to the linear
-    answer, which may be inverted itself.)
+    Where elements are inverted, the energy is NaN or has minima with inverted elements. The loss of
+    such a sample is u^T K(0) u / 2 on the same scale, without the load. It is positive and
+    decreases towards u = 0, where no element is inverted. With the load it would decrease towards
+    the linear solution, which can have inverted elements.
 
     Source: Samaniego, Anitescu, Goswami et al. (2020), CMAME 362, for energies as losses.
     """
@@ -76,7 +83,7 @@ class PotentialEnergyLoss(Loss):
             ValueError: `floor` is out of range.
         """
         super().__init__()
-        self.floor = _checked(floor)
+        self.floor = check_floor(floor)
         self._rest: RestStiffness | None = None
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
@@ -90,8 +97,10 @@ class PotentialEnergyLoss(Loss):
                 energy = torch.where(sound, energy, (prediction * image).sum(dim=(1, 2)) / 2)
                 slope = torch.where(sound[:, None, None], slope, image)
             self.terms = {"inverted": 1 - sound.double().mean()}
-        return _FixedGradient.apply(prediction, energy / scale, slope / scale[:, None, None]).mean()
+        return PrescribedGradient.apply(
+            prediction, energy / scale, slope / scale[:, None, None]
+        ).mean()
 
     def skipped_work(self) -> list[str]:
         """See `Loss`."""
-        return ["no displacement of the data set in the loss: it is the energy itself"]
+        return ["no displacement of the data set in the loss: it is the potential energy"]

@@ -1,4 +1,7 @@
-"""Losses from the residual of equilibrium: L_r^* and L_r^+ of the paper."""
+"""Residual-based losses L_r^* and L_r^+.
+
+Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.3.
+"""
 
 import lightning as L
 import torch
@@ -6,22 +9,21 @@ from torch import Tensor
 
 from dpl.fem.postprocess import tangent_product
 from dpl.scene import Sample
-from dpl.training.losses.loss import Loss, LossContext, squared_error
-from dpl.training.losses.supervised import _FixedGradient
+from dpl.training.losses.loss import Loss, LossContext, PrescribedGradient, squared_error
 
 
 class LrStar(Loss):
-    """L_r^* = MSE x ||R|| / ||Phi q_max||, the residual a constant weight without gradient.
+    """L_r^* = MSE x ||R|| / ||Phi q_max||; the residual norm is a weight without gradient.
 
-    The residual norm is averaged over the batch as in the paper, where it scales the gradient of
-    the whole batch; per sample it also weighs the samples of a batch against each other.
+    As in the paper, the residual norm is averaged over the batch and scales the gradient of the
+    whole batch. With `per_sample` it also weights the samples of a batch relative to each other.
     """
 
     def __init__(self, *, per_sample: bool = False) -> None:
         """Choose the weighting.
 
         Args:
-            per_sample: Weigh each sample by its own residual instead of the batch's mean.
+            per_sample: Weight each sample by its own residual norm, not by the mean of the batch.
         """
         super().__init__()
         self.per_sample = per_sample
@@ -36,22 +38,22 @@ class LrStar(Loss):
 
     def skipped_work(self) -> list[str]:
         """See `Loss`."""
-        return ["no backward pass through the residual: it is a weight"]
+        return ["no backward pass through the residual: it is a constant weight"]
 
 
 class LrPlus(Loss):
     """L_r^+ = MSE + weight ||R|| / ||Phi q_max||, differentiable through the residual.
 
     Attributes:
-        weight: Factor on the residual at present [-].
+        weight: Current factor on the residual [-].
     """
 
     def __init__(self, *, weight: float = 1.0, warmup_epochs: int = 0) -> None:
-        """Choose how much the residual counts.
+        """Choose the factor on the residual.
 
         Args:
-            weight: Factor on the residual; 1 is the paper's.
-            warmup_epochs: Epochs in which it rises linearly from zero.
+            weight: Final factor on the residual; the paper has 1.
+            warmup_epochs: Number of epochs in which the factor rises linearly from zero.
 
         Raises:
             ValueError: A number is negative.
@@ -61,11 +63,12 @@ class LrPlus(Loss):
             raise ValueError(
                 f"weight = {weight}, warmup_epochs = {warmup_epochs} must be 0 or more"
             )
-        self._final, self._warmup = weight, warmup_epochs
+        self._final = weight
+        self._warmup = warmup_epochs
         self.weight = weight if warmup_epochs == 0 else 0.0
 
     def on_train_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """Anneal the weight."""
+        """Set the weight of the epoch."""
         if self._warmup:
             self.weight = self._final * min(1.0, trainer.current_epoch / self._warmup)
 
@@ -80,9 +83,9 @@ class LrPlus(Loss):
 def residual_norm(prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
     """Return ||R_free(u)|| / ||Phi q_max||, (B,) [-].
 
-    Its slope K R / ||R|| takes two more evaluations, see `tangent_product`. Where elements are
-    inverted so far that the law has no stress, the norm is not finite; such samples take the
-    largest finite norm of the batch (1 if there is none) and no gradient.
+    Its gradient K R / ||R|| takes two more evaluations, see `tangent_product`. If elements are
+    inverted so far that the law has no stress, the norm is not finite. Such samples get the largest
+    finite norm of the batch (1 if there is none) and a zero gradient.
     """
     problem = physics.problem.at(batch.poisson)
     residual = torch.where(problem.free, problem.evaluate(prediction).internal - batch.force, 0.0)
@@ -95,4 +98,4 @@ def residual_norm(prediction: Tensor, batch: Sample, physics: LossContext) -> Te
     unit = residual / length.clamp(min=torch.finfo(length.dtype).tiny)[:, None, None]
     slope = tangent_product(problem, prediction.detach(), unit) / physics.largest_force
     slope = torch.where(slope.isfinite() & sound[:, None, None], slope, 0.0)
-    return _FixedGradient.apply(prediction, norm, slope)
+    return PrescribedGradient.apply(prediction, norm, slope)

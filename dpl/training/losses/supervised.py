@@ -1,22 +1,11 @@
-"""Physics losses: callables (prediction, batch, physics) -> scalar, Lightning callbacks too.
+"""Supervised losses: squared errors of displacements."""
 
-The module carries its loss into the trainer (`configure_callbacks`), so that a loss may anneal
-between epochs and log its own terms. Where mechanics enters, slopes come from the compiled forces
-of `Problem.evaluate` and not from automatic differentiation, which takes 3 to 17 times as long.
-
-Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.3, for the first three.
-"""
-
-from typing import Any
-
-import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from dpl.scene import Sample
-from dpl.training.losses.loss import Loss, LossContext, _checked, clamp_scale, squared_error
+from dpl.training.losses.loss import Loss, LossContext, check_floor, clamp_scale, squared_error
 
-SMALLEST_SQUARE = 1e-24  # square of an error below which a norm has no slope [-]
+SMALLEST_SQUARE = 1e-24  # added to squared errors: the root has no gradient at zero [-]
 
 
 class MSE(Loss):
@@ -26,9 +15,9 @@ class MSE(Loss):
         """Choose the weighting.
 
         Args:
-            relative: Power of the mean square of its own displacement that each sample's error is
-                divided by: at 1 small loads count as much as large ones, at 0 by their size.
-            floor: See `clamp_scale`; only where `relative` is above 0.
+            relative: Exponent of the mean squared displacement by which the error of each sample is
+                divided. 1 gives relative errors, 0 absolute errors.
+            floor: See `clamp_scale`; has no effect if `relative` is 0.
 
         Raises:
             ValueError: A number is out of range.
@@ -36,7 +25,8 @@ class MSE(Loss):
         super().__init__()
         if not 0 <= relative <= 1:
             raise ValueError(f"relative = {relative} must lie between 0 and 1")
-        self.relative, self.floor = relative, _checked(floor)
+        self.relative = relative
+        self.floor = check_floor(floor)
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         """See `Loss`."""
@@ -44,7 +34,7 @@ class MSE(Loss):
         return self.from_squared_errors(squared_error(prediction, batch), size)
 
     def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
-        """Return the loss of mean squared errors (B,) of displacements of mean squares (B,)."""
+        """Return the loss () of mean squared errors (B,) and mean squared displacements (B,)."""
         return self._weighted(error, size).mean()
 
     def _weighted(self, error: Tensor, size: Tensor) -> Tensor:
@@ -52,30 +42,16 @@ class MSE(Loss):
 
     def skipped_work(self) -> list[str]:
         """See `Loss`."""
-        return ["no finite-element evaluation in training: the loss knows no residual"]
+        return ["no finite-element evaluation in training: the loss has no residual term"]
 
 
 class RMSELoss(MSE):
-    """Mean over samples of the root mean square error of u/L: e_mean, but for a factor.
+    """Mean over samples of the root mean square error of u/L: e_mean times the root of N.
 
-    Its slope does not fade as the error falls, and no sample with a large error outweighs a batch.
+    Its gradient does not vanish with the error, and samples with large errors dominate a batch less
+    than in the mean squared error.
     """
 
     def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
         """See `MSE`."""
         return (self._weighted(error, size) + SMALLEST_SQUARE).sqrt().mean()
-
-
-class _FixedGradient(torch.autograd.Function):
-    """Values (B,) of displacements (B, N, D), their slope (B, N, D) found by other means."""
-
-    @staticmethod
-    def forward(ctx: Any, displacement: Tensor, value: Tensor, slope: Tensor) -> Tensor:
-        ctx.save_for_backward(slope)
-        return value.clone()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        (slope,) = ctx.saved_tensors
-        return gradient[:, None, None] * slope, None, None
