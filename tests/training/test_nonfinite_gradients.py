@@ -104,7 +104,7 @@ def test_a_rate_far_too_high_ends_with_one_line(script, tiny_training, tmp_path)
     assert ended.status == 2
     last = ended.err.strip().splitlines()[-1]
     assert last.startswith("error: training has diverged: the gradients of 20 consecutive steps")
-    assert "lower optimizer.lr" in last
+    assert "reduce optimizer.lr" in last
     assert "Traceback" not in ended.err
 
 
