@@ -67,7 +67,7 @@ def test_a_bad_step_changes_nothing_and_is_counted(tmp_path, capsys, optimizer, 
 
 
 def test_a_training_without_finite_steps_ends_in_words(tmp_path):
-    with pytest.raises(Diverged, match=r"3 consecutive steps .*learning rate of 5.0e-02; reduce opt"):
+    with pytest.raises(Diverged, match=r"3 consecutive steps .*rate of 5.0e-02; reduce opt"):
         fit(tmp_path, [*GOOD[:5], *[BAD] * 9])
 
 
