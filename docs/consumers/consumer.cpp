@@ -1,4 +1,4 @@
-// What an export answers, in C++ with ONNX Runtime: ./consumer runs/mine/export [tolerance]
+// Evaluate an exported surrogate with ONNX Runtime: ./consumer runs/mine/export [tolerance]
 #include <onnxruntime_cxx_api.h>
 
 #include <cmath>
@@ -22,7 +22,8 @@ int main(int argc, char** argv) {
   Ort::AllocatorWithDefaultOptions memory;
   const auto cpu = Ort::MemoryInfo::CreateCpu(OrtArenaAllocator, OrtMemTypeDefault);
 
-  std::vector<std::string> names;  // force (B, N, D) [N], young (B,) [Pa], perhaps poisson (B,)
+  // force (B, N, D) [N], young (B,) [Pa] and, if the law has a range, poisson (B,)
+  std::vector<std::string> names;
   std::vector<std::vector<double>> data;
   std::vector<Ort::Value> inputs;
   for (size_t k = 0; k < session.GetInputCount(); ++k) {
@@ -33,19 +34,20 @@ int main(int argc, char** argv) {
     inputs.push_back(Ort::Value::CreateTensor<double>(cpu, data.back().data(), data.back().size(),
                                                       shape.data(), shape.size()));
   }
-  std::vector<const char*> given;
-  for (const auto& name : names) given.push_back(name.c_str());
-  const char* wanted[] = {"displacement"};  // (B, N, D) [m]
-  const auto answers = session.Run({}, given.data(), inputs.data(), inputs.size(), wanted, 1);
-  const double* answer = answers[0].GetTensorData<double>();
+  std::vector<const char*> input_names;
+  for (const auto& name : names) input_names.push_back(name.c_str());
+  const char* output_names[] = {"displacement"};  // (B, N, D) [m]
+  const auto outputs = session.Run({}, input_names.data(), inputs.data(), inputs.size(),
+                                   output_names, 1);
+  const double* displacement = outputs[0].GetTensorData<double>();
 
-  double apart = 0, size = 0;
+  double difference = 0, size = 0;
   const auto expected = read(folder + "/reference/displacement.f64");
   for (size_t i = 0; i < expected.size(); ++i) {
-    apart += std::pow(answer[i] - expected[i], 2);
+    difference += std::pow(displacement[i] - expected[i], 2);
     size += std::pow(expected[i], 2);
   }
-  const double error = std::sqrt(apart / size);
+  const double error = std::sqrt(difference / size);
   std::cout << expected.size() << " numbers, " << error << " from the reference\n";
   return !(error <= (argc > 2 ? std::stod(argv[2]) : 1e-4));
 }

@@ -1,6 +1,6 @@
-"""A trained surrogate for others, and its results for ParaView: python scripts/export.py run=...
+"""Command `python scripts/export.py run=...`: ONNX model and results for ParaView.
 
-Ends with 1 where the graph is farther from torch than `tol`.
+The exit status is 1 if ONNX and torch differ by more than `tol`.
 """
 
 import json
@@ -15,107 +15,146 @@ from omegaconf import DictConfig
 
 from dpl import config
 from dpl.commands.cli import command
-from dpl.evaluation import tables as table
+from dpl.evaluation import tables
 from dpl.system.files import atomic_write
 from dpl.version import install
 
 if TYPE_CHECKING:
+    from dpl.export.comparison import BatchLatency, OutputDifference
+    from dpl.export.onnx_graph import ExportGraph, OnnxSession
     from dpl.training import Surrogate
 
 PARTS = ("model", "results")
-SHOWN = (0, 12)  # the stream of the loads in results
+RESULT_STREAM = (0, 12)  # random stream of the loads in results
 
 
 @command("export")
 def main(cfg: DictConfig) -> None:
-    """Write the parts that are asked for."""
-    from dpl.export.onnx_graph import missing
+    """Write the parts that `parts` names."""
+    from dpl.export.onnx_graph import missing_packages
 
     config.check(cfg)
     if unknown := [part for part in cfg.parts if part not in PARTS]:
-        raise config.ConfigError(f"parts: {unknown[0]!r} is none of {', '.join(PARTS)}")
+        raise config.ConfigError(f"parts = {unknown[0]!r} must be one of {', '.join(PARTS)}")
     if not cfg.parts:
-        raise config.ConfigError(f"parts: choose of {', '.join(PARTS)}")
-    if "model" in cfg.parts and (absent := missing()):
-        told = f"parts: model needs {', '.join(absent)}: {install('onnx')}, or take parts=[results]"
-        raise config.ConfigError(told)
+        raise config.ConfigError(f"parts = [] must contain one of {', '.join(PARTS)}")
+    if "results" in cfg.parts and cfg.count < 1:
+        raise config.ConfigError(f"count = {cfg.count} must be 1 or more; or use parts=[model]")
+    if "model" in cfg.parts and (absent := missing_packages()):
+        raise config.ConfigError(
+            f"parts: model needs {', '.join(absent)}: {install('onnx')}, or use parts=[results]"
+        )
     _, surrogate = config.load_run(cfg.run)
     folder = Path(cfg.run) / "export" if cfg.folder is None else Path(cfg.folder)
     if "model" in cfg.parts:
-        model(cfg, surrogate, folder)
+        export_model(cfg, surrogate, folder)
     if "results" in cfg.parts:
-        results(cfg, surrogate, folder / "results")
+        export_results(cfg, surrogate, folder / "results")
 
 
-def model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
-    """Write the graph and what goes with it; compare it with torch, and time both."""
-    from dpl.evaluation import timing
-    from dpl.export import check, export, opset, read_reference, verify, write
-    from dpl.export.folder import described, reference
-    from dpl.export.onnx_graph import NEEDED, Graph, Session
-    from dpl.inference import Simulator
+def export_model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
+    """Write the graph and its folder, compare the graph with torch, and measure latencies."""
+    from dpl.export import (
+        ExportGraph,
+        OnnxSession,
+        comparison,
+        export_onnx,
+        verify_folder,
+        write_folder,
+    )
+    from dpl.export.metadata import describe
+    from dpl.export.reference import solve_reference
 
-    graph, path = Graph(surrogate), folder / "model.onnx"
+    graph, path = ExportGraph(surrogate), folder / "model.onnx"
     start = time.perf_counter()
     try:
-        export(graph, path)
+        export_onnx(graph, path)
     except ValueError as error:
         raise config.ConfigError(f"run: {error}") from error
     seconds = time.perf_counter() - start
-    session = Session(path)
-    tried = check.trial(surrogate.scene, cfg.samples)
-    compared = check.compare(graph, session, tried)
-    told = reference(graph)
-    meta = described(graph, path, told, tol=cfg.tol, errors=_errors(Path(cfg.run)))
-    write(folder, surrogate, told, meta)
-    verify(folder, surrogate, told, meta)
-    kept = read_reference(folder)
-    again = session(*(kept[name] for name in graph.inputs))
-    repeated = float(check.distance(again.displacement, kept["displacement"]).max())
-    worst = max(repeated, *(row.error for row in compared))
-    times = check.clock(graph, session, tried, calls=cfg.repeats)
-    sample = surrogate.scene.loads.sample(check.TRIED, range(cfg.samples))
-    measured = timing.latencies(Simulator(surrogate), sample)
-    report: dict[str, Any] = {
+    session = OnnxSession(path)
+    loads = comparison.sample_check_loads(surrogate.scene, cfg.samples)
+    differences = comparison.compare_outputs(graph, session, loads)
+    reference = solve_reference(graph)
+    meta = describe(graph, path, reference, tol=cfg.tol, errors=_test_errors(Path(cfg.run)))
+    write_folder(folder, surrogate, reference, meta)
+    verify_folder(folder, surrogate, reference, meta)
+    reference_error = _reference_error(folder, graph, session)
+    largest = max(reference_error, *(row.max_error for row in differences))
+    times = comparison.measure_latency(graph, session, loads, calls=cfg.repeats)
+    report = {
         "network": type(surrogate.net).__name__,
-        "passed": worst <= cfg.tol,
+        "passed": largest <= cfg.tol,
         "tolerance": cfg.tol,
-        "largest_error": worst,
-        "reference_error": repeated,
-        "loads": [{key: _known(value) for key, value in asdict(row).items()} for row in compared],
-        "milliseconds": [asdict(row) for row in times],
-        "latency": {name: asdict(one) for name, one in measured.items()},
-        "threads": 1,
-        "repeats": cfg.repeats,
+        "largest_error": largest,
+        "reference_error": reference_error,
+        **_report(cfg, surrogate, path, differences, times),
         "export_seconds": round(seconds, 2),
-        "bytes": sum(file.stat().st_size for file in folder.glob("model.onnx*")),
-        "opset": opset(path),
-        "machine": table.machine(),
-        "versions": {name: version(name) for name in ("torch", *NEEDED)},
     }
     with atomic_write(folder / "report.json") as file:
         file.write((json.dumps(report, indent=1) + "\n").encode())
-    table.show(compared, "ONNX against torch")
-    table.show(times, "bare network, loads of the range that are not local [ms], 1 thread")
-    print(timing.describe(measured))
     if not report["passed"]:
         for part in folder.glob("model.onnx*"):
             part.unlink()
-        told_of = f"{worst:.2g} of an answer, more than tol = {cfg.tol:g}; {path} is removed"
-        print(f"error: ONNX and torch differ by {told_of}", file=sys.stderr)
-        sys.exit(1)
-    if graph.flags:
         print(
-            "output 'local': loads whose linear answer the basis of the network misses by more "
-            f"than {surrogate.net.linear_tol:.2g}; dpl answers these with a factor of K(0), "
-            "which is not in the graph, and the graph's answer is off by as much as 'local error'"
+            f"error: ONNX and torch differ by {largest:.2g}, more than tol = {cfg.tol:g}; {path} "
+            "was removed",
+            file=sys.stderr,
         )
-    size = report["bytes"] / 1e6
-    print(f"largest difference {worst:.1e}; {path}, {size:.3g} MB, {seconds:.1f} s to write")
+        sys.exit(1)
+    if graph.has_local_output:
+        print(
+            "output 'local' marks loads whose linear solution has a projection error above "
+            f"{surrogate.net.linear_tol:.2g} in the basis of the network. dpl solves these loads "
+            "with a factor of K(0), which the graph does not contain; see max_local_error."
+        )
+    megabytes = report["bytes"] / 1e6
+    print(f"largest difference {largest:.1e}; {path}, {megabytes:.3g} MB, {seconds:.1f} s to write")
 
 
-def _errors(folder: Path) -> dict[str, float] | None:
-    """Return the errors of the network on the test set; None if it was not evaluated."""
+def _reference_error(folder: Path, graph: "ExportGraph", session: "OnnxSession") -> float:
+    """Return the relative difference of ONNX and the reference displacement on disk [-]."""
+    from dpl.export import comparison, read_reference
+
+    stored = read_reference(folder)
+    found = session(*(stored[name] for name in graph.inputs))
+    return float(comparison.relative_differences(found.displacement, stored["displacement"]).max())
+
+
+def _report(
+    cfg: DictConfig,
+    surrogate: "Surrogate",
+    path: Path,
+    differences: list["OutputDifference"],
+    times: list["BatchLatency"],
+) -> dict[str, Any]:
+    """Print differences and latencies, and return them with versions and file size."""
+    from dpl.evaluation import timing
+    from dpl.export.comparison import CHECK_STREAM
+    from dpl.export.onnx_graph import PACKAGES, onnx_opset
+    from dpl.inference import Simulator
+
+    sample = surrogate.scene.loads.sample(CHECK_STREAM, range(cfg.samples))
+    latencies = timing.latencies(Simulator(surrogate), sample)
+    tables.show(differences, "ONNX against torch")
+    tables.show(times, "network, loads in the training range that are not local [ms], 1 thread")
+    print(timing.describe(latencies))
+    rows = [asdict(row) for row in differences]
+    return {
+        "loads": [{key: _json_number(value) for key, value in row.items()} for row in rows],
+        "milliseconds": [asdict(row) for row in times],
+        "latency": {name: asdict(one) for name, one in latencies.items()},
+        "threads": 1,
+        "repeats": cfg.repeats,
+        "bytes": sum(file.stat().st_size for file in path.parent.glob("model.onnx*")),
+        "opset": onnx_opset(path),
+        "machine": tables.machine(),
+        "versions": {name: version(name) for name in ("torch", *PACKAGES)},
+    }
+
+
+def _test_errors(folder: Path) -> dict[str, float] | None:
+    """Return the errors of the network on the test set; None if the run was not evaluated."""
     path = folder / "evaluation.json"
     if not path.is_file():
         return None
@@ -124,26 +163,26 @@ def _errors(folder: Path) -> dict[str, float] | None:
         return {str(key): float(value) for key, value in rows["network"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise config.ConfigError(
-            f"run: {path} is no evaluation; make it anew with python scripts/evaluate.py "
-            f"run={folder}, or remove it"
+            f"run: {path} is not an evaluation; repeat it with python scripts/evaluate.py "
+            f"run={folder}, or remove the file"
         ) from error
 
 
-def _known(value: Any) -> Any:
-    """Return a number for JSON, which has no NaN."""
+def _json_number(value: Any) -> Any:
+    """Return a value for JSON, with None instead of NaN."""
     return value if value == value else None
 
 
-def results(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
-    """Write answers to random loads for ParaView."""
-    from dpl.export import results as written
+def export_results(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
+    """Write predictions for random loads as files for ParaView."""
+    from dpl.export import write_results
 
-    if cfg.count < 1:
-        raise config.ConfigError(f"count = {cfg.count} must be 1 or more; or take parts=[model]")
-    for old in folder.glob("results_[0-9]*.vtu"):  # there may have been more
+    for old in folder.glob("results_[0-9]*.vtu"):  # an earlier series may have been longer
         old.unlink()
-    load = surrogate.scene.loads.sample(SHOWN, range(cfg.count))
-    rows, files = written(surrogate, load, folder / "results", exact=cfg.exact)
-    table.write(rows, folder / "results.csv")
-    table.show(rows, "answers of the network")
+    load = surrogate.scene.loads.sample(RESULT_STREAM, range(cfg.count))
+    rows, files = write_results(
+        surrogate, load, folder / "results", solve_reference=cfg.solve_reference
+    )
+    tables.write(rows, folder / "results.csv")
+    tables.show(rows, "predictions of the network")
     print(f"for ParaView: {' or '.join(map(str, files))}")

@@ -27,7 +27,7 @@ KEYS: dict[str, Any] = {  # what a configuration may hold at its top, and of whi
     **dict.fromkeys(("repeats", "count", "workers", "samples", "far"), int),
     **{"name": str, "galerkin": dict | None, "corrected": dict | None},
     **{"networks": NAMES, "tols": Sequence[float], "resume": bool, "cases": NAMES},
-    **{"exact": bool, "discretisation": str | None},
+    **{"solve_reference": bool, "discretisation": str | None},
     **{"threads": Sequence[int | None], "across": WHOLE, "budget": int},
     **{"minutes": float, "works": Sequence[str]},
     **{"host": str, "port": int, "names": Sequence[str], "movie": str | None, "speed": bool},

@@ -1,13 +1,13 @@
-"""A surrogate for others: ONNX, a folder with a reference, files for ParaView."""
+"""Export of a surrogate: ONNX model, folder with a reference solution, files for ParaView."""
 
 from typing import TYPE_CHECKING
 
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.export.check import compare
-    from dpl.export.folder import read_meta, read_reference, verify, write
-    from dpl.export.onnx_graph import export, opset
-    from dpl.export.paraview import results
+    from dpl.export.comparison import compare_outputs
+    from dpl.export.folder import read_metadata, read_reference, verify_folder, write_folder
+    from dpl.export.onnx_graph import ExportGraph, OnnxSession, export_onnx, onnx_opset
+    from dpl.export.paraview import write_results
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -1,8 +1,8 @@
-"""A surrogate as an ONNX graph: what an engineer calls, without this package and without torch.
+"""Conversion of a surrogate into an ONNX graph that needs neither this package nor torch.
 
-Forces [N] and moduli [Pa] go in and displacements [m] come out, scaling inside, any batch. These
-borders are float64, as those of the package are: the finite elements beside it work in float64, and
-two casts cost nothing. What lies between is the network's float32.
+The graph takes forces [N] and Young's moduli [Pa], scales them, and returns displacements [m] for
+any batch size. Inputs and outputs are float64, because finite-element codes use float64 and two
+casts cost little. The network itself is float32.
 """
 
 import contextlib
@@ -21,94 +21,98 @@ from torch import Tensor, nn
 from dpl.models import Latent
 from dpl.training import Surrogate
 
-NEEDED = ("onnx", "onnxscript", "onnxruntime")
-TALKERS = ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")  # while they write
-LOCAL = "local"  # the output that says which answers are not those of the package
+PACKAGES = ("onnx", "onnxscript", "onnxruntime")
+VERBOSE_LOGGERS = ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")
+LOCAL = "local"  # output that marks loads for which dpl would use the factor of K(0)
 Array = NDArray[np.float64]
 
 
-class Answer(NamedTuple):
-    """What a graph answers.
+class GraphOutput(NamedTuple):
+    """Outputs of a graph.
 
     Attributes:
         displacement: (B, N, D) [m].
-        local: Which loads are too local for the basis of the network, (B,): the package would
-            answer these with the factor of K(0).
+        local: Mask of loads that the basis of the network cannot represent, (B,). `Latent` solves
+            these with the factor of K(0), which the graph does not contain.
     """
 
     displacement: Array
     local: NDArray[np.bool_]
 
 
-def missing() -> list[str]:
-    """Return which packages that exporting needs are not installed."""
-    return [name for name in NEEDED if importlib.util.find_spec(name) is None]
+def missing_packages() -> list[str]:
+    """Return the packages that the export needs and that are not installed."""
+    return [name for name in PACKAGES if importlib.util.find_spec(name) is None]
 
 
-class Graph(nn.Module):
-    """The surrogate, with all that depends on the values of a load taken out.
+class ExportGraph(nn.Module):
+    """Surrogate without control flow that depends on the values of a load.
 
-    `Latent` answers local loads with a sparse factor of K(0), which no graph of tensors holds: here
-    they are answered within its basis like all others, and a second output says which they are.
+    `Latent` solves local loads with a sparse factor of K(0), which is not a tensor operation. The
+    graph represents these loads in the basis like all others, and a second output marks them.
+
+    Attributes:
+        surrogate: The trained surrogate.
+        has_local_output: True if the graph has the output `local`.
     """
 
     def __init__(self, surrogate: Surrogate) -> None:
         """Take a trained surrogate on the CPU."""
         super().__init__()
         self.surrogate = surrogate.eval()
-        self.basis = isinstance(surrogate.net, Latent)
-        self.flags = isinstance(surrogate.net, Latent) and surrogate.net.linear_tol < torch.inf
+        net = surrogate.net
+        self.has_local_output = isinstance(net, Latent) and net.linear_tol < torch.inf
 
     @property
     def inputs(self) -> list[str]:
-        """Names of what goes in, in order."""
+        """Names of the inputs, in order."""
         span = self.surrogate.scene.loads.poisson_range
         return ["force", "young"] + ([] if span is None else ["poisson"])
 
     @property
     def outputs(self) -> list[str]:
-        """Names of what comes out, in order."""
-        return ["displacement", LOCAL] if self.flags else ["displacement"]
+        """Names of the outputs, in order."""
+        return ["displacement", LOCAL] if self.has_local_output else ["displacement"]
 
     def forward(
         self, force: Tensor, young: Tensor, poisson: Tensor | None = None
     ) -> tuple[Tensor, ...]:
-        """Return displacements (B, N, D) [m], and which loads are local, (B,), where `flags`.
+        """Return displacements (B, N, D) [m], and the mask `local` (B,) if `has_local_output`.
 
         Args:
             force: (B, N, D) [N]; in 2D [N/m].
             young: (B,) [Pa].
-            poisson: (B,) [-]; wanted where the law has a range of Poisson's ratios.
+            poisson: (B,) [-]; required if the law has a range of Poisson's ratios.
         """
         module = self.surrogate
         load = module.scene.load_of(force, young, poisson)
         scaled, more = module.scale_inputs(load)
-        if not self.basis:
+        if not isinstance(module.net, Latent):
             return (module.scene.length * module.unscale_outputs(module.net(scaled, **more)),)
         answer, local = module.net.within(scaled, **more)
         metres = module.scene.length * module.unscale_outputs(answer)
-        loaded = (force != 0).flatten(1).any(dim=1)  # at rest the basis misses nothing
-        return (metres, local & loaded) if self.flags else (metres,)
+        loaded = (force != 0).flatten(1).any(dim=1)  # a zero load is not local
+        return (metres, local & loaded) if self.has_local_output else (metres,)
 
 
-def export(graph: Graph, path: Path) -> None:
-    """Write a graph as ONNX; where it has more than 2 GB, with weights in a file beside it.
+def export_onnx(graph: ExportGraph, path: Path) -> None:
+    """Write a graph as an ONNX file; weights above 2 GB go to `<path>.data`.
 
     Args:
-        graph: What to write.
-        path: Of the file.
+        graph: The graph.
+        path: Path of the ONNX file. Older files at this path are removed.
 
     Raises:
-        ValueError: The network does what no graph can hold.
+        ValueError: The network has control flow that depends on values, or a fixed batch size.
     """
     import onnx
 
-    example = _example(graph)
+    example = _example_inputs(graph)
     batch = torch.export.Dim("B", min=1)
     shapes = tuple({0: batch} for _ in example)
-    with _quiet():
+    with _silence_exporter():
         try:
-            # first by itself: the exporter would fix the batch where a network does, and not say
+            # torch.onnx.export alone would fix the batch size without an error; torch.export raises
             program = torch.export.export(graph, example, dynamic_shapes=shapes, strict=False)
             exported = torch.onnx.export(
                 program,
@@ -120,7 +124,7 @@ def export(graph: Graph, path: Path) -> None:
                 verbose=False,
             )
             assert exported is not None
-        except Exception as error:  # of any kind: each layer of the exporter has its own
+        except Exception as error:  # each layer of the exporter has exceptions of its own
             name = type(graph.surrogate.net).__name__
             cause = next(line for line in (*str(error).splitlines(), type(error).__name__) if line)
             raise ValueError(f"{name} cannot be written as an ONNX graph: {cause}") from error
@@ -131,19 +135,19 @@ def export(graph: Graph, path: Path) -> None:
     onnx.checker.check_model(str(path))
 
 
-def _example(graph: Graph) -> tuple[Tensor, ...]:
-    """Return three loads to follow through the graph."""
+def _example_inputs(graph: ExportGraph) -> tuple[Tensor, ...]:
+    """Return the inputs of three loads, with which the graph is traced."""
     scene = graph.surrogate.scene
     load = scene.loads.sample((0, 0), range(3))
     force = load.force * (load.young * scene.force_unit)[:, None, None]
-    own = () if scene.loads.poisson_range is None else (load.poisson[:, 0],)
-    return (force, load.young, *own)
+    poisson = () if scene.loads.poisson_range is None else (load.poisson[:, 0],)
+    return (force, load.young, *poisson)
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep what the exporter says of its own to itself."""
-    loggers = [logging.getLogger(name) for name in TALKERS]
+def _silence_exporter() -> Iterator[None]:
+    """Suppress warnings and log records below ERROR of the exporter."""
+    loggers = [logging.getLogger(name) for name in VERBOSE_LOGGERS]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.ERROR)
@@ -156,11 +160,16 @@ def _quiet() -> Iterator[None]:
             logger.setLevel(level)
 
 
-class Session:
-    """A graph that was written, run by onnxruntime on one thread."""
+class OnnxSession:
+    """ONNX file, evaluated by onnxruntime on one thread.
+
+    Attributes:
+        inputs: Names of the inputs, in order.
+        outputs: Names of the outputs, in order.
+    """
 
     def __init__(self, path: Path) -> None:
-        """Load the file."""
+        """Load an ONNX file."""
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
@@ -171,16 +180,16 @@ class Session:
         self.inputs = [one.name for one in self._session.get_inputs()]
         self.outputs = [one.name for one in self._session.get_outputs()]
 
-    def __call__(self, *arrays: Array) -> Answer:
-        """Return the answer to force (B, N, D) [N], young (B,) [Pa] and what else there is."""
+    def __call__(self, *arrays: Array) -> GraphOutput:
+        """Return the outputs for the inputs: force (B, N, D) [N], young (B,) [Pa], ..."""
         found: list[Any] = self._session.run(None, dict(zip(self.inputs, arrays, strict=True)))
         if LOCAL not in self.outputs:
             found.append(np.zeros(len(found[0]), dtype=bool))
-        return Answer(*found)
+        return GraphOutput(*found)
 
 
-def opset(path: Path) -> int:
-    """Return the version of the operators of an ONNX file."""
+def onnx_opset(path: Path) -> int:
+    """Return the operator set version of an ONNX file."""
     import onnx
 
     return int(onnx.load(str(path), load_external_data=False).opset_import[0].version)

@@ -1,4 +1,4 @@
-"""Answers as ParaView opens them: forces, displacements, stress and volume ratio at the nodes."""
+"""Files for ParaView: forces, displacements, stresses and det F at the nodes."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,55 +12,55 @@ from dpl.training import Surrogate
 
 
 @dataclass(frozen=True)
-class Row:
-    """One load.
+class ResultRow:
+    """Row of `results.csv`: the prediction for one load.
 
     Attributes:
-        load: Its number in the series.
-        young: E [Pa].
-        displacement: Largest of all nodes [m].
-        von_mises: Largest of all nodes [Pa].
-        volume_ratio: Smallest det F of all nodes [-].
-        error: Relative L2 error against finite elements [-]; NaN where they were not asked or
-            found no equilibrium.
+        load: Index of the load in the series.
+        young: Young's modulus [Pa].
+        max_displacement: Largest displacement of a node [m].
+        max_von_mises: Largest von Mises stress at a node [Pa].
+        min_det_F: Smallest det F at a node [-].
+        error: Relative L2 error against the finite-element solution [-]; NaN if it was not
+            computed or did not converge.
     """
 
     load: int
     young: float
-    displacement: float
-    von_mises: float
-    volume_ratio: float
+    max_displacement: float
+    max_von_mises: float
+    min_det_F: float
     error: float
 
 
-def results(
-    surrogate: Surrogate, load: Load, path: Path, *, exact: bool = True
-) -> tuple[list[Row], list[Path]]:
-    """Write answers to loads as a series of VTU files, a PVD collection and an XDMF file.
+def write_results(
+    surrogate: Surrogate, load: Load, path: Path, *, solve_reference: bool = True
+) -> tuple[list[ResultRow], list[Path]]:
+    """Write predictions as a series of VTU files, a PVD collection and an XDMF file.
 
     Args:
-        surrogate: That answers.
-        load: B of them, dimensionless.
-        path: Of the series, without a suffix.
-        exact: Solve them too, and write displacement and error beside.
+        surrogate: The surrogate.
+        load: Dimensionless loads, B of them.
+        path: Path of the series, without a suffix.
+        solve_reference: Also write the finite-element displacement and the error.
 
     Returns:
-        A row for each load, and the two files to open.
+        One row for each load, and the paths of the PVD and the XDMF file.
     """
     scene = surrogate.scene
     rows, steps = [], []
     for k, single in enumerate(load.unbatch()):
         with torch.no_grad():
-            answer = surrogate.predict(single)[0]
+            prediction = surrogate.predict(single)[0]
         truth = None
-        if exact:
+        if solve_reference:
             found = solve(scene.solver, single)
             truth = torch.where(found.converged, found.displacement[0], torch.nan)
-        step = shown(scene, single, answer, truth)
+        step = nodal_fields(scene, single, prediction, truth)
         steps.append({name: field.numpy() for name, field in step.items()})
-        error = float((answer - truth).norm() / truth.norm()) if truth is not None else torch.nan
+        error = torch.nan if truth is None else float((prediction - truth).norm() / truth.norm())
         rows.append(
-            Row(
+            ResultRow(
                 k,
                 float(single.young),
                 float(step["displacement [m]"].norm(dim=1).max()),
@@ -72,28 +72,28 @@ def results(
     return rows, write_series(path, scene.problem.mesh_in_metres, steps)
 
 
-def shown(
-    scene: Scene, load: Load, answer: Tensor, truth: Tensor | None = None
+def nodal_fields(
+    scene: Scene, load: Load, displacement: Tensor, reference: Tensor | None = None
 ) -> dict[str, Tensor]:
-    """Return what is shown of one load, at the nodes, in SI units.
+    """Return named fields at the nodes in SI units, (N, ...), for one load.
 
     Args:
-        scene: What is answered.
-        load: One, dimensionless.
-        answer: (N, D) [-].
-        truth: The same by finite elements.
+        scene: The scene.
+        load: One dimensionless load.
+        displacement: Displacement over L, (N, D) [-].
+        reference: Finite-element displacement over L, (N, D) [-].
     """
     young = float(load.young)
     newton = "N" if scene.problem.shape[1] == 3 else "N/m"
-    inside = fields(scene.problem.at(load.poisson), answer[None])
+    stress = fields(scene.problem.at(load.poisson), displacement[None])
     found = {
         f"force [{newton}]": young * scene.force_unit * load.force[0],
-        "displacement [m]": scene.length * answer,
-        "Cauchy stress [Pa]": young * inside.stress[0],
-        "von Mises stress [Pa]": young * inside.von_mises[0],
-        "det F": inside.volume_ratio[0],
+        "displacement [m]": scene.length * displacement,
+        "Cauchy stress [Pa]": young * stress.stress[0],
+        "von Mises stress [Pa]": young * stress.von_mises[0],
+        "det F": stress.volume_ratio[0],
     }
-    if truth is not None:
-        found["exact displacement [m]"] = scene.length * truth
-        found["error [m]"] = scene.length * (answer - truth).norm(dim=1)
+    if reference is not None:
+        found["reference displacement [m]"] = scene.length * reference
+        found["error [m]"] = scene.length * (displacement - reference).norm(dim=1)
     return found

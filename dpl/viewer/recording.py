@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from dpl.export.paraview import shown
+from dpl.export.paraview import nodal_fields
 from dpl.fem import write_mesh
 from dpl.fem.mesh import write_collection
 from dpl.system.files import atomic_write
@@ -64,7 +64,7 @@ class Recording:
     def save_series(self, folder: Path) -> Path:
         """Write frames as VTU files and a PVD file that ParaView opens; return that.
 
-        With what an export has at the nodes, see `dpl.export.paraview.shown`.
+        With what an export has at the nodes, see `dpl.export.paraview.nodal_fields`.
 
         Raises:
             ValueError: There are none.
@@ -76,7 +76,7 @@ class Recording:
         for number, (time, frame) in enumerate(kept):
             load = self.body.load(frame.asked)
             with torch.inference_mode():
-                found = shown(scene, load, frame.displacement / scene.length)
+                found = nodal_fields(scene, load, frame.displacement / scene.length)
             name = f"{place.stem}/frame_{number:04d}.vtu"
             write_mesh(folder / name, mesh, {key: field.numpy() for key, field in found.items()})
             files.append((time, name))

@@ -1,4 +1,4 @@
-"""scripts/export.py, end to end, and what it refuses."""
+"""scripts/export.py: its files and its error messages."""
 
 import json
 import shutil
@@ -9,12 +9,12 @@ import pytest
 
 from dpl.export import onnx_graph
 
-MISSING = onnx_graph.missing()
+MISSING = onnx_graph.missing_packages()
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """The folder in which a user works."""
+    """Working directory of the commands."""
     return tmp_path_factory.mktemp("home")
 
 
@@ -28,7 +28,7 @@ def trained(script, tiny_training, home):
 
 
 @pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed (extra onnx)")
-def test_export_writes_a_folder_that_others_can_use(script, trained):
+def test_export_writes_the_documented_folder(script, trained):
     ended = script("export", "run=runs/first", "samples=4", "repeats=2", "count=2", cwd=trained)
     assert ended.status == 0, ended.err[-2000:]
     folder = trained / "runs/first/export"
@@ -55,13 +55,15 @@ def test_export_writes_a_folder_that_others_can_use(script, trained):
     assert (folder / "results" / "results_001.vtu").is_file()
     ended = script("export", "run=runs/first", "parts=[results]", "count=1", cwd=trained)
     assert ended.status == 0
-    assert not (folder / "results" / "results_001.vtu").exists(), "of the series before"
+    assert not (folder / "results" / "results_001.vtu").exists(), (
+        "files of the earlier series are removed"
+    )
     found = meshio.read(folder / "results" / "results_000.vtu").point_data
     assert np.isfinite(found["error [m]"]).all()
 
 
 @pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed (extra onnx)")
-def test_a_graph_that_is_off_is_not_handed_on(script, trained):
+def test_a_graph_with_too_large_a_difference_is_removed(script, trained):
     asked = ["run=runs/first", "folder=off", "parts=[model]", "samples=4", "repeats=1"]
     ended = script("export", *asked, "tol=1e-12", cwd=trained)
     assert ended.status == 1
@@ -79,22 +81,22 @@ def test_a_graph_that_is_off_is_not_handed_on(script, trained):
             ["run=runs/none", "parts=[results]"],
             "run = runs/none has no config.yaml; train it first",
         ),
-        (["run=runs/first", "parts=[modal]"], "parts: 'modal' is none of model, results"),
-        (["run=runs/first", "parts=[]"], "parts: choose of model, results"),
+        (["run=runs/first", "parts=[modal]"], "parts = 'modal' must be one of model, results"),
+        (["run=runs/first", "parts=[]"], "parts = [] must contain one of model, results"),
         (["run=runs/first", "parts=[results]", "count=0"], "count = 0 must be 1 or more"),
         (["run=runs/first", "tol=0"], "tol = 0 must lie between"),
-        (["run=runs/first", "exact=2"], "exact = 2 must be true or false"),
+        (["run=runs/first", "solve_reference=2"], "solve_reference = 2 must be true or false"),
     ],
 )
-def test_bad_input_ends_with_one_line(script, trained, arguments, told):
+def test_invalid_input_prints_one_line(script, trained, arguments, told):
     ended = script("export", *arguments, cwd=trained)
     assert ended.status == 2
     assert f"error: {told}" in ended.err
     assert len(ended.err.strip().splitlines()) == 1
 
 
-def test_without_onnx_the_way_to_install_it_is_named(script, trained, monkeypatch):
-    monkeypatch.setattr(onnx_graph, "missing", lambda: ["onnx"])
+def test_without_onnx_the_message_names_the_extra(script, trained, monkeypatch):
+    monkeypatch.setattr(onnx_graph, "missing_packages", lambda: ["onnx"])
     ended = script("export", "run=runs/first", cwd=trained)
     assert ended.status == 2
     assert "error: parts: model needs onnx: pip install" in ended.err
@@ -102,9 +104,9 @@ def test_without_onnx_the_way_to_install_it_is_named(script, trained, monkeypatc
 
 
 @pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed (extra onnx)")
-def test_an_evaluation_that_is_none_is_told(script, trained):
+def test_an_invalid_evaluation_file_is_reported(script, trained):
     shutil.copytree(trained / "runs/first", trained / "runs/broken")
     (trained / "runs/broken/evaluation.json").write_text("[{}]")
     ended = script("export", "run=runs/broken", "samples=1", "repeats=1", cwd=trained)
     assert ended.status == 2
-    assert "is no evaluation" in ended.err
+    assert "is not an evaluation" in ended.err

@@ -1,4 +1,4 @@
-"""Graphs of all networks against torch, and what cannot be one."""
+"""ONNX graphs of all networks against torch, exported folders, and the example consumers."""
 
 import os
 import subprocess
@@ -11,24 +11,35 @@ import torch
 from torch import nn
 
 from dpl import Sample
-from dpl.export import check, compare, export, read_meta, read_reference, verify, write
-from dpl.export import onnx_graph as graphs
-from dpl.export.check import distance, trial
-from dpl.export.folder import described, read_raw, reference
-from dpl.export.onnx_graph import Graph, Session
+from dpl.export import (
+    ExportGraph,
+    OnnxSession,
+    compare_outputs,
+    comparison,
+    export_onnx,
+    read_metadata,
+    read_reference,
+    verify_folder,
+    write_folder,
+)
+from dpl.export.comparison import relative_differences, sample_check_loads
+from dpl.export.folder import read_raw
+from dpl.export.metadata import describe
+from dpl.export.onnx_graph import missing_packages
+from dpl.export.reference import solve_reference
 from dpl.fem import Load, rectangle, solve, surface
 from dpl.fem.postprocess import triangles
 from dpl.models import CNN, FCNN, GNN, Latent, PODNet
 from dpl.training import MSE, Surrogate
 
 pytestmark = pytest.mark.skipif(
-    bool(graphs.missing()), reason=f"{', '.join(graphs.missing())} not installed (extra onnx)"
+    bool(missing_packages()), reason=f"{', '.join(missing_packages())} not installed (extra onnx)"
 )
 CONSUMERS = Path(__file__).parents[2] / "docs" / "consumers"
 
 
-def built(make, scene, seed=0, **options):
-    """Return a surrogate of random weights; with bases of a few solved loads if it has some."""
+def make_surrogate(make, scene, seed=0, **options):
+    """Return a surrogate with random weights, and with bases fitted to a few solved loads."""
     torch.manual_seed(seed)
     surrogate = Surrogate(make(scene, **options), MSE(), scene)
     if isinstance(surrogate.net, PODNet):
@@ -65,83 +76,84 @@ EVERY = [pytest.param(one, marks=pytest.mark.slow) if one in RARE else one for o
 
 
 @pytest.fixture(scope="module")
-def made(make_scene, tmp_path_factory):
-    """Surrogates with their graphs, each made once."""
-    kept = {}
+def make_graph(make_scene, tmp_path_factory):
+    """Function that returns the graph of a network and its ONNX file; each is made once."""
+    graphs = {}
 
-    def made(name):
-        if name not in kept:
+    def make_graph(name):
+        if name not in graphs:
             make, options, scene = NETWORKS[name]
             scene = {
                 key: rectangle([100.0, 25.0], [9, 3]) if value == "strip" else value
                 for key, value in scene.items()
             }
-            graph = Graph(built(make, make_scene(**scene), **options))
+            graph = ExportGraph(make_surrogate(make, make_scene(**scene), **options))
             path = tmp_path_factory.mktemp("graph") / "model.onnx"
-            export(graph, path)
-            kept[name] = graph, path
-        return kept[name]
+            export_onnx(graph, path)
+            graphs[name] = graph, path
+        return graphs[name]
 
-    return made
+    return make_graph
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_a_graph_answers_as_torch_does_whatever_the_load_and_the_batch(made, name):
-    graph, path = made(name)
-    rows = compare(graph, Session(path), trial(graph.surrogate.scene, 8))
+def test_onnx_and_torch_agree_for_all_kinds_of_loads_and_batch_sizes(make_graph, name):
+    graph, path = make_graph(name)
+    rows = compare_outputs(graph, OnnxSession(path), sample_check_loads(graph.surrogate.scene, 8))
     assert [row.kind for row in rows][:2] == ["in range", "small"]
-    assert sum(row.loads for row in rows) == 8 + 6 * check.FEW
-    assert max(row.error for row in rows) < 1e-5
+    assert sum(row.n_loads for row in rows) == 8 + 6 * comparison.N_OUTSIDE
+    assert max(row.max_error for row in rows) < 1e-5
 
 
-def test_only_latent_has_a_second_output(made):
+def test_only_latent_with_a_factor_has_the_output_local(make_graph):
     for name in ("fcnn", "pod", "latent", "latent, no factor"):
-        session = Session(made(name)[1])
+        session = OnnxSession(make_graph(name)[1])
         assert ("local" in session.outputs) == (name == "latent")
 
 
-def test_local_loads_are_flagged_and_answered_within_the_basis(made):
-    graph, path = made("latent")
-    tried = trial(graph.surrogate.scene, 8)
-    rows = {row.kind: row for row in compare(graph, Session(path), tried)}
-    assert rows["on a node"].local > 0
-    assert rows["in range"].local < rows["in range"].loads
-    assert rows["on a node"].local_error > 0.005, "which the graph says it does not know"
-    assert rows["zero"].local == 0
-    assert rows["zero"].error == 0
-    answer = Session(path)(*(column.numpy() for column in tried.part(slice(None))))
+def test_local_loads_are_marked_and_represented_in_the_basis(make_graph):
+    graph, path = make_graph("latent")
+    loads = sample_check_loads(graph.surrogate.scene, 8)
+    rows = {row.kind: row for row in compare_outputs(graph, OnnxSession(path), loads)}
+    assert rows["on a node"].n_local > 0
+    assert rows["in range"].n_local < rows["in range"].n_loads
+    assert rows["on a node"].max_local_error > 0.005, "the graph marks these loads"
+    assert rows["zero"].n_local == 0
+    assert rows["zero"].max_error == 0
+    answer = OnnxSession(path)(*(column.numpy() for column in loads.inputs()))
     with torch.no_grad():
-        truth = graph.surrogate(tried.force, tried.young)
-    near = distance(answer.displacement, truth.numpy())
+        truth = graph.surrogate(loads.force, loads.young)
+    near = relative_differences(answer.displacement, truth.numpy())
     assert near[~answer.local].max() < 1e-5
     assert near[answer.local].max() == pytest.approx(
-        max(r.local_error for r in rows.values() if r.local)
+        max(r.max_local_error for r in rows.values() if r.n_local)
     )
 
 
-def test_a_graph_that_is_off_is_found(made):
-    graph, path = made("fcnn")
-    session, scene = Session(path), graph.surrogate.scene
+def test_a_graph_with_other_weights_is_detected(make_graph):
+    graph, path = make_graph("fcnn")
+    session, scene = OnnxSession(path), graph.surrogate.scene
     first = graph.surrogate.net.stages[0].weight
     with torch.no_grad():
         first.mul_(1 + 1e-3)
-        rows = compare(graph, session, trial(scene, 4))
+        rows = compare_outputs(graph, session, sample_check_loads(scene, 4))
         first.div_(1 + 1e-3)
-    assert max(row.error for row in rows) > 1e-5
-    assert max(row.error for row in compare(graph, session, trial(scene, 4))) < 1e-5
+    assert max(row.max_error for row in rows) > 1e-5
+    rows = compare_outputs(graph, session, sample_check_loads(scene, 4))
+    assert max(row.max_error for row in rows) < 1e-5
 
 
-def test_a_flag_that_is_off_is_found(made):
-    graph, path = made("latent")
+def test_a_graph_that_marks_other_loads_is_detected(make_graph):
+    graph, path = make_graph("latent")
     net = graph.surrogate.net
     before, net.linear_tol = net.linear_tol, 1e-12
-    rows = compare(graph, Session(path), trial(graph.surrogate.scene, 4))
+    rows = compare_outputs(graph, OnnxSession(path), sample_check_loads(graph.surrogate.scene, 4))
     net.linear_tol = before
-    assert max(row.error for row in rows) == np.inf
+    assert max(row.max_error for row in rows) == np.inf
 
 
-class Looking(nn.Module):
-    """A network that decides by the values of a load."""
+class ValueDependent(nn.Module):
+    """Network with control flow that depends on the values of a load."""
 
     def __init__(self, scene):
         super().__init__()
@@ -151,58 +163,58 @@ class Looking(nn.Module):
         return self.scale * (force if bool(force.sum() > 0) else -force)
 
 
-class Counting(Looking):
-    """A network that keeps the batch that it was followed with."""
+class FixedBatch(ValueDependent):
+    """Network whose graph has the batch size of the example inputs."""
 
     def forward(self, force):
         return self.scale * torch.cat([force[k : k + 1] for k in range(len(force))])
 
 
-@pytest.mark.parametrize("make", [Looking, Counting])
-def test_a_network_that_no_graph_holds_is_refused_in_words(scene, tmp_path, make):
+@pytest.mark.parametrize("make", [ValueDependent, FixedBatch])
+def test_a_network_without_a_graph_for_all_loads_raises_an_error(scene, tmp_path, make):
     with pytest.raises(ValueError, match=f"{make.__name__} cannot be written as an ONNX graph: "):
-        export(Graph(built(make, scene)), tmp_path / "model.onnx")
+        export_onnx(ExportGraph(make_surrogate(make, scene)), tmp_path / "model.onnx")
     assert not (tmp_path / "model.onnx").exists()
 
 
-def test_distance_is_relative_and_nothing_is_far_from_nothing():
+def test_differences_are_relative_and_zero_between_zero_fields():
     zero, one = np.zeros((1, 2, 3)), np.ones((1, 2, 3))
-    assert distance(zero, zero) == 0
-    assert distance(one, zero) == np.inf
-    assert distance(1.5 * one, one) == pytest.approx(0.5)
-    assert distance(np.nan * one, one) == np.inf
+    assert relative_differences(zero, zero) == 0
+    assert relative_differences(one, zero) == np.inf
+    assert relative_differences(1.5 * one, one) == pytest.approx(0.5)
+    assert relative_differences(np.nan * one, one) == np.inf
 
 
 # ---------------------------------------------------------------------- the folder
 
 
 @pytest.fixture(scope="module")
-def handed(made):
-    """Folders as they are handed on, each with its graph and what was meant."""
+def write_export(make_graph):
+    """Function that writes the folder of a network; returns graph, folder and data."""
 
-    def handed(name):
-        graph, path = made(name)
-        told = reference(graph)
-        meta = described(graph, path, told, tol=1e-5, errors={"e_mean": 1.0})
-        write(path.parent, graph.surrogate, told, meta)
-        return graph, path.parent, told, meta
+    def write_export(name):
+        graph, path = make_graph(name)
+        reference = solve_reference(graph)
+        meta = describe(graph, path, reference, tol=1e-5, errors={"e_mean": 1.0})
+        write_folder(path.parent, graph.surrogate, reference, meta)
+        return graph, path.parent, reference, meta
 
-    return handed
+    return write_export
 
 
 @pytest.mark.parametrize("name", ["fcnn", "latent, quadratic", "cnn, poisson, 2D"])
-def test_a_folder_read_back_is_what_was_written(handed, name):
-    graph, folder, told, meta = handed(name)
-    verify(folder, graph.surrogate, told, meta)
+def test_a_folder_read_back_is_what_was_written(write_export, name):
+    graph, folder, reference, meta = write_export(name)
+    verify_folder(folder, graph.surrogate, reference, meta)
     problem = graph.surrogate.scene.problem
-    found = read_meta(folder)
+    found = read_metadata(folder)
     points = np.array(found["mesh"]["points"])
     assert np.array_equal(points, (problem.length * problem.points).numpy())
     assert len(found["mesh"]["cells"]) == len(problem.cells)
     held = np.zeros(problem.free.numel(), dtype=bool)
-    held[found["dofs"]["held"]] = True
+    held[found["dofs"]["fixed"]] = True
     assert np.array_equal(held.reshape(problem.shape), ~problem.free.numpy())
-    assert [one["name"] for one in found["model"]["inputs"]] == Session(
+    assert [one["name"] for one in found["model"]["inputs"]] == OnnxSession(
         folder / "model.onnx"
     ).inputs
 
@@ -215,56 +227,56 @@ def test_a_folder_read_back_is_what_was_written(handed, name):
         ("weights.safetensors", lambda path: path.write_bytes(path.read_bytes()[:-1] + b"\x7f")),
     ],
 )
-def test_a_folder_that_changed_is_found(handed, file, change):
-    graph, folder, told, meta = handed("fcnn")
+def test_a_changed_file_is_detected(write_export, file, change):
+    graph, folder, reference, meta = write_export("fcnn")
     change(folder / file)
-    with pytest.raises(ValueError, match=r"is not what was written"):
-        verify(folder, graph.surrogate, told, meta)
-    handed("fcnn")
+    with pytest.raises(ValueError, match=r"differs from what was written"):
+        verify_folder(folder, graph.surrogate, reference, meta)
+    write_export("fcnn")
 
 
-def test_the_reference_is_the_surrogate_s_answer_and_that_of_finite_elements(handed):
-    graph, folder, told, _ = handed("latent")
+def test_the_reference_has_the_displacements_of_surrogate_and_finite_elements(write_export):
+    graph, folder, reference, _ = write_export("latent")
     scene, found = graph.surrogate.scene, read_reference(folder)
-    assert told.converged
-    assert told.exact_residual < 1e-8 < told.residual
+    assert reference.fe_converged
+    assert reference.fe_residual < 1e-8 < reference.residual
     load = scene.load_of(torch.from_numpy(found["force"]), torch.from_numpy(found["young"]))
-    exact = torch.from_numpy(found["exact"]) / scene.length
+    exact = torch.from_numpy(found["fe_displacement"]) / scene.length
     assert float(scene.problem.relative_residual(exact, load.force)) < 1e-8
-    answer = Session(folder / "model.onnx")(found["force"], found["young"])
+    answer = OnnxSession(folder / "model.onnx")(found["force"], found["young"])
     assert not answer.local.any()
-    assert distance(answer.displacement, found["displacement"]) < 1e-5
+    assert relative_differences(answer.displacement, found["displacement"]) < 1e-5
 
 
-def test_scales_and_weights_are_enough_to_answer_without_this_package(handed):
-    """The fully connected network in NumPy, by what meta.json says."""
+def test_scales_and_weights_suffice_to_evaluate_the_network_without_this_package(write_export):
+    """Evaluate the fully connected network in NumPy from meta.json and the weights."""
     from safetensors.numpy import load_file
 
-    _, folder, _, _ = handed("fcnn")
-    meta, found = read_meta(folder), read_reference(folder)
+    _, folder, _, _ = write_export("fcnn")
+    meta, found = read_metadata(folder), read_reference(folder)
     weights, scales = load_file(folder / "weights.safetensors"), meta["scales"]
     unit = found["young"] * scales["force_unit"] * scales["force"]
-    x = (found["force"].reshape(-1) / unit)[meta["dofs"]["acting"]].astype(np.float32)
+    x = (found["force"].reshape(-1) / unit)[meta["dofs"]["loadable"]].astype(np.float32)
     for k in (0, 2, 4, 6):
         x = weights[f"net.stages.{k}.weight"] @ x + weights[f"net.stages.{k}.bias"]
         if k < 6:
             x = np.where(x > 0, x, weights[f"net.stages.{k + 1}.weight"] * x)
     answer = np.zeros(meta["dofs"]["count"])
-    answer[np.setdiff1d(np.arange(len(answer)), meta["dofs"]["held"])] = x
+    answer[np.setdiff1d(np.arange(len(answer)), meta["dofs"]["fixed"])] = x
     answer *= scales["length"] * scales["displacement"]
     expected = found["displacement"].reshape(-1)
     assert np.linalg.norm(answer - expected) < 1e-5 * np.linalg.norm(expected)
 
 
-def test_the_range_of_the_training_can_be_told_without_this_package(handed):
-    graph, folder, _, _ = handed("fcnn")
-    scene, meta = graph.surrogate.scene, read_meta(folder)
+def test_the_training_range_can_be_checked_without_this_package(write_export):
+    graph, folder, _, _ = write_export("fcnn")
+    scene, meta = graph.surrogate.scene, read_metadata(folder)
     modes = read_raw(folder / "modes.f64", meta["range"]["modes"]["shape"])
     load = scene.loads.sample((0, 13), range(6))
     load = Load(torch.cat([load.force, 3 * load.force, torch.ones_like(load.force)]), load.young)
     amplitude, strange = scene.loads.project(load.force)
     for k, force in enumerate(load.force.numpy()):
-        force.reshape(-1)[meta["dofs"]["held"]] = 0.0
+        force.reshape(-1)[meta["dofs"]["fixed"]] = 0.0
         acting = force.any(axis=1)
         shapes = modes[acting].reshape(-1, modes.shape[2])
         right = force[acting].reshape(-1)
@@ -277,7 +289,7 @@ def test_the_range_of_the_training_can_be_told_without_this_package(handed):
 
 
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
-def test_triangles_enclose_the_body_and_look_outwards(make_scene, cell):
+def test_triangles_enclose_the_body_and_have_outward_normals(make_scene, cell):
     flat = cell in ("quad", "triangle")
     body = {"mesh": rectangle([100.0, 25.0], [5, 3], cell)} if flat else {"cell": cell}
     problem = make_scene(**body).problem
@@ -291,11 +303,11 @@ def test_triangles_enclose_the_body_and_look_outwards(make_scene, cell):
         assert volume == pytest.approx(0.0625)
 
 
-# ---------------------------------------------------------------------- who reads it
+# ---------------------------------------------------------------------- consumers
 
 
-def spoilt(folder, tmp_path):
-    """Return a copy of a folder whose reference is a percent off."""
+def copy_with_error(folder, tmp_path):
+    """Return a copy of a folder whose reference displacement is 1 % larger."""
     import shutil
 
     other = tmp_path / "spoilt"
@@ -306,24 +318,24 @@ def spoilt(folder, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["fcnn", "cnn, poisson, 2D", "gnn", "pod", "latent"])
-def test_the_consumer_in_python_repeats_the_reference(handed, tmp_path, name):
-    _, folder, _, _ = handed(name)
+def test_the_python_consumer_reproduces_the_reference(write_export, tmp_path, name):
+    _, folder, _, _ = write_export(name)
     program = str(CONSUMERS / "consumer.py")
-    for place, status in ((folder, 0), (spoilt(folder, tmp_path), 1)):
+    for place, status in ((folder, 0), (copy_with_error(folder, tmp_path), 1)):
         command = [sys.executable, program, str(place)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120)
         assert done.returncode == status, done.stderr
         assert "from the reference" in done.stdout
 
 
-def test_the_consumer_in_python_needs_numpy_and_onnxruntime_alone():
+def test_the_python_consumer_imports_only_numpy_and_onnxruntime():
     text = (CONSUMERS / "consumer.py").read_text()
     imported = {line.split()[1] for line in text.splitlines() if line.startswith("import")}
     assert imported == {"json", "sys", "numpy", "onnxruntime"}
 
 
 def headers():
-    """Return the folder of ONNX Runtime's headers, or None; wheels have none."""
+    """Return the folder of ONNX Runtime's headers, or None; wheels do not contain them."""
     root = os.environ.get("ONNXRUNTIME_ROOT")
     places = [Path(root) / "include"] if root else []
     places += [Path("/usr/include/onnxruntime"), Path("/usr/local/include/onnxruntime")]
@@ -332,7 +344,7 @@ def headers():
 
 @pytest.fixture(scope="module")
 def consumer(tmp_path_factory):
-    """The consumer in C++, linked against the library within the wheel."""
+    """The C++ consumer, linked against the library in the wheel."""
     import shutil
 
     import onnxruntime
@@ -345,9 +357,9 @@ def consumer(tmp_path_factory):
     if compiler is None:
         pytest.skip("no g++")
     if include is None:
-        pytest.skip("no headers of ONNX Runtime: set ONNXRUNTIME_ROOT to where include/ is")
+        pytest.skip("no headers of ONNX Runtime; set ONNXRUNTIME_ROOT to the folder of include/")
     if library is None:
-        pytest.skip("the wheel of onnxruntime holds no libonnxruntime.so")
+        pytest.skip("the onnxruntime wheel contains no libonnxruntime.so")
     folder = tmp_path_factory.mktemp("consumer")
     (folder / "libonnxruntime.so.1").symlink_to(library)
     program = folder / "consumer"
@@ -359,9 +371,9 @@ def consumer(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", ["fcnn", "cnn, poisson, 2D", "gnn", "pod", "latent"])
-def test_the_consumer_in_cpp_repeats_the_reference(consumer, handed, tmp_path, name):
-    _, folder, _, _ = handed(name)
-    for place, status in ((folder, 0), (spoilt(folder, tmp_path), 1)):
+def test_the_cpp_consumer_reproduces_the_reference(consumer, write_export, tmp_path, name):
+    _, folder, _, _ = write_export(name)
+    for place, status in ((folder, 0), (copy_with_error(folder, tmp_path), 1)):
         done = subprocess.run(
             [str(consumer), str(place)], capture_output=True, text=True, timeout=120
         )

@@ -1,4 +1,4 @@
-"""Results for ParaView, read back."""
+"""Files for ParaView, read back with meshio."""
 
 import xml.etree.ElementTree as ElementTree
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.export import results
+from dpl.export import write_results
 from dpl.fem import box, fields, read_mesh, rectangle, write_mesh, write_series
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
@@ -25,27 +25,27 @@ BODIES = {
 
 
 @pytest.fixture
-def scene_on(make_scene):
-    """Builds a small scene on cells of a kind."""
+def make_scene_of(make_scene):
+    """Function that returns a small scene with cells of a kind."""
 
-    def scene_on(name):
+    def make_scene_of(name):
         cell, degree = name.split(",")[0], BODIES[name][0]
         solid = cell in ("hexahedron", "tetra")
         size, nodes = [100.0, 25.0, 25.0], [3, 2, 2]
         grid = box(size, nodes, cell) if solid else rectangle(size[:2], [4, 2], cell)
         return make_scene(mesh=grid, degree=degree, n_modes=2)
 
-    return scene_on
+    return make_scene_of
 
 
 @pytest.mark.parametrize("name", BODIES)
-def test_series_hold_the_fields_of_the_answers_in_si_units(scene_on, tmp_path, name):
-    scene = scene_on(name)
+def test_series_contain_the_fields_of_the_predictions_in_si_units(make_scene_of, tmp_path, name):
+    scene = make_scene_of(name)
     _, kind, corners = BODIES[name]
     torch.manual_seed(0)
     surrogate = Surrogate(FCNN(scene, width=8), MSE(), scene).eval()
-    asked = scene.loads.sample((0, 12), range(2))
-    rows, files = results(surrogate, asked, tmp_path / "new" / "series")
+    loads = scene.loads.sample((0, 12), range(2))
+    rows, files = write_results(surrogate, loads, tmp_path / "new" / "series")
     assert [path.name for path in files] == ["series.pvd", "series.xdmf"]
     collection = ElementTree.parse(files[0]).getroot()
     named = [one.get("file") for one in collection.iter("DataSet")]
@@ -53,7 +53,7 @@ def test_series_hold_the_fields_of_the_answers_in_si_units(scene_on, tmp_path, n
     newton = "N" if scene.problem.shape[1] == 3 else "N/m"
     nodes, dim = scene.problem.shape
     with torch.no_grad():
-        answer = torch.cat([surrogate.predict(single) for single in asked.unbatch()])
+        answer = torch.cat([surrogate.predict(single) for single in loads.unbatch()])
     inside = fields(scene.problem, answer)
     for k, file in enumerate(named):
         found = meshio.read(tmp_path / "new" / file)
@@ -62,16 +62,16 @@ def test_series_hold_the_fields_of_the_answers_in_si_units(scene_on, tmp_path, n
         assert np.allclose(found.points[:, :dim], points, rtol=1e-14)
         data = found.point_data
         unit = 4500.0 * scene.force_unit
-        assert np.allclose(data[f"force [{newton}]"][:, :dim], unit * asked.force[k].numpy())
+        assert np.allclose(data[f"force [{newton}]"][:, :dim], unit * loads.force[k].numpy())
         assert np.allclose(data["displacement [m]"][:, :dim], scene.length * answer[k].numpy())
         assert not data["displacement [m]"][:, dim:].any()
         stress = data["Cauchy stress [Pa]"].reshape(nodes, 3, 3)
         assert np.allclose(stress, 4500.0 * inside.stress[k].numpy())
         assert np.allclose(data["von Mises stress [Pa]"], 4500.0 * inside.von_mises[k].numpy())
         assert np.allclose(data["det F"], inside.volume_ratio[k].numpy())
-        exact = data["exact displacement [m]"][:, :dim] / scene.length
+        exact = data["reference displacement [m]"][:, :dim] / scene.length
         balance = scene.problem.relative_residual(
-            torch.from_numpy(exact)[None], asked.force[k : k + 1]
+            torch.from_numpy(exact)[None], loads.force[k : k + 1]
         )
         assert float(balance) < 1e-7
         error = np.linalg.norm(exact - answer[k].numpy(), axis=1)
@@ -92,19 +92,19 @@ def test_series_hold_the_fields_of_the_answers_in_si_units(scene_on, tmp_path, n
                 )
 
 
-def test_without_finite_elements_no_error_is_claimed(scene_on, tmp_path):
-    scene = scene_on("quad")
+def test_without_a_reference_solution_the_error_is_nan(make_scene_of, tmp_path):
+    scene = make_scene_of("quad")
     surrogate = Surrogate(FCNN(scene, width=8), MSE(), scene).eval()
-    asked = scene.loads.sample((0, 12), range(1))
-    rows, _ = results(surrogate, asked, tmp_path / "series", exact=False)
+    loads = scene.loads.sample((0, 12), range(1))
+    rows, _ = write_results(surrogate, loads, tmp_path / "series", solve_reference=False)
     assert np.isnan(rows[0].error)
     assert "error [m]" not in meshio.read(tmp_path / "series_000.vtu").point_data
 
 
 @pytest.mark.parametrize("name", ["tetra", "tetra, quadratic"])
-def test_tetrahedra_are_written_right_handed(scene_on, tmp_path, name):
-    """Of Kuhn's tetrahedra half are left-handed."""
-    problem = scene_on(name).problem
+def test_tetrahedra_are_written_right_handed(make_scene_of, tmp_path, name):
+    """Half of Kuhn's tetrahedra are left-handed before they are written."""
+    problem = make_scene_of(name).problem
     write_mesh(tmp_path / "body.vtu", problem.mesh, {"x": problem.points.numpy()[:, 0]})
     found = meshio.read(tmp_path / "body.vtu")
     nodes = found.points[found.cells[0].data]
@@ -114,11 +114,11 @@ def test_tetrahedra_are_written_right_handed(scene_on, tmp_path, name):
     pairs = {"tetra10": [(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]}
     for k, (i, j) in enumerate(pairs.get(found.cells[0].type, [])):
         middle = (nodes[:, i] + nodes[:, j]) / 2
-        assert np.allclose(nodes[:, 4 + k], middle), "in VTK's order"
+        assert np.allclose(nodes[:, 4 + k], middle), "midpoints are in VTK order"
     assert len(read_mesh(tmp_path / "body.vtu").p.T) == len(problem.points)
 
 
-def test_fields_of_another_body_are_refused(tmp_path):
+def test_fields_of_another_size_raise_an_error(tmp_path):
     mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
     with pytest.raises(ValueError, match="9 nodes are of another body"):
         write_mesh(tmp_path / "body.vtu", mesh, {"x": np.zeros(9)})
@@ -126,7 +126,7 @@ def test_fields_of_another_body_are_refused(tmp_path):
         write_mesh(tmp_path / "body.vtu", mesh, {"x": np.zeros(8), "y": np.zeros(27)})
 
 
-def test_names_that_xml_knows_are_written(tmp_path):
+def test_paths_with_xml_characters_are_escaped(tmp_path):
     mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
     files = write_series(tmp_path / 'a&"b', mesh, [{"x": np.zeros(8)}])
     (one,) = ElementTree.parse(files[0]).getroot().iter("DataSet")

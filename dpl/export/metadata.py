@@ -1,0 +1,135 @@
+"""Contents of `meta.json`: everything that a program needs to use an exported surrogate."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from dpl.export.onnx_graph import ExportGraph, onnx_opset
+from dpl.export.reference import Reference
+from dpl.fem import Problem, surface
+from dpl.fem.mesh.writing import flat_cells
+from dpl.fem.postprocess import triangles
+from dpl.scene import Scene
+from dpl.version import __version__
+
+FORMAT = 2  # version of the keys of meta.json
+RANGE = (
+    "f: a force over E L^(D-1), minus `constant_force`, and 0 at fixed degrees of freedom. "
+    "q: the least-squares fit of `modes` to f at the nodes where f is not zero. "
+    "In range: max |q| <= 1 and |f - modes q| <= 1e-3 |f| at these nodes. "
+    "Without a fit: |f| above `largest_force` is out of range."
+)
+LOCAL = (
+    "the basis of the network does not represent the load: dpl would add the linear solution with "
+    "a factor of K(0), which the graph does not contain; do not use this output"
+)
+SCALING = (
+    "input = force / (young force_unit scales.force); network; "
+    "displacement = length scales.displacement output, 0 at fixed degrees of freedom"
+)
+
+
+def describe(
+    graph: ExportGraph,
+    path: Path,
+    reference: Reference,
+    *,
+    tol: float,
+    errors: Mapping[str, Any] | None,
+) -> dict[str, Any]:
+    """Return the contents of meta.json.
+
+    Args:
+        graph: The exported graph.
+        path: Path of the ONNX file.
+        reference: The reference load and its solutions.
+        tol: Largest relative difference of ONNX and torch [-].
+        errors: Errors of the network on the test set, see `dpl.training.metrics`; None if the run
+            was not evaluated.
+    """
+    module, scene = graph.surrogate, graph.surrogate.scene
+    loads, variables = scene.loads, _variables(scene)
+    count = sum(parameter.numel() for parameter in module.net.parameters())
+    return {
+        "format": FORMAT,
+        "dpl": __version__,
+        "scene": scene.fingerprint,
+        "network": {"name": type(module.net).__name__, "parameters": count},
+        "model": {
+            "file": path.name,
+            "opset": onnx_opset(path),
+            "inputs": [{"name": name, **variables[name]} for name in graph.inputs],
+            "outputs": [{"name": name, **variables[name]} for name in graph.outputs],
+            "tolerance": tol,
+        },
+        "units": {"length": "m", "force": _force_unit(scene), "stress": "Pa", "young": "Pa"},
+        "dofs": {
+            "count": scene.problem.free.numel(),
+            "order": "node-major: D * node + component; components x, y, z",
+            "fixed": _indices(~scene.problem.free),
+            "loadable": _indices(loads.loadable_dofs),
+        },
+        "scales": {
+            "length": scene.length,
+            "force_unit": scene.force_unit,
+            "force": float(module.force_scale),
+            "displacement": float(module.displacement_scale),
+            "meaning": SCALING,
+        },
+        "material": {**_law(scene), "young": loads.young_range, "poisson": loads.poisson_range},
+        "range": _range(scene),
+        "errors": errors,
+        "reference": reference.describe(),
+        "mesh": _mesh(scene.problem),
+    }
+
+
+def _variables(scene: Scene) -> dict[str, dict[str, Any]]:
+    """Return shape, type and unit of each input and output of the graph."""
+    loads, field = scene.loads, ["B", *scene.problem.shape]
+    return {
+        "force": {"shape": field, "type": "float64", "unit": _force_unit(scene)},
+        "young": {"shape": ["B"], "type": "float64", "unit": "Pa", "range": loads.young_range},
+        "poisson": {"shape": ["B"], "type": "float64", "unit": "1", "range": loads.poisson_range},
+        "displacement": {"shape": field, "type": "float64", "unit": "m"},
+        "local": {"shape": ["B"], "type": "bool", "unit": "1", "meaning": LOCAL},
+    }
+
+
+def _force_unit(scene: Scene) -> str:
+    return "N" if scene.problem.shape[1] == 3 else "N/m"
+
+
+def _indices(mask: Tensor) -> list[int]:
+    return mask.flatten().nonzero()[:, 0].tolist()
+
+
+def _law(scene: Scene) -> dict[str, Any]:
+    law = dict(scene.identity()["law"])  # type: ignore[call-overload]
+    return {"name": law.pop("name"), "parameters_over_E": law}
+
+
+def _range(scene: Scene) -> dict[str, Any]:
+    """Return the data by which a program checks whether a force is in the training range."""
+    loads, constant = scene.loads, scene.loads.constant_force
+    return {
+        "modes": {"file": "modes.f64", "shape": [*scene.problem.shape, len(loads.q_max)]},
+        "constant_force": None if constant is None else constant.flatten().tolist(),
+        "largest_force": loads.largest_force,
+        "deflection": loads.deflection,
+        "patch": [scene.length * float(radius) for radius in loads.patch],
+        "meaning": RANGE,
+    }
+
+
+def _mesh(problem: Problem) -> dict[str, Any]:
+    kind, cells = flat_cells(problem.mesh, len(problem.points))
+    return {
+        "points": (problem.length * (problem.points.numpy() + problem.origin)).tolist(),
+        "cell_type": kind,
+        "cell_order": "VTK",
+        "cells": cells.tolist(),
+        "triangles": triangles(surface(problem.mesh)).tolist(),
+    }
