@@ -1,7 +1,7 @@
-"""Notebooks as pages: executed when the site is made, their outputs real.
+"""Notebooks as pages, executed when the site is built.
 
-What has been executed is kept in .cache/notebooks under a digest of the notebook and of the
-package, so that a site made again executes what has changed.
+Executed notebooks are cached in .cache/notebooks under a digest of the notebook, the package and
+conf/. mkdocs-jupyter has no such cache, and its pages load scripts from another host.
 """
 
 import hashlib
@@ -21,12 +21,12 @@ ANSI = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 def paths() -> list[Path]:
-    """Return the notebooks that there are."""
+    """Return the paths of the notebooks."""
     return sorted(NOTEBOOKS.glob("*.ipynb"))
 
 
 def title(path: Path) -> str:
-    """Return what a notebook is called: its first heading, or its name."""
+    """Return the title of a notebook: its first heading, else its name."""
     import nbformat
 
     for cell in nbformat.read(path, as_version=4).cells:
@@ -40,7 +40,7 @@ def pages(*, execute: bool) -> Iterator[tuple[str, str | bytes]]:
     """Yield paths and contents of the pages and of their figures.
 
     Args:
-        execute: Otherwise they are shown as they lie there.
+        execute: Execute the notebooks; otherwise the pages have no outputs.
 
     Raises:
         PluginError: A cell fails.
@@ -92,7 +92,7 @@ def run(path: Path) -> Any:
 
 
 def digest(path: Path) -> str:
-    """Return what decides the outputs of a notebook, in short."""
+    """Return a digest of everything that a notebook's outputs depend on."""
     found = hashlib.sha256()
     for one in [path, *sorted(PACKAGE.rglob("*.py")), *sorted(CONF.rglob("*.yaml"))]:
         found.update(one.read_bytes())

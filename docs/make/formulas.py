@@ -1,4 +1,4 @@
-"""Formulas as MathML, made with the page: no script draws them, and their font lies beside them."""
+"""Formulas as MathML with a font, so that pages need no script to show them."""
 
 import html
 import io
@@ -12,13 +12,19 @@ MARKED = re.compile(
     r'<(span|div) class="arithmatex">(?:\\\((?P<inline>.*?)\\\)|\\\[(?P<block>.*?)\\\])</\1>', re.S
 )
 TAG = re.compile(r"\\tag\{(.*?)\}")
-BAR = re.compile(r"<mo[^>]*>(&#x0?2016;|&#x0*7C;)</mo>")  # of norms: as high as letters
-NAME = re.compile(r"<m[io]>(ln|log|exp|sin|cos|tan|det|min|max)</m[io]>")  # with space around
-ITALIC = [0x210E, *range(0x1D434, 0x1D468), *range(0x1D6E2, 0x1D71C)]  # what single letters become
+BAR = re.compile(r"<mo[^>]*>(&#x0?2016;|&#x0*7C;)</mo>")  # norms: do not stretch
+NAME = re.compile(
+    r"<m[io]>(ln|log|exp|sin|cos|tan|det|min|max)</m[io]>"
+)  # function names: with space around them
+ITALIC = [
+    0x210E,
+    *range(0x1D434, 0x1D468),
+    *range(0x1D6E2, 0x1D71C),
+]  # code points of italic letters
 
 
 def mathml(text: str) -> str:
-    """Return a page's HTML with the formulas that arithmatex has marked as MathML."""
+    """Return HTML in which the formulas that arithmatex marked are MathML."""
     return MARKED.sub(_drawn, text)
 
 
@@ -38,9 +44,9 @@ def _converted(source: str, **options: str) -> str:
 
 
 def font(pages: str) -> bytes:
-    """Return STIX Two Math (SIL Open Font License) as WOFF, cut down to what formulas hold.
+    """Return STIX Two Math (SIL Open Font License) as WOFF, with the characters of the formulas.
 
-    Browsers need a font with a table of mathematics, and not every machine has one.
+    Browsers need a font with an OpenType MATH table, which many machines lack.
 
     Args:
         pages: HTML of all pages.

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable
 from pathlib import PurePosixPath
 
-from paths import DOCS, GENERATED, INCLUDED, NOTEBOOKS, ROOT
+from paths import DOCS, GENERATED, INCLUDED, NOTEBOOKS
 
 LINK = re.compile(r"(?P<mark>!?)\[(?P<text>[^\]]*)\]\((?P<target>[^)\s]+)\)")
 NAME = re.compile(r"(?<![\[`])`(?P<name>dpl(?:\.\w+)+)`(?![\]`])")
@@ -15,7 +15,7 @@ PLACES = {"conf": "options.md", "benchmarks": "results.md", "scripts": "commands
 
 
 def outside_code(text: str, change: Callable[[str], str]) -> str:
-    """Return a text with what is no fenced block changed."""
+    """Return a text with `change` applied outside of fenced blocks."""
     parts = re.split(r"(^ *```.*?^ *``` *$)", text, flags=re.M | re.S)
     return "".join(part if k % 2 else change(part) for k, part in enumerate(parts))
 
@@ -37,16 +37,15 @@ def targets(text: str) -> list[str]:
 
 
 def place(path: str) -> str | None:
-    """Return the page or file of the site that shows a path of the repository; None if none."""
+    """Return the page or file of the site for a path of the repository; None if there is none."""
     for page, source in INCLUDED.items():
-        if path == source and (ROOT / source).is_file():
+        if path == source:
             return page
     pure = PurePosixPath(path)
     if pure.parts[0] == "docs":
         inside = str(pure.relative_to("docs"))
-        if inside in GENERATED or (inside in INCLUDED and (ROOT / INCLUDED[inside]).is_file()):
-            return inside
-        return inside if (DOCS / inside).is_file() else None
+        there = inside in GENERATED or inside in INCLUDED or (DOCS / inside).is_file()
+        return inside if there else None
     if path.startswith("benchmarks/results/"):
         return path.removeprefix("benchmarks/")
     if pure.parts[0] == "notebooks":
@@ -60,7 +59,7 @@ def place(path: str) -> str | None:
 
 
 def rewritten(text: str, source: str, page: str) -> str:
-    """Return a text of the repository as it stands in the site.
+    """Return a text with its links rewritten for the site; links without a page become plain text.
 
     Args:
         text: Markdown.
@@ -83,11 +82,11 @@ def rewritten(text: str, source: str, page: str) -> str:
 
 
 def named(text: str, anchor: Callable[[str], str | None]) -> str:
-    """Return a text in which names of the package, set as code, lead to their page.
+    """Return a text in which names of the package in backticks link to the reference.
 
     Args:
         text: Markdown.
-        anchor: From a dotted name to what it is linked by.
+        anchor: Returns the anchor of a dotted name, or None.
     """
 
     def link(match: re.Match) -> str:
@@ -98,7 +97,7 @@ def named(text: str, anchor: Callable[[str], str | None]) -> str:
 
 
 def named_in_html(text: str, anchor: Callable[[str], str | None]) -> str:
-    """Return what `named` does, of a page of docstrings."""
+    """Return HTML in which names of the package in `<code>` link to the reference."""
 
     def link(match: re.Match) -> str:
         found = None if match["linked"] else anchor(match["name"])

@@ -1,49 +1,29 @@
-"""The page of benchmarks/results/: every table and figure with the command that makes it."""
+"""The page of benchmarks/results/: tables and figures with the commands that make them."""
 
 import csv
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from paths import RESULTS
 
 Row = dict[str, str]
-HEADS = {
-    "SNR_min": "SNR min [dB]",
-    "e_max": "e_max [-]",
-    "e_mean": "e_mean [-]",
-    "factorisations": "factors",
-    "generation_minutes": "solving [min]",
-    "memory": "memory [MB]",
-    "min_det_F": "min det F",
-    "ms": "ms",
-    "ms_p99": "ms, 99 %",
-    "newton_iterations": "Newton iterations after",
-    "peak": "peak of the process [MB]",
-    "rel_L2_median": "rel. L2, median",
-    "rel_L2_worst": "rel. L2, worst",
-    "residual": "‖R‖/‖f‖",
-    "seconds": "s",
-    "training_minutes": "training [min]",
-    "volume_ratio": "min det F",
-}
 VALUE = re.compile(r"\{\{ *(?P<stem>\w+):(?P<which>[^{}]*): *(?P<column>\w+) *\}\}")
 
 
 @dataclass(frozen=True)
 class Part:
-    """Some files of benchmarks/results/.
+    """Files of benchmarks/results/ that one command makes.
 
     Attributes:
-        pattern: Their stem, whole.
-        title: Of the section; groups of the pattern may stand in it and in `command`.
-        command: Makes them.
-        about: What is seen.
-        split: Column whose values get a table each.
-        opened: So many of these tables are open, the others folded.
-        keep: Rows that are shown; the file has all.
+        pattern: Regular expression of their stem; `title` and `command` may use its groups.
+        title: Title of the section.
+        command: The command.
+        about: What the files contain.
+        split: Column whose values get a table each; the first is open, the others are folded.
+        tabulated: Whether the page shows the table, and not its figure and file alone.
     """
 
     pattern: str
@@ -51,33 +31,7 @@ class Part:
     command: str
     about: str
     split: str | None = None
-    opened: int = 1
-    keep: Callable[[list[Row]], list[Row]] = lambda rows: rows
-
-
-def _ends(rows: list[Row]) -> list[Row]:
-    """Return what each solver ended with, on one thread."""
-    return [row for row in rows if row["last"] == "True" and row["threads"] == "1"]
-
-
-def _extremes(rows: list[Row]) -> list[Row]:
-    """Return the load of the smallest and that of the largest deflection of each body."""
-    kept = []
-    for body in dict.fromkeys(row["body"] for row in rows):
-        mine = sorted(
-            (row for row in rows if row["body"] == body), key=lambda row: float(row["deflection"])
-        )
-        kept += [mine[0], mine[-1]]
-    return kept
-
-
-def _moments(rows: list[Row]) -> list[Row]:
-    """Return the first, middle and last of the rows of each work."""
-    kept = []
-    for work in dict.fromkeys(row["what"] for row in rows):
-        mine = [row for row in rows if row["what"] == work]
-        kept += [mine[0], mine[len(mine) // 2], mine[-1]]
-    return kept
+    tabulated: bool = True
 
 
 PARTS = (
@@ -85,7 +39,7 @@ PARTS = (
         r"(beam_svk|propeller_nh|beam_nh_loss|beam_young)",
         "All methods on `{0}`",
         "python scripts/results.py name={0}",
-        "Every run below `runs/{0}` beside the linear answer, POD-Galerkin and the paper: 100 test "
+        "All runs below `runs/{0}`, the linear solution, POD-Galerkin and the paper: 100 test "
         "loads in range, 50 small ones and 50 of one to two times the range.",
         split="loads",
     ),
@@ -94,14 +48,13 @@ PARTS = (
         "Newton from predictions",
         "python scripts/convergence.py run=runs/beam_svk networks=[latent,fcnn] far=0 "
         "folder=benchmarks/results",
-        "The paper's experiment 4: 50 loads in range, 50 of one to two times the range, one at a "
-        "time on one thread.",
+        "The paper's experiment 4: 50 loads in range and 50 of one to two times the range, one at "
+        "a time on one thread.",
         split="tol",
-        opened=2,
     ),
     Part(
         "hybrid_newton_far",
-        "Newton from predictions, far out",
+        "Newton from predictions outside the training range",
         "python scripts/convergence.py name=hybrid_newton_far run=runs/beam_svk networks=[latent] "
         "count=0 far=8 tols=[1e-6] folder=benchmarks/results",
         "Loads of three and of five times the range.",
@@ -112,44 +65,42 @@ PARTS = (
         "Run time against error on `{0}`",
         "python scripts/pareto.py run=runs/{0} folder=benchmarks/results "
         "discretisation=benchmarks/results/discretisation_{0}.csv",
-        "The table has what each solver ends with; the figure and the file have every iterate.",
-        keep=_ends,
+        "Figure and file contain every iterate of every solver.",
+        tabulated=False,
     ),
     Part(
         r"discretisation_(beam_svk|propeller_nh)",
         "Discretisation error on `{0}`",
         "python scripts/benchmark.py parts=[discretisation] folder=benchmarks/results",
-        "One load on ever finer meshes, against the limit by Richardson's extrapolation.",
+        "One load on refined meshes, compared with the limit by Richardson extrapolation.",
     ),
     Part(
         "sizes",
         "Cost against degrees of freedom",
         "python scripts/benchmark.py parts=[sizes] repeats=3 folder=benchmarks/results",
-        "Beams from 4 to 20 cells across, each in a process of its own, random weights.",
+        "Beams of 4 to 20 elements across, each in its own process, with random weights.",
     ),
     Part(
         "deflections",
-        "How far test loads move the bodies",
+        "Displacements of the test loads",
         "python scripts/benchmark.py parts=[deflections] count=100 folder=benchmarks/results",
         "The largest nodal displacement of each test load of `beam_svk` and of `propeller_nh`, "
-        "over the longest side of the body. The table has the loads that move each body least and "
-        "most.",
-        keep=_extremes,
+        "over the longest side of the body.",
+        tabulated=False,
     ),
     Part(
         r"stress_(\w+)",
-        "A trained run far beyond its range, `{0}`",
+        "A trained run outside its range, `{0}`",
         "python scripts/stress.py cases=[] run=runs/{0}/latent",
         "Loads from 1e-9 to 25 times the range.",
         split="series",
     ),
     Part(
         "soak",
-        "Thirty minutes at full speed",
+        "Thirty minutes at full load",
         "python scripts/soak.py minutes=30",
-        "Online training, then the simulator. The table has the first, the middle and the last "
-        "look at each.",
-        keep=_moments,
+        "Online training, then the simulator.",
+        tabulated=False,
     ),
 )
 
@@ -161,12 +112,12 @@ def read(stem: str) -> list[Row]:
 
 
 def stems() -> list[str]:
-    """Return what there is."""
+    """Return the stems of all tables and figures."""
     return sorted({path.stem for path in RESULTS.iterdir() if path.suffix in (".csv", ".png")})
 
 
 def part_of(stem: str) -> tuple[Part, tuple[str, ...]] | None:
-    """Return what a file belongs to, with the groups of its pattern."""
+    """Return the part of a file and the groups of its pattern; None if no part matches."""
     for part in PARTS:
         found = re.fullmatch(part.pattern, stem)
         if found:
@@ -178,22 +129,21 @@ def page() -> str:
     """Return the page.
 
     Raises:
-        LookupError: A file belongs to no part.
+        LookupError: No part matches a file.
     """
     there = stems()
     for stem in there:
         if part_of(stem) is None:
             raise LookupError(
-                f"results/{stem}: which command makes it? add it to PARTS in {__file__}"
+                f"results/{stem} has no part; add the command that makes it to PARTS in {__file__}"
             )
     order = {part: k for k, part in enumerate(PARTS)}
     there.sort(key=lambda stem: (order[part_of(stem)[0]], stem))
     parts = [
         "---\nhide: [navigation]\n---\n",
         "# Results\n",
-        "Tables and figures are those of `benchmarks/results/`, read when this page was made. "
-        "What they mean is told in [Measurements](measurements.md). Times differ from machine to "
-        "machine.\n",
+        "Tables and figures of `benchmarks/results/`. [Measurements](measurements.md) explains "
+        "them. Times differ from machine to machine.\n",
     ]
     for stem in there:
         parts += section(stem)
@@ -210,43 +160,33 @@ def section(stem: str) -> Iterator[str]:
     yield f"{part.about.format(*groups)} {_machine(stem)}Files: {links}.\n"
     if (RESULTS / f"{stem}.png").is_file():
         yield f"![{part.title.format(*groups)}](results/{stem}.png)\n"
-    if (RESULTS / f"{stem}.csv").is_file():
-        yield from tables(part.keep(read(stem)), part.split, part.opened)
+    if part.tabulated and (RESULTS / f"{stem}.csv").is_file():
+        yield from tables(read(stem), part.split)
 
 
 def _machine(stem: str) -> str:
     path = RESULTS / f"{stem}.json"
     if not path.is_file():
         return ""
-    told = json.loads(path.read_text(encoding="utf-8"))
-    return "Measured on " + ", ".join(_fact(key, value) for key, value in told.items()) + ". "
+    facts = json.loads(path.read_text(encoding="utf-8"))
+    return f"Measured with {', '.join(f'{key}: {value}' for key, value in facts.items())}. "
 
 
-def _fact(key: str, value: object) -> str:
-    return f"{value} thread{'s' * (value != 1)}" if key == "threads" else str(value)
-
-
-def tables(rows: list[Row], split: str | None, opened: int = 1) -> Iterator[str]:
-    """Yield tables: one, or one for each value of a column."""
+def tables(rows: list[Row], split: str | None) -> Iterator[str]:
+    """Yield one table, or one for each value of a column."""
     if split is None:
         yield from table(rows)
         return
-    values = dict.fromkeys(row[split] for row in rows)
-    for k, value in enumerate(values):
+    for k, value in enumerate(dict.fromkeys(row[split] for row in rows)):
         mine = [{c: x for c, x in row.items() if c != split} for row in rows if row[split] == value]
-        name = f"{split} {value}" if split == "tol" and value else value or "the paper"
-        if k < opened:
-            yield f"**{name}**\n"
-            yield from table(mine)
-            continue
-        yield f'??? note "{name}"\n'
+        yield f'???{"+" if k == 0 else ""} note "{split}: {value or "the paper"}"\n'
         yield from (f"    {line}" for line in table(mine))
 
 
 def table(rows: list[Row]) -> Iterator[str]:
-    """Yield one table, columns without any number left out."""
+    """Yield one table without its empty columns."""
     columns = [c for c in rows[0] if any(row[c] for row in rows)]
-    yield "| " + " | ".join(HEADS.get(c, c.replace("_", " ")) for c in columns) + " |"
+    yield "| " + " | ".join(column.replace("_", " ") for column in columns) + " |"
     yield "|" + " --- |" * len(columns)
     for row in rows:
         yield "| " + " | ".join(shown(row[c]) for c in columns) + " |"
@@ -254,7 +194,7 @@ def table(rows: list[Row]) -> Iterator[str]:
 
 
 def shown(text: str) -> str:
-    """Return a number as it is read: at most three digits, thousands apart."""
+    """Return a number with at most three digits and separated thousands; other text as it is."""
     try:
         number = float(text)
     except ValueError:
@@ -270,10 +210,10 @@ def shown(text: str) -> str:
 
 
 def filled(text: str) -> str:
-    """Return a text with `{{ file: column=value, column=value: column }}` as the number itself.
+    """Return a text with `{{ file: column=value; column=value: column }}` replaced by numbers.
 
     Raises:
-        LookupError: No row, or more than one, is meant.
+        LookupError: Not exactly one row matches.
     """
     return VALUE.sub(lambda match: shown(value(**match.groupdict())), text)
 
@@ -282,17 +222,17 @@ def value(stem: str, which: str, column: str) -> str:
     """Return one number of a file.
 
     Args:
-        stem: Of the file in benchmarks/results/.
-        which: `column=value` that its row has, apart by semicolons.
-        column: Where it stands.
+        stem: Stem of the file in benchmarks/results/.
+        which: `column=value` of its row, separated by semicolons.
+        column: Column of the number.
 
     Raises:
-        LookupError: No row, or more than one, is meant.
+        LookupError: Not exactly one row matches.
     """
     wanted = dict(pair.strip().split("=", 1) for pair in which.split(";"))
     found = [row for row in read(stem) if all(row[c] == x for c, x in wanted.items())]
     if len(found) != 1:
-        raise LookupError(f"results/{stem}.csv: {len(found)} rows are {wanted}")
+        raise LookupError(f"results/{stem}.csv: {len(found)} rows match {wanted}")
     return found[0][column]
 
 

@@ -1,4 +1,4 @@
-"""Where things lie."""
+"""Folders of the repository, and the pages of the site that do not lie in docs/."""
 
 from pathlib import Path
 
@@ -6,18 +6,17 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 CONF = ROOT / "conf"
 RESULTS = ROOT / "benchmarks" / "results"
-COMMANDS = {  # folders of commands: folder of their configurations
-    ROOT / "dpl" / "commands": CONF,
-    ROOT / "benchmarks" / "commands": ROOT / "benchmarks" / "conf",
-}
 NOTEBOOKS = ROOT / "notebooks"
 PACKAGE = ROOT / "dpl"
+COMMANDS = {  # folder of commands -> folder of their configurations
+    PACKAGE / "commands": CONF,
+    ROOT / "benchmarks" / "commands": ROOT / "benchmarks" / "conf",
+}
 
 INCLUDED = {  # page of the site -> file of the repository
-    "house.md": "DESIGN.md",
+    "design.md": "DESIGN.md",
     "readme.md": "README.md",
     "contributing.md": "CONTRIBUTING.md",
     "changelog.md": "CHANGELOG.md",
 }
-
-GENERATED = ("options.md", "commands.md", "results.md")  # pages that are made of what is there
+GENERATED = ("options.md", "commands.md", "results.md")
