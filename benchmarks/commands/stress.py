@@ -1,6 +1,7 @@
-"""What the package does where it is hard: python scripts/stress.py, or with run=runs/... besides.
+"""Run the stress cases: python scripts/stress.py [run=runs/...].
 
-One line per case: what was asked, what came of it. Ends with 1 if anything was silently wrong.
+Each case prints its task, its expected and its observed outcome. The exit status is 1 if an
+outcome is silently wrong.
 """
 
 import sys
@@ -19,53 +20,54 @@ COLOURS = {"as expected": "green", "reported": "yellow", "silently wrong": "bold
 
 @command("stress", conf=CONF)
 def main(cfg: DictConfig) -> None:
-    """Run the matrix; rows are written after each case, the figure at the end."""
+    """Run the cases; rows are written after each case, the figure at the end."""
     from benchmarks import stress
     from benchmarks.stress.drawing import draw
 
     config.check(cfg)
     try:
-        cases = stress.matrix(cfg.cases)
+        cases = stress.select_cases(cfg.cases)
     except ValueError as error:
         raise config.ConfigError(f"cases: {error}") from error
     if cfg.run is not None:
         _, surrogate = config.load_run(cfg.run)
         cases += stress.trained_run.cases(surrogate)
     folder, console = Path(cfg.folder), Console(highlight=False)
-    lines: list[stress.Line] = []
-    numbers: list[stress.Number] = []
-    rungs: list[stress.LoadLevel] = []
+    lines: list[stress.CaseResult] = []
+    comparisons: list[stress.Comparison] = []
+    levels: list[stress.LoadLevel] = []
     for k, case in enumerate(cases, 1):
-        print(f"{k}/{len(cases)} {case.name}: {case.what} ...", end="\r", file=sys.stderr)
-        line, outcome = stress.perform(case)
+        print(f"{k}/{len(cases)} {case.name}: {case.description} ...", end="\r", file=sys.stderr)
+        line, outcome = stress.run_case(case)
         lines.append(line)
-        numbers += stress.numbers(case, outcome)
-        rungs += outcome.rungs
-        for rows, name in ((lines, "cases"), (numbers, "numbers"), (rungs, "ladders")):
+        comparisons += stress.comparisons(case, outcome)
+        levels += outcome.levels
+        for rows, name in ((lines, "cases"), (comparisons, "numbers"), (levels, "load_sweeps")):
             if rows:
                 table.write(rows, folder / f"{name}.csv")
         colour = COLOURS[line.verdict]
         console.print(
-            f"[{colour}]{line.verdict:14}[/] {line.case:6} {line.what} ({line.seconds:.1f} s)\n"
-            f"    expected: {line.expected}\n    happened: {line.happened}",
+            f"[{colour}]{line.verdict:14}[/] {line.case:6} {line.description} "
+            f"({line.seconds:.1f} s)\n"
+            f"    expected: {line.expected}\n    observed: {line.observed}",
             soft_wrap=True,
         )
     table.write_machine(folder / "machine.json")
-    if rungs:
-        draw(rungs, folder / "ladders.png")
+    if levels:
+        draw(levels, folder / "load_sweeps.png")
     print(_summary(lines))
     if any(line.verdict == stress.Verdict.WRONG for line in lines):
         sys.exit(1)
 
 
 def _summary(lines: list) -> str:
-    """Return how many cases, solves and states there were, and what came of them."""
+    """Return the numbers of cases, verdicts, solves and states as text."""
     counts = [f"{sum(x.verdict == name for x in lines)} {name}" for name in COLOURS]
-    smallest = [line.smallest for line in lines if line.smallest == line.smallest]
-    lowest = f", smallest min det F {min(smallest):.2g}" if smallest else ""
-    states = sum(line.iterates for line in lines)
+    min_detF = [line.min_detF for line in lines if line.min_detF == line.min_detF]
+    lowest = f", smallest min det F {min(min_detF):.2g}" if min_detF else ""
+    states = sum(line.states_checked for line in lines)
     seconds = sum(line.seconds for line in lines)
     return (
         f"{len(lines)} cases in {seconds:.0f} s: {', '.join(counts)}; "
-        f"{sum(line.solves for line in lines)} solves, {states:,} states watched{lowest}"
+        f"{sum(line.solves for line in lines)} solves, {states:,} states checked{lowest}"
     )

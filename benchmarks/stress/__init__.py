@@ -1,21 +1,31 @@
-"""Stress: hard and hopeless things that are asked of the package, and whether it says what it does.
+"""Stress cases: difficult and unsolvable tasks, and whether the package reports its results truly.
 
-A case asks, an outcome tells what happened and is as expected, reported (it failed, and said so) or
-silently wrong; only the last is a defect. Every state of every solve in the matrix is watched.
-Sources of the numbers: table 2.2 of the verification dossier, typed in beside the cases.
+The outcome of a case is as expected, reported (a failure that the package reports itself) or
+silently wrong; only the last is a defect. An auditor checks every state of every solve.
+Reference numbers stand beside the cases. Where no source is named, they were computed by an
+independent finite-element program in NumPy.
 """
 
 from collections.abc import Sequence
 
 from benchmarks.stress import bodies, invalid_input, loads, networks, stability, trained_run
-from benchmarks.stress.case import Case, Line, LoadLevel, Number, Outcome, Verdict, numbers, perform
+from benchmarks.stress.case import (
+    Case,
+    CaseResult,
+    Comparison,
+    LoadLevel,
+    Outcome,
+    Verdict,
+    comparisons,
+    run_case,
+)
 
 __all__ = [
     "Case",
     "Line",
+    "LoadLevel",
     "Number",
     "Outcome",
-    "Rung",
     "Verdict",
     "matrix",
     "names",
@@ -25,14 +35,14 @@ __all__ = [
 ]
 
 
-def matrix(wanted: Sequence[str] | None = None) -> list[Case]:
-    """Return the cases of the mechanics and of stubs of networks.
+def select_cases(wanted: Sequence[str] | None = None) -> list[Case]:
+    """Return the cases of the mechanics and of predictors that stand for networks.
 
     Args:
-        wanted: Names of those; all if left out.
+        wanted: Names of cases; all if left out.
 
     Raises:
-        ValueError: There is no case of a name.
+        ValueError: A name is unknown.
     """
     themes = loads, bodies, invalid_input, stability, networks
     found = sorted((case for theme in themes for case in theme.cases()), key=_order)
@@ -43,7 +53,7 @@ def matrix(wanted: Sequence[str] | None = None) -> list[Case]:
 
 
 def names(cases: Sequence[Case]) -> list[str]:
-    """Return the names of cases, each once."""
+    """Return the distinct names of cases."""
     return list(dict.fromkeys(case.name for case in cases))
 
 

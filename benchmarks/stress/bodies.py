@@ -1,4 +1,4 @@
-"""Bodies of any size, stiffness, Poisson's ratio and flatness: T7, T8, T10, T11."""
+"""Sizes, moduli, Poisson's ratios and aspect ratios of bodies: T7, T8, T10, T11."""
 
 import warnings
 from functools import cache, partial
@@ -8,8 +8,8 @@ import torch
 from benchmarks.stress import fixtures
 from benchmarks.stress.auditor import Auditor
 from benchmarks.stress.case import Case, Outcome, classify
-from benchmarks.stress.fixtures import load_of
-from benchmarks.stress.loads import kinds, words
+from benchmarks.stress.fixtures import as_load
+from benchmarks.stress.loads import describe, newton_variants
 from benchmarks.verification.refinement import LOCKING, POISSON, compliance
 from benchmarks.verification.report import Row
 from dpl import Scene
@@ -30,35 +30,46 @@ from dpl.fem import (
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
 DIRECT = [name for name in installed_backends() if name != "cg"]
-UNITS = [(4500.0, 25.0), (1.0, 1e-3), (1.0, 1e3), (1e12, 1e-3), (1e12, 1e3)]  # E [Pa], side [m]
-SCALED: list[tuple[str, Material, tuple[str, str, str]]] = [  # VERIFICATION 1.10: u/L of the corner
+UNIT_SYSTEMS = [
+    (4500.0, 25.0),
+    (1.0, 1e-3),
+    (1.0, 1e3),
+    (1e12, 1e-3),
+    (1e12, 1e3),
+]  # E [Pa], side [m]
+REFERENCE_CORNER: list[tuple[str, Material, tuple[str, str, str]]] = [  # u/L of the corner
     ("SVK", SVK, ("8.023468838e-3", "-2.392426382e-4", "-.2479226415")),
     ("NH-ln", NH, ("1.024683172e-2", "-2.397967447e-4", "-.2477360716")),
 ]
-# VERIFICATION 2.2 T10: cells along a side, through the thickness, degree -> w at a/h = 100 and 10
-PLATES = {
+# T10: cells along a side, through the thickness, degree -> w at a/h = 100 and 10
+PLATE_DEFLECTIONS = {
     (16, 1, 1): (".087", ".904"),
     (16, 2, 1): (".088", ".990"),
     (8, 1, 2): (".937", "1.119"),
     (16, 1, 2): (".982", "1.132"),
 }
-SLIVERS = {1e-2: "-.2388289", 1e-4: "-.2386176", 1e-6: "-.2386155", 1e-8: "-.2386155"}  # T11: u_z/L
+SLIVER_DEFLECTIONS = {
+    1e-2: "-.2388289",
+    1e-4: "-.2386176",
+    1e-6: "-.2386155",
+    1e-8: "-.2386155",
+}  # T11: u_z/L
 ASPECTS = (1.0, 10.0, 100.0, 1000.0)
 
 
-def scaled(law: Material, printed: tuple[str, ...], watch: Auditor) -> Outcome:
-    """Bend the same beam in all units, newtons in and metres out."""
-    rows, fails, counts = [], [], []
-    for young, side in UNITS:
+def unit_systems(law: Material, printed: tuple[str, ...], auditor: Auditor) -> Outcome:
+    """Bend the same beam in several systems of units, [N] to [m]."""
+    rows, failures, counts = [], [], []
+    for young, side in UNIT_SYSTEMS:
         mesh = box([4 * side, side, side], [9, 3, 3])
         problem = Problem.build(mesh, law, fixed=Plane(0, "min"))
         newton = Newton(problem, mixed_integration=False)
         scene = Scene(problem, ModalLoads(newton.linear_solver, n_modes=1, young=young), newton)
-        newtons = young * scene.force_unit * fixtures.pulled(problem, 20.0)
+        newtons = young * scene.force_unit * fixtures.end_traction(problem, 20.0)
         given = scene.load_of(newtons[None], torch.tensor([young], dtype=torch.float64))
-        state = watch.solve(newton, problem, given)
+        state = auditor.solve(newton, problem, given)
         if not state.stable.all():
-            fails.append(f"E = {young:g} Pa, side {side:g} m: {words(state)}")
+            failures.append(f"E = {young:g} Pa, side {side:g} m: {describe(state)}")
             continue
         counts.append(int(state.iterations))
         metres = scene.length * state.displacement[0, int(problem.points.sum(dim=1).argmax())]
@@ -66,12 +77,12 @@ def scaled(law: Material, printed: tuple[str, ...], watch: Auditor) -> Outcome:
             name = f"E = {young:g} Pa, L = {4 * side:g} m: u_{'xyz'[k]}/L"
             rows.append(Row(name, known, float(metres[k]) / (4 * side), 1e-9))
     if len(set(counts)) > 1:
-        fails.append("iterations differ")
-    return classify(f"iterations {', '.join(map(str, counts))}", rows, fails=fails)
+        failures.append("iterations differ")
+    return classify(f"iterations {', '.join(map(str, counts))}", rows, failures=failures)
 
 
-def locked(name: str, watch: Auditor) -> Outcome:
-    """Measure how far an element locks towards incompressibility, and whether it says so."""
+def volumetric_locking(name: str, auditor: Auditor) -> Outcome:
+    """Measure the volumetric locking of an element and whether `Problem.build` warns of it."""
     cells, cell, degree, printed = LOCKING[name]
     mean, rows = "mean" in name, list[Row]()
     for k, nu in enumerate(POISSON):
@@ -96,24 +107,24 @@ def _reference(nu: float) -> float:
     return compliance(nu, (16, 4, 4), "hexahedron", 2)
 
 
-def flat(cells: tuple[int, int, int], watch: Auditor) -> Outcome:
+def plate_bending(cells: tuple[int, int, int], auditor: Auditor) -> Outcome:
     """Bend a clamped plate, thin and thick."""
     rows = [
         Row(f"a/h = {slenderness}: w over Kirchhoff's", printed, _plate(cells, slenderness))
-        for slenderness, printed in zip((100, 10), PLATES[cells], strict=True)
+        for slenderness, printed in zip((100, 10), PLATE_DEFLECTIONS[cells], strict=True)
     ]
     return classify(", ".join(f"{row.value:.3f}" for row in rows), rows)
 
 
 def _plate(cells: tuple[int, int, int], slenderness: int) -> float:
     problem, force, known = fixtures.plate(*cells, slenderness)
-    answer = solve(LinearSolver(problem), load_of(force))
+    answer = solve(LinearSolver(problem), as_load(force))
     below = fixtures.nearest_node(problem, [0.5, 0.5, 0.0])
     return -answer.displacement[0, below, 2].item() / known
 
 
-def flattest(watch: Auditor) -> Outcome:
-    """Bend a plate of a/h = 1000: linear cells must warn, quadratic ones stay below the limit."""
+def very_thin_plate(auditor: Auditor) -> Outcome:
+    """Bend a plate of a/h = 1000: linear cells warn, quadratic cells agree with theory."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         linear = _plate((16, 1, 1), 1000)
@@ -127,29 +138,29 @@ def flattest(watch: Auditor) -> Outcome:
     return classify(f"degree 1 {linear:.4f}, warned of; degree 2 {quadratic:.3f}", rows)
 
 
-def drawn_out(watch: Auditor) -> Outcome:
-    """Pull rods of ever longer cells to a stretch of 1.5; all cells stretch alike."""
-    rows, fails = [], []
+def long_cells(auditor: Auditor) -> Outcome:
+    """Pull rods of cells with growing aspect ratio to a stretch of 1.5."""
+    rows, failures = [], []
     for aspect in ASPECTS:
         mesh = box([1.0, 1 / aspect, 1 / aspect], [3, 3, 3])
         problem = Problem.build(mesh, NH, fixed=mesh.p.T == 0, length=1.0)
         force = Traction(Plane(0, "max"), [0.37828018, 0.0, 0.0]).on(problem)
-        for name, newton in kinds(problem):
-            state = watch.solve(newton, problem, load_of(force))
+        for name, newton in newton_variants(problem):
+            state = auditor.solve(newton, problem, as_load(force))
             if not state.stable.all():
-                fails.append(f"1:{aspect:g}, {name}: {words(state)}")
+                failures.append(f"1:{aspect:g}, {name}: {describe(state)}")
                 continue
             longest = 1 + float(state.displacement[..., 0].max())
             rows.append(Row(f"1:{aspect:g}, {name}: stretch", "1.5", longest, 1e-7))
             thinner = 1 + aspect * float(state.displacement[..., 1].min())
             rows.append(Row(f"1:{aspect:g}, {name}: lateral", ".88017459", thinner, 1e-7))
-    return classify("stretches to 1e-7", rows, fails=fails)
+    return classify("stretches to 1e-7", rows, failures=failures)
 
 
-def sliver(part: float, watch: Auditor) -> Outcome:
-    """Bend the beam with a layer of slivers, by every direct backend."""
-    rows, fails, worst = [], [], 0.0
-    mesh = fixtures.slivers(part)
+def sliver(part: float, auditor: Auditor) -> Outcome:
+    """Bend a beam with a layer of slivers with every direct backend."""
+    rows, failures, worst = [], [], 0.0
+    mesh = fixtures.sliver_mesh(part)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         problem = Problem.build(mesh, SVK, fixed=Plane(0, "min"))
@@ -157,47 +168,56 @@ def sliver(part: float, watch: Auditor) -> Outcome:
     rows.append(Row("warnings of aspect ratio", "1", float(said), 0))
     end = int(problem.points.sum(dim=1).argmax())
     for name in DIRECT:
-        for kind, newton in kinds(problem):
+        for kind, newton in newton_variants(problem):
             solver = newton.replace(linear=name)
             del solver.__dict__["linear_solver"]
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", UserWarning)
-                state = watch.solve(solver, problem, load_of(fixtures.pulled(problem, 20.0)))
+                state = auditor.solve(
+                    solver, problem, as_load(fixtures.end_traction(problem, 20.0))
+                )
             ratio = float(state.residual)
             worst = max(worst, ratio)
             if not state.stable.all():
-                fails.append(f"{name}, {kind}: {words(state)}")
+                failures.append(f"{name}, {kind}: {describe(state)}")
                 continue
             value = float(state.displacement[0, end, 2])
-            rows.append(Row(f"{name}, {kind}: u_z/L", SLIVERS[part], value))
+            rows.append(Row(f"{name}, {kind}: u_z/L", SLIVER_DEFLECTIONS[part], value))
             if ratio >= 1e-8:
                 said = any("rounding allows no less" in str(w.message) for w in caught)
                 rows.append(Row(f"{name}, {kind}: warnings of rounding", "1", float(said), 0))
     return classify(
-        f"{', '.join(DIRECT)}: largest |R|/|f| {worst:.0e}, warned of", rows, fails=fails
+        f"{', '.join(DIRECT)}: largest |R|/|f| {worst:.0e}, warned of", rows, failures=failures
     )
 
 
 def cases() -> list[Case]:
-    """Return the cases of this theme."""
+    """Return the cases of this module."""
     same = "u/L to 1e-9 of the printed one, the same iterations"
     found = [
-        Case("T7", f"{name}, E 1 to 1e12 Pa, L 4 mm to 4 km", same, partial(scaled, law, printed))
-        for name, law, printed in SCALED
+        Case(
+            "T7",
+            f"{name}, E 1 to 1e12 Pa, L 4 mm to 4 km",
+            same,
+            partial(unit_systems, law, printed),
+        )
+        for name, law, printed in REFERENCE_CORNER
     ]
     for name, (*_, printed) in LOCKING.items():
         wanted = "as printed" if printed else "0.94 or more"
         expected = f"compliance over hex27's {wanted}; warned of where it locks"
-        found.append(Case("T8", f"{name}, nu .3 to .4999", expected, partial(locked, name)))
-    for cells, deflections in PLATES.items():
-        what = f"clamped plate, {cells[0]} x {cells[0]} x {cells[1]} of degree {cells[2]}"
+        found.append(
+            Case("T8", f"{name}, nu .3 to .4999", expected, partial(volumetric_locking, name))
+        )
+    for cells, deflections in PLATE_DEFLECTIONS.items():
+        description = f"clamped plate, {cells[0]} x {cells[0]} x {cells[1]} of degree {cells[2]}"
         expected = f"w over Kirchhoff's {deflections[0]} (a/h = 100) and {deflections[1]} (10)"
-        found.append(Case("T10", what, expected, partial(flat, cells)))
+        found.append(Case("T10", description, expected, partial(plate_bending, cells)))
     expected = "linear cells warned of; quadratic ones within 0.8 to 1.01 of Kirchhoff's"
-    found.append(Case("T10", "clamped plate, a/h = 1000", expected, flattest))
+    found.append(Case("T10", "clamped plate, a/h = 1000", expected, very_thin_plate))
     expected = "stretch 1.5 and lateral .88017459, each to 1e-7"
-    found.append(Case("T11", "rod of cells of aspect ratio 1 to 1:1000", expected, drawn_out))
-    for part, printed in SLIVERS.items():
+    found.append(Case("T11", "rod of cells of aspect ratio 1 to 1:1000", expected, long_cells))
+    for part, printed in SLIVER_DEFLECTIONS.items():
         expected = f"u_z/L = {printed}; a warning, not a failure"
         found.append(Case("T11", f"sliver layer of {part:g}", expected, partial(sliver, part)))
     return found

@@ -1,4 +1,4 @@
-"""Meshes that cannot be solved, each with the words that the front door has for it."""
+"""Invalid meshes and the words of the error that each must raise."""
 
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,14 @@ FAN = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
 
 
 def write(path: Path, points: Any, **cells: Any) -> Path:
-    """Write a mesh by meshio alone; cells are its kinds and their nodes."""
+    """Write a mesh with meshio; `cells` maps cell types to connectivity."""
     kind = {"file_format": "gmsh"} if path.suffix == ".msh" else {}
     meshio.write(path, meshio.Mesh(points, list(cells.items())), **kind)
     return path
 
 
 def with_node(points: Array, index: int, place: Any) -> Array:
-    """Return the points with one of them elsewhere."""
+    """Return the points with one of them moved to `place`."""
     moved = np.array(points, dtype=float)
     moved[index] = place
     return moved
@@ -36,7 +36,7 @@ def with_node(points: Array, index: int, place: Any) -> Array:
 FAR = TWO_CUBES + np.array([5, 0, 0])
 NEXT = TWO_CUBES + np.array([2, 0, 0])
 # name -> words of the error, points, cells
-BAD: dict[str, tuple[str, Any, dict[str, Any]]] = {
+BROKEN_MESHES: dict[str, tuple[str, Any, dict[str, Any]]] = {
     "not a number": ("not finite", with_node(TWO_CUBES, 3, np.nan), {"hexahedron": TWO_HEXES}),
     "infinite": ("not finite", with_node(TWO_CUBES, 3, np.inf), {"hexahedron": TWO_HEXES}),
     "index from one": ("does the numbering start at 1?", TWO_CUBES, {"hexahedron": TWO_HEXES + 1}),

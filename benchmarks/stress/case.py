@@ -1,4 +1,4 @@
-"""A stress case, what came of it, and the watch that is kept over every solve in it."""
+"""Stress cases, their outcomes and how they are classified."""
 
 import math
 import time
@@ -13,25 +13,25 @@ from dpl.system.threads import one_thread
 
 
 class Verdict(StrEnum):
-    """What a case has shown."""
+    """Classification of an outcome."""
 
     EXPECTED = "as expected"
-    REPORTED = "reported"  # it failed, and said so: in a value, a warning or an error
+    REPORTED = "reported"  # a failure reported by a value, a warning or an error
     WRONG = "silently wrong"
 
 
 @dataclass(frozen=True)
 class LoadLevel:
-    """One load of a ladder.
+    """One load of a load sweep.
 
     Attributes:
-        series: Which ladder.
-        amplitude: Load over the largest of the training range [-].
-        residual: ||R_free|| / ||f|| where the solver ended [-].
-        volume_ratio: Smallest min det F on the way and at the end [-].
+        series: Name of the sweep.
+        amplitude: Load over the largest load of the training range [-].
+        residual: Final relative residual ||R_free|| / ||f|| [-].
+        volume_ratio: Smallest min det F of all states [-].
         iterations: Linear solves.
-        status: Of the end, in words.
-        error: ||u - u*|| / ||u*|| against Newton's answer u* [-]; NaN where that is not asked.
+        status: Final status.
+        error: ||u - u*|| / ||u*|| against Newton's solution u* [-]; NaN if it was not computed.
     """
 
     series: str
@@ -45,68 +45,68 @@ class LoadLevel:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a case.
+    """Result of a case.
 
     Attributes:
-        happened: In words.
-        verdict: What it is worth.
-        rows: Numbers beside their references.
-        rungs: Loads of a ladder, to be drawn.
+        observed: Description of what happened.
+        verdict: Its classification.
+        rows: Measured numbers with their references.
+        levels: Loads of a load sweep, to be drawn.
     """
 
-    happened: str
+    observed: str
     verdict: Verdict
     rows: Sequence[Row] = ()
-    rungs: Sequence[LoadLevel] = ()
+    levels: Sequence[LoadLevel] = ()
 
 
 @dataclass(frozen=True)
 class Case:
-    """Something hard or hopeless that is asked of the package.
+    """A difficult or unsolvable task for the package.
 
     Attributes:
-        name: Its number in table 2.2 of the verification dossier (T1 to T23), or "ladder".
-        what: Is asked.
-        expected: What should happen.
-        run: Does it; all solves go through the watch.
+        name: Identifier, T1 to T23 or "sweep"; the cases of one topic share it.
+        description: The task.
+        expected: The expected outcome.
+        run: Performs the task; the auditor checks all solves.
     """
 
     name: str
-    what: str
+    description: str
     expected: str
     run: Callable[[Auditor], Outcome]
 
 
 @dataclass(frozen=True)
-class Line:
-    """A case that was run, one row of the table.
+class CaseResult:
+    """A case that was run, one row of cases.csv.
 
     Attributes:
-        case, what, expected: Of the case.
-        happened, verdict: Of its outcome.
-        solves: Answers that were asked for.
-        iterates: States on the way to them, all of them seen by the watch.
-        smallest: Smallest min det F of the states that Newton accepted [-]; NaN without any.
+        case, description, expected: See `Case`.
+        observed, verdict: See `Outcome`.
+        solves: Number of solves.
+        states_checked: Number of states of these solves; the auditor checks all of them.
+        min_detF: Smallest min det F of the accepted states [-]; NaN without any.
         seconds: Wall time [s].
     """
 
     case: str
-    what: str
+    description: str
     expected: str
-    happened: str
+    observed: str
     verdict: str
     solves: int
-    iterates: int
-    smallest: float
+    states_checked: int
+    min_detF: float
     seconds: float
 
 
 @dataclass(frozen=True)
-class Number:
-    """A number beside its reference, one row of the second table; see `Row`."""
+class Comparison:
+    """A measured number and its reference, one row of numbers.csv; see `Row`."""
 
     case: str
-    what: str
+    description: str
     quantity: str
     reference: str
     value: float
@@ -115,78 +115,84 @@ class Number:
 
 
 def classify(
-    happened: str,
+    observed: str,
     rows: Sequence[Row] = (),
     *,
-    fails: Sequence[str] = (),
-    rungs: Sequence[LoadLevel] = (),
+    failures: Sequence[str] = (),
+    levels: Sequence[LoadLevel] = (),
 ) -> Outcome:
-    """Return an outcome: rows that miss are silently wrong, for nothing else said so.
+    """Return an outcome; it is silently wrong where a row misses its reference.
 
     Args:
-        happened: In words.
-        rows: Numbers of answers that count as such.
-        fails: What fell short of what is expected, and was said by the answer itself.
-        rungs: Loads of a ladder.
+        observed: Description of what happened.
+        rows: Numbers of solutions that are reported as valid.
+        failures: Deviations from the expectation that the solutions themselves report.
+        levels: Loads of a load sweep.
     """
     missed = [
         f"{row.quantity} is {row.value:.6g} and not {row.reference}"
         for row in rows
         if not row.holds
     ]
-    verdict = Verdict.WRONG if missed else Verdict.REPORTED if fails else Verdict.EXPECTED
-    return Outcome("; ".join([*missed, *fails, happened]), verdict, rows, rungs)
+    verdict = Verdict.WRONG if missed else Verdict.REPORTED if failures else Verdict.EXPECTED
+    return Outcome("; ".join([*missed, *failures, observed]), verdict, rows, levels)
 
 
-def refused(what: str, action: Callable[[], object], words: str) -> Outcome:
-    """Return whether an action ends with an error of one line that holds these words."""
+def expect_error(description: str, action: Callable[[], object], words: str) -> Outcome:
+    """Return the outcome of an action that must raise a one-line error with these words."""
     try:
         action()
     except (ValueError, TypeError, MemoryError, OSError) as error:
-        told = str(error)
-        right = words in told and "\n" not in told
-        happened = f"{type(error).__name__}: {told}"
-        return classify(happened, fails=() if right else [f"{what}: not {words!r}"])
-    return Outcome(f"{what}: no error", Verdict.WRONG)
+        messages = str(error)
+        right = words in messages and "\n" not in messages
+        observed = f"{type(error).__name__}: {messages}"
+        return classify(observed, failures=() if right else [f"{description}: not {words!r}"])
+    return Outcome(f"{description}: no error", Verdict.WRONG)
 
 
-def all_of(outcomes: Sequence[Outcome]) -> Outcome:
-    """Return several outcomes as one, as bad as the worst of them."""
+def combine(outcomes: Sequence[Outcome]) -> Outcome:
+    """Return several outcomes as one with the worst verdict."""
     order = [Verdict.EXPECTED, Verdict.REPORTED, Verdict.WRONG]
     worst = max((outcome.verdict for outcome in outcomes), key=order.index)
-    shown = [o.happened for o in outcomes if worst == Verdict.EXPECTED or o.verdict == worst]
+    shown = [o.observed for o in outcomes if worst == Verdict.EXPECTED or o.verdict == worst]
     rows = [row for outcome in outcomes for row in outcome.rows]
-    rungs = [rung for outcome in outcomes for rung in outcome.rungs]
-    return Outcome("; ".join(dict.fromkeys(shown)), worst, rows, rungs)
+    levels = [level for outcome in outcomes for level in outcome.levels]
+    return Outcome("; ".join(dict.fromkeys(shown)), worst, rows, levels)
 
 
-def perform(case: Case) -> tuple[Line, Outcome]:
-    """Return what came of a case; whatever it raises is reported, whatever is not so is wrong."""
-    watch, start = Auditor(), time.perf_counter()
+def run_case(case: Case) -> tuple[CaseResult, Outcome]:
+    """Return the result of a case; errors count as reported, violations as silently wrong."""
+    auditor, start = Auditor(), time.perf_counter()
     with warnings.catch_warnings(), one_thread():
         warnings.simplefilter("ignore", UserWarning)  # cases that are about warnings record them
         try:
-            outcome = case.run(watch)
+            outcome = case.run(auditor)
         except Exception as error:
-            told = str(error).partition("\n")[0]
-            outcome = Outcome(f"{type(error).__name__}: {told}", Verdict.REPORTED)
-    if watch.lies:
-        happened = "; ".join([*dict.fromkeys(watch.lies), outcome.happened])
-        outcome = replace(outcome, happened=happened, verdict=Verdict.WRONG)
-    line = Line(
-        case.name, case.what, case.expected, outcome.happened, str(outcome.verdict),
-        watch.solves, watch.iterates,
-        watch.smallest if math.isfinite(watch.smallest) else math.nan,
+            messages = str(error).partition("\n")[0]
+            outcome = Outcome(f"{type(error).__name__}: {messages}", Verdict.REPORTED)
+    if auditor.violations:
+        observed = "; ".join([*dict.fromkeys(auditor.violations), outcome.observed])
+        outcome = replace(outcome, observed=observed, verdict=Verdict.WRONG)
+    line = CaseResult(
+        case.name, case.description, case.expected, outcome.observed, str(outcome.verdict),
+        auditor.solves, auditor.states_checked,
+        auditor.min_detF if math.isfinite(auditor.min_detF) else math.nan,
         time.perf_counter() - start,
     )  # fmt: skip
     return line, outcome
 
 
-def numbers(case: Case, outcome: Outcome) -> list[Number]:
-    """Return the numbers of an outcome as rows of a table."""
+def comparisons(case: Case, outcome: Outcome) -> list[Comparison]:
+    """Return the rows of an outcome for numbers.csv."""
     return [
-        Number(
-            case.name, case.what, row.quantity, row.reference, row.value, row.difference, row.holds
+        Comparison(
+            case.name,
+            case.description,
+            row.quantity,
+            row.reference,
+            row.value,
+            row.difference,
+            row.holds,
         )
         for row in outcome.rows
     ]

@@ -1,4 +1,4 @@
-"""What cannot work and is refused: T9 and T12 to T16."""
+"""Invalid input that must raise an error: T9 and T12 to T16."""
 
 import tempfile
 from collections.abc import Callable
@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks.stress import broken_meshes, fixtures
 from benchmarks.stress.auditor import Auditor
-from benchmarks.stress.case import Case, Outcome, all_of, classify, refused
-from benchmarks.stress.fixtures import load_of
+from benchmarks.stress.case import Case, Outcome, classify, combine, expect_error
+from benchmarks.stress.fixtures import as_load
 from benchmarks.verification.report import Row
 from dpl.fem import (
     Box,
@@ -34,9 +34,11 @@ from dpl.fem import (
 from dpl.fem.mesh import check_mesh
 
 NH = NeoHookeanLn(0.3)
-APART = ["two pieces", "crack"]  # T14; the rest of the flaws are T15's
-NOWHERE = {"plane": Plane(0, 0.3), "box": Box([2, 2, 2], [3, 3, 3]), "tag": Tag("end")}
-USES: dict[str, Callable[[Any, Any], Any]] = {  # what takes a region: of mesh and region
+DISCONNECTED = ["two pieces", "crack"]  # T14; the other meshes are T15
+EMPTY_REGIONS = {"plane": Plane(0, 0.3), "box": Box([2, 2, 2], [3, 3, 3]), "tag": Tag("end")}
+REGION_USES: dict[
+    str, Callable[[Any, Any], Any]
+] = {  # uses of a region, functions of mesh and region
     "fixed": lambda mesh, region: Problem.build(mesh, NH, fixed=region),
     "moved": lambda mesh, region: Problem.build(mesh, NH, supports=[DirichletBC(region)]),
     "spring": lambda mesh, region: Problem.build(mesh, NH, supports=[RobinBC(region, 1.0)]),
@@ -45,12 +47,12 @@ USES: dict[str, Callable[[Any, Any], Any]] = {  # what takes a region: of mesh a
 
 
 def of_modulus(young: float) -> ModalLoads:
-    """Return loads on the beam of a Young's modulus [Pa]."""
-    problem = fixtures.beam_of("hexahedron", 1, NH)
+    """Return modal loads on the beam with a Young's modulus [Pa]."""
+    problem = fixtures.coarse_beam("hexahedron", 1, NH)
     return ModalLoads(LinearSolver(problem), n_modes=1, young=young)
 
 
-IMPOSSIBLE: dict[str, tuple[Callable[[], Any], str]] = {  # T9: call, words
+OUT_OF_RANGE: dict[str, tuple[Callable[[], Any], str]] = {  # T9: call, words
     **{
         f"nu = {nu}": (partial(NeoHookeanLn, nu), "poisson")
         for nu in (0.5, 0.7, -1.0, float("nan"), float("inf"))
@@ -62,54 +64,56 @@ IMPOSSIBLE: dict[str, tuple[Callable[[], Any], str]] = {  # T9: call, words
 }
 
 
-def inverted(watch: Auditor) -> Outcome:
-    """Check a mesh of which four cells are inverted."""
-    return refused(
-        "folded", lambda: check_mesh(fixtures.folded()), "4 cells are inverted: 2, 3, 6, 7"
+def inverted_cells(auditor: Auditor) -> Outcome:
+    """Check a mesh with four inverted cells."""
+    return expect_error(
+        "folded", lambda: check_mesh(fixtures.folded_mesh()), "4 cells are inverted: 2, 3, 6, 7"
     )
 
 
-def impossible(watch: Auditor) -> Outcome:
-    """Build what cannot be."""
-    found = [refused(name, call, said) for name, (call, said) in IMPOSSIBLE.items()]
+def out_of_range_constants(auditor: Auditor) -> Outcome:
+    """Construct objects with constants out of range."""
+    found = [expect_error(name, call, said) for name, (call, said) in OUT_OF_RANGE.items()]
     return _counted(found)
 
 
 def _counted(found: list[Outcome]) -> Outcome:
-    """Return outcomes as one; where all are as expected, in few words."""
-    whole = all_of(found)
+    """Return outcomes as one, shortened where all have the same verdict."""
+    whole = combine(found)
     if any(outcome.verdict != found[0].verdict for outcome in found) or len(found) == 1:
         return whole
-    return Outcome(f"{len(found)} errors, such as {found[0].happened}", whole.verdict)
+    return Outcome(f"{len(found)} errors, such as {found[0].observed}", whole.verdict)
 
 
-def held_too_little(support: str, watch: Auditor) -> Outcome:
-    """Load a body that can move as a whole: by every backend, and ask for its modes."""
-    problem = fixtures.loose(support)
+def underconstrained(support: str, auditor: Auditor) -> Outcome:
+    """Solve and compute modes of a body with rigid-body modes, with every backend."""
+    problem = fixtures.underconstrained_bar(support)
     linear = LinearSolver(problem)
-    outcome = refused(support, lambda: eigenmodes(linear, 3), fixtures.LOOSE[support][1])
+    outcome = expect_error(
+        support, lambda: eigenmodes(linear, 3), fixtures.UNDERCONSTRAINED[support][1]
+    )
     force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
     rows = [Row("factors before the error", "0", float("factor" in linear.__dict__))]
     for name in installed_backends():
-        state = watch.solve(Newton(problem, linear=name), problem, load_of(force))
+        state = auditor.solve(Newton(problem, linear=name), problem, as_load(force))
         rows.append(Row(f"{name}: converged", "< 0.5", float(state.converged)))
         rows.append(Row(f"{name}: |u|/L", "0", float(state.displacement.abs().max())))
-    return all_of([outcome, classify(f"{Status(int(state.status))}, at rest", rows)])
+    return combine([outcome, classify(f"{Status(int(state.status))}, at rest", rows)])
 
 
-def read_flawed(names: list[str], watch: Auditor) -> Outcome:
-    """Read files of meshes that cannot be solved."""
+def read_broken_meshes(names: list[str], auditor: Auditor) -> Outcome:
+    """Read files of invalid meshes."""
     found = []
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
-            said, points, cells = broken_meshes.BAD[name]
+            said, points, cells = broken_meshes.BROKEN_MESHES[name]
             path = broken_meshes.write(Path(folder) / "bad.vtu", np.asarray(points, float), **cells)
-            found.append(refused(name, partial(read_mesh, path), said))
+            found.append(expect_error(name, partial(read_mesh, path), said))
     return _counted([_without(outcome, folder) for outcome in found])
 
 
-def read_broken(watch: Auditor) -> Outcome:
-    """Read half a file, an empty one, one of nonsense, and none."""
+def read_damaged_files(auditor: Auditor) -> Outcome:
+    """Read a truncated file, an empty file, a text file and a missing file."""
     found = []
     with tempfile.TemporaryDirectory() as folder:
         whole = broken_meshes.write(
@@ -118,46 +122,52 @@ def read_broken(watch: Auditor) -> Outcome:
         for name, content in (("half", whole[: len(whole) // 2]), ("empty", b""), ("text", b"no")):
             path = Path(folder) / f"{name}.vtu"
             path.write_bytes(content)
-            found.append(refused(name, partial(read_mesh, path), f"{name}.vtu"))
-        found.append(refused("none", partial(read_mesh, Path(folder) / "none.vtu"), "none.vtu"))
+            found.append(expect_error(name, partial(read_mesh, path), f"{name}.vtu"))
+        found.append(
+            expect_error("none", partial(read_mesh, Path(folder) / "none.vtu"), "none.vtu")
+        )
     return _counted([_without(outcome, folder) for outcome in found])
 
 
 def _without(outcome: Outcome, folder: str) -> Outcome:
-    """Return an outcome that does not name a folder of this moment."""
-    return Outcome(outcome.happened.replace(folder, "..."), outcome.verdict)
+    """Return an outcome without the name of a temporary folder."""
+    return Outcome(outcome.observed.replace(folder, "..."), outcome.verdict)
 
 
-def nowhere(watch: Auditor) -> Outcome:
-    """Hold and load bodies where they have no node."""
+def empty_regions(auditor: Auditor) -> Outcome:
+    """Use regions without nodes as supports and loads."""
     mesh = box([1.0, 1.0, 1.0], [3, 3, 3])
     found = []
-    for use, call in USES.items():
-        for where, region in NOWHERE.items():
+    for use, call in REGION_USES.items():
+        for where, region in EMPTY_REGIONS.items():
             words = "no tags at all" if where == "tag" else "holds no"
-            found.append(refused(f"{use}, {where}", partial(call, mesh, region), words))
+            found.append(expect_error(f"{use}, {where}", partial(call, mesh, region), words))
     return _counted(found)
 
 
 def cases() -> list[Case]:
-    """Return the cases of this theme."""
+    """Return the cases of this module."""
     found = []
     expected = "an error that names the key, before anything is computed"
-    found.append(Case("T9", "nu and E out of range, not finite", expected, impossible))
+    found.append(Case("T9", "nu and E out of range, not finite", expected, out_of_range_constants))
     expected = "an error with the numbers of the cells"
-    found.append(Case("T12", "cells inverted at rest", expected, inverted))
-    for support, (_, told) in fixtures.LOOSE.items():
-        expected = f"'{told}', before any factor; Newton: no valid equilibrium, at rest"
+    found.append(Case("T12", "cells inverted at rest", expected, inverted_cells))
+    for support, (_, messages) in fixtures.UNDERCONSTRAINED.items():
+        expected = f"'{messages}', before any factor; Newton: no valid equilibrium, at rest"
         found.append(
-            Case("T13", f"support: {support}", expected, partial(held_too_little, support))
+            Case("T13", f"support: {support}", expected, partial(underconstrained, support))
         )
-    others = [name for name in broken_meshes.BAD if name not in APART]
+    others = [name for name in broken_meshes.BROKEN_MESHES if name not in DISCONNECTED]
     expected = "an error with the sizes of pieces or the nodes"
-    found.append(Case("T14", "two pieces, crack", expected, partial(read_flawed, APART)))
+    found.append(
+        Case("T14", "two pieces, crack", expected, partial(read_broken_meshes, DISCONNECTED))
+    )
     expected = "each an error of one line with its own words"
-    run = partial(read_flawed, others)
+    run = partial(read_broken_meshes, others)
     found.append(Case("T15", f"{len(others)} meshes that cannot be solved", expected, run))
-    found.append(Case("T15", "half a file, an empty one, nonsense, none", expected, read_broken))
+    found.append(
+        Case("T15", "half a file, an empty one, nonsense, none", expected, read_damaged_files)
+    )
     expected = "an error, not a load or a support left out"
-    what = f"{len(USES)} uses of {len(NOWHERE)} regions without a node"
-    return [*found, Case("T16", what, expected, nowhere)]
+    description = f"{len(REGION_USES)} uses of {len(EMPTY_REGIONS)} regions without a node"
+    return [*found, Case("T16", description, expected, empty_regions)]

@@ -1,4 +1,4 @@
-"""Networks and what stands for them, in front of the mechanics: T18 to T21, T23, and a ladder."""
+"""Networks, and predictors that stand for them, with Newton: T18 to T21, T23 and a sweep."""
 
 from collections.abc import Callable
 from functools import cache, partial
@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from benchmarks.stress.auditor import Auditor
-from benchmarks.stress.case import Case, LoadLevel, Outcome, classify, refused
-from benchmarks.stress.fixtures import LARGEST, YOUNG, load_of, pulled
-from benchmarks.stress.loads import LADDER, rung, words
+from benchmarks.stress.case import Case, LoadLevel, Outcome, classify, expect_error
+from benchmarks.stress.fixtures import MAX_TRACTION, YOUNG, as_load, end_traction
+from benchmarks.stress.loads import AMPLITUDES, describe, level
 from benchmarks.verification.bodies import paper_beam
 from benchmarks.verification.report import Row
 from dpl import Scene
@@ -34,10 +34,14 @@ from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
-USELESS = ("not a number", "one not a number", "infinite", "inverted")
-# VERIFICATION 2.2 T20: rms noise over L -> residual ratio of the prediction, plain iterations
+INVALID = ("not a number", "one not a number", "infinite", "inverted")
+# T20: rms noise over L -> residual ratio of the prediction, plain iterations
 NOISE = {1e-2: ("592", "14"), 1e-3: ("53.6", "5"), 1e-4: ("5.47", "3"), 1e-5: (".534", "2")}
-SCALED = {1e-1: "8.96", 1e-2: ".818", 1e-3: ".081"}  # T21: error of a uniform factor -> ||R||/||f||
+REFERENCE_CORNER = {
+    1e-1: "8.96",
+    1e-2: ".818",
+    1e-3: ".081",
+}  # T21: error of a uniform factor -> ||R||/||f||
 FLOAT32 = 1.5e-4  # T18: residual ratio of an exact answer, rounded to float32, 1275 DOF
 
 
@@ -50,30 +54,32 @@ def scene() -> Scene:
 
 
 @cache
-def bent() -> tuple[Newton, Load, Tensor]:
+def bent_beam() -> tuple[Newton, Load, Tensor]:
     """Return the beam of 16 x 4 x 4 cells of SVK, q = 20 Pa and the exact answer (1, N, 3)."""
     problem = paper_beam(SVK, (16, 4, 4))
-    load = load_of(pulled(problem, 20.0))
+    load = as_load(end_traction(problem, 20.0))
     newton = Newton(problem, linear="auto")
     return newton, load, solve(newton.replace(tol=1e-12), load).displacement
 
 
-def known(displacement: Tensor) -> Predict:
-    """Return a network that has one answer, (1, N, D) [-]."""
+def constant_prediction(displacement: Tensor) -> Predict:
+    """Return a predictor with a constant prediction, (1, N, D) [-]."""
     return lambda load: displacement
 
 
-def ways(newton: Newton) -> dict[str, Callable[[Tensor], Solver]]:
-    """Return hybrids by name, as functions of what is predicted (1, N, D)."""
+def hybrids(newton: Newton) -> dict[str, Callable[[Tensor], Solver]]:
+    """Return hybrid solvers by name, as functions of the prediction (1, N, D) [-]."""
     return {
-        "best": lambda guess: Hybrid(known(guess), newton),
-        "paper": lambda guess: Hybrid(known(guess), newton, "paper"),
-        "steps": lambda guess: Hybrid(known(guess), newton, steps=AndersonSolver(newton)),
+        "best": lambda guess: Hybrid(constant_prediction(guess), newton),
+        "paper": lambda guess: Hybrid(constant_prediction(guess), newton, "paper"),
+        "steps": lambda guess: Hybrid(
+            constant_prediction(guess), newton, steps=AndersonSolver(newton)
+        ),
     }
 
 
-def _useless(problem: Problem, truth: Tensor) -> dict[str, Tensor]:
-    """Return predictions (1, N, D) that are worth nothing, by name."""
+def _invalid_predictions(problem: Problem, truth: Tensor) -> dict[str, Tensor]:
+    """Return invalid predictions (1, N, D) by name."""
     one = truth.clone()
     one[:, -1, 0] = torch.nan
     return {
@@ -84,13 +90,13 @@ def _useless(problem: Problem, truth: Tensor) -> dict[str, Tensor]:
     }
 
 
-def useless(name: str, watch: Auditor) -> Outcome:
-    """Start the hybrid from a useless prediction: the answer is the classic one, bit for bit."""
-    newton, load, truth = bent()
-    problem, guess = newton.problem, _useless(newton.problem, truth)[name]
+def invalid_prediction(name: str, auditor: Auditor) -> Outcome:
+    """Start the hybrid from an invalid prediction: the solution is Newton's, bit for bit."""
+    newton, load, truth = bent_beam()
+    problem, guess = newton.problem, _invalid_predictions(newton.problem, truth)[name]
     classic, rows = solve(newton, load), []
-    for way, hybrid in ways(newton).items():
-        state = watch.solve(hybrid(guess), problem, load)
+    for way, hybrid in hybrids(newton).items():
+        state = auditor.solve(hybrid(guess), problem, load)
         same = torch.equal(state.displacement, classic.displacement)
         rows += [
             Row(f"{way}: classic answer, bit for bit", "1", float(same), 0),
@@ -100,30 +106,30 @@ def useless(name: str, watch: Auditor) -> Outcome:
                 *("0", float(state.iterations - classic.iterations), 0),
             ),
         ]
-    (alone,) = Direct(known(guess), problem).iterate(load)
+    (alone,) = Direct(constant_prediction(guess), problem).iterate(load)
     rows.append(Row("network alone: converged", "0", float(alone.converged), 0))
     return classify(f"classic answer in {int(classic.iterations)} iterations, not picked", rows)
 
 
-def misled(name: str, watch: Auditor) -> Outcome:
-    """Start the hybrid from a prediction that is finite and far off."""
-    newton, load, truth = bent()
+def poor_prediction(name: str, auditor: Auditor) -> Outcome:
+    """Start the hybrid from a finite prediction with a large error."""
+    newton, load, truth = bent_beam()
     guess = {"huge": 1e6 * truth, "minus": -truth, "half": 0.5 * truth, "zero": 0 * truth}[name]
-    rows, fails, told = [], [], []
-    for way, hybrid in ways(newton).items():
-        state = watch.solve(hybrid(guess), newton.problem, load)
-        told.append(f"{way} {int(state.iterations)}")
+    rows, failures, messages = [], [], []
+    for way, hybrid in hybrids(newton).items():
+        state = auditor.solve(hybrid(guess), newton.problem, load)
+        messages.append(f"{way} {int(state.iterations)}")
         if not state.converged.all():
-            fails.append(f"{way}: {words(state)}")
+            failures.append(f"{way}: {describe(state)}")
             continue
         off = float((state.displacement - truth).abs().max())
         rows.append(Row(f"{way}: off Newton's answer, over L", "< 1e-8", off))
-    return classify(f"Newton's answer; iterations: {', '.join(told)}", rows, fails=fails)
+    return classify(f"Newton's answer; iterations: {', '.join(messages)}", rows, failures=failures)
 
 
-def noisy(size: float, watch: Auditor) -> Outcome:
-    """Start from the exact answer with noise; picked exactly where its residual is smaller."""
-    newton, load, truth = bent()
+def noisy_prediction(size: float, auditor: Auditor) -> Outcome:
+    """Start from the exact solution with noise; it is used where its residual is smaller."""
+    newton, load, truth = bent_beam()
     problem, random = newton.problem, torch.Generator().manual_seed(0)
     noise = size * torch.randn(truth.shape, generator=random, dtype=torch.float64)
     guess = truth + torch.where(problem.free, noise, 0.0)
@@ -131,17 +137,17 @@ def noisy(size: float, watch: Auditor) -> Outcome:
     plain = PlainNewton(newton)
     *_, first = (state for state, _ in zip(plain.iterate(load), range(2), strict=False))
     *_, corrected = plain.iterate(load, guess=guess)
-    (alone,) = Direct(known(guess), problem).iterate(load)
+    (alone,) = Direct(constant_prediction(guess), problem).iterate(load)
     rows = [
         Row("||R|| / ||f|| of the prediction", printed, float(alone.residual), 0.1),
         Row("the same after one step from rest", "95.6", float(first.residual), 1e-3),
         Row("network alone: converged", "0", float(alone.converged), 0),
     ]
-    fails = []
-    for way, hybrid in ways(newton).items():
-        states = list(watch.over(hybrid(guess), problem, newton.tol).iterate(load))
+    failures = []
+    for way, hybrid in hybrids(newton).items():
+        states = list(auditor.wrap(hybrid(guess), problem, newton.tol).iterate(load))
         if not states[-1].converged.all():
-            fails.append(f"{way}: {words(states[-1])}")
+            failures.append(f"{way}: {describe(states[-1])}")
             continue
         off = float((states[-1].displacement - truth).abs().max())
         rows.append(Row(f"{way}: off Newton's answer, over L", "< 1e-8", off))
@@ -152,32 +158,32 @@ def noisy(size: float, watch: Auditor) -> Outcome:
             )
     taken = int(corrected.iterations)
     if taken > int(count) if size < 1e-2 else taken <= 6:  # at 1e-2 the draw decides how many
-        fails.append(f"plain Newton takes {taken} iterations, printed {count}")
-    told = f"|R|/|f| {float(alone.residual):.3g}, plain Newton from it {taken} iterations"
-    return classify(told, rows, fails=fails)
+        failures.append(f"plain Newton takes {taken} iterations, printed {count}")
+    messages = f"|R|/|f| {float(alone.residual):.3g}, plain Newton from it {taken} iterations"
+    return classify(messages, rows, failures=failures)
 
 
-def factored(watch: Auditor) -> Outcome:
-    """Multiply the exact answer by a factor: a small error of a stiff kind."""
-    newton, load, truth = bent()
+def scaled_prediction(auditor: Auditor) -> Outcome:
+    """Multiply the exact solution by a factor, an error with a large residual."""
+    newton, load, truth = bent_beam()
     rows = []
-    for error, printed in SCALED.items():
-        (alone,) = Direct(known((1 + error) * truth), newton.problem).iterate(load)
+    for error, printed in REFERENCE_CORNER.items():
+        (alone,) = Direct(constant_prediction((1 + error) * truth), newton.problem).iterate(load)
         rows.append(Row(f"{error:.1%} too long: ||R|| / ||f||", printed, float(alone.residual)))
         rows.append(Row(f"{error:.1%}: converged", "0", float(alone.converged), 0))
     return classify(", ".join(f"{row.value:.3g}" for row in rows[::2]), rows)
 
 
-def rounded(watch: Auditor) -> Outcome:
-    """Round an exact answer to float32 and bfloat16: how small a residual a network can have."""
-    newton, load, truth = bent()
-    rows, told = [], []
+def rounded_prediction(auditor: Auditor) -> Outcome:
+    """Round an exact solution to float32 and bfloat16: the smallest residual of a network."""
+    newton, load, truth = bent_beam()
+    rows, messages = [], []
     for dtype, bound in ((torch.float32, FLOAT32), (torch.bfloat16, None)):
         guess, name = truth.to(dtype).double(), str(dtype).removeprefix("torch.")
-        (alone,) = Direct(known(guess), newton.problem).iterate(load)
-        state = watch.solve(Hybrid(known(guess), newton), newton.problem, load)
+        (alone,) = Direct(constant_prediction(guess), newton.problem).iterate(load)
+        state = auditor.solve(Hybrid(constant_prediction(guess), newton), newton.problem, load)
         ratio = float(alone.residual)
-        told.append(f"{name} {ratio:.2g}, then {int(state.iterations)} iterations")
+        messages.append(f"{name} {ratio:.2g}, then {int(state.iterations)} iterations")
         if bound is not None:
             rows.append(Row(f"{name}: ||R|| / ||f||", f"{bound}", ratio, 0.5))
         off = float((state.displacement - truth).abs().max())
@@ -185,11 +191,11 @@ def rounded(watch: Auditor) -> Outcome:
             Row(f"{name}: converged alone", "0", float(alone.converged), 0),
             Row(f"{name}: off Newton's answer, over L", "< 1e-8", off),
         ]
-    return classify("; ".join(told), rows)
+    return classify("; ".join(messages), rows)
 
 
-def precise(dtype: torch.dtype, device: str, watch: Auditor) -> Outcome:
-    """Ask a network of another precision: what it says is float64, and judged in float64."""
+def network_precision(dtype: torch.dtype, device: str, auditor: Auditor) -> Outcome:
+    """Predict with a network of another precision: its output is float64, evaluated in float64."""
     own = scene()
     torch.manual_seed(0)
     surrogate = Surrogate(FCNN(own, width=64), MSE(), own).to(device, dtype)
@@ -200,7 +206,7 @@ def precise(dtype: torch.dtype, device: str, watch: Auditor) -> Outcome:
 
     with torch.inference_mode():
         said = predict(drawn)
-        state = watch.solve(Hybrid(predict, own.solver), own.problem, drawn)
+        state = auditor.solve(Hybrid(predict, own.solver), own.problem, drawn)
     exact = solve(own.solver.replace(tol=1e-12), drawn).displacement
     off = float((state.displacement - exact).abs().max())
     rows = [
@@ -208,13 +214,13 @@ def precise(dtype: torch.dtype, device: str, watch: Auditor) -> Outcome:
         Row("the answer is float64", "1", float(state.displacement.dtype == torch.float64), 0),
         Row("off Newton's answers, over L", "< 1e-6", off),
     ]
-    fails = [] if state.converged.all() else [words(state)]
-    return classify(f"4 loads, {int(state.iterations.sum())} iterations", rows, fails=fails)
+    failures = [] if state.converged.all() else [describe(state)]
+    return classify(f"4 loads, {int(state.iterations.sum())} iterations", rows, failures=failures)
 
 
-def single_precision(watch: Auditor) -> Outcome:
-    """Give Newton forces in float32: no answer may be of that precision."""
-    newton, load, truth = bent()
+def float32_forces(auditor: Auditor) -> Outcome:
+    """Solve with forces in float32: no solution may have that precision."""
+    newton, load, truth = bent_beam()
     try:
         state = solve(newton, Load(load.force.float(), load.young, load.poisson))
     except (RuntimeError, TypeError, ValueError) as error:
@@ -224,83 +230,92 @@ def single_precision(watch: Auditor) -> Outcome:
     return classify(f"answer in {state.displacement.dtype}, off {off:.0e} L", rows)
 
 
-def climbed(watch: Auditor) -> Outcome:
-    """Climb the ladder of loads with hybrids that start from the linear answer."""
-    own, rungs, fails = scene(), [], []
-    problem, unit, rows = own.problem, pulled(own.problem, LARGEST), list[Row]()
+def load_sweep(auditor: Auditor) -> Outcome:
+    """Solve loads of growing amplitude with hybrids that start from the linear solution."""
+    own, levels, failures = scene(), [], []
+    problem, unit, rows = own.problem, end_traction(own.problem, MAX_TRACTION), list[Row]()
     for way in ("natural_monotonicity", "paper", "steps"):
-        for amplitude in LADDER:
-            load = load_of(amplitude * unit)
+        for amplitude in AMPLITUDES:
+            load = as_load(amplitude * unit)
             guess = solve(LinearSolver(problem), load).displacement
             exact = solve(own.solver, load)
-            hybrid = ways(own.solver)[way](guess)
-            states = list(watch.over(hybrid, problem, own.solver.tol).iterate(load))
+            hybrid = hybrids(own.solver)[way](guess)
+            states = list(auditor.wrap(hybrid, problem, own.solver.tol).iterate(load))
             last = states[-1]
             apart = float((last.displacement - exact.displacement).norm())
             error = apart / float(exact.displacement.norm())
-            smallest = min(float(s.volume_ratio) for s in states if s.iterations > 0 or s is last)
-            rungs.append(rung(f"hybrid, {way}", amplitude, last, smallest, error))
+            min_detF = min(float(s.volume_ratio) for s in states if s.iterations > 0 or s is last)
+            levels.append(level(f"hybrid, {way}", amplitude, last, min_detF, error))
             if not last.converged.all():
-                fails.append(f"{way}, {amplitude:g}: {words(last)}")
+                failures.append(f"{way}, {amplitude:g}: {describe(last)}")
             elif amplitude <= 1:
                 rows.append(Row(f"{way}, {amplitude:g}: off Newton", "< 1e-6", error))
-    return classify(_told(rungs), rows, fails=fails, rungs=rungs)
+    return classify(_summary(levels), rows, failures=failures, levels=levels)
 
 
-def _told(rungs: list[LoadLevel]) -> str:
-    done = sum(rung.status in ("converged", "unstable") for rung in rungs)
-    most = max(rung.iterations for rung in rungs)
-    return f"{done} of {len(rungs)} answered, at most {most} iterations"
+def _summary(levels: list[LoadLevel]) -> str:
+    done = sum(level.status in ("converged", "unstable") for level in levels)
+    most = max(level.iterations for level in levels)
+    return f"{done} of {len(levels)} answered, at most {most} iterations"
 
 
-def too_large(watch: Auditor) -> Outcome:
-    """Ask for the paper's network on a mesh of more than 100,000 degrees of freedom."""
+def too_large(auditor: Auditor) -> Outcome:
+    """Build the paper's network on a mesh of more than 100,000 degrees of freedom."""
     mesh = box([1.0, 1.0, 1.0], [33, 33, 33])
     problem = Problem.build(mesh, NH, fixed=Plane(0, "min"))
     newton = Newton(problem)
     own = Scene(problem, ModalLoads(newton.linear_solver, n_modes=1, young=YOUNG), newton)
     size = problem.points.numel()
-    words = f"{4 * size**2 + 7 * size:,} parameters"
+    text = f"{4 * size**2 + 7 * size:,} parameters"
     build = partial(FCNN, own, all_dofs=True, memory_limit=128.0)
-    return refused(f"{size:,} degrees of freedom", build, words)
+    return expect_error(f"{size:,} degrees of freedom", build, text)
 
 
 def cases() -> list[Case]:
-    """Return the cases of this theme."""
+    """Return the cases of this module."""
     floor = f"{FLOAT32:g} in float32; never converged; the hybrid exact to 1e-8 L"
-    found = [Case("T18", "exact answer, rounded to float32 and bfloat16", floor, rounded)]
+    found = [
+        Case("T18", "exact answer, rounded to float32 and bfloat16", floor, rounded_prediction)
+    ]
     expected = "predictions and answers in float64, answers Newton's to 1e-6 L"
     places = [("float32", torch.float32, "cpu"), ("bfloat16", torch.bfloat16, "cpu")]
     if torch.cuda.is_available():
         places.append(("float32 with TF32, on the GPU", torch.float32, "cuda"))
     for name, dtype, device in places:
-        run = partial(_with_tf32 if device == "cuda" else precise, dtype, device)
+        run = partial(_with_tf32 if device == "cuda" else network_precision, dtype, device)
         found.append(Case("T18", f"network in {name}", expected, run))
     expected = "an error, or the answer of float64; none in float32"
-    found.append(Case("T18", "Newton, given forces in float32", expected, single_precision))
-    for name in USELESS:
+    found.append(Case("T18", "Newton, given forces in float32", expected, float32_forces))
+    for name in INVALID:
         expected = "the classic answer bit for bit, at its cost; not picked"
-        found.append(Case("T19", f"prediction {name}", expected, partial(useless, name)))
+        found.append(Case("T19", f"prediction {name}", expected, partial(invalid_prediction, name)))
     for name in ("huge", "minus", "half", "zero"):
         found.append(
-            Case("T19", f"prediction {name}", "Newton's answer to 1e-8 L", partial(misled, name))
+            Case(
+                "T19",
+                f"prediction {name}",
+                "Newton's answer to 1e-8 L",
+                partial(poor_prediction, name),
+            )
         )
     for size, (printed, count) in NOISE.items():
         expected = f"|R|/|f| {printed}, {count} plain iterations; picked where below 95.6"
-        found.append(Case("T20", f"noise of {size:g} L", expected, partial(noisy, size)))
+        found.append(Case("T20", f"noise of {size:g} L", expected, partial(noisy_prediction, size)))
     expected = "|R|/|f| 8.96, .818, .081: none converged"
-    found.append(Case("T21", "exact answer, 10 %, 1 %, 0.1 % too long", expected, factored))
+    found.append(
+        Case("T21", "exact answer, 10 %, 1 %, 0.1 % too long", expected, scaled_prediction)
+    )
     expected = "refused with its parameters, before any memory is taken"
     found.append(Case("T23", "the paper's network, 107,811 DOF, 128 GB", expected, too_large))
     expected = "Newton's answers in range; beyond, an answer or a status"
-    what = "hybrids from the linear answer, 1e-9 to 25 times the range"
-    return [*found, Case("ladder", what, expected, climbed)]
+    description = "hybrids from the linear answer, 1e-9 to 25 times the range"
+    return [*found, Case("sweep", description, expected, load_sweep)]
 
 
-def _with_tf32(dtype: torch.dtype, device: str, watch: Auditor) -> Outcome:
+def _with_tf32(dtype: torch.dtype, device: str, auditor: Auditor) -> Outcome:
     before = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = True
     try:
-        return precise(dtype, device, watch)
+        return network_precision(dtype, device, auditor)
     finally:
         torch.backends.cuda.matmul.allow_tf32 = before

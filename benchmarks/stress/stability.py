@@ -1,4 +1,4 @@
-"""Where equilibria end or lose stability: T17, T22 and the limits of laws."""
+"""Limit points, bifurcations and limits of laws: T17 and T22."""
 
 import math
 from functools import partial
@@ -8,8 +8,8 @@ import torch
 from benchmarks.stress import fixtures
 from benchmarks.stress.auditor import Auditor
 from benchmarks.stress.case import Case, Outcome, classify
-from benchmarks.stress.fixtures import load_of
-from benchmarks.stress.loads import kinds, words
+from benchmarks.stress.fixtures import as_load
+from benchmarks.stress.loads import describe, newton_variants
 from benchmarks.verification.report import Row
 from dpl.fem import (
     NeoHookeanIsoK2,
@@ -25,25 +25,25 @@ from dpl.fem import (
 
 DIRECT = [name for name in installed_backends() if name != "cg"]
 SVK = SaintVenantKirchhoff(0.0)
-# VERIFICATION 1.8g: P [N], angle of the guess, w/L and u/L of the end's centre, hex27 20 x 2 x 2
+# column: P [N], angle of the guess, w/L and u/L of the end's centre, hex27 20 x 2 x 2
 BUCKLED = [(2.5, 1.2, ".6873", ".3885"), (4.0, 2.0, ".7925", ".9731")]
-# VERIFICATION 1.8i: nu, equal stretch at which the cube loses its symmetry, T / E
+# Rivlin (1948): nu, equal stretch at which the cube loses its symmetry, T / E
 RIVLIN = [(0.45, 1.083880948, ".7475041023"), (0.49, 1.013891353, ".6804639956")]
-# VERIFICATION 1.11: P / E on a bar of NH-ln, stretch
+# P / E on a bar of NH-ln, stretch
 BARRIER = [(-1, ".4835138104"), (-10, ".1073321638"), (1, "2.780359487"), (10, "26.00274671")]
 SINGULAR = (2.0397, 2.039763, 2.0398, 2.5)  # P [N] about the critical load 2.039763
 
 
-def straight(watch: Auditor) -> Outcome:
-    """Push a column beyond its critical load, from rest."""
+def straight_column(auditor: Auditor) -> Outcome:
+    """Compress a straight column beyond its critical load."""
     problem, force = fixtures.column(SVK, (10, 1, 1))
-    rows, fails = [], []
+    rows, failures = [], []
     for backend in DIRECT:
-        for name, newton in kinds(problem):
+        for name, newton in newton_variants(problem):
             solver = Newton(problem, mixed_integration=newton.mixed_integration, linear=backend)
-            state = watch.solve(solver, problem, load_of(2.5 * force))
+            state = auditor.solve(solver, problem, as_load(2.5 * force))
             if not state.converged.all():
-                fails.append(f"{backend}, {name}: {words(state)}")
+                failures.append(f"{backend}, {name}: {describe(state)}")
                 continue
             down = 10 * float(state.displacement[..., 0].min())
             rows += [
@@ -51,80 +51,82 @@ def straight(watch: Auditor) -> Outcome:
                 Row(f"{backend}, {name}: negative pivots", "2", float(state.negative_pivots)),
                 Row(f"{backend}, {name}: status", "1", float(state.status), 0),
             ]
-    return classify(f"unstable, 2 negative pivots, with {', '.join(DIRECT)}", rows, fails=fails)
+    return classify(
+        f"unstable, 2 negative pivots, with {', '.join(DIRECT)}", rows, failures=failures
+    )
 
 
-def buckled(P: float, angle: float, printed: tuple[str, str], watch: Auditor) -> Outcome:
-    """Start beyond buckling from bent guesses, to either side."""
+def buckled_column(P: float, angle: float, printed: tuple[str, str], auditor: Auditor) -> Outcome:
+    """Solve for both buckled equilibria from bent guesses."""
     problem, force = fixtures.column(SVK, (20, 2, 2))
     centre = fixtures.nearest_node(problem, [1.0, 0.05, 0.05])
-    rows, fails = [], []
+    rows, failures = [], []
     for side in (1.0, -1.0):
         solver = Newton(problem, tol=1e-10)
-        watched = watch.over(solver, problem, solver.tol)
-        guess = fixtures.bowed(problem, angle, side)
-        *_, state = watched.iterate(load_of(P * force), guess=guess)
+        audited = auditor.wrap(solver, problem, solver.tol)
+        guess = fixtures.bent_column(problem, angle, side)
+        *_, state = audited.iterate(as_load(P * force), guess=guess)
         if not state.stable.all():
-            fails.append(f"side {side:+g}: {words(state)}")
+            failures.append(f"side {side:+g}: {describe(state)}")
             continue
         end = state.displacement[0, centre]
         rows += [
             Row(f"side {side:+g}: w/L", printed[0], float(side * end[2])),
             Row(f"side {side:+g}: u/L", printed[1], -float(end[0])),
         ]
-    return classify("both sides found, stable", rows, fails=fails)
+    return classify("both sides found, stable", rows, failures=failures)
 
 
-def gives_way(watch: Auditor) -> Outcome:
-    """Ask what an unstable column gives way to."""
+def branch_switching(auditor: Auditor) -> Outcome:
+    """Switch from an unstable equilibrium to the branches of the buckled column."""
     problem, force = fixtures.column(SVK, (10, 1, 1))
-    solver, load = Newton(problem), load_of(2.5 * force)
-    state = watch.solve(solver, problem, load)
+    solver, load = Newton(problem), as_load(2.5 * force)
+    state = auditor.solve(solver, problem, load)
     found = post_buckling_branches(solver, load, state)
     centre = fixtures.nearest_node(problem, [1.0, 0.05, 0.05])
-    fails, told = [], []
+    failures, messages = [], []
     for side in found:
-        watch.see(problem, side)
-        watch.end(problem, load, side, solver.tol, solver.intermediate_tol)
-        told.append(str(Status(int(side.status))))
+        auditor.check_iterate(problem, side)
+        auditor.check_result(problem, load, side, solver.tol, solver.intermediate_tol)
+        messages.append(str(Status(int(side.status))))
         if not side.converged.all():
-            fails.append(words(side))
+            failures.append(describe(side))
     left, right = (side.displacement[0, centre, 1:] for side in found)
     rows = [
         Row("mirror images: difference", "< 1e-6", float((left + right).norm() / left.norm())),
         Row("deflection/L", "> 0.1", float(left.norm())),
     ]
     return classify(
-        f"deflection {float(left.norm()):.3f} L; {' and '.join(told)}", rows, fails=fails
+        f"deflection {float(left.norm()):.3f} L; {' and '.join(messages)}", rows, failures=failures
     )
 
 
-def singular(watch: Auditor) -> Outcome:
-    """Push a column at its critical load and about it, by every backend."""
+def singular_tangent(auditor: Auditor) -> Outcome:
+    """Compress a column by loads about the critical one with every backend."""
     problem, force = fixtures.column(SVK, (10, 1, 1))
-    rows, fails, told = [], [], []
+    rows, failures, messages = [], [], []
     for backend in installed_backends():
         ended = []
         for P in SINGULAR:
             solver = Newton(problem, linear=backend)
-            states = list(watch.over(solver, problem, 1e-8).iterate(load_of(P * force)))
+            states = list(auditor.wrap(solver, problem, 1e-8).iterate(as_load(P * force)))
             ended.append(str(Status(int(states[-1].status))))
             sound = all(_finite(state) for state in states)
             rows.append(Row(f"{backend}, P = {P}: all finite", "1", float(sound), 0))
             definite = backend not in DIRECT  # conjugate gradients want a positive definite tangent
             if not definite and not states[-1].converged.all():
-                fails.append(f"{backend}, P = {P}: {words(states[-1])}")
-        told.append(f"{backend}: {', '.join(dict.fromkeys(ended))}")
-    return classify("; ".join(told), rows, fails=fails)
+                failures.append(f"{backend}, P = {P}: {describe(states[-1])}")
+        messages.append(f"{backend}: {', '.join(dict.fromkeys(ended))}")
+    return classify("; ".join(messages), rows, failures=failures)
 
 
 def _finite(state: Solution) -> bool:
-    """Return whether all that is said of a state is finite."""
+    """Return True if all fields of a state are finite."""
     return all(bool(value.isfinite().all()) for value in state)
 
 
-def peak(watch: Auditor) -> Outcome:
-    """Pull Yeoh's rubber beyond its peak load, from rest; then from a guess beyond the gap."""
+def limit_point(auditor: Auditor) -> Outcome:
+    """Pull Yeoh's rubber beyond its limit point, from rest and from a guess beyond it."""
     problem, unit = fixtures.cube(fixtures.RUBBER)
     solver = Newton(
         problem,
@@ -133,27 +135,29 @@ def peak(watch: Auditor) -> Outcome:
         min_load_step=2.0**-17,
         max_total_iter=2000,
     )
-    load = load_of(0.57 * unit)
-    *_, state = watch.over(solver, problem, solver.tol, solver.intermediate_tol).iterate(load)
+    load = as_load(0.57 * unit)
+    *_, state = auditor.wrap(solver, problem, solver.tol, solver.intermediate_tol).iterate(load)
     part = 0.57 * float(state.load_factor)
     rows = [
         Row("from rest: converged", "< 0.5", float(state.converged)),
         Row("from rest: P of the last answer", ".5696673896", part, 4e-5),
     ]
     beyond = Newton(problem, tol=1e-10, linear="superlu")
-    *_, snapped = watch.over(beyond, problem, beyond.tol).iterate(
-        load, guess=fixtures.stretched(problem, 2.8)
+    *_, snapped = auditor.wrap(beyond, problem, beyond.tol).iterate(
+        load, guess=fixtures.uniaxial_stretch(problem, 2.8)
     )
-    fails = [] if snapped.stable.all() else [words(snapped)]
-    if not fails:
+    failures = [] if snapped.stable.all() else [describe(snapped)]
+    if not failures:
         stretch = 1 + float(snapped.displacement[..., 0].max())
         rows.append(Row("beyond the gap: stretch", "2.836546", stretch, 2e-6))
-    told = f"{Status(int(state.status))}, answered up to P = {part:.5f}; beyond: stretch as printed"
-    return classify(told, rows, fails=fails)
+    messages = (
+        f"{Status(int(state.status))}, answered up to P = {part:.5f}; beyond: stretch as printed"
+    )
+    return classify(messages, rows, failures=failures)
 
 
-def collapsed(watch: Auditor) -> Outcome:
-    """Press a bar of SVK beyond its largest load; hold its mirror image to be no answer."""
+def compressive_collapse(auditor: Auditor) -> Outcome:
+    """Compress a bar of SVK beyond its limit load; its mirror image is no valid solution."""
     law = SaintVenantKirchhoff(0.3)
     problem, unit = fixtures.cube(law, 2)
     solver = Newton(
@@ -163,12 +167,12 @@ def collapsed(watch: Auditor) -> Outcome:
         min_load_step=2.0**-17,
         max_total_iter=2000,
     )
-    *_, state = watch.over(solver, problem, solver.tol, solver.intermediate_tol).iterate(
-        load_of(-0.2 * unit)
+    *_, state = auditor.wrap(solver, problem, solver.tol, solver.intermediate_tol).iterate(
+        as_load(-0.2 * unit)
     )
     part = 0.2 * float(state.load_factor)
     mirrored = (problem.points * torch.tensor([-2.0, 0.0, 0.0]))[None]
-    rest = load_of(0 * unit)
+    rest = as_load(0 * unit)
     verdict = evaluate_solution(problem, mirrored, rest, 1e-8)
     rows = [
         Row("converged", "< 0.5", float(state.converged)),
@@ -180,42 +184,42 @@ def collapsed(watch: Auditor) -> Outcome:
         Row("mirror image: min J", "-1", float(verdict.volume_ratio), 1e-9),
         Row("mirror image: converged", "< 0.5", float(verdict.converged)),
     ]
-    told = f"{Status(int(state.status))}, answered up to {part:.5f}; mirror image not accepted"
-    return classify(told, rows)
+    messages = f"{Status(int(state.status))}, answered up to {part:.5f}; mirror image not accepted"
+    return classify(messages, rows)
 
 
 def _shortest(state: Solution) -> float:
     return 1 + float(state.displacement[..., 0].min())
 
 
-def barrier(watch: Auditor) -> Outcome:
-    """Press and pull a bar of NH-ln, whose barrier holds any load."""
+def volumetric_barrier(auditor: Auditor) -> Outcome:
+    """Compress and pull a bar of NH-ln, whose volumetric barrier carries any load."""
     problem, unit = fixtures.cube(NeoHookeanLn(0.3), 2)
-    rows, fails = [], []
+    rows, failures = [], []
     end = problem.points[:, 0] == 1
     for P, printed in BARRIER:
-        for name, newton in kinds(problem):
+        for name, newton in newton_variants(problem):
             solver = Newton(
                 problem, tol=1e-11, linear="superlu", mixed_integration=newton.mixed_integration
             )
-            state = watch.solve(solver, problem, load_of(P * unit), tol=1e-11)
+            state = auditor.solve(solver, problem, as_load(P * unit), tol=1e-11)
             if not state.converged.all():
-                fails.append(f"P = {P}, {name}: {words(state)}")
+                failures.append(f"P = {P}, {name}: {describe(state)}")
                 continue
             stretch = 1 + float(state.displacement[0, end, 0].mean())
             rows.append(Row(f"P/E = {P}, {name}: stretch", printed, stretch, 1e-8))
-    return classify("stretches to 1e-8", rows, fails=fails)
+    return classify("stretches to 1e-8", rows, failures=failures)
 
 
-def pressed(watch: Auditor) -> Outcome:
-    """Press a cube of NHiso-k2, which is no barrier: kappa s^2 (1 - s^3) at most, s^3 = 2/5."""
+def hydrostatic_pressure(auditor: Auditor) -> Outcome:
+    """Compress a cube of NHiso-k2; its largest pressure is kappa s^2 (1 - s^3) at s^3 = 2/5."""
     law = NeoHookeanIsoK2(0.3)
     problem, unit = fixtures.cube(law, 1, (0, 1, 2))
     limit, rows = float(law.bulk) * 0.4 ** (2 / 3) * 0.6, []
-    for name, newton in kinds(problem):
+    for name, newton in newton_variants(problem):
         solver = Newton(problem, linear="superlu", mixed_integration=newton.mixed_integration)
-        below = watch.solve(solver, problem, load_of(-0.99 * limit * unit))
-        above = watch.solve(solver, problem, load_of(-1.02 * limit * unit))
+        below = auditor.solve(solver, problem, as_load(-0.99 * limit * unit))
+        above = auditor.solve(solver, problem, as_load(-1.02 * limit * unit))
         reached = 1.02 * float(above.load_factor)
         rows += [
             Row(f"{name}, 0.99 of the limit: converged", "1", float(below.converged)),
@@ -225,14 +229,14 @@ def pressed(watch: Auditor) -> Outcome:
     return classify(f"answered below, {Status(int(above.status))} above", rows)
 
 
-def symmetric(nu: float, stretch: float, printed: str, watch: Auditor) -> Outcome:
-    """Load Rivlin's cube below and above where it loses its symmetry."""
+def rivlin_cube(nu: float, stretch: float, printed: str, auditor: Auditor) -> Outcome:
+    """Load Rivlin's cube below and above the bifurcation of the symmetric state."""
     problem, unit = fixtures.cube(NeoHookeanLn(nu), 1, (0, 1, 2))
-    rows = [Row("T/E there", printed, fixtures.swollen(problem, stretch)[1], 1e-7)]
+    rows = [Row("T/E there", printed, fixtures.equitriaxial_stretch(problem, stretch)[1], 1e-7)]
     for part, pivots in ((0.99, "0"), (1.01, "2")):
-        known, T = fixtures.swollen(problem, 1 + part * (stretch - 1))
+        known, T = fixtures.equitriaxial_stretch(problem, 1 + part * (stretch - 1))
         solver = Newton(problem, linear="superlu")
-        state = watch.solve(solver, problem, load_of(T * unit))
+        state = auditor.solve(solver, problem, as_load(T * unit))
         off = float((state.displacement - known).abs().max())
         rows += [
             Row(f"{part}: negative pivots", pivots, float(state.negative_pivots)),
@@ -242,48 +246,50 @@ def symmetric(nu: float, stretch: float, printed: str, watch: Auditor) -> Outcom
 
 
 def cases() -> list[Case]:
-    """Return the cases of this theme."""
+    """Return the cases of this module."""
     found = [
         Case(
             "T17",
             "column 10 x 1 x 1, SVK, P = 2.5 N, from rest",
             "balanced, tagged unstable with 2 negative pivots, u_x = -.02509 m",
-            straight,
+            straight_column,
         )
     ]
     for P, angle, *printed in BUCKLED:
-        what = f"column in hex27 20 x 2 x 2, P = {P} N, from bent guesses"
+        description = f"column in hex27 20 x 2 x 2, P = {P} N, from bent guesses"
         expected = f"w/L = {printed[0]}, u/L = {printed[1]} to either side, stable"
-        run = partial(buckled, P, angle, (printed[0], printed[1]))
-        found.append(Case("T17", what, expected, run))
+        run = partial(buckled_column, P, angle, (printed[0], printed[1]))
+        found.append(Case("T17", description, expected, run))
     for nu, stretch, printed_load in RIVLIN:
-        what = f"Rivlin's cube, NH-ln, nu = {nu}"
+        description = f"Rivlin's cube, NH-ln, nu = {nu}"
         expected = f"symmetry lost at T/E = {printed_load}: tagged unstable above"
-        found.append(Case("T17", what, expected, partial(symmetric, nu, stretch, printed_load)))
+        found.append(
+            Case("T17", description, expected, partial(rivlin_cube, nu, stretch, printed_load))
+        )
     return [
         *found,
         Case(
-            *("T17", "what an unstable column gives way to"),
+            *("T17", "branch switching from an unstable column"),
             *(
                 "two answers, mirror images; each with its status (soft in two directions)",
-                gives_way,
+                branch_switching,
             ),
         ),
         Case(
             *("T17", "snap-through: cube of Yeoh's rubber, P = .57"),
-            *("from rest refused at P = .5696673896; beyond the gap 2.836546", peak),
+            *("from rest refused at P = .5696673896; beyond the gap 2.836546", limit_point),
         ),
         Case(
             *("T17", "collapse: bar of SVK, P = -.2 E; its mirror image"),
-            *("refused at .1924500897 E; min J = -1 is no answer", collapsed),
+            *("refused at .1924500897 E; min J = -1 is no answer", compressive_collapse),
         ),
-        Case(*("T17", "bar of NH-ln, P = -10 to 10 E", "stretches as printed", barrier)),
+        Case(*("T17", "bar of NH-ln, P = -10 to 10 E", "stretches as printed", volumetric_barrier)),
         Case(
             *("T17", "cube of NHiso-k2 under pressure"),
-            *("answered below its largest pressure, refused above", pressed),
+            *("answered below its largest pressure, refused above", hydrostatic_pressure),
         ),
         Case(
             *("T22", "singular tangent: column at P = 2.039763 N and about, every backend"),
-            *("an answer or a status, nothing that is not a number", singular),
+            *("an answer or a status, nothing that is not a number", singular_tangent),
         ),
     ]

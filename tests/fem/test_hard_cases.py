@@ -12,16 +12,16 @@ import pytest
 import torch
 
 from benchmarks.stress.fixtures import (
-    LOOSE,
+    UNDERCONSTRAINED,
+    as_load,
     column,
-    folded,
-    load_of,
-    loose,
+    folded_mesh,
     nearest_node,
     plate,
-    slivers,
+    sliver_mesh,
+    underconstrained_bar,
 )
-from benchmarks.stress.invalid_input import NOWHERE, USES
+from benchmarks.stress.invalid_input import EMPTY_REGIONS, REGION_USES
 from dpl.fem import (
     LinearSolver,
     NeoHookeanLn,
@@ -65,7 +65,7 @@ def test_large_load_that_has_an_answer_gets_it(beam, pull, mixed, case):
     """VERIFICATION 2.2 T1, T3, T4: whole, uninverted on the way, stable; hex8 16 x 4 x 4."""
     law, q, deepest, volume = ANSWERED[case]
     problem = beam(law, 16, 4)
-    for state in Newton(problem, mixed_integration=mixed).iterate(load_of(pull(problem, q)[0])):
+    for state in Newton(problem, mixed_integration=mixed).iterate(as_load(pull(problem, q)[0])):
         assert state.volume_ratio.item() > 0
         assert 0 <= state.load_factor.item() <= 1
     assert state.status.item() == Status.CONVERGED
@@ -82,7 +82,7 @@ def test_slender_beam_takes_steps_where_one_does_not_do(mixed):
     mesh = box([20.0, 1.0, 1.0], [21, 2, 2])
     problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=2)
     force = Traction(Plane(0, "max"), [0.0, 0.0, -1 / 12 / 400]).on(problem)
-    states = list(Newton(problem, mixed_integration=mixed).iterate(load_of(force)))
+    states = list(Newton(problem, mixed_integration=mixed).iterate(as_load(force)))
     assert states[-1].status.item() == Status.CONVERGED
     mean = force[:, 2] @ states[-1].displacement[0, :, 2] / force[:, 2].sum()
     assert -mean.item() == pytest.approx(0.302130893, abs=5.1e-10)
@@ -99,7 +99,7 @@ def test_load_beyond_all_answers_is_refused_with_the_part_that_has_one(beam, pul
     problem = beam(SVK, 16, 4)
     force = pull(problem, q)[0]
     solver = Newton(problem, mixed_integration=mixed)
-    for state in solver.iterate(load_of(force)):
+    for state in solver.iterate(as_load(force)):
         assert state.volume_ratio.item() > 0
         assert not state.converged.any()
     assert state.status.item() == Status.NO_VALID_EQUILIBRIUM
@@ -108,7 +108,7 @@ def test_load_beyond_all_answers_is_refused_with_the_part_that_has_one(beam, pul
     assert state.residual.item() > solver.tol
     assert 130 < q * state.load_factor.item() < q
     part = evaluate_solution(
-        problem, state.displacement, load_of(state.load_factor * force), solver.intermediate_tol
+        problem, state.displacement, as_load(state.load_factor * force), solver.intermediate_tol
     )
     assert part.converged.all()
 
@@ -117,7 +117,7 @@ def test_load_beyond_all_answers_is_refused_with_the_part_that_has_one(beam, pul
 def test_tiny_load_of_any_law_ends_at_the_linear_answer(beam, pull, corner, any_law, q):
     """VERIFICATION 2.2 T6: u / q within 1e-6 of the linear one; no law stalls above 1e-8."""
     problem = beam(any_law)
-    load = load_of(pull(problem, q)[0])
+    load = as_load(pull(problem, q)[0])
     answer, linear = (solve(kind(problem), load) for kind in (Newton, LinearSolver))
     assert answer.status.item() == Status.CONVERGED
     assert answer.iterations.item() <= 3
@@ -129,7 +129,7 @@ def test_tiny_load_of_any_law_ends_at_the_linear_answer(beam, pull, corner, any_
 def test_no_load_at_all_is_answered_by_rest(beam, any_law):
     """VERIFICATION 2.2 T6: in 0 iterations."""
     problem = beam(any_law)
-    answer = solve(Newton(problem), load_of(torch.zeros(problem.shape, dtype=torch.float64)))
+    answer = solve(Newton(problem), as_load(torch.zeros(problem.shape, dtype=torch.float64)))
     assert answer.status.item() == Status.CONVERGED
     assert answer.iterations.item() == 0
     assert not answer.displacement.any()
@@ -160,7 +160,7 @@ def compliance(beam, pull):
         options = {"cell": cell, "degree": degree, "mean_dilatation": mean}
         problem = beam(NeoHookeanLn(nu), *cells, **options)
         force = pull(problem, 1e-3)
-        return (force * solve(LinearSolver(problem), load_of(force[0])).displacement).sum().item()
+        return (force * solve(LinearSolver(problem), as_load(force[0])).displacement).sum().item()
 
     return compliance
 
@@ -217,7 +217,7 @@ PLATES = {
 def deflection(sides: int, layers: int, degree: int, slenderness: int) -> float:
     """Return the deflection of a clamped square plate over Kirchhoff's, under an even load."""
     problem, force, known = plate(sides, layers, degree, slenderness)
-    answer = solve(LinearSolver(problem), load_of(force))
+    answer = solve(LinearSolver(problem), as_load(force))
     below = nearest_node(problem, [0.5, 0.5, 0.0])
     return -answer.displacement[0, below, 2].item() / known
 
@@ -252,9 +252,9 @@ SLIVERS = {1e-2: -0.2388289, 1e-4: -0.2386176, 1e-6: -0.2386155, 1e-8: -0.238615
 def test_slivers_are_warned_of_and_change_nothing(pull, name, mixed, part):
     """VERIFICATION 2.2 T11: the plane x = 50 of the beam moved to 37.5 + 12.5 eps."""
     with pytest.warns(UserWarning, match="aspect ratio .* lock in bending"):
-        problem = Problem.build(slivers(part), SVK, fixed=Plane(0, "min"))
+        problem = Problem.build(sliver_mesh(part), SVK, fixed=Plane(0, "min"))
     answer = solve(
-        Newton(problem, linear=name, mixed_integration=mixed), load_of(pull(problem, 20.0)[0])
+        Newton(problem, linear=name, mixed_integration=mixed), as_load(pull(problem, 20.0)[0])
     )
     assert answer.status.item() == Status.CONVERGED
     assert answer.load_factor.item() == 1
@@ -268,44 +268,44 @@ def test_slivers_are_warned_of_and_change_nothing(pull, name, mixed, part):
 def test_body_folded_at_rest_is_refused_by_the_numbers_of_its_cells():
     """VERIFICATION 2.2 T12."""
     with pytest.raises(ValueError, match="4 cells are inverted: 2, 3, 6, 7"):
-        check_mesh(folded())
+        check_mesh(folded_mesh())
 
 
-@pytest.mark.parametrize("support", LOOSE)
+@pytest.mark.parametrize("support", UNDERCONSTRAINED)
 def test_loose_body_is_refused_by_its_motions(support):
     """VERIFICATION 2.2 T13: before any factorisation."""
-    linear = LinearSolver(loose(support))
-    with pytest.raises(ValueError, match=LOOSE[support][1]):
+    linear = LinearSolver(underconstrained_bar(support))
+    with pytest.raises(ValueError, match=UNDERCONSTRAINED[support][1]):
         eigenmodes(linear, 3)
     assert "factor" not in linear.__dict__
 
 
-@pytest.mark.parametrize("support", LOOSE)
+@pytest.mark.parametrize("support", UNDERCONSTRAINED)
 @pytest.mark.parametrize("name", installed_backends())
 def test_loose_body_never_moves_far(support, name):
     """VERIFICATION 2.2 T13: Newton does not take the rounding of a zero pivot for an answer."""
-    problem = loose(support)
+    problem = underconstrained_bar(support)
     force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
-    answer = solve(Newton(problem, linear=name), load_of(force))
+    answer = solve(Newton(problem, linear=name), as_load(force))
     assert answer.status.item() >= Status.NO_VALID_EQUILIBRIUM
     assert answer.load_factor.item() == 0
     assert not answer.displacement.any()
 
 
-@pytest.mark.parametrize("where", NOWHERE)
-@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("where", EMPTY_REGIONS)
+@pytest.mark.parametrize("use", REGION_USES)
 def test_region_without_a_node_is_an_error_and_not_an_absent_load(grid, use, where):
     """VERIFICATION 2.2 T16."""
-    region = NOWHERE[where]
+    region = EMPTY_REGIONS[where]
     with pytest.raises(ValueError, match=rf"{type(region).__name__}\(.*(holds no|no tags at all)"):
-        USES[use](grid("hexahedron"), region)
+        REGION_USES[use](grid("hexahedron"), region)
 
 
 @pytest.mark.parametrize("name", DIRECT)
 def test_column_beyond_buckling_is_in_balance_and_flagged(mixed, name):
     """VERIFICATION 2.2 T17, T22: two negative pivots, whichever backend meets them; not stored."""
     problem, force = column(SaintVenantKirchhoff(0.0), (10, 1, 1))
-    answer = solve(Newton(problem, mixed_integration=mixed, linear=name), load_of(2.5 * force))
+    answer = solve(Newton(problem, mixed_integration=mixed, linear=name), as_load(2.5 * force))
     assert answer.status.item() == Status.UNSTABLE
     assert answer.negative_pivots.item() == 2
     assert answer.converged.all()
@@ -320,7 +320,7 @@ def test_column_beyond_buckling_is_in_balance_and_flagged(mixed, name):
 def test_singular_tangent_ends_in_words_and_not_in_nan(name, P):
     """VERIFICATION 2.2 T22: at the critical load 2.039763 and about it, with any backend."""
     problem, force = column(SaintVenantKirchhoff(0.0), (10, 1, 1))
-    for state in Newton(problem, linear=name).iterate(load_of(P * force)):
+    for state in Newton(problem, linear=name).iterate(as_load(P * force)):
         assert check_sane(state)
     if P > 2.04:
         assert not state.stable.any()

@@ -1,13 +1,22 @@
 """Where equilibria end or lose stability: VERIFICATION 1.8 g to i and the bodies of 1.11."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.stress.fixtures import RUBBER, bowed, column, cube, load_of, stretched, swollen
+from benchmarks.stress.fixtures import (
+    RUBBER,
+    as_load,
+    bent_column,
+    column,
+    cube,
+    equitriaxial_stretch,
+    uniaxial_stretch,
+)
 from dpl.fem import (
     Material,
     NeoHookeanIsoK2,
@@ -41,6 +50,11 @@ def inertia(problem: Problem, displacement: Tensor) -> int:
     return SuperLU(problem.pattern).factorise(tangent).negative_pivots
 
 
+def loses_symmetry(problem, stretch: float) -> bool:
+    """Return True if an equitriaxially stretched cube is unstable."""
+    return inertia(problem, equitriaxial_stretch(problem, stretch)[0]) > 0
+
+
 def bisected(loses, stable: float, unstable: float) -> float:
     """Return where a truth value changes from false at `stable` to true at `unstable`."""
     assert not loses(stable)
@@ -55,7 +69,7 @@ def squeezed(problem: Problem, force: Tensor, P: float, **options) -> Solution:
     """Return the answer to an axial load, from rest or from a guess."""
     guess = options.pop("guess", None)
     solver = Newton(problem, tol=1e-10, linear="superlu", **options)
-    *_, last = solver.iterate(load_of(P * force), guess=guess)
+    *_, last = solver.iterate(as_load(P * force), guess=guess)
     return last
 
 
@@ -97,7 +111,9 @@ BUCKLED += [(4.0, 2.0, (0.7925, 0.9731), (0.80022, 0.90518))]
 def test_buckled_column_is_found_from_a_bent_guess(mixed, side, P, angle, printed, elastica):
     """VERIFICATION 1.8g: a stable answer to either side, mirror images of each other."""
     problem, force = column(SVK, (20, 2, 2))
-    answer = squeezed(problem, force, P, guess=bowed(problem, angle, side), mixed_integration=mixed)
+    answer = squeezed(
+        problem, force, P, guess=bent_column(problem, angle, side), mixed_integration=mixed
+    )
     assert answer.status.item() == Status.CONVERGED
     assert inertia(problem, answer.displacement) == 0
     centre = torch.tensor([1.0, 0.05, 0.05], dtype=torch.float64)
@@ -134,7 +150,7 @@ def test_pull_on_yeohs_rubber_has_the_tabulated_extremes(stretch, printed, sign,
     problem, _ = pulled(stretch + off)
     none = torch.zeros(problem.shape, dtype=torch.float64)
     solver = Newton(problem, tol=1e-11, linear="superlu")
-    *_, answer = solver.iterate(load_of(none), guess=stretched(problem, stretch + off))
+    *_, answer = solver.iterate(as_load(none), guess=uniaxial_stretch(problem, stretch + off))
     assert answer.converged.all()
     far = problem.points[:, 0] == 1
     pull = problem.internal_force(answer.displacement)[0, far, 0].sum().item()
@@ -154,7 +170,7 @@ def test_load_beyond_the_peak_is_reported_with_the_part_below_it():
         min_load_step=2.0**-17,
         max_total_iter=2000,
     )
-    answer = solve(solver, load_of(0.57 * unit))
+    answer = solve(solver, as_load(0.57 * unit))
     assert answer.status.item() == Status.NO_VALID_EQUILIBRIUM
     assert 0.57 * answer.load_factor.item() == pytest.approx(0.5696673896, abs=2e-5)
     assert 1 + answer.displacement[..., 0].max().item() == pytest.approx(1.364017197, abs=0.02)
@@ -164,7 +180,7 @@ def test_rubber_beyond_the_peak_has_snapped_through():
     """VERIFICATION 1.8h: at P = .57 the stretch is 2.836546, where a guess beyond the gap leads."""
     problem, unit = pulled()
     solver = Newton(problem, tol=1e-10, linear="superlu")
-    *_, answer = solver.iterate(load_of(0.57 * unit), guess=stretched(problem, 2.8))
+    *_, answer = solver.iterate(as_load(0.57 * unit), guess=uniaxial_stretch(problem, 2.8))
     assert answer.status.item() == Status.CONVERGED
     assert answer.load_factor.item() == 1
     stretch = 1 + answer.displacement[..., 0].max().item()
@@ -183,13 +199,13 @@ def rivlin(law: Material) -> tuple[Problem, Tensor]:
 def test_cube_of_rivlin_loses_its_symmetry_at_the_tabulated_load(poisson, stretch, load):
     """VERIFICATION 1.8i, NH-ln: the inertia changes by two; beyond, the answer says so."""
     problem, unit = rivlin(NeoHookeanLn(poisson))
-    critical = bisected(lambda s: inertia(problem, swollen(problem, s)[0]) > 0, 1.0, 1.1)
+    critical = bisected(partial(loses_symmetry, problem), 1.0, 1.1)
     assert critical == pytest.approx(stretch, abs=1.5e-9)
-    assert swollen(problem, critical)[1] == pytest.approx(load, abs=1e-7)
-    assert inertia(problem, swollen(problem, critical + 1e-6)[0]) == 2
+    assert equitriaxial_stretch(problem, critical)[1] == pytest.approx(load, abs=1e-7)
+    assert inertia(problem, equitriaxial_stretch(problem, critical + 1e-6)[0]) == 2
     for part, status, negative in ((0.99, Status.CONVERGED, 0), (1.01, Status.UNSTABLE, 2)):
-        state, T = swollen(problem, 1 + part * (critical - 1))
-        answer = solve(Newton(problem, linear="superlu"), load_of(T * unit))
+        state, T = equitriaxial_stretch(problem, 1 + part * (critical - 1))
+        answer = solve(Newton(problem, linear="superlu"), as_load(T * unit))
         assert answer.status.item() == status
         assert answer.negative_pivots.item() == negative
         assert (answer.displacement - state).abs().max() < 1e-7
@@ -199,7 +215,7 @@ def test_compressible_cube_of_rivlin_keeps_its_symmetry():
     """VERIFICATION 1.8i: NH-ln with nu = .3 has no such load."""
     problem, _ = rivlin(NeoHookeanLn(0.3))
     for stretch in np.linspace(1.0, 4.0, 61):
-        assert inertia(problem, swollen(problem, stretch)[0]) == 0
+        assert inertia(problem, equitriaxial_stretch(problem, stretch)[0]) == 0
 
 
 def test_cube_of_rivlin_loses_its_symmetry_at_two_shear_moduli_in_the_limit():
@@ -208,8 +224,8 @@ def test_cube_of_rivlin_loses_its_symmetry_at_two_shear_moduli_in_the_limit():
     for poisson in (0.499, 0.4999):
         law = NeoHookeanLn(poisson)
         problem, _ = rivlin(law)
-        critical = bisected(lambda s: inertia(problem, swollen(problem, s)[0]) > 0, 1.0, 1.1)  # noqa: B023
-        excess.append(swollen(problem, critical)[1] / law.mu - 2)
+        critical = bisected(partial(loses_symmetry, problem), 1.0, 1.1)
+        excess.append(equitriaxial_stretch(problem, critical)[1] / law.mu - 2)
     assert excess[1] == pytest.approx(0, abs=1e-3)
     assert excess[0] / excess[1] == pytest.approx(10, rel=0.05)
 
@@ -227,7 +243,7 @@ def test_neo_hookean_bar_answers_every_load(mixed, P, stretch):
     """VERIFICATION 1.11: its barrier holds; solved from rest, whatever steps it takes."""
     problem, unit = bar(NeoHookeanLn(0.3))
     answer = solve(
-        Newton(problem, tol=1e-11, linear="superlu", mixed_integration=mixed), load_of(P * unit)
+        Newton(problem, tol=1e-11, linear="superlu", mixed_integration=mixed), as_load(P * unit)
     )
     assert answer.converged.all()
     found = 1 + answer.displacement[0, problem.points[:, 0] == 1, 0]
@@ -242,13 +258,13 @@ def test_quadratic_volume_term_is_no_barrier_under_pressure(mixed):
     limit = law.bulk * 0.4 ** (2 / 3) * 0.6
     for part, status in ((0.99, Status.CONVERGED), (1.02, Status.NO_VALID_EQUILIBRIUM)):
         solver = Newton(problem, linear="superlu", mixed_integration=mixed)
-        answer = solve(solver, load_of(-part * limit * unit))
+        answer = solve(solver, as_load(-part * limit * unit))
         assert answer.status.item() == status
         assert answer.volume_ratio.item() > 0
     assert answer.load_factor.item() == pytest.approx(1 / 1.02, abs=0.02)
     problem, unit = rivlin(NeoHookeanLn(0.3))
     answer = solve(
-        Newton(problem, linear="superlu", mixed_integration=mixed), load_of(-3 * limit * unit)
+        Newton(problem, linear="superlu", mixed_integration=mixed), as_load(-3 * limit * unit)
     )
     assert answer.converged.all()
 
@@ -259,7 +275,7 @@ def test_mirror_image_of_a_body_at_rest_is_no_answer():
     mirrored = (problem.points * torch.tensor([-2.0, 0.0, 0.0]))[None]
     assert problem.internal_force(mirrored).abs().max() < 1e-15
     verdict = evaluate_solution(
-        problem, mirrored, load_of(torch.zeros(problem.shape).double()), 1e-8
+        problem, mirrored, as_load(torch.zeros(problem.shape).double()), 1e-8
     )
     assert verdict.volume_ratio.item() == pytest.approx(-1.0)
     assert verdict.status.item() == Status.NOT_CONVERGED
@@ -275,7 +291,7 @@ def test_longest_load_of_a_saint_venant_bar_is_the_tabulated_one():
         min_load_step=2.0**-17,
         max_total_iter=2000,
     )
-    answer = solve(solver, load_of(-0.2 * unit))
+    answer = solve(solver, as_load(-0.2 * unit))
     assert answer.status.item() == Status.NO_VALID_EQUILIBRIUM
     assert 0.2 * answer.load_factor.item() == pytest.approx(0.1924500897, abs=1e-5)
     stretch = 1 + answer.displacement[..., 0].min().item()

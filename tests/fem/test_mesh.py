@@ -12,7 +12,7 @@ import pytest
 import skfem
 
 from benchmarks.stress.broken_meshes import (
-    BAD,
+    BROKEN_MESHES,
     CORNERS,
     FAN,
     PATCH,
@@ -466,9 +466,9 @@ def test_half_a_file_is_an_error(tmp_path):
         read_mesh(path)
 
 
-@pytest.mark.parametrize("flaw", BAD)
+@pytest.mark.parametrize("flaw", BROKEN_MESHES)
 def test_mesh_that_cannot_be_solved_is_an_error_that_says_why(tmp_path, flaw):
-    message, points, cells = BAD[flaw]
+    message, points, cells = BROKEN_MESHES[flaw]
     path = write(tmp_path / "bad.vtu", np.asarray(points, float), **cells)
     with pytest.raises(ValueError, match=r"bad\.vtu") as error:
         read_mesh(path)
@@ -479,7 +479,7 @@ def test_mesh_that_cannot_be_solved_is_an_error_that_says_why(tmp_path, flaw):
 @pytest.mark.parametrize("flaw", ["crack", "hanging nodes", "not a number", "surface in space"])
 def test_errors_number_nodes_as_the_file_does(tmp_path, flaw):
     """Nodes that no cell uses are dropped: here every second one."""
-    _, points, cells = BAD[flaw]
+    _, points, cells = BROKEN_MESHES[flaw]
     loose = np.repeat(points, 2, axis=0).astype(float)
     loose[::2] += np.nan  # not even that counts
     errors = []
