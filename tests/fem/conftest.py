@@ -27,8 +27,8 @@ from dpl.fem import (
 from dpl.fem.linear import SuperLU
 from dpl.fem.loads import traction
 
-YOUNG, LENGTH = 4500.0, 100.0  # of the beam of VERIFICATION 1.8e [Pa], [m]
-LAWS = {  # VERIFICATION 1.1 with its constants
+YOUNG, LENGTH = 4500.0, 100.0  # of the paper's beam [Pa], [m]
+LAWS = {  # with their constants
     "linear": LinearElastic(0.3),
     "SVK": SaintVenantKirchhoff(0.3),
     "NH-ln": NeoHookeanLn(0.3),
@@ -50,7 +50,7 @@ def law(request) -> Material:
 
 @pytest.fixture(scope="session")
 def laws() -> dict[str, Material]:
-    """All laws by the names of VERIFICATION 1.1."""
+    """All laws by name."""
     return LAWS
 
 
@@ -118,7 +118,7 @@ def bend() -> Callable[..., Tensor]:
 
 @pytest.fixture(scope="session")
 def beam() -> Callable[..., Problem]:
-    """The beam 100 x 25 x 25 m clamped at x = 0 of VERIFICATION 1.8e, (n, m, m) cells."""
+    """The beam 100 x 25 x 25 m clamped at x = 0, the paper's, in (n, m, m) cells."""
 
     def beam(material: Material, n: int = 8, m: int = 2, **options) -> Problem:
         cell, degree = options.pop("cell", "hexahedron"), options.pop("degree", 1)

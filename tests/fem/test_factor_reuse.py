@@ -293,7 +293,7 @@ def test_storage_of_a_factor_that_is_not_used_again_is_that_of_the_next(
 
 @cache
 def column(law: Material) -> tuple[Problem, Tensor]:
-    """Return the column of VERIFICATION 1.8g, 10 x 1 x 1, E = 1000, and the axial load P = 1."""
+    """Return a column of 10 x 1 x 1 m, E = 1000 Pa, and the axial load P = 1."""
     mesh = box([10.0, 1.0, 1.0], [11, 2, 2])
     problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=2)
     return problem, Traction(Plane(0, "max"), [-1 / 1000, 0.0, 0.0]).on(problem)
@@ -301,7 +301,7 @@ def column(law: Material) -> tuple[Problem, Tensor]:
 
 @cache
 def cube(poisson: float) -> tuple[Problem, Tensor]:
-    """Return the cube of VERIFICATION 1.8i that slides on three planes, and T = 1 on the others."""
+    """Return the cube of Rivlin (1948) on three symmetry planes, and T = 1 on the other faces."""
     mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
     problem = Problem.build(mesh, NeoHookeanLn(poisson), fixed=mesh.p.T == 0, length=1.0)
     normals = torch.eye(3).tolist()
@@ -314,7 +314,7 @@ def negative(problem: Problem, displacement: Tensor) -> int:
     return SuperLU(problem.pattern).factorise(tangent).negative_pivots
 
 
-BODIES = {  # body with its unit load, critical load (VERIFICATION 1.8g, 1.8i)
+BODIES = {  # body with its unit load, critical load (independent code)
     "SVK column": (partial(column, SaintVenantKirchhoff(0.0)), 2.039763),
     "NH column": (partial(column, NeoHookeanLn(0.0)), 2.056558),
     "cube, nu = .45": (partial(cube, 0.45), 0.7475041023),
@@ -331,7 +331,7 @@ BEYOND = (1.0005, 1.001, 1.002, 1.01, 1.05)
     + [("SVK column", 1.001, linear) for linear in ("band", "band32", "pardiso")],
 )
 def test_load_beyond_a_critical_one_is_unstable_whatever_is_reused(name, part, linear, reuse):
-    """VERIFICATION 1.8g, 1.8i."""
+    """The column, and the cube of Rivlin (1948)."""
     if linear not in installed_backends():
         pytest.skip(f"{linear} is not installed")
     (build, critical), options = (

@@ -1,7 +1,7 @@
-"""Stress tests of VERIFICATION 2.2: what is said of bodies and loads that are hard or hopeless.
+"""Difficult and unsolvable bodies and loads, and what the package reports of them.
 
 Further cases are in tests/config/test_run_folder.py and test_mesh.py.
-All of them, watched, are in `benchmarks.stress` too, whose bodies these are.
+The names T1 to T23 are those of the cases in `benchmarks.stress`, which check all states too.
 """
 
 import math
@@ -50,7 +50,7 @@ def mixed(request) -> bool:
     return request.param
 
 
-# VERIFICATION 2.2: law, q [Pa], min u_z / L of any node, min J
+# law, q [Pa], min u_z / L of any node, min J
 ANSWERED = {
     "T1": (SVK, 80.0, None, 0.720),
     "T3": (NH, 80.0, -0.7239, 0.804),
@@ -62,7 +62,7 @@ ANSWERED = {
 
 @pytest.mark.parametrize("case", ANSWERED)
 def test_large_load_that_has_an_answer_gets_it(beam, pull, mixed, case):
-    """VERIFICATION 2.2 T1, T3, T4: whole, uninverted on the way, stable; hex8 16 x 4 x 4."""
+    """Stress cases T1, T3, T4: whole, uninverted on the way, stable; hex8 16 x 4 x 4."""
     law, q, deepest, volume = ANSWERED[case]
     problem = beam(law, 16, 4)
     for state in Newton(problem, mixed_integration=mixed).iterate(as_load(pull(problem, q)[0])):
@@ -77,7 +77,7 @@ def test_large_load_that_has_an_answer_gets_it(beam, pull, mixed, case):
 
 
 def test_slender_beam_takes_steps_where_one_does_not_do(mixed):
-    """VERIFICATION 2.2 T5: NH-ln 20 x 1 x 1, nu = 0, P L^2 / EI = 1: w / L = .302130893."""
+    """Stress case T5: NH-ln 20 x 1 x 1, nu = 0, P L^2 / EI = 1: w / L = .302130893."""
     law = NeoHookeanLn(0.0)
     mesh = box([20.0, 1.0, 1.0], [21, 2, 2])
     problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=2)
@@ -90,12 +90,12 @@ def test_slender_beam_takes_steps_where_one_does_not_do(mixed):
     assert stepped != mixed  # mixed points spare the steps
 
 
-# VERIFICATION 2.2 T2: q [Pa] of SVK on hex8 16 x 4 x 4; plain Newton inverts elements there
+# Stress case T2: q [Pa] of SVK on hex8 16 x 4 x 4; plain Newton inverts elements there
 @pytest.mark.parametrize(
     "q", [pytest.param(q, marks=pytest.mark.slow) for q in (160.0, 400.0)] + [1000.0]
 )
 def test_load_beyond_all_answers_is_refused_with_the_part_that_has_one(beam, pull, mixed, q):
-    """VERIFICATION 2.2 T2: no inverted state passes, and none is stored as an answer."""
+    """Stress case T2: no inverted state passes, and none is stored as an answer."""
     problem = beam(SVK, 16, 4)
     force = pull(problem, q)[0]
     solver = Newton(problem, mixed_integration=mixed)
@@ -115,7 +115,7 @@ def test_load_beyond_all_answers_is_refused_with_the_part_that_has_one(beam, pul
 
 @pytest.mark.parametrize("q", [1e-2, 1e-4, 1e-6, 1e-12])
 def test_tiny_load_of_any_law_ends_at_the_linear_answer(beam, pull, corner, any_law, q):
-    """VERIFICATION 2.2 T6: u / q within 1e-6 of the linear one; no law stalls above 1e-8."""
+    """Stress case T6: u / q within 1e-6 of the linear one; no law stalls above 1e-8."""
     problem = beam(any_law)
     load = as_load(pull(problem, q)[0])
     answer, linear = (solve(kind(problem), load) for kind in (Newton, LinearSolver))
@@ -127,7 +127,7 @@ def test_tiny_load_of_any_law_ends_at_the_linear_answer(beam, pull, corner, any_
 
 
 def test_no_load_at_all_is_answered_by_rest(beam, any_law):
-    """VERIFICATION 2.2 T6: in 0 iterations."""
+    """Stress case T6: the zero load takes 0 iterations."""
     problem = beam(any_law)
     answer = solve(Newton(problem), as_load(torch.zeros(problem.shape, dtype=torch.float64)))
     assert answer.status.item() == Status.CONVERGED
@@ -135,7 +135,7 @@ def test_no_load_at_all_is_answered_by_rest(beam, any_law):
     assert not answer.displacement.any()
 
 
-# VERIFICATION 2.2 T8: nu -> compliance over that of hex27 16 x 4 x 4
+# Stress case T8: nu -> compliance over that of hex27 16 x 4 x 4
 LOCKING = {
     0.3: (0.960, 0.795, 0.991, 0.996),
     0.45: (0.901, 0.615, 0.973, 0.981),
@@ -169,7 +169,7 @@ def compliance(beam, pull):
 @pytest.mark.parametrize("nu", LOCKING)
 @pytest.mark.parametrize("element", ELEMENTS)
 def test_element_locks_as_tabulated(compliance, element, nu):
-    """VERIFICATION 2.2 T8."""
+    """Stress case T8."""
     reference = compliance(nu, "hexahedron", 2, (16, 4))
     ratio = compliance(nu, *ELEMENTS[element]) / reference
     printed = LOCKING[nu][list(ELEMENTS).index(element)]
@@ -178,7 +178,7 @@ def test_element_locks_as_tabulated(compliance, element, nu):
 
 @pytest.mark.parametrize("nu", LOCKING)
 def test_mean_dilatation_does_not_lock(compliance, nu):
-    """VERIFICATION 2.2 T8: .94 or more of the compliance; not softer than the exact body either."""
+    """Stress case T8: .94 or more of the compliance; not softer than the exact body either."""
     reference = compliance(nu, "hexahedron", 2, (16, 4))
     ratio = compliance(nu, "hexahedron", 1, (16, 4), True) / reference
     assert 0.94 <= ratio <= 1.02
@@ -187,7 +187,7 @@ def test_mean_dilatation_does_not_lock(compliance, nu):
 @pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
 @pytest.mark.parametrize("nu", [0.45, 0.499])
 def test_linear_elements_near_incompressibility_are_warned_of(grid, cell, nu):
-    """VERIFICATION 2.2 T8: with the remedies that the shape has."""
+    """Stress case T8: with the remedies that the shape has."""
     remedy = "set degree=2$" if cell in ("triangle", "tetra") else "or mean_dilatation=true$"
     with pytest.warns(UserWarning, match=f"lock at Poisson's ratio {nu}: .*{remedy}"):
         Problem.build(grid(cell), NeoHookeanLn(nu))
@@ -195,7 +195,7 @@ def test_linear_elements_near_incompressibility_are_warned_of(grid, cell, nu):
 
 @pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
 def test_elements_that_do_not_lock_are_not_warned_of(grid, cell):
-    """VERIFICATION 2.2 T8."""
+    """Stress case T8."""
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always", UserWarning)
         Problem.build(grid(cell), NeoHookeanLn(0.449))
@@ -205,7 +205,7 @@ def test_elements_that_do_not_lock_are_not_warned_of(grid, cell):
     assert [str(one.message) for one in seen] == []
 
 
-# VERIFICATION 2.2 T10: cells along a side, through the thickness, degree -> w at a/h = 100 and 10
+# Stress case T10: cells along a side, through the thickness, degree -> w at a/h = 100 and 10
 PLATES = {
     (16, 1, 1): (0.087, 0.904),
     (16, 2, 1): (0.088, 0.990),
@@ -226,13 +226,13 @@ def deflection(sides: int, layers: int, degree: int, slenderness: int) -> float:
 @pytest.mark.parametrize("cells", PLATES)
 @pytest.mark.parametrize("case", [0, 1], ids=["thin", "thick"])
 def test_plate_bends_as_tabulated(cells, case):
-    """VERIFICATION 2.2 T10: linear elements lock in a thin plate, quadratic ones hardly."""
+    """Stress case T10: linear elements lock in a thin plate, quadratic ones hardly."""
     assert deflection(*cells, (100, 10)[case]) == pytest.approx(PLATES[cells][case], abs=6e-4)
 
 
 @pytest.mark.parametrize(("slenderness", "warned"), [(100, False), (330, True)])
 def test_flat_linear_cells_are_warned_of(slenderness, warned):
-    """VERIFICATION 2.2 T10: aspect ratio above 20; those of degree 2 are not."""
+    """Stress case T10: aspect ratio above 20; those of degree 2 are not."""
     mesh = box([1.0, 1.0, 1 / slenderness], [17, 17, 2])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -250,7 +250,7 @@ SLIVERS = {1e-2: -0.2388289, 1e-4: -0.2386176, 1e-6: -0.2386155, 1e-8: -0.238615
 @pytest.mark.parametrize("part", SLIVERS)
 @pytest.mark.parametrize("name", DIRECT)
 def test_slivers_are_warned_of_and_change_nothing(pull, name, mixed, part):
-    """VERIFICATION 2.2 T11: the plane x = 50 of the beam moved to 37.5 + 12.5 eps."""
+    """Stress case T11: the plane x = 50 of the beam moved to 37.5 + 12.5 eps."""
     with pytest.warns(UserWarning, match="aspect ratio .* lock in bending"):
         problem = Problem.build(sliver_mesh(part), SVK, fixed=Plane(0, "min"))
     answer = solve(
@@ -266,14 +266,14 @@ def test_slivers_are_warned_of_and_change_nothing(pull, name, mixed, part):
 
 
 def test_body_folded_at_rest_is_refused_by_the_numbers_of_its_cells():
-    """VERIFICATION 2.2 T12."""
+    """Stress case T12."""
     with pytest.raises(ValueError, match="4 cells are inverted: 2, 3, 6, 7"):
         check_mesh(folded_mesh())
 
 
 @pytest.mark.parametrize("support", UNDERCONSTRAINED)
 def test_loose_body_is_refused_by_its_motions(support):
-    """VERIFICATION 2.2 T13: before any factorisation."""
+    """Stress case T13: before any factorisation."""
     linear = LinearSolver(underconstrained_bar(support))
     with pytest.raises(ValueError, match=UNDERCONSTRAINED[support][1]):
         eigenmodes(linear, 3)
@@ -283,7 +283,7 @@ def test_loose_body_is_refused_by_its_motions(support):
 @pytest.mark.parametrize("support", UNDERCONSTRAINED)
 @pytest.mark.parametrize("name", installed_backends())
 def test_loose_body_never_moves_far(support, name):
-    """VERIFICATION 2.2 T13: Newton does not take the rounding of a zero pivot for an answer."""
+    """Stress case T13: Newton does not take the rounding of a zero pivot for an answer."""
     problem = underconstrained_bar(support)
     force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
     answer = solve(Newton(problem, linear=name), as_load(force))
@@ -295,7 +295,7 @@ def test_loose_body_never_moves_far(support, name):
 @pytest.mark.parametrize("where", EMPTY_REGIONS)
 @pytest.mark.parametrize("use", REGION_USES)
 def test_region_without_a_node_is_an_error_and_not_an_absent_load(grid, use, where):
-    """VERIFICATION 2.2 T16."""
+    """Stress case T16."""
     region = EMPTY_REGIONS[where]
     with pytest.raises(ValueError, match=rf"{type(region).__name__}\(.*(holds no|no tags at all)"):
         REGION_USES[use](grid("hexahedron"), region)
@@ -303,7 +303,7 @@ def test_region_without_a_node_is_an_error_and_not_an_absent_load(grid, use, whe
 
 @pytest.mark.parametrize("name", DIRECT)
 def test_column_beyond_buckling_is_in_balance_and_flagged(mixed, name):
-    """VERIFICATION 2.2 T17, T22: two negative pivots, whichever backend meets them; not stored."""
+    """Stress cases T17 and T22: two negative pivots, whichever backend meets them; not stored."""
     problem, force = column(SaintVenantKirchhoff(0.0), (10, 1, 1))
     answer = solve(Newton(problem, mixed_integration=mixed, linear=name), as_load(2.5 * force))
     assert answer.status.item() == Status.UNSTABLE
@@ -318,7 +318,7 @@ def test_column_beyond_buckling_is_in_balance_and_flagged(mixed, name):
 @pytest.mark.parametrize("P", [2.0397, 2.039763, 2.0398, 2.5])
 @pytest.mark.parametrize("name", installed_backends())
 def test_singular_tangent_ends_in_words_and_not_in_nan(name, P):
-    """VERIFICATION 2.2 T22: at the critical load 2.039763 and about it, with any backend."""
+    """Stress case T22: at the critical load 2.039763 and about it, with any backend."""
     problem, force = column(SaintVenantKirchhoff(0.0), (10, 1, 1))
     for state in Newton(problem, linear=name).iterate(as_load(P * force)):
         assert check_sane(state)

@@ -1,4 +1,4 @@
-"""Where equilibria end or lose stability: VERIFICATION 1.8 g to i and the bodies of 1.11."""
+"""Limit points and bifurcations: a column, a Yeoh cube, the cube of Rivlin, limits of laws."""
 
 import math
 from functools import partial
@@ -73,7 +73,7 @@ def squeezed(problem: Problem, force: Tensor, P: float, **options) -> Solution:
     return last
 
 
-# VERIFICATION 1.8g: law, cells, P at which K is singular; Euler's load is 2.056168
+# Column of 10 x 1 x 1 m: law, cells, P at which K is singular; Euler's load is 2.056168
 CRITICAL = [
     (SVK, (10, 1, 1), 2.039763),
     pytest.param(SVK, (20, 2, 2), 2.037811, marks=pytest.mark.slow),
@@ -83,7 +83,7 @@ CRITICAL = [
 
 @pytest.mark.parametrize(("law", "cells", "printed"), CRITICAL)
 def test_column_loses_its_stability_at_the_critical_load(law, cells, printed):
-    """VERIFICATION 1.8g, by bisection on the inertia of the tangent at the straight answer."""
+    """Column of 10 x 1 x 1 m: bisection on the inertia of the tangent of the straight state."""
     problem, force = column(law, cells)
 
     def buckles(P: float) -> bool:
@@ -99,7 +99,7 @@ def test_column_loses_its_stability_at_the_critical_load(law, cells, printed):
         assert answer.negative_pivots.item() == negative
 
 
-# VERIFICATION 1.8g, beyond buckling: P, angle of the guess, w / L and u / L of the end's centre,
+# beyond buckling: P, angle of the guess, w / L and u / L of the centre of the end,
 # the same of the elastica
 BUCKLED = [(2.5, 1.2, (0.6873, 0.3885), (0.66363, 0.34682))]
 BUCKLED += [(4.0, 2.0, (0.7925, 0.9731), (0.80022, 0.90518))]
@@ -109,7 +109,7 @@ BUCKLED += [(4.0, 2.0, (0.7925, 0.9731), (0.80022, 0.90518))]
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])
 def test_buckled_column_is_found_from_a_bent_guess(mixed, side, P, angle, printed, elastica):
-    """VERIFICATION 1.8g: a stable answer to either side, mirror images of each other."""
+    """Column of 10 x 1 x 1 m: a stable answer to either side, mirror images of each other."""
     problem, force = column(SVK, (20, 2, 2))
     answer = squeezed(
         problem, force, P, guess=bent_column(problem, angle, side), mixed_integration=mixed
@@ -143,7 +143,7 @@ def pulled(stretch: float | None = None) -> tuple[Problem, Tensor]:
     ids=["peak", "trough"],
 )
 def test_pull_on_yeohs_rubber_has_the_tabulated_extremes(stretch, printed, sign, off):
-    """VERIFICATION 1.8h, its end moved: beside the peak it pulls less, beside the trough more.
+    """Yeoh cube (felupe ex09) under prescribed stretch: force maximum and minimum.
 
     The bulk modulus leaves 3e-6 of it.
     """
@@ -161,7 +161,7 @@ def test_pull_on_yeohs_rubber_has_the_tabulated_extremes(stretch, printed, sign,
 
 
 def test_load_beyond_the_peak_is_reported_with_the_part_below_it():
-    """VERIFICATION 1.8h: load control ends at P = .5696673896; the rest is no path from rest."""
+    """Yeoh cube (felupe ex09): load control from rest ends at P = .5696673896."""
     problem, unit = pulled()
     solver = Newton(
         problem,
@@ -177,7 +177,7 @@ def test_load_beyond_the_peak_is_reported_with_the_part_below_it():
 
 
 def test_rubber_beyond_the_peak_has_snapped_through():
-    """VERIFICATION 1.8h: at P = .57 the stretch is 2.836546, where a guess beyond the gap leads."""
+    """Yeoh cube (felupe ex09): from a guess beyond the gap, P = .57 has the stretch 2.836546."""
     problem, unit = pulled()
     solver = Newton(problem, tol=1e-10, linear="superlu")
     *_, answer = solver.iterate(as_load(0.57 * unit), guess=uniaxial_stretch(problem, 2.8))
@@ -197,7 +197,7 @@ def rivlin(law: Material) -> tuple[Problem, Tensor]:
     [(0.45, 1.083880948, 0.7475041023), (0.49, 1.013891353, 0.6804639956)],
 )
 def test_cube_of_rivlin_loses_its_symmetry_at_the_tabulated_load(poisson, stretch, load):
-    """VERIFICATION 1.8i, NH-ln: the inertia changes by two; beyond, the answer says so."""
+    """Cube of Rivlin (1948), NH-ln: the inertia changes by two; beyond, the answer says so."""
     problem, unit = rivlin(NeoHookeanLn(poisson))
     critical = bisected(partial(loses_symmetry, problem), 1.0, 1.1)
     assert critical == pytest.approx(stretch, abs=1.5e-9)
@@ -212,14 +212,14 @@ def test_cube_of_rivlin_loses_its_symmetry_at_the_tabulated_load(poisson, stretc
 
 
 def test_compressible_cube_of_rivlin_keeps_its_symmetry():
-    """VERIFICATION 1.8i: NH-ln with nu = .3 has no such load."""
+    """Cube of Rivlin (1948): NH-ln with nu = .3 has no such load."""
     problem, _ = rivlin(NeoHookeanLn(0.3))
     for stretch in np.linspace(1.0, 4.0, 61):
         assert inertia(problem, equitriaxial_stretch(problem, stretch)[0]) == 0
 
 
 def test_cube_of_rivlin_loses_its_symmetry_at_two_shear_moduli_in_the_limit():
-    """VERIFICATION 1.8i: T / mu = 2 for incompressible bodies."""
+    """Cube of Rivlin (1948): T / mu = 2 for incompressible bodies."""
     excess = []
     for poisson in (0.499, 0.4999):
         law = NeoHookeanLn(poisson)
@@ -240,7 +240,7 @@ def bar(law: Material) -> tuple[Problem, Tensor]:
     ("P", "stretch"), [(-1, 0.4835138104), (-10, 0.1073321638), (1, 2.780359487), (10, 26.00274671)]
 )
 def test_neo_hookean_bar_answers_every_load(mixed, P, stretch):
-    """VERIFICATION 1.11: its barrier holds; solved from rest, whatever steps it takes."""
+    """NH-ln has a volumetric barrier: any compressive load has a solution from rest."""
     problem, unit = bar(NeoHookeanLn(0.3))
     answer = solve(
         Newton(problem, tol=1e-11, linear="superlu", mixed_integration=mixed), as_load(P * unit)
@@ -252,7 +252,7 @@ def test_neo_hookean_bar_answers_every_load(mixed, P, stretch):
 
 @pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])
 def test_quadratic_volume_term_is_no_barrier_under_pressure(mixed):
-    """VERIFICATION 1.11: NHiso-k2 holds kappa s^2 (1 - s^3) at most, s^3 = 2/5; NH-ln any load."""
+    """NHiso-k2 carries kappa s^2 (1 - s^3) at most, s^3 = 2/5; NH-ln carries any pressure."""
     law = NeoHookeanIsoK2(0.3)
     problem, unit = rivlin(law)
     limit = law.bulk * 0.4 ** (2 / 3) * 0.6
@@ -270,7 +270,7 @@ def test_quadratic_volume_term_is_no_barrier_under_pressure(mixed):
 
 
 def test_mirror_image_of_a_body_at_rest_is_no_answer():
-    """VERIFICATION 1.11: SVK is blind to reflection, so forces alone would accept it."""
+    """SVK is invariant under reflection: a mirrored body has no internal forces."""
     problem, _ = bar(SaintVenantKirchhoff(0.3))
     mirrored = (problem.points * torch.tensor([-2.0, 0.0, 0.0]))[None]
     assert problem.internal_force(mirrored).abs().max() < 1e-15
@@ -282,7 +282,7 @@ def test_mirror_image_of_a_body_at_rest_is_no_answer():
 
 
 def test_longest_load_of_a_saint_venant_bar_is_the_tabulated_one():
-    """VERIFICATION 1.11: max |P| = E / (3 sqrt 3) = .1924500897 at a stretch of .57735."""
+    """SVK, closed form: max |P| = E / (3 sqrt 3) = .1924500897 at a stretch of .57735."""
     problem, unit = bar(SaintVenantKirchhoff(0.3))
     solver = Newton(
         problem,

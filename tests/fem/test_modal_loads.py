@@ -28,7 +28,7 @@ from dpl.fem.loads import constant, log_tail_mixture, logarithmic, modal_basis, 
 from dpl.fem.loads.sampling import SAMPLINGS
 
 YOUNG, LENGTH = 4500.0, 100.0
-REFERENCE = {  # VERIFICATION 1.8e: eigenvalues of K(0) [N/m]
+REFERENCE = {  # paper's beam, independent code: eigenvalues of K(0) [N/m]
     (8, 2): [21.24835125] * 2 + [163.64340492] + [536.30691952] * 2 + [867.54630154, 1433.87488669],
     (16, 4): [3.88134628] * 2 + [37.40358032] + [98.17128826] * 2 + [165.64636884],
 }

@@ -32,7 +32,7 @@ from dpl.fem import (
 from dpl.fem.linear import BACKENDS, SuperLU
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
-LENGTH = 100.0  # of the beam of VERIFICATION 1.8e [m]
+LENGTH = 100.0  # of the paper's beam [m]
 
 
 def load_of(force: torch.Tensor) -> Load:
@@ -57,7 +57,7 @@ def mixed(request) -> bool:
     return request.param
 
 
-# VERIFICATION 1.8e: law, cells, cell, degree, q [Pa], u_z, u_x of the corner [m], iterations (1.10)
+# The paper's beam: law, cells, cell, degree, q [Pa], u_z, u_x of the corner [m], iterations
 BEAMS = [
     (SVK, (4, 1), "hexahedron", 1, 5, -4.74016, None, None),
     (SVK, (4, 1), "hexahedron", 1, 20, -18.7537, None, None),
@@ -95,7 +95,7 @@ FINE_BEAMS = [
 def test_beam_bends_as_tabulated(
     beam, pull, corner, mixed, law, cells, cell, degree, q, z, x, count
 ):
-    """VERIFICATION 1.8e to 1e-6, and the iterations of 1.10, which are those of plain Newton."""
+    """The paper's beam to 1e-6, and the iterations of plain Newton (independent code)."""
     problem = beam(law, *cells, cell=cell, degree=degree)
     backend = "auto" if cells[0] * degree > 16 else "superlu"
     answer = solve(
@@ -111,7 +111,7 @@ def test_beam_bends_as_tabulated(
         assert mixed or answer.iterations.item() == count
 
 
-KUHN = [  # VERIFICATION 1.8e: cells, degree, SVK q = 5, 20, 40, NH-ln q = 40
+KUHN = [  # The paper's beam: cells, degree, SVK q = 5, 20, 40, NH-ln q = 40
     ((39, 9), 1, [-6.99204, -27.03095, -48.04821, -48.11608]),
     ((8, 2), 2, [-7.29293, -28.08539, -49.46152, -49.50036]),
     ((16, 4), 2, [-7.35097, -28.3029, -49.81862, -49.8045]),
@@ -121,7 +121,7 @@ KUHN = [  # VERIFICATION 1.8e: cells, degree, SVK q = 5, 20, 40, NH-ln q = 40
 @pytest.mark.slow
 @pytest.mark.parametrize(("cells", "degree", "printed"), KUHN)
 def test_beam_of_tetrahedra_bends_as_tabulated(beam, pull, corner, cells, degree, printed):
-    """VERIFICATION 1.8e; six Kuhn tetrahedra a cell, along another diagonal: within 0.5 %."""
+    """The paper's beam in six Kuhn tetrahedra per cell; another diagonal: within 0.5 %."""
     for law, q, z in zip([SVK, SVK, SVK, NH], [5, 20, 40, 40], printed, strict=True):
         problem = beam(law, *cells, cell="tetra", degree=degree)
         answer = solve(newton(problem, linear="auto"), load_of(pull(problem, q)))
@@ -132,14 +132,14 @@ def test_beam_of_tetrahedra_bends_as_tabulated(beam, pull, corner, cells, degree
 
 @pytest.mark.parametrize(("law", "q"), [(SVK, 5), (SVK, 20), (NH, 5)])
 def test_residual_falls_with_the_second_order(beam, pull, law, q):
-    """VERIFICATION 1.10: the last three residuals above rounding give an order of 1.9 or more."""
+    """The last three residuals above rounding give an order of 1.9 or more."""
     states = newton(beam(law), tol=1e-10).iterate(load_of(pull(beam(law), q)))
     a, b, c = [s.residual.item() for s in states if s.residual > 1e-11][-3:]
     assert math.log(c / b) / math.log(b / a) >= 1.9
 
 
 def test_one_step_squares_the_error(law, beam, pull):
-    """VERIFICATION 1.10: half the error in the guess leaves a quarter behind."""
+    """Half the error in the guess leaves a quarter of the error after one iteration."""
     problem = beam(law)
     load = load_of(pull(problem, 20.0))
     answer = solve(newton(problem, tol=1e-12), load).displacement
@@ -162,7 +162,7 @@ def test_one_step_squares_the_error(law, beam, pull):
     ids=["svk", "neo-hookean"],
 )
 def test_answer_does_not_depend_on_the_size_of_the_body(pull, corner, law, printed, length):
-    """VERIFICATION 1.10, last: same u/L in six iterations at q/E = 20/4500."""
+    """The same u/L in six iterations at q/E = 20/4500, for any E and L."""
     mesh = box([length, length / 4, length / 4], [9, 3, 3])
     problem = Problem.build(mesh, law, fixed=Plane(0, "min"))
     answer = solve(
@@ -174,7 +174,7 @@ def test_answer_does_not_depend_on_the_size_of_the_body(pull, corner, law, print
 
 
 def test_tiny_loads_converge_to_the_linear_answer(law, beam, pull, corner):
-    """VERIFICATION 2.2 T6: u / q is constant; the deviation is linear in q (1.8e)."""
+    """Stress case T6: u / q is constant; the deviation is linear in q."""
     problem, loads, deviations = beam(law), (1e-2, 1e-4, 1e-6), []
     for q in loads:
         load = load_of(pull(problem, q))
@@ -190,7 +190,7 @@ def test_tiny_loads_converge_to_the_linear_answer(law, beam, pull, corner):
 
 
 def test_no_load_costs_nothing(law, beam, monkeypatch):
-    """VERIFICATION 2.2 T6: zero load, u = 0, 0 iterations, no factor."""
+    """Stress case T6: zero load, u = 0, 0 iterations, no factor."""
     problem = beam(law)
     monkeypatch.setattr(SuperLU, "factorise", None)
     states = list(newton(problem).iterate(load_of(torch.zeros(1, *problem.shape).double())))
@@ -205,7 +205,7 @@ def test_no_load_costs_nothing(law, beam, monkeypatch):
     ("law", "deepest", "volume"), [(SVK, None, 0.720), (NH, -0.7239, 0.804)], ids=["T1", "T3"]
 )
 def test_four_times_the_training_load_converges(beam, pull, mixed, law, deepest, volume):
-    """VERIFICATION 2.2 T1 and T3, q = 80 on hex8 16 x 4 x 4."""
+    """Stress cases T1 and T3, q = 80 on hex8 16 x 4 x 4."""
     problem = beam(law, 16, 4)
     answer = solve(newton(problem, mixed_integration=mixed), load_of(pull(problem, 80.0)))
     assert answer.converged.all()
@@ -223,7 +223,7 @@ def test_four_times_the_training_load_converges(beam, pull, mixed, law, deepest,
     ],
 )
 def test_neo_hookean_beam_answers_any_load(beam, pull, mixed, q, deepest, volume):
-    """VERIFICATION 2.2 T4."""
+    """Stress case T4."""
     problem = beam(NH, 16, 4)
     for state in newton(problem, mixed_integration=mixed).iterate(load_of(pull(problem, q))):
         assert state.volume_ratio.item() > 0
@@ -235,7 +235,7 @@ def test_neo_hookean_beam_answers_any_load(beam, pull, mixed, q, deepest, volume
 
 @pytest.mark.slow
 def test_slender_beam_needs_load_steps_and_gets_there(pull):
-    """VERIFICATION 2.2 T5: NH-ln 20 x 1 x 1, nu = 0, hex27, P L^2 / EI = 1: w / L = .302130893."""
+    """Stress case T5: NH-ln 20 x 1 x 1, nu = 0, hex27, P L^2 / EI = 1: w / L = .302130893."""
     mesh = box([20.0, 1.0, 1.0], [21, 2, 2])
     problem = Problem.build(mesh, NeoHookeanLn(0.0), fixed=Plane(0, "min"), degree=2)
     answer = solve(newton(problem, linear="auto"), load_of(pull(problem, 4500.0 / 12 / 400)))
@@ -247,7 +247,7 @@ def test_slender_beam_needs_load_steps_and_gets_there(pull):
 
 
 def check_defeat(problem: Problem, solver: Newton, force: torch.Tensor) -> None:
-    """Assert that a load without an answer ends as VERIFICATION 2.2 T2 demands."""
+    """Assert that a load without an answer ends as stress case T2 requires."""
     for state in solver.iterate(load_of(force)):
         assert state.volume_ratio.item() > 0
         assert state.residual.isfinite().all()
@@ -264,7 +264,7 @@ def check_defeat(problem: Problem, solver: Newton, force: torch.Tensor) -> None:
 
 @pytest.mark.parametrize("q", [400.0, 1000.0])
 def test_load_without_an_answer_is_reported_with_the_part_that_has_one(beam, pull, mixed, q):
-    """VERIFICATION 2.2 T2: SVK far beyond its limit."""
+    """Stress case T2: SVK far beyond its limit."""
     problem = beam(SVK)
     solver = newton(problem, min_load_step=2.0**-6, mixed_integration=mixed)
     check_defeat(problem, solver, pull(problem, q))
@@ -291,13 +291,13 @@ def test_a_load_step_is_at_most_twice_the_one_before(most):
 @pytest.mark.slow
 @pytest.mark.parametrize("q", [160.0, 400.0, 1000.0])
 def test_load_without_an_answer_on_the_finer_mesh_is_reported(beam, pull, mixed, q):
-    """VERIFICATION 2.2 T2 as printed there: hex8 16 x 4 x 4."""
+    """Stress case T2 on hex8 16 x 4 x 4."""
     problem = beam(SVK, 16, 4)
     check_defeat(problem, newton(problem, mixed_integration=mixed), pull(problem, q))
 
 
 def test_squeezed_block_fails_where_its_law_softens(mixed):
-    """VERIFICATION 1.11: an SVK bar under |P| > E / (3 sqrt 3) has no answer; below it has one."""
+    """An SVK bar has a solution up to |P| = E / (3 sqrt 3), and none beyond (closed form)."""
     mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
     slides = mesh.p.T == 0  # each coordinate plane holds its own normal
     problem = Problem.build(mesh, SVK, fixed=slides, length=1.0)
@@ -349,7 +349,7 @@ def wrong(law, beam, pull) -> tuple[Problem, Load, Solution]:
 
 @pytest.mark.parametrize("kind", ["nan", "one nan", "infinite", "inverted", "huge"])
 def test_bad_guess_changes_no_bit_of_the_answer(wrong, kind):
-    """VERIFICATION 2.2 T19."""
+    """Stress case T19."""
     problem, load, answer = wrong
     guess = torch.zeros_like(load.force)
     if kind == "nan":
@@ -405,7 +405,7 @@ def test_newton_takes_whole_steps_from_a_guess_or_gives_it_up(wrong):
 
 
 def test_exact_guess_costs_nothing(wrong, monkeypatch):
-    """VERIFICATION 2.3: 0 assemblies, 0 factorisations."""
+    """No assembly and no factorisation."""
     problem, load, answer = wrong
     monkeypatch.setattr(SuperLU, "factorise", None)
     monkeypatch.setattr(Problem, "tangent", None)
@@ -505,7 +505,7 @@ def test_unknown_backend_is_an_error(beam, pull):
 
 
 def test_rest_state_is_factorised_once_for_all_loads(law, beam, pull, counted):
-    """VERIFICATION 2.3; the factor of the rest state is the scene's, not the load's."""
+    """The factor of K(0) belongs to the scene and is not counted."""
     problem = beam(law)
     solver, load = newton(problem, factor_reuse_tol=0.0), load_of(pull(problem, 20.0))
     first = solve(solver, load)
@@ -603,7 +603,7 @@ def test_pickled_solver_answers_the_same(beam, pull, kind):
 
 
 def test_moved_supports_pull_the_body_along(law, mixed):
-    """A bar stretched by its ends has the lateral stretch of VERIFICATION 1.2 at 1.5."""
+    """A bar stretched by its ends has the closed-form lateral stretch at 1.5."""
     mesh = box([1.0, 1.0, 1.0], [3, 3, 3])
     held = mesh.p.T == 0
     held[:, 0] |= mesh.p[0] == 1
@@ -636,14 +636,14 @@ def test_judge_believes_nothing(law, beam, pull):
 
 @pytest.fixture(scope="module")
 def column() -> Problem:
-    """The column 10 x 1 x 1 of VERIFICATION 1.8g: ten hex27 of SVK, nu = 0."""
+    """A column of 10 x 1 x 1 m: ten hex27 of SVK, nu = 0."""
     mesh = box([10.0, 1.0, 1.0], [11, 2, 2])
     return Problem.build(mesh, SaintVenantKirchhoff(0.0), fixed=Plane(0, "min"), degree=2)
 
 
 @pytest.fixture
 def squeezed(column) -> Callable[[float], Solution]:
-    """Answers to the axial dead load P of VERIFICATION 1.8g, E = 1000."""
+    """Solutions under an axial dead load P, E = 1000 Pa."""
 
     def squeezed(P: float) -> Solution:
         force = Traction(Plane(0, "max"), [-P / 1000, 0.0, 0.0]).on(column)[None]
@@ -653,7 +653,7 @@ def squeezed(column) -> Callable[[float], Solution]:
 
 
 def test_column_below_its_critical_load_is_stable(squeezed):
-    """VERIFICATION 1.8g: K becomes singular at P = 2.039763."""
+    """K becomes singular at P = 2.039763 (independent code)."""
     answer = squeezed(2.03)
     assert answer.stable.all()
     assert answer.status.item() == Status.CONVERGED
@@ -661,7 +661,7 @@ def test_column_below_its_critical_load_is_stable(squeezed):
 
 
 def test_straight_column_beyond_its_critical_load_is_flagged(squeezed):
-    """VERIFICATION 1.8g: at P = 2.5 in balance, u_x = -.02509, two negative eigenvalues."""
+    """At P = 2.5 the straight state is an equilibrium with two negative eigenvalues."""
     answer = squeezed(2.5)
     assert answer.converged.all()
     assert not answer.stable.any()
@@ -707,7 +707,7 @@ def test_time_goes_on(beam, pull):
     [(1e-2, -0.2388289), (1e-4, -0.2386176), (1e-6, -0.2386155), (1e-8, -0.2386155)],
 )
 def test_slivers_end_where_rounding_ends_them(pull, corner, part, deepest):
-    """VERIFICATION 2.2 T11: the plane x = 50 moved to 37.5 + 12.5 eps."""
+    """Stress case T11: the plane x = 50 moved to 37.5 + 12.5 eps."""
     mesh = box([LENGTH, 25.0, 25.0], [9, 3, 3])
     points = mesh.p.copy()
     points[0, points[0] == 50.0] = 37.5 + 12.5 * part

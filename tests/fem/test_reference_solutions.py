@@ -1,4 +1,4 @@
-"""Benchmarks of VERIFICATION 1.8 a to f: beams, Cook's membrane, a twisted column, the elastica."""
+"""Solutions of other codes and of theory: beams, Cook's membrane, torsion, the elastica."""
 
 import math
 from collections.abc import Iterator
@@ -52,7 +52,7 @@ def node_at(problem: Problem, *place: float) -> int:
     return int(distance.argmin())
 
 
-# VERIFICATION 1.8a: R_k / R_1 of the load steps 1 to 5, R_1 the residual after one iteration
+# Caribou (mimesis-inria), test_static.cpp: R_k / R_1 of load steps 1 to 5, R_1 after one iteration
 CARIBOU = [
     [4.802014100e-3, 3.457785824e-4, 6.4178e-8],
     [4.700052322e-3, 3.771851553e-4, 1.289757639e-5, 2.12504e-8],
@@ -97,7 +97,7 @@ def end_face(problem: Problem, state: Tensor) -> list[float]:
 
 
 def test_beam_of_caribou_has_its_residuals_and_its_end():
-    """VERIFICATION 1.8a: 19 ratios to 1e-10, the end face's centre to all digits."""
+    """Caribou's static beam: 19 ratios to 1e-10, the centre of the end face to all digits."""
     problem, force = caribou(1)
     steps = list(load_steps(problem, force))
     for (ratios, _), printed in zip(steps, CARIBOU, strict=True):
@@ -109,7 +109,7 @@ def test_beam_of_caribou_has_its_residuals_and_its_end():
 
 
 def test_beam_of_caribou_in_quadratic_elements_bends_twice_as_far():
-    """VERIFICATION 1.8a: the printed place is one where Caribou stops, 7e-4 out of balance."""
+    """Caribou stops at a relative residual of 7e-4; its printed position is that state."""
     problem, force = caribou(2)
     *_, (_, state) = load_steps(problem, force)
     printed = [0, -49.22035, 58.16711]
@@ -120,7 +120,7 @@ def test_beam_of_caribou_in_quadratic_elements_bends_twice_as_far():
     assert end_face(problem, answer.displacement) == pytest.approx(printed, abs=1e-3)
 
 
-# VERIFICATION 1.8b: law, degree, cells a side, place, displacement [mm], digits of it
+# Cook's membrane (deal.II): law, degree, cells per side, point, displacement [mm], digits
 COOK = [
     *((K4, 1, n, (48, 52), u, 5e-5) for n, u in ((2, 8.6384), (4, 12.0712), (8, 13.8632))),
     (K4, 1, 16, (48, 52), 14.4853, 5e-5),
@@ -155,7 +155,7 @@ def cook(law: Material, degree: int, count: int, *, solid: bool = False) -> tupl
 @pytest.mark.parametrize("solid", [False, True], ids=["plane", "solid"])
 @pytest.mark.parametrize(("law", "degree", "count", "place", "printed", "digits"), COOK)
 def test_membrane_of_cook_rises_as_tabulated(solid, law, degree, count, place, printed, digits):
-    """VERIFICATION 1.8b: plane strain and a slice of the solid say the same."""
+    """Cook's membrane: plane strain and a slice of the solid agree."""
     problem, force = cook(law, degree, count, solid=solid)
     answer = solve(Newton(problem), load_of(force))
     assert answer.status.item() == Status.CONVERGED
@@ -173,7 +173,7 @@ SLOW_COOK = [(1, 4), (1, 5), (2, 3)]
     ("degree", "level"), FINE_COOK + [pytest.param(*c, marks=pytest.mark.slow) for c in SLOW_COOK]
 )
 def test_membrane_of_cook_rises_as_printed_by_deal_ii(degree, level):
-    """VERIFICATION 1.8b: the four digits of the gallery's table, 0.5 % at the finest meshes."""
+    """Cook's membrane: the four digits of deal.II's code gallery, 0.5 % on the finest meshes."""
     problem, force = cook(K4, degree, SIDES[level])
     answer = solve(Newton(problem), load_of(force))
     rise = problem.length * answer.displacement[0, node_at(problem, 48, 52), 1].item()
@@ -181,7 +181,7 @@ def test_membrane_of_cook_rises_as_printed_by_deal_ii(degree, level):
     assert level < 3 or rise == pytest.approx(14.74, rel=0.02 if degree == 1 else 5e-3)
 
 
-# VERIFICATION 1.8c: degree, n -> displacement of (20, 1, 1) [m], iterations of plain Newton
+# dolfinx tutorial, hyperelasticity: degree, n -> u of (20, 1, 1) [m], plain iterations
 DOLFINX = {
     (2, 1): (-0.456847, -1.8e-5, -4.554805),
     (2, 3): (-3.152621, -7.2e-5, -10.444325),
@@ -196,7 +196,7 @@ DOLFINX_ITERATIONS = [7, 8, 9, 8, 7, 6, 6, 5, 5]
 @pytest.mark.parametrize("degree", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])
 def test_beam_of_the_dolfinx_tutorial_bends_as_computed(degree, mixed):
-    """VERIFICATION 1.8c: nine loads, each from the answer before, no load step."""
+    """Beam of the dolfinx tutorial: nine loads, each from the previous solution, no load steps."""
     mesh = box([20.0, 1.0, 1.0], [21, 6, 6])
     problem = Problem.build(mesh, NH, fixed=Plane(0, "min"), degree=degree)
     unit = Traction(Plane(0, "max"), [0.0, 0.0, -1.5 / 1e4]).on(problem)
@@ -216,7 +216,7 @@ def test_beam_of_the_dolfinx_tutorial_bends_as_computed(degree, mixed):
         assert energy == pytest.approx(56.966619, abs=5e-7)
 
 
-# VERIFICATION 1.8d: degree, cells -> torque [N m], axial force [N], energy [J]
+# Twisted column: degree, cells -> torque [N m], axial force [N], energy [J]
 TWISTED = {
     (1, (4, 4, 20)): (18024.62786229, -800.53818109, 14151.84978085),
     (2, (2, 2, 10)): (17404.618354, -479.767061, 13664.649365),
@@ -230,7 +230,7 @@ TWISTED = {
     [pytest.param(*c, marks=pytest.mark.slow if c[1][0] * c[0] > 4 else []) for c in TWISTED],
 )
 def test_column_follows_the_rotation_of_its_end(degree, cells, mixed):
-    """VERIFICATION 1.8d: 90 degrees in nine steps, each from the answer before."""
+    """Twisted column: 90 degrees in nine steps, each from the previous solution."""
     mesh = box([1.0, 1.0, 5.0], [n + 1 for n in cells])
     points = 5 * Problem.build(mesh, NH, degree=degree).points
     centred = points - torch.tensor([0.5, 0.5, 0.0])
@@ -258,7 +258,7 @@ def test_column_follows_the_rotation_of_its_end(degree, cells, mixed):
     assert moment[:2].abs().max() < 1e-6 * torque
 
 
-# VERIFICATION 1.8e, rows of quadratic elements: cells, q -> u_z of the corner [m]
+# The paper's beam, rows of quadratic elements: cells, q -> u_z of the corner [m]
 BEAMS = {
     ((8, 2), 5): -7.32678,
     ((8, 2), 40): -49.67143,
@@ -268,7 +268,7 @@ BEAMS = {
 
 
 def sag(beam, pull, corner, law: Material, cells: tuple[int, int], q: float) -> float:
-    """Return u_z of the corner [m] of the beam of VERIFICATION 1.8e in hex27."""
+    """Return u_z of the corner [m] of the paper's beam in hex27."""
     problem = beam(law, *cells, degree=2)
     answer = solve(Newton(problem, tol=1e-10), load_of(pull(problem, q)[0]))
     assert answer.status.item() == Status.CONVERGED
@@ -278,7 +278,7 @@ def sag(beam, pull, corner, law: Material, cells: tuple[int, int], q: float) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize(("cells", "q"), BEAMS)
 def test_beam_of_quadratic_elements_bends_as_tabulated(beam, pull, corner, cells, q):
-    """VERIFICATION 1.8e; the other rows are in test_newton."""
+    """The paper's beam; the other rows are in test_newton."""
     assert sag(beam, pull, corner, SVK, cells, q) == pytest.approx(BEAMS[cells, q], abs=5.1e-6)
 
 
@@ -287,7 +287,7 @@ def test_beam_of_quadratic_elements_bends_as_tabulated(beam, pull, corner, cells
 def test_beams_of_quadratic_elements_tend_to_the_tabulated_limit(
     beam, pull, corner, q, limit, within
 ):
-    """VERIFICATION 1.8e: Richardson's limit of 4, 8 and 16 cells."""
+    """The paper's beam: Richardson's limit of 4, 8 and 16 cells."""
     a, b, c = (sag(beam, pull, corner, SVK, n, q) for n in ((4, 1), (8, 2), (16, 4)))
     rate = (b - a) / (c - b)
     assert rate > 2
@@ -296,13 +296,13 @@ def test_beams_of_quadratic_elements_tend_to_the_tabulated_limit(
 
 @pytest.mark.slow
 def test_finest_beam_has_the_tabulated_eigenvalues(beam):
-    """VERIFICATION 1.8e: those of K(0) in N/m at 12 000 degrees of freedom, tolerance 1e-6."""
+    """The paper's beam: eigenvalues of K(0) in N/m at 12 000 degrees of freedom, to 1e-6."""
     printed = [0.41357726] * 2 + [4.69213513] + [10.51183774] * 2 + [17.59484223]
     values = eigenmodes(LinearSolver(beam(NH, 39, 9)), len(printed)).values[: len(printed)]
     assert (4500 * 100 * values).tolist() == pytest.approx(printed, rel=1e-6)
 
 
-# VERIFICATION 1.8f: P L^2 / EI -> w / L and u / L of the elastica
+# Elastica, Bisshopp and Drucker (1945): P L^2 / EI -> w / L and u / L of the elastica
 ELASTICA = {
     1: (0.30172077, 0.056433236),
     4: (0.66996418, 0.32894124),
@@ -328,7 +328,7 @@ def tip(element: str, alpha: float) -> tuple[float, float]:
 @pytest.mark.parametrize("alpha", ELASTICA)
 @pytest.mark.parametrize("element", ["hex27", "tet10"])
 def test_slender_bar_of_quadratic_elements_is_the_elastica(element, alpha):
-    """VERIFICATION 1.8f, Bisshopp and Drucker (1945): within 0.6 %."""
+    """Elastica, Bisshopp and Drucker (1945): within 0.6 %."""
     assert tip(element, alpha) == pytest.approx(ELASTICA[alpha], rel=6e-3)
 
 
@@ -337,7 +337,7 @@ def test_slender_bar_of_quadratic_elements_is_the_elastica(element, alpha):
     [("hex27", 1, 0.30216), ("hex27", 4, 0.67157), ("hex27", 10, 0.81379)],
 )
 def test_slender_bar_has_the_tabulated_tip(element, alpha, printed):
-    """VERIFICATION 1.8f."""
+    """Elastica, Bisshopp and Drucker (1945)."""
     assert tip(element, alpha)[0] == pytest.approx(printed, abs=5.1e-6)
 
 
@@ -345,5 +345,5 @@ def test_slender_bar_has_the_tabulated_tip(element, alpha, printed):
     ("element", "short", "digits"), [("hex8", 0.093, 5e-4), ("tet4", 0.41, 5e-3)]
 )
 def test_slender_bar_of_linear_elements_locks_as_tabulated(element, short, digits):
-    """VERIFICATION 1.8f: 9.3 % and 41 % short of the elastica at P L^2 / EI = 1."""
+    """hex8 and tet4 are 9.3 % and 41 % below the elastica at P L^2 / EI = 1."""
     assert 1 - tip(element, 1)[0] / ELASTICA[1][0] == pytest.approx(short, abs=digits)

@@ -36,7 +36,7 @@ from dpl.fem.loads import body_force, traction
 FIELDS = Path(__file__).parents[3] / "shared" / "reference" / "fields"
 SVK, NH = SaintVenantKirchhoff(0.25), NeoHookeanLn(0.25)
 
-# VERIFICATION 1.6, MacNeal and Harder (1985): a cube in a cube
+# Patch test, MacNeal and Harder (1985): a cube in a cube
 OUTER = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
 INNER = [
     *([0.249, 0.342, 0.192], [0.826, 0.288, 0.288], [0.850, 0.649, 0.263], [0.273, 0.750, 0.230]),
@@ -48,7 +48,7 @@ VOLUMES = [
     *(0.1701827558, 0.1418706427, 0.1101509738),
 ]
 LOCAL = [0, 4, 3, 1, 7, 5, 2, 6]  # scikit-fem's order of the corners OUTER
-# VERIFICATION 1.4, general F, and 1.6a
+# P at a general F, independent code, and of the patch test
 GENERAL = [[0.2, 0.2, -0.1], [0.05, -0.05, 0.15], [-0.08, 0.12, 0.1]]
 SMALL = [[1e-3, 5e-4, 5e-4], [5e-4, 1e-3, 5e-4], [5e-4, 5e-4, 1e-3]]
 
@@ -82,7 +82,7 @@ def isotropic(normal: float, shear: float) -> Tensor:
 
 
 def test_patch_of_macneal_and_harder_has_the_printed_volumes():
-    """VERIFICATION 1.6."""
+    """Patch test, MacNeal and Harder (1985)."""
     problem = Problem.build(cube_in_cube(), NH, length=1.0)
     volumes = problem.dV.sum(dim=1).numpy()
     assert np.sort(volumes) == pytest.approx(np.sort(VOLUMES), abs=1e-10)
@@ -92,7 +92,7 @@ def test_patch_of_macneal_and_harder_has_the_printed_volumes():
 
 @pytest.mark.parametrize("degree", [1, 2])
 def test_linear_patch_has_the_printed_stress(degree):
-    """VERIFICATION 1.6a: linear elasticity, stress 2000 and 400 at E = 1e6, in one iteration."""
+    """MacNeal and Harder (1985): linear stresses 2000 and 400 at E = 1e6, in one iteration."""
     problem = stretched(cube_in_cube(), LinearElastic(0.25), SMALL, degree)
     answer = at_rest(problem)
     assert answer.converged.all()
@@ -105,7 +105,7 @@ def test_linear_patch_has_the_printed_stress(degree):
 
 @pytest.mark.parametrize("material", [SaintVenantKirchhoff, NeoHookeanLn, NeoHookeanIsoK4])
 def test_patch_at_rest_resists_like_the_linear_one(material):
-    """VERIFICATION 1.6a, 1.7: all laws share K(0), which balances the linear field."""
+    """Patch test: all laws share K(0), which balances the linear field."""
     problem = stretched(cube_in_cube(), material(0.25), SMALL, 1)
     linear = stretched(cube_in_cube(), LinearElastic(0.25), SMALL, 1)
     H = torch.tensor(SMALL, dtype=torch.float64)
@@ -126,7 +126,7 @@ def test_patch_at_rest_resists_like_the_linear_one(material):
     ids=["NH-ln", "SVK", "NHiso-k4"],
 )
 def test_finite_patch_has_the_printed_stress(law, normal, shear, tolerance):
-    """VERIFICATION 1.6a in finite strain, E = 1e6."""
+    """The patch test in finite strain, E = 1e6."""
     problem = stretched(cube_in_cube(), law, SMALL, 1)
     answer = at_rest(problem)
     assert answer.converged.all()
@@ -137,7 +137,7 @@ def test_finite_patch_has_the_printed_stress(law, normal, shear, tolerance):
 @pytest.mark.parametrize("law", [SVK, NH], ids=["svk", "neo-hookean"])
 @pytest.mark.parametrize("degree", [1, 2])
 def test_patch_passes_in_finite_strain(law, degree):
-    """VERIFICATION 1.6b: inner nodes exact, stress uniform, six or seven iterations."""
+    """Patch test in finite strain: inner nodes exact, stress uniform, six or seven iterations."""
     problem = stretched(cube_in_cube(), law, GENERAL, degree)
     check_patch(problem, at_rest(problem))
 
@@ -146,7 +146,7 @@ def test_patch_passes_in_finite_strain(law, degree):
 @pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
 @pytest.mark.parametrize("law", [SVK, NH], ids=["svk", "neo-hookean"])
 def test_crooked_patch_of_any_element_passes(law, cell, degree, grid):
-    """VERIFICATION 1.6c: randomly shaken inner nodes."""
+    """Patch test with randomly moved inner nodes."""
     mesh = grid(cell, 3, 0.2, inside=True)
     dim = mesh.dim()
     problem = stretched(mesh, law, [row[:dim] for row in GENERAL[:dim]], degree)
@@ -173,7 +173,7 @@ def check_patch(problem: Problem, answer: Solution) -> None:
 @pytest.mark.parametrize("cell", ["tetra", "hexahedron"])
 @pytest.mark.parametrize("law", [SVK, NH], ids=["svk", "neo-hookean"])
 def test_crooked_patch_passes_under_tractions(law, cell, degree, grid):
-    """VERIFICATION 1.6d: confined stretch 1.4 driven by P11 on x = 1, the other sides sliding."""
+    """Patch test with tractions: confined stretch 1.4 by P11 on x = 1; the other sides slide."""
     mesh = grid(cell, 2, 0.2, inside=True)
     bare = Problem.build(mesh, law, degree=degree, length=1.0)
     held = bare.points.numpy() < 1e-9
@@ -190,7 +190,7 @@ def test_crooked_patch_passes_under_tractions(law, cell, degree, grid):
 
 
 def manufactured(x: Tensor, amplitude: float) -> Tensor:
-    """Return the displacement of VERIFICATION 1.9 at one point (3,)."""
+    """Return the manufactured displacement at one point (3,)."""
     X, Y, Z = math.pi * x
     u = (X.sin() * (Y / 2).cos(), (Y / 2).cos() * Z.sin(), x[1] * (X / 2).sin() * Z.sin())
     return amplitude * torch.stack(u)
@@ -240,7 +240,7 @@ def errors(
     return math.sqrt((off * fine.dx).sum()), math.sqrt((off_slope * fine.dx).sum())
 
 
-# VERIFICATION 1.9, NH-ln, A = 0.1: number of cells a side, error in L2, error in the H1-seminorm
+# Manufactured solution, NH-ln, A = 0.1: cells per side, errors in L2 and the H1-seminorm
 MANUFACTURED = {
     ("hexahedron", 1): (
         [2, 4, 8, 16],
@@ -273,7 +273,7 @@ def measured() -> Callable[[type[Material], str, int, int], tuple[float, float]]
 
     @cache
     def measured(law: type[Material], cell: str, degree: int, level: int) -> tuple[float, float]:
-        amplitude = 0.1 if law is NeoHookeanLn else 0.02  # VERIFICATION 1.9
+        amplitude = 0.1 if law is NeoHookeanLn else 0.02  # SVK loses ellipticity at 0.1
         count = MANUFACTURED[cell, degree][0][level]
         return errors(law(0.3), amplitude, cell, degree, count)
 
@@ -282,7 +282,7 @@ def measured() -> Callable[[type[Material], str, int, int], tuple[float, float]]
 
 @pytest.mark.parametrize(("cell", "degree", "level"), COARSE + FINE)
 def test_manufactured_answer_has_the_printed_error(measured, cell, degree, level):
-    """VERIFICATION 1.9; tetrahedra lie along another diagonal there, so within 10 % for them."""
+    """Errors of the manufactured solution; tetrahedra (another diagonal) within 10 %."""
     _, L2, H1 = MANUFACTURED[cell, degree]
     error, slope_error = measured(NeoHookeanLn, cell, degree, level)
     tolerance = 5e-3 if cell == "hexahedron" else 0.1
@@ -294,14 +294,14 @@ def test_manufactured_answer_has_the_printed_error(measured, cell, degree, level
 @pytest.mark.parametrize(("cell", "degree", "level"), [(*kind, 2) for kind in MANUFACTURED] + FINE)
 @pytest.mark.parametrize("law", [SaintVenantKirchhoff, NeoHookeanLn])
 def test_error_falls_with_the_order_of_the_element(measured, law, cell, degree, level):
-    """VERIFICATION 1.9: p + 1 - 0.1 in L2, p - 0.05 in H1 on the last pair; twice that before."""
+    """Orders p + 1 - 0.1 in L2 and p - 0.05 in H1 on the last pair; twice these gaps before."""
     coarse, fine = measured(law, cell, degree, level - 1), measured(law, cell, degree, level)
     slack = 1 if level == 3 else 2
     assert math.log2(coarse[0] / fine[0]) > degree + 1 - 0.1 * slack
     assert math.log2(coarse[1] / fine[1]) > degree - 0.05 * slack
 
 
-# VERIFICATION 1.9: orders of the last pair, L2 and H1, NH-ln at A = 0.1 and SVK at A = 0.02
+# orders of the last pair, L2 and H1, NH-ln at A = 0.1 and SVK at A = 0.02
 ORDERS = {
     (NeoHookeanLn, "hexahedron", 1): (1.997, 1.001),
     (NeoHookeanLn, "hexahedron", 2): (2.999, 1.999),
@@ -313,7 +313,7 @@ ORDERS = {
 @pytest.mark.slow
 @pytest.mark.parametrize(("law", "cell", "degree"), ORDERS)
 def test_error_of_hexahedra_falls_with_the_printed_order(measured, law, cell, degree):
-    """VERIFICATION 1.9; tetrahedra lie along another diagonal there."""
+    """Orders of the manufactured solution (independent code; tetrahedra along another diagonal)."""
     coarse, fine = (measured(law, cell, degree, level) for level in (2, 3))
     orders = [math.log2(a / b) for a, b in zip(coarse, fine, strict=True)]
     assert orders == pytest.approx(ORDERS[law, cell, degree], abs=1.1e-3)
@@ -321,7 +321,7 @@ def test_error_of_hexahedra_falls_with_the_printed_order(measured, law, cell, de
 
 @pytest.mark.slow
 def test_error_of_mean_dilatation_falls_with_the_order_of_its_element():
-    """VERIFICATION 1.9: what does not lock is as accurate where nothing would."""
+    """Elements with mean dilatation are as accurate where no element locks."""
     law, options = NeoHookeanLn(0.3), {"mean_dilatation": True}
     coarse, fine = (errors(law, 0.1, "hexahedron", 1, n, **options) for n in (4, 8))
     assert math.log2(coarse[0] / fine[0]) > 1.8
@@ -329,7 +329,7 @@ def test_error_of_mean_dilatation_falls_with_the_order_of_its_element():
     assert fine == pytest.approx(errors(law, 0.1, "hexahedron", 1, 8), rel=0.25)
 
 
-# VERIFICATION 1.10: iterations of plain Newton on the beam of 1.8e, one step from rest
+# iterations of plain Newton on the paper's beam, one step from rest
 COUNTS = {
     (SaintVenantKirchhoff, 5): [4],
     (SaintVenantKirchhoff, 20): [6],
@@ -343,7 +343,7 @@ COUNTS = {
 @pytest.mark.parametrize(("law", "q"), COUNTS)
 @pytest.mark.parametrize("cells", [(8, 2), (16, 4)])
 def test_newton_takes_the_printed_number_of_iterations(beam, pull, cells, law, q):
-    """VERIFICATION 1.10; with mixed integration points not more, and from 40 on fewer."""
+    """Mixed integration points take no more iterations, and fewer from q = 40 on."""
     problem = beam(law(0.3), *cells)
     load = Load(pull(problem, q), torch.ones(1))
     plain, mixed = (solve(Newton(problem, mixed_integration=m), load) for m in (False, True))
@@ -351,7 +351,7 @@ def test_newton_takes_the_printed_number_of_iterations(beam, pull, cells, law, q
     assert mixed.iterations.item() <= plain.iterations.item() - (q == 40)
 
 
-# VERIFICATION 1.10: u / L of the corner at q / E = 20 / 4500
+# u / L of the corner at q / E = 20 / 4500
 SCALED = {
     SaintVenantKirchhoff: [8.023468838e-3, -2.392426382e-4, -0.2479226415],
     NeoHookeanLn: [1.024683172e-2, -2.397967447e-4, -0.2477360716],
@@ -362,7 +362,7 @@ UNITS = [(1.0, 1e-3), (1.0, 1e3), (1e12, 1e-3), (1e12, 1e3), (4500.0, 100.0), (2
 @pytest.mark.parametrize("law", SCALED)
 @pytest.mark.parametrize("mixed", [False, True], ids=["plain", "mixed"])
 def test_answer_knows_no_units(corner, mixed, law):
-    """VERIFICATION 1.10, 2.2 T7: E from 1 to 1e12 Pa, L from 1 mm to 1 km; newtons in."""
+    """Stress case T7: E from 1 to 1e12 Pa, L from 1 mm to 1 km; forces in newtons."""
     ends, counts = [], set()
     for young, length in UNITS:
         mesh = box([length, length / 4, length / 4], [9, 3, 3])
