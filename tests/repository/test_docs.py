@@ -15,6 +15,7 @@ import yaml
 from hydra.core.global_hydra import GlobalHydra
 
 from dpl.config import build as run
+from dpl.fem.linear import BACKENDS
 
 ROOT = Path(__file__).parents[2]
 DOCS, CONF, RESULTS = ROOT / "docs", ROOT / "conf", ROOT / "benchmarks" / "results"
@@ -51,6 +52,7 @@ def blocks(tmp_path, monkeypatch):
 
     yield blocks
     sys.modules.pop("my_parts", None)
+    BACKENDS.pop("dense", None)  # which my_parts.py adds
 
 
 @pytest.mark.parametrize(
@@ -214,13 +216,14 @@ def test_a_notebook_is_executed_once_and_shown_with_its_figures(make, tmp_path, 
     assert "40 42" not in bare[path]
 
 
-def test_the_parts_of_the_page_on_adding_things_work(blocks, monkeypatch):
+def test_the_examples_of_the_page_on_extensions_work(blocks, monkeypatch):
     made = blocks("extend.md")
     assert made["answers"].converged.all()
+    assert made["load"].force.shape == (1, *made["small_body"].shape)
     monkeypatch.setattr(sys, "path", [str(Path.cwd()), *sys.path])
     GlobalHydra.instance().clear()
     own = f"hydra.searchpath=[file://{Path.cwd() / 'my_conf'}]"
-    chosen = ["material=gent", "mesh=tube", "model=modal", "loss=tip", "folder=."]
+    chosen = ["material=gent", "mesh=tube", "loads=bimodal", "model=modal", "loss=tip", "folder=."]
     try:
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
             cfg = hydra.compose("train", overrides=[own, *chosen])
@@ -229,6 +232,7 @@ def test_the_parts_of_the_page_on_adding_things_work(blocks, monkeypatch):
             surrogate = run.build_surrogate(cfg, scene)
     finally:
         GlobalHydra.instance().clear()
+    assert scene.loads.distribution.keywords == {"gap": 0.3}
     assert (surrogate.net.inner[0].out_features, type(surrogate.loss).__name__) == (64, "TipError")
     search = yaml.safe_load((Path.cwd() / "my_conf/sweep/modal.yaml").read_text())
     assert set(search["hydra"]["sweeper"]["params"]) == {"model.width", "optimizer.lr"}
