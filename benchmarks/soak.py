@@ -1,4 +1,4 @@
-"""Soak: hours of work at full speed, in which nothing may grow, slow down or be left behind."""
+"""Soak test: memory, rate, files and processes over hours of work at full speed."""
 
 import os
 import statistics
@@ -15,57 +15,57 @@ from dpl import Scene
 from dpl.inference import Simulator
 
 SHARED = Path("/dev/shm")
-STREAM = (0, 13)  # of the simulator's loads
+STREAM = (0, 13)  # random stream of the loads
 BATCH = 64  # loads that are drawn at once
-FLAT = 0.03  # part of the memory that its second half may gain
-STEADY = 0.8  # part of its rate that the end must have
-SOME = 16.0  # memory that counts as none [MB]
-FEW = 0.1  # part of the open files that come and go with batches
+MEMORY_GROWTH = 0.03  # largest relative growth of the memory in the second half
+MIN_RATE = 0.8  # smallest final rate over the rate at mid-time
+MEMORY_NOISE = 16.0  # growth that is ignored [MB]
+FILE_GROWTH = 0.1  # largest relative growth of open files; batches open and close some
 
 
 @dataclass(frozen=True)
-class Vitals:
-    """What a process and its descendants hold at one time.
+class Usage:
+    """Resources of a process and its descendants at one time.
 
     Attributes:
-        what: They do.
-        seconds: Since the start [s].
-        done: Answers or steps so far.
-        memory: Of all of them, shared pages once (PSS) [MB].
-        files: Open files, segments of shared memory among them.
-        processes: This one included.
-        shared: Segments of shared memory with names, which outlive a process that is killed.
+        workload: Name of the work.
+        seconds: Time since the start [s].
+        steps: Answers or training steps so far.
+        memory: Proportional set size of all processes [MB].
+        files: Open files, segments of shared memory included.
+        processes: Number of processes.
+        shm_segments: Named segments of shared memory, which outlive a killed process.
     """
 
-    what: str
+    workload: str
     seconds: float
-    done: int
+    steps: int
     memory: float
     files: int
     processes: int
-    shared: int
+    shm_segments: int
 
 
-def vitals(what: str, seconds: float, done: int) -> Vitals:
-    """Return what this process and its descendants hold now (Linux)."""
-    memory, files, found = 0, 0, family()
+def usage(workload: str, seconds: float, steps: int) -> Usage:
+    """Return the resources of this process and its descendants (Linux)."""
+    memory, files, found = 0, 0, process_tree()
     for number in found:
         home = Path(f"/proc/{number}")
         try:
             lines = (home / "smaps_rollup").read_text().splitlines()
             memory += next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
             files += len(os.listdir(home / "fd"))
-        except OSError:  # it has just ended
+        except OSError:  # the process has ended
             continue
     names = os.listdir(SHARED) if SHARED.is_dir() else []
-    shared = sum(any(f"_{number}_" in name for number in found) for name in names)
-    return Vitals(what, seconds, done, memory / 1024, files, len(found), shared)
+    shm_segments = sum(any(f"_{number}_" in name for number in found) for name in names)
+    return Usage(workload, seconds, steps, memory / 1024, files, len(found), shm_segments)
 
 
-def family() -> list[int]:
-    """Return the numbers of this process and its living descendants.
+def process_tree() -> list[int]:
+    """Return the process ids of this process and its living descendants.
 
-    Left out is Python's resource tracker, of which a process that has had others keeps one.
+    Python's resource tracker does not count: it lives as long as its parent.
     """
     parents: dict[int, int] = {}
     for home in Path("/proc").glob("[0-9]*"):
@@ -77,36 +77,36 @@ def family() -> list[int]:
         if state != "Z" and not tracker:
             parents[int(home.name)] = int(parent)
     found = [os.getpid()]
-    for number in found:  # which grows
+    for number in found:  # the list grows
         found += [child for child, parent in parents.items() if parent == number]
     return found
 
 
-def simulator(sim: Simulator, seconds: float, *, every: float = 5.0) -> Iterator[Vitals]:
-    """Ask for answers as fast as they come, in and beyond the range, and yield what that holds.
+def simulator(sim: Simulator, seconds: float, *, every: float = 5.0) -> Iterator[Usage]:
+    """Evaluate a simulator without pause, in and beyond its range, and yield its resources.
 
-    Network, tolerances, budgets, warm starts and refusals take turns. The loads repeat after
-    `BATCH` times the turns.
+    Network, tolerances, budgets, warm starts and invalid forces alternate. The loads repeat after
+    `BATCH` times the number of calls.
 
     Args:
-        sim: The simulator.
-        seconds: For so long.
-        every: Time between two looks [s].
+        sim: A simulator.
+        seconds: Duration [s].
+        every: Time between two records [s].
     """
-    turns = list(_turns(sim))
+    calls = list(_calls(sim))
     newtons = _loads(sim.scene)
-    yield from _watched("simulator", lambda k: turns[k % len(turns)](newtons(k)), seconds, every)
+    yield from _record("simulator", lambda k: calls[k % len(calls)](newtons(k)), seconds, every)
 
 
 def _loads(scene: Scene) -> Callable[[int], torch.Tensor]:
-    """Return the k-th force, (N, D) [N], every third one to twice the range."""
+    """Return a function of k to forces (N, D) [N]; every third one is twice as large."""
     drawn = scene.loads.sample(STREAM, range(BATCH))
     force = drawn.force * (drawn.young * scene.force_unit).view(-1, 1, 1)
     return lambda k: force[k % BATCH] * (2.0 if k % 3 == 0 else 1.0)
 
 
-def _turns(sim: Simulator) -> Iterator[Callable[[torch.Tensor], object]]:
-    """Yield the ways to ask; with a modulus where the scene has a range of them."""
+def _calls(sim: Simulator) -> Iterator[Callable[[torch.Tensor], object]]:
+    """Yield the kinds of calls; each gives Young's modulus."""
     loads = sim.scene.loads
     young = float(loads.young if isinstance(loads.young, int | float) else max(loads.young))
     yield partial(sim, young=young)
@@ -130,115 +130,116 @@ def _turns(sim: Simulator) -> Iterator[Callable[[torch.Tensor], object]]:
     yield refused
 
 
-def _watched(
-    what: str, step: Callable[[int], object], seconds: float, every: float
-) -> Iterator[Vitals]:
-    start, following = time.perf_counter(), 0.0
-    done = 0
+def _record(
+    workload: str, step: Callable[[int], object], seconds: float, every: float
+) -> Iterator[Usage]:
+    start, next_record = time.perf_counter(), 0.0
+    steps = 0
     while (now := time.perf_counter() - start) < seconds:
-        if now >= following:
-            yield vitals(what, now, done)
-            following = now + every
-        step(done)
-        done += 1
-    yield vitals(what, time.perf_counter() - start, done)
+        if now >= next_record:
+            yield usage(workload, now, steps)
+            next_record = now + every
+        step(steps)
+        steps += 1
+    yield usage(workload, time.perf_counter() - start, steps)
 
 
-class Pulse(L.Callback):
-    """Looks at a training every few seconds and ends it in time.
+class UsageMonitor(L.Callback):
+    """Record the resources of a training and end it after a given time.
 
     Attributes:
-        rows: What it has seen.
+        rows: Records.
     """
 
     def __init__(self, seconds: float, *, every: float = 5.0) -> None:
-        """Choose how long the training lasts and how often to look [s]."""
-        self.rows: list[Vitals] = []
+        """Set the duration of the training and the time between records [s]."""
+        self.rows: list[Usage] = []
         self._seconds, self._every = seconds, every
-        self._start = self._following = 0.0
+        self._start = self._next_record = 0.0
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Start the clock."""
         self._start = time.perf_counter()
 
     def on_train_batch_end(self, trainer: L.Trainer, *args: object) -> None:
-        """Look, if it is time to."""
+        """Record the resources at the chosen times."""
         now = time.perf_counter() - self._start
-        if now >= self._following:
-            self.rows.append(vitals("online training", now, trainer.global_step))
-            self._following = now + self._every
+        if now >= self._next_record:
+            self.rows.append(usage("online training", now, trainer.global_step))
+            self._next_record = now + self._every
         trainer.should_stop |= now >= self._seconds
 
 
-def flaws(rows: Sequence[Vitals]) -> list[str]:
-    """Return what has grown, slowed down or been lost in the second half, a line each.
+def regressions(rows: Sequence[Usage]) -> list[str]:
+    """Return growth of resources and loss of speed in the second half, one line each.
 
-    The first half is for buffers, caches and compiled kernels to fill.
+    Buffers, caches and compiled kernels fill in the first half.
 
     Raises:
         ValueError: There are fewer than ten rows.
     """
     if len(rows) < 10:
-        raise ValueError(f"{len(rows)} looks tell nothing; let it take longer")
+        raise ValueError(f"{len(rows)} records must be 10 or more; increase minutes")
     fifth = len(rows) // 5
     middle, end = rows[-3 * fifth : -2 * fifth], rows[-fifth:]
     found = []
     before, after = (statistics.median(row.memory for row in part) for part in (middle, end))
-    if after - before > max(FLAT * before, SOME):
+    if after - before > max(MEMORY_GROWTH * before, MEMORY_NOISE):
         found.append(f"memory grew from {before:.0f} to {after:.0f} MB")
     slow, fast = _rate(rows[-fifth - 1 :]), _rate(rows[-3 * fifth - 1 : -fifth])
-    if slow < STEADY * fast:
+    if slow < MIN_RATE * fast:
         found.append(f"{fast:.1f} a second became {slow:.1f}")
-    for name in ("files", "processes", "shared"):
+    for name in ("files", "processes", "shm_segments"):
         before, after = (statistics.median(getattr(r, name) for r in p) for p in (middle, end))
-        if after > (1 + FEW) * before or (name == "processes" and before != after):
+        if after > (1 + FILE_GROWTH) * before or (name == "processes" and before != after):
             found.append(f"{name} were {before:g}, are {after:g}")
     return found
 
 
-def _rate(rows: Sequence[Vitals]) -> float:
-    """Return what was done a second between the first and the last row [1/s]."""
-    return (rows[-1].done - rows[0].done) / (rows[-1].seconds - rows[0].seconds)
+def _rate(rows: Sequence[Usage]) -> float:
+    """Return the rate between the first and the last row [1/s]."""
+    return (rows[-1].steps - rows[0].steps) / (rows[-1].seconds - rows[0].seconds)
 
 
-def left(before: Vitals, after: Vitals) -> list[str]:
-    """Return which processes and named segments a work has left behind, a line each."""
+def leftovers(before: Usage, after: Usage) -> list[str]:
+    """Return leftover processes and segments of shared memory, one line each."""
     counts = {
-        name: getattr(after, name) - getattr(before, name) for name in ("processes", "shared")
+        name: getattr(after, name) - getattr(before, name) for name in ("processes", "shm_segments")
     }
     return [f"{count} {name} more than before" for name, count in counts.items() if count > 0]
 
 
-def told(rows: Sequence[Vitals]) -> str:
-    """Return a work in a line: how long, how much, how fast, in how much memory."""
+def summary(rows: Sequence[Usage]) -> str:
+    """Return duration, rate and resources of a workload as one line."""
     memory = [row.memory for row in rows[len(rows) // 2 :]]
     last = rows[-1]
     return (
-        f"{last.what}: {last.done:,} in {last.seconds / 60:.1f} min, {_rate(rows):.1f} a second; "
+        f"{last.workload}: {last.steps:,} in {last.seconds / 60:.1f} min, "
+        f"{_rate(rows):.1f} a second; "
         f"second half {min(memory):.0f} to {max(memory):.0f} MB, {last.files} files, "
         f"{last.processes} processes"
     )
 
 
-def draw(rows: Sequence[Vitals], path: Path) -> None:
-    """Draw memory, rate, and open files and processes against time, a line for each work."""
+def draw(rows: Sequence[Usage], path: Path) -> None:
+    """Draw memory, rate, open files and processes against time, one line per workload."""
     from benchmarks.verification.drawing import panel, picture
     from dpl.visualization import COLOURS
 
-    works = list(dict.fromkeys(row.what for row in rows))
+    workloads = list(dict.fromkeys(row.workload for row in rows))
     with picture(path, 3.4) as figure:
         memory = panel(figure, 1, "time [min]", "memory [MB]", "(a)", columns=3)
         rate = panel(figure, 2, "time [min]", "answers or steps a second", "(b)", columns=3)
-        held = panel(figure, 3, "time [min]", "open files; processes", "(c)", columns=3)
-        for colour, what in zip(COLOURS, works, strict=False):
-            own = [row for row in rows if row.what == what]
+        counts = panel(figure, 3, "time [min]", "open files; processes", "(c)", columns=3)
+        for colour, workload in zip(COLOURS, workloads, strict=False):
+            own = [row for row in rows if row.workload == workload]
             minutes = [row.seconds / 60 for row in own]
-            memory.plot(minutes, [row.memory for row in own], color=colour, label=what)
+            memory.plot(minutes, [row.memory for row in own], color=colour, label=workload)
             span = max(1, len(own) // 40)
             rates = [_rate(own[k - span : k + 1]) for k in range(span, len(own))]
             rate.plot(minutes[span:], rates, color=colour)
-            held.plot(minutes, [row.files for row in own], color=colour)
-            held.plot(minutes, [row.processes for row in own], color=colour, linestyle="--")
-        for ax in (memory, rate, held):
+            counts.plot(minutes, [row.files for row in own], color=colour)
+            counts.plot(minutes, [row.processes for row in own], color=colour, linestyle="--")
+        for ax in (memory, rate, counts):
             ax.set_ylim(bottom=0)
         figure.legend(*memory.get_legend_handles_labels(), loc="outside lower center", ncols=2)

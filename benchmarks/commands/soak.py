@@ -1,7 +1,8 @@
-"""What grows, slows down or is left behind: python scripts/soak.py minutes=30; 1 if anything is.
+"""Run the soak test: python scripts/soak.py minutes=30.
 
-Trains on an endless stream, solved by worker processes, then asks the simulator of what was
-trained, each for so long; writes what they held, every few seconds, and a figure of it.
+Trains on a stream that worker processes solve, then evaluates the simulator of the trained run,
+each for `minutes`. Writes the resources of both, every few seconds, and a figure. The exit status
+is 1 if resources grow, the rate falls or processes are left over.
 """
 
 import gc
@@ -15,14 +16,14 @@ from benchmarks.commands import CONF
 from dpl import config
 from dpl.commands import cli
 
-LOOKS = 360  # at each work
+RECORDS = 360  # of each workload
 WORKS = ("training", "simulator")
 
 
 @cli.command("soak", conf=CONF)
 def main(cfg: DictConfig) -> None:
-    """Train, simulate, and look at both."""
-    # here and not above: worker processes import this file, and need none of it
+    """Train, simulate and record the resources of both."""
+    # Worker processes import this file and need none of these imports.
     from benchmarks import soak
     from dpl.evaluation import tables as table
     from dpl.inference import Simulator
@@ -36,37 +37,37 @@ def main(cfg: DictConfig) -> None:
     rows: list = []
     wrong: list[str] = []
 
-    def seen(work: list) -> None:
+    def report(work: list) -> None:
         rows.extend(work)
-        wrong.extend(f"{work[-1].what}: {line}" for line in soak.flaws(work))
+        wrong.extend(f"{work[-1].workload}: {line}" for line in soak.regressions(work))
         table.write(rows, folder / "soak.csv")
         table.write_machine(folder / "machine.json")
         soak.draw(rows, folder / "soak.png")
-        print(soak.told(work))
+        print(soak.summary(work))
 
     if "training" in cfg.works:
-        before = soak.vitals("before", 0.0, 0)
-        seen(_trained(cfg, seconds))
-        gc.collect()  # the last batches, in shared memory
-        time.sleep(2.0)  # in which workers end
-        after = soak.vitals("after", 0.0, 0)
-        wrong += [f"after the training: {line}" for line in soak.left(before, after)]
+        before = soak.usage("before", 0.0, 0)
+        report(_train(cfg, seconds))
+        gc.collect()  # frees the last batches in shared memory
+        time.sleep(2.0)  # workers end
+        after = soak.usage("after", 0.0, 0)
+        wrong += [f"after the training: {line}" for line in soak.leftovers(before, after)]
     if "simulator" in cfg.works:
         _, surrogate = config.load_run(folder, trust=True)
-        asked = []
-        for row in soak.simulator(Simulator(surrogate), seconds, every=seconds / LOOKS):
-            asked.append(row)
+        records = []
+        for row in soak.simulator(Simulator(surrogate), seconds, every=seconds / RECORDS):
+            records.append(row)
             print(
-                f"{row.seconds / 60:.1f} min: {row.done:,} answers ...", end="\r", file=sys.stderr
+                f"{row.seconds / 60:.1f} min: {row.steps:,} answers ...", end="\r", file=sys.stderr
             )
-        seen(asked)
-    print("\n".join(wrong) or "nothing grew, slowed down or was left behind")
+        report(records)
+    print("\n".join(wrong) or "no growth, no loss of speed, nothing left over")
     if wrong:
         sys.exit(1)
 
 
-def _trained(cfg: DictConfig, seconds: float) -> list:
-    """Train for so long and return what was seen."""
+def _train(cfg: DictConfig, seconds: float) -> list:
+    """Train for a time [s] and return the records."""
     from benchmarks import soak
 
     scene = config.build_scene(cfg)
@@ -74,11 +75,11 @@ def _trained(cfg: DictConfig, seconds: float) -> list:
     surrogate = config.build_surrogate(cfg, scene)
     trainer = config.instantiate(cfg, "trainer")
     cli.check_trainer(trainer, cfg)
-    pulse = soak.Pulse(seconds, every=seconds / LOOKS)
-    trainer.callbacks.append(pulse)
+    monitor = soak.UsageMonitor(seconds, every=seconds / RECORDS)
+    trainer.callbacks.append(monitor)
     config.save_config(cfg, Path(cfg.folder))
     try:
         trainer.fit(surrogate, datamodule=data)
     finally:
         data.teardown("fit")
-    return pulse.rows
+    return monitor.rows
