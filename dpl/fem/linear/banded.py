@@ -16,6 +16,7 @@ from scipy.sparse import csr_matrix
 from dpl.fem.linear.interface import (
     Array,
     Backend,
+    DirectFactor,
     Factor,
     Pattern,
     SingularMatrix,
@@ -153,7 +154,7 @@ def banded_triangular_solve(L, right):  # type: ignore[no-untyped-def]
 
 
 @dataclass(frozen=True, eq=False)
-class BandedFactor:
+class BandedFactor(DirectFactor):
     """Banded Cholesky factor; in float64 it is a backend's factor as it is.
 
     Attributes:
@@ -273,7 +274,7 @@ class MixedPrecisionBandedCholesky(BandedCholesky):
         return MixedPrecisionFactor(self, values.copy(), rough, scale)
 
 
-class MixedPrecisionFactor:
+class MixedPrecisionFactor(DirectFactor):
     """A matrix with its factor in float32, and in float64 once a solve has needed that.
 
     Attributes:
@@ -293,7 +294,7 @@ class MixedPrecisionFactor:
     @property
     def negative_pivots(self) -> int:
         """Number of negative eigenvalues, as far as known."""
-        return 0 if self.exact is None else self.exact.negative_pivots
+        return 0 if self.exact is None else self.exact.negative_pivots or 0
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), see `Factor.solve`."""

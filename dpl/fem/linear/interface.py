@@ -1,6 +1,6 @@
-"""What all linear backends share: their interface, their error, the product with a half matrix."""
+"""Interface of the linear backends, their exception, products with symmetric matrices."""
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,12 +35,37 @@ class SingularMatrix(ArithmeticError):
     """The matrix has no usable factorisation, or an iteration on it does not end."""
 
 
-class Factor(Protocol):
-    """A factorised matrix, or what stands for it in an iterative backend."""
+class Stability(NamedTuple):
+    """Number of negative eigenvalues of a symmetric matrix, as far as it is known.
+
+    Attributes:
+        least: Lower bound of the number.
+        exact: Whether the bound is the number itself.
+    """
+
+    least: int
+    exact: bool
 
     @property
     def negative_pivots(self) -> int:
-        """Number of negative eigenvalues; -1: not counted, as by iterative backends."""
+        """The bound as `Solution.negative_pivots` stores it; -1 where nothing is known."""
+        return self.least if self.least or self.exact else -1
+
+
+UNKNOWN = Stability(0, exact=False)
+UNSTABLE = Stability(1, exact=False)  # some eigenvalues are negative or zero, not counted
+
+
+class Factor(Protocol):
+    """A factorised matrix, or the matrix and its preconditioner in an iterative backend."""
+
+    @property
+    def negative_pivots(self) -> int | None:
+        """Number of negative eigenvalues; None where the backend does not count them."""
+        ...
+
+    def stability(self) -> Stability:
+        """Return what is known of negative eigenvalues; an iterative backend spends a solve."""
         ...
 
     def apply(self, right: Array) -> Array:
@@ -59,6 +84,14 @@ class Factor(Protocol):
             SingularMatrix: An iterative backend met negative curvature or did not converge.
         """
         ...
+
+
+class DirectFactor:
+    """Base of the factors that count negative pivots."""
+
+    def stability(self: Factor) -> Stability:
+        """Return the number of negative pivots."""
+        return Stability(self.negative_pivots or 0, exact=True)
 
 
 class Backend(Protocol):

@@ -13,9 +13,12 @@ from scipy.linalg import eigvalsh_tridiagonal
 from scipy.sparse import csr_matrix
 
 from dpl.fem.linear.interface import (
+    UNKNOWN,
+    UNSTABLE,
     Array,
     Pattern,
     SingularMatrix,
+    Stability,
     SymmetricProduct,
     full_matrix,
     require_finite,
@@ -138,30 +141,34 @@ class CGFactor:
         product: x -> K x.
         precondition: r -> approximately K^-1 r.
         max_iter: Conjugate gradient steps a solve may take.
-        negative_pivots: -1, not counted; `definiteness` tells none from some.
+        negative_pivots: None, not counted; see `stability`.
     """
 
     product: SymmetricProduct
     precondition: Map
     max_iter: int
-    negative_pivots: int = -1
+    negative_pivots: None = None
+
+    def stability(self) -> Stability:
+        """Return whether the matrix is positive definite; unknown if the solve does not converge.
+
+        CG detects negative curvature only in the Krylov space of its right-hand side, so this
+        solves with a random one, which has a component along every eigenvector. The residual
+        polynomial is 1 at zero and has positive roots only, hence exceeds 1 at a negative
+        eigenvalue: a small residual proves that there is none.
+        """
+        return self._stability
 
     @cached_property
-    def definiteness(self) -> int:
-        """0 if the matrix is positive definite, 1 if it is not, -1 if that did not show in time.
-
-        A solve may miss directions that its right-hand side does not hold, noise holds all: a
-        residual polynomial that is 1 at zero and has only positive roots exceeds 1 at a negative
-        eigenvalue, so that none can be left where the residual of noise is small.
-        """
+    def _stability(self) -> Stability:
         noise = np.random.default_rng(0).standard_normal(len(self.product.diagonal))
         try:
             self.solve(noise, DEFINITENESS_TOL)
         except NotDefinite:
-            return 1
+            return UNSTABLE
         except SingularMatrix:
-            return -1
-        return 0
+            return UNKNOWN
+        return Stability(0, exact=True)
 
     def apply(self, right: Array) -> Array:
         """Return the preconditioner's answer, (n,)."""

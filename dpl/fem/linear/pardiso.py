@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 
 from dpl.fem.linear.interface import (
     Array,
+    DirectFactor,
     Pattern,
     SingularMatrix,
     require_finite,
@@ -17,7 +18,7 @@ from dpl.fem.linear.interface import (
 
 
 @dataclass(frozen=True, eq=False)
-class PardisoFactor:
+class PardisoFactor(DirectFactor):
     """LDL^T factor inside MKL, which holds one at a time: an older one is made anew when asked."""
 
     parent: "Pardiso"

@@ -11,6 +11,7 @@ from scipy.sparse.linalg import splu
 
 from dpl.fem.linear.interface import (
     Array,
+    DirectFactor,
     Pattern,
     SingularMatrix,
     full_matrix,
@@ -20,7 +21,7 @@ from dpl.fem.linear.interface import (
 
 
 @dataclass(frozen=True, eq=False)
-class SuperLUFactor:
+class SuperLUFactor(DirectFactor):
     """LDL^T-like factor in a fill-reducing order."""
 
     lu: Any

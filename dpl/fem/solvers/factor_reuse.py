@@ -1,135 +1,164 @@
-"""Which factor serves which tangent on the way to an answer: its own, the last one's, K(0)'s."""
+"""Selection and reuse of the factors that precondition the tangents of one load."""
 
-from collections.abc import Callable
 from contextlib import suppress
+from enum import Enum
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.linear.interface import Factor, SingularMatrix, SymmetricProduct
-from dpl.fem.linear.krylov import CGFactor, conjugate_gradients, smallest_ritz_value
+from dpl.fem.linear.interface import (
+    UNKNOWN,
+    UNSTABLE,
+    Array,
+    Backend,
+    Factor,
+    Pattern,
+    SingularMatrix,
+    Stability,
+    SymmetricProduct,
+)
+from dpl.fem.linear.krylov import conjugate_gradients, smallest_ritz_value
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.fem.solvers.linear import LinearSolver
 
-Factorise = Callable[[NDArray[np.float64]], Factor]
-
-DOUBT = 0.05  # eigenvalue, relative to a factor nearby, below which a tangent is examined
-PATIENCE = 8  # conjugate gradient steps with the factor of another tangent, then its own
-TURNS = 16  # of the same with K(0)'s, turned
+MIN_RITZ_VALUE = 0.05  # smallest eigenvalue of M^-1 K below which the tangent K is factorised
+MAX_CG_STALE = 8  # conjugate gradient steps with a stale factor before the tangent is factorised
+MAX_CG_COROTATED = 16  # the same with the corotated factor of K(0)
 
 
-class FactorCache:
-    """The factors that one load needs on its way.
+class Preconditioner(Enum):
+    """Matrix whose factor preconditions the solve with a tangent K(u)."""
 
-    The one at hand preconditions conjugate gradients on the next tangents until they take too many
-    steps or it is forgotten; then a tangent is factorised. Only positive definite ones are kept.
+    REST = "K(0), where u = 0"
+    COROTATED = "K(0), rotated node by node"
+    STALE = "tangent of an earlier iterate"
+    FRESH = "K(u)"
+
+
+def select_preconditioner(
+    last: Preconditioner | None, *, near: bool, definite: bool, corotational: bool
+) -> Preconditioner:
+    """Return the preconditioner of the next solve with a tangent K(u), u other than 0.
+
+    Args:
+        last: Preconditioner of the last solve; None if there was none.
+        near: Whether u is near enough to the last iterate to reuse its factor.
+        definite: Whether the last factor has no negative pivots.
+        corotational: Whether the corotated factor of K(0) may be used.
+    """
+    if near and last in (Preconditioner.STALE, Preconditioner.FRESH):
+        return Preconditioner.STALE if definite else Preconditioner.FRESH
+    return Preconditioner.COROTATED if corotational else Preconditioner.FRESH
+
+
+class TangentSolver:
+    """Solver of K(u) x = r for the successive tangents of one load.
+
+    A factor preconditions conjugate gradients on later tangents until these need too many steps;
+    then a tangent is factorised.
 
     Attributes:
-        count: Tangents factorised so far; K(0) is not counted.
+        factorisations: Tangents factorised so far; K(0) is not counted.
     """
 
-    def __init__(self, rest: LinearSolver, factorise: Factorise, *, corotational: bool) -> None:
-        """Begin with none.
+    def __init__(self, linear_solver: LinearSolver, *, corotational: bool) -> None:
+        """Start without a factor.
 
         Args:
-            rest: Brings the body and the factor of K(0).
-            factorise: From the entries of a tangent, (nnz,), to its factor.
-            turned: Let the factor of K(0), turned with the nodes, be at hand where no other is.
+            linear_solver: Provides the problem, the factor of K(0) and the backend of tangents.
+            corotational: Whether to use the corotated factor of K(0).
         """
-        self.rest, self.factorise, self.corotational = rest, factorise, corotational
-        self.count = 0
-        self._pivots = -1  # negative ones of the last tangent that was factorised
-        self._near: Factor | CorotatedFactor | None = None  # the one at hand
-        self._served: SymmetricProduct | None = None  # the last tangent, if an older factor did
+        self.linear_solver, self.backend = linear_solver, linear_solver.tangent_backend
+        self.factorisations = 0
+        self._corotational = corotational
+        self._last: Preconditioner | None = None
+        self._factor: Factor | CorotatedFactor | None = None
+        self._tangent: SymmetricProduct | None = None  # last one, if it was not factorised
 
-    def invalidate(self) -> None:
-        """Let the one at hand go: the next tangent is too far from its own."""
-        self._near = None
+    @property
+    def _pattern(self) -> Pattern:
+        return self.linear_solver.problem.pattern
 
-    def at_rest(self, right: NDArray[np.float64], rtol: float) -> NDArray[np.float64]:
+    def solve_at_rest(self, right: Array, rtol: float) -> Array:
         """Return K(0)^-1 of a right-hand side (n,), to a relative residual.
 
         Raises:
             SingularMatrix: K(0) has no factor.
         """
-        self._served, factor = None, self.rest.factor
-        self._pivots = count_negative_pivots(factor)
-        return factor.solve(right, rtol)
+        self._last, self._factor = Preconditioner.REST, None
+        return self.linear_solver.factor.solve(right, rtol)
 
-    def solve(
-        self, tangent: NDArray[np.float64], u: Tensor, right: NDArray[np.float64], rtol: float
-    ) -> NDArray[np.float64]:
-        """Return K^-1 of a right-hand side (n,), to a relative residual.
+    def solve(self, tangent: Array, u: Tensor, right: Array, rtol: float, *, near: bool) -> Array:
+        """Return K(u)^-1 of a right-hand side (n,), to a relative residual.
 
         Args:
-            tangent: Entries of K, (nnz,).
-            u: Where it is the tangent, (1, N, D) [-].
-            right: What the step has to balance.
-            rtol: Relative residual that may be left.
+            tangent: Entries of K(u), (nnz,).
+            u: Displacement, (1, N, D) [-].
+            right: Right-hand side, (n,).
+            rtol: Relative residual at which conjugate gradients stop [-].
+            near: Whether u is near enough to the last iterate to reuse its factor.
 
         Raises:
-            SingularMatrix: It has no factor.
+            SingularMatrix: The tangent has no factor.
         """
-        self._served = None
-        if self._near is None and self.corotational:
-            self._near = self.rest.corotational.at(u)
-        if self._near is not None and self._near.negative_pivots <= 0:
-            product = SymmetricProduct(self.rest.problem.pattern, tangent)
-            abort_if_slow = isinstance(self._near, CorotatedFactor)
-            steps = TURNS if abort_if_slow else PATIENCE
+        kind = select_preconditioner(
+            self._last,
+            near=near,
+            definite=self._factor is not None and not self._factor.negative_pivots,
+            corotational=self._corotational and not self.linear_solver.factor.negative_pivots,
+        )
+        corotated = kind is Preconditioner.COROTATED
+        if corotated and not (near and self._last is kind):
+            self._factor = self.linear_solver.corotational.at(u)
+        if kind is not Preconditioner.FRESH and self._factor is not None:
+            self._last, self._tangent = kind, SymmetricProduct(self._pattern, tangent)
+            apply, steps = self._factor.apply, MAX_CG_COROTATED if corotated else MAX_CG_STALE
             with suppress(SingularMatrix):
-                step = conjugate_gradients(
-                    product, self._near.apply, right, rtol, steps, abort_if_slow=abort_if_slow
+                return conjugate_gradients(
+                    self._tangent, apply, right, rtol, steps, abort_if_slow=corotated
                 )
-                self._served = product
-                return step
-        self.corotational &= not isinstance(self._near, CorotatedFactor)
-        self.count += 1
-        self._near = None  # its storage serves the next one
-        self._near = self.factorise(tangent)
-        step = self._near.solve(right, rtol)
-        self._pivots = self._near.negative_pivots
-        return step
+            self._corotational &= not corotated
+            del apply  # it refers to the factor, whose storage the next one takes
+        self._last, self._factor, self._tangent = Preconditioner.FRESH, None, None
+        self.factorisations += 1
+        self._factor = self.backend.factorise(tangent)
+        return self._factor.solve(right, rtol)
 
-    def negative_pivots(self, answer: Tensor) -> int:
-        """Return those of the tangent at an answer (1, N, D); -1: not known.
+    def stability(self, u: Tensor) -> Stability:
+        """Return the stability of the equilibrium (1, N, D) that the last solve led to.
 
-        It is factorised only where it may have some: if the last tangent had some, or was not
-        examined (conjugate gradients); or, where an older factor served for it, if it has an
-        eigenvalue far below that factor's.
+        The tangent there is factorised only if it may be indefinite: if the last factor has
+        negative pivots or its backend does not count them, or if a Ritz value shows an eigenvalue
+        far below the stale factor's.
         """
-        if isinstance(self._near, CorotatedFactor):
-            return -1
-        problem = self.rest.problem
-        suspect = self._pivots > 0 or isinstance(self._near, CGFactor)
-        if not suspect and self._served is not None and self._near is not None:
-            with suppress(SingularMatrix):
-                suspect |= (
-                    smallest_ritz_value(self._served, self._near.apply, problem.pattern.size)
-                    < DOUBT
-                )
-            self._served = None
-        if suspect:
-            self.count += 1
-            self._near = None
-            self._pivots = negative_pivots_at(problem, self.factorise, answer)
-        return self._pivots
+        if self._last is Preconditioner.REST:
+            known = self.linear_solver.factor.stability()
+            suspect = known.least > 0
+        elif self._factor is None or self._last is Preconditioner.COROTATED:
+            return UNKNOWN
+        else:
+            known = Stability(0, exact=True)
+            suspect = self._factor.negative_pivots != 0 or self._ritz_value_is_small()
+        if not suspect:
+            return known
+        self.factorisations += 1
+        self._last, self._factor = None, None
+        return stability_at(self.linear_solver.problem, self.backend, u)
+
+    def _ritz_value_is_small(self) -> bool:
+        """Return whether the last tangent, solved with a stale factor, may be indefinite."""
+        if self._factor is None or self._tangent is None:
+            return False
+        with suppress(SingularMatrix):
+            value = smallest_ritz_value(self._tangent, self._factor.apply, self._pattern.size)
+            return value < MIN_RITZ_VALUE
+        return False
 
 
-def count_negative_pivots(factor: Factor) -> int:
-    """Return the negative eigenvalues of what was factorised, see `negative_pivots_at`."""
-    return factor.definiteness if isinstance(factor, CGFactor) else factor.negative_pivots
-
-
-def negative_pivots_at(problem: Problem, factorise: Factorise, displacement: Tensor) -> int:
-    """Return the negative eigenvalues of the tangent at (1, N, D); 1 where it is singular.
-
-    Conjugate gradients do not count them: 1 stands for some, -1 for not known.
-    """
+def stability_at(problem: Problem, backend: Backend, displacement: Tensor) -> Stability:
+    """Return the stability of the tangent at (1, N, D); a singular one counts as unstable."""
     tangent = problem.linearise(displacement).tangent
     try:
-        return count_negative_pivots(factorise(tangent[0].numpy()))
+        return backend.factorise(tangent[0].numpy()).stability()
     except SingularMatrix:  # at the critical load itself
-        return 1
+        return UNSTABLE

@@ -1,10 +1,9 @@
 """K(0)^-1, the compliance of a body at rest: its factor, and the linear answer to a load."""
 
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -17,7 +16,7 @@ from dpl.fem.problem import Problem
 from dpl.fem.solvers.corotational import CorotationalPreconditioner
 from dpl.fem.solvers.solution import Load, Solution, check_force, check_tol, evaluate_solution
 
-MAX_CLONES = 4  # bodies of other Poisson's ratios whose factors are kept
+MAX_CLONES = 4  # solvers of other Poisson's ratios that are kept with their factors
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,11 +27,13 @@ class LinearSolver:
         problem: The body.
         tol: Residual ratio below which the answer counts as converged [-]; at least 1e-15, below 1.
         linear: Backend of the sparse solves, see `dpl.fem.linear.make_backend`.
+        parent: Solver of the same mesh with another Poisson's ratio, whose backends are used.
     """
 
     problem: Problem
     tol: float = 1e-8
     linear: str = "auto"
+    parent: "LinearSolver | None" = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Check the tolerance.
@@ -47,7 +48,7 @@ class LinearSolver:
         """Factor of K(0)."""
         rest = torch.zeros(1, *self.problem.shape, dtype=torch.float64)
         values = self.problem.linearise(rest).tangent[0].numpy()
-        return self._backend.factorise(values)
+        return self.backend.factorise(values)
 
     @cached_property
     def corotational(self) -> CorotationalPreconditioner:
@@ -57,8 +58,19 @@ class LinearSolver:
         return CorotationalPreconditioner(self.problem, rough)
 
     @cached_property
-    def _backend(self) -> Backend:
-        return backend_for(self.problem, self.linear, many_rhs=True)
+    def backend(self) -> Backend:
+        """Backend of K(0), whose factor solves for many loads."""
+        return self.parent.backend if self.parent else self._make_backend(many_rhs=True)
+
+    @cached_property
+    def tangent_backend(self) -> Backend:
+        """Backend of the tangents far from rest, each of which is factorised for few solves."""
+        return self.parent.tangent_backend if self.parent else self._make_backend(many_rhs=False)
+
+    def _make_backend(self, *, many_rhs: bool) -> Backend:
+        pattern, modes = self.problem.pattern, self.problem.near_null
+        name = select_backend(self.linear, pattern, modes, many_rhs=many_rhs)
+        return make_backend(pattern, name, modes)
 
     def at(self, poisson: Tensor | float) -> "LinearSolver":
         """Return the linear answer of the body of another Poisson's ratio, see `Problem.at`."""
@@ -66,12 +78,13 @@ class LinearSolver:
 
     def of(self, problem: Problem) -> "LinearSolver":
         """Return the linear answer of a body that differs in Poisson's ratio only."""
-        return self if problem is self.problem else cached_clone(self._clones, problem, self._clone)
-
-    def _clone(self, problem: Problem) -> "LinearSolver":
-        twin = replace(self, problem=problem)
-        twin.__dict__["_backend"] = self._backend
-        return twin
+        if problem is self.problem:
+            return self
+        if problem not in self._clones:
+            if len(self._clones) >= MAX_CLONES:
+                self._clones.pop(next(iter(self._clones)))
+            self._clones[problem] = replace(self, problem=problem, parent=self)
+        return self._clones[problem]
 
     @cached_property
     def _clones(self) -> "dict[Problem, LinearSolver]":
@@ -79,9 +92,9 @@ class LinearSolver:
 
     @cached_property
     def reference(self) -> "LinearSolver":
-        """The linear answer of the reference body, see `Problem.reference`."""
+        """The linear solver of the reference body, see `Problem.reference`."""
         problem = self.problem.reference
-        return self if problem is self.problem else self._clone(problem)
+        return self if problem is self.problem else replace(self, problem=problem, parent=self)
 
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield the linear answer.
@@ -103,24 +116,3 @@ class LinearSolver:
     def __getstate__(self) -> dict[str, object]:
         """Pickle without the factor."""
         return {"problem": self.problem, "tol": self.tol, "linear": self.linear}
-
-
-Twin = TypeVar("Twin")
-
-
-def cached_clone(
-    twins: dict[Problem, Twin], problem: Problem, make: Callable[[Problem], Twin]
-) -> Twin:
-    """Return what belongs to a problem, made if it is not there; the oldest leaves for it."""
-    if problem not in twins:
-        if len(twins) >= MAX_CLONES:
-            twins.pop(next(iter(twins)))
-        twins[problem] = make(problem)
-    return twins[problem]
-
-
-def backend_for(problem: Problem, name: str, *, many_rhs: bool = False) -> Backend:
-    """Return the backend for a problem's tangents, or for one whose factor answers many loads."""
-    motions = problem.near_null
-    best = select_backend(name, problem.pattern, motions, many_rhs=many_rhs)
-    return make_backend(problem.pattern, best, motions)

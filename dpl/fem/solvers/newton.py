@@ -1,66 +1,67 @@
-"""Newton-Raphson on the nodal equilibrium f_int(u) = f, with load steps where it must."""
+"""Newton-Raphson on the nodal equilibrium f_int(u) = f, with load steps where needed."""
 
 import math
 import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear.backends import select_backend
-from dpl.fem.linear.interface import Backend, Factor, SingularMatrix
+from dpl.fem.linear.interface import UNKNOWN, SingularMatrix, Stability
 from dpl.fem.problem import Problem
-from dpl.fem.solvers.factor_reuse import FactorCache, negative_pivots_at
-from dpl.fem.solvers.linear import LinearSolver, backend_for, cached_clone
+from dpl.fem.solvers.factor_reuse import TangentSolver, stability_at
+from dpl.fem.solvers.linear import LinearSolver
+from dpl.fem.solvers.load_stepping import LoadStepping, longest_valid_step
 from dpl.fem.solvers.solution import Load, Solution, Status, check_force, check_steps, run_lockstep
 
-CAREFUL = 2.0**-4  # load step from which on the end of the path may be near: full accuracy
+FULL_TOL_STEP = 2.0**-4  # load step below which intermediate states are solved to `tol` [-]
 
 
 @dataclass(frozen=True, eq=False)
 class Newton:
-    """Newton-Raphson that never accepts an inverted element, with load steps where it must.
+    """Newton-Raphson with a guard against inverted elements and automatic load stepping.
 
-    Full steps on the whole load first; a step that would bring det F at a quadrature point below
-    `min_detF_ratio` of its value is shortened until it does not. (No line search on the residual
-    norm: on the way to large rotations it rises a hundredfold before it falls.) Where that does not
-    converge, the load is applied in steps, each half the one that failed, twice the one that
-    succeeded; intermediate states need only `intermediate_tol`.
+    Full steps on the whole load come first. A step that would reduce det F at a quadrature point
+    below `min_detF_ratio` of its value is halved until it does not. There is no line search on the
+    residual norm, because on the way to large rotations the norm rises a hundredfold before it
+    falls. Where the iterations do not converge, the load is applied in steps: a step that fails is
+    halved, one that succeeds is doubled. Intermediate states need only `intermediate_tol`.
 
-    An answer whose tangent has negative pivots is in balance but no minimum of the energy, a
-    straight column beyond its critical load, for one: its status says so. The tangent at the
-    answer is factorised only if the last one on the way had some or may have had, so that an answer
-    within 1e-4 of a critical load may pass.
+    An equilibrium whose tangent has negative pivots is no minimum of the energy, for example a
+    straight column beyond its critical load; its status is UNSTABLE. The tangent at the solution is
+    factorised only if the last tangent on the way had negative pivots or may have had some, so
+    that a solution within 1e-4 of a critical load may pass as stable.
 
     Source: Wriggers (2008), Nonlinear Finite Element Methods, sections 5.1 and 5.3.
 
     Attributes:
         problem: The body.
-        tol: Residual ratio ||R_free|| / ||f|| of an answer [-], see
-            `Problem.relative_residual_of`; at least 1e-15, below 1. Where
-            rounding does not allow it, on very thin cells, an answer whose residual no longer falls
-            counts as converged, with a warning.
-        max_iter: Iterations per load step before it is halved.
+        tol: Relative residual ||R_free|| / ||f|| of a solution [-], see
+            `Problem.relative_residual_of`; at least 1e-15, below 1. Where rounding does not allow
+            it, on very thin cells, a solution whose residual no longer falls counts as converged,
+            with a warning.
+        max_iter: Iterations per load step before the step is halved.
         max_total_iter: Iterations in all before a load is given up.
-        min_load_step: Load step, as a part of the load, below which to give up [-].
-        intermediate_tol: Residual ratio at intermediate load factors [-].
-        min_detF_ratio: Part of det F that one step may leave of the smallest one [-].
+        min_load_step: Load step, as a part of the load, below which a load is given up [-].
+        intermediate_tol: Relative residual at intermediate load factors [-].
+        min_detF_ratio: Smallest ratio of min det F after and before a step [-].
         linear: Backend of the sparse solves, see `dpl.fem.linear.make_backend`.
-        mixed_integration: Let the strains at the quadrature points be unknowns of their own
-            (Magisano, Leonetti, Garcea 2017), for laws that can: fewer iterations and far larger
-            steps.
-        factor_reuse_tol: Residual ratio below which the last factor, as preconditioner of conjugate
-            gradients on the new tangent, stands for a new one [-]; 0: a factor for every tangent.
-        corotational: Let the factor of K(0), rotated with the nodes, stand for those of tangents
-            while conjugate gradients with it are short. Whether an answer is stable is then known
-            only where they were not.
+        mixed_integration: Treat the strains at the quadrature points as independent unknowns
+            (Magisano, Leonetti, Garcea 2017), for laws that support it: fewer iterations and far
+            larger steps.
+        factor_reuse_tol: Relative residual below which the last factor is reused as
+            preconditioner of conjugate gradients on the new tangent [-]; 0: every tangent is
+            factorised.
+        corotational: Precondition conjugate gradients with the factor of K(0), rotated with the
+            nodes, and factorise only tangents for which they are too slow. Stability is then known
+            only where a tangent was factorised.
+        linear_solver: Solver with the factor of K(0), which every first step from zero uses.
+            Solvers made by `dataclasses.replace` share it unless `problem` or `linear` change.
     """
 
     problem: Problem
@@ -74,273 +75,273 @@ class Newton:
     mixed_integration: bool = True
     factor_reuse_tol: float = 0.1
     corotational: bool = False
+    linear_solver: LinearSolver = field(default=None, repr=False)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        """Check the ranges.
+        """Check the ranges and make the linear solver if none fits.
 
         Raises:
-            ValueError: An attribute is out of range, or the backend is not there.
+            ValueError: An attribute is out of range, or the backend is not installed.
         """
         check_steps(self, parts=("intermediate_tol", "min_detF_ratio", "min_load_step"))
         select_backend(self.linear)
+        given = self.linear_solver
+        if given is None or given.problem is not self.problem or given.linear != self.linear:
+            made = LinearSolver(self.problem, self.tol, self.linear)
+            object.__setattr__(self, "linear_solver", made)
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
         """Yield the state before the first update and after each one.
 
-        Members of a batch are solved one by one, in step; one that has ended repeats its end. A
-        member that ends without an answer ends with its last equilibrium under a part of the load.
+        Members of a batch are solved one by one, in lockstep; a member that has ended repeats its
+        last state. A member that does not converge ends with its last equilibrium under a part of
+        the load.
 
         Args:
-            load: What acts.
-            guess: Where to start, (B, N, D) [-]; zero if left out, and where it is inverted.
+            load: The load.
+            guess: Displacement to start from, (B, N, D) [-]; zero if left out, and where the guess
+                inverts an element.
 
         Raises:
-            ValueError: The force is none for this body, see `check_force`.
+            ValueError: The force does not fit the body, see `check_force`.
         """
         check_force(self.problem, load)
-        acting, own = self.problem.acting(load.force), load.poisson.expand(len(load.force), -1)
-        guesses = [None] * len(own) if guess is None else guess.split(1)
+        forces, ratios = self.problem.acting(load.force), load.poisson.expand(len(load.force), -1)
+        guesses = [None] * len(forces) if guess is None else guess.split(1)
         yield from run_lockstep(
             [
-                self.at(nu[None])._member(force[None], start)
-                for force, nu, start in zip(acting, own, guesses, strict=True)
+                self.at(nu[None])._apply_load(force[None], start)
+                for force, nu, start in zip(forces, ratios, guesses, strict=True)
             ]
         )
 
-    def replace(self, **changes: Any) -> "Newton":
-        """Return the solver with other attributes, those of its K(0) excepted: it keeps that."""
-        other = replace(self, **changes)
-        other.__dict__["linear_solver"] = self.linear_solver
-        return other
-
     def at(self, poisson: Tensor | float) -> "Newton":
-        """Return the solver of the body of another Poisson's ratio, see `Problem.at`.
+        """Return the solver of the body with another Poisson's ratio, see `Problem.at`.
 
-        It has a K(0) of its own to factorise; those of the last few are kept.
+        It has a factor of K(0) of its own; the linear solvers of the last few ratios are kept.
         """
         problem = self.problem.at(poisson)
-        return self if problem is self.problem else cached_clone(self._clones, problem, self._clone)
+        if problem is self.problem:
+            return self
+        return replace(self, problem=problem, linear_solver=self.linear_solver.of(problem))
 
-    def _clone(self, problem: Problem) -> "Newton":
-        twin = replace(self, problem=problem)
-        twin.__dict__["_backend"] = self._backend
-        twin.__dict__["linear_solver"] = self.linear_solver.of(problem)
-        return twin
+    def stability(self, displacement: Tensor) -> Stability:
+        """Return the stability of the tangent at (1, N, D); a singular one counts as unstable."""
+        return stability_at(self.problem, self.linear_solver.tangent_backend, displacement)
 
-    @cached_property
-    def _clones(self) -> "dict[Problem, Newton]":
-        return {}
-
-    def _member(self, force: Tensor, guess: Tensor | None) -> Iterator[Solution]:
-        """Yield the states under one load (1, N, D)."""
-        problem = self.problem
-        count = _Count(
-            FactorCache(self.linear_solver, self.factorise, corotational=self.corotational)
+    def _apply_load(self, force: Tensor, guess: Tensor | None) -> Iterator[Solution]:
+        """Yield the states under one load (1, N, D), applied in steps if necessary."""
+        run = _Run(
+            TangentSolver(self.linear_solver, corotational=self.corotational),
+            LoadStepping(self.min_load_step),
         )
-        state = base = self._rest(force)
-        guessed = guess is not None and bool(guess.any())
-        guessed &= bool(force.any()) or problem.moved_supports
-        if guess is not None and guessed:
-            held = torch.where(problem.free, guess, problem.prescribed)
-            start = self._state(held, torch.zeros_like(force))
-            state, guessed = (start, True) if start.volume_ratio > 0 else (base, False)
-        count.known, count.guessed, step = 0.0, guessed, 1.0
-        yield self._report(state, force, count)
-        while not self._balanced(state, force, 1.0, self.tol):
-            target = min(count.known + step, 1.0)
-            whole = target == 1.0
-            tol = self.tol if whole or step < CAREFUL else self.intermediate_tol
-            for iterate in self._correct(state, force, target, tol, count):
+        state = base = self._undeformed(force)
+        if (start := self._initial(force, guess)) is not None:
+            state, run.from_guess = start, True
+        yield self._report(state, force, run)
+        while not self._is_balanced(state, force, 1.0, self.tol):
+            steps, target = run.steps, run.steps.target
+            intermediate = target < 1 and steps.step >= FULL_TOL_STEP
+            tol = self.intermediate_tol if intermediate else self.tol
+            for iterate in self._newton_raphson(state, force, tol, run):
                 state = iterate
-                yield self._report(state, force, count)
-            if self._balanced(state, force, target, tol):
-                base, count.known, step = state, target, 2 * step
-            else:  # a guess that failed costs no load step
-                step = step if count.guessed else (target - count.known) / 2
-                state, count.guessed = base, False
-            lost = step < self.min_load_step
-            spent = count.iterations >= self.max_total_iter
-            if lost or (spent and not self._balanced(state, force, 1.0, self.tol)):
+                yield self._report(state, force, run)
+            if self._is_balanced(state, force, target, tol):
+                base = state
+                steps.accept()
+            elif run.from_guess:  # start again from rest, with the same load step
+                state, run.from_guess = base, False
+            else:
+                state = base
+                steps.reject()
+            spent = run.iterations >= self.max_total_iter
+            if steps.exhausted or (spent and not self._is_balanced(state, force, 1.0, self.tol)):
+                lost = steps.exhausted
                 end = Status.NO_VALID_EQUILIBRIUM if lost else Status.NOT_CONVERGED
-                yield self._report(base, force, count, end)
+                yield self._report(base, force, run, end)
                 return
-            ahead = min(count.known + step, 1.0) - count.known
-            state = state._replace(jump=ahead * problem.prescribed[None])
+            move = (steps.target - steps.factor) * self.problem.prescribed[None]
+            state = state._replace(support_step=move)
 
-    def _correct(
-        self, state: "_State", force: Tensor, target: float, tol: float, count: "_Count"
+    def _newton_raphson(
+        self, state: "_State", force: Tensor, tol: float, run: "_Run"
     ) -> Iterator["_State"]:
-        """Yield iterates under `target` times a load until they balance it or cannot go on."""
-        before = float("nan")
-        count.factors.invalidate()
-        for _ in range(self.max_iter):
-            ratio = self._ratio(state, force, target)
-            if not ratio < self.factor_reuse_tol:
-                count.factors.invalidate()
+        """Yield iterates under the target load until they balance it or an iteration fails."""
+        factor, previous = run.steps.target, math.nan
+        for k in range(self.max_iter):
+            residual = self._residual(state, force, factor)
+            rtol = forcing_term(residual, previous, tol=self.tol, corotational=self.corotational)
+            near = k > 0 and residual < self.factor_reuse_tol
             try:
-                update = self._update(state, target * force, count, self._forcing(ratio, before))
+                update = self._solve(state, factor * force, run.tangents, rtol, near=near)
             except SingularMatrix:
                 return
-            count.iterations += 1
-            stepped = self._stepped(state, update, shorten=not count.guessed)
-            if stepped is None:
+            run.iterations += 1
+            found = self._update(state, update, halvings=0 if run.from_guess else 9)
+            if found is None:
                 return
-            state = stepped._replace(before=ratio)
+            state, previous = found._replace(previous=residual), residual
             yield state
-            if self._balanced(state, force, target, tol) or count.iterations >= self.max_total_iter:
+            spent = run.iterations >= self.max_total_iter
+            if spent or self._is_balanced(state, force, factor, tol):
                 return
-            before = ratio
 
-    def _forcing(self, ratio: float, before: float) -> float:
-        """Return the relative residual that a linear solve may leave.
-
-        As much as does not slow Newton down; `before` is the residual ratio an iteration ago, NaN
-        in the first one.
-
-        Source: Eisenstat, Walker (1996), SIAM J. Sci. Comput. 17, choice 2.
-        """
-        enough = 0.1 * self.tol / ratio if ratio > 0 else 0.0
-        unknown = 1e-3 if self.corotational else 0.0
-        earned = 0.01 * (ratio / before) ** 2 if before > 0 else unknown
-        return max(1e-12, enough, min(1e-3, earned))
-
-    def _update(self, state: "_State", force: Tensor, count: "_Count", rtol: float) -> Tensor:
-        """Return the full Newton step (1, N, D) under a force, supports included.
+    def _solve(
+        self, state: "_State", force: Tensor, tangents: TangentSolver, rtol: float, *, near: bool
+    ) -> Tensor:
+        """Return the full Newton step (1, N, D) under a force, with the step of the supports.
 
         Raises:
             SingularMatrix: The tangent has no factor.
         """
         problem, u = self.problem, state.displacement
-        if not u.any():
-            right = self._right(state, force, state.internal)
-            return scatter(count.factors.at_rest(right, rtol), problem)[None] + state.jump
-        system = problem.linearise(u, state.gap)
-        if not system.valid:
-            system = problem.linearise(u)
-        right = self._right(state, force, system.force)
-        step = count.factors.solve(system.tangent[0].numpy(), u, right, rtol)
-        return scatter(step, problem)[None] + state.jump
-
-    def _right(self, state: "_State", force: Tensor, internal: Tensor) -> NDArray[np.float64]:
-        """Return what the step has to balance, (n,)."""
+        internal, tangent = state.internal, None
+        if u.any():
+            system = problem.linearise(u, state.gap)
+            system = system if system.valid else problem.linearise(u)
+            internal, tangent = system.force, system.tangent[0].numpy()
         right = force - internal
-        if state.jump.any():
-            right = right - self.problem.tangent_product(state.displacement, state.jump)
-        return gather(right[0], self.problem)
+        if state.support_step.any():
+            right = right - problem.tangent_product(u, state.support_step)
+        values = gather(right[0], problem)
+        if tangent is None:
+            step = tangents.solve_at_rest(values, rtol)
+        else:
+            step = tangents.solve(tangent, u, values, rtol, near=near)
+        return scatter(step, problem)[None] + state.support_step
 
-    def _stepped(self, state: "_State", update: Tensor, *, shorten: bool) -> "_State | None":
-        """Return the state after the longest of the steps 1, 1/2, 1/4, ... that inverts nothing.
+    def _update(self, state: "_State", update: Tensor, *, halvings: int) -> "_State | None":
+        """Return the state after the longest of the steps 1, 1/2, ... that inverts no element."""
 
-        Only the whole one unless it is to `shorten`: a guess is good, or it is given up.
-        """
-        floor = self.min_detF_ratio * min(float(state.volume_ratio), 1.0)
-        for length in (0.5 ** np.arange(10 if shorten else 1)).tolist():
-            jump = (1 - length) * state.jump
-            end = self._state(state.displacement + length * update, jump)
-            if end.volume_ratio > floor:
-                if self.mixed_integration and self.problem.supports_mip:
-                    return end._replace(
-                        gap=self.problem.update_strain_gap(state.gap, length, update)
-                    )
-                return end
-        return None
+        def state_after(length: float) -> _State:
+            ahead = (1 - length) * state.support_step
+            return self._evaluate(state.displacement + length * update, ahead)
 
-    @cached_property
-    def linear_solver(self) -> LinearSolver:
-        """The linear answer, with the factor that every first step from zero uses."""
-        return LinearSolver(self.problem, self.tol, self.linear)
+        bound = self.min_detF_ratio * min(float(state.volume_ratio), 1.0)
+        if (found := longest_valid_step(state_after, bound, halvings=halvings)) is None:
+            return None
+        new, length = found
+        if self.mixed_integration and self.problem.supports_mip:
+            return new._replace(gap=self.problem.update_strain_gap(state.gap, length, update))
+        return new
 
-    @cached_property
-    def _backend(self) -> Backend:
-        return backend_for(self.problem, self.linear)
+    def _initial(self, force: Tensor, guess: Tensor | None) -> "_State | None":
+        """Return the state of a guess; None where it is zero, inverted or there is no load."""
+        if guess is None or not guess.any():
+            return None
+        if not (force.any() or self.problem.moved_supports):
+            return None
+        u = torch.where(self.problem.free, guess, self.problem.prescribed)
+        start = self._evaluate(u, torch.zeros_like(force))
+        return start if start.volume_ratio > 0 else None
+
+    def _undeformed(self, force: Tensor) -> "_State":
+        """Return the state at zero displacement, which needs no evaluation."""
+        zero, one = torch.zeros_like(force), torch.ones(1, dtype=force.dtype)
+        return _State(zero, zero, one, self.problem.prescribed[None], {})
+
+    def _evaluate(self, displacement: Tensor, support_step: Tensor) -> "_State":
+        return _State(displacement, *self.problem.evaluate(displacement), support_step, {})
+
+    def _residual(self, state: "_State", force: Tensor, factor: float) -> float:
+        """Return the relative residual under `factor` times a load, evaluated once."""
+        if factor not in state.residuals:
+            residual = self.problem.relative_residual_of(state.internal, factor * force)
+            state.residuals[factor] = float(residual)
+        return state.residuals[factor]
+
+    def _is_balanced(self, state: "_State", force: Tensor, factor: float, tol: float) -> bool:
+        """Return whether a state balances `factor` times a load, to a tolerance or to rounding."""
+        if not state.volume_ratio > 0 or state.support_step.any():
+            return False
+        if (residual := self._residual(state, force, factor)) < tol:
+            return True
+        if not 0.1 * state.previous < residual < 1e-4:  # the residual still falls
+            return False
+        u, internal = state.displacement, state.internal
+        return bool(self.problem.is_equilibrium(u, internal, factor * force, tol))
+
+    def _report(
+        self, state: "_State", force: Tensor, run: "_Run", end: Status | None = None
+    ) -> Solution:
+        """Return a state as a solution, with status `end` if given."""
+        residual, stability = self._residual(state, force, 1.0), UNKNOWN
+        balanced = end is None and self._is_balanced(state, force, 1.0, self.tol)
+        if balanced:
+            if residual >= self.tol:
+                warnings.warn(
+                    f"||R||/||f|| = {residual:.1e} and not {self.tol:g}: rounding allows no less "
+                    "on this body (very thin cells, moduli far apart?)",
+                    stacklevel=2,
+                )
+            stability = run.tangents.stability(state.displacement)
+            end = Status.UNSTABLE if stability.least else Status.CONVERGED
+        factor = 1.0 if balanced else run.steps.factor
+        return Solution(
+            displacement=state.displacement,
+            residual=torch.tensor([residual], dtype=force.dtype),
+            volume_ratio=state.volume_ratio,
+            status=torch.tensor([int(Status.NOT_CONVERGED if end is None else end)]),
+            negative_pivots=torch.tensor([stability.negative_pivots]),
+            iterations=torch.tensor([run.iterations]),
+            factorisations=torch.tensor([run.tangents.factorisations]),
+            load_factor=torch.tensor([factor], dtype=force.dtype),
+            seconds=torch.tensor([time.perf_counter() - run.start], dtype=torch.float64),
+            from_guess=torch.tensor([run.from_guess]),
+        )
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle without factors."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
-    def _rest(self, force: Tensor) -> "_State":
-        """Return the state of the body at rest, which needs no evaluation."""
-        zero, one = torch.zeros_like(force), torch.ones(1, dtype=force.dtype)
-        return _State(zero, zero, one, self.problem.prescribed[None], None, {})
 
-    def _state(self, displacement: Tensor, jump: Tensor, gap: Any = None) -> "_State":
-        return _State(displacement, *self.problem.evaluate(displacement), jump, gap, {})
+def forcing_term(residual: float, previous: float, *, tol: float, corotational: bool) -> float:
+    """Return the relative residual at which the linear solve of a Newton step may stop [-].
 
-    def _ratio(self, state: "_State", force: Tensor, target: float) -> float:
-        """Return ||R_free|| / ||f|| under `target` times a load, evaluated once."""
-        if target not in state.ratios:
-            ratio = self.problem.relative_residual_of(state.internal, target * force)
-            state.ratios[target] = float(ratio)
-        return state.ratios[target]
+    It is as large as the convergence of Newton's method allows.
 
-    def _balanced(self, state: "_State", force: Tensor, target: float, tol: float) -> bool:
-        if not state.volume_ratio > 0 or state.jump.any():
-            return False
-        if (ratio := self._ratio(state, force, target)) < tol:
-            return True
-        u, internal = state.displacement, state.internal
-        stuck = 0.1 * state.before < ratio < 1e-4
-        return stuck and bool(self.problem.is_equilibrium(u, internal, target * force, tol))
+    Source: Eisenstat, Walker (1996), SIAM J. Sci. Comput. 17, choice 2.
 
-    def _report(
-        self, state: "_State", force: Tensor, count: "_Count", end: Status | None = None
-    ) -> Solution:
-        balanced, pivots = end is None and self._balanced(state, force, 1.0, self.tol), -1
-        if balanced:
-            if (ratio := self._ratio(state, force, 1.0)) >= self.tol:
-                warnings.warn(
-                    f"||R||/||f|| = {ratio:.1e} and not {self.tol:g}: rounding allows no less on "
-                    "this body (very thin cells, moduli far apart?)",
-                    stacklevel=2,
-                )
-            pivots = count.factors.negative_pivots(state.displacement)
-            end = Status.UNSTABLE if pivots > 0 else Status.CONVERGED
-        elif end is None:
-            end = Status.NOT_CONVERGED
-        factor = 1.0 if balanced else count.known
-        return Solution(
-            displacement=state.displacement,
-            residual=torch.tensor([self._ratio(state, force, 1.0)], dtype=force.dtype),
-            volume_ratio=state.volume_ratio,
-            status=torch.tensor([int(end)]),
-            negative_pivots=torch.tensor([pivots]),
-            iterations=torch.tensor([count.iterations]),
-            factorisations=torch.tensor([count.factors.count]),
-            load_factor=torch.tensor([factor], dtype=force.dtype),
-            seconds=torch.tensor([time.perf_counter() - count.start], dtype=torch.float64),
-            from_guess=torch.tensor([count.guessed]),
-        )
-
-    def factorise(self, tangent: NDArray[np.float64]) -> Factor:
-        """Return the factor of a tangent's entries (nnz,), see `Backend.factorise`."""
-        return self._backend.factorise(tangent)
-
-    def negative_pivots(self, displacement: Tensor) -> int:
-        """Return the negative eigenvalues of the tangent at (1, N, D); 1 where it is singular.
-
-        Conjugate gradients do not count them: 1 stands for some, -1 for not known.
-        """
-        return negative_pivots_at(self.problem, self.factorise, displacement)
+    Args:
+        residual: Relative residual of the state [-].
+        previous: The same one iteration earlier; NaN in the first iteration.
+        tol: Relative residual of a solution [-].
+        corotational: Whether the first step from a state may be inexact.
+    """
+    enough = 0.1 * tol / residual if residual > 0 else 0.0
+    first = 1e-3 if corotational else 0.0
+    earned = 0.01 * (residual / previous) ** 2 if previous > 0 else first
+    return max(1e-12, enough, min(1e-3, earned))
 
 
 class _State(NamedTuple):
-    """An iterate, evaluated once, and how far its supports have yet to move."""
+    """An evaluated iterate.
+
+    Attributes:
+        displacement: u, (1, N, D) [-].
+        internal: f_int(u), (1, N, D) [-].
+        volume_ratio: min det F, (1,) [-].
+        support_step: Displacement that the next step has to add at the supports, (1, N, D) [-].
+        residuals: Relative residuals by load factor, evaluated once.
+        gap: Strain gap of the mixed integration points, see `Problem.update_strain_gap`.
+        previous: Relative residual before the step that led here [-].
+    """
 
     displacement: Tensor
     internal: Tensor
     volume_ratio: Tensor
-    jump: Tensor
-    gap: Any
-    ratios: dict[float, float]
-    before: float = math.inf  # residual ratio that the step came from
+    support_step: Tensor
+    residuals: dict[float, float]
+    gap: Any = None
+    previous: float = math.inf
 
 
 @dataclass
-class _Count:
-    """What one load has cost so far, and what is known of it."""
+class _Run:
+    """Progress and cost of one load."""
 
-    factors: FactorCache
+    tangents: TangentSolver
+    steps: LoadStepping
     iterations: int = 0
-    known: float = 0.0
-    guessed: bool = False  # whether the guess, if there was one, has not failed
+    from_guess: bool = False  # whether the iterates go on from the guess
     start: float = field(default_factory=time.perf_counter)
