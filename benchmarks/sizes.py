@@ -6,7 +6,7 @@ import resource
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +87,7 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     yield row("linear answer", lambda load: newton.linear_solver.solve(load.force[0]))
     answers = {float(load.force.norm()): solve(newton, load).displacement for load in singles}
     yield row("Newton", lambda load: solve(newton, load))
-    turned = newton.replace(corotational=True)
+    turned = replace(newton, corotational=True)
 
     def hybrid(load: Load) -> None:
         guess = 1.001 * answers[float(load.force.norm())]

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from numbers import Real
 from typing import Any, NamedTuple
@@ -89,7 +89,7 @@ class Scene:
         bodies = [self.linear.at(load.poisson) for load in drawn]
         pairs = zip(bodies, answers, strict=True)
         steps = [linear.corotational.steps(answer.displacement) for linear, answer in pairs]
-        return self.solver.replace(corotational=sum(steps) <= SHORT * len(steps))
+        return replace(self.solver, corotational=sum(steps) <= SHORT * len(steps))
 
     @property
     def length(self) -> float:

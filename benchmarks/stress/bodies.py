@@ -1,6 +1,7 @@
 """Sizes, moduli, Poisson's ratios and aspect ratios of bodies: T7, T8, T10, T11."""
 
 import warnings
+from dataclasses import replace
 from functools import cache, partial
 
 import torch
@@ -169,8 +170,7 @@ def sliver(part: float, auditor: Auditor) -> Outcome:
     end = int(problem.points.sum(dim=1).argmax())
     for name in DIRECT:
         for kind, newton in newton_variants(problem):
-            solver = newton.replace(linear=name)
-            del solver.__dict__["linear_solver"]
+            solver = replace(newton, linear=name)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", UserWarning)
                 state = auditor.solve(

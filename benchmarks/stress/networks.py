@@ -1,6 +1,7 @@
 """Networks, and predictors that stand for them, with Newton: T18 to T21, T23 and a sweep."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 
 import torch
@@ -59,7 +60,7 @@ def bent_beam() -> tuple[Newton, Load, Tensor]:
     problem = paper_beam(SVK, (16, 4, 4))
     load = as_load(end_traction(problem, 20.0))
     newton = Newton(problem, linear="auto")
-    return newton, load, solve(newton.replace(tol=1e-12), load).displacement
+    return newton, load, solve(replace(newton, tol=1e-12), load).displacement
 
 
 def constant_prediction(displacement: Tensor) -> Predict:
@@ -207,7 +208,7 @@ def network_precision(dtype: torch.dtype, device: str, auditor: Auditor) -> Outc
     with torch.inference_mode():
         said = predict(drawn)
         state = auditor.solve(Hybrid(predict, own.solver), own.problem, drawn)
-    exact = solve(own.solver.replace(tol=1e-12), drawn).displacement
+    exact = solve(replace(own.solver, tol=1e-12), drawn).displacement
     off = float((state.displacement - exact).abs().max())
     rows = [
         Row("the prediction is float64", "1", float(said.dtype == torch.float64), 0),

@@ -1,5 +1,6 @@
 """Run time against error of every solver: python scripts/pareto.py run=runs/beam_svk."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -87,7 +88,7 @@ def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
     train = data.samples("train")
     robust = scene.solver
     solvers: dict[str, Solver] = {"linear": scene.linear}
-    solvers |= {f"Newton to {tol:g}": robust.replace(tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
+    solvers |= {f"Newton to {tol:g}": replace(robust, tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
     if cfg.galerkin:
         model = config.instantiate(cfg, "galerkin")(scene, train)
         solvers["POD-Galerkin"] = Direct(model.predict, scene.problem)

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -81,6 +82,7 @@ class PlainNewton:
 
     def _member(self, load: Load, u: Tensor, guessed: bool) -> Iterator[Solution]:
         problem, start = self.solver.problem, time.perf_counter()
+        backend = self.solver.linear_solver.tangent_backend
         for k in range(self.max_iter + 1):
             state = evaluate_solution(problem, u, load, self.tol, iterations=k, from_guess=guessed)
             yield state._replace(
@@ -92,7 +94,7 @@ class PlainNewton:
             system = problem.linearise(u)
             right = gather((load.force - system.force)[0], problem)
             try:
-                factor = self.solver.factorise(system.tangent[0].numpy())
+                factor = backend.factorise(system.tangent[0].numpy())
                 u = u + scatter(factor.solve(right, 1e-10), problem)[None]
             except SingularMatrix:
                 return
@@ -191,17 +193,17 @@ def contestants(
         tol: Residual ratio [-].
         budget: Iterations before a load is given up; the scene's if left out.
     """
-    settings: dict[str, float] = {"tol": tol}
+    settings: dict[str, Any] = {"tol": tol}
     settings |= {} if budget is None else {"max_total_iter": budget}
-    robust, quick = scene.solver.replace(**settings), scene.corrector.replace(**settings)
+    robust, quick = replace(scene.solver, **settings), replace(scene.corrector, **settings)
     plain = PlainNewton(robust)
     solvers: dict[tuple[str, str], Solver] = {
         ("plain Newton", ""): plain,
-        ("plain Newton, load steps", ""): robust.replace(
-            mixed_integration=False, factor_reuse_tol=0.0
+        ("plain Newton, load steps", ""): replace(
+            robust, mixed_integration=False, factor_reuse_tol=0.0
         ),
         (REFERENCE, ""): robust,
-        ("robust Newton, K(0) turned", ""): robust.replace(corotational=True),
+        ("robust Newton, K(0) turned", ""): replace(robust, corotational=True),
     }
     for name, predict in networks.items():
         solvers["hybrid, paper's rule", name] = Hybrid(predict, plain, "paper")

@@ -163,7 +163,7 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
         tol: Residual ratio of Newton and the hybrid [-].
     """
     scene = surrogate.scene
-    newton = scene.solver.replace(tol=tol)
+    newton = replace(scene.solver, tol=tol)
     # with Poisson's ratios of their own, loads have their own K(0): each solver makes it for itself
     shared = scene.loads.poisson_range is None
     own = scene if shared else replace(scene, solver=replace(scene.solver))

@@ -1,7 +1,7 @@
 """Solvers with a network in them: its answer alone, and as the start of Newton."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -187,7 +187,7 @@ def default_hybrid(predict: Predict, scene: Scene, tol: float | None = None) -> 
         scene: What is simulated.
         tol: Residual ratio [-]; the scene's if left out.
     """
-    newton = scene.corrector if tol is None else scene.corrector.replace(tol=tol)
+    newton = scene.corrector if tol is None else replace(scene.corrector, tol=tol)
     return Hybrid(predict, newton, steps=AndersonSolver(newton) if newton.corotational else None)
 
 

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from numbers import Real
 from typing import Any, NamedTuple, Self
 
@@ -274,7 +274,7 @@ class Simulator:
         if self.correct is not None and bool(guess.isfinite().all()):
             guess = self.correct(load.force[0], guess[0])[None]
             yield "corrected", evaluate_solution(problem, guess, load, tol, from_guess=True)
-        newton = self.scene.corrector.replace(tol=tol)
+        newton = replace(self.scene.corrector, tol=tol)
         guesses = [guess] if guess is prediction else [guess, prediction]
         if ask.warm and self._before is not None and torch.equal(self._before[0], load.poisson):
             guesses.append(self._before[1])
@@ -292,8 +292,9 @@ class Simulator:
         """Return an answer with the negative eigenvalues of its tangent."""
         if not state.converged or int(state.negative_pivots) >= 0:
             return state
-        pivots = self.scene.solver.at(load.poisson).negative_pivots(state.displacement)
-        status = Status.UNSTABLE if pivots > 0 else Status.CONVERGED
+        stability = self.scene.solver.at(load.poisson).stability(state.displacement)
+        pivots = stability.negative_pivots
+        status = Status.UNSTABLE if stability.least else Status.CONVERGED
         return state._replace(
             negative_pivots=torch.full_like(state.negative_pivots, pivots),
             status=torch.full_like(state.status, int(status)),

@@ -5,6 +5,7 @@ that underflow.
 """
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -136,7 +137,7 @@ def test_loads_that_arithmetic_cannot_resolve_are_never_answered(load, solvers, 
 
 TAKERS = {
     "newton": lambda newton, tol: Newton(newton.problem, tol=tol),
-    "changed newton": lambda newton, tol: newton.replace(tol=tol),
+    "changed newton": lambda newton, tol: replace(newton, tol=tol),
     "linear": lambda newton, tol: LinearSolver(newton.problem, tol=tol),
     "batched": lambda newton, tol: BatchedNewton(newton.problem, tol=tol),
     "direct": lambda newton, tol: Direct(lambda load: load.force, newton.problem, tol),
@@ -168,7 +169,7 @@ def test_a_tolerance_in_range_is_taken(newton, name, tol):
 
 def test_only_newton_takes_for_balance_what_rounding_leaves(newton, load):
     """It has tried; of a prediction whose residual is small no one knows that it is the least."""
-    exact = solve(newton.replace(tol=1e-11), load).displacement
+    exact = solve(replace(newton, tol=1e-11), load).displacement
     problem, tol = newton.problem, 1e-15
     for ratio in (
         evaluate_solution(problem, exact, load, tol),
@@ -176,7 +177,7 @@ def test_only_newton_takes_for_balance_what_rounding_leaves(newton, load):
     ):
         assert not ratio.converged.any()
     with pytest.warns(UserWarning, match="rounding allows no less"):
-        ended = [*newton.replace(tol=tol).iterate(load, guess=exact)][-1]
+        ended = [*replace(newton, tol=tol).iterate(load, guess=exact)][-1]
     assert ended.converged.all()
     assert int(ended.iterations) >= 1
 

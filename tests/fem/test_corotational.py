@@ -1,6 +1,7 @@
 """Laws of K(0)'s factor turned with the nodes: what it turns by, and Newton's answers with it."""
 
 import math
+from dataclasses import replace
 from multiprocessing.reduction import ForkingPickler
 
 import numpy as np
@@ -132,7 +133,7 @@ def test_newton_has_the_same_answer_with_it(options, mixed):
     problem = body(**options)
     load = bend(problem, 1e-4 if problem.shape[1] == 3 else 5e-4)
     plain = Newton(problem, mixed_integration=mixed)
-    ours, theirs = solve(plain.replace(corotational=True), load), solve(plain, load)
+    ours, theirs = solve(replace(plain, corotational=True), load), solve(plain, load)
     assert theirs.displacement.norm(dim=-1).max() > 0.09, "or it would prove nothing"
     assert ours.converged.all()
     assert (ours.residual < 1e-8).all()
@@ -156,7 +157,7 @@ def test_where_it_does_not_contract_a_factor_takes_over():
     force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
     load = Load(force[None], torch.ones(1, dtype=torch.float64))
     plain = Newton(problem)
-    ours, theirs = solve(plain.replace(corotational=True), load), solve(plain, load)
+    ours, theirs = solve(replace(plain, corotational=True), load), solve(plain, load)
     assert ours.factorisations.all()
     assert ours.converged.all()
     assert torch.allclose(ours.displacement, theirs.displacement, rtol=0, atol=1e-8)
@@ -183,10 +184,18 @@ def test_moved_supports_go_with_it():
 
 def test_other_attributes_keep_the_factor_of_rest():
     newton = Newton(body())
-    other = newton.replace(tol=1e-3, corotational=True)
+    other = replace(newton, tol=1e-3, corotational=True)
     assert (other.tol, other.corotational) == (1e-3, True)
     assert other.linear_solver is newton.linear_solver
     assert other.linear_solver.factor is newton.linear_solver.factor
+
+
+def test_another_backend_or_body_has_a_linear_solver_of_its_own():
+    newton = Newton(body())
+    for other in (replace(newton, linear="superlu"), replace(newton, problem=body(law=SVK))):
+        assert other.linear_solver is not newton.linear_solver
+        assert other.linear_solver.problem is other.problem
+        assert other.linear_solver.linear == other.linear
 
 
 def test_a_load_of_nothing_needs_no_tangent():

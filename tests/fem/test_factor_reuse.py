@@ -28,8 +28,10 @@ from dpl.fem import (
     solve,
 )
 from dpl.fem.linear import BandedCholesky, Pardiso, SuperLU, multigrid_installed
+from dpl.fem.linear.interface import UNKNOWN, UNSTABLE, Stability
 from dpl.fem.linear.superlu import SuperLUFactor
 from dpl.fem.solvers import factor_reuse as reuse_module
+from dpl.fem.solvers.factor_reuse import Preconditioner, select_preconditioner
 
 NH, SVK = NeoHookeanLn(0.3), SaintVenantKirchhoff(0.3)
 
@@ -222,7 +224,7 @@ def test_preconditioner_that_does_not_help_is_replaced_after_its_patience(
     assert answer.converged.all()
     assert answer.iterations.item() == every.iterations.item()
     assert answer.factorisations.item() == every.factorisations.item() > few.factorisations.item()
-    assert set(steps) == {reuse_module.PATIENCE}
+    assert set(steps) == {reuse_module.MAX_CG_STALE}
     assert torch.equal(answer.displacement, every.displacement)
 
 
@@ -389,6 +391,37 @@ def test_straight_column_far_beyond_is_the_same_with_and_without_reuse():
         assert few.status.item() == every.status.item() == Status.UNSTABLE
         assert few.negative_pivots.item() == every.negative_pivots.item()
         check(every, few, fewer=False)
+
+
+# ---- selection
+
+
+@pytest.mark.parametrize(
+    ("last", "near", "definite", "corotational", "expected"),
+    [
+        (None, False, False, False, "FRESH"),
+        (None, False, False, True, "COROTATED"),
+        ("REST", True, True, False, "FRESH"),
+        ("REST", True, True, True, "COROTATED"),
+        ("FRESH", True, True, True, "STALE"),
+        ("STALE", True, True, True, "STALE"),
+        ("FRESH", True, False, True, "FRESH"),
+        ("FRESH", False, True, True, "COROTATED"),
+        ("STALE", False, True, False, "FRESH"),
+        ("COROTATED", True, True, True, "COROTATED"),
+        ("COROTATED", True, True, False, "FRESH"),
+    ],
+)
+def test_preconditioner_follows_from_the_last_one(last, near, definite, corotational, expected):
+    kind = None if last is None else Preconditioner[last]
+    found = select_preconditioner(kind, near=near, definite=definite, corotational=corotational)
+    assert found is Preconditioner[expected]
+
+
+def test_stability_is_encoded_as_in_the_solution():
+    assert UNKNOWN.negative_pivots == -1
+    assert UNSTABLE.negative_pivots == 1
+    assert [Stability(n, exact=True).negative_pivots for n in (0, 1, 3)] == [0, 1, 3]
 
 
 # ---- options

@@ -3,6 +3,7 @@
 The stubs and the pick rule are those of the verification dossier, T19, T20 and section 0.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -460,7 +461,7 @@ def test_it_is_said_what_goes_on_from_a_guess(scene, loads, stubs, rule):
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_steps_come_first_where_a_turned_factor_serves(scene, turned):
-    corrector = scene.solver.replace(corotational=turned)
+    corrector = replace(scene.solver, corotational=turned)
     suited = default_hybrid(lambda load: load.force, SimpleNamespace(corrector=corrector))
     assert suited.newton is corrector
     assert (suited.steps is not None) == turned

@@ -9,7 +9,6 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,6 +24,7 @@ from dpl.fem.rom.reduced_problem import (
     refuse_range,
 )
 from dpl.fem.solvers.linear import LinearSolver
+from dpl.fem.solvers.load_stepping import LoadStepping, longest_valid_step
 from dpl.fem.solvers.solution import Load, Solution, check_steps, evaluate_solution
 
 
@@ -202,21 +202,21 @@ class PODGalerkin:
         model, count = self._model, _Count()
         task = model.task(force)
         state = model.state(task, torch.zeros_like(task.load), 0.0)
-        known, step = 0.0, 1.0
+        steps = LoadStepping(self.min_load_step)
         if not task.moves and model.ratio(task, state, 1.0) < self.reduced_tol:
-            known = 1.0
-        while known < 1 and step >= self.min_load_step and count.iterations < self.max_total_iter:
-            target = min(known + step, 1.0)
-            end = self._corrected(task, state, target, count)
+            steps.accept()
+        while steps.factor < 1 and not steps.exhausted and count.iterations < self.max_total_iter:
+            end = self._corrected(task, state, steps.target, count)
             if end is None:
-                step = (target - known) / 2
+                steps.reject()
             else:
-                state, known, step = end, target, 2 * step
+                state = end
+                steps.accept()
         return Reduced(
-            displacement=model.whole(state.y).add_(task.offset, alpha=known),
+            displacement=model.whole(state.y).add_(task.offset, alpha=steps.factor),
             coordinates=model.coordinates(state.y),
             residual=model.ratio(task, state, 1.0),
-            load_factor=known,
+            load_factor=steps.factor,
             iterations=count.iterations,
             factorisations=count.factorisations,
         )
@@ -293,13 +293,12 @@ class PODGalerkin:
         self, task: ReducedLoad, state: ReducedState, step: Tensor, jump: float, target: float
     ) -> ReducedState | None:
         """Return the state after the longest of the steps 1, 1/2, 1/4, ... that inverts nothing."""
-        floor = self.min_detF_ratio * min(state.volume, 1.0)
-        for length in (0.5 ** np.arange(10)).tolist():
+
+        def state_after(length: float) -> ReducedState:
             part = target if jump and length == 1 else state.part + length * jump
-            end = self._model.state(task, state.y + length * step, part)
-            if end.volume > floor:
-                return end._replace(length=length)
-        return None
+            return self._model.state(task, state.y + length * step, part)._replace(length=length)
+
+        return longest_valid_step(state_after, self.min_detF_ratio * min(state.volume_ratio, 1.0))
 
     @cached_property
     def _model(self) -> ReducedProblem:

@@ -43,7 +43,7 @@ class ReducedState(NamedTuple):
     part: float
     field: Tensor
     internal: Tensor
-    volume: float
+    volume_ratio: float
     length: float = 1.0  # of the step that led here
     gap: Any = None
 

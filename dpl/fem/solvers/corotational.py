@@ -108,7 +108,7 @@ class CorotatedFactor:
     places: NDArray[np.int64]
 
     @property
-    def negative_pivots(self) -> int:
+    def negative_pivots(self) -> int | None:
         """Those of K(0)."""
         return self.factor.negative_pivots
 

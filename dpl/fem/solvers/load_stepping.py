@@ -56,8 +56,8 @@ State = TypeVar("State", bound=HasVolumeRatio)
 
 def longest_valid_step(
     state_after: Callable[[float], State], min_volume_ratio: float, *, halvings: int = 9
-) -> tuple[State, float] | None:
-    """Return the state after the longest step that inverts no element, and the step's length.
+) -> State | None:
+    """Return the state after the longest of the steps 1, 1/2, 1/4, ... that inverts no element.
 
     Args:
         state_after: Function from the length of a step, 1 for the full one, to the state after it.
@@ -68,8 +68,7 @@ def longest_valid_step(
         None if the shortest step violates the bound too.
     """
     for k in range(halvings + 1):
-        length = 0.5**k
-        state = state_after(length)
+        state = state_after(0.5**k)
         if state.volume_ratio > min_volume_ratio:
-            return state, length
+            return state
     return None

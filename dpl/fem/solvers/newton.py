@@ -214,15 +214,14 @@ class Newton:
         """Return the state after the longest of the steps 1, 1/2, ... that inverts no element."""
 
         def state_after(length: float) -> _State:
-            ahead = (1 - length) * state.support_step
-            return self._evaluate(state.displacement + length * update, ahead)
+            u = state.displacement + length * update
+            return self._evaluate(u, (1 - length) * state.support_step)._replace(length=length)
 
         bound = self.min_detF_ratio * min(float(state.volume_ratio), 1.0)
-        if (found := longest_valid_step(state_after, bound, halvings=halvings)) is None:
-            return None
-        new, length = found
-        if self.mixed_integration and self.problem.supports_mip:
-            return new._replace(gap=self.problem.update_strain_gap(state.gap, length, update))
+        new = longest_valid_step(state_after, bound, halvings=halvings)
+        if new is not None and self.mixed_integration and self.problem.supports_mip:
+            gap = self.problem.update_strain_gap(state.gap, new.length, update)
+            return new._replace(gap=gap)
         return new
 
     def _initial(self, force: Tensor, guess: Tensor | None) -> "_State | None":
@@ -324,7 +323,8 @@ class _State(NamedTuple):
         support_step: Displacement that the next step has to add at the supports, (1, N, D) [-].
         residuals: Relative residuals by load factor, evaluated once.
         gap: Strain gap of the mixed integration points, see `Problem.update_strain_gap`.
-        previous: Relative residual before the step that led here [-].
+        length: Length of the step that led here, 1 for a full one.
+        previous: Relative residual before that step [-].
     """
 
     displacement: Tensor
@@ -333,6 +333,7 @@ class _State(NamedTuple):
     support_step: Tensor
     residuals: dict[float, float]
     gap: Any = None
+    length: float = 1.0
     previous: float = math.inf
 
 
