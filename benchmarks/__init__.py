@@ -1,4 +1,4 @@
-"""What judges this repository: verification, stress cases, peers, tables of the paper.
+"""Benchmarks of this repository: verification, stress cases, public codes, tables of the paper.
 
 It is not installed: `scripts/` call it in a checkout.
 """

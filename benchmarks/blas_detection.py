@@ -1,4 +1,4 @@
-"""Which BLAS another program uses, told from the shared libraries that it has loaded."""
+"""Detection of the BLAS of another program by its loaded shared libraries."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""How far test loads move the bodies of the paper: largest nodal displacement of each load."""
+"""Largest nodal displacement of the bodies of the paper under each test load."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ BINS = 20
 
 @dataclass(frozen=True)
 class Deflection:
-    """How far one test load moves a body.
+    """Deflection of a body under a test load.
 
     Attributes:
         body: Name of the body.
@@ -34,9 +34,9 @@ def deflections(scenes: Mapping[str, Scene], count: int, workers: int) -> list[D
     """Return the deflection of each test load that a data set of seed 0 accepts.
 
     Args:
-        scenes: Named.
-        count: Test loads of each scene.
-        workers: Processes that solve.
+        scenes: Scenes by name.
+        count: Number of test loads of each scene.
+        workers: Number of worker processes.
     """
     rows = []
     for name, scene in scenes.items():

@@ -1,4 +1,4 @@
-"""Finite elements on coarser, finer and quadratic meshes, against the limit of ever finer ones."""
+"""Discretisation errors of coarse, fine and quadratic meshes against the limit of refinement."""
 
 import statistics
 from collections.abc import Callable
@@ -31,7 +31,7 @@ Build = Callable[[Material, Cells, int], tuple[Problem, Tensor, Callable[[Tensor
 
 @dataclass(frozen=True)
 class Family:
-    """A body on meshes of any size.
+    """A body that can be meshed with any number of cells.
 
     Attributes:
         build: From law, cells and degree to the body, its load over E and what is read off.
@@ -87,7 +87,7 @@ FAMILIES = {
 
 
 def discretisations(family: Family, law: Material, *, repeats: int = 5) -> list[Discretisation]:
-    """Return linear, then quadratic meshes of a body, and how far each is from the limit.
+    """Return the discretisation errors of linear, then of quadratic meshes of a body.
 
     The limit is Richardson's of the last three quadratic meshes where each is twice as fine as the
     one before (Roache 1998, Verification and Validation in Computational Science, section 5.4);
@@ -115,5 +115,5 @@ def discretisations(family: Family, law: Material, *, repeats: int = 5) -> list[
 
 
 def limit(coarse: float, middle: float, fine: float) -> float:
-    """Return where values on three meshes, each twice as fine as the one before, tend to."""
+    """Return the Richardson limit of values on three meshes, each twice as fine as the last."""
     return fine + (fine - middle) ** 2 / ((middle - coarse) - (fine - middle))

@@ -1,4 +1,4 @@
-"""What a sample costs: Newton with and without what may make it faster and keeps it exact."""
+"""Cost of a sample: Newton with and without options that reduce its run time."""
 
 import statistics
 import time
@@ -16,17 +16,17 @@ Guess = Callable[[Load], Tensor]  # loads to displacements (B, N, D) [-]
 
 @dataclass(frozen=True)
 class Cost:
-    """Solving the same loads in one way, one at a time, on one core.
+    """Cost of one method on the same loads, one at a time, on one core.
 
     Attributes:
-        way: How.
+        method: Name of the method.
         seconds: Median time of a sample [s].
-        rate: Samples a second: their number over the sum of their times.
-        iterations, factorisations: Mean numbers of a sample.
-        accepted: Of how many loads the answer was accepted.
+        rate: Number of samples over the sum of their times [1/s].
+        iterations, factorisations: Mean numbers per sample.
+        accepted: Number of accepted samples.
     """
 
-    way: str
+    method: str
     seconds: float
     rate: float
     iterations: float
@@ -37,13 +37,13 @@ class Cost:
 def costs(
     scene: Scene, loads: int, *, pool: int = 256, surrogate: Guess | None = None
 ) -> list[Cost]:
-    """Return what a sample costs in each way; the ways take turns on each load.
+    """Return the cost of a sample of each method; the methods alternate on each load.
 
     Args:
-        scene: What is simulated.
-        loads: How many loads are solved in each way.
-        pool: Solved loads of which the nearest one is a start.
-        surrogate: Another start.
+        scene: The scene.
+        loads: Number of loads that each method solves.
+        pool: Number of solved loads; the nearest one is a guess.
+        surrogate: A further source of guesses.
     """
     newton = scene.solver
     once = replace(newton, factor_reuse_tol=0.0)
@@ -54,24 +54,24 @@ def costs(
     }
     if surrogate is not None:
         starts["the same, from the surrogate"] = (newton, surrogate)
-    found: dict[str, list[tuple[float, int, int, bool]]] = {way: [] for way in starts}
-    for k in range(-1, loads):  # the first one warms up
+    found: dict[str, list[tuple[float, int, int, bool]]] = {method: [] for method in starts}
+    for k in range(-1, loads):  # the first one is not timed
         load = scene.loads.sample((1, 0), [max(k, 0)])
-        for way, (solver, guess) in starts.items():
+        for method, (solver, guess) in starts.items():
             start = time.perf_counter()
             (*_, answer) = solver.iterate(load, guess=guess(load) if guess else None)  # type: ignore[attr-defined]
             seconds = time.perf_counter() - start
             count = int(answer.iterations), int(answer.factorisations), bool(answer.stable)
             if k >= 0:
-                found[way].append((seconds, *count))
-    rows = [_cost(way, rows) for way, rows in found.items()]
+                found[method].append((seconds, *count))
+    rows = [_cost(method, rows) for method, rows in found.items()]
     return [*rows, _images(scene, rows[1])]
 
 
-def _cost(way: str, rows: list[tuple[float, int, int, bool]]) -> Cost:
+def _cost(method: str, rows: list[tuple[float, int, int, bool]]) -> Cost:
     seconds, iterations, factorisations, accepted = zip(*rows, strict=True)
     return Cost(
-        way,
+        method,
         statistics.median(seconds),
         len(rows) / sum(seconds),
         statistics.mean(iterations),
@@ -81,7 +81,7 @@ def _cost(way: str, rows: list[tuple[float, int, int, bool]]) -> Cost:
 
 
 def _images(scene: Scene, solved: Cost) -> Cost:
-    """Return the cost of a sample where each solve gives its images under the symmetries too."""
+    """Return the cost of a sample if the symmetric images of each solution count too."""
     group = symmetries(scene.problem)
     field = torch.zeros(2, *scene.problem.shape, dtype=torch.float64)
     start = time.perf_counter()
@@ -100,9 +100,9 @@ def _images(scene: Scene, solved: Cost) -> Cost:
 
 
 def _nearest(scene: Scene, pool: int) -> Guess:
-    """Return a guess: the answer to the nearest of `pool` solved loads, moved on linearly.
+    """Return a guess: the solution of the nearest of `pool` solved loads, corrected linearly.
 
-    Near is what has a near linear answer; to it the linear answer to the difference is added.
+    The distance is that of the linear solutions. The linear solution of the difference is added.
     """
     loads = scene.loads.sample((2, 0), range(pool))
     answers = [solve(scene.solver, single) for single in loads.unbatch()]

@@ -58,7 +58,7 @@ def run(cfg: DictConfig) -> None:
     for part in cfg.parts:
         with one_thread():
             results = globals()[part](cfg, backends)
-        if results is None:  # written by itself
+        if results is None:  # the part has written its results
             continue
         text = json.dumps({"machine": machine(), part: results}, indent=1, default=asdict)
         (folder / f"{part}.json").write_text(text + "\n")
@@ -66,20 +66,22 @@ def run(cfg: DictConfig) -> None:
 
 
 def scenes(cfg: DictConfig, backends: list[str]) -> list[dict[str, peers.Time]]:
-    """Return the field's scenes, a row for each code measured here."""
+    """Return the times on the scenes of `benchmarks.peers`, one row per code."""
     rows = [peers.beams(name, cfg.repeats) for name in backends]
     programs = Path(peers.__file__).parent / "programs"
     for name, python in cfg.peers.items():
         if python:
             program = programs / f"{name}_beam.py"
             try:
-                rows.append(peers.measured_peer(python, program, cfg.repeats))
+                rows.append(peers.time_reference_code(python, program, cfg.repeats))
             except OSError as error:
                 raise config.ConfigError(f"peers.{name}: {error}") from error
-    table = Table("seconds (Newton iterations)", *peers.CASES, "residual, tip against the field")
+    table = Table(
+        "seconds (Newton iterations)", *peers.CASES, "tip against the reference, residual"
+    )
     for row in rows:
         cells = [f"{t.seconds:.3f} ({t.iterations})" for t in row.values()]
-        table.add_row(row["S1"].what, *cells, row["S1"].note)
+        table.add_row(row["S1"].case, *cells, row["S1"].note)
     table.add_section()
     for name, seconds in peers.PUBLISHED.items():
         table.add_row(f"published: {name}", *(f"{s:.3f}" for s in seconds), "on a Zen 5 core")
@@ -88,7 +90,7 @@ def scenes(cfg: DictConfig, backends: list[str]) -> list[dict[str, peers.Time]]:
 
 
 def pieces(cfg: DictConfig, backends: list[str]) -> list[peers.Time]:
-    """Return what an iteration on the beam is made of."""
+    """Return the times of the parts of an iteration on the beam."""
     return _listed(peers.pieces(3 * cfg.repeats), "beam of 12,000 degrees of freedom")
 
 
@@ -104,7 +106,7 @@ def large(cfg: DictConfig, backends: list[str]) -> list[peers.Time]:
 
 
 def robustness(cfg: DictConfig, backends: list[str]) -> dict[str, dict[str, float]]:
-    """Return how many random loads are solved in one step and how many at all."""
+    """Return the numbers of random loads solved in one step and with load steps."""
     builders: dict[str, Callable[[], Scene]] = {
         "beam, NH-ln": partial(peers.beam_scene, NeoHookeanLn(0.3)),
         "beam, SVK": partial(peers.beam_scene, SaintVenantKirchhoff(0.3)),
@@ -119,7 +121,7 @@ def robustness(cfg: DictConfig, backends: list[str]) -> dict[str, dict[str, floa
 
 
 def generation(cfg: DictConfig, backends: list[str]) -> dict[str, list[ways.Cost]]:
-    """Return what a sample costs on one core, with and without what makes it faster."""
+    """Return the cost of a sample on one core for each method."""
     scenes = {
         "paper's beam, NH-ln": peers.beam_scene(NeoHookeanLn(0.3)),
         "paper's propeller, NH-ln": peers.propeller_scene(),
@@ -135,7 +137,7 @@ def generation(cfg: DictConfig, backends: list[str]) -> dict[str, list[ways.Cost
         for row in rows:
             count = f"{row.iterations:.2f}", f"{row.factorisations:.2f}"
             done = f"{row.accepted}/{cfg.samples}"
-            table.add_row(row.way, f"{1e3 * row.seconds:.1f}", f"{row.rate:.2f}", *count, done)
+            table.add_row(row.method, f"{1e3 * row.seconds:.1f}", f"{row.rate:.2f}", *count, done)
         CONSOLE.print(table)
     return results
 
@@ -159,7 +161,7 @@ def discretisation(cfg: DictConfig, backends: list[str]) -> None:
 
 
 def sizes(cfg: DictConfig, backends: list[str]) -> None:
-    """Write what solvers and networks cost on beams of growing size."""
+    """Write the costs of solvers and networks on beams of growing size."""
     from benchmarks import sizes as beams
 
     rows: list[Size] = []
@@ -171,16 +173,18 @@ def sizes(cfg: DictConfig, backends: list[str]) -> None:
             write(rows, Path(cfg.folder) / "sizes.csv")
             progress.advance(bar)
     for row in rows:
-        kept = "" if row.memory is None else f"{row.memory:.1f}"
+        kept = "" if row.memory_mb is None else f"{row.memory_mb:.1f}"
         count = "" if row.parameters is None else f"{row.parameters:,}"
-        table.add_row(row.what, f"{row.dofs:,}", f"{row.ms:.2f}", count, kept, f"{row.peak:.0f}")
+        table.add_row(
+            row.case, f"{row.dofs:,}", f"{row.ms:.2f}", count, kept, f"{row.peak_memory_mb:.0f}"
+        )
     CONSOLE.print(table)
     beams.draw(rows, Path(cfg.folder) / "sizes.png")
     write_machine(Path(cfg.folder) / "sizes.json")
 
 
 def deflections(cfg: DictConfig, backends: list[str]) -> None:
-    """Write how far test loads move the paper's beam and propeller, as rows and as histograms."""
+    """Write the deflections of the paper's beam and propeller under test loads, with histograms."""
     from benchmarks import deflections as sizes
 
     scenes = {
@@ -201,6 +205,6 @@ def _listed(rows: list[peers.Time], title: str) -> list[peers.Time]:
     table = Table(title, "ms", "iterations", "")
     for row in rows:
         count = f"{row.iterations:.1f}" if row.iterations == row.iterations else ""
-        table.add_row(row.what, f"{1e3 * row.seconds:.2f}", count, row.note)
+        table.add_row(row.case, f"{1e3 * row.seconds:.2f}", count, row.note)
     CONSOLE.print(table)
     return rows

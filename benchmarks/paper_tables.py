@@ -1,4 +1,4 @@
-"""All methods on one scene side by side: how wrong on three sets of loads, how slow, how large."""
+"""Errors, run times and sizes of all methods on one scene and three sets of loads."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -76,7 +76,7 @@ class Result:
 
 
 def load_sets(scene: Scene, test: Sample, count: int = 50) -> dict[str, Sample]:
-    """Return the test loads in range, and more of them outside, solved here.
+    """Return the test loads in range and further solved loads out of range.
 
     Loads that have no stable answer are left out.
 
@@ -146,7 +146,7 @@ def measure(
 
 
 def _iterations(newton: Newton, loads: Sequence[Load], guesses: Tensor) -> float:
-    """Return the mean number of Newton's iterations from guesses (S, N, D)."""
+    """Return the mean number of Newton iterations from guesses (S, N, D) [-]."""
     total = 0
     for load, guess in zip(loads, guesses, strict=True):
         *_, last = newton.iterate(load, guess=guess[None])
@@ -155,7 +155,7 @@ def _iterations(newton: Newton, loads: Sequence[Load], guesses: Tensor) -> float
 
 
 def paper(experiment: str) -> list[Result]:
-    """Return the paper's rows of an experiment; none if it has none."""
+    """Return the rows of the paper for an experiment; empty if the paper has none."""
     rows = []
     for name, (e_mean, e_max, snr, samples) in PAPER.get(experiment, {}).items():
         worst = None if snr is None else 10 ** (-snr / 20)

@@ -1,8 +1,8 @@
-"""Scenes on which public finite-element codes were timed, what they needed, and what dpl needs.
+"""Run time of dpl on scenes that public finite-element codes were timed on.
 
-A clamped beam of 39 x 9 x 9 trilinear hexahedra (12,000 degrees of freedom) under a dead load
-spread evenly over the 100 nodes of its end face; a propeller of the same size; a beam of 100,000
-degrees of freedom; and thousands of random loads.
+The scenes are a clamped beam of 39 x 9 x 9 trilinear hexahedra (12,000 degrees of freedom) under a
+dead load that is distributed evenly over the 100 nodes of its end face, a propeller of the same
+size, a beam of 100,000 degrees of freedom, and thousands of random loads.
 """
 
 import json
@@ -49,11 +49,11 @@ class Case:
     """A load on the beam.
 
     Attributes:
-        law: Its material.
-        size: Of the beam [m].
-        young: [Pa]
-        force: Total on the end face, against z [N].
-        tip: Displacement of the end face's centre along x and z [m], agreed on by nine codes.
+        law: Material of the beam.
+        size: Lengths of its sides [m].
+        young: Young's modulus [Pa].
+        force: Total force on the end face along -z [N].
+        tip: Displacement of the centre of the end face along x and z [m]; nine codes agree on it.
     """
 
     law: Material
@@ -78,12 +78,12 @@ class Case:
         return torch.nonzero(x > x.max() - 1e-9).ravel()
 
     def error(self, problem: Problem, solution: Solution) -> float:
-        """Return how far the tip is from where the codes agree it is, over L [-]."""
+        """Return the distance of the tip from the reference position, over L [-]."""
         tip = solution.displacement[0, self.end(problem)].mean(dim=0) * problem.length
-        return self.miss(tip.tolist())
+        return self.tip_error(tip.tolist())
 
-    def miss(self, tip: Sequence[float]) -> float:
-        """Return how far a tip, x, y and z [m], is from where the codes agree it is, over L [-]."""
+    def tip_error(self, tip: Sequence[float]) -> float:
+        """Return the distance of a tip displacement (3,) [m] from the reference, over L [-]."""
         return math.dist((tip[0], tip[2]), self.tip) / self.size[0]
 
 
@@ -98,8 +98,8 @@ CASES = {
 }
 
 # Seconds on one core of an AMD Zen 5, set-up and compilation excluded, median of 3; measured for
-# this project in 2026. Another machine, another number: compare ratios, best with a code that is
-# measured beside dpl.
+# this project in 2026. On another machine compare ratios only, best with a code that is timed
+# together with dpl.
 PUBLISHED = {
     "dolfinx 0.5.2, MUMPS": (0.682, 0.320, 0.614, 0.422),
     "felupe 11.3, PARDISO wrapped": (0.727, 0.323, 0.764, 0.407),
@@ -117,23 +117,23 @@ PUBLISHED = {
 
 @dataclass(frozen=True)
 class Time:
-    """How long something takes.
+    """Median time of a task.
 
     Attributes:
-        what: A name.
-        seconds: Median [s].
-        iterations: Of Newton, mean; NaN where there are none.
-        note: What else is to be said.
+        case: Name of the task.
+        seconds: Median wall time [s].
+        iterations: Mean number of Newton iterations; NaN where there are none.
+        note: Further numbers.
     """
 
-    what: str
+    case: str
     seconds: float
     iterations: float = float("nan")
     note: str = ""
 
 
 def median(task: Callable[[], object], repeats: int) -> float:
-    """Return the median wall time of a task [s], once warmed up."""
+    """Return the median wall time of a task [s]; the first call is not timed."""
     task()
     times = []
     for _ in range(repeats):
@@ -144,7 +144,11 @@ def median(task: Callable[[], object], repeats: int) -> float:
 
 
 def beams(linear: str, repeats: int) -> dict[str, Time]:
-    """Return the time of each case with a backend, the answer checked."""
+    """Return the time of each case with a backend.
+
+    Raises:
+        ArithmeticError: A solution does not converge or misses the reference.
+    """
     rows = {}
     for name, case in CASES.items():
         problem, load = case.build()
@@ -158,15 +162,15 @@ def beams(linear: str, repeats: int) -> dict[str, Time]:
     return rows
 
 
-def measured_peer(python: str, program: Path, repeats: int) -> dict[str, Time]:
-    """Return the time of each case in another code, run by the Python that has it.
+def time_reference_code(python: str, program: Path, repeats: int) -> dict[str, Time]:
+    """Return the time of each case in another code, run by another Python interpreter.
 
-    The program is first asked for its shared libraries. Where its BLAS is the reference one and
-    Debian's OpenBLAS is installed, the program is given that; the notes name the BLAS.
+    The program first lists its shared libraries. Where it uses the reference BLAS and Debian's
+    OpenBLAS is installed, it runs with OpenBLAS; the notes name the BLAS.
 
     Args:
         python: The interpreter.
-        program: What it runs, see `benchmarks.programs`.
+        program: The script, see `benchmarks.programs`.
         repeats: Timed solves of each case.
 
     Raises:
@@ -187,20 +191,20 @@ def measured_peer(python: str, program: Path, repeats: int) -> dict[str, Time]:
     }
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")} | threads
-    used = blas_detection.name(_asked(python, program, {}, environment)["libraries"])
+    used = blas_detection.name(_run_program(python, program, {}, environment)["libraries"])
     if used == blas_detection.REFERENCE and (folder := blas_detection.optimised()):
         before = environment.get("LD_LIBRARY_PATH")
         environment["LD_LIBRARY_PATH"] = f"{folder}:{before}" if before else folder
-        used = blas_detection.name(_asked(python, program, {}, environment)["libraries"])
+        used = blas_detection.name(_run_program(python, program, {}, environment)["libraries"])
     if used in (None, blas_detection.REFERENCE):
-        flaw = "the reference BLAS, several times slower than others" if used else "no known BLAS"
+        reason = "the reference BLAS, which is several times slower" if used else "no known BLAS"
         raise OSError(
-            f"{program.name} with {python}: it uses {flaw}, and is not compared; install OpenBLAS "
+            f"{program.name} with {python}: it uses {reason}, and is not compared; install OpenBLAS "
             "for it (Debian: libopenblas0-pthread)"
         )
     rows = {}
-    for name, row in _asked(python, program, cases, environment)["times"].items():
-        error = CASES[name].miss(row["tip"])
+    for name, row in _run_program(python, program, cases, environment)["times"].items():
+        error = CASES[name].tip_error(row["tip"])
         if not error <= 1e-8:
             raise OSError(f"{program.name} with {python}: {name}: tip {error:.1e} L off")
         note = ", ".join(filter(None, [f"tip to {error:.0e} L", row.get("note"), used]))
@@ -208,10 +212,10 @@ def measured_peer(python: str, program: Path, repeats: int) -> dict[str, Time]:
     return rows
 
 
-def _asked(
+def _run_program(
     python: str, program: Path, cases: Mapping[str, object], environment: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Return what a program answers to cases: its shared libraries, and times by case.
+    """Return the output of a program: its shared libraries and the times by case.
 
     Raises:
         OSError: There is no such Python, or the program failed.
@@ -231,7 +235,7 @@ def _asked(
 
 
 def pieces(repeats: int) -> list[Time]:
-    """Return the times of what a Newton iteration of case S1 is made of."""
+    """Return the times of the parts of a Newton iteration of case S1."""
     problem, load = CASES["S1"].build()
     u = solve(Newton(problem, tol=1e-4), load).displacement
     gap = problem.update_strain_gap(None, 1.0, 0.1 * u)
@@ -258,7 +262,7 @@ def pieces(repeats: int) -> list[Time]:
 
 
 def propeller_scene(linear: str = "auto", deflection: float = 0.055) -> Scene:
-    """Return the propeller, NH-ln, held at its bore, its blades bent to a tenth of L."""
+    """Return the propeller of NH-ln, fixed at its bore, with deflections up to L / 10."""
     problem = Problem.build(propeller(), NeoHookeanLn(0.3), fixed=Tag("bore"))
     newton = Newton(problem, linear=linear)
     return Scene(
@@ -267,14 +271,14 @@ def propeller_scene(linear: str = "auto", deflection: float = 0.055) -> Scene:
 
 
 def beam_scene(law: Material) -> Scene:
-    """Return the paper's beam with its loads, deflections to 0.4 L."""
+    """Return the paper's beam with its loads, deflections up to 0.4 L."""
     problem = Problem.build(box(LONG, [40, 10, 10]), law, fixed=Plane(0, "min"))
     newton = Newton(problem)
     return Scene(problem, ModalLoads(newton.linear_solver, deflection=0.4, young=4500.0), newton)
 
 
 def propellers(linear: str, loads: int) -> Time:
-    """Return the time of one random load on the propeller, median of several."""
+    """Return the median time of a random load on the propeller."""
     scene = propeller_scene(linear)
     batch = scene.loads.sample(0, range(loads))
     singles = [Load(batch.force[k : k + 1], batch.young[k : k + 1]) for k in range(loads)]
@@ -319,12 +323,12 @@ def large(linear: str) -> Time:
 def robustness(
     scenes: Mapping[str, Callable[[], Scene]], loads: int, workers: int
 ) -> dict[str, dict[str, float]]:
-    """Return how many random loads are solved in one step, and how many at all.
+    """Return the numbers of random loads that are solved in one step and with load steps.
 
     Args:
-        scenes: Named builders.
-        loads: Of each scene.
-        workers: Processes.
+        scenes: Functions that build the scenes, by name.
+        loads: Number of loads of each scene.
+        workers: Number of worker processes.
     """
     results = {}
     for name, build in scenes.items():

@@ -1,4 +1,4 @@
-"""What solvers and networks cost as a beam gets more degrees of freedom: time, memory, weights."""
+"""Time, memory and parameters of solvers and networks against degrees of freedom."""
 
 import math
 import multiprocessing
@@ -24,37 +24,37 @@ from dpl.training import MSE, Surrogate
 
 @dataclass(frozen=True)
 class Size:
-    """What something costs on a beam of some size.
+    """Cost of a method on a beam.
 
     Attributes:
-        what: It.
-        dofs: Degrees of freedom, held ones included.
-        ms: Median wall time, one thread [ms].
-        parameters: Of the network.
-        memory: What it keeps, weights or factors [MB]; None: not measured.
-        peak: Largest memory of the process that measured everything of this size [MB].
+        case: Name of the method.
+        dofs: Degrees of freedom, fixed ones included.
+        ms: Median wall time on one thread [ms].
+        parameters: Number of parameters of the network.
+        memory_mb: Memory of weights or factors [MB]; None if not measured.
+        peak_memory_mb: Peak memory of the process that measured this beam [MB].
     """
 
-    what: str
+    case: str
     dofs: int
     ms: float
     parameters: int | None = None
-    memory: float | None = None
-    peak: float | None = None
+    memory_mb: float | None = None
+    peak_memory_mb: float | None = None
 
 
 def sizes(
-    across: Sequence[int], *, memory_limit: float = 4.0, loads: int = 5
+    cells_across: Sequence[int], *, memory_limit: float = 4.0, loads: int = 5
 ) -> Iterator[list[Size]]:
-    """Yield what solvers and networks cost, beam by beam, each measured in a process of its own.
+    """Yield the costs of solvers and networks for each beam, measured in a separate process.
 
     Args:
-        across: Cells across each beam; four times as many along it.
-        memory_limit: Weights of a fully connected network beyond which it is not built [GB].
-        loads: Timed loads.
+        cells_across: Cells across each beam; there are four times as many along it.
+        memory_limit: Largest fully connected network that is built [GB].
+        loads: Number of timed loads.
     """
     context = multiprocessing.get_context("spawn")
-    for cells in across:
+    for cells in cells_across:
         with ProcessPoolExecutor(1, mp_context=context) as pool:
             yield pool.submit(_size, cells, memory_limit, loads).result()
 
@@ -62,12 +62,12 @@ def sizes(
 def _size(cells: int, memory_limit: float, loads: int) -> list[Size]:
     with one_thread(), torch.inference_mode():
         rows = list(_costs(cells, memory_limit, loads))
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return [Size(r.what, r.dofs, r.ms, r.parameters, r.memory, peak) for r in rows]
+    peak_memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return [Size(r.case, r.dofs, r.ms, r.parameters, r.memory_mb, peak_memory_mb) for r in rows]
 
 
 def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
-    """Yield the rows of one beam; weights are random, for they take as long as trained ones."""
+    """Yield the rows of one beam; the networks have random weights."""
     mesh = box(BEAM, [4 * cells + 1, cells + 1, cells + 1])
     problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"))
     newton = Newton(problem, tol=1e-6)
@@ -76,8 +76,8 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     batch = scene.loads.sample((0, 2), range(max(loads, 3)))
     singles = batch.unbatch()[:loads]
 
-    def row(what: str, call: Callable[[Load], object], **more: float | int) -> Size:
-        return Size(what, dofs, latency(call, singles).p50, **more)  # type: ignore[arg-type]
+    def row(case: str, call: Callable[[Load], object], **more: float | int) -> Size:
+        return Size(case, dofs, latency(call, singles).p50, **more)  # type: ignore[arg-type]
 
     start = time.perf_counter()
     LinearSolver(problem).factor  # noqa: B018
@@ -87,14 +87,14 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     yield row("linear answer", lambda load: newton.linear_solver.solve(load.force[0]))
     answers = {float(load.force.norm()): solve(newton, load).displacement for load in singles}
     yield row("Newton", lambda load: solve(newton, load))
-    turned = replace(newton, corotational=True)
+    corotational = replace(newton, corotational=True)
 
     def hybrid(load: Load) -> None:
         guess = 1.001 * answers[float(load.force.norm())]
-        for _ in turned.iterate(load, guess=guess):
+        for _ in corotational.iterate(load, guess=guess):
             pass
 
-    yield row("Newton from an answer a thousandth off, K(0) turned", hybrid)
+    yield row("Newton, corotational, from a guess with a relative error of 1e-3", hybrid)
     net = Latent(scene)
     surrogate = Surrogate(net, MSE(), scene).eval()
     drawn = scene.loads.sample((0, 0), range(64))
@@ -103,12 +103,12 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     surrogate.fit_bases(Sample(drawn.force, bent, drawn.young))
     kept = sum(t.nbytes for t in surrogate.state_dict().values()) / 1e6
     count = sum(p.numel() for p in net.parameters())
-    yield row("latent", surrogate.predict, parameters=count, memory=kept)
+    yield row("latent", surrogate.predict, parameters=count, memory_mb=kept)
     weights = 4 * dofs**2 + 7 * dofs
     if 4e-9 * weights < memory_limit:
         whole = Surrogate(FCNN(scene, all_dofs=True, memory_limit=1e9), MSE(), scene).eval()
         count = sum(p.numel() for p in whole.net.parameters())
-        yield row("fcnn, as in the paper", whole.predict, parameters=count, memory=4e-6 * count)
+        yield row("fcnn, as in the paper", whole.predict, parameters=count, memory_mb=4e-6 * count)
 
 
 def exponent(dofs: Sequence[float], costs: Sequence[float]) -> float:
@@ -126,22 +126,22 @@ def draw(rows: Sequence[Size], path: Path) -> None:
     panels = figure.subplots(1, 3)
     families: dict[str, list[Size]] = {}
     for row in rows:
-        families.setdefault(row.what.partition(" (")[0], []).append(row)
+        families.setdefault(row.case.partition(" (")[0], []).append(row)
     one_a_size = list({row.dofs: row for row in rows}.values())
-    families["the whole process, at its peak"] = one_a_size
-    for ax, name in zip(panels, ("ms", "parameters", "memory"), strict=True):
-        for number, (what, family) in enumerate(families.items()):
-            field = "peak" if family is one_a_size and name == "memory" else name
+    families["whole process, peak"] = one_a_size
+    for ax, name in zip(panels, ("ms", "parameters", "memory_mb"), strict=True):
+        for number, (case, family) in enumerate(families.items()):
+            field = "peak_memory_mb" if family is one_a_size and name == "memory_mb" else name
             known = [(row.dofs, value) for row in family if (value := getattr(row, field))]
-            if not known or (family is one_a_size and field != "peak"):
+            if not known or (family is one_a_size and field != "peak_memory_mb"):
                 continue
             x, y = zip(*known, strict=True)
-            label = f"{what}: DOFs^{exponent(x, y):.2f}" if len(x) > 1 else what
+            label = f"{case}: DOFs^{exponent(x, y):.2f}" if len(x) > 1 else case
             ax.loglog(x, y, marker="o", ms=4, color=f"C{number}", label=label)
         ax.set_xlabel("degrees of freedom")
         ax.grid(alpha=0.3)
         low, high = ax.get_ylim()
-        ax.set_ylim(low, high * (high / low) ** 0.5)  # room for the legend
+        ax.set_ylim(low, high * (high / low) ** 0.5)  # space for the legend
         ax.legend(fontsize=7, loc="upper left")
     for ax, name in zip(
         panels, ("time of one load [ms]", "parameters", "memory [MB]"), strict=True

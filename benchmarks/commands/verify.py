@@ -1,4 +1,4 @@
-"""The mechanics against known answers: python scripts/verify.py writes docs/verification.md.
+"""Compare the mechanics with known solutions: python scripts/verify.py writes docs/verification.md.
 
 Some cases alone: parts=[cook,elastica]. The page keeps what the others measured last.
 """
@@ -15,7 +15,7 @@ from dpl.commands.cli import command
 
 @command("verify", conf=CONF)
 def main(cfg: DictConfig) -> None:
-    """Solve the cases that are asked for, and write the page of all that there are."""
+    """Solve the chosen cases and write the page of all cases."""
     from benchmarks import verification
     from dpl.system.threads import one_thread
 

@@ -1,7 +1,7 @@
-"""Cases whose answers are known, solved again: the sections of docs/verification.md.
+"""Verification cases with known solutions: the sections of docs/verification.md.
 
-A case solves, draws and returns a `Section`; its references stand beside it, typed as their source
-prints them. Sources: closed forms and elliptic integrals; public codes, by name; and "an
+A case solves, draws and returns a `Section`. References stand beside the case with the digits that
+their source prints. Sources: closed forms and elliptic integrals; public codes, by name; and "an
 independent code": a finite-element program in NumPy, written for these numbers, that shares no line
 with this package.
 """
@@ -36,7 +36,7 @@ CASES: dict[str, Callable[[Path], Section]] = {
 
 
 def measure(name: str, folder: Path) -> Section:
-    """Return a case's section; its figures and its numbers are written into a folder."""
+    """Return the section of a case and write its figures and numbers into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     with warnings.catch_warnings():
@@ -48,7 +48,7 @@ def measure(name: str, folder: Path) -> Section:
 
 
 def page(folder: Path) -> str:
-    """Return the page of all sections whose numbers lie in a folder, in Markdown."""
+    """Return the Markdown page of all sections whose numbers are in a folder."""
     sections = {}
     for name in CASES:
         if (path := folder / f"{name}.json").is_file():

@@ -1,4 +1,4 @@
-"""The paper's beam, Newton on it, and the identities that any answer satisfies."""
+"""The paper's beam, convergence of Newton, and identities that every solution satisfies."""
 
 import math
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ def bent(
 
 
 def beam(folder: Path) -> Section:
-    """Bend the paper's beam, and watch Newton do it."""
+    """Bend the paper's beam and measure the convergence of Newton."""
     rows, curves, tips = [], {}, {}
     for kind, printed in BEAM.items():
         cell, cells, degree = kind
@@ -113,13 +113,13 @@ def _draw_beam(path: Path, curves: dict[str, Any], residuals: dict[bool, list[fl
 
 
 def _rotation() -> Tensor:
-    """Return a rotation (3, 3) about no axis in particular."""
+    """Return a rotation (3, 3) about an oblique axis."""
     turn = torch.tensor([[0, -0.7, 0.4], [0.7, 0, -1.1], [-0.4, 1.1, 0]], dtype=torch.float64)
     return torch.linalg.matrix_exp(turn)
 
 
 def balance(folder: Path) -> Section:
-    """Check the identities that any answer must satisfy."""
+    """Check identities that every solution satisfies."""
     problem = paper_beam(NH, (8, 2, 2))
     newton = Newton(problem, tol=1e-12)
     unit = Traction(Plane(0, "max"), [0.0, 0.0, -1 / 4500]).on(problem)

@@ -1,4 +1,4 @@
-"""Bodies and answers that several cases share."""
+"""Bodies and solves that several cases share."""
 
 from collections.abc import Sequence
 
@@ -13,10 +13,10 @@ Array = NDArray[np.float64]
 
 
 def balanced(newton: Newton, force: Tensor | None = None, guess: Tensor | None = None) -> Solution:
-    """Return the answer to nodal forces (N, D) [-], those of the supports alone if left out.
+    """Return the solution under nodal forces (N, D) [-]; without forces, under moved supports.
 
     Raises:
-        ArithmeticError: There is none.
+        ArithmeticError: Newton does not converge.
     """
     force = torch.zeros(newton.problem.shape, dtype=torch.float64) if force is None else force
     load = Load(force[None], torch.ones(1, dtype=torch.float64))
@@ -37,7 +37,7 @@ NAMES = {
 def paper_beam(
     law: Material, cells: Sequence[int], cell: str = "hexahedron", degree: int = 1
 ) -> Problem:
-    """Return the paper's beam, 100 x 25 x 25 m, held at x = 0."""
+    """Return the paper's beam, 100 x 25 x 25 m, fixed at x = 0."""
     mesh = box([100.0, 25.0, 25.0], [n + 1 for n in cells], cell)
     return Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
 
@@ -45,13 +45,13 @@ def paper_beam(
 def slender(
     law: Material, cells: Sequence[int], cell: str = "hexahedron", degree: int = 2
 ) -> Problem:
-    """Return a beam of cross-section 1 x 1, as long as it has cells over those across, clamped."""
+    """Return a clamped beam of cross-section 1 x 1 with cubic cells."""
     mesh = box([cells[0] / cells[1], 1.0, 1.0], [n + 1 for n in cells], cell)
     return Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
 
 
 def lattice(points: Array) -> NDArray[np.int_]:
-    """Return the nodes of a grid by their places along the axes, (n1, ..., nD)."""
+    """Return the node numbers of a grid by their positions along the axes, (n1, ..., nD)."""
     ranks = [np.unique(x.round(9), return_inverse=True)[1] for x in points.T]
     nodes = np.empty([rank.max() + 1 for rank in ranks], dtype=np.int64)
     nodes[tuple(ranks)] = np.arange(len(points))

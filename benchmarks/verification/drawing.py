@@ -1,4 +1,4 @@
-"""Figures of one style: black is the reference, colour is dpl; readable without colour."""
+"""Figures in one style: black for references, colour for dpl, readable without colour."""
 
 import io
 import math
@@ -20,7 +20,7 @@ MARKS = "osD^vP"
 
 @contextmanager
 def picture(path: Path, height: float = 3.1) -> Iterator[Any]:
-    """Lend an empty figure as wide as a page, written to a file at the end."""
+    """Yield an empty figure of page width and write it to a file at the end."""
     import matplotlib
     from matplotlib.figure import Figure
     from PIL import Image
@@ -31,12 +31,12 @@ def picture(path: Path, height: float = 3.1) -> Iterator[Any]:
         yield figure
         drawn = io.BytesIO()
         figure.savefig(drawn, dpi=150)
-    palette = Image.open(drawn).convert("RGB").quantize(128)  # a third of the bytes
+    palette = Image.open(drawn).convert("RGB").quantize(128)  # a third of the size
     palette.save(path, optimize=True)
 
 
 def panel(figure: Any, place: int, x: str, y: str, title: str = "", **options: Any) -> Any:
-    """Return one of a figure's axes, labelled."""
+    """Return labelled axes of a figure."""
     ax = figure.add_subplot(1, options.pop("columns", 2), place)
     ax.set(xlabel=x, ylabel=y, **options)
     ax.set_title(title, loc="left")
@@ -51,7 +51,7 @@ def measured(ax: Any, x: Any, y: Any, k: int, label: str | None = None, **style:
 
 
 def reference(ax: Any, x: Any, y: Any, label: str | None = None) -> None:
-    """Draw printed values: open circles, measured ones show inside."""
+    """Draw reference values as open circles."""
     ax.plot(
         *(x, y, "o"),
         **{"markersize": 6.5, "markerfacecolor": "none", "markeredgecolor": "black"},

@@ -46,14 +46,14 @@ ERRORS: dict[tuple[str, int], tuple[list[int], str, str]] = {
 
 
 def manufactured(x: Tensor) -> Tensor:
-    """Return the displacement (3,) chosen for the unit cube at a point (3,)."""
+    """Return the manufactured displacement (3,) at a point (3,) of the unit cube."""
     X, Y, Z = math.pi * x
     u = (X.sin() * (Y / 2).cos(), (Y / 2).cos() * Z.sin(), x[1] * (X / 2).sin() * Z.sin())
     return 0.1 * torch.stack(u)
 
 
 def errors(cell: str, degree: int, n: int) -> tuple[float, float]:
-    """Return the errors of the manufactured answer on n^3 cells, L2 and H1-seminorm [-]."""
+    """Return the errors of the manufactured solution on n^3 cells in L2 and the H1-seminorm [-]."""
     law = NeoHookeanLn(0.3)
     gradient = torch.func.jacrev(manufactured)
 
@@ -242,7 +242,7 @@ def compliance(
 
 
 def locking(folder: Path) -> Section:
-    """Approach incompressibility with every element."""
+    """Measure the locking of every element towards incompressibility."""
     best = [compliance(nu, (16, 4, 4), "hexahedron", 2) for nu in POISSON]
     found, rows = {}, []
     for name, (cells, cell, degree, printed) in LOCKING.items():

@@ -1,4 +1,4 @@
-"""What a case returns, and the page that is made of it."""
+"""Sections of the verification page and their tables."""
 
 import math
 from collections.abc import Sequence
@@ -8,12 +8,12 @@ from decimal import Decimal
 
 @dataclass(frozen=True)
 class Row:
-    """A quantity, what it should be and what it is.
+    """A measured quantity with its reference.
 
     Attributes:
-        quantity: In words.
-        reference: As its source prints it; "< 1e-10" or "> 0.94" is a bound.
-        value: What was measured.
+        quantity: Name of the quantity.
+        reference: Digits as the source prints them; "< 1e-10" or "> 0.94" is a bound.
+        value: The measured value.
         within: Relative difference allowed; None: one unit of the last digit printed.
     """
 
@@ -24,7 +24,7 @@ class Row:
 
     @property
     def difference(self) -> float:
-        """Relative difference; NaN from a bound."""
+        """Relative difference from the reference; NaN for a bound."""
         if self.reference[0] in "<>":
             return math.nan
         known = float(self.reference)
@@ -32,7 +32,7 @@ class Row:
 
     @property
     def holds(self) -> bool:
-        """Whether the value is where it should be."""
+        """True if the value agrees with the reference."""
         if self.reference[0] in "<>":
             bound = float(self.reference[1:])
             return self.value < bound if self.reference[0] == "<" else self.value > bound
@@ -61,15 +61,15 @@ class Row:
 
 @dataclass(frozen=True)
 class Section:
-    """What a case measured.
+    """Results of a case.
 
     Attributes:
-        title: Of the section.
-        text: What is solved, and where the references are from.
-        rows: Of its table.
+        title: Title of the section.
+        text: Description of the problem and sources of the references.
+        rows: Rows of the table.
         figures: File names with captions.
-        notes: What else was seen.
-        seconds: It took [s].
+        notes: Further observations.
+        seconds: Run time [s].
     """
 
     title: str

@@ -1,4 +1,4 @@
-"""Slender beams against the elastica: bent by a load across, buckled by one along."""
+"""Slender beams against the elastica: bending and buckling."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -220,7 +220,7 @@ def critical(law: Material, cells: Sequence[int]) -> float:
 
 
 def bent_branch(cells: Sequence[int], lowest: float) -> dict[float, tuple[Problem, Any, Any]]:
-    """Return body, answer and tip (w/L, u/L) of a buckled column by loads [N] above the lowest.
+    """Return body, solution and tip (w/L, u/L) of a buckled column by loads [N].
 
     The first answer is reached by a guess, the elastica's shape; each of the others by the last.
     """
@@ -242,7 +242,7 @@ def bent_branch(cells: Sequence[int], lowest: float) -> dict[float, tuple[Proble
 
 
 def buckling(folder: Path) -> Section:
-    """Buckle columns, and tell the straight branch from the bent one."""
+    """Buckle columns and follow the bent branch."""
     rows = []
     for law, cells, printed in CRITICAL:
         name = f"{'SVK' if law is SVK else 'NH-ln'}, {' × '.join(map(str, cells))}"

@@ -61,7 +61,7 @@ def peer(tmp_path):
 
 
 def test_peer_is_another_program_that_reads_cases_and_writes_times(peer):
-    times = peers.measured_peer(sys.executable, peer(), 1)
+    times = peers.time_reference_code(sys.executable, peer(), 1)
     assert set(times) == set(peers.CASES)
     assert times["S1"].seconds == 20100.0
     assert times["S1"].iterations == 7
@@ -98,7 +98,7 @@ def test_a_folder_with_openblas_as_the_blas_is_found(tmp_path):
 
 def test_a_peer_with_the_reference_blas_is_given_openblas_which_its_note_names(peer, monkeypatch):
     monkeypatch.setattr(blas_detection, "optimised", lambda: "/opt/openblas-pthread")
-    times = peers.measured_peer(sys.executable, peer(libraries=[REFERENCE]), 1)
+    times = peers.time_reference_code(sys.executable, peer(libraries=[REFERENCE]), 1)
     assert times["S1"].note == "tip to 0e+00 L, a note, OpenBLAS"
 
 
@@ -108,14 +108,14 @@ def test_a_peer_with_the_reference_blas_is_given_openblas_which_its_note_names(p
 def test_a_peer_without_an_optimised_blas_is_not_compared(peer, monkeypatch, libraries, flaw):
     monkeypatch.setattr(blas_detection, "optimised", lambda: None)
     with pytest.raises(OSError, match=f"it uses {flaw}.* libopenblas0") as refused:
-        peers.measured_peer(sys.executable, peer(libraries=libraries), 1)
+        peers.time_reference_code(sys.executable, peer(libraries=libraries), 1)
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("off", [1e-5, math.nan])
 def test_peer_with_another_answer_is_not_timed(peer, off):
     with pytest.raises(OSError, match="S1: tip"):
-        peers.measured_peer(sys.executable, peer(off), 1)
+        peers.time_reference_code(sys.executable, peer(off), 1)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_peer_that_fails_says_why(tmp_path, end, reason):
     program = tmp_path / "broken_beam.py"
     program.write_text(f"import sys\n{end}\n")
     with pytest.raises(OSError, match=reason):
-        peers.measured_peer(sys.executable, program, 1)
+        peers.time_reference_code(sys.executable, program, 1)
 
 
 def test_random_loads_are_counted(scene):

@@ -12,9 +12,9 @@ from dpl.evaluation.tables import write
 def test_each_size_is_measured_in_a_process_of_its_own(tmp_path):
     rows = [row for part in beams.sizes([2, 3], loads=2) for row in part]
     assert sorted({row.dofs for row in rows}) == [3 * 9 * 9, 3 * 13 * 16]
-    whole = [row for row in rows if row.what.startswith("fcnn")]
+    whole = [row for row in rows if row.case.startswith("fcnn")]
     assert [row.parameters for row in whole] == [4 * n**2 + 7 * n for n in (243, 624)]
-    assert all(row.peak > 100 for row in rows)
+    assert all(row.peak_memory_mb > 100 for row in rows)
     write(rows, tmp_path / "sizes.csv")
     beams.draw(rows, tmp_path / "sizes.png")
     assert len(list(csv.DictReader((tmp_path / "sizes.csv").open()))) == len(rows)
