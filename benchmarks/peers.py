@@ -199,7 +199,7 @@ def time_reference_code(python: str, program: Path, repeats: int) -> dict[str, T
     if used in (None, blas_detection.REFERENCE):
         reason = "the reference BLAS, which is several times slower" if used else "no known BLAS"
         raise OSError(
-            f"{program.name} with {python}: it uses {reason}, and is not compared; install OpenBLAS "
+            f"{program.name} with {python}: it uses {reason}; install OpenBLAS "
             "for it (Debian: libopenblas0-pthread)"
         )
     rows = {}
