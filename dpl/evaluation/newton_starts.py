@@ -25,7 +25,6 @@ from dpl.fem import (
     Solver,
     evaluate_solution,
 )
-from dpl.fem.dofs import gather, scatter
 from dpl.fem.solvers import run_lockstep
 from dpl.inference import Hybrid
 from dpl.inference.hybrid import Predict
@@ -92,10 +91,10 @@ class PlainNewton:
             if state.converged or k == self.max_iter:
                 return
             system = problem.linearise(u)
-            right = gather((load.force - system.force)[0], problem)
+            right = problem.restrict((load.force - system.force)[0])
             try:
                 factor = backend.factorise(system.tangent[0].numpy())
-                u = u + scatter(factor.solve(right, 1e-10), problem)[None]
+                u = u + problem.extend(factor.solve(right, 1e-10))[None]
             except SingularMatrix:
                 return
 

@@ -205,6 +205,16 @@ class Problem(TensorAssembly):
         """
         return self if self.material.poisson_range is None else self.at(self._middle)
 
+    def restrict(self, field: Tensor) -> NDArray[np.float64]:
+        """Return the values, (n,), of a nodal field (N, D) at the free degrees of freedom."""
+        return field[self.free].numpy()
+
+    def extend(self, values: NDArray[np.float64]) -> Tensor:
+        """Return the nodal field (N, D) with values (n,) where free and zero elsewhere."""
+        field = torch.zeros(self.shape, dtype=torch.float64)
+        field[self.free] = torch.from_numpy(values)
+        return field
+
     def residual(self, displacement: Tensor, force: Tensor) -> Tensor:
         """Return f_int - f where free and zero where held, (B, N, D) [-]."""
         return torch.where(self.free, self.internal_force(displacement) - force, 0.0)

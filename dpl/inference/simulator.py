@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dpl.fem import Load, Newton, Solution, Status, evaluate_solution
-from dpl.fem.dofs import gather
 from dpl.fem.problem import FAINT
 from dpl.fem.solvers import check_tol, concatenate
 from dpl.inference.hybrid import default_hybrid
@@ -329,7 +328,7 @@ def nearest(newton: Newton, load: Load, guesses: list[Tensor]) -> Tensor:
         internal, volume = turning.problem.evaluate(guess)
         if not bool(volume > 0):
             return math.inf
-        right = gather((load.force - internal)[0], turning.problem)
+        right = turning.problem.restrict((load.force - internal)[0])
         return float(np.linalg.norm(turning.at(guess).apply(right)))
 
     return min(guesses, key=distance)

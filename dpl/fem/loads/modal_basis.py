@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigsh
 from torch import Tensor
 
-from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear.interface import SingularMatrix, full_matrix
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.linear import LinearSolver
@@ -70,7 +69,7 @@ def eigenmodes(linear: LinearSolver, count: int) -> Modes:
     probes = _probes(problem)
     for space in _eigenspaces(values):
         vectors[:, space] = _leaning(vectors[:, space], probes)
-    fields = torch.stack([scatter(vector, problem) for vector in vectors[:, :count].T], dim=-1)
+    fields = torch.stack([problem.extend(vector) for vector in vectors[:, :count].T], dim=-1)
     return Modes(torch.from_numpy(values[:count]), fields)
 
 
@@ -88,7 +87,7 @@ def _probes(problem: Problem) -> Array:
     monomials = [torch.ones(len(x), dtype=torch.float64), *x.T]
     monomials += [x[:, i] * x[:, j] for i in range(dim) for j in range(i, dim)]
     axes = torch.eye(dim, dtype=torch.float64)
-    fields = [gather(m[:, None] * axis, problem) for m in monomials for axis in axes]
+    fields = [problem.restrict(m[:, None] * axis) for m in monomials for axis in axes]
     noise = np.random.default_rng(1).standard_normal((len(fields[0]), 4))
     return np.column_stack([*fields, noise])
 

@@ -8,7 +8,6 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from dpl.fem.dofs import gather
 from dpl.fem.linear.interface import full_matrix
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.linear import LinearSolver
@@ -76,7 +75,7 @@ class RestStiffness:
         problem, found = self._linear.problem, []
         poisson = force.new_zeros(1, 0) if poisson is None else poisson
         for one, own in zip(force.cpu(), poisson.cpu().expand(len(force), -1), strict=True):
-            right = gather(one, problem)
+            right = problem.restrict(one)
             key = hash(right.tobytes() + own.numpy().tobytes())
             if key not in self._works:
                 if len(self._works) >= REMEMBERED:

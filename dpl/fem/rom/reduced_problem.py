@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dpl.fem.dofs import gather, scatter
 from dpl.fem.problem import Problem
 from dpl.fem.rom.ecsw import Cubature, ReducedMesh, whitening
 from dpl.fem.solvers.linear import LinearSolver
@@ -196,4 +195,4 @@ def _support_force(problem: Problem) -> Tensor:
 def _linear_answer(lift: LinearSolver, force: Tensor) -> Tensor:
     """Return K(0)^-1 f, (N, D); what it is short of, the subspace adds."""
     problem = lift.problem
-    return scatter(lift.factor.solve(gather(force, problem), LIFT), problem)
+    return problem.extend(lift.factor.solve(problem.restrict(force), LIFT))

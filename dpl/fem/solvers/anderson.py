@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear.interface import Array
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.corotational import CorotatedFactor
@@ -74,7 +73,7 @@ class AndersonSolver:
         past = _Past(self.memory, len(right))
         while count < self.max_iter:
             step = past.step(right, turned)
-            u, count, before = u + scatter(step, problem)[None], count + 1, right
+            u, count, before = u + problem.extend(step)[None], count + 1, right
             state, right = self._state(load, u, count, start)
             yield state
             ratios.append(float(state.residual))
@@ -93,7 +92,7 @@ class AndersonSolver:
             iterations=count, seconds=time.perf_counter() - start, from_guess=True,
             evaluation=evaluation,
         )  # fmt: skip
-        return state, gather((load.force - internal)[0], problem)
+        return state, problem.restrict((load.force - internal)[0])
 
 
 class _Past:

@@ -7,7 +7,6 @@ import torch
 from scipy.sparse.linalg import LinearOperator, eigsh
 from torch import Tensor
 
-from dpl.fem.dofs import scatter
 from dpl.fem.linear.backends import make_backend
 from dpl.fem.linear.interface import full_matrix
 from dpl.fem.solvers.newton import Newton
@@ -43,7 +42,7 @@ def unstable_directions(newton: Newton, solution: Solution) -> Tensor:
         v0=start,
     )
     negative = np.argsort(lowest)[: int((lowest < 0).sum())]
-    fields = torch.stack([scatter(vectors[:, k], problem) for k in negative])
+    fields = torch.stack([problem.extend(vectors[:, k]) for k in negative])
     return fields / fields.norm(dim=-1).amax(dim=1)[:, None, None]
 
 

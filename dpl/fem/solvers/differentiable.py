@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear.backends import make_backend
 from dpl.fem.linear.interface import Backend, Factor
 from dpl.fem.solvers.newton import Newton
@@ -116,7 +115,7 @@ class _Answer(torch.autograd.Function):
             (displacement,) = ctx.saved_tensors
             ctx.factors = ctx.parent.factors(displacement, ctx.poisson)
         solved = [
-            scatter(factor.solve(gather(one, problem)), problem)
+            problem.extend(factor.solve(problem.restrict(one)))
             for factor, one in zip(ctx.factors, gradient, strict=True)
         ]
         return torch.stack(solved), None, None, None

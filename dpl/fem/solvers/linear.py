@@ -8,7 +8,6 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear.backends import make_backend, select_backend
 from dpl.fem.linear.banded import BandedFactor
 from dpl.fem.linear.interface import Backend, Factor
@@ -111,7 +110,7 @@ class LinearSolver:
 
     def solve(self, force: Tensor) -> Tensor:
         """Return K(0)^-1 f, (N, D) [-], for f (N, D) [-]; zero where held."""
-        return scatter(self.factor.solve(gather(force, self.problem)), self.problem)
+        return self.problem.extend(self.factor.solve(self.problem.restrict(force)))
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle without the factor."""

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dpl.fem.dofs import gather, scatter
 from dpl.fem.linear.backends import select_backend
 from dpl.fem.linear.interface import UNKNOWN, SingularMatrix, Stability
 from dpl.fem.problem import Problem
@@ -203,12 +202,12 @@ class Newton:
         right = force - internal
         if state.support_step.any():
             right = right - problem.tangent_product(u, state.support_step)
-        values = gather(right[0], problem)
+        values = problem.restrict(right[0])
         if tangent is None:
             step = tangents.solve_at_rest(values, rtol)
         else:
             step = tangents.solve(tangent, u, values, rtol, near=near)
-        return scatter(step, problem)[None] + state.support_step
+        return problem.extend(step)[None] + state.support_step
 
     def _update(self, state: "_State", update: Tensor, *, halvings: int) -> "_State | None":
         """Return the state after the longest of the steps 1, 1/2, ... that inverts no element."""
