@@ -16,7 +16,6 @@ from dpl.data.storage.integrity import verify
 from dpl.data.storage.shard import decode_shard
 from dpl.evaluation import evaluate
 from dpl.fem import (
-    BatchedNewton,
     DifferentiableSolve,
     LinearElastic,
     Load,
@@ -222,13 +221,9 @@ def test_a_scene_of_one_refuses_to_predict_for_another(scene, few):
         Surrogate(FCNN(scene, width=4), MSE(), scene).predict(few.load)
 
 
-def test_what_knows_one_body_only_refuses_a_range(wide, few):
-    with pytest.raises(ValueError, match="poisson: a range"):
-        BatchedNewton(wide.problem)
+def test_a_reduced_basis_refuses_a_range(wide, few):
     with pytest.raises(ValueError, match="poisson: reduced stiffness"):
         PODGalerkin.fit(wide.problem, few.displacement, 2)
-    with pytest.raises(ValueError, match="poisson: loads with their own"):
-        solve(BatchedNewton(wide.problem.reference), few.load)
 
 
 def test_gradients_of_exact_answers_are_those_of_the_body_of_each_load(wide, few, make_scene):

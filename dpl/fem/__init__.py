@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from dpl.fem.problem import Problem
     from dpl.fem.rom.galerkin import PODGalerkin
     from dpl.fem.solvers.anderson import AndersonSolver
-    from dpl.fem.solvers.batched_newton import BatchedNewton
     from dpl.fem.solvers.bifurcation import post_buckling_branches
     from dpl.fem.solvers.differentiable import DifferentiableSolve
     from dpl.fem.solvers.linear import LinearSolver

@@ -6,7 +6,6 @@ from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
     from dpl.fem.solvers.anderson import AndersonSolver
-    from dpl.fem.solvers.batched_newton import BatchedNewton
     from dpl.fem.solvers.bifurcation import post_buckling_branches, unstable_directions
     from dpl.fem.solvers.differentiable import DifferentiableSolve
     from dpl.fem.solvers.linear import LinearSolver
