@@ -45,7 +45,7 @@ def costs(
         pool: Number of solved loads; the nearest one is a guess.
         surrogate: A further source of guesses.
     """
-    newton = scene.solver
+    newton = scene.newton
     once = replace(newton, factor_reuse_tol=0.0)
     starts: dict[str, tuple[object, Guess | None]] = {
         "a factor for every tangent": (once, None),

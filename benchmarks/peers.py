@@ -332,7 +332,7 @@ def robustness(
     results = {}
     for name, build in scenes.items():
         scene = build()
-        once = replace(scene, solver=replace(scene.solver, min_load_step=0.9))
+        once = replace(scene, solver=replace(scene.newton, min_load_step=0.9))
         jobs = [LoadKey((0, 0), k) for k in range(loads)]
         first = {o.job.number: o for o in solve_loads(once, jobs, workers=workers)}
         failed = [o.job for o in first.values() if not o.accepted]

@@ -2,27 +2,27 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from numbers import Real
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem import LinearSolver, Load, ModalLoads, Newton, Problem, solve
+from dpl.fem import LinearSolver, Load, LoadFamily, Newton, Problem, ReferenceSolver, solve
+from dpl.fem.identity import plain, sha256_of
 from dpl.fem.solvers.solution import as_column
 
-TYPICAL = 6  # the stream of the loads that the corrector is chosen on
+CORRECTOR_STREAM = 6  # stream of the loads on which the corrector is chosen
 CELLS = {  # scikit-fem's names of shapes and those of bodies, in the plural
     "Hexahedral": "hexahedra",
     "Tetrahedral": "tetrahedra",
     "Quadrilateral": "quadrilaterals",
     "Triangular": "triangles",
 }
-SHORT = 8  # conjugate gradient steps, on the mean, that cost less than a factor
+MAX_MEAN_STEPS = 8  # conjugate gradient steps, on average, that cost less than a factor
 
 
 class _Sample(NamedTuple):
@@ -59,37 +59,45 @@ class Sample(_Sample):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is simulated.
+    """A body, its loads and the solver that computes its solutions.
 
     Attributes:
-        problem: The body, dimensionless.
-        loads: The family of loads to be answered.
-        solver: The reference that makes the truth.
+        problem: Body, dimensionless.
+        loads: Load family.
+        solver: Reference solver, which computes the solutions of data sets and comparisons.
     """
 
     problem: Problem
-    loads: ModalLoads
-    solver: Newton
+    loads: LoadFamily
+    solver: ReferenceSolver
 
     @property
     def linear(self) -> LinearSolver:
-        """The linear answer, with the scene's one factor of K(0)."""
+        """Linear solver with the one factor of K(0) of the scene."""
         return self.solver.linear_solver
 
     @cached_property
-    def corrector(self) -> Newton:
-        """The solver as it goes on from a good guess.
+    def newton(self) -> Newton:
+        """Reference solver if that is Newton's method, else Newton's method of its tolerance."""
+        if isinstance(self.solver, Newton):
+            return self.solver
+        linear = self.linear
+        return Newton(self.problem, self.solver.tol, linear=linear.linear, linear_solver=linear)
 
-        Without a factor of its own for a tangent where that of K(0), turned with the nodes, makes
-        conjugate gradients short: on compact bodies, seldom on thin ones. A few loads, the first of
-        a stream of their own, tell.
+    @cached_property
+    def corrector(self) -> Newton:
+        """Newton's method as it continues from a prediction.
+
+        It preconditions with the corotated factor of K(0) in place of new factors where that makes
+        conjugate gradients short: on compact bodies, seldom on thin ones. The mean number of steps
+        for a few random loads decides.
         """
-        drawn = self.loads.sample((0, TYPICAL), range(3)).unbatch()
-        answers = [solve(self.solver, load) for load in drawn]
-        bodies = [self.linear.at(load.poisson) for load in drawn]
-        pairs = zip(bodies, answers, strict=True)
-        steps = [linear.corotational.steps(answer.displacement) for linear, answer in pairs]
-        return replace(self.solver, corotational=sum(steps) <= SHORT * len(steps))
+        loads = self.loads.sample((0, CORRECTOR_STREAM), range(3)).unbatch()
+        steps = []
+        for load in loads:
+            displacement = solve(self.solver, load).displacement
+            steps.append(self.linear.at(load.poisson).corotational.steps(displacement))
+        return replace(self.newton, corotational=sum(steps) <= MAX_MEAN_STEPS * len(steps))
 
     @property
     def length(self) -> float:
@@ -119,34 +127,20 @@ class Scene:
         Sizes and Young's moduli are absent: u/L depends on f/(E L^2) alone. Coordinates count to
         1e-9 L. Real parameters are floats, so that 1 and 1.0 make one scene.
         """
-        points = self.problem.points.numpy()
+        problem, points = self.problem, self.problem.points.numpy()
         # Not rounded: the halves among dyadic coordinates would flip with the last bit.
         lattice = np.floor((points - points.min(axis=0)) * 1e9 + 0.3).astype(np.int64)
-        law, loads = self.problem.material, self.loads
         return {
-            "points": _digest(lattice),
-            "cells": _digest(self.problem.cells.numpy()),
-            "free": _digest(self.problem.free.numpy()),
-            "degree": self.problem.degree,
-            "mean_dilatation": self.problem.mean_dilatation,
-            "prescribed": _digest(self.problem.prescribed.numpy()),
-            "springs": [_digest(part.numpy()) for part in self.problem.springs or ()],
-            "law": {"name": type(law).__name__, **_real(vars(law))},
-            "loads": {
-                "name": type(loads).__name__,
-                "n_modes": loads.n_modes,
-                "deflection": float(loads.deflection),
-                "patch": [float(radius) for radius in loads.patch],
-                "distribution": _name(loads.distribution),
-                "spectrum": float(loads.eigenvalue_exponent),
-                "radius": _name(loads.radius),
-                "amplitude": _name(loads.amplitude),
-                "sampling": loads.sampling,
-                "always": None
-                if loads.constant_force is None
-                else _digest(loads.constant_force.numpy()),
-            },
-            "tol": float(self.solver.tol),
+            "points": sha256_of(lattice),
+            "cells": plain(problem.cells),
+            "free": plain(problem.free),
+            "degree": problem.degree,
+            "mean_dilatation": problem.mean_dilatation,
+            "prescribed": plain(problem.prescribed),
+            "springs": plain(problem.springs or ()),
+            "law": problem.material.identity(),
+            "loads": self.loads.identity(),
+            "solver": self.solver.identity(),
         }
 
     @cached_property
@@ -211,27 +205,7 @@ class Scene:
                 "K(0) factorised once for modes, linear answers and every first Newton step"
             )
         lines.append("no factorisation for loads whose linear answer meets the tolerance")
-        if loads.modes.values.shape[0] > loads.n_modes:
-            count = len(loads.modes.values)
-            lines.append(f"{count} modes instead of {loads.n_modes}: a family is kept whole")
-        return lines
-
-
-def _name(function: Callable[..., object]) -> str:
-    """Return what a function or a partial of one is called, with its arguments."""
-    if isinstance(function, partial):
-        keywords = _real(dict(sorted(function.keywords.items())))
-        return f"{_name(function.func)}{_real(function.args) or ''}{keywords or ''}"
-    return getattr(function, "__name__", repr(function))
-
-
-def _real(value: Any) -> Any:
-    """Return plain data with all numbers as floats."""
-    if isinstance(value, Mapping):
-        return {key: _real(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return type(value)(map(_real, value))
-    return float(value) if isinstance(value, Real) and not isinstance(value, bool) else value
+        return lines + loads.skipped_work()
 
 
 def _plain(identity: Any) -> Any:
@@ -245,17 +219,10 @@ def _differences(theirs: Any, ours: Mapping[str, Any], path: str = "") -> list[s
         place, b = f"{path}{key}", ours.get(key)
         if isinstance(a, Mapping) and isinstance(b, Mapping):
             lines += _differences(a, b, f"{place}.")
-        elif _real(a) != b and a != b:
+        elif plain(a) != b and a != b:
             digest = isinstance(a, str) and len(a) == 64
             lines.append(f"{place}: " + ("differ" if digest else f"{a} there, {b} here"))
     return lines
-
-
-def _digest(array: np.ndarray) -> str:
-    contiguous = np.ascontiguousarray(array)
-    return hashlib.sha256(
-        f"{contiguous.dtype}{contiguous.shape}".encode() + contiguous.tobytes()
-    ).hexdigest()
 
 
 def stack(samples: list[Sample]) -> Sample:

@@ -461,7 +461,7 @@ def test_encoded_samples_are_what_the_network_sees(wide, sets, few):
 
 def test_a_network_that_is_told_poissons_ratio_is_clearly_better(make_scene, tmp_path):
     """Loads of two modes on the whole boundary: three numbers and Poisson's ratio make them."""
-    scene = make_scene(poisson=[0.0, 0.45], n_modes=2, patch=(2.0, 2.0), deflection=0.2)
+    scene = make_scene(poisson=[0.0, 0.45], n_modes=2, patch_radius=(2.0, 2.0), deflection=0.2)
     data = OfflineData(scene, folder=str(tmp_path), train=256, val=1, test=64, workers=0)
     data.prepare_data()
     batch, errors = data.samples("train"), {}

@@ -77,17 +77,17 @@ CHANGES = {
     "tolerance": {"tol": 1e-6},
     "modes": {"n_modes": 2},
     "deflection": {"deflection": 0.41},
-    "patch": {"patch": (0.0, 0.5)},
+    "patch radius": {"patch_radius": (0.0, 0.5)},
     "distribution": {"distribution": normal},
     "argument of the distribution": {"distribution": partial(mild, factor=0.5)},
-    "spectrum": {"eigenvalue_exponent": 1.0},
+    "eigenvalue exponent": {"eigenvalue_exponent": 1.0},
     "radius": {"radius": logarithmic},
     "argument of the radius": {"radius": partial(logarithmic, low=1e-4)},
     "amplitude": {"amplitude": log_tail_mixture},
     "argument of the amplitude": {"amplitude": partial(log_tail_mixture, part=0.5)},
     "amplitude as the radius": {"amplitude": uniform01},
     "sampling": {"sampling": "sobol"},
-    "always": {"constant_force": torch.ones(45, 3, dtype=torch.float64)},
+    "constant force": {"constant_force": torch.ones(45, 3, dtype=torch.float64)},
 }
 
 
@@ -108,8 +108,8 @@ def test_arguments_of_a_distribution_tell_scenes_apart(make_scene):
 def test_the_identity_names_the_options_of_the_loads_and_no_other(make_scene, scene):
     """Nor does it name what decides no sample: how Newton gets there."""
     assert set(scene.identity()["loads"]) == {
-        *("name", "n_modes", "deflection", "patch", "distribution", "spectrum", "radius"),
-        *("amplitude", "sampling", "always"),
+        *("name", "n_modes", "deflection", "patch_radius", "distribution", "radius"),
+        *("eigenvalue_exponent", "amplitude", "sampling", "constant_force"),
     }
     for options in (
         {"newton": partial(Newton, factor_reuse_tol=0.0)},

@@ -43,7 +43,7 @@ def main(cfg: DictConfig) -> None:
     a_load = data.store.seconds_a_load()
     minutes = None if a_load is None else a_load * sum(data.wanted.sizes.values()) / 60
     for row, error in paper_tables.measure(
-        compared, sets, scene.solver, generation_minutes=minutes
+        compared, sets, scene.newton, generation_minutes=minutes
     ):
         rows.append(row)
         errors[row.method, row.loads] = error

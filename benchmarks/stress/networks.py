@@ -207,8 +207,8 @@ def network_precision(dtype: torch.dtype, device: str, auditor: Auditor) -> Outc
 
     with torch.inference_mode():
         said = predict(drawn)
-        state = auditor.solve(Hybrid(predict, own.solver), own.problem, drawn)
-    exact = solve(replace(own.solver, tol=1e-12), drawn).displacement
+        state = auditor.solve(Hybrid(predict, own.newton), own.problem, drawn)
+    exact = solve(replace(own.newton, tol=1e-12), drawn).displacement
     off = float((state.displacement - exact).abs().max())
     rows = [
         Row("the prediction is float64", "1", float(said.dtype == torch.float64), 0),
@@ -240,7 +240,7 @@ def load_sweep(auditor: Auditor) -> Outcome:
             load = as_load(amplitude * unit)
             guess = solve(LinearSolver(problem), load).displacement
             exact = solve(own.solver, load)
-            hybrid = hybrids(own.solver)[way](guess)
+            hybrid = hybrids(own.newton)[way](guess)
             states = list(auditor.wrap(hybrid, problem, own.solver.tol).iterate(load))
             last = states[-1]
             apart = float((last.displacement - exact.displacement).norm())

@@ -86,7 +86,7 @@ def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
     scene = surrogate.scene
     data = config.load_data(first, scene)
     train = data.samples("train")
-    robust = scene.solver
+    robust = scene.newton
     solvers: dict[str, Solver] = {"linear": scene.linear}
     solvers |= {f"Newton to {tol:g}": replace(robust, tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
     if cfg.galerkin:

@@ -87,9 +87,7 @@ def instantiate(cfg: DictConfig, key: str, /, **more: Any) -> Any:
         and not partial
         and not validation.is_instance_of(type(made), validation.EXPECTED_TYPES[key])
     ):
-        raise ConfigError(
-            f"{key} gives {_a(made)}; it must give {_named(validation.EXPECTED_TYPES[key])}"
-        )
+        raise ConfigError(f"{key} gives {_a(made)}; it must give {_expected(key, type(made))}")
     return made
 
 
@@ -117,8 +115,14 @@ def _a(made: Any) -> str:
     return f"an object of {type(made).__name__}"
 
 
-def _named(kinds: set[str]) -> str:
-    return " or ".join(sorted(kind.rpartition(".")[2] for kind in kinds))
+def _expected(key: str, found: type) -> str:
+    """Return the types that a key stands for, and which members of a protocol a class lacks."""
+    kinds = validation.EXPECTED_TYPES[key]
+    lines = [" or ".join(sorted(kind.rpartition(".")[2] for kind in kinds))]
+    for protocol in sorted(kinds & validation.PROTOCOLS):
+        missing = sorted(validation.missing_members(found, protocol))
+        lines.append(f"which has {', '.join(missing)}; see dpl.fem.{protocol.rpartition('.')[2]}")
+    return ", ".join(lines)
 
 
 def build_scene(cfg: DictConfig) -> Scene:
@@ -167,7 +171,7 @@ def build_scene(cfg: DictConfig) -> Scene:
         cfg, "loads", linear=solver.linear_solver, young=young, constant_force=_always(cfg, problem)
     )
     try:
-        loads.modes  # noqa: B018  # which says whether there are so many
+        loads.largest_force  # noqa: B018  # which says whether the body allows these loads
     except ValueError as error:
         raise ConfigError(f"loads: {error}") from error
     except SingularMatrix as error:
@@ -196,7 +200,7 @@ def _parts(cfg: DictConfig, key: str) -> list[Any]:
     parts = {str(name): _made(node[name], f"{key}.{name}", {}) for name in node if node[name]}
     for name, part in parts.items():
         if not validation.is_instance_of(type(part), validation.EXPECTED_TYPES[key]):
-            kinds = _named(validation.EXPECTED_TYPES[key])
+            kinds = _expected(key, type(part))
             raise ConfigError(f"{key}.{name} gives {_a(part)}; it must give {kinds}")
     return list(parts.values())
 

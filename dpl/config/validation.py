@@ -55,8 +55,8 @@ EXPECTED_TYPES = {  # of what the call under a key gives: one of these, or deriv
         "dpl.fem.assembly.boundary_conditions.RobinBC",
     },
     "forces": {"dpl.fem.loads.forces.Traction", "dpl.fem.loads.forces.BodyForce"},
-    "solver": {"dpl.fem.solvers.newton.Newton"},
-    "loads": {"dpl.fem.loads.modal.ModalLoads"},
+    "solver": {"dpl.fem.solvers.reference.ReferenceSolver"},
+    "loads": {"dpl.fem.loads.family.LoadFamily"},
     "data": {"dpl.data.dataset.DataSet", "dpl.data.datamodule.OfflineData"},
     "model": {"torch.nn.modules.module.Module"},
     "loss": {"dpl.training.losses.loss.Loss"},
@@ -65,10 +65,11 @@ EXPECTED_TYPES = {  # of what the call under a key gives: one of these, or deriv
     "trainer": {"lightning.pytorch.trainer.trainer.Trainer"},
 }
 SEVERAL = ("supports", "forces")  # keys that hold calls by name
-TRUSTED = {  # modules whose public functions a run may name; classes: EXPECTED_TYPES
-    *(f"dpl.fem.mesh.{name}" for name in ("generators", "propeller_mesh", "reading")),
-    "dpl.fem.loads.sampling",
-    "dpl.training.schedules",
+PROTOCOLS = EXPECTED_TYPES["solver"] | EXPECTED_TYPES["loads"]  # a class needs their members only
+TRUSTED_RESULTS = {  # of functions that a run may name: they compute and have no other effect
+    "skfem.mesh.mesh.Mesh",
+    "numpy.ndarray",
+    "torch.optim.lr_scheduler.LRScheduler",
 }
 OWN_PACKAGES = ("dpl.", "torch.optim.")  # where those classes are
 HYDRA_KEYS = {"_target_", "_partial_", "_recursive_", "_convert_"}  # Hydra's own options of a call
@@ -101,8 +102,8 @@ def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = Tr
         written: The configuration, with interpolations as they are written.
         resolved: The same without them.
         trust: Whether it may name any object to call, or only what the keys of a run stand for:
-            classes of this package and of PyTorch's optimisers, and the functions of the modules
-            in `TRUSTED`.
+            classes of this package and of PyTorch's optimisers, and public functions of this
+            package that return a mesh, an array or a scheduler.
 
     Raises:
         ConfigError: A key that its object does not know, a value of another type, a number that is
@@ -178,18 +179,45 @@ def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
                 target, kinds
             )
         else:
-            ours = getattr(target, "__module__", None) in TRUSTED
-            if ours:
-                folder = importlib.import_module(target.__module__.rpartition(".")[0])
-                ours = target.__name__ in folder.__all__
+            ours = _is_trusted_function(target)
         if not ours:
             raise ConfigError(foreign)
     return typing.cast("Callable[..., Any]", target)
 
 
+def _is_trusted_function(target: Any) -> bool:
+    """Return whether a function is public in this package and gives one of `TRUSTED_RESULTS`.
+
+    Its folder lists the public functions, its annotation says what it returns: a new mesh function,
+    sampling distribution or schedule needs no other entry.
+    """
+    module = getattr(target, "__module__", None) or ""
+    if not inspect.isfunction(target) or not module.startswith("dpl."):
+        return False
+    folder = importlib.import_module(module.rpartition(".")[0])
+    if target.__name__ not in getattr(folder, "__all__", ()):
+        return False
+    result = typing.get_type_hints(target).get("return")
+    result = typing.get_origin(result) or result
+    return isinstance(result, type) and is_instance_of(result, TRUSTED_RESULTS)
+
+
 def is_instance_of(kind: type, names: set[str]) -> bool:
-    """Return whether a class is one of these or derived from them, none of them imported."""
-    return not names.isdisjoint(f"{base.__module__}.{base.__qualname__}" for base in kind.__mro__)
+    """Return whether a class is one of these or derived from them, none of them imported.
+
+    A class with all members of a protocol among them counts as one of it.
+    """
+    if not names.isdisjoint(f"{base.__module__}.{base.__qualname__}" for base in kind.__mro__):
+        return True
+    return any(not missing_members(kind, name) for name in names & PROTOCOLS)
+
+
+def missing_members(kind: type, protocol: str) -> set[str]:
+    """Return the public members of a protocol that a class lacks."""
+    module, _, name = protocol.rpartition(".")
+    declared = vars(getattr(importlib.import_module(module), name))
+    given = {*dir(kind), *getattr(kind, "__dataclass_fields__", ())}
+    return {member for member in declared if member[0] != "_"} - given
 
 
 def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> None:

@@ -194,7 +194,7 @@ def contestants(
     """
     settings: dict[str, Any] = {"tol": tol}
     settings |= {} if budget is None else {"max_total_iter": budget}
-    robust, quick = replace(scene.solver, **settings), replace(scene.corrector, **settings)
+    robust, quick = replace(scene.newton, **settings), replace(scene.corrector, **settings)
     plain = PlainNewton(robust)
     solvers: dict[tuple[str, str], Solver] = {
         ("plain Newton", ""): plain,

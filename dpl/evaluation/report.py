@@ -163,10 +163,10 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
         tol: Residual ratio of Newton and the hybrid [-].
     """
     scene = surrogate.scene
-    newton = replace(scene.solver, tol=tol)
+    newton = replace(scene.newton, tol=tol)
     # with Poisson's ratios of their own, loads have their own K(0): each solver makes it for itself
     shared = scene.loads.poisson_range is None
-    own = scene if shared else replace(scene, solver=replace(scene.solver))
+    own = scene if shared else replace(scene, solver=replace(scene.newton))
     solvers: dict[str, Solver] = {
         "linear": replace(newton.linear_solver, tol=tol),
         "network": Direct(surrogate.predict, scene.problem, tol),

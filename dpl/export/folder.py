@@ -21,6 +21,7 @@ import torch
 from dpl.export.metadata import FORMAT
 from dpl.export.onnx_graph import Array
 from dpl.export.reference import Reference
+from dpl.fem import HasModes
 from dpl.system.files import atomic_write
 from dpl.training import Surrogate, checkpoints
 
@@ -42,8 +43,8 @@ def write_folder(
     (folder / "reference").mkdir(parents=True, exist_ok=True)
     for name, field in reference.fields().items():
         write_raw(folder / "reference" / f"{name}.f64", field)
-    modes = torch.where(loads.loadable_dofs[..., None], loads.modes.vectors, 0.0) * loads.q_max
-    write_raw(folder / "modes.f64", modes.numpy())
+    if isinstance(loads, HasModes):
+        write_raw(folder / "modes.f64", loads.modal_forces.numpy())
     checkpoint: dict[str, Any] = {"state_dict": surrogate.state_dict()}
     checkpoint |= {"scene": scene.fingerprint, "identity": scene.identity()}
     checkpoints.write(checkpoint, folder / "weights.safetensors")

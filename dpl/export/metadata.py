@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dpl.export.onnx_graph import ExportGraph, onnx_opset
 from dpl.export.reference import Reference
-from dpl.fem import Problem, surface
+from dpl.fem import HasModes, Problem, surface
 from dpl.fem.mesh.writing import flat_cells
 from dpl.fem.postprocess import triangles
 from dpl.scene import Scene
@@ -107,21 +107,22 @@ def _indices(mask: Tensor) -> list[int]:
 
 
 def _law(scene: Scene) -> dict[str, Any]:
-    law = dict(scene.identity()["law"])  # type: ignore[call-overload]
+    law = scene.problem.material.identity()
     return {"name": law.pop("name"), "parameters_over_E": law}
 
 
 def _range(scene: Scene) -> dict[str, Any]:
     """Return the data by which a program checks whether a force is in the training range."""
     loads, constant = scene.loads, scene.loads.constant_force
-    return {
-        "modes": {"file": "modes.f64", "shape": [*scene.problem.shape, len(loads.q_max)]},
+    told = {
+        "family": loads.identity(),
         "constant_force": None if constant is None else constant.flatten().tolist(),
         "largest_force": loads.largest_force,
-        "deflection": loads.deflection,
-        "patch": [scene.length * float(radius) for radius in loads.patch],
         "meaning": RANGE,
     }
+    if isinstance(loads, HasModes):
+        told["modes"] = {"file": "modes.f64", "shape": list(loads.modal_forces.shape)}
+    return told
 
 
 def _mesh(problem: Problem) -> dict[str, Any]:

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from dpl.fem.assembly.boundary_conditions import DirichletBC, RobinBC
     from dpl.fem.linear.backends import installed_backends
     from dpl.fem.linear.interface import SingularMatrix
+    from dpl.fem.loads.family import HasModes, LoadFamily, RandomLoads
     from dpl.fem.loads.forces import BodyForce, Traction
     from dpl.fem.loads.modal import ModalLoads
     from dpl.fem.loads.modal_basis import Modes, eigenmodes
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from dpl.fem.solvers.differentiable import DifferentiableSolve
     from dpl.fem.solvers.linear import LinearSolver
     from dpl.fem.solvers.newton import Newton
+    from dpl.fem.solvers.reference import ReferenceSolver
     from dpl.fem.solvers.solution import Load, Solution, Solver, Status, evaluate_solution, solve
     from dpl.fem.symmetry import symmetries
 else:

@@ -291,7 +291,7 @@ class Simulator:
         """Return an answer with the negative eigenvalues of its tangent."""
         if not state.converged or int(state.negative_pivots) >= 0:
             return state
-        stability = self.scene.solver.at(load.poisson).stability(state.displacement)
+        stability = self.scene.newton.at(load.poisson).stability(state.displacement)
         pivots = stability.negative_pivots
         status = Status.UNSTABLE if stability.least else Status.CONVERGED
         return state._replace(

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dpl.fem import HasModes
 from dpl.scene import Scene
 
 RIDGE = 1e-2  # of the compliance squared: what only stiff modes would give is hardly asked for
@@ -56,12 +57,11 @@ class Patch:
         """Loads of the largest size each, (M, N, D) [-]: of modes, or along the axes."""
         loads = self.scene.loads
         kept = self.inside[:, None] & loads.loadable_dofs
-        if self.uniform:
+        if self.uniform or not isinstance(loads, HasModes):
             size = loads.largest_force / float(kept.any(dim=1).sum()) ** 0.5
             axes = torch.eye(kept.shape[1], dtype=torch.float64)
             return torch.where(kept, size * axes[:, None], 0.0)
-        modes = (loads.modes.vectors * loads.q_max).permute(2, 0, 1)
-        return torch.where(kept, modes, 0.0)
+        return torch.where(kept, loads.modal_forces.permute(2, 0, 1), 0.0)
 
     @cached_property
     def compliance(self) -> Tensor:

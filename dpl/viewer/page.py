@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpl.fem import HasModes
 from dpl.viewer import environment, panel
 from dpl.viewer.access import AccessPolicy, check, serve_with
 from dpl.viewer.body_node import BodyNode, Server
@@ -209,7 +210,8 @@ class Page:
             gui.add_html(
                 panel.message("Drag the body to pull it; click it to place the patch.", "inherit")
             )
-            low, high = scene.loads.patch
+            loads = scene.loads
+            low, high = loads.patch_radius if isinstance(loads, HasModes) else (0.0, 1.0)
             span = max(high, 0.05)
             self._radius = gui.add_slider(
                 "patch radius / L", 0.0, float(span), 0.01, float(min(max(0.4, low), span))

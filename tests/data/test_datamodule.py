@@ -402,7 +402,7 @@ def test_errors_of_the_surrogate_decide_where_new_loads_are(scene, online):
     next(iter(stream))
     worst = module._replay._source.worst
     assert int(worst.count) == 1
-    load = scene.loads.at(worst.points[:1])
+    load = scene.loads.loads_at(worst.points[:1])
     assert torch.equal(load.force[0], first.force[3])
 
 

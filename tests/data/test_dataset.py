@@ -252,7 +252,7 @@ def test_signals_are_given_back(wanted):
 
 
 def test_a_set_whose_large_loads_are_rejected_is_warned_of(make_scene, tmp_path, capsys):
-    hard = make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch=(2.0, 2.0))
+    hard = make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch_radius=(2.0, 2.0))
     few = DataSet(hard, str(tmp_path / "d"), train=6, val=0, test=0, workers=0)
     few.fill()
     assert "biased" not in capsys.readouterr().err, "six loads say nothing"

@@ -29,7 +29,7 @@ def jobs():
 @pytest.fixture(scope="module")
 def hard(make_scene):
     """Loads of ten times L on a law that does not bear them all."""
-    return make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch=(2.0, 2.0))
+    return make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch_radius=(2.0, 2.0))
 
 
 def test_an_outcome_does_not_depend_on_what_was_solved_before(scene, jobs):

@@ -63,7 +63,7 @@ def solved(monkeypatch):
 @pytest.fixture(scope="module")
 def hard(make_scene):
     """Loads of ten times L on a law that does not bear them all."""
-    return make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch=(2.0, 2.0))
+    return make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch_radius=(2.0, 2.0))
 
 
 def fill(store, missing=None, workers=0, **more):
@@ -148,8 +148,8 @@ def test_the_first_samples_do_not_depend_on_how_many_there_are(data):
 
 def test_the_modes_are_kept_with_the_data(data, scene):
     kept = data.store.modes()
-    assert torch.equal(kept.values, scene.loads.modes.values)
-    assert torch.equal(kept.vectors, scene.loads.modes.vectors)
+    assert torch.equal(kept["values"], scene.loads.modes.values)
+    assert torch.equal(kept["vectors"], scene.loads.modes.vectors)
 
 
 def test_the_data_set_carries_fingerprint_seed_and_versions(data, scene):

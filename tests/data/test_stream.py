@@ -458,7 +458,7 @@ def test_a_load_drawn_near_the_worst_is_an_answer_to_its_own_point(scene):
     worst = HardExamples(scene.loads.n_random)
     worst.put(torch.full((1, scene.loads.n_random), 0.5, dtype=torch.float64))
     one = next(iter(OnlineSamples(scene, SEED, worst=worst, near=1.0)))
-    load = scene.loads.at(one.point[None])
+    load = scene.loads.loads_at(one.point[None])
     assert torch.equal(one.sample.force, load.force[0])
     assert torch.equal(one.sample.young, load.young[0])
     internal, volume = scene.problem.evaluate(one.sample.displacement[None])

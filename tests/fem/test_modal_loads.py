@@ -228,7 +228,7 @@ def test_samples_are_the_loads_of_points(linear, sampling):
     assert loads.n_random == len(loads.modes.values) + 4
     direct = SAMPLINGS[sampling]((3, 0), 5, loads.n_random)
     assert np.array_equal(points[1].numpy(), direct)
-    at, sample = loads.at(points), loads.sample((3, 0), [2, 5])
+    at, sample = loads.loads_at(points), loads.sample((3, 0), [2, 5])
     assert torch.equal(at.force, sample.force)
     assert torch.equal(at.young, sample.young)
     assert torch.equal(at.young, loads.young_at(points))
@@ -241,10 +241,10 @@ def point_of(loads, *q, centre=0.0, radius=0.0, amplitude=0.0, young=0.0):
 
 
 def test_coordinates_of_a_point_are_the_modal_loads_in_their_order(linear):
-    loads = ModalLoads(linear, n_modes=5, patch=(2.0, 2.0))
+    loads = ModalLoads(linear, n_modes=5, patch_radius=(2.0, 2.0))
     for k in range(5):
         for t, share in ((0.0, -1.0), (0.5, 0.0), (0.75, 0.5)):
-            force = loads.at(point_of(loads, *[0.5] * k, t)).force[0]
+            force = loads.loads_at(point_of(loads, *[0.5] * k, t)).force[0]
             expected = share * loads.q_max[k] * loads.modes.vectors[..., k]
             expected = torch.where(loads.loadable_dofs, expected, 0.0)
             assert torch.allclose(force, expected, rtol=1e-14, atol=0)
@@ -255,17 +255,17 @@ def test_coordinates_besides_are_centre_radius_amplitude_and_modulus(linear):
     loads = ModalLoads(
         linear,
         n_modes=2,
-        patch=(0.1, 1.0),
+        patch_radius=(0.1, 1.0),
         amplitude=uniform01,
         young=[1.0, 3.0],
         distribution=constant,
     )
     middle = {"centre": 0.5, "radius": 0.3, "amplitude": 0.5, "young": 0.5}
-    usual = loads.at(point_of(loads, **middle))
+    usual = loads.loads_at(point_of(loads, **middle))
     loaded = usual.force[0].any(dim=1)
 
     def changed(**options):
-        return loads.at(point_of(loads, **{**middle, **options}))
+        return loads.loads_at(point_of(loads, **{**middle, **options}))
 
     assert changed(young=0.75).young.item() == 2.5
     assert torch.equal(changed(young=0.75).force, usual.force)
@@ -282,7 +282,7 @@ def test_every_point_of_the_closed_cube_below_one_has_a_load(linear):
     last = 1 - 2.0**-53
     loads = ModalLoads(linear, n_modes=2, young=[1.0, 3.0], distribution=normal, radius=logarithmic)
     for value in (0.0, last):
-        load = loads.at(torch.full((1, loads.n_random), value, dtype=torch.float64))
+        load = loads.loads_at(torch.full((1, loads.n_random), value, dtype=torch.float64))
         assert load.force.isfinite().all()
         assert load.force.any()
         assert 1.0 <= load.young.item() <= 3.0
@@ -301,7 +301,7 @@ def test_forces_act_on_free_boundary_nodes_within_the_patch_only(loads):
 
 @pytest.mark.parametrize("radius", [0.0, 0.2, 0.5])
 def test_the_loaded_area_has_the_radius_of_the_patch(linear, radius):
-    loads = ModalLoads(linear, n_modes=3, patch=(radius, radius))
+    loads = ModalLoads(linear, n_modes=3, patch_radius=(radius, radius))
     points = linear.problem.points
     sizes = []
     for force in loads.sample((0, 0), range(20)).force:
@@ -313,7 +313,7 @@ def test_the_loaded_area_has_the_radius_of_the_patch(linear, radius):
 
 
 def test_a_patch_over_the_whole_body_keeps_the_modal_force(linear):
-    loads = ModalLoads(linear, n_modes=3, patch=(2.0, 2.0))
+    loads = ModalLoads(linear, n_modes=3, patch_radius=(2.0, 2.0))
     force = loads.sample((0, 0), [0]).force[0]
     reach = loads.loadable_dofs
     basis = loads.modes.vectors[reach].numpy()
@@ -323,7 +323,7 @@ def test_a_patch_over_the_whole_body_keeps_the_modal_force(linear):
 
 
 def test_modal_loads_are_uniform_up_to_their_largest(linear, sampling):
-    loads = ModalLoads(linear, n_modes=2, patch=(2.0, 2.0), sampling=sampling)
+    loads = ModalLoads(linear, n_modes=2, patch_radius=(2.0, 2.0), sampling=sampling)
     reach = loads.loadable_dofs
     basis = np.linalg.pinv(loads.modes.vectors[reach].numpy())
     drawn = loads.sample((0, 0), range(400)).force[:, reach].numpy() @ basis.T
@@ -340,7 +340,7 @@ def test_radii_and_centres_vary(loads):
 
 
 def test_other_distributions_can_be_plugged_in(linear):
-    loads = ModalLoads(linear, n_modes=3, patch=(2.0, 2.0), distribution=constant)
+    loads = ModalLoads(linear, n_modes=3, patch_radius=(2.0, 2.0), distribution=constant)
     force = loads.sample((0, 0), [0]).force[0]
     expected = torch.where(loads.loadable_dofs, loads.modes.vectors @ loads.q_max, 0.0)
     assert torch.allclose(force, expected, rtol=1e-12, atol=0)
@@ -348,7 +348,9 @@ def test_other_distributions_can_be_plugged_in(linear):
     def scaled(t, *, factor):
         return factor * np.ones_like(t)
 
-    half = ModalLoads(linear, n_modes=3, patch=(2.0, 2.0), distribution=partial(scaled, factor=0.5))
+    half = ModalLoads(
+        linear, n_modes=3, patch_radius=(2.0, 2.0), distribution=partial(scaled, factor=0.5)
+    )
     assert torch.allclose(half.sample((0, 0), [0]).force[0], expected / 2, rtol=1e-12, atol=0)
 
 
@@ -382,8 +384,8 @@ def test_positions_of_loads_know_nothing_of_their_moduli(linear, sampling):
     moved = points[0].clone()
     moved[:, -1] = 0.123
     loads = ModalLoads(linear, young=kinds[1], sampling=sampling)
-    assert torch.equal(loads.at(moved).force, loads.at(points[0]).force)
-    assert not torch.equal(loads.at(moved).young, loads.at(points[0]).young)
+    assert torch.equal(loads.loads_at(moved).force, loads.loads_at(points[0]).force)
+    assert not torch.equal(loads.loads_at(moved).young, loads.loads_at(points[0]).young)
 
 
 def test_one_modulus_is_that_of_every_load(linear):
@@ -434,10 +436,10 @@ def test_radius_makes_areas_small_down_to_one_node(linear):
     assert counts["even"] < 25
     assert 55 < counts["log"] < 80
     loads = ModalLoads(
-        linear, n_modes=2, patch=(0.0, 2.0), radius=logarithmic, distribution=constant
+        linear, n_modes=2, patch_radius=(0.0, 2.0), radius=logarithmic, distribution=constant
     )
     for t in (0.0, 0.3, 0.6, 0.9):
-        force = loads.at(point_of(loads, centre=0.7, radius=t)).force[0]
+        force = loads.loads_at(point_of(loads, centre=0.7, radius=t)).force[0]
         middle = places[int(0.7 * len(places))]
         reach = (points - middle).norm(dim=1) <= 2 * 1e-2 ** (1 - t)
         inside = reach[:, None] & loads.loadable_dofs
@@ -450,9 +452,9 @@ def test_amplitude_is_one_factor_on_a_whole_load(linear):
     )
     points = plain.points((0, 0), range(64))
     factors = torch.from_numpy(log_tail_mixture(points[:, -2].numpy()))
-    expected = factors[:, None, None] * plain.at(points).force
+    expected = factors[:, None, None] * plain.loads_at(points).force
     rounding = 1e-15 * float(plain.q_max.max())
-    assert torch.allclose(scaled.at(points).force, expected, rtol=1e-12, atol=rounding)
+    assert torch.allclose(scaled.loads_at(points).force, expected, rtol=1e-12, atol=rounding)
     assert 5 < int((factors < 1).sum()) < 30
 
 
@@ -461,7 +463,7 @@ def test_tail_of_the_amplitude_makes_small_loads(linear):
     loads = ModalLoads(
         linear,
         n_modes=2,
-        patch=(2.0, 2.0),
+        patch_radius=(2.0, 2.0),
         distribution=constant,
         amplitude=log_tail_mixture,
         sampling="sobol",
@@ -487,7 +489,7 @@ def test_sobol_loads_cover_what_few_independent_ones_leave_out(linear):
     """32 centres of a sequence are spread over the nodes; 32 of any others are not."""
     spread = {}
     for name in SAMPLINGS:
-        loads = ModalLoads(linear, patch=(0.0, 0.0), distribution=constant, sampling=name)
+        loads = ModalLoads(linear, patch_radius=(0.0, 0.0), distribution=constant, sampling=name)
         forces = loads.sample(1, range(32)).force.any(dim=2)
         spread[name] = len({int(row.nonzero()) for row in forces})
     assert spread["sobol"] >= 30  # of 65 nodes
@@ -511,10 +513,10 @@ def test_plane_bodies_have_modal_loads_too():
         ({"deflection": -1.0}, r"deflection = -1\.0"),
         ({"deflection": 11.0}, r"deflection = 11\.0"),
         ({"deflection": float("nan")}, "deflection = nan"),
-        ({"patch": (0.5, 0.1)}, "patch = "),
-        ({"patch": (-0.1, 0.1)}, "patch = "),
-        ({"patch": (0.0, float("inf"))}, "patch = "),
-        ({"patch": (0.1,)}, "patch = "),
+        ({"patch_radius": (0.5, 0.1)}, "patch_radius = "),
+        ({"patch_radius": (-0.1, 0.1)}, "patch_radius = "),
+        ({"patch_radius": (0.0, float("inf"))}, "patch_radius = "),
+        ({"patch_radius": (0.1,)}, "patch_radius = "),
         ({"young": 0.0}, r"young = 0\.0"),
         ({"young": -1.0}, r"young = -1\.0"),
         ({"young": float("inf")}, "young = inf"),

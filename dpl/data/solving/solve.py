@@ -24,7 +24,7 @@ class SolvedLoad(NamedTuple):
 
     Attributes:
         job: Which load it is.
-        point: Point of the unit cube that it stands for, see `ModalLoads`, (d,).
+        point: Point of the unit cube that it stands for, see `LoadFamily`, (d,).
         force, displacement: (N, D) [-]; the displacement is an answer only if `accepted`.
         amplitude: ||f|| / ||Phi q_max|| [-].
         accepted: Whether `displacement` meets the tolerance, inverts nothing and is stable.
@@ -95,4 +95,4 @@ def _amplitude(scene: Scene, load: Load) -> float:
 
 def _drawn(scene: Scene, job: LoadKey, point: Tensor | None) -> tuple[Load, NDArray[np.float64]]:
     points = scene.loads.points(job.seed, [job.number]) if point is None else point[None]
-    return scene.loads.at(points), points[0].numpy()
+    return scene.loads.loads_at(points), points[0].numpy()

@@ -13,7 +13,6 @@ from torch import Tensor
 from dpl.data.storage.manifest import STREAMS, lines_of, torn_lines
 from dpl.data.storage.store import MODES, SHARD, Store
 from dpl.data.storage.writer import rewrite
-from dpl.fem import Modes
 from dpl.scene import Scene
 from dpl.system.files import (
     DataSetError,
@@ -92,7 +91,7 @@ def repair(store: Store) -> list[tuple[Part, str]]:
                 flaws.setdefault(_part(line), "holds loads that the machine lost")
         poor = {part.file for part in flaws}
         if MODES in poor:
-            write_file(store.folder / MODES, save(store.scene.loads.modes._asdict()))
+            write_file(store.folder / MODES, save(dict(store.scene.loads.arrays())))
         for manifest in store.manifests():
             rewrite(manifest, [line for line in lines_of(manifest) if line["file"] not in poor])
         for path in [*_unnamed(store), *store.folder.rglob(".*.part")]:
@@ -142,12 +141,12 @@ def _stray(store: Store, path: Path) -> Part:
     return Part(path.name, name[1] if name else "", tuple(loads))
 
 
-def check_modes(scene: Scene, kept: Modes) -> str:
+def check_modes(scene: Scene, stored: Mapping[str, Tensor]) -> str:
     """Return what is wrong with stored modes, their signs and bases included; empty if nothing."""
     near = [
-        (a.shape, a.dtype) == (b.shape, b.dtype)
-        and torch.allclose(a, b, rtol=0, atol=1e-6 * float(b.abs().max()))
-        for a, b in zip(kept, scene.loads.modes, strict=True)
+        (stored[name].shape, stored[name].dtype) == (array.shape, array.dtype)
+        and torch.allclose(stored[name], array, rtol=0, atol=1e-6 * float(array.abs().max()))
+        for name, array in scene.loads.arrays().items()
     ]
     return "" if all(near) else "holds other modes than this scene has"
 
@@ -167,7 +166,7 @@ def check_shard(scene: Scene, stream: tuple[int, int], shard: Mapping[str, Tenso
     if not torch.allclose(shard["point"], points, rtol=0, atol=1e-12):
         return "holds other loads than its seed draws"
     rounding = 1e-9 * loads.largest_force
-    if not torch.allclose(shard["force"], loads.at(points).force, rtol=1e-6, atol=rounding):
+    if not torch.allclose(shard["force"], loads.loads_at(points).force, rtol=1e-6, atol=rounding):
         return "holds loads that this scene does not draw"
     poisson = loads.poisson_at(points)
     if not torch.allclose(shard["poisson"], poisson, rtol=0, atol=1e-12):

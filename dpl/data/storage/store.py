@@ -33,7 +33,6 @@ from dpl.data.storage import acceptance as balance
 from dpl.data.storage.manifest import STREAMS, is_number, kept_in, lines_of, place
 from dpl.data.storage.pending import PendingSamples
 from dpl.data.storage.shard import decode_shard, select
-from dpl.fem import Modes
 from dpl.scene import Sample, Scene
 from dpl.system.files import DataSetError, read_jsonl, read_regular_file
 
@@ -241,17 +240,18 @@ class Store:
             found.update(column.contiguous().numpy().tobytes())
         return found.hexdigest()
 
-    def modes(self) -> Modes:
-        """Return the modes that the data set's loads are made of.
+    def modes(self) -> dict[str, Tensor]:
+        """Return the stored arrays of the load family, such as modes, see `LoadFamily.arrays`.
 
         Raises:
             DataSetError: They are damaged.
         """
         path = self.folder / MODES
-        most = HEADER + 16 * sum(column.numel() for column in self.scene.loads.modes)
+        expected = self.scene.loads.arrays()
+        most = HEADER + 16 * sum(array.numel() for array in expected.values())
         try:
             found = load(read_regular_file(path, most))
-            return Modes(found["values"], found["vectors"])
+            return {name: found[name] for name in expected}
         except (FileNotFoundError, KeyError, SafetensorError, ValueError) as error:
             raise DataSetError(
                 f"{path} is damaged: {error}; scripts/generate.py action=repair makes it again"

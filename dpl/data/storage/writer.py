@@ -53,7 +53,7 @@ class Writer:
         if (folder / "scene.json").exists():
             return
         folder.mkdir(parents=True, exist_ok=True)
-        write_file(folder / MODES, save(scene.loads.modes._asdict()))
+        write_file(folder / MODES, save(dict(scene.loads.arrays())))
         card = {
             "format": FORMAT,
             "fingerprint": scene.fingerprint,

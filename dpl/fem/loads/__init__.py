@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
+    from dpl.fem.loads.family import HasModes, LoadFamily, RandomLoads
     from dpl.fem.loads.forces import BodyForce, Traction, body_force, traction
     from dpl.fem.loads.modal import ModalLoads
     from dpl.fem.loads.modal_basis import Modes, eigenmodes

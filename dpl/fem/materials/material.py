@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple, Self, cast
 import torch
 from torch import Tensor
 
+from dpl.fem.identity import identity_of
 from dpl.fem.materials.tensors import (
     dyad,
     green_lagrange,
@@ -87,6 +88,10 @@ class Material:
             return self.response(green_lagrange(H)).tangent(H)
         hessian = torch.func.vmap(torch.func.hessian(self.energy))
         return hessian(H.reshape(-1, 3, 3)).reshape(*H.shape, 3, 3)
+
+    def identity(self) -> dict[str, Any]:
+        """Return class name and parameters as plain data."""
+        return identity_of(self)
 
     @property
     def mu(self) -> float:

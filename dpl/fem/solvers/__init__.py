@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from dpl.fem.solvers.differentiable import DifferentiableSolve
     from dpl.fem.solvers.linear import LinearSolver
     from dpl.fem.solvers.newton import Newton
+    from dpl.fem.solvers.reference import ReferenceSolver
     from dpl.fem.solvers.solution import (
         Load,
         Solution,

@@ -114,6 +114,10 @@ class Newton:
             ]
         )
 
+    def identity(self) -> dict[str, Any]:
+        """Return class name and tolerance; the other options only change the iterations."""
+        return {"name": type(self).__name__, "tol": float(self.tol)}
+
     def at(self, poisson: Tensor | float) -> "Newton":
         """Return the solver of the body with another Poisson's ratio, see `Problem.at`.
 

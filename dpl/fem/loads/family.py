@@ -1,0 +1,250 @@
+"""Load families: the interface that the package needs, and a base class for new ones."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpl.fem.identity import identity_of
+from dpl.fem.loads.sampling import SAMPLINGS, Array
+from dpl.fem.problem import Problem
+from dpl.fem.solvers.linear import LinearSolver
+from dpl.fem.solvers.solution import Load
+
+
+@runtime_checkable
+class LoadFamily(Protocol):
+    """Random loads on a body, each a function of a point of the unit cube.
+
+    Any class with these attributes can be the loads of a scene; `RandomLoads` implements all but
+    the force itself. The configuration calls the class with the keywords `linear` (a
+    `LinearSolver`), `young` and `constant_force`.
+    """
+
+    @property
+    def n_random(self) -> int:
+        """d, dimension of the unit cube."""
+        ...
+
+    @property
+    def young_range(self) -> tuple[float, float]:
+        """Smallest and largest Young's modulus [Pa]."""
+        ...
+
+    @property
+    def poisson_range(self) -> tuple[float, float] | None:
+        """Smallest and largest Poisson's ratio [-]; None if the law has one for all loads."""
+        ...
+
+    @property
+    def constant_force(self) -> Tensor | None:
+        """Force that is part of every load, (N, D) [-]; None if there is none."""
+        ...
+
+    @property
+    def loadable_dofs(self) -> Tensor:
+        """Free degrees of freedom on which these loads can act, (N, D), boolean."""
+        ...
+
+    @property
+    def largest_force(self) -> float:
+        """Norm of the largest force [-], the scale of residuals in the losses of the paper.
+
+        Raises:
+            ValueError: The body does not allow these loads.
+        """
+        ...
+
+    def points(self, seed: int | Sequence[int], indices: Sequence[int]) -> Tensor:
+        """Return the points of the unit cube of loads `indices` of a stream, (B, d)."""
+        ...
+
+    def loads_at(self, points: Tensor) -> Load:
+        """Return the loads of points (B, d) of the unit cube."""
+        ...
+
+    def young_at(self, points: Tensor) -> Tensor:
+        """Return the Young's moduli of points (B, d), (B,) [Pa]."""
+        ...
+
+    def poisson_at(self, points: Tensor) -> Tensor:
+        """Return the Poisson's ratios of points (B, d), (B, P) [-]; P = 0 if the law has one."""
+        ...
+
+    def sample(
+        self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0
+    ) -> Load:
+        """Return loads `indices` of a stream, their forces multiplied by `amplitude`."""
+        ...
+
+    def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
+        """Return amplitudes (B,) and distances (B,) of forces (B, N, D) [-] from the family.
+
+        The amplitude is relative to the largest load of the family: above 1 the force is larger.
+        The distance is the part of the force that no load of the family explains, in [0, 1].
+        """
+        ...
+
+    def arrays(self) -> Mapping[str, Tensor]:
+        """Return the arrays from which forces are computed; data sets store and compare them."""
+        ...
+
+    def identity(self) -> dict[str, Any]:
+        """Return the options that determine the loads, as plain data, without Young's moduli."""
+        ...
+
+    def skipped_work(self) -> list[str]:
+        """Return notes for the plan that a command prints, one line each."""
+        ...
+
+
+@runtime_checkable
+class HasModes(Protocol):
+    """Load family whose forces are combinations of modes on a part of the boundary."""
+
+    @property
+    def modal_forces(self) -> Tensor:
+        """Mode times its largest modal load, zero on degrees of freedom without load, (N, D, M)."""
+        ...
+
+    @property
+    def patch_radius(self) -> Sequence[float]:
+        """Smallest and largest radius of the loaded area over L [-]."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class RandomLoads(LoadFamily):
+    """Base of load families: subclasses define the force of a point of the unit cube.
+
+    A subclass defines `n_force`, `force_at` and `largest_force`. It overrides `project` if it can
+    recognise its forces, and `loadable_dofs` if it loads nodes inside the body.
+
+    Attributes:
+        linear: Body, with the factor of its K(0).
+        young: Young's modulus [Pa], or a range [low, high] from which each load draws one.
+        constant_force: Force that is part of every load, (N, D) [-]; none if left out.
+        sampling: "independent" points of the unit cube, or a "sobol" sequence.
+    """
+
+    linear: LinearSolver
+    _: KW_ONLY
+    young: float | Sequence[float] = 1.0
+    constant_force: Tensor | None = None
+    sampling: str = "independent"
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            ValueError: An attribute is out of range.
+        """
+        if self.sampling not in SAMPLINGS:
+            raise ValueError(f"sampling = {self.sampling!r} must be {' or '.join(SAMPLINGS)}")
+        moduli = [self.young] * 2 if isinstance(self.young, int | float) else list(self.young)
+        if len(moduli) != 2 or not 0 < moduli[0] <= moduli[1] < math.inf:
+            raise ValueError(f"young = {self.young} must be a modulus above 0 [Pa] or [low, high]")
+
+    @property
+    @abstractmethod
+    def n_force(self) -> int:
+        """Number of random numbers from which a force is made."""
+
+    @abstractmethod
+    def force_at(self, point: Array) -> Tensor:
+        """Return the force (N, D) [-] of a point (n_force,) of the unit cube.
+
+        `constant_force` is added to it.
+        """
+
+    @property
+    def problem(self) -> Problem:
+        """Body."""
+        return self.linear.problem
+
+    @property
+    def young_range(self) -> tuple[float, float]:
+        """Smallest and largest Young's modulus [Pa]."""
+        moduli = [self.young] if isinstance(self.young, int | float) else self.young
+        return float(moduli[0]), float(moduli[-1])
+
+    @property
+    def poisson_range(self) -> tuple[float, float] | None:
+        """Smallest and largest Poisson's ratio [-]; None if the law has one for all loads."""
+        return self.problem.material.poisson_range
+
+    @property
+    def loadable_dofs(self) -> Tensor:
+        """Free degrees of freedom of the boundary, (N, D), boolean."""
+        return self.problem.boundary[:, None] & self.problem.free
+
+    @property
+    def n_random(self) -> int:
+        """d: the numbers of a force, Young's modulus, and Poisson's ratio where it has a range."""
+        return self.n_force + 1 + self._n_poisson
+
+    @property
+    def _n_poisson(self) -> int:
+        return int(self.poisson_range is not None)
+
+    def points(self, seed: int | Sequence[int], indices: Sequence[int]) -> Tensor:
+        """Return the points of the unit cube of loads `indices` of a stream, (B, d)."""
+        drawn = [SAMPLINGS[self.sampling](seed, index, self.n_random) for index in indices]
+        return torch.from_numpy(np.stack(drawn))
+
+    def loads_at(self, points: Tensor) -> Load:
+        """Return the loads of points (B, d) of the unit cube."""
+        force = torch.stack([self.force_at(point[: self.n_force].numpy()) for point in points])
+        if self.constant_force is not None:
+            force = force + self.constant_force
+        return Load(force, self.young_at(points), self.poisson_at(points))
+
+    def young_at(self, points: Tensor) -> Tensor:
+        """Return the Young's moduli of points (B, d), (B,) [Pa]."""
+        low, high = self.young_range
+        return low + (high - low) * points[:, -1 - self._n_poisson]
+
+    def poisson_at(self, points: Tensor) -> Tensor:
+        """Return the Poisson's ratios of points (B, d), (B, P) [-]; P = 0 if the law has one."""
+        low, high = self.poisson_range or (0.0, 0.0)
+        return low + (high - low) * points[:, points.shape[1] - self._n_poisson :]
+
+    def sample(
+        self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0
+    ) -> Load:
+        """Return loads.
+
+        Args:
+            seed: Name of the stream.
+            indices: Numbers of the loads in the stream, B of them.
+            amplitude: Factor on all forces [-].
+        """
+        load = self.loads_at(self.points(seed, indices))
+        return load._replace(force=amplitude * load.force)
+
+    def own_force(self, force: Tensor) -> Tensor:
+        """Return forces (B, N, D) [-] on free degrees of freedom, without `constant_force`."""
+        own = force if self.constant_force is None else force - self.constant_force
+        return self.problem.acting(own)
+
+    def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
+        """Return ||f|| / `largest_force`, (B,), and zeros: no force is told from the family's."""
+        amplitude = self.own_force(force).flatten(1).norm(dim=1) / self.largest_force
+        return amplitude, torch.zeros_like(amplitude)
+
+    def arrays(self) -> Mapping[str, Tensor]:
+        """Return no arrays."""
+        return {}
+
+    def identity(self) -> dict[str, Any]:
+        """Return all options but the body and Young's modulus, see `LoadFamily.identity`."""
+        return identity_of(self, exclude=("linear", "young"))
+
+    def skipped_work(self) -> list[str]:
+        """Return no notes."""
+        return []
