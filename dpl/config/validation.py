@@ -197,7 +197,10 @@ def _is_trusted_function(target: Any) -> bool:
     folder = importlib.import_module(module.rpartition(".")[0])
     if target.__name__ not in getattr(folder, "__all__", ()):
         return False
-    result = typing.get_type_hints(target).get("return")
+    try:
+        result = typing.get_type_hints(target).get("return")
+    except NameError:  # an annotation that only type checkers resolve
+        return False
     result = typing.get_origin(result) or result
     return isinstance(result, type) and is_instance_of(result, TRUSTED_RESULTS)
 

@@ -229,7 +229,7 @@ class Latent(PODNet):
         count = min(self.scaled.shape[1], len(values))
         gaps = -values.diff()
         while 0 < count < len(values) and gaps[count - 1] < SAME * values[count - 1]:
-            count -= 1  # a family is kept whole or not at all
+            count -= 1  # a cluster of eigenvalues is kept whole or not at all
         axes = padded(axes[:, :count], self.scaled.shape[1])
         size = ((axes.T @ spread(read)) * axes.T).sum(dim=1).clamp(min=0).sqrt()
         self.scaled.zero_()[: len(axes)] = (axes / partial_whitening(size)).to(self.scaled)
