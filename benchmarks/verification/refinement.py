@@ -101,11 +101,12 @@ def order(folder: Path) -> Section:
     _draw_errors(folder / "order.png", found)
     return Section(
         "Order of accuracy",
-        "Manufactured solution on the unit cube (NH-ln, ν = 0.3): u₁ = A sin πx cos πy/2, "
-        "u₂ = A cos πy/2 sin πz, u₃ = A y sin πx/2 sin πz with A = 0.1 on the whole boundary, the "
-        "body force −Div P by automatic differentiation. References: errors of an independent "
-        "code, to 5e-4 for hexahedra; its tetrahedra lie along another diagonal of the cube, so "
-        "within 10 % for them. Orders must exceed p + 0.9 in L2 and p − 0.05 in H1.",
+        "The manufactured solution on the unit cube (NH-ln, ν = 0.3) is u₁ = A sin πx cos πy/2, "
+        "u₂ = A cos πy/2 sin πz, u₃ = A y sin πx/2 sin πz with A = 0.1. It is prescribed on the "
+        "whole boundary; automatic differentiation gives the body force −Div P. References: "
+        "errors of an independent code, with a tolerance of 5e-4 for hexahedra and of 10 % for "
+        "tetrahedra, whose diagonals differ. Orders must exceed p + 0.9 in L2 and p − 0.05 in "
+        "H1.",
         rows,
         [("order.png", "Errors against cell size, with triangles of the theoretical slopes.")],
     )
@@ -183,12 +184,13 @@ def cook(folder: Path) -> Section:
     _draw_membrane(folder / "cook.png", tips, *found[2, 8])
     return Section(
         "Cook's membrane",
-        "A tapered panel (corners (0, 0), (48, 44), (48, 60), (0, 44) mm), clamped on the left, "
-        "under a dead shear traction of 1/16 N/mm² on the right, in plane strain at finite strain; "
-        "NHiso-k4, μ = 0.4225 N/mm², ν = 0.3. References: the tables of deal.II's code gallery "
-        "(*Quasi-static finite-strain compressible elasticity*, as corrected in 2021), whose mesh "
-        "is one hexahedron thick with no displacement across it, which is the same; more digits "
-        "and the other laws by an independent code (NH-ln on Q1 by felupe 11.3.0 as well).",
+        "A tapered panel (corners (0, 0), (48, 44), (48, 60), (0, 44) mm) is clamped on the left "
+        "and has a dead shear traction of 1/16 N/mm² on the right, in plane strain at finite "
+        "strain (NHiso-k4, μ = 0.4225 N/mm², ν = 0.3). References: the tables of deal.II's code "
+        "gallery (*Quasi-static finite-strain compressible elasticity*, as corrected in 2021), "
+        "whose mesh has one layer of hexahedra without displacement across it, which is "
+        "equivalent. An independent code gives further digits and the other laws (felupe 11.3.0 "
+        "also NH-ln on Q1).",
         rows,
         [("cook.png", "(a) Tip displacement against refinement, (b) rest and deformed mesh.")],
     )
@@ -257,15 +259,16 @@ def locking(folder: Path) -> Section:
     _draw_locking(folder / "locking.png", found)
     return Section(
         "Nearly incompressible bodies",
-        "Compliance f·u of the paper's beam (4 × 1 × 1) under a small load across its end, over "
-        "that of hex27 on 16 × 4 × 4 cells, as ν approaches ½. References: an independent code. "
-        "Elements that do not lock must stay above 0.94.",
+        "The table lists the compliance f·u of the paper's beam (4 × 1 × 1) under a small "
+        "transverse load on its end, relative to that of hex27 on 16 × 4 × 4 cells, as ν "
+        "approaches ½. References: an independent code. The ratio of elements that do not lock "
+        "must exceed 0.94.",
         rows,
         [("locking.png", "Compliance ratio against Poisson's ratio; 1 is right, 0 is locked.")],
         [
-            "hex8 and tet4 lock, as they must: dpl warns when it builds such a body "
-            "(ν ≥ 0.45). With `mean_dilatation` hex8 does not; it ends up slightly softer "
-            "than the hex27 that it is compared with, which is not exact either."
+            "hex8 and tet4 lock as expected; dpl warns when it builds such a body (ν ≥ 0.45). "
+            "hex8 with `mean_dilatation` does not lock. It is slightly softer than the reference "
+            "hex27, which is not exact either."
         ],
     )
 

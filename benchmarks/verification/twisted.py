@@ -61,10 +61,10 @@ def twist(folder: Path) -> Section:
     torque, force = (rows[k].value / rows[k + 6].value for k in (0, 1))
     return Section(
         "Twisted column",
-        "A column 1 × 1 × 5 m (NH-ln, E = 1 MPa, ν = 0.3), clamped at its foot; its top is turned "
-        "rigidly by 90° and kept at its height. The axial force is what keeps it there, an effect "
-        "of second order that no linear theory has. References: an independent code on the same "
-        "meshes, to 1e-8; Saint-Venant's torsion GJθ/L for comparison.",
+        "A column 1 × 1 × 5 m (NH-ln, E = 1 MPa, ν = 0.3) is clamped at its foot; its top is "
+        "rotated rigidly by 90° at constant height. This requires an axial force, an effect of "
+        "second order that linear theories do not contain. References: an independent code on "
+        "the same meshes (tolerance 1e-8); Saint-Venant's torsion GJθ/L for comparison.",
         rows,
         [
             (
@@ -73,9 +73,9 @@ def twist(folder: Path) -> Section:
             )
         ],
         [
-            f"The coarsest answer (hex8) is off the finest by {100 * (torque - 1):.0f} % in the "
-            f"torque, but by a factor of {force:.1f} in the axial force, a small difference of "
-            "large stresses: each is the right answer of its mesh, not yet that of the body."
+            f"The coarsest mesh (hex8) differs from the finest by {100 * (torque - 1):.0f} % in "
+            f"the torque and by a factor of {force:.1f} in the axial force, a small difference of "
+            "large stresses: each is the correct solution of its mesh, and not that of the body."
         ],
     )
 

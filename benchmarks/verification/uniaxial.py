@@ -119,18 +119,19 @@ def laws(folder: Path) -> Section:
         _draw_laws(panels, grid, curves)
     return Section(
         "Uniaxial stress",
-        "A cube of one hexahedron is stretched along x, its sides free; the stress is the "
-        "reaction on the moved face. Moduli: ν = 0.3, and E = 1 but for the rubber laws, whose "
-        "shear moduli are 0.40 (Mooney-Rivlin, Yeoh) and 0.42 (Ogden) at κ = 2. References: "
-        "closed forms, solved for the lateral stretch by an independent root finder.",
+        "A cube of one hexahedron is stretched along x with free sides. The stress is the "
+        "reaction on the moved face. The moduli are E = 1 and ν = 0.3; the rubber laws have "
+        "shear moduli of 0.40 (Mooney-Rivlin, Yeoh) and 0.42 (Ogden) and κ = 2. References: "
+        "closed forms, with the lateral stretch from an independent root finder.",
         rows,
         [("laws.png", "Uniaxial stress of all laws: curves and markers dpl, circles reference.")],
         [
-            "All laws agree at small strains, none at large ones. SVK softens in compression "
-            "(its stress is largest at λ = 1/√3 = 0.577, beyond which a pushed body has no "
-            "equilibrium) and hardens in tension; the neo-Hookean laws do the opposite. Two laws "
-            "that both call themselves neo-Hookean differ by "
-            f"{_spread(curves, grid):.0f} % at λ = 1.5, so a test at 1 % strain proves nothing.",
+            "All laws agree at small strains and differ at large ones. SVK softens in compression "
+            "(its stress has a maximum at λ = 1/√3 = 0.577; a body under a larger pressure has no "
+            "equilibrium) and stiffens in tension; the neo-Hookean laws do the opposite. Two laws "
+            "with the name neo-Hookean differ by "
+            f"{_spread(curves, grid):.0f} % at λ = 1.5; a test at 1 % strain cannot tell "
+            "them apart.",
         ],
     )
 
