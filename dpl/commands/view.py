@@ -1,4 +1,4 @@
-"""A trained run in the browser: python scripts/view.py run=runs/..."""
+"""Command `python scripts/view.py run=runs/...`: interactive viewer in the browser."""
 
 import errno
 import sys
@@ -18,24 +18,24 @@ if TYPE_CHECKING:
 
 @command("view")
 def main(cfg: DictConfig) -> None:
-    """Serve the page until Ctrl-C; with `movie` write an animation instead."""
+    """Serve the page until Ctrl-C; with `animation` write an animation instead."""
     config.check(cfg)
-    if cfg.movie:
-        _film(_body(cfg), Path(cfg.movie))
+    if cfg.animation:
+        write_animation(load_body(cfg), Path(cfg.animation))
         return
     try:
         from dpl.viewer import Page
     except ImportError as error:
         raise config.ConfigError(
-            f"the viewer cannot be used ({error}): {install('viewer')}"
+            f"the viewer cannot be imported ({error}): {install('viewer')}"
         ) from error
-    door = _door(cfg)
-    page = Page(_body(cfg), door, title=str(cfg.run), folder=Path(cfg.folder))
+    policy = bind(cfg)
+    page = Page(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
     try:
-        if cfg.speed:
-            _show_speed(page)
+        if cfg.profile:
+            print_profile(page)
             return
-        print(f"the page is at {door.address}  (Ctrl-C ends it)", flush=True)
+        print(f"the page is at {policy.url}  (Ctrl-C ends it)", flush=True)
         while True:
             time.sleep(0.1)
             page.refresh()
@@ -43,61 +43,77 @@ def main(cfg: DictConfig) -> None:
         page.close()
 
 
-def _body(cfg: DictConfig) -> "Body":
+def load_body(cfg: DictConfig) -> "Body":
+    """Return the body of the run.
+
+    Raises:
+        ConfigError: `galerkin_correction` is set, and the network has no modes.
+    """
     import torch
 
-    from dpl.inference import Simulator
+    import dpl
     from dpl.viewer import Body
 
     torch.set_num_threads(1)
-    return Body(Simulator(config.load_run(cfg.run)[1]))
+    try:
+        return Body(dpl.load(cfg.run, corrected=cfg.galerkin_correction))
+    except config.ConfigError:
+        raise
+    except ValueError as error:
+        raise config.ConfigError(f"galerkin_correction: {error}") from error
 
 
-def _door(cfg: DictConfig) -> "AccessPolicy":
-    """Return where the page will be, bound already.
+def bind(cfg: DictConfig) -> "AccessPolicy":
+    """Return the access policy with a bound socket.
 
     Raises:
-        ConfigError: It cannot be there.
+        ConfigError: The socket cannot be bound.
     """
     from dpl.viewer import AccessPolicy
 
     try:
-        door = AccessPolicy.bound(cfg.host, cfg.port, cfg.names)
+        policy = AccessPolicy.bind(cfg.host, cfg.port, cfg.allowed_hosts)
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            describe = f"port = {cfg.port} is taken; name another, or port=0 for any that is free"
+            message = f"port = {cfg.port} is in use; choose another, or port=0 for any free port"
         else:
-            describe = f"host = {cfg.host}, port = {cfg.port} cannot be served: {error.strerror}"
-        raise config.ConfigError(describe) from error
-    if door.open_to_all:
+            message = f"host = {cfg.host}, port = {cfg.port} cannot be bound: {error.strerror}"
+        raise config.ConfigError(message) from error
+    if policy.is_public:
         print(
-            f"warning: host = {cfg.host}: whoever reaches this machine and has the address can "
-            "use the page; it is not encrypted",
+            f"warning: host = {cfg.host}: everyone who reaches this machine and knows the address "
+            "can use the page; the connection is not encrypted",
             file=sys.stderr,
         )
-    return door
+    return policy
 
 
-def _show_speed(page: "Page") -> None:
+def print_profile(page: "Page") -> None:
+    """Measure and print frame times, frame rates and latencies."""
     from dpl.evaluation.tables import show
     from dpl.evaluation.timing import describe
-    from dpl.viewer.frame_rate import speed
+    from dpl.viewer.frame_rate import measure_frames
 
-    rows, measured = speed(page)
-    show(rows, "a frame: milliseconds on the server, and what arrives a second")
-    print(describe(measured))
+    rows, latencies = measure_frames(page)
+    show(rows, "times per frame on the server, and frames received by a client")
+    print(describe(latencies))
 
 
-def _film(body: "Body", path: Path) -> None:
+def write_animation(body: "Body", path: Path) -> None:
+    """Write an animation of a rotating load.
+
+    Raises:
+        ConfigError: The format is unknown, or the package that writes it is not installed.
+    """
     from dpl.viewer.animation import animate_load
     from dpl.viewer.recording import FORMATS
 
     if path.suffix not in FORMATS:
-        raise config.ConfigError(f"movie = {path} must end with {' or '.join(FORMATS)}")
+        raise config.ConfigError(f"animation = {path} must end with {' or '.join(FORMATS)}")
     try:
         animate_load(body, path)
-    except ImportError as error:  # of what writes MP4
+    except ImportError as error:  # imageio-ffmpeg
         raise config.ConfigError(
-            f"movie: {path.suffix} needs {error.name}: {install('viewer')}"
+            f"animation: {path.suffix} needs {error.name}: {install('viewer')}"
         ) from error
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")

@@ -30,7 +30,8 @@ KEYS: dict[str, Any] = {  # what a configuration may hold at its top, and of whi
     **{"solve_reference": bool, "discretisation": str | None},
     **{"threads": Sequence[int | None], "across": WHOLE, "budget": int},
     **{"minutes": float, "works": Sequence[str]},
-    **{"host": str, "port": int, "names": Sequence[str], "movie": str | None, "speed": bool},
+    **{"host": str, "port": int, "allowed_hosts": Sequence[str], "animation": str | None},
+    **{"profile": bool, "galerkin_correction": bool},
 }
 RANGES = {  # smallest and largest of them
     **{"repeats": (1, 10**6), "samples": (1, 10**6), "shards": (1, math.inf)},

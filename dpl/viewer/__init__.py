@@ -1,4 +1,4 @@
-"""The trained body in the browser."""
+"""Interactive viewer of a trained surrogate in the browser."""
 
 from typing import TYPE_CHECKING
 

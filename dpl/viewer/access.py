@@ -1,8 +1,8 @@
-"""Who may come in: a token in the path, names of this host, pages of its own; nobody else.
+"""Access control of the viewer: a token in the path, names of this host, and its own page only.
 
-A page in the same browser can send requests to 127.0.0.1, and a name that an attacker owns can be
-made to point there (DNS rebinding). So every request must bring the token, ask for a host that is
-this one, and open its socket from this page.
+A page from elsewhere in the same browser can send requests to 127.0.0.1, and a host name of an
+attacker can be resolved to 127.0.0.1 (DNS rebinding). Every request must therefore contain the
+token and name this host, and a web socket must be opened by the page of this server.
 """
 
 import asyncio
@@ -23,16 +23,16 @@ from websockets.http11 import Request, Response
 
 from dpl.viewer.rate_limited_log import RateLimitedHandler
 
-Handle = Callable[[Any, Request], Response | None]
-LARGEST = 2**18  # bytes of a message from the browser
-HOME = ("127.0.0.1", "localhost", "::1")
+RequestHandler = Callable[[Any, Request], Response | None]
+MAX_MESSAGE = 2**18  # largest message from the browser [bytes]
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
 HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
-    # the page holds its scripts itself, some of which Emscripten made and which call Function();
-    # nothing may be fetched from anywhere else
+    # All scripts are in the page; those that Emscripten generated need 'unsafe-eval'. Other hosts
+    # are not reachable.
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; "
         "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; "
@@ -44,28 +44,28 @@ HEADERS = {
 
 @dataclass(frozen=True, eq=False)
 class AccessPolicy:
-    """A bound socket and the rule of who may come through it.
+    """A bound socket and the rules for requests to it.
 
     Attributes:
-        socket: Bound, not listening yet.
-        host: Where it is bound.
-        names: Names of this host, besides those of the loopback, that may be asked for.
-        token: What the path begins with.
-        complaints: Prints what goes wrong with requests.
+        socket: Bound socket that does not listen yet.
+        host: Host name or address to which it is bound.
+        allowed_hosts: Names of this host that requests may use besides those of the loopback.
+        token: First part of the path of every request.
+        log: Handler that prints failed requests.
     """
 
     socket: socket.socket
     host: str
-    names: tuple[str, ...] = ()
+    allowed_hosts: tuple[str, ...] = ()
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
-    complaints: RateLimitedHandler = field(default_factory=RateLimitedHandler, repr=False)
+    log: RateLimitedHandler = field(default_factory=RateLimitedHandler, repr=False)
 
     @classmethod
-    def bound(cls, host: str, port: int, names: Sequence[str] = ()) -> "AccessPolicy":
-        """Return the door at a port of a host, 0: any that is free.
+    def bind(cls, host: str, port: int, allowed_hosts: Sequence[str] = ()) -> "AccessPolicy":
+        """Return the policy of a socket that is bound to a host and a port; port 0: any free one.
 
         Raises:
-            OSError: It is taken, or there is no such host.
+            OSError: The port is in use, or the host does not exist.
         """
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         bound = socket.socket(family, socket.SOCK_STREAM)
@@ -75,134 +75,139 @@ class AccessPolicy:
         except OSError:
             bound.close()
             raise
-        return cls(bound, host, tuple(name.lower() for name in names))
+        return cls(bound, host, tuple(name.lower() for name in allowed_hosts))
 
     @property
     def port(self) -> int:
-        """Where it is."""
+        """Port of the socket."""
         return int(self.socket.getsockname()[1])
 
     @property
-    def open_to_all(self) -> bool:
-        """Whether other machines can reach it."""
-        return self.host not in HOME
+    def is_public(self) -> bool:
+        """True if other machines can reach the socket."""
+        return self.host not in LOOPBACK
 
     @property
-    def address(self) -> str:
-        """What is typed into the browser."""
+    def url(self) -> str:
+        """Address of the page for the browser, with the token."""
         shown = "127.0.0.1" if self.host in ("0.0.0.0", "::") else self.host
         shown = f"[{shown}]" if ":" in shown else shown
         return f"http://{shown}:{self.port}/{self.token}/"
 
-    def refusal(self, request: Request) -> tuple[http.HTTPStatus, str] | None:
-        """Return why a request is refused; None: it is not."""
+    def denial_reason(self, request: Request) -> tuple[http.HTTPStatus, str] | None:
+        """Return status and message for a request that is denied; None if it is allowed."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-        if len(hosts) != 1 or not self._ours(hosts[0]):
-            return http.HTTPStatus.MISDIRECTED_REQUEST, "This is not the host you asked for.\n"
+        if len(hosts) != 1 or not self.is_own_host(hosts[0]):
+            return http.HTTPStatus.MISDIRECTED_REQUEST, "The requested host is not this one.\n"
         own = [f"http://{hosts[0]}"]
         upgrade = "upgrade" in ",".join(request.headers.get_all("Connection")).lower()
         if origins != own and (upgrade or origins):
-            return http.HTTPStatus.FORBIDDEN, "Only this page's own socket is served.\n"
-        token = re.split("[/?]", request.path, maxsplit=2)[1:2] or [""]
-        given = token[0].encode("ascii", "surrogateescape")  # as websockets has decoded it
-        if not hmac.compare_digest(given, self.token.encode()):
-            return http.HTTPStatus.FORBIDDEN, "The address lacks the token that was printed.\n"
+            return http.HTTPStatus.FORBIDDEN, "Only the page of this server may open a socket.\n"
+        parts = re.split("[/?]", request.path, maxsplit=2)[1:2] or [""]
+        found = parts[0].encode("ascii", "surrogateescape")  # websockets decodes paths this way
+        if not hmac.compare_digest(found, self.token.encode()):
+            return http.HTTPStatus.FORBIDDEN, "The address does not contain the printed token.\n"
         return None
 
-    def guarding(self, handle: Handle) -> Handle:
-        """Return a handler of requests that lets through what is not refused, without the token."""
+    def authenticate(self, handle: RequestHandler) -> RequestHandler:
+        """Return a request handler that passes allowed requests on, without the token."""
 
-        def guarded(connection: Any, request: Request) -> Response | None:
-            refused = self.refusal(request)
-            if refused is not None:
-                return _answer(*refused)
+        def handle_allowed(connection: Any, request: Request) -> Response | None:
+            denied = self.denial_reason(request)
+            if denied is not None:
+                return _text_response(*denied)
             path = request.path.removeprefix(f"/{self.token}")
             inner = Request(path if path.startswith("/") else "/" + path, request.headers)
             try:
                 response = handle(connection, inner)
-            except (LookupError, OSError, ValueError):  # two of a header, or a path too long
-                return _answer(http.HTTPStatus.BAD_REQUEST, "The request cannot be read.\n")
+            except (LookupError, OSError, ValueError):  # a repeated header or a path too long
+                return _text_response(http.HTTPStatus.BAD_REQUEST, "The request is malformed.\n")
             if response is not None:
+                sockets = f"ws://{request.headers['Host']}"
                 for name, value in HEADERS.items():
-                    host = request.headers["Host"]
-                    response.headers[name] = value.replace("{sockets}", f"ws://{host}")
+                    response.headers[name] = value.replace("{sockets}", sockets)
             return response
 
-        return guarded
+        return handle_allowed
 
-    def _ours(self, host: str) -> bool:
-        """Return whether the Host of a request is this one."""
+    def is_own_host(self, host: str) -> bool:
+        """Return True if the value of a Host header names this host and port."""
         found = re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]/@]+)(?::([0-9]{1,5}))?", host)
         if found is None or int(found[2] or 80) != self.port:
             return False
         name = found[1].strip("[]").lower()
-        if name in (*HOME, *self.names):
+        if name in (*LOOPBACK, *self.allowed_hosts):
             return True
-        if not self.open_to_all:
+        if not self.is_public:
             return False
-        try:  # an address is no name, and cannot be made to point elsewhere
+        try:  # DNS rebinding needs a name; a numeric address is safe
             ipaddress.ip_address(name)
         except ValueError:
             return name in (self.host.lower(), socket.gethostname().lower())
         return True
 
 
-def _answer(status: http.HTTPStatus, words: str) -> Response:
-    body = words.encode()
+def _text_response(status: http.HTTPStatus, text: str) -> Response:
+    body = text.encode()
     headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(body))})
     return Response(status.value, status.phrase, headers, body)
 
 
 @contextlib.contextmanager
-def serve_with(door: AccessPolicy) -> Iterator[None]:
-    """Let a server that is started in here take its requests through a door.
+def serve_with(policy: AccessPolicy) -> Iterator[None]:
+    """Apply a policy to the websockets server that is started in this context.
 
-    viser starts `websockets.asyncio.server.serve` itself and has no option for who may connect.
+    viser calls `websockets.asyncio.server.serve` and has no option for access control, so that this
+    function is replaced while viser starts.
     """
-    genuine = websockets.asyncio.server.serve
+    original = websockets.asyncio.server.serve
 
-    def serve(handler: Any, host: str, port: int, *, process_request: Handle, **more: Any) -> Any:
-        more |= {"max_size": LARGEST, "server_header": None, "logger": door.complaints.logger}
+    def serve(
+        handler: Any, host: str, port: int, *, process_request: RequestHandler, **options: Any
+    ) -> Any:
+        options |= {"max_size": MAX_MESSAGE, "server_header": None, "logger": policy.log.logger}
         asyncio.get_running_loop().set_exception_handler(
-            lambda loop, told: door.complaints.add(told["message"], told.get("exception"))
+            lambda loop, context: policy.log.report(context["message"], context.get("exception"))
         )
-        return genuine(
-            handler, sock=door.socket, process_request=door.guarding(process_request), **more
-        )
+        authenticated = policy.authenticate(process_request)
+        return original(handler, sock=policy.socket, process_request=authenticated, **options)
 
     websockets.asyncio.server.serve = serve
     try:
         yield
     finally:
-        websockets.asyncio.server.serve = genuine
+        websockets.asyncio.server.serve = original
 
 
-def status_for(door: AccessPolicy, path: str, **headers: str) -> int:
-    """Return the status that a door answers a request of this machine with."""
+def request_status(policy: AccessPolicy, path: str, **headers: str) -> int:
+    """Return the HTTP status of a request to the socket of a policy, sent from this machine."""
     lines = [f"GET {path} HTTP/1.1"]
     lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(door.host, door.host)
-    with socket.create_connection((host, door.port), timeout=60) as call:
-        call.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
-        return int(call.recv(64).split()[1])
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(policy.host, policy.host)
+    with socket.create_connection((host, policy.port), timeout=60) as connection:
+        connection.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
+        return int(connection.recv(64).split()[1])
 
 
-def check(door: AccessPolicy) -> None:
-    """Try a door from outside.
+def check_server(policy: AccessPolicy) -> None:
+    """Send requests that must be allowed and requests that must be denied.
 
     Raises:
-        RuntimeError: It lets in whom it must not, or not whom it must.
+        RuntimeError: A response has another status than the policy requires.
     """
-    home = f"127.0.0.1:{door.port}"
-    path = f"/{door.token}/"
-    socket_of = {"Connection": "Upgrade", "Upgrade": "websocket"}
+    own = f"127.0.0.1:{policy.port}"
+    path = f"/{policy.token}/"
+    upgrade = {"Connection": "Upgrade", "Upgrade": "websocket"}
     cases = [
-        (200, path, {"Host": home}),
-        (403, "/", {"Host": home}),
-        (421, path, {"Host": f"rebound.example:{door.port}"}),
-        (403, path, {"Host": home, "Origin": "http://foreign.example", **socket_of}),
-        (403, path, {"Host": home, **socket_of}),
+        (200, path, {"Host": own}),
+        (403, "/", {"Host": own}),
+        (421, path, {"Host": f"rebound.example:{policy.port}"}),
+        (403, path, {"Host": own, "Origin": "http://foreign.example", **upgrade}),
+        (403, path, {"Host": own, **upgrade}),
     ]
     for status, path, headers in cases:
-        if (found := status_for(door, path, **headers)) != status:
-            raise RuntimeError(f"the page is not safe: {found} where {status} must be; not served")
+        if (found := request_status(policy, path, **headers)) != status:
+            raise RuntimeError(
+                f"access control: a request returned status {found} instead of {status}; "
+                "the page is not served"
+            )

@@ -1,4 +1,4 @@
-"""An animation of the body, bent by a load that moves."""
+"""Animation of the body under a load that rotates once."""
 
 import math
 from pathlib import Path
@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dpl.viewer.frames import Body, Frame, ViewSettings
+from dpl.viewer.frames import STRESS, Body, Frame, ViewSettings
 from dpl.viewer.rasterizer import Camera, Renderer
-from dpl.viewer.recording import RATE, film
+from dpl.viewer.recording import FRAME_RATE, write_animation
 
-SECONDS = 5
+DURATION = 5  # [s]
 
 
 def animate_load(
@@ -21,59 +21,65 @@ def animate_load(
     radius: float = 0.45,
     deflection: float = 0.33,
 ) -> None:
-    """Write an animation of the network's answers to a load that goes round; it runs in a loop.
+    """Write a looping animation of the network's predictions for a load that rotates once.
 
-    The load acts on an area around the point farthest from the supports and turns once. Colours
-    are von Mises stress; time is the median, errors are those of each picture.
+    The load acts on a patch around the point farthest from the supports. Colours show the von Mises
+    stress. The caption has the median time, and residual and error of each frame.
 
     Args:
-        body: What answers.
-        path: A .gif or .mp4 file.
-        size: Width and height [pixels].
-        radius: Of the area over L [-].
-        deflection: Linear displacement of its centre at most, over L [-].
+        body: The body.
+        path: Path of a .gif or .mp4 file.
+        size: Width and height [pixel].
+        radius: Radius of the patch over L [-].
+        deflection: Linear displacement of the centre of the patch over L [-].
     """
-    frames = answers(body, radius=radius, deflection=deflection)
-    typical = float(np.median([frame.answer.milliseconds for frame in frames if frame.answer]))
+    frames = circular_load(body, radius=radius, deflection=deflection)
+    median = float(np.median([frame.answer.milliseconds for frame in frames if frame.answer]))
     count = math.prod(body.scene.problem.shape)
 
-    def words(frame: Frame) -> list[str]:
-        error = difference(body, frame)
+    def captions(frame: Frame) -> list[str]:
         return [
-            f"sim(force): {typical:.1f} ms",
+            f"sim(force): {median:.1f} ms",
             f"{count:,} degrees of freedom",
-            f"residual {frame.residual:.1e} of the load",
-            f"displacement within {100 * error:.1g} % of finite elements",
+            f"relative residual {frame.residual:.1e}",
+            f"displacement error {100 * relative_error(body, frame):.1g} %",
         ]
 
-    camera = Camera.before(body.surface, wide=0.82)
-    film(path, frames, Renderer(body.surface, camera, size), words)
+    camera = Camera.facing(body.surface, distance=0.82)
+    write_animation(path, frames, Renderer(body.surface, camera, size), captions)
 
 
-def difference(body: Body, frame: Frame) -> float:
-    """Return ||u - u_FE|| / ||u_FE|| of an answer, u_FE to the scene's tolerance."""
-    wish = ViewSettings(tol=body.scene.solver.tol)
-    exact = body.answer(frame.asked, wish).displacement
+def relative_error(body: Body, frame: Frame) -> float:
+    """Return ||u - u_FE|| / ||u_FE|| [-], with u_FE to the tolerance of the scene."""
+    exact = body.solve(frame.request, ViewSettings(tol=body.scene.solver.tol)).displacement
     return float((frame.displacement - exact).norm() / exact.norm().clamp(min=1e-300))
 
 
-def answers(body: Body, *, radius: float, deflection: float) -> list[Frame]:
-    """Return the answers to the load that goes round once in `SECONDS`, `RATE` a second."""
-    problem = body.scene.problem
-    held = problem.points[~problem.free.any(dim=1)]
-    points = problem.points[body.surface.nodes]
-    far = torch.cdist(points, held).amin(dim=1) if len(held) else points[:, 0]
-    tip = points[far > 0.99 * far.max()]
-    node = int(body.surface.nodes[int((points - tip.mean(dim=0)).norm(dim=1).argmin())])
-    patch = body.patch(node, radius)
-    across = np.argsort(np.ptp(problem.points.numpy(), axis=0))  # the thinnest first
-    wish = ViewSettings(quantity="von Mises stress")
-    found = []
-    for k in range(SECONDS * RATE):
-        angle = 2 * math.pi * k / (SECONDS * RATE)
-        target = torch.zeros(problem.shape[1], dtype=torch.float64)
-        target[int(across[0])] = deflection * math.sin(angle)
-        if len(across) > 2:
-            target[int(across[1])] = deflection * math.cos(angle)
-        found.append(body.answer(body.asked(patch.towards(target), None), wish))
-    return found
+def circular_load(body: Body, *, radius: float, deflection: float) -> list[Frame]:
+    """Return the predictions for a load that rotates once in `DURATION`.
+
+    The load acts at the node farthest from the fixed nodes. It rotates in the plane of the two
+    smallest extents of the body; in 2D it oscillates along the smallest one.
+    """
+    patch = body.patch(_farthest_node(body), radius)
+    points = body.scene.problem.points.numpy()
+    axes = np.argsort(np.ptp(points, axis=0))[: points.shape[1] - 1]
+    settings = ViewSettings(quantity=STRESS)
+    frames, count = [], DURATION * FRAME_RATE
+    for k in range(count):
+        angle = 2 * math.pi * k / count
+        target = torch.zeros(points.shape[1], dtype=torch.float64)
+        for axis, component in zip(axes.tolist(), (math.sin(angle), math.cos(angle)), strict=False):
+            target[axis] = deflection * component
+        frames.append(body.solve(body.request(patch.force_towards(target)), settings))
+    return frames
+
+
+def _farthest_node(body: Body) -> int:
+    """Return the surface node in the middle of those that are farthest from the fixed nodes."""
+    problem, nodes = body.scene.problem, body.surface.nodes
+    fixed = problem.points[~problem.free.any(dim=1)]
+    points = problem.points[nodes]
+    distance = torch.cdist(points, fixed).amin(dim=1) if len(fixed) else points[:, 0]
+    middle = points[distance > 0.99 * distance.max()].mean(dim=0)
+    return int(nodes[int((points - middle).norm(dim=1).argmin())])

@@ -1,4 +1,4 @@
-"""Loads that a hand makes: of the training's modes, on an area, to move a point somewhere."""
+"""Modal loads on a patch of the body that move a point in a requested direction."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,16 +10,16 @@ from torch import Tensor
 from dpl.fem import HasModes
 from dpl.scene import Scene
 
-RIDGE = 1e-2  # of the compliance squared: what only stiff modes would give is hardly asked for
+RIDGE = 1e-2  # Tikhonov parameter over the squared compliance; limits the use of stiff modes
 
 
 class LoadRequest(NamedTuple):
-    """A load as an engineer says it.
+    """A load in SI units.
 
     Attributes:
         force: (N, D) [N], in 2D [N/m].
-        young: E [Pa].
-        poisson: Poisson's ratio [-]; None where the law has its own.
+        young: Young's modulus [Pa].
+        poisson: Poisson's ratio [-]; None if the law has a single one.
     """
 
     force: Tensor
@@ -29,13 +29,14 @@ class LoadRequest(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Loads f = Phi q of the training on one area.
+    """Loads f = Phi q of the training distribution, restricted to the nodes within a radius.
 
     Attributes:
         scene: The body and its loads.
-        node: Centre.
-        radius: Over L [-].
-        uniform: One force for all nodes of the area instead: unlike the training's loads.
+        node: Node at the centre.
+        radius: Radius over L [-].
+        uniform: Use equal forces on all nodes instead of modes, as for load families without
+            modes. The training contains no such loads.
     """
 
     scene: Scene
@@ -44,58 +45,59 @@ class Patch:
     uniform: bool = False
 
     @cached_property
-    def inside(self) -> Tensor:
-        """Nodes that loads act on, (N,)."""
+    def node_mask(self) -> Tensor:
+        """Mask of the loaded nodes, (N,)."""
         problem = self.scene.problem
         distance = (problem.points - problem.points[self.node]).norm(dim=1)
-        acting = (distance <= self.radius * (1 + 1e-9)) & self.scene.loads.loadable_dofs.any(dim=1)
-        acting[self.node] = True
-        return acting
+        mask = (distance <= self.radius * (1 + 1e-9)) & self.scene.loads.loadable_dofs.any(dim=1)
+        mask[self.node] = True
+        return mask
 
     @cached_property
-    def fields(self) -> Tensor:
-        """Loads of the largest size each, (M, N, D) [-]: of modes, or along the axes."""
+    def unit_loads(self) -> Tensor:
+        """Loads of amplitude 1, of one mode or along one axis each, (M, N, D) [-]."""
         loads = self.scene.loads
-        kept = self.inside[:, None] & loads.loadable_dofs
+        loaded = self.node_mask[:, None] & loads.loadable_dofs
         if self.uniform or not isinstance(loads, HasModes):
-            size = loads.largest_force / float(kept.any(dim=1).sum()) ** 0.5
-            axes = torch.eye(kept.shape[1], dtype=torch.float64)
-            return torch.where(kept, size * axes[:, None], 0.0)
-        return torch.where(kept, loads.modal_forces.permute(2, 0, 1), 0.0)
+            size = loads.largest_force / float(loaded.any(dim=1).sum()) ** 0.5
+            axes = torch.eye(loaded.shape[1], dtype=torch.float64)
+            return torch.where(loaded, size * axes[:, None], 0.0)
+        return torch.where(loaded, loads.modal_forces.permute(2, 0, 1), 0.0)
 
     @cached_property
     def compliance(self) -> Tensor:
-        """Linear displacement of the centre under each of `fields`, (D, M) [-]."""
+        """Linear displacement of the centre under each unit load, (D, M) [-]."""
         linear = self.scene.linear.reference
-        return torch.stack([linear.solve(field)[self.node] for field in self.fields], dim=1)
+        return torch.stack([linear.solve(load)[self.node] for load in self.unit_loads], dim=1)
 
-    def towards(self, displacement: Tensor, *, most: float | None = 1.0) -> Tensor:
-        """Return the force that, linearly, displaces the centre so, (N, D) [-].
+    def force_towards(self, displacement: Tensor, *, max_amplitude: float | None = 1.0) -> Tensor:
+        """Return the force whose linear response moves the centre by a displacement, (N, D) [-].
 
-        Of all such loads the one of the smallest modal loads over their largest.
+        Of all such forces the one with the smallest amplitudes, by ridge regression.
 
         Args:
-            displacement: (D,) [-].
-            most: Amplitude that it may have, see `Scene.loads.place`; None: any.
+            displacement: Displacement of the centre over L, (D,) [-].
+            max_amplitude: Largest amplitude of a unit load; larger forces are scaled down. None: no
+                limit.
         """
         C = self.compliance
         square = C @ C.T
         ridge = RIDGE * square.diagonal().sum() * torch.eye(len(C), dtype=C.dtype)
-        share = C.T @ torch.linalg.solve(square + ridge, displacement)
-        largest = float(share.abs().max())
-        if most is not None and largest > most:
-            share = share * (most / largest)
-        return torch.einsum("m,mnd->nd", share, self.fields)
+        amplitudes = C.T @ torch.linalg.solve(square + ridge, displacement)
+        largest = float(amplitudes.abs().max())
+        if max_amplitude is not None and largest > max_amplitude:
+            amplitudes = amplitudes * (max_amplitude / largest)
+        return torch.einsum("m,mnd->nd", amplitudes, self.unit_loads)
 
-    def along(self, direction: Tensor, amplitude: float) -> Tensor:
-        """Return the force that pushes the centre in a direction (D,), (N, D) [-].
+    def force_along(self, direction: Tensor, amplitude: float) -> Tensor:
+        """Return the force whose linear response moves the centre in a direction, (N, D) [-].
 
         Args:
-            direction: Of any length; zero gives no force.
-            amplitude: Of the force, see `Scene.loads.place`: up to 1 the training's.
+            direction: (D,), of any length; zero gives zero force.
+            amplitude: Largest amplitude of a unit load; up to 1 it is in the training range.
         """
         size = float(direction.norm())
         if size == 0:
-            return torch.zeros_like(self.fields[0])
+            return torch.zeros_like(self.unit_loads[0])
         far = direction / size * (1e6 * float(self.compliance.norm()) + 1e-300)
-        return amplitude * self.towards(far)
+        return amplitude * self.force_towards(far)

@@ -1,4 +1,4 @@
-"""Where a body stands in the browser: camera, lights, ground."""
+"""Theme, camera, lights and ground of the page."""
 
 import numpy as np
 import viser
@@ -7,17 +7,17 @@ from dpl.viewer.rasterizer import Camera
 from dpl.viewer.surface import Floats
 
 
-def build(
-    server: viser.ViserServer, camera: Camera, low: Floats, high: Floats, *, flat: bool
+def add_environment(
+    server: viser.ViserServer, camera: Camera, low: Floats, high: Floats, *, planar: bool
 ) -> None:
-    """Put the page's frame, the camera, lights and the ground there.
+    """Set the theme and the initial camera, and add lights and ground.
 
     Args:
-        server: Where.
-        camera: Where a browser begins.
-        low: Corner of the body at rest, (3,) over L.
-        high: The opposite corner.
-        flat: Whether the body lies in the plane of the ground.
+        server: The server of the page.
+        camera: Initial camera of a browser.
+        low: Lower corner of the bounding box of the undeformed body over L, (3,).
+        high: Upper corner.
+        planar: True for a body in 2D, which lies in the ground plane.
     """
     gui, scene = server.gui, server.scene
     gui.configure_theme(
@@ -30,18 +30,18 @@ def build(
     gui.main_panel.set_width(370)
     server.initial_camera.position = camera.position
     server.initial_camera.look_at = camera.look_at
-    server.initial_camera.fov = camera.field
+    server.initial_camera.fov = camera.field_of_view
     scene.configure_environment_map(None)
     scene.configure_default_lights(False)
     scene.add_light_ambient("/ambient", intensity=1.9)
-    towards = np.subtract(camera.position, camera.look_at)
-    for name, way, strength, shadow in (
+    to_camera = np.subtract(camera.position, camera.look_at)
+    for name, direction, intensity, shadow in (
         ("sun", np.array([-0.3, 0.25, 1.0]), 1.5, True),
-        ("eye", towards, 1.4, False),
+        ("headlight", to_camera, 1.4, False),
     ):
-        place = (low + high) / 2 + 4 * way / np.linalg.norm(way)
+        position = (low + high) / 2 + 4 * direction / np.linalg.norm(direction)
         scene.add_light_directional(
-            f"/{name}", intensity=strength, position=place, cast_shadow=shadow
+            f"/{name}", intensity=intensity, position=position, cast_shadow=shadow
         )
     scene.add_grid(
         "/ground",
@@ -52,8 +52,8 @@ def build(
         cell_color=(226, 228, 233),
         section_color=(200, 204, 212),
         plane_color=(246, 247, 249),
-        plane_opacity=0.0 if flat else 0.6,
+        plane_opacity=0.0 if planar else 0.6,
         shadow_opacity=0.18,
         fade_distance=7.0,
-        position=(*((low + high) / 2)[:2], float(low[2]) - (0.01 if flat else 0.45)),
+        position=(*((low + high) / 2)[:2], float(low[2]) - (0.01 if planar else 0.45)),
     )

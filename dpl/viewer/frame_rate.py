@@ -1,4 +1,4 @@
-"""What a frame costs, part by part, how many reach a browser, and how long an answer takes."""
+"""Measurement of frame times, frames received by a browser, and latencies of the simulator."""
 
 import statistics
 import time
@@ -15,98 +15,107 @@ from websockets.typing import Origin, Subprotocol
 
 from dpl.evaluation import timing
 from dpl.fem import Load
-from dpl.viewer.animation import answers
+from dpl.viewer.animation import circular_load
+from dpl.viewer.body_node import DRAG_MESH
 from dpl.viewer.drag_loads import LoadRequest
 from dpl.viewer.frames import QUANTITIES, Body, ViewSettings
 from dpl.viewer.page import Page
-from dpl.viewer.rasterizer import BANDS
-from dpl.viewer.surface import bands
+from dpl.viewer.rasterizer import N_BANDS
+from dpl.viewer.surface import contour_bands
+
+TIMED_FRAMES = 40
+START_UP = 0.5  # time before frames are counted, in which the scene is sent [s]
+REQUEST_RATE = 20  # rate at which a browser sends drag events [1/s]
 
 
 @dataclass(frozen=True)
-class Row:
-    """Times of a frame, medians [ms], and frames that arrived.
+class FrameTimes:
+    """Median times of a frame, and the rate at which frames are received.
 
     Attributes:
-        colours: What they show.
-        coloured: The answer of the simulator, and what colours show.
-        cut: The surface into bands.
-        arrived: Frames at the other end of the socket, a second.
-        megabytes: Of those, a second.
+        quantity: Quantity that colours show.
+        solve_ms: Time of the simulator and of the values on the surface [ms].
+        bands_ms: Time of the division into colour bands [ms].
+        frames_per_s: Frames received through the web socket [1/s].
+        megabytes_per_s: Data received through the web socket [MB/s].
     """
 
-    colours: str
-    coloured: float
-    cut: float
-    arrived: float
-    megabytes: float
+    quantity: str
+    solve_ms: float
+    bands_ms: float
+    frames_per_s: float
+    megabytes_per_s: float
 
 
-def speed(page: Page, seconds: float = 4.0) -> tuple[list[Row], dict[str, timing.Latency]]:
-    """Return what frames cost under the load that goes round, and the latency of its answers.
+def measure_frames(
+    page: Page, seconds: float = 4.0
+) -> tuple[list[FrameTimes], dict[str, timing.Latency]]:
+    """Return the frame times for a rotating load, and the latencies of the simulator.
 
     Args:
-        page: Where frames arrive.
-        seconds: For how long frames are counted, for each quantity [s].
+        page: The page to which a client connects.
+        seconds: Time for which frames are counted, per quantity [s].
     """
     body = page.body
-    loads = [frame.asked for frame in answers(body, radius=0.45, deflection=0.3)]
+    loads = [frame.request for frame in circular_load(body, radius=0.45, deflection=0.3)]
     columns = zip(*map(body.load, loads), strict=True)
-    measured = timing.latencies(body.simulator, Load(*map(torch.cat, columns)))
+    latencies = timing.latencies(body.simulator, Load(*map(torch.cat, columns)))
     rows = []
     for quantity in QUANTITIES:
-        wish = ViewSettings(quantity=quantity)
-        coloured, cut = map(statistics.median, zip(*_times(body, loads, wish), strict=True))
-        page.worker.ask(wish=wish)
-        arrived, size = _arrived(page, loads, seconds)
-        rows.append(Row(quantity, coloured, cut, arrived / seconds, size / seconds / 1e6))
-    return rows, measured
+        settings = ViewSettings(quantity=quantity)
+        times = zip(*_frame_times(body, loads, settings), strict=True)
+        solve_ms, bands_ms = map(statistics.median, times)
+        page.worker.submit(settings=settings)
+        frames, size = _received(page, loads, seconds)
+        rates = frames / seconds, size / seconds / 1e6
+        rows.append(FrameTimes(quantity, solve_ms, bands_ms, *rates))
+    return rows, latencies
 
 
-def _times(
-    body: Body, loads: list[LoadRequest], wish: ViewSettings
+def _frame_times(
+    body: Body, loads: list[LoadRequest], settings: ViewSettings
 ) -> Iterator[tuple[float, float]]:
-    """Yield of each load how long the answer with its colours and the bands took [ms]."""
-    for load in loads[:40]:
-        begin = time.perf_counter()
-        frame = body.answer(load, wish)
-        shown = time.perf_counter()
-        levels = frame.values / max(float(frame.values.max()), 1e-300) * BANDS
-        bands(frame.points, body.surface.triangles, levels, BANDS)
+    """Yield the times of the solution and of the colour bands for each load [ms]."""
+    for load in loads[:TIMED_FRAMES]:
+        start = time.perf_counter()
+        frame = body.solve(load, settings)
+        solved = time.perf_counter()
+        levels = frame.values / max(float(frame.values.max()), 1e-300) * N_BANDS
+        contour_bands(frame.points, body.surface.triangles, levels, N_BANDS)
         end = time.perf_counter()
-        yield 1e3 * (shown - begin), 1e3 * (end - shown)
+        yield 1e3 * (solved - start), 1e3 * (end - solved)
 
 
-def _arrived(page: Page, loads: list[LoadRequest], seconds: float) -> tuple[int, int]:
-    """Return frames and bytes that arrive while the load goes round."""
-    address = page.address.replace("http", "ws", 1)
-    origin = Origin("/".join(page.address.split("/")[:3]))
+def _received(page: Page, loads: list[LoadRequest], seconds: float) -> tuple[int, int]:
+    """Return the number of frames and bytes that a client receives during a rotating load."""
+    url = page.url.replace("http", "ws", 1)
+    origin = Origin("/".join(page.url.split("/")[:3]))
     protocol = Subprotocol(f"viser-v{viser.__version__}")
-    frames = size = asked = 0
+    frames = size = submitted = 0
     with websockets.sync.client.connect(
-        address, origin=origin, subprotocols=[protocol], max_size=None, compression=None
-    ) as call:
-        begin = time.monotonic()
-        while (now := time.monotonic() - begin) < seconds + 0.5:
-            if now * 20 > asked:  # as often as a browser sends a drag
-                page.worker.ask(partial(loads.__getitem__, asked % len(loads)))
-                asked += 1
+        url, origin=origin, subprotocols=[protocol], max_size=None, compression=None
+    ) as connection:
+        start = time.monotonic()
+        while (now := time.monotonic() - start) < seconds + START_UP:
+            if now * REQUEST_RATE > submitted:
+                page.worker.submit(partial(loads.__getitem__, submitted % len(loads)))
+                submitted += 1
             try:
-                message = call.recv(timeout=0.01)
+                message = connection.recv(timeout=0.01)
             except TimeoutError:
                 continue
-            if now > 0.5:  # the first brings all that there is
+            if now > START_UP:
                 frames += _is_frame(message)
                 size += len(message)
     return frames, size
 
 
 def _is_frame(message: bytes | str) -> bool:
-    """Return whether a message moves the surface that is grabbed."""
+    """Return True if a message updates the vertices of the mesh to drag."""
     assert isinstance(message, bytes)
     length = int.from_bytes(message[8:16], "little")
     plain = zstandard.ZstdDecompressor().decompress(message[16 : 16 + length])
     return any(
-        entry.get("name") == "/network/grip" and "vertices" in entry.get("updates", {})
+        entry.get("name", "").endswith(DRAG_MESH) and "vertices" in entry.get("updates", {})
         for entry in msgspec.msgpack.decode(plain)["messages"]
     )

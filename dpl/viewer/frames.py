@@ -1,13 +1,12 @@
-"""From a load to what is shown of its answer, without a browser."""
+"""Requests, solutions and the surface values that the viewer shows; independent of the browser."""
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem import Load, Solution
@@ -15,61 +14,64 @@ from dpl.fem.solvers import check_tol
 from dpl.inference import Answer, Simulator
 from dpl.system.threads import one_thread
 from dpl.viewer.drag_loads import LoadRequest, Patch
-from dpl.viewer.surface import Surface
+from dpl.viewer.surface import Floats, Surface
 
-Floats = NDArray[np.float64]
-QUANTITIES = {"displacement": "m", "von Mises stress": "Pa", "error against FE": "m"}
-NETWORK, TIERS = "network alone", (1e-3, 1e-6, 1e-8)
-WIDER = 4.0  # by how much E may be changed where the scene has one
+STRESS, ERROR = "von Mises stress", "error against FE"
+QUANTITIES = {"displacement": "m", STRESS: "Pa", ERROR: "m"}
+TOLERANCES = (1e-3, 1e-6, 1e-8)  # relative residuals that the page offers
+YOUNG_FACTOR = 4.0  # range of E on the page, down and up, if the scene has a single value
+SAMPLE_STREAM = (0, 11)  # random stream of the loads that the page draws
 
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """How a load is to be answered and shown.
+    """Method and quantity of a frame.
 
     Attributes:
-        quantity: What colours show, of `QUANTITIES`.
-        tol: Residual ratio that the answer is to keep [-]; None: the network alone.
-        budget_ms: Wall time that it may take [ms]; None: any.
-        compare: Whether Newton from rest is shown beside it.
+        quantity: Quantity that colours show, a key of `QUANTITIES`.
+        tol: Relative residual to reach [-]; None: the prediction of the network.
+        budget_ms: Largest wall time [ms]; None: no limit.
+        galerkin: Correct the prediction in the modes of the network before Newton.
+        show_newton: Also show the iterates of Newton from zero displacement.
     """
 
     quantity: str = "displacement"
     tol: float | None = None
     budget_ms: float | None = None
-    compare: bool = False
+    galerkin: bool = False
+    show_newton: bool = False
 
     def __post_init__(self) -> None:
         """Check the values.
 
         Raises:
-            ValueError: One is out of range.
+            ValueError: A value is out of range.
         """
         if self.quantity not in QUANTITIES:
             raise ValueError(f"quantity = {self.quantity!r} must be {' or '.join(QUANTITIES)}")
         if self.tol is not None:
             check_tol(self.tol)
         if self.budget_ms is not None and not 0 < self.budget_ms < math.inf:
-            raise ValueError(f"budget_ms = {self.budget_ms} must be a number above 0")
+            raise ValueError(f"budget_ms = {self.budget_ms} must be finite and above 0")
 
 
 class Frame(NamedTuple):
-    """What is shown of one answer.
+    """A displacement and the values that are shown.
 
     Attributes:
-        asked: The load.
+        request: The load.
         displacement: (N, D) [m].
-        points: Surface, over L, (S, 3) [-].
-        values: What colours show, at the surface, (S,), in the unit of the quantity.
-        quantity: Of `QUANTITIES`.
-        answer: What it is worth; None of an iterate of Newton.
-        iteration: Of Newton from rest; -1: an answer.
+        points: Deformed surface over L, (S, 3) [-].
+        values: Values of the quantity on the surface, (S,), in the unit of the quantity.
+        quantity: Key of `QUANTITIES`.
+        answer: Result of the simulator; None for an iterate of Newton.
+        iteration: Number of the Newton iteration; -1 for a result of the simulator.
         residual: ||R_free|| / ||f|| [-].
         volume_ratio: min det F [-].
-        converged: Whether it is in balance to what was asked for.
+        converged: True if the residual is below the tolerance and no element is inverted.
     """
 
-    asked: LoadRequest
+    request: LoadRequest
     displacement: Tensor
     points: Floats
     values: Floats
@@ -82,109 +84,118 @@ class Frame(NamedTuple):
 
 
 class Body:
-    """A simulator and what is seen of its body.
+    """A simulator and the surface of its body.
 
     Attributes:
-        simulator: What answers.
-        surface: What is seen.
-        young: E where nothing else is said, the middle of the training's [Pa].
-        poisson: The same of Poisson's ratio; None where the law has its own.
+        simulator: The simulator.
+        scene: Its scene.
+        surface: Surface of the body.
+        young: Default Young's modulus, the middle of the training range [Pa].
+        poisson: Default Poisson's ratio, alike [-]; None if the law has a single one.
     """
 
     def __init__(self, simulator: Simulator) -> None:
-        """Take a simulator."""
+        """Prepare the surface of the body of a simulator."""
         self.simulator = simulator
         self.scene = simulator.scene
         self.surface = Surface.of(self.scene.problem)
         self.young = sum(self.scene.loads.young_range) / 2
         span = self.scene.loads.poisson_range
         self.poisson = None if span is None else sum(span) / 2
+        self._without_galerkin = simulator
+        if self.has_galerkin:
+            self._without_galerkin = Simulator(simulator.surrogate)
         self._patch: Patch | None = None
 
     @property
-    def young_span(self) -> tuple[float, float]:
-        """Smallest and largest E that can be asked for [Pa]."""
+    def has_galerkin(self) -> bool:
+        """True if the simulator can correct predictions in the modes of the network."""
+        return self.simulator.correct is not None
+
+    @property
+    def young_range(self) -> tuple[float, float]:
+        """Smallest and largest Young's modulus of a request [Pa]."""
         low, high = self.scene.loads.young_range
-        return (low, high) if low < high else (low / WIDER, high * WIDER)
+        return (low, high) if low < high else (low / YOUNG_FACTOR, high * YOUNG_FACTOR)
 
     @property
     def force_unit(self) -> float:
-        """Force of a dimensionless 1 at the usual E [N], in 2D [N/m]."""
+        """Force of a dimensionless force of 1 at the default Young's modulus [N], in 2D [N/m]."""
         return self.young * self.scene.force_unit
 
-    def asked(
-        self, force: Tensor, young: float | None, poisson: float | None = None
+    def request(
+        self, force: Tensor, young: float | None = None, poisson: float | None = None
     ) -> LoadRequest:
-        """Return a dimensionless force (N, D), and what every load holds besides, as a load.
+        """Return the request of a dimensionless force (N, D) plus the constant force of the scene.
 
-        The force is that of the usual E, so that a softer body is moved further by it.
+        The force [N] does not depend on `young`, so that a softer body has larger displacements.
 
         Raises:
             ValueError: A modulus is out of its range.
         """
         young = self.young if young is None else young
-        low, high = self.young_span
+        low, high = self.young_range
         if not low * (1 - 1e-9) <= young <= high * (1 + 1e-9):
-            raise ValueError(f"E = {young:g} Pa must lie between {low:g} and {high:g}")
+            raise ValueError(f"young = {young:g} must lie between {low:g} and {high:g} Pa")
         span = self.scene.loads.poisson_range
         if span is None:
             poisson = None
         else:
-            poisson = sum(span) / 2 if poisson is None else poisson
-            if not span[0] <= poisson <= span[1]:
-                raise ValueError(f"Poisson's ratio {poisson:g} must lie in {list(span)}")
-        always = self.scene.loads.constant_force
-        whole = force if always is None else force + always
-        return LoadRequest(whole * self.force_unit, young, poisson)
+            poisson = self.poisson if poisson is None else poisson
+            if poisson is None or not span[0] <= poisson <= span[1]:
+                raise ValueError(f"poisson = {poisson:g} must lie between {span[0]} and {span[1]}")
+        constant = self.scene.loads.constant_force
+        total = force if constant is None else force + constant
+        return LoadRequest(total * self.force_unit, young, poisson)
 
-    def rest(self, young: float | None = None, poisson: float | None = None) -> LoadRequest:
-        """Return the load of no hand."""
-        return self.asked(
-            torch.zeros(self.scene.problem.shape, dtype=torch.float64), young, poisson
-        )
+    def zero_load(self, young: float | None = None, poisson: float | None = None) -> LoadRequest:
+        """Return the request without a force of the user."""
+        force = torch.zeros(self.scene.problem.shape, dtype=torch.float64)
+        return self.request(force, young, poisson)
 
     def sample(self, index: int) -> LoadRequest:
-        """Return a random load like those of the training."""
-        load = self.scene.loads.sample((0, 11), [index])
+        """Return a random load of the training distribution."""
+        load = self.scene.loads.sample(SAMPLE_STREAM, [index])
         young = float(load.young)
-        ratio = float(load.poisson) if load.poisson.numel() else None
-        return LoadRequest(load.force[0] * young * self.scene.force_unit, young, ratio)
+        poisson = float(load.poisson) if load.poisson.numel() else None
+        return LoadRequest(load.force[0] * young * self.scene.force_unit, young, poisson)
 
     def patch(self, node: int, radius: float, *, uniform: bool = False) -> Patch:
-        """Return the loads of an area; the last is kept, for it takes a few solves.
+        """Return the loads of a patch. The last patch is cached, because it takes several solves.
 
         Raises:
-            ValueError: There is no such node, or the radius is out of range.
+            ValueError: The node does not exist, or the radius is out of range.
         """
-        if not 0 <= node < self.scene.problem.shape[0]:
-            raise ValueError(f"node = {node} is none of the body")
+        count = self.scene.problem.shape[0]
+        if not 0 <= node < count:
+            raise ValueError(f"node = {node} must be 0 to {count - 1}")
         if not 0 <= radius < math.inf:
-            raise ValueError(f"radius = {radius} must be a length")
-        same = (node, radius, uniform)
-        kept = self._patch
-        if kept is None or (kept.node, kept.radius, kept.uniform) != same:
-            self._patch = kept = Patch(self.scene, node, radius, uniform)
-        return kept
+            raise ValueError(f"radius = {radius} must be 0 or more and finite")
+        key, cached = (node, radius, uniform), self._patch
+        if cached is None or (cached.node, cached.radius, cached.uniform) != key:
+            self._patch = cached = Patch(self.scene, *key)
+        return cached
 
-    def load(self, asked: LoadRequest) -> Load:
-        """Return a load as solvers take it."""
-        ratio = None if asked.poisson is None else torch.tensor([asked.poisson]).double()
-        return self.scene.load_of(asked.force[None], torch.tensor([asked.young]).double(), ratio)
+    def load(self, request: LoadRequest) -> Load:
+        """Return the dimensionless load of a request, with B = 1."""
+        poisson = None if request.poisson is None else torch.tensor([request.poisson]).double()
+        young = torch.tensor([request.young]).double()
+        return self.scene.load_of(request.force[None], young, poisson)
 
-    def answer(self, asked: LoadRequest, wish: ViewSettings) -> Frame:
-        """Return the answer to a load, and what it is worth, as it is shown."""
-        answer = self._ask(asked, tol=wish.tol, budget_ms=wish.budget_ms)
-        over_length = answer.displacement / self.scene.length
-        other = None
-        if wish.quantity == "error against FE":
-            exact = self._ask(asked, tol=self.scene.solver.tol, warm=True)
-            other = exact.displacement / self.scene.length
+    def solve(self, request: LoadRequest, settings: ViewSettings) -> Frame:
+        """Return the frame of a request, computed by the simulator."""
+        answer = self._simulate(request, settings)
+        u = answer.displacement / self.scene.length
+        reference = None
+        if settings.quantity == ERROR:
+            exact = self._simulate(request, ViewSettings(tol=self.scene.solver.tol), warm=True)
+            reference = exact.displacement / self.scene.length
         return Frame(
-            asked,
+            request,
             answer.displacement,
-            self.surface.moved(over_length),
-            self._values(over_length, other, asked, wish.quantity),
-            wish.quantity,
+            self.surface.deformed_points(u),
+            self._values(u, reference, request, settings.quantity),
+            settings.quantity,
             answer,
             -1,
             answer.residual,
@@ -192,26 +203,38 @@ class Body:
             answer.converged,
         )
 
-    def _ask(self, asked: LoadRequest, **options: Any) -> Answer:
-        return self.simulator(asked.force, young=asked.young, poisson=asked.poisson, **options)
+    def _simulate(
+        self, request: LoadRequest, settings: ViewSettings, *, warm: bool = False
+    ) -> Answer:
+        simulator = self.simulator if settings.galerkin else self._without_galerkin
+        return simulator(
+            request.force,
+            young=request.young,
+            poisson=request.poisson,
+            tol=settings.tol,
+            budget_ms=settings.budget_ms,
+            warm=warm,
+        )
 
-    def newton(self, asked: LoadRequest, wish: ViewSettings, beside: Frame) -> Iterator[Frame]:
-        """Yield Newton's iterates from rest as they are shown; errors are those of `beside`."""
-        answer = beside.displacement / self.scene.length
+    def newton_frames(
+        self, request: LoadRequest, settings: ViewSettings, reference: Frame
+    ) -> Iterator[Frame]:
+        """Yield the iterates of Newton from zero displacement; errors are against `reference`."""
+        expected = reference.displacement / self.scene.length
         with one_thread():
-            for state in self.scene.solver.iterate(self.load(asked)):
-                yield self._iterate(state, answer, asked, wish)
+            for state in self.scene.solver.iterate(self.load(request)):
+                yield self._newton_frame(state, expected, request, settings.quantity)
 
-    def _iterate(
-        self, state: Solution, answer: Tensor, asked: LoadRequest, wish: ViewSettings
+    def _newton_frame(
+        self, state: Solution, expected: Tensor, request: LoadRequest, quantity: str
     ) -> Frame:
         u = state.displacement[0]
         return Frame(
-            asked,
+            request,
             u * self.scene.length,
-            self.surface.moved(u),
-            self._values(u, answer, asked, wish.quantity),
-            wish.quantity,
+            self.surface.deformed_points(u),
+            self._values(u, expected, request, quantity),
+            quantity,
             None,
             int(state.iterations),
             float(state.residual),
@@ -219,24 +242,30 @@ class Body:
             bool(state.converged),
         )
 
-    def _values(self, u: Tensor, other: Tensor | None, asked: LoadRequest, quantity: str) -> Floats:
-        """Return what colours show of a displacement (N, D) [-], at the surface, (S,)."""
-        if quantity == "von Mises stress":
+    def _values(
+        self, u: Tensor, reference: Tensor | None, request: LoadRequest, quantity: str
+    ) -> Floats:
+        """Return the values of a quantity on the surface, (S,), of displacements (N, D) [-]."""
+        if quantity == STRESS:
             with torch.inference_mode():
-                return asked.young * self.surface.von_mises(u, self.load(asked).poisson)
-        shown = u - other if quantity == "error against FE" and other is not None else u
-        return self.scene.length * shown.norm(dim=1).numpy()[self.surface.nodes]
+                return request.young * self.surface.von_mises(u, self.load(request).poisson)
+        field = u - reference if quantity == ERROR and reference is not None else u
+        return self.scene.length * field.norm(dim=1).numpy()[self.surface.nodes]
 
 
-class Scale:
-    """The range of colours: from 0 to a round number that follows the values without trembling."""
+class ColourScale:
+    """Colour scale from 0 to a rounded maximum that changes only with large changes of the values.
+
+    Attributes:
+        top: Upper end; 0 before the first values.
+    """
 
     def __init__(self) -> None:
-        """Begin without a range."""
+        """Start without an upper end."""
         self.top = 0.0
 
-    def follow(self, values: Floats) -> float:
-        """Return the upper end for values, of which some may not be finite."""
+    def update(self, values: Floats) -> float:
+        """Return the upper end for values; values that are not finite are ignored."""
         finite = values[np.isfinite(values)]
         largest = float(finite.max()) if len(finite) else 0.0
         if largest > self.top or largest < 0.4 * self.top:
@@ -245,7 +274,7 @@ class Scale:
 
 
 def round_up(number: float) -> float:
-    """Return the smallest of 1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten that is not smaller."""
+    """Return the smallest number {1, 1.5, 2, 3, 4, 5, 6, 8} x 10^k that is not smaller."""
     if not 0 < number < math.inf:
         return 0.0
     power = 10.0 ** math.floor(math.log10(number))
@@ -253,9 +282,9 @@ def round_up(number: float) -> float:
     return power * next((step for step in steps if number <= step * power * (1 + 1e-9)), 10.0)
 
 
-def between(old: LoadRequest, new: LoadRequest, share: float) -> LoadRequest:
-    """Return the load that lies so far, from 0 to 1, on the way from one to another."""
+def interpolate(start: LoadRequest, end: LoadRequest, share: float) -> LoadRequest:
+    """Return the load at a share of the way from `start` (0) to `end` (1)."""
     if share >= 1:
-        return new
-    force = torch.lerp(old.force, new.force, share)
-    return new._replace(force=force, young=old.young + share * (new.young - old.young))
+        return end
+    force = torch.lerp(start.force, end.force, share)
+    return end._replace(force=force, young=start.young + share * (end.young - start.young))

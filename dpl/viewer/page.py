@@ -1,4 +1,4 @@
-"""The page: a thin layer of viser between a browser and a worker."""
+"""Page of the viewer: connects the browser (viser) with the worker."""
 
 import contextlib
 import io
@@ -12,392 +12,313 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem import HasModes
-from dpl.viewer import environment, panel
-from dpl.viewer.access import AccessPolicy, check, serve_with
-from dpl.viewer.body_node import BodyNode, Server
-from dpl.viewer.drag_loads import LoadRequest
-from dpl.viewer.frames import QUANTITIES, TIERS, Body, Frame, Scale, ViewSettings
+from dpl.viewer import panel
+from dpl.viewer.access import AccessPolicy, check_server, serve_with
+from dpl.viewer.body_node import BodyNode, LocalServer
+from dpl.viewer.controls import Controls
+from dpl.viewer.drag_loads import LoadRequest, Patch
+from dpl.viewer.environment import add_environment
+from dpl.viewer.frames import Body, ColourScale, Frame
+from dpl.viewer.load_marker import LoadMarker
 from dpl.viewer.rasterizer import Camera, Renderer
-from dpl.viewer.recording import MOST, Recording
+from dpl.viewer.recording import Recording
 from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
-Hold = Callable[[float | None, float | None], LoadRequest]  # E, Poisson's ratio -> load
-ALONE, BUDGET = "network alone", "as far as the budget"
-ANSWERS = (ALONE, *(f"corrected to {tol:.0e}" for tol in TIERS), BUDGET)
-NEAR = 0.8  # distance of the camera from one body
-DOTS = 120  # at most, that mark a patch
-RED = (214, 40, 57)
+Load = Callable[[float | None, float | None], LoadRequest]  # E [Pa], Poisson's ratio -> request
+DISTANCE, DISTANCE_OF_TWO = 0.8, 1.25  # factors on the distance of the camera
+PICK_RADIUS = 0.02  # distance of a ray to the points that it may pick, beyond the nearest, over L
 
 
 class Page:
-    """Controls, readings and bodies in the browser.
+    """Page with controls, readings and one or two bodies.
 
     Attributes:
-        body: What is simulated.
-        worker: What answers.
-        server: viser's.
-        camera: Where a browser begins.
+        body: The body.
+        worker: Thread that solves.
+        server: viser server.
+        camera: Initial camera of a browser.
+        controls: Widgets of the panel.
+        recording: Recording of the shown frames.
+        folder: Folder of recordings.
+        frame: The most recent frame; None before the first.
+        newton_frame: The most recent iterate of Newton; None if there is none for this load.
+        node: Node at the centre of the patch.
     """
 
-    def __init__(self, body: Body, door: AccessPolicy, *, title: str, folder: Path) -> None:
-        """Serve behind a door.
+    def __init__(self, body: Body, policy: AccessPolicy, *, title: str, folder: Path) -> None:
+        """Start the server behind an access policy, and the worker.
 
         Args:
-            body: What is simulated.
-            door: Who may come in.
-            title: Name of the run.
-            folder: Where recordings are written.
+            body: The body.
+            policy: Access policy with the bound socket.
+            title: Title of the panel.
+            folder: Folder of recordings.
 
         Raises:
-            RuntimeError: The door does not hold.
+            RuntimeError: The server does not enforce the policy.
         """
-        self.body, self._door, self._folder = body, door, folder
-        self._problem = body.scene.problem
-        with serve_with(door), contextlib.redirect_stdout(io.StringIO()):
-            self.server = Server(host=door.host, port=door.port, label="dpl", verbose=False)
+        self.body, self.folder, self._policy = body, folder, policy
+        with serve_with(policy), contextlib.redirect_stdout(io.StringIO()):
+            self.server = LocalServer(
+                host=policy.host, port=policy.port, label="dpl", verbose=False
+            )
         try:
-            check(door)
+            check_server(policy)
         except BaseException:
             self.close()
             raise
         self.recording = Recording(body)
-        self._scale = Scale()
-        self._frame: Frame | None = None
-        self._beside: tuple[Frame | None, int] = None, 0
-        self._said, self._dirty = "", False
-        self._hold: Hold = lambda young, poisson: body.rest(young, poisson)
-        tip = body.surface.rest[:, 0].argmax()
-        self._node = int(body.surface.nodes[tip])
-        self._grabbed: tuple[int, Floats, Tensor] | None = None
-        self._draws = 0
+        self.frame: Frame | None = None
+        self.newton_frame: Frame | None = None
+        self._scale = ColourScale()
+        self._error, self._changed = "", False
+        self._load: Load = body.zero_load
+        self.node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
+        self._drag: tuple[int, Floats, Tensor] | None = None  # node, position, displacement
+        self._n_samples = 0
         self._build_scene()
-        self._build_panel(title)
-        self.worker = Worker(body, self._show, beside=self._show_beside, trouble=self._trouble)
-        self._mark()
+        self._build_controls(title)
+        self.worker = Worker(
+            body, self._show, on_newton=self._show_newton, on_error=self._show_error
+        )
+        self._mark_patch()
         self.worker.start()
 
     @property
-    def address(self) -> str:
-        """What is typed into the browser, with the token."""
-        return self._door.address
+    def url(self) -> str:
+        """Address of the page for the browser, with the token."""
+        return self._policy.url
 
     def close(self) -> None:
-        """End."""
+        """Stop worker and server."""
         if hasattr(self, "worker"):
             self.worker.stop()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
-    # --- the scene
-
     def _build_scene(self) -> None:
         server, surface = self.server, self.body.surface
-        low, high = surface.rest.min(axis=0), surface.rest.max(axis=0)
-        self.camera = Camera.before(surface, wide=NEAR)
-        environment.build(server, self.camera, low, high, flat=self._problem.shape[1] == 2)
-        self._network = BodyNode(server, "/network", self.body, grab=True)
-        self._fe = BodyNode(server, "/fe", self.body, grab=False)
-        aside = float(high[1] - low[1]) + 0.7
-        self._aside = np.array([0.0, aside, 0.0])
-        self._fe.frame.position = self._aside
-        self._fe.frame.visible = False
+        points = surface.undeformed
+        low, high = points.min(axis=0), points.max(axis=0)
+        self.camera = Camera.facing(surface, distance=DISTANCE)
+        planar = self.body.scene.problem.shape[1] == 2
+        add_environment(server, self.camera, low, high, planar=planar)
+        self._body_node = BodyNode(server, "/body", self.body, draggable=True)
+        self._newton_node = BodyNode(server, "/newton", self.body, draggable=False)
+        self._newton_offset = np.array([0.0, float(high[1] - low[1]) + 0.7, 0.0])
+        self._newton_node.frame.position = self._newton_offset
+        self._newton_node.frame.visible = False
         corner = np.array([low[0], low[1], high[2] + 0.12])
-        server.scene.add_label("/fe/label", "Newton from rest", position=corner)
+        server.scene.add_label("/newton/label", "Newton from zero", position=corner)
         self._label = server.scene.add_label(
-            "/network/label", "answer", position=corner, visible=False
+            "/body/label", "selected method", position=corner, visible=False
         )
-        self._patch_dots = server.scene.add_point_cloud(
-            "/patch", np.zeros((1, 3)), RED, point_size=0.004, point_shape="circle"
-        )
-        self._arrow = server.scene.add_arrows(
-            "/arrow",
-            np.zeros((1, 2, 3)),
-            RED,
-            shaft_radius=0.008,
-            head_radius=0.022,
-            head_length=0.05,
-        )
-        self._arrow.visible = False
-        assert self._network.grip is not None
-        caught = self._door.complaints.caught
-        self._network.grip.on_drag("left")(caught(self._dragged))
-        self._network.grip.on_click(caught(self._clicked))
+        self._marker = LoadMarker(server, self.body)
+        drag_mesh, catch = self._body_node.drag_mesh, self._policy.log.catch_errors
+        assert drag_mesh is not None
+        drag_mesh.on_drag("left")(catch(self.drag))
+        drag_mesh.on_click(catch(self.click))
 
-    async def _dragged(self, event: Any) -> None:
-        """Move the grabbed point with the hand."""
-        frame = self._frame
-        if frame is None:
+    def _build_controls(self, title: str) -> None:
+        controls = self.controls = Controls(self.server, self.body, title, self.folder)
+        catch = self._policy.log.catch_errors
+        controls.connect(
+            catch,
+            on_load=self.apply_controls,
+            on_moduli=lambda event: None if event.client is None else self._submit(),
+            on_settings=self.apply_settings,
+        )
+        controls.sample.on_click(catch(self.sample))
+        controls.reset.on_click(catch(self.reset))
+        controls.record.on_click(catch(self._toggle_recording))
+        controls.save.on_click(catch(self._save))
+
+    # --- events of the browser
+
+    async def drag(self, event: Any) -> None:
+        """Load the patch so that the dragged point follows the mouse."""
+        if self.frame is None:
             return
-        if event.phase == "start" or self._grabbed is None:
-            place = np.asarray(event.start_position)
-            node = self.body.surface.nearest(frame.points, place)
-            self._node = node
-            moved = frame.displacement[node] / self._problem.length
-            self._grabbed = node, place, moved
-        node, place, moved = self._grabbed
-        way = np.asarray(event.end_position) - place
-        target = moved + torch.from_numpy(way[: len(moved)])
+        if event.phase == "start" or self._drag is None:
+            position = np.asarray(event.start_position)
+            self.node = self.body.surface.nearest_node(self.frame.points, position)
+            start = self.frame.displacement[self.node] / self.body.scene.length
+            self._drag = self.node, position, start
+        node, position, start = self._drag
+        motion = np.asarray(event.end_position) - position
+        target = start + torch.from_numpy(motion[: len(start)])
         if event.phase == "end":
-            self._grabbed = None
-        self._push(node, target)
+            self._drag = None
+        patch = self._patch(node)
+        max_amplitude = None if self.controls.unlimited.value else 1.0
 
-    async def _clicked(self, event: Any) -> None:
-        """Make the clicked point the centre of the patch."""
-        frame = self._frame
+        def load(young: float | None, poisson: float | None) -> LoadRequest:
+            force = patch().force_towards(target, max_amplitude=max_amplitude)
+            return self.body.request(force, young, poisson)
+
+        self._show_direction(target)
+        self._submit(load)
+
+    def _show_direction(self, target: Tensor) -> None:
+        """Set direction and, with the next frame, amplitude to those of a drag."""
+        size = float(target.norm())
+        if size > 0:
+            direction = np.pad((target / size).numpy(), (0, 3 - len(target)))
+            self.controls.direction.value = tuple(direction.round(2).tolist())
+        self.controls.follows_frame = True
+
+    async def click(self, event: Any) -> None:
+        """Move the patch to the clicked point."""
+        frame = self.frame
         if frame is None or event.ray_origin is None:
             return
-        origin, way = np.asarray(event.ray_origin), np.asarray(event.ray_direction)
-        along = (frame.points - origin) @ way
-        off = np.linalg.norm(frame.points - origin - along[:, None] * way, axis=1)
-        near = off < off.min() + 0.02  # of those that the ray passes, the first
-        first = np.flatnonzero(near)[along[near].argmin()]
-        self._node = int(self.body.surface.nodes[first])
-        self._controlled()
+        origin, direction = np.asarray(event.ray_origin), np.asarray(event.ray_direction)
+        along = (frame.points - origin) @ direction
+        off = np.linalg.norm(frame.points - origin - along[:, None] * direction, axis=1)
+        near = off < off.min() + PICK_RADIUS
+        first = np.flatnonzero(near)[along[near].argmin()]  # the nearest to the camera
+        self.node = int(self.body.surface.nodes[first])
+        self.apply_controls()
 
-    def _push(self, node: int, target: Tensor) -> None:
-        """Load an area so that its centre goes to a displacement over L (D,)."""
-        radius, uniform, free = self._radius.value, self._uniform.value, self._beyond.value
-
-        def hold(young: float | None, poisson: float | None) -> LoadRequest:
-            patch = self.body.patch(node, radius, uniform=uniform)
-            most = None if free else 1.0
-            return self.body.asked(patch.towards(target, most=most), young, poisson)
-
-        self._ask(hold)
-
-    def _controlled(self, event: Any = None) -> None:
-        """Load an area as the controls say."""
+    def apply_controls(self, event: Any = None) -> None:
+        """Load the patch as the sliders say; values set by the server are ignored."""
         if event is not None and event.client is None:
             return
-        node, radius, uniform = self._node, self._radius.value, self._uniform.value
-        way = torch.tensor(self._direction.value[: self._problem.shape[1]]).double()
-        amplitude = self._amplitude.value
+        self.controls.follows_frame = False
+        patch = self._patch(self.node)
+        dim = self.body.scene.problem.shape[1]
+        direction = torch.tensor(self.controls.direction.value[:dim]).double()
+        amplitude = self.controls.amplitude.value
 
-        def hold(young: float | None, poisson: float | None) -> LoadRequest:
-            patch = self.body.patch(node, radius, uniform=uniform)
-            return self.body.asked(patch.along(way, amplitude), young, poisson)
+        def load(young: float | None, poisson: float | None) -> LoadRequest:
+            return self.body.request(patch().force_along(direction, amplitude), young, poisson)
 
-        self._ask(hold)
+        self._submit(load)
 
-    def _ask(self, hold: Hold | None = None) -> None:
-        """Ask for the newest load under the newest moduli."""
-        self._hold = self._hold if hold is None else hold
-        ratio = None if self._poisson is None else self._poisson.value
-        self.worker.ask(partial(self._hold, self._young.value, ratio))
-        self._mark()
+    def sample(self, event: Any) -> None:
+        """Apply a random load of the training distribution with its moduli."""
+        self._n_samples += 1
+        request = self.body.sample(self._n_samples)
+        self.controls.young.value = float(np.clip(request.young, *self.body.young_range))
+        if self.controls.poisson is not None and request.poisson is not None:
+            self.controls.poisson.value = request.poisson
 
-    def _mark(self) -> None:
-        """Show the area that is loaded."""
-        patch = self.body.patch(self._node, self._radius.value, uniform=self._uniform.value)
-        self._marked = patch.inside.numpy()[self.body.surface.nodes]
-        self._said = ""
+        def load(young: float | None, poisson: float | None) -> LoadRequest:
+            return request._replace(
+                young=request.young if young is None else young,
+                poisson=None if request.poisson is None else poisson,
+            )
 
-    # --- the panel
+        self.controls.follows_frame = True
+        self._submit(load)
+        self._marker.mask = request.force.any(dim=1).numpy()[self.body.surface.nodes]
 
-    def _build_panel(self, title: str) -> None:
-        gui, scene = self.server.gui, self.body.scene
-        nodes, dim = self._problem.shape
-        law = type(self._problem.material).__name__
-        gui.add_html(
-            panel.message(f"{title} · {nodes * dim:,} degrees of freedom · {law}", "inherit")
-        )
-        self._reading, self._colours = gui.add_html(""), gui.add_html("")
-        self._newton = gui.add_html("", visible=False)
-        self._told = gui.add_html("")
-        with gui.add_folder("Load"):
-            gui.add_html(
-                panel.message("Drag the body to pull it; click it to place the patch.", "inherit")
-            )
-            loads = scene.loads
-            low, high = loads.patch_radius if isinstance(loads, HasModes) else (0.0, 1.0)
-            span = max(high, 0.05)
-            self._radius = gui.add_slider(
-                "patch radius / L", 0.0, float(span), 0.01, float(min(max(0.4, low), span))
-            )
-            self._direction = gui.add_vector3(
-                "direction", (0.0, 1.0 if dim == 2 else 0.0, 1.0), step=0.1
-            )
-            self._amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
-            least, most = self.body.young_span
-            self._young = gui.add_slider(
-                "E [Pa]", least, most, (most - least) / 500, self.body.young
-            )
-            span_nu = scene.loads.poisson_range
-            self._poisson = (
-                None
-                if span_nu is None
-                else gui.add_slider(
-                    "Poisson's ratio", *map(float, span_nu), 1e-3, self.body.poisson
-                )
-            )
-            self._beyond = gui.add_checkbox(
-                "beyond range",
-                False,
-                hint="let a drag ask for more than the training's largest loads",
-            )
-            self._uniform = gui.add_checkbox(
-                "even force",
-                False,
-                hint="one force at all nodes of the patch: unlike the training's",
-            )
-            random, reset = (
-                gui.add_button("Random load of the training"),
-                gui.add_button("Reset", color="gray"),
-            )
-        with gui.add_folder("Answer and colours"):
-            self._answered = gui.add_dropdown("answer", ANSWERS)
-            self._budget = gui.add_number("budget [ms]", 20.0, min=0.1, max=10_000.0)
-            self._quantity = gui.add_dropdown("colours", tuple(QUANTITIES))
-            self._mesh = gui.add_checkbox("mesh lines", True)
-            self._compare = gui.add_checkbox("Newton from rest beside it", False)
-        with gui.add_folder("Record", expand_by_default=False):
-            self._record = gui.add_button("Start recording", color="red")
-            self._state = gui.add_html(panel.message(f"Saved into {self._folder}", "inherit"))
-            saves = gui.add_button_group("save as", ("VTU", "GIF", "MP4"))
-        caught = self._door.complaints.caught
-        for control in (self._direction, self._amplitude, self._uniform, self._radius):
-            control.on_update(caught(self._controlled))
-        for control in (self._young, self._poisson):
-            if control is not None:
-                control.on_update(
-                    caught(lambda event: None if event.client is None else self._ask())
-                )
-        for control in (self._answered, self._budget, self._quantity, self._compare):
-            control.on_update(caught(self._wished))
-        self._mesh.on_update(caught(self._wished))
-        random.on_click(caught(self._sampled))
-        reset.on_click(caught(self._reset))
-        self._record.on_click(caught(self._toggle))
-        saves.on_click(caught(self._save))
+    def reset(self, event: Any) -> None:
+        """Remove the load and restore the default Young's modulus."""
+        self.controls.follows_frame = False
+        self.controls.amplitude.value = 0.0
+        self.controls.young.value = self.body.young
+        self._submit(self.body.zero_load)
 
-    def _wished(self, event: Any) -> None:
-        """Ask for the same load, answered or shown otherwise."""
-        chosen = self._answered.value
-        tol = dict(zip(ANSWERS[1:4], TIERS, strict=True)).get(chosen)
-        budget = self._budget.value if chosen == BUDGET else None
-        if budget is not None:
-            tol = TIERS[-1]
-        compare = bool(self._compare.value)
-        if self._quantity.value != self.worker.wish.quantity:
-            self._scale = Scale()
-        if compare != self.worker.wish.compare:
-            self._fe.frame.visible = self._newton.visible = self._label.visible = compare
-            middle = self._aside / 2 if compare else np.zeros(3)
-            camera = Camera.before(self.body.surface, wide=1.25 if compare else NEAR)
-            for client in self.server.get_clients().values():
-                client.camera.position = camera.position + middle
-                client.camera.look_at = camera.look_at + middle
+    def apply_settings(self, event: Any) -> None:
+        """Solve and show the same load with the selected method and quantity."""
+        old = self.worker.settings
         try:
-            self.worker.ask(wish=ViewSettings(self._quantity.value, tol, budget, compare))
+            settings = self.controls.settings()
         except ValueError as error:
-            self._trouble(str(error))
+            self._show_error(str(error))
+            return
+        if settings.quantity != old.quantity:
+            self._scale = ColourScale()
+        if settings.show_newton != old.show_newton:
+            self._show_second_body(settings.show_newton)
+        self.worker.submit(settings=settings)
 
-    def _sampled(self, event: Any) -> None:
-        """Ask for a random load of the training, with its moduli."""
-        self._draws += 1
-        asked = self.body.sample(self._draws)
-        self._young.value = float(np.clip(asked.young, *self.body.young_span))
-        if self._poisson is not None and asked.poisson is not None:
-            self._poisson.value = asked.poisson
+    def _show_second_body(self, visible: bool) -> None:
+        """Show or hide the body of Newton, and move the cameras."""
+        self._newton_node.frame.visible = self._label.visible = visible
+        self.controls.show_newton_table(visible)
+        offset = self._newton_offset / 2 if visible else np.zeros(3)
+        distance = DISTANCE_OF_TWO if visible else DISTANCE
+        camera = Camera.facing(self.body.surface, distance=distance)
+        for client in self.server.get_clients().values():
+            client.camera.position = camera.position + offset
+            client.camera.look_at = camera.look_at + offset
 
-        def hold(young: float | None, poisson: float | None) -> LoadRequest:
-            return asked._replace(
-                young=asked.young if young is None else young,
-                poisson=None if asked.poisson is None else poisson,
-            )
-
-        self._ask(hold)
-        self._marked = asked.force.any(dim=1).numpy()[self.body.surface.nodes]
-
-    def _reset(self, event: Any) -> None:
-        """Take the load away."""
-        self._amplitude.value = 0.0
-        self._young.value = self.body.young
-        self._ask(self.body.rest)
-
-    def _toggle(self, event: Any) -> None:
-        """Start or stop a recording."""
+    def _toggle_recording(self, event: Any) -> None:
         if self.recording.running:
             self.recording.stop()
         else:
             self.recording.start()
-        self._dirty = True
+        self._changed = True
 
     def _save(self, event: Any) -> None:
-        """Write the recording into the folder; a film goes to the browser too."""
+        """Write the recording into the folder; send animations to the browser too."""
         self.recording.stop()
         kind = event.target.value
-        self._state.content = panel.message(f"Writing {len(self.recording)} frames ...")
+        self.controls.show_state(f"Writing {len(self.recording)} frames ...")
         try:
             if kind == "VTU":
-                path = self.recording.save_series(self._folder)
+                path = self.recording.save_series(self.folder)
             else:
-                scenery = Renderer(self.body.surface, Camera.before(self.body.surface))
-                path = self.recording.save_film(self._folder, scenery, f".{kind.lower()}")
+                renderer = Renderer(self.body.surface, Camera.facing(self.body.surface))
+                path = self.recording.save_animation(self.folder, renderer, f".{kind.lower()}")
                 if event.client is not None:
                     event.client.send_file_download(path.name, path.read_bytes())
-            self._state.content = panel.message(f"Written: {path}", panel.GOOD)
+            self.controls.show_state(f"Written: {path}", panel.GOOD)
         except (ValueError, OSError) as error:
-            self._state.content = panel.message(str(error), panel.BAD)
+            self.controls.show_state(str(error), panel.BAD)
 
-    # --- what the worker brings
+    # --- requests to the worker and its results
+
+    def _patch(self, node: int) -> Callable[[], Patch]:
+        """Return a function that makes the patch of a node with the values of the controls."""
+        radius, uniform = self.controls.radius.value, self.controls.uniform.value
+        return partial(self.body.patch, node, radius, uniform=uniform)
+
+    def _submit(self, load: Load | None = None) -> None:
+        """Submit a load, or the last one, with the moduli of the sliders."""
+        self._load = self._load if load is None else load
+        poisson = self.controls.poisson
+        moduli = self.controls.young.value, None if poisson is None else poisson.value
+        self.worker.submit(partial(self._load, *moduli))
+        self._mark_patch()
+
+    def _mark_patch(self) -> None:
+        """Mark the nodes of the patch and remove the error message."""
+        node_mask = self._patch(self.node)().node_mask.numpy()
+        self._marker.mask = node_mask[self.body.surface.nodes]
+        self._error = ""
 
     def _show(self, frame: Frame) -> None:
-        """Show an answer; in the worker's thread."""
-        self._frame, self._dirty, self._said = frame, True, ""
-        top = self._scale.follow(frame.values)
-        self._network.show(frame.points, frame.values, top, frame.quantity, self._mesh.value)
-        self._show_load(frame)
-        self.server.flush()  # now, and not with viser's next window
-        self.recording.take(frame, time.monotonic())
+        """Show a frame; runs in the thread of the worker."""
+        self.frame, self._changed, self._error = frame, True, ""
+        top = self._scale.update(frame.values)
+        edges = self.controls.edges.value
+        self._body_node.show(frame.points, frame.values, top, frame.quantity, edges)
+        self._marker.show(frame)
+        self.server.flush()  # viser would otherwise wait for its next update interval
+        self.recording.add(frame, time.monotonic())
 
-    def _show_load(self, frame: Frame) -> None:
-        """Show where a load acts and which way it goes."""
-        where = self._marked
-        force = frame.asked.force.numpy()
-        size = float(np.linalg.norm(force))
-        with self.server.atomic():
-            dots = frame.points[where]
-            dots = dots[:: len(dots) // DOTS + 1]
-            self._patch_dots.points = np.nan_to_num(dots).astype(np.float32)
-            self._arrow.visible = size > 0
-            if size > 0:
-                total = np.pad(force.sum(axis=0), (0, 3 - force.shape[1]))
-                way = total / max(float(np.linalg.norm(total)), 1e-300)
-                acts = np.linalg.norm(force[self.body.surface.nodes], axis=1)
-                start = np.nan_to_num(frame.points).T @ (acts / max(acts.sum(), 1e-300))
-                share = 0.0 if frame.answer is None else min(float(frame.answer.amplitude), 2.0)
-                ends = np.stack([start, start + (0.06 + 0.22 * share) * way])
-                self._arrow.points = ends[None].astype(np.float32)
-
-    def _show_beside(self, frame: Frame | None) -> None:
-        """Show an iterate of Newton; in the worker's thread."""
-        self._dirty = True
-        self._beside = frame, 0 if frame is None else frame.iteration
+    def _show_newton(self, frame: Frame | None) -> None:
+        """Show an iterate of Newton; runs in the thread of the worker."""
+        self._changed = True
+        self.newton_frame = frame
         if frame is not None:
-            top = self._scale.top
-            self._fe.show(frame.points, frame.values, top, frame.quantity, self._mesh.value)
+            top, edges = self._scale.top, self.controls.edges.value
+            self._newton_node.show(frame.points, frame.values, top, frame.quantity, edges)
 
-    def _trouble(self, words: str) -> None:
-        """Say why there is no answer."""
-        self._said, self._dirty = words, True
+    def _show_error(self, text: str) -> None:
+        self._error, self._changed = text, True
 
     def refresh(self) -> None:
-        """Bring the readings up to date; a few times a second is enough."""
-        if not self._dirty or self._frame is None:
+        """Update the readings of the panel; to be called a few times per second."""
+        if not self._changed or self.frame is None:
             return
-        self._dirty = False
-        frame = self._frame
-        finite = frame.values[np.isfinite(frame.values)]
-        low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
-        self._reading.content = panel.readout(frame, self.worker.rate)
-        self._colours.content = panel.legend(frame.quantity, self._scale.top, low, high)
-        if self.worker.wish.compare:
-            self._newton.content = panel.newton(*self._beside)
-        self._told.content = panel.message(self._said, panel.BAD)
-        running, count = self.recording.running, len(self.recording)
-        self._record.label = f"Stop ({count} of {MOST} frames)" if running else "Start recording"
-        if running:
-            self._state.content = panel.message(f"{count} frames", "inherit")
+        self._changed = False
+        self.controls.show_frame(self.frame, self._scale, self.worker.frame_rate)
+        if self.worker.settings.show_newton:
+            self.controls.show_newton_frame(self.newton_frame)
+        self.controls.show_error(self._error)
+        self.controls.show_recording(self.recording)

@@ -1,11 +1,11 @@
-"""What the panel says, as HTML: numbers and names of this package only."""
+"""HTML of the readings on the page. All text is escaped."""
 
 import html
 
 from dpl.viewer.frames import QUANTITIES, Frame
-from dpl.viewer.rasterizer import BANDS, colours
+from dpl.viewer.rasterizer import N_BANDS, band_colours
 
-GOOD, DOUBT, BAD = "#15803d", "#b45309", "#b91c1c"
+GOOD, WARNING, BAD = "#15803d", "#b45309", "#b91c1c"
 ROW = (
     '<div style="display:flex;justify-content:space-between;gap:12px;line-height:1.65">'
     '<span style="opacity:.62">{}</span>'
@@ -14,70 +14,76 @@ ROW = (
 BOX = '<div style="padding:2px 12px 6px;font-size:13.5px">{}</div>'
 
 
-def readout(frame: Frame, rate: float) -> str:
-    """Return what an answer is worth."""
+def result_table(frame: Frame, frame_rate: float) -> str:
+    """Return method, time, residual, range check and summary of a result of the simulator."""
     answer = frame.answer
     assert answer is not None
-    good = frame.converged
-    tone = GOOD if good else BAD if not frame.volume_ratio > 0 else DOUBT
-    away = answer.out_of_distribution
+    colour = GOOD if frame.converged else WARNING if frame.volume_ratio > 0 else BAD
+    outside = answer.out_of_distribution
     rows = [
-        _row("answered by", str(answer.method), "font-weight:600"),
-        _row("in", f"{answer.milliseconds:.1f} ms", "font-weight:600"),
-        _row("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{tone}"),
+        _row("method", str(answer.method), "font-weight:600"),
+        _row("time", f"{answer.milliseconds:.1f} ms", "font-weight:600"),
+        _row("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{colour}"),
         _row("min det F", f"{frame.volume_ratio:.3f}"),
-        _row("tangents solved", f"{answer.iterations}"),
+        _row("linear solves", f"{answer.iterations}"),
         _row(
-            "range of the training",
-            f"{'outside' if away else 'inside'}, {answer.amplitude:.2f}",
-            f"color:{BAD if away else GOOD}",
+            "training range",
+            f"{'outside' if outside else 'inside'}, amplitude {answer.amplitude:.2f}",
+            f"color:{BAD if outside else GOOD}",
         ),
-        _row("answers a second", f"{rate:.0f}"),
+        _row("frames per second", f"{frame_rate:.0f}"),
     ]
-    words = html.escape(str(answer.summary))
-    verdict = (
+    summary = (
         f'<div style="margin-top:6px;padding:6px 9px;border-radius:6px;border-left:3px solid '
-        f'{tone};background:{tone}14;line-height:1.35">{words}</div>'
+        f'{colour};background:{colour}14;line-height:1.35">{html.escape(str(answer.summary))}</div>'
     )
-    return BOX.format("".join(rows) + verdict)
+    return BOX.format("".join(rows) + summary)
 
 
-def newton(frame: Frame | None, iterations: int) -> str:
-    """Return how far Newton from rest has come."""
+def newton_table(frame: Frame | None) -> str:
+    """Return state, iteration and residual of an iterate of Newton; None before the first."""
     if frame is None:
-        return BOX.format(_row("Newton from rest", "waits for the load to rest"))
-    tone = GOOD if frame.converged else DOUBT
-    state = "in balance" if frame.converged else "iterating"
+        return BOX.format(_row("Newton from zero", "starts when the load is constant"))
+    colour = GOOD if frame.converged else WARNING
+    state = "converged" if frame.converged else "iterating"
     rows = [
-        _row("Newton from rest", state, f"color:{tone};font-weight:600"),
-        _row("iteration", str(iterations)),
-        _row("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{tone}"),
+        _row("Newton from zero", state, f"color:{colour};font-weight:600"),
+        _row("iteration", str(frame.iteration)),
+        _row("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{colour}"),
     ]
     return BOX.format("".join(rows))
 
 
 def legend(quantity: str, top: float, low: float, high: float) -> str:
-    """Return the colours of a quantity, and what it spans on the surface."""
+    """Return the colour bar of a quantity and its range on the surface.
+
+    Args:
+        quantity: Name of the quantity.
+        top: Upper end of the colour scale; 0: all values are zero, and the bar has no numbers.
+        low: Smallest value on the surface.
+        high: Largest value on the surface.
+    """
     unit = QUANTITIES[quantity]
     cells = "".join(
         f'<span style="flex:1;background:rgb({r},{g},{b})"></span>'
-        for r, g, b in colours(quantity).tolist()
+        for r, g, b in band_colours(quantity).tolist()
     )
-    ticks = "".join(f"<span>{top * k / 4:.3g}</span>" for k in range(5))
+    ticks = "".join(f"<span>{top * k / 4:.3g}</span>" for k in range(5)) if top > 0 else ""
+    span = f"{low:.3g} to {high:.3g} {unit}" if top > 0 else f"0 {unit} everywhere"
     return BOX.format(
         f'<div style="display:flex;justify-content:space-between;margin-bottom:4px">'
         f"<b>{html.escape(quantity)} [{unit}]</b>"
-        f'<span style="opacity:.62">{BANDS} bands</span></div>'
+        f'<span style="opacity:.62">{N_BANDS} bands</span></div>'
         f'<div style="display:flex;height:14px;border-radius:3px;overflow:hidden">{cells}</div>'
         f'<div style="display:flex;justify-content:space-between;font-size:11.5px;opacity:.75">'
-        f"{ticks}</div>" + _row("on the surface", f"{low:.3g} to {high:.3g} {unit}")
+        f"{ticks}</div>" + _row("on the surface", span)
     )
 
 
-def message(words: str, tone: str = DOUBT) -> str:
-    """Return a line of words."""
-    style = f"padding:2px 12px 6px;font-size:13px;color:{tone};line-height:1.35"
-    return f'<div style="{style}">{html.escape(words)}</div>' if words else ""
+def message(text: str, colour: str = WARNING) -> str:
+    """Return a line of text."""
+    style = f"padding:2px 12px 6px;font-size:13px;color:{colour};line-height:1.35"
+    return f'<div style="{style}">{html.escape(text)}</div>' if text else ""
 
 
 def _row(name: str, value: str, style: str = "") -> str:

@@ -1,4 +1,4 @@
-"""Pictures of frames without a display: a depth buffer, and words beside it."""
+"""Rendering of frames without a display: a depth-buffered rasterizer, captions and a legend."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,51 +11,56 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from dpl.viewer.frames import QUANTITIES
-from dpl.viewer.surface import Floats, Surface
+from dpl.viewer.surface import SMOOTH, Floats, Surface, triangle_normals, vertex_normals
 
-COLOURS = {"displacement": "viridis", "von Mises stress": "turbo", "error against FE": "magma"}
-BANDS = 12
-PAPER, INK, LINE, FAINT = (250, 250, 252), (32, 36, 48), (70, 74, 88), (205, 209, 218)
-FINER = 2  # pixels of the buffer a pixel of the picture, each way
+COLOUR_MAPS = {"displacement": "viridis", "von Mises stress": "turbo", "error against FE": "magma"}
+N_BANDS = 12
+BACKGROUND, TEXT, TEXT_GREY, OUTLINE = (250, 250, 252), (32, 36, 48), (70, 74, 88), (205, 209, 218)
+SUPERSAMPLING = 2  # pixels of the depth buffer per pixel of the image, in each direction
 Bytes = NDArray[np.uint8]
 
 
-def colours(quantity: str, count: int = BANDS) -> Bytes:
-    """Return the colours of bands, (K, 3)."""
-    first, last = (0.06, 0.94) if COLOURS[quantity] == "turbo" else (0.12, 0.98)
-    found = matplotlib.colormaps[COLOURS[quantity]](np.linspace(first, last, count))[:, :3]
+def band_colours(quantity: str) -> Bytes:
+    """Return the RGB colours of the bands, (N_BANDS, 3)."""
+    first, last = (0.06, 0.94) if COLOUR_MAPS[quantity] == "turbo" else (0.12, 0.98)
+    found = matplotlib.colormaps[COLOUR_MAPS[quantity]](np.linspace(first, last, N_BANDS))[:, :3]
     return np.asarray(np.round(255 * found), dtype=np.uint8)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Where a picture is taken from.
+    """Perspective camera.
 
     Attributes:
-        position: Over L, (3,).
-        look_at: (3,).
-        field: Vertical angle of view [radians].
+        position: Position over L, (3,).
+        look_at: Point at the centre of the image over L, (3,).
+        field_of_view: Vertical angle of view [rad].
     """
 
     position: tuple[float, float, float]
     look_at: tuple[float, float, float]
-    field: float = 0.6
+    field_of_view: float = 0.6
 
     @classmethod
-    def before(cls, surface: Surface, *, wide: float = 1.0) -> "Camera":
-        """Return a camera that sees a body with room to bend; `wide` times as far away."""
-        low, high = surface.rest.min(axis=0), surface.rest.max(axis=0)
-        middle = (low + high) / 2
-        flat = surface.problem.shape[1] == 2
-        way = np.array([0.0, -0.02, 1.0]) if flat else np.array([0.62, -1.0, 0.48])
-        distance = 1.45 * wide * (0.45 + float(np.linalg.norm(high - low)))
-        place = middle + distance * way / np.linalg.norm(way)
-        x, y, z = map(float, place)
-        a, b, c = map(float, middle)
+    def facing(cls, surface: Surface, *, distance: float = 1.0) -> "Camera":
+        """Return a camera in front of a body with space for its deformation.
+
+        Args:
+            surface: Surface of the body.
+            distance: Factor on the distance to the body [-].
+        """
+        points = surface.undeformed
+        low, high = points.min(axis=0), points.max(axis=0)
+        centre = (low + high) / 2
+        planar = surface.problem.shape[1] == 2
+        direction = np.array([0.0, -0.02, 1.0] if planar else [0.62, -1.0, 0.48])
+        length = 1.45 * distance * (0.45 + float(np.linalg.norm(high - low)))
+        x, y, z = (centre + length * direction / np.linalg.norm(direction)).tolist()
+        a, b, c = centre.tolist()
         return cls((x, y, z), (a, b, c))
 
     def axes(self) -> Floats:
-        """Return right, up and forward, (3, 3)."""
+        """Return the unit vectors right, up and forward, (3, 3)."""
         forward = np.subtract(self.look_at, self.position)
         forward = forward / np.linalg.norm(forward)
         right = np.cross(forward, (0.0, 0.0, 1.0))
@@ -65,91 +70,92 @@ class Camera:
         return np.stack([right, np.cross(right, forward), forward])
 
     def project(self, points: Floats, width: int, height: int) -> Floats:
-        """Return columns, rows and depths of points (n, 3), (n, 3)."""
-        seen = (points - self.position) @ self.axes().T
-        scale = height / (2 * np.tan(self.field / 2))
-        column = width / 2 + scale * seen[:, 0] / seen[:, 2]
-        row = height / 2 - scale * seen[:, 1] / seen[:, 2]
-        return np.stack([column, row, seen[:, 2]], axis=1)
+        """Return column [pixel], row [pixel] and depth over L of points (n, 3), (n, 3)."""
+        local = (points - self.position) @ self.axes().T
+        scale = height / (2 * np.tan(self.field_of_view / 2))
+        column = width / 2 + scale * local[:, 0] / local[:, 2]
+        row = height / 2 - scale * local[:, 1] / local[:, 2]
+        return np.stack([column, row, local[:, 2]], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class Renderer:
-    """What every picture of one body shares.
+    """Renderer of images of one body.
 
     Attributes:
-        surface: The body.
-        camera: Where it is seen from.
-        size: Width and height [pixels].
+        surface: Surface of the body.
+        camera: The camera.
+        size: Width and height of images [pixel].
     """
 
     surface: Surface
     camera: Camera
     size: tuple[int, int] = (960, 540)
 
-    def draw(
-        self, points: Floats, values: Floats, top: float, quantity: str, words: Sequence[str]
+    def render(
+        self, points: Floats, values: Floats, top: float, quantity: str, captions: Sequence[str]
     ) -> Image.Image:
-        """Return the picture of a deformed surface.
+        """Return the image of a deformed surface.
 
         Args:
-            points: Its nodes, over L, (S, 3).
-            values: At them, (S,).
-            top: Upper end of the colours.
-            quantity: What values are.
-            words: Lines beside it, the first large.
+            points: Positions over L, (S, 3).
+            values: Values at the points, (S,).
+            top: Upper end of the colour scale.
+            quantity: Name of the quantity.
+            captions: Lines of text in the upper left corner, the first one in large letters.
         """
-        width, height = (FINER * side for side in self.size)
+        width, height = (SUPERSAMPLING * side for side in self.size)
         surface = self.surface
         depth = np.full((height, width), np.inf)
         value = np.zeros((height, width))
         normal = np.zeros((height, width, 3))
-        seen = self.camera.project(points, width, height)
+        pixels = self.camera.project(points, width, height)
         levels = np.nan_to_num(values / top if top > 0 else 0 * values)
-        _fill(seen, surface.triangles, levels, _smooth(points, surface), depth, value, normal)
-        table = colours(quantity).astype(float)
-        band = np.clip((value * BANDS).astype(int), 0, BANDS - 1)
-        away = np.subtract(self.camera.position, self.camera.look_at)
-        towards = away / np.linalg.norm(away)
-        lamp = towards + np.array([-0.25, 0.1, 0.75])
-        lamp = lamp / np.linalg.norm(lamp)
-        bright = 0.52 + 0.5 * np.abs(normal @ lamp)
-        body = np.clip(table[band] * bright[..., None], 0, 255)
-        hit = np.isfinite(depth)
-        picture = np.where(hit[..., None], body, np.asarray(PAPER, float))
-        _lines(seen, surface.lines, depth, picture, 0.22, np.asarray(INK, float))
-        rest = self.camera.project(surface.rest, width, height)
-        _lines(rest, surface.rims, depth, picture, 0.75, np.asarray(FAINT, float))
-        image = Image.fromarray(np.asarray(picture, dtype=np.uint8))
+        normals = _corner_normals(points, surface)
+        _fill_triangles(pixels, surface.triangles, levels, normals, depth, value, normal)
+        colours = self._shade(value, normal, quantity)
+        background = np.asarray(BACKGROUND, float)
+        canvas = np.where(np.isfinite(depth)[..., None], colours, background)
+        _draw_lines(pixels, surface.edges, depth, canvas, 0.22, np.asarray(TEXT, float))
+        outline = self.camera.project(surface.undeformed, width, height)
+        colour = np.asarray(OUTLINE, float)
+        _draw_lines(outline, surface.feature_edges, depth, canvas, 0.75, colour)
+        image = Image.fromarray(np.asarray(canvas, dtype=np.uint8))
         image = image.resize(self.size, Image.Resampling.LANCZOS)
-        _write(image, words)
-        _legend(image, quantity, top)
+        _draw_captions(image, captions)
+        _draw_legend(image, quantity, top)
         return image
 
+    def _shade(self, value: Floats, normal: Floats, quantity: str) -> Floats:
+        """Return colours (height, width, 3) of values in [0, 1], lit from beside the camera."""
+        band = np.clip((value * N_BANDS).astype(int), 0, N_BANDS - 1)
+        to_camera = np.subtract(self.camera.position, self.camera.look_at)
+        light = to_camera / np.linalg.norm(to_camera) + np.array([-0.25, 0.1, 0.75])
+        light = light / np.linalg.norm(light)
+        brightness = 0.52 + 0.5 * np.abs(normal @ light)
+        return np.clip(band_colours(quantity).astype(float)[band] * brightness[..., None], 0, 255)
 
-def _smooth(points: Floats, surface: Surface) -> Floats:
-    """Return a normal at each corner of each triangle, (T, 3, 3): that of the triangle."""
-    a, b, c = (points[surface.triangles[:, k]] for k in range(3))
-    own = np.cross(b - a, c - a)
-    own /= np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-300)
-    total = np.zeros_like(points)
-    for k in range(3):
-        np.add.at(total, surface.triangles[:, k], own)
-    total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
-    mean = total[surface.triangles]
-    sharp = (mean * own[:, None]).sum(axis=2, keepdims=True) < 0.9  # at an edge of the shape
-    return np.where(sharp, own[:, None], mean)
+
+def _corner_normals(points: Floats, surface: Surface) -> Floats:
+    """Return a normal at each corner of each triangle, (T, 3, 3).
+
+    Vertex normals give smooth shading; at sharp edges the normal of the triangle is used.
+    """
+    own = triangle_normals(points, surface.triangles)[:, None]
+    mean = vertex_normals(points, surface.triangles)[surface.triangles]
+    sharp = (mean * own).sum(axis=2, keepdims=True) < SMOOTH
+    return np.where(sharp, own, mean)
 
 
 @njit(cache=True)
-def _fill(seen, triangles, levels, normals, depth, value, normal):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Draw triangles into a depth buffer, with their values and normals."""
+def _fill_triangles(pixels, triangles, levels, normals, depth, value, normal):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write depth, value and normal of the nearest triangle to each pixel."""
     height, width = depth.shape
     for t in range(len(triangles)):
         i, j, k = triangles[t]
-        ax, ay, az = seen[i]
-        bx, by, bz = seen[j]
-        cx, cy, cz = seen[k]
+        ax, ay, az = pixels[i]
+        bx, by, bz = pixels[j]
+        cx, cy, cz = pixels[k]
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if area == 0.0 or not (az > 0 and bz > 0 and cz > 0):
             continue
@@ -179,13 +185,13 @@ def _fill(seen, triangles, levels, normals, depth, value, normal):  # type: igno
 
 
 @njit(cache=True)
-def _lines(seen, lines, depth, picture, strength, colour):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Blend lines that nothing hides into a picture."""
+def _draw_lines(pixels, lines, depth, canvas, opacity, colour):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Blend lines that are not hidden into an image."""
     height, width = depth.shape
     for n in range(len(lines)):
         i, j = lines[n]
-        ax, ay, az = seen[i]
-        bx, by, bz = seen[j]
+        ax, ay, az = pixels[i]
+        bx, by, bz = pixels[j]
         steps = int(max(abs(bx - ax), abs(by - ay))) + 1
         for step in range(steps):
             share = step / steps
@@ -196,8 +202,8 @@ def _lines(seen, lines, depth, picture, strength, colour):  # type: ignore[no-un
             column, row = int(x), int(y)
             if z * 0.996 < depth[row, column]:
                 for axis in range(3):
-                    old = picture[row, column, axis]
-                    picture[row, column, axis] = old + strength * (colour[axis] - old)
+                    old = canvas[row, column, axis]
+                    canvas[row, column, axis] = old + opacity * (colour[axis] - old)
 
 
 def _font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
@@ -206,36 +212,32 @@ def _font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(found, size)
 
 
-def _write(image: Image.Image, words: Sequence[str]) -> None:
-    """Put lines into the upper left corner."""
-    pen = ImageDraw.Draw(image)
+def _draw_captions(image: Image.Image, captions: Sequence[str]) -> None:
+    """Draw lines of text in the upper left corner."""
+    draw = ImageDraw.Draw(image)
     unit = image.height / 540
     row = 18 * unit
-    for number, line in enumerate(words):
-        size = round((25 if number == 0 else 17) * unit)
-        pen.text(
-            (22 * unit, row),
-            line,
-            fill=INK if number == 0 else LINE,
-            font=_font(size, bold=number == 0),
-        )
+    for number, line in enumerate(captions):
+        title = number == 0
+        size = round((25 if title else 17) * unit)
+        font, colour = _font(size, bold=title), TEXT if title else TEXT_GREY
+        draw.text((22 * unit, row), line, fill=colour, font=font)
         row += 1.5 * size
 
 
-def _legend(image: Image.Image, quantity: str, top: float) -> None:
-    """Put the colours and what they stand for at the right."""
-    pen = ImageDraw.Draw(image)
+def _draw_legend(image: Image.Image, quantity: str, top: float) -> None:
+    """Draw the colour bar at the right edge."""
+    draw = ImageDraw.Draw(image)
     unit = image.height / 540
-    right, high, low = image.width - 92 * unit, 120 * unit, image.height - 60 * unit
-    step = (low - high) / BANDS
+    left, high, low = image.width - 92 * unit, 120 * unit, image.height - 60 * unit
+    step = (low - high) / N_BANDS
     font = _font(round(14 * unit))
-    for k, colour in enumerate(colours(quantity)):
+    for k, colour in enumerate(band_colours(quantity)):
         y = low - (k + 1) * step
-        pen.rectangle((right, y, right + 18 * unit, y + step), fill=tuple(int(c) for c in colour))
-    for k in range(0, BANDS + 1, 3):
-        y = low - k * step
-        pen.text(
-            (right + 24 * unit, y), f"{top * k / BANDS:.3g}", fill=LINE, font=font, anchor="lm"
-        )
+        draw.rectangle((left, y, left + 18 * unit, y + step), fill=tuple(int(c) for c in colour))
+    for k in range(0, N_BANDS + 1, 3):
+        label, place = f"{top * k / N_BANDS:.3g}", (left + 24 * unit, low - k * step)
+        draw.text(place, label, fill=TEXT_GREY, font=font, anchor="lm")
     title = f"{quantity} [{QUANTITIES[quantity]}]"
-    pen.text((image.width - 22 * unit, high - 22 * unit), title, fill=INK, font=font, anchor="rm")
+    place = (image.width - 22 * unit, high - 22 * unit)
+    draw.text(place, title, fill=TEXT, font=font, anchor="rm")

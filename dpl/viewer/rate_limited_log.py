@@ -1,4 +1,4 @@
-"""What goes wrong with requests of browsers: one line each, and at most one line a second."""
+"""Log of failed browser requests: one line per failure, at most one line per second."""
 
 import contextlib
 import inspect
@@ -9,76 +9,78 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-PERIOD = 1.0  # shortest time between two lines [s]
-LONGEST = 200  # characters of what is told
+MIN_INTERVAL = 1.0  # shortest time between two lines [s]
+MAX_CHARACTERS = 200  # longest message
 
 
 class RateLimitedHandler(logging.Handler):
-    """A handler of log records that prints one line for a record, without a traceback.
+    """Handler of log records that prints one line per record, without a traceback.
 
-    A browser decides how often a request fails, and often what the error says. So lines that come
-    too soon after another are counted and not printed, and what is printed is cut and has no
+    A browser decides how often requests fail and can influence the text of errors. Lines within
+    `MIN_INTERVAL` of the last one are counted and not printed. Lines are shortened and contain no
     control characters.
 
     Attributes:
-        logger: A logger that has this handler only.
+        logger: A logger with this handler only.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin with no line printed.
+        """Create the handler and its logger.
 
         Args:
-            clock: Returns the time [s].
+            clock: Function that returns the time [s].
         """
         super().__init__(logging.ERROR)
         self.logger = logging.Logger("dpl.viewer", logging.ERROR)
         self.logger.addHandler(self)
-        self._clock, self._counting = clock, threading.Lock()
-        self._printed: float | None = None
-        self._left_out = 0
+        self._clock = clock
+        self._count_lock = threading.Lock()
+        self._last_line: float | None = None
+        self._n_omitted = 0
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print a record in one line, or count it."""
-        self.add(record.getMessage(), record.exc_info[1] if record.exc_info else None)
+        """Print or count a record."""
+        self.report(record.getMessage(), record.exc_info[1] if record.exc_info else None)
 
-    def add(self, told: str, error: BaseException | None = None) -> None:
-        """Print what went wrong in one line, or count it.
+    def report(self, message: str, error: BaseException | None = None) -> None:
+        """Print a failure in one line, or count it if the last line is too recent.
 
         Args:
-            told: What failed.
-            error: Why.
+            message: Description of the failed operation.
+            error: Its exception.
         """
-        with self._counting:
+        with self._count_lock:
             now = self._clock()
-            if self._printed is not None and now - self._printed < PERIOD:
-                self._left_out += 1
+            if self._last_line is not None and now - self._last_line < MIN_INTERVAL:
+                self._n_omitted += 1
                 return
-            more = f" ({self._left_out} more were not printed)" if self._left_out else ""
-            self._printed, self._left_out = now, 0
-        why = "" if error is None else f": {type(error).__name__}: {error}"
-        line = "".join(c if c.isprintable() else " " for c in f"{told}{why}")
-        line = " ".join(line.split())[:LONGEST].encode("ascii", "backslashreplace").decode()
-        print(f"warning: a request of a browser failed: {line}{more}", file=sys.stderr, flush=True)
+            omitted = f" ({self._n_omitted} more were not printed)" if self._n_omitted else ""
+            self._last_line = now
+            self._n_omitted = 0
+        cause = "" if error is None else f": {type(error).__name__}: {error}"
+        line = "".join(c if c.isprintable() else " " for c in f"{message}{cause}")
+        line = " ".join(line.split())[:MAX_CHARACTERS].encode("ascii", "backslashreplace").decode()
+        print(f"warning: browser request failed: {line}{omitted}", file=sys.stderr, flush=True)
 
-    def caught(self, callback: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """Return a callback, a coroutine function or not, whose errors are told here."""
+    def catch_errors(self, callback: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """Return a callback, or a coroutine function, whose exceptions are reported here."""
         if inspect.iscoroutinefunction(callback):
 
-            async def awaited(event: Any) -> None:
-                with self._telling():
+            async def call_async(event: Any) -> None:
+                with self._report_errors():
                     await callback(event)
 
-            return awaited
+            return call_async
 
-        def called(event: Any) -> None:
-            with self._telling():
+        def call(event: Any) -> None:
+            with self._report_errors():
                 callback(event)
 
-        return called
+        return call
 
     @contextlib.contextmanager
-    def _telling(self) -> Iterator[None]:
+    def _report_errors(self) -> Iterator[None]:
         try:
             yield
-        except Exception as error:  # the page must go on, whatever one browser asked for
-            self.add("a control", error)
+        except Exception as error:  # no request of a browser may stop the server
+            self.report("control", error)

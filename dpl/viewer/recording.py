@@ -1,4 +1,4 @@
-"""What was shown, kept: a series for ParaView, or a film."""
+"""Recordings of frames: series for ParaView and animations."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -13,151 +13,167 @@ from dpl.export.paraview import nodal_fields
 from dpl.fem import write_mesh
 from dpl.fem.mesh import write_collection
 from dpl.system.files import atomic_write
-from dpl.viewer.frames import Body, Frame, Scale
-from dpl.viewer.rasterizer import INK, PAPER, Renderer, colours
+from dpl.viewer.frames import Body, ColourScale, Frame
+from dpl.viewer.rasterizer import BACKGROUND, TEXT, Renderer, band_colours
 
-MOST = 900  # frames of a recording, 30 s at 30 a second
-RATE = 20  # frames of a film a second
+MAX_FRAMES = 900  # frames of a recording, 30 s at 30 frames per second
+FRAME_RATE = 20  # frames per second of an animation
 FORMATS = (".gif", ".mp4")
 
 
 class Recording:
-    """Frames as they were shown, with their times.
+    """Frames with the times at which they were shown.
 
     Attributes:
-        body: Whose.
-        running: Whether frames are taken.
+        body: The body.
+        running: True while frames are recorded.
     """
 
     def __init__(self, body: Body) -> None:
-        """Begin empty."""
+        """Create an empty recording."""
         self.body, self.running = body, False
         self._frames: list[tuple[float, Frame]] = []
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
-        """Return how many frames there are."""
+        """Return the number of frames."""
         return len(self._frames)
 
     def start(self) -> None:
-        """Begin anew."""
+        """Remove all frames and start recording."""
         with self._lock:
             self._frames, self.running = [], True
 
     def stop(self) -> None:
-        """Take no more."""
+        """Stop recording."""
         self.running = False
 
-    def take(self, frame: Frame, now: float) -> None:
-        """Keep a frame shown at a time [s], while running and there is room."""
+    def add(self, frame: Frame, time: float) -> None:
+        """Append a frame that is shown at a time [s]; ignored if stopped or full."""
         with self._lock:
-            if self.running and len(self._frames) < MOST:
-                self._frames.append((now, frame))
-            self.running &= len(self._frames) < MOST
+            if self.running and len(self._frames) < MAX_FRAMES:
+                self._frames.append((time, frame))
+            self.running &= len(self._frames) < MAX_FRAMES
 
     def frames(self) -> list[tuple[float, Frame]]:
-        """Return what there is, times from 0."""
+        """Return times [s] from the first frame on, and frames."""
         with self._lock:
-            kept = list(self._frames)
-        return [(now - kept[0][0], frame) for now, frame in kept]
+            frames = list(self._frames)
+        return [(time - frames[0][0], frame) for time, frame in frames]
 
     def save_series(self, folder: Path) -> Path:
-        """Write frames as VTU files and a PVD file that ParaView opens; return that.
-
-        With what an export has at the nodes, see `dpl.export.paraview.nodal_fields`.
+        """Write VTU files with `nodal_fields` and a PVD file; return the path of the PVD file.
 
         Raises:
-            ValueError: There are none.
+            ValueError: The recording is empty.
         """
-        kept, scene = self._some(), self.body.scene
+        frames, scene = self._recorded_frames(), self.body.scene
         mesh = scene.problem.mesh_in_metres
-        place = free_name(folder, "recording", ".pvd")
+        path = free_path(folder, "recording", ".pvd")
         files = []
-        for number, (time, frame) in enumerate(kept):
-            load = self.body.load(frame.asked)
+        for number, (time, frame) in enumerate(frames):
+            load = self.body.load(frame.request)
             with torch.inference_mode():
-                found = nodal_fields(scene, load, frame.displacement / scene.length)
-            name = f"{place.stem}/frame_{number:04d}.vtu"
-            write_mesh(folder / name, mesh, {key: field.numpy() for key, field in found.items()})
+                fields = nodal_fields(scene, load, frame.displacement / scene.length)
+            name = f"{path.stem}/frame_{number:04d}.vtu"
+            write_mesh(folder / name, mesh, {key: field.numpy() for key, field in fields.items()})
             files.append((time, name))
-        write_collection(place, files)
-        return place
+        write_collection(path, files)
+        return path
 
-    def save_film(self, folder: Path, scenery: Renderer, kind: str) -> Path:
-        """Write frames as a film, ".gif" or ".mp4", as long as it took; return it.
+    def save_animation(self, folder: Path, renderer: Renderer, suffix: str) -> Path:
+        """Write an animation in real time, ".gif" or ".mp4", and return its path.
 
         Raises:
-            ValueError: There are no frames, or no such format.
+            ValueError: The recording is empty, or the format is unknown.
         """
-        place = free_name(folder, "recording", kind)
-        film(place, evenly(self._some()), scenery)
-        return place
+        path = free_path(folder, "recording", suffix)
+        write_animation(path, resample(self._recorded_frames()), renderer)
+        return path
 
-    def _some(self) -> list[tuple[float, Frame]]:
-        kept = self.frames()
-        if not kept:
-            raise ValueError("nothing is recorded yet")
-        return kept
+    def _recorded_frames(self) -> list[tuple[float, Frame]]:
+        frames = self.frames()
+        if not frames:
+            raise ValueError("the recording is empty; start recording first")
+        return frames
 
 
-def evenly(frames: list[tuple[float, Frame]]) -> list[Frame]:
-    """Return of frames with times [s] those that a film shows, `RATE` a second."""
+def resample(frames: list[tuple[float, Frame]]) -> list[Frame]:
+    """Return the frames shown at multiples of 1 / `FRAME_RATE`, of frames with times [s]."""
     times = np.array([time for time, _ in frames])
-    ticks = np.arange(0.0, times[-1] + 1 / RATE, 1 / RATE)
+    ticks = np.arange(0.0, times[-1] + 1 / FRAME_RATE, 1 / FRAME_RATE)
     chosen = np.clip(np.searchsorted(times, ticks + 1e-9) - 1, 0, None)
     return [frames[k][1] for k in chosen]
 
 
-def film(
+def default_captions(frame: Frame) -> list[str]:
+    """Return the lines of text for a frame of a recording."""
+    answer = frame.answer
+    if answer is None:
+        return [f"Newton, iteration {frame.iteration}", f"relative residual {frame.residual:.1e}"]
+    return [
+        f"{answer.method} · {answer.milliseconds:.1f} ms",
+        f"relative residual {frame.residual:.1e}",
+        f"min det F {frame.volume_ratio:.2f}",
+    ]
+
+
+def write_animation(
     path: Path,
     frames: list[Frame],
-    scenery: Renderer,
-    words: Callable[[Frame], list[str]] | None = None,
+    renderer: Renderer,
+    captions: Callable[[Frame], list[str]] = default_captions,
 ) -> None:
-    """Write frames, `RATE` a second, as a film; a GIF runs in a loop.
+    """Write frames, `FRAME_RATE` per second, as an animation; a GIF loops.
 
     Args:
-        path: A .gif or .mp4 file.
-        frames: One or more.
-        scenery: Where they are drawn.
-        words: What stands on the picture of a frame; `caption` if left out.
+        path: Path of a .gif or .mp4 file.
+        frames: At least one frame.
+        renderer: Renderer of the images.
+        captions: Function that returns the lines of text for a frame.
 
     Raises:
-        ValueError: No such format.
+        ValueError: The format is unknown.
     """
     if path.suffix not in FORMATS:
-        raise ValueError(f"{path.name} must end with {' or '.join(FORMATS)}")
-    pictures = _pictures(frames, scenery, words or caption)
+        raise ValueError(f"path = {path.name} must end with {' or '.join(FORMATS)}")
+    images = _render(frames, renderer, captions)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".mp4":
-        _mp4(path, pictures, scenery.size)
-        return
-    palette = _palette({frame.quantity for frame in frames})
-    flat = [
-        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
-        for picture in pictures
-    ]
+        _write_mp4(path, images, renderer.size)
+    else:
+        _write_gif(path, images, {frame.quantity for frame in frames})
+
+
+def _write_gif(path: Path, images: Iterator[NDArray[np.uint8]], quantities: set[str]) -> None:
+    palette = _palette(quantities)
+    first, *others = (
+        Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE)
+        for image in images
+    )
     with atomic_write(path) as file:
-        flat[0].save(
+        first.save(
             file,
             format="GIF",
             save_all=True,
-            append_images=flat[1:],
-            duration=round(1000 / RATE),
+            append_images=others,
+            duration=round(1000 / FRAME_RATE),
             loop=0,
             optimize=False,
         )
 
 
-def _mp4(path: Path, pictures: Iterator[NDArray[np.uint8]], size: tuple[int, int]) -> None:
+def _write_mp4(path: Path, images: Iterator[NDArray[np.uint8]], size: tuple[int, int]) -> None:
     import imageio_ffmpeg
 
     part = path.with_name(f".{path.stem}.part.mp4")
-    writer = imageio_ffmpeg.write_frames(str(part), size, fps=RATE, quality=7, macro_block_size=2)
+    writer = imageio_ffmpeg.write_frames(
+        str(part), size, fps=FRAME_RATE, quality=7, macro_block_size=2
+    )
     writer.send(None)
     try:
-        for picture in pictures:
-            writer.send(np.ascontiguousarray(picture))
+        for image in images:
+            writer.send(np.ascontiguousarray(image))
         writer.close()
         part.replace(path)
     finally:
@@ -165,49 +181,38 @@ def _mp4(path: Path, pictures: Iterator[NDArray[np.uint8]], size: tuple[int, int
 
 
 def _palette(quantities: set[str]) -> Image.Image:
-    """Return the colours of a GIF: bands in light and shade, and from paper to ink.
+    """Return one palette for all images: shades of the band colours, and greys.
 
-    One palette for all pictures, so that what does not move costs nothing and does not flicker.
+    With a common palette, unchanged pixels take no space and do not flicker.
     """
     shades = np.linspace(0.45, 1.05, 16 // len(quantities))[:, None, None]
-    bands = [np.clip(shades * colours(quantity), 0, 255) for quantity in sorted(quantities)]
-    greys = np.linspace(PAPER, INK, 40)
-    flat = np.concatenate([*(shade.reshape(-1, 3) for shade in bands), greys]).round()
+    bands = [np.clip(shades * band_colours(quantity), 0, 255) for quantity in sorted(quantities)]
+    greys = np.linspace(BACKGROUND, TEXT, 40)
+    colours = np.concatenate([*(shade.reshape(-1, 3) for shade in bands), greys]).round()
     image = Image.new("P", (1, 1))
-    image.putpalette(flat.astype(np.uint8).tobytes())
+    image.putpalette(colours.astype(np.uint8).tobytes())
     return image
 
 
-def _pictures(
-    frames: list[Frame], scenery: Renderer, words: Callable[[Frame], list[str]]
+def _render(
+    frames: list[Frame], renderer: Renderer, captions: Callable[[Frame], list[str]]
 ) -> Iterator[NDArray[np.uint8]]:
-    """Yield the pictures of frames; colours span what the whole film holds."""
-    largest = np.concatenate([frame.values for frame in frames])
-    top = Scale().follow(largest)
-    before: tuple[Frame, NDArray[np.uint8]] | None = None
+    """Yield the images of frames with one colour scale for all."""
+    top = ColourScale().update(np.concatenate([frame.values for frame in frames]))
+    last: tuple[Frame, NDArray[np.uint8]] | None = None
     for frame in frames:
-        if before is None or frame is not before[0]:
-            image = scenery.draw(frame.points, frame.values, top, frame.quantity, words(frame))
-            before = frame, np.asarray(image)
-        yield before[1]
+        if last is None or frame is not last[0]:
+            image = renderer.render(
+                frame.points, frame.values, top, frame.quantity, captions(frame)
+            )
+            last = frame, np.asarray(image)
+        yield last[1]
 
 
-def caption(frame: Frame) -> list[str]:
-    """Return what stands on a picture."""
-    answer = frame.answer
-    if answer is None:
-        return [f"Newton from rest: iteration {frame.iteration}", f"residual {frame.residual:.1e}"]
-    return [
-        f"{answer.method} · {answer.milliseconds:.1f} ms",
-        f"residual {frame.residual:.1e} of the load",
-        f"min det F {frame.volume_ratio:.2f}",
-    ]
-
-
-def free_name(folder: Path, stem: str, suffix: str) -> Path:
-    """Return the first path stem-001, stem-002, ... of which nothing is there."""
+def free_path(folder: Path, stem: str, suffix: str) -> Path:
+    """Return the first unused path of stem-001, stem-002, ..., with and without the suffix."""
     for number in range(1, 10_000):
         name = f"{stem}-{number:03d}"
         if not any((folder / f"{name}{s}").exists() for s in (suffix, "")):
             return folder / f"{name}{suffix}"
-    raise ValueError(f"{folder} is full of recordings")
+    raise ValueError(f"{folder} contains 9999 recordings; remove some")

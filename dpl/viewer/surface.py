@@ -1,4 +1,4 @@
-"""What is seen of a body: its surface, cut into bands of one colour."""
+"""Surface of a body and its division into colour bands."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -9,104 +9,105 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem import Problem, fields, surface
-from dpl.fem.postprocess import triangles as fans
+from dpl.fem.postprocess import triangles as triangulate
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-SHARP = 0.9  # cosine between normals below which an edge is one of the shape
+SMOOTH = 0.9  # smallest cosine between normals of facets that form a smooth surface
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The surface of a body; in 2D the body itself. Cells of degree 2 are drawn by their corners.
+    """Surface of a body; in 2D the body itself. Cells of degree 2 are drawn by their corners.
 
     Attributes:
         problem: The body.
-        nodes: Its nodes that are drawn, (S,).
-        triangles: Of those, in their order here, seen from outside anticlockwise, (T, 3).
-        lines: Edges of facets, (K, 2).
-        rims: Those where the surface bends sharply or ends, (R, 2).
+        nodes: Nodes on the surface, (S,).
+        triangles: Triangles as indices into `nodes`, anticlockwise seen from outside, (T, 3).
+        edges: Edges of facets as indices into `nodes`, (K, 2).
+        feature_edges: Edges at the boundary or between facets that are not smooth, (R, 2).
     """
 
     problem: Problem
     nodes: Ints
     triangles: Ints
-    lines: Ints
-    rims: Ints
+    edges: Ints
+    feature_edges: Ints
 
     @classmethod
     def of(cls, problem: Problem) -> "Surface":
         """Return the surface of a body."""
-        rest = _in_space(problem.points.numpy())
+        points = _to_3d(problem.points.numpy())
         facets = surface(problem.mesh)
-        corners = facets.shape[1]
-        normals = _normals(rest, facets[:, :3])
+        normals = triangle_normals(points, facets[:, :3])
         sides = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
-        lines, where = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
-        owner = np.repeat(np.arange(len(facets)), corners)
-        total = np.zeros((len(lines), 3))
-        np.add.at(total, where.ravel(), normals[owner])
-        count = np.bincount(where.ravel(), minlength=len(lines))
-        bent = (total**2).sum(axis=1) < 2 + 2 * SHARP  # |n + m|^2 of two unit normals
+        edges, index = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
+        facet = np.repeat(np.arange(len(facets)), facets.shape[1])
+        total = np.zeros((len(edges), 3))
+        np.add.at(total, index.ravel(), normals[facet])
+        count = np.bincount(index.ravel(), minlength=len(edges))
+        sharp = (total**2).sum(axis=1) < 2 + 2 * SMOOTH  # |n + m|^2 of two unit normals
         nodes = np.unique(facets)
-        number = np.full(len(rest), -1)
+        number = np.full(len(points), -1)
         number[nodes] = np.arange(len(nodes))
-        triangles = number[fans(facets)]
-        return cls(problem, nodes, triangles, number[lines], number[lines[bent | (count == 1)]])
+        edges = number[edges]
+        return cls(problem, nodes, number[triangulate(facets)], edges, edges[sharp | (count == 1)])
 
     @cached_property
-    def rest(self) -> Floats:
-        """Nodes of the surface without load, (S, 3) [-]."""
-        return _in_space(self.problem.points.numpy())[self.nodes]
+    def undeformed(self) -> Floats:
+        """Undeformed positions of the nodes over L, (S, 3) [-]."""
+        return _to_3d(self.problem.points.numpy())[self.nodes]
 
     @cached_property
-    def shell(self) -> Problem:
-        """The cells at the surface: all that stresses at its nodes depend on."""
+    def adjacent_cells(self) -> Problem:
+        """The cells with a node on the surface, which determine the stresses there."""
         body = self.problem
-        drawn = torch.zeros(body.shape[0], dtype=torch.bool)
-        drawn[self.nodes] = True
-        kept = drawn[body.cells].any(dim=1)
-        cells = body.cells[kept]
+        on_surface = torch.zeros(body.shape[0], dtype=torch.bool)
+        on_surface[self.nodes] = True
+        chosen = on_surface[body.cells].any(dim=1)
+        cells = body.cells[chosen]
         if body.equal_cells:
             return replace(body, cells=cells)
-        return replace(body, cells=cells, dN=body.dN[kept], dV=body.dV[kept])
+        return replace(body, cells=cells, dN=body.dN[chosen], dV=body.dV[chosen])
 
-    def moved(self, displacement: Tensor) -> Floats:
-        """Return the nodes of the surface where displacements (N, D) [-] take them, (S, 3) [-]."""
-        return self.rest + _in_space(displacement.numpy()[self.nodes])
+    def deformed_points(self, displacement: Tensor) -> Floats:
+        """Return the deformed positions over L, (S, 3) [-], of displacements (N, D) [-]."""
+        return self.undeformed + _to_3d(displacement.numpy()[self.nodes])
 
     def von_mises(self, displacement: Tensor, poisson: Tensor) -> Floats:
-        """Return von Mises stress over E at the surface under displacements (N, D) [-], (S,) [-].
+        """Return the von Mises stress over E at the nodes of the surface, (S,) [-].
 
         Args:
-            displacement: Over L.
-            poisson: As that of a load, (1, P).
+            displacement: Displacement over L, (N, D) [-].
+            poisson: Poisson's ratio as in a load, (1, P) [-].
         """
-        body = self.problem.at(poisson)
-        shell = self.shell if body is self.problem else replace(self.shell, material=body.material)
-        found = fields(shell, displacement[None]).von_mises[0]
-        return found.numpy()[self.nodes]
+        body, cells = self.problem.at(poisson), self.adjacent_cells
+        if body is not self.problem:
+            cells = replace(cells, material=body.material)
+        return fields(cells, displacement[None]).von_mises[0].numpy()[self.nodes]
 
-    def nearest(self, points: Floats, place: Floats) -> int:
-        """Return the node of the body whose place (S, 3) is nearest to a point (3,)."""
-        return int(self.nodes[np.argmin(((points - place) ** 2).sum(axis=1))])
+    def nearest_node(self, points: Floats, position: Floats) -> int:
+        """Return the node of the body whose position (S, 3) is nearest to a point (3,)."""
+        return int(self.nodes[np.argmin(((points - position) ** 2).sum(axis=1))])
 
 
-def bands(points: Floats, triangles: Ints, levels: Floats, count: int) -> list[Floats]:
-    """Return a triangulated surface cut into bands, for each the corners of its triangles.
+def contour_bands(points: Floats, triangles: Ints, levels: Floats, count: int) -> list[Floats]:
+    """Return the parts of a triangulated surface between consecutive contour lines.
+
+    Values are interpolated linearly in each triangle.
 
     Args:
-        points: (S, 3).
-        triangles: (T, 3).
-        levels: At points, (S,): band k is where they lie between k and k + 1.
-        count: Bands, K.
+        points: Positions, (S, 3).
+        triangles: Indices of points, (T, 3).
+        levels: Values at the points, (S,). Band k contains values between k and k + 1.
+        count: Number of bands, K.
 
     Returns:
-        K arrays, (3 times its triangles, 3).
+        The corners of the triangles of each band: K arrays of shape (3 n_k, 3).
     """
     levels = np.clip(levels, 0.0, count * (1 - 1e-9))
     order = np.argsort(levels[triangles], axis=1, kind="stable")
-    odd = order[:, 1] == (order[:, 0] + 2) % 3
+    reversed_ = order[:, 1] == (order[:, 0] + 2) % 3  # sorting reversed the orientation
     sorted_ = np.take_along_axis(triangles, order, axis=1)
     lowest, highest = levels[sorted_[:, 0]].astype(int), levels[sorted_[:, 2]].astype(int)
     owner = np.repeat(np.arange(len(triangles)), highest - lowest + 1)
@@ -116,47 +117,61 @@ def bands(points: Floats, triangles: Ints, levels: Floats, count: int) -> list[F
     v0, v1, v2 = (levels[sorted_[owner, k]] for k in range(3))
     low, high = np.maximum(band, v0), np.minimum(band + 1, v2)
 
-    def long_side(level: Floats) -> Floats:
-        return _between(p0, p2, v0, v2, level)
+    def on_long_side(level: Floats) -> Floats:
+        return _interpolate(p0, p2, v0, v2, level)
 
-    def short_sides(level: Floats) -> Floats:
+    def on_short_sides(level: Floats) -> Floats:
         below = ((level <= v1) & (v0 < v1))[:, None]
-        return np.where(below, _between(p0, p1, v0, v1, level), _between(p1, p2, v1, v2, level))
+        return np.where(
+            below, _interpolate(p0, p1, v0, v1, level), _interpolate(p1, p2, v1, v2, level)
+        )
 
-    a, b, c, e = long_side(low), long_side(high), short_sides(high), short_sides(low)
-    flat = (v0 == v2)[:, None]  # all of it in one band
+    a, b, c, e = on_long_side(low), on_long_side(high), on_short_sides(high), on_short_sides(low)
+    flat = (v0 == v2)[:, None]  # the whole triangle is in one band
     b, c, e = np.where(flat, p2, b), np.where(flat, p1, c), np.where(flat, p0, e)
     kink = (low < v1) & (v1 < high)
     d = np.where(kink[:, None], p1, e)
-    # the cut-out polygon a, b, c, d, e as a fan; where there is no kink, d is e
-    turned = odd[owner]
+    # the polygon a, b, c, d, e as a triangle fan; d is a corner (kink) or equal to e
+    flip = reversed_[owner]
     pieces = [(a, c, b), (a, d, c), (a[kink], e[kink], d[kink])]
-    ways, belongs = [turned, turned, turned[kink]], [band, band, band[kink]]
+    flips, bands = [flip, flip, flip[kink]], [band, band, band[kink]]
     soup = np.stack([np.concatenate(column) for column in zip(*pieces, strict=True)], axis=1)
-    back, whose = np.concatenate(ways), np.concatenate(belongs)
-    soup[back] = soup[back][:, [0, 2, 1]]
-    kept = np.ones(len(soup), dtype=bool)
-    for i, j in ((0, 1), (1, 2), (0, 2)):  # where a cut goes through a corner
-        kept &= (soup[:, i] != soup[:, j]).any(axis=1)
-    soup, whose = soup[kept], whose[kept]
-    ranked = np.argsort(whose, kind="stable")
-    cuts = np.searchsorted(whose[ranked], np.arange(1, count))
-    return [part.reshape(-1, 3) for part in np.split(soup[ranked], cuts)]
+    flipped, owner_band = np.concatenate(flips), np.concatenate(bands)
+    soup[flipped] = soup[flipped][:, [0, 2, 1]]
+    proper = np.ones(len(soup), dtype=bool)
+    for i, j in ((0, 1), (1, 2), (0, 2)):  # a contour through a corner gives degenerate triangles
+        proper &= (soup[:, i] != soup[:, j]).any(axis=1)
+    soup, owner_band = soup[proper], owner_band[proper]
+    order = np.argsort(owner_band, kind="stable")
+    starts = np.searchsorted(owner_band[order], np.arange(1, count))
+    return [part.reshape(-1, 3) for part in np.split(soup[order], starts)]
 
 
-def _between(p: Floats, q: Floats, v: Floats, w: Floats, level: Floats) -> Floats:
-    """Return the points of segments pq, of values v to w, at a level."""
+def _interpolate(p: Floats, q: Floats, v: Floats, w: Floats, level: Floats) -> Floats:
+    """Return the points of segments pq, with values v at p and w at q, at a level."""
     share = np.divide(level - v, w - v, out=np.zeros_like(v), where=w > v)
     return p + np.clip(share, 0.0, 1.0)[:, None] * (q - p)
 
 
-def _normals(points: Floats, triangles: Ints) -> Floats:
+def triangle_normals(points: Floats, triangles: Ints) -> Floats:
     """Return unit normals of triangles, (T, 3)."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    return _normalise(np.cross(b - a, c - a))
 
 
-def _in_space(vectors: Floats) -> Floats:
-    """Return vectors (n, D) as (n, 3)."""
+def vertex_normals(points: Floats, triangles: Ints) -> Floats:
+    """Return the normalised sums of the triangle normals at each point, (S, 3)."""
+    normals = triangle_normals(points, triangles)
+    total = np.zeros_like(points)
+    for k in range(3):
+        np.add.at(total, triangles[:, k], normals)
+    return _normalise(total)
+
+
+def _normalise(vectors: Floats) -> Floats:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+
+
+def _to_3d(vectors: Floats) -> Floats:
+    """Return vectors (n, D) padded with zeros to (n, 3)."""
     return np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))

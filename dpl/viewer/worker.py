@@ -1,4 +1,4 @@
-"""One thread that answers, and the newest wish wins: nothing is ever queued."""
+"""Thread that solves the most recent load request; earlier requests are dropped."""
 
 import math
 import threading
@@ -7,151 +7,159 @@ from collections import deque
 from collections.abc import Callable
 
 from dpl.viewer.drag_loads import LoadRequest
-from dpl.viewer.frames import Body, Frame, ViewSettings, between
+from dpl.viewer.frames import Body, Frame, ViewSettings, interpolate
 
-Make = Callable[[], LoadRequest]
-NEAR = 1e-3  # part of the way at which a load has arrived
+MakeRequest = Callable[[], LoadRequest]
+ARRIVED = 1e-3  # relative distance below which the next load is the requested one
 
 
 class Worker(threading.Thread):
-    """Answers the newest load again and again until there is a newer one.
+    """Thread that solves loads on the way to the most recent request.
 
-    The load glides: what is answered lies on the way from the last load to the newest, a little
-    nearer with each frame, so that a hand that is heard 20 times a second moves a body that is
-    drawn 60 times. Each frame is an answer of its own.
+    A browser sends drag events 20 times per second. Loads are smoothed exponentially in time, so
+    that the body is drawn up to `max_rate` times per second; each frame is solved.
 
     Attributes:
-        body: What answers.
+        body: The body.
     """
 
     def __init__(
         self,
         body: Body,
-        show: Callable[[Frame], None],
+        on_frame: Callable[[Frame], None],
         *,
-        beside: Callable[[Frame | None], None] = lambda frame: None,
-        trouble: Callable[[str], None] = lambda words: None,
-        rate: float = 60.0,
+        on_newton: Callable[[Frame | None], None] = lambda frame: None,
+        on_error: Callable[[str], None] = lambda message: None,
+        max_rate: float = 60.0,
         smoothing_time: float = 0.06,
         min_frame_time: float = 0.35,
     ) -> None:
-        """Take where answers go.
+        """Create the thread; `start` starts it.
 
         Args:
-            body: What answers.
-            show: Takes an answer.
-            beside: Takes an iterate of Newton; None where there is none for this load.
-            trouble: Takes why a load cannot be answered.
-            rate: Most frames a second.
-            glide: Time in which 63 % of the way to a new load is gone [s]; 0: at once.
-            pace: Shortest time that an iterate is seen [s].
+            body: The body.
+            on_frame: Receives each frame.
+            on_newton: Receives each iterate of Newton; None when a new load is solved.
+            on_error: Receives the message of a request that cannot be solved.
+            max_rate: Largest number of frames per second [1/s].
+            smoothing_time: Time constant of the smoothing [s]; 0: no smoothing.
+            min_frame_time: Shortest time for which an iterate of Newton is shown [s].
         """
         super().__init__(name="viewer", daemon=True)
-        self.body, self._show, self._beside, self._trouble = body, show, beside, trouble
-        self._rate, self._glide, self._pace = rate, smoothing_time, min_frame_time
-        self._news = threading.Condition()
-        self._make: Make = body.rest
-        self._wish = ViewSettings()
-        self._asked, self._done, self._ended = 1, 0, False  # numbers of wishes
+        self.body, self._on_frame = body, on_frame
+        self._on_newton, self._on_error = on_newton, on_error
+        self._max_rate, self._smoothing_time = max_rate, smoothing_time
+        self.min_frame_time = min_frame_time
+        self._changed = threading.Condition()
+        self._make_request: MakeRequest = body.zero_load
+        self._settings = ViewSettings()
+        self._submitted, self._finished, self._stopped = 1, 0, False  # counts of requests
         self._times: deque[float] = deque(maxlen=240)
 
-    def ask(self, make: Make | None = None, wish: ViewSettings | None = None) -> None:
-        """Replace load, wish or both; `make` is called by this thread."""
-        with self._news:
-            self._make = self._make if make is None else make
-            self._wish = self._wish if wish is None else wish
-            self._asked += 1
-            self._news.notify_all()
+    def submit(
+        self, make_request: MakeRequest | None = None, settings: ViewSettings | None = None
+    ) -> None:
+        """Replace the request, the settings or both.
+
+        Args:
+            make_request: Function that returns the request; it runs in this thread.
+            settings: Method and quantity.
+        """
+        with self._changed:
+            self._make_request = self._make_request if make_request is None else make_request
+            self._settings = self._settings if settings is None else settings
+            self._submitted += 1
+            self._changed.notify_all()
 
     @property
-    def wish(self) -> ViewSettings:
-        """The newest."""
-        return self._wish
+    def settings(self) -> ViewSettings:
+        """The most recent settings."""
+        return self._settings
 
     @property
-    def rate(self) -> float:
-        """Answers in the second before the last."""
+    def frame_rate(self) -> float:
+        """Number of frames in the second before the last frame [1/s]."""
         times = list(self._times)
         return float(sum(times[-1] - then < 1.0 for then in times))
 
-    def settle(self, timeout: float) -> bool:
-        """Wait until the newest wish is answered; return whether it is."""
-        with self._news:
-            return self._news.wait_for(lambda: self._done == self._asked, timeout)
+    def wait(self, timeout: float) -> bool:
+        """Wait until the most recent request is finished; return False after `timeout` [s]."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._finished == self._submitted, timeout)
 
     def stop(self) -> None:
-        """End after the answer at work."""
-        with self._news:
-            self._ended = True
-            self._news.notify_all()
+        """Stop after the solve in progress."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
         if self.is_alive():
             self.join(timeout=30)
 
     def run(self) -> None:
-        """Answer until `stop`."""
-        here: LoadRequest | None = None
+        """Solve requests until `stop`."""
+        current: LoadRequest | None = None
         while True:
-            with self._news:
-                self._news.wait_for(lambda: self._ended or self._done != self._asked)
-                if self._ended:
+            with self._changed:
+                self._changed.wait_for(lambda: self._stopped or self._finished != self._submitted)
+                if self._stopped:
                     return
-                number, make, wish = self._asked, self._make, self._wish
+                number, make_request = self._submitted, self._make_request
+                settings = self._settings
             try:
-                here = self._serve(number, make, wish, here)
-            except Exception as error:  # the page must go on, whatever one load did
-                self._trouble(" ".join(str(error).split()) or type(error).__name__)
+                current = self._solve(number, make_request(), settings, current)
+            except Exception as error:  # one failed request must not end the thread
+                self._on_error(" ".join(str(error).split()) or type(error).__name__)
                 self._finish(number)
 
-    def _serve(
-        self, number: int, make: Make, wish: ViewSettings, here: LoadRequest | None
+    def _solve(
+        self, number: int, goal: LoadRequest, settings: ViewSettings, current: LoadRequest | None
     ) -> LoadRequest:
-        """Go to a load, and return where the newer one found it."""
-        goal = make()
-        here = goal if here is None or self._glide <= 0 else here
-        size = max(float(here.force.norm()), float(goal.force.norm())) or 1.0
-        left = self._left(here, goal, size)
-        self._beside(None)
-        before = time.monotonic()
+        """Solve loads from `current` to `goal` until a newer request; return the last load."""
+        if current is None or self._smoothing_time <= 0:
+            current = goal
+        size = max(float(current.force.norm()), float(goal.force.norm())) or 1.0
+        self._on_newton(None)
+        start = time.monotonic()
         while True:
-            here = between(here, goal, 1.0 if left < NEAR else self._share(before))
-            left = self._left(here, goal, size)
-            before = time.monotonic()
-            frame = self.body.answer(here, wish)
+            arrived = _distance(current, goal, size) < ARRIVED
+            current = interpolate(current, goal, 1.0 if arrived else self._smoothing(start))
+            start = time.monotonic()
+            frame = self.body.solve(current, settings)
             self._times.append(time.monotonic())
-            self._show(frame)
-            if here is goal:
+            self._on_frame(frame)
+            if current is goal:
                 break
-            if self._interrupted(number, before + 1 / self._rate - time.monotonic()):
-                return here
-        if wish.compare:
-            for iterate in self.body.newton(goal, wish, frame):
-                if self._interrupted(number, 0.0):
-                    return here
-                self._beside(iterate)
-                if self._interrupted(number, self._pace):
-                    return here
+            if self._is_replaced(number, start + 1 / self._max_rate - time.monotonic()):
+                return current
+        if settings.show_newton:
+            for iterate in self.body.newton_frames(goal, settings, frame):
+                if self._is_replaced(number, 0.0):
+                    return current
+                self._on_newton(iterate)
+                if self._is_replaced(number, self.min_frame_time):
+                    return current
         self._finish(number)
-        return here
+        return current
 
-    def _share(self, before: float) -> float:
-        """Return the part of the way that is gone in the time since the last frame."""
-        since = max(time.monotonic() - before, 1 / self._rate)
-        return 1 - math.exp(-since / self._glide)
+    def _smoothing(self, start: float) -> float:
+        """Return the share of the remaining distance for the time since `start`."""
+        elapsed = max(time.monotonic() - start, 1 / self._max_rate)
+        return 1 - math.exp(-elapsed / self._smoothing_time)
 
-    @staticmethod
-    def _left(here: LoadRequest, goal: LoadRequest, size: float) -> float:
-        """Return how far a load is from another, in parts of the larger force and of E."""
-        way = float((goal.force - here.force).norm()) / size
-        return max(way, abs(goal.young - here.young) / goal.young)
-
-    def _interrupted(self, number: int, seconds: float) -> bool:
-        """Wait so long for a newer wish; return whether there is one."""
-        with self._news:
-            return self._news.wait_for(
-                lambda: self._ended or self._asked != number, max(seconds, 0.0)
+    def _is_replaced(self, number: int, seconds: float) -> bool:
+        """Wait for a newer request; return True if there is one or the thread must stop."""
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: self._stopped or self._submitted != number, max(seconds, 0.0)
             )
 
     def _finish(self, number: int) -> None:
-        with self._news:
-            self._done = number
-            self._news.notify_all()
+        with self._changed:
+            self._finished = number
+            self._changed.notify_all()
+
+
+def _distance(request: LoadRequest, goal: LoadRequest, size: float) -> float:
+    """Return the larger of the differences of forces over `size` and of E over the goal's [-]."""
+    force = float((goal.force - request.force).norm()) / size
+    return max(force, abs(goal.young - request.young) / goal.young)

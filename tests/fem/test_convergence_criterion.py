@@ -141,7 +141,7 @@ TAKERS = {
     "reduced": lambda newton, tol: PODGalerkin(
         newton.problem, torch.zeros(*newton.problem.shape, 1), tol=tol
     ),
-    "wish": lambda newton, tol: ViewSettings(tol=tol),
+    "view settings": lambda newton, tol: ViewSettings(tol=tol),
     "judge": lambda newton, tol: evaluate_solution(
         newton.problem,
         torch.zeros(1, *newton.problem.shape, dtype=torch.float64),

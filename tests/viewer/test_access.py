@@ -16,8 +16,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from dpl.viewer import AccessPolicy
-from dpl.viewer.access import LARGEST, check, status_for
-from dpl.viewer.rate_limited_log import LONGEST, PERIOD, RateLimitedHandler
+from dpl.viewer.access import MAX_MESSAGE, check_server, request_status
+from dpl.viewer.rate_limited_log import MAX_CHARACTERS, MIN_INTERVAL, RateLimitedHandler
 
 LONG = 120  # no test waits so long, unless what it waits for does not come [s]
 UPGRADE = {
@@ -30,32 +30,32 @@ UPGRADE = {
 
 
 @pytest.fixture
-def door(page):
+def policy(page):
     """That of a page."""
-    return page._door
+    return page._policy
 
 
-def home(door):
-    return f"127.0.0.1:{door.port}"
+def home(policy):
+    return f"127.0.0.1:{policy.port}"
 
 
-def test_the_page_is_served_to_who_has_its_address(door):
-    path = f"/{door.token}/"
-    for host in (home(door), f"localhost:{door.port}"):
-        assert status_for(door, path, Host=host) == 200
-    assert status_for(door, path + "nothing-here.js", Host=home(door)) == 404
+def test_the_page_is_served_to_who_has_its_address(policy):
+    path = f"/{policy.token}/"
+    for host in (home(policy), f"localhost:{policy.port}"):
+        assert request_status(policy, path, Host=host) == 200
+    assert request_status(policy, path + "nothing-here.js", Host=home(policy)) == 404
 
 
 @pytest.mark.parametrize("path", ["/", "/x/", "/?token=x", "//", "/%2e%2e/", "/index.html"])
-def test_without_the_token_there_is_no_page_and_no_socket(door, path):
-    assert status_for(door, path, Host=home(door)) == 403
-    origin = f"http://{home(door)}"
-    assert status_for(door, path, Host=home(door), Origin=origin, **UPGRADE) == 403
+def test_without_the_token_there_is_no_page_and_no_socket(policy, path):
+    assert request_status(policy, path, Host=home(policy)) == 403
+    origin = f"http://{home(policy)}"
+    assert request_status(policy, path, Host=home(policy), Origin=origin, **UPGRADE) == 403
 
 
-def test_a_token_that_is_nearly_right_is_wrong(door):
-    for wrong in (door.token[:-1], door.token + "x", door.token.swapcase()):
-        assert status_for(door, f"/{wrong}/", Host=home(door)) == 403
+def test_a_token_that_is_nearly_right_is_wrong(policy):
+    for wrong in (policy.token[:-1], policy.token + "x", policy.token.swapcase()):
+        assert request_status(policy, f"/{wrong}/", Host=home(policy)) == 403
 
 
 @pytest.mark.parametrize(
@@ -65,11 +65,11 @@ def test_a_token_that_is_nearly_right_is_wrong(door):
         *("", "127.0.0.1:{port}@rebound.example:{port}", "192.168.0.7:{port}", "[::2]:{port}"),
     ],
 )
-def test_a_host_that_is_not_this_one_is_refused(door, host):
-    named = host.format(port=door.port)
-    assert status_for(door, f"/{door.token}/", Host=named) == 421
+def test_a_host_that_is_not_this_one_is_refused(policy, host):
+    named = host.format(port=policy.port)
+    assert request_status(policy, f"/{policy.token}/", Host=named) == 421
     headers = {"Host": named, "Origin": f"http://{named}", **UPGRADE}
-    assert status_for(door, f"/{door.token}/", **headers) == 421
+    assert request_status(policy, f"/{policy.token}/", **headers) == 421
 
 
 @pytest.mark.parametrize(
@@ -79,19 +79,19 @@ def test_a_host_that_is_not_this_one_is_refused(door, host):
         *("http://127.0.0.1:{port}.foreign.example", "http://localhost:{port}"),
     ],
 )
-def test_a_socket_from_another_page_is_refused(door, origin):
-    more = {} if origin is None else {"Origin": origin.format(port=door.port)}
-    assert status_for(door, f"/{door.token}/", Host=home(door), **more, **UPGRADE) == 403
+def test_a_socket_from_another_page_is_refused(policy, origin):
+    more = {} if origin is None else {"Origin": origin.format(port=policy.port)}
+    assert request_status(policy, f"/{policy.token}/", Host=home(policy), **more, **UPGRADE) == 403
 
 
-def test_the_pages_own_socket_is_opened(door):
-    headers = {"Host": home(door), "Origin": f"http://{home(door)}", **UPGRADE}
-    assert status_for(door, f"/{door.token}", **headers) == 101
+def test_the_pages_own_socket_is_opened(policy):
+    headers = {"Host": home(policy), "Origin": f"http://{home(policy)}", **UPGRADE}
+    assert request_status(policy, f"/{policy.token}", **headers) == 101
 
 
-def test_only_this_machine_can_reach_it(door):
-    assert door.socket.getsockname()[0] == "127.0.0.1"
-    assert not door.open_to_all
+def test_only_this_machine_can_reach_it(policy):
+    assert policy.socket.getsockname()[0] == "127.0.0.1"
+    assert not policy.is_public
 
 
 def drained(call):
@@ -100,28 +100,28 @@ def drained(call):
         call.recv(timeout=LONG)
 
 
-def connected(door):
+def connected(policy):
     """Return a socket of the page."""
     return connect(
-        door.address.replace("http", "ws"),
-        origin=f"http://{home(door)}",
+        policy.url.replace("http", "ws"),
+        origin=f"http://{home(policy)}",
         subprotocols=[f"viser-v{viser.__version__}"],
         max_size=None,
         open_timeout=LONG,
     )
 
 
-def test_a_message_that_is_too_long_ends_the_connection(door):
-    with connected(door) as call:
-        call.send(b"x" * (LARGEST + 1))
+def test_a_message_that_is_too_long_ends_the_connection(policy):
+    with connected(policy) as call:
+        call.send(b"x" * (MAX_MESSAGE + 1))
         with pytest.raises(ConnectionClosed) as closed:
             drained(call)
     assert closed.value.rcvd.code == 1009
 
 
-def test_a_message_of_the_largest_size_is_read(door, told):
-    with connected(door) as call:
-        call.send(packed("GuiModalMessage", title="x" * LARGEST)[:LARGEST])
+def test_a_message_of_the_largest_size_is_read(policy, told):
+    with connected(policy) as call:
+        call.send(packed("GuiModalMessage", title="x" * MAX_MESSAGE)[:MAX_MESSAGE])
         with pytest.raises(ConnectionClosed) as closed:
             drained(call)
     assert closed.value.rcvd.code == 1011, "it was read and is garbage"
@@ -138,46 +138,46 @@ def test_a_message_of_the_largest_size_is_read(door, told):
     ],
     ids=ascii,
 )
-def test_a_token_that_is_not_ascii_is_wrong_and_no_error(door, capfd, path):
-    path = path.format(token=door.token)
-    assert raw_status(door, path.encode("utf-8", "surrogateescape")) == 403
+def test_a_token_that_is_not_ascii_is_wrong_and_no_error(policy, capfd, path):
+    path = path.format(token=policy.token)
+    assert raw_status(policy, path.encode("utf-8", "surrogateescape")) == 403
     assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("more", ["\u00e9", "%00", "%ff", "x" * 5000, "../" * 9, "%2e%2e/x"])
-def test_a_path_behind_the_token_that_is_no_file_is_not_found_and_no_error(door, capfd, more):
-    found = raw_status(door, f"/{door.token}/{more}".encode())
+def test_a_path_behind_the_token_that_is_no_file_is_not_found_and_no_error(policy, capfd, more):
+    found = raw_status(policy, f"/{policy.token}/{more}".encode())
     assert found in (400, 404)
     assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("name", ["Connection", "Accept-Encoding", "Upgrade", "Origin", "Host"])
-def test_a_header_that_comes_twice_is_no_error(door, capfd, name):
+def test_a_header_that_comes_twice_is_no_error(policy, capfd, name):
     twice = f"{name}: x\r\n{name}: y\r\n".encode()
-    found = raw_status(door, f"/{door.token}/".encode(), twice)
+    found = raw_status(policy, f"/{policy.token}/".encode(), twice)
     assert found == {"Host": 421, "Origin": 403, "Connection": 200}.get(name, 400)
     assert capfd.readouterr().err == ""
 
 
-def raw_status(door, path, headers=b""):
+def raw_status(policy, path, headers=b""):
     """Return the status that a request of these bytes is answered with."""
-    with socket.create_connection(("127.0.0.1", door.port), timeout=LONG) as call:
-        host = f"Host: {home(door)}\r\n".encode()
+    with socket.create_connection(("127.0.0.1", policy.port), timeout=LONG) as call:
+        host = f"Host: {home(policy)}\r\n".encode()
         call.sendall(b"GET " + path + b" HTTP/1.1\r\n" + host + headers + b"\r\n")
         return int(call.recv(64).split()[1])
 
 
 @pytest.fixture
-def told(door, monkeypatch):
-    """Complaints of the page's door as they come: a list, and an event for each new one."""
-    heard, genuine = SimpleNamespace(all=[], news=threading.Event()), door.complaints.add
+def told(policy, monkeypatch):
+    """Complaints of the page's policy as they come: a list, and an event for each new one."""
+    heard, genuine = SimpleNamespace(all=[], news=threading.Event()), policy.log.report
 
     def add(*what):
         genuine(*what)
         heard.all.append(what)
         heard.news.set()
 
-    monkeypatch.setattr(door.complaints, "add", add)
+    monkeypatch.setattr(policy.log, "report", add)
     return heard
 
 
@@ -197,25 +197,27 @@ GARBAGE = {
 
 
 @pytest.mark.parametrize("message", GARBAGE.values(), ids=GARBAGE)
-def test_garbage_ends_its_connection_with_one_line(door, told, capfd, message):
-    with connected(door) as call:
+def test_garbage_ends_its_connection_with_one_line(policy, told, capfd, message):
+    with connected(policy) as call:
         call.send(message)
         with pytest.raises(ConnectionClosed):
             drained(call)
     assert told.news.wait(LONG)
     (line,) = capfd.readouterr().err.splitlines()
-    assert line.startswith("warning: a request of a browser failed: connection handler failed: ")
+    assert line.startswith("warning: browser request failed: connection handler failed: ")
     assert line.isascii()
     assert line.isprintable()
-    assert len(line) < LONGEST + 60
-    assert status_for(door, f"/{door.token}/", Host=home(door)) == 200, "others are served"
+    assert len(line) < MAX_CHARACTERS + 60
+    assert request_status(policy, f"/{policy.token}/", Host=home(policy)) == 200, (
+        "others are served"
+    )
 
 
-def test_garbage_again_and_again_is_one_line(door, told, capfd, monkeypatch):
-    monkeypatch.setattr(door.complaints, "_clock", lambda: 0.0)
+def test_garbage_again_and_again_is_one_line(policy, told, capfd, monkeypatch):
+    monkeypatch.setattr(policy.log, "_clock", lambda: 0.0)
     for _ in range(5):
         told.news.clear()
-        with connected(door) as call:
+        with connected(policy) as call:
             call.send(b"\xc1")
             with pytest.raises(ConnectionClosed):
                 drained(call)
@@ -225,31 +227,31 @@ def test_garbage_again_and_again_is_one_line(door, told, capfd, monkeypatch):
 
 
 @pytest.mark.parametrize("update", [{"value": "x"}, {"no_such_thing": 1}, {"value": None}])
-def test_a_value_that_a_control_cannot_have_is_one_line(page, door, told, capfd, update):
-    slider = page._radius
+def test_a_value_that_a_control_cannot_have_is_one_line(page, policy, told, capfd, update):
+    slider = page.controls.radius
     before = slider.value
-    with connected(door) as call:
+    with connected(policy) as call:
         call.send(packed("GuiUpdateMessage", uuid=slider._impl.uuid, updates=update))
         while not told.news.wait(0.1):  # the task's error is told once the task is collected
             gc.collect()
     assert slider.value == before
     err = capfd.readouterr().err
     assert err.count("\n") == 1
-    assert err.startswith("warning: a request of a browser failed: ")
+    assert err.startswith("warning: browser request failed: ")
 
 
 def test_an_error_of_any_control_is_one_line(page, capfd):
     now = 0.0
-    page._door.complaints._clock = lambda: now
-    page._ask = page._sampled = None  # whatever calls it fails
-    page.worker.ask = page.recording.start = page.recording.stop = None
+    page._policy.log._clock = lambda: now
+    page._submit = None  # every call fails
+    page.worker.submit = page.recording.start = page.recording.stop = None
     event = SimpleNamespace(client=object(), target=SimpleNamespace(value="VTU"))
-    for name in ("_direction", "_amplitude", "_uniform", "_radius", "_young", "_mesh", "_compare"):
-        (callback,) = getattr(page, name)._impl.update_cb
+    for name in ("direction", "amplitude", "uniform", "radius", "young", "edges", "show_newton"):
+        (callback,) = getattr(page.controls, name)._impl.update_cb
         callback(event)
-        now += PERIOD
+        now += MIN_INTERVAL
         (line,) = capfd.readouterr().err.splitlines()
-        assert line.startswith("warning: a request of a browser failed: a control: TypeError: ")
+        assert line.startswith("warning: browser request failed: control: TypeError: ")
 
 
 def test_errors_of_callbacks_are_told_whether_they_are_awaited_or_not(capfd):
@@ -259,9 +261,9 @@ def test_errors_of_callbacks_are_told_whether_they_are_awaited_or_not(capfd):
     def called(event):
         raise ZeroDivisionError(event)
 
-    asyncio.run(RateLimitedHandler().caught(awaited)("far\naway"))
-    RateLimitedHandler().caught(called)("far\naway")
-    told = "warning: a request of a browser failed: a control: ZeroDivisionError: far away"
+    asyncio.run(RateLimitedHandler().catch_errors(awaited)("far\naway"))
+    RateLimitedHandler().catch_errors(called)("far\naway")
+    told = "warning: browser request failed: control: ZeroDivisionError: far away"
     assert capfd.readouterr().err.splitlines() == [told, told]
 
 
@@ -269,11 +271,11 @@ def test_one_line_a_second_is_printed_and_the_others_are_counted(capfd):
     now = 5.0
     complaints = RateLimitedHandler(lambda: now)
     lines = []
-    for step in (0.0, 0.25, PERIOD - 0.25 - 2**-20, 2**-20, 0.5, 3.0, 0.0):
+    for step in (0.0, 0.25, MIN_INTERVAL - 0.25 - 2**-20, 2**-20, 0.5, 3.0, 0.0):
         now += step
         complaints.logger.error("it failed")
         lines.append(capfd.readouterr().err)
-    plain = "warning: a request of a browser failed: it failed"
+    plain = "warning: browser request failed: it failed"
     assert lines == [
         *(f"{plain}\n", "", "", f"{plain} (2 more were not printed)\n"),
         *("", f"{plain} (1 more were not printed)\n", ""),
@@ -285,9 +287,9 @@ def test_warnings_are_no_complaints(capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_the_answer_forbids_to_fetch_from_elsewhere(door):
-    with socket.create_connection(("127.0.0.1", door.port), timeout=LONG) as call:
-        call.sendall(f"GET /{door.token}/ HTTP/1.1\r\nHost: {home(door)}\r\n\r\n".encode())
+def test_the_answer_forbids_to_fetch_from_elsewhere(policy):
+    with socket.create_connection(("127.0.0.1", policy.port), timeout=LONG) as call:
+        call.sendall(f"GET /{policy.token}/ HTTP/1.1\r\nHost: {home(policy)}\r\n\r\n".encode())
         head = call.recv(4096).decode("latin1").split("\r\n\r\n")[0].lower()
     assert "content-security-policy: default-src 'none'" in head
     assert "referrer-policy: no-referrer" in head
@@ -296,14 +298,14 @@ def test_the_answer_forbids_to_fetch_from_elsewhere(door):
 
 
 def test_a_door_to_all_takes_addresses_and_its_names_but_no_others():
-    door = AccessPolicy.bound("0.0.0.0", 0, ["Lab-7"])
+    policy = AccessPolicy.bind("0.0.0.0", 0, ["Lab-7"])
     try:
-        assert door.open_to_all
+        assert policy.is_public
         hosts = {"192.168.0.7": True, "lab-7": True, "LAB-7": True, "rebound.example": False}
         for name, ours in hosts.items():
-            assert door._ours(f"{name}:{door.port}") is ours
+            assert policy.is_own_host(f"{name}:{policy.port}") is ours
     finally:
-        door.socket.close()
+        policy.socket.close()
 
 
 def test_a_browser_cannot_ask_for_a_tunnel(page):
@@ -312,27 +314,27 @@ def test_a_browser_cannot_ask_for_a_tunnel(page):
 
 
 @pytest.mark.parametrize("which", range(5))
-def test_a_door_that_answers_one_request_wrongly_is_not_served(door, monkeypatch, which):
+def test_a_door_that_answers_one_request_wrongly_is_not_served(policy, monkeypatch, which):
     asked = []
 
-    def status(door, path, **headers):
+    def status(policy, path, **headers):
         asked.append((path, headers))
-        found = status_for(door, path, **headers)
+        found = request_status(policy, path, **headers)
         return 500 if len(asked) == which + 1 else found
 
-    monkeypatch.setattr("dpl.viewer.access.status_for", status)
+    monkeypatch.setattr("dpl.viewer.access.request_status", status)
     must = (200, 403, 421, 403, 403)[which]
-    with pytest.raises(RuntimeError, match=f"not safe: 500 where {must} must be; not served"):
-        check(door)
+    with pytest.raises(RuntimeError, match=f"status 500 instead of {must}"):
+        check_server(policy)
     monkeypatch.undo()
-    check(door)
+    check_server(policy)
 
 
-def test_a_host_without_a_port_is_that_of_port_80(door):
+def test_a_host_without_a_port_is_that_of_port_80(policy):
     bound = SimpleNamespace(getsockname=lambda: ("127.0.0.1", 80))
     other = AccessPolicy(bound, "127.0.0.1", ("lab",))
     for host in ("127.0.0.1", "localhost", "[::1]", "LAB", "127.0.0.1:80", "localhost:00080"):
-        assert other._ours(host), host
+        assert other.is_own_host(host), host
     for host in (
         "127.0.0.1:81",
         "lab:8080",
@@ -343,11 +345,11 @@ def test_a_host_without_a_port_is_that_of_port_80(door):
         "la",
         "127.0.0.2",
     ):
-        assert not other._ours(host), host
+        assert not other.is_own_host(host), host
 
 
 @pytest.mark.parametrize(
-    ("host", "open_to_all", "address"),
+    ("host", "is_public", "address"),
     [
         ("127.0.0.1", False, "http://127.0.0.1:81/t/"),
         ("localhost", False, "http://localhost:81/t/"),
@@ -358,26 +360,26 @@ def test_a_host_without_a_port_is_that_of_port_80(door):
         ("fe80::1", True, "http://[fe80::1]:81/t/"),
     ],
 )
-def test_the_address_is_what_a_browser_can_open(host, open_to_all, address):
+def test_the_address_is_what_a_browser_can_open(host, is_public, address):
     bound = SimpleNamespace(getsockname=lambda: (host, 81))
-    door = AccessPolicy(bound, host, (), "t")
-    assert (door.open_to_all, door.address) == (open_to_all, address)
+    policy = AccessPolicy(bound, host, (), "t")
+    assert (policy.is_public, policy.url) == (is_public, address)
 
 
 def test_a_door_to_all_takes_its_own_names_too():
     bound = SimpleNamespace(getsockname=lambda: ("0.0.0.0", 81))
     name = socket.gethostname().lower()
-    assert AccessPolicy(bound, "0.0.0.0")._ours(f"{name}:81")
-    assert AccessPolicy(bound, "Lab-7.example")._ours("lab-7.EXAMPLE:81")
-    assert not AccessPolicy(bound, "127.0.0.1")._ours(f"{name}.example:81")
-    assert AccessPolicy(bound, "0.0.0.0")._ours("[fe80::7]:81")
-    assert not AccessPolicy(bound, "127.0.0.1")._ours("[fe80::7]:81")
+    assert AccessPolicy(bound, "0.0.0.0").is_own_host(f"{name}:81")
+    assert AccessPolicy(bound, "Lab-7.example").is_own_host("lab-7.EXAMPLE:81")
+    assert not AccessPolicy(bound, "127.0.0.1").is_own_host(f"{name}.example:81")
+    assert AccessPolicy(bound, "0.0.0.0").is_own_host("[fe80::7]:81")
+    assert not AccessPolicy(bound, "127.0.0.1").is_own_host("[fe80::7]:81")
 
 
 def test_two_pages_have_two_tokens():
-    first, second = AccessPolicy.bound("127.0.0.1", 0), AccessPolicy.bound("127.0.0.1", 0)
+    first, second = AccessPolicy.bind("127.0.0.1", 0), AccessPolicy.bind("127.0.0.1", 0)
     assert first.token != second.token
     assert len(first.token) >= 32
     assert first.token not in repr(first)
-    for door in (first, second):
-        door.socket.close()
+    for policy in (first, second):
+        policy.socket.close()

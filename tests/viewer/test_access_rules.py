@@ -1,4 +1,4 @@
-"""Laws of the door of the viewer, asked of its rules alone: no page and no browser."""
+"""Laws of the policy of the viewer, asked of its rules alone: no page and no browser."""
 
 import asyncio
 import http
@@ -16,16 +16,18 @@ from websockets.http11 import Request, Response
 
 from dpl.viewer import AccessPolicy
 from dpl.viewer import access as module
-from dpl.viewer.access import LARGEST, check, serve_with, status_for
+from dpl.viewer.access import MAX_MESSAGE, check_server, request_status, serve_with
 
 PORT, TOKEN = 8123, "Token-7_x"
 HOME = f"127.0.0.1:{PORT}"
 LONG = 120  # no test waits so long, unless what it waits for does not come [s]
 
 
-def door_at(host="127.0.0.1", port=PORT, names=()):
-    """Return a door whose socket only knows its address."""
-    return AccessPolicy(SimpleNamespace(getsockname=lambda: (host, port)), host, names, TOKEN)
+def policy_at(host="127.0.0.1", port=PORT, allowed_hosts=()):
+    """Return a policy whose socket only knows its address."""
+    return AccessPolicy(
+        SimpleNamespace(getsockname=lambda: (host, port)), host, allowed_hosts, TOKEN
+    )
 
 
 def request(path=f"/{TOKEN}/", *pairs, host=HOME):
@@ -36,9 +38,9 @@ def request(path=f"/{TOKEN}/", *pairs, host=HOME):
     return Request(path, headers)
 
 
-def status(door, *args, **more):
+def status(policy, *args, **more):
     """Return the status of the refusal of a request; None if it is not refused."""
-    refused = door.refusal(request(*args, **more))
+    refused = policy.denial_reason(request(*args, **more))
     return None if refused is None else refused[0]
 
 
@@ -50,13 +52,13 @@ def status(door, *args, **more):
     [HOME, f"localhost:{PORT}", f"LocalHost:{PORT}", f"[::1]:{PORT}", f"lab-7:{PORT}"],
 )
 def test_names_of_the_loopback_and_names_that_are_given_are_this_host(host):
-    assert status(door_at(names=("lab-7",)), host=host) is None
+    assert status(policy_at(allowed_hosts=("lab-7",)), host=host) is None
 
 
 def test_a_host_without_a_port_means_port_80():
-    assert status(door_at(port=80), host="localhost") is None
-    assert status(door_at(port=80), host="localhost:80") is None
-    assert status(door_at(), host="localhost") == 421
+    assert status(policy_at(port=80), host="localhost") is None
+    assert status(policy_at(port=80), host="localhost:80") is None
+    assert status(policy_at(), host="localhost") == 421
 
 
 @pytest.mark.parametrize(
@@ -70,26 +72,26 @@ def test_a_host_without_a_port_means_port_80():
     ],
 )
 def test_another_host_is_refused_as_such(host):
-    refused = door_at(names=("lab-7",)).refusal(request(host=host))
+    refused = policy_at(allowed_hosts=("lab-7",)).denial_reason(request(host=host))
     assert refused is not None
     assert refused[0] == http.HTTPStatus.MISDIRECTED_REQUEST
-    assert refused[1].startswith("This is not the host")
+    assert refused[1].startswith("The requested host")
 
 
 def test_a_request_without_a_host_or_with_two_is_refused():
-    assert status(door_at(), host=None) == 421
-    assert status(door_at(), f"/{TOKEN}/", ("Host", HOME)) == 421
+    assert status(policy_at(), host=None) == 421
+    assert status(policy_at(), f"/{TOKEN}/", ("Host", HOME)) == 421
 
 
 def test_a_door_to_all_takes_any_address_and_the_names_of_this_machine(monkeypatch):
     monkeypatch.setattr(socket, "gethostname", lambda: "Bench-3")
-    door = door_at("Lab.Example", names=("alias",))
+    policy = policy_at("Lab.Example", allowed_hosts=("alias",))
     own = ["192.168.0.7", "[fe80::1]", "[FE80::ab]", "[::ffff:10.0.0.1]", "bench-3", "BENCH-3"]
     for name in [*own, "lab.example", "LAB.EXAMPLE", "alias", "localhost"]:
-        assert door._ours(f"{name}:{PORT}"), name
+        assert policy.is_own_host(f"{name}:{PORT}"), name
     for name in ["rebound.example", "192.168.0.7.example", "bench-4", "300.1.1.1", "[1.2.3]"]:
-        assert not door._ours(f"{name}:{PORT}"), name
-    assert not door._ours(f"192.168.0.7:{PORT + 1}")
+        assert not policy.is_own_host(f"{name}:{PORT}"), name
+    assert not policy.is_own_host(f"192.168.0.7:{PORT + 1}")
 
 
 @pytest.mark.parametrize(
@@ -105,9 +107,9 @@ def test_a_door_to_all_takes_any_address_and_the_names_of_this_machine(monkeypat
     ],
 )
 def test_the_address_is_one_that_a_browser_of_this_machine_can_open(host, address, everyone):
-    door = door_at(host)
-    assert door.address == f"http://{address}:{PORT}/{TOKEN}/"
-    assert door.open_to_all is everyone
+    policy = policy_at(host)
+    assert policy.url == f"http://{address}:{PORT}/{TOKEN}/"
+    assert policy.is_public is everyone
 
 
 # ------------------------------------------------------------------ the page that asks
@@ -119,21 +121,21 @@ UPGRADE = ("Connection", "keep-alive, Upgrade")
 def test_a_socket_needs_the_origin_of_this_page_and_a_page_needs_none():
     own, foreign = ("Origin", f"http://{HOME}"), ("Origin", "http://foreign.example")
     for several in ([], [own], [own, UPGRADE], [("Connection", "keep-alive")]):
-        assert status(door_at(), f"/{TOKEN}/", *several) is None
+        assert status(policy_at(), f"/{TOKEN}/", *several) is None
     for several in (
         *([foreign], [UPGRADE], [foreign, UPGRADE], [own, foreign], [own, own, UPGRADE]),
         *([("Origin", "null")], [("Origin", f"https://{HOME}")], [("Origin", HOME)]),
     ):
-        refused = door_at().refusal(request(f"/{TOKEN}/", *several))
+        refused = policy_at().denial_reason(request(f"/{TOKEN}/", *several))
         assert refused is not None, several
         assert refused[0] == http.HTTPStatus.FORBIDDEN
-        assert refused[1].startswith("Only this page's own socket")
+        assert refused[1].startswith("Only the page of this server")
 
 
 def test_the_origin_is_that_of_the_host_that_was_asked_for():
     origin = ("Origin", f"http://localhost:{PORT}")
-    assert status(door_at(), f"/{TOKEN}/", origin, host=f"localhost:{PORT}") is None
-    assert status(door_at(), f"/{TOKEN}/", origin) == 403
+    assert status(policy_at(), f"/{TOKEN}/", origin, host=f"localhost:{PORT}") is None
+    assert status(policy_at(), f"/{TOKEN}/", origin) == 403
 
 
 # ------------------------------------------------------------------ the token
@@ -141,7 +143,7 @@ def test_the_origin_is_that_of_the_host_that_was_asked_for():
 
 @pytest.mark.parametrize("rest", ["", "/", "/a.js", "/a/b?c=1", "?x=/y", "?", "//"])
 def test_the_token_is_the_first_part_of_the_path(rest):
-    assert status(door_at(), f"/{TOKEN}{rest}") is None
+    assert status(policy_at(), f"/{TOKEN}{rest}") is None
 
 
 @pytest.mark.parametrize(
@@ -153,10 +155,10 @@ def test_the_token_is_the_first_part_of_the_path(rest):
     ],
 )
 def test_any_other_path_is_refused_for_its_token(path):
-    refused = door_at().refusal(request(path))
+    refused = policy_at().denial_reason(request(path))
     assert refused is not None
     assert refused[0] == http.HTTPStatus.FORBIDDEN
-    assert refused[1].startswith("The address lacks the token")
+    assert refused[1].startswith("The address does not contain")
 
 
 # ------------------------------------------------------------------ what is handed on
@@ -170,14 +172,14 @@ def guarded(*args, answer=None, **more):
         seen.append((connection, inner))
         return answer
 
-    return door_at().guarding(handle)("connection", request(*args, **more)), seen
+    return policy_at().authenticate(handle)("connection", request(*args, **more)), seen
 
 
 def test_a_refused_request_does_not_reach_the_page():
     found, seen = guarded("/wrong/", answer=Response(200, "OK", Headers(), b"page"))
     assert seen == []
     assert (found.status_code, found.reason_phrase) == (403, "Forbidden")
-    assert found.body == door_at().refusal(request("/wrong/"))[1].encode()
+    assert found.body == policy_at().denial_reason(request("/wrong/"))[1].encode()
     assert found.headers["Content-Length"] == str(len(found.body))
     assert found.headers["Content-Type"] == "text/plain"
 
@@ -228,23 +230,23 @@ def test_every_answer_forbids_other_pages_to_use_it():
 )
 def test_a_door_is_bound_where_it_is_asked_to_be(host, family):
     try:
-        door = AccessPolicy.bound(host, 0, ["Lab-7", "x"])
+        policy = AccessPolicy.bind(host, 0, ["Lab-7", "x"])
     except OSError:
         pytest.skip(f"this machine has no {host}")
-    with door.socket as bound:
+    with policy.socket as bound:
         assert bound.family == family
         assert bound.type == socket.SOCK_STREAM
         assert bound.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR)
-        assert bound.getsockname()[:2] == (host, door.port)
-        assert (door.host, door.names) == (host, ("lab-7", "x"))
+        assert bound.getsockname()[:2] == (host, policy.port)
+        assert (policy.host, policy.allowed_hosts) == (host, ("lab-7", "x"))
 
 
 def test_a_door_has_no_names_and_a_long_token_of_its_own_unless_told():
-    with AccessPolicy.bound("127.0.0.1", 0).socket as bound:
-        doors = [AccessPolicy(bound, "127.0.0.1") for _ in range(2)]
-    assert [door.names for door in doors] == [(), ()]
-    assert doors[0].token != doors[1].token
-    assert all(len(door.token) == 32 for door in doors)  # 24 bytes in base 64
+    with AccessPolicy.bind("127.0.0.1", 0).socket as bound:
+        policies = [AccessPolicy(bound, "127.0.0.1") for _ in range(2)]
+    assert [policy.allowed_hosts for policy in policies] == [(), ()]
+    assert policies[0].token != policies[1].token
+    assert all(len(policy.token) == 32 for policy in policies)  # 24 bytes in base 64
 
 
 def test_a_port_that_is_taken_is_an_error_and_its_socket_is_closed(monkeypatch):
@@ -258,12 +260,12 @@ def test_a_port_that_is_taken_is_an_error_and_its_socket_is_closed(monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as other:
         monkeypatch.setattr(socket, "socket", Recorded)
         with pytest.raises(OSError, match="in use"):
-            AccessPolicy.bound("127.0.0.1", other.getsockname()[1])
+            AccessPolicy.bind("127.0.0.1", other.getsockname()[1])
     assert made[0].fileno() == -1
 
 
 def test_a_server_that_starts_behind_a_door_takes_its_socket_and_its_rules(monkeypatch):
-    calls, door = [], door_at()
+    calls, policy = [], policy_at()
 
     def genuine(handler, **options):
         calls.append((handler, options))
@@ -276,13 +278,13 @@ def test_a_server_that_starts_behind_a_door_takes_its_socket_and_its_rules(monke
             "handler", "0.0.0.0", 1, process_request=lambda *_: "passed", compression=None
         )
 
-    with serve_with(door):
+    with serve_with(policy):
         assert asyncio.run(start()) == "server"
     assert websockets.asyncio.server.serve is genuine
     ((handler, options),) = calls
     assert handler == "handler"
-    assert options["sock"] is door.socket
-    assert options["max_size"] == LARGEST == 2**18
+    assert options["sock"] is policy.socket
+    assert options["max_size"] == MAX_MESSAGE == 2**18
     assert options["server_header"] is None
     assert options["compression"] is None
     assert options["process_request"](None, request("/wrong/")).status_code == 403
@@ -294,7 +296,7 @@ def test_an_error_behind_a_door_leaves_servers_as_they_were():
     genuine = websockets.asyncio.server.serve
 
     def fail():
-        with serve_with(door_at()):
+        with serve_with(policy_at()):
             assert websockets.asyncio.server.serve is not genuine
             raise RuntimeError("stop")
 
@@ -322,7 +324,9 @@ def answered(listening, answer):
 def test_the_status_of_a_request_is_that_of_the_answer(host):
     with socket.create_server((host, 0)) as listening:
         thread, seen = answered(listening, b"HTTP/1.1 418 I'm a teapot\r\n\r\n")
-        found = status_for(AccessPolicy(listening, host), "/a?b", Host="x:1", Sec_WebSocket_Key="k")
+        found = request_status(
+            AccessPolicy(listening, host), "/a?b", Host="x:1", Sec_WebSocket_Key="k"
+        )
         thread.join(LONG)
     assert found == 418
     assert seen == [b"GET /a?b HTTP/1.1\r\nHost: x:1\r\nSec-WebSocket-Key: k\r\n\r\n"]
@@ -333,13 +337,13 @@ def test_a_door_to_all_addresses_is_asked_at_the_loopback(monkeypatch):
 
     def refused(address, timeout):
         asked.append(address)
-        assert 0 < timeout < LONG, "a door that does not answer is no reason to wait for ever"
+        assert 0 < timeout < LONG, "a policy that does not answer is no reason to wait for ever"
         raise ConnectionRefusedError
 
     monkeypatch.setattr(socket, "create_connection", refused)
     for host in ("::", "0.0.0.0", "10.0.0.1"):
         with pytest.raises(ConnectionRefusedError):
-            status_for(door_at(host), "/")
+            request_status(policy_at(host), "/")
     assert asked == [("::1", PORT), ("127.0.0.1", PORT), ("10.0.0.1", PORT)]
 
 
@@ -347,19 +351,19 @@ def test_a_door_to_all_addresses_is_asked_at_the_loopback(monkeypatch):
 
 
 def tried(monkeypatch, wrong=None):
-    """Check a door that answers by its rules, but for one case; return the requests."""
+    """Check a policy that answers by its rules, but for one case; return the requests."""
     asked = []
 
-    def by_rule(door, path, **headers):
+    def by_rule(policy, path, **headers):
         asked.append((path, headers))
-        refused = door.refusal(request(path, *headers.items(), host=None))
+        refused = policy.denial_reason(request(path, *headers.items(), host=None))
         status = 200 if refused is None else int(refused[0])
         if len(asked) - 1 == wrong:
             return 403 if status == 200 else 200
         return status
 
-    monkeypatch.setattr(module, "status_for", by_rule)
-    check(door_at())
+    monkeypatch.setattr(module, "request_status", by_rule)
+    check_server(policy_at())
     return asked
 
 
@@ -379,5 +383,5 @@ def test_a_door_is_tried_in_every_way_that_must_fail_and_in_the_one_that_must_no
 
 @pytest.mark.parametrize("wrong", range(5))
 def test_a_door_that_answers_one_request_wrongly_is_not_served(monkeypatch, wrong):
-    with pytest.raises(RuntimeError, match="not safe"):
+    with pytest.raises(RuntimeError, match="access control"):
         tried(monkeypatch, wrong)

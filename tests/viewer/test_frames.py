@@ -1,4 +1,4 @@
-"""Laws of the viewer's mechanics: surfaces, loads of a hand, answers as they are shown."""
+"""Surfaces, patch loads and frames of the viewer."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,8 @@ import torch
 
 from dpl.fem import NeoHookeanLn, fields, rectangle
 from dpl.viewer import Body
-from dpl.viewer.frames import Scale, ViewSettings, between, round_up
-from dpl.viewer.surface import Surface, bands
-
-STRESS, ERROR = "von Mises stress", "error against FE"
+from dpl.viewer.frames import ERROR, STRESS, ColourScale, ViewSettings, interpolate, round_up
+from dpl.viewer.surface import Surface, contour_bands
 
 
 def volume(points, triangles):
@@ -23,11 +21,11 @@ def areas(soup):
 
 
 @pytest.fixture
-def pushed(body):
+def patch_load(body):
     """A load on the tip and its frame."""
-    node = int(body.surface.nodes[body.surface.rest[:, 0].argmax()])
+    node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
     target = torch.tensor([0.0, 0.0, 0.2]).double()
-    return node, body.asked(body.patch(node, 0.4).towards(target), None)
+    return node, body.request(body.patch(node, 0.4).force_towards(target), None)
 
 
 @pytest.mark.parametrize(
@@ -35,31 +33,31 @@ def pushed(body):
     [{}, {"cell": "tetra"}, {"degree": 2}, {"degree": 2, "cell": "tetra"}],
     ids=["hexahedra", "tetrahedra", "degree 2", "degree 2, tetrahedra"],
 )
-def test_a_surface_is_closed_and_looks_outward(make_scene, more):
+def test_a_surface_is_closed_and_has_outward_normals(make_scene, more):
     surface = Surface.of(make_scene(**more).problem)
-    assert volume(surface.rest, surface.triangles) == pytest.approx(0.25 * 0.25)
+    assert volume(surface.undeformed, surface.triangles) == pytest.approx(0.25 * 0.25)
     sides = np.sort(surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     assert (np.unique(sides, axis=0, return_counts=True)[1] == 2).all()
-    rims = np.linalg.norm(np.diff(surface.rest[surface.rims], axis=1), axis=2).sum()
+    rims = np.linalg.norm(np.diff(surface.undeformed[surface.feature_edges], axis=1), axis=2).sum()
     assert rims == pytest.approx(4 * (1 + 0.25 + 0.25)), "the twelve edges of a beam"
 
 
 def test_a_surface_in_the_plane_is_the_body(make_scene):
     mesh = rectangle([100.0, 25.0], [9, 4])
     surface = Surface.of(make_scene(mesh=mesh).problem)
-    assert surface.rest.shape == (36, 3)
-    corners = surface.rest[surface.triangles]
+    assert surface.undeformed.shape == (36, 3)
+    corners = surface.undeformed[surface.triangles]
     assert areas(corners)[:, 2].min() > 0
     assert areas(corners).sum(axis=0) == pytest.approx([0, 0, 0.25])
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_bands_are_the_whole_surface_and_hold_their_values(body, seed):
+def test_bands_cover_the_surface(body, seed):
     surface, random = body.surface, np.random.default_rng(seed)
-    levels = random.integers(0, 6, len(surface.rest)) * 1.0  # many ties, at and between edges
+    levels = random.integers(0, 6, len(surface.undeformed)) * 1.0  # many ties, at and between edges
     levels += random.random(len(levels)) * (seed > 0)
-    cut = bands(surface.rest, surface.triangles, levels, 7)
-    whole = areas(surface.rest[surface.triangles])
+    cut = contour_bands(surface.undeformed, surface.triangles, levels, 7)
+    whole = areas(surface.undeformed[surface.triangles])
     pieces = np.concatenate([areas(soup) for soup in cut])
     assert np.linalg.norm(pieces, axis=1).sum() == pytest.approx(
         np.linalg.norm(whole, axis=1).sum()
@@ -68,16 +66,18 @@ def test_bands_are_the_whole_surface_and_hold_their_values(body, seed):
     assert volume(total, np.arange(len(total)).reshape(-1, 3)) == pytest.approx(1 / 16)
 
 
-def test_bands_of_one_colour_are_the_surface(body):
+def test_a_constant_field_has_one_band(body):
     surface = body.surface
-    cut = bands(surface.rest, surface.triangles, np.full(len(surface.rest), 2.5), 4)
+    cut = contour_bands(
+        surface.undeformed, surface.triangles, np.full(len(surface.undeformed), 2.5), 4
+    )
     assert [len(soup) for soup in cut] == [0, 0, 3 * len(surface.triangles), 0]
 
 
-def test_bands_of_a_plane_field_are_cut_straight(body):
+def test_bands_of_a_linear_field_have_straight_boundaries(body):
     surface = body.surface
-    levels = 5 * surface.rest[:, 0]
-    for k, soup in enumerate(bands(surface.rest, surface.triangles, levels, 5)):
+    levels = 5 * surface.undeformed[:, 0]
+    for k, soup in enumerate(contour_bands(surface.undeformed, surface.triangles, levels, 5)):
         assert soup[:, 0].min() == pytest.approx(k / 5)
         assert soup[:, 0].max() == pytest.approx((k + 1) / 5)
 
@@ -91,78 +91,82 @@ def test_stress_at_the_surface_is_that_of_the_whole_body(body, make_scene):
         assert surface.von_mises(u, load.poisson) == pytest.approx(exact, rel=1e-12)
 
 
-def test_a_pulled_point_goes_where_the_hand_is(body, pushed):
-    node, asked = pushed
-    frame = body.answer(asked, ViewSettings(tol=1e-8))
+def test_the_dragged_point_moves_to_the_target(body, patch_load):
+    node, request = patch_load
+    frame = body.solve(request, ViewSettings(tol=1e-8))
     moved = frame.displacement[node] / body.scene.length
-    assert moved[2] == pytest.approx(0.2, rel=0.25), "but for the body's nonlinearity"
+    assert moved[2] == pytest.approx(0.2, rel=0.25), "up to the nonlinearity of the body"
     assert abs(moved[1]) < 0.02
     assert not frame.answer.out_of_distribution
 
 
-def test_a_pull_is_held_within_the_training(body, pushed):
-    node, _ = pushed
-    far = torch.tensor([0.0, 0.0, 50.0]).double()
+def test_the_amplitude_of_a_drag_can_be_limited(body, patch_load):
+    node, _ = patch_load
+    far, patch = torch.tensor([0.0, 0.0, 50.0]).double(), body.patch(node, 0.4)
     amplitudes = [
-        float(body.scene.loads.project(body.patch(node, 0.4).towards(far, most=most)[None])[0])
-        for most in (1.0, None)
+        float(body.scene.loads.project(patch.force_towards(far, max_amplitude=limit)[None])[0])
+        for limit in (1.0, None)
     ]
     assert amplitudes[0] <= 1 + 1e-9
     assert amplitudes[1] > 10
 
 
-def test_the_controls_amplitude_is_that_of_the_training(body):
+def test_the_amplitude_of_a_patch_load_is_that_of_the_training(body):
     for node in map(int, body.surface.nodes[::7]):
         if not body.scene.problem.free[node].any():
             continue
-        force = body.patch(node, 0.4).along(torch.tensor([0.0, 1.0, 1.0]).double(), 0.7)
+        force = body.patch(node, 0.4).force_along(torch.tensor([0.0, 1.0, 1.0]).double(), 0.7)
         amplitude, strange = body.scene.loads.project(force[None])
         assert float(amplitude) <= 0.7 + 1e-6
         assert float(strange) < 1e-9
-    still = body.patch(node, 0.4).along(torch.zeros(3).double(), 0.7)
+    still = body.patch(node, 0.4).force_along(torch.zeros(3).double(), 0.7)
     assert not still.any()
 
 
-def test_an_even_force_is_said_to_be_unlike_the_training(body, pushed):
-    node, _ = pushed
+def test_a_uniform_force_is_out_of_distribution(body, patch_load):
+    node, _ = patch_load
     patch = body.patch(node, 0.4, uniform=True)
-    force = patch.along(torch.tensor([0.0, 0.0, 1.0]).double(), 0.5)
-    acting = force[patch.inside & body.scene.loads.loadable_dofs.any(dim=1)]
+    force = patch.force_along(torch.tensor([0.0, 0.0, 1.0]).double(), 0.5)
+    acting = force[patch.node_mask & body.scene.loads.loadable_dofs.any(dim=1)]
     assert torch.allclose(acting, acting[:1].expand_as(acting))
-    assert body.answer(body.asked(force, None), ViewSettings()).answer.out_of_distribution
+    assert body.solve(body.request(force, None), ViewSettings()).answer.out_of_distribution
 
 
-def test_colours_are_what_they_are_called(body, pushed):
-    _, asked = pushed
+def test_values_are_those_of_the_quantity(body, patch_load):
+    _, request = patch_load
     surface = body.surface
-    frame = body.answer(asked, ViewSettings())
+    frame = body.solve(request, ViewSettings())
     moved = frame.displacement.norm(dim=1).numpy()[surface.nodes]
     assert frame.values == pytest.approx(moved)
-    assert frame.points == pytest.approx(surface.moved(frame.displacement / body.scene.length))
-    stress = body.answer(asked, ViewSettings(quantity=STRESS)).values
+    assert frame.points == pytest.approx(
+        surface.deformed_points(frame.displacement / body.scene.length)
+    )
+    stress = body.solve(request, ViewSettings(quantity=STRESS)).values
     assert stress.max() > 0
-    error = body.answer(asked, ViewSettings(quantity=ERROR)).values
+    error = body.solve(request, ViewSettings(quantity=ERROR)).values
     assert error.max() == pytest.approx(0.02 / 0.98 * moved.max(), rel=1e-4)
-    exact = body.answer(asked, ViewSettings(quantity=ERROR, tol=1e-8)).values
+    exact = body.solve(request, ViewSettings(quantity=ERROR, tol=1e-8)).values
     assert exact.max() < 1e-6 * moved.max()
 
 
-def test_a_softer_body_is_moved_further_and_stress_is_in_pascals(body, pushed):
-    _, asked = pushed
-    wish = ViewSettings(quantity=STRESS, tol=1e-8)
-    stiff = body.answer(asked._replace(young=2 * asked.young), wish)
-    soft = body.answer(asked, wish)
+def test_displacements_and_stresses_scale_with_young(body, patch_load):
+    _, request = patch_load
+    settings = ViewSettings(quantity=STRESS, tol=1e-8)
+    stiff = body.solve(request._replace(young=2 * request.young), settings)
+    soft = body.solve(request, settings)
     assert stiff.displacement.norm() < 0.7 * soft.displacement.norm()
-    bigger = body.answer(asked._replace(force=3 * asked.force, young=3 * asked.young), wish)
+    bigger = body.solve(
+        request._replace(force=3 * request.force, young=3 * request.young), settings
+    )
     assert bigger.values == pytest.approx(3 * soft.values, rel=1e-5)
 
 
-def test_newtons_iterates_begin_at_rest_and_end_in_balance(body, pushed):
-    _, asked = pushed
-    wish = ViewSettings(quantity=ERROR)
-    frame = body.answer(asked, wish)
-    iterates = list(body.newton(asked, wish, frame))
-    assert iterates[0].points == pytest.approx(body.surface.rest)
+def test_newton_frames_start_undeformed_and_converge(body, patch_load):
+    _, request = patch_load
+    settings = ViewSettings(quantity=ERROR)
+    frame = body.solve(request, settings)
+    iterates = list(body.newton_frames(request, settings, frame))
+    assert iterates[0].points == pytest.approx(body.surface.undeformed)
     assert [state.iteration for state in iterates] == sorted(state.iteration for state in iterates)
     assert iterates[-1].converged
     assert iterates[-1].residual < 1e-8
@@ -171,14 +175,14 @@ def test_newtons_iterates_begin_at_rest_and_end_in_balance(body, pushed):
 
 def test_random_loads_are_the_trainings(body):
     for index in range(4):
-        answer = body.answer(body.sample(index), ViewSettings()).answer
+        answer = body.solve(body.sample(index), ViewSettings()).answer
         assert not answer.out_of_distribution
     assert not torch.equal(body.sample(0).force, body.sample(1).force)
 
 
-def test_what_cannot_be_asked_is_refused_in_words(body):
-    with pytest.raises(ValueError, match="E = 1 Pa must lie between"):
-        body.rest(young=1.0)
+def test_invalid_requests_raise_an_error(body):
+    with pytest.raises(ValueError, match="young = 1 must lie between"):
+        body.zero_load(young=1.0)
     with pytest.raises(ValueError, match="quantity = 'heat'"):
         ViewSettings(quantity="heat")
     with pytest.raises(ValueError, match="tol = nan"):
@@ -191,52 +195,52 @@ def test_what_cannot_be_asked_is_refused_in_words(body):
 
 def test_ranges_of_moduli_are_those_of_the_scene(make_scene, make_body):
     body = make_body(make_scene(young=[1e6, 3e6]))
-    assert body.young_span == (1e6, 3e6)
+    assert body.young_range == (1e6, 3e6)
     assert body.young == 2e6
     assert body.poisson is None
     assert 1e6 <= body.sample(1).young <= 3e6
 
 
-def test_a_range_of_poissons_ratios_is_asked_for(make_scene, make_body):
+def test_poissons_ratio_changes_the_solution(make_scene, make_body):
     scene = make_scene(poisson=[0.2, 0.4])
     body: Body = make_body(scene)
-    node = int(body.surface.nodes[body.surface.rest[:, 0].argmax()])
-    force = body.patch(node, 0.4).towards(torch.tensor([0.0, 0.0, 0.1]).double())
+    node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
+    force = body.patch(node, 0.4).force_towards(torch.tensor([0.0, 0.0, 0.1]).double())
     values = [
-        body.answer(
-            body.asked(force, None, nu), ViewSettings(quantity=STRESS, tol=1e-8)
+        body.solve(
+            body.request(force, None, nu), ViewSettings(quantity=STRESS, tol=1e-8)
         ).values.max()
         for nu in (0.2, 0.4)
     ]
     assert values[0] != pytest.approx(values[1], rel=1e-3)
-    with pytest.raises(ValueError, match=r"Poisson's ratio 0.45 must lie in"):
-        body.asked(force, None, 0.45)
-    asked = body.asked(force, None, 0.25)
-    assert list(body.newton(asked, ViewSettings(), body.answer(asked, ViewSettings())))[
+    with pytest.raises(ValueError, match=r"poisson = 0.45 must lie between"):
+        body.request(force, None, 0.45)
+    request = body.request(force, None, 0.25)
+    assert list(body.newton_frames(request, ViewSettings(), body.solve(request, ViewSettings())))[
         -1
     ].converged
 
 
-def test_a_body_in_the_plane_is_answered_and_shown(make_scene, make_body):
+def test_a_body_in_2d_is_solved_and_shown(make_scene, make_body):
     mesh = rectangle([100.0, 25.0], [9, 4])
     body = make_body(make_scene(mesh=mesh, law=NeoHookeanLn))
-    node = int(body.surface.nodes[body.surface.rest[:, 0].argmax()])
-    force = body.patch(node, 0.4).towards(torch.tensor([0.0, 0.1]).double())
-    frame = body.answer(body.asked(force, None), ViewSettings(quantity=STRESS, tol=1e-6))
+    node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
+    force = body.patch(node, 0.4).force_towards(torch.tensor([0.0, 0.1]).double())
+    frame = body.solve(body.request(force, None), ViewSettings(quantity=STRESS, tol=1e-6))
     assert frame.points.shape == (36, 3)
     assert not frame.points[:, 2].any()
     assert frame.values.shape == (36,)
 
 
-def test_the_way_between_loads_begins_and_ends_at_them(body):
+def test_interpolated_loads_start_and_end_at_the_given_loads(body):
     old, new = body.sample(0), body.sample(1)
-    assert between(old, new, 1.0) is new
-    assert torch.allclose(between(old, new, 0.5).force, (old.force + new.force) / 2)
+    assert interpolate(old, new, 1.0) is new
+    assert torch.allclose(interpolate(old, new, 0.5).force, (old.force + new.force) / 2)
 
 
-def test_the_scale_is_round_and_does_not_tremble():
+def test_the_colour_scale_has_rounded_ends_and_ignores_small_changes():
     assert [round_up(x) for x in (0.0, 1.0, 1.2, 7.0, 9.0, 480.0)] == [0, 1, 1.5, 8, 10, 500]
-    scale = Scale()
-    tops = [scale.follow(np.array([0.0, top])) for top in (4.1, 4.9, 5.2, 4.1, 1.0)]
+    scale = ColourScale()
+    tops = [scale.update(np.array([0.0, top])) for top in (4.1, 4.9, 5.2, 4.1, 1.0)]
     assert tops == [5, 5, 6, 6, 1]
-    assert scale.follow(np.array([np.nan, np.inf])) == 0
+    assert scale.update(np.array([np.nan, np.inf])) == 0

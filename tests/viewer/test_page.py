@@ -1,4 +1,4 @@
-"""Laws of the page without a browser: bodies of all kinds, and what a hand does to them."""
+"""Pages of all kinds of bodies, without a browser: drags, clicks and controls."""
 
 import asyncio
 from types import SimpleNamespace
@@ -25,74 +25,74 @@ BODIES = {
 def any_page(request, make_scene, make_body, tmp_path):
     """A page of each kind of body."""
     body = make_body(make_scene(**BODIES[request.param]))
-    page = Page(body, AccessPolicy.bound("127.0.0.1", 0), title="t", folder=tmp_path)
-    assert page.worker.settle(240)
+    page = Page(body, AccessPolicy.bind("127.0.0.1", 0), title="t", folder=tmp_path)
+    assert page.worker.wait(240)
     yield page
     page.close()
 
 
-def drag(page, way):
-    """Drag the tip by a vector (3,), as the browser tells it."""
-    place = page._frame.points[page.body.surface.rest[:, 0].argmax()]
+def drag_tip(page, motion):
+    """Send the drag events of a browser that moves the tip by a vector (3,)."""
+    place = page.frame.points[page.body.surface.undeformed[:, 0].argmax()]
     for phase, share in (("start", 0.1), ("update", 0.6), ("end", 1.0)):
         event = SimpleNamespace(
-            phase=phase, start_position=tuple(place), end_position=tuple(place + share * way)
+            phase=phase, start_position=tuple(place), end_position=tuple(place + share * motion)
         )
-        asyncio.run(page._dragged(event))
-    assert page.worker.settle(240)
+        asyncio.run(page.drag(event))
+    assert page.worker.wait(240)
 
 
-def test_a_drag_moves_the_body_with_the_hand(any_page):
+def test_a_dragged_point_follows_the_mouse(any_page):
     page = any_page
     flat = page.body.scene.problem.shape[1] == 2
-    drag(page, np.array([0.0, 0.08, 0.0] if flat else [0.0, 0.0, 0.08]))
-    frame = page._frame
-    tip = frame.displacement[page._node] / page.body.scene.length
+    drag_tip(page, np.array([0.0, 0.08, 0.0] if flat else [0.0, 0.0, 0.08]))
+    frame = page.frame
+    tip = frame.displacement[page.node] / page.body.scene.length
     assert tip[-1] == pytest.approx(0.08, rel=0.3)
     page.refresh()
-    assert "min det F" in page._reading.content
-    assert "displacement [m]" in page._colours.content
-    assert page._said == ""
+    assert "min det F" in page.controls._result.content
+    assert "displacement [m]" in page.controls._legend.content
+    assert page._error == ""
 
 
-def test_controls_load_the_patch(any_page):
+def test_sliders_load_the_patch(any_page):
     page = any_page
-    page._amplitude.value = 0.5
-    page._controlled(SimpleNamespace(client=object()))
-    assert page.worker.settle(240)
-    assert page._frame.asked.force.any()
-    assert page._frame.answer.amplitude == pytest.approx(0.5, abs=0.5)
-    page._sampled(None)
-    assert page.worker.settle(240)
-    assert not page._frame.answer.out_of_distribution
-    page._reset(None)
-    assert page.worker.settle(240)
-    assert page._frame.answer.method == "rest"
+    page.controls.amplitude.value = 0.5
+    page.apply_controls(SimpleNamespace(client=object()))
+    assert page.worker.wait(240)
+    assert page.frame.request.force.any()
+    assert page.frame.answer.amplitude == pytest.approx(0.5, abs=0.5)
+    page.sample(None)
+    assert page.worker.wait(240)
+    assert not page.frame.answer.out_of_distribution
+    page.reset(None)
+    assert page.worker.wait(240)
+    assert page.frame.answer.method == "rest"
 
 
-def test_a_click_places_the_patch_on_the_near_side(page):
-    assert page.worker.settle(240)
+def test_a_click_moves_the_patch_to_the_nearest_point_on_the_ray(page):
+    assert page.worker.wait(240)
     event = SimpleNamespace(ray_origin=(0.5, -3.0, 0.125), ray_direction=(0.0, 1.0, 0.0))
-    asyncio.run(page._clicked(event))
-    assert page.body.scene.problem.points[page._node].tolist() == [0.5, 0.0, 0.125]
+    asyncio.run(page.click(event))
+    assert page.body.scene.problem.points[page.node].tolist() == [0.5, 0.0, 0.125]
 
 
-def test_trouble_is_read_and_nothing_of_it_is_markup(page):
-    assert page.worker.settle(240)
-    page._trouble("<script>")
+def test_error_messages_are_escaped(page):
+    assert page.worker.wait(240)
+    page._show_error("<script>")
     page.refresh()
-    assert "&lt;script&gt;" in page._told.content
+    assert "&lt;script&gt;" in page.controls._error.content
 
 
-def test_a_frame_that_is_not_finite_is_said_to_be_invalid(page):
-    assert page.worker.settle(240)
+def test_a_frame_that_is_not_finite_is_shown_as_invalid(page):
+    assert page.worker.wait(240)
     surrogate = page.body.simulator.surrogate
     good = surrogate.predict
     try:
         surrogate.predict = lambda load: torch.full_like(load.force, torch.nan)
-        page._sampled(None)
-        assert page.worker.settle(240)
+        page.sample(None)
+        assert page.worker.wait(240)
         page.refresh()
-        assert "NOT VALID" in page._reading.content
+        assert "NOT VALID" in page.controls._result.content
     finally:
         surrogate.predict = good

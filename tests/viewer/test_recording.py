@@ -1,4 +1,4 @@
-"""Laws of recordings: what is written is what was shown."""
+"""Recordings contain the frames that were shown."""
 
 import xml.etree.ElementTree as ET
 
@@ -10,7 +10,7 @@ from PIL import Image
 from dpl.viewer.animation import animate_load
 from dpl.viewer.frames import ViewSettings
 from dpl.viewer.rasterizer import Camera, Renderer
-from dpl.viewer.recording import MOST, RATE, Recording, evenly
+from dpl.viewer.recording import FRAME_RATE, MAX_FRAMES, Recording, resample
 
 
 @pytest.fixture
@@ -19,14 +19,16 @@ def recording(body):
     recording = Recording(body)
     recording.start()
     for index, now in ((1, 10.0), (2, 10.2), (3, 10.5)):
-        recording.take(
-            body.answer(body.sample(index), ViewSettings(quantity="von Mises stress")), now
+        recording.add(
+            body.solve(body.sample(index), ViewSettings(quantity="von Mises stress")), now
         )
     recording.stop()
     return recording
 
 
-def test_a_series_holds_forces_displacements_stress_and_volumes(recording, body, tmp_path):
+def test_a_series_contains_forces_displacements_stresses_and_volume_ratios(
+    recording, body, tmp_path
+):
     path = recording.save_series(tmp_path)
     sets = ET.parse(path).getroot().findall(".//DataSet")
     assert [float(one.get("timestep")) for one in sets] == pytest.approx([0.0, 0.2, 0.5])
@@ -34,7 +36,7 @@ def test_a_series_holds_forces_displacements_stress_and_volumes(recording, body,
         found = meshio.read(path.parent / one.get("file"))
         assert np.ptp(found.points[:, 0]) == pytest.approx(100.0)
         data = found.point_data
-        assert data["force [N]"] == pytest.approx(frame.asked.force.numpy())
+        assert data["force [N]"] == pytest.approx(frame.request.force.numpy())
         assert data["displacement [m]"] == pytest.approx(frame.displacement.numpy())
         stress = data["von Mises stress [Pa]"][body.surface.nodes]
         assert stress == pytest.approx(frame.values)
@@ -45,66 +47,66 @@ def test_a_series_holds_forces_displacements_stress_and_volumes(recording, body,
 
 
 @pytest.mark.parametrize("kind", [".gif", ".mp4"])
-def test_a_film_is_as_long_as_it_took(recording, body, tmp_path, kind):
+def test_an_animation_has_the_duration_of_the_recording(recording, body, tmp_path, kind):
     if kind == ".mp4":
         pytest.importorskip("imageio_ffmpeg", reason="the extra viewer is not installed")
-    scenery = Renderer(body.surface, Camera.before(body.surface), (320, 180))
-    path = recording.save_film(tmp_path, scenery, kind)
+    renderer = Renderer(body.surface, Camera.facing(body.surface), (320, 180))
+    path = recording.save_animation(tmp_path, renderer, kind)
     if kind == ".gif":
         image = Image.open(path)
         times = 0
         for k in range(image.n_frames):
             image.seek(k)
             times += image.info["duration"]
-        assert times / 1000 == pytest.approx(0.5, abs=2 / RATE)
+        assert times / 1000 == pytest.approx(0.5, abs=2 / FRAME_RATE)
         assert image.size == (320, 180)
     else:
         import imageio_ffmpeg
 
         frames, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
-        assert frames == pytest.approx(0.5 * RATE, abs=2)
+        assert frames == pytest.approx(0.5 * FRAME_RATE, abs=2)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-def test_frames_are_taken_while_it_runs_and_there_is_room(recording, body):
+def test_frames_are_added_while_recording_up_to_the_limit(recording, body):
     frame = recording.frames()[0][1]
-    recording.take(frame, 11.0)
+    recording.add(frame, 11.0)
     assert len(recording) == 3
     recording.start()
-    for k in range(MOST + 5):
-        recording.take(frame, float(k))
-    assert len(recording) == MOST
+    for k in range(MAX_FRAMES + 5):
+        recording.add(frame, float(k))
+    assert len(recording) == MAX_FRAMES
     assert not recording.running
 
 
-def test_frames_of_a_film_are_the_last_shown_by_then(recording):
+def test_resampled_frames_are_the_last_shown_before_each_tick(recording):
     frames = recording.frames()
-    chosen = evenly(frames)
+    chosen = resample(frames)
     assert chosen[0] is frames[0][1]
-    assert chosen[round(0.3 * RATE)] is frames[1][1]
+    assert chosen[round(0.3 * FRAME_RATE)] is frames[1][1]
     assert chosen[-1] is frames[-1][1]
 
 
-def test_nothing_is_not_written(body, tmp_path):
-    with pytest.raises(ValueError, match="nothing is recorded yet"):
+def test_an_empty_recording_is_not_written(body, tmp_path):
+    with pytest.raises(ValueError, match="the recording is empty"):
         Recording(body).save_series(tmp_path)
 
 
-def test_a_picture_shows_the_body_where_the_camera_sees_it(body):
-    scenery = Renderer(body.surface, Camera.before(body.surface), (320, 180))
-    frame = body.answer(body.sample(1), ViewSettings())
-    picture = np.asarray(scenery.draw(frame.points, frame.values, 1.0, frame.quantity, []))
-    paper = picture[0, 0].astype(int)
-    drawn = np.abs(picture.astype(int) - paper).sum(axis=2) > 30
+def test_an_image_shows_the_deformed_body(body):
+    renderer = Renderer(body.surface, Camera.facing(body.surface), (320, 180))
+    frame = body.solve(body.sample(1), ViewSettings())
+    picture = np.asarray(renderer.render(frame.points, frame.values, 1.0, frame.quantity, []))
+    background = picture[0, 0].astype(int)
+    drawn = np.abs(picture.astype(int) - background).sum(axis=2) > 30
     assert 0.05 < drawn[:, :250].mean() < 0.6
-    again = scenery.draw(body.surface.rest, frame.values, 1.0, frame.quantity, [])
+    again = renderer.render(body.surface.undeformed, frame.values, 1.0, frame.quantity, [])
     assert np.abs(np.asarray(again).astype(int) - picture).max() > 50
 
 
 @pytest.mark.slow
-def test_the_moving_load_becomes_a_loop(body, tmp_path):
+def test_a_rotating_load_is_written_as_a_looping_gif(body, tmp_path):
     path = tmp_path / "live.gif"
     animate_load(body, path, size=(320, 180))
     image = Image.open(path)
-    assert image.n_frames == 5 * RATE
+    assert image.n_frames == 5 * FRAME_RATE
     assert image.info["loop"] == 0

@@ -1,4 +1,4 @@
-"""The command: what a user types, and how it says no."""
+"""Command line of the viewer and its error messages."""
 
 import os
 import re
@@ -10,12 +10,12 @@ import pytest
 from PIL import Image
 
 import dpl.viewer
-from dpl.viewer.recording import RATE
+from dpl.viewer.recording import FRAME_RATE
 
 
 @pytest.fixture(scope="module")
 def home(start, tiny_training, tmp_path_factory):
-    """The folder of a user with a trained run."""
+    """Working directory with a trained run."""
     home = tmp_path_factory.mktemp("home")
     process = start("train", *tiny_training, "trainer.max_epochs=1", "run=runs/a", cwd=home)
     _, err = process.communicate(timeout=240)
@@ -23,7 +23,7 @@ def home(start, tiny_training, tmp_path_factory):
     return home
 
 
-def test_the_page_says_where_it_is_and_ctrl_c_ends_it_whole(start, members, home):
+def test_the_page_prints_its_address_and_ctrl_c_ends_all_processes(start, members, home):
     pytest.importorskip("viser", reason="the extra viewer is not installed")
     process = start("view", "run=runs/a", "port=0", cwd=home)
     line = process.stdout.readline()
@@ -36,13 +36,13 @@ def test_the_page_says_where_it_is_and_ctrl_c_ends_it_whole(start, members, home
     assert not members(process.pid)
 
 
-def test_a_host_that_others_reach_is_warned_of(start, home):
+def test_a_public_host_prints_a_warning(start, home):
     pytest.importorskip("viser", reason="the extra viewer is not installed")
     process = start("view", "run=runs/a", "port=0", "host=0.0.0.0", cwd=home)
     assert process.stdout.readline().startswith("the page is at http://127.0.0.1:")
     os.kill(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=240)
-    assert err.startswith("warning: host = 0.0.0.0: whoever reaches this machine")
+    assert err.startswith("warning: host = 0.0.0.0: everyone who reaches this machine")
 
 
 @pytest.mark.parametrize(
@@ -53,11 +53,11 @@ def test_a_host_that_others_reach_is_warned_of(start, home):
         (["run=runs/a", "port=70000"], "port = 70000 must lie between 0 and 65535"),
         (["run=runs/a", "host=no.such.host.invalid"], "host = no.such.host.invalid, port = "),
         (["run=runs/a", "hots=x"], ""),
-        (["run=runs/a", "movie=x.avi"], "movie = x.avi must end with .gif or .mp4"),
+        (["run=runs/a", "animation=x.avi"], "animation = x.avi must end with .gif or .mp4"),
     ],
     ids=str,
 )
-def test_bad_input_ends_with_one_line(script, home, arguments, words):
+def test_invalid_input_prints_one_line(script, home, arguments, words):
     pytest.importorskip("viser", reason="the extra viewer is not installed")
     ended = script("view", *arguments, cwd=home)
     assert ended.status != 0
@@ -67,18 +67,18 @@ def test_bad_input_ends_with_one_line(script, home, arguments, words):
         assert ended.err.count("\n") == 1
 
 
-def test_a_port_that_is_taken_is_named(script, home):
+def test_a_port_in_use_is_reported(script, home):
     pytest.importorskip("viser", reason="the extra viewer is not installed")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
         ended = script("view", "run=runs/a", f"port={port}", cwd=home)
-    told = f"error: port = {port} is taken; name another, or port=0 for any that is free\n"
-    assert (ended.status, ended.err) == (2, told)
+    message = f"error: port = {port} is in use; choose another, or port=0 for any free port\n"
+    assert (ended.status, ended.err) == (2, message)
 
 
-def test_without_viser_it_says_how_to_get_it(script, home, monkeypatch):
+def test_without_viser_the_message_names_the_extra(script, home, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     for name in ("page", "body_node"):
         monkeypatch.delitem(sys.modules, f"dpl.viewer.{name}", raising=False)
@@ -90,8 +90,8 @@ def test_without_viser_it_says_how_to_get_it(script, home, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_movie_is_written_without_a_browser(script, home):
-    ended = script("view", "run=runs/a", "movie=films/live.gif", cwd=home)
+def test_an_animation_is_written_without_a_browser(script, home):
+    ended = script("view", "run=runs/a", "animation=films/live.gif", cwd=home)
     assert ended.status == 0, ended.err
     image = Image.open(home / "films" / "live.gif")
-    assert (image.n_frames, image.size) == (5 * RATE, (720, 405))
+    assert (image.n_frames, image.size) == (5 * FRAME_RATE, (720, 405))

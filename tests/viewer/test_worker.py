@@ -1,4 +1,4 @@
-"""Laws of the worker: the newest wish wins, and nothing is queued."""
+"""The worker solves the most recent request; earlier ones are dropped."""
 
 import itertools
 import threading
@@ -11,7 +11,7 @@ import torch
 from dpl.viewer.frames import ViewSettings
 from dpl.viewer.worker import Worker
 
-LONG = 240.0  # no test waits so long, unless what it waits for does not come [s]
+LONG = 240.0  # time-out, which no test reaches if the worker works [s]
 
 
 @pytest.fixture
@@ -21,111 +21,111 @@ def shown():
 
 @pytest.fixture
 def make_worker(body, shown, monkeypatch):
-    """Makes running workers, on a clock on which every look takes 5 ms."""
-    looks = itertools.count()
-    clock = SimpleNamespace(monotonic=lambda: 0.005 * next(looks))
+    """Function that starts workers, on a clock that advances by 5 ms per reading."""
+    ticks = itertools.count()
+    clock = SimpleNamespace(monotonic=lambda: 0.005 * next(ticks))
     monkeypatch.setattr("dpl.viewer.worker.time", clock)
-    made = []
+    workers = []
 
     def make(**more):
         worker = Worker(body, shown.append, **more)
         worker.start()
-        made.append(worker)
-        assert worker.settle(LONG)
+        workers.append(worker)
+        assert worker.wait(LONG)
         return worker
 
     yield make
-    for worker in made:
+    for worker in workers:
         worker.stop()
         assert not worker.is_alive()
 
 
-def test_the_last_frame_is_of_the_newest_load(make_worker, body, shown):
+def test_the_last_frame_has_the_most_recent_load(make_worker, body, shown):
     worker = make_worker(smoothing_time=0.05)
     load = body.sample(1)
-    worker.ask(lambda: load)
-    assert worker.settle(LONG)
-    assert shown[-1].asked is load
-    assert len(shown) > 3, "it glides there"
-    sizes = [float(frame.asked.force.norm()) for frame in shown]
+    worker.submit(lambda: load)
+    assert worker.wait(LONG)
+    assert shown[-1].request is load
+    assert len(shown) > 3, "the load is smoothed"
+    sizes = [float(frame.request.force.norm()) for frame in shown]
     assert sizes == sorted(sizes)
 
 
-def test_it_glides_to_no_load_in_a_moment(make_worker, body, shown):
+def test_the_load_approaches_zero_load_in_a_few_frames(make_worker, body, shown):
     worker = make_worker(smoothing_time=0.05)
-    for make in (lambda: body.sample(1), body.rest):
+    for make in (lambda: body.sample(1), body.zero_load):
         before = len(shown)
-        worker.ask(make)
-        assert worker.settle(LONG)
+        worker.submit(make)
+        assert worker.wait(LONG)
         assert 3 < len(shown) - before < 60
     assert shown[-1].answer.method == "rest"
 
 
-def test_another_wish_for_the_same_load_is_one_frame(make_worker, body, shown):
+def test_new_settings_for_the_same_load_give_one_frame(make_worker, body, shown):
     worker = make_worker(smoothing_time=0.05)
-    worker.ask(lambda: body.sample(1))
-    assert worker.settle(LONG)
+    worker.submit(lambda: body.sample(1))
+    assert worker.wait(LONG)
     before = len(shown)
-    worker.ask(wish=ViewSettings(tol=1e-6))
-    assert worker.settle(LONG)
+    worker.submit(settings=ViewSettings(tol=1e-6))
+    assert worker.wait(LONG)
     assert len(shown) == before + 1
     assert shown[-1].converged
 
 
-def test_without_a_glide_there_is_one_frame_for_a_load(make_worker, body, shown):
+def test_without_smoothing_each_load_gives_one_frame(make_worker, body, shown):
     worker = make_worker(smoothing_time=0.0)
-    worker.ask(lambda: body.sample(1))
-    assert worker.settle(LONG)
+    worker.submit(lambda: body.sample(1))
+    assert worker.wait(LONG)
     assert len(shown) == 2
 
 
-def test_of_many_wishes_only_the_newest_is_answered(make_worker, body, shown):
+def test_of_many_requests_only_the_most_recent_is_solved(make_worker, body, shown):
     worker = make_worker(smoothing_time=0.0)
-    asked, first = [], threading.Event()
+    requested, first = [], threading.Event()
 
     def make(index):
-        asked.append(index)
+        requested.append(index)
         first.wait(LONG)
         return body.sample(index)
 
-    worker.ask(lambda: make(0))
-    while not asked:
+    worker.submit(lambda: make(0))
+    while not requested:
         time.sleep(0.01)
     for index in range(1, 50):
-        worker.ask(lambda index=index: make(index))
+        worker.submit(lambda index=index: make(index))
     first.set()
-    assert worker.settle(LONG)
-    assert asked == [0, 49]
-    assert torch.equal(shown[-1].asked.force, body.sample(49).force)
+    assert worker.wait(LONG)
+    assert requested == [0, 49]
+    assert torch.equal(shown[-1].request.force, body.sample(49).force)
 
 
-def test_newton_is_shown_step_by_step_and_a_new_load_ends_it(make_worker, body, shown):
-    beside = []
-    worker = make_worker(smoothing_time=0.0, min_frame_time=0.02, beside=beside.append)
+def test_newton_iterates_are_shown_until_a_new_load_arrives(make_worker, body, shown):
+    newton = []
+    worker = make_worker(smoothing_time=0.0, min_frame_time=0.02, on_newton=newton.append)
     load = body.sample(1)
-    worker.ask(lambda: load, ViewSettings(compare=True))
-    assert worker.settle(LONG)
-    iterates = [frame for frame in beside if frame is not None]
+    worker.submit(lambda: load, ViewSettings(show_newton=True))
+    assert worker.wait(LONG)
+    iterates = [frame for frame in newton if frame is not None]
     assert len(iterates) > 3
     assert iterates[-1].converged
-    beside.clear()
-    worker._pace = 1e6
-    worker.ask(lambda: body.sample(2))
-    while not any(beside):
+    newton.clear()
+    worker.min_frame_time = 1e6
+    worker.submit(lambda: body.sample(2))
+    while not any(newton):
         time.sleep(0.01)
-    worker.ask(lambda: body.sample(3), ViewSettings())
-    assert worker.settle(LONG)
-    assert torch.equal(shown[-1].asked.force, body.sample(3).force)
+    worker.submit(lambda: body.sample(3), ViewSettings())
+    assert worker.wait(LONG)
+    assert torch.equal(shown[-1].request.force, body.sample(3).force)
 
 
-def test_trouble_is_told_and_the_next_load_is_answered(make_worker, body, shown):
-    told = []
-    worker = make_worker(smoothing_time=0.0, trouble=told.append)
-    worker.ask(lambda: body.rest(young=1.0))
-    assert worker.settle(LONG)
-    assert told
-    assert told[0].startswith("E = 1 Pa must lie")
+def test_an_error_is_reported_and_the_next_load_is_solved(make_worker, body, shown):
+    messages = []
+    worker = make_worker(smoothing_time=0.0, on_error=messages.append)
+    worker.submit(lambda: body.zero_load(young=1.0))
+    assert worker.wait(LONG)
+    assert messages
+    assert messages[0].startswith("young = 1 must lie between")
     load = body.sample(1)
-    worker.ask(lambda: load)
-    assert worker.settle(LONG)
-    assert shown[-1].asked is load
+    worker.submit(lambda: load)
+    assert worker.wait(LONG)
+    assert shown[-1].request is load

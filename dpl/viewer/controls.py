@@ -1,0 +1,165 @@
+"""Controls and readings in the panel of the page."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from viser import ViserServer
+
+from dpl.fem import HasModes
+from dpl.viewer import panel
+from dpl.viewer.frames import QUANTITIES, TOLERANCES, Body, ColourScale, Frame, ViewSettings
+from dpl.viewer.recording import MAX_FRAMES, Recording
+
+NETWORK, BUDGET = "network", "best within the budget"
+METHODS = {NETWORK: None, **{f"residual below {tol:.0e}": tol for tol in TOLERANCES}}
+Callback = Callable[[Any], Any]
+
+
+class Controls:
+    """Widgets of the panel.
+
+    Attributes:
+        radius, direction, amplitude, unlimited, uniform: The patch load.
+        young, poisson: The moduli; `poisson` is None if the law has a single Poisson's ratio.
+        sample, reset: Buttons for a random load and for no load.
+        method, budget, galerkin, quantity, edges, show_newton: Method and display.
+        record, save: Buttons of the recording.
+        follows_frame: True while a drag or a random load determines the load, so that the slider
+            shows the amplitude of the frame.
+    """
+
+    def __init__(self, server: ViserServer, body: Body, title: str, folder: Path) -> None:
+        """Add the widgets to the panel."""
+        gui, scene = server.gui, body.scene
+        self._gui, self._body = gui, body
+        nodes, dim = scene.problem.shape
+        law = type(scene.problem.material).__name__
+        about = f"{title} · {nodes * dim:,} degrees of freedom · {law}"
+        gui.add_html(panel.message(about, "inherit"))
+        self._result, self._legend = gui.add_html(""), gui.add_html("")
+        self._newton = gui.add_html("", visible=False)
+        self._error = gui.add_html("")
+        with gui.add_folder("Load"):
+            self._add_load_controls()
+        with gui.add_folder("Method and colours"):
+            self._add_method_controls()
+        with gui.add_folder("Record", expand_by_default=False):
+            self.record = gui.add_button("Start recording", color="red")
+            self._state = gui.add_html(panel.message(f"Files are saved in {folder}", "inherit"))
+            self.save = gui.add_button_group("save as", ("VTU", "GIF", "MP4"))
+        self.follows_frame = False
+
+    def _add_load_controls(self) -> None:
+        gui, body, loads = self._gui, self._body, self._body.scene.loads
+        about = "Drag the body to pull it. Click it to place the loaded patch."
+        gui.add_html(panel.message(about, "inherit"))
+        span = loads.patch_radius if isinstance(loads, HasModes) else (0.0, 1.0)
+        low, high = float(span[0]), max(float(span[1]), 0.05)
+        self.radius = gui.add_slider("patch radius / L", 0.0, high, 0.01, min(max(0.4, low), high))
+        upwards = (0.0, 1.0 if body.scene.problem.shape[1] == 2 else 0.0, 1.0)
+        self.direction = gui.add_vector3("direction", upwards, step=0.1)
+        self.amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
+        low, high = body.young_range
+        self.young = gui.add_slider("E [Pa]", low, high, (high - low) / 500, body.young)
+        self.poisson = None
+        if loads.poisson_range is not None and body.poisson is not None:
+            low, high = map(float, loads.poisson_range)
+            self.poisson = gui.add_slider("Poisson's ratio", low, high, 1e-3, body.poisson)
+        self.unlimited = gui.add_checkbox(
+            "no amplitude limit",
+            False,
+            hint="let a drag exceed the largest load of the training",
+        )
+        self.uniform = gui.add_checkbox(
+            "uniform force",
+            False,
+            hint="equal forces on all nodes of the patch, outside the training range",
+        )
+        self.sample = gui.add_button("Random training load")
+        self.reset = gui.add_button("Reset", color="gray")
+
+    def _add_method_controls(self) -> None:
+        gui = self._gui
+        self.method = gui.add_dropdown("method", (*METHODS, BUDGET))
+        self.budget = gui.add_number("budget [ms]", 20.0, min=0.1, max=10_000.0)
+        self.galerkin = gui.add_checkbox(
+            "Galerkin correction",
+            self._body.has_galerkin,
+            visible=self._body.has_galerkin,
+            hint="correct the prediction in the modes of the network before Newton",
+        )
+        self.quantity = gui.add_dropdown("colours", tuple(QUANTITIES))
+        self.edges = gui.add_checkbox("mesh edges", True)
+        self.show_newton = gui.add_checkbox("compare with Newton from zero", False)
+
+    def connect(
+        self,
+        catch_errors: Callable[[Callback], Callback],
+        *,
+        on_load: Callback,
+        on_moduli: Callback,
+        on_settings: Callback,
+    ) -> None:
+        """Set the callbacks of the widgets that change load, moduli or settings."""
+        for control in (self.direction, self.amplitude, self.uniform, self.radius):
+            control.on_update(catch_errors(on_load))
+        for control in (self.young, self.poisson):
+            if control is not None:
+                control.on_update(catch_errors(on_moduli))
+        for control in (
+            *(self.method, self.budget, self.galerkin, self.quantity, self.edges),
+            self.show_newton,
+        ):
+            control.on_update(catch_errors(on_settings))
+
+    def settings(self) -> ViewSettings:
+        """Return method and quantity.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        within_budget = self.method.value == BUDGET
+        return ViewSettings(
+            self.quantity.value,
+            TOLERANCES[-1] if within_budget else METHODS.get(self.method.value),
+            self.budget.value if within_budget else None,
+            bool(self.galerkin.value) and self._body.has_galerkin,
+            bool(self.show_newton.value),
+        )
+
+    def show_frame(self, frame: Frame, scale: ColourScale, frame_rate: float) -> None:
+        """Update result, legend and, if a drag determined the load, the amplitude."""
+        finite = frame.values[np.isfinite(frame.values)]
+        low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
+        self._result.content = panel.result_table(frame, frame_rate)
+        self._legend.content = panel.legend(frame.quantity, scale.top, low, high)
+        if self.follows_frame and frame.answer is not None:
+            limit = float(self.amplitude.max)
+            self.amplitude.value = round(min(float(frame.answer.amplitude), limit), 2)
+
+    def show_newton_frame(self, frame: Frame | None) -> None:
+        """Update the table of Newton; hidden if Newton is not shown."""
+        self._newton.content = panel.newton_table(frame)
+
+    def show_newton_table(self, visible: bool) -> None:
+        """Show or hide the table of Newton."""
+        self._newton.visible = visible
+
+    def show_error(self, text: str) -> None:
+        """Show why a request cannot be solved; an empty text removes the message."""
+        self._error.content = panel.message(text, panel.BAD)
+
+    def show_recording(self, recording: Recording) -> None:
+        """Update the label of the record button."""
+        running, count = recording.running, len(recording)
+        self.record.label = (
+            f"Stop ({count} of {MAX_FRAMES} frames)" if running else "Start recording"
+        )
+        if running:
+            self.show_state(f"{count} frames", "inherit")
+
+    def show_state(self, text: str, colour: str = panel.WARNING) -> None:
+        """Show a message below the record button."""
+        self._state.content = panel.message(text, colour)
