@@ -1,4 +1,4 @@
-"""Who may come in, asked with real sockets; and how the command says no."""
+"""Access control of a running server, tested with real sockets."""
 
 import asyncio
 import gc
@@ -19,7 +19,7 @@ from dpl.viewer import AccessPolicy
 from dpl.viewer.access import MAX_MESSAGE, check_server, request_status
 from dpl.viewer.rate_limited_log import MAX_CHARACTERS, MIN_INTERVAL, RateLimitedHandler
 
-LONG = 120  # no test waits so long, unless what it waits for does not come [s]
+LONG = 120  # time-out, which no test reaches if the server works [s]
 UPGRADE = {
     "Connection": "Upgrade",
     "Upgrade": "websocket",
@@ -31,7 +31,7 @@ UPGRADE = {
 
 @pytest.fixture
 def policy(page):
-    """That of a page."""
+    """Access policy of a page."""
     return page._policy
 
 
@@ -39,7 +39,7 @@ def home(policy):
     return f"127.0.0.1:{policy.port}"
 
 
-def test_the_page_is_served_to_who_has_its_address(policy):
+def test_the_page_is_served_at_its_address(policy):
     path = f"/{policy.token}/"
     for host in (home(policy), f"localhost:{policy.port}"):
         assert request_status(policy, path, Host=host) == 200
@@ -47,13 +47,13 @@ def test_the_page_is_served_to_who_has_its_address(policy):
 
 
 @pytest.mark.parametrize("path", ["/", "/x/", "/?token=x", "//", "/%2e%2e/", "/index.html"])
-def test_without_the_token_there_is_no_page_and_no_socket(policy, path):
+def test_requests_without_the_token_are_denied(policy, path):
     assert request_status(policy, path, Host=home(policy)) == 403
     origin = f"http://{home(policy)}"
     assert request_status(policy, path, Host=home(policy), Origin=origin, **UPGRADE) == 403
 
 
-def test_a_token_that_is_nearly_right_is_wrong(policy):
+def test_similar_tokens_are_denied(policy):
     for wrong in (policy.token[:-1], policy.token + "x", policy.token.swapcase()):
         assert request_status(policy, f"/{wrong}/", Host=home(policy)) == 403
 
@@ -65,7 +65,7 @@ def test_a_token_that_is_nearly_right_is_wrong(policy):
         *("", "127.0.0.1:{port}@rebound.example:{port}", "192.168.0.7:{port}", "[::2]:{port}"),
     ],
 )
-def test_a_host_that_is_not_this_one_is_refused(policy, host):
+def test_other_hosts_are_denied(policy, host):
     named = host.format(port=policy.port)
     assert request_status(policy, f"/{policy.token}/", Host=named) == 421
     headers = {"Host": named, "Origin": f"http://{named}", **UPGRADE}
@@ -79,17 +79,17 @@ def test_a_host_that_is_not_this_one_is_refused(policy, host):
         *("http://127.0.0.1:{port}.foreign.example", "http://localhost:{port}"),
     ],
 )
-def test_a_socket_from_another_page_is_refused(policy, origin):
+def test_sockets_of_other_pages_are_denied(policy, origin):
     more = {} if origin is None else {"Origin": origin.format(port=policy.port)}
     assert request_status(policy, f"/{policy.token}/", Host=home(policy), **more, **UPGRADE) == 403
 
 
-def test_the_pages_own_socket_is_opened(policy):
+def test_the_socket_of_the_page_is_opened(policy):
     headers = {"Host": home(policy), "Origin": f"http://{home(policy)}", **UPGRADE}
     assert request_status(policy, f"/{policy.token}", **headers) == 101
 
 
-def test_only_this_machine_can_reach_it(policy):
+def test_the_default_socket_is_not_public(policy):
     assert policy.socket.getsockname()[0] == "127.0.0.1"
     assert not policy.is_public
 
@@ -111,7 +111,7 @@ def connected(policy):
     )
 
 
-def test_a_message_that_is_too_long_ends_the_connection(policy):
+def test_a_too_long_message_closes_the_connection(policy):
     with connected(policy) as call:
         call.send(b"x" * (MAX_MESSAGE + 1))
         with pytest.raises(ConnectionClosed) as closed:
@@ -119,15 +119,15 @@ def test_a_message_that_is_too_long_ends_the_connection(policy):
     assert closed.value.rcvd.code == 1009
 
 
-def test_a_message_of_the_largest_size_is_read(policy, told):
+def test_a_message_of_the_largest_size_is_accepted(policy, failures):
     with connected(policy) as call:
         call.send(packed("GuiModalMessage", title="x" * MAX_MESSAGE)[:MAX_MESSAGE])
         with pytest.raises(ConnectionClosed) as closed:
             drained(call)
-    assert closed.value.rcvd.code == 1011, "it was read and is garbage"
+    assert closed.value.rcvd.code == 1011, "the message was read and is invalid"
 
 
-# ------------------------------------------------------------------ what strangers send
+# ------------------------------------------------------------------ invalid requests
 
 
 @pytest.mark.parametrize(
@@ -138,21 +138,21 @@ def test_a_message_of_the_largest_size_is_read(policy, told):
     ],
     ids=ascii,
 )
-def test_a_token_that_is_not_ascii_is_wrong_and_no_error(policy, capfd, path):
+def test_a_token_that_is_not_ascii_is_denied_without_an_error(policy, capfd, path):
     path = path.format(token=policy.token)
     assert raw_status(policy, path.encode("utf-8", "surrogateescape")) == 403
     assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("more", ["\u00e9", "%00", "%ff", "x" * 5000, "../" * 9, "%2e%2e/x"])
-def test_a_path_behind_the_token_that_is_no_file_is_not_found_and_no_error(policy, capfd, more):
+def test_an_unknown_path_is_not_found_without_an_error(policy, capfd, more):
     found = raw_status(policy, f"/{policy.token}/{more}".encode())
     assert found in (400, 404)
     assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("name", ["Connection", "Accept-Encoding", "Upgrade", "Origin", "Host"])
-def test_a_header_that_comes_twice_is_no_error(policy, capfd, name):
+def test_a_repeated_header_causes_no_error(policy, capfd, name):
     twice = f"{name}: x\r\n{name}: y\r\n".encode()
     found = raw_status(policy, f"/{policy.token}/".encode(), twice)
     assert found == {"Host": 421, "Origin": 403, "Connection": 200}.get(name, 400)
@@ -160,7 +160,7 @@ def test_a_header_that_comes_twice_is_no_error(policy, capfd, name):
 
 
 def raw_status(policy, path, headers=b""):
-    """Return the status that a request of these bytes is answered with."""
+    """Return the status of the response to a request with these bytes."""
     with socket.create_connection(("127.0.0.1", policy.port), timeout=LONG) as call:
         host = f"Host: {home(policy)}\r\n".encode()
         call.sendall(b"GET " + path + b" HTTP/1.1\r\n" + host + headers + b"\r\n")
@@ -168,17 +168,17 @@ def raw_status(policy, path, headers=b""):
 
 
 @pytest.fixture
-def told(policy, monkeypatch):
-    """Complaints of the page's policy as they come: a list, and an event for each new one."""
-    heard, genuine = SimpleNamespace(all=[], news=threading.Event()), policy.log.report
+def failures(policy, monkeypatch):
+    """Reported failures of the page: a list, and an event that is set by each new one."""
+    seen, original = SimpleNamespace(all=[], added=threading.Event()), policy.log.report
 
     def add(*what):
-        genuine(*what)
-        heard.all.append(what)
-        heard.news.set()
+        original(*what)
+        seen.all.append(what)
+        seen.added.set()
 
     monkeypatch.setattr(policy.log, "report", add)
-    return heard
+    return seen
 
 
 def packed(kind, **fields):
@@ -197,12 +197,14 @@ GARBAGE = {
 
 
 @pytest.mark.parametrize("message", GARBAGE.values(), ids=GARBAGE)
-def test_garbage_ends_its_connection_with_one_line(policy, told, capfd, message):
+def test_an_invalid_message_closes_its_connection_and_prints_one_line(
+    policy, failures, capfd, message
+):
     with connected(policy) as call:
         call.send(message)
         with pytest.raises(ConnectionClosed):
             drained(call)
-    assert told.news.wait(LONG)
+    assert failures.added.wait(LONG)
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith("warning: browser request failed: connection handler failed: ")
     assert line.isascii()
@@ -213,26 +215,28 @@ def test_garbage_ends_its_connection_with_one_line(policy, told, capfd, message)
     )
 
 
-def test_garbage_again_and_again_is_one_line(policy, told, capfd, monkeypatch):
+def test_repeated_invalid_messages_print_one_line(policy, failures, capfd, monkeypatch):
     monkeypatch.setattr(policy.log, "_clock", lambda: 0.0)
     for _ in range(5):
-        told.news.clear()
+        failures.added.clear()
         with connected(policy) as call:
             call.send(b"\xc1")
             with pytest.raises(ConnectionClosed):
                 drained(call)
-        assert told.news.wait(LONG)
-    assert len(told.all) == 5
+        assert failures.added.wait(LONG)
+    assert len(failures.all) == 5
     assert capfd.readouterr().err.count("\n") == 1
 
 
 @pytest.mark.parametrize("update", [{"value": "x"}, {"no_such_thing": 1}, {"value": None}])
-def test_a_value_that_a_control_cannot_have_is_one_line(page, policy, told, capfd, update):
+def test_an_invalid_value_of_a_control_prints_one_line(page, policy, failures, capfd, update):
     slider = page.controls.radius
     before = slider.value
     with connected(policy) as call:
         call.send(packed("GuiUpdateMessage", uuid=slider._impl.uuid, updates=update))
-        while not told.news.wait(0.1):  # the task's error is told once the task is collected
+        while not failures.added.wait(
+            0.1
+        ):  # the task's error is failures once the task is collected
             gc.collect()
     assert slider.value == before
     err = capfd.readouterr().err
@@ -240,7 +244,7 @@ def test_a_value_that_a_control_cannot_have_is_one_line(page, policy, told, capf
     assert err.startswith("warning: browser request failed: ")
 
 
-def test_an_error_of_any_control_is_one_line(page, capfd):
+def test_an_error_in_a_callback_prints_one_line(page, capfd):
     now = 0.0
     page._policy.log._clock = lambda: now
     page._submit = None  # every call fails
@@ -254,7 +258,7 @@ def test_an_error_of_any_control_is_one_line(page, capfd):
         assert line.startswith("warning: browser request failed: control: TypeError: ")
 
 
-def test_errors_of_callbacks_are_told_whether_they_are_awaited_or_not(capfd):
+def test_errors_of_functions_and_coroutines_are_reported(capfd):
     async def awaited(event):
         raise ZeroDivisionError(event)
 
@@ -263,11 +267,11 @@ def test_errors_of_callbacks_are_told_whether_they_are_awaited_or_not(capfd):
 
     asyncio.run(RateLimitedHandler().catch_errors(awaited)("far\naway"))
     RateLimitedHandler().catch_errors(called)("far\naway")
-    told = "warning: browser request failed: control: ZeroDivisionError: far away"
-    assert capfd.readouterr().err.splitlines() == [told, told]
+    failures = "warning: browser request failed: control: ZeroDivisionError: far away"
+    assert capfd.readouterr().err.splitlines() == [failures, failures]
 
 
-def test_one_line_a_second_is_printed_and_the_others_are_counted(capfd):
+def test_one_line_per_second_is_printed_and_others_are_counted(capfd):
     now = 5.0
     complaints = RateLimitedHandler(lambda: now)
     lines = []
@@ -282,12 +286,12 @@ def test_one_line_a_second_is_printed_and_the_others_are_counted(capfd):
     ]
 
 
-def test_warnings_are_no_complaints(capfd):
+def test_warnings_are_not_printed(capfd):
     RateLimitedHandler().logger.warning("slow")
     assert capfd.readouterr().err == ""
 
 
-def test_the_answer_forbids_to_fetch_from_elsewhere(policy):
+def test_responses_forbid_requests_to_other_hosts(policy):
     with socket.create_connection(("127.0.0.1", policy.port), timeout=LONG) as call:
         call.sendall(f"GET /{policy.token}/ HTTP/1.1\r\nHost: {home(policy)}\r\n\r\n".encode())
         head = call.recv(4096).decode("latin1").split("\r\n\r\n")[0].lower()
@@ -297,7 +301,7 @@ def test_the_answer_forbids_to_fetch_from_elsewhere(policy):
     assert "access-control-allow-origin" not in head
 
 
-def test_a_door_to_all_takes_addresses_and_its_names_but_no_others():
+def test_a_public_socket_accepts_addresses_and_allowed_hosts_only():
     policy = AccessPolicy.bind("0.0.0.0", 0, ["Lab-7"])
     try:
         assert policy.is_public
@@ -308,19 +312,19 @@ def test_a_door_to_all_takes_addresses_and_its_names_but_no_others():
         policy.socket.close()
 
 
-def test_a_browser_cannot_ask_for_a_tunnel(page):
+def test_a_browser_cannot_open_a_tunnel(page):
     assert page.server.request_share_url() is None
     assert page.server._share_tunnel is None
 
 
 @pytest.mark.parametrize("which", range(5))
-def test_a_door_that_answers_one_request_wrongly_is_not_served(policy, monkeypatch, which):
-    asked = []
+def test_a_server_with_one_wrong_response_is_not_started(policy, monkeypatch, which):
+    requests = []
 
     def status(policy, path, **headers):
-        asked.append((path, headers))
+        requests.append((path, headers))
         found = request_status(policy, path, **headers)
-        return 500 if len(asked) == which + 1 else found
+        return 500 if len(requests) == which + 1 else found
 
     monkeypatch.setattr("dpl.viewer.access.request_status", status)
     must = (200, 403, 421, 403, 403)[which]
@@ -330,7 +334,7 @@ def test_a_door_that_answers_one_request_wrongly_is_not_served(policy, monkeypat
     check_server(policy)
 
 
-def test_a_host_without_a_port_is_that_of_port_80(policy):
+def test_a_host_without_a_port_means_port_80(policy):
     bound = SimpleNamespace(getsockname=lambda: ("127.0.0.1", 80))
     other = AccessPolicy(bound, "127.0.0.1", ("lab",))
     for host in ("127.0.0.1", "localhost", "[::1]", "LAB", "127.0.0.1:80", "localhost:00080"):
@@ -360,13 +364,13 @@ def test_a_host_without_a_port_is_that_of_port_80(policy):
         ("fe80::1", True, "http://[fe80::1]:81/t/"),
     ],
 )
-def test_the_address_is_what_a_browser_can_open(host, is_public, address):
+def test_the_url_can_be_opened_by_a_browser(host, is_public, address):
     bound = SimpleNamespace(getsockname=lambda: (host, 81))
     policy = AccessPolicy(bound, host, (), "t")
     assert (policy.is_public, policy.url) == (is_public, address)
 
 
-def test_a_door_to_all_takes_its_own_names_too():
+def test_a_public_socket_accepts_the_names_of_this_machine():
     bound = SimpleNamespace(getsockname=lambda: ("0.0.0.0", 81))
     name = socket.gethostname().lower()
     assert AccessPolicy(bound, "0.0.0.0").is_own_host(f"{name}:81")
@@ -376,7 +380,7 @@ def test_a_door_to_all_takes_its_own_names_too():
     assert not AccessPolicy(bound, "127.0.0.1").is_own_host("[fe80::7]:81")
 
 
-def test_two_pages_have_two_tokens():
+def test_each_policy_has_its_own_token():
     first, second = AccessPolicy.bind("127.0.0.1", 0), AccessPolicy.bind("127.0.0.1", 0)
     assert first.token != second.token
     assert len(first.token) >= 32

@@ -1,4 +1,4 @@
-"""Laws of the policy of the viewer, asked of its rules alone: no page and no browser."""
+"""Rules of the access policy, without a page or a browser."""
 
 import asyncio
 import http
@@ -20,11 +20,11 @@ from dpl.viewer.access import MAX_MESSAGE, check_server, request_status, serve_w
 
 PORT, TOKEN = 8123, "Token-7_x"
 HOME = f"127.0.0.1:{PORT}"
-LONG = 120  # no test waits so long, unless what it waits for does not come [s]
+LONG = 120  # time-out, which no test reaches if the server works [s]
 
 
 def policy_at(host="127.0.0.1", port=PORT, allowed_hosts=()):
-    """Return a policy whose socket only knows its address."""
+    """Return a policy with a stub socket that knows only its address."""
     return AccessPolicy(
         SimpleNamespace(getsockname=lambda: (host, port)), host, allowed_hosts, TOKEN
     )
@@ -39,19 +39,19 @@ def request(path=f"/{TOKEN}/", *pairs, host=HOME):
 
 
 def status(policy, *args, **more):
-    """Return the status of the refusal of a request; None if it is not refused."""
-    refused = policy.denial_reason(request(*args, **more))
-    return None if refused is None else refused[0]
+    """Return the status with which a request is denied; None if it is allowed."""
+    denied = policy.denial_reason(request(*args, **more))
+    return None if denied is None else denied[0]
 
 
-# ------------------------------------------------------------------ the host that is asked for
+# ------------------------------------------------------------------ host
 
 
 @pytest.mark.parametrize(
     "host",
     [HOME, f"localhost:{PORT}", f"LocalHost:{PORT}", f"[::1]:{PORT}", f"lab-7:{PORT}"],
 )
-def test_names_of_the_loopback_and_names_that_are_given_are_this_host(host):
+def test_loopback_names_and_allowed_hosts_are_accepted(host):
     assert status(policy_at(allowed_hosts=("lab-7",)), host=host) is None
 
 
@@ -71,19 +71,19 @@ def test_a_host_without_a_port_means_port_80():
         f"127.0.0.1.rebound.example:{PORT}",
     ],
 )
-def test_another_host_is_refused_as_such(host):
-    refused = policy_at(allowed_hosts=("lab-7",)).denial_reason(request(host=host))
-    assert refused is not None
-    assert refused[0] == http.HTTPStatus.MISDIRECTED_REQUEST
-    assert refused[1].startswith("The requested host")
+def test_other_hosts_are_denied(host):
+    denied = policy_at(allowed_hosts=("lab-7",)).denial_reason(request(host=host))
+    assert denied is not None
+    assert denied[0] == http.HTTPStatus.MISDIRECTED_REQUEST
+    assert denied[1].startswith("The requested host")
 
 
-def test_a_request_without_a_host_or_with_two_is_refused():
+def test_a_request_without_a_host_or_with_two_is_denied():
     assert status(policy_at(), host=None) == 421
     assert status(policy_at(), f"/{TOKEN}/", ("Host", HOME)) == 421
 
 
-def test_a_door_to_all_takes_any_address_and_the_names_of_this_machine(monkeypatch):
+def test_a_public_socket_accepts_any_address_and_the_names_of_this_machine(monkeypatch):
     monkeypatch.setattr(socket, "gethostname", lambda: "Bench-3")
     policy = policy_at("Lab.Example", allowed_hosts=("alias",))
     own = ["192.168.0.7", "[fe80::1]", "[FE80::ab]", "[::ffff:10.0.0.1]", "bench-3", "BENCH-3"]
@@ -106,13 +106,13 @@ def test_a_door_to_all_takes_any_address_and_the_names_of_this_machine(monkeypat
         ("fe80::1", "[fe80::1]", True),
     ],
 )
-def test_the_address_is_one_that_a_browser_of_this_machine_can_open(host, address, everyone):
+def test_the_url_can_be_opened_by_a_browser_on_this_machine(host, address, everyone):
     policy = policy_at(host)
     assert policy.url == f"http://{address}:{PORT}/{TOKEN}/"
     assert policy.is_public is everyone
 
 
-# ------------------------------------------------------------------ the page that asks
+# ------------------------------------------------------------------ origin
 
 
 UPGRADE = ("Connection", "keep-alive, Upgrade")
@@ -126,13 +126,13 @@ def test_a_socket_needs_the_origin_of_this_page_and_a_page_needs_none():
         *([foreign], [UPGRADE], [foreign, UPGRADE], [own, foreign], [own, own, UPGRADE]),
         *([("Origin", "null")], [("Origin", f"https://{HOME}")], [("Origin", HOME)]),
     ):
-        refused = policy_at().denial_reason(request(f"/{TOKEN}/", *several))
-        assert refused is not None, several
-        assert refused[0] == http.HTTPStatus.FORBIDDEN
-        assert refused[1].startswith("Only the page of this server")
+        denied = policy_at().denial_reason(request(f"/{TOKEN}/", *several))
+        assert denied is not None, several
+        assert denied[0] == http.HTTPStatus.FORBIDDEN
+        assert denied[1].startswith("Only the page of this server")
 
 
-def test_the_origin_is_that_of_the_host_that_was_asked_for():
+def test_the_origin_must_equal_the_requested_host():
     origin = ("Origin", f"http://localhost:{PORT}")
     assert status(policy_at(), f"/{TOKEN}/", origin, host=f"localhost:{PORT}") is None
     assert status(policy_at(), f"/{TOKEN}/", origin) == 403
@@ -154,18 +154,18 @@ def test_the_token_is_the_first_part_of_the_path(rest):
         *(f"/?{TOKEN}", f"?token={TOKEN}", f"/{TOKEN}%2f", f"/{TOKEN}#"),
     ],
 )
-def test_any_other_path_is_refused_for_its_token(path):
-    refused = policy_at().denial_reason(request(path))
-    assert refused is not None
-    assert refused[0] == http.HTTPStatus.FORBIDDEN
-    assert refused[1].startswith("The address does not contain")
+def test_other_paths_are_denied(path):
+    denied = policy_at().denial_reason(request(path))
+    assert denied is not None
+    assert denied[0] == http.HTTPStatus.FORBIDDEN
+    assert denied[1].startswith("The address does not contain")
 
 
-# ------------------------------------------------------------------ what is handed on
+# ------------------------------------------------------------------ requests that are passed on
 
 
-def guarded(*args, answer=None, **more):
-    """Return what comes of a request, and the requests that the page's handler has seen."""
+def respond(*args, answer=None, **more):
+    """Return the response to a request, and the requests that reach the handler of the page."""
     seen = []
 
     def handle(connection, inner):
@@ -175,8 +175,8 @@ def guarded(*args, answer=None, **more):
     return policy_at().authenticate(handle)("connection", request(*args, **more)), seen
 
 
-def test_a_refused_request_does_not_reach_the_page():
-    found, seen = guarded("/wrong/", answer=Response(200, "OK", Headers(), b"page"))
+def test_a_denied_request_does_not_reach_the_page():
+    found, seen = respond("/wrong/", answer=Response(200, "OK", Headers(), b"page"))
     assert seen == []
     assert (found.status_code, found.reason_phrase) == (403, "Forbidden")
     assert found.body == policy_at().denial_reason(request("/wrong/"))[1].encode()
@@ -188,17 +188,17 @@ def test_a_refused_request_does_not_reach_the_page():
     ("rest", "inner"),
     [("", "/"), ("/", "/"), ("/a.js", "/a.js"), ("?x=1", "/?x=1"), (f"/{TOKEN}", f"/{TOKEN}")],
 )
-def test_the_page_is_asked_without_the_token(rest, inner):
-    found, ((connection, seen),) = guarded(f"/{TOKEN}{rest}", ("Accept", "text/html"))
-    assert found is None, "the handler has answered nothing: a socket is opened"
+def test_the_page_receives_requests_without_the_token(rest, inner):
+    found, ((connection, seen),) = respond(f"/{TOKEN}{rest}", ("Accept", "text/html"))
+    assert found is None, "no response of the handler: a socket is opened"
     assert connection == "connection"
     assert seen.path == inner
     assert list(seen.headers.raw_items()) == [("Host", HOME), ("Accept", "text/html")]
 
 
-def test_every_answer_forbids_other_pages_to_use_it():
+def test_every_response_has_the_security_headers():
     answer = Response(200, "OK", Headers({"Content-Type": "text/html"}), b"page")
-    found, _ = guarded(answer=answer)
+    found, _ = respond(answer=answer)
     assert found is answer
     headers = dict(found.headers.raw_items())
     policy = headers.pop("Content-Security-Policy")
@@ -222,13 +222,13 @@ def test_every_answer_forbids_other_pages_to_use_it():
     }
 
 
-# ------------------------------------------------------------------ the socket and the server
+# ------------------------------------------------------------------ socket and server
 
 
 @pytest.mark.parametrize(
     ("host", "family"), [("127.0.0.1", socket.AF_INET), ("::1", socket.AF_INET6)]
 )
-def test_a_door_is_bound_where_it_is_asked_to_be(host, family):
+def test_a_socket_is_bound_to_host_and_port(host, family):
     try:
         policy = AccessPolicy.bind(host, 0, ["Lab-7", "x"])
     except OSError:
@@ -241,7 +241,7 @@ def test_a_door_is_bound_where_it_is_asked_to_be(host, family):
         assert (policy.host, policy.allowed_hosts) == (host, ("lab-7", "x"))
 
 
-def test_a_door_has_no_names_and_a_long_token_of_its_own_unless_told():
+def test_a_policy_has_no_allowed_hosts_and_a_random_token_by_default():
     with AccessPolicy.bind("127.0.0.1", 0).socket as bound:
         policies = [AccessPolicy(bound, "127.0.0.1") for _ in range(2)]
     assert [policy.allowed_hosts for policy in policies] == [(), ()]
@@ -249,7 +249,7 @@ def test_a_door_has_no_names_and_a_long_token_of_its_own_unless_told():
     assert all(len(policy.token) == 32 for policy in policies)  # 24 bytes in base 64
 
 
-def test_a_port_that_is_taken_is_an_error_and_its_socket_is_closed(monkeypatch):
+def test_a_port_in_use_raises_an_error_and_closes_the_socket(monkeypatch):
     made = []
 
     class Recorded(socket.socket):
@@ -264,14 +264,14 @@ def test_a_port_that_is_taken_is_an_error_and_its_socket_is_closed(monkeypatch):
     assert made[0].fileno() == -1
 
 
-def test_a_server_that_starts_behind_a_door_takes_its_socket_and_its_rules(monkeypatch):
+def test_a_server_uses_socket_and_rules_of_the_policy(monkeypatch):
     calls, policy = [], policy_at()
 
-    def genuine(handler, **options):
+    def original(handler, **options):
         calls.append((handler, options))
         return "server"
 
-    monkeypatch.setattr(websockets.asyncio.server, "serve", genuine)
+    monkeypatch.setattr(websockets.asyncio.server, "serve", original)
 
     async def start():
         return websockets.asyncio.server.serve(
@@ -280,7 +280,7 @@ def test_a_server_that_starts_behind_a_door_takes_its_socket_and_its_rules(monke
 
     with serve_with(policy):
         assert asyncio.run(start()) == "server"
-    assert websockets.asyncio.server.serve is genuine
+    assert websockets.asyncio.server.serve is original
     ((handler, options),) = calls
     assert handler == "handler"
     assert options["sock"] is policy.socket
@@ -288,25 +288,27 @@ def test_a_server_that_starts_behind_a_door_takes_its_socket_and_its_rules(monke
     assert options["server_header"] is None
     assert options["compression"] is None
     assert options["process_request"](None, request("/wrong/")).status_code == 403
-    with pytest.raises(AttributeError):  # "passed" is no response: the page was asked
+    with pytest.raises(
+        AttributeError
+    ):  # "passed" is not a response: the handler of the page was called
         options["process_request"](None, request())
 
 
-def test_an_error_behind_a_door_leaves_servers_as_they_were():
-    genuine = websockets.asyncio.server.serve
+def test_an_error_restores_the_websockets_server():
+    original = websockets.asyncio.server.serve
 
     def fail():
         with serve_with(policy_at()):
-            assert websockets.asyncio.server.serve is not genuine
+            assert websockets.asyncio.server.serve is not original
             raise RuntimeError("stop")
 
     with pytest.raises(RuntimeError, match="stop"):
         fail()
-    assert websockets.asyncio.server.serve is genuine
+    assert websockets.asyncio.server.serve is original
 
 
-def answered(listening, answer):
-    """Answer one request at a socket; return the thread, and the list that the request joins."""
+def respond_once(listening, answer):
+    """Respond to one request; return the thread, and the list to which the request is added."""
     seen = []
 
     def serve():
@@ -321,9 +323,9 @@ def answered(listening, answer):
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
-def test_the_status_of_a_request_is_that_of_the_answer(host):
+def test_the_status_of_a_request_is_that_of_the_response(host):
     with socket.create_server((host, 0)) as listening:
-        thread, seen = answered(listening, b"HTTP/1.1 418 I'm a teapot\r\n\r\n")
+        thread, seen = respond_once(listening, b"HTTP/1.1 418 I'm a teapot\r\n\r\n")
         found = request_status(
             AccessPolicy(listening, host), "/a?b", Host="x:1", Sec_WebSocket_Key="k"
         )
@@ -332,56 +334,56 @@ def test_the_status_of_a_request_is_that_of_the_answer(host):
     assert seen == [b"GET /a?b HTTP/1.1\r\nHost: x:1\r\nSec-WebSocket-Key: k\r\n\r\n"]
 
 
-def test_a_door_to_all_addresses_is_asked_at_the_loopback(monkeypatch):
-    asked = []
+def test_a_public_socket_is_tested_through_the_loopback(monkeypatch):
+    requests = []
 
-    def refused(address, timeout):
-        asked.append(address)
-        assert 0 < timeout < LONG, "a policy that does not answer is no reason to wait for ever"
+    def denied(address, timeout):
+        requests.append(address)
+        assert 0 < timeout < LONG, "a server without a response causes a time-out"
         raise ConnectionRefusedError
 
-    monkeypatch.setattr(socket, "create_connection", refused)
+    monkeypatch.setattr(socket, "create_connection", denied)
     for host in ("::", "0.0.0.0", "10.0.0.1"):
         with pytest.raises(ConnectionRefusedError):
             request_status(policy_at(host), "/")
-    assert asked == [("::1", PORT), ("127.0.0.1", PORT), ("10.0.0.1", PORT)]
+    assert requests == [("::1", PORT), ("127.0.0.1", PORT), ("10.0.0.1", PORT)]
 
 
-# ------------------------------------------------------------------ the check before it is served
+# ------------------------------------------------------------------ check of the server
 
 
-def tried(monkeypatch, wrong=None):
-    """Check a policy that answers by its rules, but for one case; return the requests."""
-    asked = []
+def checked_requests(monkeypatch, wrong=None):
+    """Check a server that follows its policy except for one case; return the requests."""
+    requests = []
 
     def by_rule(policy, path, **headers):
-        asked.append((path, headers))
-        refused = policy.denial_reason(request(path, *headers.items(), host=None))
-        status = 200 if refused is None else int(refused[0])
-        if len(asked) - 1 == wrong:
+        requests.append((path, headers))
+        denied = policy.denial_reason(request(path, *headers.items(), host=None))
+        status = 200 if denied is None else int(denied[0])
+        if len(requests) - 1 == wrong:
             return 403 if status == 200 else 200
         return status
 
     monkeypatch.setattr(module, "request_status", by_rule)
     check_server(policy_at())
-    return asked
+    return requests
 
 
-def test_a_door_is_tried_in_every_way_that_must_fail_and_in_the_one_that_must_not(monkeypatch):
-    asked = tried(monkeypatch)
-    without_token = [path for path, _ in asked if TOKEN not in path]
-    hosts = {headers["Host"] for _, headers in asked}
-    origins = {headers.get("Origin") for _, headers in asked if "Upgrade" in headers}
+def test_the_check_contains_an_allowed_request_and_each_kind_of_denied_one(monkeypatch):
+    requests = checked_requests(monkeypatch)
+    without_token = [path for path, _ in requests if TOKEN not in path]
+    hosts = {headers["Host"] for _, headers in requests}
+    origins = {headers.get("Origin") for _, headers in requests if "Upgrade" in headers}
     assert without_token
     assert any(host not in (HOME, f"localhost:{PORT}") for host in hosts)
     assert None in origins
     assert any(origin and HOME not in origin for origin in origins)
-    for _, headers in asked:
+    for _, headers in requests:
         upgrade = {name: headers[name] for name in ("Connection", "Upgrade") if name in headers}
         assert upgrade in ({}, {"Connection": "Upgrade", "Upgrade": "websocket"})
 
 
 @pytest.mark.parametrize("wrong", range(5))
-def test_a_door_that_answers_one_request_wrongly_is_not_served(monkeypatch, wrong):
+def test_a_server_with_one_wrong_response_is_not_started(monkeypatch, wrong):
     with pytest.raises(RuntimeError, match="access control"):
-        tried(monkeypatch, wrong)
+        checked_requests(monkeypatch, wrong)

@@ -10,12 +10,13 @@ import torch
 pytest.importorskip("viser", reason="the extra viewer is not installed")
 
 from dpl.fem import rectangle
-from dpl.viewer import AccessPolicy, Page
+from dpl.inference import Simulator
+from dpl.viewer import AccessPolicy, Body, Page
 
 BODIES = {
     "hexahedra": {},
     "degree 2": {"degree": 2, "cell": "tetra"},
-    "in the plane": {"mesh": rectangle([100.0, 25.0], [9, 4])},
+    "2D": {"mesh": rectangle([100.0, 25.0], [9, 4])},
     "range of Poisson's ratios": {"poisson": [0.2, 0.4]},
     "range of Young's moduli": {"young": [1e6, 3e6]},
 }
@@ -75,6 +76,61 @@ def test_a_click_moves_the_patch_to_the_nearest_point_on_the_ray(page):
     event = SimpleNamespace(ray_origin=(0.5, -3.0, 0.125), ray_direction=(0.0, 1.0, 0.0))
     asyncio.run(page.click(event))
     assert page.body.scene.problem.points[page.node].tolist() == [0.5, 0.0, 0.125]
+
+
+def test_the_amplitude_slider_follows_a_drag_and_not_itself(page):
+    assert page.worker.wait(240)
+    drag_tip(page, np.array([0.0, 0.0, 0.08]))
+    page.refresh()
+    amplitude = page.frame.answer.amplitude
+    assert amplitude > 0.01
+    assert page.controls.amplitude.value == pytest.approx(amplitude, abs=0.01)
+    direction = np.array(page.controls.direction.value)
+    assert direction[2] > 0.9 * np.linalg.norm(direction)
+    page.controls.amplitude.value = -0.5
+    page.apply_controls(SimpleNamespace(client=object()))
+    assert page.worker.wait(240)
+    page.refresh()
+    assert page.controls.amplitude.value == -0.5
+
+
+def test_the_legend_of_an_undeformed_body_has_no_numbers_on_its_scale(page):
+    assert page.worker.wait(240)
+    page.refresh()
+    legend = page.controls._legend.content
+    assert "0 m everywhere" in legend
+    assert "<span>0</span>" not in legend
+
+
+def test_dots_lie_above_the_surface(page):
+    assert page.worker.wait(240)
+    marker, points = page._marker, page.frame.points
+    middle = points.mean(axis=0)
+    above = np.linalg.norm(marker._dot_positions(points) - middle, axis=1)
+    assert len(above) == marker.mask.sum()
+    assert (above > np.linalg.norm(points[marker.mask] - middle, axis=1)).all()
+
+
+def test_the_galerkin_correction_is_offered_if_the_simulator_has_one(page, body, tmp_path):
+    assert page.worker.wait(240)
+    assert not page.controls.galerkin.visible
+    assert not page.controls.settings().galerkin
+    simulator = Simulator(body.simulator.surrogate, correct=lambda force, u: u / 0.98)
+    policy = AccessPolicy.bind("127.0.0.1", 0)
+    other = Page(Body(simulator), policy, title="t", folder=tmp_path)
+    try:
+        assert other.controls.galerkin.visible
+        other.controls.method.value = "residual below 1e-06"
+        other.apply_settings(None)
+        other.sample(None)
+        assert other.worker.wait(240)
+        assert other.frame.answer.method == "corrected"
+        other.controls.galerkin.value = False
+        other.apply_settings(None)
+        assert other.worker.wait(240)
+        assert other.frame.answer.method == "hybrid"
+    finally:
+        other.close()
 
 
 def test_error_messages_are_escaped(page):
