@@ -114,15 +114,15 @@ def _law(scene: Scene) -> dict[str, Any]:
 def _range(scene: Scene) -> dict[str, Any]:
     """Return the data by which a program checks whether a force is in the training range."""
     loads, constant = scene.loads, scene.loads.constant_force
-    told = {
+    found = {
         "family": loads.identity(),
         "constant_force": None if constant is None else constant.flatten().tolist(),
         "largest_force": loads.largest_force,
         "meaning": RANGE,
     }
     if isinstance(loads, HasModes):
-        told["modes"] = {"file": "modes.f64", "shape": list(loads.modal_forces.shape)}
-    return told
+        found["modes"] = {"file": "modes.f64", "shape": list(loads.modal_forces.shape)}
+    return found
 
 
 def _mesh(problem: Problem) -> dict[str, Any]:
