@@ -127,7 +127,7 @@ def laws(folder: Path) -> Section:
         [("laws.png", "Uniaxial stress of all laws: curves and markers dpl, circles reference.")],
         [
             "All laws agree at small strains and differ at large ones. SVK softens in compression "
-            "(its stress has a maximum at λ = 1/√3 = 0.577; a body under a larger pressure has no "
+            "(its stress has a maximum at λ = 1/√3 = 0.577; a larger compressive load has no "
             "equilibrium) and stiffens in tension; the neo-Hookean laws do the opposite. Two laws "
             "with the name neo-Hookean differ by "
             f"{_spread(curves, grid):.0f} % at λ = 1.5; a test at 1 % strain cannot tell "

@@ -219,6 +219,7 @@ def test_a_notebook_is_executed_once_and_shown_with_its_figures(make, tmp_path, 
 def test_the_examples_of_the_page_on_extensions_work(blocks, monkeypatch):
     made = blocks("extend.md")
     assert made["answers"].converged.all()
+    assert made["pulled"].converged.all()
     assert made["load"].force.shape == (1, *made["small_body"].shape)
     monkeypatch.setattr(sys, "path", [str(Path.cwd()), *sys.path])
     GlobalHydra.instance().clear()
@@ -230,6 +231,9 @@ def test_the_examples_of_the_page_on_extensions_work(blocks, monkeypatch):
             run.check(cfg)
             scene = run.build_scene(cfg)
             surrogate = run.build_surrogate(cfg, scene)
+            ends = hydra.compose("train", overrides=[own, "loads=end", "folder=."])
+            run.check(ends)
+            assert run.build_scene(ends).loads.largest == 2e-3
     finally:
         GlobalHydra.instance().clear()
     assert scene.loads.distribution.keywords == {"gap": 0.3}
