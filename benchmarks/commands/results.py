@@ -15,7 +15,7 @@ def main(cfg: DictConfig) -> None:
     from benchmarks import paper_tables
     from dpl.evaluation import methods
     from dpl.evaluation.tables import show
-    from dpl.models import PODNet
+    from dpl.models import Correctable
 
     config.check(cfg)
     runs = config.load_runs(cfg.run)
@@ -36,7 +36,7 @@ def main(cfg: DictConfig) -> None:
     for name, (trained, surrogate) in runs.items():
         method = methods.network(surrogate, Path(cfg.run) / name, trained.data.train)
         compared[name] = method
-        if cfg.corrected and isinstance(surrogate.net, PODNet):
+        if cfg.corrected and isinstance(surrogate.net, Correctable):
             compared[name + paper_tables.CORRECTED] = made("corrected", surrogate, method, train)
     sets = paper_tables.load_sets(scene, data.samples("test"), cfg.count)
     rows, errors = paper_tables.paper(cfg.name), {}

@@ -79,7 +79,7 @@ def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
 
     from dpl.evaluation import methods, pareto
     from dpl.inference import Direct, default_hybrid
-    from dpl.models import PODNet
+    from dpl.models import Correctable
 
     runs = config.load_runs(cfg.run)
     first, surrogate = next(iter(runs.values()))
@@ -95,7 +95,7 @@ def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
     for name, (trained, surrogate) in runs.items():
         predict = surrogate.predict
         solvers[name] = Direct(predict, scene.problem)
-        if cfg.corrected and isinstance(surrogate.net, PODNet):
+        if cfg.corrected and isinstance(surrogate.net, Correctable):
             row = methods.network(surrogate, Path(cfg.run) / name, trained.data.train)
             tier = config.instantiate(cfg, "corrected")(surrogate, row, train)
             solvers[f"{name}, corrected"] = Direct(tier.predict, scene.problem)

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from dpl.fem import Load, PODGalerkin
 from dpl.inference.hybrid import Predict
-from dpl.models import Latent, PODNet
+from dpl.models import Correctable
 from dpl.scene import Sample, Scene
 from dpl.training import Surrogate
 
@@ -87,32 +87,28 @@ def corrected(
     tolerance: float,
     steps: int,
 ) -> Method:
-    """Return a network whose answers are corrected by equilibrium in its own first modes.
-
-    The linear part of a latent network is the exact one here.
+    """Return a network whose predictions are corrected by Galerkin iterations in its modes.
 
     Args:
-        surrogate: The network, one between coordinates.
-        method: Its row.
-        train: Its samples.
-        rank: Modes of its basis in which to correct.
-        tolerance: Of the choice of cells, see `dpl.fem.rom.cubature`.
-        steps: Corrections, see `PODGalerkin.correct`.
+        surrogate: A surrogate whose network is `Correctable`.
+        method: The method of the network alone.
+        train: Training samples.
+        rank: Number of modes of the correction.
+        tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
+        steps: Number of iterations, see `PODGalerkin.correct`.
 
     Raises:
         ValueError: A number is out of range.
     """
-    net = cast(PODNet, surrogate.net)
+    net = cast(Correctable, surrogate.net)
     start = time.perf_counter()
     solver = net.galerkin(train.displacement, rank=rank, tolerance=tolerance)
     minutes = (method.training_minutes or 0.0) + (time.perf_counter() - start) / 60
-    tier = copy.copy(surrogate)
-    tier._modules = {**surrogate._modules, "net": copy.copy(net)}
-    if isinstance(tier.net, Latent):
-        tier.net.linear_tol = 0.0
+    start_from = copy.copy(surrogate)
+    start_from._modules = {**surrogate._modules, "net": cast(nn.Module, net.for_correction())}
 
     def predict(load: Load) -> Tensor:
-        pairs = zip(load.force, tier.predict(load), strict=True)
+        pairs = zip(load.force, start_from.predict(load), strict=True)
         return torch.stack([solver.correct(f, u, steps=steps) for f, u in pairs])
 
     return Method(predict, method.samples, minutes, method.parameters)

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from dpl.models import Latent
+from dpl.models import FlagsLocalLoads
 from dpl.training import Surrogate
 
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
@@ -48,7 +48,8 @@ def missing_packages() -> list[str]:
 class ExportGraph(nn.Module):
     """Surrogate without control flow that depends on the values of a load.
 
-    `Latent` solves local loads with a sparse factor of K(0), which is not a tensor operation. The
+    A `FlagsLocalLoads` network solves local loads with a sparse factor of K(0), which is not a
+    tensor operation. The
     graph represents these loads in the basis like all others, and a second output marks them.
 
     Attributes:
@@ -61,7 +62,7 @@ class ExportGraph(nn.Module):
         super().__init__()
         self.surrogate = surrogate.eval()
         net = surrogate.net
-        self.has_local_output = isinstance(net, Latent) and net.linear_tol < torch.inf
+        self.has_local_output = isinstance(net, FlagsLocalLoads) and net.flags_local_loads
 
     @property
     def inputs(self) -> list[str]:
@@ -87,9 +88,9 @@ class ExportGraph(nn.Module):
         module = self.surrogate
         load = module.scene.load_of(force, young, poisson)
         scaled, more = module.scale_inputs(load)
-        if not isinstance(module.net, Latent):
+        if not isinstance(module.net, FlagsLocalLoads):
             return (module.scene.length * module.unscale_outputs(module.net(scaled, **more)),)
-        answer, local = module.net.within(scaled, **more)
+        answer, local = module.net.forward_in_basis(scaled, **more)
         metres = module.scene.length * module.unscale_outputs(answer)
         loaded = (force != 0).flatten(1).any(dim=1)  # a zero load is not local
         return (metres, local & loaded) if self.has_local_output else (metres,)

@@ -16,7 +16,7 @@ from dpl.fem import Load, Newton, Solution, Status, evaluate_solution
 from dpl.fem.problem import FAINT
 from dpl.fem.solvers import check_tol, concatenate
 from dpl.inference.hybrid import default_hybrid
-from dpl.models import PODNet
+from dpl.models import Correctable
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import Surrogate
@@ -104,7 +104,7 @@ class Simulator:
             ValueError: The network has no modes, or a number is out of range.
         """
         net = surrogate.net
-        if not isinstance(net, PODNet):
+        if not isinstance(net, Correctable):
             raise ValueError(f"corrected: {type(net).__name__} has no modes to correct in")
         solver = net.galerkin(states, rank=rank, tolerance=tolerance)
         return cls(surrogate, correct=solver.correct)

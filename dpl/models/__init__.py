@@ -1,6 +1,6 @@
-"""Networks: nn.Modules from scaled forces (B, N, D) to scaled displacements (B, N, D).
+"""Networks: modules from scaled forces (B, N, D) to scaled displacements (B, N, D), float32.
 
-Each is built from a scene and its own options, and is float32 throughout.
+Each is built from a scene and options of its own.
 """
 
 from typing import TYPE_CHECKING
@@ -13,5 +13,6 @@ if TYPE_CHECKING:
     from dpl.models.gnn import GNN
     from dpl.models.latent import Latent
     from dpl.models.pod import PODNet
+    from dpl.models.protocols import Correctable, FlagsLocalLoads, TrainsInCoordinates
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -69,10 +69,10 @@ class FCNN(nn.Module):
         ends = int(inputs.sum()) + len(self.extra_inputs), int(outputs.sum())
         hidden = width or ends[1]
         sizes = [ends[0], *[hidden] * (layers - 1), ends[1]]
-        self.parameters_needed = _parameters(sizes)
-        self.parameters_saved = _parameters([everything.numel()] * (layers + 1)) - _parameters(
-            sizes
-        )
+        self.parameters_needed = count_parameters(sizes)
+        self.parameters_saved = count_parameters(
+            [everything.numel()] * (layers + 1)
+        ) - count_parameters(sizes)
         remedy = "take a coarser mesh, model.width or another model"
         refuse_weights(self.parameters_needed, memory_limit, remedy)
         self.register_buffer("inputs", inputs, persistent=False)
@@ -122,7 +122,7 @@ class FCNN(nn.Module):
         ]
 
 
-def _parameters(sizes: list[int]) -> int:
+def count_parameters(sizes: list[int]) -> int:
     """Return weights, biases and slopes of linear layers between these sizes."""
     linear = sum((before + 1) * after for before, after in pairwise(sizes))
     return linear + sum(sizes[1:-1])

@@ -1,45 +1,60 @@
-"""The linear answer, and a network for what is nonlinear: the flagship."""
+"""Linear solution plus a network for the nonlinear part of the displacement."""
 
+import copy
 from functools import reduce
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from dpl.fem.symmetry import products
-from dpl.models.pod import PODNet, Reading, padded
+from dpl.models.invariant_basis import (
+    group_actions,
+    invariant_pod,
+    pad_columns,
+    scatter_fields,
+)
+from dpl.models.pod import LoadEncoding, PODNet
 from dpl.models.poisson_interpolation import PoissonInterpolation
-from dpl.models.reduced_samples import partial_whitening, projection_error, root_mean_square
-from dpl.models.symmetric_fields import turned_back
+from dpl.models.reduced_samples import (
+    partial_whitening,
+    root_mean_square,
+    squared_projection_error,
+)
+from dpl.models.symmetric_fields import sum_over_images
 from dpl.scene import Sample, Scene
 
-SAME = 1e-4  # eigenvalues closer than this, relatively, belong to one family
-PROBES = 16  # random fields that tell how much of a linear answer the basis misses, at least
-RESPONSE = 1e-6  # residual ratio of linear answers in a prediction
+EIGENVALUE_TOL = 1e-4  # relative gap below which eigenvalues belong to one family
+MIN_PROBES = 16  # random fields that estimate the projection residual of a linear solution
+LINEAR_RTOL = 1e-6  # relative residual of linear solutions in a prediction
 
 
 class Latent(PODNet):
-    """K(0)^-1 f plus what a network learns of u - K(0)^-1 f, in one basis.
+    """K(0)^-1 f plus a network for u - K(0)^-1 f, in one basis.
 
-    Its error vanishes quadratically with the load: the linear part is the exact one, projected on
-    the basis, and what is learnt is a quadratic form of the inputs x, coordinates of the linear
-    answer, over 1 + |x|^2, and a network held to zero as |x|^3 where they are small. The basis
-    holds linear answers and nonlinear rests of the training samples. Local loads, whose near field
-    no global basis sees, take their linear part from the factor of K(0) itself: those of whose
-    linear answer the basis misses too much. How much that is, a few random probes tell without a
-    solve (Halko, Martinsson, Tropp, 2011, SIAM Rev. 53, section 4.3).
+    The error decreases quadratically with the load. The linear part is the projection of the exact
+    linear solution onto the basis. The learnt part is a quadratic form of the inputs x, coordinates
+    of the linear solution, divided by 1 + |x|^2, plus a network whose output is damped like |x|^3
+    for small x. The basis is fitted to the linear solutions and the nonlinear parts of the training
+    samples.
+
+    A global basis cannot represent the near field of local loads. If the projection residual of the
+    linear solution is too large, the linear part is solved with the factor of K(0). A few random
+    fields estimate this residual without a solve (Halko, Martinsson, Tropp, 2011, SIAM Rev. 53,
+    section 4.3).
 
     Attributes:
-        unit: What scaled linear answers are multiples of, ().
-        probers: From forces at the inlet to products with images of random fields, see `missed`,
-            (n' D, K F G) with F fields at each of K Poisson's ratios.
-        pairs: Which image of the load and of a field meet, (G, G).
+        linear_tol: Relative projection residual of the linear solution above which a load is local.
+        linear_unit: K(0)^-1 f of scaled fields over K(0)^-1 f of dimensionless fields, ().
+        probe_matrix: Map from forces at the representatives to products of the projection residual
+            with all images of F random fields, at each of K Poisson's ratios, (n' D, K F G).
+        group_products: Index of the product of each two symmetries, (G, G).
     """
 
-    unit: Tensor
-    probers: Tensor
-    pairs: Tensor
+    linear_unit: Tensor
+    probe_matrix: Tensor
+    group_products: Tensor
 
     def __init__(
         self,
@@ -52,17 +67,17 @@ class Latent(PODNet):
         symmetry: bool = True,
         linear_tol: float = 5e-4,
     ) -> None:
-        """Build the network; see `PODNet`, besides.
+        """Build the network.
 
         Args:
-            scene: What it is to answer.
-            rank: Modes of the displacement, R.
-            coordinates: Inputs of the network, M.
-            width: Units in the hidden layers.
-            blocks: Residual blocks of two layers.
-            symmetry: Find the symmetries of the body and respect them.
-            linear_tol: Part of its linear answer that the basis may miss; a load of which it
-                misses more takes it from the factor of K(0). 0: all do; infinity: none.
+            scene: The scene to predict.
+            rank: Number of modes of the displacement, R.
+            coordinates: Number of inputs of the network, M.
+            width: Units of the hidden layers.
+            blocks: Number of residual blocks, each of two layers.
+            symmetry: Find the symmetries of the body and build them into the network.
+            linear_tol: Relative projection residual of the linear solution above which the linear
+                part is solved with the factor of K(0). 0: for all loads; infinity: for none.
 
         Raises:
             ValueError: A number is out of range.
@@ -77,220 +92,247 @@ class Latent(PODNet):
             blocks=blocks,
             symmetry=symmetry,
         )
-        self.linear_tol, self.rests = linear_tol, PoissonInterpolation(scene.linear)
-        self.register_buffer("unit", torch.tensor(0.0, dtype=torch.float64))
-        members = len(self.turns)
-        columns = -(-PROBES // members) * members
-        probers = torch.zeros(len(self.readers), self.rests.count * columns)
-        self.register_buffer("probers", probers)
-        pairs = products(self.group) * members + torch.arange(members)
-        self.register_buffer("pairs", pairs, persistent=False)
-        inputs = self.scaled.shape[1]
-        bent = inputs * (1 + self.turns.shape[1] - inputs)  # x, and x nu where nu is an input
+        self.linear_tol = linear_tol
+        self.interpolation = PoissonInterpolation(scene.linear)
+        self.register_buffer("linear_unit", torch.tensor(0.0, dtype=torch.float64))
+        members = len(self.input_actions)
+        columns = self.interpolation.count * -(-MIN_PROBES // members) * members
+        self.register_buffer("probe_matrix", torch.zeros(len(self.load_basis), columns))
+        group_products = products(self.group) * members + torch.arange(members)
+        self.register_buffer("group_products", group_products, persistent=False)
+        inputs = self.input_map.shape[1]
+        # x, and x nu where nu is an input
+        augmented = inputs * (1 + self.input_actions.shape[1] - inputs)
         self.left = nn.Linear(inputs, width, bias=False)
-        self.right = nn.Linear(bent, width, bias=False)
+        self.right = nn.Linear(augmented, width, bias=False)
         self.product = nn.Linear(width, len(self.modes), bias=False)
 
-    def _weights(self, coordinates: int, rank: int, width: int) -> int:
-        bent = coordinates * (1 + len(self.extra_inputs))
-        return super()._weights(coordinates, rank, width) + width * (coordinates + bent + rank)
+    def _count_parameters(self, coordinates: int, rank: int, width: int) -> int:
+        augmented = coordinates * (1 + len(self.extra_inputs))
+        bilinear = width * (coordinates + augmented + rank)
+        return super()._count_parameters(coordinates, rank, width) + bilinear
 
-    def _reading(self, rank: int, coordinates: int) -> Reading:
-        """Return how linear answers are read: in the basis of the displacement."""
-        return Reading(rank, PoissonInterpolation(self.scene.linear).count, own=False)
+    def _load_encoding(self, rank: int, coordinates: int) -> LoadEncoding:
+        """Return the sizes of linear solutions in the basis of the displacement."""
+        return LoadEncoding(rank, PoissonInterpolation(self.scene.linear).count, own_basis=False)
 
     def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
         """See `PODNet.forward`."""
         linear, learnt, local = self._parts(force, poisson)
         if not local.any():
             return self.field(linear + learnt, force)
-        moved = self.field(torch.where(local[:, None], learnt, linear + learnt), force)
-        exact = _Respond.apply(force[local][:, self.acting].double(), self)
-        exact = self.rests.between(exact, None if poisson is None else poisson[local])
-        return moved.index_add(0, local.nonzero()[:, 0], self._fields(exact, self.moving).to(moved))
+        predicted = self.field(torch.where(local[:, None], learnt, linear + learnt), force)
+        exact = _LinearSolve.apply(force[local][:, self.load_dofs].double(), self)
+        exact = self.interpolation.interpolate(exact, None if poisson is None else poisson[local])
+        exact = scatter_fields(exact, self.free_dofs).to(predicted)
+        return predicted.index_add(0, local.nonzero()[:, 0], exact)
 
-    def within(self, force: Tensor, poisson: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return answers within the basis (B, N, D), and of which loads it misses too much, (B,).
+    def forward_in_basis(
+        self, force: Tensor, poisson: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return displacements (B, N, D) within the basis and a mask of local loads, (B,).
 
-        Where it does not, they are those of `forward`; where it does, a factor of K(0) is wanted.
+        `forward` returns the same displacements for loads that are not local.
         """
         linear, learnt, local = self._parts(force, poisson)
         return self.field(linear + learnt, force), local
 
+    @property
+    def flags_local_loads(self) -> bool:
+        """See `FlagsLocalLoads`."""
+        return self.linear_tol < torch.inf
+
+    def for_correction(self) -> Self:
+        """Return the network with shared weights that solves for the linear part of all loads."""
+        net = copy.copy(self)
+        net.linear_tol = 0.0
+        return net
+
     def _parts(self, force: Tensor, poisson: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return coordinates (B, R) of linear answer and rest, and which loads are local, (B,)."""
-        seen = self.inlet.seen(force)
-        linear = self.reading(seen, poisson)
-        learnt = self.learnt(self.beside(linear @ self.scaled, poisson))
-        return linear, learnt, self._local(seen, linear, poisson)
+        """Return coordinates of linear and learnt part (B, R), and a mask of local loads, (B,)."""
+        images = self.input_orbits.images(force)
+        linear = self.encode_loads(images, poisson)
+        learnt = self.symmetrised_output(self.append_poisson(linear @ self.input_map, poisson))
+        return linear, learnt, self._is_local(images, linear, poisson)
 
-    def reading(self, seen: Tensor, poisson: Tensor | None) -> Tensor:
-        """See `PODNet.reading`; coordinates of the linear answer."""
-        read = (seen @ self.readers.to(seen)).unflatten(2, (self.rests.count, -1))
-        returns = self.returns.to(seen)
-        every = [turned_back(one, returns) for one in read.unbind(2)]
-        return self.rests.between(torch.cat(every, dim=1), poisson)
+    def encode_loads(self, images: Tensor, poisson: Tensor | None) -> Tensor:
+        """Return coordinates of linear solutions (B, R); see `PODNet.encode_loads`."""
+        read = (images @ self.load_basis.to(images)).unflatten(2, (self.interpolation.count, -1))
+        inverse_actions = self.inverse_output_actions.to(images)
+        every = [sum_over_images(one, inverse_actions) for one in read.unbind(2)]
+        return self.interpolation.interpolate(torch.cat(every, dim=1), poisson)
 
-    def missed(self, seen: Tensor, poisson: Tensor | None) -> Tensor:
-        """Return about what squares the basis misses of linear answers, (B,).
+    def projection_residual_estimate(self, images: Tensor, poisson: Tensor | None) -> Tensor:
+        """Return estimates (B,) of the squared projection residuals of linear solutions.
 
-        The mean square of the products of what it misses with random fields and all their images,
-        so that a load and its images are told alike.
-
-        Args:
-            seen: Images of the loads at the inlet, (B, G, n' D).
-            poisson: Poisson's ratios, (B, P) [-].
-        """
-        met = (seen @ self.probers.to(seen)).unflatten(2, (-1, len(self.pairs)))  # (B, G, K F, G)
-        met = met.movedim(1, 2).flatten(2)[..., self.pairs].sum(dim=3)
-        return self.rests.between(met.flatten(1), poisson).square().mean(dim=1)
-
-    def _local(self, seen: Tensor, linear: Tensor, poisson: Tensor | None) -> Tensor:
-        """Return of which loads the basis misses too much, (B,).
+        The estimate is the mean square of the products of the residual with random fields and all
+        their images, so that it is the same for a load and its images.
 
         Args:
-            seen: Their images at the inlet, (B, G, n' D).
-            linear: Coordinates of their linear answers, (B, R).
+            images: Images of the loads at the representatives, (B, G, n' D).
             poisson: Poisson's ratios, (B, P) [-].
         """
-        missed = self.missed(seen, poisson)
-        return missed >= self.linear_tol**2 * (linear.square().sum(dim=1) + missed)
+        products = images @ self.probe_matrix.to(images)
+        products = products.unflatten(2, (-1, len(self.group_products)))  # (B, G, K F, G)
+        products = products.movedim(1, 2).flatten(2)[..., self.group_products].sum(dim=3)
+        return self.interpolation.interpolate(products.flatten(1), poisson).square().mean(dim=1)
+
+    def _is_local(self, images: Tensor, linear: Tensor, poisson: Tensor | None) -> Tensor:
+        """Return the mask of loads whose projection residual is too large, (B,).
+
+        Args:
+            images: Images of the loads at the representatives, (B, G, n' D).
+            linear: Coordinates of the linear solutions, (B, R).
+            poisson: Poisson's ratios, (B, P) [-].
+        """
+        residual = self.projection_residual_estimate(images, poisson)
+        return residual >= self.linear_tol**2 * (linear.square().sum(dim=1) + residual)
 
     def network(self, inputs: Tensor) -> Tensor:
-        """Return coordinates (..., R) of the nonlinear part from inputs (..., M), see `PODNet`."""
-        x, beside = inputs.tensor_split([self.scaled.shape[1]], dim=-1)
+        """Return coordinates (..., R) of the nonlinear part from inputs (..., M)."""
+        x, extra = inputs.tensor_split([self.input_map.shape[1]], dim=-1)
         square = x.square().sum(dim=-1, keepdim=True)
-        bent = torch.cat([x, *(x * one[..., None] for one in beside.unbind(-1))], dim=-1)
-        curved = self.spread * self.product(self.left(x) * self.right(bent))
-        return curved / (1 + square) + (square / (1 + square)) ** 1.5 * super().network(inputs)
+        augmented = torch.cat([x, *(x * one[..., None] for one in extra.unbind(-1))], dim=-1)
+        quadratic = self.output_scale * self.product(self.left(x) * self.right(augmented))
+        return quadratic / (1 + square) + (square / (1 + square)) ** 1.5 * super().network(inputs)
 
     def skipped_work(self) -> list[str]:
-        """Return what the network leaves out, a line each."""
+        """Return the work that the network saves, one line each."""
         lines = super().skipped_work()
-        lines.append("nothing linear learnt: K(0)^-1 f is exact to the rank of the basis")
+        lines.append("no learning of the linear part: K(0)^-1 f is projected onto the basis")
         if self.linear_tol < torch.inf:
             lines.append(
-                "no rank for near fields: loads of whose linear answer the basis misses more than "
-                f"{self.linear_tol:.2g} are answered with the factor of K(0)"
+                "no modes for near fields: where the projection residual of K(0)^-1 f exceeds "
+                f"{self.linear_tol:.2g}, the linear part is solved with the factor of K(0)"
             )
-        if self.rests.count > 1:
+        if self.interpolation.count > 1:
             lines.append(
-                f"no K(0) for every Poisson's ratio: that of {self.rests.count} of them, and a "
-                "polynomial between"
+                f"no K(0) for every Poisson's ratio: K(0)^-1 is interpolated between "
+                f"{self.interpolation.count} ratios"
             )
         return lines
 
     def fit_bases(self, samples: Sample, unit: float) -> None:
-        """Make the basis; see `PODNet.fit_bases`."""
-        self.unit.fill_(unit)
+        """Compute the basis; see `TrainsInCoordinates`."""
+        self.linear_unit.fill_(unit)
         force, displacement = self._columns(samples)
-        linear = self.linear(force, samples.poisson, rtol=1e-12)
+        linear = self.linear_solutions(force, samples.poisson, rtol=1e-12)
         size = displacement.norm(dim=1)
         weight = torch.where(size > 0, size.clamp(min=1e-12) ** -0.5, 0.0)
-        parts = [weight[:, None] * linear, weight[:, None] * (displacement - linear)]
-        basis = self._modes(torch.cat(parts), self.moving, len(self.modes))
-        # its coordinates in the order of what they have of the rests
-        rests = parts[1] @ basis
-        basis = basis @ torch.linalg.eigh(rests.T @ rests)[1].flip(1)
-        motions = self._motions(basis, self.moving)
-        self._scale(linear @ basis, (displacement - linear) @ basis, weight, motions)
-        self._turn(motions, motions)
-        basis = padded(basis, len(self.modes))
+        nonlinear = weight[:, None] * (displacement - linear)
+        snapshots = torch.cat([weight[:, None] * linear, nonlinear])
+        basis = invariant_pod(snapshots, self.free_dofs, self.group, len(self.modes))
+        # order the modes by their share of the nonlinear parts
+        coordinates = nonlinear @ basis
+        basis = basis @ torch.linalg.eigh(coordinates.T @ coordinates)[1].flip(1)
+        actions = group_actions(basis, self.free_dofs, self.group)
+        self._set_scales(linear @ basis, (displacement - linear) @ basis, weight, actions)
+        self._set_actions(actions, actions)
+        basis = pad_columns(basis, len(self.modes))
         self._set_modes(basis)
-        members = range(self.rests.count)
-        read = [self._read(self._reach(basis.T, k)) for k in members]
-        self.readers.copy_(torch.cat(read).T)
-        fields = self._probing(basis)
-        probed = [self._fields(self._reach(fields, k).T, self.acting) for k in members]
-        images = self.inlet.seen(torch.cat(probed).to(self.probers.device)) * self.inlet.share
-        self.probers.copy_(images.flatten(0, 1).T)
-        self.prepared.fill_(True)
+        self._set_load_functionals(basis)
+        self.fitted.fill_(True)
 
-    def _reach(self, fields: Tensor, k: int) -> Tensor:
-        """Return K(0)^-1 of fields (S, outputs) where loads act, (inputs, S); see `respond`."""
-        acting = self.acting.cpu()[self.moving.cpu()]
-        return self._respond_all(fields, k, rtol=1e-12)[:, acting].T
+    def _set_load_functionals(self, basis: Tensor) -> None:
+        """Set the maps from loads to coordinates and projection residuals of linear solutions."""
+        members = range(self.interpolation.count)
+        read = [self._load_functionals(self._responses_at_loads(basis.T, k)) for k in members]
+        self.load_basis.copy_(torch.cat(read).T)
+        fields = self._random_residuals(basis)
+        responses = [self._responses_at_loads(fields, k).T for k in members]
+        probes = torch.cat([scatter_fields(one, self.load_dofs) for one in responses])
+        images = self.input_orbits.images(probes.to(self.probe_matrix.device))
+        self.probe_matrix.copy_((images * self.input_orbits.weights).flatten(0, 1).T)
 
-    def _probing(self, basis: Tensor) -> Tensor:
-        """Return random fields less what a basis (outputs, R) has of them, (F, outputs)."""
+    def _responses_at_loads(self, fields: Tensor, k: int) -> Tensor:
+        """Return K(0)^-1 of fields (S, outputs) at the loaded degrees of freedom, (inputs, S)."""
+        loaded = self.load_dofs.cpu()[self.free_dofs.cpu()]
+        return self._solve(fields, k, rtol=1e-12)[:, loaded].T
+
+    def _random_residuals(self, basis: Tensor) -> Tensor:
+        """Return random fields orthogonal to a basis (outputs, R), (F, outputs)."""
         random = torch.Generator().manual_seed(0)
-        count = self.probers.shape[1] // (len(self.turns) * self.rests.count)
+        count = self.probe_matrix.shape[1] // (len(self.input_actions) * self.interpolation.count)
         fields = torch.randn(count, len(basis), generator=random, dtype=torch.float64)
         return fields - (fields @ basis) @ basis.T
 
-    def _scale(self, read: Tensor, targets: Tensor, weight: Tensor, motions: Tensor) -> None:
-        def spread(columns: Tensor) -> Tensor:
-            """Return mean products of coordinates (S, C) over all images, (C, C)."""
-            return (motions.mT @ (columns.T @ columns / len(columns)) @ motions).mean(dim=0)
+    def _set_scales(
+        self, encoded: Tensor, targets: Tensor, weight: Tensor, actions: Tensor
+    ) -> None:
+        """See `PODNet._set_scales`; inputs are principal components of the linear solutions."""
+
+        def covariance(columns: Tensor) -> Tensor:
+            """Return the mean products of coordinates (S, C) over all images, (C, C)."""
+            return (actions.mT @ (columns.T @ columns / len(columns)) @ actions).mean(dim=0)
 
         values, axes = (
-            found.flip(-1) for found in torch.linalg.eigh(spread(weight[:, None] * read))
+            found.flip(-1) for found in torch.linalg.eigh(covariance(weight[:, None] * encoded))
         )
-        count = min(self.scaled.shape[1], len(values))
+        count = min(self.input_map.shape[1], len(values))
         gaps = -values.diff()
-        while 0 < count < len(values) and gaps[count - 1] < SAME * values[count - 1]:
-            count -= 1  # a cluster of eigenvalues is kept whole or not at all
-        axes = padded(axes[:, :count], self.scaled.shape[1])
-        size = ((axes.T @ spread(read)) * axes.T).sum(dim=1).clamp(min=0).sqrt()
-        self.scaled.zero_()[: len(axes)] = (axes / partial_whitening(size)).to(self.scaled)
+        while 0 < count < len(values) and gaps[count - 1] < EIGENVALUE_TOL * values[count - 1]:
+            count -= 1  # never split a family of equal eigenvalues
+        axes = pad_columns(axes[:, :count], self.input_map.shape[1])
+        size = ((axes.T @ covariance(encoded)) * axes.T).sum(dim=1).clamp(min=0).sqrt()
+        self.input_map.zero_()[: len(axes)] = (axes / partial_whitening(size)).to(self.input_map)
         size = root_mean_square(targets)
-        self.spread.zero_()[: len(size)] = (size * size.max()).sqrt().to(self.spread)
+        scale = (size * size.max()).sqrt()
+        self.output_scale.zero_()[: len(size)] = scale.to(self.output_scale)
 
-    def _split(self, samples: Sample) -> tuple[Tensor, Tensor, Tensor]:
-        """See `PODNet._split`; of the linear answer the basis has its part, unless it is exact."""
-        seen = self.inlet.seen(samples.force)
-        linear, whole = self.reading(seen, samples.poisson), self.coordinates(samples.displacement)
-        missed = projection_error(samples.displacement, whole)
-        local = self._local(seen, linear, samples.poisson)
+    def _reduce(self, samples: Sample) -> tuple[Tensor, Tensor, Tensor]:
+        """See `PODNet._reduce`; the linear part of local loads has no projection error."""
+        images = self.input_orbits.images(samples.force)
+        linear = self.encode_loads(images, samples.poisson)
+        whole = self.coordinates(samples.displacement)
+        error = squared_projection_error(samples.displacement, whole)
+        local = self._is_local(images, linear, samples.poisson)
         if local.any():
-            acting = samples.force[local][:, self.acting]
-            exact = self._fields(self.linear(acting, samples.poisson[local]), self.moving)
-            beyond = samples.displacement[local] - exact
-            missed[local] = projection_error(beyond, self.coordinates(beyond))
-        return linear, whole - linear, missed
+            force = samples.force[local][:, self.load_dofs]
+            exact = self.linear_solutions(force, samples.poisson[local])
+            nonlinear = samples.displacement[local] - scatter_fields(exact, self.free_dofs)
+            error[local] = squared_projection_error(nonlinear, self.coordinates(nonlinear))
+        return linear, whole - linear, error
 
-    def linear(self, acting: Tensor, poisson: Tensor, rtol: float = RESPONSE) -> Tensor:
-        """Return linear answers (S, outputs) of forces on the inputs (S, inputs), scaled."""
-        parts = zip(acting.split(256), poisson.split(256), strict=True)
-        return torch.cat([self.rests.between(self.respond(some, rtol), nu) for some, nu in parts])
+    def linear_solutions(self, force: Tensor, poisson: Tensor, rtol: float = LINEAR_RTOL) -> Tensor:
+        """Return scaled linear solutions (S, outputs) of forces (S, inputs)."""
+        parts = zip(force.split(256), poisson.split(256), strict=True)
+        return torch.cat(
+            [self.interpolation.interpolate(self.solve_linear(f, rtol), nu) for f, nu in parts]
+        )
 
-    def respond(self, acting: Tensor, rtol: float = RESPONSE) -> Tensor:
-        """Return K(0)^-1 f, scaled: (B, K outputs) of forces on the inputs (B, inputs), float64.
-
-        At each of the K Poisson's ratios of `rests`; where the law has one, K = 1.
-        """
-        every = acting.new_zeros(len(acting), int(self.moving.sum()))
-        every[:, self.acting[self.moving].to(acting.device)] = acting
-        members = range(self.rests.count)
-        return torch.cat([self._respond_all(every, k, rtol) for k in members], dim=1)
-
-    def _respond_all(self, forces: Tensor, k: int, rtol: float = RESPONSE) -> Tensor:
-        """Return K(0)^-1 f, scaled, (B, outputs) of forces on all that moves, (B, outputs).
+    def solve_linear(self, force: Tensor, rtol: float = LINEAR_RTOL) -> Tensor:
+        """Return scaled K(0)^-1 f at the K nodes of the interpolation, (B, K outputs), float64.
 
         Args:
-            forces: What acts.
-            k: Which of the Poisson's ratios of `rests`.
-            rtol: Residual ratio.
+            force: Forces on the loaded degrees of freedom, (B, inputs).
+            rtol: Relative residual.
         """
-        factor = self.rests.members[k].factor
-        answers = [torch.from_numpy(factor.solve(one.numpy(), rtol)) for one in forces.cpu()]
-        return float(self.unit) * torch.stack(answers).to(forces.device)
+        forces = force.new_zeros(len(force), int(self.free_dofs.sum()))
+        forces[:, self.load_dofs[self.free_dofs].to(force.device)] = force
+        nodes = range(self.interpolation.count)
+        return torch.cat([self._solve(forces, k, rtol) for k in nodes], dim=1)
+
+    def _solve(self, forces: Tensor, k: int, rtol: float = LINEAR_RTOL) -> Tensor:
+        """Return scaled K(0)^-1 f, (B, outputs), of forces (B, outputs) at node k."""
+        factor = self.interpolation.solvers[k].factor
+        found = [torch.from_numpy(factor.solve(one.numpy(), rtol)) for one in forces.cpu()]
+        return float(self.linear_unit) * torch.stack(found).to(forces.device)
 
 
-class _Respond(torch.autograd.Function):
-    """K(0)^-1 f, scaled; K is symmetric, so the slope is the same solve."""
+class _LinearSolve(torch.autograd.Function):
+    """Scaled K(0)^-1 f; K(0) is symmetric, so the gradient is the same solve."""
 
     @staticmethod
-    def forward(ctx: Any, acting: Tensor, net: Latent) -> Tensor:
-        """Return (B, K outputs) of (B, inputs)."""
+    def forward(ctx: Any, force: Tensor, net: Latent) -> Tensor:
+        """Return solutions (B, K outputs) of forces (B, inputs)."""
         ctx.net = net
-        return net.respond(acting)
+        return net.solve_linear(force)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None]:
-        """Return the slope with respect to forces."""
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        """Return the gradient with respect to forces, (B, inputs)."""
         net = ctx.net
-        parts = slope.chunk(net.rests.count, dim=1)
-        solved = reduce(torch.add, (net._respond_all(part, k) for k, part in enumerate(parts)))
-        return solved[:, net.acting[net.moving]], None
+        parts = gradient.chunk(net.interpolation.count, dim=1)
+        solved = reduce(torch.add, (net._solve(part, k) for k, part in enumerate(parts)))
+        return solved[:, net.load_dofs[net.free_dofs]], None

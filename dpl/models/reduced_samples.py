@@ -1,108 +1,80 @@
-"""Samples in the few coordinates that a network works on: small enough to stay in a cache."""
+"""Samples in the reduced coordinates of a network; a whole data set fits into memory."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.data import Dataset
-
-from dpl.fem.symmetry import Symmetry
-from dpl.scene import Sample
 
 
 class ReducedSamples(NamedTuple):
-    """Samples in coordinates; a batch is the same with a leading B.
+    """Samples in reduced coordinates.
 
     Attributes:
-        inputs: Of the load, (B, M) [-].
-        targets: Of the displacement that is to be learnt, in an orthonormal basis, (B, R) [-].
-        rest: Square of what the basis does not reach, (B,) [-].
-        size: Mean square of the whole displacement over degrees of freedom, (B,) [-].
+        inputs: Coordinates of the loads, (B, M) [-].
+        targets: Coordinates of the displacements in an orthonormal basis, (B, R) [-].
+        squared_error: Squared projection errors of the displacements, (B,) [-].
+        mean_square: Mean squares of the displacements over degrees of freedom, (B,) [-].
     """
 
     inputs: Tensor
     targets: Tensor
-    rest: Tensor
-    size: Tensor
+    squared_error: Tensor
+    mean_square: Tensor
 
 
 class ReducedDataset(Dataset):
-    """Samples in coordinates with their images under symmetries, fetched a batch at a time."""
+    """Reduced samples and their images under symmetries, indexed by batches."""
 
-    def __init__(self, samples: ReducedSamples, inputs: Tensor, targets: Tensor) -> None:
-        """Make the images.
+    def __init__(
+        self, samples: ReducedSamples, input_actions: Tensor, target_actions: Tensor
+    ) -> None:
+        """Compute the images.
 
         Args:
-            samples: S of them.
-            inputs: What each symmetry does to the inputs, x -> x T, (G, M, M); identity first.
-            targets: What it does to the targets, (G, R, R).
+            samples: The S samples.
+            input_actions: T of each symmetry: inputs x of an image are x T, (G, M, M); identity
+                first.
+            target_actions: The same for targets, (G, R, R).
         """
-        images = len(inputs)
+        images = len(input_actions)
         self.samples = ReducedSamples(
-            inputs=(samples.inputs @ inputs).flatten(0, 1),
-            targets=(samples.targets @ targets).flatten(0, 1),
-            rest=samples.rest.repeat(images),
-            size=samples.size.repeat(images),
+            inputs=(samples.inputs @ input_actions).flatten(0, 1),
+            targets=(samples.targets @ target_actions).flatten(0, 1),
+            squared_error=samples.squared_error.repeat(images),
+            mean_square=samples.mean_square.repeat(images),
         )
 
     def __len__(self) -> int:
-        """Return S times the number of symmetries."""
-        return len(self.samples.rest)
+        """Return the number of samples, S G."""
+        return len(self.samples.inputs)
 
     def __getitems__(self, indices: list[int]) -> ReducedSamples:
-        """Return a batch."""
-        chosen = torch.tensor(indices)
-        return ReducedSamples(*(column[chosen] for column in self.samples))
+        """Return the batch of some samples."""
+        selected = torch.tensor(indices)
+        return ReducedSamples(*(column[selected] for column in self.samples))
 
 
-class ReducedOrderNet(nn.Module, ABC):
-    """A network that works between few coordinates of loads and of displacements.
-
-    `dpl.training.Surrogate` lets it make its bases before training starts and, where the
-    loss is a function of squared errors, trains it on samples in coordinates.
-
-    Attributes:
-        prepared: Whether its bases are there, ().
-        group: The symmetries that it knows; empty: none.
-    """
-
-    prepared: Tensor
-    group: Sequence[Symmetry]
-
-    @abstractmethod
-    def fit_bases(self, samples: Sample, unit: float) -> None:
-        """Make the bases of training samples, scaled; `unit`: scale of forces over that of u."""
-
-    @abstractmethod
-    def encode(self, samples: Sample) -> ReducedDataset:
-        """Return training samples, scaled, in coordinates, with their images."""
-
-    @abstractmethod
-    def network(self, inputs: Tensor) -> Tensor:
-        """Return coordinates (B, R) of displacements from those of loads (B, M)."""
-
-
-def projection_error(field: Tensor, coordinates: Tensor) -> Tensor:
-    """Return squares (B,) of what of fields (B, N, D) an orthonormal basis does not hold.
+def squared_projection_error(field: Tensor, coordinates: Tensor) -> Tensor:
+    """Return the squared distances (B,) of fields from the span of an orthonormal basis.
 
     Args:
-        field: The fields.
-        coordinates: In the basis, (B, R).
+        field: Fields, (B, N, D).
+        coordinates: Their coordinates in the basis, (B, R).
     """
     return field.flatten(1).square().sum(dim=1) - coordinates.square().sum(dim=1)
 
 
 def partial_whitening(size: Tensor) -> Tensor:
-    """Return what coordinates of sizes (n,) are divided by, (n,).
+    """Return divisors (n,) of coordinates with root mean squares `size` (n,).
 
-    Between whitened and as they are: small ones matter less, but not nothing, and rounding least.
+    The divisor of a coordinate is size^0.6 times the largest size^0.4, so that small coordinates
+    are amplified less than by whitening, and rounding errors at most by 1000.
     """
     largest = size.max().clamp(min=1e-30)
     return (size**0.6 * largest**0.4).clamp(min=1e-3 * float(largest))
 
 
 def root_mean_square(columns: Tensor) -> Tensor:
-    """Return the size of each column of (S, n), (n,)."""
+    """Return the root mean square of each column of (S, n), (n,)."""
     return columns.square().mean(dim=0).sqrt()

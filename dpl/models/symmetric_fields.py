@@ -1,4 +1,4 @@
-"""Fields of a body with symmetries, by what their images are at a few of its nodes."""
+"""Fields of a symmetric body, stored at one node of each orbit of its symmetry group."""
 
 from collections.abc import Sequence
 from typing import cast
@@ -10,84 +10,92 @@ from dpl.fem.symmetry import Symmetry
 
 
 class Orbits(nn.Module):
-    """One node of each orbit: what all images of a field are there is the field.
+    """One representative node of each orbit of a symmetry group.
 
-    So linear maps that commute with the symmetries cost the G-th part of the memory: of fields c B
-    whose images under symmetry g are (c T_g) B, the rows of B are wanted at those nodes only.
+    The values of all images of a field at the representatives determine the field. A linear map
+    that commutes with the G symmetries therefore takes 1/G of the memory: if the image under
+    symmetry g of the field c B is (c T_g) B, only the rows of B at the representatives are needed.
 
     Attributes:
-        sources: Nodes that the G images take their values from, G after one another, (G n,).
-        turns: Q of each symmetry, transposed, (G, D, D).
-        share: Part in which a value counts, D for each node, (n D,): a node that m symmetries leave
-            in place is seen m times.
-        nodes: Nodes that the orbits reach, (P,).
-        places: Where among the images these stand, (P,).
+        sources: Nodes from which the images take their values at the n representatives, image by
+            image, (G n,).
+        rotations: Transposed rotation of each symmetry, (G, D, D).
+        weights: Weight of each value in sums over images, (n D,): 1/m at a node that m symmetries
+            map onto itself.
+        nodes: Nodes of all orbits, (P,).
+        positions: Position of each of these nodes among the images, (P,).
     """
 
     sources: Tensor
-    turns: Tensor
-    share: Tensor
+    rotations: Tensor
+    weights: Tensor
     nodes: Tensor
-    places: Tensor
+    positions: Tensor
 
-    def __init__(self, group: Sequence[Symmetry], where: Tensor) -> None:
+    def __init__(self, group: Sequence[Symmetry], dofs: Tensor) -> None:
         """Find the orbits.
 
         Args:
-            group: Symmetries, the identity first; none: the identity alone.
-            where: Degrees of freedom that count, which every symmetry maps onto themselves, (N, D).
+            group: The symmetries, identity first; empty for the identity alone.
+            dofs: Mask of degrees of freedom that every symmetry maps onto itself, (N, D).
         """
         super().__init__()
-        where = where.cpu()
-        count, dim = where.shape
-        every = torch.arange(count)
-        sources, turns = every[None], torch.eye(dim, dtype=torch.float64)[None]
+        dofs = dofs.cpu()
+        count, dim = dofs.shape
+        sources = torch.arange(count)[None]
+        rotations = torch.eye(dim, dtype=torch.float64)[None]
         if group:
             sources = torch.stack([symmetry.source for symmetry in group]).cpu()
-            turns = torch.stack([symmetry.rotation for symmetry in group]).cpu().mT.double()
-        nodes = where.any(dim=1).nonzero()[:, 0]
+            rotations = torch.stack([symmetry.rotation for symmetry in group]).cpu().mT.double()
+        nodes = dofs.any(dim=1).nonzero()[:, 0]
         first = nodes[sources.amin(dim=0)[nodes] == nodes]
         sources = sources[:, first]
-        places = torch.empty(count, dtype=torch.int64)
-        places[sources.flatten()] = torch.arange(sources.numel())
-        share = 1 / (sources == first).sum(dim=0).double()
+        positions = torch.empty(count, dtype=torch.int64)
+        positions[sources.flatten()] = torch.arange(sources.numel())
+        weights = 1 / (sources == first).sum(dim=0).double()
         for name, buffer in {
             "sources": sources.flatten(),
-            "turns": turns.contiguous(),
-            "share": share.repeat_interleave(dim),
+            "rotations": rotations.contiguous(),
+            "weights": weights.repeat_interleave(dim),
             "nodes": nodes,
-            "places": places[nodes],
+            "positions": positions[nodes],
         }.items():
             self.register_buffer(name, buffer, persistent=False)
 
-    def seen(self, field: Tensor) -> Tensor:
-        """Return all images of fields (B, N, D) at one node of each orbit, (B, G, n D)."""
-        taken = field.index_select(1, self.sources).unflatten(1, (len(self.turns), -1))
-        return (taken @ self.turns.to(field)).flatten(2)
+    def images(self, field: Tensor) -> Tensor:
+        """Return all images of fields (B, N, D) at the representatives, (B, G, n D)."""
+        values = field.index_select(1, self.sources).unflatten(1, (len(self.rotations), -1))
+        return (values @ self.rotations.to(field)).flatten(2)
 
-    def whole(self, images: Tensor, like: Tensor) -> Tensor:
-        """Return fields (B, N, D), shaped like others, of their images (B, G, n D)."""
-        values = images.unflatten(2, (-1, like.shape[2])) @ self.turns.mT.to(images)
+    def field(self, images: Tensor, like: Tensor) -> Tensor:
+        """Return fields (B, N, D), shaped like `like`, from their images (B, G, n D)."""
+        values = images.unflatten(2, (-1, like.shape[2])) @ self.rotations.mT.to(images)
         field = images.new_zeros(like.shape)
-        return field.index_copy(1, self.nodes, values.flatten(1, 2).index_select(1, self.places))
+        selected = values.flatten(1, 2).index_select(1, self.positions)
+        return field.index_copy(1, self.nodes, selected)
 
-    def first(self, field: Tensor) -> Tensor:
-        """Return fields (B, N, D) at one node of each orbit, (B, n D)."""
-        count = len(self.sources) // len(self.turns)
+    def at_representatives(self, field: Tensor) -> Tensor:
+        """Return fields (B, N, D) at the representatives, (B, n D)."""
+        count = len(self.sources) // len(self.rotations)
         return field.index_select(1, self.sources[:count]).flatten(1)
 
 
-def turned_back(answers: Tensor, returns: Tensor) -> Tensor:
-    """Return the sum over images of their coordinates (B, G, C), each turned back, (B, C).
+def sum_over_images(coordinates: Tensor, inverse_actions: Tensor) -> Tensor:
+    """Return sum_g c_g T_g^-1, (B, C).
 
     Args:
-        answers: Coordinates of images.
-        returns: What turns those of each image back, c -> c T_g^-1, (G, C, C).
+        coordinates: Coordinates c_g of each image, (B, G, C).
+        inverse_actions: T_g^-1, (G, C, C).
     """
-    return answers.flatten(1) @ returns.flatten(0, 1)
+    return coordinates.flatten(1) @ inverse_actions.flatten(0, 1)
 
 
-def turned(coordinates: Tensor, returns: Tensor) -> Tensor:
-    """Return coordinates (B, C) of all images, (B, G, C); T_g is orthogonal, see `turned_back`."""
-    every = nn.functional.linear(coordinates, returns.flatten(0, 1))
-    return cast(Tensor, every.unflatten(1, (len(returns), -1)))
+def coordinates_of_images(coordinates: Tensor, inverse_actions: Tensor) -> Tensor:
+    """Return the coordinates c T_g of all images, (B, G, C), from c (B, C).
+
+    Args:
+        coordinates: Coordinates c, (B, C).
+        inverse_actions: T_g^-1 with orthogonal T_g, (G, C, C).
+    """
+    every = nn.functional.linear(coordinates, inverse_actions.flatten(0, 1))
+    return cast(Tensor, every.unflatten(1, (len(inverse_actions), -1)))

@@ -1,4 +1,4 @@
-"""Surrogate: a network with its scales and its loss, trained by Lightning."""
+"""The LightningModule: a network with scales, loss, metrics and optimiser."""
 
 from collections.abc import Callable, Iterable
 from typing import Any, cast
@@ -8,29 +8,30 @@ import torch
 from torch import Tensor, nn
 
 from dpl.fem import Load
-from dpl.models.reduced_samples import ReducedDataset, ReducedOrderNet, ReducedSamples
+from dpl.models.protocols import TrainsInCoordinates
+from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.scene import Sample, Scene
 from dpl.training.losses.loss import Loss, LossContext
-from dpl.training.losses.supervised import MSE
+from dpl.training.losses.supervised import SquaredErrorLoss
 from dpl.training.metrics import default_metrics
 from dpl.training.rng_state import random_states, set_random_states
 
-SCALES = 3  # the stream of the loads that give the scales; those of samples are below
+SCALE_STREAM = 3  # random stream of the loads for the scales; samples use smaller numbers
 
 
 class Surrogate(L.LightningModule):
-    """A network's answer to which displacement balances a load.
+    """A network that predicts the displacement in equilibrium with a load.
 
-    Here is the one border between float64 physics and the float32 network: `predict` scales,
-    casts, asks the network, scales back, and sets what is held to exactly zero. Called with newtons
-    and pascals the module answers in metres.
+    `predict` is the only border between float64 mechanics and the float32 network: it scales and
+    casts loads, evaluates the network, scales displacements back and sets fixed degrees of freedom
+    to zero. `forward` takes newtons and pascals and returns metres.
 
     Attributes:
-        net: Scaled force (B, N, D) to scaled displacement (B, N, D). What it takes besides of a
-            load, by name, its `extra_inputs` says: "young", "poisson".
-        scene: What it answers for.
-        loss: What it is trained with.
-        batch_errors: Relative L2 errors on the last training batch, (B,); None before the first.
+        net: Module from scaled forces (B, N, D) to scaled displacements (B, N, D). Its optional
+            attribute `extra_inputs` names further inputs: "young", "poisson".
+        scene: The scene.
+        loss: The loss.
+        batch_errors: Relative L2 errors of the last training batch, (B,); None before the first.
     """
 
     def __init__(
@@ -42,30 +43,30 @@ class Surrogate(L.LightningModule):
         optimizer: Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer] = torch.optim.AdamW,
         scheduler: Callable[..., Any] | None = None,
     ) -> None:
-        """Put the parts together.
+        """Combine a network, a loss and a scene.
 
         Args:
             net: The network.
             loss: The loss.
-            scene: What it answers for.
-            optimizer: From parameters to an optimiser.
-            scheduler: From an optimiser and `total_steps` to a learning-rate schedule, stepped
-                every batch; none if left out.
+            scene: The scene.
+            optimizer: Function of the parameters that returns an optimiser.
+            scheduler: Function of an optimiser and `total_steps` that returns a learning-rate
+                schedule, stepped every batch; None for a constant learning rate.
 
         Raises:
-            ValueError: The law has a range of Poisson's ratios that the network does not take.
+            ValueError: The law has a range of Poisson's ratios and the network no such input.
         """
         super().__init__()
         self.net, self.loss, self.scene = net, loss, scene
         self.batch_errors: Tensor | None = None
-        self._random_states: dict[str, Any] | None = None  # of the run that this one resumes
+        self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
         span = scene.loads.poisson_range
-        self._own = int(span is not None)
+        self._poisson_columns = int(span is not None)
         if span is not None and "poisson" not in getattr(net, "extra_inputs", ()):
             raise ValueError(
-                f"{type(net).__name__} takes no Poisson's ratio, and the law has a range of them, "
-                f"{list(span)}; take one of them (material.poisson) or another model"
+                f"material.poisson is a range, {list(span)}, and {type(net).__name__} has no input "
+                "for Poisson's ratio; set material.poisson to a number or choose another model"
             )
         force_scale, displacement_scale = scales(scene)
         self.register_buffer("force_scale", force_scale)
@@ -81,55 +82,64 @@ class Surrogate(L.LightningModule):
         """Return displacements (B, N, D) [m] under nodal forces (B, N, D) [N].
 
         Args:
-            force: What acts.
-            young: E, (B,) [Pa].
-            poisson: Poisson's ratios, (B,) [-]; wanted where the law has a range of them.
+            force: Nodal forces, (B, N, D) [N].
+            young: Young's moduli, (B,) [Pa].
+            poisson: Poisson's ratios, (B,) [-]; required if the law has a range of them.
         """
         return self.scene.length * self.predict(self.scene.load_of(force, young, poisson))
 
     def predict(self, load: Load) -> Tensor:
-        """Return displacements over L, (B, N, D), float64."""
+        """Return displacements over L, (B, N, D) [-], float64."""
         scaled, more = self.scale_inputs(load)
         return self.unscale_outputs(self.net(scaled, **more))
 
     def scale_inputs(self, load: Load) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return what the network takes of loads: scaled forces (B, N, D), and more by name."""
-        scaled = (self._felt(load.force) / self.force_scale).to(self.dtype)
-        if load.poisson.shape[-1] != self._own:
+        """Return the inputs of the network: scaled forces (B, N, D), and its extra inputs by name.
+
+        Raises:
+            ValueError: The load has no Poisson's ratios although the law has a range, or has them
+                although the law has a single one.
+        """
+        scaled = (self._effective_force(load.force) / self.force_scale).to(self.dtype)
+        if load.poisson.shape[-1] != self._poisson_columns:
             raise ValueError(
-                "poisson: the law has a range of them, and the load does not say which"
-                if self._own
-                else "poisson: the law has one for all loads, and this load brings its own"
+                "Load.poisson is missing: the law has a range of Poisson's ratios"
+                if self._poisson_columns
+                else "Load.poisson must be empty: the law has a single Poisson's ratio"
             )
         return scaled, {name: getattr(load, name) for name in getattr(self.net, "extra_inputs", ())}
 
-    def _felt(self, force: Tensor) -> Tensor:
-        """Return forces (B, N, D) that are on held degrees of freedom as they were in training.
+    def _effective_force(self, force: Tensor) -> Tensor:
+        """Return forces (B, N, D) whose values on fixed degrees of freedom are those in training.
 
-        Those have no effect on the body, so a network must not answer to them.
+        Forces there have no effect on the body, so they must not change the prediction.
         """
-        problem, always = self.physics.problem, self.scene.loads.constant_force
+        problem, constant = self.physics.problem, self.scene.loads.constant_force
         force = problem.acting(force)
-        if always is None:
+        if constant is None:
             return force
-        return force + torch.where(problem.free, 0.0, always.to(force.device))
+        return force + torch.where(problem.free, 0.0, constant.to(force.device))
 
-    def unscale_outputs(self, answer: Tensor) -> Tensor:
-        """Return displacements over L, float64, of the network's answers, (B, N, D)."""
-        displacement = answer.double() * self.displacement_scale
+    def unscale_outputs(self, output: Tensor) -> Tensor:
+        """Return displacements over L (B, N, D) [-], float64, from outputs of the network."""
+        displacement = output.double() * self.displacement_scale
         return torch.where(self.physics.problem.free, displacement, 0.0)
 
     def skipped_work(self) -> list[str]:
-        """Return what network and loss leave out, a line each."""
+        """Return the work that network and loss save, one line each."""
         lines = [*getattr(self.net, "skipped_work", list)(), *self.loss.skipped_work()]
-        if isinstance(self.net, ReducedOrderNet) and isinstance(self.loss, MSE):
-            lines.append("no field in training from disk: squared errors are those of coordinates")
+        if self._trains_in_coordinates:
+            lines.append("no fields in training from disk: the loss is computed in coordinates")
         return lines
 
+    @property
+    def _trains_in_coordinates(self) -> bool:
+        return isinstance(self.net, TrainsInCoordinates) and isinstance(self.loss, SquaredErrorLoss)
+
     def training_step(self, batch: Sample | ReducedSamples, batch_idx: int) -> Tensor:
-        """Return the loss."""
+        """Return the loss of a batch, ()."""
         if isinstance(batch, ReducedSamples):
-            loss = self._loss_of_coordinates(batch)
+            loss = self._reduced_loss(batch)
         else:
             prediction = self.predict(batch.load)
             loss = self.loss(prediction, batch, self.physics)
@@ -139,41 +149,49 @@ class Surrogate(L.LightningModule):
         self.log("loss/train", loss, prog_bar=True, batch_size=len(batch[0]))
         return loss
 
-    def _loss_of_coordinates(self, batch: ReducedSamples) -> Tensor:
-        """Return the loss of a batch in coordinates: of its mean squared errors alone."""
-        net = cast(ReducedOrderNet, self.net)
-        missed = (net.network(batch.inputs) - batch.targets).square().sum(dim=1) + batch.rest
+    def _reduced_loss(self, batch: ReducedSamples) -> Tensor:
+        """Return the loss of a batch in reduced coordinates, ()."""
+        net = cast(TrainsInCoordinates, self.net)
+        error = (net.network(batch.inputs) - batch.targets).square().sum(dim=1)
+        error = error + batch.squared_error
         square = self.displacement_scale**2
-        error = square * missed / self.scene.problem.free.numel()
-        return cast(MSE, self.loss).from_squared_errors(error, square * batch.size)
+        error = square * error / self.scene.problem.free.numel()
+        loss = cast(SquaredErrorLoss, self.loss)
+        return loss.from_squared_errors(error, square * batch.mean_square)
 
     def encode(self, samples: Sample, *, images: bool = False) -> ReducedDataset | None:
-        """Return training samples (S, N, D) in the coordinates of the network; None if it has none.
+        """Return training samples (S, N, D) in reduced coordinates.
 
-        With their images if the network knows the symmetries; None if only the caller does.
+        In an orthonormal basis the squared error of a displacement is the squared error of its
+        coordinates plus the squared projection error. A loss that is a function of squared errors
+        therefore needs no fields.
 
-        In an orthonormal basis the squared error of a displacement is that of its coordinates: a
-        loss that is a function of squared errors needs no field.
+        Args:
+            samples: The samples.
+            images: The images of the samples under the symmetries of the body are wanted.
+
+        Returns:
+            The reduced samples; None if the network or the loss needs fields, or if images are
+            wanted and the network does not compute them.
         """
-        if not (isinstance(self.net, ReducedOrderNet) and isinstance(self.loss, MSE)):
+        if not self._trains_in_coordinates:
             return None
-        if images and not self.net.group:
-            return None
-        return self.net.encode(self._scaled(samples))
+        net = cast(TrainsInCoordinates, self.net)
+        return None if images and not net.is_symmetric else net.encode(self._scale(samples))
 
-    def _scaled(self, samples: Sample) -> Sample:
+    def _scale(self, samples: Sample) -> Sample:
         return samples._replace(
             force=samples.force / self.force_scale.cpu(),
             displacement=samples.displacement / self.displacement_scale.cpu(),
         )
 
     def fit_bases(self, samples: Sample) -> None:
-        """Let the network make its bases from training samples (S, N, D)."""
+        """Fit the bases of the network to training samples (S, N, D)."""
         unit = float(self.force_scale / self.displacement_scale)
-        cast(ReducedOrderNet, self.net).fit_bases(self._scaled(samples), unit)
+        cast(TrainsInCoordinates, self.net).fit_bases(self._scale(samples), unit)
 
     def validation_step(self, batch: Sample, batch_idx: int) -> None:
-        """Update the metrics."""
+        """Update the validation metrics."""
         prediction = self.predict(batch.load)
         loss = self.loss(prediction, batch, self.physics)
         self.log("loss/val", loss, batch_size=len(batch.force))
@@ -181,18 +199,18 @@ class Surrogate(L.LightningModule):
         self.log_dict(self.val_metrics, batch_size=len(batch.force))
 
     def test_step(self, batch: Sample, batch_idx: int) -> None:
-        """Update the metrics."""
+        """Update the test metrics."""
         self.test_metrics.update(self.predict(batch.load), batch)
         self.log_dict(self.test_metrics, batch_size=len(batch.force))
 
     def setup(self, stage: str) -> None:
-        """Bring the physics to the device of the network; let the network see the samples."""
+        """Move the problem to the device of the network, and fit the bases of the network."""
         problem = self.scene.problem
         if problem.points.device != self.device:
             problem = problem.to(self.device)
         self.physics = LossContext(problem, self.largest_force)
-        # here: schedules ask for the batches, which want the bases, before any later hook
-        if stage == "fit" and isinstance(self.net, ReducedOrderNet) and not self.net.prepared:
+        # before later hooks: schedules load the batches, and encoding them takes the bases
+        if stage == "fit" and isinstance(self.net, TrainsInCoordinates) and not self.net.is_fitted:
             self.fit_bases(self.trainer.datamodule.snapshots())
         for collection in (self.val_metrics, self.test_metrics):
             for metric in collection.values():
@@ -200,7 +218,7 @@ class Surrogate(L.LightningModule):
                     metric.problem = problem
 
     def configure_callbacks(self) -> list[L.Callback]:
-        """Carry the loss into the trainer."""
+        """Return the loss, which is a callback."""
         return [self.loss]
 
     def configure_optimizers(self) -> Any:
@@ -216,42 +234,43 @@ class Surrogate(L.LightningModule):
         }
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Write down whose surrogate this is, and where random numbers are."""
+        """Store the identity of the scene and the states of random number generators."""
         checkpoint["scene"] = self.scene.fingerprint
         checkpoint["identity"] = self.scene.identity()
         checkpoint["nodes"] = self.scene.problem.shape[0]
         checkpoint["random"] = random_states()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse the checkpoint of another scene.
+        """Check that the checkpoint belongs to this scene.
 
         Raises:
-            ValueError: It is one.
+            ValueError: The checkpoint belongs to another scene.
         """
-        theirs, identity = checkpoint.get("scene", "unknown"), checkpoint.get("identity", {})
-        if theirs != self.scene.fingerprint and not self.scene.matches(identity):
+        stored, identity = checkpoint.get("scene", "unknown"), checkpoint.get("identity", {})
+        if stored != self.scene.fingerprint and not self.scene.matches(identity):
             raise ValueError(
-                f"the checkpoint is of scene {theirs[:12]}, this scene is "
+                f"the checkpoint is of scene {stored[:12]}, this scene is "
                 f"{self.scene.fingerprint[:12]}"
                 + "".join(f"; {line}" for line in self.scene.differences(identity))
             )
         self._random_states = checkpoint.get("random")
 
     def on_train_start(self) -> None:
-        """Go on with the random numbers of the run that this one resumes."""
+        """Restore the states of random number generators of a resumed run."""
         if self._random_states is not None:
             set_random_states(self._random_states)
 
 
 def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:
-    """Return the scales of forces and of displacements of the scene's loads, scalars [-].
+    """Return the scales of forces and displacements, scalars [-].
 
-    Root mean squares over the first loads of a stream of their own, over the degrees of freedom
-    that loads can act on and over those that move; displacements are linear answers. So no sample
-    is needed, and online and offline training share the scales. One number each, so that forces
-    and displacements keep their proportions within the body.
+    The scales are root mean squares over the first `count` loads of a separate random stream:
+    of forces over loadable degrees of freedom, of linear solutions over free degrees of freedom.
+    They need no training sample and are the same for online and offline training. A single number
+    each preserves the proportions of forces and displacements within the body.
     """
-    force = scene.loads.sample((0, SCALES), range(count)).force
+    force = scene.loads.sample((0, SCALE_STREAM), range(count)).force
     displacement = torch.stack([scene.linear.reference.solve(one) for one in force])
-    acting, moving = force[:, scene.loads.loadable_dofs], displacement[:, scene.problem.free]
-    return acting.square().mean().sqrt(), moving.square().mean().sqrt()
+    force = force[:, scene.loads.loadable_dofs]
+    displacement = displacement[:, scene.problem.free]
+    return force.square().mean().sqrt(), displacement.square().mean().sqrt()

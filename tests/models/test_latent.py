@@ -61,7 +61,7 @@ def sizes(field):
 def projected(net, field):
     """Return fields (B, N, D) on the basis."""
     image = torch.zeros_like(field)
-    image[:, net.moving] = field[:, net.moving] @ net.basis.double().T @ net.basis.double()
+    image[:, net.free_dofs] = field[:, net.free_dofs] @ net.basis.double().T @ net.basis.double()
     return image
 
 
@@ -158,9 +158,9 @@ def test_without_a_tolerance_the_linear_part_is_that_of_the_basis(scene, batch):
 def test_probes_tell_what_the_basis_misses_of_a_linear_answer(scene, batch):
     net = prepared(scene, batch, rank=20).net
     force = torch.cat([batch.force, sparse(scene, 2), sparse(scene, 60)])
-    linear = linear_of(scene, force) * net.unit
+    linear = linear_of(scene, force) * net.linear_unit
     missed = sizes(linear - projected(net, linear))
-    told = net.missed(net.inlet.seen(force), None).sqrt()
+    told = net.projection_residual_estimate(net.input_orbits.images(force), None).sqrt()
     assert float(missed.max() / missed.min()) > 100
     assert (told / missed > 1 / 3).all()
     assert (told / missed < 3).all()
@@ -168,7 +168,7 @@ def test_probes_tell_what_the_basis_misses_of_a_linear_answer(scene, batch):
 
 def test_only_loads_of_which_the_basis_misses_too_much_are_solved_for(scene, batch, monkeypatch):
     asked = []
-    original = Latent.respond
+    original = Latent.solve_linear
     monkeypatch.setattr(
         Latent,
         "respond",
@@ -192,7 +192,11 @@ def test_images_of_a_load_are_told_alike(scene, batch):
     assert len(net.group) > 1
     told = []
     for symmetry in net.group:
-        told.append(net.missed(net.inlet.seen(symmetry.image(batch.force)), None))
+        told.append(
+            net.projection_residual_estimate(
+                net.input_orbits.images(symmetry.image(batch.force)), None
+            )
+        )
     assert torch.allclose(torch.stack(told), told[0].expand(len(told), -1), rtol=1e-4)
 
 
@@ -231,7 +235,7 @@ def test_slopes_of_a_batch_of_local_and_other_forces_are_those_of_differences(sc
 
 def test_without_a_tolerance_nothing_is_solved(scene, batch, monkeypatch):
     module = prepared(scene, batch, linear_tol=torch.inf)
-    monkeypatch.setattr(Latent, "_respond_all", None)
+    monkeypatch.setattr(Latent, "_solve", None)
     assert answer_to(module, sparse(scene, 60)).any()
 
 
@@ -261,7 +265,7 @@ def test_the_basis_holds_linear_answers_and_rests(scene, batch):
 def test_coordinates_come_in_the_order_of_what_they_have_of_the_rests(scene, batch):
     net = prepared(scene, batch, rank=20).net
     weight = sizes(batch.displacement)[:, None] ** -0.5
-    rests = weight * (batch.displacement - linear_of(scene, batch.force))[:, net.moving]
+    rests = weight * (batch.displacement - linear_of(scene, batch.force))[:, net.free_dofs]
     found = (rests @ net.basis.T).square().sum(dim=0)
     assert (found.diff() <= 1e-9 * found[0]).all()
     assert found[0] > 10 * found[-1]
@@ -270,14 +274,14 @@ def test_coordinates_come_in_the_order_of_what_they_have_of_the_rests(scene, bat
 def test_the_unit_makes_linear_answers_scaled_ones(scene, batch):
     module = prepared(scene, batch)
     scaled = batch.force / module.force_scale
-    found = module.net.respond(scaled[:, module.net.acting])
+    found = module.net.solve_linear(scaled[:, module.net.load_dofs])
     expected = linear_of(scene, batch.force) / module.displacement_scale
-    assert torch.allclose(found, expected[:, module.net.moving], rtol=1e-6)
+    assert torch.allclose(found, expected[:, module.net.free_dofs], rtol=1e-6)
 
 
 def test_a_network_without_bases_answers_nothing(scene, batch):
     net = Latent(scene, **SMALL).eval()
-    assert not net.prepared
+    assert not net.fitted
     assert not net(batch.force.float()).any()
 
 
@@ -287,7 +291,7 @@ def test_the_plan_tells_of_near_fields_only_where_they_are_exact(scene):
     )
     lines = Latent(scene, linear_tol=torch.inf, **SMALL).skipped_work()
     assert not any("near field" in line for line in lines)
-    assert any("nothing linear learnt" in line for line in lines)
+    assert any("no learning of the linear part" in line for line in lines)
 
 
 @pytest.mark.parametrize("tol", [-1, torch.nan])
@@ -345,7 +349,7 @@ def test_a_run_comes_back_as_it_was(trained, home, monkeypatch):
     cfg, module = run_folder.load_run(trained)
     saved = checkpoint(trained, "best.safetensors")["state_dict"]
     assert cfg.model._target_.endswith("Latent")
-    assert module.net.prepared
+    assert module.net.fitted
     assert alike(saved, dict(module.state_dict()))
     again = run_folder.load_run(trained)[1]
     test = build.instantiate(cfg, "data", scene=module.scene).samples("test")
@@ -419,7 +423,7 @@ def test_a_run_that_is_to_resume_before_it_began_makes_its_bases(script, overrid
     ended = script("train", *overrides("fresh", *more), cwd=home)
     assert ended.status == 0, ended.err
     state = checkpoint(home / "fresh")["state_dict"]
-    assert state["net.prepared"]
+    assert state["net.fitted"]
     assert state["net.modes"].any()
 
 
@@ -444,7 +448,7 @@ def test_the_plan_of_a_stream_promises_coordinates_from_disk_only(script, overri
     more = ["data=online", "data.batches=1", "data.fresh=4", "trainer.max_epochs=1"]
     ended = script("train", *kept, *more, cwd=home)
     assert ended.status == 0
-    assert "no field in training:" not in ended.out
+    assert "no fields in training" not in ended.out
 
 
 @pytest.mark.parametrize(

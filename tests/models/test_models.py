@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from dpl.fem import Load
 from dpl.models import FCNN, GNN, Latent, PODNet
-from dpl.models.fcnn import _parameters
+from dpl.models.fcnn import count_parameters
 from dpl.system.memory import refuse_weights
 from dpl.training import MSE, Surrogate
 
@@ -148,7 +148,7 @@ def test_the_papers_network_has_4_n2_plus_7_n_parameters(make_scene):
 
 
 def test_the_papers_beam_has_576_million_parameters():
-    assert _parameters([12_000] * 5) == 4 * 12_000**2 + 7 * 12_000 == 576_084_000
+    assert count_parameters([12_000] * 5) == 4 * 12_000**2 + 7 * 12_000 == 576_084_000
 
 
 @pytest.mark.parametrize("options", [{}, {"width": 20}, {"layers": 2}, {"layers": 6, "width": 7}])

@@ -22,6 +22,7 @@ from dpl.fem import (
     solve,
 )
 from dpl.models import Latent, PODNet
+from dpl.models.invariant_basis import image_columns, scatter_fields
 from dpl.training import MSE, Surrogate
 from dpl.training.surrogate import scales
 
@@ -91,14 +92,14 @@ def eye(size):
 
 def read(net):
     """Return what a network reads of a unit force on each degree of freedom, (inputs, C)."""
-    units = net._fields(torch.eye(int(net.acting.sum())), net.acting)
-    return net.reading(net.inlet.seen(units), None).double()
+    units = scatter_fields(torch.eye(int(net.load_dofs.sum())), net.load_dofs)
+    return net.encode_loads(net.input_orbits.images(units), None).double()
 
 
 def left_over(basis, net, where):
     """Return the largest part of an image of a mode (R, n) that the modes do not reach."""
     basis = basis.double()
-    images = torch.cat([net._image(basis, where, k) for k in range(len(net.group))])
+    images = torch.cat([image_columns(basis, where, net.group, k) for k in range(len(net.group))])
     return float((images - images @ basis.T @ basis).norm(dim=1).max())
 
 
@@ -137,9 +138,11 @@ def test_modes_come_in_the_order_of_their_size(scene, batch):
 
 
 def assert_ordered(net, samples):
-    moved = samples.displacement[:, net.moving]
+    moved = samples.displacement[:, net.free_dofs]
     weighted = moved / moved.norm(dim=1, keepdim=True).sqrt()
-    found = torch.cat([net._image(weighted, net.moving, k) for k in range(max(1, len(net.group)))])
+    members = range(max(1, len(net.group)))
+    images = [image_columns(weighted, net.free_dofs, net.group, k) for k in members]
+    found = torch.cat(images)
     coordinates = found @ net.basis.double().T
     spread = coordinates.T @ coordinates
     sizes = spread.diagonal()
@@ -172,26 +175,26 @@ def test_whole_families_of_modes_are_invariant_under_the_symmetries(kind, bar):
     scene, samples = bar
     net = prepared(kind, scene, samples, rank=4).net
     assert len(net.group) == 8
-    assert left_over(net.basis, net, net.moving) < 1e-5
+    assert left_over(net.basis, net, net.free_dofs) < 1e-5
 
 
 def test_all_modes_of_few_samples_are_invariant_under_the_symmetries(scene, batch):
     net = prepared(Latent, scene, some(batch, 2), **WHOLE).net
-    assert left_over(net.basis, net, net.moving) < 1e-5
+    assert left_over(net.basis, net, net.free_dofs) < 1e-5
 
 
 def test_all_modes_of_few_loads_are_invariant_under_the_symmetries(scene, batch):
     net = prepared(PODNet, scene, some(batch, 2), **WHOLE).net
     kept = read(net)
     kept = kept[:, kept.abs().amax(dim=0) > 1e-5].T
-    assert left_over(kept, net, net.acting) < 1e-5
+    assert left_over(kept, net, net.load_dofs) < 1e-5
 
 
 @NETWORKS
 def test_a_basis_of_any_rank_is_invariant_under_the_symmetries(kind, scene, batch):
     for rank in (2, 3, 5, 6, 8, 11):
         net = prepared(kind, scene, batch, rank=rank).net
-        assert left_over(net.basis, net, net.moving) < 1e-5, rank
+        assert left_over(net.basis, net, net.free_dofs) < 1e-5, rank
 
 
 def test_the_basis_of_loads_is_orthonormal_and_holds_them(scene, batch):
@@ -216,7 +219,7 @@ def test_bases_are_a_function_of_the_samples(kind, scene, batch):
 @NETWORKS
 def test_more_samples_than_snapshots_are_thinned_out(kind, scene, batch, monkeypatch):
     """Every third of twelve makes the basis that these four make."""
-    monkeypatch.setattr("dpl.models.pod.SNAPSHOTS", 8 * 4)
+    monkeypatch.setattr("dpl.models.invariant_basis.MAX_SNAPSHOTS", 8 * 4)
     seen = []
     original = PODNet._image
     monkeypatch.setattr(
@@ -237,9 +240,13 @@ def test_turns_and_returns_are_a_representation(kind, bar):
     net = exact(prepared(kind, *bar, **WHOLE))
     order = len(net.group)
     assert order == 8
-    for motion in (net.turns[0], net.returns[0], *(net.returns.mT @ net.returns)):
+    for motion in (
+        net.input_actions[0],
+        net.inverse_output_actions[0],
+        *(net.inverse_output_actions.mT @ net.inverse_output_actions),
+    ):
         assert torch.allclose(motion, eye(48), rtol=0, atol=1e-5)
-    for motions in (net.turns, net.returns.mT):
+    for motions in (net.input_actions, net.inverse_output_actions.mT):
         for one in motions:
             far = (motions @ one)[:, None] - motions  # (G, G, r, r)
             nearest = far.flatten(2).norm(dim=2).min(dim=1)
@@ -300,7 +307,7 @@ def test_symmetry_false_respects_none(kind, bar):
     scene, samples = bar
     net = exact(prepared(kind, scene, samples, symmetry=False, **WHOLE))
     assert net.group == []
-    assert net.turns.shape[0] == net.returns.shape[0] == 1
+    assert net.input_actions.shape[0] == net.inverse_output_actions.shape[0] == 1
     force, group = noise(scene), kind(scene, **SMALL).group
     with torch.no_grad():
         answer = net(force)
@@ -316,7 +323,7 @@ def test_the_plan_counts_coordinates_and_symmetries(kind, scene):
     assert lines[0] == f"20 coordinates learnt instead of {int(scene.problem.free.sum())} " + (
         "displacements"
     )
-    assert lines[1].startswith("nothing learnt 8 times")
+    assert lines[1].startswith("no learning of 8 symmetries")
 
 
 # ------------------------------------------------------------------ bodies
@@ -354,7 +361,7 @@ def test_a_body_without_symmetry_is_answered(kind, skew):
     scene, samples = skew
     net = exact(prepared(kind, scene, samples, rank=5, coordinates=4))
     assert len(net.group) == 1
-    assert net.turns.shape == (1, 4, 4)
+    assert net.input_actions.shape == (1, 4, 4)
     assert len(net.skipped_work()) == (1 if kind is PODNet else 3)
     basis = net.basis
     assert torch.allclose(basis @ basis.T, eye(5), rtol=0, atol=1e-6)
@@ -431,9 +438,9 @@ def test_a_latent_network_reads_no_more_coordinates_than_it_has_modes(scene):
 @NETWORKS
 def test_no_bases_no_answer_and_they_are_told_apart(kind, scene, batch):
     net = kind(scene, **SMALL)
-    assert not net.prepared
+    assert not net.fitted
     assert not net(noise(scene).float()).any() or kind is Latent
-    assert prepared(kind, scene, batch).net.prepared
+    assert prepared(kind, scene, batch).net.fitted
 
 
 @NETWORKS

@@ -69,14 +69,14 @@ def test_errors_of_coordinates_and_the_rest_are_those_of_the_field(build, batch,
     with torch.no_grad():
         field = (module.predict(batch.load) - batch.displacement) / module.displacement_scale
         learnt = module.net.network(part.inputs)
-    found = (learnt - part.targets).square().sum(dim=1) + part.rest
+    found = (learnt - part.targets).square().sum(dim=1) + part.squared_error
     assert torch.allclose(found, field.square().sum(dim=(1, 2)), rtol=1e-4)
 
 
 @CASES
 def test_sizes_are_mean_squares_of_whole_displacements(build, batch, kind, options):
     module = build(kind, options)
-    size = encoded(module, batch).size * module.displacement_scale**2
+    size = encoded(module, batch).mean_square * module.displacement_scale**2
     assert torch.allclose(size, batch.displacement.square().mean(dim=(1, 2)), rtol=1e-9)
 
 
@@ -85,8 +85,8 @@ def test_targets_are_the_best_coordinates(build, batch, kind, options):
     """No other coordinates are nearer to the field; with all modes nothing is left."""
     module = build(kind, options)
     part = encoded(module, batch)
-    assert (part.rest >= 0).all()
-    left = (part.rest / (part.rest + part.targets.square().sum(dim=1))).max()
+    assert (part.squared_error >= 0).all()
+    left = (part.squared_error / (part.squared_error + part.targets.square().sum(dim=1))).max()
     assert (left > 1e-4) == bool(options), left
 
 
@@ -100,7 +100,7 @@ def test_squared_errors_are_right_with_fewer_snapshots_than_modes(build, scene, 
     with torch.no_grad():
         field = (module.predict(batch.load) - batch.displacement) / module.displacement_scale
         learnt = module.net.network(part.inputs)
-    found = (learnt - part.targets).square().sum(dim=1) + part.rest
+    found = (learnt - part.targets).square().sum(dim=1) + part.squared_error
     assert torch.allclose(found, field.square().sum(dim=(1, 2)), rtol=1e-4)
 
 
@@ -154,7 +154,7 @@ def test_only_losses_of_squared_errors_are_found_in_coordinates(build, scene, ba
 
 
 def test_the_plan_tells_of_coordinates_where_they_are_used(build):
-    told = "no field in training from disk: squared errors are those of coordinates"
+    told = "no fields in training from disk: the loss is computed in coordinates"
     assert told in build(PODNet, {}).skipped_work()
     assert told in build(Latent, {}, RMSELoss()).skipped_work()
     assert told not in build(Latent, {}, LrStar()).skipped_work()
@@ -192,7 +192,9 @@ def test_without_symmetry_there_is_one_image(build, batch):
 
 def test_the_first_images_are_the_samples_as_the_network_reads_them(build, batch):
     module, seen = build(PODNet, {"rank": 4, "coordinates": 4}), []
-    module.net.learnt = lambda inputs: seen.append(inputs) or torch.zeros(len(inputs), 4)
+    module.net.symmetrised_output = lambda inputs: (
+        seen.append(inputs) or torch.zeros(len(inputs), 4)
+    )
     module.predict(batch.load)
     whole = module.encode(batch)
     part = whole.__getitems__(list(range(12)))
@@ -213,8 +215,8 @@ def test_batches_are_fetched_in_any_order():
     assert torch.allclose(batch.inputs[0], parts[0][2] @ turn[1])
     assert torch.equal(batch.inputs[1], parts[0][0])
     assert torch.equal(batch.targets, torch.stack([-parts[1][2], parts[1][0], -parts[1][0]]))
-    assert batch.rest.tolist() == [2.0, 0.0, 0.0]
-    assert batch.size.tolist() == [5.0, 3.0, 3.0]
+    assert batch.squared_error.tolist() == [2.0, 0.0, 0.0]
+    assert batch.mean_square.tolist() == [5.0, 3.0, 3.0]
 
 
 def test_images_that_the_data_want_are_made_where_the_network_has_no_symmetry(

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dpl.fem import box, symmetries
-from dpl.models.symmetric_fields import Orbits, turned, turned_back
+from dpl.models.symmetric_fields import Orbits, coordinates_of_images, sum_over_images
 
 
 @pytest.fixture(scope="module", params=["even", "odd", "skew"])
@@ -33,19 +33,19 @@ def noise(body, count=3):
 
 def test_fields_are_what_their_images_are_at_few_nodes(body, orbits):
     field = noise(body)
-    assert torch.allclose(orbits.whole(orbits.seen(field), field), field, rtol=0, atol=1e-14)
+    assert torch.allclose(orbits.field(orbits.images(field), field), field, rtol=0, atol=1e-14)
 
 
 def test_images_are_seen(body, group, orbits):
     field = noise(body)
     for k, symmetry in enumerate(group):
-        expected = orbits.first(symmetry.image(field))
-        assert torch.allclose(orbits.seen(field)[:, k], expected, rtol=0, atol=1e-14)
+        expected = orbits.at_representatives(symmetry.image(field))
+        assert torch.allclose(orbits.images(field)[:, k], expected, rtol=0, atol=1e-14)
 
 
 def test_shares_make_a_scalar_product(body, orbits):
     one, other = noise(body), noise(body).roll(1, dims=0)
-    found = (orbits.seen(one) * orbits.share * orbits.seen(other)).sum(dim=(1, 2))
+    found = (orbits.images(one) * orbits.weights * orbits.images(other)).sum(dim=(1, 2))
     assert torch.allclose(found, (one * other).sum(dim=(1, 2)), rtol=1e-12)
 
 
@@ -53,25 +53,25 @@ def test_there_is_one_node_of_each_orbit(body, group, orbits):
     free = body.problem.free.any(dim=1)
     sources = torch.stack([symmetry.source for symmetry in group])[:, free]
     count = len({tuple(sorted(set(column.tolist()))) for column in sources.T})
-    assert len(orbits.share) == 3 * count
-    assert len(orbits.share) <= 3 * int(free.sum()) / (len(group) / 2)
+    assert len(orbits.weights) == 3 * count
+    assert len(orbits.weights) <= 3 * int(free.sum()) / (len(group) / 2)
 
 
 def test_without_a_group_all_nodes_stand_for_themselves(body):
     orbits, field = Orbits([], body.problem.free), noise(body)
     free = body.problem.free.any(dim=1)
-    assert torch.equal(orbits.first(field), field[:, free].flatten(1))
-    assert torch.equal(orbits.seen(field)[:, 0], orbits.first(field))
-    assert torch.equal(orbits.whole(orbits.seen(field), field), field)
-    assert (orbits.share == 1).all()
+    assert torch.equal(orbits.at_representatives(field), field[:, free].flatten(1))
+    assert torch.equal(orbits.images(field)[:, 0], orbits.at_representatives(field))
+    assert torch.equal(orbits.field(orbits.images(field), field), field)
+    assert (orbits.weights == 1).all()
 
 
-def test_turned_coordinates_are_turned_back():
+def test_coordinates_of_images_sum_to_the_order_of_the_group_times_the_coordinates():
     """Of the quarter turns of the plane."""
     quarter = torch.tensor([[0.0, 1.0], [-1.0, 0.0]])
     motions = torch.stack([torch.linalg.matrix_power(quarter, k) for k in range(4)])
     one = torch.randn(5, 2, generator=torch.Generator().manual_seed(0))
-    every = turned(one, motions.mT)
+    every = coordinates_of_images(one, motions.mT)
     for k in range(4):
         assert torch.allclose(every[:, k], one @ motions[k], atol=1e-6)
-    assert torch.allclose(turned_back(every, motions.mT), 4 * one, atol=1e-5)
+    assert torch.allclose(sum_over_images(every, motions.mT), 4 * one, atol=1e-5)

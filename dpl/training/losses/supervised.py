@@ -1,11 +1,25 @@
 """Supervised losses: squared errors of displacements."""
 
+from typing import Protocol, runtime_checkable
+
 from torch import Tensor
 
 from dpl.scene import Sample
 from dpl.training.losses.loss import Loss, LossContext, check_floor, clamp_scale, squared_error
 
 SMALLEST_SQUARE = 1e-24  # added to squared errors: the root has no gradient at zero [-]
+
+
+@runtime_checkable
+class SquaredErrorLoss(Protocol):
+    """A loss that is a function of the squared errors of samples.
+
+    Networks with the capability `TrainsInCoordinates` train without fields on such a loss.
+    """
+
+    def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
+        """Return the loss () of mean squared errors (B,) and mean squared displacements (B,)."""
+        ...
 
 
 class MSE(Loss):
@@ -34,7 +48,7 @@ class MSE(Loss):
         return self.from_squared_errors(squared_error(prediction, batch), size)
 
     def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
-        """Return the loss () of mean squared errors (B,) and mean squared displacements (B,)."""
+        """See `SquaredErrorLoss`."""
         return self._weighted(error, size).mean()
 
     def _weighted(self, error: Tensor, size: Tensor) -> Tensor:

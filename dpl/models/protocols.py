@@ -1,0 +1,89 @@
+"""Optional capabilities of networks, found with `isinstance`.
+
+A network of another package has a capability if it defines the methods; it need not inherit.
+"""
+
+from typing import Protocol, Self, runtime_checkable
+
+from torch import Tensor
+
+from dpl.fem import PODGalerkin
+from dpl.models.reduced_samples import ReducedDataset
+from dpl.scene import Sample
+
+
+@runtime_checkable
+class TrainsInCoordinates(Protocol):
+    """A network between reduced coordinates of loads and displacements.
+
+    `dpl.training.Surrogate` lets it fit its bases before training. If the loss is a function of
+    squared errors, it trains the network on samples in reduced coordinates.
+    """
+
+    @property
+    def is_fitted(self) -> bool:
+        """True after `fit_bases`, or once a checkpoint with bases has been loaded."""
+        ...
+
+    @property
+    def is_symmetric(self) -> bool:
+        """True if `encode` adds the images of the samples under the symmetries of the body."""
+        ...
+
+    def fit_bases(self, samples: Sample, unit: float) -> None:
+        """Compute the bases from scaled training samples.
+
+        Args:
+            samples: Scaled forces and displacements, (S, N, D), float64.
+            unit: Scale of forces over scale of displacements: K(0)^-1 f of scaled fields is `unit`
+                times K(0)^-1 f of dimensionless fields.
+        """
+        ...
+
+    def encode(self, samples: Sample) -> ReducedDataset:
+        """Return scaled samples (S, N, D), float64, in reduced coordinates."""
+        ...
+
+    def network(self, inputs: Tensor) -> Tensor:
+        """Return coordinates of displacements (B, R) from coordinates of loads (B, M)."""
+        ...
+
+
+@runtime_checkable
+class Correctable(Protocol):
+    """A network whose predictions POD-Galerkin iterations in its modes can correct."""
+
+    def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> PODGalerkin:
+        """Return the solver in the first `rank` modes, see `dpl.fem.PODGalerkin.within`.
+
+        Args:
+            states: Equilibrium displacements, (S, N, D) [-].
+            rank: Number of modes.
+            tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
+        """
+        ...
+
+    def for_correction(self) -> Self:
+        """Return the network, with shared weights, whose predictions are to be corrected."""
+        ...
+
+
+@runtime_checkable
+class FlagsLocalLoads(Protocol):
+    """A network that predicts within a basis and detects loads that the basis cannot represent.
+
+    `forward` solves with the factor of K(0) for these loads, which an ONNX graph cannot contain.
+    """
+
+    linear_tol: float
+
+    @property
+    def flags_local_loads(self) -> bool:
+        """True if some load can be local."""
+        ...
+
+    def forward_in_basis(
+        self, force: Tensor, poisson: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return displacements (B, N, D) within the basis, and a mask of local loads, (B,)."""
+        ...
