@@ -14,7 +14,7 @@ from benchmarks.stress.loads import AMPLITUDES, describe, level
 from benchmarks.verification.bodies import paper_beam
 from benchmarks.verification.report import Row
 from dpl import Scene
-from dpl.evaluation.newton_starts import PlainNewton
+from dpl.evaluation.plain_newton import PlainNewton
 from dpl.fem import (
     AndersonSolver,
     LinearSolver,

@@ -34,7 +34,7 @@ def main(cfg: DictConfig) -> None:
         bar = progress.add_task("loads", total=sum(len(sets[name].force) for _, name in tasks))
         for tol, name in tasks:
             budget = cfg.budget if name.endswith("times") else None
-            solvers = newton_starts.contestants(scene, networks, tol, budget=budget)
+            solvers = newton_starts.solvers_of(scene, networks, tol, max_total_iter=budget)
             known = {(t.solver, t.network): t for t in trials if (t.tol, t.loads) == (tol, name)}
             count = len(sets[name].force)
             if set(known) == set(solvers) and all(t.number == count - 1 for t in known.values()):

@@ -64,12 +64,12 @@ def _discretisations(cfg: DictConfig) -> list["Discretisation"]:
 
 
 def _show(title: str, rows: list["Point"]) -> None:
-    table = Table(title, "iterate", "threads", "ms", "p99", "error", "worst", "||R||/||f||")
+    table = Table(title, "iteration", "threads", "ms", "p99", "error", "max error", "||R||/||f||")
     for row in rows:
         times = f"{row.ms:.2f}", f"{row.ms_p99:.2f}"
-        errors = f"{row.error:.1e}", f"{row.worst:.1e}", f"{row.residual:.1e}"
-        name = "" if row.iterate else row.solver
-        table.add_row(name, str(row.iterate), str(row.threads), *times, *errors)
+        errors = f"{row.error:.1e}", f"{row.max_error:.1e}", f"{row.residual:.1e}"
+        name = "" if row.iteration else row.solver
+        table.add_row(name, str(row.iteration), str(row.threads), *times, *errors)
     Console(width=150).print(table)
 
 
@@ -97,8 +97,8 @@ def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
         solvers[name] = Direct(predict, scene.problem)
         if cfg.corrected and isinstance(surrogate.net, Correctable):
             row = methods.network(surrogate, Path(cfg.run) / name, trained.data.train)
-            tier = config.instantiate(cfg, "corrected")(surrogate, row, train)
-            solvers[f"{name}, corrected"] = Direct(tier.predict, scene.problem)
+            method = config.instantiate(cfg, "corrected")(surrogate, row, train)
+            solvers[f"{name}, corrected"] = Direct(method.predict, scene.problem)
         solvers[f"{name}, hybrid"] = default_hybrid(predict, scene)
         if torch.cuda.is_available():
             copy = config.load_run(Path(cfg.run) / name, scene=scene)[1]

@@ -1,4 +1,4 @@
-"""Solvers timed and compared: errors, run times, Newton started from predictions."""
+"""Errors and run times of solvers, and Newton started from predictions."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The methods that one experiment compares: linear, POD-Galerkin, network, corrected network."""
+"""Methods of a comparison: linear, POD-Galerkin, network, corrected network."""
 
 import copy
 import json
@@ -19,13 +19,13 @@ from dpl.training import Surrogate
 
 @dataclass(frozen=True)
 class Method:
-    """Something that predicts, and what it has cost to make.
+    """A method that predicts displacements, and the cost of its training.
 
     Attributes:
-        predict: From a load to displacements.
-        samples: Solved loads that it learnt from.
-        training_minutes: Wall time of its making.
-        parameters: Numbers that were trained.
+        predict: Function from a load to displacements (B, N, D) [-].
+        samples: Number of training samples; None without training.
+        training_minutes: Wall time of the training [min]; None without training.
+        parameters: Number of trained parameters; None without training.
     """
 
     predict: Predict
@@ -35,7 +35,7 @@ class Method:
 
 
 def linear(scene: Scene) -> Method:
-    """Return K(0)^-1 f."""
+    """Return the linear solution K(0)^-1 f."""
 
     def predict(load: Load) -> Tensor:
         pairs = zip(load.force, load.poisson, strict=True)
@@ -45,13 +45,13 @@ def linear(scene: Scene) -> Method:
 
 
 def pod_galerkin(scene: Scene, train: Sample, *, rank: int, tolerance: float) -> Method:
-    """Return the hyper-reduced model of the training samples, on the linear answer.
+    """Return the hyper-reduced POD-Galerkin model with the linear solution as offset.
 
     Args:
-        scene: What is simulated.
-        train: The samples.
-        rank: Modes of what is beyond linear.
-        tolerance: Of the choice of cells, see `dpl.fem.rom.cubature`.
+        scene: The scene.
+        train: Training samples.
+        rank: Number of modes of the nonlinear part of displacements.
+        tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
 
     Raises:
         ValueError: A number is out of range.
@@ -69,7 +69,7 @@ def pod_galerkin(scene: Scene, train: Sample, *, rank: int, tolerance: float) ->
 
 
 def network(surrogate: Surrogate, folder: Path, samples: int) -> Method:
-    """Return the network of a run's folder."""
+    """Return the network of the run in a folder."""
     return Method(
         surrogate.predict,
         samples,
@@ -115,7 +115,7 @@ def corrected(
 
 
 def training_minutes(folder: Path) -> float | None:
-    """Return the wall time of a run's training, all its sessions together; None if not known."""
+    """Return the wall time of all training sessions of a run [min]; None if not recorded."""
     path = folder / "training.jsonl"
     if not path.is_file():
         return None

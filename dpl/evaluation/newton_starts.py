@@ -1,113 +1,44 @@
-"""Newton from rest and from predictions: who converges, in how many iterations, and how fast.
+"""Convergence of Newton started from rest and from predictions.
 
-The paper's experiment 4, and beyond it.
+Extends experiment 4 of Odot, Haferssas, Cotin (2022), DeepPhysics.
 """
 
 import math
 import statistics
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
+from dpl.evaluation.plain_newton import PlainNewton
 from dpl.evaluation.timing import time_interleaved
-from dpl.fem import (
-    AndersonSolver,
-    Load,
-    Newton,
-    Problem,
-    SingularMatrix,
-    Solution,
-    Solver,
-    evaluate_solution,
-)
-from dpl.fem.solvers import run_lockstep
+from dpl.fem import AndersonSolver, Load, Solver
 from dpl.inference import Hybrid
 from dpl.inference.hybrid import Predict
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 
-DASHES = ("-", "--", ":", "-.")
-REFERENCE = "robust Newton"  # what times are compared with
-STREAMS = {"in range": 2, "twice": 4, "3 times": 7, "5 times": 8}  # of loads; the first: test loads
-BOTH = "in range and twice"  # the loads of the paper
+LINE_STYLES = ("-", "--", ":", "-.")
+REFERENCE = "robust Newton"  # solver with which times and displacements are compared
+# random streams of the sets of loads; 2 is the stream of the test loads
+STREAMS = {"in range": 2, "twice": 4, "3 times": 7, "5 times": 8}
+BOTH = "in range and twice"  # the set of loads in the paper
 
-# Odot, Haferssas, Cotin (2022), table 5: converged, prediction picked [%], mean iterations
+# Odot, Haferssas, Cotin (2022), table 5: converged [%], prediction used [%], mean iterations
 PAPER = {"paper: Newton": (46, None, 6.1), "paper: hybrid Newton": (71, 66, 5.0)}
 
 
-@dataclass(frozen=True, eq=False)
-class PlainNewton:
-    """Newton as in textbooks and in the paper: every step whole, whatever becomes of the body.
-
-    Source: Odot, Haferssas, Cotin (2022), DeepPhysics, algorithm 1.
-
-    Attributes:
-        solver: Whose body and linear solver it takes, and its tolerance.
-        max_iter: Iterations after which it has not converged.
-    """
-
-    solver: Newton
-    max_iter: int = 20
-
-    def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
-        """Yield the start and the state after each step; loads one by one, in step.
-
-        Args:
-            load: What acts.
-            guess: Where to start, (B, N, D) [-]; zero if left out.
-        """
-        guesses = torch.zeros_like(load.force) if guess is None else guess
-        yield from run_lockstep(
-            [
-                self._member(single, u[None], guess is not None)
-                for single, u in zip(load.unbatch(), guesses, strict=True)
-            ]
-        )
-
-    @property
-    def problem(self) -> Problem:
-        """The body."""
-        return self.solver.problem
-
-    @property
-    def tol(self) -> float:
-        """Residual ratio below which an answer counts as converged [-]."""
-        return self.solver.tol
-
-    def _member(self, load: Load, u: Tensor, guessed: bool) -> Iterator[Solution]:
-        problem, start = self.solver.problem, time.perf_counter()
-        backend = self.solver.linear_solver.tangent_backend
-        for k in range(self.max_iter + 1):
-            state = evaluate_solution(problem, u, load, self.tol, iterations=k, from_guess=guessed)
-            yield state._replace(
-                factorisations=torch.tensor([k]),
-                seconds=torch.tensor([time.perf_counter() - start], dtype=torch.float64),
-            )
-            if state.converged or k == self.max_iter:
-                return
-            system = problem.linearise(u)
-            right = problem.restrict((load.force - system.force)[0])
-            try:
-                factor = backend.factorise(system.tangent[0].numpy())
-                u = u + problem.extend(factor.solve(right, 1e-10))[None]
-            except SingularMatrix:
-                return
-
-
 @dataclass(frozen=True)
-class Asked:
-    """What a solver is asked for.
+class Setting:
+    """A solver, a set of loads and a tolerance.
 
     Attributes:
-        solver: Its name.
-        network: Whose predictions it starts from; empty: from rest.
-        loads: Name of the set.
-        tol: Residual ratio asked for [-].
+        solver: Name of the solver.
+        network: Name of the network that predicts the initial state; empty for rest.
+        loads: Name of the set of loads.
+        tol: Relative residual [-].
     """
 
     solver: str
@@ -117,58 +48,64 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Trial(Asked):
-    """One solver on one load, to one tolerance.
+class Trial(Setting):
+    """Result of one solver for one load.
 
     Attributes:
-        number: Of the load in its set.
-        converged: Whether it is answered to the tolerance with nothing inverted.
-        picked: Whether the answer goes on from the prediction.
-        iterations: Linear solves, with a tangent or what stands for one.
-        factorisations: Of tangents.
-        ms: Wall time, prediction included [ms].
-        apart: Relative distance from robust Newton's answer [-].
+        number: Index of the load in its set.
+        converged: The residual is below the tolerance and no element is inverted.
+        used_prediction: The solver iterated from the prediction.
+        iterations: Number of linear solves.
+        factorisations: Number of factorised tangents.
+        ms: Wall time with the prediction [ms].
+        deviation: Relative L2 distance from the solution of robust Newton [-].
     """
 
     number: int
     converged: bool
-    picked: bool
+    used_prediction: bool
     iterations: int
     factorisations: int
     ms: float
-    apart: float
+    deviation: float
 
 
 @dataclass(frozen=True)
-class Row(Asked):
-    """One solver, on one set of loads, to one tolerance.
+class Summary(Setting):
+    """Results of one solver for a set of loads; means and medians are over converged loads.
 
     Attributes:
-        count: Loads.
-        converged: Answered to the tolerance with nothing inverted [%].
-        picked: Answers that go on from the prediction [%].
-        iterations: Mean linear solves, with a tangent or what stands for one, of those that
-            converged.
-        worst: Most of them.
-        factorisations: Mean, of those that converged.
-        ms: Median wall time of those that converged, prediction included [ms].
-        ratio: Wall time of all loads over that of robust Newton, both where both converged [-].
-        apart: Largest relative distance from robust Newton's answer, where both converged [-].
+        count: Number of loads.
+        converged: Fraction of converged loads [%].
+        used_prediction_pct: Fraction of loads for which the solver used the prediction [%].
+        iterations: Mean number of linear solves.
+        max_iterations: Maximum number of linear solves.
+        factorisations: Mean number of factorised tangents.
+        ms: Median wall time with the prediction [ms].
+        time_ratio: Total wall time over that of robust Newton, for loads where both converged [-].
+        deviation: Largest relative L2 distance from the solution of robust Newton, for loads where
+            both converged [-].
     """
 
     count: int
     converged: float
-    picked: float | None = None
+    used_prediction_pct: float | None = None
     iterations: float | None = None
-    worst: int | None = None
+    max_iterations: int | None = None
     factorisations: float | None = None
     ms: float | None = None
-    ratio: float | None = None
-    apart: float | None = None
+    time_ratio: float | None = None
+    deviation: float | None = None
 
 
 def load_sets(scene: Scene, count: int, far: int) -> dict[str, Load]:
-    """Return `count` test loads, as many one to two times, and `far` 3 and 5 times as large."""
+    """Return sets of loads by name.
+
+    Args:
+        scene: The scene.
+        count: Number of test loads ("in range"), and of loads scaled by 1 to 2 ("twice").
+        far: Number of loads scaled by 3, and of loads scaled by 5.
+    """
     part = torch.linspace(0, 1, count, dtype=torch.float64)
     factors = {"in range": 1 + 0 * part, "twice": 1 + part}
     factors |= {f"{k} times": torch.full((far,), float(k)).double() for k in (3, 5)}
@@ -181,19 +118,19 @@ def load_sets(scene: Scene, count: int, far: int) -> dict[str, Load]:
     return sets
 
 
-def contestants(
-    scene: Scene, networks: Mapping[str, Predict], tol: float, *, budget: int | None = None
+def solvers_of(
+    scene: Scene, networks: Mapping[str, Predict], tol: float, *, max_total_iter: int | None = None
 ) -> dict[tuple[str, str], Solver]:
-    """Return the solvers, by name and network, that have the same body and linear solver.
+    """Return the solvers to compare, by name and network.
 
     Args:
-        scene: What is simulated.
-        networks: Predictions, named.
-        tol: Residual ratio [-].
-        budget: Iterations before a load is given up; the scene's if left out.
+        scene: The scene, which provides problem and linear solver.
+        networks: Predictions by name of the network.
+        tol: Relative residual [-].
+        max_total_iter: Maximum number of iterations; None for that of the scene's solver.
     """
     settings: dict[str, Any] = {"tol": tol}
-    settings |= {} if budget is None else {"max_total_iter": budget}
+    settings |= {} if max_total_iter is None else {"max_total_iter": max_total_iter}
     robust, quick = replace(scene.newton, **settings), replace(scene.corrector, **settings)
     plain = PlainNewton(robust)
     solvers: dict[tuple[str, str], Solver] = {
@@ -202,7 +139,7 @@ def contestants(
             robust, mixed_integration=False, factor_reuse_tol=0.0
         ),
         (REFERENCE, ""): robust,
-        ("robust Newton, K(0) turned", ""): replace(robust, corotational=True),
+        ("robust Newton, corotational", ""): replace(robust, corotational=True),
     }
     for name, predict in networks.items():
         solvers["hybrid, paper's rule", name] = Hybrid(predict, plain, "paper")
@@ -221,35 +158,37 @@ def measure(
     tol: float,
     tick: Callable[[], None] = lambda: None,
 ) -> list[Trial]:
-    """Return every solver on every load, one at a time on one thread.
+    """Return the results of all solvers for all loads, one load at a time on one thread.
 
     Args:
-        solvers: By name and network; `REFERENCE` from rest among them.
-        title: Name of the loads.
-        load: B of them.
-        tol: What the solvers are to reach [-].
+        solvers: Solvers by name and network; must contain `REFERENCE` from rest.
+        title: Name of the set of loads.
+        load: The loads, B of them.
+        tol: Tolerance of the solvers, for the record [-].
         tick: Called after each load.
     """
     with one_thread(), torch.inference_mode():
-        whole = time_interleaved(solvers, load, tick)
-    exact = whole[REFERENCE, ""][0].displacement.flatten(1)
+        timed = time_interleaved(solvers, load, tick)
+    reference = timed[REFERENCE, ""][0].displacement.flatten(1)
     trials = []
-    for (name, network), (answer, times) in whole.items():
-        apart = (answer.displacement.flatten(1) - exact).norm(dim=1) / exact.norm(dim=1)
+    for (name, network), (solution, times) in timed.items():
+        distance = (solution.displacement.flatten(1) - reference).norm(dim=1)
         columns = (
-            answer.converged, answer.from_guess, answer.iterations, answer.factorisations,
-            times, apart,
+            solution.converged, solution.from_guess, solution.iterations, solution.factorisations,
+            times, distance / reference.norm(dim=1),
         )  # fmt: skip
         numbers = zip(*(column.tolist() for column in columns), strict=True)
         trials += [Trial(name, network, title, tol, k, *row) for k, row in enumerate(numbers)]
     return trials
 
 
-def summary(trials: Iterable[Trial]) -> list[Row]:
-    """Return a row for each solver, set of loads and tolerance, the paper's two sets also as one.
+def summary(trials: Iterable[Trial]) -> list[Summary]:
+    """Return a summary for each solver, set of loads and tolerance.
+
+    The sets "in range" and "twice" are also combined into the set of the paper, `BOTH`.
 
     Args:
-        trials: Each solver's in the same order.
+        trials: Results; the loads of a set have the same order for all solvers.
     """
     groups: dict[tuple[str, float], dict[tuple[str, str], list[Trial]]] = {}
     every = list(trials)
@@ -257,47 +196,50 @@ def summary(trials: Iterable[Trial]) -> list[Row]:
     for trial in [*both, *every]:
         group = groups.setdefault((trial.loads, trial.tol), {})
         group.setdefault((trial.solver, trial.network), []).append(trial)
-    return [_row(own, group[REFERENCE, ""]) for group in groups.values() for own in group.values()]
+    return [
+        _summarise(own, group[REFERENCE, ""]) for group in groups.values() for own in group.values()
+    ]
 
 
-def _row(trials: Sequence[Trial], reference: Sequence[Trial]) -> Row:
+def _summarise(trials: Sequence[Trial], reference: Sequence[Trial]) -> Summary:
     first, count = trials[0], len(trials)
     done = [trial for trial in trials if trial.converged]
-    row = Row(
+    row = Summary(
         first.solver, first.network, first.loads, first.tol, count, 100 * len(done) / count,
-        100 * sum(trial.picked for trial in trials) / count if first.network else None,
+        100 * sum(trial.used_prediction for trial in trials) / count if first.network else None,
     )  # fmt: skip
     if not done:
         return row
     both = [pair for pair in zip(trials, reference, strict=True) if all(t.converged for t in pair)]
+    ratio = sum(own.ms for own, _ in both) / sum(ref.ms for _, ref in both) if both else None
     return replace(
         row,
         iterations=statistics.mean(trial.iterations for trial in done),
-        worst=max(trial.iterations for trial in done),
+        max_iterations=max(trial.iterations for trial in done),
         factorisations=statistics.mean(trial.factorisations for trial in done),
         ms=statistics.median(trial.ms for trial in done),
-        ratio=sum(own.ms for own, _ in both) / sum(ref.ms for _, ref in both) if both else None,
-        apart=max(own.apart for own, _ in both) if both else None,
+        time_ratio=ratio,
+        deviation=max(own.deviation for own, _ in both) if both else None,
     )
 
 
-def paper() -> list[Row]:
-    """Return the paper's rows; its 100 loads are half in range, half up to twice."""
+def paper() -> list[Summary]:
+    """Return the results of the paper: 50 loads in range and 50 of up to twice the range."""
     return [
-        Row(name, "", BOTH, math.nan, 100, converged, picked, iterations)
-        for name, (converged, picked, iterations) in PAPER.items()
+        Summary(name, "", BOTH, math.nan, 100, converged, used, iterations)
+        for name, (converged, used, iterations) in PAPER.items()
     ]
 
 
 def draw(trials: Sequence[Trial], path: Path) -> None:
-    """Draw how many loads each solver has answered within a time, a panel for each tolerance.
+    """Draw the fraction of converged loads over wall time, one panel for each tolerance.
 
-    Source: Dolan, More (2002), Benchmarking optimization software with performance profiles, with
-    times as they are.
+    Source: Dolan, More (2002), Benchmarking optimization software with performance profiles; here
+    with absolute times.
 
     Args:
-        trials: Those to be drawn.
-        path: Of the picture.
+        trials: Results to draw.
+        path: Image file to write.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter
@@ -307,8 +249,8 @@ def draw(trials: Sequence[Trial], path: Path) -> None:
     networks = list(dict.fromkeys(network for _, network in names))
     styles: dict[str, str] = {}
     for network in networks:
-        of_it = [solver for solver, other in names if other == network]
-        styles |= {solver: DASHES[k % len(DASHES)] for k, solver in enumerate(reversed(of_it))}
+        same = [solver for solver, other in names if other == network]
+        styles |= {s: LINE_STYLES[k % len(LINE_STYLES)] for k, s in enumerate(reversed(same))}
     figure = Figure(figsize=(3.6 * len(tols) + 2.6, 3.8), layout="constrained")
     axes = figure.subplots(1, len(tols), sharex=True, sharey=True, squeeze=False)[0]
     for ax, tol in zip(axes, tols, strict=True):
@@ -328,7 +270,7 @@ def draw(trials: Sequence[Trial], path: Path) -> None:
         ax.set_title(f"to ||R|| / ||f|| < {tol:g}", fontsize=10)
         ax.set_xlabel("time [ms]")
         ax.grid(alpha=0.3, which="both")
-    axes[0].set_ylabel("loads answered [%]")
+    axes[0].set_ylabel("converged loads [%]")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", fontsize=8)
     figure.savefig(path, dpi=130)

@@ -1,4 +1,4 @@
-"""Run time against error: every solver and every iterate of it on the same loads."""
+"""Run time against error of all iterates of solvers on the same loads."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,21 +17,21 @@ from dpl.training import RelativeL2, Surrogate
 from dpl.training.metrics import median
 
 Cells = tuple[int, ...]
-COLOURS = [f"C{k}" for k in range(10) if k != 7]  # grey is for what is beside
+COLOURS = [f"C{k}" for k in range(10) if k != 7]  # without grey, the colour of references
 
 
 @dataclass(frozen=True)
 class Discretisation:
-    """A mesh under a load that all meshes of its body have.
+    """A mesh of a refinement study, all under the same load.
 
     Attributes:
-        cells: Along the edges of the beam, or as `dpl.fem.propeller` counts them.
-        degree: Of the elements.
-        dofs: Degrees of freedom, held ones included.
-        ms: Median wall time of Newton to 1e-6 [ms].
-        value: What is read off the answer: the beam's displacement across itself at a corner of the
-            end face [m], the propeller's mean displacement along its shaft over L [-].
-        error: Of the value, over the limit [-].
+        cells: Cells along the edges of the beam, or as `dpl.fem.propeller` counts them.
+        degree: Polynomial degree of the elements.
+        dofs: Degrees of freedom with fixed ones.
+        ms: Median wall time of Newton to a relative residual of 1e-6 [ms].
+        value: Quantity of interest: transverse displacement at a corner of the end face of the beam
+            [m], or mean displacement of the propeller along its shaft over L [-].
+        error: Error of the value relative to its limit under refinement [-].
     """
 
     cells: Cells
@@ -47,30 +47,30 @@ class Point:
     """One iterate of a solver, over all loads.
 
     Attributes:
-        solver: Its name.
-        iterate: Which one; a load that has ended before stays with its end.
-        last: Whether all loads have ended.
+        solver: Name of the solver.
+        iteration: Index of the iterate; a load with fewer iterates keeps its last one.
+        is_final: This is the last iterate of all loads.
         threads: Threads of torch and BLAS.
-        device: Where the network runs.
-        loads: How many.
-        ms: Median wall time until it is there, one load at a time, its residual and min det F
-            included [ms].
-        ms_p99: 99th percentile of the same [ms].
-        error: Median relative L2 error against the mesh's exact answer [-].
-        worst: Largest of the same [-].
-        residual: Median ||R|| / ||f|| [-].
+        device: Device of the network.
+        loads: Number of loads.
+        ms: Median wall time up to this iterate, with its residual and min det F, one load at a time
+            [ms].
+        ms_p99: 99th percentile of this time [ms].
+        error: Median relative L2 error against the converged solution on the same mesh [-].
+        max_error: Maximum of this error [-].
+        residual: Median relative residual ||R|| / ||f|| [-].
     """
 
     solver: str
-    iterate: int
-    last: bool
+    iteration: int
+    is_final: bool
     threads: int
     device: str
     loads: int
     ms: float
     ms_p99: float
     error: float
-    worst: float
+    max_error: float
     residual: float
 
 
@@ -82,13 +82,15 @@ def points(
     device: str = "cpu",
     tick: Callable[[], None] = lambda: None,
 ) -> list[Point]:
-    """Return the iterates of solvers; each has all loads in a row, one at a time, after a warm-up.
+    """Return run times and errors of all iterates of solvers, one load at a time.
+
+    Each solver is warmed up, then solves all loads in a row.
 
     Args:
-        solvers: Named.
-        batch: Loads with the truth.
-        threads: Of torch and BLAS; more than one lets BLAS have what it takes.
-        device: Where networks run, for the record.
+        solvers: Solvers by name.
+        batch: Loads with reference solutions.
+        threads: Threads of torch; with 1 BLAS has one thread too, otherwise its default.
+        device: Device of the networks, for the record.
         tick: Called after each solver.
     """
     singles = batch.load.unbatch()
@@ -100,11 +102,11 @@ def points(
             paths = [time_iterates(solver, load) for load in singles]
             count = max(map(len, paths))
             for k in range(count):
-                now = [states[min(k, len(states) - 1)] for states in paths]
-                taken = torch.tensor([ms for ms, _ in now], dtype=torch.float64)
-                answers = torch.cat([state.displacement for _, state in now])
-                error = RelativeL2().measure(answers, batch)
-                residual = torch.cat([state.residual for _, state in now])
+                iterates = [states[min(k, len(states) - 1)] for states in paths]
+                times = torch.tensor([ms for ms, _ in iterates], dtype=torch.float64)
+                displacement = torch.cat([state.displacement for _, state in iterates])
+                error = RelativeL2().measure(displacement, batch)
+                residual = torch.cat([state.residual for _, state in iterates])
                 found.append(
                     Point(
                         name,
@@ -113,7 +115,7 @@ def points(
                         threads,
                         device,
                         len(singles),
-                        *percentiles(taken),
+                        *percentiles(times),
                         float(median(error)),
                         float(error.max()),
                         float(median(residual)),
@@ -135,17 +137,17 @@ def _threads(count: int) -> Iterator[None]:
 
 
 def all_threads() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def on_gpu(surrogate: Surrogate) -> Callable[[Load], Tensor]:
-    """Return a surrogate's predictions made on the GPU, copies there and back included."""
+    """Return the prediction of a surrogate on the GPU, with copies from and to the CPU."""
     device = torch.device("cuda")
-    there = surrogate.to(device)
+    on_device = surrogate.to(device)
 
     def predict(load: Load) -> Tensor:
-        return there.predict(Load(*(column.to(device) for column in load))).cpu()
+        return on_device.predict(Load(*(column.to(device) for column in load))).cpu()
 
     return predict
 
@@ -156,13 +158,13 @@ def draw(
     floor: float | None,
     file: Path,
 ) -> None:
-    """Draw run time against error: a line for each solver that iterates, a dot for the others.
+    """Draw run time against error: one line or dot for each solver.
 
     Args:
-        rows: Iterates of solvers, one setting of threads.
-        meshes: Finite elements on other meshes, against the limit.
-        floor: Discretisation error of the mesh that all solvers have [-]; None: not known.
-        file: Of the picture.
+        rows: Iterates of solvers, all with the same number of threads.
+        meshes: Errors of Newton on other meshes, relative to the limit under refinement.
+        floor: Discretisation error of the mesh of the solvers [-]; None if it is not known.
+        file: Image file to write.
     """
     from matplotlib.figure import Figure
 
@@ -171,18 +173,18 @@ def draw(
     named: set[str] = set()
     families = list(dict.fromkeys(_family(row.solver) for row in rows))
     for name in dict.fromkeys(row.solver for row in rows):
-        path_of = [row for row in rows if row.solver == name and row.error < 1]
-        x, y = [row.ms for row in path_of], [max(row.error, 1e-12) for row in path_of]
-        tier = name.partition(", ")[2]
+        own = [row for row in rows if row.solver == name and row.error < 1]
+        x, y = [row.ms for row in own], [max(row.error, 1e-12) for row in own]
+        method = name.partition(", ")[2]
         colour = "0.1" if _family(name) == "Newton" else COLOURS[families.index(_family(name)) % 9]
-        marker = {"corrected": "D", "hybrid": "s", "GPU": "*"}.get(tier, "o")
-        shown = not tier or tier == "GPU"  # other marks are explained below
+        marker = {"corrected": "D", "hybrid": "s", "GPU": "*"}.get(method, "o")
+        shown = not method or method == "GPU"  # other marks are explained below
         label = name.partition(" to ")[0] if shown and _family(name) not in named else None
         named.add(_family(name))
         ax.loglog(x, y, color=colour, lw=1.2, marker=marker, ms=4, label=label)
         ax.loglog(x[-1:], y[-1:], color=colour, marker=marker, ms=8)
-    for marker, tier in (("D", "corrected"), ("s", "hybrid: each iterate")):
-        ax.plot([], [], color="0.5", ls="", marker=marker, label=f"the same, {tier}")
+    for marker, method in (("D", "corrected"), ("s", "hybrid: each iterate")):
+        ax.plot([], [], color="0.5", ls="", marker=marker, label=f"the same, {method}")
     for degree, marker, name in ((1, "s", "linear"), (2, "D", "quadratic")):
         family = [mesh for mesh in meshes if mesh.degree == degree]
         if not family:
@@ -202,7 +204,7 @@ def draw(
     if floor is not None:
         ax.axhline(floor, color="0.3", ls="--", lw=1)
         ax.annotate(
-            "what the mesh itself is off",
+            "discretisation error of the mesh",
             (0.01, floor),
             xycoords=("axes fraction", "data"),
             fontsize=8,
@@ -219,5 +221,5 @@ def draw(
 
 
 def _family(solver: str) -> str:
-    """Return what solvers of one colour have in common."""
+    """Return the part of a name that solvers of one colour share."""
     return solver.partition(", ")[0].partition(" to ")[0]

@@ -1,4 +1,4 @@
-"""Solvers against each other on the same loads, one at a time: how wrong, how sure, how slow."""
+"""Errors, convergence and run times of solvers on the same test loads."""
 
 import json
 import re
@@ -23,19 +23,19 @@ from dpl.visualization import plot_deformed
 
 
 @dataclass(frozen=True)
-class Row:
-    """One solver over all loads.
+class SolverResult:
+    """Results of one solver for all loads.
 
     Attributes:
-        solver: Its name.
-        errors: The numbers of `dpl.training.metrics` against the truth.
-        converged: Loads answered to the tolerance with nothing inverted.
-        loads: Loads asked.
-        iterations: Mean linear solves a load.
-        worst_iterations: Most of them for one load.
-        milliseconds: Median wall time of one load, its residual and min det F included [ms].
-        slowest: 99th percentile of the same [ms].
-        latency: Of the network's row: that of `sim(force)` and of the bare network.
+        solver: Name of the solver.
+        errors: The metrics of `dpl.training.metrics`.
+        converged: Number of loads with a residual below the tolerance and no inverted element.
+        loads: Number of loads.
+        iterations: Mean number of linear solves.
+        max_iterations: Maximum number of linear solves.
+        ms: Median wall time of one load, with its residual and min det F [ms].
+        ms_p99: 99th percentile of this time [ms].
+        latency: Latency of `sim(force)` and of the bare network; empty for other solvers.
     """
 
     solver: str
@@ -43,51 +43,53 @@ class Row:
     converged: int
     loads: int
     iterations: float
-    worst_iterations: int
-    milliseconds: float
-    slowest: float
+    max_iterations: int
+    ms: float
+    ms_p99: float
     latency: Mapping[str, Latency] = field(default_factory=dict)
 
 
-def clock(
+def measure(
     solvers: Mapping[str, Solver], batch: Sample, problem: Problem
-) -> tuple[list[Row], dict[str, Tensor]]:
-    """Return a row for each solver, and the displacements (B, N, D) [-] that it answered.
+) -> tuple[list[SolverResult], dict[str, Tensor]]:
+    """Return the results and the displacements (B, N, D) [-] of each solver.
 
-    Loads are asked one at a time, see `dpl.evaluation.timing.time_interleaved`.
+    Loads are solved one at a time, see `dpl.evaluation.timing.time_interleaved`.
 
     Args:
-        solvers: Named.
-        batch: The loads with the truth.
-        problem: The body.
+        solvers: Solvers by name.
+        batch: Loads with reference solutions.
+        problem: The problem.
     """
-    whole = time_interleaved(solvers, batch.load)
-    rows = [_row(name, *taken, batch, problem) for name, taken in whole.items()]
-    return rows, {name: answer.displacement for name, (answer, _) in whole.items()}
+    timed = time_interleaved(solvers, batch.load)
+    rows = [_result(name, *found, batch, problem) for name, found in timed.items()]
+    return rows, {name: solution.displacement for name, (solution, _) in timed.items()}
 
 
-def _row(name: str, answer: Solution, times: Tensor, batch: Sample, problem: Problem) -> Row:
+def _result(
+    name: str, solution: Solution, times: Tensor, batch: Sample, problem: Problem
+) -> SolverResult:
     errors = default_metrics(problem)
-    errors.update(answer.displacement, batch)
-    median, slowest = percentiles(times)
-    return Row(
+    errors.update(solution.displacement, batch)
+    ms, ms_p99 = percentiles(times)
+    return SolverResult(
         solver=name,
         errors={key: float(value) for key, value in errors.compute().items()},
-        converged=int(answer.converged.sum()),
-        loads=len(answer.converged),
-        iterations=float(answer.iterations.double().mean()),
-        worst_iterations=int(answer.iterations.max()),
-        milliseconds=median,
-        slowest=slowest,
+        converged=int(solution.converged.sum()),
+        loads=len(solution.converged),
+        iterations=float(solution.iterations.double().mean()),
+        max_iterations=int(solution.iterations.max()),
+        ms=ms,
+        ms_p99=ms_p99,
     )
 
 
-def show(rows: Sequence[Row], title: str) -> None:
+def show(rows: Sequence[SolverResult], title: str) -> None:
     """Print rows as a table."""
     table = Table(title=title, title_justify="left")
     columns = (
-        "solver", "e_mean", "e_max", "SNR min [dB]", "rel. L2 median", "worst",
-        "||R||/||f||", "min det F", "converged", "iterations", "worst", "p50 [ms]", "p99 [ms]",
+        "solver", "e_mean", "e_max", "SNR min [dB]", "rel. L2 median", "max",
+        "||R||/||f||", "min det F", "converged", "iterations", "max", "p50 [ms]", "p99 [ms]",
     )  # fmt: skip
     for column in columns:
         table.add_column(column, justify="left" if column == "solver" else "right")
@@ -106,24 +108,24 @@ def show(rows: Sequence[Row], title: str) -> None:
             f"{e['min_det_F']:.2f}",
             f"{row.converged}/{row.loads}",
             f"{row.iterations:.1f}",
-            f"{row.worst_iterations}",
-            f"{row.milliseconds:.1f}",
-            f"{row.slowest:.1f}",
+            f"{row.max_iterations}",
+            f"{row.ms:.1f}",
+            f"{row.ms_p99:.1f}",
         )
     Console(width=max(Console().width, 160)).print(table)
 
 
 def compare(folder: Path) -> None:
-    """Print the network and the hybrid of every evaluated run below a folder, then medians.
+    """Print the errors of the network and the hybrid of all evaluated runs below a folder.
 
-    Runs that differ in nothing but `seed` in their folder's name form a group.
+    Runs whose folder names differ only in `seed` form a group, for which medians are printed.
 
     Raises:
         FileNotFoundError: No run below the folder has been evaluated.
     """
     found = sorted(folder.rglob("evaluation.json"))
     if not found:
-        raise FileNotFoundError(f"{folder} holds no evaluated run")
+        raise FileNotFoundError(f"{folder} contains no evaluated run")
     table = Table(title=str(folder), title_justify="left")
     names = ("e_mean", "e_max", "SNR_min", "rel_L2_median", "rel_L2_worst", "residual")
     for column in ("run", *names, "hybrid iterations", "hybrid ms / Newton ms"):
@@ -132,7 +134,7 @@ def compare(folder: Path) -> None:
     for path in found:
         rows = {row["solver"]: row for row in json.loads(path.read_text())}
         network, hybrid = rows["network"]["errors"], rows["hybrid Newton"]
-        ratio = hybrid["milliseconds"] / rows["Newton from zero"]["milliseconds"]
+        ratio = hybrid["ms"] / rows["Newton from zero"]["ms"]
         numbers = [*(network[name] for name in names), hybrid["iterations"], ratio]
         name = str(path.parent.relative_to(folder))
         table.add_row(name, *(f"{number:.3g}" for number in numbers))
@@ -144,27 +146,30 @@ def compare(folder: Path) -> None:
     Console(width=max(Console().width, 160)).print(table)
 
 
-def save(rows: Sequence[Row], path: Path) -> None:
+def save(rows: Sequence[SolverResult], path: Path) -> None:
     """Write rows as JSON."""
     path.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
 
 
-def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1e-8) -> list[Row]:
-    """Judge a surrogate: a table of five solvers, printed and saved, with a figure and one case.
+def evaluate(
+    surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1e-8
+) -> list[SolverResult]:
+    """Evaluate a surrogate on test loads: print and save a table of five solvers.
 
-    Linear answer, network, hybrid Newton from the network by the paper's rule and by the best, and
-    Newton from zero, each asked one load at a time on one thread; and the latency of `sim(force)`
-    and of the bare network. Writes `evaluation.json`, `shapes.png` and `worst.vtu`.
+    The solvers are the linear solver, the network, hybrid Newton with the rule of the paper and
+    with the default rule, and Newton from zero. They solve one load at a time on one thread. The
+    latencies of `sim(force)` and of the bare network are measured as well. Writes
+    `evaluation.json`, `shapes.png` and `worst.vtu`.
 
     Args:
-        surrogate: On the CPU.
-        test: Loads with the truth.
-        folder: Where results go.
-        tol: Residual ratio of Newton and the hybrid [-].
+        surrogate: A surrogate on the CPU.
+        test: Loads with reference solutions.
+        folder: Folder of the results.
+        tol: Relative residual of Newton and the hybrid [-].
     """
     scene = surrogate.scene
     newton = replace(scene.newton, tol=tol)
-    # with Poisson's ratios of their own, loads have their own K(0): each solver makes it for itself
+    # with a range of Poisson's ratios every load has its own K(0); no solver reuses another's
     shared = scene.loads.poisson_range is None
     own = scene if shared else replace(scene, solver=replace(scene.newton))
     solvers: dict[str, Solver] = {
@@ -175,31 +180,29 @@ def evaluate(surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1
         "Newton from zero": newton,
     }
     with one_thread():
-        rows, answers = clock(solvers, test, scene.problem)
-    measured = latencies(Simulator(surrogate), test.load)
-    rows = [replace(row, latency=measured) if row.solver == "network" else row for row in rows]
-    show(rows, f"{len(test.force)} fresh loads, one at a time, 1 thread, tol {tol:g}")
-    print(describe(measured))
+        rows, displacements = measure(solvers, test, scene.problem)
+    latency = latencies(Simulator(surrogate), test.load)
+    rows = [replace(row, latency=latency) if row.solver == "network" else row for row in rows]
+    show(rows, f"{len(test.force)} test loads, one at a time, 1 thread, tol {tol:g}")
+    print(describe(latency))
     save(rows, folder / "evaluation.json")
-    _picture(surrogate, test, answers, folder)
+    _draw(surrogate, test, displacements, folder)
     return rows
 
 
-def _picture(
-    surrogate: Surrogate, test: Sample, answers: Mapping[str, Tensor], folder: Path
+def _draw(
+    surrogate: Surrogate, test: Sample, displacements: Mapping[str, Tensor], folder: Path
 ) -> None:
-    """Draw the best, the median and the worst load of the network; write the worst as VTU."""
-    scene, network = surrogate.scene, answers["network"]
+    """Draw the loads with minimum, median and maximum error; write the last one as VTU."""
+    scene, network = surrogate.scene, displacements["network"]
     error = RelativeL2().measure(network, test)
     order = error.argsort()
-    chosen = order[
-        [0, (len(order) - 1) // 2, -1]
-    ]  # of an even number of loads the better one in the middle
+    chosen = order[[0, (len(order) - 1) // 2, -1]]  # of two middle loads the one with less error
     names = [
         f"{name} load: relative L2 {error[k]:.2%}"
         for name, k in zip(("best", "median", "worst"), chosen, strict=True)
     ]
-    shown = [(name, answers[name][chosen]) for name in ("network", "linear")]
+    shown = [(name, displacements[name][chosen]) for name in ("network", "linear")]
     figure = plot_deformed(scene.problem, test.displacement[chosen], shown, names=names)
     figure.savefig(folder / "shapes.png", dpi=150)
     worst = int(order[-1])

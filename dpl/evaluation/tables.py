@@ -1,4 +1,4 @@
-"""Results as rows: frozen dataclasses, shown as tables and written as CSV."""
+"""Tables whose rows are instances of a frozen dataclass: print, write and read as CSV."""
 
 import csv
 import io
@@ -26,7 +26,7 @@ READERS: dict[Any, Callable[[str], Any]] = {
 
 
 def show(rows: Sequence[Any], title: str) -> None:
-    """Print rows of one dataclass, a column for each field."""
+    """Print rows of a dataclass, one column for each field."""
     table = Table(title=title, title_justify="left")
     for field in fields(rows[0]):
         table.add_column(field.name.replace("_", " "))
@@ -36,7 +36,7 @@ def show(rows: Sequence[Any], title: str) -> None:
 
 
 def write(rows: Sequence[Any], path: Path) -> None:
-    """Write rows of one dataclass as CSV, a file that is whole or not there; its folder is made."""
+    """Write rows of a dataclass as CSV, atomically; missing folders are created."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = io.StringIO(newline="")
     writer = csv.writer(lines)
@@ -47,25 +47,25 @@ def write(rows: Sequence[Any], path: Path) -> None:
 
 
 def read(kind: type[Row], path: Path) -> list[Row]:
-    """Return the rows of a CSV file that `write` wrote.
+    """Return the rows of a CSV file written by `write`.
 
     Args:
-        kind: Their dataclass, of texts, numbers, truth values and tuples of whole numbers.
-        path: Of the file.
+        kind: Dataclass of the rows; its fields are str, int, float, bool or tuple[int, ...].
+        path: Path of the file.
 
     Raises:
-        ValueError: It holds other columns.
+        ValueError: The file has other columns.
     """
     readers = {name: READERS[hint] for name, hint in get_type_hints(kind).items()}
     with path.open(newline="") as file:
         lines = csv.DictReader(file)
         if lines.fieldnames != list(readers):
-            raise ValueError(f"{path} has not the columns {', '.join(readers)}")
+            raise ValueError(f"{path} must have the columns {', '.join(readers)}")
         return [kind(**{name: readers[name](cell) for name, cell in row.items()}) for row in lines]
 
 
 def machine() -> str:
-    """Return what a table of times must say of the machine."""
+    """Return processor and number of cores of this machine."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -73,12 +73,12 @@ def machine() -> str:
 
 
 def write_machine(path: Path, *, threads: int = 1) -> None:
-    """Write on what rows were measured, as JSON."""
+    """Write machine and number of threads as JSON."""
     path.write_text(json.dumps({"machine": machine(), "threads": threads}) + "\n")
 
 
 def text(value: object, digits: int) -> str:
-    """Return a value as text, a float to so many digits; what is not known is empty."""
+    """Return a value as text, floats with `digits` significant digits, None and NaN as empty."""
     if isinstance(value, float):
         return "" if math.isnan(value) else f"{value:.{digits}g}"
     return "" if value is None else str(value)

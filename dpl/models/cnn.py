@@ -1,4 +1,4 @@
-"""A convolutional network on the grid that immerses the body: U-Mesh."""
+"""Convolutional network (U-Net) on a regular grid around the body."""
 
 import math
 from itertools import pairwise
@@ -12,21 +12,21 @@ from dpl.models.poisson_interpolation import normalise_poisson
 from dpl.scene import Scene
 from dpl.system.memory import refuse_beyond
 
-COARSE = 3  # grid points along a side across which two convolutions carry everything
-LEAK = 0.25  # slope of negative values: near enough to linear that training does not stall
+COARSE = 3  # grid points per side that two convolutions connect completely
+LEAK = 0.25  # slope of rectifiers at negative values; nearly linear units train faster
 CONVOLUTION: dict[int, type[nn.Module]] = {2: nn.Conv2d, 3: nn.Conv3d}
 TRANSPOSED: dict[int, type[nn.Module]] = {2: nn.ConvTranspose2d, 3: nn.ConvTranspose3d}
 
 
 class CNN(nn.Module):
-    """A U-Net on the points of a regular grid around the body.
+    """U-Net on a regular grid around the body.
 
-    Nodal forces are spread onto the grid, and displacements are read off it, with the same
-    multilinear weights; where the nodes are the points of a regular grid, one goes over into the
-    other. Constant channels say what part of a grid point's voxel the body fills, and what is held;
-    those that say nothing are left out. Each step downwards is a convolution of stride 2 and each
-    step upwards its transpose, so that any number of points works; a side of one cell is not
-    coarsened. Nothing is normalised over a sample: the size of a load matters.
+    Nodal forces are distributed to the grid and displacements interpolated from it with the same
+    multilinear weights. If the nodes form a regular grid, they are its points. Constant channels
+    contain the volume fraction of the body and the fixed degrees of freedom; channels that are
+    uniform are omitted. Each coarsening is a convolution of stride 2 and each refinement its
+    transpose, for any number of points; a side of one cell is not coarsened. There is no
+    normalisation over samples, because it would remove the magnitude of the load.
 
     Source: Mendizabal, Marquez-Neila, Cotin (2020), Simulation of hyperelastic materials in
     real-time using deep learning, Medical Image Analysis 59, section 3.
@@ -46,14 +46,14 @@ class CNN(nn.Module):
         """Build the network.
 
         Args:
-            scene: What it is to answer.
-            channels: Of the finest grid; every step downwards has twice as many.
-            steps: Steps downwards; if left out, until every point of the coarsest grid sees all.
-            grid: Points along the longest side of the bounding box, about equally far apart on the
-                others. If left out, the nodes where they are a regular grid, else about as many
-                points as nodes.
-            memory_limit: Memory that training on one sample may take [GB]; what the machine has if
-                left out.
+            scene: The scene to predict.
+            channels: Channels of the finest grid; each coarsening doubles them.
+            steps: Number of coarsenings; None for as many as connect all points of the coarsest
+                grid.
+            grid: Points along the longest side of the bounding box, with about the same spacing on
+                other sides; None for the nodes if they form a regular grid, otherwise for about as
+                many points as nodes.
+            memory_limit: Memory for training on one sample [GB]; None for that of the machine.
 
         Raises:
             ValueError: `channels`, `steps` or `grid` is out of range.
@@ -79,15 +79,15 @@ class CNN(nn.Module):
         self.net = UNet(dim + len(constant) + len(self.extra_inputs), dim, sizes, widths)
 
     def _constant(self, problem: Problem, shape: tuple[int, ...]) -> Tensor:
-        """Return the channels that no load changes and that are not the same everywhere."""
-        held = (~problem.free).float()
-        if (held == held[:, :1]).all():
-            held = held[:, :1]
-        ones = torch.ones(1, len(held), 1)
-        share = self.immersion.spread(held[None])[0] / self.immersion.spread(ones)[0].clamp(1e-6)
+        """Return the constant channels that are not uniform, (C, *shape)."""
+        fixed = (~problem.free).float()
+        if (fixed == fixed[:, :1]).all():
+            fixed = fixed[:, :1]
+        ones = torch.ones(1, len(fixed), 1)
+        share = self.immersion.spread(fixed[None])[0] / self.immersion.spread(ones)[0].clamp(1e-6)
         volume = problem.dV.expand(len(problem.cells), -1).sum()
         box = (problem.points.amax(0) - problem.points.amin(0)).prod()
-        self.full = bool(volume > 0.999 * box)  # a grid of nodes may have cells left out
+        self.full = bool(volume > 0.999 * box)  # False for a grid of nodes with missing cells
         channels = [*share] if self.full else [*share, filling(problem, shape).float()]
         varying = [channel for channel in channels if channel.min() < channel.max()]
         return torch.stack(varying) if varying else share[:0]
@@ -96,32 +96,33 @@ class CNN(nn.Module):
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
 
         Args:
-            force: What acts.
-            poisson: Poisson's ratios, (B, 1) [-]; wanted where the law has a range of them.
+            force: Scaled nodal forces.
+            poisson: Poisson's ratios, (B, 1) [-]; required if the law has a range of them.
         """
         constant = self.constant.expand(force.shape[0], *self.constant.shape)
         fields = [self.immersion.spread(force), constant]
         if self.poisson_range is not None:
-            place = normalise_poisson(poisson, self.poisson_range, force)
+            ratio = normalise_poisson(poisson, self.poisson_range, force)
             sides = fields[0].shape[2:]
-            fields.append(place.view(-1, 1, *[1] * len(sides)).expand(-1, -1, *sides))
+            fields.append(ratio.view(-1, 1, *[1] * len(sides)).expand(-1, -1, *sides))
         return self.immersion.read(self.net(torch.cat(fields, 1)))
 
     def skipped_work(self) -> list[str]:
-        """Return what the network leaves out, a line each."""
+        """Return the work that the network saves, one line each."""
         lines = []
         if isinstance(self.immersion, Permutation):
             size = " x ".join(map(str, self.immersion.shape))
-            lines.append(f"no interpolation: the nodes are the points of a grid, {size}")
+            lines.append(f"no interpolation: the nodes form a grid of {size} points")
         if self.full:
-            lines.append("no input for what lies inside the body: all of the grid does")
+            lines.append("no input for the volume fraction: the body fills the grid")
         return lines
 
 
 class UNet(nn.Module):
-    """Convolutions on ever coarser grids and back, each joined by what was found on the way down.
+    """Encoder and decoder on a hierarchy of grids, with skip connections.
 
-    Source: Ronneberger, Fischer, Brox (2015), U-Net; with strides for pooling and no norm.
+    Source: Ronneberger, Fischer, Brox (2015), U-Net; here with strided convolutions instead of
+    pooling, and without normalisation.
     """
 
     def __init__(
@@ -130,10 +131,10 @@ class UNet(nn.Module):
         """Build the network.
 
         Args:
-            inputs: Channels of what enters.
-            outputs: Channels of what leaves.
+            inputs: Input channels.
+            outputs: Output channels.
             sizes: Grid points along each side, from the finest grid to the coarsest.
-            widths: Channels on each grid.
+            widths: Channels of each grid.
         """
         super().__init__()
         dim = len(sizes[0])
@@ -151,14 +152,14 @@ class UNet(nn.Module):
         self.apply(_initialise)
 
     def forward(self, field: Tensor) -> Tensor:
-        """Return a field (B, outputs, *sizes[0]) of one (B, inputs, *sizes[0])."""
+        """Return output fields (B, outputs, *sizes[0]) of input fields (B, inputs, *sizes[0])."""
         field = self.encoders[0](field)
-        passed = []
+        skipped = []
         for descent, encoder in zip(self.descents, self.encoders[1:], strict=True):
-            passed.append(field)
+            skipped.append(field)
             field = encoder(self.rectify(descent(field)))
         for ascent, decoder in zip(reversed(self.ascents), reversed(self.decoders), strict=True):
-            field = decoder(torch.cat([passed.pop(), ascent(field)], dim=1))
+            field = decoder(torch.cat([skipped.pop(), ascent(field)], dim=1))
         return self.last(field)
 
 
@@ -182,18 +183,18 @@ def _sizes(shape: tuple[int, ...], steps: int | None) -> list[tuple[int, ...]]:
 
 
 def _pair(inputs: int, outputs: int, dim: int) -> nn.Sequential:
-    """Return two convolutions, each with its rectifier."""
+    """Return two convolutions, each followed by a rectifier."""
     first = CONVOLUTION[dim](inputs, outputs, 3, 1, 1)
     second = CONVOLUTION[dim](outputs, outputs, 3, 1, 1)
     return nn.Sequential(first, nn.LeakyReLU(LEAK), second, nn.LeakyReLU(LEAK))
 
 
 def _initialise(module: nn.Module) -> None:
-    """Draw the weights of a convolution so that values keep their size (He et al. 2015)."""
+    """Draw weights of a convolution that preserve the variance of values (He et al. 2015)."""
     if not isinstance(module, nn.Conv2d | nn.Conv3d | nn.ConvTranspose2d | nn.ConvTranspose3d):
         return
     taps = float(module.in_channels * math.prod(module.kernel_size))
-    if module.transposed:  # a point meets one tap in each stride
+    if module.transposed:  # an output point has one tap per stride
         taps /= math.prod(module.stride)
     nn.init.normal_(module.weight, std=math.sqrt(2 / (1 + LEAK**2) / taps))
     assert module.bias is not None
@@ -203,12 +204,14 @@ def _initialise(module: nn.Module) -> None:
 def _refuse_beyond_memory(
     sizes: list[tuple[int, ...]], widths: list[int], limit: float | None
 ) -> None:
-    """Raise where training in float32 would not fit, even on one sample."""
+    """Raise MemoryError if float32 training on one sample would not fit."""
     kernel = 3 ** len(sizes[0])
-    # a level: 2 convolutions down and 2 up, of twice the width, its stride and that one's transpose
+    # per level: 2 convolutions down, 2 up with twice the inputs, a strided one and its transpose
     parameters = sum(9 * kernel * width**2 for width in widths)
     fields = sum(10 * width * math.prod(size) for size, width in zip(sizes, widths, strict=True))
-    needed = (parameters * 4 * 4 + fields * 4) / 1e9  # as many gradients and two moments; 4 bytes
+    needed = (
+        parameters * 4 * 4 + fields * 4
+    ) / 1e9  # weights, gradients and two moments of 4 bytes
     points = " x ".join(map(str, sizes[0]))
     what = f"about {parameters:,} parameters and a grid of {points} points"
     remedy = "take a smaller model.grid, model.channels or model.steps"

@@ -1,4 +1,4 @@
-"""The paper's fully connected network."""
+"""Fully connected network of the paper."""
 
 from itertools import pairwise
 
@@ -9,23 +9,23 @@ from dpl.models.poisson_interpolation import normalise_poisson
 from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 
-DEEPEST = 1000  # layers
+MAX_LAYERS = 1000
 
 
 class FCNN(nn.Module):
     """Linear layers of equal width with PReLU, one slope per unit, between them.
 
-    Over all N D degrees of freedom this is the paper's network of 4 N^2 + 7 N parameters (there N
-    counts degrees of freedom). By default only those enter that loads can reach and that are free,
-    and only free ones leave.
+    By default the inputs are the loadable degrees of freedom and the outputs the free ones. With
+    `all_dofs` this is the network of the paper with 4 n^2 + 7 n parameters for n degrees of
+    freedom.
 
     Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.1.1.
     """
 
     inputs: Tensor
     outputs: Tensor
-    entries: Tensor
-    exits: Tensor
+    input_index: Tensor
+    output_index: Tensor
 
     def __init__(
         self,
@@ -40,45 +40,45 @@ class FCNN(nn.Module):
         """Build the network.
 
         Args:
-            scene: What it is to answer.
-            layers: Linear layers, 2 or more.
-            width: Units in the hidden layers; as many as outputs if left out.
-            all_dofs: Let every degree of freedom in and out, as the paper does.
-            young: Let forces in as newtons are, and Young's modulus besides, as the paper does for
-                a range of moduli; u/L depends on f/(E L^2) alone, so that nothing is gained.
-            memory_limit: Memory that training may take [GB]; what the machine has if left out.
+            scene: The scene to predict.
+            layers: Number of linear layers, 2 or more.
+            width: Units of the hidden layers; None for the number of outputs.
+            all_dofs: Use all degrees of freedom as inputs and outputs, as in the paper.
+            young: Use forces over the largest Young's modulus, and Young's modulus, as inputs. The
+                paper does so for a range of moduli. It adds no information, since u/L depends on
+                f/(E L^2) alone.
+            memory_limit: Memory for training [GB]; None for that of the machine.
 
         Raises:
             ValueError: `layers` or `width` is out of range.
             MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()
-        if not 2 <= layers <= DEEPEST:
-            raise ValueError(f"layers = {layers} must be 2 or more and at most {DEEPEST}")
+        if not 2 <= layers <= MAX_LAYERS:
+            raise ValueError(f"layers = {layers} must be 2 or more and at most {MAX_LAYERS}")
         if width is not None and width < 1:
             raise ValueError(f"width = {width} must be 1 or more")
         everything = torch.ones(scene.problem.shape, dtype=torch.bool)
         inputs = everything if all_dofs else scene.loads.loadable_dofs
         outputs = everything if all_dofs else scene.problem.free
         low, high = scene.loads.young_range
-        self.largest, self.middle = high, (low + high) / 2  # [Pa]
-        self.spread = (high - low) / 2 or high  # of one modulus, itself: others are not far away
+        self.young_max = high  # [Pa]
+        self.young_mean = (low + high) / 2  # [Pa]
+        self.young_scale = (high - low) / 2 or high  # [Pa]; without a range the modulus itself
         self.poisson_range = scene.loads.poisson_range
         varying = {"young": young, "poisson": self.poisson_range is not None}
         self.extra_inputs = tuple(name for name, enters in varying.items() if enters)
-        ends = int(inputs.sum()) + len(self.extra_inputs), int(outputs.sum())
-        hidden = width or ends[1]
-        sizes = [ends[0], *[hidden] * (layers - 1), ends[1]]
+        n_inputs, n_outputs = int(inputs.sum()) + len(self.extra_inputs), int(outputs.sum())
+        sizes = [n_inputs, *[width or n_outputs] * (layers - 1), n_outputs]
         self.parameters_needed = count_parameters(sizes)
-        self.parameters_saved = count_parameters(
-            [everything.numel()] * (layers + 1)
-        ) - count_parameters(sizes)
+        all_sizes = [everything.numel()] * (layers + 1)
+        self.parameters_saved = count_parameters(all_sizes) - self.parameters_needed
         remedy = "take a coarser mesh, model.width or another model"
         refuse_weights(self.parameters_needed, memory_limit, remedy)
         self.register_buffer("inputs", inputs, persistent=False)
         self.register_buffer("outputs", outputs, persistent=False)
-        for name, where in {"entries": inputs, "exits": outputs}.items():
-            self.register_buffer(name, where.flatten().nonzero()[:, 0], persistent=False)
+        for name, mask in {"input_index": inputs, "output_index": outputs}.items():
+            self.register_buffer(name, mask.flatten().nonzero()[:, 0], persistent=False)
         stages: list[nn.Module] = [nn.Linear(sizes[0], sizes[1])]
         for before, after in pairwise(sizes[1:]):
             stages += [nn.PReLU(before), nn.Linear(before, after)]
@@ -90,39 +90,40 @@ class FCNN(nn.Module):
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
 
         Args:
-            force: Over E L^2, scaled.
-            young: E, (B,) [Pa]; wanted where it is an input, ignored elsewhere.
-            poisson: Poisson's ratios, (B, 1) [-]; wanted where the law has a range of them.
+            force: Scaled nodal forces.
+            young: Young's moduli, (B,) [Pa]; required if they are an input, else ignored.
+            poisson: Poisson's ratios, (B, 1) [-]; required if the law has a range of them.
 
         Raises:
-            ValueError: It is wanted and not there.
+            ValueError: A required input is None.
         """
-        entering = force.flatten(1).index_select(1, self.entries)
+        inputs = force.flatten(1).index_select(1, self.input_index)
         if "young" in self.extra_inputs:
             if young is None:
-                raise ValueError("young is an input of this network: give E, (B,) [Pa]")
-            size = (young / self.largest).to(force.dtype)[:, None]
-            place = ((young - self.middle) / self.spread).to(force.dtype)[:, None]
-            entering = torch.cat([size * entering, place], dim=1)
+                raise ValueError(
+                    "young is an input of this network; give Young's moduli, (B,) [Pa]"
+                )
+            stiffness = (young / self.young_max).to(force.dtype)[:, None]
+            normalised = ((young - self.young_mean) / self.young_scale).to(force.dtype)[:, None]
+            inputs = torch.cat([stiffness * inputs, normalised], dim=1)
         if self.poisson_range is not None:
-            entering = torch.cat(
-                [entering, normalise_poisson(poisson, self.poisson_range, force)], dim=1
-            )
+            ratio = normalise_poisson(poisson, self.poisson_range, force)
+            inputs = torch.cat([inputs, ratio], dim=1)
         whole = torch.zeros_like(force).flatten(1)
-        return whole.index_copy(1, self.exits, self.stages(entering)).view_as(force)
+        return whole.index_copy(1, self.output_index, self.stages(inputs)).view_as(force)
 
     def skipped_work(self) -> list[str]:
-        """Return what the network leaves out, a line."""
+        """Return the work that the network saves, one line."""
         if self.parameters_saved <= 0:
             return []
         return [
             f"{self.parameters_saved:,} of {self.parameters_needed + self.parameters_saved:,} "
-            f"parameters: {int(self.inputs.sum())} inputs where loads can act, "
-            f"{int(self.outputs.sum())} outputs where the body can move"
+            f"parameters: inputs are {int(self.inputs.sum())} loadable degrees of freedom, outputs "
+            f"{int(self.outputs.sum())} free ones"
         ]
 
 
 def count_parameters(sizes: list[int]) -> int:
-    """Return weights, biases and slopes of linear layers between these sizes."""
+    """Return the number of weights, biases and slopes of layers with the given sizes."""
     linear = sum((before + 1) * after for before, after in pairwise(sizes))
     return linear + sum(sizes[1:-1])

@@ -1,4 +1,4 @@
-"""Regular grids around a body: maps from its nodes to them and back, and what they see of it."""
+"""Regular grids around a body: transfer of nodal fields, and the volume fraction of voxels."""
 
 import math
 from itertools import product
@@ -8,11 +8,11 @@ from torch import Tensor, nn
 
 from dpl.fem import Problem
 
-SAME = 1e-4  # nodes this close to a grid point, in spacings, are at it; files in float32 are
+GRID_TOL = 1e-4  # distance of a node from its grid point, in spacings; allows float32 meshes
 
 
 class Permutation(nn.Module):
-    """Nodes that are the points of a regular grid, and back; the counterpart of `Immersion`.
+    """Transfer between a regular grid and nodes that are its points; see `Immersion`.
 
     Attributes:
         shape: Grid points along each side.
@@ -22,7 +22,7 @@ class Permutation(nn.Module):
     places: Tensor
 
     def __init__(self, points: Tensor, shape: tuple[int, ...]) -> None:
-        """Number nodes (N, D) as the points of their grid."""
+        """Find the grid points of nodes (N, D)."""
         super().__init__()
         self.shape = shape
         places = _ravel(_in_spacings(points, points, shape).round().long(), shape)
@@ -42,16 +42,16 @@ class Immersion(nn.Module):
     """Multilinear interpolation from a regular grid to nodes, and its adjoint.
 
     Attributes:
-        shape: Grid points along each side of the nodes' bounding box, which the grid fills.
-        corners: Grid points of the cell that a node lies in, (N, 2^D).
-        weights: Of these, (N, 2^D) [-], float32; they sum to 1.
+        shape: Grid points along each side of the bounding box of the nodes.
+        corners: Grid points of the cell that contains a node, (N, 2^D).
+        weights: Their interpolation weights, (N, 2^D) [-], float32; they sum to 1.
     """
 
     corners: Tensor
     weights: Tensor
 
     def __init__(self, points: Tensor, shape: tuple[int, ...]) -> None:
-        """Find the cells that nodes (N, D) lie in."""
+        """Find the cells that contain nodes (N, D)."""
         super().__init__()
         self.shape = shape
         corners, weights = _stencil(_in_spacings(points, points, shape), shape)
@@ -59,7 +59,7 @@ class Immersion(nn.Module):
         self.register_buffer("weights", weights.float(), persistent=False)
 
     def spread(self, values: Tensor) -> Tensor:
-        """Return nodal values (B, N, C) shared out to the grid, (B, C, *shape): sums are kept."""
+        """Return nodal values (B, N, C) distributed to the grid, (B, C, *shape); preserves sums."""
         shares = (values[:, :, None] * self.weights[..., None]).flatten(1, 2)
         field = values.new_zeros(values.shape[0], math.prod(self.shape), values.shape[2])
         return field.index_add(1, self.corners.flatten(), shares).mT.unflatten(2, self.shape)
@@ -71,22 +71,22 @@ class Immersion(nn.Module):
 
 
 def own_grid(points: Tensor) -> tuple[int, ...] | None:
-    """Return the sides of the regular grid that nodes (N, D) are all points of, or None."""
+    """Return the shape of the regular grid that nodes (N, D) form, None if they do not."""
     shape = []
     for coordinate in points.mT:
         ordered = coordinate.sort().values
-        apart = ordered.diff() > 1e-6 * (ordered[-1] - ordered[0])
-        shape.append(int(apart.sum()) + 1)
+        distinct = ordered.diff() > 1e-6 * (ordered[-1] - ordered[0])
+        shape.append(int(distinct.sum()) + 1)
     if math.prod(shape) != len(points):
         return None
     place = _in_spacings(points, points, shape)
-    regular = (place - place.round()).abs().max() < SAME
+    regular = (place - place.round()).abs().max() < GRID_TOL
     every = len(_ravel(place.round().long(), shape).unique()) == len(points)
     return tuple(shape) if regular and every else None
 
 
 def cubic_grid(points: Tensor, grid: int | None) -> tuple[int, ...]:
-    """Return the sides of a grid of nearly cubic cells on the bounding box of nodes (N, D)."""
+    """Return the shape of a grid of nearly cubic cells on the bounding box of nodes (N, D)."""
     sides = (points.amax(0) - points.amin(0)).tolist()
 
     def shape(cells: float) -> tuple[int, ...]:
@@ -101,9 +101,10 @@ def cubic_grid(points: Tensor, grid: int | None) -> tuple[int, ...]:
 
 
 def filling(problem: Problem, shape: tuple[int, ...]) -> Tensor:
-    """Return what part of each grid point's voxel the body fills, (*shape) [-].
+    """Return the volume fraction of the body in the voxel of each grid point, (*shape) [-].
 
-    The volume of small parts of cells, spread with multilinear weights: it sums to the body's.
+    Cells are divided into small parts, whose volumes are distributed to the grid with multilinear
+    weights. The sum over voxels is the volume of the body.
     """
     points, mapping, cell = problem.points, problem.basis.mapping, problem.mesh.elem.refdom
     simplex = cell.name in ("Triangular", "Tetrahedral")
@@ -130,30 +131,30 @@ def filling(problem: Problem, shape: tuple[int, ...]) -> Tensor:
 
 
 def _lattice(count: int, dim: int, *, simplex: bool) -> tuple[Tensor, Tensor]:
-    """Return even points (P, D) of the reference cube or simplex and their weights (P,)."""
+    """Return evenly spaced points (P, D) of the reference cube or simplex and weights (P,)."""
     side = (torch.arange(count, dtype=torch.float64) + 0.5) / count
     points = torch.cartesian_prod(*[side] * dim)
     if not simplex:
         return points, side.new_ones(len(points))
-    # the cube folded onto one of its Kuhn simplices, and that one sheared onto the reference
+    # fold the cube onto one of its Kuhn simplices and shear that onto the reference simplex
     folded, copies = points.sort(dim=1).values.unique(dim=0, return_counts=True)
     return folded.diff(dim=1, prepend=folded.new_zeros(len(folded), 1)), copies.double()
 
 
 def _in_spacings(where: Tensor, points: Tensor, shape: tuple[int, ...] | list[int]) -> Tensor:
-    """Return places (P, D) in spacings of the grid on the bounding box of nodes (N, D)."""
+    """Return positions (P, D) in spacings of the grid on the bounding box of nodes (N, D)."""
     low, high = points.amin(0), points.amax(0)
     return (where - low) / (high - low) * (torch.tensor(shape) - 1)
 
 
 def _ravel(place: Tensor, shape: tuple[int, ...] | list[int]) -> Tensor:
-    """Return the numbers of grid points (..., D)."""
+    """Return the flat indices of grid points (..., D)."""
     strides = [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
     return (place * torch.tensor(strides)).sum(-1)
 
 
 def _stencil(place: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """Return the corners of the cells that places (P, D) lie in and their weights, (P, 2^D)."""
+    """Return the corners of the cells that contain positions (P, D), and weights, (P, 2^D)."""
     last = torch.tensor(shape) - 1
     low = place.floor().clamp(min=torch.zeros_like(last), max=last - 1)
     part = (place - low).clamp(0, 1)[:, None]

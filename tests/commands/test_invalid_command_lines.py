@@ -26,7 +26,7 @@ NONSENSE = {  # command line -> what the one line says
     "train clamped=null": r"^clamped = null: .* one of cylinder, plane, tag; ~clamped leaves it",
     "train clamped=3": r"^clamped = 3: .* one of cylinder, plane, tag$",
     "train +model=cnn": r"^model: an option is chosen already; write model=cnn$",
-    "train tiers=default": r"^tiers: this command has no such key",
+    "train methods=default": r"^methods: this command has no such key",
     "train model/part=cnn": r"^model/part: there is no such group",
     "train hydra/launcher=jobblib": r"^hydra/launcher = jobblib: .*pip install .*launch",
     "train hydra.swep.dir=3": r"^hydra\.swep\.dir: .*; did you mean hydra\.sweep\?$",

@@ -52,7 +52,7 @@ def test_training_ends_with_a_table_of_five_solvers(trained, home):
     status, out, err = trained
     assert status == 0, err[-2000:]
     assert out.index("plan: skipped") < out.index("24 accepted, 0 rejected")
-    assert out.index("24 accepted, 0 rejected") < out.index("4 fresh loads")
+    assert out.index("24 accepted, 0 rejected") < out.index("4 test loads")
     rows = json.loads((home / "runs/first/evaluation.json").read_text())
     assert [row["solver"] for row in rows] == ROWS
     assert all(name in out for name in ROWS)

@@ -25,7 +25,7 @@ MESHES = [
     pytest.param(name, marks=pytest.mark.slow) if name == "paper_beam" else name
     for name in options("mesh")
 ]
-WHOLE = ("experiment", "sweep", "tiers")  # groups of whole commands, not of one part
+WHOLE = ("experiment", "sweep", "methods")  # groups of whole commands, not of one part
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name not in WHOLE)
 
 

@@ -9,13 +9,13 @@ import torch
 
 from dpl.evaluation import newton_starts
 from dpl.evaluation.newton_starts import (
-    PlainNewton,
     Trial,
-    contestants,
     load_sets,
     measure,
+    solvers_of,
     summary,
 )
+from dpl.evaluation.plain_newton import PlainNewton
 from dpl.evaluation.tables import read, write
 from dpl.fem import Newton, solve
 
@@ -71,7 +71,7 @@ def test_loads_are_those_of_the_test_set_and_larger_ones(scene):
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-8])
 def test_each_solver_has_a_row(scene, loads, networks, tol):
-    solvers = contestants(scene, networks, tol)
+    solvers = solvers_of(scene, networks, tol)
     ticks = []
     trials = measure(solvers, "in range", loads, tol, lambda: ticks.append(1))
     assert len(ticks) == 4
@@ -80,20 +80,20 @@ def test_each_solver_has_a_row(scene, loads, networks, tol):
     assert [(row.solver, row.network) for row in rows] == list(solvers)
     by = {(row.solver, row.network): row for row in rows}
     reference = by[newton_starts.REFERENCE, ""]
-    assert reference.ratio == 1.0
-    assert reference.picked is None
+    assert reference.time_ratio == 1.0
+    assert reference.used_prediction_pct is None
     best, useless = by["hybrid, best rule", "near"], by["hybrid, best rule", "nan"]
-    assert (best.picked, useless.picked) == (100, 0)
+    assert (best.used_prediction_pct, useless.used_prediction_pct) == (100, 0)
     assert best.iterations < reference.iterations
-    assert best.apart < 10 * tol
+    assert best.deviation < 10 * tol
     assert all(row.converged == 100 for row in rows)
     assert all(0 < trial.ms < math.inf for trial in trials)
 
 
-def trial(solver, number, converged, ms, iterations=3, apart=0.0):
+def trial(solver, number, converged, ms, iterations=3, deviation=0.0):
     network = "" if solver == newton_starts.REFERENCE else "net"
     return Trial(
-        solver, network, "in range", 1e-6, number, converged, True, iterations, 1, ms, apart
+        solver, network, "in range", 1e-6, number, converged, True, iterations, 1, ms, deviation
     )
 
 
@@ -112,11 +112,20 @@ def test_rows_count_what_converged_and_compare_where_both_did():
     rows = {(r.loads, r.solver): r for r in summary([*trials, *twice])}
     assert len(rows) == 6
     both = rows["in range and twice", "hybrid"]
-    assert (both.count, both.converged, both.ratio, both.ms) == (8, 75, 20 / 40, 15)
+    assert (both.count, both.converged, both.time_ratio, both.ms) == (8, 75, 20 / 40, 15)
     reference, row = rows["in range", newton_starts.REFERENCE], rows["in range", "hybrid"]
-    assert (reference.converged, reference.picked, reference.ratio) == (75, None, 1)
-    assert (row.converged, row.picked, row.iterations, row.worst) == (75, 100, 3, 6)
-    assert (row.ms, row.ratio, row.apart) == (8, 20 / 40, 1e-7)
+    assert (reference.converged, reference.used_prediction_pct, reference.time_ratio) == (
+        75,
+        None,
+        1,
+    )
+    assert (row.converged, row.used_prediction_pct, row.iterations, row.max_iterations) == (
+        75,
+        100,
+        3,
+        6,
+    )
+    assert (row.ms, row.time_ratio, row.deviation) == (8, 20 / 40, 1e-7)
 
 
 def test_what_does_not_converge_has_no_iterations_and_no_time(scene, loads):
@@ -126,25 +135,25 @@ def test_what_does_not_converge_has_no_iterations_and_no_time(scene, loads):
     row, same = summary(trials)
     assert (row.loads, same.loads) == ("in range and twice", "in range")
     assert row.converged == 0
-    assert row.iterations is row.ms is row.ratio is None
+    assert row.iterations is row.ms is row.time_ratio is None
 
 
 def test_answers_rows_and_figure_are_written(scene, loads, networks, tmp_path):
-    trials = measure(contestants(scene, networks, 1e-3), "in range", loads, 1e-3)
+    trials = measure(solvers_of(scene, networks, 1e-3), "in range", loads, 1e-3)
     write(trials, tmp_path / "trials.csv")
     again = read(Trial, tmp_path / "trials.csv")
-    assert [replace(t, ms=0.0, apart=0.0) for t in again] == [
-        replace(t, ms=0.0, apart=0.0) for t in trials
+    assert [replace(t, ms=0.0, deviation=0.0) for t in again] == [
+        replace(t, ms=0.0, deviation=0.0) for t in trials
     ]
     assert [t.ms for t in again] == pytest.approx([t.ms for t in trials], rel=1e-3)
     write(newton_starts.paper() + summary(trials), tmp_path / "a.csv")
     newton_starts.draw(trials, tmp_path / "a.png")
     written = list(csv.DictReader((tmp_path / "a.csv").open()))
     assert len(written) == 2 + 2 * (4 + 2 * 4)
-    assert written[1]["picked"] == "66"
+    assert written[1]["used_prediction_pct"] == "66"
     assert written[0]["tol"] == ""
     assert (tmp_path / "a.png").stat().st_size > 10_000
-    with pytest.raises(ValueError, match=r"a\.csv has not the columns solver, network"):
+    with pytest.raises(ValueError, match=r"a\.csv must have the columns solver, network"):
         read(Trial, tmp_path / "a.csv")
 
 
@@ -170,7 +179,7 @@ def test_the_script_measures_the_runs_of_a_folder_and_goes_on(script, tiny_train
     raw.write_text("a,b\n")
     refused = script("convergence", *few, cwd=tmp_path)
     assert refused.status == 2
-    assert "has not the columns" in refused.err
+    assert "must have the columns" in refused.err
     refused = script("convergence", "run=runs/none", cwd=tmp_path)
     assert refused.status == 2
     assert "holds no runs" in refused.err

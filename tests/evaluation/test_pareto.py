@@ -40,22 +40,22 @@ def rows(solvers, batch):
 def test_every_iterate_has_a_row_and_time_goes_on(rows, solvers):
     for name in solvers:
         path = [row for row in rows if row.solver == name]
-        assert [row.iterate for row in path] == list(range(len(path)))
-        assert [row.last for row in path] == [False] * (len(path) - 1) + [True]
+        assert [row.iteration for row in path] == list(range(len(path)))
+        assert [row.is_final for row in path] == [False] * (len(path) - 1) + [True]
         assert all(a.ms <= b.ms for a, b in itertools.pairwise(path))
         assert all(row.ms <= row.ms_p99 for row in path)
 
 
 def test_errors_are_those_of_the_iterates(rows):
-    by = {(row.solver, row.iterate): row for row in rows}
+    by = {(row.solver, row.iteration): row for row in rows}
     assert by["Newton to 1e-08", 0].error == pytest.approx(1.0)
     assert by["Newton to 1e-08", 1].error == pytest.approx(by["linear", 0].error, rel=1e-6)
     assert by["near", 0].error == pytest.approx(1e-3)
-    ends = {row.solver: row for row in rows if row.last}
+    ends = {row.solver: row for row in rows if row.is_final}
     assert ends["Newton to 1e-08"].error < 1e-10
-    assert ends["near, hybrid"].worst < 1e-6
+    assert ends["near, hybrid"].max_error < 1e-6
     assert ends["near, hybrid"].residual < 1e-8
-    assert ends["near, hybrid"].iterate < ends["Newton to 1e-08"].iterate
+    assert ends["near, hybrid"].iteration < ends["Newton to 1e-08"].iteration
 
 
 def test_threads_are_set_and_given_back(solvers, batch):
@@ -65,7 +65,7 @@ def test_threads_are_set_and_given_back(solvers, batch):
     class Spy:
         def iterate(self, load):
             seen.append(torch.get_num_threads())
-            return solvers["near"].iterate(load)
+            return solvers["near"].iteration(load)
 
     (row,) = pareto.points({"spy": Spy()}, batch, threads=2)
     assert set(seen) == {2}

@@ -13,7 +13,7 @@ import torch
 
 from dpl import Sample
 from dpl.evaluation import compare, evaluate, timing
-from dpl.evaluation.report import Row, clock, save, show
+from dpl.evaluation.report import SolverResult, measure, save, show
 from dpl.fem import Load, Solution, evaluate_solution
 from dpl.models import FCNN
 from dpl.training import MSE, RelativeL2, Surrogate
@@ -45,13 +45,13 @@ def test_rows_count_what_the_solvers_did(scene, few):
     wrong[2] *= 1.01
     exact = Known(scene.problem, few, few.displacement, [3, 4, 5, 8])
     poor = Known(scene.problem, few, wrong, [0, 0, 0, 0])
-    rows, answers = clock({"exact": exact, "poor": poor}, few, scene.problem)
+    rows, answers = measure({"exact": exact, "poor": poor}, few, scene.problem)
     assert [row.solver for row in rows] == ["exact", "poor"]
     first, second = rows
     assert (first.converged, first.loads) == (4, 4)
     assert (second.converged, second.loads) == (3, 4)
-    assert (first.iterations, first.worst_iterations) == (5.0, 8)
-    assert (second.iterations, second.worst_iterations) == (0.0, 0)
+    assert (first.iterations, first.max_iterations) == (5.0, 8)
+    assert (second.iterations, second.max_iterations) == (0.0, 0)
     assert first.errors["e_max"] == 0.0
     assert second.errors["rel_L2_worst"] == pytest.approx(0.01, rel=1e-9)
     assert second.errors["rel_L2_median"] == 0.0
@@ -67,7 +67,7 @@ def test_every_solver_is_warmed_up_then_asked_each_load_in_turn(scene, few):
             return super().iterate(load)
 
     a, b = (Spy(scene.problem, few, few.displacement, [1] * 4) for _ in range(2))
-    clock({"a": a, "b": b}, few, scene.problem)
+    measure({"a": a, "b": b}, few, scene.problem)
     assert a.asked == b.asked == [0, 0, 1, 2, 3]
     assert order == [a, b] + [a, b] * 4
 
@@ -83,26 +83,26 @@ def test_the_clock_measures_the_solver(scene, few, monkeypatch):
 
     slow = Slow(scene.problem, few, few.displacement, [1] * 4)
     fast = Known(scene.problem, few, few.displacement, [1] * 4)
-    (first, second), _ = clock({"slow": slow, "fast": fast}, few, scene.problem)
-    assert first.milliseconds == pytest.approx(11.5)
-    assert first.slowest == pytest.approx(12.97)
-    assert second.milliseconds == second.slowest == 0.0
+    (first, second), _ = measure({"slow": slow, "fast": fast}, few, scene.problem)
+    assert first.ms == pytest.approx(11.5)
+    assert first.ms_p99 == pytest.approx(12.97)
+    assert second.ms == second.ms_p99 == 0.0
 
 
 def test_a_solver_that_fails_is_a_row_and_no_crash(scene, few):
     broken = Known(scene.problem, few, torch.full_like(few.displacement, torch.nan), [9] * 4)
-    (row,), _ = clock({"broken": broken}, few, scene.problem)
+    (row,), _ = measure({"broken": broken}, few, scene.problem)
     assert row.converged == 0
     assert row.errors["residual"] == np.inf
     show([row], "broken")
 
 
 def test_rows_come_back_from_json(scene, few, tmp_path):
-    rows, _ = clock(
+    rows, _ = measure(
         {"exact": Known(scene.problem, few, few.displacement, [1] * 4)}, few, scene.problem
     )
     save(rows, tmp_path / "rows.json")
-    assert [Row(**row) for row in json.loads((tmp_path / "rows.json").read_text())] == rows
+    assert [SolverResult(**row) for row in json.loads((tmp_path / "rows.json").read_text())] == rows
 
 
 def test_runs_that_differ_in_their_seed_are_one_group(evaluated, tmp_path, capsys, monkeypatch):
@@ -192,7 +192,7 @@ def test_the_table_prints_every_row(surrogate, few, tmp_path, capsys, monkeypatc
     monkeypatch.setenv("COLUMNS", "200")
     evaluate(surrogate, few, tmp_path)
     out = capsys.readouterr().out
-    assert "4 fresh loads, one at a time, 1 thread, tol 1e-08" in out
+    assert "4 test loads, one at a time, 1 thread, tol 1e-08" in out
     assert "latency, 1 thread, 4 loads: sim(force) p50 " in out
     for words in ("linear", "network", "hybrid Newton", "Newton from zero", "4/4", "p99"):
         assert words in out

@@ -196,8 +196,8 @@ def test_another_grid_can_be_asked_for(scene):
 
 def test_the_plan_says_what_is_left_out(scene):
     assert network(scene).skipped_work() == [
-        "no interpolation: the nodes are the points of a grid, 5 x 3 x 3",
-        "no input for what lies inside the body: all of the grid does",
+        "no interpolation: the nodes form a grid of 5 x 3 x 3 points",
+        "no input for the volume fraction: the body fills the grid",
     ]
 
 

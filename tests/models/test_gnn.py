@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from dpl.fem import NeoHookeanLn, Problem, box, rectangle
-from dpl.models import GNN, gnn
-from dpl.models.gnn import Filtered
+from dpl.models import GNN, message_passing
 from dpl.models.graph import COARSEST, coarser, mesh_graph
+from dpl.models.message_passing import NeighbourSum
 from dpl.training import MSE, Surrogate
 
 BODIES = {
@@ -147,7 +147,7 @@ def test_levels_end_with_few_clusters_that_all_hear_each_other(bar):
     assert net.sizes[0] == len(bar.problem.points)
     assert net.sizes[-1] == COARSEST
     assert net.sizes == sorted(net.sizes, reverse=True)
-    assert net.levels[-1].whole
+    assert net.levels[-1].complete
     assert build(bar, levels=4).sizes[3] == COARSEST
     assert len(build(bar, levels=1).sizes) == 1
 
@@ -189,7 +189,7 @@ def test_each_part_of_a_body_has_a_cluster():
     two = Problem.build(cube + cube.translated((9.0, 0.0, 0.0)), NeoHookeanLn(0.3))
     coarse, cluster = coarser(mesh_graph(two), 1)
     assert np.bincount(cluster).tolist() == [64, 64]
-    assert coarse.whole
+    assert coarse.complete
 
 
 def test_it_can_be_exported_for_batches_of_any_size(bar):
@@ -209,9 +209,9 @@ def test_blocks_of_messages_have_the_right_slopes(bar, monkeypatch):
     probe = torch.randn_like(state)
     plain = torch.zeros_like(state).index_add(0, pairs[0], state[pairs[1]] * weight[:, None])
     expected = torch.autograd.grad((plain * probe).sum(), (state, weight))
-    for cache in (1, 1000, gnn.CACHE):
-        monkeypatch.setattr(gnn, "CACHE", cache)
-        heard = Filtered.apply(state, weight, *pairs)
+    for cache in (1, 1000, message_passing.CACHE):
+        monkeypatch.setattr(message_passing, "CACHE", cache)
+        heard = NeighbourSum.apply(state, weight, *pairs)
         assert torch.allclose(heard, plain)
         for slope, right in zip(
             torch.autograd.grad((heard * probe).sum(), (state, weight)), expected, strict=True
@@ -223,13 +223,13 @@ def test_blocks_of_messages_have_the_right_slopes(bar, monkeypatch):
 
 
 def test_the_plan_says_what_is_left_out(make_scene, bar):
-    assert build(bar).skipped_work()[1].startswith("no long ways over 272 nodes: clusters, ")
+    assert build(bar).skipped_work()[1].startswith("multigrid hierarchy: 272 nodes, ")
     assert (
         build(bar, levels=1).skipped_work()[1]
-        == "no clusters: 272 nodes hear their neighbours only"
+        == "no clusters: 272 nodes with messages to neighbours only"
     )
     few = make_scene(**BODIES["few nodes"])
-    assert build(few).skipped_work()[1] == "no clusters: 16 nodes all hear each other"
+    assert build(few).skipped_work()[1] == "no clusters: complete graph of 16 nodes"
 
 
 @pytest.mark.parametrize("options", [{"width": 0}, {"levels": 0}, {"passes": 0}])

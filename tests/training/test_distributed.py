@@ -98,7 +98,7 @@ def test_two_processes_end_with_equal_weights_and_one_evaluation(trained, tmp_pa
     for k in range(3):
         one, other = set(seen[8 * k : 8 * k + 8]), set(rest[8 * k : 8 * k + 8])
         assert len(one | other) == 16
-    assert out.count("fresh loads") == 1
+    assert out.count("test loads") == 1
     assert out.count("plan: skipped") == 1
     rows = json.loads((tmp_path / "r/evaluation.json").read_text())
     assert next(row for row in rows if row["solver"] == "hybrid Newton")["converged"] == 4

@@ -1,0 +1,70 @@
+"""The textbook Newton method, as a reference."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dpl.fem import Load, Newton, Problem, SingularMatrix, Solution, evaluate_solution
+from dpl.fem.solvers import run_lockstep
+
+
+@dataclass(frozen=True, eq=False)
+class PlainNewton:
+    """Newton with full steps, without safeguards against inverted elements.
+
+    Source: Odot, Haferssas, Cotin (2022), DeepPhysics, algorithm 1.
+
+    Attributes:
+        solver: Newton solver that provides problem, linear solver and tolerance.
+        max_iter: Maximum number of iterations.
+    """
+
+    solver: Newton
+    max_iter: int = 20
+
+    def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
+        """Yield the initial state and the state after each iteration of all loads.
+
+        Args:
+            load: The loads.
+            guess: Initial displacements, (B, N, D) [-]; zero if None.
+        """
+        guesses = torch.zeros_like(load.force) if guess is None else guess
+        yield from run_lockstep(
+            [
+                self._member(single, u[None], guess is not None)
+                for single, u in zip(load.unbatch(), guesses, strict=True)
+            ]
+        )
+
+    @property
+    def problem(self) -> Problem:
+        """The problem of the solver."""
+        return self.solver.problem
+
+    @property
+    def tol(self) -> float:
+        """Relative residual below which a state has converged [-]."""
+        return self.solver.tol
+
+    def _member(self, load: Load, u: Tensor, guessed: bool) -> Iterator[Solution]:
+        problem, start = self.solver.problem, time.perf_counter()
+        backend = self.solver.linear_solver.tangent_backend
+        for k in range(self.max_iter + 1):
+            state = evaluate_solution(problem, u, load, self.tol, iterations=k, from_guess=guessed)
+            yield state._replace(
+                factorisations=torch.tensor([k]),
+                seconds=torch.tensor([time.perf_counter() - start], dtype=torch.float64),
+            )
+            if state.converged or k == self.max_iter:
+                return
+            system = problem.linearise(u)
+            right = problem.restrict((load.force - system.force)[0])
+            try:
+                factor = backend.factorise(system.tangent[0].numpy())
+                u = u + problem.extend(factor.solve(right, 1e-10))[None]
+            except SingularMatrix:
+                return
