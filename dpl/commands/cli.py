@@ -163,7 +163,7 @@ def check_trainer(trainer: Any, cfg: DictConfig) -> None:
             "trainer.max_epochs = -1: the schedule of the learning rate needs an end; give it "
             "one, or trainer.max_steps, or set scheduler=null"
         )
-    if not any(checkpoints.keeps(kept, trainer, cfg.folder) for kept in trainer.callbacks):
+    if not any(checkpoints.writes_loadable(one, trainer, cfg.folder) for one in trainer.callbacks):
         raise ConfigError(
             "trainer.callbacks keep no weights that the run can be loaded from; add "
             "{_target_: lightning.pytorch.callbacks.ModelCheckpoint, "

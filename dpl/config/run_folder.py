@@ -196,7 +196,7 @@ def load_run(
     from dpl.training import checkpoints  # which imports Lightning
 
     config = Path(folder) / "config.yaml"
-    kept = [Path(folder) / "checkpoints" / name for name in checkpoints.KEPT]
+    kept = [Path(folder) / "checkpoints" / name for name in checkpoints.LOADABLE]
     best = next((path for path in kept if path.exists()), kept[-1])
     for path in (config, best):
         if not path.is_file():

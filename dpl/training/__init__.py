@@ -1,4 +1,4 @@
-"""The LightningModule, its losses, metrics, optimisers and callbacks."""
+"""The LightningModule with its losses, metrics, optimisers and callbacks."""
 
 from typing import TYPE_CHECKING
 

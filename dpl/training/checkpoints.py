@@ -1,10 +1,10 @@
-"""Checkpoints: files that are whole or not there, and are read without running code.
+"""Checkpoints: files that are written atomically and read without executing code.
 
-    RUN/checkpoints/best.safetensors   the weights of the smallest validation error, and whose
-    RUN/checkpoints/last.ckpt          all that resuming to the bit takes: optimiser, random numbers
+    RUN/checkpoints/best.safetensors   weights with the smallest validation error, and their scene
+    RUN/checkpoints/last.ckpt          complete state, which resumes a training bit for bit
 
-The first is what is handed on: tensors behind a header of JSON. The second is a pickle inside, of
-which torch reads tensors and plain data only (`weights_only`).
+The first is a safetensors file with a JSON header. The second is a pickle, from which torch reads
+tensors and plain data only (`weights_only`).
 """
 
 import json
@@ -24,18 +24,18 @@ from safetensors.torch import save
 from dpl.system.files import atomic_write
 
 WEIGHTS = ".safetensors"
-# what stands beside the weights, as JSON
+# keys of a checkpoint that are stored in the JSON header
 HEADER = ("scene", "identity", "nodes", "epoch", "global_step")
-# "best.ckpt" is of runs before weights had files of their own; a short run has only its last
-KEPT = (f"best{WEIGHTS}", "best.ckpt", "last.ckpt")  # files of weights that a run is loaded from
-RESUMED = {"loops", "callbacks", "optimizer_states", "lr_schedulers"}  # parts that resuming needs
-MOST = 8e9  # bytes of a file that is read
+# files from which a run is loaded, by priority; a short run has only its last checkpoint
+LOADABLE = (f"best{WEIGHTS}", "best.ckpt", "last.ckpt")
+RESUME_KEYS = {"loops", "callbacks", "optimizer_states", "lr_schedulers"}
+MAX_BYTES = 8e9
 
 
 def write(checkpoint: dict[str, Any], path: Path) -> None:
-    """Write a checkpoint: of a `.safetensors` file its weights and `HEADER`, else all of it.
+    """Write a checkpoint atomically; a `.safetensors` file contains only weights and `HEADER`.
 
-    What a killed process was writing in its place is removed.
+    Removes the partial file of a process that was killed while writing the same checkpoint.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     for part in path.parent.glob(f".{path.name}.*.part"):
@@ -50,47 +50,48 @@ def write(checkpoint: dict[str, Any], path: Path) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Return what `write` wrote, tensors on the CPU; nothing in the file is called.
+    """Return a checkpoint written by `write`, tensors on the CPU, without executing code in it.
 
     Raises:
-        ValueError: It is damaged, of another kind, or larger inside than outside.
-        OSError: It cannot be opened.
+        ValueError: The file is damaged, no checkpoint, or compressed.
+        OSError: The file cannot be opened.
     """
-    if path.stat().st_size > MOST:
-        raise ValueError(f"has {path.stat().st_size / 1e9:.3g} GB, of {MOST / 1e9:g} at most")
+    if path.stat().st_size > MAX_BYTES:
+        size = path.stat().st_size / 1e9
+        raise ValueError(f"has {size:.3g} GB; the maximum is {MAX_BYTES / 1e9:g} GB")
     try:
         if path.suffix == WEIGHTS:
             return _weights(path)
-        with zipfile.ZipFile(path) as archive:  # torch packs without compressing
-            inside = sum(member.file_size for member in archive.infolist())
-        if inside > path.stat().st_size:
-            raise ValueError(f"unpacks to {inside / 1e9:.3g} GB, which no checkpoint does")
+        with zipfile.ZipFile(path) as archive:  # torch does not compress
+            unpacked = sum(member.file_size for member in archive.infolist())
+        if unpacked > path.stat().st_size:
+            raise ValueError(f"unpacks to {unpacked / 1e9:.3g} GB; a checkpoint is not compressed")
         found = torch.load(path, map_location="cpu", weights_only=True)
-    except UnpicklingError as error:  # torch advises to read it all the same
-        raise ValueError("holds more than tensors and plain data, and is not read") from error
+    except UnpicklingError as error:  # torch's message advises weights_only=False
+        raise ValueError("contains objects other than tensors and plain data") from error
     except OSError:
         raise
-    except Exception as error:  # torch raises errors of any kind at a damaged pickle
+    except Exception as error:  # torch raises any kind of error for a damaged pickle
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"is damaged or no checkpoint: {reason}") from error
+        raise ValueError(f"is damaged or not a checkpoint: {reason}") from error
     if not isinstance(found, dict) or not isinstance(found.get("state_dict"), dict):
-        raise ValueError("is no checkpoint: it holds no weights")
+        raise ValueError("is not a checkpoint: it contains no weights")
     return found
 
 
 def epochs(checkpoint: Mapping[str, Any]) -> int:
-    """Return how many epochs a checkpoint was written after.
+    """Return the number of epochs before a checkpoint was written.
 
     Raises:
-        ValueError: It holds less than resuming takes.
+        ValueError: The checkpoint lacks data for resuming.
     """
-    if missing := RESUMED - checkpoint.keys():
+    if missing := RESUME_KEYS - checkpoint.keys():
         raise ValueError(
-            f"holds no {', '.join(sorted(missing))}, which resuming takes; resume from last.ckpt"
+            f"cannot be resumed: it contains no {', '.join(sorted(missing))}; resume from last.ckpt"
         )
     epoch = checkpoint.get("epoch")
     if not isinstance(epoch, int):
-        raise ValueError(f"says epoch = {epoch!r}, which must be a whole number")
+        raise ValueError(f"has epoch = {epoch!r}, which must be an integer")
     return epoch + 1
 
 
@@ -98,16 +99,16 @@ def _weights(path: Path) -> dict[str, Any]:
     with safe_open(path, framework="pt") as file:
         header = json.loads((file.metadata() or {}).get("dpl", "null"))
         if not isinstance(header, dict):
-            raise ValueError("is no checkpoint: its header names no scene")
+            raise ValueError("is not a checkpoint: its header contains no scene")
         state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     return {**{name: header[name] for name in HEADER if name in header}, "state_dict": state}
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Lightning's way to `write` and `read`.
+    """Lightning plugin that calls `write` and `read`.
 
-    Its own goes through the default temporary folder; where that is another file system, a kill
-    while writing leaves half a file under the final name.
+    Lightning writes to the default temporary folder first. If that is on another file system, a
+    process that is killed while writing leaves a partial file under the final name.
     """
 
     def save_checkpoint(
@@ -119,10 +120,10 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def load_checkpoint(
         self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Return a checkpoint, on the CPU.
+        """Return a checkpoint on the CPU.
 
         Raises:
-            ValueError: It cannot be used; the message names it.
+            ValueError: The file cannot be used; the message contains its path.
         """
         try:
             return read(Path(path))
@@ -130,26 +131,26 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             raise ValueError(f"{path} {error}") from error
 
 
-def keeps(callback: Any, trainer: L.Trainer, folder: str | Path) -> bool:
-    """Return whether a callback writes weights from which a run can be loaded.
+def writes_loadable(callback: Any, trainer: L.Trainer, folder: str | Path) -> bool:
+    """Return True if a callback writes a checkpoint from which a run can be loaded.
 
     Args:
-        callback: Of the trainer.
-        trainer: The trainer, before it begins.
-        folder: The run's.
+        callback: A callback of the trainer.
+        trainer: The trainer, before the training.
+        folder: Folder of the run.
     """
     if not isinstance(callback, ModelCheckpoint) or callback.save_top_k == 0:
         return False
     if callback.monitor is not None and not _validates(trainer):
         return False
-    place = Path(folder).resolve() / "checkpoints"
-    there = callback.dirpath is not None and Path(callback.dirpath).resolve() == place
-    named = f"{callback.filename}{callback.FILE_EXTENSION}" in KEPT or callback.save_last
-    return bool(there and named and not getattr(trainer, "fast_dev_run", False))
+    target = Path(folder).resolve() / "checkpoints"
+    in_target = callback.dirpath is not None and Path(callback.dirpath).resolve() == target
+    named = f"{callback.filename}{callback.FILE_EXTENSION}" in LOADABLE or callback.save_last
+    return bool(in_target and named and not getattr(trainer, "fast_dev_run", False))
 
 
 def _validates(trainer: L.Trainer) -> bool:
-    """Return whether there is a validation before a training ends."""
+    """Return True if the training has at least one validation."""
     every, most = trainer.check_val_every_n_epoch, trainer.max_epochs
     return trainer.limit_val_batches != 0 and (
         every is None or most is None or most == -1 or every <= most
@@ -157,18 +158,18 @@ def _validates(trainer: L.Trainer) -> bool:
 
 
 class BestWeights(ModelCheckpoint):
-    """The weights of the smallest validation error, as a file of tensors.
+    """Writes the weights with the smallest validation error as a safetensors file.
 
-    An error that is infinite or not a number is never the smallest.
+    Infinite and NaN errors are ignored.
     """
 
     FILE_EXTENSION = WEIGHTS
 
     def __init__(self, **options: Any) -> None:
-        """Choose as for Lightning's `ModelCheckpoint`."""
+        """Take the options of Lightning's `ModelCheckpoint`."""
         super().__init__(save_weights_only=True, **options)
 
     def check_monitor_top_k(self, trainer: L.Trainer, current: torch.Tensor | None = None) -> bool:
-        """Return whether an error is finite and smaller than those before."""
+        """Return True if an error is finite and smaller than the previous ones."""
         finite = current is None or bool(current.isfinite())
         return finite and super().check_monitor_top_k(trainer, current)

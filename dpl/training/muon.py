@@ -1,4 +1,4 @@
-"""Muon for matrices with Adam for all else, as one optimiser."""
+"""Muon for matrices and Adam for all other parameters, as one optimiser."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -7,14 +7,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-# Jordan et al. (2024): a quintic whose repetition brings all singular values near 1
-QUINTIC, TIMES = (3.4445, -4.7750, 2.0315), 5
+# Jordan et al. (2024): iterating this quintic polynomial moves all singular values close to 1
+QUINTIC, ITERATIONS = (3.4445, -4.7750, 2.0315), 5
 
 
 def orthogonal(matrix: Tensor) -> Tensor:
-    """Return about the nearest matrix with orthonormal rows or columns, in the same dtype.
+    """Return an approximation of the nearest matrix with orthonormal rows or columns.
 
-    Singular values that were not tiny lie between 0.7 and 1.2; so much is enough for steps.
+    Singular values that were not tiny lie between 0.7 and 1.2, which is sufficient for optimiser
+    steps. The dtype is that of the argument.
 
     Source: Jordan et al. (2024), Muon: an optimizer for hidden layers in neural networks.
     """
@@ -22,31 +23,31 @@ def orthogonal(matrix: Tensor) -> Tensor:
     tall = matrix.size(0) > matrix.size(1)
     x = matrix.T if tall else matrix
     x = x / x.norm().clamp(min=1e-7)
-    for _ in range(TIMES):
+    for _ in range(ITERATIONS):
         gram = x @ x.T
         x = torch.addmm(x, torch.addmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
     return x.T if tall else x
 
 
 class Orthogonal(torch.optim.Optimizer):
-    """Orthogonalised momentum, the Muon of matrices alone.
+    """Muon, orthogonalised momentum, for matrices only.
 
-    What `torch.optim.Muon` does, except that it multiplies in bfloat16 everywhere, which processors
-    without it emulate, far slower than float32; here only GPUs do.
+    Differs from `torch.optim.Muon` in the precision of matrix products: bfloat16 on GPUs only,
+    since CPUs without bfloat16 emulate it far slower than float32.
 
-    Source: Jordan et al. (2024); scale of the steps after Liu et al. (2025), Muon is scalable for
-    LLM training, section 2.2.
+    Source: Jordan et al. (2024); step size of Liu et al. (2025), Muon is scalable for LLM training,
+    section 2.2.
     """
 
     def __init__(
         self, params: Iterable[nn.Parameter], *, lr: float, momentum: float, weight_decay: float
     ) -> None:
-        """Take matrices, their learning rate, momentum and decoupled decay."""
+        """Take matrices, learning rate, momentum and decoupled weight decay."""
         super().__init__(params, {"lr": lr, "momentum": momentum, "weight_decay": weight_decay})
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """Move every matrix that has a gradient; return what the closure returns."""
+        """Update every matrix with a gradient; return the result of the closure."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -54,10 +55,10 @@ class Orthogonal(torch.optim.Optimizer):
         for group in self.param_groups:
             for matrix in group["params"]:
                 if matrix.grad is not None:
-                    self._move(matrix, **group)
+                    self._update(matrix, **group)
         return loss
 
-    def _move(
+    def _update(
         self, matrix: Tensor, lr: float, momentum: float, weight_decay: float, **_: Any
     ) -> None:
         state, gradient = self.state[matrix], matrix.grad
@@ -72,14 +73,13 @@ class Orthogonal(torch.optim.Optimizer):
 
 
 class Muon(torch.optim.Optimizer):
-    """Orthogonalised momentum for weight matrices, Adam for biases, slopes and convolutions.
+    """Muon for weight matrices, Adam for biases, slopes and convolutions.
 
-    Both take the same learning rate: the steps of Muon are scaled to the root mean square of
-    Adam's. Where an accurate fit of a smooth function is wanted, it needs a fraction of the steps
-    that Adam needs.
+    Both have the same learning rate: the steps of Muon are scaled to the root mean square of Adam's
+    steps. An accurate fit of a smooth function takes fewer steps than with Adam.
 
-    Source: Jordan et al. (2024), Muon: an optimizer for hidden layers in neural networks; scale of
-    the steps after Liu et al. (2025), Muon is scalable for LLM training, section 2.2.
+    Source: Jordan et al. (2024), Muon: an optimizer for hidden layers in neural networks; step size
+    of Liu et al. (2025), Muon is scalable for LLM training, section 2.2.
     """
 
     def __init__(
@@ -91,14 +91,14 @@ class Muon(torch.optim.Optimizer):
         betas: tuple[float, float] = (0.9, 0.99),
         weight_decay: float = 0.0,
     ) -> None:
-        """Share the parameters out.
+        """Assign the parameters to the two optimisers.
 
         Args:
-            params: All of them.
+            params: All parameters.
             lr: Learning rate.
-            momentum: Of Muon.
-            betas: Of Adam.
-            weight_decay: Decoupled, of both.
+            momentum: Momentum of Muon.
+            betas: Averaging coefficients of Adam.
+            weight_decay: Decoupled weight decay of both.
 
         Raises:
             ValueError: A number is out of range.
@@ -116,11 +116,11 @@ class Muon(torch.optim.Optimizer):
         if others:
             adam = torch.optim.AdamW(others, lr=lr, betas=betas, weight_decay=weight_decay)
             self.parts.append(adam)
-        # the very dictionaries of the parts: a schedule that sets a rate here sets it there
+        # share the dictionaries of the parts, so that schedules change their learning rates
         super().__init__([group for part in self.parts for group in part.param_groups], {"lr": lr})
 
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """Take a step of each part; return what the closure returns."""
+        """Step both optimisers; return the result of the closure."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -130,11 +130,11 @@ class Muon(torch.optim.Optimizer):
         return loss
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the states of the parts, one after the other."""
+        """Return the states of both optimisers."""
         return {"parts": [part.state_dict() for part in self.parts]}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take up the states of the parts."""
+        """Restore the states of both optimisers."""
         for part, state in zip(self.parts, state_dict["parts"], strict=True):
             part.load_state_dict(state)
         self.param_groups = [group for part in self.parts for group in part.param_groups]

@@ -8,8 +8,8 @@ import torch
 
 
 def random_states() -> dict[str, Any]:
-    """Return the states of all random number generators of this process, as plain data."""
-    kind, keys, *rest = np.random.get_state()  # noqa: NPY002 - the global one, of others' code
+    """Return the states of all random number generators of this process as tensors and numbers."""
+    kind, keys, *rest = np.random.get_state()  # noqa: NPY002 - the global generator, which other packages use
     return {
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
@@ -19,7 +19,7 @@ def random_states() -> dict[str, Any]:
 
 
 def set_random_states(states: dict[str, Any]) -> None:
-    """Put random number generators where `random_states` found them."""
+    """Restore the states returned by `random_states`."""
     kind, keys, *rest = states["numpy"]
     torch.set_rng_state(states["torch"].cpu())
     if states["cuda"] and torch.cuda.device_count() == len(states["cuda"]):

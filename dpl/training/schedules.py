@@ -1,4 +1,4 @@
-"""Schedules of the learning rate."""
+"""Learning-rate schedules."""
 
 import math
 
@@ -8,12 +8,12 @@ import torch
 def warmup_cosine(
     optimizer: torch.optim.Optimizer, *, total_steps: int, warmup: float = 0.05
 ) -> torch.optim.lr_scheduler.LambdaLR:
-    """Return a schedule that rises linearly over a part of the steps and falls to zero as a cosine.
+    """Return a schedule with a linear warm-up and a cosine decay to zero.
 
     Args:
-        optimizer: Whose learning rate is the largest one.
-        total_steps: After which it is zero.
-        warmup: Part of them in which it rises.
+        optimizer: The optimiser; its learning rate is the maximum of the schedule.
+        total_steps: Number of steps after which the learning rate is zero.
+        warmup: Fraction of the steps in which the learning rate rises.
 
     Raises:
         ValueError: `warmup` lies outside [0, 1).
