@@ -171,7 +171,7 @@ def test_only_loads_of_which_the_basis_misses_too_much_are_solved_for(scene, bat
     original = Latent.solve_linear
     monkeypatch.setattr(
         Latent,
-        "respond",
+        "solve_linear",
         lambda net, acting, *how: asked.append(len(acting)) or original(net, acting, *how),
     )
     module = prepared(scene, batch, rank=20, linear_tol=torch.inf)
@@ -325,7 +325,7 @@ def trained(script, overrides, home):
     if not (home / "whole").exists():
         ended = script("train", *overrides("whole"), cwd=home)
         assert ended.status == 0, ended.err
-        assert "squared errors are those of coordinates" in ended.out
+        assert "the loss is computed in coordinates" in ended.out
     return home / "whole"
 
 
@@ -448,7 +448,7 @@ def test_the_plan_of_a_stream_promises_coordinates_from_disk_only(script, overri
     more = ["data=online", "data.batches=1", "data.fresh=4", "trainer.max_epochs=1"]
     ended = script("train", *kept, *more, cwd=home)
     assert ended.status == 0
-    assert "no fields in training" not in ended.out
+    assert "no fields in training:" not in ended.out
 
 
 @pytest.mark.parametrize(

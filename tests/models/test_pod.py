@@ -221,9 +221,9 @@ def test_more_samples_than_snapshots_are_thinned_out(kind, scene, batch, monkeyp
     """Every third of twelve makes the basis that these four make."""
     monkeypatch.setattr("dpl.models.invariant_basis.MAX_SNAPSHOTS", 8 * 4)
     seen = []
-    original = PODNet._image
     monkeypatch.setattr(
-        PODNet, "_image", lambda net, c, *more: seen.append(len(c)) or original(net, c, *more)
+        "dpl.models.invariant_basis.image_columns",
+        lambda columns, *more: seen.append(len(columns)) or image_columns(columns, *more),
     )
     net = prepared(kind, scene, batch, rank=20).net
     assert 0 < seen[0] <= 4
