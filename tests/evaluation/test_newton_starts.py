@@ -32,7 +32,7 @@ def networks(scene):
     return {"near": near, "nan": lambda load: torch.full_like(load.force, torch.nan)}
 
 
-def test_plain_newton_takes_whole_steps_until_it_balances(scene, loads):
+def test_plain_newton_takes_full_steps_until_it_converges(scene, loads):
     load = loads.unbatch()[0]
     states = list(PlainNewton(scene.solver).iterate(load))
     assert states[-1].converged
@@ -42,7 +42,7 @@ def test_plain_newton_takes_whole_steps_until_it_balances(scene, loads):
     assert torch.allclose(states[-1].displacement, exact, atol=1e-8)
 
 
-def test_plain_newton_may_fail_and_says_so(scene, loads):
+def test_plain_newton_reports_divergence(scene, loads):
     load = loads.unbatch()[0]
     hard = load._replace(force=200 * load.force)
     end = solve(PlainNewton(scene.solver), hard)
@@ -70,7 +70,7 @@ def test_loads_are_those_of_the_test_set_and_larger_ones(scene):
 
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-8])
-def test_each_solver_has_a_row(scene, loads, networks, tol):
+def test_each_solver_has_a_summary(scene, loads, networks, tol):
     solvers = solvers_of(scene, networks, tol)
     ticks = []
     trials = measure(solvers, "in range", loads, tol, lambda: ticks.append(1))
@@ -97,7 +97,7 @@ def trial(solver, number, converged, ms, iterations=3, deviation=0.0):
     )
 
 
-def test_rows_count_what_converged_and_compare_where_both_did():
+def test_summaries_count_converged_loads_and_compare_where_both_converged():
     """Of four loads, robust Newton answers three, the hybrid three, both of them two."""
     trials = [
         trial(newton_starts.REFERENCE, k, converged, ms)
@@ -128,7 +128,7 @@ def test_rows_count_what_converged_and_compare_where_both_did():
     assert (row.ms, row.time_ratio, row.deviation) == (8, 20 / 40, 1e-7)
 
 
-def test_what_does_not_converge_has_no_iterations_and_no_time(scene, loads):
+def test_a_solver_that_never_converges_has_no_iterations_and_no_time(scene, loads):
     hard = loads._replace(force=1e5 * loads.force)
     solver = Newton(scene.problem, min_load_step=0.9, max_iter=2)
     trials = measure({(newton_starts.REFERENCE, ""): solver}, "in range", hard, 1e-8)
@@ -138,7 +138,7 @@ def test_what_does_not_converge_has_no_iterations_and_no_time(scene, loads):
     assert row.iterations is row.ms is row.time_ratio is None
 
 
-def test_answers_rows_and_figure_are_written(scene, loads, networks, tmp_path):
+def test_trials_summaries_and_figure_are_written(scene, loads, networks, tmp_path):
     trials = measure(solvers_of(scene, networks, 1e-3), "in range", loads, 1e-3)
     write(trials, tmp_path / "trials.csv")
     again = read(Trial, tmp_path / "trials.csv")
@@ -157,7 +157,7 @@ def test_answers_rows_and_figure_are_written(scene, loads, networks, tmp_path):
         read(Trial, tmp_path / "a.csv")
 
 
-def test_the_script_measures_the_runs_of_a_folder_and_goes_on(script, tiny_training, tmp_path):
+def test_the_script_measures_the_runs_of_a_folder_and_resumes(script, tiny_training, tmp_path):
     ended = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/e/a", cwd=tmp_path)
     assert ended.status == 0, ended.err[-2000:]
     few = ["run=runs/e", "tols=[1e-3,1e-6,1e-8]", "count=2", "far=1"]

@@ -1,4 +1,4 @@
-"""Laws of run time against error: every iterate is clocked, and judged."""
+"""Run time against error: every iterate has a time and an error."""
 
 import csv
 import itertools
@@ -37,7 +37,7 @@ def rows(solvers, batch):
     return pareto.points(solvers, batch)
 
 
-def test_every_iterate_has_a_row_and_time_goes_on(rows, solvers):
+def test_every_iterate_has_a_row_with_increasing_times(rows, solvers):
     for name in solvers:
         path = [row for row in rows if row.solver == name]
         assert [row.iteration for row in path] == list(range(len(path)))
@@ -58,14 +58,14 @@ def test_errors_are_those_of_the_iterates(rows):
     assert ends["near, hybrid"].iteration < ends["Newton to 1e-08"].iteration
 
 
-def test_threads_are_set_and_given_back(solvers, batch):
+def test_the_number_of_threads_is_set_and_restored(solvers, batch):
     before = torch.get_num_threads()
     seen = []
 
     class Spy:
         def iterate(self, load):
             seen.append(torch.get_num_threads())
-            return solvers["near"].iteration(load)
+            return solvers["near"].iterate(load)
 
     (row,) = pareto.points({"spy": Spy()}, batch, threads=2)
     assert set(seen) == {2}

@@ -40,7 +40,7 @@ class Known:
         yield evaluate_solution(self.problem, answer, load, 1e-8, iterations=self.counts[k])
 
 
-def test_rows_count_what_the_solvers_did(scene, few):
+def test_rows_contain_iterations_and_converged_loads(scene, few):
     wrong = few.displacement.clone()
     wrong[2] *= 1.01
     exact = Known(scene.problem, few, few.displacement, [3, 4, 5, 8])
@@ -58,7 +58,7 @@ def test_rows_count_what_the_solvers_did(scene, few):
     assert torch.equal(answers["poor"], wrong)
 
 
-def test_every_solver_is_warmed_up_then_asked_each_load_in_turn(scene, few):
+def test_every_solver_is_warmed_up_and_then_timed_alternately(scene, few):
     order = []
 
     class Spy(Known):
@@ -89,7 +89,7 @@ def test_the_clock_measures_the_solver(scene, few, monkeypatch):
     assert second.ms == second.ms_p99 == 0.0
 
 
-def test_a_solver_that_fails_is_a_row_and_no_crash(scene, few):
+def test_a_solver_that_does_not_converge_has_a_row(scene, few):
     broken = Known(scene.problem, few, torch.full_like(few.displacement, torch.nan), [9] * 4)
     (row,), _ = measure({"broken": broken}, few, scene.problem)
     assert row.converged == 0
@@ -97,7 +97,7 @@ def test_a_solver_that_fails_is_a_row_and_no_crash(scene, few):
     show([row], "broken")
 
 
-def test_rows_come_back_from_json(scene, few, tmp_path):
+def test_saved_rows_can_be_read(scene, few, tmp_path):
     rows, _ = measure(
         {"exact": Known(scene.problem, few, few.displacement, [1] * 4)}, few, scene.problem
     )
@@ -105,7 +105,7 @@ def test_rows_come_back_from_json(scene, few, tmp_path):
     assert [SolverResult(**row) for row in json.loads((tmp_path / "rows.json").read_text())] == rows
 
 
-def test_runs_that_differ_in_their_seed_are_one_group(evaluated, tmp_path, capsys, monkeypatch):
+def test_runs_that_differ_in_the_seed_form_a_group(evaluated, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     rows, _ = evaluated
     for k, name in enumerate(("loss=mse,seed=0", "loss=mse,seed=1", "loss=lr_star,seed=0")):
@@ -121,7 +121,7 @@ def test_runs_that_differ_in_their_seed_are_one_group(evaluated, tmp_path, capsy
     assert sum("seed=" in line for line in lines) == 3
 
 
-def test_a_folder_without_evaluated_runs_is_refused(tmp_path):
+def test_a_folder_without_evaluated_runs_raises_an_error(tmp_path):
     with pytest.raises(FileNotFoundError, match="no evaluated run"):
         compare(tmp_path)
 
@@ -180,7 +180,7 @@ def test_hybrid_and_newton_answer_every_load(evaluated):
     assert newton.iterations >= 2
 
 
-def test_the_tolerance_of_an_evaluation_is_its_own(surrogate, few, tmp_path):
+def test_the_tolerance_of_an_evaluation_replaces_that_of_the_scene(surrogate, few, tmp_path):
     rows = evaluate(surrogate, few, tmp_path, tol=1e-2)
     newton = rows[-1]
     assert newton.converged == 4
@@ -198,7 +198,7 @@ def test_the_table_prints_every_row(surrogate, few, tmp_path, capsys, monkeypatc
         assert words in out
 
 
-def test_the_figure_is_a_picture(evaluated):
+def test_the_figure_is_written(evaluated):
     pixels = matplotlib.image.imread(evaluated[1] / "shapes.png")
     assert pixels.shape[0] > 300
     assert pixels.shape[1] > 600
@@ -222,7 +222,7 @@ def test_the_worst_case_is_written_in_si_units(evaluated, surrogate, scene, few)
     assert fields["force [N]"] == pytest.approx(newtons, rel=1e-9, abs=1e-9)
 
 
-def test_the_written_case_is_in_equilibrium(evaluated, scene):
+def test_the_written_load_is_in_equilibrium(evaluated, scene):
     """Read back, newtons and metres still balance."""
     case = meshio.read(evaluated[1] / "worst.vtu")
     force = torch.from_numpy(case.point_data["force [N]"])[None]

@@ -19,7 +19,7 @@ def watch(monkeypatch):
     return watch
 
 
-def test_percentiles_are_those_of_the_calls_after_the_warm_up(watch):
+def test_percentiles_exclude_the_warm_up(watch):
     asked = []
 
     def answer(load):
@@ -51,9 +51,7 @@ def test_calls_are_timed_on_one_thread(monkeypatch):
         torch.set_num_threads(before)
 
 
-def test_the_simulator_with_its_checks_and_the_bare_network_are_asked_the_same_loads(
-    scene, batch, monkeypatch
-):
+def test_simulator_and_bare_network_are_timed_on_the_same_loads(scene, batch, monkeypatch):
     torch.manual_seed(0)
     surrogate = Surrogate(FCNN(scene, width=8), MSE(), scene).eval()
     simulator = Simulator(surrogate)

@@ -60,7 +60,7 @@ def field(scene, batch=3, seed=0):
 # ------------------------------------------------------------------ the grid
 
 
-def test_nodes_of_a_box_are_its_grid_whatever_their_order(scene, make_scene):
+def test_nodes_of_a_box_form_a_grid_in_any_order(scene, make_scene):
     for body, shape in ((scene, (5, 3, 3)), (make_scene(cell="tetra"), (5, 3, 3))):
         net = network(body)
         assert own_grid(body.problem.points) == shape
@@ -75,11 +75,11 @@ def test_nodes_of_a_box_are_its_grid_whatever_their_order(scene, make_scene):
     assert (z.diff(dim=2) > 0).all()
 
 
-def test_quadratic_hexahedra_make_a_grid_of_half_the_spacing(make_scene):
+def test_quadratic_hexahedra_form_a_grid_of_half_the_spacing(make_scene):
     assert own_grid(make_scene(nodes=(3, 2, 2), degree=2).problem.points) == (5, 3, 3)
 
 
-def test_what_only_looks_like_a_grid_is_none(unstructured, ring, scene):
+def test_irregular_nodes_form_no_grid(unstructured, ring, scene):
     points = scene.problem.points
     assert own_grid(unstructured.problem.points) is None
     assert own_grid(ring.problem.points) is None
@@ -88,7 +88,7 @@ def test_what_only_looks_like_a_grid_is_none(unstructured, ring, scene):
     assert own_grid(points.float().double() @ torch.eye(3).double().roll(1, 0)) == (3, 3, 5)
 
 
-def test_a_permutation_is_what_interpolation_would_be(scene):
+def test_a_permutation_equals_interpolation(scene):
     points, values = scene.problem.points, field(scene)
     one, other = Permutation(points, (5, 3, 3)), Immersion(points, (5, 3, 3))
     grid = one.spread(values)
@@ -96,7 +96,7 @@ def test_a_permutation_is_what_interpolation_would_be(scene):
     assert torch.allclose(one.read(grid), other.read(grid), atol=1e-5)
 
 
-def test_spreading_keeps_the_total_force_and_its_moment(body):
+def test_spreading_preserves_total_force_and_moment(body):
     """The moment too: multilinear weights reproduce linear fields."""
     points = body.problem.points
     shape = tuple(3 + axis for axis in range(points.shape[1]))
@@ -132,7 +132,7 @@ def test_spreading_is_the_adjoint_of_interpolation(body):
     assert torch.allclose(left, (force * immersion.read(grid)).sum(), rtol=1e-4, atol=1e-3)
 
 
-def test_filling_is_the_volume_of_the_body(body):
+def test_filling_sums_to_the_volume_of_the_body(body):
     problem = body.problem
     sides = problem.points.amax(0) - problem.points.amin(0)
     for shape in ((5, 3, 4), (11, 8, 9)):
@@ -148,7 +148,7 @@ def test_filling_is_the_volume_of_the_body(body):
         assert filled.max() < 1.2
 
 
-def test_a_hole_is_empty_and_only_bodies_with_one_are_told_so(ring, unstructured):
+def test_only_bodies_with_holes_have_a_volume_fraction_channel(ring, unstructured):
     net = network(ring)
     held, filled = net.constant
     middle = [n // 2 for n in filled.shape]
@@ -157,11 +157,11 @@ def test_a_hole_is_empty_and_only_bodies_with_one_are_told_so(ring, unstructured
     assert held.max() > 0.5
     assert held.min() == 0
     assert len(network(unstructured).constant) == 1
-    assert any("all of the grid" in line for line in network(unstructured).skipped_work())
+    assert any("volume fraction" in line for line in network(unstructured).skipped_work())
     assert net.skipped_work() == []
 
 
-def test_a_cell_left_out_of_a_grid_of_nodes_is_seen(make_scene):
+def test_a_missing_cell_of_a_grid_of_nodes_is_detected(make_scene):
     net = network(make_scene(mesh=rectangle([1.0, 1.0], [5, 5]).remove_elements(np.array([5]))))
     assert isinstance(net.immersion, Permutation)
     _, filled = net.constant
@@ -169,7 +169,7 @@ def test_a_cell_left_out_of_a_grid_of_nodes_is_seen(make_scene):
     assert len(net.skipped_work()) == 1
 
 
-def test_held_nodes_are_a_channel_for_each_component_that_differs(make_scene, scene):
+def test_fixed_degrees_of_freedom_have_a_channel_for_each_distinct_component(make_scene, scene):
     (held,) = network(scene).constant
     assert torch.equal(held, (torch.arange(5) == 0).float()[:, None, None].expand(5, 3, 3))
     free = scene.problem.free.clone()
@@ -187,14 +187,14 @@ def test_a_grid_has_about_as_many_points_as_the_mesh_and_cubic_cells(ring, unstr
         assert spacing.max() < 1.6 * spacing.min()
 
 
-def test_another_grid_can_be_asked_for(scene):
+def test_the_number_of_grid_points_can_be_set(scene):
     assert network(scene, grid=9).immersion.shape == (9, 3, 3)
     assert isinstance(network(scene, grid=9).immersion, Immersion)
     assert isinstance(network(scene, grid=5).immersion, Permutation)
     assert network(scene, grid=2).immersion.shape == (2, 2, 2)
 
 
-def test_the_plan_says_what_is_left_out(scene):
+def test_skipped_work_describes_the_network(scene):
     assert network(scene).skipped_work() == [
         "no interpolation: the nodes form a grid of 5 x 3 x 3 points",
         "no input for the volume fraction: the body fills the grid",
@@ -204,7 +204,7 @@ def test_the_plan_says_what_is_left_out(scene):
 # ------------------------------------------------------------------ the network
 
 
-def test_fields_go_in_and_out_in_two_and_three_dimensions(body):
+def test_fields_of_two_and_three_dimensions_are_accepted(body):
     force = field(body)
     answer = network(body)(force)
     assert answer.shape == force.shape
@@ -212,7 +212,7 @@ def test_fields_go_in_and_out_in_two_and_three_dimensions(body):
 
 
 @pytest.mark.parametrize("shape", [(17, 5, 5), (40, 10, 10), (7, 2), (2, 13), (31, 6, 3)])
-def test_any_number_of_points_goes_down_and_up(shape):
+def test_any_number_of_grid_points_is_accepted(shape):
     sizes = cnn._sizes(shape, None)
     assert max(sizes[-1]) <= 3
     assert min(min(size) for size in sizes) == min(min(shape), 2)
@@ -221,7 +221,7 @@ def test_any_number_of_points_goes_down_and_up(shape):
 
 
 @pytest.mark.parametrize("shape", [(17, 5, 5), (33, 9)])
-def test_every_point_feels_every_other(shape):
+def test_every_output_depends_on_every_input(shape):
     """The gradient at one end with respect to the input at the other is not zero."""
     torch.manual_seed(0)
     sizes = cnn._sizes(shape, None)
@@ -231,7 +231,7 @@ def test_every_point_feels_every_other(shape):
     assert (force.grad != 0).all()
 
 
-def test_a_batch_is_its_members_on_every_mesh(body):
+def test_the_output_for_a_load_does_not_depend_on_its_batch_on_every_mesh(body):
     net, force = network(body).eval(), field(body, 4)
     with torch.no_grad():
         parts = torch.cat([net(one[None]) for one in force])
@@ -253,7 +253,7 @@ def test_moving_the_network_moves_its_grid(unstructured):
 
 
 @pytest.mark.parametrize("name", ["plate", "unstructured"])
-def test_it_overfits_a_batch_on_plane_and_on_unstructured_bodies(request, name):
+def test_the_network_overfits_a_batch_on_plane_and_unstructured_meshes(request, name):
     """A fifty times smaller error on four samples within 300 steps."""
     scene = request.getfixturevalue(name)
     load = scene.loads.sample((0, 0), range(4))
@@ -275,7 +275,7 @@ def test_it_overfits_a_batch_on_plane_and_on_unstructured_bodies(request, name):
     pytest.fail(f"the loss fell {first / float(loss):.0f} times only")
 
 
-def test_newton_started_by_it_is_as_exact_as_newton(body):
+def test_newton_started_from_its_prediction_reaches_the_tolerance(body):
     surrogate = Surrogate(network(body), MSE(), body).eval()
     load = body.loads.sample((0, 0), range(2))
     direct = solve(Direct(surrogate.predict, body.problem), load)
@@ -295,7 +295,7 @@ def test_newton_started_by_it_is_as_exact_as_newton(body):
         ({"steps": 3}, "steps = 3 must be 2 or less: after them the grid of 5 x 3 x 3 points"),
     ],
 )
-def test_options_out_of_range_are_refused_with_what_would_do(scene, options, message):
+def test_options_out_of_range_raise_an_error_with_the_allowed_range(scene, options, message):
     with pytest.raises(ValueError, match=message):
         CNN(scene, **options)
     CNN(scene, steps=2, channels=1)
@@ -303,12 +303,12 @@ def test_options_out_of_range_are_refused_with_what_would_do(scene, options, mes
 
 
 @pytest.mark.parametrize("options", [{"grid": 10**6}, {"channels": 10**6}])
-def test_what_no_memory_can_hold_is_refused_before_it_is_made(scene, options):
+def test_a_grid_beyond_memory_raises_an_error_before_the_network_is_built(scene, options):
     with pytest.raises(MemoryError, match=r"parameters and a grid of .* GB; take a smaller model"):
         CNN(scene, **options)
 
 
-def test_the_memory_limit_is_kept(scene):
+def test_the_memory_limit_is_respected(scene):
     CNN(scene, channels=4, memory_limit=0.01)
     with pytest.raises(MemoryError, match=r"there are 0\.0 GB"):
         CNN(scene, channels=4, memory_limit=1e-6)

@@ -44,7 +44,7 @@ def forces(scene, count=3):
 
 
 @pytest.mark.parametrize("options", [{}, {"levels": 1}, {"levels": 4}, {"passes": 2}])
-def test_it_answers_on_every_kind_of_mesh(body, options):
+def test_the_network_accepts_every_kind_of_mesh(body, options):
     net, force = build(body, **options), forces(body)
     answer = net(force)
     assert answer.shape == force.shape
@@ -64,21 +64,21 @@ def test_information_crosses_the_body_in_one_pass(body):
     assert slope.any(dim=2).all()
 
 
-def test_without_clusters_it_does_not_cross(bar):
+def test_without_clusters_information_does_not_cross_the_body(bar):
     net, force = build(bar, levels=1), forces(bar, 1).requires_grad_()
     x = bar.problem.points[:, 0]
     (slope,) = torch.autograd.grad(net(force)[0, x.argmax()].sum(), force)
     assert not slope[0, x.argmin()].any()
 
 
-def test_a_batch_is_its_members(body):
+def test_the_output_for_a_load_does_not_depend_on_its_batch(body):
     net, force = build(body), forces(body)
     with torch.no_grad():
         parts = torch.cat([net(one[None]) for one in force])
         assert torch.allclose(net(force), parts, rtol=1e-4, atol=1e-6)
 
 
-def test_the_body_may_be_anywhere(make_scene):
+def test_predictions_are_invariant_under_translations(make_scene):
     here, there = box((4.0, 1.0, 1.0), (9, 4, 4)), box((4.0, 1.0, 1.0), (9, 4, 4))
     there = there.translated((1000.3, -77.7, 0.1))
     one, other = make_scene(mesh=here), make_scene(mesh=there)
@@ -88,7 +88,7 @@ def test_the_body_may_be_anywhere(make_scene):
         assert torch.allclose(build(one)(force), build(other)(force), rtol=1e-4, atol=1e-5)
 
 
-def test_it_overfits_one_batch_of_tetrahedra(make_scene):
+def test_the_network_overfits_one_batch_of_tetrahedra(make_scene):
     """A hundred times smaller error on four linear answers within 300 steps."""
     scene = make_scene(**BODIES["tetrahedra"])
     load = scene.loads.sample((0, 0), range(4))
@@ -122,7 +122,7 @@ def test_a_saved_network_is_the_same_network_with_its_graph(body, tmp_path):
 # ------------------------------------------------------------------ levels
 
 
-def test_force_and_moment_are_the_same_on_every_level(body):
+def test_total_force_and_moment_are_the_same_on_every_level(body):
     """Sums over clusters lose no load, and no moment of it about the origin."""
     net, force = build(body).double(), forces(body).double()
     places = body.problem.points
@@ -142,7 +142,7 @@ def test_force_and_moment_are_the_same_on_every_level(body):
             graph, _ = coarser(graph, net.sizes[k + 1])
 
 
-def test_levels_end_with_few_clusters_that_all_hear_each_other(bar):
+def test_the_coarsest_level_is_a_complete_graph_of_few_clusters(bar):
     net = build(bar)
     assert net.sizes[0] == len(bar.problem.points)
     assert net.sizes[-1] == COARSEST
@@ -152,7 +152,7 @@ def test_levels_end_with_few_clusters_that_all_hear_each_other(bar):
     assert len(build(bar, levels=1).sizes) == 1
 
 
-def test_a_mesh_hears_along_the_edges_of_its_cells(make_scene):
+def test_edges_of_the_mesh_graph_are_edges_of_cells(make_scene):
     grid = mesh_graph(make_scene(nodes=(9, 4, 4)).problem)
     assert len(grid.sender) == 2 * (8 * 16 + 2 * 9 * 3 * 4)
     plane = mesh_graph(make_scene(mesh=rectangle((4.0, 1.0), (13, 4), "triangle")).problem)
@@ -161,7 +161,7 @@ def test_a_mesh_hears_along_the_edges_of_its_cells(make_scene):
     assert len(fine.sender) == 2 * (6 * 9 + 2 * 7 * 2 * 3)  # the edges of 7 x 3 x 3 nodes
 
 
-def test_whom_one_hears_hears_one(body):
+def test_the_graph_is_symmetric(body):
     graph = mesh_graph(body.problem)
     for count in (30, 10):
         pairs = set(zip(graph.receiver.tolist(), graph.sender.tolist(), strict=True))
@@ -171,7 +171,7 @@ def test_whom_one_hears_hears_one(body):
         assert sorted(set(cluster.tolist())) == list(range(len(graph.points)))
 
 
-def test_clusters_are_in_one_piece(bar):
+def test_clusters_are_connected(bar):
     graph = mesh_graph(bar.problem)
     _, cluster = coarser(graph, 40)
     for k in range(40):
@@ -192,7 +192,7 @@ def test_each_part_of_a_body_has_a_cluster():
     assert coarse.complete
 
 
-def test_it_can_be_exported_for_batches_of_any_size(bar):
+def test_the_network_can_be_exported_for_batches_of_any_size(bar):
     net, force = build(bar).eval(), forces(bar, 5)
     exported = torch.export.export(
         net, (force[:2],), dynamic_shapes=({0: torch.export.Dim("batch", min=1, max=64)},)
@@ -201,7 +201,7 @@ def test_it_can_be_exported_for_batches_of_any_size(bar):
         assert torch.allclose(exported(force), net(force), rtol=1e-4, atol=1e-6)
 
 
-def test_blocks_of_messages_have_the_right_slopes(bar, monkeypatch):
+def test_gradients_of_neighbour_sums_do_not_depend_on_the_size_of_blocks(bar, monkeypatch):
     graph = mesh_graph(bar.problem)
     pairs = torch.from_numpy(graph.receiver), torch.from_numpy(graph.sender)
     state = torch.randn(len(graph.points), 2, 3, dtype=torch.float64, requires_grad=True)
@@ -222,7 +222,7 @@ def test_blocks_of_messages_have_the_right_slopes(bar, monkeypatch):
 # ------------------------------------------------------------------ what it says
 
 
-def test_the_plan_says_what_is_left_out(make_scene, bar):
+def test_skipped_work_describes_the_network(make_scene, bar):
     assert build(bar).skipped_work()[1].startswith("multigrid hierarchy: 272 nodes, ")
     assert (
         build(bar, levels=1).skipped_work()[1]
@@ -233,6 +233,6 @@ def test_the_plan_says_what_is_left_out(make_scene, bar):
 
 
 @pytest.mark.parametrize("options", [{"width": 0}, {"levels": 0}, {"passes": 0}])
-def test_options_out_of_range_are_refused_by_name(scene, options):
+def test_options_out_of_range_raise_an_error_with_their_name(scene, options):
     with pytest.raises(ValueError, match=f"{next(iter(options))} = 0 must be 1 or more"):
         GNN(scene, **options)

@@ -1,4 +1,4 @@
-"""Laws of the flagship: exact linear answers, and a network for the rest alone."""
+"""Latent has an exact linear part and learns the nonlinear part alone."""
 
 import functools
 import json
@@ -89,7 +89,7 @@ def halved(scene, batch):
 # ------------------------------------------------------------------ the linear limit
 
 
-def test_what_is_added_to_the_linear_answer_is_quadratic_in_the_load(scene, batch, wild):
+def test_the_learnt_part_is_quadratic_in_the_load(scene, batch, wild):
     force, linear = batch.force, linear_of(scene, batch.force)
     found = []
     for k in range(15):
@@ -114,7 +114,7 @@ def test_the_error_vanishes_quadratically_with_the_load(scene, batch, wild):
     assert torch.allclose(found[1], found[0], rtol=1.0)
 
 
-def test_a_load_a_thousand_times_smaller_is_answered_a_thousand_times_better(scene, batch, wild):
+def test_the_relative_error_is_proportional_to_small_loads(scene, batch, wild):
     load = Load(1e-3 * batch.force, batch.young)
     truth = solve(scene.solver, load).displacement
     relative = [
@@ -125,7 +125,7 @@ def test_a_load_a_thousand_times_smaller_is_answered_a_thousand_times_better(sce
 
 
 @pytest.mark.parametrize("tol", [0, 5e-4, torch.inf])
-def test_no_load_moves_nothing_at_all(scene, batch, wild, tol):
+def test_the_prediction_for_zero_load_is_zero(scene, batch, wild, tol):
     wild.net.linear_tol = tol
     none = torch.zeros_like(batch.force)
     assert not answer_to(wild, none).any()
@@ -145,7 +145,7 @@ def test_the_linear_part_of_local_forces_is_exact_for_any_weights(scene, batch, 
     assert float((missed / sizes(linear)).min()) > 1e-3, "else the basis would do"
 
 
-def test_without_a_tolerance_the_linear_part_is_that_of_the_basis(scene, batch):
+def test_with_infinite_tolerance_the_linear_part_is_projected_onto_the_basis(scene, batch):
     force = 1e-9 * sparse(scene, 2)
     linear = linear_of(scene, force)
     net = prepared(scene, batch, rank=20, linear_tol=torch.inf)
@@ -155,7 +155,7 @@ def test_without_a_tolerance_the_linear_part_is_that_of_the_basis(scene, batch):
     assert float((sizes(found - linear) / sizes(linear)).min()) > 1e-3
 
 
-def test_probes_tell_what_the_basis_misses_of_a_linear_answer(scene, batch):
+def test_probes_estimate_the_projection_residual_of_a_linear_solution(scene, batch):
     net = prepared(scene, batch, rank=20).net
     force = torch.cat([batch.force, sparse(scene, 2), sparse(scene, 60)])
     linear = linear_of(scene, force) * net.linear_unit
@@ -166,7 +166,7 @@ def test_probes_tell_what_the_basis_misses_of_a_linear_answer(scene, batch):
     assert (told / missed < 3).all()
 
 
-def test_only_loads_of_which_the_basis_misses_too_much_are_solved_for(scene, batch, monkeypatch):
+def test_only_loads_with_large_projection_residuals_are_solved(scene, batch, monkeypatch):
     asked = []
     original = Latent.solve_linear
     monkeypatch.setattr(
@@ -187,7 +187,7 @@ def test_only_loads_of_which_the_basis_misses_too_much_are_solved_for(scene, bat
         assert (few, many) != (0, len(force))
 
 
-def test_images_of_a_load_are_told_alike(scene, batch):
+def test_images_of_a_load_have_equal_projection_residual_estimates(scene, batch):
     net = prepared(scene, batch, rank=20).net
     assert len(net.group) > 1
     told = []
@@ -200,7 +200,7 @@ def test_images_of_a_load_are_told_alike(scene, batch):
     assert torch.allclose(torch.stack(told), told[0].expand(len(told), -1), rtol=1e-4)
 
 
-def test_a_solve_changes_what_the_basis_does_not_hold_and_nothing_else(scene, batch):
+def test_a_solve_changes_only_the_part_outside_the_basis(scene, batch):
     force = sparse(scene, 4)
     net, plain = (prepared(scene, batch, rank=20, linear_tol=tol) for tol in (0, torch.inf))
     linear = linear_of(scene, force)
@@ -209,7 +209,7 @@ def test_a_solve_changes_what_the_basis_does_not_hold_and_nothing_else(scene, ba
     assert torch.allclose(found, beyond, rtol=1e-4, atol=1e-6 * float(linear.abs().max()))
 
 
-def test_a_batch_of_local_and_other_forces_is_its_members(scene, batch):
+def test_predictions_of_local_and_other_loads_do_not_depend_on_the_batch(scene, batch):
     module = halved(scene, batch)
     force = torch.cat([sparse(scene, dofs, 2) for dofs in (3, 60, 0, 5, 90)])
     force = force[torch.tensor([0, 2, 4, 6, 8, 1, 3, 5, 7, 9])]
@@ -217,7 +217,7 @@ def test_a_batch_of_local_and_other_forces_is_its_members(scene, batch):
     assert torch.allclose(answer_to(module, force), parts, rtol=1e-9, atol=1e-15)
 
 
-def test_slopes_of_a_batch_of_local_and_other_forces_are_those_of_differences(scene, batch):
+def test_gradients_of_local_and_other_loads_equal_finite_differences(scene, batch):
     net = halved(scene, batch).net
     force = torch.cat([sparse(scene, dofs, 2) for dofs in (3, 60, 5)])
     force = (force / force.abs().amax(dim=(1, 2), keepdim=True)).requires_grad_()
@@ -233,13 +233,13 @@ def test_slopes_of_a_batch_of_local_and_other_forces_are_those_of_differences(sc
     assert (found != 0).all()
 
 
-def test_without_a_tolerance_nothing_is_solved(scene, batch, monkeypatch):
+def test_with_infinite_tolerance_nothing_is_solved(scene, batch, monkeypatch):
     module = prepared(scene, batch, linear_tol=torch.inf)
     monkeypatch.setattr(Latent, "_solve", None)
     assert answer_to(module, sparse(scene, 60)).any()
 
 
-def test_slopes_reach_every_weight_alike_with_and_without_solves(scene, batch):
+def test_gradients_of_weights_are_the_same_with_and_without_solves(scene, batch):
     """The linear part has no weights."""
     found = []
     for tol in (0, torch.inf):
@@ -254,7 +254,7 @@ def test_slopes_reach_every_weight_alike_with_and_without_solves(scene, batch):
 # ------------------------------------------------------------------ bases
 
 
-def test_the_basis_holds_linear_answers_and_rests(scene, batch):
+def test_the_basis_represents_linear_solutions_and_nonlinear_parts(scene, batch):
     net = prepared(scene, batch, rank=1000).net
     linear = linear_of(scene, batch.force)
     for field in (linear, batch.displacement - linear):
@@ -262,7 +262,7 @@ def test_the_basis_holds_linear_answers_and_rests(scene, batch):
         assert float((sizes(missed) / sizes(field)).max()) < 1e-4
 
 
-def test_coordinates_come_in_the_order_of_what_they_have_of_the_rests(scene, batch):
+def test_modes_are_ordered_by_their_share_of_the_nonlinear_parts(scene, batch):
     net = prepared(scene, batch, rank=20).net
     weight = sizes(batch.displacement)[:, None] ** -0.5
     rests = weight * (batch.displacement - linear_of(scene, batch.force))[:, net.free_dofs]
@@ -271,7 +271,7 @@ def test_coordinates_come_in_the_order_of_what_they_have_of_the_rests(scene, bat
     assert found[0] > 10 * found[-1]
 
 
-def test_the_unit_makes_linear_answers_scaled_ones(scene, batch):
+def test_solve_linear_returns_scaled_linear_solutions(scene, batch):
     module = prepared(scene, batch)
     scaled = batch.force / module.force_scale
     found = module.net.solve_linear(scaled[:, module.net.load_dofs])
@@ -279,13 +279,13 @@ def test_the_unit_makes_linear_answers_scaled_ones(scene, batch):
     assert torch.allclose(found, expected[:, module.net.free_dofs], rtol=1e-6)
 
 
-def test_a_network_without_bases_answers_nothing(scene, batch):
+def test_a_network_without_bases_predicts_zero(scene, batch):
     net = Latent(scene, **SMALL).eval()
     assert not net.fitted
     assert not net(batch.force.float()).any()
 
 
-def test_the_plan_tells_of_near_fields_only_where_they_are_exact(scene):
+def test_skipped_work_mentions_near_fields_only_with_a_finite_tolerance(scene):
     assert any(
         "0.0005" in line and "near field" in line for line in Latent(scene, **SMALL).skipped_work()
     )
@@ -295,7 +295,7 @@ def test_the_plan_tells_of_near_fields_only_where_they_are_exact(scene):
 
 
 @pytest.mark.parametrize("tol", [-1, torch.nan])
-def test_a_tolerance_below_zero_is_refused_by_name(scene, tol):
+def test_a_negative_tolerance_raises_an_error(scene, tol):
     with pytest.raises(ValueError, match=r"linear_tol = .+ must be 0 or more"):
         Latent(scene, linear_tol=tol)
 
@@ -344,7 +344,7 @@ def alike(one, other):
     return one == other
 
 
-def test_a_run_comes_back_as_it_was(trained, home, monkeypatch):
+def test_a_loaded_run_has_the_same_predictions(trained, home, monkeypatch):
     monkeypatch.chdir(home)
     cfg, module = run_folder.load_run(trained)
     saved = checkpoint(trained, "best.safetensors")["state_dict"]
@@ -363,7 +363,7 @@ def test_a_run_comes_back_as_it_was(trained, home, monkeypatch):
     assert network["errors"]["e_mean"] == pytest.approx(e_mean, rel=1e-5)
 
 
-def test_a_run_makes_its_bases_from_the_training_samples(trained, home, monkeypatch):
+def test_a_run_fits_its_bases_to_the_training_samples(trained, home, monkeypatch):
     monkeypatch.chdir(home)
     cfg, module = run_folder.load_run(trained)
     train = build.instantiate(cfg, "data", scene=module.scene).samples("train")
@@ -374,12 +374,12 @@ def test_a_run_makes_its_bases_from_the_training_samples(trained, home, monkeypa
     assert alike(buffers, dict(module.net.named_buffers()))
 
 
-def test_training_beats_the_linear_answer(trained):
+def test_training_improves_on_the_linear_solution(trained):
     rows = {row["solver"]: row for row in json.loads((trained / "evaluation.json").read_text())}
     assert rows["network"]["errors"]["e_mean"] < rows["linear"]["errors"]["e_mean"]
 
 
-def test_a_run_that_was_interrupted_ends_bit_for_bit_like_one_that_was_not(
+def test_an_interrupted_run_ends_bit_for_bit_like_an_uninterrupted_one(
     trained, script, overrides, home, monkeypatch
 ):
     step = Surrogate.training_step
@@ -405,7 +405,7 @@ def test_a_run_that_was_interrupted_ends_bit_for_bit_like_one_that_was_not(
 @pytest.mark.xfail(
     strict=True, reason="Lightning names the checkpoint after setup: made, then lost"
 )
-def test_a_run_that_resumes_makes_no_bases_again(trained, script, overrides, home, monkeypatch):
+def test_a_resumed_run_does_not_fit_its_bases_again(trained, script, overrides, home, monkeypatch):
     made, prepare = [], Surrogate.fit_bases
     monkeypatch.setattr(
         Surrogate, "fit_bases", lambda module, samples: made.append(0) or prepare(module, samples)
@@ -417,7 +417,7 @@ def test_a_run_that_resumes_makes_no_bases_again(trained, script, overrides, hom
     assert made == []
 
 
-def test_a_run_that_is_to_resume_before_it_began_makes_its_bases(script, overrides, home, trained):
+def test_a_run_resumed_before_its_first_epoch_fits_its_bases(script, overrides, home, trained):
     """The same command line, whether it is the first start of a job or a later one."""
     more = ("ckpt_path=last", "trainer.max_epochs=1")
     ended = script("train", *overrides("fresh", *more), cwd=home)
@@ -427,7 +427,7 @@ def test_a_run_that_is_to_resume_before_it_began_makes_its_bases(script, overrid
     assert state["net.modes"].any()
 
 
-def test_a_stream_trains_it_on_bases_of_the_validation_loads(script, overrides, home, trained):
+def test_a_stream_fits_the_bases_to_the_validation_loads(script, overrides, home, trained):
     kept = [o for o in overrides("stream") if "data.train" not in o]
     more = ["data=online", "data.batches=2", "data.fresh=4", "trainer.max_epochs=2"]
     ended = script("train", *kept, *more, cwd=home)
@@ -443,7 +443,7 @@ def test_a_stream_trains_it_on_bases_of_the_validation_loads(script, overrides, 
     assert json.loads((home / "stream" / "evaluation.json").read_text())
 
 
-def test_the_plan_of_a_stream_promises_coordinates_from_disk_only(script, overrides, home):
+def test_skipped_work_of_a_stream_mentions_coordinates_from_disk_only(script, overrides, home):
     kept = [o for o in overrides("told") if "data.train" not in o]
     more = ["data=online", "data.batches=1", "data.fresh=4", "trainer.max_epochs=1"]
     ended = script("train", *kept, *more, cwd=home)
@@ -476,7 +476,7 @@ def test_a_wrong_option_ends_with_one_line_before_anything_is_solved(
     assert not (tmp_path / "wrong" / "checkpoints").exists()
 
 
-def test_a_run_of_another_rank_is_refused(trained, home, monkeypatch, tmp_path):
+def test_a_run_of_another_rank_raises_an_error(trained, home, monkeypatch, tmp_path):
     monkeypatch.chdir(home)
     for name in ("config.yaml", "checkpoints/best.safetensors"):
         (tmp_path / name).parent.mkdir(exist_ok=True)

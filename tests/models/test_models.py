@@ -31,7 +31,7 @@ def build(request, scene, batch):
     return build
 
 
-def test_a_network_answers_fields_with_fields_in_single_precision(build, scene):
+def test_a_network_maps_fields_to_fields_in_single_precision(build, scene):
     net = build()
     for size in (1, 3):
         force = torch.randn(size, *scene.problem.shape)
@@ -41,7 +41,7 @@ def test_a_network_answers_fields_with_fields_in_single_precision(build, scene):
     assert all(parameter.dtype == torch.float32 for parameter in net.parameters())
 
 
-def test_what_is_held_does_not_move(build, scene, batch):
+def test_fixed_degrees_of_freedom_do_not_move(build, scene, batch):
     surrogate = Surrogate(build(), MSE(), scene).eval()
     with torch.no_grad():
         answer = surrogate.predict(Load(batch.force + 1.0, batch.young))
@@ -50,7 +50,7 @@ def test_what_is_held_does_not_move(build, scene, batch):
     assert answer.abs().max() > 0
 
 
-def test_a_batch_is_its_members(build, scene):
+def test_the_output_for_a_load_does_not_depend_on_its_batch(build, scene):
     net = build().eval()
     force = torch.randn(4, *scene.problem.shape, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -60,7 +60,7 @@ def test_a_batch_is_its_members(build, scene):
 
 
 @pytest.mark.parametrize("kind", ["all the same", "all zero", "one degree of freedom moves"])
-def test_samples_without_variance_do_no_harm(build, scene, batch, kind):
+def test_identical_samples_give_finite_outputs(build, scene, batch, kind):
     """Nothing is divided by the spread of a degree of freedom that has none."""
     force, displacement = (
         batch.force[:1].expand(6, -1, -1),
@@ -152,12 +152,12 @@ def test_the_papers_beam_has_576_million_parameters():
 
 
 @pytest.mark.parametrize("options", [{}, {"width": 20}, {"layers": 2}, {"layers": 6, "width": 7}])
-def test_parameters_are_counted_before_they_are_made(scene, options):
+def test_the_predicted_number_of_parameters_is_exact(scene, options):
     net = FCNN(scene, **options)
     assert net.parameters_needed == count(net)
 
 
-def test_inputs_are_where_loads_can_act_and_outputs_where_the_body_can_move(scene, batch):
+def test_inputs_are_loadable_and_outputs_free_degrees_of_freedom(scene, batch):
     torch.manual_seed(0)
     net = FCNN(scene)
     inputs, outputs = int(scene.loads.loadable_dofs.sum()), int(scene.problem.free.sum())
@@ -171,7 +171,7 @@ def test_inputs_are_where_loads_can_act_and_outputs_where_the_body_can_move(scen
     assert not answer[:, ~scene.problem.free].any()
 
 
-def test_the_plan_counts_the_parameters_that_are_saved(scene):
+def test_skipped_work_contains_the_number_of_saved_parameters(scene):
     net, whole = FCNN(scene), FCNN(scene, all_dofs=True)
     (line,) = net.skipped_work()
     assert line.startswith(f"{count(whole) - count(net):,} of {count(whole):,} parameters")
@@ -183,7 +183,7 @@ def test_each_unit_has_its_own_slope(scene):
     assert [slope.num_parameters for slope in slopes] == [20, 20, 20]
 
 
-def test_a_network_beyond_memory_is_refused_with_the_numbers_before_it_is_made(scene, monkeypatch):
+def test_a_network_beyond_memory_raises_an_error_before_it_is_built(scene, monkeypatch):
     def forbidden(*_, **__):
         raise AssertionError("allocated")
 
@@ -215,7 +215,7 @@ def test_the_papers_beam_needs_nine_gigabytes():
         (FCNN, {"width": 10**18}),
     ],
 )
-def test_a_width_that_no_memory_can_hold_is_refused_before_it_is_made(
+def test_a_width_beyond_memory_raises_an_error_before_the_network_is_built(
     scene, monkeypatch, network, options
 ):
     def forbidden(*_, **__):
@@ -235,7 +235,7 @@ def test_a_width_that_no_memory_can_hold_is_refused_before_it_is_made(
         (FCNN, {"layers": 10**9, "width": 1}),
     ],
 )
-def test_a_depth_that_would_never_be_built_is_refused(scene, network, options):
+def test_a_depth_out_of_range_raises_an_error(scene, network, options):
     name, number = next(iter(options.items()))
     with pytest.raises(ValueError, match=f"{name} = {number} must be . or more and at most 1000"):
         network(scene, **options)
@@ -260,7 +260,7 @@ def test_youngs_modulus_matters_where_it_is_an_input_and_only_there(over_moduli)
         assert torch.equal(plain.predict(soft), plain.predict(stiff))
 
 
-def test_an_answer_has_a_slope_with_respect_to_youngs_modulus(over_moduli):
+def test_predictions_are_differentiable_with_respect_to_youngs_modulus(over_moduli):
     """That of the input itself, against a difference quotient."""
     surrogate, load = over_moduli
     surrogate.double()
@@ -274,7 +274,7 @@ def test_an_answer_has_a_slope_with_respect_to_youngs_modulus(over_moduli):
     assert torch.allclose(young.grad, quotient, rtol=1e-2)
 
 
-def test_youngs_modulus_enters_between_minus_one_and_one_and_forces_as_newtons_are(over_moduli):
+def test_youngs_modulus_is_normalised_and_forces_are_relative_to_its_maximum(over_moduli):
     surrogate, load = over_moduli
     entered = []
     surrogate.net.stages[0].register_forward_hook(lambda _, given, __: entered.append(given[0]))
@@ -289,7 +289,7 @@ def test_youngs_modulus_enters_between_minus_one_and_one_and_forces_as_newtons_a
     assert torch.allclose(inputs[-1:, :-1], scaled), "the stiffest body's are those over E L^2"
 
 
-def test_one_modulus_as_an_input_leaves_its_neighbours_in_reach(scene, batch):
+def test_a_single_modulus_as_an_input_is_normalised_by_itself(scene, batch):
     """The tiny scene has E = 4500 Pa alone; a hundredth more is no other world."""
     torch.manual_seed(0)
     surrogate = Surrogate(FCNN(scene, young=True), MSE(), scene)
@@ -301,13 +301,13 @@ def test_one_modulus_as_an_input_leaves_its_neighbours_in_reach(scene, batch):
     assert ((apart > 0) & (apart < 0.1 * size)).all()
 
 
-def test_a_network_that_wants_youngs_modulus_says_so_where_it_is_not_given(over_moduli):
+def test_a_missing_youngs_modulus_raises_an_error(over_moduli):
     surrogate, load = over_moduli
     with pytest.raises(ValueError, match="young is an input"):
         surrogate.net(load.force.float())
 
 
 @pytest.mark.parametrize("options", [{"layers": 1}, {"width": 0}, {"layers": 0}])
-def test_options_out_of_range_are_refused_by_name(scene, options):
+def test_options_out_of_range_raise_an_error_with_their_name(scene, options):
     with pytest.raises(ValueError, match=f"{next(iter(options))} = "):
         FCNN(scene, **options)

@@ -1,6 +1,6 @@
-"""Laws of the networks between few coordinates: the POD network's, and what the latent one shares.
+"""Properties of PODNet, and of Latent where it shares them.
 
-Where laws are exact but for rounding they are tested in double precision.
+Properties that hold up to rounding errors are tested in double precision.
 """
 
 import functools
@@ -127,12 +127,12 @@ def test_a_basis_is_orthonormal_and_zero_beyond(kind, scene, batch, count, symme
     assert torch.allclose(gram, torch.diag(there.double()), rtol=0, atol=1e-5)
 
 
-def test_modes_of_a_body_without_symmetry_come_in_the_order_of_their_size(scene, batch):
+def test_modes_of_a_body_without_symmetry_are_ordered_by_size(scene, batch):
     net = prepared(PODNet, scene, batch, rank=12, symmetry=False).net
     assert_ordered(net, batch)
 
 
-def test_modes_come_in_the_order_of_their_size(scene, batch):
+def test_modes_are_ordered_by_size(scene, batch):
     """Uncorrelated too: scales of single coordinates are those of single modes."""
     assert_ordered(prepared(PODNet, scene, batch, rank=12).net, batch)
 
@@ -151,7 +151,7 @@ def assert_ordered(net, samples):
 
 
 @NETWORKS
-def test_a_basis_of_all_modes_holds_every_training_sample(kind, scene, batch):
+def test_a_basis_of_all_modes_represents_every_training_sample(kind, scene, batch):
     net = prepared(kind, scene, batch, **WHOLE).net
     basis = net.basis.double()
     moved = batch.displacement[:, scene.problem.free]
@@ -160,7 +160,7 @@ def test_a_basis_of_all_modes_holds_every_training_sample(kind, scene, batch):
 
 
 @NETWORKS
-def test_more_modes_hold_more_of_the_samples(kind, scene, batch):
+def test_more_modes_reduce_the_projection_error(kind, scene, batch):
     moved = batch.displacement[:, scene.problem.free]
     left = []
     for rank in (4, 12, 40):
@@ -197,7 +197,7 @@ def test_a_basis_of_any_rank_is_invariant_under_the_symmetries(kind, scene, batc
         assert left_over(net.basis, net, net.free_dofs) < 1e-5, rank
 
 
-def test_the_basis_of_loads_is_orthonormal_and_holds_them(scene, batch):
+def test_the_basis_of_loads_is_orthonormal_and_represents_them(scene, batch):
     kept = read(prepared(PODNet, scene, batch, **WHOLE).net)
     kept = kept[:, kept.abs().amax(dim=0) > 1e-5]
     assert torch.allclose(kept.T @ kept, eye(kept.shape[1]), rtol=0, atol=1e-6)
@@ -217,7 +217,9 @@ def test_bases_are_a_function_of_the_samples(kind, scene, batch):
 
 
 @NETWORKS
-def test_more_samples_than_snapshots_are_thinned_out(kind, scene, batch, monkeypatch):
+def test_samples_beyond_the_maximum_number_of_snapshots_are_thinned_out(
+    kind, scene, batch, monkeypatch
+):
     """Every third of twelve makes the basis that these four make."""
     monkeypatch.setattr("dpl.models.invariant_basis.MAX_SNAPSHOTS", 8 * 4)
     seen = []
@@ -235,7 +237,7 @@ def test_more_samples_than_snapshots_are_thinned_out(kind, scene, batch, monkeyp
 
 
 @NETWORKS
-def test_turns_and_returns_are_a_representation(kind, bar):
+def test_actions_on_inputs_and_outputs_are_a_group_representation(kind, bar):
     """The product of two members is a member; returns are orthogonal."""
     net = exact(prepared(kind, *bar, **WHOLE))
     order = len(net.group)
@@ -256,7 +258,7 @@ def test_turns_and_returns_are_a_representation(kind, bar):
 
 @NETWORKS
 @pytest.mark.parametrize("seed", [0, 1])
-def test_answers_have_the_symmetries_exactly(kind, bar, seed):
+def test_predictions_have_the_symmetries_exactly(kind, bar, seed):
     scene, samples = bar
     module = prepared(kind, scene, samples, seed=seed, **WHOLE)
     force = noise(scene)
@@ -269,27 +271,27 @@ def test_answers_have_the_symmetries_exactly(kind, bar, seed):
 
 
 @NETWORKS
-def test_in_training_it_is_the_network_alone(kind, bar):
+def test_in_training_mode_outputs_are_not_symmetrised(kind, bar):
     scene, samples = bar
     net = exact(prepared(kind, scene, samples, **WHOLE)).train()
     assert asymmetry(net, noise(scene)) > 1e-4
 
 
 @NETWORKS
-def test_answers_have_the_symmetries_for_any_rank(kind, scene, batch):
+def test_predictions_have_the_symmetries_for_any_rank(kind, scene, batch):
     for rank in (2, 3, 5, 6, 8, 11):
         net = exact(prepared(kind, scene, batch, rank=rank, coordinates=4))
         assert asymmetry(net, noise(scene)) < 1e-4, rank
 
 
 @NETWORKS
-def test_answers_have_the_symmetries_for_any_number_of_coordinates(kind, scene, batch):
+def test_predictions_have_the_symmetries_for_any_number_of_coordinates(kind, scene, batch):
     for coordinates in (1, 2, 3, 5, 6, 8, 11):
         net = exact(prepared(kind, scene, batch, rank=12, coordinates=coordinates))
         assert asymmetry(net, noise(scene)) < 1e-4, coordinates
 
 
-def test_a_rank_that_leaves_no_mode_is_told(scene, batch):
+def test_a_rank_that_leaves_no_invariant_mode_raises_an_error(scene, batch):
     """Of twins, bending to both sides, one is none: refused by name, or not left out."""
     module = Surrogate(PODNet(scene, rank=1, **SMALL), MSE(), scene)
     with suppress(ValueError):
@@ -297,13 +299,13 @@ def test_a_rank_that_leaves_no_mode_is_told(scene, batch):
         assert module.net.basis.any()
 
 
-def test_answers_of_the_defaults_have_the_symmetries(scene, batch):
+def test_predictions_with_default_options_have_the_symmetries(scene, batch):
     """Sixty coordinates of the load, a hundred modes: conf/model/pod.yaml."""
     assert asymmetry(exact(prepared(PODNet, scene, batch)), noise(scene)) < 1e-4
 
 
 @NETWORKS
-def test_symmetry_false_respects_none(kind, bar):
+def test_symmetry_false_disables_symmetries(kind, bar):
     scene, samples = bar
     net = exact(prepared(kind, scene, samples, symmetry=False, **WHOLE))
     assert net.group == []
@@ -318,7 +320,7 @@ def test_symmetry_false_respects_none(kind, bar):
 
 
 @NETWORKS
-def test_the_plan_counts_coordinates_and_symmetries(kind, scene):
+def test_skipped_work_contains_the_numbers_of_coordinates_and_symmetries(kind, scene):
     lines = kind(scene, rank=20, **SMALL).skipped_work()
     assert lines[0] == f"20 coordinates learnt instead of {int(scene.problem.free.sum())} " + (
         "displacements"
@@ -345,7 +347,7 @@ def skew(make_scene):
 
 
 @NETWORKS
-def test_a_body_in_the_plane_is_answered_with_its_mirror_image(kind, plane):
+def test_predictions_of_a_plane_body_have_its_mirror_symmetry(kind, plane):
     scene, samples = plane
     net = exact(prepared(kind, scene, samples, **WHOLE))
     assert len(net.group) == 2
@@ -357,7 +359,7 @@ def test_a_body_in_the_plane_is_answered_with_its_mirror_image(kind, plane):
 
 
 @NETWORKS
-def test_a_body_without_symmetry_is_answered(kind, skew):
+def test_a_body_without_symmetry_is_accepted(kind, skew):
     scene, samples = skew
     net = exact(prepared(kind, scene, samples, rank=5, coordinates=4))
     assert len(net.group) == 1
@@ -373,7 +375,7 @@ def test_a_body_without_symmetry_is_answered(kind, skew):
 
 
 @NETWORKS
-def test_a_body_that_is_held_in_some_directions_only_is_answered(kind):
+def test_a_body_fixed_in_some_directions_only_is_accepted(kind):
     """Rails: a node moves in some directions and not in others."""
     ends = [(0, [0.0, None, None]), (1, [None, 0.0, None]), (2, [None, None, 0.0])]
     rails = [DirichletBC(Plane(axis, "min"), value) for axis, value in ends]
@@ -395,7 +397,7 @@ def test_a_body_that_is_held_in_some_directions_only_is_answered(kind):
 
 @NETWORKS
 @pytest.mark.parametrize("count", [1, 2])
-def test_fewer_snapshots_than_modes_are_enough(kind, scene, batch, count):
+def test_fewer_snapshots_than_modes_are_accepted(kind, scene, batch, count):
     module = prepared(kind, scene, some(batch, count), rank=100, symmetry=False)
     for name, buffer in module.net.named_buffers():
         assert buffer.isfinite().all(), name
@@ -409,7 +411,7 @@ def test_fewer_snapshots_than_modes_are_enough(kind, scene, batch, count):
 
 
 @NETWORKS
-def test_a_sample_that_does_not_move_changes_nothing(kind, scene, batch):
+def test_a_sample_of_zero_displacement_changes_nothing(kind, scene, batch):
     """No size, no weight: neither a NaN nor a mode of its own."""
     still = Sample(*(torch.cat([column, column[:1]]) for column in some(batch, 4)))
     still.force[-1], still.displacement[-1] = 0.0, 0.0
@@ -422,7 +424,7 @@ def test_a_sample_that_does_not_move_changes_nothing(kind, scene, batch):
 
 
 @NETWORKS
-def test_ranks_beyond_what_moves_and_acts_are_cut(kind, scene, batch):
+def test_rank_and_coordinates_are_limited_by_the_degrees_of_freedom(kind, scene, batch):
     net = prepared(kind, scene, batch, **WHOLE).net
     outputs, inputs = int(scene.problem.free.sum()), int(scene.loads.loadable_dofs.sum())
     assert net.basis.shape == (outputs, outputs)
@@ -430,13 +432,13 @@ def test_ranks_beyond_what_moves_and_acts_are_cut(kind, scene, batch):
     assert net.enter.in_features == inputs
 
 
-def test_a_latent_network_reads_no_more_coordinates_than_it_has_modes(scene):
+def test_a_latent_network_has_at_most_as_many_inputs_as_modes(scene):
     assert Latent(scene, rank=7, coordinates=60, **SMALL).enter.in_features == 7
     assert PODNet(scene, rank=7, coordinates=60, **SMALL).enter.in_features == 60
 
 
 @NETWORKS
-def test_no_bases_no_answer_and_they_are_told_apart(kind, scene, batch):
+def test_without_bases_the_prediction_is_zero_and_is_fitted_is_false(kind, scene, batch):
     net = kind(scene, **SMALL)
     assert not net.fitted
     assert not net(noise(scene).float()).any() or kind is Latent
@@ -444,7 +446,7 @@ def test_no_bases_no_answer_and_they_are_told_apart(kind, scene, batch):
 
 
 @NETWORKS
-def test_a_batch_is_its_members(kind, scene, batch):
+def test_the_output_for_a_load_does_not_depend_on_its_batch(kind, scene, batch):
     net = exact(prepared(kind, scene, batch))
     force = noise(scene, 5)
     with torch.no_grad():
@@ -453,7 +455,7 @@ def test_a_batch_is_its_members(kind, scene, batch):
 
 
 @NETWORKS
-def test_slopes_with_respect_to_forces_are_those_of_differences(kind, scene, batch):
+def test_gradients_with_respect_to_forces_equal_finite_differences(kind, scene, batch):
     net = exact(prepared(kind, scene, batch, rank=40))
     force, way = noise(scene).requires_grad_(), noise(scene, seed=1)
     weight = noise(scene, seed=2)
@@ -474,14 +476,14 @@ def test_slopes_with_respect_to_forces_are_those_of_differences(kind, scene, bat
 @pytest.mark.parametrize(
     "options", [{"rank": 0}, {"coordinates": 0}, {"width": 0}, {"blocks": -1}, {"rank": -3}]
 )
-def test_options_out_of_range_are_refused_by_name(kind, scene, options):
+def test_options_out_of_range_raise_an_error_with_their_name(kind, scene, options):
     (name, number) = next(iter(options.items()))
     with pytest.raises(ValueError, match=f"{name} = {number} must be"):
         kind(scene, **options)
 
 
 @NETWORKS
-def test_no_blocks_at_all_are_a_network_too(kind, scene, batch):
+def test_a_network_without_blocks_is_accepted(kind, scene, batch):
     net = prepared(kind, scene, batch, blocks=0).net
     assert len(net.blocks) == 0
     assert net(noise(scene).float()).any()

@@ -62,7 +62,9 @@ def gradients(module, batch):
 
 
 @CASES
-def test_errors_of_coordinates_and_the_rest_are_those_of_the_field(build, batch, kind, options):
+def test_squared_errors_of_coordinates_plus_projection_errors_equal_those_of_fields(
+    build, batch, kind, options
+):
     """Parseval: the basis is orthonormal."""
     module = build(kind, options)
     part = encoded(module, batch)
@@ -74,14 +76,14 @@ def test_errors_of_coordinates_and_the_rest_are_those_of_the_field(build, batch,
 
 
 @CASES
-def test_sizes_are_mean_squares_of_whole_displacements(build, batch, kind, options):
+def test_mean_square_is_that_of_whole_displacements(build, batch, kind, options):
     module = build(kind, options)
     size = encoded(module, batch).mean_square * module.displacement_scale**2
     assert torch.allclose(size, batch.displacement.square().mean(dim=(1, 2)), rtol=1e-9)
 
 
 @CASES
-def test_targets_are_the_best_coordinates(build, batch, kind, options):
+def test_targets_are_the_least_squares_coordinates(build, batch, kind, options):
     """No other coordinates are nearer to the field; with all modes nothing is left."""
     module = build(kind, options)
     part = encoded(module, batch)
@@ -92,7 +94,7 @@ def test_targets_are_the_best_coordinates(build, batch, kind, options):
 
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("kind", [PODNet, Latent])
-def test_squared_errors_are_right_with_fewer_snapshots_than_modes(build, scene, batch, kind, count):
+def test_squared_errors_are_exact_with_fewer_snapshots_than_modes(build, scene, batch, kind, count):
     module = build(kind, {"symmetry": False})
     few = Sample(*(column[:count] for column in batch))
     module.fit_bases(few)
@@ -109,7 +111,7 @@ def test_squared_errors_are_right_with_fewer_snapshots_than_modes(build, scene, 
 
 @CASES
 @pytest.mark.parametrize("loss", [MSE(), MSE(relative=0.5), RMSELoss(relative=0.8, floor=1e-4)])
-def test_the_loss_of_coordinates_is_that_of_fields(build, batch, kind, options, loss):
+def test_the_loss_in_coordinates_equals_the_loss_of_fields(build, batch, kind, options, loss):
     module = build(kind, options, loss)
     with torch.no_grad():
         found = float(module.training_step(encoded(module, batch), 0))
@@ -117,7 +119,7 @@ def test_the_loss_of_coordinates_is_that_of_fields(build, batch, kind, options, 
 
 
 @CASES
-def test_the_gradient_of_coordinates_is_that_of_fields(build, batch, kind, options):
+def test_the_gradient_in_coordinates_equals_that_of_fields(build, batch, kind, options):
     """Of the squared error, whatever the basis misses: it has no slope."""
     module = build(kind, options, MSE(relative=0.5))
     (_, found), (_, expected) = (
@@ -127,7 +129,9 @@ def test_the_gradient_of_coordinates_is_that_of_fields(build, batch, kind, optio
 
 
 @CASES
-def test_the_gradient_of_a_norm_is_that_of_fields_too(build, batch, kind, options):
+def test_the_gradient_of_rmse_loss_in_coordinates_equals_that_of_fields(
+    build, batch, kind, options
+):
     module = build(kind, options, RMSELoss())
     (_, found), (_, expected) = (
         gradients(module, part) for part in (encoded(module, batch), batch)
@@ -147,13 +151,13 @@ def test_a_step_in_coordinates_evaluates_no_field(build, batch, kind, monkeypatc
     assert not all(map(torch.equal, module.parameters(), before))
 
 
-def test_only_losses_of_squared_errors_are_found_in_coordinates(build, scene, batch):
+def test_only_losses_of_squared_errors_train_in_coordinates(build, scene, batch):
     assert build(Latent, {}, LrStar()).encode(batch) is None
     assert Surrogate(FCNN(scene, width=8), MSE(), scene).encode(batch) is None
     assert isinstance(build(Latent, {}, RMSELoss()).encode(batch), ReducedDataset)
 
 
-def test_the_plan_tells_of_coordinates_where_they_are_used(build):
+def test_skipped_work_mentions_coordinates_where_they_are_used(build):
     told = "no fields in training from disk: the loss is computed in coordinates"
     assert told in build(PODNet, {}).skipped_work()
     assert told in build(Latent, {}, RMSELoss()).skipped_work()
@@ -190,7 +194,7 @@ def test_without_symmetry_there_is_one_image(build, batch):
     assert len(build(Latent, {"symmetry": False}).encode(batch)) == 12
 
 
-def test_the_first_images_are_the_samples_as_the_network_reads_them(build, batch):
+def test_the_first_images_are_the_inputs_of_the_network(build, batch):
     module, seen = build(PODNet, {"rank": 4, "coordinates": 4}), []
     module.net.symmetrised_output = lambda inputs: (
         seen.append(inputs) or torch.zeros(len(inputs), 4)
@@ -219,9 +223,7 @@ def test_batches_are_fetched_in_any_order():
     assert batch.mean_square.tolist() == [5.0, 3.0, 3.0]
 
 
-def test_images_that_the_data_want_are_made_where_the_network_has_no_symmetry(
-    build, scene, data, batch
-):
+def test_the_data_module_computes_images_if_the_network_has_no_symmetry(build, scene, data, batch):
     data.symmetry = True
     module = build(PODNet, {"symmetry": False})
     data.trainer = type("Trainer", (), {"lightning_module": module, "global_rank": 0})()

@@ -31,25 +31,25 @@ def noise(body, count=3):
     return torch.where(body.problem.free, field, 0.0)
 
 
-def test_fields_are_what_their_images_are_at_few_nodes(body, orbits):
+def test_images_at_representatives_determine_the_field(body, orbits):
     field = noise(body)
     assert torch.allclose(orbits.field(orbits.images(field), field), field, rtol=0, atol=1e-14)
 
 
-def test_images_are_seen(body, group, orbits):
+def test_images_at_representatives_are_those_of_the_symmetries(body, group, orbits):
     field = noise(body)
     for k, symmetry in enumerate(group):
         expected = orbits.at_representatives(symmetry.image(field))
         assert torch.allclose(orbits.images(field)[:, k], expected, rtol=0, atol=1e-14)
 
 
-def test_shares_make_a_scalar_product(body, orbits):
+def test_weights_reproduce_the_scalar_product(body, orbits):
     one, other = noise(body), noise(body).roll(1, dims=0)
     found = (orbits.images(one) * orbits.weights * orbits.images(other)).sum(dim=(1, 2))
     assert torch.allclose(found, (one * other).sum(dim=(1, 2)), rtol=1e-12)
 
 
-def test_there_is_one_node_of_each_orbit(body, group, orbits):
+def test_each_orbit_has_one_representative(body, group, orbits):
     free = body.problem.free.any(dim=1)
     sources = torch.stack([symmetry.source for symmetry in group])[:, free]
     count = len({tuple(sorted(set(column.tolist()))) for column in sources.T})
@@ -57,7 +57,7 @@ def test_there_is_one_node_of_each_orbit(body, group, orbits):
     assert len(orbits.weights) <= 3 * int(free.sum()) / (len(group) / 2)
 
 
-def test_without_a_group_all_nodes_stand_for_themselves(body):
+def test_without_a_group_every_node_is_a_representative(body):
     orbits, field = Orbits([], body.problem.free), noise(body)
     free = body.problem.free.any(dim=1)
     assert torch.equal(orbits.at_representatives(field), field[:, free].flatten(1))

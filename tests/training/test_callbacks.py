@@ -1,6 +1,6 @@
-"""Laws of what a run shows: the worst loads, true rates, one curve a run, and a line beside others.
+"""Callbacks log pictures of the largest errors, rates, hyperparameters and the end of a run.
 
-Event files are read back by TensorBoard's own readers.
+Event files are read with TensorBoard's readers.
 """
 
 import csv
@@ -52,7 +52,7 @@ def surrogate(scene):
 
 
 def trainer(folder, *callbacks, epochs=1, logger=None, **options):
-    """Return a quiet trainer that writes to a TensorBoard of its own if not told otherwise."""
+    """Return a quiet trainer; its default logger is a TensorBoard logger in the folder."""
     if logger is None:
         logger = TensorBoardLogger(folder, name="", version="", default_hp_metric=False)
     quiet = {"enable_progress_bar": False, "enable_model_summary": False}
@@ -69,7 +69,7 @@ def trainer(folder, *callbacks, epochs=1, logger=None, **options):
 
 
 def events(folder):
-    """Return what TensorBoard reads of a run."""
+    """Return the events of a run as TensorBoard reads them."""
     found = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 0, "tensors": 0})
     found.Reload()
     return found
@@ -84,7 +84,7 @@ def last(found, tag):
 
 
 class Slow(L.Callback):
-    """Takes its time with each step, and far more with each validation."""
+    """Waits in each step, and longer in each validation."""
 
     def on_train_batch_start(self, *_):
         time.sleep(0.02)
@@ -94,7 +94,7 @@ class Slow(L.Callback):
 
 
 class Fails(L.Callback):
-    """Ends a training in the midst of an epoch."""
+    """Raises an error in the middle of an epoch."""
 
     def __init__(self, step, error):
         self.step, self.error = step, error
@@ -107,7 +107,9 @@ class Fails(L.Callback):
 # ------------------------------------------------------------------ the worst loads
 
 
-def test_pictures_come_after_ever_more_validations_and_at_the_end(scene, data, tmp_path):
+def test_the_number_of_validations_between_pictures_doubles_and_the_end_is_drawn(
+    scene, data, tmp_path
+):
     tutor = trainer(tmp_path, WorstCasePlots(every=1), epochs=6)
     tutor.fit(surrogate(scene), datamodule=data)
     found, wanted = events(tmp_path), [BATCHES * epoch - 1 for epoch in (1, 2, 4, 6)]
@@ -119,12 +121,12 @@ def test_pictures_come_after_ever_more_validations_and_at_the_end(scene, data, t
     assert set(wanted) <= set(steps(found.Scalars("val/e_mean"))), "the same steps as scalars"
 
 
-def test_a_picture_of_the_end_is_not_drawn_twice(scene, data, tmp_path):
+def test_the_final_state_is_drawn_once(scene, data, tmp_path):
     trainer(tmp_path, WorstCasePlots(every=2), epochs=2).fit(surrogate(scene), datamodule=data)
     assert steps(events(tmp_path).Images("validation/shapes")) == [2 * BATCHES - 1]
 
 
-def test_pictures_are_of_a_size_that_can_be_read(scene, data, tmp_path):
+def test_pictures_are_large_enough_to_read(scene, data, tmp_path):
     trainer(tmp_path, WorstCasePlots()).fit(surrogate(scene), datamodule=data)
     for tag in ("validation/shapes", "validation/errors"):
         (event,) = events(tmp_path).Images(tag)
@@ -142,12 +144,12 @@ def test_meshes_can_be_left_out(scene, data, tmp_path):
 
 
 @pytest.mark.parametrize("option", ["every", "loads", "max_polygons"])
-def test_less_than_one_of_anything_is_refused(option):
+def test_options_below_one_raise_an_error(option):
     with pytest.raises(ValueError, match=f"{option} = 0 must be 1 or more"):
         WorstCasePlots(**{option: 0})
 
 
-def test_judged_loads_have_the_errors_of_the_metrics(scene, batch):
+def test_per_sample_errors_equal_the_metrics(scene, batch):
     module = surrogate(scene).eval()
     with torch.no_grad():
         prediction = module.predict(batch.load)
@@ -160,7 +162,7 @@ def test_judged_loads_have_the_errors_of_the_metrics(scene, batch):
     assert torch.allclose(judged.size, batch.displacement.norm(dim=2).amax(dim=1))
 
 
-def test_the_loads_with_the_largest_errors_of_either_kind_are_chosen_and_a_typical_one():
+def test_loads_with_the_largest_errors_of_both_kinds_and_a_typical_load_are_selected():
     relative = torch.tensor([0.1, 0.5, 0.2, 0.9, 0.3, 0.4, 0.15])
     largest = torch.tensor([0.7, 0.1, 0.8, 0.3, 0.9, 0.0, 0.05])
     judged = PerLoadErrors(relative, largest, torch.full((7,), 0.25))
@@ -171,7 +173,7 @@ def test_the_loads_with_the_largest_errors_of_either_kind_are_chosen_and_a_typic
     )
 
 
-def test_a_load_that_is_worst_in_both_ways_is_shown_once_and_the_next_beside_it():
+def test_a_load_with_both_largest_errors_is_selected_once():
     worst = torch.tensor([0.1, 0.9, 0.2, 0.3, 0.05])
     judged = PerLoadErrors(worst, worst, worst)
     assert judged.select(1) == [1, 3, 0]
@@ -179,20 +181,20 @@ def test_a_load_that_is_worst_in_both_ways_is_shown_once_and_the_next_beside_it(
     assert judged.select(3) == [1, 3, 2, 0, 4]
 
 
-def test_an_answer_that_is_no_number_is_worst_of_all():
+def test_a_nan_prediction_has_the_largest_error():
     errors = torch.tensor([0.1, torch.inf, torch.nan, 0.3])
     judged = PerLoadErrors(errors, errors, torch.ones(4))
     assert set(judged.select(1)[:2]) == {1, 2}
 
 
-def test_one_load_is_enough(scene, data, tmp_path):
+def test_pictures_of_a_single_load_are_drawn(scene, data, tmp_path):
     whole = data.samples("val")
     data._loaded["val"] = Sample(*(column[:1] for column in whole))
     trainer(tmp_path, WorstCasePlots()).fit(surrogate(scene), datamodule=data)
     assert len(events(tmp_path).Images("validation/shapes")) == 1
 
 
-def test_a_network_that_answers_with_no_number_is_drawn_without_its_mesh(scene, data, tmp_path):
+def test_a_nan_prediction_is_drawn_without_a_mesh(scene, data, tmp_path):
     module = surrogate(scene)
     with torch.no_grad():
         for parameter in module.parameters():
@@ -204,7 +206,7 @@ def test_a_network_that_answers_with_no_number_is_drawn_without_its_mesh(scene, 
     assert not found.Tags()["tensors"]
 
 
-def test_pictures_do_not_change_what_is_learnt(scene, data, tmp_path):
+def test_pictures_do_not_change_the_training(scene, data, tmp_path):
     """To the bit, with a network that draws random numbers in training."""
     learnt = []
     for name, callbacks in (
@@ -220,7 +222,7 @@ def test_pictures_do_not_change_what_is_learnt(scene, data, tmp_path):
         assert torch.equal(value, learnt[1][key]), key
 
 
-def test_the_part_of_the_time_that_pictures_take_is_told(scene, data, tmp_path):
+def test_the_fraction_of_time_spent_on_pictures_is_logged(scene, data, tmp_path):
     trainer(tmp_path, WorstCasePlots(every=1), Slow(), epochs=2).fit(
         surrogate(scene), datamodule=data
     )
@@ -241,7 +243,7 @@ BODIES = {
 
 
 @pytest.mark.parametrize("name", BODIES)
-def test_a_mesh_is_where_the_network_puts_the_surface(make_scene, name):
+def test_the_mesh_has_the_predicted_positions_of_the_surface(make_scene, name):
     scene = make_scene(**BODIES[name], n_modes=2)
     generator = torch.Generator().manual_seed(0)
     truth, noise = (
@@ -278,7 +280,7 @@ def test_a_mesh_is_where_the_network_puts_the_surface(make_scene, name):
     assert torch.equal(faces[len(faces) // 2 :], of_one + half)
 
 
-def test_a_mesh_in_the_file_is_that_of_the_load_with_the_largest_error(scene, data, tmp_path):
+def test_the_written_mesh_is_that_of_the_load_with_the_largest_error(scene, data, tmp_path):
     module = surrogate(scene)
     trainer(tmp_path, WorstCasePlots(), epochs=2).fit(module, datamodule=data)
     truth = data.samples("val")
@@ -311,7 +313,7 @@ def test_the_mesh_of_a_large_body_is_coarser(make_scene):
 # ------------------------------------------------------------------ rates
 
 
-def test_rates_are_those_of_the_steps_without_validation(scene, data, tmp_path):
+def test_rates_exclude_the_time_of_validation(scene, data, tmp_path):
     tutor = trainer(tmp_path, ThroughputMonitor(), Slow(), epochs=3)
     start = time.perf_counter()
     tutor.fit(surrogate(scene), datamodule=data)
@@ -329,7 +331,7 @@ def test_rates_are_those_of_the_steps_without_validation(scene, data, tmp_path):
     assert last(found, "memory/process") == pytest.approx(resident_memory(), rel=0.5)
 
 
-def test_a_stream_shows_what_it_makes_and_how_full_its_buffer_is(scene, folder, data, tmp_path):
+def test_a_stream_logs_its_production_rate_and_buffer_size(scene, folder, data, tmp_path):
     options = {"val": 4, "test": 4, "workers": 0, "batch_size": 4, "batches": 3}
     module = OnlineData(scene, folder=str(folder), fresh=4, reuse=1, capacity=64, **options)
     threads = torch.get_num_threads()
@@ -372,7 +374,7 @@ def test_another_logger_has_the_scalars_hyperparameters_and_errors(scene, data, 
     assert "FCNN" in (tmp_path / "hparams.yaml").read_text()
 
 
-def test_of_two_loggers_each_has_its_part(scene, data, tmp_path):
+def test_two_loggers_both_receive_their_data(scene, data, tmp_path):
     loggers = [
         CSVLogger(tmp_path, name="csv", version=""),
         TensorBoardLogger(tmp_path, name="board", version=""),
@@ -410,7 +412,7 @@ def broken(scene, data, tmp_path):
     return folder
 
 
-def test_a_resumed_run_goes_on_in_the_same_curves(scene, data, tmp_path, broken):
+def test_a_resumed_run_continues_the_same_curves(scene, data, tmp_path, broken):
     """As if nothing had been: neither a step twice nor one left out, and the same values."""
     straight = tmp_path / "straight"
     resumable(straight, LogHyperparameters({}), epochs=5).fit(surrogate(scene), datamodule=data)
@@ -463,7 +465,7 @@ def hparams_tab(folder):
     }
 
 
-def test_runs_that_ended_otherwise_stand_beside_those_that_did_not(scene, data, tmp_path):
+def test_the_hparams_tab_shows_running_failed_and_finished_runs(scene, data, tmp_path):
     ends = {
         "judged": None,
         "interrupted": Fails(4, KeyboardInterrupt()),

@@ -44,7 +44,7 @@ class Harm:
 
 
 @pytest.mark.parametrize("name", ["best.safetensors", "last.ckpt"])
-def test_a_checkpoint_comes_back_as_it_was(tmp_path, name):
+def test_reading_a_checkpoint_returns_what_was_written(tmp_path, name):
     write(CHECKPOINT, tmp_path / "folder" / name)
     found = read(tmp_path / "folder" / name)
     for key, tensor in WEIGHTS.items():
@@ -55,14 +55,14 @@ def test_a_checkpoint_comes_back_as_it_was(tmp_path, name):
     assert all(found[key] == CHECKPOINT[key] for key in kept - {"state_dict"})
 
 
-def test_weights_that_are_views_of_others_are_kept(tmp_path):
+def test_weights_that_are_views_of_others_are_written(tmp_path):
     state = {"whole": WEIGHTS["net.a"].T, "part": WEIGHTS["net.a"].T[0]}
     write({**CHECKPOINT, "state_dict": state}, tmp_path / "best.safetensors")
     found = read(tmp_path / "best.safetensors")["state_dict"]
     assert all(torch.equal(found[key], state[key]) for key in state)
 
 
-def test_lightning_writes_and_reads_through_it(tmp_path):
+def test_lightning_writes_and_reads_with_the_plugin(tmp_path):
     files = AtomicCheckpointIO()
     files.save_checkpoint(CHECKPOINT, str(tmp_path / "last.ckpt"))
     assert files.load_checkpoint(str(tmp_path / "last.ckpt"))["epoch"] == 3
@@ -82,7 +82,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_old_one(tmp_path):
     assert read(path)["epoch"] == 4
 
 
-def test_a_pickle_is_not_run(tmp_path):
+def test_reading_executes_no_code_of_a_pickle(tmp_path):
     path, harm = tmp_path / "last.ckpt", tmp_path / "harm"
     torch.save({**CHECKPOINT, "more": Harm(harm)}, path)
     with pytest.raises(ValueError, match=r"."):
@@ -93,7 +93,7 @@ def test_a_pickle_is_not_run(tmp_path):
     assert not harm.exists()
 
 
-def test_a_checkpoint_that_is_larger_inside_is_not_unpacked(tmp_path):
+def test_a_compressed_checkpoint_raises_an_error(tmp_path):
     path, content = tmp_path / "last.ckpt", io.BytesIO()
     torch.save({**CHECKPOINT, "zeros": torch.zeros(1_000_000)}, content)
     with (
@@ -107,7 +107,7 @@ def test_a_checkpoint_that_is_larger_inside_is_not_unpacked(tmp_path):
         read(path)
 
 
-def test_a_refused_pickle_is_told_without_advice_to_read_it_all_the_same(tmp_path):
+def test_the_error_for_a_pickle_gives_no_advice_to_disable_weights_only(tmp_path):
     torch.save({**CHECKPOINT, "more": Harm(tmp_path / "harm")}, tmp_path / "last.ckpt")
     with pytest.raises(
         ValueError, match="contains objects other than tensors and plain data"
@@ -118,7 +118,7 @@ def test_a_refused_pickle_is_told_without_advice_to_read_it_all_the_same(tmp_pat
 
 
 @pytest.mark.parametrize("harm", [0, 1, 10, 200, 1000, -1, -100])
-def test_a_file_cut_anywhere_is_refused_in_one_line(tmp_path, harm):
+def test_a_truncated_file_raises_an_error_of_one_line(tmp_path, harm):
     path = tmp_path / "last.ckpt"
     write(CHECKPOINT, path)
     path.write_bytes(path.read_bytes()[:harm])
@@ -127,7 +127,7 @@ def test_a_file_cut_anywhere_is_refused_in_one_line(tmp_path, harm):
     assert "\n" not in str(refusal.value)
 
 
-def test_epochs_are_those_that_were_done_and_weights_alone_have_none():
+def test_epochs_counts_finished_epochs_and_needs_the_optimizer_state():
     whole = {
         **CHECKPOINT,
         "loops": {},
@@ -150,20 +150,20 @@ def test_an_error_that_is_not_finite_is_never_the_best(tmp_path):
 
 
 @pytest.mark.parametrize("what", [[], {"state_dict": 1}, {"weights": {}}])
-def test_what_holds_no_weights_is_refused(tmp_path, what):
+def test_a_checkpoint_without_weights_raises_an_error(tmp_path, what):
     torch.save(what, tmp_path / "last.ckpt")
     with pytest.raises(ValueError, match="contains no weights"):
         read(tmp_path / "last.ckpt")
 
 
 @pytest.mark.parametrize("header", [None, {"dpl": "1"}, {"dpl": "{"}, {"other": "{}"}])
-def test_weights_without_a_header_are_refused(tmp_path, header):
+def test_weights_without_a_header_raise_an_error(tmp_path, header):
     save_file(WEIGHTS, tmp_path / "best.safetensors", header)
     with pytest.raises(ValueError, match=r"."):
         read(tmp_path / "best.safetensors")
 
 
-def test_a_header_says_no_more_than_it_may(tmp_path):
+def test_only_known_keys_of_a_header_are_read(tmp_path):
     told = {"dpl": json.dumps({"scene": "0f", "state_dict": {}, "random": 1})}
     save_file(WEIGHTS, tmp_path / "best.safetensors", told)
     found = read(tmp_path / "best.safetensors")
@@ -171,7 +171,7 @@ def test_a_header_says_no_more_than_it_may(tmp_path):
     assert found["state_dict"].keys() == WEIGHTS.keys()
 
 
-def test_a_header_of_a_length_that_no_file_has_is_refused(tmp_path):
+def test_a_header_longer_than_the_file_raises_an_error(tmp_path):
     path = tmp_path / "best.safetensors"
     path.write_bytes((2**62).to_bytes(8, "little") + b"{}")
     with pytest.raises(ValueError, match=r"."):

@@ -115,7 +115,7 @@ def test_two_processes_end_with_equal_weights_and_one_evaluation(trained, tmp_pa
 
 
 @pytest.mark.slow
-def test_a_run_without_a_name_has_one_folder(trained, tmp_path):
+def test_two_processes_of_an_unnamed_run_share_one_folder(trained, tmp_path):
     """The name holds the time, and the second process starts seconds later."""
     status, _, err, ranks = trained("trainer.max_epochs=1")
     assert status == 0, err[-3000:]
@@ -153,7 +153,7 @@ def trainer(**options):
     return L.Trainer(accelerator="cpu", logger=False, callbacks=[kept], **options)
 
 
-def test_a_sweep_whose_runs_start_processes_is_refused_with_the_remedy(script, tiny, tmp_path):
+def test_a_sweep_of_multi_process_runs_raises_an_error_with_the_remedy(script, tiny, tmp_path):
     sizes = ["data.workers=0", "data.train=4", "run=sweep"]
     ended = script("train", "-m", "loss=mse,lr_star", *tiny, *sizes, *TWO, cwd=tmp_path)
     assert ended.status == 2
@@ -167,7 +167,7 @@ def test_a_sweep_whose_runs_start_processes_is_refused_with_the_remedy(script, t
     assert not list(tmp_path.rglob("config.yaml"))
 
 
-def test_a_refused_sweep_ends_with_one_line_and_makes_nothing(script, tiny, tmp_path):
+def test_a_refused_sweep_ends_with_one_line_and_writes_nothing(script, tiny, tmp_path):
     sizes = ["data.workers=0", "data.train=4", "run=sweep"]
     ended = script("train", "-m", "loss=mse,lr_star", *tiny, *sizes, *TWO, cwd=tmp_path)
     *_, last = ended.err.strip().splitlines()

@@ -121,7 +121,7 @@ def slopes_along(loss, prediction, batch, physics, step=1e-6):
         yield (up - down) / (2 * step), float((slope * way).sum())
 
 
-def test_a_loss_is_least_at_the_exact_answer(loss, few, physics, near):
+def test_a_loss_is_minimal_at_the_reference_solution(loss, few, physics, near):
     if isinstance(loss, PotentialEnergyLoss):  # least, but not zero
         exact, off = (loss(u, few, physics) for u in (few.displacement, near))
         assert exact < off
@@ -138,7 +138,9 @@ def test_a_loss_is_a_positive_scalar_in_double_precision(loss, few, physics, nea
     assert float(value) > 0 or isinstance(loss, PotentialEnergyLoss)
 
 
-def test_a_loss_has_a_finite_gradient_that_leads_downhill(loss, few, physics, near):
+def test_the_negative_gradient_of_a_loss_is_finite_and_a_descent_direction(
+    loss, few, physics, near
+):
     slope = gradient(loss, near, few, physics)
     assert slope.isfinite().all()
     step = 1e-6 / float(slope.norm())
@@ -156,7 +158,7 @@ def test_a_loss_and_its_gradient_are_finite_where_elements_are_inverted(
         assert gradient(loss, prediction, few, physics).isfinite().all()
 
 
-def test_a_loss_logs_what_it_is_made_of(loss, few, physics, near):
+def test_a_loss_logs_its_terms(loss, few, physics, near):
     loss(near, few, physics)
     assert all(term.shape == () for term in loss.terms.values())
     logged = {}
@@ -166,7 +168,9 @@ def test_a_loss_logs_what_it_is_made_of(loss, few, physics, near):
     assert not any(value.requires_grad for value in logged.values())
 
 
-def test_a_batch_is_the_mean_of_its_members_unless_the_residual_weighs_it(few, physics, near):
+def test_the_loss_of_a_batch_is_the_mean_over_samples_except_for_residual_weights(
+    few, physics, near
+):
     relative = (
         MSE(relative=True, floor=0.0),
         EnergyNormLoss(floor=0.0),
@@ -192,7 +196,7 @@ def test_mse_evaluates_no_finite_element(few, physics, near, evaluations):
 
 
 @pytest.mark.parametrize("relative", [0.0, 0.5, 0.8, 1.0])
-def test_the_power_of_a_relative_loss_is_that_of_a_samples_size(few, physics, near, relative):
+def test_the_relative_exponent_applies_to_the_mean_square_of_a_sample(few, physics, near, relative):
     error = (near - few.displacement).square().mean(dim=(1, 2))
     size = few.displacement.square().mean(dim=(1, 2))
     found = float(MSE(relative=relative, floor=0.0)(near, few, physics))
@@ -208,7 +212,7 @@ def scaled_by_sample(near, few):
 
 
 @pytest.mark.parametrize("kind", [MSE, RMSELoss])
-def test_small_loads_count_as_much_as_large_ones_at_power_one_only(few, physics, near, kind):
+def test_small_and_large_loads_have_equal_weight_only_for_exponent_one(few, physics, near, kind):
     tiny, samples = scaled_by_sample(near, few)
     whole, plain = kind(relative=1.0, floor=0.0), kind()
     assert float(whole(tiny, samples, physics)) == pytest.approx(
@@ -218,7 +222,7 @@ def test_small_loads_count_as_much_as_large_ones_at_power_one_only(few, physics,
 
 
 @pytest.mark.parametrize("kind", [MSE, RMSELoss])
-def test_a_floor_keeps_loads_near_zero_from_outweighing_a_batch(few, physics, near, kind):
+def test_a_floor_limits_the_weight_of_loads_near_zero(few, physics, near, kind):
     """The error of the last sample stays as its displacement vanishes."""
     shrunk = few.displacement.clone()
     shrunk[-1] *= 1e-6
@@ -230,7 +234,7 @@ def test_a_floor_keeps_loads_near_zero_from_outweighing_a_batch(few, physics, ne
     assert kind(relative=1.0)(near, nothing, physics).isfinite()
 
 
-def test_mean_norm_is_the_mean_of_root_mean_squares(few, physics, near):
+def test_rmse_loss_is_the_mean_of_root_mean_squares(few, physics, near):
     """e_mean but for the root of the number of degrees of freedom."""
     norms = (near - few.displacement).flatten(1).norm(dim=1)
     expected = float(norms.mean()) / near[0].numel() ** 0.5
@@ -238,14 +242,14 @@ def test_mean_norm_is_the_mean_of_root_mean_squares(few, physics, near):
 
 
 @pytest.mark.parametrize("relative", [0.0, 0.8])
-def test_a_batch_in_mean_norm_is_the_mean_of_its_members(few, physics, near, relative):
+def test_rmse_loss_of_a_batch_is_the_mean_over_samples(few, physics, near, relative):
     loss = RMSELoss(relative=relative, floor=0.0)
     parts = [loss(near[k : k + 1], one, physics) for k, one in enumerate(singles(few))]
     mean = float(torch.stack(parts).mean())
     assert float(loss(near, few, physics)) == pytest.approx(mean, rel=1e-12)
 
 
-def test_the_slope_of_mean_norm_does_not_fade_with_the_error(few, physics, near):
+def test_the_gradient_of_rmse_loss_does_not_vanish_with_the_error(few, physics, near):
     error = near - few.displacement
     sizes = {}
     for kind in (RMSELoss, MSE):
@@ -257,25 +261,25 @@ def test_the_slope_of_mean_norm_does_not_fade_with_the_error(few, physics, near)
     assert sizes[MSE] == pytest.approx(1e-4, rel=1e-3)
 
 
-def test_every_sample_has_the_same_slope_in_mean_norm_however_large_its_error(few, physics, near):
+def test_the_gradient_norm_of_rmse_loss_is_the_same_for_all_samples(few, physics, near):
     factor = 10.0 ** torch.arange(4.0, dtype=torch.float64)[:, None, None]
     off = few.displacement + factor * (near - few.displacement)
     slopes = gradient(RMSELoss(), off, few, physics).flatten(1).norm(dim=1)
     assert torch.allclose(slopes, slopes[:1].expand(4), rtol=1e-6)
 
 
-def test_mean_norm_has_no_slope_at_the_exact_answer_and_no_nan(few, physics):
+def test_the_gradient_of_rmse_loss_is_zero_at_the_reference_solution(few, physics):
     slope = gradient(RMSELoss(relative=0.8), few.displacement, few, physics)
     assert not slope.any()
     assert slope.isfinite().all()
 
 
-def test_the_gradient_of_mean_norm_is_that_of_finite_differences(few, physics, near):
+def test_the_gradient_of_rmse_loss_equals_finite_differences(few, physics, near):
     for expected, found in slopes_along(RMSELoss(relative=0.8), near, few, physics):
         assert found == pytest.approx(expected, rel=1e-5)
 
 
-def test_losses_of_squared_errors_need_no_field(few, physics, near):
+def test_losses_can_be_computed_from_squared_errors(few, physics, near):
     error = (near - few.displacement).square().mean(dim=(1, 2))
     size = few.displacement.square().mean(dim=(1, 2))
     for loss in (MSE(), MSE(relative=0.5), RMSELoss(), RMSELoss(relative=0.8, floor=1e-4)):
@@ -288,7 +292,7 @@ def test_losses_of_squared_errors_need_no_field(few, physics, near):
 @pytest.mark.parametrize(
     "options", [{"relative": -0.1}, {"relative": 1.1}, {"floor": -1.0}, {"floor": 2.0}]
 )
-def test_weights_of_squared_errors_out_of_range_are_refused_by_name(kind, options):
+def test_options_of_squared_errors_out_of_range_raise_an_error(kind, options):
     ((name, number),) = options.items()
     with pytest.raises(ValueError, match=f"{name} = {number} must lie between 0 and 1"):
         kind(**options)
@@ -301,7 +305,7 @@ def test_residual_losses_evaluate_finite_elements_once_a_batch(few, physics, nea
         assert evaluations == [4]
 
 
-def test_the_slope_of_a_residual_takes_two_evaluations_more(few, physics, near, evaluations):
+def test_the_gradient_of_a_residual_takes_two_more_evaluations(few, physics, near, evaluations):
     gradient(LrPlus(), near, few, physics)
     assert evaluations == [4, 4, 4]
     evaluations.clear()
@@ -310,16 +314,14 @@ def test_the_slope_of_a_residual_takes_two_evaluations_more(few, physics, near, 
     assert evaluations == [4]
 
 
-def test_the_residual_is_over_the_largest_modal_force(scene, few, physics, near):
+def test_the_residual_is_relative_to_the_largest_modal_force(scene, few, physics, near):
     problem = scene.problem
     forces = problem.internal_force(near) - few.force
     expected = [float(f[problem.free].norm()) / scene.loads.largest_force for f in forces]
     assert residual_norm(near, few, physics).tolist() == pytest.approx(expected, rel=1e-10)
 
 
-def test_the_residual_of_an_inverted_sample_is_the_largest_of_its_batch(
-    few, physics, near, inverted
-):
+def test_an_inverted_sample_gets_the_largest_residual_of_its_batch(few, physics, near, inverted):
     mixed = torch.cat([near[:3], inverted[3:]])
     norms = residual_norm(mixed, few, physics)
     if not physics.problem.residual(inverted[3:], few.force[3:]).isfinite().all():
@@ -352,12 +354,12 @@ def test_lr_plus_is_mse_plus_the_weighted_residual(few, physics, near):
         assert value == pytest.approx(error + weight * norm, rel=1e-12)
 
 
-def test_the_gradient_of_lr_plus_is_that_of_finite_differences(few, physics, near):
+def test_the_gradient_of_lr_plus_equals_finite_differences(few, physics, near):
     for expected, found in slopes_along(LrPlus(), near, few, physics):
         assert found == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_product_with_the_tangent_is_that_of_tensors(scene, few):
+def test_the_tangent_product_equals_the_one_of_automatic_differentiation(scene, few):
     problem, u = scene.problem, few.displacement
     way = torch.randn(u.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     way = torch.where(problem.free, way, 0.0)
@@ -368,7 +370,7 @@ def test_a_product_with_the_tangent_is_that_of_tensors(scene, few):
     assert not found[0].any()
 
 
-def test_lr_plus_at_the_answer_has_the_slope_of_no_kink(scene, few, physics):
+def test_lr_plus_has_a_finite_gradient_at_the_reference_solution(scene, few, physics):
     """The norm's slope is bounded also where the residual is all but zero."""
     exact = solve(scene.solver, few.load).displacement
     assert gradient(LrPlus(), exact, few, physics).isfinite().all()
@@ -391,7 +393,7 @@ def test_without_a_warmup_the_weight_stays():
 
 
 @pytest.mark.parametrize("options", [{"weight": -1.0}, {"warmup_epochs": -1}])
-def test_negative_options_are_refused_by_name(options):
+def test_negative_options_raise_an_error(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         LrPlus(**options)
 
@@ -405,9 +407,7 @@ def test_the_terms_of_a_residual_loss_are_its_error_and_its_residual(loss, few, 
     assert float(loss.terms["residual"]) == pytest.approx(float(norm), rel=1e-12)
 
 
-def test_an_inverted_sample_has_the_largest_residual_of_the_batch_and_no_gradient(
-    few, physics, near, inverted
-):
+def test_an_inverted_sample_has_the_largest_residual_and_no_gradient(few, physics, near, inverted):
     mixed = torch.cat([near[:3], inverted[3:]])
     norms = residual_norm(mixed, few, physics)
     sound = residual_norm(near, few, physics)[:3]
@@ -422,7 +422,7 @@ def test_an_inverted_sample_has_the_largest_residual_of_the_batch_and_no_gradien
 # ------------------------------------------------------------------ the energy norm of the error
 
 
-def test_stiffness_is_the_squared_energy_norm_of_the_error(scene, few, physics, near):
+def test_energy_norm_loss_is_the_squared_energy_norm_of_the_error(scene, few, physics, near):
     problem, rest = scene.problem, torch.zeros_like(near)
 
     def work(field):
@@ -437,12 +437,12 @@ def test_stiffness_is_the_squared_energy_norm_of_the_error(scene, few, physics, 
 
 
 @pytest.mark.parametrize("relative", [True, False])
-def test_the_gradient_of_stiffness_is_that_of_finite_differences(few, physics, near, relative):
+def test_the_gradient_of_energy_norm_loss_equals_finite_differences(few, physics, near, relative):
     for expected, found in slopes_along(EnergyNormLoss(relative=relative), near, few, physics):
         assert found == pytest.approx(expected, rel=1e-6)
 
 
-def test_stiffness_evaluates_one_tangent_and_no_other_finite_element(
+def test_energy_norm_loss_assembles_one_tangent_and_nothing_else(
     few, physics, near, evaluations, monkeypatch
 ):
     made = []
@@ -455,7 +455,7 @@ def test_stiffness_evaluates_one_tangent_and_no_other_finite_element(
     assert len(made) == 1
 
 
-def test_the_energy_assembles_one_tangent(few, physics, near, monkeypatch):
+def test_potential_energy_loss_assembles_one_tangent(few, physics, near, monkeypatch):
     made, linearise = [], Problem.linearise
     monkeypatch.setattr(Problem, "linearise", lambda *a: made.append(1) or linearise(*a))
     loss = PotentialEnergyLoss()
@@ -464,7 +464,7 @@ def test_the_energy_assembles_one_tangent(few, physics, near, monkeypatch):
     assert len(made) == 1
 
 
-def test_a_loss_forgets_the_stiffness_of_another_body(few, physics, near, make_scene):
+def test_a_loss_replaces_the_stiffness_of_another_problem(few, physics, near, make_scene):
     used, other = EnergyNormLoss(), make_scene(poisson=0.45)
     used(near, few, physics)
     there = LossContext(other.problem, physics.largest_force)
@@ -472,7 +472,7 @@ def test_a_loss_forgets_the_stiffness_of_another_body(few, physics, near, make_s
     assert float(used(near, few, there)) != float(used(near, few, physics))
 
 
-def test_products_with_the_rest_stiffness_are_those_of_any_device(scene, few):
+def test_products_with_the_rest_stiffness_do_not_depend_on_the_device(scene, few):
     """Other devices take torch's sparse matrices, which the processor has as well."""
     rest, free = RestStiffness(scene.problem), scene.problem.free
     image = rest._on_device @ few.displacement[:, free].T
@@ -487,7 +487,7 @@ def test_a_loss_is_pickled_without_its_matrices(loss, few, physics, near):
     assert float(twin(near, few, physics)) == pytest.approx(float(value), rel=1e-12)
 
 
-def test_relative_losses_weigh_a_load_by_its_own_size(few, physics, near):
+def test_relative_losses_divide_by_the_size_of_each_sample(few, physics, near):
     """A hundredth of a load, answered as badly, counts as much."""
     factor = torch.tensor([1e-2, 1.0, 1.0, 1.0], dtype=torch.float64)[:, None, None]
     small = few._replace(displacement=factor * few.displacement)
@@ -506,7 +506,7 @@ def test_sizes_have_a_floor():
 
 @pytest.mark.parametrize("kind", [MSE, EnergyNormLoss, PotentialEnergyLoss])
 @pytest.mark.parametrize("floor", [-0.1, 1.1, float("nan")])
-def test_a_floor_out_of_range_is_refused(kind, floor):
+def test_a_floor_out_of_range_raises_an_error(kind, floor):
     with pytest.raises(ValueError, match="floor"):
         kind(floor=floor)
 
@@ -520,13 +520,15 @@ def test_a_floor_may_be_zero_or_one(kind, floor):
 # ------------------------------------------------------------------ the energy, without answers
 
 
-def test_the_energy_reads_no_answer(few, unanswered, physics, near):
+def test_potential_energy_loss_does_not_read_reference_solutions(few, unanswered, physics, near):
     value = PotentialEnergyLoss()(near, unanswered, physics)
     assert value == PotentialEnergyLoss()(near, few, physics)
     assert gradient(PotentialEnergyLoss(), near, unanswered, physics).isfinite().all()
 
 
-def test_the_energy_is_the_potential_over_the_work_of_the_linear_answer(scene, few, physics, near):
+def test_potential_energy_loss_is_relative_to_the_work_of_the_linear_solution(
+    scene, few, physics, near
+):
     problem = scene.problem
     total = problem.energy(near) - (few.force * near).sum(dim=(1, 2))
     linear = torch.stack([scene.linear.solve(force) for force in few.force])
@@ -535,7 +537,9 @@ def test_the_energy_is_the_potential_over_the_work_of_the_linear_answer(scene, f
     assert found == pytest.approx(float((total / work).mean()), rel=1e-9)
 
 
-def test_the_energy_is_stationary_at_the_exact_answer(scene, few, unanswered, physics, near):
+def test_potential_energy_loss_is_stationary_at_the_reference_solution(
+    scene, few, unanswered, physics, near
+):
     exact = solve(scene.solver, few.load).displacement
     there, off = (
         gradient(PotentialEnergyLoss(), u, unanswered, physics).norm() for u in (exact, near)
@@ -543,12 +547,12 @@ def test_the_energy_is_stationary_at_the_exact_answer(scene, few, unanswered, ph
     assert there < 1e-6 * off
 
 
-def test_the_gradient_of_the_energy_is_that_of_finite_differences(unanswered, physics, near):
+def test_the_gradient_of_potential_energy_loss_equals_finite_differences(unanswered, physics, near):
     for expected, found in slopes_along(PotentialEnergyLoss(), near, unanswered, physics):
         assert found == pytest.approx(expected, rel=1e-5)
 
 
-def test_light_loads_count_as_much_as_heavy_ones(scene, few, physics):
+def test_light_and_heavy_loads_have_equal_weight(scene, few, physics):
     """Near rest the energy is -1 + the squared relative energy norm of the error, at any size."""
     energy, stiffness = PotentialEnergyLoss(floor=0.0), EnergyNormLoss(floor=0.0)
     for amplitude in (1e-3, 1e-5):
@@ -560,7 +564,7 @@ def test_light_loads_count_as_much_as_heavy_ones(scene, few, physics):
             assert float(energy(u, light, physics)) == pytest.approx(expected, abs=1e-3)
 
 
-def test_zero_loads_are_no_trouble(few, physics, near):
+def test_losses_are_finite_for_zero_loads(few, physics, near):
     still = Sample(0 * few.force, 0 * few.displacement, few.young)
     for loss in (PotentialEnergyLoss(), EnergyNormLoss(), MSE(relative=True), LrPlus(), LrStar()):
         for u in (near, 0 * near):
@@ -568,7 +572,7 @@ def test_zero_loads_are_no_trouble(few, physics, near):
             assert gradient(loss, u, still, physics).isfinite().all()
 
 
-def test_an_inverted_sample_has_the_energy_of_the_linear_body(scene, few, physics, inverted):
+def test_an_inverted_sample_has_the_linear_strain_energy(scene, few, physics, inverted):
     """Half of u^T K(0) u, over the work of the linear answer."""
     problem = scene.problem
     image = problem.tangent_product(torch.zeros_like(inverted), inverted)
@@ -582,7 +586,9 @@ def test_an_inverted_sample_has_the_energy_of_the_linear_body(scene, few, physic
     assert torch.allclose(slope, expected, rtol=1e-9, atol=1e-12 * float(expected.abs().max()))
 
 
-def test_inverted_samples_lead_to_where_nothing_is_inverted(scene, unanswered, physics, inverted):
+def test_descent_from_inverted_samples_reaches_states_without_inversion(
+    scene, unanswered, physics, inverted
+):
     u, problem, loss = inverted.clone().requires_grad_(), scene.problem, PotentialEnergyLoss()
     assert loss(u, unanswered, physics) > 0
     assert float(loss.terms["inverted"]) == 1
@@ -597,7 +603,7 @@ def test_inverted_samples_lead_to_where_nothing_is_inverted(scene, unanswered, p
     assert float(loss.terms["inverted"]) == 0
 
 
-def test_an_inverted_sample_leaves_the_others_as_they_are(unanswered, physics, near, inverted):
+def test_an_inverted_sample_does_not_change_the_others(unanswered, physics, near, inverted):
     mixed = torch.cat([near[:3], inverted[3:]])
     slope = gradient(PotentialEnergyLoss(), mixed, unanswered, physics)
     assert torch.equal(slope[:3], gradient(PotentialEnergyLoss(), near, unanswered, physics)[:3])
@@ -605,7 +611,7 @@ def test_an_inverted_sample_leaves_the_others_as_they_are(unanswered, physics, n
     assert (slope[3] * inverted[3]).sum() > 0  # downhill is towards rest
 
 
-def test_laws_that_are_finite_inside_out_have_no_minimum_there(few, make_scene):
+def test_potential_energy_loss_has_no_minimum_with_inverted_elements(few, make_scene):
     scene = make_scene(law=SaintVenantKirchhoff)
     physics = LossContext(scene.problem, torch.tensor(1.0, dtype=torch.float64))
     mirrored = torch.zeros_like(few.displacement)
@@ -615,7 +621,7 @@ def test_laws_that_are_finite_inside_out_have_no_minimum_there(few, make_scene):
     assert float(PotentialEnergyLoss()(mirrored, still, physics)) > 0.01
 
 
-def test_energies_count_from_rest(few, make_scene):
+def test_energies_are_zero_at_rest(few, make_scene):
     scene = make_scene(law=StableNeoHookean)
     physics = LossContext(scene.problem, torch.tensor(1.0, dtype=torch.float64))
     assert float(scene.problem.energy(0 * few.force)[0].abs()) > 0.01
@@ -635,7 +641,7 @@ def test_springs_are_part_of_the_energy(few):
         assert found == pytest.approx(expected, rel=1e-5)
 
 
-def test_descent_on_the_energy_ends_at_newtons_answers(scene, few, unanswered, physics):
+def test_minimising_the_energy_reaches_the_solutions_of_newton(scene, few, unanswered, physics):
     """In coordinates y with K(0) = L L^T, u = L^-T y, where stiff and soft are alike."""
     loss, free = PotentialEnergyLoss(floor=0.0), scene.problem.free
     root = torch.linalg.cholesky(torch.from_numpy(RestStiffness(scene.problem)._matrix.toarray()))
@@ -663,7 +669,7 @@ def test_descent_on_the_energy_ends_at_newtons_answers(scene, few, unanswered, p
 # ------------------------------------------------------------------ from one loss to another
 
 
-def test_an_annealed_loss_blends_its_parts(few, physics, near):
+def test_a_blended_loss_is_the_weighted_sum_of_its_parts(few, physics, near):
     first, second = MSE(relative=True), EnergyNormLoss()
     loss = BlendedLoss(first, second, epochs=4, start=2)
     seen = []
@@ -677,7 +683,7 @@ def test_an_annealed_loss_blends_its_parts(few, physics, near):
     assert seen == [0, 0, 0, 0.25, 0.5, 0.75, 1, 1]
 
 
-def test_what_has_no_weight_is_not_evaluated(few, physics, near, evaluations):
+def test_a_loss_of_weight_zero_is_not_evaluated(few, physics, near, evaluations):
     loss = BlendedLoss(MSE(), LrStar(), epochs=2)
     loss(near, few, physics)
     assert evaluations == []
@@ -688,13 +694,13 @@ def test_what_has_no_weight_is_not_evaluated(few, physics, near, evaluations):
     assert set(loss.terms) == {"weight", "second", "second/mse", "second/residual"}
 
 
-def test_the_parts_of_an_annealed_loss_anneal_too():
+def test_the_weights_of_the_parts_of_a_blended_loss_change_too():
     loss = BlendedLoss(MSE(), LrPlus(weight=2.0, warmup_epochs=4), epochs=2)
     loss.on_train_epoch_start(SimpleNamespace(current_epoch=3), None)
     assert loss.second.weight == 1.5
 
 
-def test_the_parts_of_an_annealed_loss_see_the_trainer_and_the_module():
+def test_the_parts_of_a_blended_loss_receive_trainer_and_module():
     class Watch(MSE):
         def on_train_epoch_start(self, trainer, module):
             self.seen = trainer, module
@@ -704,18 +710,18 @@ def test_the_parts_of_an_annealed_loss_see_the_trainer_and_the_module():
     assert all(part.seen == (trainer, module) for part in parts)
 
 
-def test_an_annealed_loss_leaves_out_what_both_do():
+def test_a_blended_loss_saves_the_work_that_both_parts_save():
     assert BlendedLoss(MSE(), LrStar(), epochs=1).skipped_work() == []
     assert BlendedLoss(MSE(), MSE(relative=True), epochs=1).skipped_work() == MSE().skipped_work()
 
 
 @pytest.mark.parametrize("options", [{"epochs": 0}, {"epochs": 1, "start": -1}])
-def test_a_schedule_out_of_range_is_refused(options):
+def test_a_schedule_out_of_range_raises_an_error(options):
     with pytest.raises(ValueError, match="epochs"):
         BlendedLoss(MSE(), EnergyNormLoss(), **options)
 
 
-def test_a_trainer_anneals_and_logs_the_weight(scene, data, tmp_path):
+def test_a_trainer_changes_and_logs_the_weight(scene, data, tmp_path):
     torch.manual_seed(0)
     module = Surrogate(
         FCNN(scene, width=8), BlendedLoss(MSE(), PotentialEnergyLoss(), epochs=2), scene

@@ -51,13 +51,13 @@ def test_metrics_are_the_formulas(scene, prediction, batch):
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 9])
-def test_the_median_is_that_of_numpy(count):
+def test_the_median_equals_that_of_numpy(count):
     values = np.random.default_rng(count).normal(size=(count, 3))
     assert median(torch.from_numpy(values)).numpy() == pytest.approx(np.median(values, axis=0))
     assert float(median(torch.from_numpy(values[:, 0]))) == pytest.approx(np.median(values[:, 0]))
 
 
-def test_the_median_of_endless_values_is_endless_and_of_no_number_is_none():
+def test_the_median_of_infinite_values_is_infinite_and_of_nan_is_nan():
     inf, nan = torch.inf, torch.nan
     assert float(median(torch.tensor([1.0, inf, inf, inf]))) == inf
     assert float(median(torch.tensor([1.0, 2.0, 3.0, inf]))) == 2.5
@@ -83,7 +83,9 @@ def test_metrics_forget_on_reset(scene, prediction, batch):
     assert float(found.compute()["e_max"]) == pytest.approx(expected["e_max"])
 
 
-def test_single_precision_predictions_are_judged_in_double(scene, prediction, batch):
+def test_errors_of_single_precision_predictions_are_computed_in_double_precision(
+    scene, prediction, batch
+):
     found = default_metrics(scene.problem)
     found.update(prediction.float(), batch)
     assert all(value.dtype == torch.float64 for value in found.compute().values())
@@ -120,7 +122,7 @@ def test_one_bad_node_of_one_load_is_the_largest_error(batch):
     assert float(mean.compute()) == pytest.approx(5.0 / (wrong[0].numel() * len(wrong)))
 
 
-def test_the_exact_answer_is_in_equilibrium_and_infinitely_clear(scene, batch):
+def test_the_reference_solution_has_zero_residual_and_infinite_snr(scene, batch):
     found = default_metrics(scene.problem)
     found.update(batch.displacement, batch)
     numbers = found.compute()
@@ -130,7 +132,7 @@ def test_the_exact_answer_is_in_equilibrium_and_infinitely_clear(scene, batch):
     assert float(numbers["min_det_F"]) > 0
 
 
-def test_an_inverted_prediction_is_seen(scene, batch):
+def test_an_inverted_prediction_has_a_negative_min_det_F(scene, batch):
     problem = scene.problem
     points = torch.where(problem.free, -1.5 * problem.points, 0.0).expand_as(batch.force)
     volume = MinVolumeRatio(problem)
@@ -141,7 +143,7 @@ def test_an_inverted_prediction_is_seen(scene, batch):
     assert float(residual.compute()) > 1  # infinite, and not NaN
 
 
-def test_a_prediction_that_is_no_number_is_never_the_best(scene, batch):
+def test_the_metrics_of_a_nan_prediction_are_never_the_best(scene, batch):
     broken = torch.full_like(batch.displacement, torch.nan)
     found = default_metrics(scene.problem)
     found.update(broken, batch)
@@ -156,7 +158,7 @@ METRICS = [MeanError, MaxError, MinSNR, RelativeL2, ResidualRatio, MinVolumeRati
 
 
 @pytest.mark.parametrize("kind", METRICS[:5])
-def test_a_metric_measures_each_load_by_itself(scene, prediction, batch, kind):
+def test_a_metric_of_a_load_does_not_depend_on_its_batch(scene, prediction, batch, kind):
     """The volume ratio is that of the whole batch, in `Problem.volume_ratio`."""
     metric = kind(scene.problem) if kind is ResidualRatio else kind()
     whole = metric.measure(prediction, batch)
@@ -168,7 +170,7 @@ def test_a_metric_measures_each_load_by_itself(scene, prediction, batch, kind):
         assert float(one) == pytest.approx(float(whole[k]), rel=1e-12)
 
 
-def test_numbers_of_several_processes_are_those_of_all_loads(prediction, batch):
+def test_metrics_of_several_processes_cover_all_loads(prediction, batch):
     """What torchmetrics does with the states of two processes, without the processes."""
     parts = [MeanError(), MeanError()]
     for part, rows in zip(parts, (slice(0, 5), slice(5, 12)), strict=True):
@@ -179,7 +181,7 @@ def test_numbers_of_several_processes_are_those_of_all_loads(prediction, batch):
     assert float(parts[0].compute()) == pytest.approx(float(whole.compute()), rel=1e-12)
 
 
-def test_metrics_that_agree_on_the_first_batch_are_still_measured_apart(scene, prediction, batch):
+def test_metrics_that_agree_on_the_first_batch_are_computed_separately(scene, prediction, batch):
     """At the exact answer e_mean and e_max are both zero, and their states the same."""
     found = default_metrics(scene.problem)
     found.update(batch.displacement, batch)
@@ -194,7 +196,7 @@ def test_metrics_that_agree_on_the_first_batch_are_still_measured_apart(scene, p
 # ------------------------------------------------------------------ which loads are shown
 
 
-def test_a_load_is_told_by_its_size_its_errors_and_its_rank_in_each():
+def test_the_title_of_a_load_contains_its_size_its_errors_and_their_ranks():
     relative = torch.tensor([0.012345, 0.04, 0.03, 0.02])
     largest = torch.tensor([0.4, 0.1, 0.2, 0.3])
     judged = PerLoadErrors(relative, largest, torch.tensor([0.2567, 0.1, 0.1, 0.1]))
@@ -209,7 +211,7 @@ def test_a_load_is_told_by_its_size_its_errors_and_its_rank_in_each():
     ]
 
 
-def test_the_farthest_load_has_the_largest_absolute_error():
+def test_largest_absolute_is_the_load_with_the_largest_absolute_error():
     relative, largest = torch.tensor([0.9, 0.1, 0.2]), torch.tensor([0.1, 0.8, 0.7])
     assert PerLoadErrors(relative, largest, largest).largest_absolute == 1
     assert (
@@ -223,7 +225,7 @@ def test_equal_errors_are_in_the_order_of_the_loads():
     assert PerLoadErrors(same, same, same).select(3) == [*range(6), 503]
 
 
-def test_few_loads_are_all_chosen_and_none_twice():
+def test_few_loads_are_all_selected_once():
     one = torch.tensor([0.5])
     assert PerLoadErrors(one, one, one).select(2) == [0]
     two = torch.tensor([0.5, 0.7])

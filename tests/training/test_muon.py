@@ -43,7 +43,7 @@ def same(one, other):
     return all(map(torch.equal, one.parameters(), other.parameters()))
 
 
-def test_matrices_are_muons_and_all_else_is_adams():
+def test_muon_updates_matrices_and_adam_all_other_parameters():
     """What the two do by themselves; torch's Muon to the digits of its bfloat16."""
     one, two = network(), network()
     whole = Muon(one.parameters(), lr=1e-2, momentum=0.9, betas=(0.8, 0.95), weight_decay=0.1)
@@ -88,7 +88,7 @@ def test_every_parameter_moves_and_the_loss_falls():
     assert loss_of(net) < 0.7 * loss_of(before)
 
 
-def test_steps_of_matrices_are_as_large_as_adams():
+def test_steps_of_matrices_have_the_size_of_adams_steps():
     """A root mean square of 0.2 of the rate, of any gradient (Liu et al. 2025)."""
     for size in (1e-4, 1e4):
         torch.manual_seed(0)
@@ -100,7 +100,7 @@ def test_steps_of_matrices_are_as_large_as_adams():
 
 
 @pytest.mark.parametrize("kind", ["matrices", "vectors"])
-def test_parameters_of_one_kind_are_enough(kind):
+def test_parameters_of_one_kind_are_accepted(kind):
     shape = (4, 3) if kind == "matrices" else (4,)
     parameter = nn.Parameter(torch.ones(shape))
     optimizer = Muon([parameter], lr=1e-1)
@@ -113,12 +113,12 @@ def test_parameters_of_one_kind_are_enough(kind):
     assert parameter.grad is None
 
 
-def test_no_parameters_are_refused():
+def test_an_empty_list_of_parameters_raises_an_error():
     with pytest.raises(ValueError, match="empty"):
         Muon([])
 
 
-def test_a_parameter_without_gradient_stays():
+def test_a_parameter_without_gradient_is_unchanged():
     net = network()
     net[3].weight.requires_grad_(False)
     kept = net[3].weight.clone()
@@ -182,7 +182,7 @@ def test_a_schedule_reaches_both_parts():
     assert seen[0] < seen[3] == 1.0 > seen[9] > 0
 
 
-def test_no_rate_no_step():
+def test_a_learning_rate_of_zero_changes_nothing():
     net = network()
     optimizer = Muon(net.parameters(), lr=1.0)
     torch.optim.lr_scheduler.LambdaLR(optimizer, lambda _: 0.0)
@@ -200,7 +200,7 @@ def saved(value):
     return torch.load(file, weights_only=True)
 
 
-def test_a_state_that_was_saved_goes_on_to_the_bit():
+def test_a_saved_state_continues_bit_for_bit():
     def fresh(net):
         optimizer = Muon(net.parameters(), lr=0.1, weight_decay=0.01)
         return optimizer, warmup_cosine(optimizer, total_steps=10)
@@ -223,7 +223,7 @@ def test_a_state_that_was_saved_goes_on_to_the_bit():
     assert rates(optimizer) == rates(parts[1])
 
 
-def test_a_state_brings_its_rate_and_a_schedule_still_reaches_it():
+def test_a_restored_learning_rate_still_follows_a_schedule():
     net = network()
     optimizer = Muon(net.parameters(), lr=0.5)
     state = copy.deepcopy(optimizer.state_dict())
@@ -246,7 +246,7 @@ def test_momenta_are_in_the_state():
     assert not same(one, two), "else there is nothing to save"
 
 
-def test_the_state_of_another_network_is_refused():
+def test_the_state_of_another_network_raises_an_error():
     state = Muon([nn.Parameter(torch.zeros(2, 2))]).state_dict()
     with pytest.raises(ValueError, match=r"zip|group"):
         Muon(network().parameters()).load_state_dict(state)
@@ -265,7 +265,7 @@ def test_a_copy_steps_as_its_original():
 
 
 @pytest.mark.xfail(strict=True, reason="a group that is added belongs to no part and never moves")
-def test_a_group_that_is_added_later_is_trained_or_refused():
+def test_an_added_parameter_group_is_trained_or_raises_an_error():
     """As Lightning's BaseFinetuning adds one."""
     net, late = network(), nn.Parameter(torch.ones(3))
     optimizer = Muon(net.parameters())
@@ -316,7 +316,7 @@ def fit(module, folder, **options):
     return trainer
 
 
-def test_a_run_resumed_from_a_checkpoint_ends_bit_for_bit_like_one_that_was_not(tmp_path):
+def test_a_run_resumed_from_a_checkpoint_ends_bit_for_bit_like_an_uninterrupted_one(tmp_path):
     straight = Line()
     trainer = fit(straight, tmp_path)
     assert trainer.global_step == 12
@@ -346,7 +346,7 @@ def test_a_run_resumed_from_a_checkpoint_ends_bit_for_bit_like_one_that_was_not(
     ],
 )
 @pytest.mark.parametrize("build", ["all", "vectors"])
-def test_numbers_out_of_range_are_refused_by_name(options, told, build):
+def test_numbers_out_of_range_raise_an_error_with_their_name(options, told, build):
     """With vectors alone too: that is how a command tries an optimiser before it solves."""
     parameters = network().parameters() if build == "all" else [nn.Parameter(torch.zeros(1))]
     with pytest.raises(ValueError, match=told):

@@ -1,4 +1,4 @@
-"""Laws of the guard: no step that is not finite, a count, and an end in words."""
+"""Steps with non-finite gradients are skipped, counted and stop a training that diverged."""
 
 import lightning as L
 import pytest
@@ -10,7 +10,7 @@ from dpl.training import Diverged, Muon, SkipNonFiniteGradients
 
 
 class Line(L.LightningModule):
-    """Learns y = 3 x; of a batch that is not finite its loss, or only the slope, is not."""
+    """Learns y = 3 x; the loss, or only its gradient, of a non-finite batch is not finite."""
 
     def __init__(self, optimizer, kind="loss"):
         super().__init__()
@@ -54,7 +54,9 @@ BAD = torch.tensor([[1.0], [torch.nan]])
 
 @pytest.mark.parametrize("kind", ["loss", "slope"])
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
-def test_a_bad_step_changes_nothing_and_is_counted(tmp_path, capsys, optimizer, kind):
+def test_a_step_with_nonfinite_gradients_changes_nothing_and_is_counted(
+    tmp_path, capsys, optimizer, kind
+):
     clean, none, _ = fit(tmp_path, GOOD, optimizer=optimizer, kind=kind)
     poisoned = [*GOOD[:10], BAD, *GOOD[10:20], BAD, BAD, *GOOD[20:]]
     module, guard, trainer = fit(tmp_path, poisoned, optimizer=optimizer, kind=kind)
@@ -66,17 +68,17 @@ def test_a_bad_step_changes_nothing_and_is_counted(tmp_path, capsys, optimizer, 
     assert "3 steps were skipped" in told
 
 
-def test_a_training_without_finite_steps_ends_in_words(tmp_path):
+def test_a_training_without_finite_gradients_raises_diverged(tmp_path):
     with pytest.raises(Diverged, match=r"3 consecutive steps .*rate of 5.0e-02; reduce opt"):
         fit(tmp_path, [*GOOD[:5], *[BAD] * 9])
 
 
-def test_skipped_steps_that_are_not_in_a_row_do_not_end_it(tmp_path):
+def test_skipped_steps_that_are_not_consecutive_do_not_stop_the_training(tmp_path):
     _, guard, _ = fit(tmp_path, [part for good in GOOD for part in (BAD, BAD, good)])
     assert guard.skipped_steps == 80
 
 
-def test_the_count_goes_on_in_a_resumed_run():
+def test_a_resumed_run_continues_the_count():
     guard, other = SkipNonFiniteGradients(), SkipNonFiniteGradients()
     guard.skipped_steps = 7
     other.load_state_dict(guard.state_dict())
@@ -84,13 +86,13 @@ def test_the_count_goes_on_in_a_resumed_run():
 
 
 @pytest.mark.parametrize("patience", [0, -1])
-def test_a_patience_out_of_range_is_refused(patience):
+def test_a_patience_out_of_range_raises_an_error(patience):
     with pytest.raises(ValueError, match=f"patience = {patience} must be 1 or more"):
         SkipNonFiniteGradients(patience=patience)
 
 
 @pytest.mark.parametrize(("error", "said"), [(1.7, True), (torch.nan, True), (0.4, False)])
-def test_a_network_that_has_learnt_nothing_is_told(tmp_path, capsys, error, said):
+def test_a_median_error_above_one_prints_a_warning(tmp_path, capsys, error, said):
     _, guard, trainer = fit(tmp_path, GOOD)
     trainer.callback_metrics["val/rel_L2_median"] = torch.tensor(error)
     capsys.readouterr()
@@ -98,7 +100,7 @@ def test_a_network_that_has_learnt_nothing_is_told(tmp_path, capsys, error, said
     assert ("no better than a prediction of zero" in capsys.readouterr().err) == said
 
 
-def test_a_rate_far_too_high_ends_with_one_line(script, tiny_training, tmp_path):
+def test_a_learning_rate_far_too_high_ends_with_one_line(script, tiny_training, tmp_path):
     wild = ["optimizer.lr=1e6", "trainer.max_epochs=30", "run=runs/wild"]
     ended = script("train", *tiny_training, *wild, cwd=tmp_path)
     assert ended.status == 2
@@ -108,7 +110,7 @@ def test_a_rate_far_too_high_ends_with_one_line(script, tiny_training, tmp_path)
     assert "Traceback" not in ended.err
 
 
-def test_a_training_whose_answers_are_not_finite_does_not_end_well(script, tiny_training, tmp_path):
+def test_a_training_with_nonfinite_predictions_fails(script, tiny_training, tmp_path):
     """Too short for the guard to give up, and validated as NaN each time."""
     wild = ["optimizer.lr=1e6", "trainer.max_epochs=3", "run=wild"]
     ended = script("train", *tiny_training, *wild, cwd=tmp_path)

@@ -219,7 +219,7 @@ LIMITED = textwrap.dedent(
 
 
 @pytest.mark.parametrize(("name", "most"), [("best.safetensors", 0), ("last.ckpt", 50_000)])
-def test_a_full_disk_ends_training_with_one_line_and_what_was_there_is_whole(
+def test_a_full_disk_ends_training_with_one_line_and_intact_files(
     straight, environment, overrides, home, name, most
 ):
     """No file may grow beyond a limit from the third epoch on, which is how a full disk fails."""
@@ -242,7 +242,7 @@ def test_a_full_disk_ends_training_with_one_line_and_what_was_there_is_whole(
 
 @pytest.mark.skipif(os.system("unshare -rm true 2>/dev/null") != 0, reason="needs unshare")
 @pytest.mark.parametrize("below", [pytest.param(".", marks=pytest.mark.slow), "checkpoints"])
-def test_a_folder_that_may_only_be_read_ends_training_with_one_line(
+def test_a_read_only_folder_ends_training_with_one_line(
     straight, environment, overrides, home, below
 ):
     """Root may write everywhere, so it is mounted so."""
@@ -262,13 +262,13 @@ def test_a_folder_that_may_only_be_read_ends_training_with_one_line(
     assert "Traceback" not in ended.stderr
 
 
-def test_two_runs_that_nobody_kills_are_the_same(straight, script, overrides, home):
+def test_two_uninterrupted_runs_are_equal(straight, script, overrides, home):
     """Else there is nothing to compare with."""
     assert script("train", *overrides("again", "fcnn"), cwd=home).status == 0
     assert_same(straight("fcnn"), last(home / "again"))
 
 
-def test_digests_see_a_single_bit(straight):
+def test_digests_detect_a_single_bit(straight):
     weights = straight("fcnn")["state_dict"]
     name = next(name for name in weights if name.endswith("weight"))
     other = {**weights, name: weights[name].clone()}
@@ -276,7 +276,7 @@ def test_digests_see_a_single_bit(straight):
     assert digest(other) != digest(weights)
 
 
-def test_a_run_killed_in_a_step_ends_bit_for_bit_like_one_that_was_not(
+def test_a_run_killed_in_a_step_ends_bit_for_bit_like_an_uninterrupted_one(
     straight, killed, script, overrides, home
 ):
     folder = killed("step", "fcnn", "step", 7)  # the second of epoch 3
@@ -290,7 +290,7 @@ def test_a_run_killed_in_a_step_ends_bit_for_bit_like_one_that_was_not(
     assert digest(best[0]["state_dict"]) == digest(best[1]["state_dict"])
 
 
-def test_a_killed_run_of_a_network_that_draws_ends_bit_for_bit_too(
+def test_a_killed_run_of_a_network_with_dropout_ends_bit_for_bit_the_same(
     straight, killed, script, overrides, home
 ):
     folder = killed("noise", "noisy", "step", 7)
@@ -323,7 +323,7 @@ def test_wherever_a_run_is_killed_it_ends_bit_for_bit_the_same(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("where", "at"), [("last.ckpt", 3), ("step", 2)])
-def test_a_network_that_draws_ends_the_same_wherever_it_is_killed(
+def test_a_network_with_dropout_ends_the_same_wherever_it_is_killed(
     straight, killed, script, overrides, home, where, at
 ):
     name = f"noisy-{where.partition('.')[0]}{at}"
@@ -333,7 +333,7 @@ def test_a_network_that_draws_ends_the_same_wherever_it_is_killed(
 
 
 @pytest.mark.slow
-def test_a_run_killed_again_and_again_ends_bit_for_bit_the_same(
+def test_a_run_killed_repeatedly_ends_bit_for_bit_the_same(
     straight, killed, script, overrides, home
 ):
     """Three lives."""
@@ -379,7 +379,7 @@ def test_a_run_killed_at_a_random_time_ends_bit_for_bit_the_same(
 
 
 @pytest.mark.slow
-def test_a_resumed_run_removes_what_the_killed_one_was_writing(
+def test_a_resumed_run_removes_the_partial_files_of_the_killed_one(
     straight, killed, script, overrides, home
 ):
     folder = killed("litter", "fcnn", "last.ckpt", 3)

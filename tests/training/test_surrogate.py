@@ -78,7 +78,7 @@ def identical(one, other):
 # ------------------------------------------------------------------ the border to SI units
 
 
-def test_answers_are_metres_from_newtons(scene, batch):
+def test_predictions_are_metres_from_newtons(scene, batch):
     module = surrogate(scene).eval()
     newtons = batch.force * (batch.young * scene.length**2)[:, None, None]
     with torch.no_grad():
@@ -87,7 +87,7 @@ def test_answers_are_metres_from_newtons(scene, batch):
     assert float(metres.abs().max()) > 0
 
 
-def test_the_relative_answer_does_not_depend_on_size_and_stiffness(make_scene, scene, batch):
+def test_relative_predictions_do_not_depend_on_size_and_stiffness(make_scene, scene, batch):
     """u/L is a function of f/(E L^2), to the rounding of float32."""
     steel = make_scene(size=(1.0, 0.25, 0.25), young=2e11)
     module, twin = surrogate(scene).eval(), surrogate(steel).eval()
@@ -99,7 +99,7 @@ def test_the_relative_answer_does_not_depend_on_size_and_stiffness(make_scene, s
     assert torch.allclose(soft, stiff, rtol=0, atol=1e-5 * float(soft.abs().max()))
 
 
-def test_a_stiffer_body_under_a_larger_force_moves_the_same(scene, batch):
+def test_force_and_stiffness_scaled_by_one_factor_give_the_same_displacement(scene, batch):
     module = surrogate(scene).eval()
     force = batch.force * 4500.0 * scene.length**2
     with torch.no_grad():
@@ -108,7 +108,7 @@ def test_a_stiffer_body_under_a_larger_force_moves_the_same(scene, batch):
     assert torch.allclose(here, there, rtol=1e-5, atol=1e-6 * float(here.abs().max()))
 
 
-def test_held_degrees_of_freedom_do_not_move_at_all(scene, batch):
+def test_fixed_degrees_of_freedom_have_exactly_zero_displacement(scene, batch):
     module = surrogate(scene).eval()
     wild = Load(batch.force + 1.0, batch.young)  # forces where none can act, too
     with torch.no_grad():
@@ -117,7 +117,7 @@ def test_held_degrees_of_freedom_do_not_move_at_all(scene, batch):
     assert answer[:, scene.problem.free].abs().min() > 0
 
 
-def test_the_network_is_single_and_its_answer_double_precision(scene, batch):
+def test_the_network_has_single_and_predictions_have_double_precision(scene, batch):
     seen = []
 
     class Spy(nn.Module):
@@ -156,7 +156,7 @@ def test_scales_are_a_function_of_the_scene(make_scene, scene):
         assert torch.equal(ours, theirs)
 
 
-def test_scales_know_no_load_of_the_data(scene, batch, monkeypatch):
+def test_scales_do_not_depend_on_the_data(scene, batch, monkeypatch):
     asked = []
     original = type(scene.loads).sample
 
@@ -184,7 +184,7 @@ def schedule(total, **options):
     return np.array(rates), optimizer.param_groups[0]["lr"]
 
 
-def test_the_rate_rises_then_falls_to_zero():
+def test_the_learning_rate_rises_then_falls_to_zero():
     rates, last = schedule(100, warmup=0.1)
     assert rates.max() == pytest.approx(1.0)
     assert rates.argmax() == 10
@@ -195,14 +195,14 @@ def test_the_rate_rises_then_falls_to_zero():
 
 
 @pytest.mark.parametrize("total", [1, 2, 5])
-def test_the_shortest_runs_have_a_rate(total):
+def test_the_learning_rate_of_the_shortest_runs_is_positive(total):
     rates, _ = schedule(total)
     assert (rates > 0).all()
     assert (rates <= 1).all()
 
 
 @pytest.mark.parametrize("warmup", [-0.1, 1.0, 2.0])
-def test_a_warmup_out_of_range_is_refused(warmup):
+def test_a_warmup_out_of_range_raises_an_error(warmup):
     with pytest.raises(ValueError, match="warmup"):
         schedule(10, warmup=warmup)
 
@@ -245,7 +245,7 @@ def test_validation_metrics_are_those_of_the_predictions(scene, data, tmp_path):
     assert float(tutor.callback_metrics["val/e_mean"]) == pytest.approx(float(expected), rel=1e-5)
 
 
-def test_metrics_do_not_pile_up_over_epochs(scene, data, tmp_path):
+def test_metrics_are_reset_after_each_epoch(scene, data, tmp_path):
     module = surrogate(scene, lr=0.0)  # nothing is learnt: every epoch has the same numbers
     seen = []
 
@@ -258,7 +258,7 @@ def test_metrics_do_not_pile_up_over_epochs(scene, data, tmp_path):
     assert len(set(seen)) == 1
 
 
-def test_tests_are_logged_under_their_own_names(scene, data, tmp_path):
+def test_test_metrics_have_their_own_prefix(scene, data, tmp_path):
     module = surrogate(scene)
     (numbers,) = trainer(tmp_path).test(module, datamodule=data, verbose=False)
     assert set(numbers) == {f"test/{name}" for name in METRICS}
@@ -301,7 +301,7 @@ def run(scene, folder, data, *, epochs=4, stop=None, resume=None, loss=LrPlus):
 
 
 @pytest.mark.parametrize("loss", [MSE, lambda: LrPlus(warmup_epochs=3)], ids=["mse", "annealed"])
-def test_a_resumed_run_ends_bit_for_bit_like_one_that_was_not_interrupted(
+def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(
     scene, folder, data, tmp_path, loss
 ):
     def fresh():
@@ -339,7 +339,7 @@ class Noisy(nn.Module):
         return self.linear(x).view_as(force)
 
 
-def test_a_resumed_run_of_a_network_that_draws_goes_on_with_the_same_numbers(
+def test_a_resumed_run_of_a_network_with_dropout_draws_the_same_numbers(
     scene, folder, data, tmp_path
 ):
     def noisy(name, *callbacks, resume=None):
@@ -377,7 +377,7 @@ def generators():
 
 
 @pytest.mark.parametrize("ahead", [0, 1, 700])
-def test_random_numbers_go_on_where_their_states_were_taken(generators, ahead):
+def test_random_numbers_continue_from_restored_states(generators, ahead):
     for _ in range(ahead):
         torch.rand(1), np.random.standard_normal(), random.gauss(0, 1)  # noqa: NPY002
     states = random_states()
@@ -387,7 +387,7 @@ def test_random_numbers_go_on_where_their_states_were_taken(generators, ahead):
     assert [draws(), draws()] == [first, second]
 
 
-def test_random_states_survive_a_file_that_runs_no_code(generators, tmp_path):
+def test_random_states_can_be_read_with_weights_only(generators, tmp_path):
     np.random.standard_normal(), random.gauss(0, 1)  # noqa: NPY002  # half of a pair is kept
     torch.save({"random": random_states()}, tmp_path / "states")
     expected = draws()
@@ -423,7 +423,7 @@ def test_a_checkpoint_without_random_states_is_resumed(scene, generators):
     assert torch.equal(torch.get_rng_state(), state)
 
 
-def test_loading_for_an_evaluation_leaves_random_numbers_alone(scene, generators):
+def test_loading_for_an_evaluation_does_not_change_random_numbers(scene, generators):
     """They are put back where training begins, not where a checkpoint is read."""
     checkpoint = {"scene": scene.fingerprint, "random": random_states()}
     draws()
@@ -436,13 +436,13 @@ def test_loading_for_an_evaluation_leaves_random_numbers_alone(scene, generators
     assert torch.equal(torch.get_rng_state(), checkpoint["random"]["torch"])
 
 
-def test_the_seed_decides_the_weights(scene, data, tmp_path):
+def test_the_seed_determines_the_weights(scene, data, tmp_path):
     one = run(scene, tmp_path / "a", data, epochs=1)[0]
     other = run(scene, tmp_path / "b", data, epochs=1)[0]
     assert identical(weights(one), weights(other))
 
 
-def test_an_interrupted_stream_goes_on_with_new_loads(scene, folder, data, tmp_path):
+def test_an_interrupted_stream_continues_with_new_loads(scene, folder, data, tmp_path):
     def stream():
         return OnlineData(
             scene, folder=str(folder), val=4, test=4, workers=0, batch_size=4, batches=3,
@@ -469,9 +469,7 @@ def test_best_is_the_checkpoint_with_the_smallest_error(scene, data, tmp_path):
     assert checkpoint["epoch"] == int(np.argmin(seen))
 
 
-def test_last_is_the_checkpoint_of_the_last_epoch_also_where_nothing_improves(
-    scene, data, tmp_path
-):
+def test_last_is_the_checkpoint_of_the_last_epoch_without_improvement_too(scene, data, tmp_path):
     trainer(tmp_path, max_epochs=3).fit(surrogate(scene, lr=0.0), datamodule=data)
     assert torch.load(tmp_path / "last.ckpt", weights_only=True)["epoch"] == 2
 
@@ -479,7 +477,7 @@ def test_last_is_the_checkpoint_of_the_last_epoch_also_where_nothing_improves(
 # ------------------------------------------------------------------ checkpoints
 
 
-def test_a_checkpoint_holds_scales_and_the_normaliser_of_the_residual(scene, data, tmp_path):
+def test_a_checkpoint_contains_the_scales_and_the_normaliser_of_the_residual(scene, data, tmp_path):
     run(scene, tmp_path, data, epochs=1)
     checkpoint = torch.load(tmp_path / "last.ckpt", weights_only=True)
     assert checkpoint["scene"] == scene.fingerprint
@@ -490,7 +488,9 @@ def test_a_checkpoint_holds_scales_and_the_normaliser_of_the_residual(scene, dat
     assert torch.equal(state["displacement_scale"], scales(scene)[1])
 
 
-def test_the_checkpoint_of_another_scene_is_refused_naming_both(scene, make_scene, data, tmp_path):
+def test_the_checkpoint_of_another_scene_raises_an_error_with_both_fingerprints(
+    scene, make_scene, data, tmp_path
+):
     run(scene, tmp_path, data, epochs=1)
     other = make_scene(poisson=0.25)
     checkpoint = torch.load(tmp_path / "last.ckpt", weights_only=True)
@@ -501,12 +501,12 @@ def test_the_checkpoint_of_another_scene_is_refused_naming_both(scene, make_scen
     surrogate(scene).on_load_checkpoint(checkpoint)
 
 
-def test_a_checkpoint_without_a_scene_is_refused(scene):
+def test_a_checkpoint_without_a_scene_raises_an_error(scene):
     with pytest.raises(ValueError, match="unknown"):
         surrogate(scene).on_load_checkpoint({"state_dict": {}})
 
 
-def test_the_plan_is_that_of_network_and_loss(scene):
+def test_skipped_work_is_that_of_network_and_loss(scene):
     module = surrogate(scene, MSE())
     assert module.skipped_work() == [*module.net.skipped_work(), *module.loss.skipped_work()]
     assert Surrogate(nn.Identity(), LrPlus(), scene).skipped_work() == []
