@@ -1,4 +1,4 @@
-"""Laws of the comparison of Newtons: textbook steps, honest counts, a row for each."""
+"""Comparison of Newton solvers: the textbook method, counts, summaries."""
 
 import csv
 import math
@@ -27,7 +27,7 @@ def loads(scene):
 
 @pytest.fixture(scope="module")
 def networks(scene):
-    """A network that knows the answer to a thousandth, and one that knows nothing."""
+    """A network with an error of 1e-3, and one with a random prediction."""
     near = lambda load: 1.001 * solve(scene.solver, load).displacement  # noqa: E731
     return {"near": near, "nan": lambda load: torch.full_like(load.force, torch.nan)}
 
@@ -98,7 +98,7 @@ def trial(solver, number, converged, ms, iterations=3, deviation=0.0):
 
 
 def test_summaries_count_converged_loads_and_compare_where_both_converged():
-    """Of four loads, robust Newton answers three, the hybrid three, both of them two."""
+    """Of four loads, robust Newton and the hybrid converge for three each, both for two."""
     trials = [
         trial(newton_starts.REFERENCE, k, converged, ms)
         for k, (converged, ms) in enumerate([(True, 10), (True, 30), (True, 99), (False, 999)])

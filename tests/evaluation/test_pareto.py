@@ -15,14 +15,14 @@ from dpl.inference import Direct, Hybrid
 
 @pytest.fixture(scope="module")
 def batch(scene):
-    """Six loads with the truth."""
+    """Six loads with reference solutions."""
     load = scene.loads.sample((0, 9), range(6))
     return Sample(load.force, solve(scene.solver, load).displacement, load.young)
 
 
 @pytest.fixture(scope="module")
 def solvers(scene):
-    """A network that is a thousandth off, alone and corrected, and Newton."""
+    """A network with an error of 1e-3, alone and corrected, and Newton."""
     near = lambda load: 1.001 * solve(scene.solver, load).displacement  # noqa: E731
     return {
         "linear": scene.linear,

@@ -1,4 +1,4 @@
-"""Laws of the benchmark: rows that count right, and an evaluation that leaves what it promises."""
+"""Evaluation: counts, times, and files that are written."""
 
 import json
 import re
@@ -25,7 +25,7 @@ def few(batch) -> Sample:
 
 
 class Known:
-    """Knows the answers (B, N, D) to a batch of loads, and counts as it is told."""
+    """Returns given solutions (B, N, D) and iteration counts."""
 
     def __init__(self, problem, batch, answers, counts):
         self.problem, self.batch, self.answers, self.counts = problem, batch, answers, counts
@@ -223,7 +223,7 @@ def test_the_worst_case_is_written_in_si_units(evaluated, surrogate, scene, few)
 
 
 def test_the_written_load_is_in_equilibrium(evaluated, scene):
-    """Read back, newtons and metres still balance."""
+    """The displacement and force that are read back satisfy equilibrium."""
     case = meshio.read(evaluated[1] / "worst.vtu")
     force = torch.from_numpy(case.point_data["force [N]"])[None]
     metres = torch.from_numpy(case.point_data["displacement [m]"])[None]

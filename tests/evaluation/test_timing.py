@@ -1,4 +1,4 @@
-"""Laws of latency: what is timed, in which order, and which percentiles are told."""
+"""Latency: timed calls, their order, and percentiles."""
 
 from types import SimpleNamespace
 
@@ -13,7 +13,7 @@ from dpl.training import MSE, Surrogate
 
 @pytest.fixture
 def watch(monkeypatch):
-    """A clock that only goes on where it is told to [s]."""
+    """A clock that advances only when told to [s]."""
     watch = SimpleNamespace(now=0.0)
     monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: watch.now))
     return watch

@@ -1,4 +1,4 @@
-"""Laws of the convolutional network and of the grid that immerses the body."""
+"""The convolutional network and its grid."""
 
 import math
 
@@ -14,7 +14,7 @@ from dpl.training import MSE, Surrogate
 
 
 def shaken(mesh, size=0.1):
-    """The mesh with its inner nodes moved by so many shortest edges: no longer a grid."""
+    """Return the mesh with its inner nodes moved by a fraction of the shortest edge."""
     moved = mesh.p.copy()
     inner = mesh.interior_nodes()
     noise = torch.rand(mesh.dim(), len(inner), generator=torch.Generator().manual_seed(0))
@@ -30,14 +30,14 @@ def plate(make_scene):
 
 @pytest.fixture(scope="module")
 def unstructured(make_scene, scene):
-    """The tiny beam of tetrahedra whose inner nodes are shaken."""
+    """The tiny beam of tetrahedra with perturbed inner nodes."""
     mesh = make_scene(nodes=(7, 4, 4), cell="tetra").problem.mesh
     return make_scene(mesh=shaken(mesh.scaled(100.0)))
 
 
 @pytest.fixture(scope="module")
 def ring(make_scene):
-    """A square with a square hole, in plane strain: not a grid, not all of its bounding box."""
+    """A square with a square hole in plane strain, whose nodes form no grid."""
     mesh = rectangle([1.0, 1.0], [10, 10])
     x, y = mesh.p[:, mesh.t].mean(axis=1) - 0.5
     return make_scene(mesh=mesh.remove_elements(np.flatnonzero((abs(x) < 0.3) & (abs(y) < 0.3))))
@@ -97,7 +97,7 @@ def test_a_permutation_equals_interpolation(scene):
 
 
 def test_spreading_preserves_total_force_and_moment(body):
-    """The moment too: multilinear weights reproduce linear fields."""
+    """The moment is preserved since multilinear weights reproduce linear fields."""
     points = body.problem.points
     shape = tuple(3 + axis for axis in range(points.shape[1]))
     force = field(body)
@@ -254,7 +254,7 @@ def test_moving_the_network_moves_its_grid(unstructured):
 
 @pytest.mark.parametrize("name", ["plate", "unstructured"])
 def test_the_network_overfits_a_batch_on_plane_and_unstructured_meshes(request, name):
-    """A fifty times smaller error on four samples within 300 steps."""
+    """The error on four samples decreases 50-fold within 300 steps."""
     scene = request.getfixturevalue(name)
     load = scene.loads.sample((0, 0), range(4))
     scale = 1 / load.force.std()

@@ -1,4 +1,4 @@
-"""Laws of message passing: what crosses the body, what is conserved, what does not matter."""
+"""The graph network: range of information, conservation, invariance."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_the_network_accepts_every_kind_of_mesh(body, options):
 
 
 def test_information_crosses_the_body_in_one_pass(body):
-    """Every node's force moves every node, the farthest too."""
+    """The force on any node changes the displacement of every node."""
     net, force = build(body), forces(body, 1).requires_grad_()
     far = body.problem.points[:, 0].argmax()
     (slope,) = torch.autograd.grad(net(force)[0, far].sum(), force)
@@ -89,7 +89,7 @@ def test_predictions_are_invariant_under_translations(make_scene):
 
 
 def test_the_network_overfits_one_batch_of_tetrahedra(make_scene):
-    """A hundred times smaller error on four linear answers within 300 steps."""
+    """The error on four linear solutions decreases 100-fold within 300 steps."""
     scene = make_scene(**BODIES["tetrahedra"])
     load = scene.loads.sample((0, 0), range(4))
     truth = torch.stack([scene.linear.solve(force) for force in load.force])
@@ -123,7 +123,7 @@ def test_a_saved_network_is_the_same_network_with_its_graph(body, tmp_path):
 
 
 def test_total_force_and_moment_are_the_same_on_every_level(body):
-    """Sums over clusters lose no load, and no moment of it about the origin."""
+    """Sums over clusters preserve the total force and its moment about the origin."""
     net, force = build(body).double(), forces(body).double()
     places = body.problem.points
     graph, total, moment = (

@@ -20,14 +20,14 @@ SMALL = {"width": 16, "blocks": 1}
 
 @pytest.fixture(scope="module", autouse=True)
 def scales_of_a_scene_once():
-    """They are a function of the scene and take longer than all the rest."""
+    """Caches the scales of a scene, whose computation dominates the run time of these tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("dpl.training.surrogate.scales", functools.cache(scales))
         yield
 
 
 def prepared(scene, samples, *, seed=0, **options):
-    """Return a surrogate in double precision and evaluation, with random weights."""
+    """Return a surrogate in double precision and evaluation mode, with random weights."""
     torch.manual_seed(seed)
     module = Surrogate(Latent(scene, **{**SMALL, **options}), MSE(), scene)
     module.fit_bases(samples)
@@ -36,7 +36,7 @@ def prepared(scene, samples, *, seed=0, **options):
 
 @pytest.fixture
 def wild(scene, batch):
-    """A surrogate whose weights are far from any training."""
+    """A surrogate with large random weights."""
     module = prepared(scene, batch)
     with torch.no_grad():
         for parameter in module.net.parameters():
@@ -59,14 +59,14 @@ def sizes(field):
 
 
 def projected(net, field):
-    """Return fields (B, N, D) on the basis."""
+    """Return fields (B, N, D) projected onto the basis."""
     image = torch.zeros_like(field)
     image[:, net.free_dofs] = field[:, net.free_dofs] @ net.basis.double().T @ net.basis.double()
     return image
 
 
 def sparse(scene, dofs, count=6, seed=0):
-    """Return forces (count, N, D) on so many degrees of freedom, as large as those of loads."""
+    """Return forces (count, N, D) on a few degrees of freedom, with the size of training loads."""
     random = torch.Generator().manual_seed(seed)
     force = torch.zeros(count, *scene.problem.shape, dtype=torch.float64)
     places = scene.loads.loadable_dofs.nonzero()
@@ -77,7 +77,7 @@ def sparse(scene, dofs, count=6, seed=0):
 
 
 def halved(scene, batch):
-    """Return a surrogate that takes the linear answers of about half of some loads from K(0)."""
+    """Return a surrogate for which about half of some loads are local."""
     module = prepared(scene, batch, rank=20)
     force = torch.cat([sparse(scene, dofs, 2) for dofs in (3, 60, 5, 90)])
     linear = linear_of(scene, force)
@@ -102,7 +102,7 @@ def test_the_learnt_part_is_quadratic_in_the_load(scene, batch, wild):
 
 
 def test_the_error_vanishes_quadratically_with_the_load(scene, batch, wild):
-    """Against Newton; of random weights."""
+    """The reference is Newton; the weights are random."""
     force, found = batch.force[:4], []
     for k in (6, 9, 12):
         s = 2.0**-k
@@ -135,7 +135,7 @@ def test_the_prediction_for_zero_load_is_zero(scene, batch, wild, tol):
 
 @pytest.mark.parametrize("dofs", [1, 3])
 def test_the_linear_part_of_local_forces_is_exact_for_any_weights(scene, batch, wild, dofs):
-    """To the rounding of single precision, though the basis knows no such load."""
+    """Exact up to single precision, although the basis does not represent such loads."""
     wild.float()
     force = 1e-9 * sparse(scene, dofs)
     linear = linear_of(scene, force)
@@ -321,7 +321,7 @@ def overrides(tiny_training):
 
 @pytest.fixture
 def trained(script, overrides, home):
-    """The folder of a run that nobody interrupted."""
+    """The folder of an uninterrupted run."""
     if not (home / "whole").exists():
         ended = script("train", *overrides("whole"), cwd=home)
         assert ended.status == 0, ended.err
@@ -334,7 +334,7 @@ def checkpoint(folder, name="last.ckpt"):
 
 
 def alike(one, other):
-    """Return whether plain data with tensors are equal to the last bit."""
+    """Return True if plain data with tensors are equal bit for bit."""
     if isinstance(one, torch.Tensor):
         return one.dtype == other.dtype and torch.equal(one, other)
     if isinstance(one, dict):
@@ -418,7 +418,7 @@ def test_a_resumed_run_does_not_fit_its_bases_again(trained, script, overrides, 
 
 
 def test_a_run_resumed_before_its_first_epoch_fits_its_bases(script, overrides, home, trained):
-    """The same command line, whether it is the first start of a job or a later one."""
+    """The command line is the same for the first start of a job and later ones."""
     more = ("ckpt_path=last", "trainer.max_epochs=1")
     ended = script("train", *overrides("fresh", *more), cwd=home)
     assert ended.status == 0, ended.err

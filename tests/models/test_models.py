@@ -1,4 +1,4 @@
-"""Laws of every network in conf/model, and the paper's counts for its own."""
+"""Properties of every network in conf/model, and the parameter counts of the paper."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ MODELS = sorted((Path(__file__).parents[2] / "conf" / "model").glob("*.yaml"))
 
 @pytest.fixture(params=MODELS, ids=lambda path: path.stem)
 def build(request, scene, batch):
-    """From a seed to the network, with the defaults of its file, shown a batch if it wants one."""
+    """Returns a network with the defaults of its file for a seed; bases are fitted to a batch."""
     node = OmegaConf.load(request.param)
 
     def build(seed=0):
@@ -61,7 +61,7 @@ def test_the_output_for_a_load_does_not_depend_on_its_batch(build, scene):
 
 @pytest.mark.parametrize("kind", ["all the same", "all zero", "one degree of freedom moves"])
 def test_identical_samples_give_finite_outputs(build, scene, batch, kind):
-    """Nothing is divided by the spread of a degree of freedom that has none."""
+    """Nothing is divided by a variance of zero."""
     force, displacement = (
         batch.force[:1].expand(6, -1, -1),
         batch.displacement[:1].expand(6, -1, -1),
@@ -89,7 +89,7 @@ def test_identical_samples_give_finite_outputs(build, scene, batch, kind):
 
 
 def test_a_network_overfits_one_batch(build, scene, batch):
-    """A hundred times smaller error on four samples within 300 steps."""
+    """The error on four samples decreases 100-fold within 300 steps."""
     surrogate = Surrogate(build(), MSE(), scene)
     four = type(batch)(*(column[:4] for column in batch))
     optimizer = torch.optim.Adam(surrogate.parameters(), lr=3e-3)
@@ -243,7 +243,7 @@ def test_a_depth_out_of_range_raises_an_error(scene, network, options):
 
 @pytest.fixture
 def over_moduli(make_scene):
-    """A network with E as an input, over the paper's widest range; and four loads of its scene."""
+    """A network with E as an input over the widest range of the paper, and four loads."""
     scene = make_scene(young=[1e6, 2.03e11])
     torch.manual_seed(0)
     return Surrogate(FCNN(scene, young=True), MSE(), scene), scene.loads.sample((0, 0), range(4))
@@ -261,7 +261,7 @@ def test_youngs_modulus_matters_where_it_is_an_input_and_only_there(over_moduli)
 
 
 def test_predictions_are_differentiable_with_respect_to_youngs_modulus(over_moduli):
-    """That of the input itself, against a difference quotient."""
+    """The gradient equals a difference quotient."""
     surrogate, load = over_moduli
     surrogate.double()
     young = load.young.clone().requires_grad_()
@@ -290,7 +290,7 @@ def test_youngs_modulus_is_normalised_and_forces_are_relative_to_its_maximum(ove
 
 
 def test_a_single_modulus_as_an_input_is_normalised_by_itself(scene, batch):
-    """The tiny scene has E = 4500 Pa alone; a hundredth more is no other world."""
+    """The tiny scene has E = 4500 Pa; an increase of 1 % changes the prediction little."""
     torch.manual_seed(0)
     surrogate = Surrogate(FCNN(scene, young=True), MSE(), scene)
     with torch.no_grad():

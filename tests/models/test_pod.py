@@ -33,14 +33,14 @@ NETWORKS = pytest.mark.parametrize("kind", [PODNet, Latent])
 
 @pytest.fixture(scope="module", autouse=True)
 def scales_of_a_scene_once():
-    """They are a function of the scene and take longer than all the rest."""
+    """Caches the scales of a scene, whose computation dominates the run time of these tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("dpl.training.surrogate.scales", functools.cache(scales))
         yield
 
 
 def prepared(kind, scene, samples, *, seed=0, **options):
-    """Return a surrogate in evaluation, random weights, bases made."""
+    """Return a surrogate in evaluation mode with random weights and fitted bases."""
     torch.manual_seed(seed)
     module = Surrogate(kind(scene, **{**SMALL, **options}), MSE(), scene)
     module.fit_bases(samples)
@@ -65,21 +65,21 @@ def some(batch, count):
 
 @pytest.fixture(scope="module")
 def bar(make_scene):
-    """A beam of 48 degrees of freedom, that loads all reach, with as many modes in its loads."""
+    """A beam with 48 degrees of freedom, all loadable, and as many modes in its loads."""
     scene = make_scene(nodes=(5, 2, 2))
     assert torch.equal(scene.loads.loadable_dofs, scene.problem.free)
     return scene, solved(scene, 16)
 
 
 def noise(scene, count=4, seed=0):
-    """Return forces (count, N, D) of no symmetry, on all that loads can act on."""
+    """Return forces (count, N, D) without symmetry on all loadable degrees of freedom."""
     random = torch.Generator().manual_seed(seed)
     force = torch.randn(count, *scene.problem.shape, generator=random, dtype=torch.float64)
     return torch.where(scene.loads.loadable_dofs, force, 0.0)
 
 
 def asymmetry(net, force):
-    """Return the largest relative distance of images of answers from answers to images."""
+    """Return the largest relative distance of images of predictions from predictions of images."""
     with torch.no_grad():
         answer = net(force)
         far = [(s.image(answer) - net(s.image(force))).norm() / answer.norm() for s in net.group]
@@ -91,13 +91,13 @@ def eye(size):
 
 
 def read(net):
-    """Return what a network reads of a unit force on each degree of freedom, (inputs, C)."""
+    """Return the coordinates of a unit force on each loadable degree of freedom, (inputs, C)."""
     units = scatter_fields(torch.eye(int(net.load_dofs.sum())), net.load_dofs)
     return net.encode_loads(net.input_orbits.images(units), None).double()
 
 
 def left_over(basis, net, where):
-    """Return the largest part of an image of a mode (R, n) that the modes do not reach."""
+    """Return the largest projection residual of an image of a mode (R, n)."""
     basis = basis.double()
     images = torch.cat([image_columns(basis, where, net.group, k) for k in range(len(net.group))])
     return float((images - images @ basis.T @ basis).norm(dim=1).max())
@@ -107,7 +107,7 @@ def left_over(basis, net, where):
 
 
 def gram_of(net):
-    """Return the products of the modes, (R, R), which are 1 or 0 on the diagonal."""
+    """Return the Gram matrix of the modes, (R, R), with 1 or 0 on the diagonal."""
     basis = net.basis.double()
     return basis @ basis.T
 
@@ -117,7 +117,7 @@ def gram_of(net):
 @pytest.mark.parametrize("symmetry", [True, False])
 @pytest.mark.parametrize("rank", [100, 108])
 def test_a_basis_is_orthonormal_and_zero_beyond(kind, scene, batch, count, symmetry, rank):
-    """However many snapshots there are; no rotation of the modes mixes them with the zeros."""
+    """Holds for any number of snapshots; zero columns are not mixed with modes."""
     net = prepared(kind, scene, some(batch, count), rank=rank, symmetry=symmetry).net
     assert net.basis.shape == (rank, int(scene.problem.free.sum()))
     gram = gram_of(net)
@@ -133,7 +133,7 @@ def test_modes_of_a_body_without_symmetry_are_ordered_by_size(scene, batch):
 
 
 def test_modes_are_ordered_by_size(scene, batch):
-    """Uncorrelated too: scales of single coordinates are those of single modes."""
+    """Coordinates are also uncorrelated."""
     assert_ordered(prepared(PODNet, scene, batch, rank=12).net, batch)
 
 
@@ -220,7 +220,7 @@ def test_bases_are_a_function_of_the_samples(kind, scene, batch):
 def test_samples_beyond_the_maximum_number_of_snapshots_are_thinned_out(
     kind, scene, batch, monkeypatch
 ):
-    """Every third of twelve makes the basis that these four make."""
+    """Every third of twelve samples is used."""
     monkeypatch.setattr("dpl.models.invariant_basis.MAX_SNAPSHOTS", 8 * 4)
     seen = []
     monkeypatch.setattr(
@@ -238,7 +238,7 @@ def test_samples_beyond_the_maximum_number_of_snapshots_are_thinned_out(
 
 @NETWORKS
 def test_actions_on_inputs_and_outputs_are_a_group_representation(kind, bar):
-    """The product of two members is a member; returns are orthogonal."""
+    """The product of two actions is an action; inverse actions are orthogonal."""
     net = exact(prepared(kind, *bar, **WHOLE))
     order = len(net.group)
     assert order == 8
@@ -292,7 +292,7 @@ def test_predictions_have_the_symmetries_for_any_number_of_coordinates(kind, sce
 
 
 def test_a_rank_that_leaves_no_invariant_mode_raises_an_error(scene, batch):
-    """Of twins, bending to both sides, one is none: refused by name, or not left out."""
+    """A rank of one splits the pair of bending modes."""
     module = Surrogate(PODNet(scene, rank=1, **SMALL), MSE(), scene)
     with suppress(ValueError):
         module.fit_bases(batch)
@@ -300,7 +300,7 @@ def test_a_rank_that_leaves_no_invariant_mode_raises_an_error(scene, batch):
 
 
 def test_predictions_with_default_options_have_the_symmetries(scene, batch):
-    """Sixty coordinates of the load, a hundred modes: conf/model/pod.yaml."""
+    """The defaults are 60 coordinates and 100 modes, see conf/model/pod.yaml."""
     assert asymmetry(exact(prepared(PODNet, scene, batch)), noise(scene)) < 1e-4
 
 
@@ -376,7 +376,7 @@ def test_a_body_without_symmetry_is_accepted(kind, skew):
 
 @NETWORKS
 def test_a_body_fixed_in_some_directions_only_is_accepted(kind):
-    """Rails: a node moves in some directions and not in others."""
+    """Nodes on rails are fixed in some directions only."""
     ends = [(0, [0.0, None, None]), (1, [None, 0.0, None]), (2, [None, None, 0.0])]
     rails = [DirichletBC(Plane(axis, "min"), value) for axis, value in ends]
     mesh = box([100.0, 25.0, 25.0], [5, 2, 2])
@@ -412,7 +412,7 @@ def test_fewer_snapshots_than_modes_are_accepted(kind, scene, batch, count):
 
 @NETWORKS
 def test_a_sample_of_zero_displacement_changes_nothing(kind, scene, batch):
-    """No size, no weight: neither a NaN nor a mode of its own."""
+    """Its weight is zero; it gives neither NaN nor a mode."""
     still = Sample(*(torch.cat([column, column[:1]]) for column in some(batch, 4)))
     still.force[-1], still.displacement[-1] = 0.0, 0.0
     net = prepared(kind, scene, still, rank=12).net

@@ -1,4 +1,4 @@
-"""Training in coordinates is training in fields: squared errors, images, gradients."""
+"""Training in reduced coordinates equals training on fields."""
 
 import functools
 
@@ -25,7 +25,7 @@ CASES = pytest.mark.parametrize(("kind", "options"), KINDS.values(), ids=KINDS)
 
 @pytest.fixture(scope="module", autouse=True)
 def scales_of_a_scene_once():
-    """They are a function of the scene and take longer than all the rest."""
+    """Caches the scales of a scene, whose computation dominates the run time of these tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("dpl.training.surrogate.scales", functools.cache(scales))
         yield
@@ -33,7 +33,7 @@ def scales_of_a_scene_once():
 
 @pytest.fixture
 def build(scene, batch, monkeypatch):
-    """Builds surrogates in training, random weights, bases made; nothing is logged."""
+    """Builds surrogates in training mode with random weights and fitted bases; logs nothing."""
     monkeypatch.setattr(Surrogate, "log", lambda *_, **__: None)
 
     def build(kind, options, loss=None):
@@ -46,7 +46,7 @@ def build(scene, batch, monkeypatch):
 
 
 def encoded(module, samples):
-    """Return the samples themselves in coordinates, without their images."""
+    """Return the samples in coordinates, without their images."""
     return module.encode(samples).__getitems__(list(range(len(samples.force))))
 
 
@@ -84,7 +84,7 @@ def test_mean_square_is_that_of_whole_displacements(build, batch, kind, options)
 
 @CASES
 def test_targets_are_the_least_squares_coordinates(build, batch, kind, options):
-    """No other coordinates are nearer to the field; with all modes nothing is left."""
+    """The projection error is minimal, and zero with all modes."""
     module = build(kind, options)
     part = encoded(module, batch)
     assert (part.squared_error >= 0).all()
@@ -120,7 +120,7 @@ def test_the_loss_in_coordinates_equals_the_loss_of_fields(build, batch, kind, o
 
 @CASES
 def test_the_gradient_in_coordinates_equals_that_of_fields(build, batch, kind, options):
-    """Of the squared error, whatever the basis misses: it has no slope."""
+    """The projection error is constant and has no gradient."""
     module = build(kind, options, MSE(relative=0.5))
     (_, found), (_, expected) = (
         gradients(module, part) for part in (encoded(module, batch), batch)
@@ -168,7 +168,7 @@ def test_skipped_work_mentions_coordinates_where_they_are_used(build):
 
 
 def test_images_of_coordinates_are_coordinates_of_images(make_scene):
-    """On a body whose modes are all kept, so that no family is cut."""
+    """All modes are kept, so that no family is split."""
     scene = make_scene(nodes=(5, 2, 2))
     force = scene.loads.sample((0, 0), range(16)).force
     linear = torch.stack([scene.linear.solve(one) for one in force])

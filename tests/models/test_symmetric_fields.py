@@ -1,4 +1,4 @@
-"""Laws of fields by their images at a few nodes."""
+"""Fields from their images at the representatives of orbits."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from dpl.models.symmetric_fields import Orbits, coordinates_of_images, sum_over_
 
 @pytest.fixture(scope="module", params=["even", "odd", "skew"])
 def body(request, make_scene):
-    """Beams whose mirror planes hold no node, or some; and one without symmetries."""
+    """Beams with and without nodes on their mirror planes, and one without symmetries."""
     if request.param == "skew":
         return make_scene(mesh=box([100.0, 30.0, 25.0], [4, 3, 2], "tetra"))
     return make_scene(nodes=(4, 4, 4) if request.param == "even" else (4, 5, 5))
@@ -67,7 +67,7 @@ def test_without_a_group_every_node_is_a_representative(body):
 
 
 def test_coordinates_of_images_sum_to_the_order_of_the_group_times_the_coordinates():
-    """Of the quarter turns of the plane."""
+    """The group is that of quarter turns of the plane."""
     quarter = torch.tensor([[0.0, 1.0], [-1.0, 0.0]])
     motions = torch.stack([torch.linalg.matrix_power(quarter, k) for k in range(4)])
     one = torch.randn(5, 2, generator=torch.Generator().manual_seed(0))

@@ -207,7 +207,7 @@ def test_a_nan_prediction_is_drawn_without_a_mesh(scene, data, tmp_path):
 
 
 def test_pictures_do_not_change_the_training(scene, data, tmp_path):
-    """To the bit, with a network that draws random numbers in training."""
+    """Bit for bit, with a network that draws random numbers in training."""
     learnt = []
     for name, callbacks in (
         ("with", [WorstCasePlots(every=1), ThroughputMonitor()]),
@@ -398,7 +398,7 @@ def resumable(folder, *callbacks, **options):
 
 @pytest.fixture
 def broken(scene, data, tmp_path):
-    """A run of five epochs that ended in the midst of the fourth and was resumed; its folder."""
+    """The folder of a run of five epochs that was interrupted in the fourth and resumed."""
     folder = tmp_path / "broken"
     with pytest.raises(RuntimeError, match="power"):
         resumable(folder, LogHyperparameters({}), Fails(11, RuntimeError("power")), epochs=5).fit(
@@ -413,7 +413,7 @@ def broken(scene, data, tmp_path):
 
 
 def test_a_resumed_run_continues_the_same_curves(scene, data, tmp_path, broken):
-    """As if nothing had been: neither a step twice nor one left out, and the same values."""
+    """Every step is logged once, with the values of an uninterrupted run."""
     straight = tmp_path / "straight"
     resumable(straight, LogHyperparameters({}), epochs=5).fit(surrogate(scene), datamodule=data)
     one, other = events(broken), events(straight)
@@ -436,7 +436,7 @@ def test_a_resumed_run_continues_the_same_curves(scene, data, tmp_path, broken):
 
 
 def hparams_tab(folder):
-    """Return what TensorBoard's own reader hands to the tab: the status and metrics of each run."""
+    """Return the status and metrics of each run as TensorBoard shows them in the HPARAMS tab."""
     runs = EventMultiplexer()
     runs.AddRunsFromDirectory(str(folder))
     runs.Reload()

@@ -1,4 +1,4 @@
-"""Checkpoints are whole or not there, come back as they were, and run nothing when read."""
+"""Checkpoints are written atomically, read unchanged, and executed never."""
 
 import io
 import json
@@ -27,14 +27,14 @@ CHECKPOINT = {
 
 
 class Unwritable:
-    """An object whose pickling fails half way, as a full disk does."""
+    """An object whose pickling fails half way, like a write to a full disk."""
 
     def __reduce__(self):
         raise OSError("no space left on device")
 
 
 class Harm:
-    """An object that runs a command where it is unpickled."""
+    """An object that executes a command when it is unpickled."""
 
     def __init__(self, path):
         self.path = path

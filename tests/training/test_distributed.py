@@ -1,4 +1,4 @@
-"""Laws of training in several processes: equal weights, one evaluation, no sweep within a sweep."""
+"""Training in several processes: equal weights, one evaluation, no sweeps."""
 
 import json
 import os
@@ -56,7 +56,7 @@ SPY = textwrap.dedent(
 
 @pytest.fixture
 def trained(tiny_training, environment, members, tmp_path):
-    """Trains in two processes; returns status, out, err and what each has seen."""
+    """Train in two processes; return status, output, errors and the samples of each process."""
 
     def trained(*overrides):
         kept = [o for o in tiny_training if "data.train" not in o or "data=online" not in overrides]
@@ -116,7 +116,7 @@ def test_two_processes_end_with_equal_weights_and_one_evaluation(trained, tmp_pa
 
 @pytest.mark.slow
 def test_two_processes_of_an_unnamed_run_share_one_folder(trained, tmp_path):
-    """The name holds the time, and the second process starts seconds later."""
+    """The default name contains the time, and the second process starts seconds later."""
     status, _, err, ranks = trained("trainer.max_epochs=1")
     assert status == 0, err[-3000:]
     assert ranks[0][0] == ranks[1][0]
@@ -139,7 +139,7 @@ def test_two_processes_share_one_stream(trained):
 
 @pytest.fixture
 def sweeping(monkeypatch):
-    """Says whether Hydra runs a sweep."""
+    """Sets whether Hydra runs a sweep."""
 
     def sweeping(mode=RunMode.MULTIRUN):
         config = SimpleNamespace(initialized=lambda: True, get=lambda: SimpleNamespace(mode=mode))
@@ -206,7 +206,7 @@ def test_without_a_sweep_nothing_is_refused(sweeping):
 
 
 class Outside(LightningEnvironment):
-    """A cluster, or torchrun: it has started all processes."""
+    """A cluster or torchrun has started all processes."""
 
     creates_processes_externally = True
 

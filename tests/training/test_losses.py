@@ -1,4 +1,4 @@
-"""Laws of every loss in conf/loss, and the formulas of each."""
+"""Properties of every loss in conf/loss, and the formula of each."""
 
 import pickle
 from pathlib import Path
@@ -59,7 +59,7 @@ def few(batch) -> Sample:
 
 @pytest.fixture(scope="module")
 def near(scene, few):
-    """Predictions some per cent off, which invert nothing."""
+    """Predictions with errors of some per cent and without inverted elements."""
     noise = torch.randn(
         few.force.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
@@ -68,7 +68,7 @@ def near(scene, few):
 
 @pytest.fixture(scope="module")
 def inverted(scene, few):
-    """Predictions that turn every element inside out."""
+    """Predictions that invert every element."""
     points = torch.where(scene.problem.free, -1.5 * scene.problem.points, 0.0)
     assert scene.problem.volume_ratio(points[None]) < 0
     return points.expand_as(few.displacement).clone()
@@ -76,7 +76,7 @@ def inverted(scene, few):
 
 @pytest.fixture
 def evaluations(monkeypatch):
-    """Counts of evaluated forces, by tensors and by compiled loops, and of energies."""
+    """Counts the evaluations of forces, by tensors and by compiled loops, and of energies."""
     counts = []
 
     def count(name):
@@ -96,7 +96,7 @@ def evaluations(monkeypatch):
 
 @pytest.fixture(scope="module")
 def unanswered(few) -> Sample:
-    """Loads whose displacements nobody knows."""
+    """Loads without reference solutions."""
     return few._replace(displacement=torch.full_like(few.displacement, torch.nan))
 
 
@@ -111,7 +111,7 @@ def gradient(loss, prediction, batch, physics):
 
 
 def slopes_along(loss, prediction, batch, physics, step=1e-6):
-    """Pairs of a loss's slope along random directions, from differences and from its gradient."""
+    """Return directional derivatives of a loss, from finite differences and from its gradient."""
     slope = gradient(loss, prediction, batch, physics)
     random, free = torch.Generator().manual_seed(1), physics.problem.free
     for _ in range(3):
@@ -206,7 +206,7 @@ def test_the_relative_exponent_applies_to_the_mean_square_of_a_sample(few, physi
 
 
 def scaled_by_sample(near, few):
-    """Return errors and samples, each sample a tenth of the one before."""
+    """Return errors and samples; each sample has a tenth of the size of the previous one."""
     factor = 10.0 ** -torch.arange(4.0, dtype=torch.float64)[:, None, None]
     return factor * near, few._replace(displacement=factor * few.displacement)
 
@@ -223,7 +223,7 @@ def test_small_and_large_loads_have_equal_weight_only_for_exponent_one(few, phys
 
 @pytest.mark.parametrize("kind", [MSE, RMSELoss])
 def test_a_floor_limits_the_weight_of_loads_near_zero(few, physics, near, kind):
-    """The error of the last sample stays as its displacement vanishes."""
+    """The error of the last sample is fixed while its displacement tends to zero."""
     shrunk = few.displacement.clone()
     shrunk[-1] *= 1e-6
     samples = few._replace(displacement=shrunk)
@@ -235,7 +235,7 @@ def test_a_floor_limits_the_weight_of_loads_near_zero(few, physics, near, kind):
 
 
 def test_rmse_loss_is_the_mean_of_root_mean_squares(few, physics, near):
-    """e_mean but for the root of the number of degrees of freedom."""
+    """It equals e_mean times the root of the number of degrees of freedom."""
     norms = (near - few.displacement).flatten(1).norm(dim=1)
     expected = float(norms.mean()) / near[0].numel() ** 0.5
     assert float(RMSELoss()(near, few, physics)) == pytest.approx(expected, rel=1e-9)
@@ -371,7 +371,7 @@ def test_the_tangent_product_equals_the_one_of_automatic_differentiation(scene, 
 
 
 def test_lr_plus_has_a_finite_gradient_at_the_reference_solution(scene, few, physics):
-    """The norm's slope is bounded also where the residual is all but zero."""
+    """The gradient of the norm is bounded where the residual is almost zero."""
     exact = solve(scene.solver, few.load).displacement
     assert gradient(LrPlus(), exact, few, physics).isfinite().all()
 
@@ -473,7 +473,7 @@ def test_a_loss_replaces_the_stiffness_of_another_problem(few, physics, near, ma
 
 
 def test_products_with_the_rest_stiffness_do_not_depend_on_the_device(scene, few):
-    """Other devices take torch's sparse matrices, which the processor has as well."""
+    """Other devices use torch's sparse matrices, which exist on the CPU as well."""
     rest, free = RestStiffness(scene.problem), scene.problem.free
     image = rest._on_device @ few.displacement[:, free].T
     assert torch.allclose(rest.product(few.displacement)[:, free], image.T, rtol=1e-12, atol=1e-18)
@@ -488,7 +488,7 @@ def test_a_loss_is_pickled_without_its_matrices(loss, few, physics, near):
 
 
 def test_relative_losses_divide_by_the_size_of_each_sample(few, physics, near):
-    """A hundredth of a load, answered as badly, counts as much."""
+    """A load scaled by 1/100 with the same relative error has the same weight."""
     factor = torch.tensor([1e-2, 1.0, 1.0, 1.0], dtype=torch.float64)[:, None, None]
     small = few._replace(displacement=factor * few.displacement)
     for loss in (MSE(relative=True, floor=0.0), EnergyNormLoss(floor=0.0)):
@@ -553,7 +553,7 @@ def test_the_gradient_of_potential_energy_loss_equals_finite_differences(unanswe
 
 
 def test_light_and_heavy_loads_have_equal_weight(scene, few, physics):
-    """Near rest the energy is -1 + the squared relative energy norm of the error, at any size."""
+    """For small loads the loss is -1 plus the squared relative energy norm of the error."""
     energy, stiffness = PotentialEnergyLoss(floor=0.0), EnergyNormLoss(floor=0.0)
     for amplitude in (1e-3, 1e-5):
         force = amplitude * few.force
@@ -573,7 +573,7 @@ def test_losses_are_finite_for_zero_loads(few, physics, near):
 
 
 def test_an_inverted_sample_has_the_linear_strain_energy(scene, few, physics, inverted):
-    """Half of u^T K(0) u, over the work of the linear answer."""
+    """It is u^T K(0) u / 2 over the work of the linear solution."""
     problem = scene.problem
     image = problem.tangent_product(torch.zeros_like(inverted), inverted)
     linear = torch.stack([scene.linear.solve(force) for force in few.force])
@@ -642,7 +642,7 @@ def test_springs_are_part_of_the_energy(few):
 
 
 def test_minimising_the_energy_reaches_the_solutions_of_newton(scene, few, unanswered, physics):
-    """In coordinates y with K(0) = L L^T, u = L^-T y, where stiff and soft are alike."""
+    """In coordinates y with K(0) = L L^T and u = L^-T y, in which K(0) is the identity."""
     loss, free = PotentialEnergyLoss(floor=0.0), scene.problem.free
     root = torch.linalg.cholesky(torch.from_numpy(RestStiffness(scene.problem)._matrix.toarray()))
     size = RestStiffness(scene.problem).work(few.force).sqrt()[:, None]

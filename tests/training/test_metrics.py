@@ -1,4 +1,4 @@
-"""Laws of the metrics: the paper's formulas, written once more in numpy."""
+"""Metrics against the formulas of the paper in NumPy."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def prediction(scene, batch):
 
 
 def by_hand(problem: Problem, prediction, batch):
-    """Return every number, load by load, without a line of `dpl.training.metrics`."""
+    """Return every metric, computed load by load without `dpl.training.metrics`."""
     u, v, f = (x.numpy() for x in (prediction, batch.displacement, batch.force))
     loads, nodes, dim = u.shape
     whole = [np.linalg.norm(u[s] - v[s]) for s in range(loads)]
@@ -92,7 +92,7 @@ def test_errors_of_single_precision_predictions_are_computed_in_double_precision
 
 
 def test_noise_of_a_tenth_of_the_signal_is_20_dB_and_printed_as_10(batch):
-    """10 log10 of power is 20 log10 of amplitude; the paper's tables are the former."""
+    """10 log10 of power is 20 log10 of amplitude; the tables of the paper are in power dB."""
     scaled = batch.displacement * 1.0
     error = scaled.flip(0)
     error *= (scaled.flatten(1).norm(dim=1) / error.flatten(1).norm(dim=1))[:, None, None] / 10
@@ -104,7 +104,7 @@ def test_noise_of_a_tenth_of_the_signal_is_20_dB_and_printed_as_10(batch):
 
 
 def test_relative_l2_is_the_printed_power_of_the_snr(batch, prediction):
-    """PAPER.md: relative L2 = 10^(-SNR/20), where both refer to the same norm."""
+    """The relative L2 error is 10^(-SNR/20) if both refer to the same norm."""
     snr = MinSNR().measure(prediction, batch)
     size = prediction.flatten(1).norm(dim=1) / batch.displacement.flatten(1).norm(dim=1)
     relative = RelativeL2().measure(prediction, batch)
@@ -171,7 +171,7 @@ def test_a_metric_of_a_load_does_not_depend_on_its_batch(scene, prediction, batc
 
 
 def test_metrics_of_several_processes_cover_all_loads(prediction, batch):
-    """What torchmetrics does with the states of two processes, without the processes."""
+    """Concatenates the states like torchmetrics in two processes, without processes."""
     parts = [MeanError(), MeanError()]
     for part, rows in zip(parts, (slice(0, 5), slice(5, 12)), strict=True):
         part.update(prediction[rows], Sample(*(column[rows] for column in batch)))
@@ -182,7 +182,7 @@ def test_metrics_of_several_processes_cover_all_loads(prediction, batch):
 
 
 def test_metrics_that_agree_on_the_first_batch_are_computed_separately(scene, prediction, batch):
-    """At the exact answer e_mean and e_max are both zero, and their states the same."""
+    """At the reference solution e_mean and e_max are both zero and have equal states."""
     found = default_metrics(scene.problem)
     found.update(batch.displacement, batch)
     found.update(prediction, batch)
@@ -220,7 +220,7 @@ def test_largest_absolute_is_the_load_with_the_largest_absolute_error():
 
 
 def test_equal_errors_are_in_the_order_of_the_loads():
-    """Enough of them that a sort which is not stable would mix them."""
+    """There are enough loads for an unstable sort to permute them."""
     same = torch.full((1000,), 0.5)
     assert PerLoadErrors(same, same, same).select(3) == [*range(6), 503]
 

@@ -1,4 +1,4 @@
-"""Muon with Adam is two optimisers that look like one: to schedules, checkpoints, trainers."""
+"""Muon with Adam acts as one optimiser for schedules, checkpoints and trainers."""
 
 import copy
 import io
@@ -44,7 +44,7 @@ def same(one, other):
 
 
 def test_muon_updates_matrices_and_adam_all_other_parameters():
-    """What the two do by themselves; torch's Muon to the digits of its bfloat16."""
+    """Equal to torch's Adam, and to torch's Muon up to the precision of bfloat16."""
     one, two = network(), network()
     whole = Muon(one.parameters(), lr=1e-2, momentum=0.9, betas=(0.8, 0.95), weight_decay=0.1)
     matrices = [p for p in two.parameters() if p.ndim == 2]
@@ -89,7 +89,7 @@ def test_every_parameter_moves_and_the_loss_falls():
 
 
 def test_steps_of_matrices_have_the_size_of_adams_steps():
-    """A root mean square of 0.2 of the rate, of any gradient (Liu et al. 2025)."""
+    """The root mean square is 0.2 times the learning rate (Liu et al. 2025)."""
     for size in (1e-4, 1e4):
         torch.manual_seed(0)
         matrix = nn.Parameter(torch.zeros(32, 64))
@@ -266,7 +266,7 @@ def test_a_copy_steps_as_its_original():
 
 @pytest.mark.xfail(strict=True, reason="a group that is added belongs to no part and never moves")
 def test_an_added_parameter_group_is_trained_or_raises_an_error():
-    """As Lightning's BaseFinetuning adds one."""
+    """Lightning's BaseFinetuning adds parameter groups in this way."""
     net, late = network(), nn.Parameter(torch.ones(3))
     optimizer = Muon(net.parameters())
     try:
@@ -282,7 +282,7 @@ def test_an_added_parameter_group_is_trained_or_raises_an_error():
 
 
 class Line(L.LightningModule):
-    """A network that Lightning trains with it."""
+    """A network that Lightning trains with Muon."""
 
     def __init__(self, *, epochs=4, stop=None):
         super().__init__()
@@ -347,7 +347,7 @@ def test_a_run_resumed_from_a_checkpoint_ends_bit_for_bit_like_an_uninterrupted_
 )
 @pytest.mark.parametrize("build", ["all", "vectors"])
 def test_numbers_out_of_range_raise_an_error_with_their_name(options, told, build):
-    """With vectors alone too: that is how a command tries an optimiser before it solves."""
+    """Vectors alone suffice; commands validate an optimiser in this way."""
     parameters = network().parameters() if build == "all" else [nn.Parameter(torch.zeros(1))]
     with pytest.raises(ValueError, match=told):
         Muon(parameters, **options)

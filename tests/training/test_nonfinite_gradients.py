@@ -111,7 +111,7 @@ def test_a_learning_rate_far_too_high_ends_with_one_line(script, tiny_training, 
 
 
 def test_a_training_with_nonfinite_predictions_fails(script, tiny_training, tmp_path):
-    """Too short for the guard to give up, and validated as NaN each time."""
+    """The run is shorter than `patience`, and every validation gives NaN."""
     wild = ["optimizer.lr=1e6", "trainer.max_epochs=3", "run=wild"]
     ended = script("train", *tiny_training, *wild, cwd=tmp_path)
     assert ended.status == 2

@@ -1,7 +1,7 @@
-"""A run that was killed goes on as if nothing had been: equal to the last bit.
+"""A killed and resumed run equals an uninterrupted one bit for bit.
 
-Processes are killed (SIGKILL) in the midst of a step or of a checkpoint, at a place that is known,
-or at a random time; the temporary folder is on another file system.
+Processes are killed (SIGKILL) within a step or while writing a checkpoint, at a known place or at a
+random time. The temporary folder is on another file system.
 """
 
 import hashlib
@@ -96,7 +96,7 @@ KILLER = textwrap.dedent(
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
-    """A folder with a network of somebody's own, and later a data set."""
+    """A folder with a user's network, and later a data set."""
     home = tmp_path_factory.mktemp("resume")
     (home / "noisy.py").write_text(NOISY)
     return home
@@ -129,13 +129,13 @@ def overrides(tiny_training, home):
 
 @pytest.fixture(scope="module")
 def ended():
-    """What runs that nobody killed ended with, by network."""
+    """The last checkpoints of uninterrupted runs, by network."""
     return {}
 
 
 @pytest.fixture
 def straight(elsewhere, script, overrides, home, ended):
-    """Trains without an interruption; returns the last checkpoint."""
+    """Train without interruption; return the last checkpoint."""
 
     def straight(net):
         if net not in ended:
@@ -149,7 +149,7 @@ def straight(elsewhere, script, overrides, home, ended):
 
 @pytest.fixture
 def killed(elsewhere, overrides, environment, home):
-    """Starts a run that kills itself, see KILLER; returns its folder."""
+    """Start a run that kills itself, see KILLER; return its folder."""
 
     def killed(name, net, where, at):
         command = [sys.executable, "-c", KILLER, str(ROOT / "scripts/train.py"), where, str(at)]
@@ -169,7 +169,7 @@ def last(folder):
 
 
 def digest(value):
-    """Return the SHA-256 of plain data with tensors, to the last bit."""
+    """Return the SHA-256 of plain data with tensors."""
     found = hashlib.sha256()
 
     def add(value):
@@ -192,7 +192,7 @@ def digest(value):
 
 
 def assert_same(one, other):
-    """Hold two checkpoints to the same weights, optimiser, schedule and random numbers."""
+    """Assert that two checkpoints have equal weights, optimiser, schedule and random states."""
     assert (one["epoch"], one["global_step"]) == (EPOCHS - 1, 2 * EPOCHS)
     assert (other["epoch"], other["global_step"]) == (EPOCHS - 1, 2 * EPOCHS)
     for part in ("state_dict", "optimizer_states", "lr_schedulers"):
@@ -222,7 +222,7 @@ LIMITED = textwrap.dedent(
 def test_a_full_disk_ends_training_with_one_line_and_intact_files(
     straight, environment, overrides, home, name, most
 ):
-    """No file may grow beyond a limit from the third epoch on, which is how a full disk fails."""
+    """From the third epoch on the size of files is limited, which simulates a full disk."""
     straight("fcnn")
     run = f"full-{name}-{most}"
     command = [sys.executable, "-c", LIMITED, str(ROOT / "scripts/train.py"), name, str(most)]
@@ -245,7 +245,7 @@ def test_a_full_disk_ends_training_with_one_line_and_intact_files(
 def test_a_read_only_folder_ends_training_with_one_line(
     straight, environment, overrides, home, below
 ):
-    """Root may write everywhere, so it is mounted so."""
+    """The folder is mounted read-only, since root can write to any folder."""
     straight("fcnn")
     run = home / f"read-only-{below}"
     (run / below).mkdir(parents=True)
@@ -263,7 +263,7 @@ def test_a_read_only_folder_ends_training_with_one_line(
 
 
 def test_two_uninterrupted_runs_are_equal(straight, script, overrides, home):
-    """Else there is nothing to compare with."""
+    """This is the condition for the comparisons below."""
     assert script("train", *overrides("again", "fcnn"), cwd=home).status == 0
     assert_same(straight("fcnn"), last(home / "again"))
 
@@ -336,7 +336,7 @@ def test_a_network_with_dropout_ends_the_same_wherever_it_is_killed(
 def test_a_run_killed_repeatedly_ends_bit_for_bit_the_same(
     straight, killed, script, overrides, home
 ):
-    """Three lives."""
+    """The run is killed twice and resumed twice."""
     folder = killed("lives", "fcnn", "step", 3)
     assert last(folder)["epoch"] == 0
     command = [*overrides("lives", "fcnn"), "ckpt_path=last"]
@@ -361,7 +361,7 @@ def killed_again(command, home, step):
 def test_a_run_killed_at_a_random_time_ends_bit_for_bit_the_same(
     straight, start, script, overrides, home, delay
 ):
-    """From outside, some time after its first checkpoint, that is replaced many times."""
+    """Another process kills the run at a random time after its first checkpoint."""
     name = f"random-{delay}"
     straight("fcnn")  # the data set is there
     process = start("train", *overrides(name, "fcnn"), cwd=home)

@@ -1,4 +1,4 @@
-"""Laws of the surrogate: one border to SI units, exact resume, and records that tell all."""
+"""Surrogate: units, scales, logged metrics, checkpoints and exact resumption."""
 
 import random
 from pathlib import Path
@@ -58,7 +58,7 @@ def trainer(folder, *callbacks, **options):
 
 
 class StopAfter(L.Callback):
-    """Ends a run early, as a wall time would."""
+    """Stops a run early, like a limit of the wall time."""
 
     def __init__(self, epochs):
         self.epochs = epochs
@@ -88,7 +88,7 @@ def test_predictions_are_metres_from_newtons(scene, batch):
 
 
 def test_relative_predictions_do_not_depend_on_size_and_stiffness(make_scene, scene, batch):
-    """u/L is a function of f/(E L^2), to the rounding of float32."""
+    """u/L is a function of f/(E L^2), up to the rounding errors of float32."""
     steel = make_scene(size=(1.0, 0.25, 0.25), young=2e11)
     module, twin = surrogate(scene).eval(), surrogate(steel).eval()
     force = 4500.0 * 100.0**2 * batch.force
@@ -145,7 +145,7 @@ def test_scaled_forces_and_displacements_are_of_order_one(scene, batch):
 
 
 def test_scales_are_one_positive_number_for_each_field(scene):
-    """One number keeps the shape of a field: directions and places stay comparable."""
+    """A single number preserves the proportions of a field."""
     for scale in scales(scene):
         assert len(scale.unique()) == 1
         assert float(scale.min()) > 0
@@ -324,7 +324,7 @@ def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(
 
 
 class Noisy(nn.Module):
-    """A network whose training draws from every generator there is."""
+    """A network whose training uses all random number generators."""
 
     def __init__(self, scene):
         super().__init__()
@@ -363,14 +363,14 @@ def test_a_resumed_run_of_a_network_with_dropout_draws_the_same_numbers(
 
 
 def draws():
-    """Numbers of every generator."""
+    """Returns numbers of every generator."""
     numbers = np.random.standard_normal(3).tolist()  # noqa: NPY002
     return [torch.rand(3).tolist(), numbers, [random.random(), random.gauss(0, 1)]]
 
 
 @pytest.fixture
 def generators():
-    """Gives the tests that follow their random numbers back."""
+    """Restores the random states after a test."""
     before = random_states()
     yield
     set_random_states(before)
@@ -407,7 +407,7 @@ def test_random_states_are_a_copy(generators):
 
 
 def test_a_checkpoint_of_many_devices_is_resumed_on_one(generators):
-    """The states of devices that are not there are left out."""
+    """States of missing devices are ignored."""
     states = {**random_states(), "cuda": [torch.zeros(16, dtype=torch.uint8)] * 2}
     expected = draws()
     draws()
@@ -424,7 +424,7 @@ def test_a_checkpoint_without_random_states_is_resumed(scene, generators):
 
 
 def test_loading_for_an_evaluation_does_not_change_random_numbers(scene, generators):
-    """They are put back where training begins, not where a checkpoint is read."""
+    """States are restored at the start of a training, not when a checkpoint is read."""
     checkpoint = {"scene": scene.fingerprint, "random": random_states()}
     draws()
     state = torch.get_rng_state()
