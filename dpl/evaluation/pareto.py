@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -15,6 +16,9 @@ from dpl.scene import Sample
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2, Surrogate
 from dpl.training.metrics import median
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Cells = tuple[int, ...]
 COLOURS = [f"C{k}" for k in range(10) if k != 7]  # without grey, the colour of references
@@ -185,6 +189,23 @@ def draw(
         ax.loglog(x[-1:], y[-1:], color=colour, marker=marker, ms=8)
     for marker, method in (("D", "corrected"), ("s", "hybrid: each iterate")):
         ax.plot([], [], color="0.5", ls="", marker=marker, label=f"the same, {method}")
+    _draw_meshes(ax, meshes)
+    if floor is not None:
+        ax.axhline(floor, color="0.3", ls="--", lw=1)
+        ax.annotate(
+            "discretisation error of the mesh", (0.01, floor), xycoords=("axes fraction", "data"),
+            fontsize=8, va="top", xytext=(0, -2), textcoords="offset points",
+        )  # fmt: skip
+    ax.set_xlabel("time of one load, its residual and min det F included, p50 [ms]")
+    ax.set_ylabel("relative error, median of the loads")
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.grid(alpha=0.3)
+    figure.legend(loc="outside right center", fontsize=8)
+    figure.savefig(file, dpi=130)
+
+
+def _draw_meshes(ax: "Axes", meshes: Sequence[Discretisation]) -> None:
+    """Draw the errors of Newton on other meshes, one line per polynomial degree."""
     for degree, marker, name in ((1, "s", "linear"), (2, "D", "quadratic")):
         family = [mesh for mesh in meshes if mesh.degree == degree]
         if not family:
@@ -201,23 +222,6 @@ def draw(
                 f"{mesh.dofs:,}", (mesh.ms, mesh.error), fontsize=7, color="0.4",
                 textcoords="offset points", xytext=away,
             )  # fmt: skip
-    if floor is not None:
-        ax.axhline(floor, color="0.3", ls="--", lw=1)
-        ax.annotate(
-            "discretisation error of the mesh",
-            (0.01, floor),
-            xycoords=("axes fraction", "data"),
-            fontsize=8,
-            va="top",
-            xytext=(0, -2),
-            textcoords="offset points",
-        )
-    ax.set_xlabel("time of one load, its residual and min det F included, p50 [ms]")
-    ax.set_ylabel("relative error, median of the loads")
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.grid(alpha=0.3)
-    figure.legend(loc="outside right center", fontsize=8)
-    figure.savefig(file, dpi=130)
 
 
 def _family(solver: str) -> str:
