@@ -15,7 +15,7 @@ def test_values_on_meshes_twice_as_fine_tend_to_the_limit():
 
 
 def test_finer_meshes_are_nearer_to_the_limit_and_quadratic_ones_nearer_still():
-    """The tips are those of the verification dossier, 1.8e: Saint Venant-Kirchhoff, q = 20 Pa."""
+    """The deflections are those of an independent code: Saint Venant-Kirchhoff, q = 20 Pa."""
     family = replace(discretisation.FAMILIES["beam"], linear=((4, 1, 1), (8, 2, 2), (16, 4, 4)))
     rows = discretisation.discretisations(family, SaintVenantKirchhoff(0.3), repeats=1)
     tips = [mesh.value for mesh in rows]

@@ -1,4 +1,4 @@
-"""Laws of all materials: closed forms of VERIFICATION 1.2 to 1.4 and 1.11, invariance, Hooke."""
+"""Laws of all materials: tabulated stresses, closed forms, invariance, Hooke."""
 
 import math
 from collections.abc import Callable
@@ -54,7 +54,7 @@ class EnergyAlone(Material):
         return self.law.energy(H)
 
 
-UNIAXIAL = {  # VERIFICATION 1.2: lateral stretch and P11 at each of STRETCHES
+UNIAXIAL = {  # lateral stretch and P11 at each of STRETCHES, by an independent root finder
     "SVK": [
         (1.0737784, -0.1785),
         (1.0281051, -0.0855),
@@ -112,7 +112,7 @@ UNIAXIAL = {  # VERIFICATION 1.2: lateral stretch and P11 at each of STRETCHES
         (0.78310418, 0.83342554),
     ],
 }
-CAUCHY = {  # VERIFICATION 1.2: sigma11 at a stretch of 1.5
+CAUCHY = {  # sigma11 at a stretch of 1.5
     "SVK": 1.5,
     "NH-ln": 0.48828786,
     "NHiso-k2": 0.432703,
@@ -122,7 +122,7 @@ CAUCHY = {  # VERIFICATION 1.2: sigma11 at a stretch of 1.5
     "Yeoh": 0.49233813,
     "Ogden3": 0.59340287,
 }
-BIAXIAL = {  # VERIFICATION 1.3: thickness and P11 at a stretch of 0.8 and of 1.3
+BIAXIAL = {  # thickness and P11 at a stretch of 0.8 and of 1.3
     "SVK": [(1.1439281, -0.20571429), (0.63919592, 0.64071429)],
     "NH-ln": [(1.187912, -0.37073795), (0.77345679, 0.32300727)],
     "NHiso-k2": [(1.0864523, -0.33100998), (0.73668846, 0.29329827)],
@@ -132,7 +132,7 @@ BIAXIAL = {  # VERIFICATION 1.3: thickness and P11 at a stretch of 0.8 and of 1.
     "Yeoh": [(1.2872907, -0.54416545), (0.66565261, 0.32438342)],
     "Ogden3": [(1.2530384, -0.59561046), (0.67756476, 0.38338602)],
 }
-CONFINED = {  # VERIFICATION 1.3: P11 and P22 at a stretch of 0.6 and of 1.4
+CONFINED = {  # P11 and P22 at a stretch of 0.6 and of 1.4
     "SVK": [(-0.25846154, -0.18461538), (0.90461538, 0.27692308)],
     "NH-ln": [(-0.90143489, -0.29470709), (0.40239241, 0.1941186)],
     "NHiso-k2": [(-0.71780406, -0.084658781), (0.47382802, 0.36832039)],
@@ -142,7 +142,7 @@ CONFINED = {  # VERIFICATION 1.3: P11 and P22 at a stretch of 0.6 and of 1.4
     "Yeoh": [(-1.1774821, -0.36675538), (0.94160919, 1.0208736)],
     "Ogden3": [(-1.2346369, -0.34960893), (0.95766777, 1.0096326)],
 }
-VOLUMETRIC = {  # VERIFICATION 1.3: P of F = s I at s = 0.8 and 1.2
+VOLUMETRIC = {  # P of F = s I at s = 0.8 and 1.2
     "SVK": (-0.36, 0.66),
     "NH-ln": (-0.65583941, 0.40398942),
     "NHiso-k2": (-0.26026667, 0.8736),
@@ -152,7 +152,7 @@ VOLUMETRIC = {  # VERIFICATION 1.3: P of F = s I at s = 0.8 and 1.2
     "Yeoh": (-0.62464, 2.09664),
     "Ogden3": (-0.62464, 2.09664),
 }
-SIMPLE_SHEAR = {  # VERIFICATION 1.4: P12, P21, P11 = P22, P33 at a shear of 0.5 and of 1
+SIMPLE_SHEAR = {  # P12, P21, P11 = P22, P33 at a shear of 0.5 and of 1
     "SVK": [
         (0.27644231, 0.19230769, 0.16826923, 0.072115385),
         (1.0576923, 0.38461538, 0.67307692, 0.28846154),
@@ -244,7 +244,6 @@ def rotation() -> Tensor:
 
 @pytest.mark.parametrize("name", UNIAXIAL)
 def test_uniaxial_tension_has_the_tabulated_lateral_stretch_and_stress(laws, name):
-    """VERIFICATION 1.2."""
     for stretch, (lateral, stress) in zip(STRETCHES, UNIAXIAL[name], strict=True):
         side, axial = uniaxial(laws[name], stretch, 0.8 * lateral, 1.2 * lateral)
         assert side == digits(lateral)
@@ -253,7 +252,7 @@ def test_uniaxial_tension_has_the_tabulated_lateral_stretch_and_stress(laws, nam
 
 @pytest.mark.parametrize("name", CAUCHY)
 def test_cauchy_stress_of_uniaxial_tension_is_tabulated(laws, name):
-    """VERIFICATION 1.2, sigma11 = P11 / lateral^2 at a stretch of 1.5."""
+    """The stress is sigma11 = P11 / lateral^2 at a stretch of 1.5."""
     lateral = UNIAXIAL[name][STRETCHES.index(1.5)][0]
     side, axial = uniaxial(laws[name], 1.5, 0.8 * lateral, 1.2 * lateral)
     assert axial / side**2 == digits(CAUCHY[name])
@@ -262,7 +261,7 @@ def test_cauchy_stress_of_uniaxial_tension_is_tabulated(laws, name):
 @pytest.mark.parametrize("stretch", [0.7, 0.9, 1.1, 1.5])
 @pytest.mark.parametrize("poisson", [0.0, 0.1, 0.3, 0.49])
 def test_uniaxial_tension_follows_the_closed_form(poisson, stretch):
-    """VERIFICATION 1.2, closed forms, tolerance 1e-8."""
+    """The tolerance is 1e-8."""
     side, axial = uniaxial(SaintVenantKirchhoff(poisson), stretch)
     assert axial == pytest.approx(stretch * (stretch**2 - 1) / 2, rel=1e-8)
     assert side**2 == pytest.approx(1 - poisson * (stretch**2 - 1), rel=1e-8)
@@ -277,7 +276,6 @@ def test_uniaxial_tension_follows_the_closed_form(poisson, stretch):
 
 @pytest.mark.parametrize("name", BIAXIAL)
 def test_equibiaxial_tension_has_the_tabulated_thickness_and_stress(laws, name):
-    """VERIFICATION 1.3."""
     law = laws[name]
     for stretch, (thickness, stress) in zip((0.8, 1.3), BIAXIAL[name], strict=True):
         free = brentq(
@@ -292,7 +290,6 @@ def test_equibiaxial_tension_has_the_tabulated_thickness_and_stress(laws, name):
 
 @pytest.mark.parametrize("name", CONFINED)
 def test_confined_stretch_has_the_tabulated_stresses(laws, name):
-    """VERIFICATION 1.3."""
     for stretch, (P11, P22) in zip((0.6, 1.4), CONFINED[name], strict=True):
         found = principal(laws[name], stretch, 1.0, 1.0)
         assert found == [digits(P11), digits(P22), digits(P22)]
@@ -300,14 +297,13 @@ def test_confined_stretch_has_the_tabulated_stresses(laws, name):
 
 @pytest.mark.parametrize("name", VOLUMETRIC)
 def test_swelling_has_the_tabulated_stress(laws, name):
-    """VERIFICATION 1.3, volumetric states F = s I."""
+    """The deformation gradient is F = s I."""
     for stretch, stress in zip((0.8, 1.2), VOLUMETRIC[name], strict=True):
         assert principal(laws[name], *[stretch] * 3) == [digits(stress)] * 3
 
 
 @pytest.mark.parametrize("name", SIMPLE_SHEAR)
 def test_simple_shear_has_the_tabulated_stresses(laws, name):
-    """VERIFICATION 1.4."""
     for shear, (P12, P21, P11, P33) in zip((0.5, 1.0), SIMPLE_SHEAR[name], strict=True):
         P = laws[name].stress(shear * SHEAR).tolist()
         assert [P[0][1], P[1][0]] == [digits(P12), digits(P21)]
@@ -317,7 +313,7 @@ def test_simple_shear_has_the_tabulated_stresses(laws, name):
 
 @pytest.mark.parametrize("shear", [0.1, 0.5, 1.0, 2.0])
 def test_normal_stresses_of_simple_shear_are_universal(law, shear):
-    """VERIFICATION 1.4: sigma11 - sigma22 = shear sigma12 for every isotropic law."""
+    """The relation is sigma11 - sigma22 = shear sigma12 for every isotropic law."""
     cauchy = law.stress(shear * SHEAR) @ (EYE + shear * SHEAR).T
     assert (cauchy[0, 0] - cauchy[1, 1]).item() == pytest.approx(
         shear * cauchy[0, 1].item(), rel=1e-12
@@ -351,7 +347,7 @@ def test_normal_stresses_of_simple_shear_are_universal(law, shear):
     ids=["SVK", "NH-ln", "NHiso-k4"],
 )
 def test_general_deformation_has_the_tabulated_stress(law, printed):
-    """VERIFICATION 1.4, general F, E = 1e6 (misprints there: P31 of NH-ln, P13 of NHiso-k4)."""
+    """Compare with an independent code at a general F, E = 1e6."""
     F = torch.tensor(
         [[1.2, 0.2, -0.1], [0.05, 0.95, 0.15], [-0.08, 0.12, 1.1]], dtype=torch.float64
     )
@@ -370,7 +366,7 @@ def test_tangent_is_the_curvature_of_the_energy(law, gradients):
 
 
 def test_differences_of_stress_follow_the_tangent(law, gradients):
-    """VERIFICATION 1.4: central differences with h = 1e-6 to 1e-9, independent of autodiff."""
+    """Central differences use h = 1e-6 to 1e-9, independent of autodiff."""
     direction = gradients.flip(0)
     slope = (
         law.stress(gradients + 1e-6 * direction) - law.stress(gradients - 1e-6 * direction)
@@ -440,7 +436,7 @@ def test_material_cut_in_another_direction_is_the_same(finite, gradients, rotati
 
 
 def test_body_at_rest_has_neither_energy_nor_stress(law):
-    """VERIFICATION 1.4; only differences matter to SNH, whose energy at rest is printed."""
+    """Only the energy of SNH at rest is not zero; differences of the energy matter alone."""
     rest = torch.zeros(3, 3, dtype=torch.float64)
     energy = law.energy(rest).item()
     assert energy == (digits(-0.2730425102, 10) if isinstance(law, StableNeoHookean) else 0)
@@ -461,7 +457,7 @@ def test_tangent_at_rest_is_hooke(hookean, poisson):
 
 
 def test_moduli_are_those_of_young_and_poisson():
-    """VERIFICATION 1: mu, lambda and kappa at E = 1, nu = 0.3."""
+    """Compare mu, lambda and kappa at E = 1, nu = 0.3."""
     assert digits(0.3846153846, 10) == SVK.mu
     assert digits(0.5769230769, 10) == SVK.lam
     assert digits(0.8333333333, 10) == SVK.bulk
@@ -477,7 +473,7 @@ def test_moduli_at_rest_are_those_of_the_tangent(law):
 
 @pytest.mark.parametrize(("name", "shear"), [("MR", 0.4), ("Yeoh", 0.4), ("Ogden3", 0.42)])
 def test_rubbers_have_their_shear_and_bulk_modulus_at_rest(laws, name, shear):
-    """VERIFICATION 1.1: 2 (C10 + C01), 2 C10, sum of mu_i; kappa = 2."""
+    """The moduli are 2 (C10 + C01), 2 C10, sum of mu_i; kappa = 2."""
     assert laws[name].mu == pytest.approx(shear, rel=1e-14)
     assert laws[name].lam + 2 / 3 * shear == pytest.approx(2.0, rel=1e-14)
 
@@ -634,7 +630,7 @@ def test_slopes_say_the_same_of_numbers_and_tensors(isotropic, logs):
 
 
 def test_saint_venant_softens_below_its_limit_stretch():
-    """VERIFICATION 1.11: max |P| = 1 / (3 sqrt 3) at 1 / sqrt 3."""
+    """The largest stress is |P| = 1 / (3 sqrt 3) at 1 / sqrt 3."""
     limit = 1 / math.sqrt(3)
     peak = uniaxial(SVK, limit)[1]
     assert peak == digits(-0.1924500897, 10)
@@ -643,7 +639,6 @@ def test_saint_venant_softens_below_its_limit_stretch():
 
 
 def test_saint_venant_is_blind_to_reflection_and_lets_a_body_collapse():
-    """VERIFICATION 1.11."""
     mirrored = torch.diag(torch.tensor([-2.0, 0.0, 0.0], dtype=torch.float64))
     assert SVK.energy(mirrored) == 0
     assert not SVK.stress(mirrored).any()
@@ -656,7 +651,7 @@ def test_saint_venant_is_blind_to_reflection_and_lets_a_body_collapse():
     [(0.5, -1.376708), (0.1, -17.09184), (0.01, -304.1406), (0.001, -4369.858)],
 )
 def test_neo_hookean_resists_collapse_without_bound(stretch, stress):
-    """VERIFICATION 1.11, confined compression."""
+    """The compression is confined."""
     assert principal(NH, stretch, 1.0, 1.0)[0] == digits(stress, 7)
 
 
@@ -665,7 +660,6 @@ def test_neo_hookean_resists_collapse_without_bound(stretch, stress):
     [(-1, 0.4835138104), (-10, 0.1073321638), (1, 2.780359487), (10, 26.00274671)],
 )
 def test_neo_hookean_answers_every_uniaxial_load(stress, stretch):
-    """VERIFICATION 1.11."""
     found = brentq(lambda s: uniaxial(NH, s)[1] - stress, 0.05, 50, xtol=1e-14, rtol=1e-14)
     assert found == digits(stretch, 10)
 
@@ -697,7 +691,7 @@ def peak_of(stress: Callable[[float], float], low: float, high: float) -> float:
 
 
 def test_neo_hookean_softens_where_it_is_torn_from_all_sides():
-    """VERIFICATION 1.11: the largest hydrostatic Cauchy stress is .3505 E at J = 3.251."""
+    """The largest hydrostatic Cauchy stress is .3505 E at J = 3.251."""
 
     def cauchy(J):
         return principal(NH, *[J ** (1 / 3)] * 3)[0] / J ** (2 / 3)
@@ -709,7 +703,7 @@ def test_neo_hookean_softens_where_it_is_torn_from_all_sides():
 
 @pytest.mark.parametrize(("poisson", "limit"), [(0.49, 2.8977), (0.499, 2.7337)])
 def test_dead_hydrostatic_load_of_neo_hookean_has_a_limit_point(poisson, limit):
-    """VERIFICATION 1.11; none for nu = 0.45."""
+    """There is none for nu = 0.45."""
     law = NeoHookeanLn(poisson)
     assert peak_of(lambda s: principal(law, s, s, s)[0], 1.0, 4.0) == pytest.approx(limit, abs=6e-5)
     tame = NeoHookeanLn(0.45)
@@ -718,7 +712,7 @@ def test_dead_hydrostatic_load_of_neo_hookean_has_a_limit_point(poisson, limit):
 
 
 def test_quadratic_volume_term_is_no_barrier():
-    """VERIFICATION 1.11: volumetric collapse of NHiso-k2 costs kappa/2 = .4166667."""
+    """Volumetric collapse of NHiso-k2 costs kappa/2 = .4166667."""
     energy = NeoHookeanIsoK2(0.3).energy(-(1 - 1e-3) * EYE)
     assert energy.item() == pytest.approx(0.4166667, abs=2e-7)
 
@@ -728,7 +722,7 @@ def test_quadratic_volume_term_is_no_barrier():
     [((0.0, 0.0, 0.0), 0.1465201465), ((-1.0, 1.0, 1.0), 2.291060054), ((1, 1, 1), -0.2730425102)],
 )
 def test_stable_neo_hookean_is_finite_everywhere(diagonal, energy):
-    """VERIFICATION 1.11: collapsed, mirrored, at rest."""
+    """The states are collapsed, reflected and at rest."""
     H = torch.diag(torch.tensor(diagonal, dtype=torch.float64)) - EYE
     assert SNH.energy(H).item() == digits(energy, 10)
 
@@ -765,7 +759,7 @@ def test_moduli_have_minor_and_major_symmetry(finite, gradients):
 
 
 def test_linear_law_is_hooke_at_any_gradient(gradients, laws):
-    """VERIFICATION 1: no strain is too large for it, no rotation too small to be felt."""
+    """No strain is too large for it, no rotation too small to be felt."""
     law = laws["linear"]
     strain = (gradients + gradients.mT) / 2
     volume = strain.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]

@@ -61,7 +61,7 @@ def free_vectors(modes, problem):
 
 
 @pytest.mark.parametrize("cells", REFERENCE, ids=lambda cells: f"{cells[0]}x{cells[1]}x{cells[1]}")
-def test_eigenvalues_are_those_of_the_verification_dossier(beam, law, cells):
+def test_eigenvalues_are_those_of_an_independent_code(beam, law, cells):
     expected = REFERENCE[cells]
     found = eigenmodes(LinearSolver(beam(law, *cells), linear="superlu"), len(expected)).values
     assert found[: len(expected)].numpy() * YOUNG * LENGTH == pytest.approx(expected, rel=1e-6)

@@ -32,7 +32,7 @@ from dpl.fem import (
 )
 from dpl.fem.linear import full_matrix
 
-YOUNG, LENGTH = 4500.0, 100.0  # of the beam of VERIFICATION 1.8e [Pa], [m]
+YOUNG, LENGTH = 4500.0, 100.0  # of the paper's beam [Pa], [m]
 NH = NeoHookeanLn(0.3)
 CORNER = skfem.MeshTet(
     np.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), np.arange(4)[:, None]
@@ -60,7 +60,7 @@ def rotation() -> Tensor:
     return torch.matrix_exp(skew)
 
 
-# VERIFICATION 1.7: mesh, degree, eigenvalues from below, number of them in all, largest, trace
+# By another code: mesh, degree, eigenvalues from below, number of them in all, largest, trace
 ELEMENTS = {
     "hex8": (
         *(CUBE, 1),
@@ -84,7 +84,6 @@ ELEMENTS = {
 @pytest.mark.parametrize("material", [SaintVenantKirchhoff, NeoHookeanLn])
 @pytest.mark.parametrize("element", ELEMENTS)
 def test_element_matrix_has_the_tabulated_eigenvalues(element, material):
-    """VERIFICATION 1.7."""
     mesh, degree, smallest, count, largest, trace = ELEMENTS[element]
     K = stiffness(Problem.build(mesh, material(0.3), degree=degree, length=1.0))
     values = np.linalg.eigvalsh(K)
@@ -96,7 +95,7 @@ def test_element_matrix_has_the_tabulated_eigenvalues(element, material):
 
 
 def test_all_eigenvalues_of_the_hexahedron_are_tabulated():
-    """VERIFICATION 1.7, the upper part and the Frobenius norm; lambda_max = (3 lam + 2 mu) / 2."""
+    """Compare the upper part and the Frobenius norm; lambda_max = (3 lam + 2 mu) / 2."""
     K = stiffness(Problem.build(CUBE, NH, length=1.0))
     assert np.linalg.eigvalsh(K)[15:-1] == pytest.approx([0.384615385] * 8, abs=6e-10)
     assert (K**2).sum() == pytest.approx(2.9722770107, abs=6e-11)
@@ -105,7 +104,7 @@ def test_all_eigenvalues_of_the_hexahedron_are_tabulated():
 
 @pytest.mark.parametrize("element", ELEMENTS)
 def test_homogeneous_strain_has_the_energy_of_hooke(element):
-    """VERIFICATION 1.7: u K u for u = x e1, X and y e1, times the volume."""
+    """Compare u K u for u = x e1, X and y e1, times the volume."""
     mesh, degree, *_ = ELEMENTS[element]
     problem = Problem.build(mesh, NH, degree=degree, length=1.0)
     volume = problem.dV.sum().item()
@@ -121,7 +120,7 @@ def test_homogeneous_strain_has_the_energy_of_hooke(element):
 
 
 def test_beam_has_the_tabulated_stiffness(law, beam):
-    """VERIFICATION 1.8e, eigenvalues of K in N/m on free degrees of freedom, tolerance 1e-6."""
+    """Compare eigenvalues of K in N/m on free degrees of freedom, tolerance 1e-6."""
     values = np.linalg.eigvalsh(stiffness(beam(law))) * YOUNG * LENGTH
     printed = (
         [21.24835125] * 2 + [163.64340492] + [536.30691952] * 2 + [867.54630154, 1433.87488669]
@@ -130,7 +129,6 @@ def test_beam_has_the_tabulated_stiffness(law, beam):
 
 
 def test_finer_beam_has_the_tabulated_stiffness(beam):
-    """VERIFICATION 1.8e."""
     K = csc_array(stiffness(beam(NH, 16, 4))) * YOUNG * LENGTH
     values = np.sort(eigsh(K, 6, sigma=0.0, v0=np.arange(1.0, K.shape[0] + 1))[0])
     printed = [3.88134628] * 2 + [37.40358032] + [98.17128826] * 2 + [165.64636884]
@@ -139,7 +137,7 @@ def test_finer_beam_has_the_tabulated_stiffness(beam):
 
 @pytest.fixture(scope="module")
 def bent(beam, pull) -> tuple[Problem, Tensor, Tensor]:
-    """The beam of VERIFICATION 1.10 (hex8 8 x 2 x 2, NH-ln, q = 20), its load and its answer."""
+    """The paper's beam (hex8 8 x 2 x 2, NH-ln, q = 20), its load and its solution."""
     problem = beam(NH)
     force = pull(problem, 20.0)
     load = Load(force, torch.tensor([YOUNG]))
@@ -159,7 +157,7 @@ def direction(bent) -> Tensor:
 
 
 def test_energy_is_expanded_by_force_and_tangent(bent, direction):
-    """VERIFICATION 1.10, Taylor test: remainders of order 2 and 3."""
+    """The Taylor test has remainders of order 2 and 3."""
     problem, _, u = bent
     steps = 3e-5 * 0.5 ** torch.arange(5, dtype=torch.float64)
     change = problem.energy(u + steps[:, None, None] * direction) - problem.energy(u)
@@ -171,7 +169,7 @@ def test_energy_is_expanded_by_force_and_tangent(bent, direction):
 
 
 def test_differences_of_force_follow_the_tangent(bent, direction):
-    """VERIFICATION 1.10: the error falls by 100 as the step falls by 10, down to 1e-8."""
+    """The error falls by 100 as the step falls by 10, down to 1e-8."""
     problem, _, u = bent
     sparse = stiffness(problem, u) @ direction[problem.free[None]].numpy()
     product = problem.tangent_product(u, direction)[problem.free[None]].numpy()
@@ -188,7 +186,7 @@ def test_differences_of_force_follow_the_tangent(bent, direction):
 
 
 def test_moved_and_turned_body_feels_turned_forces(bent):
-    """VERIFICATION 1.10, objectivity, tolerance 1e-12."""
+    """The tolerance is 1e-12."""
     problem, _, u = bent
     Q, X = rotation(), problem.points
     moved = (X + u) @ Q.T + torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64) - X
@@ -200,7 +198,6 @@ def test_moved_and_turned_body_feels_turned_forces(bent):
 
 
 def test_turning_alone_needs_no_force(bent):
-    """VERIFICATION 1.10, objectivity."""
     problem = bent[0]
     turned = (problem.points @ (rotation() - torch.eye(3, dtype=torch.float64)).T)[None]
     assert problem.internal_force(turned).norm() < 1e-14
@@ -208,7 +205,7 @@ def test_turning_alone_needs_no_force(bent):
 
 
 def test_reactions_balance_the_load(bent):
-    """VERIFICATION 1.10: forces to 1e-10 of the load, moments about the deformed body to 1e-12."""
+    """Compare forces to 1e-10 of the load, moments about the deformed body to 1e-12."""
     problem, force, u = bent
     internal = problem.internal_force(u)
     reactions = torch.where(problem.free, 0.0, internal)
@@ -218,7 +215,7 @@ def test_reactions_balance_the_load(bent):
 
 
 def test_linear_answers_are_reciprocal(bent):
-    """VERIFICATION 1.10, Maxwell and Betti: u_a(f_b) = u_b(f_a)."""
+    """Maxwell and Betti: u_a(f_b) = u_b(f_a)."""
     problem = bent[0]
     linear = LinearSolver(problem, linear="superlu")
     random = torch.Generator().manual_seed(5)
@@ -228,7 +225,7 @@ def test_linear_answers_are_reciprocal(bent):
 
 
 def test_free_body_has_exactly_the_rigid_zero_modes(bent):
-    """VERIFICATION 1.10: six eigenvalues below 1e-10 of the largest, at rest and turned."""
+    """Six eigenvalues are below 1e-10 of the largest, at rest and after a rotation."""
     problem = Problem.build(box([4.0, 1.0, 1.0], [5, 2, 2]), NH)
     turned = (problem.points @ (rotation() - torch.eye(3, dtype=torch.float64)).T)[None]
     for state in (torch.zeros_like(turned), turned):
@@ -249,7 +246,7 @@ def path(problem: Problem, pull, loads: list[float]) -> tuple[Tensor, Tensor]:
 
 
 def test_slope_of_the_total_energy_over_the_load_is_the_displacement(bent, pull):
-    """VERIFICATION 1.10, Hellmann-Feynman: d(U - q f u)/dq = -f u."""
+    """Hellmann-Feynman: d(U - q f u)/dq = -f u."""
     errors = []
     for step in (0.2, 0.1):
         loads = torch.tensor([20 - step, 20, 20 + step], dtype=torch.float64)
@@ -263,7 +260,7 @@ def test_slope_of_the_total_energy_over_the_load_is_the_displacement(bent, pull)
 
 
 def test_work_of_the_load_is_stored_as_strain_energy(bent, pull):
-    """VERIFICATION 1.10: integral of q d(f u) by Simpson in 40 steps = U."""
+    """The integral of q d(f u) by Simpson in 40 steps is U."""
     loads = np.linspace(0.0, 20.0, 41)
     energy, stroke = path(bent[0], pull, loads.tolist())
     weights = np.array([1] + [4, 2] * 19 + [4, 1]) * (loads[1] / 3)
@@ -623,7 +620,6 @@ SPACE = {
 
 @pytest.mark.parametrize("support", SPACE)
 def test_motions_that_no_support_holds_are_named(grid, support):
-    """VERIFICATION 2.2 T13."""
     fixed, count = SPACE[support]
     names = Problem.build(grid("hexahedron", 3), NH, fixed=fixed).unconstrained_rigid_body_modes()
     assert len(names) == count
@@ -661,7 +657,7 @@ def test_loose_motions_of_a_plane_body_are_three(grid):
 
 
 def test_loose_motions_are_the_zero_modes(grid):
-    """VERIFICATION 2.2 T13: as many as K has zero eigenvalues, for any support."""
+    """Their number is that of the zero eigenvalues of K, for every support."""
     random = np.random.default_rng(0)
     mesh = grid("hexahedron", 2, 0.1)
     for count in (1, 2, 3, 4, 5, 6, 7):
@@ -764,7 +760,7 @@ def test_mean_dilatation_changes_no_homogeneous_deformation(dilated):
 
 @pytest.mark.parametrize("cell", ["quad", "hexahedron"])
 def test_mean_dilatation_passes_the_patch_test(cell, any_law, grid):
-    """VERIFICATION 1.6: the boundary is moved linearly, the inner nodes follow exactly."""
+    """The boundary is moved linearly, the inner nodes follow exactly."""
     mesh = grid(cell, 3, 0.2, inside=True)
     dim = len(mesh.p)
     H = np.array([[0.2, 0.2, -0.1], [0.05, -0.05, 0.15], [-0.08, 0.12, 0.1]])[:dim, :dim]
@@ -784,7 +780,7 @@ def test_mean_dilatation_passes_the_patch_test(cell, any_law, grid):
 
 @pytest.mark.parametrize("cell", ["quad", "hexahedron"])
 def test_mean_dilatation_does_not_lock(cell):
-    """VERIFICATION 2.2 T8: at nu = 0.4999 within 6 % of quadratic cells, which hardly lock."""
+    """At nu = 0.4999 the compliance is within 6 % of quadratic cells, which hardly lock."""
     size, nodes = ([10.0, 2.0], [21, 5]) if cell == "quad" else ([10.0, 2.0, 2.0], [21, 5, 3])
     build = rectangle if cell == "quad" else box
     law, sags = NeoHookeanLn(0.4999), {}
@@ -824,7 +820,7 @@ def test_mean_dilatation_is_refused_for_a_mesh_that_is_quadratic(grid):
     + [(cell, "or mean_dilatation=true$") for cell in ("quad", "hexahedron")],
 )
 def test_linear_cells_that_will_lock_are_warned_of(grid, cell, remedy):
-    """VERIFICATION 2.2 T8, from a Poisson ratio of 0.45 on."""
+    """The warning starts at a Poisson's ratio of 0.45."""
     with pytest.warns(UserWarning, match=f"lock at Poisson's ratio 0.45: .*{remedy}"):
         Problem.build(grid(cell), NeoHookeanLn(0.45))
     assert Problem.build(grid(cell), NeoHookeanLn(0.449)).advice() == []
@@ -843,7 +839,7 @@ def test_locking_of_a_law_without_poisson_ratio_is_seen_too(grid):
 
 
 def test_thin_linear_cells_are_warned_of():
-    """VERIFICATION 2.2 T10: aspect ratios above 20."""
+    """The warning starts at an aspect ratio of 20."""
     for thickness, lines in ((1.001 / 20, 0), (0.999 / 20, 1)):
         mesh = rectangle([4.0, 4 * thickness], [5, 5])
         with warnings.catch_warnings(record=True) as caught:

@@ -1,6 +1,6 @@
 """Laws of the network-started Newton: as exact as Newton's, and never worse led than the classic.
 
-The stubs and the pick rule are those of the verification dossier, T19, T20 and section 0.
+The predictions are exact solutions with noise, and predictions that are useless.
 """
 
 from dataclasses import replace
