@@ -139,12 +139,9 @@ class Controls:
             limit = float(self.amplitude.max)
             self.amplitude.value = round(min(float(frame.answer.amplitude), limit), 2)
 
-    def show_newton_frame(self, frame: Frame | None) -> None:
-        """Update the table of Newton; hidden if Newton is not shown."""
+    def show_newton_frame(self, frame: Frame | None, *, visible: bool) -> None:
+        """Update the table of Newton, or hide it."""
         self._newton.content = panel.newton_table(frame)
-
-    def show_newton_table(self, visible: bool) -> None:
-        """Show or hide the table of Newton."""
         self._newton.visible = visible
 
     def show_error(self, text: str) -> None:

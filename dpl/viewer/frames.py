@@ -185,23 +185,11 @@ class Body:
     def solve(self, request: LoadRequest, settings: ViewSettings) -> Frame:
         """Return the frame of a request, computed by the simulator."""
         answer = self._simulate(request, settings)
-        u = answer.displacement / self.scene.length
         reference = None
         if settings.quantity == ERROR:
-            exact = self._simulate(request, ViewSettings(tol=self.scene.solver.tol), warm=True)
-            reference = exact.displacement / self.scene.length
-        return Frame(
-            request,
-            answer.displacement,
-            self.surface.deformed_points(u),
-            self._values(u, reference, request, settings.quantity),
-            settings.quantity,
-            answer,
-            -1,
-            answer.residual,
-            answer.volume_ratio,
-            answer.converged,
-        )
+            exact = ViewSettings(tol=self.scene.solver.tol)
+            reference = self._simulate(request, exact, warm=True).displacement
+        return self._frame(request, settings.quantity, answer.displacement, reference, answer)
 
     def _simulate(
         self, request: LoadRequest, settings: ViewSettings, *, warm: bool = False
@@ -220,37 +208,52 @@ class Body:
         self, request: LoadRequest, settings: ViewSettings, reference: Frame
     ) -> Iterator[Frame]:
         """Yield the iterates of Newton from zero displacement; errors are against `reference`."""
-        expected = reference.displacement / self.scene.length
         with one_thread():
             for state in self.scene.solver.iterate(self.load(request)):
-                yield self._newton_frame(state, expected, request, settings.quantity)
+                displacement = self.scene.length * state.displacement[0]
+                yield self._frame(
+                    request, settings.quantity, displacement, reference.displacement, state
+                )
 
-    def _newton_frame(
-        self, state: Solution, expected: Tensor, request: LoadRequest, quantity: str
+    def _frame(
+        self,
+        request: LoadRequest,
+        quantity: str,
+        displacement: Tensor,
+        reference: Tensor | None,
+        result: Answer | Solution,
     ) -> Frame:
-        u = state.displacement[0]
+        """Return the frame of displacements (N, D) [m]."""
+        answer = result if isinstance(result, Answer) else None
         return Frame(
             request,
-            u * self.scene.length,
-            self.surface.deformed_points(u),
-            self._values(u, expected, request, quantity),
+            displacement,
+            self.surface.deformed_points(displacement / self.scene.length),
+            self._values(displacement, reference, request, quantity),
             quantity,
-            None,
-            int(state.iterations),
-            float(state.residual),
-            float(state.volume_ratio),
-            bool(state.converged),
+            answer,
+            int(result.iterations) if answer is None else -1,
+            float(result.residual),
+            float(result.volume_ratio),
+            bool(result.converged),
         )
 
     def _values(
-        self, u: Tensor, reference: Tensor | None, request: LoadRequest, quantity: str
+        self,
+        displacement: Tensor,
+        reference: Tensor | None,
+        request: LoadRequest,
+        quantity: str,
     ) -> Floats:
-        """Return the values of a quantity on the surface, (S,), of displacements (N, D) [-]."""
+        """Return the values of a quantity on the surface, (S,), of displacements (N, D) [m]."""
         if quantity == STRESS:
+            u, poisson = displacement / self.scene.length, self.load(request).poisson
             with torch.inference_mode():
-                return request.young * self.surface.von_mises(u, self.load(request).poisson)
-        field = u - reference if quantity == ERROR and reference is not None else u
-        return self.scene.length * field.norm(dim=1).numpy()[self.surface.nodes]
+                return request.young * self.surface.von_mises(u, poisson)
+        field = displacement
+        if quantity == ERROR and reference is not None:
+            field = displacement - reference
+        return field.norm(dim=1).numpy()[self.surface.nodes]
 
 
 class ColourScale:

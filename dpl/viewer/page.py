@@ -238,7 +238,6 @@ class Page:
     def _show_second_body(self, visible: bool) -> None:
         """Show or hide the body of Newton, and move the cameras."""
         self._newton_node.frame.visible = self._label.visible = visible
-        self.controls.show_newton_table(visible)
         offset = self._newton_offset / 2 if visible else np.zeros(3)
         distance = DISTANCE_OF_TWO if visible else DISTANCE
         camera = Camera.facing(self.body.surface, distance=distance)
@@ -318,7 +317,7 @@ class Page:
             return
         self._changed = False
         self.controls.show_frame(self.frame, self._scale, self.worker.frame_rate)
-        if self.worker.settings.show_newton:
-            self.controls.show_newton_frame(self.newton_frame)
+        visible = self.worker.settings.show_newton
+        self.controls.show_newton_frame(self.newton_frame, visible=visible)
         self.controls.show_error(self._error)
         self.controls.show_recording(self.recording)
