@@ -94,14 +94,7 @@ def export_model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
     with atomic_write(folder / "report.json") as file:
         file.write((json.dumps(report, indent=1) + "\n").encode())
     if not report["passed"]:
-        for part in folder.glob("model.onnx*"):
-            part.unlink()
-        print(
-            f"error: ONNX and torch differ by {largest:.2g}, more than tol = {cfg.tol:g}; {path} "
-            "was removed",
-            file=sys.stderr,
-        )
-        sys.exit(1)
+        _remove_model(path, largest, cfg.tol)
     if graph.has_local_output:
         print(
             "output 'local' marks loads whose linear solution has a projection error above "
@@ -110,6 +103,18 @@ def export_model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
         )
     megabytes = report["bytes"] / 1e6
     print(f"largest difference {largest:.1e}; {path}, {megabytes:.3g} MB, {seconds:.1f} s to write")
+
+
+def _remove_model(path: Path, difference: float, tol: float) -> None:
+    """Remove the ONNX files, print why, and exit with status 1."""
+    for part in path.parent.glob("model.onnx*"):
+        part.unlink()
+    print(
+        f"error: ONNX and torch differ by {difference:.2g}, more than tol = {tol:g}; {path} was "
+        "removed",
+        file=sys.stderr,
+    )
+    sys.exit(1)
 
 
 def _reference_error(folder: Path, graph: "ExportGraph", session: "OnnxSession") -> float:

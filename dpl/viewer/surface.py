@@ -138,9 +138,7 @@ def contour_bands(points: Floats, triangles: Ints, levels: Floats, count: int) -
     soup = np.stack([np.concatenate(column) for column in zip(*pieces, strict=True)], axis=1)
     flipped, owner_band = np.concatenate(flips), np.concatenate(bands)
     soup[flipped] = soup[flipped][:, [0, 2, 1]]
-    proper = np.ones(len(soup), dtype=bool)
-    for i, j in ((0, 1), (1, 2), (0, 2)):  # a contour through a corner gives degenerate triangles
-        proper &= (soup[:, i] != soup[:, j]).any(axis=1)
+    proper = _is_proper(soup)  # a contour through a corner gives degenerate triangles
     soup, owner_band = soup[proper], owner_band[proper]
     order = np.argsort(owner_band, kind="stable")
     starts = np.searchsorted(owner_band[order], np.arange(1, count))
@@ -151,6 +149,12 @@ def _interpolate(p: Floats, q: Floats, v: Floats, w: Floats, level: Floats) -> F
     """Return the points of segments pq, with values v at p and w at q, at a level."""
     share = np.divide(level - v, w - v, out=np.zeros_like(v), where=w > v)
     return p + np.clip(share, 0.0, 1.0)[:, None] * (q - p)
+
+
+def _is_proper(soup: Floats) -> NDArray[np.bool_]:
+    """Return the mask of triangles (T, 3, 3) with three different corners, (T,)."""
+    sides = soup - np.roll(soup, 1, axis=1)
+    return np.asarray((sides != 0).any(axis=2).all(axis=1))
 
 
 def triangle_normals(points: Floats, triangles: Ints) -> Floats:
