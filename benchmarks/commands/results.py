@@ -40,8 +40,8 @@ def main(cfg: DictConfig) -> None:
             compared[name + paper_tables.CORRECTED] = made("corrected", surrogate, method, train)
     sets = paper_tables.load_sets(scene, data.samples("test"), cfg.count)
     rows, errors = paper_tables.paper(cfg.name), {}
-    a_load = data.store.seconds_a_load()
-    minutes = None if a_load is None else a_load * sum(data.wanted.sizes.values()) / 60
+    a_load = data.store.seconds_per_load()
+    minutes = None if a_load is None else a_load * sum(data.dataset.sizes.values()) / 60
     for row, error in paper_tables.measure(
         compared, sets, scene.newton, generation_minutes=minutes
     ):

@@ -13,6 +13,7 @@ from rich.table import Table
 from dpl import config
 from dpl.commands.cli import command
 from dpl.evaluation import tables
+from dpl.system.threads import available_cores
 
 if TYPE_CHECKING:
     from dpl.evaluation.pareto import Discretisation, Point
@@ -30,7 +31,7 @@ def main(cfg: DictConfig) -> None:
     scene, solvers, batch = _solvers(cfg)
     rows: list[Point] = []
     for threads in cfg.threads:
-        count = threads or pareto.all_threads()
+        count = threads or available_cores()
         with Progress() as progress:
             bar = progress.add_task(f"solvers, {count} threads", total=len(solvers))
             tick = partial(progress.advance, bar)

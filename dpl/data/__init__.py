@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.data.datamodule import OfflineData, OnlineData, Samples
+    from dpl.data.datamodule import OfflineData, Samples
     from dpl.data.dataset import DataSet
+    from dpl.data.online import OnlineData
     from dpl.data.replay_buffer import ReplayBuffer
     from dpl.data.storage.store import Store
     from dpl.data.storage.writer import Writer

@@ -1,10 +1,6 @@
-"""What is wanted of a data set, and the long work of filling it: progress, interruption, report."""
+"""A data set with the sizes that are wanted, and its generation with progress and interruption."""
 
-import os
-import platform
-import socket
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -22,33 +18,39 @@ from rich.progress import (
 
 from dpl.data.solving.solve import LoadKey
 from dpl.data.solving.worker_pool import GracefulShutdown
-from dpl.data.storage import acceptance
+from dpl.data.storage.acceptance import bias_warning
 from dpl.data.storage.integrity import repair, verify
+from dpl.data.storage.journal import Session
 from dpl.data.storage.store import Store
 from dpl.data.storage.writer import Writer
 from dpl.scene import Scene
-from dpl.system.files import append_jsonl
-from dpl.version import __version__
 
-MOST = 10**7  # loads in a split
-WORKERS = 1024  # processes on a machine
+MAX_LOADS = 10**7  # in a split
+MAX_WORKERS = 1024
+
+
+def check_range(low: float, high: float, **values: float) -> None:
+    """Raise ValueError if a value, named by its keyword, is not in [low, high]."""
+    for name, value in values.items():
+        if not low <= value <= high:
+            raise ValueError(f"{name} = {value} must lie between {low:,} and {high:,}")
 
 
 @dataclass(frozen=True)
 class DataSet:
-    """A data set as it is wanted, there or not.
+    """A data set with the sizes that are wanted; it may exist in part or not at all.
 
     Attributes:
-        scene: What is simulated.
-        folder: Where it is; named after the scene's fingerprint and the seed if left out.
-        seed: Names the loads.
-        train: Loads to train on.
-        val: Loads to validate on.
-        test: Loads to test on.
-        workers: Processes that solve, one core each; 0: this one.
-        timeout: Longest time for one load [s]; null: no limit.
-        shard: Which part of the files to make, from 0, of
-        shards: so many parts, each made by a process of its own.
+        scene: Scene of the loads.
+        folder: Folder of the data set; None: named after the scene's fingerprint and the seed.
+        seed: Seed of the loads.
+        train: Number of loads to train on.
+        val: Number of loads to validate on.
+        test: Number of loads to test on.
+        workers: Number of processes that solve, one core each; 0: solve in this process.
+        timeout: Time limit for a load [s]; None: no limit.
+        shard: Index of this process among `shards` processes that share the work.
+        shards: Number of these processes; each makes its part of the files.
     """
 
     scene: Scene
@@ -68,40 +70,35 @@ class DataSet:
         Raises:
             ValueError: A number is out of range.
         """
-        spans = {"seed": 2**32 - 1, "train": MOST, "val": MOST, "test": MOST, "workers": WORKERS}
-        for name, most in spans.items():
-            if not 0 <= getattr(self, name) <= most:
-                told = f"{name} = {getattr(self, name)} must be 0 or more and at most {most:,}"
-                raise ValueError(told)
-        if self.shards < 1:
-            raise ValueError(f"shards = {self.shards} must be 1 or more")
+        check_range(0, 2**32 - 1, seed=self.seed)
+        check_range(0, MAX_LOADS, **self.sizes)
+        check_range(0, MAX_WORKERS, workers=self.workers)
         if self.timeout is not None and not self.timeout > 0:
             raise ValueError(f"timeout = {self.timeout} must be above 0 [s], or null")
-        if not 0 <= self.shard < self.shards:
-            raise ValueError(
-                f"shard = {self.shard} must be one of 0 to shards - 1 = {self.shards - 1}"
-            )
+        if self.shards < 1:
+            raise ValueError(f"shards = {self.shards} must be 1 or more")
+        check_range(0, self.shards - 1, shard=self.shard)
 
     @cached_property
     def store(self) -> Store:
-        """Where it is kept."""
+        """Files of the data set."""
         name = f"datasets/{self.scene.fingerprint[:12]}-seed{self.seed}"
         return Store(Path(self.folder or name), self.scene, self.seed)
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Loads wanted in each split."""
+        """Number of loads wanted in each split."""
         return {"train": self.train, "val": self.val, "test": self.test}
 
     def missing(self) -> dict[str, list[int]]:
-        """Return the loads of this part that have not been tried, by split."""
+        """Return the loads of this process that have not been tried, by split."""
         return {
             split: self.store.missing(split, size, self.shard, self.shards)
             for split, size in self.sizes.items()
         }
 
     def skipped_work(self) -> list[str]:
-        """Return what need not be solved, a line each."""
+        """Return one line for each kind of work that is not needed."""
         wanted = sum(self.sizes.values())
         there = wanted - sum(len(self.store.missing(*split)) for split in self.sizes.items())
         lines = [
@@ -113,19 +110,20 @@ class DataSet:
         return lines
 
     def fill(self) -> Store:
-        """Return the data set; what is missing is solved under a progress bar.
+        """Solve the missing loads under a progress bar; return the data set.
 
-        Ctrl-C and SIGTERM once finish the loads at work. What is solved is kept in any case.
+        After the first SIGINT or SIGTERM, the solves in progress are finished. Solved loads are
+        kept in any case.
 
         Raises:
             DataSetError: The folder holds something else, or another process writes there.
-            KeyboardInterrupt: Stopped.
+            KeyboardInterrupt: The run was interrupted.
         """
         missing = self.missing()
         if any(missing.values()):
             self._solve(missing)
-        if told := acceptance.bias_warning(self.store.acceptance()):
-            print(f"warning: {told}", file=sys.stderr)
+        if warning := bias_warning(self.store.acceptance()):
+            print(f"warning: {warning}", file=sys.stderr)
         return self.store
 
     def _solve(self, missing: Mapping[str, Sequence[int]]) -> None:
@@ -142,87 +140,54 @@ class DataSet:
             for split, numbers in missing.items()
             for number in numbers
         }
-        found = len(jobs & self.store.pending.files().keys())
-        done = _Session(workers=self.workers)
+        completed = len(jobs & self.store.pending.files().keys())
+        session = Session(workers=self.workers)
         with GracefulShutdown() as stop, Progress(*columns, refresh_per_second=2) as progress:
-            bar = progress.add_task("loads", total=len(jobs), completed=found, news="")
+            bar = progress.add_task("loads", total=len(jobs), completed=completed, news="")
             writer = Writer(self.store, self.shard, self.shards)
             solving = writer.fill(missing, workers=self.workers, timeout=self.timeout, stop=stop)
             try:
-                with closing(solving):  # which ends the workers before anything else
-                    for one in solving:
-                        news = done.count(one.accepted, one.seconds)
+                with closing(solving):  # ends the workers first
+                    for solved in solving:
+                        news = session.count(solved.accepted, solved.seconds)
                         progress.update(bar, advance=1, news=news)
             finally:
-                done.write(self.store.folder)
+                session.append_to_journal(self.store.folder)
             stop.exit()
 
     def verify(self) -> Iterator[str]:
-        """Yield what is wrong with the data set, a line for each flaw.
+        """Yield one line for each flaw of the data set.
 
-        Flaws are those of `dpl.data.storage.integrity.verify`, and loads that are
-        wanted and are not there.
+        Flaws are those of `dpl.data.storage.integrity.verify`, and missing loads.
 
         Raises:
             DataSetError: There is no data set.
         """
         files = len(self.store.shards()) + 1
-        for part, flaw in track(verify(self.store), "looking at files", total=files):
+        for part, flaw in track(verify(self.store), "verifying files", total=files):
             if flaw:
                 yield f"{self.store.folder / part.file} {flaw}"
         for split, numbers in self.missing().items():
             if numbers:
                 yield (
                     f"{self.store.folder} lacks {len(numbers)} of the loads that data.{split} = "
-                    f"{self.sizes[split]} asks for; the first is load {numbers[0]}"
+                    f"{self.sizes[split]} requires; the first is load {numbers[0]}"
                 )
 
     def repair(self) -> Store:
-        """Return the data set, its damaged files made again, also those beyond the sizes wanted.
+        """Make damaged files again, also beyond the sizes wanted; return the data set.
 
-        What is done is printed, a line for each flaw.
+        One line is printed for each flaw.
         """
-        mended = repair(self.store)
+        flaws = repair(self.store)
         missing = self.missing()
-        for part, told in mended:
-            print(f"{self.store.folder / part.file} {told}")
+        for part, action in flaws:
+            print(f"{self.store.folder / part.file} {action}")
             if part.split:
                 missing[part.split] = sorted({*missing[part.split], *part.loads})
         for split, numbers in missing.items():
             if numbers:
-                print(f"{len(numbers)} loads of {split} are not there; they are solved")
+                print(f"{len(numbers)} loads of {split} are missing and are solved")
         if any(missing.values()):
             self._solve(missing)
         return self.fill()
-
-
-class _Session:
-    """What one run of the generator has done, for the progress bar and the journal."""
-
-    def __init__(self, workers: int) -> None:
-        self.workers, self.loads, self.accepted, self.core_seconds = workers, 0, 0, 0.0
-        self.started, self.begin = time.strftime("%Y-%m-%d %H:%M:%S"), time.perf_counter()
-
-    def count(self, accepted: bool, seconds: float) -> str:
-        """Count a load; return the news."""
-        self.loads += 1
-        self.accepted += accepted
-        self.core_seconds += seconds
-        rate = self.loads / (time.perf_counter() - self.begin)
-        return f"{self.accepted} accepted, {self.loads - self.accepted} rejected, {rate:.1f}/s"
-
-    def write(self, folder: Path) -> None:
-        """Add a line to the journal."""
-        if self.loads and folder.is_dir():
-            line = {
-                "started": self.started,
-                "machine": socket.gethostname(),
-                "process": os.getpid(),
-                "python": platform.python_version(),
-                "dpl": __version__,
-                "workers": self.workers,
-                "loads": self.loads,
-                "seconds": round(time.perf_counter() - self.begin, 3),
-                "core_seconds": round(self.core_seconds, 3),
-            }
-            append_jsonl(folder / "journal.jsonl", line)

@@ -1,4 +1,4 @@
-"""A replay buffer of samples that worker processes solve while the network trains."""
+"""Replay buffer of samples that worker processes solve while the network trains."""
 
 import itertools
 import signal
@@ -20,13 +20,13 @@ from dpl.system.processes import block_signals, spawn_context
 
 
 class StreamRates(NamedTuple):
-    """How fast an epoch's samples were made and used.
+    """Rates of production and use of samples in one epoch.
 
     Attributes:
-        produced, consumed: Samples a second.
-        waiting: Part of the time in which the optimiser had nothing to do.
-        uses: How often the samples made so far have been used, on average.
-        buffer: Samples kept.
+        produced, consumed: Samples per second.
+        waiting: Fraction of the time in which training waited for samples.
+        uses: Mean number of uses of the samples produced so far.
+        buffer: Number of samples in the buffer.
     """
 
     produced: float
@@ -37,20 +37,20 @@ class StreamRates(NamedTuple):
 
 
 class ReplayBuffer:
-    """Batches from a stream and from what it has given so far: a slow solver, a busy optimiser.
+    """Batches from the last samples of a stream, each used a bounded number of times.
 
-    Every `fresh` new samples enter a buffer (the oldest leave a full one), and batches are drawn
-    from those in it that have been used less than `reuse` times: once it is full, as many batches
-    as use each sample `reuse` times on average; while it fills, half as many. So no sample is used
-    more than `reuse` times, and batches do not depend on who was faster. One pass is an epoch of
-    `batches`; the stream goes on from epoch to epoch.
+    In each round, `new_per_round` new samples enter a buffer, where they replace the oldest ones
+    once it is full. Batches are then drawn from the samples that have been used less than `reuse`
+    times. Once the buffer is full, a sample is used `reuse` times on average; while it fills, half
+    as often. Batches are therefore a function of the stream and not of relative speeds. One pass
+    is an epoch of `batches` batches; the stream continues from epoch to epoch.
 
-    A worker that dies is replaced; what it was solving is drawn anew.
+    A worker that dies is replaced, and the loads that it was solving are solved again.
 
     Attributes:
-        produced: Samples taken from the stream so far.
-        following: A number above all loads taken from the stream so far.
-        rates: Of the last epoch.
+        produced: Number of samples taken from the stream so far.
+        next_index: Upper bound of the numbers of these loads, plus one.
+        rates: Rates of the last epoch; None before its end.
     """
 
     def __init__(
@@ -60,54 +60,61 @@ class ReplayBuffer:
         workers: int,
         batch_size: int,
         batches: int,
-        fresh: int,
+        new_per_round: int,
         reuse: int,
         capacity: int,
         group: Sequence[Symmetry] = (),
         errors: Callable[[], Tensor | None] = lambda: None,
         report: Callable[[StreamRates], None] = lambda rates: None,
     ) -> None:
-        """Keep the arguments, see the class; nothing starts before the first pass.
+        """Store the arguments; workers start in the first pass.
 
         Args:
-            stream: What to draw from.
-            workers: Processes that solve; 0: this one, between the steps.
+            stream: Source of the samples.
+            workers: Number of processes that solve; 0: solve in this process, between the steps.
             batch_size: Samples in a batch.
             batches: Batches in a pass.
-            fresh: New samples after which batches are drawn again.
-            reuse: How often a sample is used at most.
-            capacity: Samples kept.
+            new_per_round: New samples per round.
+            reuse: Maximum number of uses of a sample.
+            capacity: Number of samples that the buffer keeps.
             group: Symmetries of the body, identity first: each use is that of a random image.
-            errors: Gives the errors on the last batch, (B,), if the stream wants to know where the
-                surrogate is worst.
-            report: Is told the rates at the end of each pass.
+            errors: Returns the surrogate's errors on the last batch, (B,); called only if the
+                stream has hard examples.
+            report: Called with the rates at the end of each pass.
         """
-        self.produced = self.following = 0
+        self.produced = self.next_index = 0
         self.rates: StreamRates | None = None
-        self._source, self._workers, self._group = stream, workers, group
-        self._batches, self._batch_size = batches, batch_size
-        self._fresh, self._reuse = fresh, reuse
-        self._errors, self._report = errors, report
+        self._source = stream
+        self._workers = workers
+        self._group = group
+        self._batches = batches
+        self._batch_size = batch_size
+        self._new_per_round = new_per_round
+        self._reuse = reuse
+        self._errors = errors
+        self._report = report
         self._buffer = _Buffer(capacity, reuse)
         self._stream: Any = None
         self._endless: Iterator[Sample] | None = None
         self._generator = torch.Generator().manual_seed(0)
-        self._used, self._waited, self._restarts = 0, 0.0, 0
+        self._used = 0
+        self._waited = 0.0
+        self._restarts = 0
 
     def __len__(self) -> int:
         """Return the number of batches in an epoch."""
         return self._batches
 
     def __iter__(self) -> Iterator[Sample]:
-        """Yield one epoch."""
+        """Yield the batches of one epoch."""
         if self._endless is None:
             self._start()
             self._endless = self._draw()
-        begin, produced, used, waited = time.monotonic(), self.produced, self._used, self._waited
+        start, produced, used, waited = time.monotonic(), self.produced, self._used, self._waited
         for k, batch in enumerate(itertools.islice(self._endless, self._batches), 1):
-            if k == self._batches:  # before the last batch: nobody may ask for one more
-                used += self._batch_size if k > 1 else 0  # which is not used yet
-                seconds = max(time.monotonic() - begin, 1e-9)
+            if k == self._batches:  # before the last batch, after which no code of this loop runs
+                used += self._batch_size if k > 1 else 0  # the last batch is not used yet
+                seconds = max(time.monotonic() - start, 1e-9)
                 self.rates = StreamRates(
                     produced=(self.produced - produced) / seconds,
                     consumed=(self._used - used) / seconds,
@@ -119,77 +126,83 @@ class ReplayBuffer:
             yield batch
 
     def _start(self) -> None:
+        """Start the workers."""
         loader = DataLoader(
             self._source,
-            # once a worker has died, one by one: none is lost with those that come after it
-            batch_size=1 if self._restarts else self._fresh,
+            # single samples after a crash: the samples that precede a fatal load are not lost
+            batch_size=1 if self._restarts else self._new_per_round,
             num_workers=self._workers,
-            collate_fn=_batch,
+            collate_fn=_collate,
             multiprocessing_context=spawn_context() if self._workers else None,
-            worker_init_fn=_begin,
-            generator=torch.Generator(),  # none of the training's random numbers
+            worker_init_fn=_ignore_interrupts,
+            generator=torch.Generator(),  # the random numbers of the training stay untouched
         )
         before = signal.getsignal(signal.SIGCHLD)
         with block_signals(signal.SIGINT):
             self._stream = iter(loader)
         if threading.current_thread() is threading.main_thread():
-            # torch would raise wherever training is when a worker dies; `_next` finds out
+            # torch's handler raises at any point of the training when a worker dies;
+            # `_next_samples` detects dead workers
             signal.signal(signal.SIGCHLD, before if before is not None else signal.SIG_DFL)
 
     def _draw(self) -> Iterator[Sample]:
-        first, turns = self._source.first, self._turns
-        owed = 0.0  # uses that the samples so far are good for
-        while (news := self._next()) is not None:
-            self.produced += len(news.number)
-            self.following = max(self.following, int(news.number.max()) + 1)
-            for number in news.number.tolist():
-                self._source.starts[(number - first) % turns] = number + turns
+        """Yield batches without end."""
+        first, stride = self._source.first, self._total_workers
+        budget = 0.0  # uses that the samples so far allow
+        while (new := self._next_samples()) is not None:
+            self.produced += len(new.number)
+            self.next_index = max(self.next_index, int(new.number.max()) + 1)
+            for number in new.number.tolist():
+                self._source.offsets[(number - first) % stride] = number + stride
             uses = self._reuse if self._buffer.full else max(1.0, self._reuse / 2)
-            owed += len(news.number) * uses
-            self._buffer.put(news)
-            while owed >= self._batch_size and self._buffer.left >= self._batch_size:
-                owed -= self._batch_size
+            budget += len(new.number) * uses
+            self._buffer.put(new)
+            while budget >= self._batch_size and self._buffer.uses_left >= self._batch_size:
+                budget -= self._batch_size
                 chosen = self._buffer.choose(self._batch_size, self._generator)
                 self._used += self._batch_size
-                yield self._imaged(Sample(*(column[chosen] for column in self._buffer.sample)))
-                if self._source.worst is not None:
-                    self._buffer.note(chosen, self._errors())
-                    self._source.worst.put(self._buffer.worst())
+                yield self._random_images(Sample(*(c[chosen] for c in self._buffer.sample)))
+                if self._source.hard_examples is not None:
+                    self._buffer.set_errors(chosen, self._errors())
+                    self._source.hard_examples.update(self._buffer.hardest_points())
 
     @property
-    def _turns(self) -> int:
-        """How many workers of all training processes take turns on the stream."""
-        return max(1, self._workers) * self._source.lanes
+    def _total_workers(self) -> int:
+        """Number of the workers of all training processes."""
+        return max(1, self._workers) * self._source.world_size
 
-    def _imaged(self, batch: Sample) -> Sample:
+    def _random_images(self, batch: Sample) -> Sample:
         if not self._group:
             return batch
         which = torch.randint(len(self._group), (len(batch.force),), generator=self._generator)
-        force, displacement = (images(field, self._group, which) for field in batch[:2])
-        return batch._replace(force=force, displacement=displacement)
+        return transform(batch, self._group, which)
 
-    def _next(self) -> DrawnSample | None:
-        """Return new samples; None at the end of a stream that has one."""
+    def _next_samples(self) -> DrawnSample | None:
+        """Return new samples; None at the end of a finite stream. Replace dead workers."""
         start = time.monotonic()
         try:
-            news = next(self._stream, None)
+            new = next(self._stream, None)
             self._restarts = 0
-            return news
-        except (RuntimeError, OSError, EOFError) as error:  # what a dead worker leaves behind
+            return new
+        except (RuntimeError, OSError, EOFError) as error:  # raised where a worker has died
             self._restarts += 1
             died = "DataLoader worker" in str(error)
             died |= bool(self._workers) and not isinstance(error, RuntimeError)
             if not died or self._restarts > MAX_CONSECUTIVE_CRASHES:
                 raise
-            if self._restarts % MAX_RETRIES == 0:  # some load kills worker after worker
-                lane, first = self._source.lane * self._workers, self._source.first
-                for place in range(lane, lane + self._workers):
-                    following = self._source.starts.get(place, first + place)
-                    self._source.starts[place] = following + self._turns
+            if self._restarts % MAX_RETRIES == 0:
+                self._skip_loads()
             self._start()
-            return self._next()
+            return self._next_samples()
         finally:
             self._waited += time.monotonic() - start
+
+    def _skip_loads(self) -> None:
+        """Skip the next load of each worker of this process: one of them kills its worker."""
+        source, first = self._source, self._source.rank * self._workers
+        for index in range(first, first + self._workers):
+            next_load = source.offsets.get(index, source.first + index)
+            source.offsets[index] = next_load + self._total_workers
 
     def close(self) -> None:
         """Stop the workers."""
@@ -197,69 +210,83 @@ class ReplayBuffer:
 
 
 class _Buffer:
-    """The last samples of a stream, with how often each may still be used, and its last error."""
+    """The last samples of a stream, each with its last error and the number of uses left."""
 
     def __init__(self, capacity: int, reuse: int) -> None:
-        self._capacity, self._reuse, self._count = capacity, reuse, 0
-        self._left = torch.zeros(capacity, dtype=torch.int64)
+        self._capacity = capacity
+        self._reuse = reuse
+        self._count = 0
+        self._uses_left = torch.zeros(capacity, dtype=torch.int64)
         self._error = torch.zeros(capacity, dtype=torch.float64)
         self._point = torch.zeros(capacity, 0, dtype=torch.float64)
         self.sample = Sample(*(torch.zeros(0) for _ in Sample._fields))
 
     @property
     def full(self) -> bool:
-        """Whether the oldest sample leaves for the next one."""
+        """True if each new sample replaces the oldest one."""
         return self._count >= self._capacity
 
     @property
     def size(self) -> int:
-        """Samples kept."""
+        """Number of samples."""
         return min(self._count, self._capacity)
 
     @property
-    def left(self) -> int:
-        """Uses that are left in all."""
-        return int(self._left.sum())
+    def uses_left(self) -> int:
+        """Total number of uses left."""
+        return int(self._uses_left.sum())
 
-    def put(self, news: DrawnSample) -> None:
-        """Put samples in the place of the oldest ones."""
-        if not self._count:  # memory is taken as it is written to
-            self.sample = Sample(*(c.new_empty(self._capacity, *c.shape[1:]) for c in news.sample))
-            self._point = news.point.new_zeros(self._capacity, news.point.shape[1])
-        place = torch.arange(self._count, self._count + len(news.number)) % self._capacity
-        for column, new in zip(self.sample, news.sample, strict=True):
-            column[place] = new
-        self._left[place], self._error[place] = self._reuse, 0.0
-        self._point[place] = news.point
-        self._count += len(news.number)
+    def put(self, new: DrawnSample) -> None:
+        """Replace the oldest samples by new ones."""
+        if not self._count:  # the system provides memory when it is first written
+            self.sample = Sample(*(c.new_empty(self._capacity, *c.shape[1:]) for c in new.sample))
+            self._point = new.point.new_zeros(self._capacity, new.point.shape[1])
+        rows = torch.arange(self._count, self._count + len(new.number)) % self._capacity
+        for column, values in zip(self.sample, new.sample, strict=True):
+            column[rows] = values
+        self._uses_left[rows] = self._reuse
+        self._error[rows] = 0.0
+        self._point[rows] = new.point
+        self._count += len(new.number)
 
     def choose(self, count: int, generator: torch.Generator) -> Tensor:
-        """Return the places of samples for a batch, none twice if there are enough, (B,)."""
-        live = self._left.nonzero()[:, 0]
-        if len(live) < count:
-            live = torch.repeat_interleave(live, self._left[live])
-        chosen = live[torch.randperm(len(live), generator=generator)[:count]]
-        self._left -= torch.bincount(chosen, minlength=self._capacity)
+        """Return rows of samples for a batch, distinct if there are enough, (B,)."""
+        usable = self._uses_left.nonzero()[:, 0]
+        if len(usable) < count:
+            usable = torch.repeat_interleave(usable, self._uses_left[usable])
+        chosen = usable[torch.randperm(len(usable), generator=generator)[:count]]
+        self._uses_left -= torch.bincount(chosen, minlength=self._capacity)
         return chosen
 
-    def note(self, chosen: Tensor, errors: Tensor | None) -> None:
-        """Write down the surrogate's errors on a batch."""
+    def set_errors(self, chosen: Tensor, errors: Tensor | None) -> None:
+        """Store the surrogate's errors on a batch."""
         if errors is not None and len(errors) == len(chosen):
             self._error[chosen] = errors.double().cpu()
 
-    def worst(self, part: float = 0.1) -> Tensor:
-        """Return the points on which it was worst, a part of the buffer, worst first, (H, d)."""
-        seen = int(self._error.count_nonzero())
-        order = self._error.argsort(descending=True)[: int(np.ceil(part * seen))]
-        return self._point[order]
+    def hardest_points(self, fraction: float = 0.1) -> Tensor:
+        """Return the points of this fraction of the samples with errors, largest first, (H, d)."""
+        count = int(np.ceil(fraction * int(self._error.count_nonzero())))
+        return self._point[self._error.argsort(descending=True)[:count]]
 
 
-def _begin(worker: int) -> None:
-    """Make a worker process leave Ctrl-C to its parent."""
+def transform(batch: Sample, group: Sequence[Symmetry], which: Tensor) -> Sample:
+    """Return samples transformed by symmetries of the body.
+
+    Args:
+        batch: Samples.
+        group: The symmetries.
+        which: Index of the symmetry of each sample, (B,).
+    """
+    force, displacement = (images(field, group, which) for field in batch[:2])
+    return batch._replace(force=force, displacement=displacement)
+
+
+def _ignore_interrupts(worker: int) -> None:
+    """Make a worker ignore Ctrl-C, which is handled by its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _batch(drawn: list[DrawnSample]) -> DrawnSample:
+def _collate(drawn: list[DrawnSample]) -> DrawnSample:
     return DrawnSample(
         stack([one.sample for one in drawn]),
         torch.stack([one.number for one in drawn]),

@@ -1,4 +1,4 @@
-"""An endless stream of fresh samples, drawn and solved while the network trains."""
+"""Endless stream of samples that are drawn and solved while a network trains."""
 
 import itertools
 import signal
@@ -16,18 +16,16 @@ from dpl.data.solving.worker_pool import STARTUP_GRACE
 from dpl.data.storage.store import Store
 from dpl.scene import Sample, Scene
 
-NEIGHBOURHOOD = (
-    0.05  # deviation from a bad load, in the unit cube, of the loads that are drawn near it
-)
+PERTURBATION = 0.05  # standard deviation of a load from a hard example, in the unit cube
 
 
 class DrawnSample(NamedTuple):
-    """A sample (or a batch of them) and its place in the stream.
+    """A sample, or a batch of samples, with its position in the stream.
 
     Attributes:
-        sample: The load with its answer.
-        number: Which load of the stream, (B,).
-        point: Point of the unit cube that the load stands for, (B, d).
+        sample: Load and solution.
+        number: Number of the load in the stream, (B,).
+        point: Point of the unit cube that the load is drawn from, (B, d).
     """
 
     sample: Sample
@@ -36,49 +34,51 @@ class DrawnSample(NamedTuple):
 
 
 class HardExamples:
-    """Where the surrogate is worst at present: written by the trainer, read by all workers.
+    """Points with the largest errors of the surrogate, shared between processes.
+
+    The training process writes them, all worker processes read them.
 
     Attributes:
-        points: Points of the unit cube, of which the first `count` count, (H, d), shared.
-        count: How many there are, (1,), shared.
+        points: Points of the unit cube, of which the first `count` are valid, (H, d), shared.
+        count: Number of valid points, (1,), shared.
     """
 
     def __init__(self, dimension: int, size: int = 64) -> None:
-        """Begin with none."""
+        """Allocate memory for `size` points of this dimension; none is valid yet."""
         self.points = torch.zeros(size, dimension, dtype=torch.float64).share_memory_()
         self.count = torch.zeros(1, dtype=torch.int64).share_memory_()
 
-    def put(self, points: Tensor) -> None:
-        """Put new points, the worst first, in the place of the old ones."""
+    def update(self, points: Tensor) -> None:
+        """Replace the points by new ones, sorted by descending error."""
         count = min(len(points), len(self.points))
         self.points[:count] = points[:count]
         self.count.fill_(count)
 
-    def near(self, rng: np.random.Generator) -> Tensor | None:
-        """Return a point near one of them, (d,); None while there are none."""
+    def sample(self, rng: np.random.Generator) -> Tensor | None:
+        """Return a random point near one of them, (d,); None while there are none."""
         if not (count := int(self.count)):
             return None
         centre = self.points[int(rng.integers(count))].numpy()
-        moved = (
-            np.abs(centre + NEIGHBOURHOOD * rng.standard_normal(len(centre))) % 2
-        )  # folded back at 0
-        return torch.from_numpy(np.minimum(moved, 2 - moved).clip(0, 1 - 2.0**-53))  # and at 1
+        # reflected at 0 and at 1, so that no probability accumulates on the faces of the cube
+        reflected = np.abs(centre + PERTURBATION * rng.standard_normal(len(centre))) % 2
+        return torch.from_numpy(np.minimum(reflected, 2 - reflected).clip(0, 1 - 2.0**-53))
 
 
 class OnlineSamples(IterableDataset):
-    """The accepted loads of a stream, without end; every worker process solves its own.
+    """The accepted loads of an endless stream; each worker process solves its own.
 
     Attributes:
-        scene: What is simulated.
-        seed: Names the stream.
-        first: Index of the first load.
-        starts: Index of the first load of some places, each the turn of one worker of one lane;
-            the others begin at `first`.
-        lane, lanes: Which training process this is, of how many; they share the stream.
-        store: Keeps what is solved and gives what it has; none if left out.
-        worst: Where the surrogate is worst; none if left out.
-        near: Part of the loads that are drawn near those.
-        timeout: Longest time for a load in a worker [s]; None: no limit.
+        scene: Scene whose loads are solved.
+        seed: Seed of the stream.
+        first: Number of the first load.
+        rank: Index of this training process.
+        world_size: Number of training processes, which share the stream.
+        offsets: Number of the next load of a worker, by its index among the workers of all
+            training processes; worker k starts at `first + k` by default.
+        store: Data set that keeps solved loads and provides those that it has; None: not used.
+        hard_examples: Points with the largest errors; None: loads are drawn from the stream only.
+        hard_example_fraction: Fraction of the loads that are drawn near hard examples.
+        timeout: Time limit for a load in a worker [s]; None: no limit.
     """
 
     def __init__(
@@ -87,68 +87,82 @@ class OnlineSamples(IterableDataset):
         seed: tuple[int, int],
         first: int = 0,
         *,
-        lane: int = 0,
-        lanes: int = 1,
+        rank: int = 0,
+        world_size: int = 1,
         store: Store | None = None,
-        worst: HardExamples | None = None,
-        near: float = 0.0,
+        hard_examples: HardExamples | None = None,
+        hard_example_fraction: float = 0.0,
         timeout: float | None = None,
     ) -> None:
-        """Keep the arguments, see the class."""
-        self.scene, self.seed, self.first = scene, seed, first
-        self.starts: dict[int, int] = {}
-        self.lane, self.lanes = lane, lanes
-        self.store, self.worst, self.near, self.timeout = store, worst, near, timeout
+        """Store the arguments, see the class."""
+        self.scene = scene
+        self.seed = seed
+        self.first = first
+        self.rank = rank
+        self.world_size = world_size
+        self.offsets: dict[int, int] = {}
+        self.store = store
+        self.hard_examples = hard_examples
+        self.hard_example_fraction = hard_example_fraction
+        self.timeout = timeout
 
     def __iter__(self) -> Iterator[DrawnSample]:
-        """Yield samples (N, D), one at a time."""
+        """Yield single samples, fields of shape (N, D)."""
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
-        place = self.lane * workers + worker
-        first = self.starts.get(place, self.first + place)
-        known = self.store.reader("train") if self.store else None
+        index = self.rank * workers + worker
+        first = self.offsets.get(index, self.first + index)
+        read = self.store.reader("train") if self.store else None
         grace = STARTUP_GRACE
-        for index in itertools.count(first, workers * self.lanes):
-            one = known(index) if known else None
-            if one is None:
+        for number in itertools.count(first, workers * self.world_size):
+            solved = read(number) if read else None
+            if solved is None:
                 limit = self.timeout + grace if self.timeout and info is not None else None
-                one, grace = self._solved(index, limit), 0.0
+                solved, grace = self._solve(number, limit), 0.0
                 if self.store:
-                    self.store.pending.put(one)
-            if one.accepted:
-                point = torch.from_numpy(one.point)
-                loads, where = self.scene.loads, point[None]
-                moduli = loads.young_at(where)[0], loads.poisson_at(where)[0]
-                fields = torch.from_numpy(one.force), torch.from_numpy(one.displacement)
-                yield DrawnSample(Sample(*fields, *moduli), torch.tensor(index), point)
+                    self.store.pending.write(solved)
+            if solved.accepted:
+                yield self._drawn_sample(solved)
 
-    def _solved(self, index: int, limit: float | None) -> SolvedLoad:
-        """Return a load, solved within so many seconds, or recorded as lost."""
-        job, point = LoadKey(self.seed, index), None
-        if self.worst is not None:
-            rng = np.random.default_rng(np.random.SeedSequence((*self.seed, 1), spawn_key=(index,)))
-            point = self.worst.near(rng) if rng.random() < self.near else None
+    def _drawn_sample(self, solved: SolvedLoad) -> DrawnSample:
+        point = torch.from_numpy(solved.point)
+        sample = Sample(
+            torch.from_numpy(solved.force),
+            torch.from_numpy(solved.displacement),
+            self.scene.loads.young_at(point[None])[0],
+            self.scene.loads.poisson_at(point[None])[0],
+        )
+        return DrawnSample(sample, torch.tensor(solved.job.number), point)
+
+    def _solve(self, number: int, limit: float | None) -> SolvedLoad:
+        """Solve a load within a time limit [s]; return it as failed beyond the limit."""
+        job, point = LoadKey(self.seed, number), None
+        if self.hard_examples is not None:
+            seeds = np.random.SeedSequence((*self.seed, 1), spawn_key=(number,))
+            rng = np.random.default_rng(seeds)
+            if rng.random() < self.hard_example_fraction:
+                point = self.hard_examples.sample(rng)
         try:
-            with _within(limit):
+            with _time_limit(limit):
                 return solve_load(self.scene, job, point=point)
         except TimeoutError as error:
             return failed_load(self.scene, job, str(error))
 
 
 @contextmanager
-def _within(seconds: float | None) -> Iterator[None]:
-    """Raise TimeoutError if the body takes longer; in the main thread of a process only."""
+def _time_limit(seconds: float | None) -> Iterator[None]:
+    """Raise TimeoutError if the body takes longer; works in the main thread of a process only."""
     if seconds is None:
         yield
         return
 
-    def end(*_: object) -> None:
+    def stop(*_: object) -> None:
         raise TimeoutError(f"timed out after {seconds:g} s")
 
-    before = signal.signal(signal.SIGALRM, end)
+    previous = signal.signal(signal.SIGALRM, stop)
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        signal.signal(signal.SIGALRM, previous)

@@ -1,18 +1,19 @@
-"""Find a BLAS whose kernels are older than the processor."""
+"""Detection of a BLAS library whose kernels are older than the processor."""
 
 import os
 from pathlib import Path
 
 from threadpoolctl import threadpool_info
 
-# flag of the CPU -> its OpenBLAS kernels, best first; those that OpenBLAS takes for unknown CPUs
+# OpenBLAS kernels by flag of the CPU, best first
 KERNELS = {"avx512dq": "SkylakeX", "avx2": "Haswell"}
 CPUINFO = Path("/proc/cpuinfo")
+# kernels that OpenBLAS selects for CPUs that it does not know
 OLD_KERNELS = {"generic", "prescott", "core2", "penryn", "dunnington", "atom", "nehalem"}
 
 
 def slow_blas() -> str | None:
-    """Return one line of advice if OpenBLAS has not recognised this CPU, else None."""
+    """Return a line of advice if OpenBLAS does not recognise this CPU, else None."""
     if "OPENBLAS_CORETYPE" in os.environ or not CPUINFO.exists():
         return None
     lines = CPUINFO.read_text().splitlines()
@@ -22,7 +23,7 @@ def slow_blas() -> str | None:
         kernels = str(library.get("architecture", ""))
         if library["internal_api"] == "openblas" and best and kernels.lower() in OLD_KERNELS:
             return (
-                f"OpenBLAS runs its {kernels} kernels on a CPU that can do more: "
+                f"OpenBLAS runs its {kernels} kernels on a CPU with newer instructions: "
                 f"set OPENBLAS_CORETYPE={best} before Python starts"
             )
     return None

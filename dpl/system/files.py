@@ -1,4 +1,4 @@
-"""Files that are whole or not there, and folders that one process at a time writes to."""
+"""Atomic writes, reading of regular files, JSON lines, and exclusive locks of folders."""
 
 import fcntl
 import json
@@ -11,24 +11,24 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-TEXT = 2.0**28  # bytes of one in a data set, at most
+MAX_TEXT_SIZE = 2.0**28  # of a text file in a data set [bytes]
 
 
 class DataSetError(ValueError):
-    """A data set that cannot be used, and what to do about it, in one line."""
+    """Unusable data set; the message is one line that names the remedy."""
 
-    def __init__(self, told: str) -> None:
-        """Fold what is told into a line."""
-        super().__init__(" ".join(told.splitlines()))
+    def __init__(self, message: str) -> None:
+        """Join the lines of the message."""
+        super().__init__(" ".join(message.splitlines()))
 
 
 @contextmanager
 def atomic_write(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
-    """Open a file to write that will be there whole or not at all.
+    """Open a temporary file for writing; it replaces `path` when the context ends without error.
 
     Args:
-        path: Where it will be.
-        sync: Whether it must survive a crash of the machine too, and not of this process only.
+        path: Path of the file.
+        sync: Make the file survive a crash of the machine, not only of this process.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -46,22 +46,22 @@ def atomic_write(path: Path, *, sync: bool = True) -> Iterator[BinaryIO]:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file of a data set, whole or not at all.
+    """Write a file of a data set atomically.
 
     Raises:
-        DataSetError: A folder is in its place.
+        DataSetError: `path` is a folder.
     """
     try:
         with atomic_write(path) as file:
             file.write(content)
     except IsADirectoryError:
         raise DataSetError(
-            f"{path} is a folder where a file must be; remove it or choose another data.folder"
+            f"{path} must be a file, but is a folder; remove it or choose another data.folder"
         ) from None
 
 
 def sync_folder(path: Path) -> None:
-    """Make what was renamed or removed in a folder survive a crash of the machine."""
+    """Make renamed and removed files of a folder survive a crash of the machine."""
     folder = os.open(path, os.O_RDONLY)
     try:
         os.fsync(folder)
@@ -70,66 +70,68 @@ def sync_folder(path: Path) -> None:
 
 
 def append_jsonl(path: Path, line: dict[str, Any]) -> None:
-    """Add a line of JSON, synced; after a line that a crash has torn, on a line of its own.
+    """Append a line of JSON and sync it; an incomplete last line is terminated first.
 
     Raises:
-        DataSetError: The file is a link, a folder or a device, or far too large.
+        DataSetError: The file is a link, a folder or a device, or larger than `MAX_TEXT_SIZE`.
     """
     with suppress(FileNotFoundError):
-        _refuse_foreign(path, TEXT)
+        _check_regular_file(path, MAX_TEXT_SIZE)
     with path.open("ab+", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - 1))
-        torn = size > 0 and file.read(1) != b"\n"
-        left = b"\n" * torn + json.dumps(line).encode() + b"\n"
+        incomplete = size > 0 and file.read(1) != b"\n"
+        left = b"\n" * incomplete + json.dumps(line).encode() + b"\n"
         try:
             while left:
                 left = left[file.write(left) :]
             os.fsync(file.fileno())
-        except OSError:  # no space: the half of a line is taken back
+        except OSError:  # no space left: remove the part of the line that was written
             os.ftruncate(file.fileno(), size)
             raise
 
 
-def read_regular_file(path: Path, most: float = TEXT) -> bytes:
+def read_regular_file(path: Path, most: float = MAX_TEXT_SIZE) -> bytes:
     """Return the content of a file of a data set.
 
     Raises:
-        FileNotFoundError: There is none.
+        FileNotFoundError: The file does not exist.
         DataSetError: It is a link, a folder or a device, or larger than `most` bytes.
     """
-    _refuse_foreign(path, most)
+    _check_regular_file(path, most)
     return path.read_bytes()
 
 
-def _refuse_foreign(path: Path, most: float) -> None:
+def _check_regular_file(path: Path, most: float) -> None:
     status = path.lstat()
     if not stat.S_ISREG(status.st_mode):
         raise DataSetError(
-            f"{path} is no file of its own, and links are not followed; put the file itself there, "
-            "remove it, or choose another data.folder"
+            f"{path} is not a regular file (symbolic links are refused); replace it by the file "
+            "itself, remove it, or choose another data.folder"
         )
     if status.st_size > most:
         raise DataSetError(
-            f"{path} is damaged: it has {status.st_size:,} bytes, and at most {most:,.0f} are "
+            f"{path} is damaged: its size is {status.st_size:,} bytes, and at most {most:,.0f} are "
             "expected; remove it or choose another data.folder"
         )
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
-    """Return the lines of JSON in a file, those left out that a crash has torn.
+    """Return the JSON objects in the lines of a file; other lines are left out.
 
     Raises:
-        DataSetError: It is no file of its own, see `read_regular_file`.
+        DataSetError: It is not a regular file, see `read_regular_file`.
     """
     return [line for line in parsed_lines(path) if line is not None]
 
 
 def parsed_lines(path: Path) -> list[dict[str, Any] | None]:
-    """Return what each line of a file holds, None for a line that is not a JSON object.
+    """Return the JSON object in each line of a file, None for a line that is none.
+
+    A file that does not exist has no lines.
 
     Raises:
-        DataSetError: It is no file of its own, see `read_regular_file`.
+        DataSetError: It is not a regular file, see `read_regular_file`.
     """
     content = b""
     with suppress(FileNotFoundError):
@@ -146,14 +148,15 @@ def _parsed(line: bytes) -> dict[str, Any] | None:
 
 @contextmanager
 def exclusive_lock(folder: Path, shard: int = 0, shards: int = 1) -> Iterator[None]:
-    """Be the only writer of shard `shard` of `shards` of a folder; a dead writer does not count.
+    """Hold the lock of writer `shard` of `shards` writers of a folder.
 
-    The kernel keeps the locks (flock), so none outlives its process.
+    Writers of the same number `shards` and different `shard` do not exclude each other. The kernel
+    keeps the locks (flock), so that none outlives its process.
 
     Raises:
-        DataSetError: Another process writes some of the same; its number and machine are named.
+        DataSetError: Another process holds a lock that excludes this one; the message names it.
     """
-    with ExitStack() as held:
+    with ExitStack() as stack:
         with (folder / ".writers").open("a") as gate:
             fcntl.flock(gate, fcntl.LOCK_EX)
             for other in folder.glob(".writer-*"):
@@ -165,23 +168,23 @@ def exclusive_lock(folder: Path, shard: int = 0, shards: int = 1) -> Iterator[No
                     "another data.folder"
                 )
             mine = folder / f".writer-{shard}-{shards}"
-            file = held.enter_context(mine.open("w"))
+            file = stack.enter_context(mine.open("w"))
             fcntl.flock(file, fcntl.LOCK_EX)
             since = time.strftime("%Y-%m-%d %H:%M:%S")
             file.write(f"process {os.getpid()} on {socket.gethostname()} since {since}")
             file.flush()
-            held.callback(mine.unlink, missing_ok=True)
+            stack.callback(mine.unlink, missing_ok=True)
         yield
 
 
 def _holder(path: Path) -> str:
-    """Return who holds a lock; empty if nobody does."""
+    """Return a description of the process that holds a lock; empty if none does."""
     try:
         with path.open("r+") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except FileNotFoundError:
         return ""
     except BlockingIOError:
-        with suppress(FileNotFoundError):  # it has just ended
+        with suppress(FileNotFoundError):  # the process has just ended
             return path.read_text() or "another process"
     return ""

@@ -1,4 +1,4 @@
-"""Public names of a package whose modules are imported when a name is first used."""
+"""Lazy import of the public names of a package."""
 
 import ast
 import importlib

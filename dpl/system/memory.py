@@ -1,4 +1,4 @@
-"""What does not fit into memory is refused before it is made."""
+"""Checks of required memory before anything is allocated."""
 
 import contextlib
 import os
@@ -7,21 +7,23 @@ from contextvars import ContextVar
 
 import torch
 
-NODE = 1000  # of a node with its row of K(0), in 2D, where it is least [bytes]
-_MOST: ContextVar[tuple[int, str] | None] = ContextVar("most nodes of a mesh", default=None)
+NODE_SIZE = 1000  # lower bound of the memory of a node with its row of K(0), in 2D [bytes]
+_MOST: ContextVar[tuple[int, str] | None] = ContextVar(
+    "maximum number of nodes of a mesh", default=None
+)
 
 
 def refuse_beyond(needed: float, limit: float | None, what: str, remedy: str) -> None:
-    """Raise where memory does not do.
+    """Raise MemoryError if the required memory exceeds a limit.
 
     Args:
-        needed: [GB].
-        limit: What there is [GB]; None: what the GPU has, or the machine where it has none.
-        what: Needs it, in the plural.
-        remedy: What to do about it.
+        needed: Required memory [GB].
+        limit: Available memory [GB]; None: that of the GPU, or of the machine if it has no GPU.
+        what: Objects that require the memory, a plural noun.
+        remedy: Advice for the user.
 
     Raises:
-        MemoryError: More is needed than there is.
+        MemoryError: More memory is required than available.
     """
     if limit is None:
         limit = torch.cuda.mem_get_info()[1] / 1e9 if torch.cuda.is_available() else machine()
@@ -36,7 +38,7 @@ def machine() -> float:
 
 @contextlib.contextmanager
 def at_most(nodes: int, reason: str) -> Iterator[None]:
-    """Let `refuse_mesh` refuse meshes of more nodes, before they are made, and say why."""
+    """Make `refuse_mesh` refuse meshes with more nodes, with this reason in its message."""
     token = _MOST.set((nodes, reason))
     try:
         yield
@@ -45,19 +47,20 @@ def at_most(nodes: int, reason: str) -> Iterator[None]:
 
 
 def refuse_mesh(nodes: int, key: str) -> None:
-    """Raise where not even the stiffness matrix of so many nodes would fit, see `refuse_beyond`.
+    """Raise an error if the stiffness matrix of a mesh with this many nodes exceeds the memory.
 
     Raises:
-        ValueError: They are more than `at_most` allows.
+        MemoryError: See `refuse_beyond`.
+        ValueError: There are more nodes than `at_most` allows.
     """
     most, reason = _MOST.get() or (nodes, "")
     if nodes > most:
         raise ValueError(f"{key} = {_count(nodes)} nodes must be {_count(most)} at most; {reason}")
-    refuse_beyond(nodes * NODE / 1e9, machine(), f"{_count(nodes)} nodes", f"take fewer {key}")
+    refuse_beyond(nodes * NODE_SIZE / 1e9, machine(), f"{_count(nodes)} nodes", f"take fewer {key}")
 
 
 def refuse_weights(parameters: int, limit: float | None, remedy: str) -> None:
-    """Raise where training so many parameters in float32 would not fit, see `refuse_beyond`."""
+    """Raise MemoryError if training this many float32 parameters exceeds the memory."""
     needed = parameters * 4 * 4 / 1e9  # parameters, gradients, two moments, 4 bytes each
     what = f"{_count(parameters)} parameters with gradients and Adam's moments"
     refuse_beyond(needed, limit, what, remedy)

@@ -1,4 +1,4 @@
-"""Worker processes that end with the process that started them."""
+"""Worker processes that end when their parent process ends."""
 
 import contextlib
 import inspect
@@ -15,15 +15,15 @@ _starting = threading.Lock()
 
 
 def die_with_parent(parent: int) -> None:
-    """End this process as soon as the one that started it has ended.
+    """End this process as soon as its parent process has ended.
 
-    Linux does that by itself (`prctl`), from then on and whatever this process does; elsewhere a
-    thread looks twice a second. On Linux the parent's thread that started this process counts.
+    On Linux the kernel does it (`prctl`), and the end of the parent's thread that started this
+    process counts. On other systems a thread checks the parent twice a second.
 
     Args:
-        parent: Number of the process that started this one.
+        parent: Process number of the parent.
     """
-    # imports are in here: a new process is given the source of this function alone
+    # imports are local, because `_Popen` passes only the source of this function
     import os
     import sys
 
@@ -43,15 +43,15 @@ def die_with_parent(parent: int) -> None:
             os._exit(1)
 
         threading.Thread(target=watch, daemon=True).start()
-    if os.getppid() != parent:  # it has ended before
+    if os.getppid() != parent:  # it ended before the lines above
         os._exit(1)
 
 
 class _Popen(popen_spawn_posix.Popen):
-    """A process that calls `die_with_parent` before it imports anything else.
+    """Starts a process that calls `die_with_parent` before it imports anything else.
 
-    What `multiprocessing` starts first imports the main module and what its task needs, which takes
-    seconds, so that the command of its interpreter has to do it.
+    A process of `multiprocessing` first imports the main module and the modules of its task, which
+    takes seconds. The call is therefore part of the command line of its interpreter.
     """
 
     def _launch(self, process_obj: Any) -> None:
@@ -61,8 +61,8 @@ class _Popen(popen_spawn_posix.Popen):
             words = plain(**fields)
             if "-c" in words:
                 place = words.index("-c") + 1
-                tie = f"{inspect.getsource(die_with_parent)}\ndie_with_parent({os.getpid()})\n"
-                words[place] = tie + words[place]
+                call = f"{inspect.getsource(die_with_parent)}\ndie_with_parent({os.getpid()})\n"
+                words[place] = call + words[place]
             return words
 
         with _starting:
@@ -84,10 +84,10 @@ class _Context(SpawnContext):
 
 
 def spawn_context() -> SpawnContext:
-    """Return the way to start workers: anew, and tied to the life of this process.
+    """Return a multiprocessing context that spawns workers which end with this process.
 
-    Forking a process with BLAS threads can hang it. A process of joblib's has a way of its own,
-    which those that it spawns do not know by name.
+    Workers are not forked, because forking a process with BLAS threads can hang it. Processes of
+    joblib have a start method that their own workers do not know; it is replaced by "spawn".
     """
     if multiprocessing.get_start_method() not in multiprocessing.get_all_start_methods():
         multiprocessing.set_start_method("spawn", force=True)
@@ -96,8 +96,8 @@ def spawn_context() -> SpawnContext:
 
 @contextlib.contextmanager
 def block_signals(*numbers: signal.Signals) -> Iterator[None]:
-    """Start processes that these signals do not reach: they are their parent's to handle."""
-    resource_tracker.ensure_running()  # which would unblock them
+    """Block signals in the processes that are started in this context; the parent handles them."""
+    resource_tracker.ensure_running()  # its start would unblock them
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield

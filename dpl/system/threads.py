@@ -1,5 +1,6 @@
 """Threads of PyTorch and of the BLAS libraries."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -8,17 +9,24 @@ import torch
 from threadpoolctl import ThreadpoolController
 
 
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
 @cache
 def blas() -> ThreadpoolController:
-    """The BLAS libraries of this process; to find them takes milliseconds, to limit them none."""
+    """Return a controller of the BLAS libraries of this process; the search takes milliseconds."""
     return ThreadpoolController().select(user_api="blas")
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Keep torch and BLAS to one thread; for more, use processes.
+    """Limit torch and BLAS to one thread.
 
-    Inside one solve two threads are slower than one, and far slower where the other core is busy.
+    Within one solve, two threads are slower than one, and much slower if the other core is busy.
+    Parallel solves therefore use processes.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)

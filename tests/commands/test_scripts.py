@@ -223,7 +223,7 @@ def test_a_data_set_of_another_scene_is_refused_with_both_fingerprints(
 
 def online(tiny_training, *more):
     kept = [o for o in tiny_training if "data.train" not in o and "data.workers" not in o]
-    small = ["data.workers=2", "data.batches=4", "data.fresh=4", "data.reuse=8"]
+    small = ["data.workers=2", "data.batches=4", "data.new_per_round=4", "data.reuse=8"]
     return ["data=online", *kept, *small, *more]
 
 
@@ -315,8 +315,8 @@ def test_ctrl_c_while_generating_ends_with_130_and_keeps_all_that_was_solved(
     assert not list(folder.rglob(".*.part"))
     assert "Traceback" not in err, err[-4000:]
     (session,) = map(json.loads, (folder / "journal.jsonl").read_text().splitlines())
-    spooled = len(list(folder.glob("spool/*.load")))
-    assert session["loads"] == 64 * len(lines) + spooled
+    pending = len(list(folder.glob("pending/*.load")))
+    assert session["loads"] == 64 * len(lines) + pending
 
 
 @pytest.mark.slow

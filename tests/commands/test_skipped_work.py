@@ -243,11 +243,11 @@ def test_images_under_symmetries_are_not_solved(scene, folder, data, calls, monk
 
 
 def test_a_stream_solves_nothing_that_the_data_set_has(scene, tmp_path, calls):
-    """With save=true."""
-    options = {"val": 1, "test": 1, "workers": 0, "batch_size": 4, "batches": 2, "fresh": 4}
+    """With cache=true."""
+    options = {"val": 1, "test": 1, "workers": 0, "batch_size": 4, "batches": 2, "new_per_round": 4}
     made = OfflineData(scene, folder=str(tmp_path / "d"), train=8, val=1, test=1, workers=0)
     made.prepare_data()
-    module = OnlineData(scene, folder=str(tmp_path / "d"), reuse=1, save=True, **options)
+    module = OnlineData(scene, folder=str(tmp_path / "d"), reuse=1, cache=True, **options)
     assert "8 loads of the stream not solved again: they are there" in module.skipped_work()
     module.prepare_data()
     threads = torch.get_num_threads()

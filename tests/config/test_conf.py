@@ -262,7 +262,7 @@ def test_loads_of_different_seeds_are_different_data(compose, scene, tmp_path):
 
 def test_the_seed_shuffles_batches_and_leaves_the_loads(compose):
     cfg = compose("folder=.", "seed=5", command="train")
-    assert cfg.data.shuffle == 5
+    assert cfg.data.shuffle_seed == 5
     assert cfg.data.seed == 0
     assert np.isfinite(cfg.optimizer.lr)
 

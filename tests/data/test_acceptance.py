@@ -1,4 +1,4 @@
-"""Laws of `dpl.data.storage.acceptance`: every load in one bin, and a biased set is called so."""
+"""Laws of acceptance statistics: each load is in one bin, and a biased set gives a warning."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from dpl.data.storage.acceptance import (
 )
 
 
-def test_every_load_lies_in_one_bin_and_every_bin_holds_the_loads_between_its_ends():
+def test_every_load_lies_in_the_bin_whose_limits_enclose_its_amplitude():
     rng = np.random.default_rng(0)
     amplitudes = rng.random(500) ** 2
     accepted = rng.random(500) < 0.7
@@ -34,14 +34,14 @@ def test_the_largest_load_lies_in_the_last_bin():
     assert last == AmplitudeBin(pytest.approx(2.7), 3.0, 2, 1)
 
 
-def test_ranges_without_a_load_are_left_out():
+def test_empty_bins_are_left_out():
     assert [(part.tried, part.accepted) for part in amplitude_bins([0.05, 1.0], [True, True])] == [
         (1, 1),
         (1, 1),
     ]
 
 
-def test_no_loads_make_no_bins_and_loads_of_nothing_make_one():
+def test_no_loads_make_no_bins_and_zero_loads_make_one():
     assert amplitude_bins([], []) == []
     (only,) = amplitude_bins([0.0, 0.0], [True, False])
     assert (only.tried, only.accepted) == (2, 1)
@@ -58,28 +58,30 @@ def test_no_loads_make_no_bins_and_loads_of_nothing_make_one():
         (0, 0, False),
     ],
 )
-def test_a_range_is_biased_below_nine_in_ten_of_at_least_ten_loads(tried, accepted, biased):
+def test_a_bin_is_biased_if_less_than_nine_tenths_of_at_least_ten_loads_are_accepted(
+    tried, accepted, biased
+):
     assert AmplitudeBin(0.0, 1.0, tried, accepted).biased == biased
 
 
-def test_a_fair_set_is_not_warned_of():
+def test_an_unbiased_set_gives_no_warning():
     assert bias_warning([]) == ""
     assert bias_warning([AmplitudeBin(0.0, 0.5, 100, 95), AmplitudeBin(0.5, 1.0, 9, 0)]) == ""
 
 
-def test_the_warning_names_the_worst_range_and_what_to_do():
+def test_the_warning_names_the_bin_with_the_lowest_acceptance_and_a_remedy():
     parts = [
         AmplitudeBin(0.0, 0.5, 100, 85),
         AmplitudeBin(0.5, 1.0, 40, 10),
         AmplitudeBin(1.0, 1.5, 9, 0),
     ]
     told = bias_warning(parts)
-    assert "of 40 loads with amplitudes 0.50 to 1.00 only 10 were accepted" in told
+    assert "only 10 of 40 loads with amplitudes 0.50 to 1.00 were accepted" in told
     assert "loads.deflection" in told
     assert "\n" not in told
 
 
-def test_the_table_has_a_column_for_each_range():
+def test_the_table_has_one_column_per_bin():
     assert acceptance_table([]) == []
     parts = [AmplitudeBin(0.0, 0.5, 1000, 850), AmplitudeBin(0.5, 1.0, 4, 1)]
     heads, cells = acceptance_table(parts)

@@ -1,4 +1,4 @@
-"""Laws of the data modules: what they hand to Lightning, in which order, and from where."""
+"""Laws of the data modules: batches, their order, and which loads are solved or read."""
 
 import itertools
 import json
@@ -15,19 +15,19 @@ from dpl.data import DataSet, OfflineData, OnlineData, Samples, Writer
 from dpl.data.replay_buffer import StreamRates
 from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.data.storage.integrity import verify
-from dpl.data.storage.store import SHARD
+from dpl.data.storage.store import SHARD_SIZE
 from dpl.fem import symmetries
 from dpl.models import FCNN
 from dpl.system.files import exclusive_lock
 from dpl.training import MSE, Surrogate
 
 SIZES = {"val": 4, "test": 4, "workers": 0, "batch_size": 4}
-STREAM = {"batches": 3, "fresh": 4, "reuse": 1, "capacity": 64}
+STREAM = {"batches": 3, "new_per_round": 4, "reuse": 1, "capacity": 64}
 
 
 @pytest.fixture(autouse=True)
 def threads():
-    """The stream sets the threads of this process: not those of the tests that follow."""
+    """Restore the number of threads, which a stream changes."""
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
@@ -35,7 +35,7 @@ def threads():
 
 @pytest.fixture
 def offline(scene, folder, data):
-    """Builds data modules on the tiny data set."""
+    """Return a function that builds data modules of the tiny data set."""
 
     def offline(**options):
         return OfflineData(scene, folder=str(folder), **{"train": 12, **SIZES, **options})
@@ -45,7 +45,7 @@ def offline(scene, folder, data):
 
 @pytest.fixture
 def online(scene, folder, data):
-    """Builds streams that validate on the tiny data set; closed in the end."""
+    """Return a function that builds streams; they validate on the tiny data set and are closed."""
     made = []
 
     def online(**options):
@@ -59,11 +59,11 @@ def online(scene, folder, data):
 
 @pytest.fixture
 def saving(scene, tmp_path):
-    """Builds streams that keep what they solve in a data set of their own, with its folder."""
+    """Return a function that builds streams with a cache in a new data set."""
     made = []
 
     def saving(**options):
-        options = {**SIZES, "val": 1, "test": 1, **STREAM, "save": True, **options}
+        options = {**SIZES, "val": 1, "test": 1, **STREAM, "cache": True, **options}
         made.append(OnlineData(options.pop("scene", scene), folder=str(tmp_path / "d"), **options))
         made[-1].prepare_data()
         return made[-1]
@@ -105,10 +105,10 @@ def test_an_epoch_holds_every_sample_once(offline):
 
 
 def test_batches_are_a_function_of_shuffle_and_epoch(offline):
-    first = order(offline(shuffle=3), epoch=2)
-    assert order(offline(shuffle=3), epoch=2) == first
-    assert order(offline(shuffle=3), epoch=3) != first
-    assert order(offline(shuffle=4), epoch=2) != first
+    first = order(offline(shuffle_seed=3), epoch=2)
+    assert order(offline(shuffle_seed=3), epoch=2) == first
+    assert order(offline(shuffle_seed=3), epoch=3) != first
+    assert order(offline(shuffle_seed=4), epoch=2) != first
 
 
 def test_forces_and_displacements_stay_together(offline):
@@ -141,7 +141,7 @@ def test_batches_keep_double_precision(offline):
 
 
 def test_a_batch_is_a_copy(offline):
-    """What a training step does to its batch, the next epoch does not see."""
+    """A training step may change its batch in place."""
     module = offline(symmetry=True)
     before = module.samples("train").force.clone()
     for batch in module.train_dataloader():
@@ -189,10 +189,10 @@ def test_options_out_of_range_are_refused_by_name(offline, options):
 # ------------------------------------------------------------------ young: one data set for all
 
 
-def test_the_moduli_are_those_of_this_scene_whatever_the_store_was_made_with(
+def test_the_moduli_are_those_of_the_scene_that_reads_the_data_set(
     scene, make_scene, offline, folder
 ):
-    """u/L depends on f/(E L^2) alone: one data set serves every range, and every size."""
+    """u/L depends on f/(E L^2) only, so a data set is valid for every modulus and size."""
     wide = make_scene(young=[1e6, 2e11], size=(1.0, 0.25, 0.25))
     module = OfflineData(wide, folder=str(folder), train=12, **SIZES)
     here, there = offline().samples("train"), module.samples("train")
@@ -217,7 +217,7 @@ def test_an_epoch_holds_the_images_of_every_sample_once(scene, offline):
     assert sorted(seen) == sorted(itertools.chain(*images))
 
 
-def test_images_balance_as_well_as_their_samples(scene, offline):
+def test_images_are_in_equilibrium_to_the_tolerance(scene, offline):
     worst = 0.0
     for batch in offline(symmetry=True).train_dataloader():
         internal, volume = scene.problem.evaluate(batch.displacement)
@@ -227,7 +227,7 @@ def test_images_balance_as_well_as_their_samples(scene, offline):
 
 
 def test_images_keep_the_modulus_of_their_sample(make_scene, folder, data):
-    """Which image is which sample's is seen by the norm of the force."""
+    """The norm of the force identifies the sample of an image."""
     scene = make_scene(young=[1e6, 2e11])
     module = OfflineData(scene, folder=str(folder), train=12, symmetry=True, **SIZES)
     samples = module.samples("train")
@@ -244,15 +244,15 @@ def test_validation_and_test_have_no_images(offline):
 
 
 def test_the_order_of_images_is_a_function_of_shuffle_and_epoch(offline):
-    first = order(offline(symmetry=True, shuffle=3), epoch=2)
-    assert order(offline(symmetry=True, shuffle=3), epoch=2) == first
-    assert order(offline(symmetry=True, shuffle=3), epoch=3) != first
-    assert order(offline(symmetry=True, shuffle=4), epoch=2) != first
-    assert sorted(order(offline(symmetry=True, shuffle=4), epoch=0)) == sorted(first)
+    first = order(offline(symmetry=True, shuffle_seed=3), epoch=2)
+    assert order(offline(symmetry=True, shuffle_seed=3), epoch=2) == first
+    assert order(offline(symmetry=True, shuffle_seed=3), epoch=3) != first
+    assert order(offline(symmetry=True, shuffle_seed=4), epoch=2) != first
+    assert sorted(order(offline(symmetry=True, shuffle_seed=4), epoch=0)) == sorted(first)
 
 
 def test_images_of_a_sample_are_spread_over_the_epoch(offline):
-    """They are shuffled as samples of their own, not one batch after the other."""
+    """Images are shuffled like samples."""
     module = offline(symmetry=True, batch_size=12)
     norms = [batch.force.flatten(1).norm(dim=1) for batch in module.train_dataloader()]
     assert any(len((n / n.max()).mul(1e9).round().unique()) < 12 for n in norms)
@@ -276,14 +276,14 @@ def test_a_force_in_every_load_breaks_the_symmetries_that_turn_it(make_scene, tm
     assert all(torch.equal(one.image(down), down) for one in held.group)
 
 
-def test_samples_without_symmetries_are_handed_out_as_they_are(batch):
+def test_samples_without_symmetries_have_no_images(batch):
     plain = Samples(batch)
     assert len(plain) == 12
     assert torch.equal(plain.__getitems__([3, 1]).force, batch.force[[3, 1]])
 
 
-def test_a_stream_makes_images_too(online, scene):
-    module = online(symmetry=True, batch_size=12, fresh=12, batches=4, capacity=1000)
+def test_a_stream_yields_images_under_symmetries(online, scene):
+    module = online(symmetry=True, batch_size=12, new_per_round=12, batches=4, capacity=1000)
     assert [line for line in module.skipped_work() if "samples of each load" in line]
     batches = list(module.train_dataloader())
     own = set(forces([module._replay._buffer.sample]))
@@ -296,9 +296,9 @@ def test_a_stream_makes_images_too(online, scene):
 # ------------------------------------------------------------------ several training processes
 
 
-def test_two_processes_see_disjoint_halves_that_together_are_everything(offline):
+def test_two_processes_see_disjoint_halves_of_the_samples(offline):
     for epoch in (0, 1):
-        halves = [order(placed(offline(shuffle=1), k, 2), epoch) for k in (0, 1)]
+        halves = [order(placed(offline(shuffle_seed=1), k, 2), epoch) for k in (0, 1)]
         assert [len(half) for half in halves] == [6, 6]
         assert not set(halves[0]) & set(halves[1])
         assert sorted(halves[0] + halves[1]) == sorted(forces([offline().samples("train")]))
@@ -311,15 +311,15 @@ def test_two_processes_share_the_images(scene, offline):
     assert len(halves[0] | halves[1]) == count
 
 
-def test_the_streams_of_two_processes_are_disjoint_and_together_everything(scene, online):
-    options = {"batches": 2, "fresh": 4, "batch_size": 4}
+def test_two_processes_see_disjoint_halves_of_the_stream(scene, online):
+    options = {"batches": 2, "new_per_round": 4, "batch_size": 4}
     halves = [set(forces(placed(online(**options), k, 2).train_dataloader())) for k in (0, 1)]
     assert [len(half) for half in halves] == [8, 8]
     assert halves[0] | halves[1] == set(drawn(scene, 16))
 
 
 def test_resumed_streams_of_two_processes_draw_no_load_twice(scene, online):
-    """A checkpoint holds what rank 0 has taken; the others may be ahead of it."""
+    """A checkpoint holds the state of rank 0; the other ranks may be ahead of it."""
     first = [placed(online(), k, 2) for k in (0, 1)]
     seen = set().union(*[forces(module.train_dataloader()) for module in first])
     resumed = [placed(online(), k, 2) for k in (0, 1)]
@@ -335,7 +335,14 @@ def test_resumed_streams_of_two_processes_draw_no_load_twice(scene, online):
 
 @pytest.mark.parametrize(
     "options",
-    [{"batches": 0}, {"fresh": 0}, {"reuse": 0}, {"capacity": 3}, {"worst": -0.1}, {"worst": 1.1}],
+    [
+        {"batches": 0},
+        {"new_per_round": 0},
+        {"reuse": 0},
+        {"capacity": 3},
+        {"hard_example_fraction": -0.1},
+        {"hard_example_fraction": 1.1},
+    ],
     ids=lambda options: next(iter(options)),
 )
 def test_options_of_the_stream_out_of_range_are_refused_by_name(online, options):
@@ -343,16 +350,16 @@ def test_options_of_the_stream_out_of_range_are_refused_by_name(online, options)
         online(**options)
 
 
-def test_keeping_loads_and_drawing_others_than_the_seed_names_exclude_each_other(online):
-    with pytest.raises(ValueError, match=r"save = true .* worst > 0") as refusal:
-        online(save=True, worst=0.1)
+def test_the_cache_and_hard_examples_exclude_each_other(online):
+    with pytest.raises(ValueError, match=r"cache = true .* hard_example_fraction = 0") as refusal:
+        online(cache=True, hard_example_fraction=0.1)
     assert "\n" not in str(refusal.value)
-    online(save=True, worst=0.0)
-    online(save=False, worst=1.0)
+    online(cache=True, hard_example_fraction=0.0)
+    online(cache=False, hard_example_fraction=1.0)
 
 
 def test_the_stream_solves_the_loads_that_the_data_set_would_hold(online, offline):
-    options = {"batches": 10, "batch_size": 12, "fresh": 12, "reuse": 20}
+    options = {"batches": 10, "batch_size": 12, "new_per_round": 12, "reuse": 20}
     batches = list(online(**options).train_dataloader())
     assert set(forces(batches)) == set(forces([offline().samples("train")]))
 
@@ -377,20 +384,22 @@ def test_preparing_a_stream_solves_no_training_load(scene, tmp_path, monkeypatch
     assert len(seen) == 5
 
 
-def test_a_stream_without_worst_has_nothing_of_it(online, monkeypatch):
+def test_a_stream_without_hard_examples_computes_no_errors(online, monkeypatch):
     def forbidden(*_, **__):
         raise AssertionError("made")
 
-    monkeypatch.setattr("dpl.data.datamodule.HardExamples", forbidden)
+    monkeypatch.setattr("dpl.data.online.HardExamples", forbidden)
     monkeypatch.setattr(OnlineData, "_errors", forbidden)
     assert len(list(online().train_dataloader())) == 3
     with pytest.raises(AssertionError, match="made"):
-        online(worst=0.5).train_dataloader()
+        online(hard_example_fraction=0.5).train_dataloader()
 
 
-def test_errors_of_the_surrogate_decide_where_new_loads_are(scene, online):
-    """Not before it has told any; then near the one that it answers worst."""
-    module = online(worst=1.0, batch_size=4, fresh=4, batches=1, capacity=64)
+def test_loads_are_drawn_near_the_load_with_the_largest_error(scene, online):
+    """The first loads are those of the seed, since there are no errors yet."""
+    module = online(
+        hard_example_fraction=1.0, batch_size=4, new_per_round=4, batches=1, capacity=64
+    )
     told = SimpleNamespace(batch_errors=None)
     module.trainer = SimpleNamespace(
         lightning_module=told, logger=None, global_rank=0, world_size=1
@@ -400,7 +409,7 @@ def test_errors_of_the_surrogate_decide_where_new_loads_are(scene, online):
     told.batch_errors = torch.arange(4.0)
     assert sorted(forces([first])) == sorted(drawn(scene, 4))
     next(iter(stream))
-    worst = module._replay._source.worst
+    worst = module._replay._source.hard_examples
     assert int(worst.count) == 1
     load = scene.loads.loads_at(worst.points[:1])
     assert torch.equal(load.force[0], first.force[3])
@@ -409,17 +418,17 @@ def test_errors_of_the_surrogate_decide_where_new_loads_are(scene, online):
 # ------------------------------------------------------------------ resumed streams
 
 
-def test_a_resumed_stream_goes_on_where_it_was_left(online):
+def test_a_resumed_stream_continues_with_the_next_load(online):
     module = online()
     first = set(forces(module.train_dataloader()))
     state = module.state_dict()
-    assert state == {"produced": 12, "following": 12}
+    assert state == {"produced": 12, "next_index": 12}
     resumed = online()
     resumed.load_state_dict(state)
     assert resumed.state_dict() == state
     second = set(forces(resumed.train_dataloader()))
     assert not first & second
-    assert resumed.state_dict() == {"produced": 24, "following": 24}
+    assert resumed.state_dict() == {"produced": 24, "next_index": 24}
 
 
 def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, monkeypatch):
@@ -435,7 +444,7 @@ def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, mo
 
 
 def test_a_resumed_stream_of_two_workers_draws_no_load_twice(online):
-    module = online(workers=2, batches=3, fresh=4, batch_size=64, reuse=32, capacity=64)
+    module = online(workers=2, batches=3, new_per_round=4, batch_size=64, reuse=32, capacity=64)
     first = set(forces(itertools.islice(module.train_dataloader(), 3)))
     state = module.state_dict()
     module.teardown("fit")
@@ -452,20 +461,24 @@ def names(folder):
     return sorted(path.name for path in folder.glob("train-*.safetensors"))
 
 
-def test_what_was_produced_is_in_the_data_set_whole_shards_and_a_spool(scene, saving, tmp_path):
+def test_cached_loads_are_in_whole_shards_and_pending_files(scene, saving, tmp_path):
     module = saving(batches=20)  # 80 loads
     seen = forces(module.train_dataloader())
     folder = tmp_path / "d"
     assert names(folder) == ["train-000000.safetensors"]
     assert sorted(seen) == sorted(drawn(scene, 80))
-    assert sorted(forces([module.store.load("train", SHARD)])) == sorted(drawn(scene, SHARD))
-    spooled = sorted(path.name for path in (folder / "spool").iterdir())
-    assert [name[:13] for name in spooled] == [f"train-{k:06d}." for k in range(SHARD, 80)]
-    assert module.store.missing("train", 80) == list(range(SHARD, 80))
+    assert sorted(forces([module.store.load("train", SHARD_SIZE)])) == sorted(
+        drawn(scene, SHARD_SIZE)
+    )
+    pending = sorted(path.name for path in (folder / "pending").iterdir())
+    assert [name[:13] for name in pending] == [f"train-{k:06d}." for k in range(SHARD_SIZE, 80)]
+    assert module.store.missing("train", 80) == list(range(SHARD_SIZE, 80))
 
 
-def test_a_data_set_begun_online_is_completed_to_the_one_made_offline(scene, saving, tmp_path):
-    """Manifest and bytes: whoever has solved them, and when."""
+def test_a_data_set_started_online_and_completed_offline_has_the_same_bytes(
+    scene, saving, tmp_path
+):
+    """Manifest and samples do not depend on the process that solved a load."""
     module = saving(batches=20)
     list(module.train_dataloader())
     module.teardown("fit")
@@ -485,10 +498,10 @@ def test_a_data_set_begun_online_is_completed_to_the_one_made_offline(scene, sav
     assert manifest(one) == manifest(other)
     assert one.store.digest("train", 100) == other.store.digest("train", 100)
     assert all(not flaw for _, flaw in verify(one.store))
-    assert not (tmp_path / "d" / "spool").exists()
+    assert not (tmp_path / "d" / "pending").exists()
 
 
-def test_what_the_data_set_has_is_read_and_not_solved(scene, saving, tmp_path, monkeypatch):
+def test_loads_of_the_data_set_are_read_and_not_solved(scene, saving, tmp_path, monkeypatch):
     DataSet(scene, str(tmp_path / "d"), train=20, val=1, test=1, workers=0).fill()
     solved = []
 
@@ -518,25 +531,25 @@ def test_read_loads_have_the_moduli_of_this_scene(make_scene, saving, scene, tmp
     assert torch.equal(batch.young.sort()[0], wide.loads.sample((0, 0), range(4)).young.sort()[0])
 
 
-def test_what_waits_in_the_spool_is_not_solved_again(saving, monkeypatch, tmp_path):
-    """A run that was stopped leaves up to 63 loads there, and a resumed one begins below."""
+def test_pending_loads_are_not_solved_again(saving, monkeypatch, tmp_path):
+    """A stopped run leaves up to 63 pending loads, and a resumed one starts before them."""
     list(saving(batches=6).train_dataloader())
-    spooled = sorted((tmp_path / "d" / "spool").iterdir())
-    assert len(spooled) == 24
+    pending = sorted((tmp_path / "d" / "pending").iterdir())
+    assert len(pending) == 24
 
     def forbidden(*_, **__):
         raise AssertionError("solved again")
 
     monkeypatch.setattr("dpl.data.stream.solve_load", forbidden)
     list(saving(batches=6).train_dataloader())
-    assert sorted((tmp_path / "d" / "spool").iterdir()) == spooled
+    assert sorted((tmp_path / "d" / "pending").iterdir()) == pending
 
 
-def test_a_load_solved_twice_leaves_nothing_in_the_spool(scene, saving, tmp_path):
+def test_a_load_solved_twice_leaves_no_pending_file(scene, saving, tmp_path):
     for _ in range(2):
         list(saving(batches=6).train_dataloader())
     DataSet(scene, str(tmp_path / "d"), train=24, val=1, test=1, workers=0).fill()
-    assert not (tmp_path / "d" / "spool").exists()
+    assert not (tmp_path / "d" / "pending").exists()
 
 
 def test_rejected_loads_are_kept_as_rejected(scene, saving, tmp_path, monkeypatch):
@@ -551,8 +564,8 @@ def test_rejected_loads_are_kept_as_rejected(scene, saving, tmp_path, monkeypatc
     loads = drawn(scene, 72)
     assert sorted(seen) == sorted(load for k, load in enumerate(loads) if k % 3)
     (line,) = (line for line in module.store.shards() if line["split"] == "train")
-    assert line["tried"] == SHARD
-    assert [one["index"] for one in line["rejected"]] == list(range(0, SHARD, 3))
+    assert line["tried"] == SHARD_SIZE
+    assert [one["index"] for one in line["rejected"]] == list(range(0, SHARD_SIZE, 3))
     assert {one["reason"] for one in line["rejected"]} == {"a whim"}
     again = saving(batches=10)
     solved = []
@@ -564,8 +577,8 @@ def test_rejected_loads_are_kept_as_rejected(scene, saving, tmp_path, monkeypatc
     assert not solved, "neither what was accepted nor what was rejected"
 
 
-def test_a_data_set_without_a_rejected_point_gives_samples_of_finite_numbers(saving, monkeypatch):
-    """What a rejected load leaves, NaN, does not reach training."""
+def test_rejected_loads_with_nan_do_not_reach_training(saving, monkeypatch):
+    """Displacements of rejected loads may be NaN."""
 
     def choosy(scene, job, **options):
         one = solve_load(scene, job, **options)
@@ -577,7 +590,7 @@ def test_a_data_set_without_a_rejected_point_gives_samples_of_finite_numbers(sav
         assert all(torch.isfinite(column).all() for column in batch)
 
 
-def test_a_stream_that_does_not_save_writes_nothing(scene, tmp_path):
+def test_a_stream_without_cache_writes_nothing(scene, tmp_path):
     options = {**SIZES, **STREAM, "val": 1, "test": 1}
     module = OnlineData(scene, folder=str(tmp_path / "d"), **options)
     module.prepare_data()
@@ -590,31 +603,31 @@ def test_only_the_first_of_several_processes_writes_shards(saving, tmp_path):
     modules = [placed(saving(batches=16), k, 2) for k in (1, 0)]
     list(modules[0].train_dataloader())
     assert not names(tmp_path / "d")
-    assert len(list((tmp_path / "d" / "spool").iterdir())) == 64
+    assert len(list((tmp_path / "d" / "pending").iterdir())) == 64
     list(modules[1].train_dataloader())
     assert names(tmp_path / "d") == ["train-000000.safetensors", "train-000064.safetensors"]
 
 
 def test_another_writer_does_not_end_a_training_run(saving, tmp_path):
-    """Shards can wait for the next epoch; hours of training cannot be had again."""
+    """Shards are written after the next epoch."""
     stream = saving(batches=16).train_dataloader()
     with exclusive_lock(tmp_path / "d"):
         list(stream)
-    assert len(list((tmp_path / "d" / "spool").iterdir())) == 64
+    assert len(list((tmp_path / "d" / "pending").iterdir())) == 64
     list(stream)
     assert len(names(tmp_path / "d")) == 2
 
 
 @pytest.mark.slow
-def test_two_workers_keep_what_they_solve(scene, saving, tmp_path):
-    module = saving(workers=2, batches=24, fresh=4)
+def test_two_workers_cache_the_loads_that_they_solve(scene, saving, tmp_path):
+    module = saving(workers=2, batches=24, new_per_round=4)
     seen = forces(module.train_dataloader())
     module.teardown("fit")
     store = DataSet(scene, str(tmp_path / "d"), train=80, val=1, test=1, workers=0).fill()
     assert all(not flaw for _, flaw in verify(store))
     assert names(tmp_path / "d")[0] == "train-000000.safetensors"
     assert set(seen) <= set(drawn(scene, 128))
-    assert module.store.missing("train", SHARD) == []
+    assert module.store.missing("train", SHARD_SIZE) == []
 
 
 # ------------------------------------------------------------------ within a trainer
@@ -622,7 +635,7 @@ def test_two_workers_keep_what_they_solve(scene, saving, tmp_path):
 
 @pytest.fixture
 def fitted(scene):
-    """Trains on a stream for some epochs; returns the trainer."""
+    """Return a function that trains on a stream and returns the trainer."""
 
     def fitted(module, epochs=2):
         torch.manual_seed(0)
@@ -650,23 +663,23 @@ def test_a_trained_stream_leaves_whole_shards(saving, fitted, tmp_path):
     assert names(tmp_path / "d") == ["train-000000.safetensors", "train-000064.safetensors"]
 
 
-def test_a_trained_stream_takes_no_more_than_it_uses(online, fitted):
+def test_training_takes_no_more_samples_than_it_uses(online, fitted):
     module = online()
     trainer = fitted(module, epochs=2)
     assert trainer.global_step == 6
-    assert module.state_dict() == {"produced": 24, "following": 24}
+    assert module.state_dict() == {"produced": 24, "next_index": 24}
 
 
-def test_loads_near_the_worst_answers_are_drawn_while_it_trains(online, fitted):
-    module = online(worst=0.5, batches=8, reuse=2, fresh=4)
+def test_hard_examples_are_found_during_training(online, fitted):
+    module = online(hard_example_fraction=0.5, batches=8, reuse=2, new_per_round=4)
     fitted(module, epochs=2)
-    worst = module._replay._source.worst
+    worst = module._replay._source.hard_examples
     assert int(worst.count) > 0
     assert ((worst.points[: int(worst.count)] >= 0) & (worst.points[: int(worst.count)] < 1)).all()
 
 
-def test_a_stream_does_not_take_more_threads_than_it_was_given(online):
-    """OMP_NUM_THREADS=1 on a shared machine means one."""
+def test_a_stream_does_not_raise_the_number_of_threads(online):
+    """A limit such as OMP_NUM_THREADS=1 is kept."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     online().train_dataloader()
@@ -675,7 +688,7 @@ def test_a_stream_does_not_take_more_threads_than_it_was_given(online):
     assert after == 1
 
 
-def test_the_job_of_a_stream_is_that_of_the_training_split(online):
+def test_the_stream_has_the_seed_of_the_training_split(online):
     stream = online().train_dataloader()._source
     assert stream.seed == (0, 0)
     truth = solve_load(stream.scene, LoadKey((0, 0), 0))

@@ -1,4 +1,4 @@
-"""Laws of `dpl.data.dataset`: what is wanted, what is missing, and what is told of it."""
+"""Laws of data sets: missing loads, generation, interruption, messages, verify and repair."""
 
 import json
 import os
@@ -9,7 +9,7 @@ import pytest
 
 from dpl.data import DataSet, Writer
 from dpl.data.solving.solve import failed_load, solve_load
-from dpl.data.storage.pending import PendingSamples
+from dpl.data.storage.pending import PendingLoads
 from dpl.fem import SaintVenantKirchhoff
 
 SIZES = {"train": 6, "val": 2, "test": 2}
@@ -17,7 +17,7 @@ SIZES = {"train": 6, "val": 2, "test": 2}
 
 @pytest.fixture
 def wanted(scene, tmp_path):
-    """Makes data sets of ten loads in one folder."""
+    """Return a function that builds data sets of ten loads in one folder."""
 
     def wanted(**other):
         return DataSet(scene, str(tmp_path / "d"), **{**SIZES, "workers": 0, **other})
@@ -27,7 +27,7 @@ def wanted(scene, tmp_path):
 
 @pytest.fixture
 def solved(monkeypatch):
-    """The loads that are solved, as they are."""
+    """The list of solved loads, extended by each solve."""
     found = []
 
     def counted(scene, job):
@@ -40,11 +40,11 @@ def solved(monkeypatch):
 
 @pytest.fixture
 def interrupted(monkeypatch):
-    """Sends this process signals as soon as so many loads are solved."""
+    """Return a function that sends signals to this process after a number of solved loads."""
 
     def interrupted(after, *signals):
         count = 0
-        real = PendingSamples.put
+        real = PendingLoads.write
 
         def keep(self, one):
             nonlocal count
@@ -55,7 +55,7 @@ def interrupted(monkeypatch):
                     os.kill(os.getpid(), number)
             return path
 
-        monkeypatch.setattr(PendingSamples, "put", keep)
+        monkeypatch.setattr(PendingLoads, "write", keep)
 
     return interrupted
 
@@ -81,14 +81,14 @@ def test_negative_numbers_are_refused_by_name(wanted, tmp_path, name):
 
 
 @pytest.mark.parametrize("timeout", [0, -1.0, float("nan")])
-def test_a_limit_of_no_time_is_refused(wanted, timeout):
+def test_a_time_limit_must_be_positive(wanted, timeout):
     with pytest.raises(ValueError, match="timeout"):
         wanted(timeout=timeout)
     assert wanted(timeout=None).timeout is None
 
 
 @pytest.mark.parametrize(("shard", "shards"), [(1, 1), (-1, 2), (2, 2), (0, 0), (0, -1)])
-def test_a_part_that_is_none_is_refused(wanted, shard, shards):
+def test_shard_must_be_an_index_below_shards(wanted, shard, shards):
     with pytest.raises(ValueError, match="shard"):
         wanted(shard=shard, shards=shards)
     assert wanted(shard=1, shards=2).shard == 1
@@ -102,7 +102,7 @@ def test_the_folder_is_named_after_scene_and_seed_if_left_out(scene, monkeypatch
     assert made.folder.resolve() == folder
 
 
-def test_the_plan_says_what_is_there_and_writes_nothing(wanted, scene, tmp_path):
+def test_the_plan_counts_existing_loads_and_writes_nothing(wanted, scene, tmp_path):
     (line,) = wanted().skipped_work()
     assert scene.fingerprint[:12] in line
     assert not list(tmp_path.iterdir())
@@ -118,8 +118,8 @@ def test_nothing_is_written_where_nothing_is_wanted(wanted):
     assert not store.folder.exists()
 
 
-def test_parts_share_all_loads_among_them(wanted, monkeypatch):
-    monkeypatch.setattr("dpl.data.storage.store.SHARD", 2)
+def test_the_parts_of_a_data_set_are_disjoint_and_complete(wanted, monkeypatch):
+    monkeypatch.setattr("dpl.data.storage.store.SHARD_SIZE", 2)
     parts = [wanted(shard=k, shards=3).missing() for k in range(3)]
     for split, size in SIZES.items():
         together = sorted(index for part in parts for index in part[split])
@@ -132,7 +132,7 @@ def test_parts_share_all_loads_among_them(wanted, monkeypatch):
 # ------------------------------------------------------------------ filling it
 
 
-def test_what_is_wanted_is_there_afterwards(wanted, solved):
+def test_fill_solves_all_missing_loads(wanted, solved):
     store = wanted().fill()
     assert solved == [(0, k) for k in range(6)] + [(1, 0), (1, 1), (2, 0), (2, 1)]
     for split, size in SIZES.items():
@@ -140,7 +140,7 @@ def test_what_is_wanted_is_there_afterwards(wanted, solved):
         assert len(store.load(split, size).force) == size
 
 
-def test_growing_solves_what_is_new_and_the_samples_are_those_of_a_set_made_at_once(
+def test_growing_solves_new_loads_only_and_gives_the_samples_of_a_set_made_at_once(
     wanted, scene, tmp_path, solved
 ):
     at_once = DataSet(scene, str(tmp_path / "at once"), train=12, val=2, test=2, workers=0).fill()
@@ -162,9 +162,7 @@ def test_progress_shows_accepted_rejected_and_samples_a_second(wanted, capsys):
     assert "/s" in out
 
 
-def test_progress_counts_what_is_spooled_but_not_what_is_not_wanted(
-    wanted, interrupted, solved, capsys
-):
+def test_progress_counts_wanted_pending_loads_only(wanted, interrupted, solved, capsys):
     interrupted(4, signal.SIGINT, signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         wanted().fill()
@@ -196,11 +194,11 @@ def test_the_summary_tells_splits_amplitudes_and_time(wanted):
     assert "test: 2 of 2 loads accepted" in told[3]
     assert "Newton iterations" in told[1]
     assert any("amplitude up to" in line for line in told)
-    assert "s a load on one core" in told[-1]
+    assert "s per load on one core" in told[-1]
     assert "MB" in told[-1]
 
 
-def test_the_summary_of_nothing_is_its_folder(wanted):
+def test_the_summary_of_an_empty_data_set_is_its_folder(wanted):
     assert wanted().store.summary().splitlines() == [str(wanted().store.folder)]
 
 
@@ -210,9 +208,7 @@ def test_the_summary_of_nothing_is_its_folder(wanted):
 @pytest.mark.parametrize(
     ("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)]
 )
-def test_once_asked_to_stop_it_finishes_the_load_at_work_and_leaves(
-    wanted, interrupted, number, raised
-):
+def test_after_one_signal_the_solve_in_progress_is_finished(wanted, interrupted, number, raised):
     interrupted(3, number)
     with pytest.raises(raised) as end:
         wanted().fill()
@@ -224,7 +220,7 @@ def test_once_asked_to_stop_it_finishes_the_load_at_work_and_leaves(
 
 
 @pytest.mark.parametrize("after", [1, 5, 6, 8])
-def test_a_set_that_was_interrupted_and_resumed_is_one_made_at_once(
+def test_an_interrupted_and_resumed_set_has_the_bytes_of_an_uninterrupted_one(
     wanted, scene, tmp_path, interrupted, solved, after
 ):
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
@@ -238,11 +234,11 @@ def test_a_set_that_was_interrupted_and_resumed_is_one_made_at_once(
     wanted().fill()
     assert len(set(solved)) == len(solved) == 10, "no load is solved twice"
     assert content(wanted().store.folder) == content(at_once.folder)
-    assert not (wanted().store.folder / "spool").exists()
+    assert not (wanted().store.folder / "pending").exists()
     assert sum(one["loads"] for one in sessions(wanted().store)) in (9, 10)
 
 
-def test_signals_are_given_back(wanted):
+def test_signal_handlers_are_restored(wanted):
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     wanted().fill()
     assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
@@ -251,14 +247,14 @@ def test_signals_are_given_back(wanted):
 # ------------------------------------------------------------------ warnings
 
 
-def test_a_set_whose_large_loads_are_rejected_is_warned_of(make_scene, tmp_path, capsys):
+def test_six_rejected_loads_give_no_bias_warning(make_scene, tmp_path, capsys):
     hard = make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch_radius=(2.0, 2.0))
     few = DataSet(hard, str(tmp_path / "d"), train=6, val=0, test=0, workers=0)
     few.fill()
     assert "biased" not in capsys.readouterr().err, "six loads say nothing"
 
 
-def test_a_biased_set_is_warned_of_on_one_line(wanted, monkeypatch, capsys):
+def test_a_biased_set_gives_a_warning_of_one_line(wanted, monkeypatch, capsys):
     def picky(scene, job):
         one = solve_load(scene, job)
         return failed_load(scene, job, "not converged") if one.amplitude > 0.1 else one
@@ -268,12 +264,12 @@ def test_a_biased_set_is_warned_of_on_one_line(wanted, monkeypatch, capsys):
     err = capsys.readouterr().err
     poor = [part for part in store.acceptance() if part.biased]
     assert poor, "no range of ten large loads: want more"
-    assert err.startswith("warning: biased: of ")
+    assert err.startswith("warning: the data set is biased: only ")
     assert err.count("\n") == 1
     assert all(part.accepted == part.tried for part in store.acceptance() if part.high < 0.1)
 
 
-def test_a_fair_set_is_not_warned_of(wanted, capsys):
+def test_an_unbiased_set_gives_no_warning(wanted, capsys):
     wanted(train=20).fill()
     assert capsys.readouterr().err == ""
 
@@ -312,15 +308,15 @@ def test_repair_makes_damaged_files_again(made, wanted, solved, capsys):
     assert list(wanted().verify()) == []
 
 
-def test_repair_makes_again_what_it_forgets_even_if_less_is_wanted(made, wanted, solved):
-    """The sizes on the command line are those of a set that is made, not of one that is there."""
+def test_repair_solves_all_loads_of_a_removed_shard_even_if_fewer_are_wanted(made, wanted, solved):
+    """The sizes on the command line do not limit the repair of an existing set."""
     (made.folder / "train-000000.safetensors").write_bytes(b"")
     wanted(train=2).repair()
     assert made.missing("train", 6) == []
     assert len(made.load("train", 6).force) == 6
 
 
-def test_repair_of_nothing_makes_the_set(wanted, made, tmp_path):
+def test_repair_of_a_missing_set_makes_it(wanted, made, tmp_path):
     before = content(made.folder)
     shutil.rmtree(made.folder)
     wanted().repair()
@@ -330,7 +326,7 @@ def test_repair_of_nothing_makes_the_set(wanted, made, tmp_path):
 # ------------------------------------------------------------------ the command
 
 
-def test_the_command_says_whether_a_set_is_sound_and_repairs_it(script, tiny, tmp_path):
+def test_the_command_verifies_and_repairs_a_set(script, tiny, tmp_path):
     sizes = [*tiny, "data.train=4", "data.val=1", "data.test=1", "data.workers=0", "data.folder=d"]
     assert script("generate", *sizes, cwd=tmp_path).status == 0
     before = content(tmp_path / "d")
@@ -363,7 +359,7 @@ def test_the_command_says_whether_a_set_is_sound_and_repairs_it(script, tiny, tm
         ("material.poisson=0.31", "another scene"),
     ],
 )
-def test_what_cannot_work_ends_with_one_line_and_a_status_of_2(
+def test_invalid_options_end_with_one_line_and_status_2(
     script, tiny, scene_of, wanted, tmp_path, override, told
 ):
     scene = scene_of(*tiny)
@@ -375,7 +371,9 @@ def test_what_cannot_work_ends_with_one_line_and_a_status_of_2(
     assert ended.err.count("\n") == 1
 
 
-def test_a_second_writer_is_told_who_the_first_is(script, tiny, scene_of, tmp_path):
+def test_a_second_writer_is_refused_with_process_and_machine_of_the_first(
+    script, tiny, scene_of, tmp_path
+):
     wanted = DataSet(scene_of(*tiny), str(tmp_path / "d"), train=4, val=0, test=0, workers=0)
     running = Writer(wanted.store).fill({"train": range(4)}, workers=0)
     next(running)
@@ -386,6 +384,6 @@ def test_a_second_writer_is_told_who_the_first_is(script, tiny, scene_of, tmp_pa
     assert ended.err.count("\n") == 1
 
 
-def test_verify_of_what_is_not_there_does_not_call_it_sound(script, tiny, tmp_path):
+def test_verify_of_a_missing_data_set_fails(script, tiny, tmp_path):
     ended = script("generate", *tiny, "data.folder=typo", "action=verify", cwd=tmp_path)
     assert ended.status != 0

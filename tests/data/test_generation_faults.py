@@ -1,8 +1,8 @@
-"""Laws of scripts/generate.py among killed processes, signals, full disks and second writers.
+"""Laws of scripts/generate.py with killed processes, signals, full disks and second writers.
 
-Real processes of the tiny scene. Its loads are drawn by `Slow`, which takes its time in workers and
-is no part of what is drawn: the same bytes whatever the pause. What a test waits for is an event (a
-line, a file, the end of a process); no duration decides.
+The tests start real processes for the tiny scene. Its loads are drawn by `Slow`, which pauses in
+workers and draws the same loads for every pause. Tests wait for events (a line, a file, the end of
+a process); no result depends on a duration.
 """
 
 import hashlib
@@ -20,22 +20,22 @@ from pathlib import Path
 
 import pytest
 
-from dpl.data.storage.manifest import lines_of
+from dpl.data.storage.manifest import read_manifest
 from dpl.fem import ModalLoads
 
 HERE = Path(__file__)
-LONG = 240.0  # no test waits so long, unless what it waits for does not come [s]
+LONG = 240.0  # limit for an event; reached only if a test fails [s]
 pytestmark = pytest.mark.timeout(1800)
 SCRIPT = HERE.parents[2] / "scripts" / "generate.py"
 
 
 @dataclass(frozen=True, eq=False)
 class Slow(ModalLoads):
-    """Loads that take time in workers, each of which says in a file `begun-...` that it has begun.
+    """Loads that take time in workers; each worker creates a file `begun-...` when it starts.
 
     Attributes:
-        pause: So much [s]; below 0: all time, in one call that no signal handler interrupts.
-        gate: A file that they wait for; none if left out.
+        pause: Duration [s]; below 0: infinite, in one call that no signal handler interrupts.
+        gate: File whose creation they wait for; none if empty.
     """
 
     pause: float = 0.0
@@ -54,7 +54,7 @@ class Slow(ModalLoads):
 
 @pytest.fixture
 def slow(monkeypatch, tiny):
-    """Overrides of a data set, `d`, of so many loads that take so long."""
+    """Return a function that returns the overrides of a data set of slow loads in folder `d`."""
     monkeypatch.setenv("PYTHONPATH", str(HERE.parent))
 
     def slow(pause=0.0, train=40, val=5, test=5, workers=2, folder="d", gate=""):
@@ -68,7 +68,7 @@ def slow(monkeypatch, tiny):
 
 @pytest.fixture
 def limited(environment):
-    """Runs the generator after commands of the shell; returns status, out, err."""
+    """Return a function that runs the generator in a shell; it returns status, out, err."""
 
     def limited(before, *arguments, cwd, wrap=()):
         words = " ".join(f"'{word}'" for word in (sys.executable, SCRIPT, *arguments))
@@ -117,27 +117,29 @@ def gone(members, group):
     return waited_for(lambda: not members(group))
 
 
-def told_to_stop(process):
-    """Read what a process says until it has heard that it is asked to stop; return that."""
+def read_until_confirmed(process):
+    """Read the errors of a process until it confirms the first signal; return them."""
     said = ""
     while line := process.stderr.readline():
         said += line
-        if "once more to stop at once" in line:
+        if "again to abort" in line:
             return said
     raise AssertionError(said)
 
 
 def done(folder):
-    """Return how many loads are kept."""
-    return spooled(folder) + sum(line["tried"] for line in lines_of(folder / "manifest.jsonl"))
+    """Return the number of loads in shards and pending files."""
+    return count_pending(folder) + sum(
+        line["tried"] for line in read_manifest(folder / "manifest.jsonl")
+    )
 
 
-def spooled(folder):
-    return len(list(folder.glob("spool/*.load")))
+def count_pending(folder):
+    return len(list(folder.glob("pending/*.load")))
 
 
 def content(folder):
-    """Return the SHA-256 of all that may not depend on how the data set was made."""
+    """Return the SHA-256 of the files that must not depend on how the data set was made."""
     files = [*folder.glob("*.safetensors"), *folder.glob("manifest*")]
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
@@ -147,7 +149,7 @@ def leftovers(folder):
 
 
 def made(script, overrides, cwd):
-    """Make a data set without workers in this process, where imports are there already."""
+    """Make a data set in this process, where all modules are imported, without workers."""
     ended = script("generate", *overrides, "data.workers=0", cwd=cwd)
     assert ended.status == 0, ended.err[-2000:]
     return ended
@@ -157,10 +159,10 @@ def begun(folder):
     return len(list(folder.glob("begun-*")))
 
 
-# ------------------------------------------------------------------ nothing survives the parent
+# ------------------------------------------------------------------ workers end with the parent
 
 
-def test_a_killed_parent_takes_workers_amid_a_solve_along(start, members, slow, tmp_path):
+def test_workers_in_a_solve_end_with_a_killed_parent(start, members, slow, tmp_path):
     process = start("generate", *slow(pause=-1), cwd=tmp_path)
     assert waited_for(lambda: begun(tmp_path) == 2)
     assert len(workers_of(members, process.pid)) == 2
@@ -170,10 +172,8 @@ def test_a_killed_parent_takes_workers_amid_a_solve_along(start, members, slow, 
 
 
 @pytest.mark.slow
-def test_a_killed_parent_takes_workers_that_are_still_starting_along(
-    start, members, slow, tmp_path
-):
-    """See tests/data/test_processes.py for workers that are held while they import."""
+def test_starting_workers_end_with_a_killed_parent(start, members, slow, tmp_path):
+    """See tests/system/test_processes.py for workers that are stopped while they import."""
     process = start("generate", *slow(pause=-1), cwd=tmp_path)
     assert waited_for(lambda: workers_of(members, process.pid))
     process.kill()
@@ -184,7 +184,7 @@ def test_a_killed_parent_takes_workers_that_are_still_starting_along(
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_twenty_kills_and_a_resume_make_the_bytes_of_one_run(
+def test_twenty_killed_runs_and_a_resume_make_the_bytes_of_one_run(
     start, members, script, slow, tmp_path
 ):
     sizes = {"train": 260, "val": 20, "test": 20}
@@ -193,7 +193,7 @@ def test_twenty_kills_and_a_resume_make_the_bytes_of_one_run(
     folder = tmp_path / "d"
 
     def killed(cycle):
-        """Return whether it was amid work."""
+        """Kill a run; return True if it had solved loads."""
         before, more = done(folder), rng.randint(1, 6)
         process = start("generate", *slow(pause=0.08, **sizes), cwd=tmp_path)
         if cycle % 4:  # most of them amid work, the others as soon as there are workers
@@ -211,16 +211,18 @@ def test_twenty_kills_and_a_resume_make_the_bytes_of_one_run(
     status, _, err = finish(start("generate", *slow(**sizes), cwd=tmp_path))
     assert status == 0, err[-2000:]
     assert content(folder) == content(tmp_path / "once")
-    for path in folder.rglob("*.part"):  # may be younger than those that are swept
+    for path in folder.rglob("*.part"):  # may be too young to be removed
         os.utime(path, (0, 0))
     grown = {**sizes, "test": 21}
     made(script, slow(**grown), tmp_path)
     assert leftovers(folder) == []
-    assert not (folder / "spool").exists()
+    assert not (folder / "pending").exists()
 
 
 @pytest.mark.slow
-def test_a_killed_worker_costs_nothing_but_time(start, members, script, slow, tmp_path):
+def test_a_killed_worker_is_replaced_and_the_bytes_stay_the_same(
+    start, members, script, slow, tmp_path
+):
     made(script, slow(folder="once"), tmp_path)
     process = start("generate", *slow(gate="go"), cwd=tmp_path)
     assert waited_for(lambda: begun(tmp_path) == 2)
@@ -233,51 +235,53 @@ def test_a_killed_worker_costs_nothing_but_time(start, members, script, slow, tm
     assert content(tmp_path / "d") == content(tmp_path / "once")
 
 
-# ------------------------------------------------------------------ asked to stop
+# ------------------------------------------------------------------ signals
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "group", "status"), [(signal.SIGINT, True, 130), (signal.SIGTERM, False, 143)]
 )
-def test_asked_once_it_finishes_the_loads_at_work_and_keeps_them(
+def test_after_one_signal_the_solves_in_progress_are_finished_and_kept(
     start, members, script, slow, tmp_path, number, group, status
 ):
     made(script, slow(folder="once"), tmp_path)
     process = start("generate", *slow(gate="go"), cwd=tmp_path)
     assert waited_for(lambda: begun(tmp_path) == 2)
     (os.killpg if group else os.kill)(process.pid, number)
-    said = told_to_stop(process)
-    assert spooled(tmp_path / "d") == 0, "the loads at work go on"
+    said = read_until_confirmed(process)
+    assert count_pending(tmp_path / "d") == 0, "the solves in progress continue"
     (tmp_path / "go").touch()
     ended, _, err = finish(process)
     assert ended == status, err[-2000:]
     assert gone(members, process.pid)
     assert "Traceback" not in said + err
-    assert spooled(tmp_path / "d") == 2
+    assert count_pending(tmp_path / "d") == 2
     resumed = made(script, slow(), tmp_path)
     assert "50/50" in resumed.out
     assert content(tmp_path / "d") == content(tmp_path / "once")
 
 
-def test_asked_twice_it_stops_at_once(start, members, slow, tmp_path):
+def test_a_second_signal_aborts_the_solves_in_progress(start, members, slow, tmp_path):
     process = start("generate", *slow(pause=-1), cwd=tmp_path)
     assert waited_for(lambda: begun(tmp_path) == 2)
     os.killpg(process.pid, signal.SIGINT)
-    said = told_to_stop(process)
-    assert process.poll() is None, "the loads at work go on"
+    said = read_until_confirmed(process)
+    assert process.poll() is None, "the solves in progress continue"
     assert len(workers_of(members, process.pid)) == 2
     os.killpg(process.pid, signal.SIGINT)
-    status, _, err = finish(process)  # the loads at work would take for ever
+    status, _, err = finish(process)  # the solves in progress would never end
     assert status == 130, err[-2000:]
     assert gone(members, process.pid)
     assert err.strip().endswith("interrupted")
-    assert (said + err).count("once more to stop at once") == 1
+    assert (said + err).count("again to abort") == 1
 
 
 @pytest.mark.slow
-def test_a_stop_while_workers_start_is_as_quiet_as_any(start, members, slow, tmp_path):
-    """A terminal sends Ctrl-C to them too, before they can have set their handlers."""
+def test_an_interrupt_during_the_start_of_workers_prints_no_traceback(
+    start, members, slow, tmp_path
+):
+    """A terminal also sends Ctrl-C to workers, possibly before they set their handlers."""
     process = start("generate", *slow(pause=0.2, train=20), cwd=tmp_path)
     assert waited_for(lambda: len(workers_of(members, process.pid)) == 2)
     os.killpg(process.pid, signal.SIGINT)
@@ -288,7 +292,7 @@ def test_a_stop_while_workers_start_is_as_quiet_as_any(start, members, slow, tmp
 
 @pytest.mark.slow
 @pytest.mark.xfail(reason="a signal that comes while Python itself ends prints its traceback")
-def test_an_impatient_user_gets_no_traceback(start, members, slow, tmp_path):
+def test_repeated_interrupts_print_no_traceback(start, members, slow, tmp_path):
     process = start("generate", *slow(pause=-1), cwd=tmp_path)
     assert waited_for(lambda: begun(tmp_path) == 2)
     for _ in range(6):
@@ -305,7 +309,9 @@ def test_an_impatient_user_gets_no_traceback(start, members, slow, tmp_path):
 
 
 @pytest.mark.slow
-def test_two_parts_made_at_the_same_time_are_the_set_made_at_once(start, script, slow, tmp_path):
+def test_two_parts_made_in_parallel_have_the_bytes_of_a_set_made_at_once(
+    start, script, slow, tmp_path
+):
     sizes = {"train": 200, "val": 70, "test": 10}
     made(script, slow(**sizes, folder="once"), tmp_path)
     parts = [
@@ -331,7 +337,7 @@ def test_two_parts_made_at_the_same_time_are_the_set_made_at_once(start, script,
 
 
 @pytest.mark.slow
-def test_a_second_process_is_refused_until_the_first_is_dead(
+def test_a_second_process_is_refused_while_the_first_one_lives(
     start, members, script, slow, tmp_path
 ):
     first = start("generate", *slow(gate="never", train=100), cwd=tmp_path)
@@ -354,10 +360,10 @@ def test_a_second_process_is_refused_until_the_first_is_dead(
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 2])
 @pytest.mark.parametrize("blocks", [4, 16])
-def test_a_limit_on_files_ends_with_one_line_and_a_resume_makes_the_same_bytes(
+def test_a_limit_of_the_file_size_ends_with_one_line_and_a_resume_makes_the_same_bytes(
     limited, script, slow, tmp_path, workers, blocks
 ):
-    """4 KiB: no spooled load fits; 16 KiB: no shard of 35 does."""
+    """With 4 KiB no pending load fits; with 16 KiB no shard of 35 loads fits."""
     for folder in ("once", "d"):
         made(script, slow(train=3, val=0, test=0, folder=folder), tmp_path)
     made(script, slow(folder="once"), tmp_path)

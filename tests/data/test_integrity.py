@@ -1,4 +1,4 @@
-"""Laws of `verify` and `repair`: nothing that is wrong with a data set goes unnoticed."""
+"""Laws of `verify` and `repair`: every flaw of a data set is found and repaired."""
 
 import hashlib
 import json
@@ -18,7 +18,7 @@ SIZES = {"train": 12, "val": 4, "test": 4}
 
 @pytest.fixture
 def copy(data, tmp_path):
-    """The tiny data set in a folder that may be harmed."""
+    """A copy of the tiny data set that may be damaged."""
     folder = tmp_path / "copy"
     shutil.copytree(data.store.folder, folder)
     return Store(folder, data.scene, data.store.seed)
@@ -47,27 +47,27 @@ def flaws(store):
     return {part.file: flaw for part, flaw in verify(store) if flaw}
 
 
-# ------------------------------------------------------------------ what is noticed
+# ------------------------------------------------------------------ flaws
 
 
 @pytest.mark.parametrize(("split", "size"), SIZES.items())
-def test_a_split_whose_line_is_lost_is_noticed(copy, data, split, size, capsys):
+def test_verify_finds_a_shard_whose_line_is_lost(copy, data, split, size, capsys):
     write(copy, [line for line in lines(copy) if line["split"] != split])
     assert list(wanted(copy).verify()) == [
         f"{copy.folder}/{split}-000000.safetensors is named by no manifest",
-        f"{copy.folder} lacks {size} of the loads that data.{split} = {size} asks for; "
+        f"{copy.folder} lacks {size} of the loads that data.{split} = {size} requires; "
         "the first is load 0",
     ]
     capsys.readouterr()
     wanted(copy).repair()
     told = capsys.readouterr().out
     assert "is named by no manifest; it is removed, and its" in told
-    assert f"{size} loads of {split} are not there; they are solved" in told
+    assert f"{size} loads of {split} are missing and are solved" in told
     assert content(copy.folder) == content(data.store.folder)
     assert list(wanted(copy).verify()) == []
 
 
-def test_a_data_set_without_its_manifest_is_not_sound(copy, data):
+def test_verify_finds_a_lost_manifest(copy, data):
     (copy.folder / "manifest.jsonl").unlink()
     assert len(list(wanted(copy).verify())) == 6
     wanted(copy).repair()
@@ -79,21 +79,21 @@ def test_a_data_set_without_its_manifest_is_not_sound(copy, data):
     [
         (
             {"train": 13},
-            ["lacks 1 of the loads that data.train = 13 asks for; the first is load 12"],
+            ["lacks 1 of the loads that data.train = 13 requires; the first is load 12"],
         ),
-        ({"val": 9}, ["lacks 5 of the loads that data.val = 9 asks for; the first is load 4"]),
+        ({"val": 9}, ["lacks 5 of the loads that data.val = 9 requires; the first is load 4"]),
         ({"train": 14, "test": 5}, ["data.train = 14", "data.test = 5"]),
         ({"train": 3, "val": 0}, []),
     ],
 )
-def test_loads_that_are_wanted_and_not_there_are_noticed(copy, lost, told):
+def test_verify_finds_missing_loads(copy, lost, told):
     found = list(wanted(copy, **lost).verify())
     assert len(found) == len(told)
     assert all(words in line for words, line in zip(told, found, strict=True))
 
 
-def test_a_part_of_a_data_set_answers_for_its_own_loads_alone(copy, monkeypatch):
-    monkeypatch.setattr("dpl.data.storage.store.SHARD", 12)
+def test_verify_of_a_part_ignores_the_loads_of_other_parts(copy, monkeypatch):
+    monkeypatch.setattr("dpl.data.storage.store.SHARD_SIZE", 12)
     found = [list(wanted(copy, train=24, shard=k, shards=2).verify()) for k in range(2)]
     assert found[0] == []
     assert [line.split()[1:3] for line in found[1]] == [["lacks", "12"]]
@@ -110,7 +110,7 @@ TORN = {
 
 @pytest.mark.parametrize(("harm", "why"), TORN.values(), ids=TORN)
 @pytest.mark.parametrize("which", [0, 2])
-def test_a_line_that_describes_no_shard_is_noticed_with_its_number(copy, data, harm, why, which):
+def test_verify_finds_an_invalid_line_with_its_number(copy, data, harm, why, which):
     found = lines(copy)
     name = found[which]["file"]
     found[which] = harm(found[which])
@@ -128,7 +128,7 @@ def test_a_line_that_describes_no_shard_is_noticed_with_its_number(copy, data, h
     assert content(copy.folder) == content(data.store.folder)
 
 
-def test_torn_lines_are_counted_for_each_manifest(copy):
+def test_invalid_lines_are_counted_for_each_manifest(copy):
     with (copy.folder / "manifest.jsonl").open("a") as file:
         file.write("{\n{}\n")
     (copy.folder / "manifest-1-of-2.jsonl").write_text("torn")
@@ -141,7 +141,7 @@ def test_torn_lines_are_counted_for_each_manifest(copy):
 
 
 @pytest.mark.parametrize("name", ["../outside.safetensors", "sub/outside.safetensors", "sub/../x"])
-def test_a_line_that_names_a_file_elsewhere_is_noticed_and_the_file_is_left(copy, data, name):
+def test_verify_finds_a_line_that_names_a_file_outside_and_repair_leaves_the_file(copy, data, name):
     found = lines(copy)
     genuine = copy.folder / found[0]["file"]
     (copy.folder / "sub").mkdir()
@@ -158,14 +158,14 @@ def test_a_line_that_names_a_file_elsewhere_is_noticed_and_the_file_is_left(copy
 
 
 @pytest.mark.parametrize("harm", ["a copy", "no shard", "a link", "larger than any shard"])
-def test_a_file_that_no_manifest_names_is_noticed_and_removed(copy, data, harm):
+def test_a_shard_that_no_manifest_names_is_found_and_removed(copy, data, harm):
     stray = copy.folder / "train-000064.safetensors"
     if harm == "a copy":
         shutil.copy(copy.folder / "train-000000.safetensors", stray)
     elif harm == "a link":
         stray.symlink_to(copy.folder / "train-000000.safetensors")
     else:
-        stray.write_bytes(b"nothing" if harm == "no shard" else bytes(copy.largest(64) + 1))
+        stray.write_bytes(b"nothing" if harm == "no shard" else bytes(copy.max_shard_size(64) + 1))
     assert flaws(copy) == {stray.name: "is named by no manifest"}
     ((part, told),) = repair(copy)
     assert (part.file, list(part.loads)) == (stray.name, []), "none of its loads is of its name"
@@ -206,8 +206,8 @@ def flip_lowest_bit(path, column):
 @pytest.mark.parametrize(
     "column", ["displacement", "nodal_force", "point", "residual", "volume_ratio", "iterations"]
 )
-def test_a_flipped_bit_that_only_the_digest_can_tell_is_noticed(copy, column):
-    """Equilibrium, loads and shapes stay right within their tolerances."""
+def test_verify_finds_a_flipped_bit_that_only_the_digest_detects(copy, column):
+    """Equilibrium, loads and shapes stay within their tolerances."""
     path = copy.folder / "train-000000.safetensors"
     before = load_file(path)[column].clone()
     flip_lowest_bit(path, column)
@@ -215,7 +215,7 @@ def test_a_flipped_bit_that_only_the_digest_can_tell_is_noticed(copy, column):
     assert (before != after).sum() == 1
     if after.is_floating_point():
         assert torch.allclose(before, after, rtol=1e-15, atol=0)
-    assert flaws(copy) == {path.name: "is damaged: its SHA-256 is not the manifest's"}
+    assert flaws(copy) == {path.name: "is damaged: its SHA-256 differs from the manifest's"}
     with pytest.raises(ValueError, match="SHA-256"):
         copy.load("train", 12)
     found = lines(copy)
@@ -224,11 +224,11 @@ def test_a_flipped_bit_that_only_the_digest_can_tell_is_noticed(copy, column):
     assert flaws(copy) == {}, "no other check can tell"
 
 
-# ------------------------------------------------------------------ how far off a number may be
+# ------------------------------------------------------------------ tolerances
 
 
 def harmed(store, change):
-    """Change the columns of the first shard; return its flaw, the digest being right."""
+    """Change the columns and the digest of the first shard; return its flaw."""
     found = lines(store)
     path = store.folder / found[0]["file"]
     shard = load_file(path)
@@ -245,10 +245,10 @@ def harmed(store, change):
     [
         ("point", 1e-9, "holds other loads than its seed draws"),
         ("nodal_force", 1e-4, "holds loads that this scene does not draw"),
-        ("displacement", 1e-4, "holds an answer out of balance: load 11"),
+        ("displacement", 1e-4, "holds a displacement that is not in equilibrium: load 11"),
     ],
 )
-def test_a_number_of_one_load_that_is_a_little_off_is_noticed(copy, column, error, flaw, sign):
+def test_verify_finds_a_small_error_in_a_number_of_one_load(copy, column, error, flaw, sign):
     def change(shard):
         values = shard[column].view(-1)
         place = int(values.nonzero()[-1])  # of the last load
@@ -257,8 +257,8 @@ def test_a_number_of_one_load_that_is_a_little_off_is_noticed(copy, column, erro
     assert harmed(copy, change) == flaw
 
 
-def test_an_answer_whose_volume_is_not_positive_is_noticed(copy, monkeypatch):
-    """However well it balances its load."""
+def test_verify_finds_a_displacement_with_det_F_of_zero(copy, monkeypatch):
+    """Also if the displacement is in equilibrium."""
     body = type(copy.scene.problem)
     monkeypatch.setattr(body, "is_equilibrium", lambda *_: torch.tensor(True))
     assert flaws(copy) == {}
@@ -269,7 +269,10 @@ def test_an_answer_whose_volume_is_not_positive_is_noticed(copy, monkeypatch):
         return internal, 0 * volume
 
     monkeypatch.setattr(body, "evaluate", flat)
-    assert flaws(copy)["train-000000.safetensors"] == "holds an answer out of balance: load 0"
+    assert (
+        flaws(copy)["train-000000.safetensors"]
+        == "holds a displacement that is not in equilibrium: load 0"
+    )
 
 
 @pytest.mark.parametrize("which", ["values", "vectors"])
@@ -306,14 +309,14 @@ HARMS = {
 
 @pytest.fixture
 def made(scene_of, tiny, tmp_path):
-    """A data set that the command's own options describe, in the folder d."""
+    """A data set in folder d, and the options of the command that describe it."""
     sizes = [*tiny, "data.train=3", "data.val=2", "data.test=1", "data.workers=0", "data.folder=d"]
     store = DataSet(scene_of(*tiny), str(tmp_path / "d"), train=3, val=2, test=1, workers=0).fill()
     return store, sizes
 
 
 @pytest.mark.parametrize("harm", HARMS.values(), ids=HARMS)
-def test_the_command_fails_where_something_is_wrong_and_repair_mends_it(
+def test_the_command_fails_for_a_damaged_set_and_repair_restores_its_bytes(
     script, made, tmp_path, harm
 ):
     store, sizes = made
@@ -330,12 +333,12 @@ def test_the_command_fails_where_something_is_wrong_and_repair_mends_it(
     assert (sound.status, sound.out.splitlines()[-1]) == (0, "0 flaws found")
 
 
-def test_the_command_fails_where_loads_that_it_asks_for_are_not_there(script, made, tmp_path):
+def test_the_command_fails_if_wanted_loads_are_missing(script, made, tmp_path):
     _, sizes = made
     found = script("generate", *sizes, "data.val=3", "action=verify", cwd=tmp_path)
     assert found.status == 1
-    assert "d lacks 1 of the loads that data.val = 3 asks for; the first is load 2" in found.out
+    assert "d lacks 1 of the loads that data.val = 3 requires; the first is load 2" in found.out
 
 
-def test_the_reasons_that_lie_with_the_machine_are_those_that_are_recorded():
-    assert integrity.MACHINE == ("timed out", "its worker died")
+def test_the_reasons_of_machine_failures_are_those_that_are_recorded():
+    assert integrity.MACHINE_FAILURES == ("timed out", "its worker died")

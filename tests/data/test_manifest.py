@@ -1,17 +1,17 @@
-"""Laws of the lines of a manifest: which describe a shard, and what they say of it."""
+"""Laws of manifests: valid lines are read, invalid ones are left out with a reason."""
 
 import json
 
 import pytest
 
 from dpl.data.storage.manifest import (
-    MOST,
+    UPPER_LIMIT,
+    accepted_loads,
+    invalid_lines,
     is_number,
-    kept_in,
-    lines_of,
-    place,
+    read_manifest,
     shard_name,
-    torn_lines,
+    sort_key,
 )
 
 LINE = {
@@ -30,7 +30,7 @@ REJECT = LINE["rejected"][0]
 
 @pytest.fixture
 def manifest(tmp_path):
-    """Writes a manifest of so many lines; returns its path."""
+    """Return a function that writes a manifest of some lines and returns its path."""
 
     def manifest(*lines):
         path = tmp_path / "manifest.jsonl"
@@ -40,9 +40,9 @@ def manifest(tmp_path):
     return manifest
 
 
-def test_a_manifest_that_is_not_there_has_no_lines(tmp_path):
-    assert lines_of(tmp_path / "manifest.jsonl") == []
-    assert torn_lines(tmp_path / "manifest.jsonl") == []
+def test_a_missing_manifest_has_no_lines(tmp_path):
+    assert read_manifest(tmp_path / "manifest.jsonl") == []
+    assert invalid_lines(tmp_path / "manifest.jsonl") == []
 
 
 POSSIBLE = [
@@ -58,27 +58,27 @@ POSSIBLE = [
 
 
 @pytest.mark.parametrize("change", POSSIBLE, ids=str)
-def test_a_line_that_can_be_is_kept_as_it_is(manifest, change):
+def test_a_valid_line_is_returned_unchanged(manifest, change):
     line = LINE | change
     line["file"] = shard_name(line["split"], line["first"])
-    assert lines_of(manifest(line)) == [line]
-    assert torn_lines(manifest(line)) == []
+    assert read_manifest(manifest(line)) == [line]
+    assert invalid_lines(manifest(line)) == []
 
 
 IMPOSSIBLE = {
-    "has a file that is not text": [{"file": None}, {"file": 3}],
-    "has a sha256 that is not text": [{"sha256": None}, {"sha256": []}],
-    "has a split that is not text": [{"split": 0}, {"split": None}],
+    "has a file that is not a string": [{"file": None}, {"file": 3}],
+    "has a sha256 that is not a string": [{"sha256": None}, {"sha256": []}],
+    "has a split that is not a string": [{"split": 0}, {"split": None}],
     "names a split that does not exist": [{"split": ""}, {"split": "Train"}],
     "names a file that is not in the folder": [
         *({"file": ""}, {"file": "/a"}, {"file": "a b"}, {"file": "a\n"}, {"file": "a" * 201}),
     ],
-    "has a number first that cannot be": [
+    "has a number first out of range": [
         *({"first": -1}, {"first": 2**53}, {"first": True}, {"first": 64.0}, {"first": "64"}),
     ],
-    "has a number tried that cannot be": [{"tried": -3}, {"tried": 3.0}, {"tried": None}],
-    "has a number accepted that cannot be": [{"accepted": -2}, {"accepted": 2.0}],
-    "has a number iterations that cannot be": [{"iterations": -1}, {"iterations": 2**53}],
+    "has a number tried out of range": [{"tried": -3}, {"tried": 3.0}, {"tried": None}],
+    "has a number accepted out of range": [{"accepted": -2}, {"accepted": 2.0}],
+    "has a number iterations out of range": [{"iterations": -1}, {"iterations": 2**53}],
     "names the file of another split or of another first load": [
         *({"split": "train"}, {"first": 63}, {"first": 0}, {"file": "a"}, {"file": "a" * 200}),
         {"file": "val-64.safetensors"},
@@ -86,15 +86,15 @@ IMPOSSIBLE = {
     "has amplitudes or rejected loads that are not lists": [
         *({"amplitudes": {}}, {"amplitudes": "abc"}, {"rejected": {}}, {"rejected": None}),
     ],
-    "has numbers of loads that disagree": [
+    "has inconsistent numbers of loads": [
         *({"tried": 2}, {"tried": 4}, {"accepted": 1}, {"accepted": 3}, {"rejected": []}),
         *({"amplitudes": [1, 1]}, {"amplitudes": [1, 1, 1, 1]}),
     ],
-    "has an amplitude that cannot be": [
+    "has an amplitude out of range": [
         *({"amplitudes": [1, 1, value]} for value in (-1e-9, True, None, "1", 10**15, [1])),
         *({"amplitudes": [float(value), 1, 1]} for value in ("nan", "inf")),
     ],
-    "has a rejected load that cannot be": [
+    "has an invalid rejected load": [
         *({"rejected": [REJECT | {"index": value}]} for value in (63, 67, True, 65.0, None)),
         *({"rejected": [REJECT | {"reason": value}]} for value in (None, 3)),
         *({"rejected": [{k: v for k, v in REJECT.items() if k != name}]} for name in REJECT),
@@ -105,33 +105,40 @@ CASES = [(change, why) for why, changes in IMPOSSIBLE.items() for change in chan
 
 
 @pytest.mark.parametrize(("change", "why"), CASES, ids=str)
-def test_a_line_that_cannot_be_is_left_out_with_its_number_and_the_reason(manifest, change, why):
+def test_an_invalid_line_is_left_out_with_its_number_and_the_reason(manifest, change, why):
     path = manifest(LINE, LINE | change)
-    assert lines_of(path) == [LINE]
-    ((number, told),) = torn_lines(path)
+    assert read_manifest(path) == [LINE]
+    ((number, told),) = invalid_lines(path)
     assert number == 2
     assert told.startswith(why)
 
 
 @pytest.mark.parametrize("name", LINE)
-def test_a_line_that_lacks_something_is_left_out_and_says_what(manifest, name):
+def test_a_line_with_a_missing_key_is_left_out_with_the_key(manifest, name):
     path = manifest({key: value for key, value in LINE.items() if key != name}, LINE)
-    assert lines_of(path) == [LINE]
-    assert torn_lines(path) == [(1, f"lacks {name}")]
+    assert read_manifest(path) == [LINE]
+    assert invalid_lines(path) == [(1, f"lacks {name}")]
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "3", "null", "\0", "[" * 99_999])
-def test_a_line_that_is_no_object_is_left_out(manifest, text):
+def test_a_line_that_is_not_an_object_is_left_out(manifest, text):
     path = manifest(LINE)
     path.write_text(text + "\n" + path.read_text())
-    assert lines_of(path) == [LINE]
-    assert torn_lines(path) == [(1, "is not a JSON object")]
+    assert read_manifest(path) == [LINE]
+    assert invalid_lines(path) == [(1, "is not a JSON object")]
 
 
 @pytest.mark.parametrize(
     ("value", "possible"),
     [
-        *((0, True), (0.0, True), (1e-300, True), (MOST - 1, True), (MOST, False), (-1, False)),
+        *(
+            (0, True),
+            (0.0, True),
+            (1e-300, True),
+            (UPPER_LIMIT - 1, True),
+            (UPPER_LIMIT, False),
+            (-1, False),
+        ),
         *((True, False), (False, False), (None, False), ("1", False), (10**30, False)),
         *((float("nan"), False), (float("inf"), False)),
     ],
@@ -141,12 +148,12 @@ def test_numbers_are_finite_and_not_negative(value, possible):
 
 
 def test_a_shard_holds_the_loads_that_were_tried_and_not_rejected():
-    assert kept_in(LINE) == [64, 66]
-    assert kept_in(LINE | {"rejected": []}) == [64, 65, 66]
-    assert kept_in(LINE | {"tried": 0, "rejected": []}) == []
+    assert accepted_loads(LINE) == [64, 66]
+    assert accepted_loads(LINE | {"rejected": []}) == [64, 65, 66]
+    assert accepted_loads(LINE | {"tried": 0, "rejected": []}) == []
 
 
 def test_lines_are_ordered_by_split_and_first_load():
     keys = [("train", 0), ("train", 64), ("val", 0), ("val", 128), ("test", 0)]
-    found = [place({"split": split, "first": first}) for split, first in keys]
+    found = [sort_key({"split": split, "first": first}) for split, first in keys]
     assert found == sorted(found) == [(0, 0), (0, 64), (1, 0), (1, 128), (2, 0)]

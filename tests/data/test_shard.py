@@ -1,4 +1,4 @@
-"""Laws of shards as files: what is put in comes out, and nothing else is taken for a shard."""
+"""Laws of shards: decoded loads equal encoded ones, and damaged shards are refused."""
 
 import numpy as np
 import pytest
@@ -7,14 +7,16 @@ from safetensors.torch import load, save
 
 from dpl.data.solving.solve import LoadKey, SolvedLoad
 from dpl.data.storage import store as store_module
-from dpl.data.storage.shard import decode_shard, deserialize, encode_shard, select, serialize
+from dpl.data.storage.manifest import entry_of_load, merge_entries
+from dpl.data.storage.pending import PendingLoads
+from dpl.data.storage.shard import concatenate, decode_shard, encode_load, select, to_dense
 from dpl.data.storage.store import runs
 
 SHAPE, DIMENSION = (4, 3), 2
 
 
 def solved(number, *, nodes=(0, 3), accepted=True):
-    """Return a load on these nodes."""
+    """Return a solved load with forces on these nodes."""
     rng = np.random.default_rng(number)
     force = np.zeros(SHAPE)
     force[list(nodes)] = rng.normal(size=(len(nodes), SHAPE[1]))
@@ -34,8 +36,10 @@ def solved(number, *, nodes=(0, 3), accepted=True):
     )
 
 
-def content(*kept, poisson=None):
-    return encode_shard(kept, SHAPE, DIMENSION, poisson)
+def content(*loads, n_poisson=0):
+    """Return a shard; the Poisson's ratios are the last coordinates of the points."""
+    ratio = lambda one: torch.from_numpy(one.point)[None, DIMENSION - n_poisson :]  # noqa: E731
+    return save(concatenate([encode_load(one, ratio(one)) for one in loads]))
 
 
 def same(one, other):
@@ -45,15 +49,11 @@ def same(one, other):
     )
 
 
-def line(*tried, rejected=()):
-    return {
-        "first": tried[0].job.number,
-        "amplitudes": [one.amplitude for one in tried],
-        "rejected": [{"index": k, "reason": "diverged", "load_factor": 0.5} for k in rejected],
-    }
+def line(*loads):
+    return merge_entries([entry_of_load("val", one) for one in loads])
 
 
-def test_loads_come_out_as_they_were_put_in():
+def test_a_decoded_load_equals_the_encoded_one():
     loads = [solved(5), solved(6, nodes=(0, 1, 2, 3)), solved(7, nodes=())]
     shard = decode_shard(content(*loads), SHAPE, DIMENSION)
     for one in loads:
@@ -62,32 +62,40 @@ def test_loads_come_out_as_they_were_put_in():
     assert shard["iterations"].tolist() == [8, 9, 10]
 
 
-def test_a_rejected_load_comes_out_with_its_reason():
+def test_a_rejected_load_is_decoded_with_its_reason():
     loads = [solved(5), solved(6, accepted=False), solved(7)]
-    shard = decode_shard(content(loads[0], loads[2]), SHAPE, DIMENSION)
-    found = select(shard, loads[1].job, line(*loads, rejected=[6]))
-    assert (found.accepted, found.reason, found.load_factor) == (False, "diverged", 0.5)
+    shard = decode_shard(content(*loads), SHAPE, DIMENSION)
+    assert shard["index"].tolist() == [5, 7]
+    found = select(shard, loads[1].job, line(*loads))
+    assert (found.accepted, found.reason, found.load_factor) == (False, "diverged", 1.0)
     assert found.amplitude == loads[1].amplitude
     assert (found.iterations, found.seconds, len(found.force)) == (0, 0.0, 0)
     assert np.isnan([found.residual, found.volume_ratio]).all()
-    assert same(select(shard, loads[2].job, line(*loads, rejected=[6])), loads[2])
+    assert same(select(shard, loads[2].job, line(*loads)), loads[2])
 
 
 def test_poissons_ratios_are_kept_where_loads_have_their_own():
     loads = [solved(5), solved(6)]
-    ratio = lambda points: points[:, -1:]  # noqa: E731
-    whole = content(*loads, poisson=ratio)
+    whole = content(*loads, n_poisson=1)
     points = torch.from_numpy(np.stack([one.point for one in loads]))
-    assert torch.equal(decode_shard(whole, SHAPE, DIMENSION, 1)["poisson"], ratio(points))
-    with pytest.raises(ValueError, match="this scene has one for all loads"):
+    assert torch.equal(decode_shard(whole, SHAPE, DIMENSION, 1)["poisson"], points[:, -1:])
+    with pytest.raises(ValueError, match="poisson has shape"):
         decode_shard(whole, SHAPE, DIMENSION, 0)
-    with pytest.raises(ValueError, match="is damaged"):
+    with pytest.raises(ValueError, match="poisson has shape"):
         decode_shard(content(*loads), SHAPE, DIMENSION, 1)
 
 
-def test_a_load_of_the_spool_comes_out_as_it_was_put_in():
-    for one in (solved(3), solved(4, nodes=()), solved(5, accepted=False)):
-        assert same(deserialize(serialize(one)), one)
+def test_a_pending_load_is_a_shard_of_one_load_with_its_line_of_the_manifest(tmp_path):
+    pending = PendingLoads(tmp_path / "pending", {"val": (7, 1)}, lambda points: points[:, 2:])
+    for one in (solved(3), solved(4, nodes=())):
+        entry, columns = pending.read(pending.write(one))
+        assert same(select(columns, one.job, entry), one)
+        assert save(columns) == content(one)
+    rejected = solved(5, accepted=False)
+    entry, columns = pending.read(pending.write(rejected))
+    assert entry == line(rejected)
+    assert select(columns, rejected.job, entry).reason == "diverged"
+    assert list(pending.files()) == [LoadKey((7, 1), k) for k in (3, 4, 5)]
 
 
 def change(name, values):
@@ -101,14 +109,23 @@ def change(name, values):
     [
         *(("node", [0, 1, 2, 3, 0, 3], True), ("node", [0, 1, 2, 3, 0, 4], False)),
         ("node", [0, 1, 2, 3, -1, 3], False),
-        *(("carried", [4, 2], True), ("carried", [2, 4], True), ("carried", [5, 1], False)),
-        ("carried", [7, -1], False),
-        *(("carried", [6, 0], False), ("carried", [3, 2], False), ("carried", [4, 3], False)),
+        *(
+            ("n_loaded_nodes", [4, 2], True),
+            ("n_loaded_nodes", [2, 4], True),
+            ("n_loaded_nodes", [5, 1], False),
+        ),
+        ("n_loaded_nodes", [7, -1], False),
+        *(
+            ("n_loaded_nodes", [6, 0], False),
+            ("n_loaded_nodes", [3, 2], False),
+            ("n_loaded_nodes", [4, 3], False),
+        ),
     ],
 )
-def test_forces_act_on_nodes_that_are_there(name, values, sound):
+def test_forces_on_nodes_that_do_not_exist_are_refused(name, values, sound):
     if sound:
-        assert decode_shard(change(name, values), SHAPE, DIMENSION)["force"].shape == (2, *SHAPE)
+        shard = decode_shard(change(name, values), SHAPE, DIMENSION)
+        assert to_dense(shard, SHAPE).shape == (2, *SHAPE)
         return
     with pytest.raises(ValueError, match="is damaged"):
         decode_shard(change(name, values), SHAPE, DIMENSION)
@@ -116,7 +133,7 @@ def test_forces_act_on_nodes_that_are_there(name, values, sound):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("name", ["point", "nodal_force", "displacement"])
-def test_numbers_of_a_sample_are_finite(name, value):
+def test_numbers_of_a_sample_that_are_not_finite_are_refused(name, value):
     columns = load(content(solved(5)))
     columns[name].view(-1)[-1] = value
     with pytest.raises(ValueError, match=f"is damaged: {name} is not finite"):
@@ -124,7 +141,7 @@ def test_numbers_of_a_sample_are_finite(name, value):
 
 
 @pytest.mark.parametrize("name", sorted(load(content(solved(5)))))
-def test_each_column_has_its_shape_and_kind(name):
+def test_columns_of_wrong_shape_or_type_are_refused(name):
     genuine = load(content(solved(5), solved(6)))
     column = genuine[name]
     other = torch.int16 if column.dtype != torch.int64 else torch.int32
@@ -137,7 +154,7 @@ def test_each_column_has_its_shape_and_kind(name):
         )
 
 
-# ------------------------------------------------------------------ what the store makes of them
+# ------------------------------------------------------------------ shards of a store
 
 
 @pytest.mark.parametrize(
@@ -152,12 +169,12 @@ def test_each_column_has_its_shape_and_kind(name):
     ],
 )
 def test_a_file_holds_consecutive_loads_of_one_block(monkeypatch, indices, whole, expected):
-    monkeypatch.setattr(store_module, "SHARD", 4)
+    monkeypatch.setattr(store_module, "SHARD_SIZE", 4)
     assert list(runs(indices, whole=whole)) == expected
 
 
-def test_blocks_of_loads_fall_to_writers_in_turn(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(store_module, "SHARD", 2)
+def test_writers_take_blocks_of_loads_in_turn(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(store_module, "SHARD_SIZE", 2)
     store = store_module.Store(tmp_path / "none", scene, 0)
     assert store.missing("train", 9) == list(range(9))
     assert [store.missing("train", 9, k, 3) for k in range(3)] == [[0, 1, 6, 7], [2, 3, 8], [4, 5]]
@@ -170,10 +187,8 @@ def test_the_largest_shard_is_one_whose_loads_act_on_every_node(scene):
         *(LoadKey((0, 0), 0), np.zeros(scene.loads.n_random), np.ones((nodes, dim))),
         *(np.ones((nodes, dim)), 1.0, True, 0.0, 1.0, 1.0, 1, 0.0, ""),
     )
-    sizes = []
-    for count in (1, 2):
-        kept = [every._replace(job=LoadKey((0, 0), k)) for k in range(count)]
-        sizes.append(len(encode_shard(kept, (nodes, dim), scene.loads.n_random, None)))
-    load_size = store.largest(2) - store.largest(1)
+    columns = encode_load(every, torch.zeros(1, 0))
+    sizes = [len(save(concatenate(count * [columns]))) for count in (1, 2)]
+    load_size = store.max_shard_size(2) - store.max_shard_size(1)
     assert sizes[1] - sizes[0] <= load_size <= 2 * (sizes[1] - sizes[0])
-    assert store.largest(0) == store_module.HEADER
+    assert store.max_shard_size(0) == store_module.HEADER

@@ -32,13 +32,13 @@ def hard(make_scene):
     return make_scene(law=SaintVenantKirchhoff, deflection=10.0, patch_radius=(2.0, 2.0))
 
 
-def test_an_outcome_does_not_depend_on_what_was_solved_before(scene, jobs):
+def test_a_solution_does_not_depend_on_the_loads_solved_before(scene, jobs):
     forwards = [content(solve_load(scene, job)) for job in jobs]
     backwards = [content(solve_load(scene, job)) for job in jobs[::-1]]
     assert backwards[::-1] == forwards
 
 
-def test_an_outcome_does_not_depend_on_the_scene_object_its_size_and_stiffness(
+def test_a_solution_does_not_depend_on_the_scene_object_its_size_and_stiffness(
     scene, make_scene, jobs
 ):
     twin = make_scene(size=(1.0, 0.25, 0.25), young=2e11)
@@ -58,7 +58,7 @@ def test_streams_and_numbers_name_different_loads(scene):
     assert len(forces) == 8
 
 
-def test_an_outcome_is_judged_at_the_state_that_it_holds(scene, jobs):
+def test_residual_and_volume_ratio_belong_to_the_returned_displacement(scene, jobs):
     for job in jobs:
         one = solve_load(scene, job)
         force, displacement = torch.from_numpy(one.force), torch.from_numpy(one.displacement)
@@ -74,7 +74,7 @@ def test_an_outcome_is_judged_at_the_state_that_it_holds(scene, jobs):
         assert one.reason == ""
 
 
-def test_an_outcome_holds_the_load_of_its_point_and_its_size(scene, jobs):
+def test_a_solved_load_holds_force_point_and_amplitude(scene, jobs):
     one = solve_load(scene, jobs[2])
     load = scene.loads.sample(SEED, [2])
     assert torch.equal(torch.from_numpy(one.force), load.force[0])
@@ -83,14 +83,14 @@ def test_an_outcome_holds_the_load_of_its_point_and_its_size(scene, jobs):
     assert 0 < one.amplitude <= 1
 
 
-def test_a_point_that_is_given_takes_the_place_of_the_streams_own(scene, jobs):
+def test_a_given_point_replaces_the_point_of_the_stream(scene, jobs):
     point = scene.loads.points(SEED, [7])[0]
     given, drawn = solve_load(scene, jobs[0], point=point), solve_load(scene, jobs[7])
     assert given.job == jobs[0]
     assert content(given) | {"job": jobs[7]} == content(drawn)
 
 
-def test_a_load_without_an_answer_is_rejected_with_the_part_that_has_one(hard):
+def test_a_load_without_a_solution_is_rejected_with_the_fraction_that_has_one(hard):
     found = [solve_load(hard, LoadKey(SEED, index)) for index in range(6)]
     rejected = [one for one in found if not one.accepted]
     assert rejected, "SVK bears six loads of ten times L: choose harder ones"
@@ -104,7 +104,7 @@ def test_a_load_without_an_answer_is_rejected_with_the_part_that_has_one(hard):
             assert hard.problem.volume_ratio(displacement) > 0
 
 
-def test_a_load_that_the_machine_lost_is_the_load_without_an_answer(scene, jobs):
+def test_a_failed_load_has_its_force_and_no_displacement(scene, jobs):
     one, solved = (
         failed_load(scene, jobs[1], "the lights went out", seconds=3.0),
         solve_load(scene, jobs[1]),
@@ -120,7 +120,7 @@ def test_a_load_that_the_machine_lost_is_the_load_without_an_answer(scene, jobs)
         assert np.array_equal(getattr(one, name), getattr(solved, name))
 
 
-def test_outcomes_cross_between_processes_without_tensors(scene, jobs):
+def test_solved_loads_are_pickled_without_tensors(scene, jobs):
     for one in (solve_load(scene, jobs[0]), failed_load(scene, jobs[0], "gone")):
         for value in one:
             assert isinstance(value, LoadKey | np.ndarray | float | int | str)
@@ -129,7 +129,7 @@ def test_outcomes_cross_between_processes_without_tensors(scene, jobs):
         )  # nan is not nan
 
 
-def test_a_change_of_the_number_of_threads_between_loads_is_survived(tmp_path, environment):
+def test_the_number_of_threads_may_change_between_loads(tmp_path, environment):
     """PARDISO reads past its plan where threads are limited between analysis and factorisation."""
     pytest.importorskip("pypardiso")
     code = """

@@ -22,9 +22,9 @@ from dpl.data.solving.solve import LoadKey, failed_load, solve_load
 from dpl.data.solving.worker_pool import GracefulShutdown
 from dpl.data.storage import store as store_module
 from dpl.data.storage import writer as writer_module
-from dpl.data.storage.integrity import MACHINE, repair, verify
+from dpl.data.storage.integrity import MACHINE_FAILURES, repair, verify
 from dpl.data.storage.manifest import shard_name
-from dpl.data.storage.pending import PendingSamples
+from dpl.data.storage.pending import PendingLoads
 from dpl.data.storage.shard import to_dense, to_sparse
 from dpl.fem import SaintVenantKirchhoff, rectangle
 from dpl.system.files import append_jsonl
@@ -35,7 +35,7 @@ WANTED = {split: range(size) for split, size in SIZES.items()}
 
 @pytest.fixture
 def copy(data, tmp_path):
-    """The tiny data set in a folder that may be harmed."""
+    """A copy of the tiny data set that may be damaged."""
     folder = tmp_path / "copy"
     shutil.copytree(data.store.folder, folder)
     return Store(folder, data.scene, data.store.seed)
@@ -49,7 +49,7 @@ def fresh(scene, tmp_path):
 
 @pytest.fixture
 def solved(monkeypatch):
-    """The loads that are solved, as they are."""
+    """The list of solved loads, extended by each solve."""
     found = []
 
     def counted(scene, job):
@@ -198,7 +198,7 @@ def test_rejected_loads_are_recorded_with_reason_and_load_factor(hard, tmp_path)
     assert flaws(store) == {}
 
 
-def test_a_shard_of_rejects_alone_is_a_shard(scene, fresh, monkeypatch):
+def test_a_shard_may_hold_rejected_loads_only(scene, fresh, monkeypatch):
     monkeypatch.setattr(
         "dpl.data.solving.worker_pool.solve_load",
         lambda scene, job: failed_load(scene, job, "never"),
@@ -218,7 +218,7 @@ def test_a_shard_of_rejects_alone_is_a_shard(scene, fresh, monkeypatch):
 
 
 @pytest.mark.parametrize("shape", [(7, 3), (5, 2)])
-def test_forces_come_back_from_their_compact_form(shape):
+def test_forces_are_restored_from_their_sparse_form(shape):
     generator = torch.Generator().manual_seed(0)
     force = torch.randn(6, *shape, generator=generator, dtype=torch.float64)
     force[torch.rand(6, shape[0], generator=generator) < 0.6] = 0.0
@@ -226,18 +226,18 @@ def test_forces_come_back_from_their_compact_form(shape):
     force[3] = 0.0
     packed = to_sparse(force)
     assert torch.equal(to_dense(packed, shape), force)
-    assert len(packed["nodal_force"]) == len(packed["node"]) == packed["carried"].sum()
-    assert packed["carried"][3] == 0
+    assert len(packed["nodal_force"]) == len(packed["node"]) == packed["n_loaded_nodes"].sum()
+    assert packed["n_loaded_nodes"][3] == 0
     assert packed["node"].dtype == torch.int32
     assert packed["nodal_force"].abs().amax(dim=1).min() > 0, "nothing is stored of idle nodes"
 
 
-def test_no_forces_come_back_as_none():
+def test_an_empty_batch_of_forces_is_restored():
     force = torch.zeros(0, 7, 3, dtype=torch.float64)
     assert to_dense(to_sparse(force), (7, 3)).shape == (0, 7, 3)
 
 
-def test_shards_hold_forces_of_loaded_nodes_alone(data):
+def test_shards_hold_forces_of_loaded_nodes_only(data):
     shard = load_file(data.store.folder / lines(data.store)[0]["file"])
     assert "force" not in shard
     assert (
@@ -255,7 +255,7 @@ def test_forces_that_every_load_holds_are_stored_and_verified(scene, make_scene,
     assert flaws(store) == {}
 
 
-def test_bodies_in_the_plane_are_stored_too(make_scene, tmp_path):
+def test_samples_of_plane_bodies_are_stored(make_scene, tmp_path):
     mesh = rectangle([4.0, 1.0], [9, 3])
     store = Store(tmp_path / "d", make_scene(mesh=mesh, deflection=0.1), 0)
     fill(store, {"train": range(3)})
@@ -283,7 +283,7 @@ def test_the_bytes_do_not_depend_on_the_order_in_which_loads_are_solved(data, fr
 
 @pytest.mark.parametrize("size", [1, 5, 1000])
 def test_the_samples_do_not_depend_on_the_size_of_shards(data, fresh, monkeypatch, size):
-    monkeypatch.setattr(store_module, "SHARD", size)
+    monkeypatch.setattr(store_module, "SHARD_SIZE", size)
     fill(fresh, WANTED)
     assert max(line["tried"] for line in lines(fresh)) == min(size, 12)
     for split, count in SIZES.items():
@@ -295,7 +295,7 @@ def test_the_samples_do_not_depend_on_the_size_of_shards(data, fresh, monkeypatc
 def test_a_run_interrupted_anywhere_and_resumed_makes_the_same_bytes(
     scene, tmp_path, monkeypatch, solved, after
 ):
-    monkeypatch.setattr(store_module, "SHARD", 4)
+    monkeypatch.setattr(store_module, "SHARD_SIZE", 4)
     whole, store = Store(tmp_path / "whole", scene, 0), Store(tmp_path / "d", scene, 0)
     fill(whole)
     solved.clear()
@@ -307,7 +307,7 @@ def test_a_run_interrupted_anywhere_and_resumed_makes_the_same_bytes(
     assert fill(store) == 20 - after
     assert len(set(solved)) == len(solved) == 20, "no load is solved twice"
     assert content(store) == content(whole)
-    assert not (store.folder / "spool").exists()
+    assert not (store.folder / "pending").exists()
     assert fill(store) == 0
 
 
@@ -322,10 +322,8 @@ def test_interrupted_at_every_load_the_bytes_are_the_same(data, fresh, solved):
     assert content(fresh) == content(data.store)
 
 
-def test_what_was_solved_before_a_kill_between_shard_and_spool_is_cleared_away(
-    data, fresh, monkeypatch
-):
-    """The shard has its line, and some of its loads are in the spool still."""
+def test_pending_files_whose_shard_exists_are_removed(data, fresh, monkeypatch):
+    """The run was killed between writing a shard and removing its pending files."""
     monkeypatch.setattr(Path, "unlink", lambda *_, **__: (_ for _ in ()).throw(SystemExit(9)))
     with pytest.raises(SystemExit):
         fill(fresh, {"train": range(12)})
@@ -333,39 +331,39 @@ def test_what_was_solved_before_a_kill_between_shard_and_spool_is_cleared_away(
     assert fresh.missing("train", 12) == []
     fill(fresh)
     assert content(fresh) == content(data.store)
-    assert not (fresh.folder / "spool").exists()
+    assert not (fresh.folder / "pending").exists()
 
 
-def test_a_spooled_load_that_is_damaged_is_solved_again(data, fresh, solved):
+def test_a_damaged_pending_load_is_solved_again(data, fresh, solved):
     running = Writer(fresh).fill(WANTED, workers=0)
     for _ in range(5):
         next(running)
     running.close()
-    spool = sorted((fresh.folder / "spool").iterdir())
-    assert len(spool) == 5
-    harmed = bytearray(spool[2].read_bytes())
+    files = sorted((fresh.folder / "pending").iterdir())
+    assert len(files) == 5
+    harmed = bytearray(files[2].read_bytes())
     harmed[-5] ^= 1
-    spool[2].write_bytes(harmed)
-    spool[3].write_bytes(spool[3].read_bytes()[:-8])
-    spool[4].write_bytes(b"")  # not synced, the machine crashed
+    files[2].write_bytes(harmed)
+    files[3].write_bytes(files[3].read_bytes()[:-8])
+    files[4].write_bytes(b"")  # not synced, the machine crashed
     solved.clear()
     fill(fresh, WANTED)
     assert solved[:3] == [(0, 0, 2), (0, 0, 3), (0, 0, 4)]
     assert content(fresh) == content(data.store)
 
 
-def test_what_killed_processes_were_writing_is_removed(data, fresh):
+def test_partial_files_of_killed_processes_are_removed(data, fresh):
     running = Writer(fresh).fill(WANTED, workers=0)
     next(running)
     running.close()
     long_ago = time.time() - 3600
     for path in (fresh.folder / ".train-000000.safetensors.123.part",
-                 fresh.folder / "spool" / ".train-000001.load.123.part"):  # fmt: skip
+                 fresh.folder / "pending" / ".train-000001.load.123.part"):  # fmt: skip
         path.write_bytes(b"half of it")
         os.utime(path, (long_ago, long_ago))
     fill(fresh)
     assert hidden(fresh) == []
-    assert not (fresh.folder / "spool").exists()
+    assert not (fresh.folder / "pending").exists()
     assert content(fresh) == content(data.store)
 
 
@@ -400,7 +398,7 @@ def test_growing_solves_only_the_new_loads_and_gives_the_same_samples(data, fres
 
 
 def test_shards_begin_at_multiples_of_their_size(fresh, monkeypatch):
-    monkeypatch.setattr(store_module, "SHARD", 4)
+    monkeypatch.setattr(store_module, "SHARD_SIZE", 4)
     for count in (6, 11):
         fill(fresh, {"train": fresh.missing("train", count)})
     assert [(line["first"], line["tried"]) for line in lines(fresh)] == [
@@ -408,7 +406,7 @@ def test_shards_begin_at_multiples_of_their_size(fresh, monkeypatch):
     ]  # fmt: skip
 
 
-def test_loads_that_another_process_has_solved_meanwhile_are_not_solved_again(data, fresh, solved):
+def test_loads_that_another_process_has_solved_are_not_solved_again(data, fresh, solved):
     fill(fresh, {"train": range(5)})  # what the other one did after this one had looked
     solved.clear()
     fill(fresh, WANTED)
@@ -417,8 +415,8 @@ def test_loads_that_another_process_has_solved_meanwhile_are_not_solved_again(da
     assert fresh.digest("train", 12) == data.store.digest("train", 12)
 
 
-def test_samples_do_not_depend_on_who_had_a_load_that_two_writers_had(data, copy):
-    """Parts of different divisions that were copied into one folder."""
+def test_a_load_that_two_writers_have_solved_is_read_once(data, copy):
+    """Parts of different divisions were copied into one folder."""
     (copy.folder / "manifest-0-of-2.jsonl").write_bytes(
         (copy.folder / "manifest.jsonl").read_bytes()
     )
@@ -430,7 +428,7 @@ def test_samples_do_not_depend_on_who_had_a_load_that_two_writers_had(data, copy
 
 
 def test_parts_made_by_several_writers_are_the_same_samples(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(store_module, "SHARD", 2)
+    monkeypatch.setattr(store_module, "SHARD_SIZE", 2)
     whole, store = Store(tmp_path / "whole", scene, 0), Store(tmp_path / "d", scene, 0)
     fill(whole)
     running = []
@@ -469,12 +467,12 @@ def test_a_second_writer_of_the_whole_or_of_the_same_part_is_refused(fresh):
     assert fill(fresh) == 19
 
 
-def test_a_load_of_another_part_that_vanishes_from_the_spool_is_no_crash(data, fresh):
+def test_a_pending_file_that_another_process_removes_is_ignored(data, fresh):
     Writer(fresh).create()
-    spool = fresh.folder / "spool"
-    spool.mkdir()
-    gone = spool / "train-000099.load"
-    gone.symlink_to(spool / "nothing")  # listed, and then not there
+    pending = fresh.folder / "pending"
+    pending.mkdir()
+    gone = pending / "train-000099.load"
+    gone.symlink_to(pending / "nothing")  # listed, and then not there
     assert fresh.pending.files() == {}
     gone.unlink()
 
@@ -482,25 +480,25 @@ def test_a_load_of_another_part_that_vanishes_from_the_spool_is_no_crash(data, f
 # ------------------------------------------------------------------ interruption
 
 
-def test_a_stop_keeps_what_is_solved(fresh):
+def test_an_interrupted_run_keeps_solved_loads(fresh):
     stop = GracefulShutdown()
     found = 0
     for _ in Writer(fresh).fill(WANTED, workers=0, stop=stop):
         found += 1
-        stop._asked = found == 3
+        stop._requested = found == 3
     assert found == 3
-    assert len(list((fresh.folder / "spool").iterdir())) == 3
+    assert len(list((fresh.folder / "pending").iterdir())) == 3
     assert not list(fresh.folder.glob("train*"))
 
 
-def test_an_error_in_writing_ends_the_workers_even_while_it_is_held(fresh, monkeypatch):
-    """A traceback holds the frames, and these the crew, unless who uses the crew closes it."""
+def test_an_error_in_writing_ends_the_workers(fresh, monkeypatch):
+    """A traceback references the frames of the pool, which must be closed all the same."""
     before = multiprocessing.active_children()
 
     def keep(self, one):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(PendingSamples, "put", keep)
+    monkeypatch.setattr(PendingLoads, "write", keep)
     with pytest.raises(OSError, match="No space left") as held:
         fill(fresh, WANTED, workers=1)
     try:
@@ -524,7 +522,7 @@ def test_a_data_set_of_another_scene_is_refused_naming_both_fingerprints(copy, m
         assert "law" in str(refusal.value)
 
 
-def test_the_twin_of_another_size_shares_the_set_and_gets_its_own_moduli(copy, make_scene, solved):
+def test_a_body_of_another_size_shares_the_set_with_its_own_moduli(copy, make_scene, solved):
     twin = make_scene(size=(1.0, 0.25, 0.25), young=[1e9, 2e11])
     shared = Store(copy.folder, twin, 0)
     assert fill(shared) == 0
@@ -547,7 +545,7 @@ def test_a_data_set_of_another_seed_is_refused(copy):
         fill(other, WANTED)
 
 
-def test_a_folder_that_is_no_data_set_is_refused_and_left_as_it_is(scene, tmp_path):
+def test_a_folder_that_is_no_data_set_is_refused_and_not_changed(scene, tmp_path):
     (tmp_path / "thesis.txt").write_text("years of work")
     store = Store(tmp_path, scene, 0)
     with pytest.raises(DataSetError, match="no data set"):
@@ -567,11 +565,11 @@ def test_an_unknown_format_is_refused(copy):
     "harm",
     [
         *("", "{", "[]", "null", "\0\0\0"),
-        '{"format": 2}',
-        '{"format": 2, "fingerprint": 3}',
+        '{"format": 3}',
+        '{"format": 3, "fingerprint": 3}',
     ],
 )
-def test_a_damaged_card_is_refused_naming_it(copy, harm):
+def test_a_damaged_scene_file_is_refused_by_name(copy, harm):
     (copy.folder / "scene.json").write_text(harm)
     with pytest.raises(DataSetError, match=r"scene\.json|format|another scene"):
         copy.shards()
@@ -585,8 +583,8 @@ def test_a_data_set_of_another_scene_is_refused_by_key_with_both_values(copy):
         copy.shards()
 
 
-def test_a_data_set_whose_card_says_1_for_1_0_is_that_of_the_scene(copy):
-    """As older versions wrote it, with another fingerprint."""
+def test_numbers_of_the_scene_file_are_compared_by_value(copy):
+    """1 equals 1.0 even if the fingerprint differs."""
     card = json.loads((copy.folder / "scene.json").read_text())
     lines = copy.shards()
     card["fingerprint"], card["scene"]["degree"] = "0f" * 32, 1.0
@@ -595,7 +593,7 @@ def test_a_data_set_whose_card_says_1_for_1_0_is_that_of_the_scene(copy):
 
 
 @pytest.mark.parametrize("kind", ["file", "device"])
-def test_a_folder_that_is_none_is_refused_by_its_key(scene, tmp_path, kind):
+def test_a_folder_that_is_a_file_is_refused_by_its_key(scene, tmp_path, kind):
     path = Path("/dev/null") if kind == "device" else tmp_path / "file"
     path.touch()
     with pytest.raises(DataSetError, match=r"^data\.folder = .* must be a folder"):
@@ -603,7 +601,7 @@ def test_a_folder_that_is_none_is_refused_by_its_key(scene, tmp_path, kind):
 
 
 @pytest.mark.parametrize("harm", ["{}", '{"split": "train"}', '{"first": 0, "tried": 3}'])
-def test_a_line_of_the_manifest_that_lacks_something_counts_as_torn(copy, harm):
+def test_a_line_of_the_manifest_with_missing_keys_is_ignored(copy, harm):
     with (copy.folder / "manifest.jsonl").open("a") as file:
         file.write(harm + "\n")
     assert copy.missing("train", 13) == [12]
@@ -616,8 +614,8 @@ def test_an_empty_split_is_refused(copy):
 
 
 @pytest.mark.skipif(os.system("unshare -rm true 2>/dev/null") != 0, reason="needs unshare")
-def test_a_folder_that_may_only_be_read_is_read(copy, environment):
-    """Root may write everywhere, so it is mounted so."""
+def test_a_read_only_folder_can_only_be_read(copy, environment):
+    """The folder is mounted read-only, since root may write everywhere."""
     code = (
         "import sys; from dpl.system.files import read_jsonl; from pathlib import Path; "
         "folder = Path(sys.argv[1]); "
@@ -645,7 +643,7 @@ def test_a_folder_that_may_only_be_read_is_read(copy, environment):
 
 
 @pytest.mark.parametrize("harm", ["a flipped bit", "a cut end", "no file"])
-def test_a_damaged_shard_is_found_and_named(copy, harm):
+def test_a_damaged_shard_is_refused_by_name(copy, harm):
     path = copy.folder / lines(copy)[0]["file"]
     content = bytearray(path.read_bytes())
     content[-9] ^= 1
@@ -717,7 +715,7 @@ def cut(shard):
         *(another_shape, another_point, nodes_that_are_not_there, no_forces, no_safetensors, cut),
     ],
 )
-def test_verify_trusts_no_digest(data, copy, change):
+def test_verify_finds_damaged_shards_whose_digest_is_right(data, copy, change):
     before = content(data.store)
     name = rewrite(copy, change)
     assert list(flaws(copy)) == [name]
@@ -743,9 +741,9 @@ def as_float32(shard):
 
 
 def forces_on_less_than_no_node(shard):
-    shard["carried"] = shard["carried"].flip(0).contiguous()
-    shard["carried"][0] += shard["carried"][1] + 1
-    shard["carried"][1] = -1
+    shard["n_loaded_nodes"] = shard["n_loaded_nodes"].flip(0).contiguous()
+    shard["n_loaded_nodes"][0] += shard["n_loaded_nodes"][1] + 1
+    shard["n_loaded_nodes"][1] = -1
 
 
 def endless_force(shard):
@@ -756,7 +754,7 @@ def endless_force(shard):
     "change",
     [as_float32, forces_on_less_than_no_node, endless_force, not_a_number, a_load_less],
 )
-def test_numbers_that_cannot_be_samples_are_refused_even_with_a_right_digest(copy, change):
+def test_invalid_numbers_are_refused_even_if_the_digest_is_right(copy, change):
     name = rewrite(copy, change)
     with pytest.raises(DataSetError, match=rf"{name} .*action=repair"):
         copy.load("train", 12)
@@ -773,7 +771,7 @@ IMPOSSIBLE = [
 
 
 @pytest.mark.parametrize("harm", IMPOSSIBLE)
-def test_a_line_of_the_manifest_that_says_what_cannot_be_counts_as_torn(copy, data, harm):
+def test_an_invalid_line_of_the_manifest_is_solved_again(copy, data, harm):
     found = lines(copy)
     assert found[0]["split"] == "train"
     found[0] |= harm
@@ -787,7 +785,7 @@ def test_a_line_of_the_manifest_that_says_what_cannot_be_counts_as_torn(copy, da
 
 @pytest.mark.parametrize("name", ["scene.json", "manifest.jsonl", "modes.safetensors", "shard"])
 @pytest.mark.parametrize("harm", ["a link", "a loop", "a folder", "a pipe", "huge"])
-def test_what_is_no_file_of_its_own_is_refused_by_name_and_not_read(copy, tmp_path, name, harm):
+def test_irregular_files_are_refused_by_name_and_not_read(copy, tmp_path, name, harm):
     name = lines(copy)[0]["file"] if name == "shard" else name
     path = copy.folder / name
     if harm == "huge":
@@ -820,11 +818,11 @@ def test_modes_of_another_precision_are_found(copy):
 
 
 @pytest.mark.parametrize("line", ["{}", '{"loads": "many"}', "[" * 99_999, '{"loads": NaN}'])
-def test_a_line_of_the_journal_that_says_nothing_is_left_out(copy, line):
-    told, a_load = copy.summary(), copy.seconds_a_load()
+def test_an_invalid_line_of_the_journal_is_ignored(copy, line):
+    told, a_load = copy.summary(), copy.seconds_per_load()
     with (copy.folder / "journal.jsonl").open("a") as file:
         file.write(line + "\n")
-    assert (copy.summary(), copy.seconds_a_load()) == (told, a_load)
+    assert (copy.summary(), copy.seconds_per_load()) == (told, a_load)
 
 
 def test_a_shard_under_the_name_of_another_is_refused(copy):
@@ -836,13 +834,13 @@ def test_a_shard_under_the_name_of_another_is_refused(copy):
         file.write(json.dumps(line) + "\n")
     read = copy.reader("train")
     assert read(0) is not None
-    with pytest.raises(DataSetError, match=r"holds other loads than the manifest says"):
+    with pytest.raises(DataSetError, match=r"holds other loads than its line of the manifest"):
         read(6400)
 
 
 def test_a_load_under_the_name_of_another_is_solved_again(fresh, data, scene):
     Writer(fresh).create()
-    paths = [fresh.pending.put(solve_load(scene, LoadKey((0, 0), number))) for number in (0, 1)]
+    paths = [fresh.pending.write(solve_load(scene, LoadKey((0, 0), number))) for number in (0, 1)]
     paths[1].write_bytes(paths[0].read_bytes())
     (paths[0].parent / "train-one.load").write_bytes(b"mine")
     (paths[0].parent / "rain-000001.load").write_bytes(b"mine")
@@ -867,7 +865,7 @@ def test_a_file_outside_the_folder_is_not_read(copy):
 
 
 @pytest.mark.parametrize("harm", [b"", b"half of it", None])
-def test_damaged_modes_are_found_and_made_again(copy, harm):
+def test_damaged_modes_are_found_and_written_again(copy, harm):
     path = copy.folder / "modes.safetensors"
     whole = path.read_bytes()
     path.write_bytes(harm or b"") if harm is not None else path.unlink()
@@ -878,7 +876,7 @@ def test_damaged_modes_are_found_and_made_again(copy, harm):
     assert path.read_bytes() == whole
 
 
-def test_a_sound_set_has_no_flaw_and_repair_changes_nothing(copy, solved):
+def test_an_undamaged_set_has_no_flaw_and_repair_changes_nothing(copy, solved):
     before = content(copy)
     assert [flaw for _, flaw in verify(copy)] == 4 * [""]
     assert not repair(copy)
@@ -887,7 +885,7 @@ def test_a_sound_set_has_no_flaw_and_repair_changes_nothing(copy, solved):
     assert content(copy) == before
 
 
-def test_repair_makes_damaged_shards_again_and_no_others(copy, data, solved):
+def test_repair_solves_the_loads_of_damaged_shards_only(copy, data, solved):
     before = content(data.store)
     damaged = lines(copy)[1]
     (copy.folder / damaged["file"]).write_bytes(b"nothing")
@@ -900,24 +898,24 @@ def test_repair_makes_damaged_shards_again_and_no_others(copy, data, solved):
     assert sorted(manifests[0]) == sorted(manifests[1])
 
 
-def test_a_repaired_manifest_is_that_of_a_set_made_at_once(copy, data):
+def test_a_repaired_manifest_equals_that_of_a_set_made_at_once(copy, data):
     (copy.folder / lines(copy)[0]["file"]).unlink()
     repair(copy)
     fill(copy)
     assert content(copy) == content(data.store)
 
 
-def test_repair_retries_loads_that_the_machine_lost_and_no_others(hard, tmp_path, monkeypatch):
+def test_repair_retries_loads_that_the_machine_lost_only(hard, tmp_path, monkeypatch):
     store = Store(tmp_path / "d", hard, 0)
     sound = Store(tmp_path / "sound", hard, 0)
-    reasons = {1: f"{MACHINE[0]} after 1 s", 4: f"{MACHINE[1]} 3 times"}
+    reasons = {1: f"{MACHINE_FAILURES[0]} after 1 s", 4: f"{MACHINE_FAILURES[1]} 3 times"}
 
     def unlucky(scene, job):
         if job.number in reasons:
             return failed_load(scene, job, reasons[job.number])
         return solve_load(scene, job)
 
-    monkeypatch.setattr(store_module, "SHARD", 3)
+    monkeypatch.setattr(store_module, "SHARD_SIZE", 3)
     fill(sound, {"train": range(9)})
     monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", unlucky)
     fill(store, {"train": range(9)})
@@ -930,7 +928,7 @@ def test_repair_retries_loads_that_the_machine_lost_and_no_others(hard, tmp_path
     assert not repair(store)
 
 
-def test_repair_removes_what_no_manifest_names(copy):
+def test_repair_removes_files_that_no_manifest_names(copy):
     before = content(copy)
     stray = copy.folder / "train-000012.safetensors"
     stray.write_bytes(b"half a shard")
@@ -972,34 +970,34 @@ def test_a_line_torn_inside_its_reject_list_is_solved_again(hard, tmp_path):
 # ------------------------------------------------------------------ loads that came by a stream
 
 
-def test_kept_loads_make_shards_when_they_make_whole_ones(data, fresh, scene, monkeypatch):
-    monkeypatch.setattr(store_module, "SHARD", 4)
+def test_collect_writes_whole_shards_of_pending_loads(data, fresh, scene, monkeypatch):
+    monkeypatch.setattr(store_module, "SHARD_SIZE", 4)
     Writer(fresh).create()
     for number in (5, 1, 0, 2, 7, 6, 4):
-        fresh.pending.put(solve_load(scene, LoadKey((0, 0), number)))
+        fresh.pending.write(solve_load(scene, LoadKey((0, 0), number)))
     Writer(fresh).collect("train")
     assert [line["first"] for line in lines(fresh)] == [4]
     assert len(fresh.pending.files()) == 3
-    fresh.pending.put(solve_load(scene, LoadKey((0, 0), 3)))
+    fresh.pending.write(solve_load(scene, LoadKey((0, 0), 3)))
     Writer(fresh).collect("train")
     assert fresh.pending.files() == {}
     assert fresh.digest("train", 8) == data.store.digest("train", 8)
 
 
-def test_the_time_of_a_load_is_the_mean_over_all_sessions(copy):
+def test_the_time_per_load_is_the_mean_over_all_sessions(copy):
     (copy.folder / "journal.jsonl").unlink()
-    assert copy.seconds_a_load() is None
+    assert copy.seconds_per_load() is None
     for line in (
         {"loads": 10, "seconds": 4.0, "core_seconds": 8.0},
         {"loads": 30, "seconds": 4.0, "core_seconds": 24.0},
         {"loads": 30, "seconds": "long"},
     ):
         append_jsonl(copy.folder / "journal.jsonl", line)
-    assert copy.seconds_a_load() == pytest.approx(8.0 / 40)
-    assert "0.800 s a load on one core, 8 s of wall time in 2 sessions" in copy.summary()
+    assert copy.seconds_per_load() == pytest.approx(8.0 / 40)
+    assert "0.800 s per load on one core, 8 s of wall time in 2 sessions" in copy.summary()
 
 
-def test_a_line_that_names_the_shard_of_another_split_gives_none_of_its_loads(copy, data):
+def test_a_line_that_names_the_shard_of_another_split_is_ignored(copy, data):
     first, other = (line for line in lines(copy) if line["first"] == 0 and line["split"] != "test")
     line = other | {"split": first["split"]}
     (copy.folder / "manifest.jsonl").write_text(json.dumps(line) + "\n")

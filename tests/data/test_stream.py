@@ -1,4 +1,4 @@
-"""Laws of the endless stream: whoever solves it, every load once, used boundedly, nobody left."""
+"""Laws of the stream and the replay buffer: each load once, bounded reuse, faults of workers."""
 
 import itertools
 import json
@@ -22,7 +22,7 @@ from dpl import Sample
 from dpl.data import OnlineSamples, ReplayBuffer
 from dpl.data.replay_buffer import StreamRates
 from dpl.data.solving.solve import LoadKey, solve_load
-from dpl.data.stream import NEIGHBOURHOOD, DrawnSample, HardExamples
+from dpl.data.stream import PERTURBATION, DrawnSample, HardExamples
 from dpl.fem import Newton
 from dpl.scene import stack
 
@@ -30,25 +30,25 @@ SEED = (0, 0)
 
 
 class Numbers(IterableDataset):
-    """A stream like `OnlineSamples`, without mechanics: the modulus is the place in it.
+    """A stream like `OnlineSamples` without mechanics; the modulus is the number of the load.
 
     Attributes:
-        end: Where it ends; never if left out.
-        deadly: The place that always kills its worker.
-        pause: Seconds that each worker takes for a sample.
+        end: Number at which it ends; None: never.
+        deadly: Number of the load that kills its worker.
+        pause: Time per sample of each worker [s].
     """
 
     def __init__(self, end=None, *, deadly=None, pause=(), shape=(2, 3)):
-        self.first, self.lane, self.lanes, self.worst = 0, 0, 1, None
-        self.starts = {}
+        self.first, self.rank, self.world_size, self.hard_examples = 0, 0, 1, None
+        self.offsets = {}
         self.end, self.deadly, self.pause, self.shape = end, deadly, pause, shape
 
     def __iter__(self):
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
-        turn = self.lane * workers + worker
-        first = self.starts.get(turn, self.first + turn)
-        for place in itertools.count(first, workers * self.lanes):
+        turn = self.rank * workers + worker
+        first = self.offsets.get(turn, self.first + turn)
+        for place in itertools.count(first, workers * self.world_size):
             if self.end is not None and place >= self.end:
                 return
             if place == self.deadly:
@@ -66,7 +66,7 @@ class Numbers(IterableDataset):
 
 @pytest.fixture
 def replay():
-    """Builds replays, closed in the end."""
+    """Return a function that builds replay buffers; they are closed."""
     made = []
 
     def replay(stream=None, **options):
@@ -74,7 +74,7 @@ def replay():
             "workers": 0,
             "batch_size": 8,
             "batches": 10,
-            "fresh": 4,
+            "new_per_round": 4,
             "reuse": 6,
             "capacity": 100,
         }
@@ -86,7 +86,7 @@ def replay():
         one.close()
 
 
-def crew():
+def children():
     return {child.pid for child in multiprocessing.active_children()}
 
 
@@ -104,7 +104,7 @@ def numbers(stream, count):
 
 @pytest.fixture(scope="module")
 def drawn(scene):
-    """The first loads of the stream, as bytes by place."""
+    """The forces of the first loads of the stream, as bytes."""
     return [f.numpy().tobytes() for f in scene.loads.sample(SEED, range(32)).force]
 
 
@@ -127,7 +127,7 @@ def test_the_stream_draws_its_own_moduli(make_scene):
     assert len(young.unique()) == 6
 
 
-def test_the_stream_can_begin_anywhere(scene, drawn):
+def test_the_stream_can_start_at_any_load(scene, drawn):
     first = next(iter(OnlineSamples(scene, SEED, first=9)))
     assert first.sample.force.numpy().tobytes() == drawn[9]
 
@@ -141,27 +141,28 @@ def test_rejected_loads_do_not_enter_the_stream(scene, drawn, monkeypatch):
     assert [one.sample.force.numpy().tobytes() for one in first] == [drawn[1], drawn[4], drawn[7]]
 
 
-@pytest.mark.parametrize("lanes", [2, 3])
-def test_the_lanes_of_training_processes_are_disjoint_and_together_all(scene, lanes):
+@pytest.mark.parametrize("world_size", [2, 3])
+def test_training_processes_solve_disjoint_loads_that_cover_the_stream(scene, world_size):
     seen = [
-        numbers(OnlineSamples(scene, SEED, first=4, lane=k, lanes=lanes), 4) for k in range(lanes)
+        numbers(OnlineSamples(scene, SEED, first=4, rank=k, world_size=world_size), 4)
+        for k in range(world_size)
     ]
-    assert sorted(itertools.chain(*seen)) == list(range(4, 4 + 4 * lanes))
+    assert sorted(itertools.chain(*seen)) == list(range(4, 4 + 4 * world_size))
 
 
-def test_two_workers_solve_the_same_stream_and_end_when_it_is_closed(scene, drawn, replay):
-    before = crew()
-    options = {"fresh": 4, "batch_size": 256, "reuse": 128, "batches": 4}
+def test_two_workers_share_a_stream_and_end_when_it_is_closed(scene, drawn, replay):
+    before = children()
+    options = {"new_per_round": 4, "batch_size": 256, "reuse": 128, "batches": 4}
     stream = replay(OnlineSamples(scene, SEED), workers=2, **options)
     seen = set().union(*[keys(batch) for batch in stream])
-    started = crew() - before
+    started = children() - before
     assert len(started) == 2
     assert stream.produced == 16
     assert seen == set(drawn[:16]), "no load is left out and none is solved by both"
     next(iter(stream))  # the next epoch goes on with the same workers
-    assert crew() - before == started
+    assert children() - before == started
     stream.close()
-    assert not started & crew()
+    assert not started & children()
     assert not any(Path(f"/proc/{pid}").exists() for pid in started)
 
 
@@ -187,15 +188,15 @@ def test_nothing_starts_before_the_first_batch(replay):
     assert stream.produced == 0
 
 
-def test_an_epoch_has_its_number_of_batches_for_ever(replay):
+def test_every_epoch_has_the_same_number_of_batches(replay):
     stream = replay(batches=7)
     assert len(stream) == 7
     for _ in range(5):
         assert sum(1 for _ in stream) == 7
 
 
-def test_epochs_go_on_with_the_stream(replay):
-    stream = replay(batches=6, reuse=2, fresh=4, batch_size=8)
+def test_the_next_epoch_continues_the_stream(replay):
+    stream = replay(batches=6, reuse=2, new_per_round=4, batch_size=8)
     newest = [max(float(batch.young.max()) for batch in stream) for _ in range(4)]
     assert newest == sorted(newest)
     assert newest[-1] > 3 * newest[0]
@@ -212,15 +213,15 @@ def test_a_stream_that_ends_ends_the_epoch(replay):
 
 
 def counted(stream, batches):
-    """Return how often each place was used in so many batches."""
+    """Return the number of uses of each load in a number of batches."""
     used = [place for _ in range(batches) for place in places(next(iter(stream)))]
     return torch.bincount(torch.tensor(used), minlength=stream.produced)
 
 
 @pytest.mark.parametrize("reuse", [1, 2, 6, 50])
-@pytest.mark.parametrize(("fresh", "capacity"), [(4, 16), (8, 8), (3, 1000), (5, 12)])
-def test_no_sample_is_used_more_often_than_promised(replay, reuse, fresh, capacity):
-    stream = replay(reuse=reuse, batches=1, fresh=fresh, capacity=capacity)
+@pytest.mark.parametrize(("new_per_round", "capacity"), [(4, 16), (8, 8), (3, 1000), (5, 12)])
+def test_no_sample_is_used_more_than_reuse_times(replay, reuse, new_per_round, capacity):
+    stream = replay(reuse=reuse, batches=1, new_per_round=new_per_round, capacity=capacity)
     assert counted(stream, 300).max() <= reuse
 
 
@@ -233,13 +234,13 @@ def test_samples_are_used_half_as_often_while_the_buffer_fills(replay, reuse):
         assert (stream.produced - 4) * reuse / 2 < drawn * 8, "none is taken before it is needed"
 
 
-def test_samples_that_are_used_once_are_used_once_while_the_buffer_fills_too(replay):
+def test_with_reuse_one_each_sample_is_used_once_while_the_buffer_fills(replay):
     used = counted(replay(reuse=1, batches=1, capacity=10_000), 100)
     assert (used[:-4] == 1).all()
 
 
 @pytest.mark.parametrize("reuse", [2, 6, 50])
-def test_samples_are_used_as_often_as_promised_on_average_once_the_buffer_is_full(replay, reuse):
+def test_samples_are_used_reuse_times_on_average_once_the_buffer_is_full(replay, reuse):
     stream = replay(reuse=reuse, batches=1, capacity=64)
     while stream.produced <= 64:
         next(iter(stream))
@@ -250,20 +251,20 @@ def test_samples_are_used_as_often_as_promised_on_average_once_the_buffer_is_ful
 
 
 def test_training_starts_with_the_first_samples(replay):
-    stream = replay(reuse=50, fresh=4)
+    stream = replay(reuse=50, new_per_round=4)
     batch = next(iter(stream))
     assert stream.produced == 4
     assert set(places(batch)) <= {0, 1, 2, 3}
 
 
 def test_no_sample_is_twice_in_a_batch_if_there_are_enough(replay):
-    stream = replay(batches=1, fresh=8, reuse=4, capacity=64, batch_size=8)
+    stream = replay(batches=1, new_per_round=8, reuse=4, capacity=64, batch_size=8)
     for _ in range(300):
         assert len(set(places(next(iter(stream))))) == 8
 
 
 def test_a_batch_larger_than_the_buffer_holds_samples_more_than_once(replay):
-    stream = replay(batches=1, fresh=4, reuse=12, capacity=4, batch_size=16)
+    stream = replay(batches=1, new_per_round=4, reuse=12, capacity=4, batch_size=16)
     for _ in range(30):
         batch = next(iter(stream))
         assert len(batch.young) == 16
@@ -271,28 +272,28 @@ def test_a_batch_larger_than_the_buffer_holds_samples_more_than_once(replay):
 
 
 def test_the_oldest_samples_leave_a_full_buffer(replay):
-    stream = replay(capacity=12, fresh=4, reuse=2, batches=1)
+    stream = replay(capacity=12, new_per_round=4, reuse=2, batches=1)
     for _ in range(50):
         batch = next(iter(stream))
         assert batch.young.min() >= stream.produced - 12
         assert batch.young.max() < stream.produced
 
 
-def test_a_number_of_fresh_samples_that_does_not_divide_the_buffer_loses_none(replay):
-    used = counted(replay(capacity=42, fresh=5, reuse=1, batches=1), 60)
+def test_no_sample_is_lost_if_new_per_round_does_not_divide_the_capacity(replay):
+    used = counted(replay(capacity=42, new_per_round=5, reuse=1, batches=1), 60)
     assert (used[:-5] == 1).all()
 
 
 def test_all_samples_of_the_buffer_are_drawn(replay):
-    stream = replay(capacity=16, fresh=16, reuse=100, batch_size=100, batches=8)
+    stream = replay(capacity=16, new_per_round=16, reuse=100, batch_size=100, batches=8)
     counts = torch.bincount(torch.cat([batch.young for batch in stream]).long(), minlength=16)
     assert counts.min() > 20  # 800 draws from 16
 
 
 @pytest.mark.parametrize("reuse", [4, 50])
 def test_batches_stay_mixed_however_long_it_runs(replay, reuse):
-    """Old and new samples meet in a batch: not the newest alone, each several times."""
-    stream = replay(capacity=256, fresh=8, reuse=reuse, batch_size=32, batches=1)
+    """A batch holds old and new samples."""
+    stream = replay(capacity=256, new_per_round=8, reuse=reuse, batch_size=32, batches=1)
     for _ in range(60 * reuse):
         batch = next(iter(stream))
     ages = []
@@ -318,9 +319,11 @@ def test_batches_do_not_depend_on_which_worker_is_faster(replay):
         assert torch.equal(one, other)
 
 
-def test_memory_is_that_of_the_buffer(replay):
+def test_memory_does_not_grow_beyond_the_buffer(replay):
     shape = (100, 3)  # 5 kB a sample: 64 chunks of 64 are 20 MB
-    stream = replay(Numbers(shape=shape), fresh=64, capacity=128, reuse=2, batch_size=64, batches=2)
+    stream = replay(
+        Numbers(shape=shape), new_per_round=64, capacity=128, reuse=2, batch_size=64, batches=2
+    )
 
     def resident():
         pages = int(Path("/proc/self/statm").read_text().split()[1])
@@ -340,8 +343,8 @@ def test_memory_is_that_of_the_buffer(replay):
     assert [column.data_ptr() for column in stream._buffer.sample] == columns
 
 
-def test_what_enters_the_buffer_later_does_not_change_batches_handed_out(replay):
-    stream = replay(capacity=8, fresh=8, reuse=1, batches=1)
+def test_new_samples_do_not_change_earlier_batches(replay):
+    stream = replay(capacity=8, new_per_round=8, reuse=1, batches=1)
     batch = next(iter(stream))
     before = batch.force.clone()
     for _ in range(5):
@@ -353,10 +356,10 @@ def test_what_enters_the_buffer_later_does_not_change_batches_handed_out(replay)
 
 
 class Clocked(Numbers):
-    """A stream that takes 5 ms for a sample, on a clock of its own.
+    """A stream with a simulated clock that advances by 5 ms per sample.
 
     Attributes:
-        now: What it shows [s].
+        now: Time [s].
     """
 
     now = 100.0
@@ -371,7 +374,7 @@ class Clocked(Numbers):
 
 @pytest.fixture
 def clocked(monkeypatch):
-    """A stream whose clock is that of the replay."""
+    """A stream whose clock replaces that of the replay buffer."""
     stream = Clocked()
     monkeypatch.setattr("dpl.data.replay_buffer.time", stream)
     return stream
@@ -393,7 +396,7 @@ def test_the_rates_of_each_epoch_are_reported(replay, clocked):
     assert told[-1].uses == pytest.approx(2, rel=0.1)
 
 
-def test_an_optimiser_that_is_the_slower_one_does_not_wait(replay, clocked):
+def test_an_optimiser_slower_than_the_stream_does_not_wait(replay, clocked):
     stream = replay(clocked, batches=5)
     for _ in stream:
         clocked.now += 1.0
@@ -403,61 +406,61 @@ def test_an_optimiser_that_is_the_slower_one_does_not_wait(replay, clocked):
     assert stream.rates.consumed == pytest.approx(4 * 8 / (4.0 + waited))
 
 
-def test_an_epoch_left_early_reports_nothing_false(replay):
+def test_an_unfinished_epoch_reports_no_rates(replay):
     stream = replay(batches=5)
     next(iter(stream))
     assert stream.rates is None
 
 
-# ------------------------------------------------------------------ where the surrogate is worst
+# ------------------------------------------------------------------ hard examples
 
 
-def test_points_near_the_worst_lie_in_the_unit_cube():
+def test_points_near_hard_examples_lie_in_the_unit_cube():
     worst, rng = HardExamples(3), np.random.default_rng(0)
     corners = torch.tensor(list(itertools.product([0.0, 1 - 2.0**-53], repeat=3)))
-    worst.put(corners.double())
-    points = torch.stack([worst.near(rng) for _ in range(2000)])
+    worst.update(corners.double())
+    points = torch.stack([worst.sample(rng) for _ in range(2000)])
     assert points.dtype == torch.float64
     assert (points >= 0).all()
     assert (points < 1).all()
     distance = torch.cdist(points, corners.double()).amin(dim=1)
-    assert 0.5 * NEIGHBOURHOOD < distance.mean() < 3 * NEIGHBOURHOOD
+    assert 0.5 * PERTURBATION < distance.mean() < 3 * PERTURBATION
     assert not ((points == 0) | (points >= 1 - 2.0**-50)).any(), "folded back, not piled up"
 
 
-def test_nothing_is_near_the_worst_while_there_is_none():
+def test_no_point_is_sampled_while_there_are_no_hard_examples():
     worst = HardExamples(3)
-    assert worst.near(np.random.default_rng(0)) is None
-    worst.put(torch.rand(5, 3, dtype=torch.float64))
-    assert worst.near(np.random.default_rng(0)) is not None
-    worst.put(torch.zeros(0, 3, dtype=torch.float64))
-    assert worst.near(np.random.default_rng(0)) is None
+    assert worst.sample(np.random.default_rng(0)) is None
+    worst.update(torch.rand(5, 3, dtype=torch.float64))
+    assert worst.sample(np.random.default_rng(0)) is not None
+    worst.update(torch.zeros(0, 3, dtype=torch.float64))
+    assert worst.sample(np.random.default_rng(0)) is None
 
 
-def test_more_points_than_there_is_room_for_leave_the_worst_ones():
+def test_of_too_many_points_the_first_ones_are_kept():
     worst = HardExamples(1, size=4)
-    worst.put(torch.arange(10, dtype=torch.float64)[:, None] / 10)
-    near = {round(float(worst.near(np.random.default_rng(k))) / 0.1) for k in range(200)}
+    worst.update(torch.arange(10, dtype=torch.float64)[:, None] / 10)
+    near = {round(float(worst.sample(np.random.default_rng(k))) / 0.1) for k in range(200)}
     assert near <= set(range(6))
     assert int(worst.count) == 4
     assert worst.points[:, 0].tolist() == [0.0, 0.1, 0.2, 0.3]
 
 
-def test_new_loads_are_drawn_near_the_worst_ones_as_often_as_asked(scene):
+def test_the_fraction_of_loads_near_hard_examples_is_the_requested_one(scene):
     worst = HardExamples(scene.loads.n_random)
     centre = torch.full((1, scene.loads.n_random), 0.5, dtype=torch.float64)
-    worst.put(centre)
+    worst.update(centre)
     for part in (0.0, 0.5, 1.0):
-        stream = OnlineSamples(scene, SEED, worst=worst, near=part)
+        stream = OnlineSamples(scene, SEED, hard_examples=worst, hard_example_fraction=part)
         points = torch.stack([one.point for one in itertools.islice(stream, 40)])
-        near = ((points - centre).abs().amax(dim=1) < 6 * NEIGHBOURHOOD).double().mean()
+        near = ((points - centre).abs().amax(dim=1) < 6 * PERTURBATION).double().mean()
         assert near == pytest.approx(part, abs=0.25 if part < 1 else 0.0)
 
 
-def test_a_load_drawn_near_the_worst_is_an_answer_to_its_own_point(scene):
+def test_a_load_near_a_hard_example_is_solved_for_its_own_point(scene):
     worst = HardExamples(scene.loads.n_random)
-    worst.put(torch.full((1, scene.loads.n_random), 0.5, dtype=torch.float64))
-    one = next(iter(OnlineSamples(scene, SEED, worst=worst, near=1.0)))
+    worst.update(torch.full((1, scene.loads.n_random), 0.5, dtype=torch.float64))
+    one = next(iter(OnlineSamples(scene, SEED, hard_examples=worst, hard_example_fraction=1.0)))
     load = scene.loads.loads_at(one.point[None])
     assert torch.equal(one.sample.force, load.force[0])
     assert torch.equal(one.sample.young, load.young[0])
@@ -468,7 +471,7 @@ def test_a_load_drawn_near_the_worst_is_an_answer_to_its_own_point(scene):
 
 @pytest.fixture
 def unsolved(monkeypatch):
-    """Loads without mechanics: points alone."""
+    """A scene whose loads are not solved; only their points are drawn."""
 
     def fake(scene, job, *, point=None):
         if point is None:
@@ -486,15 +489,17 @@ def unsolved(monkeypatch):
 
 
 def test_new_loads_concentrate_where_the_errors_are_largest(unsolved, replay):
-    """A surrogate that is bad in one corner of the square sees ever more of it."""
+    """The errors of this surrogate are largest in one corner of the unit square."""
     corner, last = torch.ones(2, dtype=torch.float64), {}
 
     def errors():
         return torch.exp(-8 * (last["points"] - corner).norm(dim=1))
 
-    stream = OnlineSamples(unsolved, SEED, worst=HardExamples(2), near=0.5)
+    stream = OnlineSamples(unsolved, SEED, hard_examples=HardExamples(2), hard_example_fraction=0.5)
     stream.scene.loads.young_at = lambda points: points[:, 0] + 10 * (points[:, 1] * 1e6).round()
-    told = replay(stream, errors=errors, batches=1, fresh=16, reuse=4, capacity=256, batch_size=16)
+    told = replay(
+        stream, errors=errors, batches=1, new_per_round=16, reuse=4, capacity=256, batch_size=16
+    )
     buffer = told._buffer
 
     def share():
@@ -519,37 +524,37 @@ def test_new_loads_concentrate_where_the_errors_are_largest(unsolved, replay):
 
 
 def test_errors_are_those_of_the_batch_before(replay):
-    """The largest errors name their points, of those that have been seen alone."""
+    """Hard examples are chosen among the samples that have been used."""
 
     class Watched(HardExamples):
         def __init__(self, dimension):
             super().__init__(dimension)
-            self.puts = []
+            self.updates = []
 
-        def put(self, points):
-            self.puts.append(points)
+        def update(self, points):
+            self.updates.append(points)
 
     source, last = Numbers(), {}
-    source.worst = Watched(1)
+    source.hard_examples = Watched(1)
 
     def errors():
         return last["batch"].young + 1
 
-    stream = replay(source, errors=errors, batches=1, fresh=8, reuse=2, capacity=64)
+    stream = replay(source, errors=errors, batches=1, new_per_round=8, reuse=2, capacity=64)
     seen = set()
     for _ in range(30):
         before = set(seen)
         last["batch"] = batch = next(iter(stream))
-        if source.worst.puts:
-            named = (source.worst.puts[-1][:, 0] * 1e6).round().long().tolist()
+        if source.hard_examples.updates:
+            named = (source.hard_examples.updates[-1][:, 0] * 1e6).round().long().tolist()
             assert named == sorted(named, reverse=True)
             assert named[0] == max(before)
             assert set(named) <= before
         seen |= set(places(batch))
-    assert len(source.worst.puts) == 29
+    assert len(source.hard_examples.updates) == 29
 
 
-def test_without_worst_no_error_is_asked_for(replay):
+def test_without_hard_examples_no_error_is_computed(replay):
     def forbidden():
         raise AssertionError("asked")
 
@@ -557,21 +562,21 @@ def test_without_worst_no_error_is_asked_for(replay):
 
 
 class Watching(Numbers):
-    """A stream whose samples say how many bad points their worker knows."""
+    """A stream whose forces hold the number of hard examples and the first one."""
 
     def drawn(self, place):
         one = super().drawn(place)
-        told = torch.cat([self.worst.count.double(), self.worst.points[0]])
+        told = torch.cat([self.hard_examples.count.double(), self.hard_examples.points[0]])
         return one._replace(sample=one.sample._replace(force=told.expand(2, 3)))
 
 
-def test_spawned_workers_see_where_the_surrogate_is_worst_at_once(replay):
+def test_spawned_workers_see_new_hard_examples(replay):
     stream = Watching(pause=[0.01])
-    stream.worst = HardExamples(2)
-    told = replay(stream, workers=1, fresh=1, reuse=1, batch_size=1, batches=1, capacity=8)
+    stream.hard_examples = HardExamples(2)
+    told = replay(stream, workers=1, new_per_round=1, reuse=1, batch_size=1, batches=1, capacity=8)
     assert next(iter(told)).force[0, 0].tolist() == [0.0, 0.0, 0.0]
-    stream.worst.put(torch.tensor([[0.25, 0.75]], dtype=torch.float64))
-    stream.worst.put = lambda points: None  # the replay's own: it has no errors to tell
+    stream.hard_examples.update(torch.tensor([[0.25, 0.75]], dtype=torch.float64))
+    stream.hard_examples.update = lambda points: None  # the replay's own: it has no errors to tell
     for _ in range(4):  # those on their way do not know
         last = next(iter(told)).force[0, 0].tolist()
     assert last == [1.0, 0.25, 0.75]
@@ -582,7 +587,7 @@ def test_spawned_workers_see_where_the_surrogate_is_worst_at_once(replay):
 
 @dataclass(frozen=True)
 class Hanging(Newton):
-    """Newton that never comes back on some loads."""
+    """Newton solver that hangs on some loads."""
 
     def iterate(self, load, **options):
         if hangs(load.force[0]):
@@ -593,7 +598,7 @@ class Hanging(Newton):
 
 
 def hangs(force):
-    """By a count: the last bits of a force are another processor's business."""
+    """Return True for some loads; the number of loaded nodes does not depend on round-off."""
     return int((force != 0).any(dim=-1).sum()) % 4 == 3
 
 
@@ -604,20 +609,20 @@ def hanging(make_scene):
 
 @pytest.fixture(scope="module")
 def good(scene):
-    """The places of the loads that do not hang."""
+    """The numbers of the loads that do not hang."""
     return [k for k, f in enumerate(scene.loads.sample(SEED, range(32)).force) if not hangs(f)]
 
 
 def test_a_load_that_hangs_is_timed_out_in_a_worker_and_left_out(
     hanging, good, monkeypatch, tmp_path
 ):
-    """In this process, that says it is a worker."""
+    """This process takes the role of a worker."""
     monkeypatch.setattr(
         "dpl.data.stream.get_worker_info", lambda: SimpleNamespace(id=0, num_workers=1)
     )
     before = signal.getsignal(signal.SIGALRM)
     kept = []
-    pending = SimpleNamespace(put=kept.append)
+    pending = SimpleNamespace(write=kept.append)
     store = SimpleNamespace(reader=lambda split: lambda index: None, pending=pending)
     assert good[:6] != list(range(6)), "one of the first hangs"
     assert numbers(OnlineSamples(hanging, SEED, store=store, timeout=240.0), 6) == good[:6]
@@ -630,7 +635,7 @@ def test_a_load_that_hangs_is_timed_out_in_a_worker_and_left_out(
 
 @pytest.mark.slow
 def test_a_load_that_hangs_is_timed_out_in_a_real_worker(hanging, good, replay):
-    options = {"workers": 1, "fresh": 2, "batch_size": 2, "reuse": 1, "batches": 4}
+    options = {"workers": 1, "new_per_round": 2, "batch_size": 2, "reuse": 1, "batches": 4}
     stream = replay(OnlineSamples(hanging, SEED, timeout=240.0), **options)
     seen = set().union(*[keys(batch) for batch in stream])
     forces = hanging.loads.sample(SEED, good[:8]).force
@@ -642,22 +647,22 @@ def test_a_load_that_hangs_is_timed_out_in_a_real_worker(hanging, good, replay):
 
 @pytest.mark.slow
 def test_a_killed_worker_is_replaced_and_the_stream_goes_on(replay):
-    before = crew()
-    stream = replay(Numbers(pause=[0.05, 0.05]), workers=2, reuse=1, fresh=2, batches=2)
+    before = children()
+    stream = replay(Numbers(pause=[0.05, 0.05]), workers=2, reuse=1, new_per_round=2, batches=2)
     seen = [place for batch in stream for place in places(batch)]
-    started = crew() - before
+    started = children() - before
     for victim in sorted(started)[:1]:
         os.kill(victim, signal.SIGKILL)
     seen += [place for _ in range(4) for batch in stream for place in places(batch)]
     assert len(seen) == len(set(seen)) == 5 * 16, "none twice, none missing in a batch"
-    assert len(crew() - before) == 2
-    assert not (crew() - before) & started
+    assert len(children() - before) == 2
+    assert not (children() - before) & started
 
 
-def test_no_load_is_left_out_where_a_worker_died(replay, monkeypatch):
-    """What it was solving is drawn anew, though another worker is ahead of it."""
+def test_the_loads_of_a_dead_worker_are_solved_again(replay, monkeypatch):
+    """Also if another worker is ahead."""
     source = Numbers()
-    stream = replay(source, reuse=1, fresh=2, batch_size=2, batches=1)
+    stream = replay(source, reuse=1, new_per_round=2, batch_size=2, batches=1)
 
     def two():  # workers, of which the second dies in its first chunk
         drawn = [source.drawn(0), source.drawn(2)]
@@ -668,7 +673,7 @@ def test_no_load_is_left_out_where_a_worker_died(replay, monkeypatch):
     begun = []
 
     def start():
-        begun.append(dict(source.starts))
+        begun.append(dict(source.offsets))
         stream._stream = iter([]) if len(begun) > 1 else two()
 
     stream._workers = 2
@@ -679,12 +684,12 @@ def test_no_load_is_left_out_where_a_worker_died(replay, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_worker_that_dies_while_the_optimiser_works_is_replaced_too(replay):
-    """Training is not in the stream's hands then: nothing may come up in the middle of a step."""
-    before = crew()
-    stream = replay(Numbers(), workers=2, reuse=1, fresh=2, batches=2)
+def test_a_worker_that_dies_during_a_training_step_is_replaced(replay):
+    """No exception may be raised in the middle of a step."""
+    before = children()
+    stream = replay(Numbers(), workers=2, reuse=1, new_per_round=2, batches=2)
     seen = [place for batch in stream for place in places(batch)]
-    os.kill(min(crew() - before), signal.SIGKILL)
+    os.kill(min(children() - before), signal.SIGKILL)
     end = time.monotonic() + 1
     while time.monotonic() < end:  # a step
         torch.randn(50, 50) @ torch.randn(50, 50)
@@ -694,8 +699,8 @@ def test_a_worker_that_dies_while_the_optimiser_works_is_replaced_too(replay):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("deadly", [1, 5])
-def test_a_load_that_always_kills_its_worker_is_left_out_in_the_end(replay, deadly):
-    stream = replay(Numbers(deadly=deadly), workers=1, reuse=1, fresh=8, batches=4)
+def test_a_load_that_always_kills_its_worker_is_skipped(replay, deadly):
+    stream = replay(Numbers(deadly=deadly), workers=1, reuse=1, new_per_round=8, batches=4)
     seen = [place for batch in stream for place in places(batch)]
     assert len(seen) == len(set(seen)) == 32
     assert deadly not in seen
@@ -708,17 +713,17 @@ def test_workers_that_all_die_end_training_with_an_error(replay):
 
 
 class Deadly(Numbers):
-    """No load of it can be solved."""
+    """A stream each of whose loads kills its worker."""
 
     def drawn(self, place):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_a_replaced_worker_keeps_to_the_lane_of_its_training_process(replay):
-    """Lane 0 of 2 has the even loads, whatever happened."""
+def test_a_replaced_worker_solves_loads_of_its_own_rank(replay):
+    """Rank 0 of 2 solves the even loads."""
     source = Numbers()
-    source.lanes = 2
-    stream = replay(source, reuse=1, fresh=3, batch_size=3, batches=2)
+    source.world_size = 2
+    stream = replay(source, reuse=1, new_per_round=3, batch_size=3, batches=2)
     seen = [place for batch in stream for place in places(batch)]
 
     def dead():
@@ -730,7 +735,7 @@ def test_a_replaced_worker_keeps_to_the_lane_of_its_training_process(replay):
     assert [place % 2 for place in seen] == [0] * 12
 
 
-def test_an_error_in_a_stream_that_is_no_death_is_raised(replay):
+def test_an_error_of_the_stream_itself_is_raised(replay):
     class Faulty(Numbers):
         def drawn(self, place):
             raise RuntimeError("a fault of ours")
@@ -747,18 +752,18 @@ def test_a_closed_stream_can_be_closed_again(replay):
     assert len(set(places(next(iter(stream))))) == 8, "it begins again when it is asked"
 
 
-# ------------------------------------------------------------------ nobody outlives the parent
+# ------------------------------------------------------------------ workers end with the parent
 
 PARENT = textwrap.dedent(
     """
     import json, multiprocessing, sys, time
     sys.path.insert(0, sys.argv[1])
-    from test_online import Busy
+    from test_stream import Busy
     from dpl.data.replay_buffer import ReplayBuffer
 
     if __name__ == "__main__":
-        stream = Replay(
-            Busy(), workers=2, batch_size=2, batches=9, fresh=2, reuse=1, capacity=64
+        stream = ReplayBuffer(
+            Busy(), workers=2, batch_size=2, batches=9, new_per_round=2, reuse=1, capacity=64
         )
         batches = iter(stream)
         next(batches), next(batches)
@@ -771,7 +776,7 @@ PARENT = textwrap.dedent(
 
 
 class Busy(Numbers):
-    """A stream that works, without a pause in which somebody could be asked, from load 8 on."""
+    """A stream that computes without end from load 20 on."""
 
     def drawn(self, place):
         end = time.monotonic() + (1000 if place >= 20 else 0)

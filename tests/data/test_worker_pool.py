@@ -1,4 +1,4 @@
-"""Laws of the worker pool: the same samples from any crew, whatever happens to its workers."""
+"""Laws of the worker pool: samples do not depend on workers; faults are recorded."""
 
 import multiprocessing
 import os
@@ -26,7 +26,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @dataclass(frozen=True, eq=False)
 class Fragile(ModalLoads):
-    """Loads of which one harms the worker that draws it.
+    """Loads of which one damages the worker that draws it.
 
     Attributes:
         victim: Number of that load; -1: every one.
@@ -54,7 +54,7 @@ class Fragile(ModalLoads):
 
 
 class Asked(GracefulShutdown):
-    """Is asked to stop after so many looks."""
+    """Is true after a number of evaluations."""
 
     def __init__(self, looks):
         super().__init__()
@@ -73,7 +73,7 @@ def fragile(scene, **how):
 
 
 def content(one):
-    """Return all of an outcome that may not depend on who solved it, as comparable values."""
+    """Return the fields of a solved load that must not depend on its process."""
     fields = {name: value for name, value in one._asdict().items() if name != CLOCK}
     return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in fields.items()}
 
@@ -93,19 +93,19 @@ def jobs():
 
 @pytest.fixture(scope="module")
 def here(scene, jobs):
-    """What this process finds."""
+    """The solved loads of this process."""
     return by_index(solve_loads(scene, jobs, workers=0))
 
 
 @pytest.fixture(autouse=True)
 def _nothing_left():
-    """Every test leaves the handlers of signals and the children of this process as they were."""
+    """Check that each test restores signal handlers and ends its child processes."""
     before = children(), [signal.getsignal(number) for number in SIGNALS]
     yield
     assert (children(), [signal.getsignal(number) for number in SIGNALS]) == before
 
 
-# ------------------------------------------------------------------ the same from any crew
+# ------------------------------------------------------------------ results
 
 
 def test_loads_are_solved_in_the_order_of_the_jobs_without_workers(scene, jobs, here):
@@ -119,7 +119,7 @@ def test_no_jobs_cost_no_process(scene, monkeypatch):
     assert list(solve_loads(scene, [], workers=2)) == []
 
 
-def test_a_killed_worker_is_replaced_and_every_crew_finds_the_same_bytes(
+def test_a_killed_worker_is_replaced_and_the_bytes_do_not_depend_on_workers(
     scene, jobs, here, tmp_path
 ):
     mark = tmp_path / "killed"
@@ -131,9 +131,7 @@ def test_a_killed_worker_is_replaced_and_every_crew_finds_the_same_bytes(
     assert by_index(found) == here
 
 
-def test_a_crew_closed_early_leaves_no_process_and_has_no_more_than_there_are_loads(
-    scene, jobs, here
-):
+def test_a_pool_has_no_more_workers_than_loads_and_leaves_none_when_closed(scene, jobs, here):
     before = children()
     running = solve_loads(scene, jobs[:2], workers=64)
     first = next(running)
@@ -144,7 +142,7 @@ def test_a_crew_closed_early_leaves_no_process_and_has_no_more_than_there_are_lo
     assert not any(Path(f"/proc/{pid}").exists() for pid in members)
 
 
-# ------------------------------------------------------------------ what happens to workers
+# ------------------------------------------------------------------ faults of workers
 
 
 @pytest.mark.parametrize("tries", [1, pytest.param(3, marks=pytest.mark.slow)])
@@ -161,7 +159,7 @@ def test_a_load_that_kills_every_worker_is_given_up_with_a_reason(scene, here, m
 
 
 def test_a_load_that_hangs_is_recorded_and_the_others_are_solved(scene, here, monkeypatch):
-    """A worker has more time for its first load, once: or else this test would not end."""
+    """The additional time for the first load of a worker is granted once."""
     monkeypatch.setattr(worker_pool, "STARTUP_GRACE", 1e6)
     victim = fragile(scene, victim=1, harm="hang")
     found = {
@@ -175,7 +173,7 @@ def test_a_load_that_hangs_is_recorded_and_the_others_are_solved(scene, here, mo
     assert one.force.tobytes() == here[1]["force"]
 
 
-def test_workers_that_never_begin_are_replaced_too(scene, monkeypatch):
+def test_workers_that_exceed_the_time_limit_while_starting_are_replaced(scene, monkeypatch):
     monkeypatch.setattr(worker_pool, "STARTUP_GRACE", 0.0)
     found = list(solve_loads(scene, _jobs(0, 1, 2), workers=2, timeout=0.1))
     assert [one.reason for one in found] == 3 * ["timed out after 0.1 s"]
@@ -184,7 +182,7 @@ def test_workers_that_never_begin_are_replaced_too(scene, monkeypatch):
 def test_workers_that_all_die_end_the_run(scene, monkeypatch, capfd):
     monkeypatch.setattr(worker_pool, "MAX_CONSECUTIVE_CRASHES", 1)
     victim = fragile(scene, harm="raise")
-    with pytest.raises(RuntimeError, match="1 workers died one after the other"):
+    with pytest.raises(RuntimeError, match="1 workers died in a row"):
         list(solve_loads(victim, _jobs(0, 1), workers=1))
     assert "no load can be drawn" in capfd.readouterr().err
 
@@ -193,22 +191,22 @@ def _jobs(*numbers):
     return [LoadKey(SEED, number) for number in numbers]
 
 
-# ------------------------------------------------------------------ being asked to stop
+# ------------------------------------------------------------------ signals
 
 
-def test_nobody_asking_does_not_stop():
+def test_without_a_signal_nothing_stops():
     with GracefulShutdown() as stop:
         assert not stop
         stop.exit()
 
 
-def test_a_stop_that_is_asked_once_lets_the_program_finish_and_then_leave(capfd):
+def test_exit_raises_after_one_signal(capfd):
     with GracefulShutdown() as stop:
         os.kill(os.getpid(), signal.SIGINT)
         assert stop
         with pytest.raises(KeyboardInterrupt):
             stop.exit()
-    assert "once more to stop at once" in capfd.readouterr().err
+    assert "again to abort" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -220,7 +218,7 @@ def test_a_stop_that_is_asked_once_lets_the_program_finish_and_then_leave(capfd)
         (signal.SIGTERM, signal.SIGINT, SystemExit),
     ],
 )
-def test_a_stop_that_is_asked_twice_raises_at_once(first, second, raised):
+def test_a_second_signal_raises_at_once(first, second, raised):
     with GracefulShutdown() as stop:
         os.kill(os.getpid(), first)
         with pytest.raises(raised) as end:
@@ -230,7 +228,7 @@ def test_a_stop_that_is_asked_twice_raises_at_once(first, second, raised):
         assert end.value.code == 143
 
 
-def test_a_stop_gives_the_signals_back_even_if_it_ends_badly():
+def test_signal_handlers_are_restored_after_an_error():
     before = [signal.getsignal(number) for number in SIGNALS]
     with suppress(RuntimeError), GracefulShutdown():
         assert [signal.getsignal(number) for number in SIGNALS] != before
@@ -238,7 +236,7 @@ def test_a_stop_gives_the_signals_back_even_if_it_ends_badly():
     assert [signal.getsignal(number) for number in SIGNALS] == before
 
 
-def test_a_stop_in_another_thread_leaves_the_signals_alone():
+def test_another_thread_leaves_signal_handlers_unchanged():
     found = []
 
     def enter():
@@ -252,7 +250,7 @@ def test_a_stop_in_another_thread_leaves_the_signals_alone():
     assert found == [(True, False)]
 
 
-def test_after_a_stop_no_load_is_begun_in_this_process(scene, jobs, here):
+def test_after_a_signal_no_load_is_started_in_this_process(scene, jobs, here):
     with GracefulShutdown() as stop:
         running = solve_loads(scene, jobs, workers=0, stop=stop)
         found = [next(running), next(running)]
@@ -261,7 +259,7 @@ def test_after_a_stop_no_load_is_begun_in_this_process(scene, jobs, here):
     assert by_index(found) == {0: here[0], 1: here[1]}
 
 
-def test_after_a_stop_the_loads_at_work_are_finished_and_no_more(scene, jobs, here):
+def test_after_a_signal_only_the_solves_in_progress_are_finished(scene, jobs, here):
     with GracefulShutdown() as stop:
         running = solve_loads(scene, jobs, workers=2, stop=stop)
         found = [next(running)]
@@ -272,8 +270,8 @@ def test_after_a_stop_the_loads_at_work_are_finished_and_no_more(scene, jobs, he
 
 
 @pytest.mark.parametrize("looks", [0, 1, 2])
-def test_a_stop_may_come_at_any_moment_before_the_first_load(scene, jobs, looks):
-    """It is looked at before a load is taken, and before it is given to a worker."""
+def test_a_stop_may_be_requested_at_any_moment_before_the_first_load(scene, jobs, looks):
+    """The flag is checked before a load is taken and before it is sent to a worker."""
     running = solve_loads(scene, jobs[:2], workers=1, stop=Asked(looks), timeout=60.0)
     found = [one.job.number for one in running]
     assert found == ([] if looks < 2 else [0])
@@ -285,7 +283,7 @@ ENDING = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-import test_crew
+import test_worker_pool
 from dpl.data.solving.worker_pool import solve_loads
 from dpl.data.solving.solve import LoadKey
 from dpl.fem.materials.neo_hookean import NeoHookeanLn
@@ -303,12 +301,12 @@ if __name__ == "__main__":
     scene = Scene(problem, ModalLoads(newton.linear_solver, n_modes=3), newton)
     running = solve_loads(scene, [LoadKey((5, 0), k) for k in range(100000)], workers=1)
     print(next(running).accepted, flush=True)
-    test_crew.kept = running  # as long as the program
+    test_worker_pool.kept = running  # as long as the program
 """
 
 
 @pytest.mark.slow
-def test_a_program_that_ends_amid_a_crew_ends(tmp_path, environment):
+def test_a_program_with_a_running_pool_ends(tmp_path, environment):
     path = tmp_path / "ending.py"
     path.write_text(ENDING)
     process = subprocess.Popen(

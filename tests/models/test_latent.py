@@ -429,7 +429,7 @@ def test_a_run_resumed_before_its_first_epoch_fits_its_bases(script, overrides, 
 
 def test_a_stream_fits_the_bases_to_the_validation_loads(script, overrides, home, trained):
     kept = [o for o in overrides("stream") if "data.train" not in o]
-    more = ["data=online", "data.batches=2", "data.fresh=4", "trainer.max_epochs=2"]
+    more = ["data=online", "data.batches=2", "data.new_per_round=4", "trainer.max_epochs=2"]
     ended = script("train", *kept, *more, cwd=home)
     assert ended.status == 0, ended.err
     cfg, module = run_folder.load_run(home / "stream")
@@ -445,7 +445,7 @@ def test_a_stream_fits_the_bases_to_the_validation_loads(script, overrides, home
 
 def test_skipped_work_of_a_stream_mentions_coordinates_from_disk_only(script, overrides, home):
     kept = [o for o in overrides("told") if "data.train" not in o]
-    more = ["data=online", "data.batches=1", "data.fresh=4", "trainer.max_epochs=1"]
+    more = ["data=online", "data.batches=1", "data.new_per_round=4", "trainer.max_epochs=1"]
     ended = script("train", *kept, *more, cwd=home)
     assert ended.status == 0
     assert "no fields in training:" not in ended.out

@@ -74,7 +74,7 @@ FREE = {  # keys of any text, or of one that the script looks at
     *("monitor", "action", "parts", "linear", "cases"),
 }
 SHARED = {  # keys that others refer to
-    "seed": ("shuffle",),
+    "seed": ("shuffle_seed",),
     "max_epochs": ("epochs",),
     "folder": ("dirpath", "save_dir"),
     "name": ("run",),

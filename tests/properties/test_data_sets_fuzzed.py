@@ -1,4 +1,4 @@
-"""Laws of damaged data sets: the samples that were written, or an error that says what to do."""
+"""Laws of damaged data sets: the written samples are read, or an error names a remedy."""
 
 import hashlib
 import json
@@ -26,35 +26,35 @@ from dpl.data.storage.integrity import repair, verify
 from dpl.data.storage.manifest import STREAMS
 
 SIZES = {"train": 12, "val": 4, "test": 4}
-SPOOLED = (10, 11)  # loads of training whose shard is not complete
+PENDING = (10, 11)  # loads of training whose shard is not complete
 SHARDS = ["train-000000", "train-000004", "train-000008", "val-000000", "test-000000"]
 FILES = [
     *("scene.json", "manifest.jsonl", "journal.jsonl", "modes.safetensors"),
     *(f"{name}.safetensors" for name in SHARDS),
-    *(f"spool/train-{number:06d}.load" for number in SPOOLED),
+    *(f"pending/train-{number:06d}.load" for number in PENDING),
 ]
 REMEDIES = ("action=repair", "data.folder", "data.seed", "remove", "generate")
 
 
 class Sound:
-    """A data set that is not harmed, and its samples."""
+    """Folder and samples of an undamaged data set."""
 
     def __init__(self, folder: Path, samples: dict) -> None:
-        """Keep both."""
+        """Store folder and samples."""
         self.folder, self.samples = folder, samples
 
 
 @pytest.fixture(scope="module")
 def sound(scene, tmp_path_factory):
-    """A data set of five shards and two loads in the spool, and its samples."""
+    """A data set of five shards and two pending loads, and its samples."""
     folder = tmp_path_factory.mktemp("sound") / "set"
     store = Store(folder, scene, 0)
     wanted = {**{split: range(size) for split, size in SIZES.items()}, "train": range(10)}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store_module, "SHARD", 4)
+        patch.setattr(store_module, "SHARD_SIZE", 4)
         list(Writer(store).fill(wanted, workers=0))
-    for number in SPOOLED:
-        store.pending.put(solve_load(scene, LoadKey((0, 0), number)))
+    for number in PENDING:
+        store.pending.write(solve_load(scene, LoadKey((0, 0), number)))
     session = {"loads": 18, "seconds": 1.0, "core_seconds": 1.0}
     (folder / "journal.jsonl").write_text(json.dumps(session) + "\n")
     assert sorted(FILES) == sorted(
@@ -68,7 +68,7 @@ def sound(scene, tmp_path_factory):
 
 @contextmanager
 def copied(folder: Path) -> Iterator[Path]:
-    """Give a copy to harm; what lies beside it is outside."""
+    """Yield a copy that may be damaged; its sibling folder `outside` must not be read."""
     copy = folder.with_name("copy") / "set"
     shutil.copytree(folder, copy)
     outside = copy.parent / "outside"
@@ -84,7 +84,7 @@ def opened(scene, folder: Path) -> OfflineData:
 
 
 def samples(scene, folder: Path) -> dict:
-    """Return all samples, what is missing solved as every command does."""
+    """Return all samples; missing loads are solved as in every command."""
     data = opened(scene, folder)
     data.skipped_work()
     data.prepare_data()
@@ -102,7 +102,7 @@ def same(found: dict, written: dict) -> bool:
 
 @contextmanager
 def told(folder: Path) -> Iterator[None]:
-    """Hold an error to the file that it names and what it says to do."""
+    """Check that an error is one line with a file of the folder and a remedy."""
     try:
         yield
     except DataSetError as error:
@@ -147,7 +147,7 @@ BYTES = st.binary(min_size=1, max_size=12)
 
 @st.composite
 def blows(draw):
-    """Return what is done to which file: a name and how."""
+    """Return a damage: name of a file and parameters."""
     name = draw(st.sampled_from(FILES))
     how = draw(
         st.sampled_from(
@@ -210,7 +210,7 @@ def strike(folder: Path, blow) -> None:
 
 @given(st.lists(blows(), min_size=1, max_size=2))
 @counted
-def test_damaged_files_give_what_was_written_or_say_so(scene, sound, damage):
+def test_damaged_files_give_the_written_samples_or_an_error(scene, sound, damage):
     with copied(sound.folder) as folder:
         for blow in damage:
             strike(folder, blow)
@@ -238,7 +238,7 @@ def entries(node, path=()) -> Iterator[tuple]:
 
 @given(st.data())
 @counted
-def test_a_manifest_with_anything_in_it_gives_what_was_written_or_an_error(scene, sound, data):
+def test_a_manifest_with_arbitrary_values_gives_the_written_samples_or_an_error(scene, sound, data):
     name = data.draw(
         st.sampled_from(["manifest.jsonl", "manifest.jsonl", "scene.json", "journal.jsonl"])
     )
@@ -316,7 +316,7 @@ HEADERS = [
 
 @given(st.data())
 @counted
-def test_a_shard_with_a_right_digest_and_wrong_numbers_is_refused_or_found(scene, sound, data):
+def test_a_shard_with_wrong_numbers_and_a_right_digest_is_refused_or_found(scene, sound, data):
     name = data.draw(st.sampled_from([*SHARDS, "modes"])) + ".safetensors"
     with copied(sound.folder) as folder:
         path = folder / name

@@ -1,4 +1,4 @@
-"""Laws of `dpl.system.files`: files are whole or not there, and a folder has one writer."""
+"""Laws of files: writes are atomic, and a folder has one writer."""
 
 import errno
 import fcntl
@@ -28,7 +28,7 @@ with exclusive_lock(Path(sys.argv[1])):
 
 @contextmanager
 def largest_file(size):
-    """Let no file of this process grow beyond so many bytes, as on a full disk."""
+    """Limit the size of the files of this process, as on a full disk [bytes]."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -66,7 +66,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, sync):
     assert names(tmp_path) == ["file"]
 
 
-def test_a_file_for_which_there_is_no_space_leaves_nothing(tmp_path):
+def test_a_file_that_exceeds_the_disk_leaves_nothing(tmp_path):
     def write():
         with atomic_write(tmp_path / "file") as file:
             file.write(bytes(5000))
@@ -90,7 +90,7 @@ def test_lines_come_back_in_the_order_in_which_they_were_added(tmp_path):
 
 
 @pytest.mark.parametrize("torn", [b'{"k": 1, "l', b'{"k"', b"{", b'{"name": "\xc3', b"\x00\x00"])
-def test_a_torn_line_is_left_out_and_does_not_spoil_the_next(tmp_path, torn):
+def test_an_incomplete_line_is_left_out_and_the_next_one_is_read(tmp_path, torn):
     path = tmp_path / "lines"
     append_jsonl(path, {"k": 0})
     with path.open("ab") as file:
@@ -101,13 +101,13 @@ def test_a_torn_line_is_left_out_and_does_not_spoil_the_next(tmp_path, torn):
     assert read_jsonl(path) == [{"k": 0}, {"k": 2}, {"k": 3}]
 
 
-def test_a_line_torn_to_something_shorter_that_is_json_too_is_left_out(tmp_path):
+def test_lines_of_json_that_are_not_objects_are_left_out(tmp_path):
     path = tmp_path / "lines"
     path.write_bytes(b'{"k": 0}\n1\n[]\nnull\n"text"\n')
     assert read_jsonl(path) == [{"k": 0}]
 
 
-def test_a_line_for_which_there_is_no_space_is_taken_back_whole(tmp_path):
+def test_a_line_that_exceeds_the_disk_is_removed_again(tmp_path):
     path = tmp_path / "lines"
     append_jsonl(path, {"k": 0})
     before = path.read_bytes()
@@ -122,7 +122,7 @@ def test_a_line_for_which_there_is_no_space_is_taken_back_whole(tmp_path):
 
 
 def held(folder, *part):
-    """Return whether somebody else may not write such a part now."""
+    """Return True if the lock of a part cannot be obtained."""
     try:
         with exclusive_lock(folder, *part):
             return False
@@ -139,7 +139,7 @@ def test_a_second_writer_is_refused_naming_process_and_machine(tmp_path):
     assert "\n" not in told
 
 
-def test_a_folder_is_free_again_after_its_writer_however_it_ended(tmp_path):
+def test_a_lock_is_released_when_its_writer_ends_or_raises(tmp_path):
     with exclusive_lock(tmp_path):
         assert held(tmp_path)
     assert not held(tmp_path)
@@ -149,7 +149,7 @@ def test_a_folder_is_free_again_after_its_writer_however_it_ended(tmp_path):
     assert not list(tmp_path.glob(".writer-*"))
 
 
-def test_a_refusal_does_not_free_the_folder(tmp_path):
+def test_a_refused_writer_does_not_release_the_lock(tmp_path):
     with exclusive_lock(tmp_path):
         assert held(tmp_path)
         assert held(tmp_path)
@@ -166,7 +166,7 @@ def test_a_refusal_does_not_free_the_folder(tmp_path):
         ((0, 2), (1, 3), True),
     ],
 )
-def test_parts_have_a_writer_each_if_they_are_parts_of_the_same_division(
+def test_writers_exclude_each_other_unless_they_are_different_parts_of_one_division(
     tmp_path, mine, other, refused
 ):
     with exclusive_lock(tmp_path, *mine):
@@ -174,7 +174,7 @@ def test_parts_have_a_writer_each_if_they_are_parts_of_the_same_division(
     assert not held(tmp_path, *other)
 
 
-def test_a_killed_writer_does_not_count(tmp_path, environment):
+def test_a_killed_writer_holds_no_lock(tmp_path, environment):
     writer = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE, env=environment()
     )
@@ -197,24 +197,24 @@ def test_an_error_is_one_line():
     assert str(DataSetError("a\nb")) == "a b"
 
 
-def test_lines_are_neither_read_from_nor_added_to_what_is_no_file(tmp_path):
+def test_irregular_files_are_neither_read_nor_extended(tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "outside").write_text("mine\n")
     (tmp_path / "link").symlink_to("outside")
     for name in ("folder", "link"):
         for use in (read_jsonl, lambda path: append_jsonl(path, {"k": 0})):
-            with pytest.raises(DataSetError, match=f"{name} is no file of its own"):
+            with pytest.raises(DataSetError, match=f"{name} is not a regular file"):
                 use(tmp_path / name)
     assert (tmp_path / "outside").read_text() == "mine\n"
 
 
-def test_a_line_that_is_nested_without_end_is_left_out(tmp_path):
+def test_a_line_of_too_deep_nesting_is_left_out(tmp_path):
     path = tmp_path / "lines"
     path.write_text("[" * 99_999 + '\n{"k": 1}\n')
     assert read_jsonl(path) == [{"k": 1}]
 
 
-def test_a_writer_that_ends_while_it_is_asked_for_its_name_is_no_crash(tmp_path, monkeypatch):
+def test_a_writer_may_end_while_its_lock_is_read(tmp_path, monkeypatch):
     path = tmp_path / ".writer-0-1"
     real = fcntl.flock
 

@@ -333,7 +333,7 @@ def test_rates_exclude_the_time_of_validation(scene, data, tmp_path):
 
 def test_a_stream_logs_its_production_rate_and_buffer_size(scene, folder, data, tmp_path):
     options = {"val": 4, "test": 4, "workers": 0, "batch_size": 4, "batches": 3}
-    module = OnlineData(scene, folder=str(folder), fresh=4, reuse=1, capacity=64, **options)
+    module = OnlineData(scene, folder=str(folder), new_per_round=4, reuse=1, capacity=64, **options)
     threads = torch.get_num_threads()
     tutor = trainer(tmp_path, ThroughputMonitor(), epochs=3)
     tutor.fit(surrogate(scene), datamodule=module)

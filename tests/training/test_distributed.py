@@ -125,8 +125,14 @@ def test_two_processes_of_an_unnamed_run_share_one_folder(trained, tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_share_one_stream(trained):
-    online = ["data=online", "data.workers=0", "data.batches=2", "data.fresh=8", "data.reuse=1"]
-    status, _, err, ranks = trained(*online, "data.save=true", "trainer.max_epochs=2", "run=r")
+    online = [
+        "data=online",
+        "data.workers=0",
+        "data.batches=2",
+        "data.new_per_round=8",
+        "data.reuse=1",
+    ]
+    status, _, err, ranks = trained(*online, "data.cache=true", "trainer.max_epochs=2", "run=r")
     assert status == 0, err[-3000:]
     (weights, *seen), (others, *rest) = ranks
     assert weights == others

@@ -446,13 +446,13 @@ def test_an_interrupted_stream_continues_with_new_loads(scene, folder, data, tmp
     def stream():
         return OnlineData(
             scene, folder=str(folder), val=4, test=4, workers=0, batch_size=4, batches=3,
-            fresh=4, reuse=1, capacity=16,
+            new_per_round=4, reuse=1, capacity=16,
         )  # fmt: skip
 
     _, part = run(scene, tmp_path, stream(), stop=1)
-    assert part.datamodule.state_dict() == {"produced": 12, "following": 12}
+    assert part.datamodule.state_dict() == {"produced": 12, "next_index": 12}
     _, end = run(scene, tmp_path, stream(), epochs=2, resume="last")
-    assert end.datamodule.state_dict() == {"produced": 24, "following": 24}
+    assert end.datamodule.state_dict() == {"produced": 24, "next_index": 24}
 
 
 def test_best_is_the_checkpoint_with_the_smallest_error(scene, data, tmp_path):

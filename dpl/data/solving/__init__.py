@@ -1,1 +1,1 @@
-"""One load solved, and worker processes that solve many."""
+"""Solving of single loads, and of many loads by worker processes."""

@@ -1,4 +1,4 @@
-"""One load, drawn and solved."""
+"""Drawing and solving a single load."""
 
 import time
 from typing import NamedTuple
@@ -13,27 +13,32 @@ from dpl.system.threads import one_thread
 
 
 class LoadKey(NamedTuple):
-    """A load to solve: which one of which stream."""
+    """Identifier of a load.
+
+    Attributes:
+        seed: Seed of the stream.
+        number: Number of the load in the stream.
+    """
 
     seed: tuple[int, int]
     number: int
 
 
 class SolvedLoad(NamedTuple):
-    """One load, solved or not; arrays and numbers only, to cross between processes.
+    """A load with its solution; arrays and numbers only, so that it is pickled without torch.
 
     Attributes:
-        job: Which load it is.
-        point: Point of the unit cube that it stands for, see `LoadFamily`, (d,).
-        force, displacement: (N, D) [-]; the displacement is an answer only if `accepted`.
+        job: Identifier of the load.
+        point: Point of the unit cube that the load is drawn from, see `LoadFamily`, (d,).
+        force, displacement: (N, D) [-]; the displacement is a solution only if `accepted`.
         amplitude: ||f|| / ||Phi q_max|| [-].
-        accepted: Whether `displacement` meets the tolerance, inverts nothing and is stable.
+        accepted: True if `displacement` meets the tolerance, has det F > 0 and is stable.
         residual: ||R_free|| / ||f|| [-].
         volume_ratio: min det F [-].
-        load_factor: Part of the load for which an equilibrium was found [-].
-        iterations: Newton iterations.
+        load_factor: Fraction of the load for which an equilibrium was found [-].
+        iterations: Number of Newton iterations.
         seconds: Wall time of the solve.
-        reason: Why it is rejected; empty if accepted.
+        reason: Reason of the rejection; empty if accepted.
     """
 
     job: LoadKey
@@ -51,14 +56,14 @@ class SolvedLoad(NamedTuple):
 
 
 def solve_load(scene: Scene, job: LoadKey, *, point: Tensor | None = None) -> SolvedLoad:
-    """Return a load, solved.
+    """Draw and solve a load.
 
     Args:
-        scene: What is simulated.
-        job: Which load.
-        point: What it stands for, (d,), if it is not the stream's own.
+        scene: Scene of the load.
+        job: Identifier of the load.
+        point: Point of the unit cube to draw the load from, (d,); None: that of the stream.
     """
-    load, where = _drawn(scene, job, point)
+    load, where = _draw(scene, job, point)
     start = time.perf_counter()
     with one_thread():
         solution = solve(scene.solver, load)
@@ -80,8 +85,8 @@ def solve_load(scene: Scene, job: LoadKey, *, point: Tensor | None = None) -> So
 
 
 def failed_load(scene: Scene, job: LoadKey, reason: str, seconds: float = 0.0) -> SolvedLoad:
-    """Return a load that the machine, and not mechanics, has left without an answer."""
-    load, where = _drawn(scene, job, None)
+    """Return a rejected load whose solve did not end: a time-out or a dead worker."""
+    load, where = _draw(scene, job, None)
     force = load.force[0].numpy()
     return SolvedLoad(
         *(job, where, force, 0 * force, _amplitude(scene, load), False, np.nan, np.nan),
@@ -93,6 +98,6 @@ def _amplitude(scene: Scene, load: Load) -> float:
     return float(scene.problem.acting(load.force).norm()) / scene.loads.largest_force
 
 
-def _drawn(scene: Scene, job: LoadKey, point: Tensor | None) -> tuple[Load, NDArray[np.float64]]:
+def _draw(scene: Scene, job: LoadKey, point: Tensor | None) -> tuple[Load, NDArray[np.float64]]:
     points = scene.loads.points(job.seed, [job.number]) if point is None else point[None]
     return scene.loads.loads_at(points), points[0].numpy()

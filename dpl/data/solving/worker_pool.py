@@ -1,18 +1,22 @@
-"""Solves loads on many cores: worker processes, supervised.
+"""Pool of supervised worker processes that solve loads.
 
-A worker that dies is replaced and its load tried again; one that hangs is replaced and its load
-recorded; Ctrl-C lets loads at work be finished, a second one does not; and whatever becomes of this
-process, no worker outlives it.
+- A worker that dies is replaced, and its load is tried again.
+- A worker that exceeds the time limit is replaced, and its load is recorded as failed.
+- After the first SIGINT or SIGTERM the solves in progress are finished; the second one aborts them.
+- No worker outlives this process.
 """
 
 import atexit
 import contextlib
+import math
 import os
 import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -23,53 +27,53 @@ from dpl.data.solving.solve import LoadKey, SolvedLoad, failed_load, solve_load
 from dpl.scene import Scene
 from dpl.system.processes import block_signals, spawn_context
 
-MAX_RETRIES = 3  # of a load whose worker died, before it is given up
-MAX_CONSECUTIVE_CRASHES = 12  # deaths in a row after which the fault is not in the loads
-STARTUP_GRACE = 120.0  # more time for a worker's first load: imports, compilation [s]
+MAX_RETRIES = 3  # tries of a load whose worker dies
+MAX_CONSECUTIVE_CRASHES = 12  # without a solved load in between; the loads are not the cause
+STARTUP_GRACE = 120.0  # additional time for the first load of a worker: imports, compilation [s]
+RETRY_DELAY = 8  # loads that are solved before a load whose worker died is tried again
 
 
 class GracefulShutdown:
-    """Whether somebody wants to stop: a context that takes Ctrl-C and SIGTERM.
+    """Context manager that turns the first SIGINT or SIGTERM into a flag, which is its truth value.
 
-    Asked once, it is true. Asked twice, it raises at once where the program is: KeyboardInterrupt,
-    or SystemExit after a SIGTERM.
+    The second one raises KeyboardInterrupt, or SystemExit if the first one was a SIGTERM.
     """
 
     def __init__(self) -> None:
-        """Begin with nobody asking."""
-        self._asked = 0
-        self._before: dict[int, Any] = {}
+        """Start without a request."""
+        self._requested = 0
+        self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> "GracefulShutdown":
-        """Take the signals; threads other than the main one cannot."""
+        """Install the signal handlers, which is possible in the main thread only."""
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._ask)
+                self._previous[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Give the signals back."""
-        for number, before in self._before.items():
-            signal.signal(number, before)
+        """Restore the previous signal handlers."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
 
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        if self._asked:
-            for each in self._before:  # nothing may interrupt what ends the workers
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self._requested:
+            for each in self._previous:  # the termination of the workers must not be interrupted
                 signal.signal(each, signal.SIG_IGN)
             self.exit()
-        self._asked = number
-        # not print: it may be what the signal has interrupted
-        os.write(2, b"\nstopping when the loads at work are done; once more to stop at once\n")
+        self._requested = number
+        # not print, which is not reentrant and may be what the signal has interrupted
+        os.write(2, b"\nFinishing the solves in progress. Press Ctrl-C again to abort.\n")
 
     def __bool__(self) -> bool:
-        """Return whether somebody has asked."""
-        return self._asked != 0
+        """Return True after the first signal."""
+        return self._requested != 0
 
     def exit(self) -> None:
-        """Raise what ends a program that was asked to stop; do nothing if nobody has asked."""
-        if self._asked == signal.SIGTERM:
+        """Raise KeyboardInterrupt or SystemExit after a signal; do nothing without one."""
+        if self._requested == signal.SIGTERM:
             sys.exit(128 + signal.SIGTERM)
-        if self._asked:
+        if self._requested:
             raise KeyboardInterrupt
 
 
@@ -81,132 +85,151 @@ def solve_loads(
     timeout: float | None = None,
     stop: GracefulShutdown | None = None,
 ) -> Iterator[SolvedLoad]:
-    """Yield loads solved, in the order in which they are finished.
+    """Yield solved loads in the order in which they are finished.
 
     Args:
-        scene: What is simulated.
-        jobs: Which loads.
-        workers: Processes, one core each; 0 solves in this one, where none can be timed out.
-        timeout: Longest time for one load [s], a worker's first one has more; None: no limit.
-        stop: Asked before each load whether to begin no more.
+        scene: Scene of the loads.
+        jobs: Identifiers of the loads.
+        workers: Number of processes, one core each; 0: solve in this process, without time limit.
+        timeout: Time limit for a load [s]; the first load of a worker has more. None: no limit.
+        stop: Once it is true, no further load is started.
 
     Raises:
-        RuntimeError: Workers die one after the other.
+        RuntimeError: Workers die repeatedly.
     """
     todo, stop = list(jobs)[::-1], GracefulShutdown() if stop is None else stop
     if workers == 0:
         while todo and not stop:
             yield solve_load(scene, todo.pop())
         return
-    with WorkerPool(scene, min(workers, len(todo)), timeout) as crew:
-        deaths: dict[LoadKey, int] = {}
-        in_a_row = 0
-        while crew.busy or (todo and not stop):
-            while todo and crew.idle and not stop:
-                crew.submit(todo.pop())
-            if not crew.busy:  # asked to stop between the two looks
+    with WorkerPool(scene, min(workers, len(todo)), timeout) as pool:
+        crashes: Counter[LoadKey] = Counter()
+        consecutive = 0
+        while pool.busy or (todo and not stop):
+            while todo and pool.idle and not stop:
+                pool.submit(todo.pop())
+            if not pool.busy:  # the stop was requested after the condition of the outer loop
                 break
-            done, dead, hung = crew.wait()
-            yield from done
-            for job in hung:
-                yield failed_load(
-                    scene, job, f"timed out after {timeout:g} s", seconds=timeout or 0.0
-                )
-            in_a_row = 0 if done else in_a_row + len(dead)
-            if in_a_row >= MAX_CONSECUTIVE_CRASHES:
-                raise RuntimeError(f"{in_a_row} workers died one after the other; see above why")
-            for job in dead:
-                deaths[job] = deaths.get(job, 0) + 1
-                if deaths[job] < MAX_RETRIES:
-                    todo.insert(max(0, len(todo) - 8), job)  # after others: is it the load?
+            solved, crashed, late = pool.wait()
+            yield from solved
+            for job in late:
+                reason = f"timed out after {timeout:g} s"
+                yield failed_load(scene, job, reason, seconds=timeout or 0.0)
+            consecutive = 0 if solved else consecutive + len(crashed)
+            if consecutive >= MAX_CONSECUTIVE_CRASHES:
+                raise RuntimeError(f"{consecutive} workers died in a row; see the errors above")
+            for job in crashed:
+                crashes[job] += 1
+                if crashes[job] < MAX_RETRIES:
+                    todo.insert(max(0, len(todo) - RETRY_DELAY), job)
                 else:
                     yield failed_load(scene, job, f"its worker died {MAX_RETRIES} times")
 
 
+@dataclass(eq=False)
+class _Worker:
+    """A worker process.
+
+    Attributes:
+        process: The process.
+        pipe: Connection to it.
+        job: Load that it solves; None: it is idle.
+        deadline: Time at which the load counts as timed out [s].
+        warm: True after its first load.
+    """
+
+    process: BaseProcess
+    pipe: Connection
+    job: LoadKey | None = None
+    deadline: float = math.inf
+    warm: bool = False
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
 class WorkerPool:
-    """Worker processes, each with a pipe; a context that leaves none of them behind."""
+    """Worker processes with a pipe each; a context manager that ends them all."""
 
     def __init__(self, scene: Scene, size: int, timeout: float | None) -> None:
         self._context = spawn_context()
-        self._scene, self._size, self._timeout = scene, size, timeout
-        self._members: dict[Connection, BaseProcess] = {}
-        self._deadlines: dict[Connection, float] = {}
-        self._fresh: set[Connection] = set()
-        self.idle: list[Connection] = []
-        self.busy: dict[Connection, LoadKey] = {}
+        self._scene = scene
+        self._size = size
+        self._timeout = math.inf if timeout is None else timeout
+        self._workers: list[_Worker] = []
 
     def __enter__(self) -> "WorkerPool":
-        atexit.register(self._end)  # before multiprocessing's, which would wait for workers
+        atexit.register(self._kill_all)  # runs before multiprocessing's, which joins the workers
         for _ in range(self._size):
             self._spawn()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._end()
-        atexit.unregister(self._end)
+        self._kill_all()
+        atexit.unregister(self._kill_all)
 
-    def _end(self) -> None:
-        for process in self._members.values():
-            process.kill()
-        for pipe, process in self._members.items():
-            process.join()
-            pipe.close()
-        self._members.clear()
+    def _kill_all(self) -> None:
+        for worker in self._workers:
+            worker.process.kill()
+        while self._workers:
+            self._workers.pop().kill()
 
     def _spawn(self) -> None:
-        ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_work, args=(theirs, self._scene), daemon=True)
+        pipe, far_end = self._context.Pipe()
+        process = self._context.Process(target=_work, args=(far_end, self._scene), daemon=True)
         with block_signals(signal.SIGINT, signal.SIGTERM):
             process.start()
-        theirs.close()
-        self._members[ours] = process
-        self._fresh.add(ours)
-        self.idle.append(ours)
+        far_end.close()
+        self._workers.append(_Worker(process, pipe))
 
-    def _replace(self, pipe: Connection) -> LoadKey:
-        """Put a new worker in the place of one; return its load."""
-        process = self._members.pop(pipe)
-        process.kill()
-        process.join()
-        pipe.close()
-        self._spawn()
-        return self.busy.pop(pipe)
+    @property
+    def idle(self) -> list[_Worker]:
+        return [worker for worker in self._workers if worker.job is None]
+
+    @property
+    def busy(self) -> list[_Worker]:
+        return [worker for worker in self._workers if worker.job is not None]
 
     def submit(self, job: LoadKey) -> None:
-        """Hand a load to an idle worker."""
-        pipe = self.idle.pop()
-        self.busy[pipe] = job
-        if self._timeout is not None:
-            grace = STARTUP_GRACE if pipe in self._fresh else 0.0
-            self._deadlines[pipe] = time.monotonic() + self._timeout + grace
-        with contextlib.suppress(BrokenPipeError):  # it died idle: `wait` will see
-            pipe.send(job)
+        """Send a load to an idle worker."""
+        worker = self.idle[-1]
+        worker.job = job
+        grace = 0.0 if worker.warm else STARTUP_GRACE
+        worker.deadline = time.monotonic() + self._timeout + grace
+        with contextlib.suppress(BrokenPipeError):  # `wait` detects that it died while idle
+            worker.pipe.send(job)
 
     def wait(self) -> tuple[list[SolvedLoad], list[LoadKey], list[LoadKey]]:
-        """Return what was finished, the loads whose workers died, and those whose workers hang."""
-        done, dead = [], []
-        patience = None
-        if self._timeout is not None:
-            first = min(self._deadlines[pipe] for pipe in self.busy)
-            patience = max(0.0, first - time.monotonic())
-        for pipe in connection.wait(list(self.busy), patience):
-            assert isinstance(pipe, Connection)
+        """Wait for an event; return solved loads, loads of dead workers, and timed-out loads."""
+        solved, crashed = [], []
+        busy = {worker.pipe: worker for worker in self.busy}
+        left = min(worker.deadline for worker in busy.values()) - time.monotonic()
+        for pipe in connection.wait(list(busy), None if math.isinf(left) else max(0.0, left)):
+            worker = busy[pipe]  # type: ignore[index]
             try:
-                done.append(pipe.recv())
+                solved.append(worker.pipe.recv())
             except (EOFError, ConnectionResetError):
-                dead.append(self._replace(pipe))
+                crashed.append(self._replace(worker))
                 continue
-            del self.busy[pipe]
-            self._fresh.discard(pipe)
-            self.idle.append(pipe)
+            worker.job, worker.warm = None, True
         now = time.monotonic()
-        late = [pipe for pipe in self.busy if self._deadlines.get(pipe, now) < now]
-        return done, dead, [self._replace(pipe) for pipe in late]
+        late = [self._replace(worker) for worker in self.busy if worker.deadline < now]
+        return solved, crashed, late
+
+    def _replace(self, worker: _Worker) -> LoadKey:
+        """Replace a worker; return its load."""
+        assert worker.job is not None
+        self._workers.remove(worker)
+        worker.kill()
+        self._spawn()
+        return worker.job
 
 
 def _work(pipe: Connection, scene: Scene) -> None:
-    """Solve what comes through the pipe until it closes."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # whatever has unblocked them here
+    """Solve the loads that are received until the pipe closes."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # libraries may have unblocked them
         signal.signal(number, signal.SIG_IGN)
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:

@@ -1,1 +1,1 @@
-"""Data sets on disk: shards, their manifest, their acceptance and their integrity."""
+"""Files of a data set: shards, manifests, pending loads, journal; verification and repair."""

@@ -1,4 +1,4 @@
-"""Whether a data set is biased: how many loads of each amplitude were accepted."""
+"""Acceptance statistics of a data set: fraction of accepted loads by amplitude."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,16 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 BINS = 10
-ENOUGH = 0.9  # accepted part of a bin below which the set is biased
-FEW = 10  # loads below which a bin says nothing
+MIN_ACCEPTANCE = 0.9  # accepted fraction of a bin below which the data set is biased
+MIN_LOADS = 10  # tried loads below which a bin is not judged
 
 
 class AmplitudeBin(NamedTuple):
-    """Loads of one range of amplitudes.
+    """Numbers of loads in a range of amplitudes.
 
     Attributes:
-        low, high: ||f|| / ||Phi q_max|| [-].
-        tried, accepted: Loads.
+        low, high: Limits of ||f|| / ||Phi q_max|| [-].
+        tried, accepted: Numbers of loads.
     """
 
     low: float
@@ -25,12 +25,12 @@ class AmplitudeBin(NamedTuple):
 
     @property
     def biased(self) -> bool:
-        """Whether too many were rejected to call the data set fair."""
-        return self.tried >= FEW and self.accepted < ENOUGH * self.tried
+        """True if too large a fraction of the loads was rejected."""
+        return self.tried >= MIN_LOADS and self.accepted < MIN_ACCEPTANCE * self.tried
 
 
 def amplitude_bins(amplitudes: Sequence[float], accepted: Sequence[bool]) -> list[AmplitudeBin]:
-    """Return ten equal ranges from 0 to the largest amplitude, those without a load left out."""
+    """Return the bins of equal width from 0 to the largest amplitude that are not empty."""
     if not len(amplitudes):
         return []
     largest = max(amplitudes) or 1.0
@@ -45,12 +45,12 @@ def amplitude_bins(amplitudes: Sequence[float], accepted: Sequence[bool]) -> lis
     ]
 
 
-def acceptance_table(parts: Sequence[AmplitudeBin]) -> list[str]:
-    """Return the acceptance by amplitude, a line for the ranges, one for the parts."""
-    if not parts:
+def acceptance_table(bins: Sequence[AmplitudeBin]) -> list[str]:
+    """Return two lines of text: upper limits of the bins, and accepted of tried loads."""
+    if not bins:
         return []
-    heads = [f"{part.high:.2f}" for part in parts]
-    cells = [f"{part.accepted}/{part.tried}" for part in parts]
+    heads = [f"{part.high:.2f}" for part in bins]
+    cells = [f"{part.accepted}/{part.tried}" for part in bins]
     widths = [max(len(a), len(b)) for a, b in zip(heads, cells, strict=True)]
     rows = (("amplitude up to", heads), ("accepted", cells))
     return [
@@ -59,13 +59,14 @@ def acceptance_table(parts: Sequence[AmplitudeBin]) -> list[str]:
     ]
 
 
-def bias_warning(parts: Sequence[AmplitudeBin]) -> str:
-    """Return what is wrong with a biased data set and what to do; empty if it is fair."""
-    if not (poor := [part for part in parts if part.biased]):
+def bias_warning(bins: Sequence[AmplitudeBin]) -> str:
+    """Return a warning for the bin with the lowest acceptance; empty if no bin is biased."""
+    biased = [part for part in bins if part.biased]
+    if not biased:
         return ""
-    worst = min(poor, key=lambda part: part.accepted / part.tried)
+    worst = min(biased, key=lambda part: part.accepted / part.tried)
     return (
-        f"biased: of {worst.tried} loads with amplitudes {worst.low:.2f} to {worst.high:.2f} only "
-        f"{worst.accepted} were accepted, so such loads are rare in the set; lower "
-        "loads.deflection, or look at the reasons in the manifest"
+        f"the data set is biased: only {worst.accepted} of {worst.tried} loads with amplitudes "
+        f"{worst.low:.2f} to {worst.high:.2f} were accepted; lower loads.deflection, or read the "
+        "reasons in the manifest"
     )

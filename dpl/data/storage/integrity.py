@@ -1,4 +1,4 @@
-"""What is wrong with a data set, as far as its scene can tell, and making it sound again."""
+"""Verification and repair of data sets."""
 
 import contextlib
 import re
@@ -10,8 +10,9 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from dpl.data.storage.manifest import STREAMS, lines_of, torn_lines
-from dpl.data.storage.store import MODES, SHARD, Store
+from dpl.data.storage.manifest import STREAMS, invalid_lines, read_manifest, tried_loads
+from dpl.data.storage.shard import Columns, to_dense
+from dpl.data.storage.store import MODES, SHARD_SIZE, Store
 from dpl.data.storage.writer import rewrite
 from dpl.scene import Scene
 from dpl.system.files import (
@@ -22,17 +23,18 @@ from dpl.system.files import (
     write_file,
 )
 
-MACHINE = ("timed out", "its worker died")  # reasons that lie with the machine: `repair` retries
-STRAY = re.compile(rf"({'|'.join(STREAMS)})-(\d{{6,18}})\.safetensors")
+# first words of the reasons of loads that failed because of the machine; `repair` retries these
+MACHINE_FAILURES = ("timed out", "its worker died")
+SHARD_NAME = re.compile(rf"({'|'.join(STREAMS)})-(\d{{6,18}})\.safetensors")
 
 
 class Part(NamedTuple):
-    """A part of a data set that is sound or not.
+    """A file of a data set.
 
     Attributes:
         file: Name of the file.
         split: Split of its loads; empty if it is not a shard.
-        loads: Numbers of the loads that it stands for.
+        loads: Numbers of its loads.
     """
 
     file: str
@@ -41,15 +43,15 @@ class Part(NamedTuple):
 
 
 def verify(store: Store) -> Iterator[tuple[Part, str]]:
-    """Yield each part of a data set with what is wrong with it; empty if nothing is.
+    """Yield each file of a data set with its flaw; empty if it has none.
 
-    The parts are the modes, the shards that a manifest names, the manifests with lines that name no
-    shard, and the shards that no manifest names. A shard is sound if its bytes are those that were
-    written, its loads those that the scene draws, and each displacement balances its load to the
-    tolerance, evaluated again, with nothing inverted.
+    The files are the modes, the shards that a manifest names, the manifests with invalid lines, and
+    the shards that no manifest names. A shard has no flaw if its bytes have the digest of the
+    manifest, its loads are those that the scene draws, and each displacement, evaluated again,
+    is in equilibrium to the tolerance with det F > 0.
 
     Raises:
-        DataSetError: There is none.
+        DataSetError: There is no data set.
     """
     if not (store.folder / "scene.json").exists():
         raise DataSetError(f"{store.folder} holds no data set yet; generate it first")
@@ -60,24 +62,27 @@ def verify(store: Store) -> Iterator[tuple[Part, str]]:
     yield Part(MODES), flaw
     for line in store.shards():
         try:
-            flaw = check_shard(store.scene, store.stream(line["split"]), store.sound(line))
+            flaw = check_shard(store.scene, store.stream(line["split"]), store.read_shard(line))
         except ValueError as error:
             flaw = str(error)
         yield _part(line), flaw
     for manifest in store.manifests():
-        if torn := torn_lines(manifest):
-            number, why = torn[0]
-            told = f"has {len(torn)} lines that describe no shard; the first is line {number}, "
-            yield Part(manifest.name), f"{told}which {why}"
-    for path in _unnamed(store):
-        yield _stray(store, path), "is named by no manifest"
+        if invalid := invalid_lines(manifest):
+            number, reason = invalid[0]
+            yield (
+                Part(manifest.name),
+                f"has {len(invalid)} lines that describe no shard; the first is line {number}, "
+                f"which {reason}",
+            )
+    for path in _unnamed_shards(store):
+        yield _unnamed_part(store, path), "is named by no manifest"
 
 
 def repair(store: Store) -> list[tuple[Part, str]]:
-    """Remove what is damaged from a data set; return each part with what was done to it.
+    """Remove damaged files from a data set; return each with its flaw and the action taken.
 
-    Shards with loads that the machine lost are removed as well. The loads of a removed shard are
-    missing from then on.
+    Shards with loads that failed because of the machine are removed as well. The loads of a removed
+    shard are missing afterwards.
 
     Raises:
         DataSetError: Another process writes there.
@@ -87,28 +92,33 @@ def repair(store: Store) -> list[tuple[Part, str]]:
     with exclusive_lock(store.folder):
         flaws = {part: flaw for part, flaw in verify(store) if flaw}
         for line in store.shards():
-            if any(one["reason"].startswith(MACHINE) for one in line["rejected"]):
-                flaws.setdefault(_part(line), "holds loads that the machine lost")
-        poor = {part.file for part in flaws}
-        if MODES in poor:
+            if _failed_by_machine(line):
+                flaws.setdefault(_part(line), "holds loads that failed because of the machine")
+        damaged = {part.file for part in flaws}
+        if MODES in damaged:
             write_file(store.folder / MODES, save(dict(store.scene.loads.arrays())))
         for manifest in store.manifests():
-            rewrite(manifest, [line for line in lines_of(manifest) if line["file"] not in poor])
-        for path in [*_unnamed(store), *store.folder.rglob(".*.part")]:
+            lines = [line for line in read_manifest(manifest) if line["file"] not in damaged]
+            rewrite(manifest, lines)
+        for path in [*_unnamed_shards(store), *store.folder.rglob(".*.part")]:
             if path.is_symlink() or not path.is_dir():
                 path.unlink()
             else:
-                with contextlib.suppress(OSError):  # it is not empty: somebody's own
+                with contextlib.suppress(OSError):  # a folder of the user that is not empty
                     path.rmdir()
         for path in store.pending.files().values():
-            if store.pending.get(path).reason.startswith(MACHINE):
+            if _failed_by_machine(store.pending.read(path)[0]):
                 path.unlink()
         sync_folder(store.folder)
-    return [(part, f"{flaw}; {_done(store, part)}") for part, flaw in flaws.items()]
+    return [(part, f"{flaw}; {_action(store, part)}") for part, flaw in flaws.items()]
 
 
-def _done(store: Store, part: Part) -> str:
-    """Return what `repair` does to a part that is not sound."""
+def _failed_by_machine(line: Mapping[str, Any]) -> bool:
+    return any(one["reason"].startswith(MACHINE_FAILURES) for one in line["rejected"])
+
+
+def _action(store: Store, part: Part) -> str:
+    """Return the action of `repair` for a damaged file."""
     if part.file == MODES:
         return "it is written again"
     if part.file in {path.name for path in store.manifests()}:
@@ -118,46 +128,43 @@ def _done(store: Store, part: Part) -> str:
 
 
 def _part(line: Mapping[str, Any]) -> Part:
-    numbers = range(line["first"], line["first"] + line["tried"])
-    return Part(line["file"], line["split"], numbers)
+    return Part(line["file"], line["split"], tried_loads(line))
 
 
-def _unnamed(store: Store) -> list[Path]:
-    """Return the files of the folder that could be shards and that no manifest names."""
+def _unnamed_shards(store: Store) -> list[Path]:
+    """Return the files that could be shards and that no manifest names."""
     named = {MODES, *(Path(line["file"]).name for line in store.shards())}
     return [p for p in sorted(store.folder.glob("*.safetensors")) if p.name not in named]
 
 
-def _stray(store: Store, path: Path) -> Part:
-    """Return what a file that no manifest names stands for: the loads that can be read in it."""
+def _unnamed_part(store: Store, path: Path) -> Part:
+    """Return a shard that no manifest names, with the loads that can be read from it."""
     loads: list[int] = []
-    if name := STRAY.fullmatch(path.name):
-        try:
-            shard = store.opened(read_regular_file(path, store.largest(SHARD)))
-            numbers = range(int(name[2]), int(name[2]) + SHARD)
+    if name := SHARD_NAME.fullmatch(path.name):
+        with contextlib.suppress(ValueError):  # it is damaged: its loads are unknown
+            shard = store.decode(read_regular_file(path, store.max_shard_size(SHARD_SIZE)))
+            numbers = range(int(name[2]), int(name[2]) + SHARD_SIZE)
             loads = [number for number in shard["index"].tolist() if number in numbers]
-        except ValueError:  # it is damaged: nobody knows which loads it held
-            pass
     return Part(path.name, name[1] if name else "", tuple(loads))
 
 
 def check_modes(scene: Scene, stored: Mapping[str, Tensor]) -> str:
-    """Return what is wrong with stored modes, their signs and bases included; empty if nothing."""
-    near = [
+    """Return the flaw of stored modes, whose signs and bases count; empty if there is none."""
+    equal = [
         (stored[name].shape, stored[name].dtype) == (array.shape, array.dtype)
         and torch.allclose(stored[name], array, rtol=0, atol=1e-6 * float(array.abs().max()))
         for name, array in scene.loads.arrays().items()
     ]
-    return "" if all(near) else "holds other modes than this scene has"
+    return "" if all(equal) else "holds other modes than this scene has"
 
 
-def check_shard(scene: Scene, stream: tuple[int, int], shard: Mapping[str, Tensor]) -> str:
-    """Return what is wrong with a shard; empty if nothing is.
+def check_shard(scene: Scene, stream: tuple[int, int], shard: Columns) -> str:
+    """Return the first flaw of a shard; empty if there is none.
 
     Args:
-        scene: What it was made for.
-        stream: Seed of its loads.
-        shard: What it holds.
+        scene: Scene of the data set.
+        stream: Seed of the shard's loads.
+        shard: Columns of the shard.
     """
     problem, loads = scene.problem, scene.loads
     if not len(shard["index"]):
@@ -165,16 +172,16 @@ def check_shard(scene: Scene, stream: tuple[int, int], shard: Mapping[str, Tenso
     points = loads.points(stream, shard["index"].tolist())
     if not torch.allclose(shard["point"], points, rtol=0, atol=1e-12):
         return "holds other loads than its seed draws"
-    rounding = 1e-9 * loads.largest_force
-    if not torch.allclose(shard["force"], loads.loads_at(points).force, rtol=1e-6, atol=rounding):
+    forces, roundoff = to_dense(shard, problem.shape), 1e-9 * loads.largest_force
+    if not torch.allclose(forces, loads.loads_at(points).force, rtol=1e-6, atol=roundoff):
         return "holds loads that this scene does not draw"
     poisson = loads.poisson_at(points)
     if not torch.allclose(shard["poisson"], poisson, rtol=0, atol=1e-12):
         return "holds other Poisson's ratios than its seed draws"
-    for k, (u, force) in enumerate(zip(shard["displacement"], shard["force"], strict=True)):
+    for k, (u, force) in enumerate(zip(shard["displacement"], forces, strict=True)):
         body = problem.at(shard["poisson"][k, None])
         internal, volume = body.evaluate(u[None])
         balanced = body.is_equilibrium(u[None], internal, force[None], scene.solver.tol)
         if not (bool(volume > 0) and bool(balanced)):
-            return f"holds an answer out of balance: load {int(shard['index'][k])}"
+            return f"holds a displacement that is not in equilibrium: load {int(shard['index'][k])}"
     return ""

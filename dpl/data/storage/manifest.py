@@ -1,31 +1,54 @@
-"""What the manifest of a data set says of its shards, and whether that can be."""
+"""Manifest of a data set: a line of JSON for each shard, checked when it is read."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from dpl.data.solving.solve import SolvedLoad
 from dpl.system.files import parsed_lines
 
 STREAMS = {"train": 0, "val": 1, "test": 2}  # disjoint streams of one seed
-LINE = {  # what a line of the manifest has
+KEYS = {
     *("file", "sha256", "split", "first", "tried", "accepted"),
     *("iterations", "amplitudes", "rejected"),
 }
 NAME = re.compile(r"[\w.-][\w./-]{0,199}")  # of a shard
-MOST = 1e15  # that a number of a manifest or a journal can be
+UPPER_LIMIT = 1e15  # of a number in a manifest or a journal
 
 
-def lines_of(manifest: Path) -> list[dict[str, Any]]:
-    """Return the lines of a manifest that describe a shard.
+def entry_of_load(split: str, solved: SolvedLoad) -> dict[str, Any]:
+    """Return the line of a manifest for a shard of one load, without `file` and `sha256`."""
+    number, accepted = solved.job.number, solved.accepted
+    reject = {"index": number, "reason": solved.reason, "load_factor": solved.load_factor}
+    return {
+        "split": split,
+        "first": number,
+        "tried": 1,
+        "accepted": int(accepted),
+        "iterations": solved.iterations,
+        "amplitudes": [round(solved.amplitude, 6)],
+        "rejected": [] if accepted else [reject],
+    }
 
-    The other lines are left out, so that their loads are solved again; see `torn_lines`.
-    """
+
+def merge_entries(entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the entry of a shard from those of its loads, in ascending order."""
+    merged = {"split": entries[0]["split"], "first": entries[0]["first"]}
+    for key in ("tried", "accepted", "iterations"):
+        merged[key] = sum(entry[key] for entry in entries)
+    for key in ("amplitudes", "rejected"):
+        merged[key] = [value for entry in entries for value in entry[key]]
+    return merged
+
+
+def read_manifest(manifest: Path) -> list[dict[str, Any]]:
+    """Return the valid lines of a manifest; the loads of the others are solved again."""
     return [line for line in parsed_lines(manifest) if line is not None and not _flaw_of(line)]
 
 
-def torn_lines(manifest: Path) -> list[tuple[int, str]]:
-    """Return the number (from 1) of each line that `lines_of` leaves out, and the reason."""
+def invalid_lines(manifest: Path) -> list[tuple[int, str]]:
+    """Return the number (from 1) of each line that `read_manifest` leaves out, and the reason."""
     flaws = (
         "is not a JSON object" if line is None else _flaw_of(line)
         for line in parsed_lines(manifest)
@@ -34,43 +57,42 @@ def torn_lines(manifest: Path) -> list[tuple[int, str]]:
 
 
 def _flaw_of(line: Mapping[str, Any]) -> str:
-    """Return why a line cannot describe a shard; empty if it can."""
-    if absent := LINE - line.keys():
+    """Return the reason why a line describes no shard; empty if it is valid."""
+    if absent := KEYS - line.keys():
         return f"lacks {', '.join(sorted(absent))}"
     for key in ("file", "sha256", "split"):
         if not isinstance(line[key], str):
-            return f"has a {key} that is not text"
+            return f"has a {key} that is not a string"
     if line["split"] not in STREAMS:
         return "names a split that does not exist"
     if not NAME.fullmatch(line["file"]):
         return "names a file that is not in the folder of the data set"
     for key in ("first", "tried", "accepted", "iterations"):
         if not (type(line[key]) is int and 0 <= line[key] < 2**53):
-            return f"has a number {key} that cannot be"
+            return f"has a number {key} out of range"
     if "/" not in line["file"] and line["file"] != shard_name(line["split"], line["first"]):
         return "names the file of another split or of another first load"
     return _flaw_of_loads(line)
 
 
 def _flaw_of_loads(line: Mapping[str, Any]) -> str:
-    """Return why the loads that a line lists cannot be those of a shard; empty if they can."""
+    """Return the reason why the loads of a line are invalid; empty if they are valid."""
     amplitudes, rejected = line["amplitudes"], line["rejected"]
     if not isinstance(amplitudes, list) or not isinstance(rejected, list):
         return "has amplitudes or rejected loads that are not lists"
     if not len(amplitudes) == line["tried"] == line["accepted"] + len(rejected):
-        return "has numbers of loads that disagree"
+        return "has inconsistent numbers of loads"
     if not all(map(is_number, amplitudes)):
-        return "has an amplitude that cannot be"
-    numbers = range(line["first"], line["first"] + line["tried"])
-    possible = all(
+        return "has an amplitude out of range"
+    valid = all(
         isinstance(one, dict)
         and type(one.get("index")) is int
-        and one["index"] in numbers
+        and one["index"] in tried_loads(line)
         and isinstance(one.get("reason"), str)
         and "load_factor" in one
         for one in rejected
     )
-    return "" if possible else "has a rejected load that cannot be"
+    return "" if valid else "has an invalid rejected load"
 
 
 def shard_name(split: str, first: int) -> str:
@@ -84,17 +106,21 @@ def shard_name(split: str, first: int) -> str:
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value is a number that a manifest or a journal may hold."""
-    return type(value) in (int, float) and 0 <= value < MOST
+    """Return True for a number that a manifest or a journal may hold."""
+    return type(value) in (int, float) and 0 <= value < UPPER_LIMIT
 
 
-def kept_in(line: Mapping[str, Any]) -> list[int]:
-    """Return the loads that a shard must hold."""
+def tried_loads(line: Mapping[str, Any]) -> range:
+    """Return the numbers of the loads of a line, accepted or rejected."""
+    return range(line["first"], line["first"] + line["tried"])
+
+
+def accepted_loads(line: Mapping[str, Any]) -> list[int]:
+    """Return the numbers of the loads whose solutions the shard of a line holds."""
     rejected = {one["index"] for one in line["rejected"]}
-    numbers = range(line["first"], line["first"] + line["tried"])
-    return [number for number in numbers if number not in rejected]
+    return [number for number in tried_loads(line) if number not in rejected]
 
 
-def place(line: Mapping[str, Any]) -> tuple[int, int]:
-    """Return where a line of the manifest belongs."""
+def sort_key(line: Mapping[str, Any]) -> tuple[int, int]:
+    """Return the position of a line in the manifest: by split, then by first load."""
     return STREAMS[line["split"]], line["first"]

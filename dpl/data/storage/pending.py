@@ -1,53 +1,68 @@
-"""Loads that are solved and wait for their shard: a file each, whole or not there."""
+"""Solved loads whose shard is not complete yet, each in a file of its own."""
 
 import hashlib
+import json
 import re
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load, save
+from torch import Tensor
 
 from dpl.data.solving.solve import LoadKey, SolvedLoad
-from dpl.data.storage.shard import deserialize, serialize
+from dpl.data.storage.manifest import entry_of_load
+from dpl.data.storage.shard import Columns, encode_load
 from dpl.system.files import atomic_write, read_regular_file
 
 NAME = re.compile(r"([a-z]+)-(\d{6,18})\.load")
-DIGEST = 32  # bytes of SHA-256, of its name and itself, before a load
-LEFT = 10.0  # age from which on a file that was not finished is a killed process's [s]
+DIGEST_SIZE = 32  # bytes
+PARTIAL_FILE_AGE = 10.0  # age above which the writer of an unfinished file is taken for dead [s]
 
 
 @dataclass(frozen=True)
-class PendingSamples:
-    """A folder of loads, each in a file of its own.
+class PendingLoads:
+    """A folder of solved loads.
+
+    A file holds the SHA-256 of its name and of the rest, the manifest entry of the load (a line of
+    JSON), and a shard of this load alone.
 
     Attributes:
-        folder: Where they are; made and removed as needed.
+        folder: The folder; created by the first `write`.
         streams: Seed of each split.
+        poisson_at: From points (B, d) to Poisson's ratios (B, P).
     """
 
     folder: Path
     streams: dict[str, tuple[int, int]]
+    poisson_at: Callable[[Tensor], Tensor]
 
-    def put(self, one: SolvedLoad) -> Path:
-        """Write a load; return its file."""
+    def write(self, solved: SolvedLoad) -> Path:
+        """Write a load; return the path of its file."""
         self.folder.mkdir(exist_ok=True)
-        (split,) = (name for name, seed in self.streams.items() if seed == one.job.seed)
-        path = self.folder / f"{split}-{one.job.number:06d}.load"
-        content = serialize(one)
-        # not synced: what a crash of the machine damages, its digest tells
+        (split,) = (name for name, seed in self.streams.items() if seed == solved.job.seed)
+        path = self.folder / f"{split}-{solved.job.number:06d}.load"
+        columns = encode_load(solved, self.poisson_at(torch.from_numpy(solved.point)[None]))
+        content = json.dumps(entry_of_load(split, solved)).encode() + b"\n" + save(columns)
+        # not synced: `files` removes a file that a crash of the machine has damaged
         with atomic_write(path, sync=False) as file:
             file.write(_digest(path, content) + content)
         return path
 
-    def get(self, path: Path) -> SolvedLoad:
-        """Return the load in a file."""
-        return deserialize(path.read_bytes()[DIGEST:])
+    def read(self, path: Path) -> tuple[dict[str, Any], Columns]:
+        """Return manifest entry and columns of a load that `files` has found."""
+        entry, _, columns = path.read_bytes()[DIGEST_SIZE:].partition(b"\n")
+        return json.loads(entry), load(columns)
 
     def files(self) -> dict[LoadKey, Path]:
-        """Return the loads that are there; damaged ones are removed.
+        """Return the files by load; remove damaged ones.
 
         Raises:
-            DataSetError: One is no file of its own.
+            DataSetError: One is not a regular file.
         """
         found = {}
         for path in sorted(self.folder.glob("*.load")):
@@ -55,28 +70,27 @@ class PendingSamples:
                 continue
             if path.is_symlink():  # not followed: its load is solved again
                 continue
-            with suppress(FileNotFoundError):  # another writer has made a shard of it meanwhile
+            with suppress(FileNotFoundError):  # another writer has moved it into a shard
                 content = read_regular_file(path)
-                if _digest(path, content[DIGEST:]) == content[:DIGEST]:
+                if _digest(path, content[DIGEST_SIZE:]) == content[:DIGEST_SIZE]:
                     found[LoadKey(self.streams[name[1]], int(name[2]))] = path
                 else:
                     path.unlink()
         return found
 
-    def clean(self) -> None:
-        """Remove the folder if nothing is in it."""
+    def remove_if_empty(self) -> None:
+        """Remove the folder if it is empty."""
         with suppress(OSError):
             self.folder.rmdir()
 
 
 def _digest(path: Path, content: bytes) -> bytes:
-    """Return what tells that a file is whole, and the load that its name says."""
     return hashlib.sha256(path.name.encode() + content).digest()
 
 
 def clean_partial_files(folder: Path) -> None:
-    """Remove what killed processes were writing in a folder or below it."""
+    """Remove files that killed processes left unfinished in a folder or below it."""
     for path in folder.rglob(".*.part"):
         with suppress(FileNotFoundError):
-            if time.time() - path.stat().st_mtime > LEFT:
+            if time.time() - path.stat().st_mtime > PARTIAL_FILE_AGE:
                 path.unlink()

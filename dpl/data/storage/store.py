@@ -1,16 +1,16 @@
-"""The data set on disk: immutable safetensors shards and a manifest that names them.
+"""Data set on disk: immutable safetensors shards and manifests that name them.
 
     FOLDER/scene.json            fingerprint of the scene with its fields, seed, versions
     FOLDER/modes.safetensors     eigenvalues and eigenvectors that the loads are made of
     FOLDER/train-000000.safetensors, ...
-    FOLDER/manifest.jsonl        a line a shard: name, SHA-256, loads tried, rejects with reasons
-    FOLDER/manifest-1-of-4.jsonl the same of one writer of several
-    FOLDER/journal.jsonl         a line a session: when, where, how long
-    FOLDER/spool/                loads solved whose shard is not complete, a file each
+    FOLDER/manifest.jsonl        one line per shard: name, SHA-256, loads tried, rejected loads
+    FOLDER/manifest-1-of-4.jsonl the same of one of several writers
+    FOLDER/journal.jsonl         one line per session: date, machine, duration
+    FOLDER/pending/              solved loads whose shard is not complete, one file each
 
-Files are written beside their place, synced and renamed; a shard that no manifest names does not
-exist. The manifest holds nothing that depends on a clock: interrupted and resumed, by one worker or
-by eight, the same loads give the same bytes.
+Files are written beside their destination, synced and renamed. A shard that no manifest names is
+ignored. The manifest holds nothing that depends on a clock: the same loads give the same bytes for
+any number of workers and after any interruption.
 """
 
 import hashlib
@@ -29,27 +29,34 @@ from safetensors.torch import load
 from torch import Tensor
 
 from dpl.data.solving.solve import LoadKey, SolvedLoad
-from dpl.data.storage import acceptance as balance
-from dpl.data.storage.manifest import STREAMS, is_number, kept_in, lines_of, place
-from dpl.data.storage.pending import PendingSamples
-from dpl.data.storage.shard import decode_shard, select
+from dpl.data.storage.acceptance import AmplitudeBin, acceptance_table, amplitude_bins
+from dpl.data.storage.journal import read_sessions
+from dpl.data.storage.manifest import (
+    STREAMS,
+    accepted_loads,
+    read_manifest,
+    sort_key,
+    tried_loads,
+)
+from dpl.data.storage.pending import PendingLoads
+from dpl.data.storage.shard import Columns, decode_shard, select, to_dense
 from dpl.scene import Sample, Scene
-from dpl.system.files import DataSetError, read_jsonl, read_regular_file
+from dpl.system.files import DataSetError, read_regular_file
 
-FORMAT = 2
+FORMAT = 3
 MODES = "modes.safetensors"
-HEADER = 100_000  # bytes of a shard besides its numbers, at most
-SHARD = 64  # loads in one file
+HEADER = 100_000  # largest size of a shard without its numbers [bytes]
+SHARD_SIZE = 64  # loads in one file
 
 
 @dataclass(frozen=True)
 class Store:
-    """A data set of one scene and one seed.
+    """Data set of one scene and one seed.
 
     Attributes:
-        folder: Where it is, or will be.
-        scene: What it must be a data set of.
-        seed: Names its loads.
+        folder: Folder of the data set; need not exist.
+        scene: Scene of the loads.
+        seed: Seed of the loads.
     """
 
     folder: Path
@@ -57,16 +64,17 @@ class Store:
     seed: int
 
     def stream(self, split: str) -> tuple[int, int]:
-        """Return the seed of a split's loads."""
+        """Return the seed of the loads of a split."""
         return self.seed, STREAMS[split]
 
     @property
-    def pending(self) -> PendingSamples:
-        """The loads that are solved and wait for their shard."""
-        return PendingSamples(self.folder / "spool", {name: self.stream(name) for name in STREAMS})
+    def pending(self) -> PendingLoads:
+        """Solved loads whose shard is not complete."""
+        streams = {name: self.stream(name) for name in STREAMS}
+        return PendingLoads(self.folder / "pending", streams, self.scene.loads.poisson_at)
 
     def shards(self) -> list[dict[str, Any]]:
-        """Return the lines of all manifests by first load; none if there is no data set yet.
+        """Return the lines of all manifests, sorted; empty if there is no data set yet.
 
         Raises:
             DataSetError: The folder holds something else.
@@ -74,9 +82,9 @@ class Store:
         card = self.folder / "scene.json"
         if self.folder.exists() and not self.folder.is_dir():
             raise DataSetError(f"data.folder = {self.folder} must be a folder; choose another")
-        there = {path.name for path in self.folder.iterdir()} if self.folder.exists() else set()
-        if card.name not in there:
-            if not {name for name in there if name[0] != "."} <= {MODES}:
+        names = {path.name for path in self.folder.iterdir()} if self.folder.exists() else set()
+        if card.name not in names:
+            if not {name for name in names if name[0] != "."} <= {MODES}:
                 raise DataSetError(
                     f"{self.folder} is not empty and no data set; choose another data.folder"
                 )
@@ -89,14 +97,15 @@ class Store:
             raise DataSetError(
                 f"{card} is damaged ({error}); choose another data.folder or remove this one"
             ) from None
-        lines = [line for path in self.manifests() for line in lines_of(path)]
-        return sorted(lines, key=place)
+        lines = [line for path in self.manifests() for line in read_manifest(path)]
+        return sorted(lines, key=sort_key)
 
     def manifests(self) -> list[Path]:
-        """Return the manifests of all writers."""
+        """Return the paths of the manifests of all writers."""
         return sorted(self.folder.glob("manifest*.jsonl"))
 
     def _check(self, card: dict[str, Any]) -> None:
+        """Raise DataSetError if the data set is one of another format, scene or seed."""
         if card.get("format") != FORMAT:
             raise DataSetError(
                 f"{self.folder} has format {card.get('format')}, this dpl reads {FORMAT}; "
@@ -122,23 +131,27 @@ class Store:
 
         Args:
             split: train, val or test.
-            count: So many loads are wanted.
-            shard: Of these the ones that fall to this writer, of
-            shards: so many, who take files in turn.
+            count: Number of loads.
+            shard: Index of the writer among `shards` writers, who take blocks of `SHARD_SIZE`
+                loads in turn; only its loads are returned.
+            shards: Number of writers.
         """
-        tried: set[int] = set()
-        for line in self.shards():
-            if line["split"] == split:
-                tried.update(range(line["first"], line["first"] + line["tried"]))
-        mine = (index for index in range(count) if index // SHARD % shards == shard)
-        return [index for index in mine if index not in tried]
+        tried = {number for line in self._shards_of(split) for number in tried_loads(line)}
+        return [
+            number
+            for number in range(count)
+            if number // SHARD_SIZE % shards == shard and number not in tried
+        ]
+
+    def _shards_of(self, split: str) -> list[dict[str, Any]]:
+        return [line for line in self.shards() if line["split"] == split]
 
     def tried(self) -> set[LoadKey]:
-        """Return the loads that are in a shard, or rejected there."""
+        """Return the loads that are in a shard or were rejected."""
         return {
-            LoadKey(self.stream(line["split"]), index)
+            LoadKey(self.stream(line["split"]), number)
             for line in self.shards()
-            for index in range(line["first"], line["first"] + line["tried"])
+            for number in tried_loads(line)
         }
 
     def load(self, split: str, count: int) -> Sample:
@@ -147,94 +160,92 @@ class Store:
         Raises:
             DataSetError: A shard is damaged, or there are no samples.
         """
-        parts = []
-        for line in self.shards():
-            if line["split"] == split and line["first"] < count:
-                parts.append(self._read(line))
-        index = torch.cat([part["index"] for part in parts]) if parts else torch.zeros(0)
-        keep = np.unique(index.numpy(), return_index=True)[1]  # two writers may have had one load
-        keep = keep[index.numpy()[keep] < count]
-        if not len(keep):
+        lines = [line for line in self._shards_of(split) if line["first"] < count]
+        parts = [self._read_shard(line) for line in lines]
+        number = np.concatenate([np.zeros(0, int), *(part["index"].numpy() for part in parts)])
+        rows = np.unique(number, return_index=True)[1]  # two writers may have solved the same load
+        rows = rows[number[rows] < count]
+        if not len(rows):
             raise DataSetError(f"{self.folder} holds no {split} samples")
-        force, displacement, point, poisson = (
-            torch.cat([part[name] for part in parts])[keep]
-            for name in ("force", "displacement", "point", "poisson")
+        shape = self.scene.problem.shape
+        force = torch.cat([to_dense(part, shape) for part in parts])[rows]
+        displacement, point, poisson = (
+            torch.cat([part[name] for part in parts])[rows]
+            for name in ("displacement", "point", "poisson")
         )
         return Sample(force, displacement, self.scene.loads.young_at(point), poisson)
 
-    def _read(self, line: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Return what a shard holds, forces as fields (B, N, D).
+    def _read_shard(self, line: Mapping[str, Any]) -> Columns:
+        """Return the columns of a shard.
 
         Raises:
             DataSetError: It is damaged.
         """
         try:
-            return self.sound(line)
+            return self.read_shard(line)
         except ValueError as error:
             raise DataSetError(
                 f"{self.folder / line['file']} {error}; scripts/generate.py action=repair with the "
                 "same scene solves its loads again"
             ) from None
 
-    def sound(self, line: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Return what a shard holds.
+    def read_shard(self, line: Mapping[str, Any]) -> Columns:
+        """Return the columns of a shard, see `decode_shard`.
 
         Raises:
-            ValueError: It is damaged; the message goes on after its name.
+            ValueError: It is damaged. The message continues a sentence that starts with the name
+                of the file.
         """
         path = self.folder / line["file"]
         if path.parent != self.folder:
             raise ValueError("is not in the folder of the data set and is not read")
         if path.is_symlink() or not path.is_file():
             raise ValueError("is missing")
-        if path.stat().st_size > self.largest(line["tried"]):
+        if path.stat().st_size > self.max_shard_size(line["tried"]):
             raise ValueError("is damaged: it is larger than its loads")
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != line["sha256"]:
-            raise ValueError("is damaged: its SHA-256 is not the manifest's")
-        shard = self.opened(content)
-        if shard["index"].tolist() != kept_in(line):
-            raise ValueError("holds other loads than the manifest says")
+            raise ValueError("is damaged: its SHA-256 differs from the manifest's")
+        shard = self.decode(content)
+        if shard["index"].tolist() != accepted_loads(line):
+            raise ValueError("holds other loads than its line of the manifest")
         return shard
 
-    def largest(self, loads: int) -> int:
-        """Return the number of bytes that a shard of so many loads has at most."""
+    def max_shard_size(self, loads: int) -> int:
+        """Return the largest possible size of a shard of this many loads [bytes]."""
         numbers = 3 * math.prod(self.scene.problem.shape) + self.scene.loads.n_random + 8
         return HEADER + 8 * numbers * loads
 
-    def opened(self, content: bytes) -> dict[str, Tensor]:
+    def decode(self, content: bytes) -> Columns:
         """Return the columns of a shard of this scene, see `decode_shard`."""
         loads = self.scene.loads
-        own = int(loads.poisson_range is not None)
-        return decode_shard(content, self.scene.problem.shape, loads.n_random, own)
+        n_poisson = int(loads.poisson_range is not None)
+        return decode_shard(content, self.scene.problem.shape, loads.n_random, n_poisson)
 
     def reader(self, split: str) -> Callable[[int], SolvedLoad | None]:
-        """Return what gives a split's loads one at a time, None for those not there at present."""
-        lines = {
-            index: line
-            for line in self.shards()
-            if line["split"] == split
-            for index in range(line["first"], line["first"] + line["tried"])
-        }
-        spooled = self.pending.files()
-        shard: dict[str, Tensor] = {}
-        held: dict[str, Any] | None = None
+        """Return a function from the number of a load to the load, None if it is not solved yet."""
+        lines = {number: line for line in self._shards_of(split) for number in tried_loads(line)}
+        pending = self.pending.files()
+        shard: Columns = {}
+        current: dict[str, Any] | None = None  # line of `shard`
 
-        def read(index: int) -> SolvedLoad | None:
-            nonlocal shard, held
-            if (line := lines.get(index)) is None:
-                path = spooled.get(LoadKey(self.stream(split), index))
-                with suppress(FileNotFoundError):  # it is in a shard by now
-                    return self.pending.get(path) if path else None
+        def read(number: int) -> SolvedLoad | None:
+            nonlocal shard, current
+            job = LoadKey(self.stream(split), number)
+            if (line := lines.get(number)) is None:
+                with suppress(FileNotFoundError):  # another process has moved it into a shard
+                    if path := pending.get(job):
+                        entry, columns = self.pending.read(path)
+                        return select(columns, job, entry)
                 return None
-            if held is not line:
-                shard, held = self._read(line), line
-            return select(shard, LoadKey(self.stream(split), index), line)
+            if current is not line:
+                shard, current = self._read_shard(line), line
+            return select(shard, job, line)
 
         return read
 
     def digest(self, split: str, count: int) -> str:
-        """Return the SHA-256 of a split's samples in order, however they came into their shards."""
+        """Return the SHA-256 of the samples of a split; it does not depend on the shard size."""
         found = hashlib.sha256()
         for column in self.load(split, count)[:2]:
             found.update(column.contiguous().numpy().tobytes())
@@ -244,7 +255,7 @@ class Store:
         """Return the stored arrays of the load family, such as modes, see `LoadFamily.arrays`.
 
         Raises:
-            DataSetError: They are damaged.
+            DataSetError: Their file is damaged.
         """
         path = self.folder / MODES
         expected = self.scene.loads.arrays()
@@ -257,66 +268,58 @@ class Store:
                 f"{path} is damaged: {error}; scripts/generate.py action=repair makes it again"
             ) from None
 
-    def acceptance(self) -> list[balance.AmplitudeBin]:
-        """Return how many loads of each amplitude were accepted, all splits together."""
+    def acceptance(self) -> list[AmplitudeBin]:
+        """Return the numbers of tried and accepted loads by amplitude, over all splits."""
         amplitudes: list[float] = []
         accepted: list[bool] = []
         for line in self.shards():
-            rejected = {one["index"] for one in line["rejected"]}
+            kept = set(accepted_loads(line))
             amplitudes += line["amplitudes"]
-            accepted += [line["first"] + k not in rejected for k in range(line["tried"])]
-        return balance.amplitude_bins(amplitudes, accepted)
+            accepted += [number in kept for number in tried_loads(line)]
+        return amplitude_bins(amplitudes, accepted)
 
     def summary(self) -> str:
-        """Return how many loads were tried and accepted, by split and by amplitude."""
+        """Return a table of tried and accepted loads, by split and by amplitude."""
         lines = [str(self.folder)]
         for split in STREAMS:
-            shards = [line for line in self.shards() if line["split"] == split]
+            shards = self._shards_of(split)
             tried, accepted = (sum(line[key] for line in shards) for key in ("tried", "accepted"))
             if tried:
                 mean = sum(line["iterations"] for line in shards) / tried
                 lines.append(
                     f"  {split}: {accepted} of {tried} loads accepted, {mean:.1f} Newton iterations"
                 )
-        lines += [f"  {row}" for row in balance.acceptance_table(self.acceptance())]
-        sessions = self._sessions()
+        lines += [f"  {row}" for row in acceptance_table(self.acceptance())]
+        sessions = read_sessions(self.folder)
         if loads := sum(one["loads"] for one in sessions):
             core = sum(one["core_seconds"] for one in sessions) / loads
             wall = sum(one["seconds"] for one in sessions)
             size = sum(path.lstat().st_size for path in self.folder.glob("*.safetensors")) / 1e6
             lines.append(
-                f"  {core:.3f} s a load on one core, {wall:.0f} s of wall time in {len(sessions)} "
-                f"sessions, {size:.0f} MB"
+                f"  {core:.3f} s per load on one core, {wall:.0f} s of wall time in "
+                f"{len(sessions)} sessions, {size:.0f} MB"
             )
         return "\n".join(lines)
 
-    def _sessions(self) -> list[dict[str, Any]]:
-        """Return the lines of the journal that say how long."""
-        return [
-            line
-            for line in read_jsonl(self.folder / "journal.jsonl")
-            if all(is_number(line.get(key)) for key in ("loads", "seconds", "core_seconds"))
-        ]
-
-    def seconds_a_load(self) -> float | None:
-        """Return the wall time of a load in all sessions so far [s]; None before the first."""
-        sessions = self._sessions()
+    def seconds_per_load(self) -> float | None:
+        """Return the mean wall time per load over all sessions [s]; None before the first one."""
+        sessions = read_sessions(self.folder)
         loads = sum(one["loads"] for one in sessions)
         return sum(one["seconds"] for one in sessions) / loads if loads else None
 
 
-def runs(indices: Sequence[int], *, whole: bool = False) -> Iterator[list[int]]:
-    """Yield runs of consecutive indices, none across a multiple of SHARD: a file each.
+def runs(numbers: Sequence[int], *, whole: bool = False) -> Iterator[list[int]]:
+    """Yield the loads of each file: consecutive numbers, never across a multiple of SHARD_SIZE.
 
     Args:
-        indices: Ascending.
-        whole: Those of SHARD indices alone.
+        numbers: Numbers of loads, ascending.
+        whole: Yield runs of SHARD_SIZE loads only.
     """
     run: list[int] = []
-    for index in [*indices, None]:
-        if run and (index is None or index != run[-1] + 1 or index % SHARD == 0):
-            if not whole or len(run) == SHARD:
+    for number in [*numbers, None]:
+        if run and (number is None or number != run[-1] + 1 or number % SHARD_SIZE == 0):
+            if not whole or len(run) == SHARD_SIZE:
                 yield run
             run = []
-        if index is not None:
-            run.append(index)
+        if number is not None:
+            run.append(number)

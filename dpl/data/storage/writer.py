@@ -1,4 +1,4 @@
-"""Writing a data set: loads are solved into the spool, and from there into shards, in order."""
+"""Writing a data set: solved loads become pending files, and these become shards, in order."""
 
 import hashlib
 import json
@@ -13,9 +13,9 @@ from safetensors.torch import save
 
 from dpl.data.solving.solve import LoadKey, SolvedLoad
 from dpl.data.solving.worker_pool import GracefulShutdown, solve_loads
-from dpl.data.storage.manifest import STREAMS, lines_of, place, shard_name
+from dpl.data.storage.manifest import merge_entries, read_manifest, shard_name, sort_key
 from dpl.data.storage.pending import clean_partial_files
-from dpl.data.storage.shard import encode_shard
+from dpl.data.storage.shard import concatenate
 from dpl.data.storage.store import FORMAT, MODES, Store, runs
 from dpl.system.files import append_jsonl, exclusive_lock, write_file
 from dpl.version import __version__
@@ -23,12 +23,12 @@ from dpl.version import __version__
 
 @dataclass(frozen=True)
 class Writer:
-    """One who writes to a data set, alone or beside others.
+    """One of the processes that write to a data set.
 
     Attributes:
         store: The data set.
-        shard: Which files are its own, of
-        shards: so many writers, who take files in turn.
+        shard: Index of this writer.
+        shards: Number of writers, who take the files in turn.
     """
 
     store: Store
@@ -37,13 +37,12 @@ class Writer:
 
     @property
     def manifest(self) -> Path:
-        """Where it names its shards."""
-        alone = self.shards == 1
-        name = "manifest" if alone else f"manifest-{self.shard}-of-{self.shards}"
-        return self.store.folder / f"{name}.jsonl"
+        """Path of the manifest of this writer."""
+        part = "" if self.shards == 1 else f"-{self.shard}-of-{self.shards}"
+        return self.store.folder / f"manifest{part}.jsonl"
 
     def create(self) -> None:
-        """Write down whose data set this is, if it is not there yet.
+        """Write `scene.json` and the modes if they are missing.
 
         Raises:
             DataSetError: The folder holds something else.
@@ -75,16 +74,16 @@ class Writer:
         timeout: float | None = None,
         stop: GracefulShutdown | None = None,
     ) -> Generator[SolvedLoad, None, None]:
-        """Solve loads that are missing, by split; yield each as it is done.
+        """Solve missing loads; yield each as soon as it is solved.
 
-        Each is kept in the spool as soon as it is solved; a shard is written when it is complete,
-        in order. Loads that were spooled before an interruption are not solved again.
+        Each solved load is written to a pending file at once, and a shard as soon as all its loads
+        are solved, in order. Pending loads of an interrupted run are not solved again.
 
         Args:
             missing: Numbers of the loads, by split.
-            workers: Processes that solve; 0: this one.
-            timeout: Longest time for a load [s].
-            stop: Asked whether to begin no more.
+            workers: Number of processes that solve; 0: solve in this process.
+            timeout: Time limit for a load [s].
+            stop: Once it is true, no further load is started.
 
         Raises:
             DataSetError: The folder holds something else, or another process writes there.
@@ -93,85 +92,65 @@ class Writer:
         store = self.store
         with exclusive_lock(store.folder, self.shard, self.shards):
             clean_partial_files(store.folder)
-            spooled, tried = store.pending.files(), store.tried()
-            for job in [*spooled]:
-                if job in tried:  # killed between writing its shard and removing it
-                    spooled.pop(job).unlink(missing_ok=True)
-            wanted = {
-                split: [i for i in indices if LoadKey(store.stream(split), i) not in tried]
-                for split, indices in missing.items()
-            }
+            pending, tried = store.pending.files(), store.tried()
+            for job in pending.keys() & tried:  # killed between writing a shard and this removal
+                pending.pop(job).unlink(missing_ok=True)
             files = [
-                [LoadKey(store.stream(split), index) for index in run]
-                for split, indices in wanted.items()
-                for run in runs(indices)
+                [LoadKey(store.stream(split), number) for number in run]
+                for split, numbers in missing.items()
+                for run in runs(
+                    [k for k in numbers if LoadKey(store.stream(split), k) not in tried]
+                )
             ]
-            jobs = [job for file in files for job in file if job not in spooled]
-            self._flush(files, spooled)
-            for one in solve_loads(store.scene, jobs, workers=workers, timeout=timeout, stop=stop):
-                spooled[one.job] = store.pending.put(one)
-                yield one
-                self._flush(files, spooled)
-            rewrite(self.manifest, lines_of(self.manifest))
+            jobs = [job for file in files for job in file if job not in pending]
+            self._write_complete_shards(files, pending)
+            for solved in solve_loads(
+                store.scene, jobs, workers=workers, timeout=timeout, stop=stop
+            ):
+                pending[solved.job] = store.pending.write(solved)
+                yield solved
+                self._write_complete_shards(files, pending)
+            rewrite(self.manifest, read_manifest(self.manifest))
             if self.shards == 1:
-                store.pending.clean()
-
-    def _split(self, job: LoadKey) -> str:
-        return {self.store.stream(name): name for name in STREAMS}[job.seed]
-
-    def _flush(self, files: list[list[LoadKey]], spooled: dict[LoadKey, Path]) -> None:
-        """Write the first shards that are complete; take them off both lists."""
-        while files and all(job in spooled for job in files[0]):
-            jobs = files.pop(0)
-            paths = [spooled.pop(job) for job in jobs]
-            self._append([self.store.pending.get(path) for path in paths])
-            for path in paths:
-                path.unlink()
+                store.pending.remove_if_empty()
 
     def collect(self, split: str) -> None:
-        """Write those spooled loads of a split that make whole shards.
+        """Write the pending loads of a split that make whole shards.
 
         Raises:
             DataSetError: Another process writes there.
         """
         store = self.store
         with exclusive_lock(store.folder, self.shard, self.shards):
-            spooled = store.pending.files()
-            mine = {job for job in spooled if job.seed == store.stream(split)}
+            pending = store.pending.files()
+            mine = {job for job in pending if job.seed == store.stream(split)}
             count = max((job.number for job in mine), default=-1) + 1
             found = runs(store.missing(split, count), whole=True)
-            files = [[LoadKey(store.stream(split), index) for index in run] for run in found]
-            self._flush([file for file in files if mine.issuperset(file)], spooled)
+            files = [[LoadKey(store.stream(split), number) for number in run] for run in found]
+            self._write_complete_shards([file for file in files if mine.issuperset(file)], pending)
 
-    def _append(self, tried: Sequence[SolvedLoad]) -> None:
-        """Write one shard, then its line of the manifest."""
-        split, first = self._split(tried[0].job), tried[0].job.number
-        kept = [one for one in tried if one.accepted]
-        name = shard_name(split, first)
-        scene, loads = self.store.scene, self.store.scene.loads
-        poisson = None if loads.poisson_range is None else loads.poisson_at
-        content = encode_shard(kept, scene.problem.shape, loads.n_random, poisson)
+    def _write_complete_shards(
+        self, files: list[list[LoadKey]], pending: dict[LoadKey, Path]
+    ) -> None:
+        """Write the first shards whose loads are all pending; remove them from both arguments."""
+        while files and all(job in pending for job in files[0]):
+            paths = [pending.pop(job) for job in files.pop(0)]
+            self._write_shard(paths)
+            for path in paths:
+                path.unlink()
+
+    def _write_shard(self, paths: Sequence[Path]) -> None:
+        """Write a shard of pending loads, then its line of the manifest."""
+        entries, columns = zip(*map(self.store.pending.read, paths), strict=True)
+        entry, content = merge_entries(entries), save(concatenate(columns))
+        name = shard_name(entry["split"], entry["first"])
         write_file(self.store.folder / name, content)
-        line = {
-            "file": name,
-            "sha256": hashlib.sha256(content).hexdigest(),
-            "split": split,
-            "first": first,
-            "tried": len(tried),
-            "accepted": len(kept),
-            "iterations": sum(one.iterations for one in tried),
-            "amplitudes": [round(one.amplitude, 6) for one in tried],
-            "rejected": [
-                {"index": one.job.number, "reason": one.reason, "load_factor": one.load_factor}
-                for one in tried
-                if not one.accepted
-            ],
-        }
-        append_jsonl(self.manifest, line)
+        sha256 = hashlib.sha256(content).hexdigest()
+        append_jsonl(self.manifest, {"file": name, "sha256": sha256, **entry})
 
 
 def rewrite(manifest: Path, lines: Sequence[dict[str, Any]]) -> None:
-    """Make a manifest of these lines, in order, if it is not that already."""
-    text = "".join(json.dumps(line) + "\n" for line in sorted(lines, key=place)).encode()
+    """Write these lines, sorted, to a manifest that exists and differs."""
+    text = "".join(json.dumps(line) + "\n" for line in sorted(lines, key=sort_key)).encode()
     if manifest.exists() and manifest.read_bytes() != text:
         write_file(manifest, text)

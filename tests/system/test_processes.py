@@ -1,4 +1,4 @@
-"""Laws of worker processes: none outlives the process that started it, at any moment."""
+"""Laws of worker processes: a worker ends with its parent at any moment."""
 
 import os
 import signal
@@ -11,10 +11,10 @@ import pytest
 
 from dpl.system.processes import spawn_context
 
-LONG = 120  # no test waits so long, unless a process is left behind [s]
+LONG = 120  # limit for an event; reached only if a process is left behind [s]
 
-# Both processes hold the standard output, so that it ends when both have ended. Its main module is
-# what a worker imports first; there it stays for ever.
+# Parent and worker hold the standard output, which therefore closes when both have ended. A worker
+# first imports the main module, where it waits without end.
 PROGRAM = textwrap.dedent(
     """
     import os
@@ -34,7 +34,7 @@ PROGRAM = textwrap.dedent(
     """
 )
 STARTS = {
-    "a worker of a crew": """
+    "a worker of a pool": """
         from dpl.system.processes import spawn_context
         spawn_context().Process(target=task, daemon=True).start()
     """,
@@ -43,14 +43,14 @@ STARTS = {
         from torch.utils.data import IterableDataset
 
         class Source(IterableDataset):
-            first, lane, lanes, starts, worst = 0, 0, 1, {}, None
+            first, rank, world_size, offsets, hard_examples = 0, 0, 1, {}, None
 
             def __iter__(self):
                 task()
 
         globals()["Source"] = Source
         Source.__qualname__ = "Source"
-        sizes = {"batch_size": 1, "batches": 1, "fresh": 1, "reuse": 1, "capacity": 4}
+        sizes = {"batch_size": 1, "batches": 1, "new_per_round": 1, "reuse": 1, "capacity": 4}
         replay = ReplayBuffer(Source(), workers=1, **sizes)
         replay._start()
     """,
@@ -63,7 +63,7 @@ MOMENTS = {
 
 @pytest.fixture
 def launched(tmp_path, environment):
-    """Starts a program in a process group of its own, of which nothing is left in the end."""
+    """Return a function that starts a program in its own process group, which is killed."""
     started = []
 
     def launched(text):
@@ -107,9 +107,9 @@ def test_a_worker_that_is_still_importing_ends_with_its_parent(launched, start, 
 
 
 @pytest.mark.timeout(3 * LONG)
-def test_a_worker_lives_as_long_as_its_parent_and_tells_it_how_it_ended(launched):
+def test_a_worker_returns_its_exit_status_to_its_parent(launched):
     text = program(
-        STARTS["a worker of a crew"]
+        STARTS["a worker of a pool"]
         .replace("spawn_context().Process", "worker = spawn_context().Process")
         .replace(").start()", ")\n        worker.start()"),
         "worker.join(); print(worker.exitcode, worker.pid != os.getpid())",
@@ -118,7 +118,7 @@ def test_a_worker_lives_as_long_as_its_parent_and_tells_it_how_it_ended(launched
     assert out == "at work\n0 True\n"
 
 
-def test_other_processes_are_started_as_ever():
+def test_the_start_of_other_processes_is_unchanged():
     from multiprocessing import spawn
 
     before = spawn.get_command_line
