@@ -1,7 +1,7 @@
 """Notebooks as pages, executed when the site is built.
 
 Executed notebooks are cached in .cache/notebooks under a digest of the notebook, the package and
-conf/. mkdocs-jupyter has no such cache, and its pages load scripts from another host.
+conf/. Pages of mkdocs-jupyter 0.26 name another host for their scripts; these pages have none.
 """
 
 import hashlib
