@@ -92,7 +92,7 @@ class Controls:
         )
         self.quantity = gui.add_dropdown("colours", tuple(QUANTITIES))
         self.edges = gui.add_checkbox("mesh edges", True)
-        self.show_newton = gui.add_checkbox("compare with Newton from zero", False)
+        self.show_newton = gui.add_checkbox("compare Newton", False)
 
     def connect(
         self,

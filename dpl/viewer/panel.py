@@ -21,7 +21,7 @@ def result_table(frame: Frame, frame_rate: float) -> str:
     colour = GOOD if frame.converged else WARNING if frame.volume_ratio > 0 else BAD
     outside = answer.out_of_distribution
     rows = [
-        _row("method", str(answer.method), "font-weight:600"),
+        _row("computed by", str(answer.method), "font-weight:600"),
         _row("time", f"{answer.milliseconds:.1f} ms", "font-weight:600"),
         _row("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{colour}"),
         _row("min det F", f"{frame.volume_ratio:.3f}"),
