@@ -30,20 +30,21 @@ if TYPE_CHECKING:
 
 
 CONSOLE = Console(width=150)
-PARTS = (
+CASES = (
     *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
     *("discretisation", "sizes", "deflections"),
 )
 
 
 def run(cfg: DictConfig) -> None:
-    """Time the chosen parts, print tables and write the rows to `folder`.
+    """Time the chosen cases, print tables and write the rows to `folder`.
 
     Raises:
         ConfigError: A part or a backend does not exist, or no backend is installed.
     """
-    if unknown := [part for part in cfg.parts if part not in PARTS]:
-        raise config.ConfigError(f"parts: {unknown[0]!r} is none of {', '.join(PARTS)}")
+    cases = CASES if cfg.cases is None else cfg.cases
+    if unknown := [case for case in cases if case not in CASES]:
+        raise config.ConfigError(f"cases = {unknown[0]!r} must be one of {', '.join(CASES)}")
     if unknown := [name for name in cfg.linear if name not in ("auto", *BACKENDS)]:
         known = ", ".join(("auto", *BACKENDS))
         raise config.ConfigError(f"linear: {unknown[0]!r} is none of {known}")
@@ -55,13 +56,13 @@ def run(cfg: DictConfig) -> None:
     CONSOLE.print(f"{machine()}, 1 thread, medians of {cfg.repeats}")
     folder = Path(cfg.folder)
     folder.mkdir(parents=True, exist_ok=True)
-    for part in cfg.parts:
+    for case in cases:
         with one_thread():
-            results = globals()[part](cfg, backends)
+            results = globals()[case](cfg, backends)
         if results is None:  # the part has written its results
             continue
-        text = json.dumps({"machine": machine(), part: results}, indent=1, default=asdict)
-        (folder / f"{part}.json").write_text(text + "\n")
+        text = json.dumps({"machine": machine(), case: results}, indent=1, default=asdict)
+        (folder / f"{case}.json").write_text(text + "\n")
     print(f"written to {folder}")
 
 
@@ -69,13 +70,13 @@ def scenes(cfg: DictConfig, backends: list[str]) -> list[dict[str, peers.Time]]:
     """Return the times on the scenes of `benchmarks.peers`, one row per code."""
     rows = [peers.beams(name, cfg.repeats) for name in backends]
     programs = Path(peers.__file__).parent / "programs"
-    for name, python in cfg.peers.items():
+    for name, python in cfg.reference_codes.items():
         if python:
             program = programs / f"{name}_beam.py"
             try:
                 rows.append(peers.time_reference_code(python, program, cfg.repeats))
             except OSError as error:
-                raise config.ConfigError(f"peers.{name}: {error}") from error
+                raise config.ConfigError(f"reference_codes.{name}: {error}") from error
     table = Table(
         "seconds (Newton iterations)", *peers.CASES, "tip against the reference, residual"
     )
@@ -167,8 +168,8 @@ def sizes(cfg: DictConfig, backends: list[str]) -> None:
     rows: list[Size] = []
     table = Table("beam", "DOFs", "ms", "parameters", "memory [MB]", "peak [MB]")
     with Progress() as progress:
-        bar = progress.add_task("beams", total=len(cfg.across))
-        for part in beams.sizes(cfg.across, loads=cfg.repeats):
+        bar = progress.add_task("beams", total=len(cfg.cells_across))
+        for part in beams.sizes(cfg.cells_across, loads=cfg.repeats):
             rows += part
             write(rows, Path(cfg.folder) / "sizes.csv")
             progress.advance(bar)

@@ -1,4 +1,4 @@
-"""The mechanics against public codes: python scripts/benchmark.py."""
+"""Measure run times of the mechanics and of public codes: python scripts/benchmark.py."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The runs of a sweep side by side: python scripts/compare.py run=runs/..."""
+"""Compare the runs below a folder: python scripts/compare.py run=runs/..."""
 
 if __name__ == "__main__":
     from dpl.commands.compare import main

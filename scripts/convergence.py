@@ -1,4 +1,4 @@
-"""Newton from rest and from predictions: python scripts/convergence.py run=runs/beam_svk."""
+"""Newton from zero and from predictions: python scripts/convergence.py run=runs/beam_svk."""
 
 if __name__ == "__main__":
     from dpl.commands.convergence import main

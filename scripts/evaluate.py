@@ -1,4 +1,4 @@
-"""A trained surrogate against finite elements: python scripts/evaluate.py run=runs/..."""
+"""Evaluate a trained surrogate: python scripts/evaluate.py run=runs/..."""
 
 if __name__ == "__main__":
     from dpl.commands.evaluate import main

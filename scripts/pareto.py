@@ -1,4 +1,4 @@
-"""Run time against error of every solver: python scripts/pareto.py run=runs/beam_svk."""
+"""Measure run time and error of all solvers: python scripts/pareto.py run=runs/beam_svk."""
 
 if __name__ == "__main__":
     from dpl.commands.pareto import main

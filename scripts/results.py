@@ -1,4 +1,4 @@
-"""All methods on one experiment side by side: python scripts/results.py name=beam_svk."""
+"""Compare all methods on one experiment: python scripts/results.py name=beam_svk."""
 
 import sys
 from pathlib import Path

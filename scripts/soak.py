@@ -1,4 +1,4 @@
-"""What grows, slows down or is left behind: python scripts/soak.py minutes=30; 1 if anything is."""
+"""Run the soak test: python scripts/soak.py minutes=30."""
 
 import sys
 from pathlib import Path

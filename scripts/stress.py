@@ -1,4 +1,4 @@
-"""What the package does where it is hard: python scripts/stress.py."""
+"""Run the stress cases: python scripts/stress.py."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The mechanics against known answers: python scripts/verify.py writes docs/verification.md."""
+"""Compare the mechanics with known solutions: python scripts/verify.py."""
 
 import sys
 from pathlib import Path

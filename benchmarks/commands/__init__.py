@@ -1,4 +1,4 @@
-"""Commands that judge this repository: what `scripts/` call in a checkout."""
+"""Commands that measure this repository; `scripts/` calls them in a checkout."""
 
 from pathlib import Path
 

@@ -1,8 +1,8 @@
-"""The mechanics against public codes: python scripts/benchmark.py.
+"""Measure run times of the mechanics and of public codes: python scripts/benchmark.py.
 
-Long parts on demand: parts=[large] (run alone, it reports its memory), parts=[robustness],
-parts=[generation], parts=[sizes]; errors of other meshes: parts=[discretisation]; how far test
-loads move the bodies: parts=[deflections] count=100.
+Long cases on demand: cases=[large] (run alone, it reports its memory), cases=[robustness],
+cases=[generation], cases=[sizes]; errors of other meshes: cases=[discretisation];
+displacements of the test loads: cases=[deflections] count=100.
 """
 
 from omegaconf import DictConfig
@@ -14,7 +14,7 @@ from dpl.commands.cli import command
 
 @command("benchmark", conf=CONF)
 def main(cfg: DictConfig) -> None:
-    """Time the chosen parts, print tables and write the rows to a folder."""
+    """Time the chosen cases, print tables and write the rows to a folder."""
     from benchmarks import mechanics
 
     config.check(cfg)

@@ -17,7 +17,7 @@ from dpl import config
 from dpl.commands import cli
 
 RECORDS = 360  # of each workload
-WORKS = ("training", "simulator")
+WORKLOADS = ("training", "simulator")
 
 
 @cli.command("soak", conf=CONF)
@@ -31,8 +31,10 @@ def main(cfg: DictConfig) -> None:
     config.check(cfg)
     if not cfg.minutes > 0:
         raise config.ConfigError(f"minutes = {cfg.minutes} must be above 0")
-    if not cfg.works or not set(cfg.works) <= set(WORKS):
-        raise config.ConfigError(f"works = {cfg.works} must be some of {', '.join(WORKS)}")
+    if not cfg.workloads or not set(cfg.workloads) <= set(WORKLOADS):
+        raise config.ConfigError(
+            f"workloads = {cfg.workloads} must be some of {', '.join(WORKLOADS)}"
+        )
     folder, seconds = Path(cfg.folder), 60.0 * cfg.minutes
     rows: list = []
     wrong: list[str] = []
@@ -45,14 +47,14 @@ def main(cfg: DictConfig) -> None:
         soak.draw(rows, folder / "soak.png")
         print(soak.summary(work))
 
-    if "training" in cfg.works:
+    if "training" in cfg.workloads:
         before = soak.usage("before", 0.0, 0)
         report(_train(cfg, seconds))
         gc.collect()  # frees the last batches in shared memory
         time.sleep(2.0)  # workers end
         after = soak.usage("after", 0.0, 0)
         wrong += [f"after the training: {line}" for line in soak.leftovers(before, after)]
-    if "simulator" in cfg.works:
+    if "simulator" in cfg.workloads:
         _, surrogate = config.load_run(folder, trust=True)
         records = []
         for row in soak.simulator(Simulator(surrogate), seconds, every=seconds / RECORDS):
@@ -73,7 +75,7 @@ def _train(cfg: DictConfig, seconds: float) -> list:
     scene = config.build_scene(cfg)
     data = config.instantiate(cfg, "data", scene=scene)
     surrogate = config.build_surrogate(cfg, scene)
-    trainer = config.instantiate(cfg, "trainer")
+    trainer = config.build_trainer(cfg)
     cli.check_trainer(trainer, cfg)
     monitor = soak.UsageMonitor(seconds, every=seconds / RECORDS)
     trainer.callbacks.append(monitor)

@@ -46,7 +46,7 @@ PARTS = (
     Part(
         "hybrid_newton",
         "Newton from predictions",
-        "python scripts/convergence.py run=runs/beam_svk networks=[latent,fcnn] far=0 "
+        "python scripts/convergence.py run=runs/beam_svk networks=[latent,fcnn] n_far_loads=0 "
         "folder=benchmarks/results",
         "The paper's experiment 4: 50 loads in range and 50 of one to two times the range, one at "
         "a time on one thread.",
@@ -56,7 +56,7 @@ PARTS = (
         "hybrid_newton_far",
         "Newton from predictions outside the training range",
         "python scripts/convergence.py name=hybrid_newton_far run=runs/beam_svk networks=[latent] "
-        "count=0 far=8 tols=[1e-6] folder=benchmarks/results",
+        "count=0 n_far_loads=8 tols=[1e-6] folder=benchmarks/results",
         "Loads of three and of five times the range.",
         split="loads",
     ),
@@ -71,19 +71,19 @@ PARTS = (
     Part(
         r"discretisation_(beam_svk|propeller_nh)",
         "Discretisation error on `{0}`",
-        "python scripts/benchmark.py parts=[discretisation] folder=benchmarks/results",
+        "python scripts/benchmark.py cases=[discretisation] folder=benchmarks/results",
         "One load on refined meshes, compared with the limit by Richardson extrapolation.",
     ),
     Part(
         "sizes",
         "Cost against degrees of freedom",
-        "python scripts/benchmark.py parts=[sizes] repeats=3 folder=benchmarks/results",
+        "python scripts/benchmark.py cases=[sizes] repeats=3 folder=benchmarks/results",
         "Beams of 4 to 20 elements across, each in its own process, with random weights.",
     ),
     Part(
         "deflections",
         "Displacements of the test loads",
-        "python scripts/benchmark.py parts=[deflections] count=100 folder=benchmarks/results",
+        "python scripts/benchmark.py cases=[deflections] count=100 folder=benchmarks/results",
         "The largest nodal displacement of each test load of `beam_svk` and of `propeller_nh`, "
         "over the longest side of the body.",
         tabulated=False,

@@ -1,1 +1,1 @@
-"""The commands: one module each, its `main` what `scripts/NAME.py` and `dpl-NAME` call."""
+"""Commands: `scripts/NAME.py` and `dpl-NAME` call `main` of the module NAME."""

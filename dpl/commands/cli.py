@@ -1,4 +1,4 @@
-"""How a command begins and ends: its configuration, one line for bad input, a word to sweeps."""
+"""Start and end of a command: configuration, checks, one line for invalid input."""
 
 import contextlib
 import errno
@@ -9,6 +9,7 @@ import math
 import os
 import sys
 import typing
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from dpl.commands import dry_run, help_text
 from dpl.config import CONF, ConfigError
@@ -32,15 +33,17 @@ FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 def command(
     name: str, rehearse: Callable[[DictConfig], Any] | None = None, conf: Path = CONF
 ) -> Callable[[Callable[[DictConfig], R]], Callable[[], R]]:
-    """Return what makes a command of a task: its configuration is `NAME.yaml`.
+    """Return a decorator that turns a function of a configuration into a command.
 
-    Bad input ends it with one line and a status of 2, Ctrl-C with 130.
+    The configuration is `NAME.yaml`, composed by Hydra from the command line. All jobs are checked
+    before the first one starts. Invalid input ends the command with one line and status 2, Ctrl-C
+    with status 130.
 
     Args:
         name: Name of the configuration.
-        rehearse: Builds what a job needs before it computes, see `dpl.commands.dry_run.check`.
-        conf: Folder of the configuration. It may name `${oc.env:DPL_CONF}`, the folder of the
-            package's own configurations, in `hydra.searchpath`.
+        rehearse: Builds the objects of a job without computing, see `dpl.commands.dry_run.check`.
+        conf: Folder of the configuration. Its `hydra.searchpath` may contain `${oc.env:DPL_CONF}`,
+            the folder of the configurations of this package.
     """
 
     def decorate(task: Callable[[DictConfig], R]) -> Callable[[], R]:
@@ -70,9 +73,9 @@ def command(
 
 @contextlib.contextmanager
 def readable_errors() -> Iterator[None]:
-    """End the process with one line where what is done in here cannot be."""
+    """Turn errors of the configuration and of files into one line and exit status 2."""
     logging.getLogger("skfem").setLevel(logging.WARNING)
-    for name in ("lightning.pytorch", "lightning.fabric"):  # they print for themselves
+    for name in ("lightning.pytorch", "lightning.fabric"):  # they print without it
         logging.getLogger(name).propagate = False
     try:
         yield
@@ -85,7 +88,7 @@ def readable_errors() -> Iterator[None]:
         cause = _failed_access(error)
         if cause is None:
             raise
-        print(f"error: {_told(cause)}", file=sys.stderr)
+        print(f"error: {_describe(cause)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -93,9 +96,9 @@ def readable_errors() -> Iterator[None]:
 
 
 def _failed_access(error: BaseException | None) -> OSError | None:
-    """Return the failed access to a file that an error comes from; None if it does not.
+    """Return the failed file access that caused an error, None for other causes.
 
-    PyTorch's writer of archives and the loggers raise errors of their own after it.
+    PyTorch's archive writer and the loggers raise other errors after it.
     """
     while error is not None:
         if isinstance(error, OSError) and error.errno is not None:
@@ -104,22 +107,22 @@ def _failed_access(error: BaseException | None) -> OSError | None:
     return None
 
 
-def _told(error: OSError) -> str:
-    """Return in one line which access to a file failed, and what to do."""
+def _describe(error: OSError) -> str:
+    """Return one line with the failed file access and the remedy."""
     where = f" for {error.filename}" if error.filename else ""
     if error.errno in FULL:
-        told, do = f"no space left{where}", "make room"
+        problem, remedy = f"no space left{where}", "free some space"
     elif error.errno in FORBIDDEN:
-        told = f"no permission to write{where}"
-        do = "choose another folder or change its rights"
+        problem = f"no permission to write{where}"
+        remedy = "choose another folder or change its permissions"
     else:
-        told = f"{error.strerror}{where}"
-        do = "choose another folder or mend this one"
-    return f"{told}; what was there is whole: {do} and run the same command again"
+        problem = f"{error.strerror}{where}"
+        remedy = "choose another folder or repair this one"
+    return f"{problem}; existing files are intact: {remedy} and run the same command again"
 
 
 def _drop_empty(folder: Path) -> None:
-    """Remove the folders that Hydra made below this one for a run that did not begin."""
+    """Remove the empty folders that Hydra created for a run that did not start."""
     here = Path.cwd()
     with contextlib.suppress(OSError):  # not empty
         while here in folder.parents:
@@ -128,31 +131,42 @@ def _drop_empty(folder: Path) -> None:
 
 
 def check_sweep(arguments: Sequence[str]) -> None:
-    """End a command that asks for Optuna where it cannot be used, with one line and a status of 2.
+    """Exit with one line and status 2 if a command line needs Optuna and it is not installed.
 
-    Hydra itself would list the sweepers that it has, and not say how to get this one.
-
-    Args:
-        arguments: Of the command.
+    Hydra would list the installed sweepers without saying how to install this one.
     """
-    wanted = ("sweep=", "+sweep=", "hydra/sweeper=optuna")
-    if not any(argument.startswith(wanted) for argument in arguments):
+    needs = ("hparams_search=", "+hparams_search=", "hydra/sweeper=optuna")
+    if not any(argument.startswith(needs) for argument in arguments):
         return
     try:
         importlib.import_module("hydra_plugins.hydra_optuna_sweeper._impl")
     except ImportError as error:
-        told = f"sweep: Optuna cannot be used ({error}): {install('sweep')}"
-        print(f"error: {told}", file=sys.stderr)
+        reason = f"Optuna cannot be used ({error}): {install('sweep')}"
+        print(f"error: hparams_search: {reason}", file=sys.stderr)
         sys.exit(2)
 
 
-def check_trainer(trainer: Any, cfg: DictConfig) -> None:
-    """Refuse what a trainer cannot do with the rest of a configuration, before it begins.
+def apply_extras(cfg: DictConfig) -> None:
+    """Apply the group `extras`: print the configuration, ask for tags, silence warnings.
 
     Raises:
-        ConfigError: A schedule of the learning rate over a training without end, callbacks that
-            keep no weights, or a sweep whose training starts further processes: each would start
-            the sweep again.
+        ConfigError: A run without tags, and `extras.enforce_tags`.
+    """
+    extras = cfg.get("extras") or {}
+    if extras.get("ignore_warnings"):
+        warnings.filterwarnings("ignore")
+    if extras.get("enforce_tags") and not cfg.tags:
+        raise ConfigError("tags = [] must name one tag or more; or set extras.enforce_tags=false")
+    if extras.get("print_config"):
+        print(OmegaConf.to_yaml(cfg, resolve=True))
+
+
+def check_trainer(trainer: Any, cfg: DictConfig) -> None:
+    """Check a trainer against the rest of a configuration before the training.
+
+    Raises:
+        ConfigError: A learning-rate schedule over an unlimited training, callbacks that write no
+            weights, or a sweep whose training starts processes that would run the sweep again.
     """
     from lightning.pytorch.strategies.launchers import _SubprocessScriptLauncher
 
@@ -160,13 +174,15 @@ def check_trainer(trainer: Any, cfg: DictConfig) -> None:
 
     if cfg.scheduler and trainer.max_epochs == -1 and trainer.max_steps == -1:
         raise ConfigError(
-            "trainer.max_epochs = -1: the schedule of the learning rate needs an end; give it "
-            "one, or trainer.max_steps, or set scheduler=null"
+            "trainer.max_epochs = -1: the schedule of the learning rate needs an end; set "
+            "trainer.max_epochs or trainer.max_steps, or scheduler=null"
         )
-    if not any(checkpoints.writes_loadable(one, trainer, cfg.folder) for one in trainer.callbacks):
+    if not trainer.fast_dev_run and not any(
+        checkpoints.writes_loadable(one, trainer, cfg.folder) for one in trainer.callbacks
+    ):
         raise ConfigError(
-            "trainer.callbacks keep no weights that the run can be loaded from; add "
-            "{_target_: lightning.pytorch.callbacks.ModelCheckpoint, "
+            "callbacks must write weights from which the run can be loaded; add "
+            "+callbacks.last={_target_: lightning.pytorch.callbacks.ModelCheckpoint, "
             "dirpath: ${folder}/checkpoints, filename: last, enable_version_counter: false}"
         )
     sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
@@ -182,10 +198,10 @@ def check_trainer(trainer: Any, cfg: DictConfig) -> None:
 
 
 def failed(error: Exception) -> float:
-    """Return infinity to a sweep, which goes on with its next run.
+    """Print an error and return infinity to a sweep, which continues with its next run.
 
     Raises:
-        ConfigError: There is no sweep: the error ends the command.
+        ConfigError: Outside a sweep.
     """
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         raise ConfigError(str(error)) from error
@@ -194,12 +210,12 @@ def failed(error: Exception) -> float:
 
 
 def best_error(trainer: Any) -> float | None:
-    """Return the smallest validation e_mean of a training [-], which a sweep minimises.
+    """Return the smallest validation e_mean of a training [-], which a search minimises.
 
-    Infinite where the training diverged before its first validation, None without validation.
+    It is infinite if the training diverged before its first validation, None without validation.
 
     Raises:
-        ConfigError: There is no validation, in a sweep that needs one.
+        ConfigError: A search has no validation.
     """
     for kept in trainer.checkpoint_callbacks:
         score = getattr(kept, "best_model_score", None)
@@ -208,7 +224,7 @@ def best_error(trainer: Any) -> float | None:
     hydra_now = HydraConfig.get()
     if hydra_now.mode == RunMode.MULTIRUN and "direction" in hydra_now.sweeper:
         raise ConfigError(
-            "trainer.check_val_every_n_epoch: no epoch was validated, so that there is nothing to "
-            "minimise; validate more often or train longer"
+            "trainer.check_val_every_n_epoch: no epoch was validated, and the search has no value "
+            "to minimise; validate more often or train longer"
         )
     return None

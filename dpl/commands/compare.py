@@ -1,4 +1,4 @@
-"""The runs of a sweep side by side: python scripts/compare.py run=runs/..."""
+"""Compare the runs below a folder: python scripts/compare.py run=runs/..."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Newton from rest and from predictions: python scripts/convergence.py run=runs/beam_svk."""
+"""Newton from zero and from predictions: python scripts/convergence.py run=runs/beam_svk."""
 
 from functools import partial
 from pathlib import Path
@@ -9,7 +9,7 @@ from rich.progress import Progress
 
 from dpl import config
 from dpl.commands.cli import command
-from dpl.evaluation import tables as table
+from dpl.evaluation import tables
 
 if TYPE_CHECKING:
     from dpl.evaluation.newton_starts import Trial
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @command("convergence")
 def main(cfg: DictConfig) -> None:
-    """Measure all solvers on all loads; write rows, machine and figure; what is there is kept."""
+    """Measure all solvers on all loads; write rows, machine and figure."""
     from dpl.evaluation import newton_starts
 
     config.check(cfg)
     runs = config.load_runs(cfg.run, cfg.networks)
     scene = next(iter(runs.values()))[1].scene
     networks = {name: surrogate.predict for name, (_, surrogate) in runs.items()}
-    sets = newton_starts.load_sets(scene, cfg.count, cfg.far)
+    sets = newton_starts.load_sets(scene, cfg.count, cfg.n_far_loads)
     middle = sorted(cfg.tols)[len(cfg.tols) // 2]
     tasks = [(tol, name) for tol in cfg.tols for name in sets if not name.endswith("times")]
     tasks += [(middle, name) for name in sets if name.endswith("times")]
@@ -43,30 +43,30 @@ def main(cfg: DictConfig) -> None:
             trials = [t for t in trials if (t.tol, t.loads) != (tol, name)]
             tick = partial(progress.advance, bar)
             trials += newton_starts.measure(solvers, name, sets[name], tol, tick)
-            table.write(trials, raw)
+            tables.write(trials, raw)
     rows = newton_starts.paper() + newton_starts.summary(trials)
     stem = Path(cfg.folder) / cfg.name
-    table.show(rows, f"{cfg.name}, one load at a time, 1 thread")
-    table.write(rows, stem.with_suffix(".csv"))
-    table.write_machine(stem.with_suffix(".json"))
+    tables.show(rows, f"{cfg.name}, one load at a time, 1 thread")
+    tables.write(rows, stem.with_suffix(".csv"))
+    tables.write_machine(stem.with_suffix(".json"))
     near = [trial for trial in trials if not trial.loads.endswith("times")]
     if near:
         newton_starts.draw(near, stem.with_suffix(".png"))
 
 
 def _measured(raw: Path, names: list[str]) -> list["Trial"]:
-    """Return what an interrupted run has measured of the networks that there are now."""
+    """Return the measurements of an interrupted run if they are newer than the networks."""
     from dpl.evaluation.newton_starts import Trial
 
     if not raw.is_file():
         return []
     networks = [path for name in names for path in (raw.parent / name).glob("checkpoints/*")]
     if any(path.stat().st_mtime > raw.stat().st_mtime for path in networks):
-        print(f"{raw} is older than a network: all is measured anew")
+        print(f"{raw} is older than a network: measuring everything again")
         return []
     try:
-        trials = table.read(Trial, raw)
+        trials = tables.read(Trial, raw)
     except ValueError as error:
         raise config.ConfigError(f"{error}; remove it, or set resume=false") from error
-    print(f"{len(trials):,} answers are in {raw}; resume=false measures them anew")
+    print(f"{len(trials):,} measurements are in {raw}; resume=false repeats them")
     return trials

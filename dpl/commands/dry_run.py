@@ -1,4 +1,4 @@
-"""What a command line asks for: composed and checked, job by job, before Hydra starts the first."""
+"""Compose and check all jobs of a command line before Hydra starts the first one."""
 
 import contextlib
 import itertools
@@ -23,8 +23,8 @@ from dpl.commands import overrides
 from dpl.config import ConfigError
 
 BASIC = "hydra._internal.core_plugins.basic_sweeper.BasicSweeper"
-REMOTE = "submitit"  # launchers of other machines, which can do what this one may not
-SAME = ("seed", "run", "folder")  # keys that decide nothing about whether a job can work
+REMOTE = "submitit"  # launchers on other machines, whose hardware may differ
+SAME = ("seed", "run", "folder")  # keys on which the validity of a job does not depend
 
 
 def check(
@@ -39,11 +39,11 @@ def check(
         name: Name of the command's configuration.
         conf: Folder of the configurations.
         arguments: Command line without the name of the program.
-        rehearse: Builds what a job needs before it computes. It is called for the jobs of a sweep
-            on this machine; a single job builds its own parts.
+        rehearse: Builds the objects of a job without computing. It is called for the jobs of a
+            sweep on this machine; a single job builds its objects when it runs.
 
     Raises:
-        ConfigError: An override cannot be applied, a job cannot work, or its folder cannot be made.
+        ConfigError: An override, a job or its folder is invalid.
     """
     args = arguments_of(arguments)
     if args.help or args.hydra_help or args.shell_completion or args.experimental_rerun:
@@ -58,7 +58,7 @@ def check(
     for cfg in every:
         config.check(cfg)
     if sweep and rehearse is not None and REMOTE not in str(first.hydra.launcher):
-        logging.disable(logging.INFO)  # what trainers say of the machine, each job says again
+        logging.disable(logging.INFO)  # trainers describe the machine again in each job
         try:
             for cfg in _different(every):
                 rehearse(cfg)
@@ -85,17 +85,17 @@ def _unreadable(message: str) -> NoReturn:
 
 
 @contextlib.contextmanager
-def initialized(conf: str | Path, beside: str | None) -> Iterator[None]:
-    """Let Hydra find configurations in a folder, and in one beside it (`--config-dir`).
+def initialized(conf: str | Path, config_dir: str | None) -> Iterator[None]:
+    """Let Hydra search a folder of configurations and the folder of `--config-dir`.
 
     Raises:
-        ConfigError: The second folder is not there.
+        ConfigError: The second folder does not exist.
     """
     search = create_config_search_path(str(Path(conf).absolute()))
-    if beside is not None:
-        own = Path(beside).absolute()
+    if config_dir is not None:
+        own = Path(config_dir).absolute()
         if not own.is_dir():
-            raise ConfigError(f"--config-dir = {beside} must be an existing folder")
+            raise ConfigError(f"--config-dir = {config_dir} must be an existing folder")
         search.prepend("command-line", f"file://{own}", SearchPathQuery(provider="schema"))
     Hydra.create_main_hydra2("check", search)
     try:
@@ -107,13 +107,13 @@ def initialized(conf: str | Path, beside: str | None) -> Iterator[None]:
 def _jobs(
     name: str, lines: Sequence[str], multirun: bool
 ) -> tuple[DictConfig, Iterable[DictConfig] | None]:
-    """Return the configuration without what is swept, and those of the jobs of a sweep.
+    """Return the configuration without swept keys and the configurations of the jobs of a sweep.
 
-    The jobs of a search are not known before they run. In their place stands one job for each end
-    or option of each range, with the first values of the others.
+    The jobs of a search are not known in advance. They are represented by one job for each end or
+    option of each range, with the first values of the other ranges.
 
     Raises:
-        ConfigError: An override cannot be applied, or a sweep names no value.
+        ConfigError: An override is invalid, or a sweep has no value.
     """
     every = [overrides.parsed(line) for line in lines]
     fixed = [one.input_line for one in every if not one.is_sweep_override()]
@@ -136,7 +136,7 @@ def _jobs(
 
 
 def _one_by_one(values: list[list[str]]) -> Iterator[tuple[str, ...]]:
-    """Yield the first values of all, then each other value with the first ones of the rest."""
+    """Yield the first values of all keys, then each other value with the first of the others."""
     first = tuple(some[0] for some in values)
     yield first
     for place, some in enumerate(values):
@@ -145,7 +145,7 @@ def _one_by_one(values: list[list[str]]) -> Iterator[tuple[str, ...]]:
 
 
 def _job(cfg: DictConfig) -> DictConfig:
-    """Return the configuration of a job without Hydra's part; `folder` is named later by Hydra."""
+    """Return the configuration of a job without the node `hydra`, which sets `folder` later."""
     job = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
     if "folder" in job and OmegaConf.is_interpolation(job, "folder"):
         job.folder = "."
@@ -153,34 +153,34 @@ def _job(cfg: DictConfig) -> DictConfig:
 
 
 def _different(jobs: Iterable[DictConfig]) -> Iterator[DictConfig]:
-    """Yield the jobs that differ in more than their seed and their folder."""
+    """Yield the jobs that differ in more than seed and folder."""
     seen = set()
     for job in jobs:
         written = typing.cast("dict[str, Any]", OmegaConf.to_container(job, resolve=False))
-        told = repr([(key, value) for key, value in written.items() if key not in SAME])
-        if told not in seen:
+        content = repr([(key, value) for key, value in written.items() if key not in SAME])
+        if content not in seen:
             yield job
-        seen.add(told)
+        seen.add(content)
 
 
 def _folder(cfg: DictConfig, mode: str) -> Path:
-    """Return where a run or a sweep writes.
+    """Return the folder of a run or a sweep.
 
     Raises:
-        ConfigError: It has no name.
+        ConfigError: `run` is not a text.
     """
     try:
         return Path(cfg.hydra[mode].dir)
     except OmegaConfBaseException:
-        told = OmegaConf.to_container(cfg, resolve=False)["run"] or "null"
-        raise ConfigError(f"run = {told} must be a text, the name of a folder") from None
+        run = OmegaConf.to_container(cfg, resolve=False)["run"] or "null"
+        raise ConfigError(f"run = {run} must be a text, the name of a folder") from None
 
 
 def try_folder(folder: Path) -> None:
-    """Make a folder and a file in it, and remove what was not there before.
+    """Create a folder and a file in it, and remove both again.
 
     Raises:
-        ConfigError: That cannot be done.
+        ConfigError: The folder cannot be written.
     """
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     try:

@@ -1,4 +1,4 @@
-"""A trained surrogate against finite elements: python scripts/evaluate.py run=runs/..."""
+"""Evaluate a trained surrogate: python scripts/evaluate.py run=runs/..."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from dpl.commands.cli import command
 
 @command("evaluate")
 def main(cfg: DictConfig) -> None:
-    """Repeat the evaluation at the end of a training run."""
+    """Print and write the errors and run times of a surrogate on its test set."""
     config.check(cfg)
     trained, surrogate = config.load_run(cfg.run)
     test = config.load_data(trained, surrogate.scene).samples("test")

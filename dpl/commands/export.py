@@ -1,4 +1,4 @@
-"""Command `python scripts/export.py run=...`: ONNX model and results for ParaView.
+"""Export a trained surrogate as ONNX, and results for ParaView: python scripts/export.py run=...
 
 The exit status is 1 if ONNX and torch differ by more than `tol`.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from dpl.export.onnx_graph import ExportGraph, OnnxSession
     from dpl.training import Surrogate
 
-PARTS = ("model", "results")
+OUTPUTS = ("model", "results")
 RESULT_STREAM = (0, 12)  # random stream of the loads in results
 
 
@@ -34,21 +34,21 @@ def main(cfg: DictConfig) -> None:
     from dpl.export.onnx_graph import missing_packages
 
     config.check(cfg)
-    if unknown := [part for part in cfg.parts if part not in PARTS]:
-        raise config.ConfigError(f"parts = {unknown[0]!r} must be one of {', '.join(PARTS)}")
-    if not cfg.parts:
-        raise config.ConfigError(f"parts = [] must contain one of {', '.join(PARTS)}")
-    if "results" in cfg.parts and cfg.count < 1:
-        raise config.ConfigError(f"count = {cfg.count} must be 1 or more; or use parts=[model]")
-    if "model" in cfg.parts and (absent := missing_packages()):
+    if unknown := [part for part in cfg.outputs if part not in OUTPUTS]:
+        raise config.ConfigError(f"outputs = {unknown[0]!r} must be one of {', '.join(OUTPUTS)}")
+    if not cfg.outputs:
+        raise config.ConfigError(f"outputs = [] must contain one of {', '.join(OUTPUTS)}")
+    if "results" in cfg.outputs and cfg.count < 1:
+        raise config.ConfigError(f"count = {cfg.count} must be 1 or more; or use outputs=[model]")
+    if "model" in cfg.outputs and (absent := missing_packages()):
         raise config.ConfigError(
-            f"parts: model needs {', '.join(absent)}: {install('onnx')}, or use parts=[results]"
+            f"outputs: model needs {', '.join(absent)}: {install('onnx')}, or use outputs=[results]"
         )
     _, surrogate = config.load_run(cfg.run)
     folder = Path(cfg.run) / "export" if cfg.folder is None else Path(cfg.folder)
-    if "model" in cfg.parts:
+    if "model" in cfg.outputs:
         export_model(cfg, surrogate, folder)
-    if "results" in cfg.parts:
+    if "results" in cfg.outputs:
         export_results(cfg, surrogate, folder / "results")
 
 

@@ -1,4 +1,4 @@
-"""The data set alone: python scripts/generate.py data.train=4000 data.workers=8."""
+"""Generate, verify or repair a data set: python scripts/generate.py data.train=4000."""
 
 import sys
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ ACTIONS = ("generate", "verify", "repair")
 
 
 def parts(cfg: DictConfig) -> tuple["Scene", "DataSet"]:
-    """Return the scene and the data set that is wanted; nothing is solved or written.
+    """Return the scene and the data set of a configuration without solving or writing.
 
     Raises:
         ConfigError: One of them cannot be built.
@@ -29,7 +29,7 @@ def parts(cfg: DictConfig) -> tuple["Scene", "DataSet"]:
 
 @command("generate", rehearse=parts)
 def main(cfg: DictConfig) -> None:
-    """Solve what is missing of a data set; or look whether it is sound; or make it so."""
+    """Generate the missing loads of a data set, or verify or repair it."""
     config.check(cfg)
     scene, data = parts(cfg)
     config.show_skipped_work(scene, data)

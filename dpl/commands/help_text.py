@@ -43,7 +43,9 @@ def page(name: str, conf: Path, about: str, arguments: Sequence[str]) -> str:
         files = _files(name, chosen, overrides.folders())
     told = {row.key: row.comment for file in files for row in file.rows if row.comment}
     groups = {group: text for file in files for group, text in file.groups.items()}
-    lines = [*about.splitlines(), "", "GROUP=OPTION chooses an option of a group; * is chosen:", ""]
+    lines = about.splitlines()
+    if chosen:
+        lines += ["", "GROUP=OPTION chooses an option of a group; * is chosen:", ""]
     for group, option in sorted(chosen.items()):
         names = ", ".join(f"{one}*" if one == option else one for one in options[group])
         lines += _entry(group, f"{groups[group]}: {names}" if group in groups else names)

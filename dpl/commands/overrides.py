@@ -1,8 +1,8 @@
-"""Overrides of a command line: parsed, composed, and explained in one line where they cannot be.
+"""Parse and compose the overrides of a command line; explain invalid ones in one line.
 
-Hydra reports an override that it cannot apply in several lines, and the advice in them may be
-refused by the next check. Here each such override becomes one `ConfigError`. All functions need an
-initialised Hydra (`hydra.initialize_config_dir`).
+Hydra explains an invalid override in several lines, with advice that the next check may refuse.
+This module raises one `ConfigError` instead. All functions need an initialised Hydra
+(`hydra.initialize_config_dir`).
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from dpl.config import ConfigError, validation
 from dpl.version import install
 
-EXTRAS = {"hydra/launcher": "launch", "hydra/sweeper": "sweep"}  # groups that plugins add to
+EXTRAS = {"hydra/launcher": "launch", "hydra/sweeper": "sweep"}  # groups with options of plugins
 REFUSED = (HydraException, OmegaConfBaseException, ValueError, AssertionError, TypeError)
 
 
@@ -42,7 +42,7 @@ def parsed(line: str) -> Override:
 
 
 def composed(name: str, lines: Sequence[str]) -> DictConfig:
-    """Return the configuration of a command with overrides, Hydra's own part included.
+    """Return the configuration of a command with overrides, including the node `hydra`.
 
     Raises:
         ConfigError: An override cannot be applied.
@@ -62,14 +62,14 @@ def composed(name: str, lines: Sequence[str]) -> DictConfig:
 
 
 def values(one: Override, *, search: bool) -> list[str]:
-    """Return the overrides that a sweep over one key stands for.
+    """Return one override for each value of a sweep over a key.
 
     Args:
         one: The override.
-        search: Whether it is a range for a search, of which the ends are returned.
+        search: Return the ends of a range.
 
     Raises:
-        ConfigError: There are none, or only a search can use it.
+        ConfigError: There is no value, or it is a range without a search.
     """
     if one.is_discrete_sweep():
         found = [f"{one.get_key_element()}={value}" for value in one.sweep_string_iterator()]
@@ -91,7 +91,7 @@ def _loader() -> Any:
 
 
 def options(group: str) -> list[str]:
-    """Return the options of a group; none where there is no such group."""
+    """Return the options of a group; none if the group does not exist."""
     return sorted(_loader().get_group_options(group.partition("@")[0], ObjectType.CONFIG))
 
 
@@ -102,7 +102,7 @@ def folders() -> list[Path]:
 
 
 def _reason(name: str, asked: list[Override], error: Exception) -> str:
-    """Return in one line why overrides cannot be applied."""
+    """Return one line that explains why overrides cannot be applied."""
     groups = [one for one in asked if options(one.key_or_group)]
     with contextlib.suppress(*REFUSED):
         chosen = set(hydra.compose(name, return_hydra_config=True).hydra.runtime.choices)
@@ -120,12 +120,12 @@ def _reason(name: str, asked: list[Override], error: Exception) -> str:
 
 
 def _bad_option(one: Override, chosen: set[str], error: str) -> str | None:
-    """Return what is wrong with the choice of an option; None if nothing is.
+    """Return the problem of the choice of an option, None if it is valid.
 
     Args:
         one: The choice.
-        chosen: Groups of which the command has an option already.
-        error: What Hydra says of all overrides; a missing option is named there.
+        chosen: Groups of the command.
+        error: Hydra's message, which names a missing option.
     """
     value, group = one.value(), one.key_or_group
     known, adds = options(group), one.is_add() or one.is_force_add()
@@ -145,7 +145,7 @@ def _bad_option(one: Override, chosen: set[str], error: str) -> str | None:
 
 
 def _bad_key(one: Override, base: DictConfig) -> str | None:
-    """Return what is wrong with a key that is set, added or removed; None if nothing is."""
+    """Return the problem of a key that is set, added or removed, None if it is valid."""
     key, adds = one.key_or_group, one.is_add() or one.is_force_add()
     if "/" in key:
         parent = key.rpartition("/")[0]
@@ -172,7 +172,7 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
 
 
 def _below(node: Any) -> dict[str, Any]:
-    """Return the entries of a node by name or number, interpolations as they are."""
+    """Return the entries of a node by name or number, without resolving interpolations."""
     if not OmegaConf.is_config(node) or node._is_none() or node._is_missing():
         return {}
     keys = node.keys() if OmegaConf.is_dict(node) else range(len(node))

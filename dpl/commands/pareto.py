@@ -1,4 +1,4 @@
-"""Run time against error of every solver: python scripts/pareto.py run=runs/beam_svk."""
+"""Measure run time and error of all solvers: python scripts/pareto.py run=runs/beam_svk."""
 
 from dataclasses import replace
 from functools import partial
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @command("pareto")
 def main(cfg: DictConfig) -> None:
-    """Measure every solver, and the networks of a folder of runs; write rows and a figure."""
+    """Measure all solvers and the networks of a folder of runs; write rows and a figure."""
     from dpl.evaluation import pareto
 
     config.check(cfg)
@@ -49,10 +49,10 @@ def main(cfg: DictConfig) -> None:
 
 
 def _discretisations(cfg: DictConfig) -> list["Discretisation"]:
-    """Return the errors of other meshes that are drawn beside.
+    """Return the errors of other meshes to draw; none without a file.
 
     Raises:
-        ConfigError: Their file is not there or has other columns.
+        ConfigError: The file does not exist or has other columns.
     """
     from dpl.evaluation.pareto import Discretisation
 
@@ -75,7 +75,7 @@ def _show(title: str, rows: list["Point"]) -> None:
 
 
 def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
-    """Return the scene of some runs, every solver there is with their networks, and test loads."""
+    """Return the scene of the runs, all solvers including their networks, and the test loads."""
     import torch
 
     from dpl.evaluation import methods, pareto

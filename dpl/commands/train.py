@@ -1,10 +1,11 @@
-"""Data set, training, evaluation: python scripts/train.py model=fcnn loss=lr_star."""
+"""Train and evaluate a surrogate: python scripts/train.py model=fcnn loss=lr_star."""
 
 import math
 import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from dpl import config
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def parts(cfg: DictConfig) -> tuple["Scene", Any, "Surrogate", Any]:
-    """Return scene, data, surrogate and trainer of a run; nothing is solved or written.
+    """Return scene, data, surrogate and trainer of a run without solving or writing.
 
     Raises:
         ConfigError: One of them cannot be built, or the run cannot be resumed.
@@ -28,34 +29,37 @@ def parts(cfg: DictConfig) -> tuple["Scene", Any, "Surrogate", Any]:
     surrogate = config.build_surrogate(cfg, scene)
     if resumed is not None:
         config.check_weights(surrogate, resumed)
-    trainer = config.instantiate(cfg, "trainer")
+    trainer = config.build_trainer(cfg)
     cli.check_trainer(trainer, cfg)
     return scene, data, surrogate, trainer
 
 
 @cli.command("train", rehearse=parts)
 def main(cfg: DictConfig) -> float | None:
-    """Train a surrogate and judge it; return its smallest validation e_mean [-] to a sweep."""
-    # here and not above: worker processes import this file, and need none of it
+    """Train and evaluate a surrogate; return its smallest validation e_mean [-] to a search."""
+    # imported here, since worker processes import this module without needing them
     import torch
 
     from dpl.evaluation import evaluate
     from dpl.training import Diverged
     from dpl.training.callbacks import hparams
 
+    cfg = config.resumed_config(cfg, HydraConfig.get().overrides.task)
     config.check(cfg)
+    cli.apply_extras(cfg)
     folder = Path(cfg.folder)
     scene, data, surrogate, trainer = parts(cfg)
     session = hparams.LogHyperparameters(config.hyperparameters(cfg))
     trainer.callbacks.append(session)
     if trainer.is_global_zero:
         config.show_skipped_work(scene, data, surrogate)
-        config.save_config(cfg, folder)
+        if not trainer.fast_dev_run:
+            config.save_config(cfg, folder)
     try:
         trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path or None, weights_only=True)
     except Diverged as error:
         return cli.failed(error)
-    except SystemExit as leaving:  # how Lightning passes Ctrl-C on
+    except SystemExit as leaving:  # Lightning turns Ctrl-C into it
         if leaving.code == 128 + signal.SIGTERM:
             raise
         raise KeyboardInterrupt from leaving
@@ -66,13 +70,15 @@ def main(cfg: DictConfig) -> float | None:
             or isinstance(error, config.ConfigError | DataSetError)
         ):
             raise
-        told = f"ckpt_path = {cfg.ckpt_path} cannot be resumed: {type(error).__name__}: {error}"
-        raise config.ConfigError(told) from error
+        reason = f"{type(error).__name__}: {error}"
+        raise config.ConfigError(
+            f"ckpt_path = {cfg.ckpt_path} cannot be resumed: {reason}"
+        ) from error
     finally:
-        data.teardown("fit")  # which Lightning leaves out on Ctrl-C
-    if torch.distributed.is_initialized():  # the judging is the first process's alone
+        data.teardown("fit")  # Lightning does not call it after Ctrl-C
+    if torch.distributed.is_initialized():  # only the first process evaluates
         torch.distributed.destroy_process_group()
-    if not trainer.is_global_zero:
+    if not trainer.is_global_zero or trainer.fast_dev_run:
         return None
     _, best = config.load_run(folder, trust=True, scene=scene)
     rows = evaluate(best, data.samples("test"), folder)

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from dpl.config.build import (
         build_scene,
         build_surrogate,
+        build_trainer,
         check,
         hyperparameters,
         instantiate,
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
         load_data,
         load_run,
         load_runs,
+        resumed_config,
         save_config,
         with_mesh_of_resumed,
     )

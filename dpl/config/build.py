@@ -1,6 +1,6 @@
-"""Composition root: from a configuration to objects, from a run's folder back to its surrogate.
+"""Build scenes, surrogates and trainers from configurations.
 
-Above it only `commands` know Hydra, below it nothing does.
+Only this folder and `dpl.commands` import Hydra.
 """
 
 import contextlib
@@ -24,11 +24,13 @@ from dpl.scene import Scene
 from dpl.system.blas import slow_blas
 
 if typing.TYPE_CHECKING:
+    import lightning as L
+
     from dpl.fem import Problem
     from dpl.training import Surrogate
 
 
-SCENE = (  # keys that make a scene, and those that make a surrogate of it
+SCENE = (  # keys of a scene; those of a surrogate
     *("mesh", "degree", "mean_dilatation", "supports", "forces"),
     *("material", "young", "loads", "solver"),
 )
@@ -36,7 +38,7 @@ NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")
 
 
 def to_container(cfg: DictConfig) -> dict[str, Any]:
-    """Return a configuration as plain data, interpolations resolved.
+    """Return a configuration as a dictionary without interpolations.
 
     Raises:
         ConfigError: A value is missing.
@@ -48,12 +50,12 @@ def to_container(cfg: DictConfig) -> dict[str, Any]:
     except MissingMandatoryValue as error:
         raise ConfigError(f"{error.full_key} is missing; set it on the command line") from None
     except OmegaConfBaseException as error:
-        told = str(error.msg or error).splitlines()[0]
-        raise ConfigError(f"{error.full_key or 'config'}: {told}") from None
+        message = str(error.msg or error).splitlines()[0]
+        raise ConfigError(f"{error.full_key or 'config'}: {message}") from None
 
 
 def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
-    """Return what makes one run differ from another, flat, see `dpl.config.validation.columns`.
+    """Return the hyperparameters of a run, flat, see `dpl.config.validation.columns`.
 
     Raises:
         ConfigError: A value is missing.
@@ -62,26 +64,31 @@ def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
 
 
 def check(cfg: DictConfig, *, trust: bool = True) -> None:
-    """Hold a configuration against `dpl.config.validation`, before anything is called.
+    """Check a configuration without calling anything, see `dpl.config.validation.check`.
 
     Raises:
-        ConfigError: See `dpl.config.validation.check`.
+        ConfigError: A key, a type, a range or a called object is invalid.
     """
     written = typing.cast("dict[str, Any]", OmegaConf.to_container(cfg))
     validation.check(written, to_container(cfg), trust=trust)
 
 
 def instantiate(cfg: DictConfig, key: str, /, **more: Any) -> Any:
-    """Return the object of one node; `more` goes into the call (of a partial: into the second).
+    """Return the object of a node.
+
+    Args:
+        cfg: The configuration.
+        key: Key of the node.
+        **more: Arguments of the call; of a partial (`_partial_: true`), those of its call.
 
     Raises:
-        ConfigError: It is not there, its values are out of range, it gives another kind of object
-            than the key stands for, or its file is not there.
+        ConfigError: The node or its file does not exist, an argument is out of range, or the object
+            has another type than the key requires.
     """
-    _need(cfg, key)
+    require_keys(cfg, key)
     made = _made(cfg[key], key, more)
-    own = callable(made) and key == "clamped"  # a region may be any function of points
-    partial = own or (not more and isinstance(made, functools.partial))
+    is_region = callable(made) and key == "fixed"  # a region may be any function of points
+    partial = is_region or (not more and isinstance(made, functools.partial))
     if (
         key in validation.EXPECTED_TYPES
         and not partial
@@ -104,8 +111,8 @@ def _made(node: Any, key: str, more: dict[str, Any]) -> Any:
         raise ConfigError(f"{key}: {error or type(error).__name__}") from error
 
 
-def _need(cfg: DictConfig, *keys: str) -> None:
-    """Raise where one of the keys is not there."""
+def require_keys(cfg: DictConfig, *keys: str) -> None:
+    """Raise a `ConfigError` if a key does not exist."""
     for key in keys:
         if key not in cfg:
             raise ConfigError(f"{key} is missing")
@@ -129,15 +136,15 @@ def build_scene(cfg: DictConfig) -> Scene:
     """Return the scene of a configuration.
 
     Raises:
-        ConfigError: Something in it cannot work.
+        ConfigError: The scene cannot be built; the message names the key.
     """
     from dpl.fem import Problem
 
-    _need(cfg, *SCENE)
+    require_keys(cfg, *SCENE)
     material = instantiate(cfg, "material")
     with _shown_warnings():
         mesh = instantiate(cfg, "mesh")
-    clamped = instantiate(cfg, "clamped") if cfg.get("clamped") is not None else None
+    fixed = instantiate(cfg, "fixed") if cfg.get("fixed") is not None else None
     if cfg.degree not in (1, 2):
         raise ConfigError(f"degree = {cfg.degree} must be 1 or 2")
     if not isinstance(cfg.mean_dilatation, bool):
@@ -147,42 +154,44 @@ def build_scene(cfg: DictConfig) -> Scene:
             problem = Problem.build(
                 mesh,
                 material,
-                fixed=clamped,
+                fixed=fixed,
                 supports=_parts(cfg, "supports"),
                 degree=cfg.degree,
                 mean_dilatation=cfg.mean_dilatation,
             )
         except ValueError as error:
-            key = "clamped or supports" if cfg.supports else "clamped"
-            told = str(error)
-            key = "mean_dilatation" if told.startswith("mean_dilatation") else key
-            raise ConfigError(f"{key}: {told.removeprefix('mean_dilatation: ')}") from error
+            key = "fixed or supports" if cfg.supports else "fixed"
+            message = str(error)
+            key = "mean_dilatation" if message.startswith("mean_dilatation") else key
+            raise ConfigError(f"{key}: {message.removeprefix('mean_dilatation: ')}") from error
     if not problem.free.any():
-        raise ConfigError("clamped or supports: every node is held; hold fewer of them")
+        raise ConfigError("fixed or supports: all nodes are fixed; fix fewer nodes")
     if loose := problem.unconstrained_rigid_body_modes():
-        raise ConfigError(
-            f"clamped: {len(loose)} rigid modes are unconstrained: {', '.join(loose)}"
-        )
+        raise ConfigError(f"fixed: {len(loose)} rigid modes are unconstrained: {', '.join(loose)}")
     solver = instantiate(cfg, "solver", problem=problem)
     young = OmegaConf.to_container(cfg.young) if isinstance(cfg.young, ListConfig) else cfg.young
     if not validation.matches_type(young, float | Sequence[float]):
         raise ConfigError(f"young = {young!r} must be a modulus [Pa] or a range [low, high]")
     loads = instantiate(
-        cfg, "loads", linear=solver.linear_solver, young=young, constant_force=_always(cfg, problem)
+        cfg,
+        "loads",
+        linear=solver.linear_solver,
+        young=young,
+        constant_force=_constant_force(cfg, problem),
     )
     try:
-        loads.largest_force  # noqa: B018  # which says whether the body allows these loads
+        loads.largest_force  # noqa: B018  # raises if the body does not allow these loads
     except ValueError as error:
         raise ConfigError(f"loads: {error}") from error
     except SingularMatrix as error:
-        told = f"material, mesh, clamped or supports: K(0) cannot be used: {error}"
-        raise ConfigError(told) from error
+        message = f"material, mesh, fixed or supports: K(0) cannot be used: {error}"
+        raise ConfigError(message) from error
     return Scene(problem, loads, solver)
 
 
 @contextlib.contextmanager
 def _shown_warnings() -> Iterator[None]:
-    """Print what is warned of in here, a line each, once."""
+    """Print the warnings of the block to stderr, each once and in one line."""
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", UserWarning)
         yield
@@ -191,12 +200,14 @@ def _shown_warnings() -> Iterator[None]:
 
 
 def _parts(cfg: DictConfig, key: str) -> list[Any]:
-    """Return the objects of a node that names several, {} or null for none."""
-    node = cfg[key]
+    """Return the objects of a node that names several; none for {} or null."""
+    node = cfg.get(key)
     if node is None:
         return []
     if not isinstance(node, DictConfig):
-        raise ConfigError(f"{key} = {node!r} must name its parts: {key}: {{name: {{...}}}}")
+        raise ConfigError(
+            f"{key} = {node!r} must be a mapping of names to calls: {key}: {{name: {{...}}}}"
+        )
     parts = {str(name): _made(node[name], f"{key}.{name}", {}) for name in node if node[name]}
     for name, part in parts.items():
         if not validation.is_instance_of(type(part), validation.EXPECTED_TYPES[key]):
@@ -205,8 +216,8 @@ def _parts(cfg: DictConfig, key: str) -> list[Any]:
     return list(parts.values())
 
 
-def _always(cfg: DictConfig, problem: "Problem") -> torch.Tensor | None:
-    """Return the force that every load holds, (N, D) [-]; None if there is none."""
+def _constant_force(cfg: DictConfig, problem: "Problem") -> torch.Tensor | None:
+    """Return the force that is part of every load, (N, D) [-]; None without `forces`."""
     try:
         forces = [part.on(problem) for part in _parts(cfg, "forces")]
     except ValueError as error:
@@ -218,12 +229,12 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
     """Return the untrained surrogate of a configuration; its weights are a function of `seed`.
 
     Raises:
-        ConfigError: Something in it cannot work.
+        ConfigError: The surrogate cannot be built; the message names the key.
     """
     from dpl.training import Surrogate
 
-    _need(cfg, *NETWORK)
-    # both are tried on one number, so that their errors come before any solve
+    require_keys(cfg, *NETWORK)
+    # optimiser and schedule are built once for one number: they fail before any solve
     trial = instantiate(cfg, "optimizer", params=[torch.nn.Parameter(torch.zeros(1))])
     if cfg.scheduler:
         instantiate(cfg, "scheduler", optimizer=trial, total_steps=1)
@@ -237,8 +248,21 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
         raise ConfigError(f"model: {error}") from error
 
 
+def build_trainer(cfg: DictConfig) -> "L.Trainer":
+    """Return the trainer of a configuration with its callbacks and loggers.
+
+    Raises:
+        ConfigError: One of them cannot be built.
+    """
+    require_keys(cfg, "trainer")
+    callbacks, loggers = (_parts(cfg, key) for key in ("callbacks", "logger"))
+    return typing.cast(
+        "L.Trainer", instantiate(cfg, "trainer", callbacks=callbacks, logger=loggers or False)
+    )
+
+
 def show_skipped_work(scene: Scene, *parts: Any) -> None:
-    """Print the size of the body, and what a scene and the parts of a run do not need and skip."""
+    """Print the size of the body and the work that the scene and the parts of a run skip."""
     lines = [line for part in (scene, *parts) for line in part.skipped_work()]
     print(scene.body())
     print("plan: skipped, because this scene does not need it")

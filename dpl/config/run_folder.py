@@ -9,17 +9,18 @@ from typing import Any
 import hydra
 import torch
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dpl.config import validation
 from dpl.config.build import (
     SCENE,
-    _need,
     build_scene,
     build_surrogate,
     check,
     instantiate,
+    require_keys,
     to_container,
 )
 from dpl.config.validation import ConfigError
@@ -34,80 +35,126 @@ if typing.TYPE_CHECKING:
     from dpl.inference import Simulator
     from dpl.training import Surrogate
 
-MESH = "mesh.vtu"  # copy of the mesh file in the folder of a run
-LONGEST = 100_000  # bytes of a run's configuration
+MESH = "mesh.vtu"  # name of the copy of a mesh file in the folder of a run
+OF_THE_SESSION = {"run", "folder", "ckpt_path", "callbacks", "logger", "paths", "extras"}
+MAX_BYTES = 100_000  # of the configuration of a run
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:
-    """Write a configuration, resolved, into a run's folder, and a copy of the mesh file it names.
+    """Write a configuration without interpolations, and a copy of its mesh file, to a folder.
 
     Raises:
-        ConfigError: The folder holds a run already, and this one does not resume it.
+        ConfigError: The folder contains another run that is not resumed.
     """
     there = folder / "config.yaml"
     if (folder / "checkpoints" / "last.ckpt").exists() and not cfg.ckpt_path:
         raise ConfigError(
-            f"run: {folder} holds a run; resume it with ckpt_path=last or name another"
+            f"run = {folder} contains a run; resume it with ckpt_path=last or choose another folder"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    _keep_mesh(cfg, folder)
+    _copy_mesh(cfg, folder)
     there.write_text(OmegaConf.to_yaml(OmegaConf.create(to_container(cfg))))
 
 
-def _keep_mesh(cfg: DictConfig, folder: Path) -> None:
-    """Write the mesh file of a configuration into a run's folder, as `MESH`."""
+def _copy_mesh(cfg: DictConfig, folder: Path) -> None:
+    """Write the mesh of a mesh file to a folder."""
     cfg = with_mesh_of_resumed(cfg)
-    if not _is_file(cfg) or Path(cfg.mesh.path) == folder / MESH:
+    if not _has_mesh_file(cfg) or Path(cfg.mesh.path) == folder / MESH:
         return
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # it was read before, and they were shown
+        warnings.simplefilter("ignore", UserWarning)  # printed when the mesh was read first
         mesh = instantiate(cfg, "mesh")
     with atomic_write(folder / MESH) as file:
         write_mesh_exactly(Path(file.name), mesh)
 
 
-def _is_file(cfg: DictConfig) -> bool:
+def _has_mesh_file(cfg: DictConfig) -> bool:
     """Return whether the mesh of a configuration is read from a file."""
     return hydra.utils.get_object(cfg.mesh._target_) is load_mesh
 
 
 def _with_mesh(cfg: DictConfig, path: Path) -> DictConfig:
-    """Return a configuration that reads its mesh, if that is a file, from another one."""
+    """Return a configuration that reads its mesh from another file."""
     return OmegaConf.merge(cfg, {"mesh": {"path": str(path)}})
 
 
 def _resumed(cfg: DictConfig) -> Path | None:
-    """Return the checkpoint that a configuration resumes, None if it begins a run."""
+    """Return the path of the checkpoint to resume, None for a new run."""
     last = Path(cfg.folder) / "checkpoints" / "last.ckpt"
     if not cfg.ckpt_path or (cfg.ckpt_path == "last" and not last.exists()):
         return None
     return last if cfg.ckpt_path == "last" else Path(cfg.ckpt_path)
 
 
-def with_mesh_of_resumed(cfg: DictConfig) -> DictConfig:
-    """Return a configuration that reads its mesh file, if it names one, from the run it resumes.
+def resumed_config(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """Return the configuration of the run to resume, changed by the command line.
 
-    The original may have been moved or changed.
+    It is `cfg` where no run is resumed. It is also `cfg` where the command line names an option
+    that changes several groups, such as `experiment`: it then has to repeat all of them.
+
+    Args:
+        cfg: Configuration of the command line.
+        overrides: Overrides of the command line, as `key=value`.
+
+    Raises:
+        ConfigError: The configuration of the run cannot be read, or it calls an object outside this
+            package that the command line does not name.
     """
-    if not _is_file(cfg) or (checkpoint := _resumed(cfg)) is None:
+    checkpoint = _resumed(cfg)
+    path = None if checkpoint is None else checkpoint.parent.parent / "config.yaml"
+    if path is None or not path.is_file():
+        return cfg
+    asked = to_container(cfg)
+    before = _read_config(path)
+    kept = {key: value for key, value in before.items() if key not in OF_THE_SESSION}
+    if "trainer" in kept and "trainer" in asked:
+        calls = ("_target_", "_partial_", "plugins")  # never those of the file
+        kept["trainer"] |= {key: asked["trainer"].get(key) for key in calls}
+    unnamed = {k: v for k, v in kept.items() if k != "trainer" and v != asked.get(k)}
+    try:
+        validation.check(unnamed, unnamed, trust=False)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}; repeat the overrides of the run") from error
+    found, given = OmegaConf.create({**asked, **kept}), OmegaConf.create(asked)
+    for one in OverridesParser.create().parse_overrides(list(overrides)):
+        key = one.key_or_group
+        root = key.partition(".")[0]
+        if root in OF_THE_SESSION or root.startswith("hydra"):
+            continue
+        if one.is_delete():
+            owner, _, name = key.rpartition(".")
+            (OmegaConf.select(found, owner) if owner else found).pop(name, None)
+        elif root not in asked:
+            return cfg
+        else:
+            OmegaConf.update(found, key, OmegaConf.select(given, key), merge=False)
+    return found
+
+
+def with_mesh_of_resumed(cfg: DictConfig) -> DictConfig:
+    """Return a configuration that reads its mesh file from the copy in the run to resume.
+
+    The original file may have been moved or changed. Without a copy the result is `cfg`.
+    """
+    if not _has_mesh_file(cfg) or (checkpoint := _resumed(cfg)) is None:
         return cfg
     own = checkpoint.parent.parent / MESH
     return _with_mesh(cfg, own) if own.is_file() else cfg
 
 
 def check_resumed(cfg: DictConfig) -> dict[str, Any] | None:
-    """Return the checkpoint that a run resumes; None if it begins anew.
+    """Return the checkpoint to resume; None for a new run.
 
-    `ckpt_path=last` of a run that has not begun begins it: a job has one command line.
+    `ckpt_path=last` starts a run that has no checkpoint yet, so that a job has one command line.
 
     Raises:
-        ConfigError: There is no such checkpoint, it cannot be resumed, or its run differs in what
-            makes the run what it is.
+        ConfigError: The checkpoint does not exist or cannot be resumed, or its run has another
+            configuration, see `dpl.config.validation.changes`.
     """
     if (path := _resumed(cfg)) is None:
         return None
     if not path.is_file():
-        raise ConfigError(f"ckpt_path: there is no {path} to resume; leave it out to begin anew")
+        raise ConfigError(f"ckpt_path = {path} does not exist; leave it out to start a new run")
     before = path.parent.parent / "config.yaml"
     if before.is_file() and (
         changed := validation.changes(_read_config(before), to_container(cfg))
@@ -133,10 +180,10 @@ def check_resumed(cfg: DictConfig) -> dict[str, Any] | None:
 
 
 def check_weights(surrogate: "Surrogate", checkpoint: dict[str, Any]) -> None:
-    """Hold the checkpoint that a run resumes against its untrained surrogate.
+    """Check that the checkpoint to resume fits an untrained surrogate.
 
     Raises:
-        ConfigError: It is of another scene or of another network.
+        ConfigError: It belongs to another scene or network.
     """
     try:
         surrogate.on_load_checkpoint(checkpoint)
@@ -154,16 +201,16 @@ def check_weights(surrogate: "Surrogate", checkpoint: dict[str, Any]) -> None:
 
 
 def _read_config(path: Path) -> dict[str, Any]:
-    """Return the configuration of a run, plain data: nothing in it is called or looked up.
+    """Return the configuration of a run as a dictionary; nothing in it is called or looked up.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: The file is not the configuration of a run.
     """
     try:
-        if path.stat().st_size > LONGEST:
-            raise ValueError(f"has {path.stat().st_size:,} bytes, of {LONGEST:,} at most")
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"has {path.stat().st_size:,} bytes, of {MAX_BYTES:,} at most")
         text = path.read_text()
-        marks = yaml.AnchorToken, yaml.AliasToken  # a few lines of which unfold to gigabytes
+        marks = yaml.AnchorToken, yaml.AliasToken  # a few lines can expand to gigabytes
         if any(isinstance(token, marks) for token in yaml.scan(text, yaml.SafeLoader)):
             raise ValueError("refers to parts of itself")
         found: Any = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
@@ -185,13 +232,13 @@ def load_run(
     """Return the configuration and the best surrogate of a training run.
 
     Args:
-        folder: The run's.
-        scene: Its scene, where that is there already; built anew if left out.
-        trust: Whether its configuration may name objects outside this package, such as your own
-            law: they are imported and called.
+        folder: Folder of the run.
+        scene: Scene of the run, if it is built already.
+        trust: Import and call objects outside this package, such as your own law, that the
+            configuration names.
 
     Raises:
-        ConfigError: There is no finished run, or it names what is not trusted.
+        ConfigError: There is no finished run, or it names an object that is not trusted.
     """
     from dpl.training import checkpoints  # which imports Lightning
 
@@ -202,7 +249,8 @@ def load_run(
         if not path.is_file():
             raise ConfigError(f"run = {folder} has no {path.relative_to(folder)}; train it first")
     found = _read_config(config)
-    found.pop("trainer", None)  # of which nothing is called
+    for key in ("trainer", "callbacks", "logger"):  # none of their objects is called
+        found.pop(key, None)
     cfg = OmegaConf.create(found)
     check(cfg, trust=trust)
     try:
@@ -228,20 +276,20 @@ def _unusable(checkpoint: Path, error: Exception) -> ConfigError:
 def _scene_of_run(
     cfg: DictConfig, weights: Path, checkpoint: dict[str, Any], *, trust: bool
 ) -> Scene:
-    """Return the scene of a run, its mesh read from its folder and held to its weights.
+    """Return the scene of a run; a mesh file is read from the folder of the run.
 
     Args:
-        cfg: Its configuration.
-        weights: The file of its weights, in its folder.
-        checkpoint: What is in it. A body has no more nodes than weights have numbers, of any
-            network.
-        trust: Whether the mesh may have more nodes, and lie elsewhere if the run has no copy.
+        cfg: Configuration of the run.
+        weights: File of its weights.
+        checkpoint: Contents of that file. It bounds the number of nodes: no network has fewer
+            weights than its body has nodes.
+        trust: Allow more nodes, and a mesh file elsewhere if the run has no copy.
 
     Raises:
         ConfigError: The run has no copy of its mesh file, or the mesh has too many nodes.
     """
-    _need(cfg, *SCENE)
-    if _is_file(cfg):
+    require_keys(cfg, *SCENE)
+    if _has_mesh_file(cfg):
         folder = weights.parent.parent
         own = folder / MESH
         if own.resolve().parent == folder.resolve() and own.is_file():
@@ -264,15 +312,15 @@ def load(folder: str | Path, *, trust: bool = False, corrected: bool = False) ->
     """Return the simulator of a training run.
 
     Args:
-        folder: The run's, as `runs/...`.
-        trust: Whether its configuration may name objects outside this package, such as your own
-            law: they are imported and called.
-        corrected: Put equilibrium in the network's modes between it and Newton; for `pod` and
-            `latent`, and it needs the run's data set.
+        folder: Folder of the run, as `runs/...`.
+        trust: Import and call objects outside this package, such as your own law, that the
+            configuration names.
+        corrected: Solve for equilibrium in the modes of the network before Newton is tried. Only
+            for `pod` and `latent`; it needs the data set of the run.
 
     Raises:
-        ValueError: There is no finished run, its checkpoint is of another scene, it names what is
-            not trusted, or its network has no modes.
+        ValueError: There is no finished run, its checkpoint belongs to another scene, it names an
+            object that is not trusted, or its network has no modes.
     """
     from dpl.inference import Simulator
 
@@ -290,8 +338,8 @@ def load_runs(
     """Return the configurations and surrogates of the runs in a folder; they share one scene.
 
     Args:
-        folder: That holds the folders of runs.
-        names: Of those; all if left out.
+        folder: Folder of the folders of the runs.
+        names: Names of the runs; all if left out.
 
     Raises:
         ConfigError: There are none, or one cannot be used or belongs to another scene.
@@ -299,7 +347,7 @@ def load_runs(
     if names is None:
         names = sorted(path.parent.name for path in Path(folder).glob("*/config.yaml"))
     if not names:
-        raise ConfigError(f"run: {folder} holds no runs; train some with run={folder}/NAME")
+        raise ConfigError(f"run = {folder} contains no runs; train some with run={folder}/NAME")
     runs: dict[str, tuple[DictConfig, Surrogate]] = {}
     scene = None
     for name in names:
@@ -309,14 +357,14 @@ def load_runs(
 
 
 def load_data(cfg: DictConfig, scene: Scene) -> "OfflineData":
-    """Return the data set of a training run, made where it is missing.
+    """Return the data set of a training run; missing loads are solved.
 
     Args:
-        cfg: The run's configuration.
-        scene: Its scene.
+        cfg: Configuration of the run.
+        scene: Scene of the run.
 
     Raises:
-        ConfigError: It cannot be made.
+        ConfigError: The data set cannot be built.
     """
     data = instantiate(cfg, "data", scene=scene)
     data.prepare_data()

@@ -1,6 +1,7 @@
-"""What a configuration may hold: keys, kinds, spans, and what it may name to be called.
+"""Check configurations: keys, types, ranges, and the objects that they may call.
 
-Signatures are the schema: options and their types are those of the classes and functions named.
+Signatures are the schema: the options of a call are the arguments of the class or function that its
+`_target_` names.
 """
 
 import contextlib
@@ -15,42 +16,48 @@ from pathlib import Path
 from typing import Any
 
 WHOLE, NAMES = Sequence[int], Sequence[str] | None
-KEYS: dict[str, Any] = {  # what a configuration may hold at its top, and of which kind
+KEYS: dict[str, Any] = {  # types of the keys of all commands
     **dict.fromkeys(("mesh", "material", "loads", "solver"), dict),
-    **dict.fromkeys(("clamped", "supports", "forces"), dict | None),
+    **dict.fromkeys(("fixed", "supports", "forces"), dict | None),
     **{"degree": int, "mean_dilatation": bool, "young": float | Sequence[float]},
     **dict.fromkeys(("data", "model", "loss", "optimizer", "trainer"), dict),
-    **{"scheduler": dict | None, "seed": int, "ckpt_path": str | None},
+    **dict.fromkeys(("callbacks", "logger", "paths", "extras"), dict | None),
+    **{"scheduler": dict | None, "seed": int, "ckpt_path": str | None, "tags": Sequence[str]},
     **{"run": str | None, "folder": str, "tol": float},
     **{"action": str, "shard": int, "shards": int},
-    **{"parts": Sequence[str], "linear": Sequence[str], "peers": dict},
-    **dict.fromkeys(("repeats", "count", "workers", "samples", "far"), int),
+    **{"outputs": Sequence[str], "linear": Sequence[str], "reference_codes": dict},
+    **dict.fromkeys(("repeats", "count", "workers", "samples", "n_far_loads"), int),
     **{"name": str, "galerkin": dict | None, "corrected": dict | None},
     **{"networks": NAMES, "tols": Sequence[float], "resume": bool, "cases": NAMES},
     **{"solve_reference": bool, "discretisation": str | None},
-    **{"threads": Sequence[int | None], "across": WHOLE, "budget": int},
-    **{"minutes": float, "works": Sequence[str]},
-    **{"host": str, "port": int, "allowed_hosts": Sequence[str], "animation": str | None},
-    **{"profile": bool, "galerkin_correction": bool},
+    **{"threads": Sequence[int | None], "cells_across": WHOLE, "budget": int},
+    **{"minutes": float, "workloads": Sequence[str]},
+    **{"host": str, "port": int, "allowed_hosts": Sequence[str]},
+    **{"animation": str | None, "profile": bool, "galerkin_correction": bool},
 }
-RANGES = {  # smallest and largest of them
+RANGES = {  # smallest and largest values of keys
     **{"repeats": (1, 10**6), "samples": (1, 10**6), "shards": (1, math.inf)},
-    **{"count": (0, 10**6), "far": (0, 10**6), "workers": (0, 1024), "seed": (0, 2**32 - 1)},
+    **{
+        "count": (0, 10**6),
+        "n_far_loads": (0, 10**6),
+        "workers": (0, 1024),
+        "seed": (0, 2**32 - 1),
+    },
     **{"budget": (1, 10**6), "minutes": (1e-2, 1e6), "port": (0, 65535)},
-    **{"tol": (1e-15, 1), "tols": (1e-15, 1), "across": (1, 10**3), "threads": (1, 10**4)},
+    **{"tol": (1e-15, 1), "tols": (1e-15, 1), "cells_across": (1, 10**3), "threads": (1, 10**4)},
     **{"young": (1e-30, 1e30)},  # [Pa]
 }
-TRAINED = {  # smallest and largest of what only a training must keep to; 1e-30 is "above 0"
+TRAINING_RANGES = {  # the same for keys of a training; 1e-30 stands for "above 0"
     **{"data.train": (1, 10**7), "optimizer.lr": (1e-30, 1e6)},
     **{f"trainer.{key}": (1, 10**9) for key in ("max_epochs", "max_steps")},
     **{"trainer.check_val_every_n_epoch": (1, 10**9), "trainer.log_every_n_steps": (0, 10**9)},
     **{"trainer.limit_train_batches": (1e-30, 10**9)},
 }
-ENDLESS = {"trainer.max_epochs", "trainer.max_steps"}  # -1 of these stands for no limit
-EXPECTED_TYPES = {  # of what the call under a key gives: one of these, or derived from them
+UNLIMITED = {"trainer.max_epochs", "trainer.max_steps"}  # keys for which -1 means no limit
+EXPECTED_TYPES = {  # base classes of the object that the call under a key returns
     "mesh": {"skfem.mesh.mesh.Mesh"},
     "material": {"dpl.fem.materials.material.Material"},
-    "clamped": {f"dpl.fem.mesh.regions.{n}" for n in ("Plane", "Box", "Sphere", "Cylinder", "Tag")},
+    "fixed": {f"dpl.fem.mesh.regions.{n}" for n in ("Plane", "Box", "Sphere", "Cylinder", "Tag")},
     "supports": {
         "dpl.fem.assembly.boundary_conditions.DirichletBC",
         "dpl.fem.assembly.boundary_conditions.RobinBC",
@@ -64,55 +71,57 @@ EXPECTED_TYPES = {  # of what the call under a key gives: one of these, or deriv
     "optimizer": {"torch.optim.optimizer.Optimizer"},
     "scheduler": {"torch.optim.lr_scheduler.LRScheduler"},
     "trainer": {"lightning.pytorch.trainer.trainer.Trainer"},
+    "callbacks": {"lightning.pytorch.callbacks.callback.Callback"},
+    "logger": {"lightning.pytorch.loggers.logger.Logger"},
 }
-SEVERAL = ("supports", "forces")  # keys that hold calls by name
+SEVERAL = ("supports", "forces", "callbacks", "logger")  # keys with calls by name
 PROTOCOLS = EXPECTED_TYPES["solver"] | EXPECTED_TYPES["loads"]  # a class needs their members only
 TRUSTED_RESULTS = {  # of functions that a run may name: they compute and have no other effect
     "skfem.mesh.mesh.Mesh",
     "numpy.ndarray",
     "torch.optim.lr_scheduler.LRScheduler",
 }
-OWN_PACKAGES = ("dpl.", "torch.optim.")  # where those classes are
-HYDRA_KEYS = {"_target_", "_partial_", "_recursive_", "_convert_"}  # Hydra's own options of a call
+OWN_PACKAGES = ("dpl.", "torch.optim.")  # packages of these classes
+HYDRA_KEYS = {"_target_", "_partial_", "_recursive_", "_convert_"}  # options of Hydra in a call
 
-NOT_IDENTITY = {  # where a run lies and how it is watched, not what it is
+NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its result
     *("run", "folder", "ckpt_path", "data.folder"),
-    *("trainer.callbacks", "trainer.logger", "trainer.plugins"),
+    *("callbacks", "logger", "paths", "extras", "trainer.plugins"),
 }
-MAY_CHANGE_ON_RESUME = {  # keys of a run's length and of the machine
+MAY_CHANGE_ON_RESUME = {  # keys of the length of a run and of the machine
     *(f"trainer.max_{unit}" for unit in ("epochs", "steps", "time")),
     *(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy")),
     *("trainer.log_every_n_steps", "trainer.check_val_every_n_epoch", "trainer.profiler"),
     *("trainer.enable_progress_bar", "trainer.enable_model_summary"),
-    *("data.workers", "data.timeout"),
+    *("data.workers", "data.timeout", "tags"),
 }
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot work: which key, what is wrong, what to do, in one line."""
+    """An invalid configuration; the message names key, problem and remedy in one line."""
 
-    def __init__(self, told: str) -> None:
-        """Fold what is told into a line."""
-        super().__init__(" ".join(filter(None, map(str.strip, told.splitlines()))))
+    def __init__(self, message: str) -> None:
+        """Join the lines of the message."""
+        super().__init__(" ".join(filter(None, map(str.strip, message.splitlines()))))
 
 
 def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = True) -> None:
-    """Hold a configuration against the signatures that it calls, before anything is called.
+    """Check a configuration against the signatures of its calls without calling anything.
 
     Args:
-        written: The configuration, with interpolations as they are written.
-        resolved: The same without them.
-        trust: Whether it may name any object to call, or only what the keys of a run stand for:
-            classes of this package and of PyTorch's optimisers, and public functions of this
-            package that return a mesh, an array or a scheduler.
+        written: The configuration with interpolations.
+        resolved: The configuration without interpolations.
+        trust: Allow calls of any object. Otherwise only classes of this package and of PyTorch's
+            optimisers, and public functions of this package that return a mesh, an array or a
+            scheduler.
 
     Raises:
-        ConfigError: A key that its object does not know, a value of another type, a number that is
-            not finite or out of range, or an object that does not exist or is not trusted.
+        ConfigError: A key is unknown, a value has the wrong type, is not finite or is out of range,
+            or an object does not exist or is not trusted.
     """
     if unknown := sorted({str(key) for key in resolved} - set(KEYS)):
         raise ConfigError(f"{unknown[0]}: there is no such key; {suggestion(unknown[0], KEYS)}")
-    for node in (written, resolved):  # first where a value is written
+    for node in (written, resolved):  # `written` first: it names the key that was set
         for path, value in iter_nodes(node):
             if isinstance(value, float) and not math.isfinite(value):
                 raise ConfigError(f"{path} = {value} is not a finite number")
@@ -120,11 +129,11 @@ def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = Tr
                 raise ConfigError(f"{path} = {value} does not fit into 64 bits")
     for key, value in resolved.items():
         _check_top(key, value)
-    trained = TRAINED if "trainer" in resolved else {}
+    trained = TRAINING_RANGES if "trainer" in resolved else {}
     for path, node in iter_nodes(resolved):
-        if path in trained and not (path in ENDLESS and node == -1):
+        if path in trained and not (path in UNLIMITED and node == -1):
             least, most = trained[path]
-            _check_span(path, node, least, most, " or be -1" * (path in ENDLESS))
+            _check_range(path, node, least, most, " or be -1" * (path in UNLIMITED))
         if isinstance(node, dict) and "_target_" in node:
             _check_call(path, node, _target(path, node["_target_"], trust=trust))
         elif _is_call(path) and node is not None:
@@ -132,23 +141,23 @@ def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = Tr
 
 
 def _is_call(path: str) -> bool:
-    """Return whether what lies at a path must be a call."""
+    """Return whether the value at a path must be a call."""
     key, *below = path.split(".")
     return len(below) == (key in SEVERAL) and key in EXPECTED_TYPES
 
 
 def _check_top(key: str, value: Any) -> None:
-    """Hold the value of a key against what it must be."""
-    if key == "folder" and value is None:  # of scripts that write nothing
+    """Check type and range of the value of a top-level key."""
+    if key == "folder" and value is None:  # of commands that write nothing
         return
-    plain = {} if isinstance(value, dict) else value  # only some keys may be calls
+    plain = {} if isinstance(value, dict) else value  # calls are checked by their signatures
     if not matches_type(plain, KEYS[key]):
-        raise ConfigError(f"{key} = {value!r} must be {_words(KEYS[key])}")
-    _check_span(key, value, *RANGES.get(key, (-math.inf, math.inf)))
+        raise ConfigError(f"{key} = {value!r} must be {_describe(KEYS[key])}")
+    _check_range(key, value, *RANGES.get(key, (-math.inf, math.inf)))
 
 
-def _check_span(key: str, value: Any, least: float, most: float, more: str = "") -> None:
-    """Hold a number, or those in a list, against the smallest and the largest."""
+def _check_range(key: str, value: Any, least: float, most: float, more: str = "") -> None:
+    """Check a number, or each number of a list, against a range."""
     for one in value if isinstance(value, list) else [value]:
         if isinstance(one, int | float) and not least <= one <= most:
             span = f"between {least:g} and {most:.10g}"
@@ -156,7 +165,7 @@ def _check_span(key: str, value: Any, least: float, most: float, more: str = "")
 
 
 def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
-    """Return what a call names.
+    """Return the class or function that a call names.
 
     Raises:
         ConfigError: It does not exist, cannot be called or is not trusted.
@@ -227,7 +236,7 @@ def missing_members(kind: type, protocol: str) -> set[str]:
 def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> None:
     try:
         known, hints = _signature(target)
-    except (TypeError, ValueError):  # of what is written in C
+    except (TypeError, ValueError):  # a class or function in C
         raise ConfigError(f"{path}._target_ = {node['_target_']!r} has no known options") from None
     for key, value in node.items():
         if key in HYDRA_KEYS:
@@ -238,28 +247,28 @@ def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> 
             told = suggestion(str(key), known, f"{path}.")
             raise ConfigError(f"{path}.{key}: {node['_target_']} has no such option; {told}")
         if key in hints and not matches_type(value, hints[key]):
-            raise ConfigError(f"{path}.{key} = {value!r} must be {_words(hints[key])}")
+            raise ConfigError(f"{path}.{key} = {value!r} must be {_describe(hints[key])}")
 
 
 def options_of(node: Mapping[str, Any]) -> set[str]:
-    """Return the options of what a call names; none where it is no call or names nothing."""
+    """Return the options of a call; none if it is not a call or names nothing that exists."""
     with contextlib.suppress(ConfigError, TypeError, ValueError):
         return _signature(_target("", node.get("_target_"), trust=True))[0]
     return set()
 
 
 def nearest_name(name: str, known: Collection[str]) -> str | None:
-    """Return the known name that is most like another one; None if none is."""
+    """Return the most similar known name, None if none is similar."""
     return next(iter(difflib.get_close_matches(name, known, 1)), None)
 
 
 def suggestion(name: str, known: Collection[str], place: str = "") -> str:
-    """Return which known name may be meant, or all of them.
+    """Return an advice for an unknown name: the most similar known name, or all of them.
 
     Args:
         name: The unknown name.
         known: The known names.
-        place: What stands before the name that is meant.
+        place: Prefix of the advised name.
     """
     if found := nearest_name(name, known):
         return f"did you mean {place}{found}?"
@@ -267,7 +276,7 @@ def suggestion(name: str, known: Collection[str], place: str = "") -> str:
 
 
 def _signature(target: Callable[..., Any]) -> tuple[set[str], dict[str, Any]]:
-    """Return the keywords of a call and their types; **kwargs stand for those of the parents."""
+    """Return the arguments of a call and their types; **kwargs adds those of the parent class."""
     classes = inspect.getmro(target) if inspect.isclass(target) else ()
     levels = [vars(c)["__init__"] for c in classes if "__init__" in vars(c)]
     known: set[str] = set()
@@ -283,7 +292,7 @@ def _signature(target: Callable[..., Any]) -> tuple[set[str], dict[str, Any]]:
 
 
 def matches_type(value: Any, hint: Any) -> bool:
-    """Return whether a plain value can be what a type hint says; hints of objects accept all."""
+    """Return whether a YAML value matches a type hint; another call matches every hint."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
         return any(matches_type(value, argument) for argument in arguments)
@@ -309,19 +318,19 @@ def matches_type(value: Any, hint: Any) -> bool:
     return True
 
 
-def _words(hint: Any) -> str:
+def _describe(hint: Any) -> str:
     names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
     names |= {Path: "a path", types.NoneType: "null", dict: "a call or several by name"}
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
-        return " or ".join(_words(argument) for argument in arguments)
+        return " or ".join(_describe(argument) for argument in arguments)
     if origin is Sequence:
-        return f"a list, each {_words(arguments[0])}"
+        return f"a list, each {_describe(arguments[0])}"
     return names.get(hint, str(hint))
 
 
 def iter_nodes(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield a node and all below it with their paths."""
+    """Yield the paths and values of a node and of all nodes below it."""
     yield path, node
     entries: Any = ()
     if isinstance(node, dict):
@@ -333,14 +342,14 @@ def iter_nodes(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def columns(node: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield what makes one run differ from another, flat: numbers, truth values and texts.
+    """Yield the hyperparameters of a run, flat: keys of the command line and their values.
 
-    Under the keys of the command line (`model.width`). A call stands under its own key by the name
-    of what it calls (`model`: FCNN). Left out are null and `NOT_IDENTITY`.
+    A call has the key of its node and the name of its class (`model`: FCNN). Null, empty lists and
+    `NOT_IDENTITY` are left out.
     """
     for key, value in node.items():
         place = f"{path}.{key}" if path else key
-        if value is None or place in NOT_IDENTITY:
+        if value in (None, []) or place in NOT_IDENTITY:
             continue
         if isinstance(value, dict):
             yield from columns(value, place)
@@ -351,7 +360,7 @@ def columns(node: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def changes(theirs: dict[str, Any], ours: dict[str, Any]) -> list[str]:
-    """Return in what two configurations differ that one run must not, a line each."""
+    """Return the differences that a resumed run must not have from its configuration, as lines."""
     before, now = dict(_leaves(theirs)), dict(_leaves(ours))
     free = tuple(f"{key}." for key in (*NOT_IDENTITY, *MAY_CHANGE_ON_RESUME))
     return [
@@ -362,7 +371,7 @@ def changes(theirs: dict[str, Any], ours: dict[str, Any]) -> list[str]:
 
 
 def _leaves(node: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the values of plain data that hold no others, and their paths."""
+    """Yield the paths and values of a node that are neither mappings nor lists."""
     for path, value in iter_nodes(node):
         if not isinstance(value, dict | list):
             yield path, value

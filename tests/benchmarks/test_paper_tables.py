@@ -206,7 +206,7 @@ def test_reduced_models_may_be_left_out(trained, script):
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["name=none"], "run: runs/none holds no runs"),
+        (["name=none"], "run = runs/none contains no runs"),
         (["name=tiny", "galerkin.rank=many"], "galerkin.rank = 'many' must be"),
         (["name=tiny", "corrected.depth=2"], "corrected.depth"),
         (["name=tiny", "galerkin.rank=1000"], "galerkin: rank = 1000 must lie between 1 and"),

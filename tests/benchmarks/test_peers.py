@@ -137,17 +137,17 @@ def test_random_loads_are_counted(scene):
     assert 0 < row["min det F"] <= 1
 
 
-def test_benchmark_script_refuses_unknown_parts(script, tmp_path):
-    done = script("benchmark", "parts=[nonsense]", cwd=tmp_path)
+def test_benchmark_script_refuses_unknown_cases(script, tmp_path):
+    done = script("benchmark", "cases=[nonsense]", cwd=tmp_path)
     assert done.status == 2
-    assert "parts" in done.err
+    assert "cases" in done.err
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
 def test_benchmark_script_writes_what_it_prints(script, tmp_path):
     done = script(
-        "benchmark", "parts=[scenes,propeller]", "repeats=1", "linear=[auto]", cwd=tmp_path
+        "benchmark", "cases=[scenes,propeller]", "repeats=1", "linear=[auto]", cwd=tmp_path
     )
     assert done.status == 0, done.err
     written = json.loads((tmp_path / "runs/benchmark/scenes.json").read_text())

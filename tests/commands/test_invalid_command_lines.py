@@ -14,7 +14,7 @@ EXPERIMENTS = "experiment is one of beam_nh_loss, beam_poisson, beam_svk, "
 NONSENSE = {  # command line -> what the one line says
     "train experiment=beam_yuong": f"experiment = beam_yuong: .* beam_young\\? {EXPERIMENTS}",
     "generate experiment=beam_yuong": f"experiment = beam_yuong: .* beam_young\\? {EXPERIMENTS}",
-    "train sweep=latnt": r"sweep = latnt: there is no such option; did you mean latent\?",
+    "train hparams_search=latnt": r"^hparams_search = latnt: .* did you mean latent\?",
     "train modle=fcnn": r"^modle: there is no such key; did you mean model\?$",
     "train +modle=fcnn": r"^modle: this command has no such key; did you mean model\?$",
     "train ~modle": r"^modle: there is no such key; did you mean model\?$",
@@ -23,8 +23,8 @@ NONSENSE = {  # command line -> what the one line says
     "train model=xyz": f"^model = xyz: there is no such option; {OPTIONS}$",
     "train model=3": f"^model = 3: there is no such option; {OPTIONS}$",
     "train model=null": f"^model = null: there is no such option; {OPTIONS}; ~model leaves it out$",
-    "train clamped=null": r"^clamped = null: .* one of cylinder, plane, tag; ~clamped leaves it",
-    "train clamped=3": r"^clamped = 3: .* one of cylinder, plane, tag$",
+    "train fixed=null": r"^fixed = null: .* one of cylinder, plane, tag; ~fixed leaves it",
+    "train fixed=3": r"^fixed = 3: .* one of cylinder, plane, tag$",
     "train +model=cnn": r"^model: an option is chosen already; write model=cnn$",
     "train methods=default": r"^methods: this command has no such key",
     "train model/part=cnn": r"^model/part: there is no such group",
@@ -32,8 +32,8 @@ NONSENSE = {  # command line -> what the one line says
     "train hydra.swep.dir=3": r"^hydra\.swep\.dir: .*; did you mean hydra\.sweep\?$",
     "train model.widht=3": r"^model\.widht: there is no such key; did you mean model\.width\?$",
     "train trainer.max_epoch=3": r"did you mean trainer\.max_epochs\?$",
-    "train ~trainer.callbacks.4": r"^trainer\.callbacks\.4 is an entry of a list, .*whole list$",
-    "train trainer.callbacks.9.every=3": r"^trainer\.callbacks\.9\.every: there is no such key",
+    "train ~mesh.nodes.1": r"^mesh\.nodes\.1 is an entry of a list, .*whole list$",
+    "train callbacks.worst.every=3": r"^callbacks\.worst\.every: .*callbacks\.worst_cases\?$",
     "train mesh.cell=tetra": r"^mesh\.cell is not in this .*; add it with \+mesh\.cell=tetra$",
     "train +mesh.cel=tetra": r"^mesh\.cel: .* has no such option; did you mean mesh\.cell\?$",
     "train model=fcnn,cnn": r"^model=fcnn,cnn names several values; add -m",
@@ -57,9 +57,9 @@ NONSENSE = {  # command line -> what the one line says
     "train -m seed=0,1 optimizer.lr=1e-3,1e30": r"^optimizer\.lr = 1e\+30 must lie between",
     "train -m model.layers=2,1": r"^model: layers = 1 must be 2 or more",
     "train -m loss=lr_plus loss.weight=1,-1": r"^loss: weight = -1",
-    "train -m clamped.axis=0,3": r"^clamped: axis = 3",
+    "train -m fixed.axis=0,3": r"^fixed: axis = 3",
     "train -m trainer.accelerator=cpu,foo": r"^trainer: .*foo",
-    "generate -m shard=range(4) shards=3": r"^data: shard = 3 must be one of 0 to shards - 1 = 2$",
+    "generate -m shard=range(4) shards=3": r"^data: shard = 3 must lie between 0 and 2$",
     "generate actoin=verify": r"^actoin: there is no such key; did you mean action\?$",
     "view rn=3": r"^rn: there is no such key; did you mean run\?$",
     "evaluate": r"^run is missing",
@@ -96,7 +96,7 @@ def test_a_command_line_that_cannot_work_is_refused_in_one_line(ask, capfd, tiny
     "line",
     [
         "train",
-        "train ~experiment ~sweep",
+        "train ~experiment ~hparams_search",
         "train experiment=beam_young",
         "train +mesh.cell=tetra ++model.width=8",
         "train run=new/folder",
@@ -172,11 +172,11 @@ def test_a_folder_that_is_read_only_is_refused(tmp_path):
     "line",
     [
         "train modle=fcnn",
-        "train clamped=null",
+        "train fixed=null",
         "train -m seed=range(0)",
         "train run=/proc/nope",
         "train data.folder=/dev/null",
-        "train trainer.callbacks=[]",
+        "train ~callbacks",
         "benchmark linear=[foo]",
         "benchmark linear=[]",
     ],
@@ -193,32 +193,40 @@ def test_a_command_ends_with_one_line_and_2(script, tiny, tmp_path, line):
 
 
 def test_a_region_may_be_left_out_where_supports_hold_the_body(scene_of, tiny):
-    """As a refused `clamped=null` advises."""
+    """As a refused `fixed=null` advises."""
     with pytest.raises(ConfigError, match="6 rigid modes are unconstrained"):
-        scene_of(*tiny, "~clamped")
+        scene_of(*tiny, "~fixed")
     held = (
         "+supports.end={_target_: dpl.fem.DirichletBC, "
         "value: [0, 0, 0], "
         "region: {_target_: dpl.fem.Plane, axis: 0, at: min}}"
     )
-    usual, scene = scene_of(*tiny), scene_of(*tiny, "~clamped", held)
+    usual, scene = scene_of(*tiny), scene_of(*tiny, "~fixed", held)
     assert bool((scene.problem.free == usual.problem.free).all())
 
 
-LAST = "{_target_:lightning.pytorch.callbacks.ModelCheckpoint,dirpath:./checkpoints,filename:last}"
-BEST = "{_target_:dpl.training.BestWeights,dirpath:./checkpoints,filename:best,monitor:val/e_mean}"
+LAST = (
+    "+callbacks.z={_target_:lightning.pytorch.callbacks.ModelCheckpoint,"
+    "dirpath:./checkpoints,filename:last}"
+)
+BEST = (
+    "+callbacks.y={_target_:dpl.training.BestWeights,"
+    "dirpath:./checkpoints,filename:best,monitor:val/e_mean}"
+)
+NONE = "callbacks=none ~callbacks.best_weights ~callbacks.last_checkpoint"
 OFTEN = "trainer.check_val_every_n_epoch=1"
 OTHER = LAST.replace("last", "other")
 CALLBACKS = {  # what keeps weights from which a run can be loaded, and what does not
     "": True,
-    "trainer.callbacks=[]": False,
-    "+trainer.fast_dev_run=true": False,
-    "trainer.callbacks.1.dirpath=x trainer.callbacks.0.dirpath=x": False,
-    f"trainer.callbacks=[{OTHER}]": False,
-    f"trainer.callbacks=[{LAST}]": True,
-    f"trainer.callbacks=[{BEST}]": False,  # no epoch is validated
-    f"trainer.callbacks=[{BEST}] {OFTEN}": True,
-    f"trainer.callbacks=[{BEST}] {OFTEN} +trainer.limit_val_batches=0": False,
+    "callbacks=none": True,
+    NONE: False,
+    f"{NONE} +trainer.fast_dev_run=true": True,  # nothing is kept on purpose
+    "callbacks.best_weights.dirpath=x callbacks.last_checkpoint.dirpath=x": False,
+    f"{NONE} {OTHER}": False,
+    f"{NONE} {LAST}": True,
+    f"{NONE} {BEST}": False,  # no epoch is validated
+    f"{NONE} {BEST} {OFTEN}": True,
+    f"{NONE} {BEST} {OFTEN} +trainer.limit_val_batches=0": False,
 }
 
 
@@ -230,7 +238,9 @@ def test_a_training_that_would_keep_no_weights_is_refused(compose, tiny_training
     if CALLBACKS[line]:
         train.parts(cfg)
         return
-    with pytest.raises(ConfigError, match=r"trainer\.callbacks keep no weights.*add \{_target_"):
+    with pytest.raises(
+        ConfigError, match=r"^callbacks must write weights .*; add \+callbacks\.last="
+    ):
         train.parts(cfg)
 
 

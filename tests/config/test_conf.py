@@ -25,7 +25,9 @@ MESHES = [
     pytest.param(name, marks=pytest.mark.slow) if name == "paper_beam" else name
     for name in options("mesh")
 ]
-WHOLE = ("experiment", "sweep", "methods")  # groups of whole commands, not of one part
+WHOLE = ("experiment", "debug", "hparams_search", "methods")  # groups that set keys of others
+NAMED = ("callbacks", "logger")  # groups whose options are calls by name
+PLAIN = ("paths", "extras")  # groups without calls
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name not in WHOLE)
 
 
@@ -45,8 +47,8 @@ def overrides(part):
     def overrides(group, name):
         needed = {
             "file": [f"mesh.path={part}"],
-            "tag": ["clamped.name=bore"],
-            "cylinder": ["clamped.radius=0.05"],
+            "tag": ["fixed.name=bore"],
+            "cylinder": ["fixed.radius=0.05"],
         }
         return [f"{group}={name}", *needed.get(name, [])]
 
@@ -103,14 +105,18 @@ def test_an_experiment_composes_and_passes_the_check(compose, name):
 
 
 @pytest.mark.parametrize("experiment", [None, "beam_svk"])
-@pytest.mark.parametrize("name", options("sweep"))
+@pytest.mark.parametrize("name", options("hparams_search"))
 def test_a_sweep_composes_passes_the_check_and_searches_among_what_there_is(
     compose, name, experiment
 ):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
-    choices = [f"sweep={name}", *([f"experiment={experiment}"] if experiment else []), "folder=."]
+    choices = [
+        f"hparams_search={name}",
+        *([f"experiment={experiment}"] if experiment else []),
+        "folder=.",
+    ]
     build.check(compose(*choices, command="train"))
-    search = OmegaConf.load(CONF / "sweep" / f"{name}.yaml").hydra.sweeper.params
+    search = OmegaConf.load(CONF / "hparams_search" / f"{name}.yaml").hydra.sweeper.params
     spaces = OverridesParser.create().parse_overrides(
         [f"{k}={space}" for k, space in search.items()]
     )
@@ -147,7 +153,7 @@ def assert_holds(cfg, group, name):
 def test_commands_share_the_scene(compose, command):
     cfg = compose(*(["folder=."] if command == "train" else []), command=command)
     other = compose("folder=.", command="train")
-    for key in ("clamped", "degree", "young", "solver", "mesh", "material", "loads"):
+    for key in ("fixed", "degree", "young", "solver", "mesh", "material", "loads"):
         assert cfg[key] == other[key], key
 
 
@@ -168,43 +174,68 @@ def test_the_default_is_the_main_job(compose):
     assert cfg.data.test == 100
 
 
-def call_of(path):
-    """Return the call that a file makes, of the base that it changes where it has one.
-
-    A file for the whole package has its call under the name of its group, and defaults that choose
-    options of other groups.
-    """
+def with_defaults(path):
+    """Return a file merged with the file of the same group that it changes."""
     node = OmegaConf.load(path)
-    defaults = node.pop("defaults", [])
-    if path.read_text().startswith("# @package _global_\n"):
-        for choice in defaults:
-            ((key, option),) = choice.items()
-            verb, group = key.split()
-            assert verb == "override", path
-            assert group.startswith("/"), path
-            assert group[1:] != path.parent.name, path
-            assert option in options(group[1:]), path
-        assert set(node) - {path.parent.name} <= set(GROUPS), path
-        return node[path.parent.name]
-    for base in set(defaults) - {"_self_"}:
-        node = OmegaConf.merge(OmegaConf.load(path.with_name(f"{base}.yaml")), node)
+    for base in set(node.pop("defaults", [])) - {"_self_"}:
+        node = OmegaConf.merge(with_defaults(path.with_name(f"{base}.yaml")), node)
     return node
 
 
-def test_yaml_says_nothing_that_python_says_already_except_by_intent():
-    """Every file is a call of something that exists, or a command or a package-wide experiment."""
-    for path in CONF.glob("*/*.yaml"):
-        if path.parent.name in WHOLE:
+@pytest.mark.parametrize("group", [group for group in GROUPS if group not in PLAIN])
+def test_every_option_of_a_group_calls_something_that_exists(group):
+    for name in options(group):
+        node = with_defaults(CONF / group / f"{name}.yaml")
+        for call in node.values() if group in NAMED else [node]:
+            assert callable(get_object(call._target_)), name
+
+
+@pytest.mark.parametrize("name", options("debug"))
+def test_a_debug_option_composes_and_passes_the_check(compose, name):
+    cfg = compose(f"debug={name}", "folder=.", command="train")
+    build.check(cfg)
+    assert cfg.tags == ["debug"]
+    assert cfg.trainer.accelerator == "cpu"
+    assert list(cfg.callbacks) == ["best_weights", "last_checkpoint"]
+    assert cfg.trainer.max_epochs <= 50
+
+
+def test_an_option_changes_only_its_group(compose):
+    """Recipes that change several groups are experiments."""
+    usual = compose("folder=.", "run=x", command="train")
+    chosen = [(group, name) for group in GROUPS for name in options(group)]
+    for group, name in chosen:
+        if name in ("file", "tag", "cylinder"):  # these need a further key
             continue
-        node = call_of(path)
-        assert "_target_" in node, path
-        assert callable(get_object(node._target_)), path
+        cfg = compose(f"{group}={name}", "folder=.", "run=x", command="train")
+        assert {key for key in cfg if cfg[key] != usual[key]} <= {group}, name
+
+
+def test_callbacks_and_loggers_are_changed_added_and_removed_by_name(compose):
+    changes = [
+        "callbacks.worst_cases.meshes=false",
+        "~callbacks.throughput",
+        "+callbacks.stop={_target_: lightning.pytorch.callbacks.EarlyStopping, monitor: a}",
+        "logger=csv",
+        "+logger.more=${logger.csv}",
+        "trainer.accelerator=cpu",
+    ]
+    cfg = compose("folder=.", *changes, command="train")
+    build.check(cfg)
+    trainer = build.build_trainer(cfg)
+    names = [type(callback).__name__ for callback in trainer.callbacks]
+    assert "EarlyStopping" in names
+    assert "ThroughputMonitor" not in names
+    (plots,) = (one for one in trainer.callbacks if type(one).__name__ == "WorstCasePlots")
+    assert plots.meshes is False
+    assert [type(logger).__name__ for logger in trainer.loggers] == ["CSVLogger"] * 2
 
 
 @pytest.mark.parametrize("name", ["latent", "pod"])
-def test_a_network_may_bring_an_optimiser_and_a_loss_of_its_own(compose, name):
-    cfg = compose(f"model={name}", "folder=.", command="train")
+def test_a_recipe_chooses_model_optimiser_and_loss(compose, name):
+    cfg = compose(f"experiment={name}", "folder=.", command="train")
     build.check(cfg)
+    assert cfg.model == compose(f"model={name}", "folder=.", command="train").model
     assert cfg.optimizer._target_.endswith("Muon")
     assert cfg.optimizer.lr == 5e-3
     assert cfg.optimizer.momentum == 0.95, "the rest is that of conf/optimizer"
@@ -213,29 +244,29 @@ def test_a_network_may_bring_an_optimiser_and_a_loss_of_its_own(compose, name):
     assert "defaults" not in cfg
 
 
-def test_what_is_asked_for_wins_over_what_a_network_brings(compose):
+def test_the_command_line_wins_over_a_recipe(compose):
     """In any order on the command line, by name of the option and by number."""
-    for choice in (["model=latent", "loss=lr_star"], ["loss=lr_star", "model=latent"]):
+    for choice in (["experiment=latent", "loss=lr_star"], ["loss=lr_star", "experiment=latent"]):
         cfg = compose(*choice, "folder=.", command="train")
         assert cfg.loss._target_.endswith("LrStar")
         assert cfg.optimizer._target_.endswith("Muon")
     numbers = ["optimizer.lr=1e-3", "data.batch_size=8", "loss.relative=0.5"]
-    cfg = compose(*numbers, "model=latent", "folder=.", command="train")
+    cfg = compose(*numbers, "experiment=latent", "folder=.", command="train")
     assert (cfg.optimizer.lr, cfg.data.batch_size, cfg.loss.relative) == (1e-3, 8, 0.5)
-    cfg = compose("model=latent", "optimizer=adamw", "folder=.", command="train")
+    cfg = compose("experiment=latent", "optimizer=adamw", "folder=.", command="train")
     assert cfg.optimizer._target_.endswith("AdamW")
     build.check(cfg)
 
 
-def test_a_network_leaves_a_rate_alone_that_is_meant_for_its_own_optimiser_only(compose):
-    """5e-3 is Muon's; AdamW asked for instead keeps the rate of its file."""
+def test_another_optimiser_keeps_the_rate_of_its_file_in_a_recipe(compose):
+    """5e-3 is Muon's."""
     usual = compose("folder=.", command="train").optimizer.lr
-    cfg = compose("model=latent", "optimizer=adamw", "folder=.", command="train")
+    cfg = compose("experiment=latent", "optimizer=adamw", "folder=.", command="train")
     assert cfg.optimizer.lr == usual
 
 
-@pytest.mark.parametrize("name", ["fcnn", "cnn", "gnn"])
-def test_networks_that_bring_nothing_keep_the_defaults(compose, name):
+@pytest.mark.parametrize("name", options("model"))
+def test_a_model_alone_keeps_the_default_optimiser_and_loss(compose, name):
     cfg = compose(f"model={name}", "folder=.", command="train")
     assert cfg.optimizer._target_.endswith("AdamW")
     assert cfg.loss._target_.endswith("LrStar")
@@ -243,9 +274,9 @@ def test_networks_that_bring_nothing_keep_the_defaults(compose, name):
 
 
 @pytest.mark.parametrize("name", ["latent", "pod"])
-def test_a_network_that_brings_its_own_joins_an_experiment(compose, name):
+def test_experiments_are_combined(compose, name):
     experiment = compose("experiment=beam_nh_loss", "folder=.", command="train")
-    cfg = compose("experiment=beam_nh_loss", f"model={name}", "folder=.", command="train")
+    cfg = compose(f"experiment=[beam_nh_loss,{name}]", "folder=.", command="train")
     build.check(cfg)
     assert cfg.mesh == experiment.mesh
     assert cfg.data.train == experiment.data.train == 4095
@@ -296,8 +327,8 @@ def test_the_beam_of_a_range_of_moduli_shares_its_data_with_the_beam_of_one(scen
 
 
 @pytest.mark.parametrize(
-    "clamped", [["clamped=tag", "clamped.name=bore"], ["clamped=cylinder", "clamped.radius=0.05"]]
+    "fixed", [["fixed=tag", "fixed.name=bore"], ["fixed=cylinder", "fixed.radius=0.05"]]
 )
-def test_propeller_is_held_at_its_bore_by_name_or_by_place(scene_of, clamped):
-    scene = scene_of("mesh=propeller", *clamped)
+def test_propeller_is_held_at_its_bore_by_name_or_by_place(scene_of, fixed):
+    scene = scene_of("mesh=propeller", *fixed)
     assert int((~scene.problem.free).all(dim=1).sum()) == 175

@@ -58,11 +58,11 @@ BAD = {  # override -> what the message must name
     "mesh=file": r"mesh\.path",
     "mesh=file mesh.path=nowhere.msh": r"mesh: nowhere\.msh: no such mesh file",
     "mesh=file mesh.path=12": r"mesh\.path = 12 must be",
-    "clamped.at=7": r"clamped.*Plane\(axis=0, at=7\) holds no node",
-    "clamped.axis=3": r"clamped: axis = 3",
-    "clamped.at=middle": r"clamped: at = 'middle'",
-    "mesh=rectangle clamped.axis=2": r"clamped.*axis = 2 does not exist in 2D",
-    "clamped.at=null": r"clamped\.at = None must be a number or a text",
+    "fixed.at=7": r"fixed.*Plane\(axis=0, at=7\) holds no node",
+    "fixed.axis=3": r"fixed: axis = 3",
+    "fixed.at=middle": r"fixed: at = 'middle'",
+    "mesh=rectangle fixed.axis=2": r"fixed.*axis = 2 does not exist in 2D",
+    "fixed.at=null": r"fixed\.at = None must be a number or a text",
     "degree=3": r"degree",
     "degree=two": r"degree",
     "solver.tol=0": r"solver: tol = 0",
@@ -87,7 +87,7 @@ BAD = {  # override -> what the message must name
     "~degree": r"degree is missing",
     "~mesh._target_": r"mesh = .* must be a call: its _target_ is missing",
     "~material._target_": r"material = .* must be a call",
-    "clamped.at={}": r"clamped\.at = \{\} must be a number or a text",
+    "fixed.at={}": r"fixed\.at = \{\} must be a number or a text",
     "+supports.end={}": r"supports\.end = \{\} must be a call",
     "+forces.weight=3": r"forces\.weight = 3 must be a call",
     "material._target_=os": r"material\._target_ = 'os' does not exist",
@@ -133,7 +133,10 @@ BAD_TRAINING = {
     "+scheduler.cooldown=2": r"scheduler\.cooldown: .* has no such option",
     "trainer.max_epochs=ten": r"trainer\.max_epochs = 'ten'",
     "+trainer.epochs=10": r"trainer\.epochs: .* has no such option",
-    "+trainer.callbacks.0.speed=1": r"trainer\.callbacks\.0\.speed: .* has no such option",
+    "+callbacks.worst_cases.speed=1": r"callbacks\.worst_cases\.speed: .* has no such option",
+    "callbacks.worst_cases._target_=dpl.training.MSE": r"callbacks\.worst_cases\.every: .* no such",
+    "+callbacks.mine={_target_: dpl.fem.NeoHookeanLn, poisson: 0}": r"callbacks\.mine gives .* Neo",
+    "+callbacks.mine=3": r"callbacks\.mine = 3 must be a call",
     "seed=abc": r"(seed|shuffle_seed) = 'abc'",
     "data=online seed=abc": r"seed = 'abc'",
     "data=online data.new_per_round=0": r"data: new_per_round = 0",
@@ -159,8 +162,8 @@ BAD_TRAINING = {
     "trainer=[]": r"trainer is missing",
     "data.train=1000000000000": r"data\.train = 10+ must lie between 1 and 10000000",
     "data.workers=1000000000": r"data: workers = 10+ must lie between 0 and 1,024",
-    "trainer.callbacks.0=text": r"trainer\.callbacks = ",
-    "trainer.logger=text": r"trainer\.logger = 'text' must be",
+    "callbacks.worst_cases=text": r"callbacks\.worst_cases = 'text' must be a call",
+    "logger.tensorboard=text": r"logger\.tensorboard = 'text' must be a call",
     "trainer.max_epochs=-5": r"trainer\.max_epochs = -5 must lie between 1 and \d+ or be -1",
     "trainer.max_epochs=0": r"trainer\.max_epochs = 0 must lie",
     "+trainer.max_steps=0": r"trainer\.max_steps = 0 must lie",
@@ -178,15 +181,15 @@ BAD_COMMANDS = {
     "evaluate run=x tol=0": r"tol = 0 must lie between 1e-15 and 1",
     "convergence resume=perhaps": r"resume = 'perhaps' must be true or false",
     "convergence tols=[1e-3,2]": r"tols = \[0\.001, 2\] must lie between",
-    "convergence far=-1": r"far = -1 must lie between 0 and",
+    "convergence n_far_loads=-1": r"n_far_loads = -1 must lie between 0 and",
     "results name=x count=many": r"count = 'many' must be a whole number",
     "results name=x galerkin=text": r"galerkin = 'text' must be",
     "benchmark repeats=0": r"repeats = 0 must lie between 1 and",
     "benchmark samples=1000000000000": r"samples = 10+ must lie between 1 and",
-    "benchmark peers=text": r"peers = 'text' must be",
+    "benchmark reference_codes=text": r"reference_codes = 'text' must be",
     "stress cases=T2": r"cases = 'T2' must be a list, each a text or null",
-    "view run=x speed={_target_:builtins.dict}": r"speed = .* must be true or false",
-    "verify parts=3": r"parts = 3 must be a list, each a text",
+    "view run=x profile={_target_:builtins.dict}": r"profile = .* must be true or false",
+    "verify cases=3": r"cases = 3 must be a list, each a text",
 }
 
 
@@ -206,7 +209,7 @@ def test_what_cannot_train_is_refused_by_its_key(compose, override, scene, tmp_p
         build.check(cfg)
         build.instantiate(cfg, "data", scene=scene)
         build.build_surrogate(cfg, scene)
-        build.instantiate(cfg, "trainer")
+        build.build_trainer(cfg)
 
     with pytest.raises(ConfigError, match=BAD_TRAINING[override]):
         start()
@@ -240,8 +243,8 @@ def test_a_body_whose_stiffness_is_no_matrix_is_refused(compose, tiny, law):
 
 def test_a_body_that_is_held_everywhere_is_refused(compose, tiny):
     cfg = compose(*tiny)
-    cfg.clamped = {"_target_": "dpl.fem.Sphere", "centre": [0, 0, 0], "radius": 1e3}
-    with pytest.raises(ConfigError, match="clamped or supports: every node is held"):
+    cfg.fixed = {"_target_": "dpl.fem.Sphere", "centre": [0, 0, 0], "radius": 1e3}
+    with pytest.raises(ConfigError, match="fixed or supports: all nodes are fixed"):
         build.build_scene(cfg)
 
 
@@ -274,7 +277,7 @@ def test_what_must_be_a_call_is_refused_where_it_is_none(compose, tiny, value):
 
 def test_no_configuration_may_leave_the_body_loose(compose, tiny):
     cfg = compose(*tiny)
-    cfg.clamped = {
+    cfg.fixed = {
         "_target_": "dpl.fem.Box",
         "lower": [0, 0, 0],
         "upper": [0, 0, 0],
@@ -398,27 +401,29 @@ def test_generation_imports_neither_lightning_nor_matplotlib(tmp_path, environme
     assert "train: 3 of 3 loads accepted" in ended.stdout
 
 
-@pytest.mark.parametrize("argument", ["sweep=latent", "+sweep=latent", "hydra/sweeper=optuna"])
+@pytest.mark.parametrize(
+    "argument", ["hparams_search=latent", "+hparams_search=latent", "hydra/sweeper=optuna"]
+)
 def test_a_sweep_without_optuna_says_in_one_line_what_to_install(
     script, monkeypatch, argument, tmp_path
 ):
     monkeypatch.setitem(sys.modules, "hydra_plugins.hydra_optuna_sweeper._impl", None)
     ended = script("train", argument, cwd=tmp_path)
     assert ended.status == 2
-    assert ended.err.startswith("error: sweep: ")
+    assert ended.err.startswith("error: hparams_search: ")
     assert ended.err.count("\n") == 1
     assert "pip install -c constraints.txt -e '.[sweep]'" in ended.err
     assert not list(tmp_path.iterdir())
 
 
 def test_hyperparameters_are_flat_and_a_call_goes_by_its_name(compose):
-    cfg = compose("folder=.", "model=latent", "young=[1e6,2e11]", command="train")
+    cfg = compose("folder=.", "experiment=latent", "young=[1e6,2e11]", command="train")
     flat = build.hyperparameters(cfg)
     assert flat["model"] == "Latent"
     assert (flat["model.width"], flat["optimizer.lr"], flat["loss"]) == (256, 5e-3, "RMSELoss")
     assert flat["young"] == "[1000000.0, 200000000000.0]"
     assert all(isinstance(value, bool | int | float | str) for value in flat.values())
-    noise = ("run", "folder", "ckpt_path", "trainer.callbacks", "trainer.logger")
+    noise = ("run", "folder", "ckpt_path", "callbacks", "logger", "paths", "extras", "tags")
     assert not [key for key in flat if key.startswith(noise) or "_target_" in key]
 
 
@@ -440,17 +445,11 @@ def _trained(folder, *overrides):
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         places = [f"data.folder={folder}/data", f"folder={folder}", "run=here"]
-        cfg = hydra.compose("train", overrides=[*overrides, *places])
-    kept = [
-        node
-        for node in cfg.trainer.callbacks
-        if node._target_.endswith(("ModelCheckpoint", "BestWeights"))
-    ]
-    cfg.trainer.callbacks = kept
-    cfg.trainer.max_epochs = 1
+        one = ["callbacks=none", "trainer.max_epochs=1"]
+        cfg = hydra.compose("train", overrides=[*overrides, *places, *one])
     scene = build.build_scene(cfg)
     surrogate = build.build_surrogate(cfg, scene)
-    trainer: L.Trainer = build.instantiate(cfg, "trainer")
+    trainer = build.build_trainer(cfg)
     run_folder.save_config(cfg, folder)
     trainer.fit(surrogate, datamodule=build.instantiate(cfg, "data", scene=scene))
     return surrogate
@@ -560,9 +559,10 @@ def test_a_run_calls_only_what_a_run_is_made_of(copied, call):
         run_folder.load_run(copied)
 
 
-def test_nothing_of_the_trainer_of_a_run_is_called(copied, monkeypatch):
+@pytest.mark.parametrize("key", ["trainer", "callbacks.best_weights", "logger.tensorboard"])
+def test_nothing_of_the_trainer_of_a_run_is_called(copied, monkeypatch, key):
     cfg, called = OmegaConf.load(copied / "config.yaml"), []
-    cfg.trainer.callbacks = [{"_target_": "pathlib.Path.touch"}]
+    OmegaConf.update(cfg, key, {"_target_": "pathlib.Path.touch"}, merge=False)
     (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
     monkeypatch.setattr("pathlib.Path.touch", lambda *given, **_: called.append(given))
     run_folder.load_run(copied)
@@ -593,7 +593,7 @@ def test_a_run_cannot_reach_out_of_the_package_through_it(copied, name):
 
 def test_all_that_a_run_of_conf_calls_is_trusted(copied):
     """What is new in conf/ must be put where it may be read back, or a run of it could not be."""
-    parts = ("mesh", "material", "clamped", "loads", "data", "model", "loss", "optimizer")
+    parts = ("mesh", "material", "fixed", "loads", "data", "model", "loss", "optimizer")
     seen = set()
     for path in (path for part in parts for path in (ROOT / "conf" / part).glob("*.yaml")):
         for _, node in validation.iter_nodes(OmegaConf.to_container(OmegaConf.load(path))):
@@ -714,10 +714,69 @@ def test_a_run_is_not_resumed_with_another_configuration(resumed, override, told
     assert told in str(refusal.value)
 
 
+@pytest.fixture
+def resumed_config(compose):
+    """Returns the configuration that a command line resumes a run with."""
+
+    def resumed_config(folder, *overrides):
+        lines = [f"folder={folder}", "ckpt_path=last", *overrides]
+        return run_folder.resumed_config(compose(*lines, command="train"), lines)
+
+    return resumed_config
+
+
+def test_a_run_is_resumed_with_the_configuration_that_lies_in_it(trained, resumed_config):
+    cfg = resumed_config(trained[0], "trainer.max_epochs=7", "callbacks=early_stopping")
+    before = OmegaConf.load(trained[0] / "config.yaml")
+    for key in ("mesh", "loads", "solver", "data", "model", "optimizer", "loss", "seed"):
+        assert cfg[key] == before[key], key
+    assert (cfg.trainer.max_epochs, cfg.trainer.check_val_every_n_epoch) == (7, 1)
+    assert "early_stopping" in cfg.callbacks, "those of the command line"
+    build.check(cfg)
+    assert run_folder.check_resumed(cfg)["epoch"] == 0
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("model.width=17", r"configuration: model\.width was 16, is 17;"),
+        ("loss=mse", r"configuration: loss\._target_ was dpl\.training\.LrStar"),
+        ("~scheduler", r"configuration: scheduler\._partial_ was True, is None;"),
+    ],
+)
+def test_a_resumed_run_names_only_what_the_command_line_changes(
+    trained, resumed_config, override, told
+):
+    with pytest.raises(ConfigError, match=told):
+        run_folder.check_resumed(resumed_config(trained[0], override))
+
+
+def test_a_resumed_run_calls_only_trusted_objects_or_those_of_the_command_line(
+    copied, resumed_config
+):
+    cfg = OmegaConf.load(copied / "config.yaml")
+    cfg.model._target_ = "pathlib.Path.touch"
+    cfg.callbacks.best_weights._target_ = "pathlib.Path.touch"
+    (copied / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    with pytest.raises(ConfigError, match=r"model names pathlib\.Path\.touch.*repeat the override"):
+        resumed_config(copied)
+    named = ["model._target_=pathlib.Path.touch", "model.width=16"]
+    found = resumed_config(copied, *named)
+    assert found.model == cfg.model
+    assert found.callbacks.best_weights._target_ == "dpl.training.BestWeights"
+
+
+def test_an_experiment_on_the_command_line_is_compared_as_a_whole(trained, resumed_config):
+    found = resumed_config(trained[0], "experiment=beam_svk")
+    assert found.mesh.nodes == [40, 10, 10]
+    with pytest.raises(ConfigError, match=r"configuration: data\.batch_size was 8, is 64; "):
+        run_folder.check_resumed(found)
+
+
 def test_a_run_that_is_not_there_is_not_resumed_but_begun(compose, tmp_path):
     path = f"{tmp_path}/nowhere.ckpt"
     cfg = compose(f"folder={tmp_path}", f"ckpt_path={path}", command="train")
-    with pytest.raises(ConfigError, match="ckpt_path: there is no"):
+    with pytest.raises(ConfigError, match=r"nowhere\.ckpt does not exist; leave it out"):
         run_folder.check_resumed(cfg)
     run_folder.check_resumed(compose(f"folder={tmp_path}", "ckpt_path=last", command="train"))
 

@@ -34,7 +34,7 @@ def part(tmp_path_factory):
 def overrides(tiny_training):
     """Overrides of a short training on a mesh file."""
     kept = [o for o in tiny_training if not o.startswith("mesh.")]
-    quiet = "trainer.callbacks.3._target_=lightning.pytorch.callbacks.TQDMProgressBar"
+    quiet = "callbacks.progress_bar._target_=lightning.pytorch.callbacks.TQDMProgressBar"
     return [*kept, quiet, "mesh=file", "trainer.max_epochs=1"]
 
 
@@ -102,7 +102,7 @@ def test_all_commands_take_a_run_whose_mesh_file_is_gone(moved, script):
     for name, arguments in {
         "evaluate": ["run=runs/part"],
         "compare": ["run=runs"],
-        "export": ["run=runs/part", "count=1", "parts=[results]"],
+        "export": ["run=runs/part", "count=1", "outputs=[results]"],
         "results": ["run=runs", "name=parts", "galerkin=null", "corrected=null", "count=2"],
     }.items():
         ended = script(name, *arguments, cwd=moved)
@@ -181,7 +181,7 @@ def boxed(tiny_training, tmp_path_factory):
 def handed_on(boxed, tiny_training, script, tmp_path):
     """A run on a box of 45 nodes, in a folder that may be harmed."""
     if not (boxed / "runs" / "box").exists():
-        quiet = "trainer.callbacks.3._target_=lightning.pytorch.callbacks.TQDMProgressBar"
+        quiet = "callbacks.progress_bar._target_=lightning.pytorch.callbacks.TQDMProgressBar"
         options = [*tiny_training, quiet, "trainer.max_epochs=1", "run=runs/box"]
         assert script("train", *options, cwd=boxed).status == 0
     return shutil.copytree(boxed / "runs" / "box", tmp_path / "run")

@@ -160,7 +160,7 @@ def test_trials_summaries_and_figure_are_written(scene, loads, networks, tmp_pat
 def test_the_script_measures_the_runs_of_a_folder_and_resumes(script, tiny_training, tmp_path):
     ended = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/e/a", cwd=tmp_path)
     assert ended.status == 0, ended.err[-2000:]
-    few = ["run=runs/e", "tols=[1e-3,1e-6,1e-8]", "count=2", "far=1"]
+    few = ["run=runs/e", "tols=[1e-3,1e-6,1e-8]", "count=2", "n_far_loads=1"]
     ended = script("convergence", *few, cwd=tmp_path)
     assert ended.status == 0, ended.err[-2000:]
     results, raw = tmp_path / "runs" / "convergence", tmp_path / "runs" / "e" / "hybrid_newton.csv"
@@ -182,4 +182,4 @@ def test_the_script_measures_the_runs_of_a_folder_and_resumes(script, tiny_train
     assert "must have the columns" in refused.err
     refused = script("convergence", "run=runs/none", cwd=tmp_path)
     assert refused.status == 2
-    assert "holds no runs" in refused.err
+    assert "contains no runs" in refused.err

@@ -98,7 +98,7 @@ def test_the_script_measures_the_runs_of_a_folder(script, tiny_training, tmp_pat
     assert {row["solver"] for row in written} >= {"linear", "POD-Galerkin", "a", "a, hybrid"}
     refused = script("pareto", "run=runs/none", cwd=tmp_path)
     assert refused.status == 2
-    assert "holds no runs" in refused.err
+    assert "contains no runs" in refused.err
     refused = script("pareto", "run=runs/e", "discretisation=none.csv", cwd=tmp_path)
     assert refused.status == 2
     assert refused.err.startswith("error: discretisation: ")

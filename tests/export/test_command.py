@@ -53,7 +53,7 @@ def test_export_writes_the_documented_folder(script, trained):
     assert "results.pvd" in ended.out
     assert "[HYDRA]" not in ended.out + ended.err
     assert (folder / "results" / "results_001.vtu").is_file()
-    ended = script("export", "run=runs/first", "parts=[results]", "count=1", cwd=trained)
+    ended = script("export", "run=runs/first", "outputs=[results]", "count=1", cwd=trained)
     assert ended.status == 0
     assert not (folder / "results" / "results_001.vtu").exists(), (
         "files of the earlier series are removed"
@@ -64,7 +64,7 @@ def test_export_writes_the_documented_folder(script, trained):
 
 @pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed (extra onnx)")
 def test_a_graph_with_too_large_a_difference_is_removed(script, trained):
-    asked = ["run=runs/first", "folder=off", "parts=[model]", "samples=4", "repeats=1"]
+    asked = ["run=runs/first", "folder=off", "outputs=[model]", "samples=4", "repeats=1"]
     ended = script("export", *asked, "tol=1e-12", cwd=trained)
     assert ended.status == 1
     (line,) = ended.err.strip().splitlines()
@@ -78,12 +78,12 @@ def test_a_graph_with_too_large_a_difference_is_removed(script, trained):
     ("arguments", "told"),
     [
         (
-            ["run=runs/none", "parts=[results]"],
+            ["run=runs/none", "outputs=[results]"],
             "run = runs/none has no config.yaml; train it first",
         ),
-        (["run=runs/first", "parts=[modal]"], "parts = 'modal' must be one of model, results"),
-        (["run=runs/first", "parts=[]"], "parts = [] must contain one of model, results"),
-        (["run=runs/first", "parts=[results]", "count=0"], "count = 0 must be 1 or more"),
+        (["run=runs/first", "outputs=[modal]"], "outputs = 'modal' must be one of model, results"),
+        (["run=runs/first", "outputs=[]"], "outputs = [] must contain one of model, results"),
+        (["run=runs/first", "outputs=[results]", "count=0"], "count = 0 must be 1 or more"),
         (["run=runs/first", "tol=0"], "tol = 0 must lie between"),
         (["run=runs/first", "solve_reference=2"], "solve_reference = 2 must be true or false"),
     ],
@@ -100,7 +100,7 @@ def test_without_onnx_the_message_names_the_extra(script, trained, monkeypatch):
     ended = script("export", "run=runs/first", cwd=trained)
     assert ended.status == 2
     assert "error: parts: model needs onnx: pip install" in ended.err
-    assert "parts=[results]" in ended.err
+    assert "outputs=[results]" in ended.err
 
 
 @pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed (extra onnx)")

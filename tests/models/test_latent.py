@@ -313,7 +313,7 @@ def overrides(tiny_training):
     """The command line of a run of four epochs on the tiny scene."""
 
     def overrides(name, *more):
-        small = ["model=latent", "model.blocks=1", "model.coordinates=8", "data.folder=data"]
+        small = ["experiment=latent", "model.blocks=1", "model.coordinates=8", "data.folder=data"]
         return [*tiny_training, *small, "trainer.max_epochs=4", f"run={name}", *more]
 
     return overrides

@@ -238,7 +238,7 @@ def test_the_examples_of_the_page_on_extensions_work(blocks, monkeypatch):
         GlobalHydra.instance().clear()
     assert scene.loads.distribution.keywords == {"gap": 0.3}
     assert (surrogate.net.inner[0].out_features, type(surrogate.loss).__name__) == (64, "TipError")
-    search = yaml.safe_load((Path.cwd() / "my_conf/sweep/modal.yaml").read_text())
+    search = yaml.safe_load((Path.cwd() / "my_conf/hparams_search/modal.yaml").read_text())
     assert set(search["hydra"]["sweeper"]["params"]) == {"model.width", "optimizer.lr"}
     assert search["defaults"][0] == {"override /model": "modal"}
 

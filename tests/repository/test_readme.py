@@ -71,9 +71,9 @@ def test_what_is_said_of_run_time_against_error_is_in_its_table():
 
 def test_the_row_of_a_loss_names_the_losses(compose):
     titles = [cells[0] for experiment, cells in paper_rows() if experiment == "beam_nh_loss"]
-    assert titles == ["paper, L_r^*", "latent, mean_norm", "latent corrected, mean_norm"]
+    assert titles == ["paper, L_r^*", "latent, rmse", "latent corrected, rmse"]
     for experiment in ("beam_svk", "propeller_nh", "beam_nh_loss", "beam_young"):
-        cfg = compose(f"experiment={experiment}", "model=latent", command="train")
+        cfg = compose(f"experiment=[{experiment},latent]", command="train")
         assert cfg.loss._target_ == "dpl.training.RMSELoss"
 
 

@@ -515,14 +515,8 @@ def test_a_run_that_is_resumed_after_an_interruption_succeeds(scene, data, tmp_p
 @pytest.mark.parametrize(
     ("options", "left"),
     [
-        (["trainer.logger=false"], set()),
-        (
-            [
-                "trainer.logger._target_=lightning.pytorch.loggers.CSVLogger",
-                "~trainer.logger.default_hp_metric",
-            ],
-            {"metrics.csv", "hparams.yaml"},
-        ),
+        (["logger=none"], set()),
+        (["logger=csv", "logger.csv.name=''"], {"metrics.csv", "hparams.yaml"}),
     ],
 )
 def test_the_command_works_with_another_logger_and_with_none(

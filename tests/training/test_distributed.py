@@ -63,7 +63,7 @@ def trained(tiny_training, environment, members, tmp_path):
         (tmp_path / "spy.py").write_text(SPY)
         env = environment()
         env["PYTHONPATH"] = os.pathsep.join([str(tmp_path), env["PYTHONPATH"]])
-        spy = "trainer.callbacks.3._target_=spy.Spy"
+        spy = "callbacks.progress_bar._target_=spy.Spy"
         process = subprocess.Popen(
             [sys.executable, str(ROOT / "scripts/train.py"), *kept, *TWO, spy, *overrides],
             cwd=tmp_path,

@@ -120,7 +120,7 @@ def overrides(tiny_training, home):
     def overrides(name, net):
         networks = {"fcnn": ["model.width=8"], "noisy": ["model._target_=noisy.Noisy"]}
         kept = [o for o in tiny_training if "model." not in o]
-        quiet = "trainer.callbacks.3._target_=lightning.pytorch.callbacks.TQDMProgressBar"
+        quiet = "callbacks.progress_bar._target_=lightning.pytorch.callbacks.TQDMProgressBar"
         sizes = [f"data.folder={home}/data", f"trainer.max_epochs={EPOCHS}", "data.workers=0"]
         return [*kept, *networks[net], *sizes, f"run={name}", quiet]
 
@@ -288,6 +288,14 @@ def test_a_run_killed_in_a_step_ends_bit_for_bit_like_an_uninterrupted_one(
     best = [read(home / name / "checkpoints/best.safetensors") for name in ("fcnn", "step")]
     assert best[0]["epoch"] == best[1]["epoch"]
     assert digest(best[0]["state_dict"]) == digest(best[1]["state_dict"])
+
+
+def test_a_killed_run_is_resumed_without_repeating_its_command_line(straight, killed, script, home):
+    folder = killed("alone", "fcnn", "step", 7)
+    quiet = "callbacks.progress_bar._target_=lightning.pytorch.callbacks.TQDMProgressBar"
+    run = script("train", "run=alone", "ckpt_path=last", quiet, cwd=home)
+    assert run.status == 0, run.err
+    assert_same(straight("fcnn"), last(folder))
 
 
 def test_a_killed_run_of_a_network_with_dropout_ends_bit_for_bit_the_same(

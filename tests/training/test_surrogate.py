@@ -300,7 +300,7 @@ def run(scene, folder, data, *, epochs=4, stop=None, resume=None, loss=LrPlus):
     return module, tutor
 
 
-@pytest.mark.parametrize("loss", [MSE, lambda: LrPlus(warmup_epochs=3)], ids=["mse", "annealed"])
+@pytest.mark.parametrize("loss", [MSE, lambda: LrPlus(warmup_epochs=3)], ids=["mse", "lr_plus"])
 def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(
     scene, folder, data, tmp_path, loss
 ):
