@@ -384,8 +384,7 @@ def test_a_file_without_repairs_is_read_without_a_word(tmp_path):
 NUMBERS = {  # format: file, a node of it, the same with the number of another, words
     "gmsh22": ("cube.msh", "\n4 0.0", "\n3 0.0", r"1 node numbers .* more than once: 3"),
     "gmsh": ("cube.msh", "\n4\n5\n", "\n3\n5\n", r"1 node numbers .* more than once: 3"),
-    "abaqus": ("cube.inp", "\n4, 0.0", "\n3, 0.0", r"1 nodes have the number .* places 2 "),
-    "permas": ("cube.dato", "\n4 0.0", "\n3 0.0", r"1 nodes have the number .* places 2 "),
+    "abaqus": ("cube.inp", "\n4, 0.0", "\n3, 0.0", r"1 node numbers .* more than once: 3"),
     "nastran": (
         *("cube.bdf", "BEGIN BULK\n", "BEGIN BULK\nGRID,3,,9.0,9.0,9.0\n"),
         r"1 node numbers .* more than once: 3",
@@ -612,7 +611,7 @@ def test_a_file_that_ends_too_early_is_an_error_and_meshio_keeps_silent(tmp_path
     meshio.write(path, meshio.Mesh(mesh.p.T, [("tetra", mesh.t.T)]), file_format=kind, **binary)
     capfd.readouterr()
     text = path.read_bytes()
-    for part in np.linspace(0.0, 0.97, 30):
+    for part in np.linspace(0.0, 0.97, 10):
         path.write_bytes(text[: int(part * len(text))])
         with pytest.raises(ValueError, match=r"whole\.") as error:
             read_mesh(path)

@@ -1,10 +1,11 @@
-"""Laws of mesh files that mean harm: refused in one line, without waiting and without a price."""
+"""Hostile and damaged mesh files are refused in one line, within limits of memory and time."""
 
 import base64
 import lzma
 import os
 import resource
 import struct
+import subprocess
 import sys
 import zlib
 
@@ -14,21 +15,24 @@ import pytest
 
 from benchmarks.stress.broken_meshes import CORNERS, FAN, PATCH, TETS, TWO_CUBES, TWO_HEXES, write
 from dpl.fem import box, read_mesh, rectangle
-from dpl.fem.mesh import sandbox, sandbox_checks
+from dpl.fem.mesh import sandbox
 from dpl.fem.mesh.reading import _body
 
 
 @pytest.fixture(autouse=True)
-def _soon(monkeypatch):
-    """The limit of a reader is more than any file here takes on a busy machine."""
-    monkeypatch.setattr(sandbox, "SECONDS", (60.0, 0.0))
+def _patience(monkeypatch):
+    """Wait for the reader on a busy machine: its own limit is CPU time."""
+    monkeypatch.setattr(sandbox, "WAIT", 100.0)
+
+
+@pytest.fixture
+def few_seconds(monkeypatch):
+    """Limit the CPU time of a reader to little more than its start takes."""
+    monkeypatch.setattr(sandbox, "SECONDS", (2.0, 0.0))
 
 
 def refused(path, match: str) -> None:
-    """Hold `read_mesh` to one line that names the file, and to little memory.
-
-    The end of a reader at its limit of time has a line of its own, which `match` does not allow.
-    """
+    """Assert that `read_mesh` raises one line that names the file, and allocates little memory."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(ValueError, match=match) as error:
         read_mesh(path)
@@ -68,29 +72,26 @@ def test_xml_with_entities_is_refused(tmp_path, suffix, text, code):
     refused(path, "document type or entities")
 
 
-def test_cell_data_beside_a_dolfin_file_is_held_to_the_same(tmp_path):
+def test_dolfin_xml_is_refused(tmp_path):
+    """Meshio leaves rows that such a file declares and does not list undefined."""
     path = tmp_path / "cube.xml"
     meshio.write(path, meshio.Mesh(CORNERS, [("tetra", TETS)]), file_format="dolfin-xml")
-    read_mesh(path)
-    (tmp_path / "cube_part.xml").write_text(f"{LAUGHS}<dolfin/>")
-    refused(path, "document type or entities")
-    (tmp_path / "cube_part.xml").unlink()
-    os.mkfifo(tmp_path / "cube_part.xml")
-    refused(path, "no file")
+    refused(path, "DOLFIN XML, which is not read; convert it")
 
 
-def test_deep_xml_is_refused(tmp_path):
+@pytest.mark.parametrize("end", ["", "</a>" * 10**5 + "</VTKFile>"])
+def test_deep_xml_is_refused(tmp_path, end):
     path = tmp_path / "deep.vtu"
-    path.write_text("<VTKFile type='UnstructuredGrid'>" + "<a>" * 10**6)
-    refused(path, "nested more than")
+    path.write_text("<VTKFile type='UnstructuredGrid'>" + "<a>" * 10**5 + end)
+    refused(path, "cannot be read as a mesh")
 
 
 @pytest.mark.parametrize("name", ["NumberOfPoints", "NumberOfCells"])
-@pytest.mark.parametrize("count", [10**12, 10**8, -5])
-def test_vtu_that_declares_what_it_cannot_hold_is_refused(tmp_path, name, count):
+@pytest.mark.parametrize("count", [10**12, 10**8, 1])
+def test_vtu_that_declares_another_number_than_it_holds_is_refused(tmp_path, name, count):
     path = cube(tmp_path)
     number = len(CORNERS) if name == "NumberOfPoints" else len(TETS)
-    refused(replaced(path, f'{name}="{number}"', f'{name}="{count}"'), "declares")
+    refused(replaced(path, f'{name}="{number}"', f'{name}="{count}"'), "cannot be read as a mesh")
 
 
 def packed(data: bytes, *, blocks: int = 1, squeeze=zlib.compress) -> str:
@@ -116,7 +117,10 @@ GOOD = {
 
 @pytest.mark.parametrize("kind", ["binary", "appended"])
 @pytest.mark.parametrize("compressor", ["vtkZLibDataCompressor", "vtkLZMADataCompressor"])
-def test_a_compressed_bomb_costs_the_process_nothing(tmp_path, kind, compressor):
+def test_data_that_unpack_beyond_the_memory_limit_are_refused(
+    tmp_path, kind, compressor, monkeypatch
+):
+    monkeypatch.setattr(sandbox, "MEMORY", (2**28, 0))
     squeeze = zlib.compress if "ZLib" in compressor else lzma.compress
     text = packed(bytes(100 * 2**20), blocks=3, squeeze=squeeze)
     values = GOOD | {"compressor": compressor, "kind": kind, "here": text}
@@ -125,7 +129,7 @@ def test_a_compressed_bomb_costs_the_process_nothing(tmp_path, kind, compressor)
         values |= {"here": "", "after": after}
     path = tmp_path / "bomb.vtu"
     path.write_text(VTU.format(**values))
-    refused(path, "unpack to more than")
+    refused(path, "more memory than")
     assert read_mesh(cube(tmp_path)).t.shape[0] == 4
 
 
@@ -151,58 +155,36 @@ def test_offsets_must_fit_the_cells(tmp_path, nodes, offsets, types):
     path.write_text(
         VTU.format(**(GOOD | {"nodes": nodes, "offsets": offsets, "types": types}), here=here)
     )
-    refused(path, "offsets of its cells|have [48] nodes|type 11")
+    refused(path, "types or the offsets of its cells|more memory|damaged")
 
 
 def test_polyhedra_are_refused(tmp_path):
-    """Meshio could loop for ever over their faces."""
     path = cube(tmp_path, binary=False)
-    refused(replaced(path, 'Name="offsets"', 'Name="faces"'), "polyhedra")
+    refused(replaced(path, 'Name="offsets"', 'Name="faces"'), "cannot be read as a mesh")
 
 
 VTK = "# vtk DataFile Version 4.2\nx\nASCII\nDATASET "
-XDMF = """<Xdmf Version="3.0"><Domain><Grid Name="Grid"><Geometry GeometryType="XYZ">
-<DataItem DataType="Float" Dimensions="8 3" Format="{kind}" Precision="8">{name}</DataItem>
-</Geometry></Grid></Domain></Xdmf>"""
 
 
-@pytest.mark.parametrize(
-    ("kind", "name"),
-    [
-        ("HDF", "/etc/passwd:/data"),
-        ("HDF", "../secret.h5:/data"),
-        ("HDF", "link.h5:/data"),
-        ("HDF", "folder/inner.h5:/data"),
-        ("HDF", "http://localhost/x.h5:/data"),
-        ("HDF", "none.h5:/data"),
-        ("HDF", "pipe.h5:/data"),
-        ("Binary", "/etc/passwd"),
-        ("Binary", "../secret.h5"),
-        ("Binary", "link.h5"),
-        ("Binary", "pipe.h5"),
-        ("Binary", "/dev/zero"),
-        ("Binary", "https://localhost/x.bin"),
-        ("Binary", "../inside.d/../secret.h5"),
-    ],
-)
-@pytest.mark.parametrize("escaped", [False, True])
-def test_xdmf_that_reads_files_elsewhere_is_refused(tmp_path, kind, name, escaped):
-    (tmp_path / "secret.h5").write_bytes(bytes(192))
-    folder = tmp_path / "inside"
-    folder.mkdir()
-    (folder / "link.h5").symlink_to(tmp_path / "secret.h5")
-    (folder / "folder").symlink_to(tmp_path)
-    os.mkfifo(folder / "pipe.h5")
-    path = folder / "mesh.xdmf"
-    text = "".join(f"&#{ord(c)};" for c in name) if escaped else name
-    path.write_text(XDMF.format(kind=kind, name=text))
-    refused(path, "names")
+@pytest.mark.parametrize("form", [{"data_format": "XML"}, {"data_format": "Binary"}])
+def test_xdmf_is_refused(tmp_path, form):
+    """Its data may lie in other files, and meshio reads it with h5py only."""
+    pytest.importorskip("h5py")
+    refused(cube(tmp_path, "cube.xdmf", **form), "h5py, which is not read; convert it")
 
 
-def test_xml_inside_the_text_of_xdmf_has_no_entities_either(tmp_path):
-    path = tmp_path / "mesh.xdmf"
-    path.write_text(f"<Xdmf><Information><![CDATA[{LAUGHS}<a/>]]></Information></Xdmf>")
-    refused(path, "entities")
+@pytest.mark.parametrize("suffix", ["h5m", "med", "cgns", "hmf", "e", "xdmf"])
+def test_formats_whose_library_opens_other_files_are_refused(tmp_path, suffix):
+    """Files of HDF5 can hold links to others."""
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    if suffix == "xdmf":
+        path.write_text(
+            '<Xdmf Version="3.0"><Domain><Grid><Geometry GeometryType="XYZ">'
+            '<DataItem Dimensions="8 3" Format="Binary">/etc/passwd</DataItem>'
+            "</Geometry></Grid></Domain></Xdmf>"
+        )
+    refused(path, "h5py|netCDF4")
 
 
 @pytest.mark.parametrize(
@@ -217,12 +199,11 @@ def test_xml_inside_the_text_of_xdmf_has_no_entities_either(tmp_path):
         ("g.vtk", VTK + "STRUCTURED_POINTS\nDIMENSIONS 9999 9999 9999\n"),
         ("h.su2", "NDIME= 3\nNPOIN= 999999999999\n"),
         ("i.su2", "NDIME= 3\nNELEM= 999999999\n"),
-        ("j.xml", "<dolfin><mesh><vertices size='99999999999'/></mesh></dolfin>"),
     ],
 )  # fmt: skip
 def test_counts_beyond_the_size_of_the_file_are_refused(tmp_path, name, text):
     (tmp_path / name).write_text(text)
-    refused(tmp_path / name, "refused: it declares")
+    refused(tmp_path / name, "cannot be read as a mesh|holds no cells")
 
 
 def gmsh41(blocks: int, nodes: int, *, data: bytes = b"") -> bytes:
@@ -233,7 +214,7 @@ def gmsh41(blocks: int, nodes: int, *, data: bytes = b"") -> bytes:
 
 def test_a_binary_count_is_read_too(tmp_path):
     (tmp_path / "a.msh").write_bytes(gmsh41(1, 10**12))
-    refused(tmp_path / "a.msh", "declares 1000000000000 nodes")
+    refused(tmp_path / "a.msh", "must hold one section")
 
 
 @pytest.mark.parametrize(
@@ -248,25 +229,24 @@ def test_a_binary_count_is_read_too(tmp_path):
         ("d.mesh", "MeshVersionFormatted 2\nDimension 3\nRidges\n99999999999\n"),
     ],
 )  # fmt: skip
-def test_numbers_that_cost_memory_or_time_end_the_reader_only(tmp_path, name, text, monkeypatch):
+def test_numbers_that_need_much_memory_or_time_are_refused(tmp_path, name, text, few_seconds):
     (tmp_path / name).write_text(text)
-    with monkeypatch.context() as patch:
-        patch.setattr(sandbox, "SECONDS", (4.0, 0.0))
-        refused(tmp_path / name, "more memory|ends too early|longer than")
-    assert read_mesh(cube(tmp_path)).t.shape[0] == 4
+    refused(tmp_path / name, "more memory|ends too early|longer than|must hold")
 
 
-def test_a_reader_that_loops_is_ended(tmp_path, monkeypatch):
-    monkeypatch.setattr(sandbox, "SECONDS", (0.5, 0.0))
-    path = cube(tmp_path, "slow.msh", file_format="gmsh22", binary=False)
-    replaced(path, "$Elements", "$Periodic\n" + "99999999\n" + "0 0 0\n0\n" * 3_000_000)
-    refused(path, "longer than")
-    monkeypatch.setattr(sandbox, "SECONDS", (60.0, 0.0))
-    assert read_mesh(cube(tmp_path)).t.shape[0] == 4
+def test_a_reader_that_loops_is_ended(tmp_path, few_seconds):
+    """Meshio looks for the first node after the end of the file."""
+    (tmp_path / "loop.mdpa").write_text("Begin Nodes\n")
+    refused(tmp_path / "loop.mdpa", "longer than")
+
+
+def test_a_reader_that_does_not_answer_is_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(sandbox, "WAIT", 1e-9)
+    refused(cube(tmp_path), "longer than")
 
 
 @pytest.mark.parametrize("name", ["a.nas", "a.ele", "a.mdpa", "a.dat", "a.msh"])
-def test_what_ends_too_early_is_not_looked_for_for_ever(tmp_path, name):
+def test_files_without_their_end_are_refused(tmp_path, name, few_seconds):
     texts = {
         "a.nas": "BEGIN BULK\n\n",
         "a.mdpa": "Begin Nodes\n",
@@ -278,24 +258,46 @@ def test_what_ends_too_early_is_not_looked_for_for_ever(tmp_path, name):
     refused(tmp_path / name, "cannot be read")
 
 
-@pytest.mark.parametrize(
-    "line",
-    ["*INCLUDE, INPUT=/etc/passwd", "*include,input=a.inp", " *Inc*lude ,input=x", "INCLUDE,"],
-)
+@pytest.mark.parametrize("line", ["*INCLUDE, INPUT={}", "*include,input={}"])
 def test_abaqus_files_that_include_others_are_refused(tmp_path, line):
-    """One that includes itself too."""
+    """A file that includes itself is refused too."""
     path = cube(tmp_path, "a.inp")
-    path.write_text(path.read_text() + line + "\n")
+    whole = path.read_text()
+    (tmp_path / "other.inp").write_text("*HEADING\n")
+    path.write_text(whole + line.format("other.inp") + "\n")
     refused(path, "includes another file")
-    path.write_text(path.read_text().replace(line, "** INCLUDE, this is a comment"))
+    path.write_text(whole + line.format("/etc/passwd") + "\n")
+    refused(path, "includes another file")
+    path.write_text(whole + line.format("a.inp") + "\n")
+    refused(path, "cannot be read")
+    path.write_text(whole + "** INCLUDE, this is a comment\n")
     assert read_mesh(path).t.shape[0] == 4
 
 
-@pytest.mark.parametrize("magic", [b"\x1f\x8b\x08", b"PK\x03\x04", b"BZh9", b"\xfd7zXZ\x00"])
-@pytest.mark.parametrize("name", ["a.vtu", "a.vol.gz", "a.post.gz", "a.msh"])
-def test_packed_files_are_refused(tmp_path, magic, name):
-    (tmp_path / name).write_bytes(magic + bytes(100))
-    refused(tmp_path / name, "packed")
+def test_the_reader_opens_no_other_file_and_no_connection(tmp_path):
+    """Run in a process of its own: a hook cannot be removed."""
+    program = (
+        "import os, socket, subprocess, sys\n"
+        "from dpl.fem.mesh.sandbox_checks import Refused\n"
+        "from dpl.fem.mesh.sandbox_worker import restrict_access\n"
+        "restrict_access(os.path.realpath(sys.argv[1]))\n"
+        "open(sys.argv[1]).close()\n"
+        "calls = [lambda: open('/etc/passwd'), lambda: open(sys.argv[1], 'a'),\n"
+        "    lambda: os.open('/etc/passwd', os.O_RDONLY), lambda: os.remove(sys.argv[1]),\n"
+        "    lambda: socket.create_connection(('127.0.0.1', 9)),\n"
+        "    lambda: os.system('true'), lambda: subprocess.run(['true']), lambda: os.fork()]\n"
+        "for call in calls:\n"
+        "    try:\n"
+        "        call()\n"
+        "    except Refused:\n"
+        "        continue\n"
+        "    sys.exit('allowed')\n"
+    )
+    path = cube(tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("suffix", ["vtu", "msh", "inp", "xdmf", "h5m"])
@@ -314,7 +316,7 @@ def test_pipes_and_devices_are_refused_and_folders_are_no_files(tmp_path, suffix
 def test_files_of_more_than_four_gigabytes_are_refused(tmp_path):
     path = tmp_path / "large.vtu"
     with path.open("wb") as file:
-        file.truncate(sandbox_checks.MOST_BYTES + 1)  # takes no room
+        file.truncate(sandbox.MAX_BYTES + 1)  # takes no room
     refused(path, "GiB")
 
 
@@ -324,67 +326,14 @@ def test_a_link_to_a_good_file_is_read(tmp_path):
     assert read_mesh(tmp_path / "link.vtu").t.shape[0] == 4
 
 
-@pytest.mark.parametrize("suffix", ["h5m", "med", "cgns", "hmf", "e", "vtu"])
-def test_hdf5_is_refused_without_h5py(tmp_path, suffix, monkeypatch):
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    (tmp_path / f"a.{suffix}").write_bytes(sandbox_checks.HDF5 + bytes(100))
-    refused(tmp_path / f"a.{suffix}", "h5py")
-
-
-def test_hdf5_that_reads_other_files_is_refused(tmp_path):
-    h5py = pytest.importorskip("h5py")
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["data"] = np.arange(3.0)
-    (tmp_path / "raw").write_bytes(bytes(24))
-    for number, make in enumerate(
-        (
-            lambda file: file.__setitem__("a/b", h5py.ExternalLink("other.h5", "/data")),
-            lambda file: file.create_dataset("a/b", (3,), "f8", external=[("raw", 0, 24)]),
-            lambda file: file.create_virtual_dataset("a", _virtual(h5py)),
-        )
-    ):
-        path = tmp_path / f"{number}.med"
-        with h5py.File(path, "w") as file:
-            make(file)
-        refused(path, "other file|another file")
-    path = tmp_path / "large.med"
-    with h5py.File(path, "w") as file:
-        file.create_dataset("a", (10**12,), "f8", chunks=(1000,), compression="gzip")
-    refused(path, "GiB")
-    path = tmp_path / "loop.med"
-    with h5py.File(path, "w") as file:
-        file["a/b"] = h5py.SoftLink("/a")
-        file["a/c"] = file["a"]
-    refused(path, "cannot be read")
-
-
-def _virtual(h5py):
-    layout = h5py.VirtualLayout((3,), "f8")
-    layout[:] = h5py.VirtualSource("other.h5", "data", (3,))
-    return layout
-
-
-def test_a_reader_that_was_killed_is_started_again(tmp_path):
-    path = cube(tmp_path)
-    read_mesh(path)
-    sandbox.READER._process.kill()
-    sandbox.READER._process.wait()
-    assert read_mesh(path).t.shape[0] == 4
-    first = sandbox.READER._process.pid
-    read_mesh(path)
-    assert sandbox.READER._process.pid == first
-
-
-def test_a_path_from_the_working_folder_is_found_from_wherever_the_reader_started(
-    tmp_path, monkeypatch
-):
+def test_a_path_from_the_working_folder_is_found(tmp_path, monkeypatch):
     cube(tmp_path)
     for folder in (tmp_path, tmp_path.parent):
         monkeypatch.chdir(folder)
         assert read_mesh((tmp_path / "cube.vtu").relative_to(folder)).t.shape[0] == 4
 
 
-# What damaged files taught: tests/properties/test_mesh_files.py found them
+# Found by tests/properties/test_mesh_files.py
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e200"])
@@ -411,7 +360,7 @@ def test_elements_of_gmsh_have_the_length_of_their_type(tmp_path):
     meshio.write(
         path, meshio.Mesh(points, [("quad", mesh.t.T)]), file_format="gmsh22", binary=False
     )
-    refused(replaced(path, "\n1 3 ", "\n1 2 "), "by its length")
+    refused(replaced(path, "\n1 3 ", "\n1 2 "), "length of its type")
 
 
 def test_nodes_of_gmsh_count_from_one(tmp_path):
@@ -428,27 +377,17 @@ def test_nodes_of_gmsh_count_from_one(tmp_path):
 @pytest.mark.parametrize("form", ["gmsh", "gmsh22"])
 def test_rows_of_gmsh_beyond_their_count_are_an_error(tmp_path, block, form):
     path = cube(tmp_path, "a.msh", file_format=form, binary=False)
-    refused(replaced(path, f"$End{block}", f"9 1 1 1 1\n$End{block}"), "more than it declares")
-
-
-@pytest.mark.parametrize("form", [{}, {"data_format": "XML"}, {"data_format": "Binary"}])
-def test_xdmf_may_have_its_data_beside_it(tmp_path, form, monkeypatch):
-    pytest.importorskip("h5py")
-    monkeypatch.chdir(tmp_path)
-    path = cube(tmp_path, "cube.xdmf", **form)
-    for data in tmp_path.glob("cube*.bin"):  # meshio names it as it was told to
-        assert data.parent == tmp_path
-    monkeypatch.chdir(tmp_path.parent)
-    if form.get("data_format") == "Binary":
-        path.write_text(path.read_text().replace(f"{tmp_path}/", ""))
-    assert read_mesh(path).t.shape[0] == 4
+    refused(
+        replaced(path, f"$End{block}", f"9 1 1 1 1\n$End{block}"),
+        "more or fewer rows than it declares",
+    )
 
 
 def test_nodes_that_gmsh_declares_and_does_not_list_are_not_made_up(tmp_path):
     """Meshio leaves what it finds in memory in their place."""
     path = cube(tmp_path, "a.msh", file_format="gmsh", binary=False)
     replaced(path, "$Nodes\n1 8 1 8\n", "$Nodes\n1 9 1 9\n")
-    refused(path, "fewer nodes than it declares")
+    refused(path, "fewer rows than it declares")
 
 
 @pytest.mark.parametrize(("kind", "nodes"), [("wedge", 6), ("pyramid", 5), ("hexahedron20", 20)])

@@ -48,7 +48,6 @@ KINDS = {  # name: format of meshio, suffix, options
     "su2": ("su2", "su2", {}),
     "medit ascii": ("medit", "mesh", {}),
     "medit binary": ("medit", "meshb", {}),
-    "dolfin": ("dolfin-xml", "xml", {}),
     "netgen": ("netgen", "vol", {}),
     "permas": ("permas", "post", {}),
     "avs": ("avsucd", "avs", {}),
@@ -64,7 +63,6 @@ COUNTED = (
     "gmsh22",
     "su2",
     "medit",
-    "dolfin-xml",
 )  # tell how many cells they hold
 TEXTS = [b"nan", b"inf", b"-1", b"0", b"1", b"6", b"1e308", b"1e-320", b"1.5", b"", b"abc"]
 TEXTS += [str(n).encode() for n in (999999999999, 2**31, -(2**31) - 1, 2**63, 20_000_001, 3000000)]
@@ -78,7 +76,7 @@ def good(kind: str, cell: str) -> bytes | None:
     body = BODIES[cell]
     mesh = to_meshio(body)
     points, numbers = mesh.points, np.arange(body.nelements) % 2 + 1
-    if body.dim() == 2 and name not in ("su2", "dolfin-xml"):
+    if body.dim() == 2 and name != "su2":
         points = np.pad(points, ((0, 0), (0, 1)))
     made = meshio.Mesh(points, [(cell, mesh.cells[0].data.astype(np.int64))])
     if name.startswith("gmsh"):
@@ -147,10 +145,11 @@ CHANGES = st.tuples(
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _soon():
-    """The limit of a reader is more than any file here takes on a busy machine."""
+def _limits():
+    """Limit the CPU time of a reader; wait for it on a busy machine."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sandbox, "SECONDS", (60.0, 0.0))
+        patch.setattr(sandbox, "SECONDS", (2.0, 0.0))
+        patch.setattr(sandbox, "WAIT", 100.0)
         yield
 
 
@@ -173,8 +172,7 @@ def tried(path: Path) -> skfem.Mesh | None:
             assert text.startswith(f"{path}: ")
             assert text.isprintable()
             assert len(text) < 1000
-            assert "breaks the reader" not in text
-            assert "longer than" not in text
+            assert "crashed" not in text
     assert said.getvalue() == ""
     assert sorted(os.listdir(path.parent)) == files
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000  # [kB]

@@ -1,163 +1,205 @@
-"""What is refused of mesh files of XML and HDF5 before anything is built of it."""
+"""Checks of mesh files for errors that meshio does not report.
+
+Meshio returns a mesh with missing or wrong cells where counts, offsets or node numbers of a file
+contradict each other. The checks run in the process of `dpl.fem.mesh.sandbox_worker`.
+"""
 
 import contextlib
 import re
+import struct
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-MOST_BYTES = 4 * 2**30  # of a file [B]
-MOST_NODES = 20_000_000
-MOST_CELLS = 120_000_000  # tetrahedra are six times as many as nodes
-MOST_DEPTH = 50  # of elements in one another; those of meshes are 8 deep
-MOST_TEXT = 2**20  # of a file's name or a table of names, in characters
-HDF5 = b"\x89HDF\r\n\x1a\n"  # with which such files begin
+import meshio
+import numpy as np
+from meshio.vtu._vtu import VtuReader
+
+CONVERT = "which is not read; convert it with 'meshio convert' if you trust it"
+GMSH_NODES = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 6: 6, 7: 5, 8: 3, 9: 6, 10: 9, 11: 10, 12: 27}
+GMSH_NODES |= {13: 18, 14: 14, 15: 1, 16: 8, 17: 20, 18: 15, 19: 13}  # by type of element
 
 
-def vet_count(what: str, count: int, size: int) -> None:
-    """Hold a declared count of "nodes", "cells", "nodes of a grid" to what `size` bytes can hold.
-
-    Raises:
-        ValueError: It cannot be.
-    """
-    most = MOST_CELLS if what == "cells" else MOST_NODES
-    if not 0 <= count <= most:
-        raise ValueError(f"it declares {count} {what}, at most {most} are read; split it")
-    if count > size and what != "nodes of a grid":
-        raise ValueError(f"it declares {count} {what}, too many for its size; write it anew")
+class Refused(ValueError):
+    """A file that is not read; the message says why."""
 
 
-def vet_xml(path: Path) -> None:
-    """Refuse what no mesh needs: entities, deep nesting, other files, counts beyond all bounds.
+def check_file(path: Path) -> None:
+    """Refuse files that declare entities or list a node number twice, before they are read.
 
     Raises:
-        ValueError: The file is refused. What is no XML is left to the reader.
+        Refused: The file is not read.
     """
-    try:
-        with path.open("rb") as file:
-            _Vetting(path).parser.ParseFile(file)
-    except expat.ExpatError:
-        raw = path.read_bytes()
-        start = re.search(rb'<AppendedData[^>]+(?:">)', raw)  # bytes as they are: .vtu has them
-        if start:
-            end = max(raw.find(b"</AppendedData>"), start.end())
-            with contextlib.suppress(expat.ExpatError):
-                _Vetting(path).parser.Parse(raw[: start.end()] + raw[end:], True)
+    suffix = path.suffix.lower()
+    if suffix in (".vtu", ".xdmf", ".xmf", ".xml"):
+        parser = expat.ParserCreate()
+        parser.StartDoctypeDeclHandler = _refuse_doctype
+        with contextlib.suppress(expat.ExpatError), path.open("rb") as file:
+            parser.ParseFile(file)
+    if suffix == ".xml":  # rows that it declares and does not list would be undefined numbers
+        raise Refused(f"its format is DOLFIN XML, {CONVERT}")
+    if suffix == ".inp":
+        _check_abaqus(path.read_text(errors="replace"))
+    if suffix == ".msh":
+        _check_gmsh(path.read_bytes())
 
 
-class _Vetting:
-    """The handlers of a parser; they raise a ValueError for what is refused."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.size = path, path.stat().st_size
-        self.depth = self.pieces = 0
-        self.item: dict[str, str] | None = None  # the one whose text counts
-        self.text = ""
-        self.rows: dict[str, int] = {}  # of .xml: what is declared
-        self.places: dict[str, set[str]] = {"nodes": set(), "cells": set()}  # what is listed
-        self.parser = expat.ParserCreate()
-        self.parser.buffer_text = True
-        self.parser.StartDoctypeDeclHandler = self.parser.EntityDeclHandler = self._entities
-        self.parser.StartElementHandler = self._start
-        self.parser.EndElementHandler = self._end
-        self.parser.CharacterDataHandler = self._data
-
-    def _entities(self, *_: Any) -> None:
-        raise ValueError("it has a document type or entities, which no mesh needs; remove them")
-
-    def _start(self, tag: str, attributes: dict[str, str]) -> None:
-        self.depth += 1
-        if self.depth > MOST_DEPTH:
-            raise ValueError(f"its elements are nested more than {MOST_DEPTH} deep; write it anew")
-        if tag == "DataArray" and attributes.get("Name") == "faces":
-            raise ValueError("it holds polyhedra, which cannot be solved; cut them into tetrahedra")
-        if tag == "Piece":
-            self.pieces += 1
-            if self.pieces > 1:
-                raise ValueError("it holds several pieces, of which meshio keeps one; join them")
-            for name, what in (("NumberOfPoints", "nodes"), ("NumberOfCells", "cells")):
-                vet_count(what, _whole(attributes, name), 1000 * self.size)  # zlib packs no better
-        elif tag in ("vertices", "cells"):
-            what = "nodes" if tag == "vertices" else "cells"
-            self.rows[what] = _whole(attributes, "size")
-            vet_count(what, self.rows[what], self.size)
-        elif tag in ("vertex", "triangle", "tetrahedron"):
-            self.places["nodes" if tag == "vertex" else "cells"].add(attributes.get("index", ""))
-        elif tag == "Information" or (tag == "DataItem" and attributes.get("Format") != "XML"):
-            self.item, self.text = attributes, ""
-
-    def _data(self, text: str) -> None:
-        if self.item is not None:
-            self.text += text
-            if len(self.text) > MOST_TEXT:
-                raise ValueError(f"the name of a file in it is longer than {MOST_TEXT} letters")
-
-    def _end(self, tag: str) -> None:
-        self.depth -= 1
-        if tag == "mesh":
-            for what, count in self.rows.items():
-                if len(self.places[what]) != count:
-                    raise ValueError(
-                        f"it declares {count} {what} and holds {len(self.places[what])}"
-                    )
-        if self.item is None:
-            return
-        if tag == "Information" and "<!" in self.text:
-            self._entities()
-        if tag == "DataItem" and self.item.get("Format") in ("HDF", "Binary"):
-            self._vet_file(self.text.strip(), self.item["Format"])
-        self.item = None
-
-    def _vet_file(self, text: str, kind: str) -> None:
-        """Hold a file that this one names to the folder of this one."""
-        name = text.rpartition(":")[0] if kind == "HDF" else text
-        folder, inner = self.path.resolve().parent, Path(name)
-        inside = (folder / inner).resolve().is_relative_to(folder)
-        if not name or ":" in name or "\0" in name or inner.is_absolute() or not inside:
-            raise ValueError(f"it names {text[:80]!r}, no file in its own folder; copy that there")
-        place = folder / inner
-        if not place.is_file() or place.stat().st_size > MOST_BYTES:
-            raise ValueError(f"it names {text[:80]!r}, no file, or too large; copy that beside it")
-        if kind == "HDF":
-            vet_hdf5(place)
+def _refuse_doctype(*_: Any) -> None:
+    raise Refused("it has a document type or entities, which no mesh needs; remove them")
 
 
-def _whole(attributes: dict[str, str], name: str) -> int:
-    try:
-        return int(attributes[name])
-    except (KeyError, ValueError):
-        return -1
+def _check_unique(numbers: Any) -> None:
+    """Refuse node numbers (N,) that occur twice."""
+    found, count = np.unique(numbers, return_counts=True)
+    twice = [str(int(number)) for number in found[count > 1]]
+    if twice:
+        raise Refused(
+            f"{len(twice)} node numbers are listed more than once: {', '.join(twice[:5])}; "
+            "number each node once"
+        )
 
 
-def vet_hdf5(path: Path) -> None:
-    """Hold an HDF5 file to its own data: no links to other files, no size that it cannot have."""
-    try:
-        import h5py
-    except ImportError:
-        raise ValueError("it is an HDF5 file; install h5py to have it checked and read") from None
-    total = 0
-    try:
-        with h5py.File(path, "r") as file:
-            groups, seen = [file], {file.id.__hash__()}
-            while groups:
-                group = groups.pop()
-                for name in group:
-                    link = group.get(name, getlink=True)
-                    if isinstance(link, h5py.ExternalLink):
-                        raise ValueError(f"{name!r} in it is a link to another file; copy its data")
-                    if isinstance(link, h5py.SoftLink):
-                        continue  # leads to what the walk meets elsewhere
-                    item = group[name]
-                    if isinstance(item, h5py.Group):
-                        place = h5py.h5o.get_info(item.id).addr
-                        if place not in seen:
-                            seen.add(place)
-                            groups.append(item)
-                    elif isinstance(item, h5py.Dataset):
-                        if item.external or item.is_virtual:
-                            raise ValueError(f"{name!r} in it lies in another file; copy its data")
-                        total += item.size * item.dtype.itemsize
-                    if total > MOST_BYTES:
-                        raise ValueError(f"its data would take more than {MOST_BYTES / 2**30} GiB")
-    except (OSError, RuntimeError, KeyError) as error:
-        raise ValueError(f"it is damaged ({' '.join(str(error).split())[:200]})") from None
+def _check_abaqus(text: str) -> None:
+    """Refuse Abaqus files of which meshio would lose nodes."""
+    blocks = re.findall(r"^\*\s*NODE\s*(?:,[^\n]*)?\n([^*]*)", text, re.M | re.I)
+    if len(blocks) > 1:
+        raise Refused(f"it holds {len(blocks)} blocks *NODE; join them in one")
+    for block in blocks:
+        _check_unique([int(line.partition(",")[0]) for line in block.splitlines() if line.strip()])
+
+
+def _check_gmsh(data: bytes) -> None:
+    """Compare the nodes and elements of a Gmsh file with their declared counts and types."""
+    form = re.search(rb"\$MeshFormat\s+(\d(?:\.\d)?)\s+([01])\s", data)
+    if not form:  # a file of Ansys
+        return
+    if form[1] == b"4.0":
+        raise Refused("it has version 4.0 of the format; save it in version 4.1 or 2.2")
+    for name in ("Nodes", "Elements"):
+        pattern = rb"^\$%b[ \t\r]*\n(.*?)^\$End%b[ \t\r]*$" % (name.encode(), name.encode())
+        sections = re.findall(pattern, data, re.M | re.S)
+        if len(sections) != 1:
+            raise Refused(f"it must hold one section ${name} that ends with $End{name}")
+        try:
+            if form[2] == b"0":
+                rows = [row.split() for row in sections[0].splitlines() if row.strip()]
+            else:
+                rows = (_binary_rows2 if form[1] < b"3" else _binary_rows4)(name, sections[0])
+            _check_rows(name, rows, blocks=form[1] > b"3")
+        except (KeyError, IndexError, struct.error):
+            raise Refused(f"${name} holds more or fewer rows than it declares") from None
+
+
+def _check_rows(name: str, rows: list[Any], *, blocks: bool) -> None:
+    """Compare the rows of a section of a Gmsh file with what its heads declare."""
+    count, declared = int(rows[0][0]), int(rows[0][blocks])
+    place, first = 1, []  # node numbers, or the lowest one of each element
+    for _ in range(count if blocks else 1):
+        held = int(rows[place][3]) if blocks else declared
+        start = place + blocks
+        for row in rows[start : start + held]:
+            if name == "Nodes":
+                first.append(int(row[0]))
+                continue
+            tags = 1 if blocks else 3 + int(row[2])
+            kind = int(rows[place][2] if blocks else row[1])
+            if len(row) != tags + GMSH_NODES[kind]:
+                raise Refused(f"element {int(row[0])} has not the length of its type")
+            first.append(min(map(int, row[tags:])))
+        place = start + held * (1 + (blocks and name == "Nodes"))  # coordinates follow numbers
+    if place != len(rows) or len(first) != declared:
+        raise Refused(f"${name} holds more or fewer rows than it declares ({declared})")
+    if min(first, default=1) < 1:
+        raise Refused(f"${name} holds node {min(first)}, nodes count from 1")
+    if name == "Nodes":
+        _check_unique(first)
+
+
+def _binary_rows4(name: str, data: bytes) -> list[Any]:
+    """Return the rows that a section of version 4.1 would have as text, coordinates empty."""
+    rows: list[Any] = [struct.unpack_from("=4Q", data)]
+    place = 32
+    for _ in range(rows[0][0]):
+        rows.append(struct.unpack_from("=3iQ", data, place))
+        kind, count = rows[-1][2:]
+        width = 1 if name == "Nodes" else 1 + GMSH_NODES[kind]
+        block = np.frombuffer(data[place + 20 : place + 20 + 8 * count * width], "=u8")
+        rows += block.reshape(-1, width).tolist()
+        place += 20 + 8 * block.size
+        if name == "Nodes":
+            rows += [()] * count
+            place += 24 * count
+    return _ended(rows, data, place)
+
+
+def _binary_rows2(name: str, data: bytes) -> list[Any]:
+    """Return the rows that a section of version 2 would have as text, without coordinates."""
+    place = data.index(b"\n") + 1
+    rows: list[Any] = [(int(data[:place]),)]
+    if name == "Nodes":
+        kind = np.dtype([("number", "=i4"), ("point", "=f8", 3)])
+        found = np.frombuffer(data[place : place + 28 * rows[0][0]], kind)
+        return _ended([*rows, *found["number"][:, None].tolist()], data, place + found.nbytes)
+    while len(rows) <= rows[0][0]:
+        kind, count, tags = struct.unpack_from("=3i", data, place)
+        width = 1 + tags + GMSH_NODES[kind]
+        block = np.frombuffer(data[place + 12 : place + 12 + 4 * count * width], "=i4")
+        rows += [[n[0], kind, tags, *n[1:]] for n in block.reshape(-1, width).tolist()]
+        place += 12 + block.nbytes
+    return _ended(rows, data, place)
+
+
+def _ended(rows: list[Any], data: bytes, place: int) -> list[Any]:
+    if not 0 <= len(data) - place <= 2:  # an end of line
+        raise IndexError
+    return rows
+
+
+def read_vtu(path: Path) -> meshio.Mesh:
+    """Return the mesh of a .vtu file whose cells have the nodes that its connectivity lists.
+
+    With wrong types or offsets meshio leaves cells out or takes other nodes; of several pieces it
+    keeps the cells of the last one.
+    """
+    reader = _VtuReader(str(path))
+    if len(reader.connectivity) != 1:
+        raise Refused(f"it holds several pieces ({len(reader.connectivity)}); join them in one")
+    nodes = [block.data.ravel() for block in reader.cells if block.type != "wedge"]
+    complete = len(nodes) < len(reader.cells)  # meshio reorders wedges
+    if not complete and not np.array_equal(np.concatenate(nodes), reader.connectivity[0]):
+        raise Refused("the types or the offsets of its cells do not fit their nodes")
+    data = reader.point_data, reader.cell_data, reader.field_data
+    return meshio.Mesh(reader.points, reader.cells, *data)
+
+
+class _VtuReader(VtuReader):
+    """The reader of meshio that keeps the connectivity as the file lists it."""
+
+    def __init__(self, name: str) -> None:
+        self.connectivity: list[np.ndarray] = []
+        super().__init__(name)
+
+    def read_data(self, c: Any) -> np.ndarray:
+        """Return the values of a DataArray."""
+        data = super().read_data(c)
+        if c.get("Name") == "connectivity":
+            self.connectivity.append(data.ravel())
+        return data
+
+
+def check_counts(path: Path, mesh: meshio.Mesh) -> None:
+    """Refuse a mesh with other numbers of nodes or cells than its file declares."""
+    _check_unique(getattr(mesh, "points_id", []))  # of Nastran
+    cells = sum(len(block.data) for block in mesh.cells)
+    values = sum(np.size(block.data) for block in mesh.cells)
+    data = path.read_bytes() if path.suffix.lower() in (".vtk", ".su2") else b""
+    if not re.search(rb"^CONNECTIVITY\s", data, re.M):  # of VTK 5, else they include the counts
+        values += cells
+    for held, pattern in (
+        (len(mesh.points), rb"^(?:POINTS\s+|\s*NPOIN=\s*)(\d+)"),
+        (cells, rb"^(?:CELL_TYPES\s+|\s*NELEM=\s*|\s*MARKER_ELEMS=\s*)(\d+)"),
+        (values, rb"^CELLS\s+\d+\s+(\d+)"),
+    ):
+        declared = [int(count) for count in re.findall(pattern, data, re.M | re.I)]
+        if declared and sum(declared) != held:
+            raise Refused(f"it declares {sum(declared)} nodes or cells and holds {held}")
