@@ -149,7 +149,7 @@ def test_nothing_is_compiled_or_analysed_again(wide, monkeypatch):
     monkeypatch.setattr("dpl.fem.assembly.sparsity.Pattern.build", None)
     monkeypatch.setattr("dpl.fem.solvers.linear.make_backend", None)
     monkeypatch.setattr("dpl.fem.problem.Kernels.__init__", None)
-    monkeypatch.setattr("dpl.fem.assembly.kernels._alone", None)
+    monkeypatch.setattr("dpl.fem.assembly.kernels._cache_lock", None)
     assert solve(wide.solver, loads).converged.all()
 
 

@@ -45,7 +45,7 @@ BROKEN_MESHES: dict[str, tuple[str, Any, dict[str, Any]]] = {
         TWO_CUBES,
         {"hexahedron": np.where(TWO_HEXES > 10, 99, TWO_HEXES)},
     ),
-    "index below zero": ("nodes -1", TWO_CUBES, {"hexahedron": TWO_HEXES - 1}),
+    "index below zero": ("= -1 to", TWO_CUBES, {"hexahedron": TWO_HEXES - 1}),
     "node listed twice": (
         "1 cells list a node twice: 0",
         TWO_CUBES,
@@ -116,12 +116,16 @@ BROKEN_MESHES: dict[str, tuple[str, Any, dict[str, Any]]] = {
         np.concatenate([TWO_CUBES, CORNERS + np.array([2, 0, 0])]),
         {"hexahedron": TWO_HEXES, "tetra": TETS + 12},
     ),
-    "lines only": ("no cells that can be solved", TWO_CUBES, {"line": TWO_HEXES[:, :2]}),
-    "wedges": ("no cells that can be solved", TWO_CUBES, {"wedge": np.array([[0, 1, 3, 6, 7, 9]])}),
+    "lines only": ("no supported cells", TWO_CUBES, {"line": TWO_HEXES[:, :2]}),
+    "wedges": ("no supported cells", TWO_CUBES, {"wedge": np.array([[0, 1, 3, 6, 7, 9]])}),
     "surface in space": (
-        "surface in space",
+        "surface mesh embedded in 3D",
         with_node(PATCH, 4, [0.5, 0.5, 0.3]),
         {"triangle": FAN},
     ),
-    "surface of a box": ("surface in space", TWO_CUBES, {"quad": TWO_HEXES[:, :4] + [0, 0, 6, 6]}),
+    "surface of a box": (
+        "surface mesh embedded in 3D",
+        TWO_CUBES,
+        {"quad": TWO_HEXES[:, :4] + [0, 0, 6, 6]},
+    ),
 }

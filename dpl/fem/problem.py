@@ -306,7 +306,7 @@ class Problem(TensorAssembly):
         terms = moduli * (self.dV[..., None] * size * size.sum(-1, keepdim=True)).sum(1)
         terms = terms.expand(len(self.cells), -1)[None, ..., None]
         assemble_constraints = ~self.free.any(dim=1)
-        summed = self._gathered(terms.expand(-1, -1, -1, self.shape[1]))[0, :, 0]
+        summed = self._sum_at_nodes(terms.expand(-1, -1, -1, self.shape[1]))[0, :, 0]
         summed = torch.where(assemble_constraints, 0.0, summed)
         return torch.finfo(torch.float64).eps * float(summed.norm()) * each
 
@@ -375,7 +375,7 @@ class Problem(TensorAssembly):
         if self.mean_dilatation or not isinstance(law, InvariantBasedMaterial):
             return None
         if (first := self.__dict__.get("_first")) is not None and first._compiled is not None:
-            return first._compiled.under(law)
+            return first._compiled.with_moduli(law)
         # Copies: sending a problem to a worker process moves the memory of its tensors.
         cells, dN, dV = (tensor.numpy().copy() for tensor in (self.cells, self.dN, self.dV))
         places = self.pattern.places

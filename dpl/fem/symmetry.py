@@ -1,4 +1,4 @@
-"""Symmetries of a body: motions that turn exact solutions into exact solutions of other loads."""
+"""Symmetries of a body: isometries that map solutions to solutions of other loads."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,20 +15,20 @@ from dpl.fem.problem import Problem
 
 Array = NDArray[np.float64]
 
-NEAR = 1e-7  # over L: points as close as this are one
-SAME = 1e-11  # of the largest value: fields that differ by less are the same. In the residual of an
-# image, whose forces nearly cancel, the difference weighs a hundred times as much.
+NEAR = 1e-7  # distance over L below which points coincide
+SAME = 1e-11  # difference over the largest value below which fields are equal. The residual of an
+# image amplifies it about a hundred times, because its forces nearly cancel.
 
 
 class Symmetry(NamedTuple):
-    """A motion that maps a body onto itself.
+    """Isometry that maps a body onto itself.
 
-    It takes node `source[i]` to node i and turns vectors by Q. If u balances the force f,
-    `image(u)` balances `image(f)`.
+    It maps node `source[i]` to node i and rotates vectors by Q. If u is the solution of the force
+    f, then `image(u)` is that of `image(f)`.
 
     Attributes:
-        rotation: Q, orthogonal, (D, D) [-]; a reflection where det Q = -1.
-        source: Node whose value each node takes, (N,) int64.
+        rotation: Orthogonal matrix Q, (D, D) [-]; a reflection if det Q = -1.
+        source: Node that is mapped to each node, (N,) int64.
     """
 
     rotation: Tensor
@@ -40,23 +40,23 @@ class Symmetry(NamedTuple):
 
 
 def images(field: Tensor, group: Sequence[Symmetry], which: Tensor) -> Tensor:
-    """Return nodal fields (B, N, D), each as its image under one member of a group.
+    """Return the image of each nodal field under a member of a group, (B, N, D).
 
     Args:
-        field: (B, N, D).
+        field: Nodal fields, (B, N, D).
         group: Symmetries, the identity first.
-        which: Place of the member for each field, (B,).
+        which: Index of the member for each field, (B,).
     """
     image = field.clone()
     for k, symmetry in enumerate(group[1:], 1):
-        mine = which == k
-        if mine.any():
-            image[mine] = symmetry.image(field[mine])
+        chosen = which == k
+        if chosen.any():
+            image[chosen] = symmetry.image(field[chosen])
     return image
 
 
 def products(group: Sequence[Symmetry]) -> Tensor:
-    """Return which member image j of image i is, (G, G) int64; (1, 1) for an empty group."""
+    """Return the multiplication table (G, G) int64 of a group; (1, 1) for an empty group."""
     if not group:
         return torch.zeros(1, 1, dtype=torch.int64)
     Q = torch.stack([symmetry.rotation for symmetry in group]).cpu()
@@ -65,19 +65,18 @@ def products(group: Sequence[Symmetry]) -> Tensor:
 
 
 def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetry]:
-    """Return the group of a body's symmetries, the identity first, always in the same order.
+    """Return the symmetry group of a body in a reproducible order, the identity first.
 
-    A symmetry takes nodes to nodes, the supports to the supports, and commutes with the internal
-    force, so that mesh, law and springs share it. All this is tested, by the nodes themselves and
-    on two fixed displacements; nothing is taken from the name or the shape of a body.
+    A symmetry maps nodes to nodes, commutes with the boundary conditions and with the internal
+    force, and is therefore one of mesh, law and foundation. This is tested on the nodes and on two
+    fixed displacements.
 
     Args:
-        problem: The body. One with two nodes in one place has the identity alone.
-        also: Nodal fields (N, D) that a symmetry must leave as they are, such as the force that
-            every load holds.
+        problem: The body. A body with coincident nodes has the identity only.
+        also: Nodal fields (N, D) that a symmetry must preserve, such as a constant force.
     """
     points = problem.points.cpu().numpy()
-    points = points - points.mean(axis=0)  # which every symmetry takes to itself
+    points = points - points.mean(axis=0)  # the centre is a fixed point of every symmetry
     fixed = [problem.prescribed, *also]
     operators, fields = _operators(problem), _fields(problem, points)
     results = [operator(fields) for operator in operators]
@@ -97,8 +96,11 @@ def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetr
 
 
 def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
-    """Return what must commute with a symmetry: supports, cells, springs, each on its own scale."""
-    springs, body = problem.springs, problem.reference  # isotropic: every Poisson's ratio alike
+    """Return the operators that commute with a symmetry: constraints, cells and foundation."""
+    springs, body = (
+        problem.springs,
+        problem.reference,
+    )  # isotropic: symmetries do not depend on Poisson's ratio
     cells = body if springs is None else replace(body, springs=None)
     operators: list[Callable[[Tensor], Tensor]] = [
         lambda field: torch.where(problem.free, field, 0.0),
@@ -110,8 +112,7 @@ def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
 def _fields(problem: Problem, points: Array) -> Tensor:
     """Return two displacements without any symmetry, waves and noise, (2, N, D) [-].
 
-    They are so small that |H| < 1/2 in them and in all their images: none inverts a cell, which
-    some laws do not survive.
+    They are scaled to |H| < 1/2, so that neither they nor their images invert a cell.
     """
     rng, dim = np.random.default_rng(0), points.shape[1]
     waves = np.sin(4 * points @ rng.standard_normal((dim, dim)) + rng.uniform(0, 6, dim))
@@ -122,26 +123,28 @@ def _fields(problem: Problem, points: Array) -> Tensor:
 
 
 def _same(found: Tensor, expected: Tensor) -> bool:
-    """Return whether fields (..., N, D) are equal but for rounding; those with NaN are not."""
+    """Return True if fields (..., N, D) are equal up to rounding; False if they contain NaN."""
     error, size = ((x.abs().amax(dim=(-2, -1))) for x in (found - expected, expected))
     return bool((error <= SAME * size).all())
 
 
 def _motions(points: Array, marks: NDArray[np.int_]) -> list[tuple[Tensor, Tensor]]:
-    """Return all motions about the origin, as in `Symmetry`, that take nodes to nodes.
+    """Return all isometries about the origin that map nodes to nodes, as in `Symmetry`.
 
     Args:
         points: Nodes, (N, D) [-].
-        marks: What a node has in common with its image, (N,).
+        marks: Integer property that a node shares with its image, (N,).
     """
     distance = _classes(np.linalg.norm(points, axis=1))
     kinds = np.unique(np.stack([distance, marks]), axis=1, return_inverse=True)[1].ravel()
     tree, candidates = KDTree(points), _candidates(points, kinds)
-    probes = points[:: 1 + len(points) // 16] @ candidates.mT  # (C, 16, D), quickly looked up
+    probes = (
+        points[:: 1 + len(points) // 16] @ candidates.mT
+    )  # (C, 16, D), a fast test of a few nodes
     candidates = candidates[np.isfinite(tree.query(probes, distance_upper_bound=NEAR)[0]).all(1)]
     motions = []
     for Q in candidates:
-        # the node at Q^-1 x_i is the one that Q takes to x_i
+        # Q maps the node at Q^-1 x_i to x_i
         gap, source = tree.query(points @ Q, distance_upper_bound=NEAR)
         if np.isfinite(gap).all() and len(np.unique(source)) == len(source):
             motions.append((torch.from_numpy(_fitted(points, source)), torch.from_numpy(source)))
@@ -149,7 +152,7 @@ def _motions(points: Array, marks: NDArray[np.int_]) -> list[tuple[Tensor, Tenso
 
 
 def _classes(values: Array) -> NDArray[np.int_]:
-    """Return the number of the run of near values that each is in, (N,)."""
+    """Return the index of the cluster of each value, (N,); gaps above `NEAR` separate clusters."""
     order = np.argsort(values)
     classes = np.empty(len(values), dtype=np.int64)
     classes[order] = np.cumsum(np.diff(values[order], prepend=values.min()) > NEAR)
@@ -157,10 +160,10 @@ def _classes(values: Array) -> NDArray[np.int_]:
 
 
 def _candidates(points: Array, kinds: NDArray[np.int_]) -> Array:
-    """Return orthogonal maps (C, D, D), all symmetries of the nodes among them.
+    """Return candidate orthogonal maps (C, D, D), which include all symmetries of the nodes.
 
-    The place of D - 1 nodes that are not in line with the origin leaves two maps, mirror images of
-    one another. So nodes of the rarest kinds are taken to all others of their kinds.
+    The images of D - 1 nodes that are linearly independent determine two maps, which differ by a
+    reflection. The nodes are chosen from the smallest classes and mapped to all others of these.
     """
     sizes = np.bincount(kinds)[kinds]
 
@@ -184,7 +187,7 @@ def _candidates(points: Array, kinds: NDArray[np.int_]) -> Array:
 
 
 def _completed(vectors: Array, sense: float = 1.0) -> Array:
-    """Return D - 1 vectors (..., D - 1, D) and one across them, (..., D, D)."""
+    """Return D - 1 vectors (..., D - 1, D) and one orthogonal to them, (..., D, D)."""
     if vectors.shape[-1] == 2:
         across = vectors[..., ::-1] * [-1.0, 1.0]
     else:
@@ -193,10 +196,10 @@ def _completed(vectors: Array, sense: float = 1.0) -> Array:
 
 
 def _fitted(points: Array, source: NDArray[np.int_]) -> Array:
-    """Return the orthogonal map (D, D) that takes `points[source]` to `points` best.
+    """Return the orthogonal map (D, D) that maps `points[source]` to `points` in least squares.
 
     Source: Schoenemann (1966), Psychometrika 31, "A generalized solution of the orthogonal
-    Procrustes problem". Entries that rounding keeps from 0, 1 or -1 are made so.
+    Procrustes problem". Entries are rounded to 0, 1 or -1 where they differ by less than 1e-12.
     """
     U, _, Vt = np.linalg.svd(points.T @ points[source])
     Q = U @ Vt
@@ -204,7 +207,7 @@ def _fitted(points: Array, source: NDArray[np.int_]) -> Array:
 
 
 def _closed(found: Sequence[Symmetry]) -> list[Symmetry]:
-    """Return those that map the whole set onto itself: a group; but for rounding, all of them."""
+    """Return the members whose products with all others are in the set: a group."""
     Q = torch.stack([symmetry.rotation for symmetry in found]).cpu().numpy()
     products = (Q[:, None] @ Q).reshape(len(Q), len(Q), -1)
     known = KDTree(Q.reshape(len(Q), -1)).query(products, distance_upper_bound=1e-4)[0]

@@ -61,7 +61,7 @@ BAD = {  # override -> what the message must name
     "fixed.at=7": r"fixed.*Plane\(axis=0, at=7\) holds no node",
     "fixed.axis=3": r"fixed: axis = 3",
     "fixed.at=middle": r"fixed: at = 'middle'",
-    "mesh=rectangle fixed.axis=2": r"fixed.*axis = 2 does not exist in 2D",
+    "mesh=rectangle fixed.axis=2": r"fixed.*axis = 2 must be less than 2",
     "fixed.at=null": r"fixed\.at = None must be a number or a text",
     "degree=3": r"degree",
     "degree=two": r"degree",

@@ -71,8 +71,8 @@ def test_a_run_on_a_mesh_file_says_what_it_is_and_what_was_corrected(trained):
     _, _, ended = trained
     lines = ended.err.splitlines()
     assert [line for line in lines if line.startswith("warning: ") and "part.vtu" in line] == [
-        "warning: part.vtu: 24 of 96 cells list their nodes inside out and are read the other way "
-        "round; 1 nodes are used by no cell and are left out"
+        "warning: part.vtu: 24 of 96 cells list their nodes inside out; they are reordered; "
+        "1 nodes belong to no cell; they are dropped"
     ]
     size = "body: 100 x 25 x 25 m, 45 nodes, 96 tetrahedra, 135 degrees of freedom"
     assert ended.out.splitlines().count(size) == 1

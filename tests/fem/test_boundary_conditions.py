@@ -1,4 +1,4 @@
-"""Laws of what holds a body: prescribed displacements and springs."""
+"""Dirichlet conditions (prescribed displacements) and Robin conditions (elastic foundations)."""
 
 import math
 import pickle
@@ -56,7 +56,7 @@ def answer_of(problem: Problem, force: torch.Tensor | None = None, **options):
     return solve(Newton(problem, linear="superlu", **options), load)
 
 
-def test_clamp_holds_all_components_of_its_nodes(held):
+def test_a_condition_without_value_fixes_all_components_of_its_nodes(held):
     """The default value, the same as `fixed`."""
     clamped, fixed = held(DirichletBC(LEFT)), held(fixed=LEFT)
     assert torch.equal(clamped.free, fixed.free)
@@ -91,12 +91,12 @@ def test_value_is_a_length_in_metres(held, dim):
         assert_close(found[:, 2], torch.full_like(found[:, 2], -0.05), rtol=1e-14, atol=0)
 
 
-def test_whole_number_of_metres_is_a_value_too(held, dim):
+def test_an_integer_is_a_value_too(held, dim):
     problem = held(DirichletBC(RIGHT, [2, *[None] * (dim - 1)]))
     assert problem.prescribed.max().item() == pytest.approx(0.5, rel=1e-14)
 
 
-def test_of_two_values_for_one_component_the_later_counts(held, dim):
+def test_the_last_value_of_a_component_applies(held, dim):
     first = DirichletBC(LEFT, [0.4] * dim)
     second = DirichletBC(LEFT, [-0.8, *[None] * (dim - 1)])
     left = held().points[:, 0] < 1e-9
@@ -106,7 +106,7 @@ def test_of_two_values_for_one_component_the_later_counts(held, dim):
         assert_close(problem.prescribed[left][:, 1].unique(), torch.tensor([0.1]).double())
 
 
-def test_support_counts_more_than_what_is_fixed(held, dim):
+def test_a_boundary_condition_overrides_fixed_nodes(held, dim):
     problem = held(DirichletBC(LEFT, [0.4, *[None] * (dim - 1)]), fixed=LEFT)
     left = problem.points[:, 0] < 1e-9
     assert not problem.free[left].any()
@@ -114,7 +114,7 @@ def test_support_counts_more_than_what_is_fixed(held, dim):
     assert not problem.prescribed[left][:, 1:].any()
 
 
-def test_support_that_leaves_a_component_free_does_not_free_what_is_fixed(held, dim):
+def test_a_free_component_of_a_boundary_condition_does_not_free_fixed_nodes(held, dim):
     problem = held(DirichletBC(LEFT, [*[None] * (dim - 1), 0.0]), fixed=LEFT)
     assert torch.equal(problem.free, held(fixed=LEFT).free)
 
@@ -132,7 +132,7 @@ def test_value_of_the_wrong_length_is_an_error(grid, value):
         Problem.build(grid("hexahedron"), NH, supports=[DirichletBC(LEFT, value)])
 
 
-def test_value_for_space_is_an_error_in_the_plane(grid):
+def test_value_with_three_components_is_an_error_in_2d(grid):
     with pytest.raises(ValueError, match="must be 2 lengths"):
         Problem.build(grid("quad"), NH, supports=[DirichletBC(LEFT, [0.0, 0.0, 0.0])])
 
@@ -156,8 +156,8 @@ def test_stiffness_out_of_range_is_an_error(grid, stiffness):
         Problem.build(grid("hexahedron"), NH, supports=[RobinBC(LEFT, stiffness)])
 
 
-def test_moved_supports_pull_the_body_along():
-    """A bar stretched by 50 % of its length has the lateral stretch of VERIFICATION 1.2."""
+def test_moved_supports_stretch_the_body():
+    """A bar stretched by 50 % has the lateral stretch of uniaxial stress."""
     mesh = box([2.0, 2.0, 2.0], [3, 3, 3])
     rails = [
         DirichletBC(Plane(axis, "min"), [0.0 if k == axis else None for k in range(3)])
@@ -187,12 +187,13 @@ def test_supports_move_with_the_load():
         assert_close(moved, expected.expand_as(moved), rtol=1e-14, atol=0)
 
 
-# VERIFICATION 1.6e: t = 0.1 on x = 4, alpha = 0.5 on x = 0, nu = 0, SVK
+# Bar of length 4 with nu = 0, Saint Venant-Kirchhoff, traction t = 0.1 on x = 4 and foundation
+# alpha = 0.5 on x = 0: its stretch s solves s^3 - s = 2 t, u(0) = t / alpha.
 STRETCH, START, END = 1.0880339146912892, 0.2, 0.5521356587651567
 
 
 def bar(kind, count: int, stiffness) -> Problem:
-    """Return the bar of VERIFICATION 1.6e on springs, in space or in the plane."""
+    """Return the bar on an elastic foundation, in 3D or 2D."""
     cell, degree = kind
     dim = 3 if cell in ("tetra", "hexahedron") else 2
     build = box if dim == 3 else rectangle
@@ -224,13 +225,12 @@ def test_closed_form_of_the_robin_bar_is_consistent():
 
 @pytest.mark.parametrize("count", [1, 3, 8])
 def test_bar_on_springs_is_exact_on_every_mesh(kind, count):
-    """VERIFICATION 1.6e, tolerance 1e-10."""
     problem = bar(kind, count, 0.5)
     assert problem.unconstrained_rigid_body_modes() == []
     check_bar(problem)
 
 
-def test_bar_on_springs_does_not_care_for_the_unit_of_length(kind):
+def test_bar_on_springs_does_not_depend_on_the_unit_of_length(kind):
     """The stiffness [1/m] and the displacement [m] of a bar of 0.004 m: alpha = 500/m."""
     problem = bar(kind, 3, 0.5)
     mesh = problem.mesh.scaled(0.004)
@@ -261,7 +261,7 @@ def test_springs_in_one_direction_leave_the_others_free(kind, dim, axis):
     assert len(names) == dim - 1 + turns[axis]
 
 
-def test_loose_motions_on_springs_are_the_zero_modes(kind, dim):
+def test_unconstrained_rigid_body_modes_on_springs_are_the_zero_modes(kind, dim):
     for axis in range(dim):
         stiffness = [0.0] * dim
         stiffness[axis] = 0.5
@@ -295,14 +295,14 @@ def sprung(held, dim) -> Problem:
     )
 
 
-def test_force_on_springs_is_the_slope_of_the_energy(sprung, bend):
+def test_force_on_springs_is_the_gradient_of_the_energy(sprung, bend):
     u = bend(sprung.points, 2).requires_grad_()
     (slope,) = torch.autograd.grad(sprung.energy(u).sum(), u)
     assert_close(sprung.internal_force(u.detach()), slope, rtol=1e-11, atol=1e-13)
     assert_close(sprung.evaluate(u.detach()).internal, slope, rtol=1e-11, atol=1e-13)
 
 
-def test_tangent_on_springs_is_the_slope_of_the_force(sprung, bend):
+def test_tangent_on_springs_is_the_derivative_of_the_force(sprung, bend):
     u = bend(sprung.points)
     v = torch.where(sprung.free, bend(sprung.points, seed=1), 0.0)
     product = sprung.tangent_product(u, v)[0][sprung.free].numpy()
@@ -312,14 +312,14 @@ def test_tangent_on_springs_is_the_slope_of_the_force(sprung, bend):
         assert found == pytest.approx(product, rel=1e-10, abs=1e-13)
 
 
-def test_mixed_points_on_springs_see_the_springs(sprung, bend):
+def test_mixed_system_contains_the_springs(sprung, bend):
     u = bend(sprung.points)
     force, tangent = sprung.mixed_system(u, torch.zeros_like(sprung.strain(u)))
     assert_close(force, sprung.internal_force(u), rtol=1e-11, atol=1e-14)
     assert_close(tangent, sprung.tangent(u), rtol=1e-11, atol=1e-13)
 
 
-def test_springs_pull_with_stiffness_times_displacement_times_area(held, dim):
+def test_force_of_springs_is_stiffness_times_displacement_times_area(held, dim):
     """A body moved as a whole: the pull is -alpha u, on an area of 4 m by 4 m."""
     stiffness = np.array([0.3, 0.1, 0.7][:dim])
     problem = held(RobinBC(LEFT, stiffness.tolist()))
@@ -331,7 +331,7 @@ def test_springs_pull_with_stiffness_times_displacement_times_area(held, dim):
     assert_close(problem.energy(u), (expected * shift).sum()[None] / 2, rtol=1e-12, atol=0)
 
 
-def test_beds_of_springs_on_one_face_add_up(held, bend):
+def test_foundations_on_one_face_add_up(held, bend):
     one, two = held(RobinBC(LEFT, 0.3), RobinBC(LEFT, 0.2)), held(RobinBC(LEFT, 0.5))
     u = bend(one.points)
     assert_close(one.internal_force(u), two.internal_force(u), rtol=1e-12, atol=1e-15)
@@ -342,7 +342,7 @@ def test_body_without_springs_has_none(held):
     assert held(DirichletBC(LEFT)).springs is None
 
 
-def test_very_stiff_springs_clamp(kind):
+def test_very_stiff_springs_act_as_a_clamp(kind):
     """The difference falls with the stiffness, by 10 where it is ten times as large."""
     cell, degree = kind
     build = box if cell in ("tetra", "hexahedron") else rectangle
@@ -363,7 +363,7 @@ def test_very_stiff_springs_clamp(kind):
     assert softer / stiffer == pytest.approx(10, rel=0.05)
 
 
-def test_copy_on_a_device_and_copy_by_pickle_keep_their_springs(sprung, bend):
+def test_copies_on_a_device_and_by_pickle_contain_the_springs(sprung, bend):
     u = bend(sprung.points)
     for copy in (sprung.to("cpu"), pickle.loads(pickle.dumps(sprung))):
         assert torch.equal(copy.internal_force(u), sprung.internal_force(u))

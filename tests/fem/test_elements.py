@@ -1,4 +1,4 @@
-"""Laws of isoparametric elements: curved cells are integrated as exactly as straight ones."""
+"""Isoparametric elements: curved cells are integrated as exactly as straight ones."""
 
 import math
 

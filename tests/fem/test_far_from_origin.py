@@ -1,4 +1,4 @@
-"""Laws of bodies far from the origin: they answer as they do near it.
+"""Bodies far from the origin give the same results as near it.
 
 Coordinates at a distance of d lack eps * d of their digits, which is eps * d / h of a cell of size
 h. Results may differ by a small multiple of this, and nothing may differ by more.
@@ -60,7 +60,7 @@ def test_a_body_about_the_origin_is_not_moved(beam):
     assert np.array_equal(problem.mesh.p, box([100.0, 25.0, 25.0], [9, 3, 3]).p / 100.0)
 
 
-def test_a_far_body_is_written_where_it_lies(kind, grid, distance):
+def test_a_far_body_is_written_at_its_coordinates(kind, grid, distance):
     mesh = away(grid(kind[0], CELLS, 0.15), distance)
     problem = Problem.build(mesh, NH, degree=kind[1])
     assert np.abs(problem.points.numpy()).max() < 3
@@ -93,7 +93,7 @@ def test_loads_and_springs_on_a_far_body_are_those_on_a_near_one(kind, grid, dis
         assert_close(far, near, rtol=0.0, atol=tolerance(distance) * float(near.abs().max()))
 
 
-def test_fields_of_loads_see_the_coordinates_of_the_user(grid, distance):
+def test_fields_of_loads_receive_the_coordinates_of_the_user(grid, distance):
     mesh = away(grid("hexahedron", CELLS), distance)
     problem = Problem.build(mesh, NH, length=1.0)
     low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
@@ -126,7 +126,7 @@ def test_regions_in_absolute_coordinates_hold_the_same_nodes(distance):
         assert torch.equal(*held)
 
 
-def test_a_far_bore_is_held_by_its_cylinder(distance):
+def test_a_cylinder_selects_a_far_bore(distance):
     mesh = away(propeller(), distance)
     centre = distance * np.array([1.0, -0.7, 0.9])
     problem = Problem.build(mesh, NH, fixed=Cylinder(0, 0.05, centre))

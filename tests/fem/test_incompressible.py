@@ -1,4 +1,4 @@
-"""Bodies that keep their volume, nearly: closed forms of VERIFICATION 1.5 in elements for them."""
+"""Nearly incompressible bodies: closed forms of the incompressible limit, and locking."""
 
 import math
 from collections.abc import Callable
@@ -92,7 +92,7 @@ CASES = [
 
 @pytest.mark.parametrize(("name", "mode"), CASES)
 def test_stretched_rubber_has_the_stress_of_the_incompressible_limit(formulation, grid, name, mode):
-    """VERIFICATION 1.5: P11 on a crooked mesh, bulk over shear modulus 1e5, tolerance 1e-3."""
+    """P11 of the incompressible law on a distorted mesh; bulk over shear modulus 1e5."""
     law = RUBBERS[name]
     stretches, pulled, factors = MODES[mode]
     mesh = grid("hexahedron", 2, 0.2, inside=True)
@@ -159,8 +159,8 @@ SPHERES = [(1.1, 0.2871548459), (1.5, 0.7554331187), (2.0, 0.8069266031), (3.0, 
 
 
 @pytest.mark.parametrize(("stretch", "printed"), SPHERES)
-def test_thick_sphere_holds_the_printed_pressure(stretch, printed):
-    """VERIFICATION 1.5: p / mu at 1e4 mu = bulk modulus, radii 1 and 2, tolerance 1e-3."""
+def test_thick_sphere_has_the_inner_pressure_of_the_closed_form(stretch, printed):
+    """The pressure is mu (f(b) - f(a)) / 2, f = s^-4 + 4 / s, s the stretches at radii 1 and 2."""
     law = NeoHookeanIsoK2(poisson(1e4))
     problem, answer = blown_up(octant(2, 32, 1.0, 2.0), law, stretch)
     assert answer.status.item() == Status.CONVERGED
@@ -170,7 +170,7 @@ def test_thick_sphere_holds_the_printed_pressure(stretch, printed):
 
 @pytest.mark.filterwarnings("ignore:.*rounding allows no less")
 def test_balloon_has_its_largest_pressure_at_the_sixth_root_of_seven():
-    """VERIFICATION 1.5: p R / (2 mu H) = .6197314512 at 7^(1/6); here H / R = 1e-3."""
+    """Thin neo-Hookean sphere: p R / (2 mu H) = 1 / s - 1 / s^7; here H / R = 1e-3."""
     law, peak = NeoHookeanIsoK2(poisson(1e4)), 7 ** (1 / 6)
     mesh, found = octant(4, 1, 1.0, 1.001), {}
     for stretch in (0.97 * peak, peak, 1.03 * peak):
@@ -210,42 +210,42 @@ def bore(nu: float, cells: tuple[int, int], **options) -> float:
 
 
 @pytest.mark.parametrize("nu", CYLINDER)
-def test_thick_cylinder_of_macneal_and_harder_widens_as_printed(nu):
-    """VERIFICATION 1.5: mean dilatation, within 1e-3 whatever Poisson's ratio, of second order."""
+def test_thick_cylinder_with_mean_dilatation_converges_with_second_order(nu):
+    """MacNeal, Harder (1985), thick-walled cylinder."""
     coarse, fine = (bore(nu, (n, n - 4), mean_dilatation=True) / CYLINDER[nu] for n in (20, 40))
     assert coarse == pytest.approx(1.0, abs=1e-3)
     assert math.log2((coarse - 1) / (fine - 1)) > 1.9
 
 
 @pytest.mark.parametrize(("nu", "within"), [(0.3, 2e-6), (0.49, 3e-5), (0.499, 3e-4)])
-def test_thick_cylinder_of_quadratic_elements_widens_as_printed(nu, within):
-    """VERIFICATION 1.5: what remains grows with the bulk modulus, 2.3e-3 at nu = .4999."""
+def test_thick_cylinder_of_quadratic_elements_has_the_displacement_of_the_closed_form(nu, within):
+    """MacNeal, Harder (1985); the error grows with the bulk modulus."""
     assert bore(nu, (20, 16), degree=2) == pytest.approx(CYLINDER[nu], rel=within)
 
 
 @pytest.mark.filterwarnings("ignore:linear .* lock")
 @pytest.mark.parametrize(("nu", "short"), [(0.49, 0.086), (0.499, 0.477), (0.4999, 0.901)])
 def test_thick_cylinder_of_plain_linear_elements_locks(nu, short):
-    """VERIFICATION 1.5 as a warning: 10 x 8 cells."""
+    """MacNeal, Harder (1985), 10 x 8 cells."""
     assert 1 - bore(nu, (10, 8)) / CYLINDER[nu] == pytest.approx(short, abs=1e-3)
 
 
 @pytest.fixture(scope="module", params=["quad", "hexahedron"])
 def shaken(request, grid) -> Problem:
-    """A crooked body of cells that share their mean volume ratio, nearly incompressible."""
+    """A nearly incompressible body with mean dilatation on a distorted mesh."""
     mesh = grid(request.param, 2, 0.15)
     return Problem.build(mesh, NeoHookeanLn(0.49), fixed=Plane(0, "min"), mean_dilatation=True)
 
 
-def test_force_of_mean_dilatation_is_the_slope_of_its_energy(shaken, bend):
-    """VERIFICATION 1.10 for the elements that do not lock."""
+def test_force_of_mean_dilatation_is_the_gradient_of_its_energy(shaken, bend):
+    """By automatic differentiation."""
     u = bend(shaken.points, 2).requires_grad_()
     (slope,) = torch.autograd.grad(shaken.energy(u).sum(), u)
     assert_close(shaken.internal_force(u.detach()), slope, rtol=1e-10, atol=1e-12)
 
 
-def test_tangent_of_mean_dilatation_is_the_slope_of_its_force(shaken, bend):
-    """VERIFICATION 1.10: differences to 1e-8, and symmetry."""
+def test_tangent_of_mean_dilatation_is_the_symmetric_derivative_of_its_force(shaken, bend):
+    """By central differences, to 1e-8."""
     u = bend(shaken.points)
     v = torch.where(shaken.free, bend(shaken.points, seed=1), 0.0)
     K = full_matrix(shaken.pattern, shaken.tangent(u)[0].numpy())
@@ -257,8 +257,8 @@ def test_tangent_of_mean_dilatation_is_the_slope_of_its_force(shaken, bend):
     assert_close(shaken.tangent_product(u, v)[free].numpy(), product, rtol=1e-9, atol=1e-11)
 
 
-def test_moved_and_turned_body_of_mean_dilatation_feels_turned_forces(shaken, bend):
-    """VERIFICATION 1.10, objectivity, tolerance 1e-12 of the stiff volume."""
+def test_forces_of_mean_dilatation_are_objective(shaken, bend):
+    """A rigid motion rotates them; tolerance 1e-12."""
     dim, u = shaken.shape[1], bend(shaken.points)
     skew = torch.tensor([[0, -0.4, 0.9], [0.4, 0, -0.2], [-0.9, 0.2, 0]], dtype=torch.float64)
     turn = torch.matrix_exp(skew[:dim, :dim])
@@ -268,7 +268,7 @@ def test_moved_and_turned_body_of_mean_dilatation_feels_turned_forces(shaken, be
 
 
 def test_linear_law_of_mean_dilatation_is_linear(beam, pull):
-    """VERIFICATION 0: a linear problem converges in exactly one iteration."""
+    """A linear problem converges in exactly one iteration."""
     problem = beam(LinearElastic(0.3), mean_dilatation=True)
     answer = solve(Newton(problem), Load(pull(problem, 20.0), torch.ones(1)))
     assert answer.iterations.item() == 1
@@ -287,7 +287,7 @@ def test_beam_of_mean_dilatation_keeps_its_volume(beam, pull):
     assert (J - 1).abs().max() > 1e-2
 
 
-def test_pull_on_rubber_of_mean_dilatation_is_that_of_plain_elements_where_it_is_uniform(grid):
+def test_mean_dilatation_does_not_change_uniform_states(grid):
     """Homogeneous states know no mean: the same answer on any mesh, with and without."""
     law = NeoHookeanIsoK4(0.4)
     mesh = grid("hexahedron", 2, 0.2, inside=True)

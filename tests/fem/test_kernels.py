@@ -1,4 +1,4 @@
-"""Laws of the compiled element loops: they say what the tensor operations say."""
+"""Compiled element loops give the results of the tensor operations."""
 
 import importlib.util
 import math
@@ -38,7 +38,7 @@ def cubed(x):
 
 @dataclass(frozen=True)
 class Coupled(YoungPoissonMaterial, InvariantBasedMaterial):
-    """NH-ln + (I1 - 3)^3 / 50 + (I1 - 3)(I2 - 3) / 20 + (I2 - 3)^2 / 40: all slopes of I1, I2."""
+    """NH-ln + (I1 - 3)^3 / 50 + (I1 - 3)(I2 - 3) / 20 + (I2 - 3)^2 / 40: all derivatives."""
 
     def energy(self, H):
         """Return the energy density."""
@@ -54,7 +54,7 @@ class Coupled(YoungPoissonMaterial, InvariantBasedMaterial):
 
     @staticmethod
     def invariant_derivatives(c, i1, i2, j, log_j, m1):
-        """Return the slopes."""
+        """Return the derivatives."""
         rest, p = c[0] * log_j, c[0] * log_j - c[1]
         W1 = c[2] * 3 * (cubed(i1) - (i1 - 1) * i1 * i1) + c[3] * i2  # of what NH-ln has not
         W2 = c[3] * i1 + 2 * c[4] * i2
@@ -70,7 +70,7 @@ def law(request, laws) -> InvariantBasedMaterial:
 
 @pytest.fixture(params=["equal", "unequal"])
 def body(request, law, kind, grid, chain) -> Problem:
-    """Bodies of each kind of element, of a number of cells that fills no whole block of lanes."""
+    """Bodies of each kind of element, with an incomplete last block of SIMD lanes."""
     cell, degree = kind
     mesh = chain(cell, 2 * SIMD_WIDTH + 3) if request.param == "equal" else grid(cell, 3, 0.12)
     problem = Problem.build(mesh, law, fixed=Plane(0, "min"), degree=degree)
@@ -98,12 +98,12 @@ def check_equal(found: Tensor, expected: Tensor) -> None:
 
 
 def as_tensor(gap: np.ndarray, cells: int) -> Tensor:
-    """Return strains E (1, cells, Q, 3, 3) of the kernels' 2 E (blocks, Q, 6, WIDTH)."""
+    """Return strains E (1, cells, Q, 3, 3) of the kernels' 2 E (blocks, Q, 6, SIMD_WIDTH)."""
     rows = torch.from_numpy(gap).permute(0, 3, 1, 2).flatten(0, 1)[:cells]  # (E, Q, 6)
     return rows[..., [[0, 3, 5], [3, 1, 4], [5, 4, 2]]][None] / 2
 
 
-def test_law_written_here_is_what_its_slopes_say(bend):
+def test_the_derivatives_of_the_law_of_this_file_are_those_of_its_energy(bend):
     """So that the kernels below can be held against it: stress and energy agree."""
     law = Coupled(0.3)
     random = torch.Generator().manual_seed(0)
@@ -148,7 +148,7 @@ def test_system_of_mixed_points_is_that_of_the_tensors(body, bend):
 
 
 @pytest.mark.parametrize("law", FEW, indirect=True)
-def test_body_at_rest_feels_no_force(body):
+def test_body_at_rest_has_no_force(body):
     internal, volume = body.evaluate(torch.zeros(1, *body.shape, dtype=torch.float64))
     assert not internal.any()
     assert volume.item() == 1
@@ -165,7 +165,7 @@ def test_tiny_displacements_keep_their_digits(body, bend):
 
 @pytest.mark.parametrize("law", FEW, indirect=True)
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_displacement_that_is_no_number_has_no_volume(law, kind, grid, bad):
+def test_nan_in_a_displacement_gives_no_volume_ratio(law, kind, grid, bad):
     """In any cell, the last one of a block that is not full among them."""
     problem = Problem.build(grid(kind[0], 3, 0.12), law, degree=kind[1])
     for node in (0, problem.shape[0] // 2, problem.shape[0] - 1):
@@ -187,7 +187,7 @@ def test_inverted_body_has_the_force_of_the_tensors(body, bend):
 
 
 @pytest.mark.parametrize("law", FEW, indirect=True)
-def test_inverted_body_is_seen(body):
+def test_inverted_body_has_a_negative_volume_ratio(body):
     mirrored = body.points * (-2.0 * torch.eye(body.shape[1], dtype=torch.float64)[0])
     volume = body.evaluate(mirrored[None]).volume_ratio
     assert volume.item() == pytest.approx(-1.0, rel=1e-12)
@@ -197,7 +197,7 @@ def test_inverted_body_is_seen(body):
 
 @pytest.mark.parametrize("count", range(1, 2 * SIMD_WIDTH + 2))
 def test_number_of_cells_does_not_matter(chain, bend, count):
-    """Blocks of lanes that are full, almost full, almost empty; equal cells and unequal ones."""
+    """Blocks of SIMD lanes that are full, almost full, almost empty; equal and unequal cells."""
     body = Problem.build(chain("quad", count), NeoHookeanLn(0.3), length=1.0)
     several = replace(body, dN=body.dN.repeat(count, 1, 1, 1), dV=body.dV.repeat(count, 1))
     u = bend(body.points / count)
@@ -220,7 +220,7 @@ def test_order_of_axes_in_memory_does_not_matter(grid, bend):
     assert torch.equal(first, body.linearise(u[:1]).tangent)
 
 
-def test_springs_pull_in_compiled_and_tensor_loops_alike(kind, grid, bend):
+def test_springs_have_equal_forces_in_compiled_and_tensor_operations(kind, grid, bend):
     spring = RobinBC(Plane(0, "max"), 0.7)
     body = Problem.build(grid(kind[0]), NeoHookeanLn(0.3), supports=[spring], degree=kind[1])
     u, plain = bend(body.points), reference(body)
@@ -230,7 +230,7 @@ def test_springs_pull_in_compiled_and_tensor_loops_alike(kind, grid, bend):
     assert (body.evaluate(u).internal - free).abs().max() > 1e-3
 
 
-def test_law_without_slopes_is_not_compiled(grid, laws, bend):
+def test_law_without_invariant_derivatives_is_not_compiled(grid, laws, bend):
     body = Problem.build(grid("hexahedron"), laws["Ogden3"])
     assert body._compiled is None
     u = bend(body.points)
@@ -307,7 +307,7 @@ def name_of(module: ModuleType) -> str:
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_type_of_a_law_changes_with_the_source_of_its_slopes(written, part):
+def test_type_of_a_law_changes_with_the_source_of_its_derivatives(written, part):
     """So that no machine code of another law is taken from the disk."""
     first, again = name_of(written("first")), name_of(written("again"))
     assert first == again
@@ -343,7 +343,7 @@ def _arithmetic(a, b, out):
     store(out, row + 1, load(a, 1))
 
 
-def test_lanes_add_multiply_and_divide_like_numbers():
+def test_simd_vectors_add_multiply_and_divide_like_numbers():
     random = np.random.default_rng(0)
     a, b = random.uniform(0.5, 2.0, (2, 2, SIMD_WIDTH))
     a[:, ::2] *= -1
@@ -364,7 +364,7 @@ def _copy(rows, out):
         store(out, len(rows) - 1 - row, load(rows, row))
 
 
-def test_rows_are_loaded_and_stored_where_they_are():
+def test_rows_are_loaded_and_stored_at_their_index():
     rows = np.arange(5.0 * SIMD_WIDTH).reshape(5, SIMD_WIDTH)
     out = np.zeros((7, SIMD_WIDTH))
     _copy(rows, out[1:6])
@@ -379,7 +379,7 @@ def _quotients(a, b, out):
     store(out, 2, load(a, 0) - load(a, 0))
 
 
-def test_lanes_know_infinity_and_nan():
+def test_simd_vectors_preserve_infinity_and_nan():
     """Inverted cells are found by them."""
     a, b, out = np.full((1, SIMD_WIDTH), -1.0), np.zeros((1, SIMD_WIDTH)), np.zeros((3, SIMD_WIDTH))
     a[0, 0], a[0, 1] = math.nan, math.inf

@@ -1,4 +1,4 @@
-"""Laws of the fields that engineers look at, on states whose stress is known."""
+"""Stress fields of states whose stress is known."""
 
 import math
 
@@ -47,7 +47,7 @@ def test_a_uniform_stretch_has_the_cauchy_stress_of_its_law_at_every_node(cell, 
     assert np.abs(found.volume_ratio.numpy() - J).max() < 1e-13
 
 
-def test_in_simple_tension_von_mises_is_the_pull_per_deformed_area():
+def test_in_uniaxial_tension_von_mises_is_the_force_per_deformed_area():
     problem = body("hexahedron", 1)
     stretch = 1.4
 
@@ -68,7 +68,7 @@ def test_pressure_has_no_von_mises_stress_and_rotations_none_at_all():
     assert turned.stress.abs().max() < 1e-13
 
 
-def test_nodes_take_means_of_the_cells_around_weighted_by_volume():
+def test_nodal_values_are_volume_weighted_means_of_the_adjacent_cells():
     """Two cells of lengths 1 and 2: what they share lies two thirds of the way to the longer."""
     mesh = box([3.0, 1.0, 1.0], [3, 2, 2])
     mesh.p[0, mesh.p[0] == 1.5] = 1.0

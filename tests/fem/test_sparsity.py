@@ -1,4 +1,4 @@
-"""Laws of the tangent's structure: every entry has its place, whatever is held."""
+"""Sparsity pattern of the tangent for all kinds of cells and constraints."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def linked(cells: np.ndarray, free: np.ndarray) -> np.ndarray:
     return whole[np.ix_(kept, kept)]
 
 
-def test_structure_is_the_sorted_upper_triangle_of_what_shares_a_cell(pattern, cells, free):
+def test_pattern_is_the_sorted_upper_triangle_of_nodes_that_share_a_cell(pattern, cells, free):
     expected = np.triu(linked(cells, free))
     assert pattern.size == free.sum() == len(pattern.indptr) - 1
     assert pattern.indptr[0] == 0
@@ -105,7 +105,7 @@ def test_places_between_linked_nodes_are_those_of_equal_components(pattern, cell
                 assert (owner[place], pattern.indices[place]) == (row, column)
 
 
-def test_body_that_is_held_all_over_has_an_empty_pattern(cells, kind):
+def test_body_without_free_degrees_of_freedom_has_an_empty_pattern(cells, kind):
     dim = 3 if kind[0] in ("tetra", "hexahedron") else 2
     pattern = Pattern.build(cells, np.zeros((cells.max() + 1, dim), dtype=bool))
     assert pattern.size == len(pattern.indices) == 0

@@ -1,4 +1,4 @@
-"""Laws of the symmetries of a body: a group, all of it, and exact images of exact answers."""
+"""Symmetries of a body: all of them are found, they form a group, and map solutions exactly."""
 
 import itertools
 import math
@@ -109,7 +109,7 @@ def test_symmetries_are_a_group_that_starts_with_the_identity(body, bend):
     assert torch.equal(group[0].image(field), field)
 
 
-def test_symmetries_move_the_nodes_as_they_turn_vectors(body):
+def test_symmetries_map_nodes_by_the_matrix_that_rotates_vectors(body):
     problem, _ = body
     points = problem.points - problem.points.mean(dim=0)
     for symmetry in symmetries(problem):
@@ -154,7 +154,7 @@ def test_the_beam_of_the_paper_has_eight_symmetries():
 
 
 @pytest.mark.parametrize("blades", [2, 3, 5])
-def test_a_propeller_has_two_turns_a_blade_and_no_mirror(blades):
+def test_a_propeller_has_two_rotations_per_blade_and_no_reflection(blades):
     """About the shaft, and by half a turn about each blade, whose sections look the same."""
     group = symmetries(Problem.build(propeller(blades=blades), NH, fixed=Tag("bore")))
     assert len(group) == 2 * blades
@@ -165,14 +165,14 @@ def test_a_propeller_has_two_turns_a_blade_and_no_mirror(blades):
 
 
 @pytest.mark.parametrize("corners", [4, 5, 7, 12])
-def test_turns_and_mirrors_of_rings_are_found_however_they_lie(corners):
+def test_rotations_and_reflections_of_rings_are_found_in_every_orientation(corners):
     group = symmetries(Problem.build(ring(corners), NH))
     assert len(group) == 4 * corners
     check_group(group)
 
 
 @pytest.mark.parametrize("mesh", [CUBE, propeller()], ids=["cube", "propeller"])
-def test_products_are_the_members_that_images_of_images_are(mesh):
+def test_products_are_the_members_that_compose_two_images(mesh):
     problem = Problem.build(mesh, NH, fixed=None if mesh is CUBE else Tag("bore"))
     group = symmetries(problem)
     table, every = products(group), torch.arange(len(group))
@@ -201,7 +201,7 @@ def test_neither_size_nor_place_nor_numbering_matters():
 
 
 @pytest.mark.parametrize("shaken", [1e-8, 1e-3, 0.1])
-def test_shaken_nodes_leave_the_identity(grid, kind, shaken):
+def test_distorted_meshes_have_the_identity_only(grid, kind, shaken):
     """Shaken by 1e-8 the nodes look symmetric, but images of answers would not be exact."""
     problem = Problem.build(grid(kind[0], 2, shaken), NH, fixed=None, degree=kind[1])
     assert len(symmetries(problem)) == 1
@@ -280,7 +280,7 @@ def test_fibres_across_the_beam_leave_half_of_its_symmetries():
         ([DirichletBC(LEFT), RobinBC(Plane(1, "max"), 1e13)], 2),
     ],
 )
-def test_supports_keep_what_they_share(supports, order):
+def test_boundary_conditions_reduce_the_group_to_their_symmetries(supports, order):
     """A cube, whose nodes and cells have 48 symmetries."""
     group = symmetries(Problem.build(CUBE, NH, supports=supports))
     assert len(group) == order
@@ -293,7 +293,7 @@ def test_very_stiff_springs_do_not_hide_the_cells():
     assert len(symmetries(Problem.build(mesh, NH, supports=springs))) == 12
 
 
-def test_forces_that_every_load_holds_keep_what_they_share(solver):
+def test_constant_forces_reduce_the_group_to_their_symmetries(solver):
     problem = solver.problem
     stretch, sag, twist = (
         Traction(RIGHT, value).on(problem)
@@ -314,7 +314,7 @@ def test_forces_that_every_load_holds_keep_what_they_share(solver):
             assert_close(symmetry.image(force), force, rtol=0, atol=1e-13)
 
 
-def test_images_of_answers_balance_the_images_of_their_loads(solver):
+def test_images_of_solutions_are_solutions_of_the_images_of_their_loads(solver):
     problem = solver.problem
     load = ModalLoads(solver.linear_solver, n_modes=5).sample(0, range(4))
     load = Load(load.force * torch.tensor([1.0, 1.0, 1e-3, 1e-6])[:, None, None], load.young)
@@ -330,7 +330,7 @@ def test_images_of_answers_balance_the_images_of_their_loads(solver):
 
 
 @pytest.mark.parametrize("mean", [False, True])
-def test_images_of_answers_with_moved_supports_and_springs_are_answers(law, mean):
+def test_images_of_solutions_with_moved_supports_and_springs_are_solutions(law, mean):
     supports = [
         DirichletBC(LEFT),
         DirichletBC(RIGHT, [0.1, None, None]),
@@ -348,7 +348,7 @@ def test_images_of_answers_with_moved_supports_and_springs_are_answers(law, mean
         assert_close(image[0][~problem.free], problem.prescribed[~problem.free], rtol=0, atol=1e-15)
 
 
-def test_linear_answers_are_turned_with_their_loads(solver, bend):
+def test_linear_solutions_are_mapped_with_their_loads(solver, bend):
     problem = solver.problem
     linear = LinearSolver(problem, linear="superlu")
     force = torch.where(problem.free, bend(problem.points)[0], 0.0)
@@ -380,7 +380,7 @@ def test_the_order_is_always_the_same():
         assert torch.equal(one.source, other.source)
 
 
-def test_a_body_with_two_nodes_in_one_place_has_the_identity_alone():
+def test_a_body_with_coincident_nodes_has_the_identity_only():
     """Two cubes that touch without nodes in common: which of the two is the image is not known."""
     shifted = CUBE.translated((1.0, 0.0, 0.0))
     cells = np.concatenate([CUBE.t, shifted.t + CUBE.nvertices], axis=1)

@@ -1,4 +1,4 @@
-"""Laws of damaged mesh files: an error in one line, or a mesh that is sound."""
+"""Damaged mesh files give an error in one line or a valid mesh."""
 
 import contextlib
 import functools
@@ -180,7 +180,7 @@ def tried(path: Path) -> skfem.Mesh | None:
 
 
 def sound(mesh: skfem.Mesh) -> bool:
-    """Tell whether a mesh can be solved."""
+    """Return True for a mesh that can be solved."""
     check_mesh(mesh)
     used = np.unique(mesh.t)
     tags = [*(mesh.boundaries or {}).values(), *(mesh.subdomains or {}).values()]

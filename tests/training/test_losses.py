@@ -645,7 +645,7 @@ def test_minimising_the_energy_reaches_the_solutions_of_newton(scene, few, unans
     """In coordinates y with K(0) = L L^T and u = L^-T y, in which K(0) is the identity."""
     loss, free = PotentialEnergyLoss(floor=0.0), scene.problem.free
     root = torch.linalg.cholesky(torch.from_numpy(RestStiffness(scene.problem)._matrix.toarray()))
-    size = RestStiffness(scene.problem).work(few.force).sqrt()[:, None]
+    size = RestStiffness(scene.problem).linear_strain_energy(few.force).sqrt()[:, None]
     y = torch.zeros(len(few.force), len(root), dtype=torch.float64, requires_grad=True)
 
     def displacement():

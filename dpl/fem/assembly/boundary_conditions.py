@@ -1,4 +1,4 @@
-"""What holds a body: prescribed displacements and springs, each on a region."""
+"""Boundary conditions: prescribed displacements and elastic foundations, each on a region."""
 
 import math
 from collections.abc import Sequence
@@ -16,61 +16,62 @@ from dpl.fem.mesh.regions import Origin, Region, facets_in, nodes_in
 
 @dataclass(frozen=True)
 class DirichletBC:
-    """Dirichlet condition u = g, ramped with the load.
+    """Dirichlet condition u = g; load stepping scales g with the load.
 
     Attributes:
-        region: Which nodes.
-        value: g per component [m]; None leaves the component free. All 0 if left out: a clamp.
+        region: The nodes.
+        value: g per component [m]; None leaves the component free. Default: 0 for all components.
     """
 
     region: Region
     value: Sequence[float | None] | None = None
 
     def on(self, basis: skfem.Basis, scale: float, origin: Origin = 0.0) -> NDArray[np.float64]:
-        """Return g over `scale`, (N, D) [-], NaN where it leaves a component free.
+        """Return g / scale, (N, D) [-], NaN where a component is free.
 
         Args:
-            basis: Scalar basis of a body whose coordinates are over `scale`.
+            basis: Scalar basis of a body, its coordinates divided by `scale`.
             scale: L [m].
-            origin: Where these coordinates have their origin, (D,) [-].
+            origin: Origin of these coordinates, (D,) [-].
 
         Raises:
-            ValueError: The region holds no node, or `value` has not D entries, one of them given.
+            ValueError: The region contains no node, or `value` does not have D entries, or all of
+                them are None.
         """
         dim = basis.mesh.dim()
         value = [0.0] * dim if self.value is None else list(self.value)
         given = [math.nan if g is None else float(g) / scale for g in value]
         if len(given) != dim or all(map(math.isnan, given)) or any(map(math.isinf, given)):
-            raise ValueError(f"value = {value} must be {dim} lengths [m], null where free")
+            raise ValueError(f"value = {value} must be {dim} lengths [m]; write null where free")
         where = nodes_in(self.region, basis, scale, origin)
         return np.where(where[:, None], np.array(given), math.nan)
 
 
 @dataclass(frozen=True)
 class RobinBC:
-    """Robin condition: a bed of springs that pulls with the traction -alpha u.
+    """Robin condition: an elastic foundation (Winkler) with the traction -alpha u.
 
     Attributes:
-        region: Which boundary facets.
-        stiffness: alpha over Young's modulus [1/m], a number or one per direction. A spring whose
-            alpha is fixed [Pa/m] thus stands for one Young's modulus only.
+        region: The boundary facets.
+        stiffness: alpha over Young's modulus [1/m], one number or one per direction. A foundation
+            with a given alpha [Pa/m] is therefore correct for one Young's modulus only.
     """
 
     region: Region
     stiffness: float | Sequence[float]
 
     def on(self, basis: skfem.Basis, scale: float, origin: Origin = 0.0) -> "FoundationMatrix":
-        """Return the springs' matrix over E L^(D - 2), see `DirichletBC.on`.
+        """Return the stiffness matrix over E L^(D - 2); arguments as in `DirichletBC.on`.
 
         Raises:
-            ValueError: The region holds no boundary facet, or `stiffness` is out of range.
+            ValueError: The region contains no boundary facet, or `stiffness` is out of range.
         """
         dim = basis.mesh.dim()
         one = isinstance(self.stiffness, int | float)
         stiffness = np.array([self.stiffness] * dim if one else self.stiffness, dtype=np.float64)
         if stiffness.shape != (dim,) or not (stiffness >= 0).all() or not stiffness.any():
             raise ValueError(
-                f"stiffness = {self.stiffness} must be a number above 0 [1/m], or {dim} of them"
+                f"stiffness = {self.stiffness} must be a positive number [1/m], or {dim} of them"
             )
         facets = facets_in(self.region, basis.mesh, scale, origin)
         boundary = skfem.FacetBasis(basis.mesh, basis.elem, facets=facets, intorder=4)
@@ -84,11 +85,11 @@ class RobinBC:
 
 
 class FoundationMatrix(NamedTuple):
-    """Matrix of springs: one between each two linked nodes, per direction.
+    """Stiffness matrix of an elastic foundation in coordinate format, diagonal in the directions.
 
     Attributes:
-        rows, columns: The nodes, (S,).
-        stiffness: Over E L^(D - 2), (S, D) [-].
+        rows, columns: Nodes of each entry, (S,).
+        stiffness: Entries over E L^(D - 2) per direction, (S, D) [-].
     """
 
     rows: Tensor
@@ -96,7 +97,7 @@ class FoundationMatrix(NamedTuple):
     stiffness: Tensor
 
     def force(self, displacement: Tensor) -> Tensor:
-        """Return the forces (B, N, D) that hold the springs at displacements (B, N, D)."""
+        """Return the internal forces (B, N, D) of the foundation at displacements (B, N, D)."""
         pull = self.stiffness * displacement[:, self.columns]
         return torch.zeros_like(displacement).index_add(1, self.rows, pull)
 
@@ -105,7 +106,7 @@ Support = DirichletBC | RobinBC
 
 
 def concatenate_foundations(springs: Sequence[FoundationMatrix]) -> FoundationMatrix | None:
-    """Return several beds as one, None if there are none."""
+    """Return the sum of several matrices, None for an empty list."""
     return FoundationMatrix(*map(torch.cat, zip(*springs, strict=True))) if springs else None
 
 
@@ -118,25 +119,25 @@ def assemble_constraints(
     fixed: Region | NDArray[np.bool_] | None = None,
     prescribed: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], FoundationMatrix | None]:
-    """Return g over `scale`, (N, D) [-], NaN where free, and the springs; arguments as in a build.
+    """Return g / scale, (N, D) [-], NaN where free, and the matrix of the foundations.
 
     Args:
-        basis: Scalar basis of a body whose coordinates are over `scale`.
+        basis: Scalar basis of a body, its coordinates divided by `scale`.
         scale: L [m].
-        supports: What holds it.
-        origin: Where these coordinates have their origin, (D,) [-].
-        fixed: What is clamped besides.
-        prescribed: Displacement of that over `scale`, (N, D) [-]; zero if left out.
+        supports: Boundary conditions.
+        origin: Origin of these coordinates, (D,) [-].
+        fixed: Further fixed nodes, as a region or as a mask (N,) or (N, D).
+        prescribed: Displacement of `fixed` over `scale`, (N, D) [-]; default: zero.
 
     Raises:
-        ValueError: A region is empty, or a support is none for this body.
+        ValueError: A region is empty, or a boundary condition does not fit the body.
     """
     shape = basis.N, basis.mesh.dim()
     given = np.full(shape, np.nan)
     if fixed is not None:
         where = fixed if isinstance(fixed, np.ndarray) else nodes_in(fixed, basis, scale, origin)
         if not where.any():
-            raise ValueError(f"{fixed} holds no node of the mesh")
+            raise ValueError(f"fixed = {fixed} must contain a node of the mesh")
         everywhere = np.broadcast_to(where[:, None] if where.ndim == 1 else where, shape)
         given = np.where(everywhere, 0.0 if prescribed is None else prescribed, np.nan)
     for support in supports:

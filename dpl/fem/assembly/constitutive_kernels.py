@@ -1,7 +1,7 @@
-"""Strain, stress and moduli at a point, in Voigt notation, WIDTH points side by side.
+"""Strain, stress and moduli at `SIMD_WIDTH` quadrature points, in Voigt notation.
 
-Strains and stresses are 6 numbers, 11 22 33 12 23 13, strains as e = 2 E. All of it is compiled
-into the loops of `dpl.fem.assembly.kernels`.
+Strains and stresses are 6 numbers in the order 11 22 33 12 23 13; strains are e = 2 E. The
+functions are compiled into the loops of `dpl.fem.assembly.element_loops`.
 """
 
 import math
@@ -13,7 +13,7 @@ from dpl.fem.assembly.numba_laws import derivatives_of
 from dpl.fem.assembly.simd import SIMD_WIDTH, load, store
 
 VOIGT = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2]])
-FIRST = np.array([0, 1, 2, 0, 1, 0])  # the two indices of each of the 6
+FIRST = np.array([0, 1, 2, 0, 1, 0])  # the two indices of each Voigt index
 SECOND = np.array([0, 1, 2, 1, 2, 2])
 
 
@@ -32,7 +32,7 @@ def quadratic(H, scale, e):
 
 @njit
 def strain(H, finite, e):
-    """Set e to 2 E = H + H^T + H^T H, without the last term where `finite` is 0."""
+    """Set e to 2 E = H + H^T + finite * H^T H."""
     for v in range(6):
         store(e, v, load(H, 3 * FIRST[v] + SECOND[v]) + load(H, 3 * SECOND[v] + FIRST[v]))
     quadratic(H, finite, e)
@@ -50,7 +50,7 @@ def volume_change(H):
 
 @njit
 def square(e):
-    """Return det C - 1 of C = I + e."""
+    """Return det C - 1, where C = I + e."""
     e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
     e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
     m0, m1, m2 = e1 * e2 - e4 * e4, e0 * e2 - e5 * e5, e0 * e1 - e3 * e3
@@ -62,7 +62,7 @@ def square(e):
 def stress(law, c, needs, e, j, X, S, scratch, D, moduli):
     """Set S and X = C^-1, and with `moduli` D = dS/dE (rows 6 I + J), at e with det F = 1 + j.
 
-    Where det F is negative a law of ln J has no stress (NaN).
+    The stress of laws with ln J is NaN where det F is negative.
     """
     e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
     e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
@@ -84,8 +84,8 @@ def stress(law, c, needs, e, j, X, S, scratch, D, moduli):
             if needs > 2:
                 scratch[1, lane] = math.expm1(-2 / 3 * scratch[0, lane])
     i2 = 2.0 * i1 + second
-    slopes = derivatives_of(law, c, i1, i2, j, load(scratch, 0), load(scratch, 1))
-    rest, W2, p, W11, W12, W22, W1J, W2J, pJ = slopes
+    derivatives = derivatives_of(law, c, i1, i2, j, load(scratch, 0), load(scratch, 1))
+    rest, W2, p, W11, W12, W22, W1J, W2J, pJ = derivatives
     pressure = rest + 2.0 * W2 * i1
     for v in range(6):
         stress = -2.0 * W2 * load(e, v)
@@ -93,10 +93,10 @@ def stress(law, c, needs, e, j, X, S, scratch, D, moduli):
             stress = stress + pressure
         if needs > 0:  # - p e X
             i, k = 3 * FIRST[v], SECOND[v]
-            turned = 0.0 * i1
+            product = 0.0 * i1
             for n in range(3):
-                turned = turned + load(e, VOIGT[FIRST[v], n]) * load(X, VOIGT[n, k])
-            stress = stress - p * turned
+                product = product + load(e, VOIGT[FIRST[v], n]) * load(X, VOIGT[n, k])
+            stress = stress - p * product
         store(S, v, stress)
     if moduli:
         for v in range(6):

@@ -1,11 +1,11 @@
-"""Finite elements of a mesh: which one for which cell, and the gradients of its shape functions."""
+"""Finite elements by cell shape and degree, and the gradients of their shape functions."""
 
 import numpy as np
 import skfem
 from numpy.typing import NDArray
 
-# shape of the cell, degree -> element, polynomial order that the quadrature integrates exactly.
-# Full quadrature: fewer points leave hourglass modes, more only cost time.
+# shape of the cell, degree -> element, polynomial degree that the quadrature integrates exactly.
+# Full integration: fewer points leave hourglass modes.
 ELEMENTS = {
     ("Triangular", 1): (skfem.ElementTriP1, 0),
     ("Triangular", 2): (skfem.ElementTriP2, 2),
@@ -17,31 +17,34 @@ ELEMENTS = {
     ("Hexahedral", 2): (skfem.ElementHex2, 5),
 }
 QUADRATIC = {element for (_, degree), (element, _) in ELEMENTS.items() if degree == 2}
-# A rule of degree 3 for curved tetrahedra: barycentric coordinates (a, a, a, 1 - 3a) and shares of
-# the volume. scikit-fem's own has a negative weight, with which energies can be unbounded.
+# Quadrature of degree 3 for curved tetrahedra: a of points with the barycentric coordinates
+# (a, a, a, 1 - 3a), and their weights over the volume. With the rule of scikit-fem, which has a
+# negative weight, the energy can be unbounded below.
 CURVED = (
     (0.328163263918762614, 0.136218621884634852),
     (0.108046885699134997, 0.113781378115365148),
 )
-STRAIGHT = 1e-8  # change of the Jacobian in a cell, over its size: the error is its square
+STRAIGHT = 1e-8  # relative change of the Jacobian in a cell; the quadrature error is its square
 
 
 def basis_of(mesh: skfem.Mesh, degree: int) -> skfem.Basis:
     """Return scikit-fem's basis of one displacement component.
 
-    Its quadrature integrates the gradients of the shape functions exactly, in curved cells too, so
-    that every element passes the patch test.
+    The quadrature integrates the gradients of the shape functions exactly, also in curved cells.
+    Therefore every element passes the patch test.
 
     Args:
-        mesh: The cells, near the origin: geometry is evaluated by absolute coordinates.
+        mesh: The cells, near the origin, because scikit-fem evaluates absolute coordinates.
         degree: Polynomial degree of the displacement, 1 or 2.
 
     Raises:
-        ValueError: There is no element for such cells.
+        ValueError: There is no element for the shape of the cells.
     """
     shape = mesh.elem.refdom.name
     if (shape, degree) not in ELEMENTS:
-        raise ValueError(f"{shape} cells cannot be solved")
+        raise ValueError(
+            f"mesh = {shape} cells of degree {degree} must be one of {sorted(ELEMENTS)}; convert it"
+        )
     element, order = ELEMENTS[shape, degree]
     if (shape, degree) == ("Triangular", 1):  # scikit-fem's smallest rule has three points
         centre = np.array([[1 / 3], [1 / 3]]), np.array([1 / 2])
@@ -52,7 +55,7 @@ def basis_of(mesh: skfem.Mesh, degree: int) -> skfem.Basis:
 
 
 def _curved(mesh: skfem.Mesh) -> bool:
-    """Return whether the Jacobian of some cell is not constant: middles of edges are moved."""
+    """Return True if the Jacobian of a cell is not constant, because mid-edge nodes are moved."""
     if mesh.affine:
         return False
     J = mesh.mapping().DF(mesh.elem.refdom.p)  # (D, D, E, corners)
@@ -63,16 +66,16 @@ def _curved(mesh: skfem.Mesh) -> bool:
 def _curved_rule() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return points (3, 8) and weights (8,) of degree 3 on the reference tetrahedron.
 
-    With moved edges the gradient of a shape function times det J is cubic.
+    In curved cells the gradient of a shape function times det J is cubic.
     """
     points = [np.where(np.eye(4)[:3], 1 - 3 * a, a) for a, _ in CURVED]
     return np.hstack(points), np.repeat([share / 6 for _, share in CURVED], 4)
 
 
 def gradients(basis: skfem.Basis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return dN, (E, Q, A, D), and dV, (E, Q), over one cell, E = 1, if all cells are equal."""
-    slopes = np.stack([b[0].grad for b in basis.basis])  # (A, D, E, Q)
-    dN, dV = slopes.transpose(2, 3, 0, 1), basis.dx
+    """Return dN (E, Q, A, D) and dV (E, Q) of a basis; with E = 1 if all cells are equal."""
+    stacked = np.stack([b[0].grad for b in basis.basis])  # (A, D, E, Q)
+    dN, dV = stacked.transpose(2, 3, 0, 1), basis.dx
     if np.allclose(dN, dN[:1], rtol=0, atol=1e-11 * np.abs(dN).max()) and np.allclose(
         dV, dV[:1], rtol=1e-11
     ):

@@ -1,4 +1,4 @@
-"""Laws as arguments of compiled loops: slopes, compiled, chosen by the type of the law."""
+"""Material laws as arguments of compiled loops: numba selects the compiled law by its type."""
 
 import hashlib
 import inspect
@@ -21,14 +21,14 @@ from dpl.fem.materials.material import InvariantBasedMaterial
 
 
 class _LawType(types.Type):
-    """Type of a law in numba: its name holds a digest of all code that a kernel is made of.
+    """Type of a law in numba, whose name holds a digest of the sources of law and kernels.
 
-    So a kernel is compiled once per law, and one compiled from other sources is never taken from
-    numba's cache on disk.
+    A kernel is compiled once per law. After a change of the sources numba's cache on disk does not
+    return the old code.
     """
 
 
-_SLOPES: dict[str, Any] = {}  # name of the type -> compiled slopes
+_COMPILED: dict[str, Any] = {}  # name of the type -> compiled invariant derivatives
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Law:
     """A law as an argument of a kernel.
 
     Attributes:
-        material: Its class.
-        sources: The code of the kernel, for the digest.
+        material: Class of the law.
+        sources: Source code of the kernels, for the digest.
     """
 
     material: type[InvariantBasedMaterial]
@@ -46,52 +46,52 @@ class Law:
     @cached_property
     def kind(self) -> _LawType:
         """The law's type in numba."""
-        invariant_derivatives = self.material.invariant_derivatives
-        code = repr(_read(invariant_derivatives)) + self.sources
+        function = self.material.invariant_derivatives
+        code = repr(_code_of(function)) + self.sources
         digest = hashlib.sha256(code.encode()).hexdigest()[:16]
         name = f"{self.material.__qualname__}{digest}"
-        if name not in _SLOPES:
-            _SLOPES[name] = _jitted(invariant_derivatives)
+        if name not in _COMPILED:
+            _COMPILED[name] = _compile(function)
         return _LawType(name)
 
 
 def required_terms(material: InvariantBasedMaterial) -> int:
-    """Return what a law's slopes read: 0 nothing of C^-1, 1 no ln J, 2 ln J, 3 J^(-2/3) too."""
+    """Return the terms that a law needs: 0 no C^-1, 1 C^-1, 2 also ln J, 3 also J^(-2/3)."""
 
-    def read(**values: float) -> tuple[float, ...]:
+    def evaluate(**values: float) -> tuple[float, ...]:
         arguments = dict.fromkeys(("i1", "i2", "j", "log_j", "m1"), 0.0) | values
         return material.invariant_derivatives(material.constants, **arguments)
 
-    if np.isnan(read(m1=np.nan)).any():
+    if np.isnan(evaluate(m1=np.nan)).any():
         return 3
-    if np.isnan(read(log_j=np.nan)).any():
+    if np.isnan(evaluate(log_j=np.nan)).any():
         return 2
-    everything = read(i1=np.nan, i2=np.nan, j=np.nan)
+    everything = evaluate(i1=np.nan, i2=np.nan, j=np.nan)
     return 0 if everything[2] == 0 and not np.any(everything[6:]) else 1
 
 
 def _globals(function: Any) -> dict[str, Any]:
-    """Return what a function reads of its module, by name."""
+    """Return the globals of its module that a function uses, by name."""
     scope = function.__globals__
     return {name: scope[name] for name in function.__code__.co_names if name in scope}
 
 
-def _read(function: Any) -> tuple[Any, ...]:
-    """Return all that decides what a function returns: its code, and what it reads, in depth."""
+def _code_of(function: Any) -> tuple[Any, ...]:
+    """Return the code of a function and, recursively, of the globals that it uses."""
     code = function.__code__
     parts = [
-        (name, _read(value) if inspect.isfunction(value) else repr(value))
+        (name, _code_of(value) if inspect.isfunction(value) else repr(value))
         for name, value in sorted(_globals(function).items())
     ]
     return code.co_code, code.co_consts, code.co_names, parts
 
 
-def _jitted(function: Any) -> Any:
-    """Return a plain arithmetic function compiled, with the functions that it calls."""
+def _compile(function: Any) -> Any:
+    """Return a function compiled together with the functions that it calls."""
     scope = dict(function.__globals__)
     for name, value in _globals(function).items():
         if inspect.isfunction(value):
-            scope[name] = _jitted(value)
+            scope[name] = _compile(value)
     return njit(type(function)(function.__code__, scope, function.__name__))
 
 
@@ -111,10 +111,11 @@ def _unbox_law(kind: Any, value: Any, context: Any) -> NativeValue:
 
 
 def derivatives_of(law, c, i1, i2, j, log_j, m1):
+    """Return the invariant derivatives of a law; callable in compiled code only."""
     raise NotImplementedError
 
 
 @overload(derivatives_of)
 def _overloaded(law, c, i1, i2, j, log_j, m1):
-    function = _SLOPES[law.name]
+    function = _COMPILED[law.name]
     return lambda law, c, i1, i2, j, log_j, m1: function(c, i1, i2, j, log_j, m1)

@@ -1,8 +1,8 @@
-"""Vectors of doubles as a number type for numba: one operation on WIDTH cells at once.
+"""A SIMD vector of doubles as a number type of numba.
 
-LLVM does not vectorise loops over cells by itself here: it cannot know that workspaces do not
-overlap. A value of type `SIMDVector` is a vector register; `load` and `store` move rows of arrays
-(rows, WIDTH), and + - * / work on lanes and on numbers.
+LLVM does not vectorise the loops over cells by itself, because it cannot prove that the workspaces
+do not overlap. A value of type `SIMDVector` is a vector register. `load` and `store` transfer rows
+of arrays (rows, SIMD_WIDTH); the operators + - * / take vectors and numbers.
 """
 
 import operator
@@ -15,22 +15,22 @@ from numba.extending import intrinsic, models, overload, register_model
 
 SIMD_WIDTH = 8 if llvm.get_host_cpu_features().get("avx512f") else 4
 _VECTOR = ir.VectorType(ir.DoubleType(), SIMD_WIDTH)
-_FLAGS = ("contract", "reassoc", "nsz")  # fused multiply-adds; NaN and infinity stay themselves
+_FLAGS = ("contract", "reassoc", "nsz")  # allow fused multiply-adds, preserve NaN and infinity
 
 
 class SIMDVector(types.Type):
     """numba's type of a vector register."""
 
     def __init__(self) -> None:
-        """Name it."""
-        super().__init__(name=f"Lanes({SIMD_WIDTH})")
+        """Set the name that numba's cache uses."""
+        super().__init__(name=f"SIMDVector({SIMD_WIDTH})")
 
 
 SIMD_VECTOR = SIMDVector()
 
 
 @register_model(SIMDVector)
-class _LanesModel(models.PrimitiveModel):
+class _SIMDVectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _VECTOR)
 
@@ -44,7 +44,7 @@ def _pointer(context: Any, builder: Any, signature: Any, args: Any) -> Any:
 
 @intrinsic
 def load(typing: Any, array: Any, row: Any) -> Any:
-    """Return row `row` of a C-contiguous float64 array (rows, WIDTH)."""
+    """Return row `row` of a C-contiguous float64 array (rows, SIMD_WIDTH)."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         value = builder.load(_pointer(context, builder, signature, args))
@@ -56,11 +56,11 @@ def load(typing: Any, array: Any, row: Any) -> Any:
 
 @intrinsic
 def store(typing: Any, array: Any, row: Any, value: Any) -> Any:
-    """Write lanes, or a number into each of them, to row `row` of an array (rows, WIDTH)."""
+    """Write a vector, or a number in every lane, to row `row` of an array (rows, SIMD_WIDTH)."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        lanes = _lanes(context, builder, args[2], signature.args[2])
-        builder.store(lanes, _pointer(context, builder, signature, args)).align = 8
+        vector = _vector(context, builder, args[2], signature.args[2])
+        builder.store(vector, _pointer(context, builder, signature, args)).align = 8
         return context.get_dummy_value()
 
     return types.void(array, row, value), code
@@ -68,7 +68,7 @@ def store(typing: Any, array: Any, row: Any, value: Any) -> Any:
 
 @intrinsic
 def sqrt(typing: Any, x: Any) -> Any:
-    """Return the square roots of lanes."""
+    """Return the square root of each lane."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         kind = ir.FunctionType(_VECTOR, [_VECTOR])
@@ -78,8 +78,8 @@ def sqrt(typing: Any, x: Any) -> Any:
     return SIMD_VECTOR(x), code
 
 
-def _lanes(context: Any, builder: Any, value: Any, kind: Any) -> Any:
-    """Return a value as lanes; a number in each of them."""
+def _vector(context: Any, builder: Any, value: Any, kind: Any) -> Any:
+    """Return a value as a vector, a number repeated in every lane."""
     if isinstance(kind, SIMDVector):
         return value
     nothing = ir.Constant(_VECTOR, ir.Undefined)
@@ -94,8 +94,8 @@ def _operator(function: Any, instruction: str) -> None:
     def apply(typing: Any, x: Any, y: Any) -> Any:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             pair = zip(args, signature.args, strict=True)
-            lanes = [_lanes(context, builder, value, kind) for value, kind in pair]
-            return getattr(builder, instruction)(*lanes, flags=_FLAGS)
+            vectors = [_vector(context, builder, value, kind) for value, kind in pair]
+            return getattr(builder, instruction)(*vectors, flags=_FLAGS)
 
         return SIMD_VECTOR(x, y), code
 

@@ -1,4 +1,4 @@
-"""Where the tangent has entries: analysed once per body, from its cells and its supports."""
+"""Sparsity pattern of the tangent, built once per body from its cells and free nodes."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,9 +18,10 @@ class Pattern:
     Attributes:
         size: n, the number of free degrees of freedom.
         indptr, indices: CSR structure, (n + 1,) and (nnz,).
-        places: For pairs of a cell's nodes a <= b, b slowest, and their components i, k: where the
-            entry goes among the nnz; nnz where it is not kept, (E, A (A + 1)/2, D, D).
-        number: Number of each degree of freedom among the free ones, -1 where held, (N, D).
+        places: Position among the nnz of each entry of the cell matrices, for pairs of nodes
+            a <= b, b slowest, and components i, k; nnz for entries that are not stored,
+            (E, A (A + 1)/2, D, D).
+        number: Number of each degree of freedom among the free ones, -1 if it is fixed, (N, D).
     """
 
     size: int
@@ -31,15 +32,15 @@ class Pattern:
 
     @classmethod
     def build(cls, cells: Integers, free: NDArray[np.bool_]) -> "Pattern":
-        """Return the pattern of cells (E, A) whose degrees of freedom `free` (N, D) may move."""
+        """Return the pattern of cells (E, A) with a mask of free degrees of freedom (N, D)."""
         nodes = len(free)
         a, b = _pairs(cells.shape[1])
         p, q = cells[:, a], cells[:, b]
         codes, entry = np.unique(np.minimum(p, q) * nodes + np.maximum(p, q), return_inverse=True)
         place, indptr, indices = _places(codes // nodes, codes % nodes, free)
         places = place[entry.reshape(p.shape)]
-        turned = (p > q)[..., None, None]
-        places = np.where(turned, places.swapaxes(-1, -2), places)
+        transposed = (p > q)[..., None, None]
+        places = np.where(transposed, places.swapaxes(-1, -2), places)
         return cls(
             size=int(free.sum()),
             indptr=indptr.astype(np.int32),
@@ -49,7 +50,7 @@ class Pattern:
         )
 
     def between(self, rows: Integers, columns: Integers) -> NDArray[np.int64]:
-        """Return the places of equal components of linked nodes, (S, D) of (S,) and (S,)."""
+        """Return the positions (S, D) of the diagonal entries of pairs of nodes (S,) and (S,)."""
         row, column = self.number[rows], self.number[columns]
         kept = (row >= 0) & (column >= row)
         owner = np.repeat(np.arange(self.size), np.diff(self.indptr))
@@ -59,12 +60,12 @@ class Pattern:
 
     @cached_property
     def source(self) -> Tensor:
-        """For each kept entry of all cell matrices, laid out (E, A, i, k, A), its place in them."""
+        """Index of each stored entry in the cell matrices, laid out (E, A, i, k, A)."""
         return torch.from_numpy(self._kept[0])
 
     @cached_property
     def target(self) -> Tensor:
-        """For each kept entry of all cell matrices its place among the nnz."""
+        """Position among the nnz of each stored entry of the cell matrices."""
         return torch.from_numpy(self._kept[1])
 
     @cached_property
@@ -80,7 +81,7 @@ class Pattern:
 
 
 def _numbered(free: NDArray[np.bool_]) -> Integers:
-    """Return the number of each free degree of freedom, -1 where held, (N, D)."""
+    """Return the number of each free degree of freedom, -1 for fixed ones, (N, D)."""
     number = np.full(free.shape, -1)
     number[free] = np.arange(free.sum())
     return number
@@ -95,13 +96,13 @@ def _pairs(count: int) -> tuple[Integers, Integers]:
 def _places(
     low: Integers, high: Integers, free: NDArray[np.bool_]
 ) -> tuple[Integers, Integers, Integers]:
-    """Return places (T, D, D) of the T pairs of linked nodes low <= high, indptr and indices.
+    """Return positions (T, D, D) of the T pairs of nodes low <= high, indptr and indices.
 
-    The pairs are sorted, and each node is linked with itself.
+    The pairs are sorted, and contain each node with itself.
     """
     nodes, dim = free.shape
     width = free.sum(axis=1)  # free components of a node
-    rank = free.cumsum(axis=1) - free  # how many of them come before each
+    rank = free.cumsum(axis=1) - free  # number of free components before each one
     number = _numbered(free)
     same = low == high
     before = np.concatenate([[0], np.cumsum(width[high])])
@@ -110,7 +111,7 @@ def _places(
     indptr = np.concatenate([[0], np.cumsum(lengths[free])])
     first = np.zeros(free.shape, dtype=np.int64)
     first[free] = indptr[:-1]
-    offset = before[:-1] - row_start[low]  # of each pair in its node's first row
+    offset = before[:-1] - row_start[low]  # of each pair in the first row of its node
     place = (first - rank)[low][:, :, None] + offset[:, None, None] + rank[high][:, None, :]
     kept = free[low][:, :, None] & free[high][:, None, :]
     kept &= ~(same[:, None, None] & np.tri(dim, k=-1, dtype=bool))

@@ -1,4 +1,4 @@
-"""Body = mesh + law + supports: energy, forces and tangent as tensor operations, batched."""
+"""Energy, internal force and tangent of a body as batched tensor operations."""
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -21,28 +21,27 @@ from dpl.fem.materials.tensors import green_lagrange, volume_change
 
 @dataclass(frozen=True, eq=False)
 class TensorAssembly:
-    """A hyperelastic body on its supports, cut into cells.
+    """Hyperelastic body: mesh, material law and boundary conditions.
 
     All quantities are dimensionless. Methods take displacements (B, N, D) in float64 and return
-    values on the same device; none of them loops over cells in Python. They are tensor operations,
-    differentiable, on any device.
+    tensors on the same device. They are differentiable and contain no Python loop over cells.
 
     Attributes:
-        mesh: Geometry, coordinates from `origin`, over `length`.
+        mesh: Geometry; coordinates relative to `origin`, divided by `length`.
         degree: Polynomial degree of the displacement, 1 or 2.
         material: The law.
         length: L, longest side of the body [m].
-        origin: Where coordinates have their origin, over `length`, (D,) [-]. It is zero unless the
-            body lies farther from zero than its size. Nodes are at L (origin + points) [m].
-        points: Nodes (N, D) [-]; for degree 2 those of edges, faces and cells too.
+        origin: Origin of the coordinates over `length`, (D,) [-]. It is zero unless the body lies
+            farther from zero than its size. Nodes are at L (origin + points) [m].
+        points: Nodes (N, D) [-], for degree 2 including those of edges, faces and cells.
         cells: Nodes of each cell, (E, A).
         dN: Gradients of the shape functions, (E, Q, A, D) [-]; (1, Q, A, D) if all cells are equal.
         dV: Volumes of the quadrature points, (E, Q) [-]; (1, Q) if all cells are equal.
-        free: Degrees of freedom that may move, (N, D).
-        prescribed: Displacement of the others at full load, (N, D) [-]; zero where free.
-        boundary: Nodes on the boundary, (N,).
-        springs: Robin conditions; None if there are none.
-        mean_dilatation: Whether a cell's points share its mean volume ratio.
+        free: Mask of the free degrees of freedom, (N, D).
+        prescribed: Displacement of the fixed ones at full load, (N, D) [-]; zero where free.
+        boundary: Mask of the nodes on the boundary, (N,).
+        springs: Elastic foundation (Robin conditions), or None.
+        mean_dilatation: True if the points of a cell share its mean volume ratio (F-bar).
     """
 
     mesh: skfem.Mesh
@@ -72,7 +71,7 @@ class TensorAssembly:
         return replace(self, **tensors)
 
     def __getstate__(self) -> dict[str, object]:
-        """Pickle without what is computed from the rest."""
+        """Return the fields without cached properties."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
@@ -82,7 +81,7 @@ class TensorAssembly:
 
     @property
     def mesh_in_metres(self) -> skfem.Mesh:
-        """The mesh where the body lies [m]."""
+        """The mesh in the coordinates of the user [m]."""
         return self.mesh.scaled(self.length).translated(self.length * self.origin)
 
     @property
@@ -92,25 +91,25 @@ class TensorAssembly:
 
     @property
     def equal_cells(self) -> bool:
-        """Whether all cells share one set of gradients."""
+        """True if all cells share one set of gradients."""
         return len(self.dN) == 1
 
     @property
     def supports_mip(self) -> bool:
-        """Whether the strains of its points can be unknowns of their own, see `mixed_system`."""
+        """True if `mixed_system` is available: mixed integration points (MIP)."""
         return self.material.has_response and not self.mean_dilatation
 
     @property
     def near_null(self) -> NDArray[np.float64]:
-        """Fields that cost no energy were nothing held: rigid motions where free, (n, k)."""
+        """Near-null space for multigrid: rigid body modes at free degrees of freedom, (n, k)."""
         return rigid_body_modes(self.points)[0][self.free].numpy()
 
     def unconstrained_rigid_body_modes(self) -> list[str]:
-        """Return the rigid motions that the supports leave free, named; none of them if held."""
+        """Return the names of the rigid body modes that no boundary condition constrains."""
         return unconstrained_modes(self.points, self.free, self.springs)
 
     def energy(self, displacement: Tensor) -> Tensor:
-        """Return the strain energy over E L^D, that of springs included, (B,) [-]."""
+        """Return the strain energy over E L^D, including that of the foundation, (B,) [-]."""
         H = self.gradient(displacement)
         if self.mean_dilatation:
             H = fbar_gradient(self.material, H, self.dV, self.shape[1])
@@ -121,9 +120,9 @@ class TensorAssembly:
         return energy
 
     def internal_force(self, displacement: Tensor) -> Tensor:
-        """Return f_int, the slope of the energy, (B, N, D) [-]; on held nodes the reactions."""
+        """Return f_int, the gradient of the energy, (B, N, D) [-]; reactions at fixed nodes."""
         stress = self._effective_stress(self.gradient(displacement))
-        return self._with_springs(self._spread(stress), displacement)
+        return self._with_springs(self._nodal_forces(stress), displacement)
 
     def tangent(self, displacement: Tensor) -> Tensor:
         """Return the entries of K = d f_int / du on `pattern`, (B, nnz) [-]."""
@@ -137,31 +136,32 @@ class TensorAssembly:
         return green_lagrange(self.gradient(displacement))
 
     def quadratic_strain(self, update: Tensor) -> Tensor:
-        """Return what a step's strain is beyond linear, dH^T dH / 2, (B, E, Q, 3, 3) [-]."""
+        """Return the quadratic part of the strain of a step, dH^T dH / 2, (B, E, Q, 3, 3) [-]."""
         dH = self.gradient(update)
         return dH.mT @ dH / 2
 
     def mixed_system(self, displacement: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
-        """Return force (B, N, D) and tangent (B, nnz) of Newton with mixed integration points.
+        """Return force (B, N, D) and tangent (B, nnz) with mixed integration points (MIP).
 
-        The strain at the quadrature points is an unknown of its own that each point eliminates:
-        stress and moduli are those at the strain of u less `gap`, (B, E, Q, 3, 3), moved to the
-        strain of u by one linear step. Without a gap these are `internal_force` and `tangent`.
+        The strain at each quadrature point is an independent unknown, which the point eliminates.
+        Stress and moduli are evaluated at the strain of u minus `gap`, (B, E, Q, 3, 3), and the
+        stress is extrapolated linearly to the strain of u. With a zero gap the results are
+        `internal_force` and `tangent`.
 
         Source: Magisano, Leonetti, Garcea (2017), CMAME 313, section 3.
         """
         H = self.gradient(displacement)
         response = self.material.response(green_lagrange(H) - gap)
         stress = response.stress + response.product(gap)
-        force = self._with_springs(self._spread(stress + H @ stress), displacement)
+        force = self._with_springs(self._nodal_forces(stress + H @ stress), displacement)
         return force, self._with_spring_entries(self._assembled(response.tangent(H)))
 
     def tangent_product(self, displacement: Tensor, direction: Tensor) -> Tensor:
-        """Return K(u) v, (B, N, D) [-], on all degrees of freedom, without K."""
+        """Return K(u) v on all degrees of freedom without assembling K, (B, N, D) [-]."""
         return torch.func.jvp(self.internal_force, (displacement,), (direction,))[1]
 
     def volume_ratio(self, displacement: Tensor) -> Tensor:
-        """Return min det F over the quadrature points, (B,) [-]; not above 0: inverted."""
+        """Return min det F over the quadrature points, (B,) [-]; a value <= 0 means inversion."""
         change = volume_change(self.gradient(displacement))
         return 1 + torch.nan_to_num(change, nan=-torch.inf).flatten(1).amin(dim=1)
 
@@ -174,51 +174,51 @@ class TensorAssembly:
 
     @cached_property
     def pattern(self) -> Pattern:
-        """The tangent's sparsity, analysed once."""
+        """Sparsity pattern of the tangent."""
         return Pattern.build(self.cells.cpu().numpy(), self.free.cpu().numpy())
 
     @cached_property
     def _operator(self) -> Tensor:
-        """Gradients as matrices (E or 1, A, Q D); a plain matrix (A, Q D) where cells are equal."""
+        """Gradients as matrices (E, A, Q D), or as one matrix (A, Q D) if all cells are equal."""
         operator = self.dN.transpose(1, 2).flatten(-2).contiguous()
         return operator[0] if self.equal_cells else operator
 
     def gradient(self, displacement: Tensor) -> Tensor:
-        """Return H = du/dX, (B, E, Q, 3, 3) [-]; in 2D with zeros out of the plane."""
+        """Return H = du/dX, (B, E, Q, 3, 3) [-]; in 2D padded with zeros."""
         return self._cell_gradient(displacement[:, self.cells].mT)
 
     def _cell_gradient(self, at_cells: Tensor) -> Tensor:
         """Return H, (B, E, Q, 3, 3) [-], of the displacements of each cell's nodes (B, E, D, A)."""
         dim = self.shape[1]
         gradient = (at_cells @ self._operator).unflatten(-1, (-1, dim))  # (B, E, D, Q, D)
-        # components first in memory: laws work on long rows and not on 3 x 3
+        # components first in memory, so that laws operate on long rows instead of 3 x 3 matrices
         gradient = gradient.permute(2, 4, 0, 1, 3).contiguous().permute(2, 3, 4, 0, 1)
         return gradient if dim == 3 else torch.nn.functional.pad(gradient, (0, 1, 0, 1))
 
-    def _spread(self, stress: Tensor) -> Tensor:
+    def _nodal_forces(self, stress: Tensor) -> Tensor:
         """Return the nodal forces (B, N, D) of first Piola-Kirchhoff stresses (B, E, Q, 3, 3)."""
-        return self._gathered(self._cell_forces(stress))
+        return self._sum_at_nodes(self._cell_forces(stress))
 
     def _cell_forces(self, stress: Tensor) -> Tensor:
-        """Return what each cell has at its nodes, (B, E, A, D), of stresses (B, E, Q, 3, 3)."""
+        """Return the forces of each cell at its nodes (B, E, A, D) of stresses (B, E, Q, 3, 3)."""
         dim = self.shape[1]
         weighted = stress[..., :dim, :dim] * self.dV[..., None, None]
         weighted = weighted.transpose(-3, -2).flatten(-2)  # (B, E, D, QD)
         return (weighted @ self._operator.mT).mT
 
-    def _gathered(self, per_cell: Tensor) -> Tensor:
-        """Return the nodal sums (B, N, D) of what each cell has at its nodes (B, E, A, D)."""
+    def _sum_at_nodes(self, per_cell: Tensor) -> Tensor:
+        """Return the sums at nodes (B, N, D) of values of each cell at its nodes (B, E, A, D)."""
         force = per_cell.new_zeros(len(per_cell), *self.shape)
         return force.index_add(1, self.cells.flatten(), per_cell.flatten(1, 2))
 
     def _with_springs(self, internal: Tensor, displacement: Tensor) -> Tensor:
-        """Return forces (B, N, D) with those of the springs."""
+        """Return internal forces (B, N, D) plus those of the foundation."""
         if self.springs is None:
             return internal
         return internal + self.springs.force(displacement)
 
     def _with_spring_entries(self, tangent: Tensor) -> Tensor:
-        """Return a tangent's entries (B, nnz) with those of the springs."""
+        """Return the entries of the tangent (B, nnz) plus those of the foundation."""
         if self.springs is None:
             return tangent
         rows, columns, stiffness = (part.cpu().numpy() for part in self.springs)
@@ -227,13 +227,13 @@ class TensorAssembly:
         return tangent + torch.from_numpy(added[:-1]).to(tangent.device)
 
     def _effective_stress(self, H: Tensor) -> Tensor:
-        """Return the stress that does work on H, (B, E, Q, 3, 3) [-]."""
+        """Return the stress conjugate to H, (B, E, Q, 3, 3) [-]."""
         if not self.mean_dilatation:
             return self.material.stress(H)
         return fbar_stress(self.material, H, self.dV, self.shape[1])
 
     def _cell_tangents(self, displacement: Tensor) -> Tensor:
-        """Return the cell matrices (B, E A D D A), laid out aikb, by derivatives of cell forces."""
+        """Return the derivatives of the cell forces (B, E A D D A), laid out aikb."""
         at_cells = displacement[:, self.cells]  # (B, E, A, D)
         nodes, dim = at_cells.shape[-2:]
 
@@ -249,7 +249,7 @@ class TensorAssembly:
         return columns.permute(2, 3, 4, 5, 1, 0).flatten(1)
 
     def _assembled(self, moduli: Tensor) -> Tensor:
-        """Return the tangent's entries (B, nnz) of dP/dF (B, E, Q, 3, 3, 3, 3)."""
+        """Return the entries of the tangent (B, nnz) of dP/dF (B, E, Q, 3, 3, 3, 3)."""
         samples, dim = len(moduli), self.shape[1]
         A = moduli[..., :dim, :dim, :dim, :dim] * self.dV[..., None, None, None, None]
         A = A.transpose(-4, -3)  # (B, E, Q, j, i, k, l)
@@ -258,7 +258,7 @@ class TensorAssembly:
         return self._entries((self._operator @ right).reshape(samples, -1))
 
     def _entries(self, matrices: Tensor) -> Tensor:
-        """Return the tangent's entries (B, nnz) of cell matrices (B, E A D D A), laid out aikb."""
+        """Return the tangent (B, nnz) of cell matrices (B, E A D D A), laid out aikb."""
         kept = matrices[:, self.pattern.source.to(matrices.device)]
         values = kept.new_zeros(len(kept), len(self.pattern.indices))
         return values.index_add(1, self.pattern.target.to(matrices.device), kept)

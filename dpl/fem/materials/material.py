@@ -223,7 +223,7 @@ class InvariantBasedMaterial(Material):
     """Law of the invariants, W(I1, I2, J) of C = F^T F, with its `invariant_derivatives`.
 
     The slopes are plain arithmetic on numbers of any kind: tensors here, lanes of a processor in
-    `dpl.fem.assembly.kernels`. With X = C^-1, the stress they stand for is
+    `dpl.fem.assembly.element_loops`. With X = C^-1, the stress they stand for is
 
         S = (rest + 2 W2 i1) I - 4 W2 E - p (I - X),   I - X = 2 E X,
 

@@ -1,7 +1,6 @@
-"""Meshes (scikit-fem's own classes, in metres): grids, measures, and the door to the rest.
+"""Structured meshes of boxes and rectangles, and measures of meshes.
 
-Files are read in `dpl.fem.mesh.reading` and held to `dpl.fem.mesh.validation`; regions
-are in `dpl.fem.mesh.regions`.
+Meshes are objects of scikit-fem with coordinates in metres.
 """
 
 import math
@@ -14,39 +13,39 @@ from numpy.typing import NDArray
 from dpl.system.memory import refuse_mesh
 
 SMALLEST, LARGEST = 1e-12, 1e12  # sides of a body [m]
-THINNEST = 1e6  # longest over shortest side
+MAX_ASPECT = 1e6  # longest over shortest side
 
 
 def box(size: Sequence[float], nodes: Sequence[int], cell: str = "hexahedron") -> skfem.Mesh:
-    """Return a box [0, size] of equal cells.
+    """Return a mesh of the box [0, size] with equal cells.
 
-    Nodes are numbered along the sides from the one with the most nodes (slowest) to the one with
-    the fewest, which makes the stiffness matrix banded.
+    Node numbers increase slowest along the side with the most nodes and fastest along the side with
+    the fewest. This gives the stiffness matrix a small bandwidth.
 
     Args:
-        size: Lengths of the sides [m], 3 of them.
-        nodes: Vertices along each side, 2 or more.
-        cell: "hexahedron", or "tetra" for six Kuhn tetrahedra a cell.
+        size: Lengths of the 3 sides [m].
+        nodes: Numbers of vertices along the sides, at least 2.
+        cell: "hexahedron", or "tetra" for six Kuhn tetrahedra per hexahedron.
 
     Raises:
         ValueError: A size or a number of nodes is out of range, or `cell` is unknown.
-        MemoryError: So many nodes do not fit.
+        MemoryError: The mesh would not fit in memory.
     """
     kinds = {"hexahedron": skfem.MeshHex, "tetra": skfem.MeshTet}
     return _grid(kinds, size, nodes, cell)
 
 
 def rectangle(size: Sequence[float], nodes: Sequence[int], cell: str = "quad") -> skfem.Mesh:
-    """Return a rectangle [0, size] of equal cells, for plane strain; arguments as in `box`.
+    """Return a mesh of the rectangle [0, size] with equal cells; nodes are numbered as in `box`.
 
     Args:
-        size: Lengths of the sides [m], 2 of them.
-        nodes: Vertices along each side, 2 or more.
-        cell: "quad", or "triangle" for two triangles a cell.
+        size: Lengths of the 2 sides [m].
+        nodes: Numbers of vertices along the sides, at least 2.
+        cell: "quad", or "triangle" for two triangles per quadrilateral.
 
     Raises:
         ValueError: A size or a number of nodes is out of range, or `cell` is unknown.
-        MemoryError: So many nodes do not fit.
+        MemoryError: The mesh would not fit in memory.
     """
     kinds = {"quad": skfem.MeshQuad, "triangle": skfem.MeshTri}
     return _grid(kinds, size, nodes, cell)
@@ -61,12 +60,10 @@ def _grid(
     if len(size) != dim or not all(SMALLEST <= s <= LARGEST for s in size):
         span = f"between {SMALLEST:g} and {LARGEST:g}"
         raise ValueError(f"size = {list(size)} must be {dim} positive lengths {span} [m]")
-    if max(size) > THINNEST * min(size):
-        raise ValueError(
-            f"size = {list(size)} must be lengths that differ by {THINNEST:g} times at most"
-        )
+    if max(size) > MAX_ASPECT * min(size):
+        raise ValueError(f"size = {list(size)} must have a ratio of at most {MAX_ASPECT:g}")
     if len(nodes) != dim or not all(n == int(n) and n >= 2 for n in nodes):
-        raise ValueError(f"nodes = {list(nodes)} must be {dim} whole numbers of 2 or more")
+        raise ValueError(f"nodes = {list(nodes)} must be {dim} integers of at least 2")
     refuse_mesh(math.prod(map(int, nodes)), "mesh.nodes")
     sides = [np.linspace(0.0, s, int(n)) for s, n in zip(size, nodes, strict=True)]
     mesh = kinds[cell].init_tensor(*sides)
@@ -77,8 +74,8 @@ def _grid(
 def longest_side(points: NDArray[np.float64]) -> float:
     """Return L [m], the longest side of the object-aligned bounding box of points (N, D) [m].
 
-    Of the box along the axes and the one along the principal directions the smaller counts: the
-    first serves bodies without preferred directions (a cube), the second bodies that lie askew.
+    The box is the smaller one of two: that along the coordinate axes, which is exact for bodies
+    without principal directions (a cube), and that along the principal directions.
     """
     centred = points - points.mean(axis=0)
     principal = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
@@ -89,15 +86,15 @@ def longest_side(points: NDArray[np.float64]) -> float:
 
 
 def near_origin(mesh: skfem.Mesh) -> tuple[skfem.Mesh, NDArray[np.float64]]:
-    """Return a body moved towards the origin by whole multiples of its size, and by how much.
+    """Return a mesh moved towards the origin by integer multiples of its size.
 
-    A body that lies about the origin stays where it is, to the last bit.
+    The coordinates of a mesh that contains the origin are not changed.
 
     Args:
-        mesh: The body [m].
+        mesh: The mesh [m].
 
     Returns:
-        The mesh, and where its origin is in the coordinates of `mesh`, (D,) [m].
+        The moved mesh, and its origin in the coordinates of `mesh`, (D,) [m].
     """
     low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
     size = (high - low).max()
@@ -106,18 +103,18 @@ def near_origin(mesh: skfem.Mesh) -> tuple[skfem.Mesh, NDArray[np.float64]]:
 
 
 def aspect_ratio(mesh: skfem.Mesh) -> NDArray[np.float64]:
-    """Return the longest over the shortest length of each cell, (E,), 1 or more.
+    """Return the aspect ratio of each cell, (E,), at least 1.
 
-    The lengths are the singular values of the map, taken at the cell's centre, from a regular cell
-    (square, cube, equilateral triangle, regular tetrahedron) to the cell, so the order of nodes
-    does not matter. A brick gives its longest over its shortest side, a Kuhn tetrahedron of a cube
-    2.4 and half a square 1.7; slivers and the cells of thin plates give large numbers.
+    It is the condition number of the map from a regular cell (square, cube, equilateral triangle,
+    regular tetrahedron) to the cell at its centre, and does not depend on the order of nodes. A
+    brick has its longest over its shortest side, a Kuhn tetrahedron of a cube 2.4, half a square
+    1.7.
     """
     shape = mesh.elem.refdom
     centre = shape.p.mean(axis=1, keepdims=True)
     J = mesh.mapping().DF(centre)[..., 0].transpose(2, 0, 1)  # (E, D, D)
     if shape.name in ("Triangular", "Tetrahedral"):
-        # edges of the regular cell: those of the reference cell, made equally long and inclined
+        # the reference cell is mapped to the regular cell, whose edges have equal lengths
         J = J @ np.linalg.inv(np.linalg.cholesky((np.eye(mesh.dim()) + 1) / 2).T)
     lengths = np.linalg.svd(J, compute_uv=False)
     with np.errstate(divide="ignore"):

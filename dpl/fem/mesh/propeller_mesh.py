@@ -29,35 +29,35 @@ def propeller(
     thickness: Sequence[float] = (0.05, 0.012),
     cells: Sequence[int] = (3, 2, 2, 6, 25),
 ) -> skfem.Mesh:
-    """Return a propeller of hexahedra whose shaft is the x axis; the first blade points along y.
+    """Return a hexahedral mesh of a propeller about the x axis; the first blade points along y.
 
-    The hub is a ring whose cells follow the helix of the blades' roots, so that each root stands on
-    nodes of the hub. A blade's sections are lenses, laid on cylinders about the shaft; at the root
-    the chord takes the whole length of the hub.
+    The hub is a ring whose cells follow the helix of the blade roots, so that blades and hub share
+    nodes. The sections of a blade are lens-shaped and lie on cylinders about the x axis. At the
+    root the chord spans the whole length of the hub.
 
-    With the default cells there are 4,025 nodes (12,075 degrees of freedom, as many as the paper's
-    propeller has), 175 of them in the bore, and 2,550 cells. In general B blades and the cells
-    (t, g, w, c, s) make B (t + g) (w + 1) (c + 1) + B (t + 1) (c + 1) s nodes. Their order keeps
-    the band of the stiffness matrix narrow (reverse Cuthill-McKee).
+    The default mesh has 2,550 cells and 4,025 nodes (12,075 degrees of freedom, as in the paper),
+    175 of them in the bore. B blades and cells (t, g, w, c, s) give
+    B (t + g) (w + 1) (c + 1) + B (t + 1) (c + 1) s nodes, in reverse Cuthill-McKee order, which
+    reduces the bandwidth of the stiffness matrix.
 
     Tags: "bore" (facets), "hub" and "blades" (cells).
 
     Args:
-        diameter: Of the circle of the tips [m].
-        blades: 2 or more.
-        hub_diameter: [m]
-        bore_diameter: Of the hole for the shaft [m].
-        hub_length: Along the shaft [m].
-        pitch_angle: Of the sections against the plane of rotation, at root and tip [degrees]. In
-            between the pitch, 2 pi r tan(pitch angle), changes linearly along the radius r.
+        diameter: Diameter of the circle of the tips [m].
+        blades: Number of blades, at least 2.
+        hub_diameter: Outer diameter of the hub [m].
+        bore_diameter: Diameter of the bore for the shaft [m].
+        hub_length: Length of the hub along the shaft [m].
+        pitch_angle: Angles of the sections to the plane of rotation at root and tip [degrees]. The
+            pitch 2 pi r tan(pitch angle) is linear along the blade.
         chord: Width of a blade half-way between hub and tip, and at the tip [m].
-        thickness: Of a blade's sections in their middle, at root and tip [m].
-        cells: Through a blade, on the hub between two blades, through the hub's wall, along the
-            chord (and the hub), and along the blade.
+        thickness: Largest thickness of the sections at root and tip [m].
+        cells: Numbers of cells through a blade, on the hub between two blades, through the wall of
+            the hub, along the chord (and the hub), and along the blade.
 
     Raises:
-        ValueError: A number is out of range, or the blades would touch or fold.
-        MemoryError: So many nodes do not fit.
+        ValueError: A number is out of range, or blades would touch or fold.
+        MemoryError: The mesh would not fit in memory.
     """
     diameters = {
         "bore_diameter": bore_diameter,
@@ -70,7 +70,7 @@ def propeller(
     blade = _blade(radii, hub_length, blades, pitch_angle, chord, thickness, cells)
     hub = _hub(radii, hub_length, blades, pitch_angle[0], thickness[0], cells)
     try:
-        mesh = check_mesh(_joined(hub, blade, blades))
+        mesh = check_mesh(_assemble(hub, blade, blades))
     except ValueError as error:
         raise ValueError(f"pitch_angle, chord or thickness fold the blades: {error}") from None
     bore = facets_in(Cylinder(0, radii[0]), mesh)
@@ -98,11 +98,13 @@ def _check_ranges(
         if len(pair) != 2 or not all(math.isfinite(value) and value > 0 for value in pair):
             raise ValueError(f"{key} = {list(pair)} must be 2 positive lengths [m]")
     if len(pitch_angle) != 2 or not all(0 < angle < 90 for angle in pitch_angle):
-        raise ValueError(f"pitch_angle = {list(pitch_angle)} must be 2 angles between 0 and 90")
+        raise ValueError(
+            f"pitch_angle = {list(pitch_angle)} must be 2 angles between 0 and 90 [degrees]"
+        )
     if blades != int(blades) or blades < 2:
-        raise ValueError(f"blades = {blades} must be a whole number of 2 or more")
+        raise ValueError(f"blades = {blades} must be a integer of at least 2")
     if len(cells) != 5 or not all(n == int(n) and n >= 1 for n in cells):
-        raise ValueError(f"cells = {list(cells)} must be 5 whole numbers of 1 or more")
+        raise ValueError(f"cells = {list(cells)} must be 5 integers of at least 1")
     t, g, w, c, s = map(int, cells)
     nodes = blades * (c + 1) * ((t + g) * (w + 1) + (t + 1) * s)
     refuse_mesh(int(nodes), "mesh.cells")
@@ -126,7 +128,7 @@ def _hub(
         np.linspace(-length / 2, length / 2, along + 1),
         indexing="ij",
     )
-    return _wound(x, radius, angle + x / math.tan(math.radians(pitch_angle)) / radii[1])
+    return _from_cylindrical(x, radius, angle + x / math.tan(math.radians(pitch_angle)) / radii[1])
 
 
 def _blade(
@@ -158,30 +160,30 @@ def _blade(
         + widths[1] * 4 * rho * (1 - rho)
         + widths[2] * rho * (2 * rho - 1)
     )
-    # On the hub a section is a parallelogram with its thickness along the circumference; on the
-    # way out it turns into a lens with blunt edges, its thickness across the chord.
+    # At the hub a section is a parallelogram with its thickness along the circumference. Towards
+    # the tip it becomes a lens with blunt edges and its thickness normal to the chord.
     start = np.clip(rho / 0.4, 0, 1)
     lens = start**2 * (3 - 2 * start)
     off = depth * t * (1 - 0.7 * lens * (2 * s) ** 2)
     on = width * s + off * (1 - lens) / np.tan(beta)
     arc = on * np.cos(beta) + off * np.sin(beta)
-    return _wound(on * np.sin(beta) - off * np.cos(beta), radius, arc / radius)[:, 1:]
+    return _from_cylindrical(on * np.sin(beta) - off * np.cos(beta), radius, arc / radius)[:, 1:]
 
 
-def _wound(x: Points, radius: Points, angle: Points) -> Points:
-    """Return points (3, ...) around the x axis."""
+def _from_cylindrical(x: Points, radius: Points, angle: Points) -> Points:
+    """Return Cartesian points (3, ...) of cylindrical coordinates about the x axis."""
     return np.stack([x, radius * np.cos(angle), radius * np.sin(angle)])
 
 
-def _joined(hub: Points, blade: Points, blades: int) -> skfem.Mesh:
-    """Return the mesh of as many hubs' sectors and blades, the hub's cells first."""
-    turns = 2 * math.pi / blades * np.arange(blades)
+def _assemble(hub: Points, blade: Points, blades: int) -> skfem.Mesh:
+    """Return the mesh of all sectors of the hub and all blades, the cells of the hub first."""
+    angles = 2 * math.pi / blades * np.arange(blades)
     points = np.concatenate(
-        [_turned(part, turn).reshape(3, -1) for part in (hub, blade) for turn in turns], axis=1
+        [_rotate(part, angle).reshape(3, -1) for part in (hub, blade) for angle in angles], axis=1
     )
     _, around, wall, along = hub.shape
     ring = np.arange(blades * hub[0].size).reshape(blades * around, wall, along)
-    grids = [np.concatenate([ring, ring[:1]]).swapaxes(0, 1)]  # right-handed, as the blades are
+    grids = [np.concatenate([ring, ring[:1]]).swapaxes(0, 1)]  # right-handed like the blades
     for b in range(blades):
         root = ring[b * around :][: blade.shape[2], -1]
         own = np.arange(blade[0].size).reshape(blade.shape[1:]) + ring.size + b * blade[0].size
@@ -193,7 +195,7 @@ def _joined(hub: Points, blade: Points, blades: int) -> skfem.Mesh:
     return skfem.MeshHex(np.ascontiguousarray(points[:, order]), np.argsort(order)[t])
 
 
-def _turned(points: Points, angle: float) -> Points:
+def _rotate(points: Points, angle: float) -> Points:
     c, s = math.cos(angle), math.sin(angle)
     return np.stack([points[0], c * points[1] - s * points[2], s * points[1] + c * points[2]])
 

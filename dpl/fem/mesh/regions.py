@@ -1,7 +1,7 @@
-"""Regions of a body: which nodes are held, which facets are loaded.
+"""Regions of a body, which select nodes and facets for boundary conditions and loads.
 
-A region is a function of points (N, D) [m] that says which of them lie inside, (N,); or a `Tag`,
-the name of a part that the mesh itself knows. `nodes_in` and `facets_in` take both.
+A region is a function that maps points (N, D) [m] to a mask (N,), or a `Tag`, the name of a part of
+the mesh. `nodes_in` and `facets_in` take both.
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy as np
 import skfem
 from numpy.typing import NDArray
 
-SLACK = 1e-6  # rounding that regions forgive, over the size of the body or of the region
+SLACK = 1e-6  # geometric tolerance over the size of the body or of the region
 
 
 @dataclass(frozen=True)
@@ -21,10 +21,10 @@ class Plane:
 
     Attributes:
         axis: 0, 1 or 2 for x, y or z.
-        at: Where the plane cuts the axis [m], or "min" or "max" for the body's first or last node.
+        at: Coordinate of the plane [m], or "min" or "max" for the extreme nodes of the body.
 
     Raises:
-        ValueError: `axis` or `at` is none of the above.
+        ValueError: `axis` or `at` is invalid.
     """
 
     axis: int
@@ -38,9 +38,11 @@ class Plane:
             raise ValueError(f"at = {self.at!r} must be min, max or a coordinate [m]")
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which of points (N, D) [m] lie in the region, (N,)."""
+        """Return a mask (N,) of the points (N, D) [m] in the region."""
         if self.axis >= points.shape[1]:
-            raise ValueError(f"axis = {self.axis} does not exist in {points.shape[1]}D")
+            raise ValueError(
+                f"axis = {self.axis} must be less than {points.shape[1]}, the dimension"
+            )
         x = points[:, self.axis]
         at = {"min": x.min(), "max": x.max()}[self.at] if isinstance(self.at, str) else self.at
         return np.abs(x - at) <= SLACK * np.ptp(points, axis=0).max()
@@ -48,13 +50,13 @@ class Plane:
 
 @dataclass(frozen=True)
 class Box:
-    """Region: the nodes in a box along the axes, its faces included.
+    """Region: the nodes in an axis-aligned box, including its faces.
 
     Attributes:
-        lower, upper: Opposite corners [m], D of them.
+        lower, upper: Opposite corners, D coordinates each [m].
 
     Raises:
-        ValueError: The corners do not span a box.
+        ValueError: A coordinate of `lower` is above that of `upper`.
     """
 
     lower: Sequence[float]
@@ -69,8 +71,8 @@ class Box:
             )
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which of points (N, D) [m] lie in the region, (N,)."""
-        _same_dimension("lower", self.lower, points)
+        """Return a mask (N,) of the points (N, D) [m] in the region."""
+        _check_dimension("lower", self.lower, points)
         slack = SLACK * np.ptp(points, axis=0).max()
         inside = (points >= np.array(self.lower) - slack) & (points <= np.array(self.upper) + slack)
         return inside.all(axis=1)
@@ -78,11 +80,11 @@ class Box:
 
 @dataclass(frozen=True)
 class Sphere:
-    """Region: the nodes in a ball, its surface included.
+    """Region: the nodes in a ball, including its surface.
 
     Attributes:
         centre: D coordinates [m].
-        radius: [m]
+        radius: Radius [m].
 
     Raises:
         ValueError: The centre is not finite, or the radius not positive.
@@ -93,28 +95,28 @@ class Sphere:
 
     def __post_init__(self) -> None:
         """Check the attributes."""
-        _round("centre", self.centre, self.radius)
+        _check_ball("centre", self.centre, self.radius)
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which of points (N, D) [m] lie in the region, (N,)."""
-        _same_dimension("centre", self.centre, points)
+        """Return a mask (N,) of the points (N, D) [m] in the region."""
+        _check_dimension("centre", self.centre, points)
         distance = np.linalg.norm(points - np.array(self.centre, dtype=np.float64), axis=1)
-        return distance <= _reach(self.radius, points)
+        return distance <= _tolerant_radius(self.radius, points)
 
 
 @dataclass(frozen=True)
 class Cylinder:
-    """Region: the nodes in an endless cylinder along a coordinate axis, its surface included.
+    """Region: the nodes in an infinite cylinder along a coordinate axis, including its surface.
 
-    It takes hold of a bore: no node of the body lies deeper inside. In 2D axis 2 gives a disc.
+    It selects the surface of a bore, inside of which there are no nodes. In 2D axis 2 gives a disc.
 
     Attributes:
         axis: 0, 1 or 2 for x, y or z.
-        radius: [m]
-        centre: A point of the axis [m], D coordinates; the origin if left out.
+        radius: Radius [m].
+        centre: A point of the axis, D coordinates [m]; default: the origin.
 
     Raises:
-        ValueError: `axis` is none of the above, the centre not finite or the radius not positive.
+        ValueError: `axis` is invalid, the centre not finite or the radius not positive.
     """
 
     axis: int
@@ -125,27 +127,27 @@ class Cylinder:
         """Check the attributes."""
         if self.axis not in (0, 1, 2):
             raise ValueError(f"axis = {self.axis} must be 0, 1 or 2")
-        _round("centre", () if self.centre is None else self.centre, self.radius)
+        _check_ball("centre", () if self.centre is None else self.centre, self.radius)
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which of points (N, D) [m] lie in the region, (N,)."""
+        """Return a mask (N,) of the points (N, D) [m] in the region."""
         centre = [0.0] * points.shape[1] if self.centre is None else self.centre
-        _same_dimension("centre", centre, points)
+        _check_dimension("centre", centre, points)
         across = [i for i in range(points.shape[1]) if i != self.axis]
         distance = np.linalg.norm((points - np.array(centre, dtype=np.float64))[:, across], axis=1)
-        return distance <= _reach(self.radius, points)
+        return distance <= _tolerant_radius(self.radius, points)
 
 
 @dataclass(frozen=True)
 class Tag:
-    """Region: a part that the mesh knows by name; see `dpl.fem.read_mesh`.
+    """Region: a named part of the mesh; see `dpl.fem.read_mesh`.
 
     Attributes:
-        name: A key of scikit-fem's `mesh.boundaries` (facets) or `mesh.subdomains` (cells). Where
-            both have it, facets count.
+        name: A key of scikit-fem's `mesh.boundaries` (facets) or `mesh.subdomains` (cells). Facets
+            take precedence.
 
     Raises:
-        ValueError: The name is no text, or empty.
+        ValueError: The name is not a string, or empty.
     """
 
     name: str
@@ -153,13 +155,13 @@ class Tag:
     def __post_init__(self) -> None:
         """Check the attribute."""
         if not isinstance(self.name, str) or not self.name:
-            raise ValueError(f'name = {self.name!r} must be a text (a number in quotes: "7")')
+            raise ValueError(f'name = {self.name!r} must be a string; write numbers in quotes, "7"')
 
     def facets(self, mesh: skfem.Mesh) -> NDArray[np.int_] | None:
-        """Return the facets of that name, inner ones too; None if the name is one of cells.
+        """Return the facets of that name, including interior ones; None for a name of cells.
 
         Raises:
-            ValueError: There is no such name; the message lists those that there are.
+            ValueError: The mesh has no such name; the message lists its names.
         """
         facets, cells = mesh.boundaries or {}, mesh.subdomains or {}
         if self.name in facets:
@@ -178,25 +180,25 @@ Region = Callable[[NDArray[np.float64]], NDArray[np.bool_]] | Tag
 def nodes_in(
     region: Region, basis: skfem.Basis, scale: float = 1.0, origin: Origin = 0.0
 ) -> NDArray[np.bool_]:
-    """Return which nodes lie in a region, (N,).
+    """Return a mask of the nodes in a region, (N,).
 
     Args:
-        region: Where to look. Of a `Tag`, the nodes of its facets or cells.
-        basis: scikit-fem basis of one displacement component; its N nodes may be those of edges,
-            faces and cells too.
-        scale: [m] per unit of the basis' mesh.
-        origin: Where that mesh has its origin, (D,), in its own unit.
+        region: The region. A `Tag` contains the nodes of its facets or cells.
+        basis: scikit-fem basis of one displacement component; its N nodes include those of edges,
+            faces and cells.
+        scale: Length unit of the mesh of the basis [m].
+        origin: Origin of that mesh in its own unit, (D,).
 
     Raises:
-        ValueError: No node lies there, there is no such tag, or the region does not answer with
-            one truth value per point.
+        ValueError: The region contains no node, the tag does not exist, or the region does not
+            return a mask (N,).
     """
     if isinstance(region, Tag):
         inside = np.zeros(basis.N, dtype=bool)
         facets = region.facets(basis.mesh)
         if facets is None:
             inside[basis.element_dofs[:, basis.mesh.subdomains[region.name]]] = True
-        elif len(facets):  # scikit-fem takes an empty set for the whole boundary
+        elif len(facets):  # scikit-fem interprets an empty set as the whole boundary
             inside[basis.get_dofs(facets).all()] = True
     else:
         inside = _inside(region, (basis.doflocs.T + origin) * scale)
@@ -208,18 +210,18 @@ def nodes_in(
 def facets_in(
     region: Region, mesh: skfem.Mesh, scale: float = 1.0, origin: Origin = 0.0
 ) -> NDArray[np.int_]:
-    """Return the facets of the boundary that lie in a region, ascending.
+    """Return the boundary facets in a region in ascending order.
 
     Args:
-        region: Where to look: facets with all their vertices inside. Of a `Tag`, its facets, or
-            those of which all vertices belong to its cells.
+        region: The region. It contains the facets whose vertices all lie inside. A `Tag` contains
+            its facets, or those whose vertices all belong to its cells.
         mesh: The body.
-        scale: [m] per unit of the mesh.
-        origin: Where the mesh has its origin, (D,), in its own unit.
+        scale: Length unit of the mesh [m].
+        origin: Origin of the mesh in its own unit, (D,).
 
     Raises:
-        ValueError: No facet of the boundary lies there, there is no such tag, or the region does
-            not answer with one truth value per point.
+        ValueError: The region contains no boundary facet, the tag does not exist, or the region
+            does not return a mask (N,).
     """
     boundary = mesh.boundary_facets()
     tagged = region.facets(mesh) if isinstance(region, Tag) else None
@@ -241,8 +243,8 @@ def _inside(region: Callable, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     inside = np.asarray(region(np.ascontiguousarray(points)))
     if inside.dtype != bool or inside.shape != (len(points),):
         raise ValueError(
-            f"{_name(region)} gives {inside.dtype} of shape {inside.shape} "
-            f"for {len(points)} points, not one truth value each"
+            f"{_name(region)} returns {inside.dtype} of shape {inside.shape} and must return "
+            f"bool of shape ({len(points)},)"
         )
     return inside
 
@@ -251,18 +253,18 @@ def _name(region: Region) -> str:
     return getattr(region, "__name__", None) or repr(region)
 
 
-def _reach(radius: float, points: NDArray[np.float64]) -> float:
-    """Return a radius with the slack for its own rounding and for that of coordinates far away."""
+def _tolerant_radius(radius: float, points: NDArray[np.float64]) -> float:
+    """Return a radius with tolerances for its own rounding and for that of large coordinates."""
     return radius * (1 + SLACK) + 4 * float(np.finfo(np.float64).eps * np.abs(points).max())
 
 
-def _round(name: str, centre: Sequence[float], radius: float) -> None:
+def _check_ball(name: str, centre: Sequence[float], radius: float) -> None:
     if not all(map(math.isfinite, centre)):
         raise ValueError(f"{name} = {list(centre)} must be finite coordinates [m]")
     if not (math.isfinite(radius) and radius > 0):
         raise ValueError(f"radius = {radius} must be a positive length [m]")
 
 
-def _same_dimension(name: str, corner: Sequence[float], points: NDArray[np.float64]) -> None:
+def _check_dimension(name: str, corner: Sequence[float], points: NDArray[np.float64]) -> None:
     if len(corner) != points.shape[1]:
         raise ValueError(f"{name} = {list(corner)} must have {points.shape[1]} coordinates")

@@ -1,4 +1,4 @@
-"""The front door: what makes a mesh unsolvable, in one line with the numbers of the culprits."""
+"""Validation of meshes: errors are one line with the numbers of the invalid nodes or cells."""
 
 import numpy as np
 import skfem
@@ -7,35 +7,34 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-# Degree that the quadrature integrates exactly; no problem here puts its points more densely.
+# Degree of exactness of the densest quadrature that `dpl.fem.assembly.elements` uses.
 ORDERS = {"Triangular": 4, "Quadrilateral": 5, "Tetrahedral": 4, "Hexahedral": 5}
-CROWD = 100  # nodes in one place of which pairs are not worth listing: they are many
-LARGEST = 1e50  # of coordinates [m]; with more, volumes would overflow
+CROWD = 100  # coincident nodes above which pairs are not searched, because there are too many
+LARGEST = 1e50  # limit of coordinates [m], so that volumes do not overflow
 
 Numbers = NDArray[np.int_]
 
 
 def check_mesh(mesh: skfem.Mesh, *, numbers: Numbers | None = None) -> skfem.Mesh:
-    """Return the mesh as it is, if it can be solved.
+    """Return the mesh unchanged if it is valid.
 
     Args:
-        mesh: The body; its cells may list their nodes in either sense.
-        numbers: What errors call its vertices, (N,); their place if left out. Cells are counted
-            from 0.
+        mesh: The mesh; cells may have either orientation.
+        numbers: Numbers of its vertices in messages, (N,); default: their index.
 
     Raises:
-        ValueError: The first of these flaws, with the cells or nodes that have it: coordinates that
-            are not finite or beyond `LARGEST`, nodes without a cell, cells that list a node twice,
-            cells listed twice, inverted or flat cells, sides shared by three cells, cells folded
-            over their neighbours, nodes in one place, hanging nodes, sides that overlap without
-            being the same, a body in several pieces, parts that touch only in nodes or edges.
+        ValueError: The first of these errors, with its cells or nodes: coordinates that are not
+            finite or above `LARGEST`, nodes without a cell, cells that list a node twice, duplicate
+            cells, inverted or flat cells, sides shared by three cells, cells folded over their
+            neighbours, coincident nodes, hanging nodes, sides that overlap without being equal,
+            several disconnected pieces, parts that touch only in nodes or edges.
     """
     numbers = np.arange(mesh.p.shape[1]) if numbers is None else numbers
     _check_nodes(mesh, numbers)
     _check_lists(mesh)
     orientation = _check_volumes(mesh)
     _check_sides(mesh, orientation)
-    _check_places(mesh, numbers)
+    _check_coincidence(mesh, numbers)
     _check_contacts(mesh, numbers)
     _check_pieces(mesh)
     _check_joints(mesh, numbers)
@@ -43,7 +42,7 @@ def check_mesh(mesh: skfem.Mesh, *, numbers: Numbers | None = None) -> skfem.Mes
 
 
 def listed(numbers: Numbers, most: int = 5) -> str:
-    """Return numbers as a text, the first few of them."""
+    """Return a text with the first numbers."""
     return ", ".join(map(str, numbers[:most])) + (", ..." if len(numbers) > most else "")
 
 
@@ -54,7 +53,7 @@ def _check_nodes(mesh: skfem.Mesh, numbers: Numbers) -> None:
     bad = np.flatnonzero((np.abs(mesh.p) > LARGEST).any(axis=0))
     if len(bad):
         raise ValueError(
-            f"coordinates of {len(bad)} nodes are beyond {LARGEST:.0e} m: {_nodes(bad, numbers)}"
+            f"coordinates of {len(bad)} nodes are above {LARGEST:.0e} m: {_nodes(bad, numbers)}"
         )
     bad = np.flatnonzero(np.bincount(mesh.t.ravel(), minlength=mesh.nvertices) == 0)
     if len(bad):
@@ -74,16 +73,16 @@ def _check_lists(mesh: skfem.Mesh) -> None:
 
 
 def _check_volumes(mesh: skfem.Mesh) -> NDArray[np.float64]:
-    """Return in which sense each cell lists its nodes, (E,): 1 or -1."""
+    """Return the orientation of each cell, (E,): 1 or -1."""
     shape = mesh.elem.refdom
     X = skfem.quadrature.get_quadrature(shape, 0 if mesh.affine else ORDERS[shape.name])[0]
-    J = _determinant(mesh.mapping().DF(X))  # (E, Q). No detDF: it raises where it is zero
+    J = _determinant(mesh.mapping().DF(X))  # (E, Q); `detDF` would raise where it is zero
     sense = np.sign(np.median(J, axis=1))
     smallest = (J * sense[:, None]).min(axis=1)
     size = np.ptp(mesh.p[:, mesh.t], axis=1).max(axis=0)  # (E,)
-    # what rounding makes of nothing: of the cell's own size, and of its distance from the origin
-    nothing = (1e-12 * size + 1e-15 * np.abs(mesh.p).max()) * size ** (mesh.dim() - 1)
-    for flaw, where in (("inverted", smallest < -nothing), ("of no volume", smallest <= nothing)):
+    # bound of the rounding error, from the size of the cell and its distance from the origin
+    roundoff = (1e-12 * size + 1e-15 * np.abs(mesh.p).max()) * size ** (mesh.dim() - 1)
+    for flaw, where in (("inverted", smallest < -roundoff), ("of no volume", smallest <= roundoff)):
         bad = np.flatnonzero(where)
         if len(bad):
             raise ValueError(f"{len(bad)} cells are {flaw}: {listed(bad)}")
@@ -91,7 +90,7 @@ def _check_volumes(mesh: skfem.Mesh) -> NDArray[np.float64]:
 
 
 def _determinant(J: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return det J of (D, D, ...); for many small matrices much faster than numpy's."""
+    """Return det J of (D, D, ...); for many small matrices much faster than `np.linalg.det`."""
     if len(J) == 2:
         return J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
     return sum(
@@ -101,14 +100,14 @@ def _determinant(J: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _check_sides(mesh: skfem.Mesh, sense: NDArray[np.float64]) -> None:
-    """Hold each side to two cells, and these to its two faces."""
+    """Raise unless a side has at most two cells, and these lie on opposite faces of it."""
     shared = np.bincount(mesh.t2f.ravel())
     crowded = np.flatnonzero((shared > 2)[mesh.t2f].any(axis=0))
     if len(crowded):
         raise ValueError(f"a side is shared by three or more cells: {listed(crowded, 8)}")
     signs = np.stack([_outward(mesh, side) for side in mesh.elem.refdom.facets]) * sense
     total = np.bincount(mesh.t2f.ravel(), weights=signs.ravel())
-    folded = (shared == 2) & (np.abs(total) > 1)  # both cells lie on the same side of it
+    folded = (shared == 2) & (np.abs(total) > 1)  # both cells lie on the same face of the side
     if folded.any():
         all_of_them = (folded | (shared == 1))[mesh.t2f].all(axis=0) & folded[mesh.t2f].any(axis=0)
         bad = np.flatnonzero(all_of_them if any(all_of_them) else folded[mesh.t2f].any(axis=0))
@@ -118,10 +117,10 @@ def _check_sides(mesh: skfem.Mesh, sense: NDArray[np.float64]) -> None:
 
 
 def _outward(mesh: skfem.Mesh, side: list[int]) -> NDArray[np.int_]:
-    """Return for a side of all cells, (E,), on which face of it each cell lies: 1 or -1.
+    """Return the orientation of a local side in all cells, (E,): 1 or -1.
 
-    The face is told by the sense in which the side's vertices go round, seen from outside the cell
-    and starting from the vertex of the lowest number: the two cells of a side must disagree.
+    It is the sense of rotation of its vertices seen from outside the cell, starting from the vertex
+    of the lowest number. The two cells of a side must have opposite orientations.
     """
     p = mesh.elem.refdom.p[:, side]  # (D, corners)
     along, away = p[:, 1] - p[:, 0], p.mean(axis=1) - mesh.elem.refdom.p.mean(axis=1)
@@ -129,15 +128,15 @@ def _outward(mesh: skfem.Mesh, side: list[int]) -> NDArray[np.int_]:
     t = mesh.t[side]
     first, cells = t.argmin(axis=0), np.arange(t.shape[1])
     if len(p) == 2:
-        turn = np.where(first == 0, 1, -1)
+        sense = np.where(first == 0, 1, -1)
     else:
         after, before = t[(first + 1) % len(t), cells], t[(first - 1) % len(t), cells]
-        turn = np.where(after > before, 1, -1)
-    return turn * int(np.sign(normal @ away))
+        sense = np.where(after > before, 1, -1)
+    return sense * int(np.sign(normal @ away))
 
 
-def _check_places(mesh: skfem.Mesh, numbers: Numbers) -> None:
-    """Hold all nodes, those of quadratic edges too, to places of their own."""
+def _check_coincidence(mesh: skfem.Mesh, numbers: Numbers) -> None:
+    """Raise for coincident nodes, including those of quadratic edges."""
     close = 1e-9 * np.ptp(mesh.p, axis=1).max()
     _, place, count = np.unique(
         np.round(mesh.p / (10 * close)), axis=1, return_inverse=True, return_counts=True
@@ -159,11 +158,11 @@ def _check_places(mesh: skfem.Mesh, numbers: Numbers) -> None:
 
 
 def _check_contacts(mesh: skfem.Mesh, numbers: Numbers) -> None:
-    """Hold the boundary to touching itself nowhere but in its own vertices.
+    """Raise if the boundary touches itself other than in common vertices.
 
-    A side that should join two cells and does not is a side of the boundary to both of them. Then a
-    vertex of one lies inside the other (a hanging node). Triangles can fail without: as two ways of
-    cutting one quadrilateral, which share two vertices and most inner points.
+    If two cells meet in sides that are not equal, both sides belong to the boundary, and a vertex
+    of one lies inside the other (hanging node). Triangles that split a quadrilateral along
+    different diagonals overlap without hanging nodes; they share two vertices.
     """
     facets = mesh.boundary_facets()
     around = _around(mesh, facets)  # (corners, F)
@@ -188,7 +187,7 @@ def _check_contacts(mesh: skfem.Mesh, numbers: Numbers) -> None:
 
 
 def _around(mesh: skfem.Mesh, facets: Numbers) -> Numbers:
-    """Return the vertices of facets on the boundary in turn around each, (corners, F)."""
+    """Return the vertices of boundary facets in cyclic order, (corners, F)."""
     cells = mesh.f2t[0, facets]
     local = (mesh.t2f[:, cells] == facets).argmax(axis=0)
     return mesh.t[np.array(mesh.elem.refdom.facets).T[:, local], cells]
@@ -197,10 +196,10 @@ def _around(mesh: skfem.Mesh, facets: Numbers) -> Numbers:
 def _contacts(
     sides: NDArray[np.float64], points: NDArray[np.float64], margin: float
 ) -> tuple[Numbers, Numbers]:
-    """Return which of sides (D, corners, F) hold which of points (D, P): pairs of their places.
+    """Return the indices of sides (D, corners, F) and points (D, P) where a point lies on a side.
 
-    A side holds what lies on it, further than `margin` (a part of its size) from its edges, and is
-    none of its corners.
+    The distance of the point from the edges is above `margin` (relative to the size of the side),
+    and the point is not a vertex of the side.
     """
     middle = sides.mean(axis=1)
     radius = np.sqrt(((sides - middle[:, None]) ** 2).sum(axis=0).max(axis=0))
@@ -217,10 +216,10 @@ def _contacts(
 def _distance(
     sides: NDArray[np.float64], points: NDArray[np.float64], margin: float
 ) -> NDArray[np.float64]:
-    """Return how far points (D, P) are from segments, triangles or bilinear quads (D, corners, P).
+    """Return distances (P,) of points (D, P) to segments, triangles or quads (D, corners, P).
 
-    It is infinite if the parameters of the nearest place are not within the margin. For warped
-    quads they are found by Gauss-Newton; for the others its first step is exact.
+    The distance is infinite if the parameters of the closest point are outside the margin. For
+    warped (bilinear) quads Gauss-Newton finds them; for the others its first step is exact.
     """
     corners = sides.shape[1]
     a, b = sides[:, 0], sides[:, 1]
@@ -257,7 +256,7 @@ def _check_pieces(mesh: skfem.Mesh) -> None:
 
 
 def _check_joints(mesh: skfem.Mesh, numbers: Numbers) -> None:
-    """Hold the cells to being joined by sides: parts that touch in an edge or node are hinged."""
+    """Raise unless cells are connected by sides: parts that touch in nodes or edges are hinged."""
     pairs = mesh.f2t[:, mesh.f2t[1] >= 0]
     graph = coo_array((np.ones(pairs.shape[1]), pairs), shape=(mesh.nelements,) * 2)
     parts, member = connected_components(graph, directed=False)
@@ -278,6 +277,6 @@ def _nodes(vertices: Numbers, numbers: Numbers) -> str:
 
 
 def _pairs(pairs: NDArray[np.int_], most: int = 4) -> str:
-    """Return pairs (2, n) as a text, the first few of them."""
+    """Return a text with the first pairs of (2, n)."""
     named = ", ".join(f"{a} and {b}" for a, b in pairs.T[:most])
     return named + (", ..." if pairs.shape[1] > most else "")

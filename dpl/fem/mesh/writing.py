@@ -1,4 +1,4 @@
-"""Bodies and what was solved on them, written as mesh files for other programs."""
+"""Write meshes and nodal fields to files."""
 
 import contextlib
 import importlib.util
@@ -13,7 +13,7 @@ from meshio.xdmf import TimeSeriesWriter
 from numpy.typing import NDArray
 from skfem.io.meshio import to_meshio
 
-MIRRORED = {  # nodes of a tetrahedron whose first two corners change places
+MIRRORED = {  # node order after an exchange of the first two corners
     "tetra": [1, 0, 2, 3],
     "tetra10": [1, 0, 2, 3, 4, 6, 5, 8, 7, 9],
 }
@@ -22,30 +22,32 @@ Array = NDArray[np.float64]
 
 
 def flat_cells(mesh: skfem.Mesh, nodes: int) -> tuple[str, Numbers]:
-    """Return the cells of a body as files list them: meshio's name, nodes in VTK's order (E, A).
+    """Return the type of the cells in meshio and their nodes in VTK order, (E, A).
 
-    Tetrahedra are right-handed, as scikit-fem's need not be.
+    Left-handed tetrahedra are reordered to right-handed ones.
 
     Args:
         mesh: The body.
-        nodes: Of its fields: those of the mesh, or of quadratic cells on it.
+        nodes: Number of nodes of its fields: that of the mesh, or of quadratic cells on it.
 
     Raises:
-        ValueError: It is neither.
+        ValueError: `nodes` is neither.
     """
     if nodes != mesh.p.shape[1]:
         mesh = _quadratic(mesh)
     if nodes != mesh.p.shape[1]:
-        raise ValueError(f"fields at {nodes} nodes are of another body")
+        raise ValueError(
+            f"fields = arrays of {nodes} nodes must have those of the mesh ({mesh.p.shape[1]})"
+        )
     (block,) = to_meshio(mesh, encode_cell_data=False).cells
-    left, cells = _left(mesh), block.data.copy()
+    left, cells = _left_handed(mesh), block.data.copy()
     if left.any():
         cells[left] = cells[left][:, MIRRORED[block.type]]
     return block.type, cells
 
 
-def _left(mesh: skfem.Mesh) -> NDArray[np.bool_]:
-    """Return which cells are left-handed tetrahedra, (E,)."""
+def _left_handed(mesh: skfem.Mesh) -> NDArray[np.bool_]:
+    """Return a mask of the left-handed tetrahedra, (E,)."""
     if mesh.elem.refdom.name != "Tetrahedral":
         return np.zeros(mesh.nelements, dtype=bool)
     corners = mesh.p.T[mesh.t[:4].T]
@@ -53,22 +55,22 @@ def _left(mesh: skfem.Mesh) -> NDArray[np.bool_]:
 
 
 def _tags(mesh: skfem.Mesh) -> dict[str, list[Array]]:
-    """Return the tags of a body as data of its cells, facets numbered as by `flat_cells`.
+    """Return the tags of a body as cell data, facets numbered as by `flat_cells`.
 
-    Sets of facets are a bit for each side of each cell. Where the first two corners of a
-    tetrahedron change places its last two sides do.
+    A set of facets is stored as one bit per facet of each cell. An exchange of the first two
+    corners of a tetrahedron exchanges its last two facets.
     """
     tags: dict[str, list[Array]] = to_meshio(mesh).cell_data
     for name, (bits,) in tags.items():
         if name.startswith("skfem:b:"):
             whole = np.asarray(bits).astype(np.int64)
-            change = (whole >> 3 ^ whole >> 2) & _left(mesh)
+            change = (whole >> 3 ^ whole >> 2) & _left_handed(mesh)
             tags[name] = [(whole ^ (change << 3 | change << 2)).astype(bits.dtype)]
     return tags
 
 
 def _quadratic(mesh: skfem.Mesh) -> skfem.Mesh:
-    """Return a mesh with the nodes of quadratic cells, numbered as `Problem` numbers them."""
+    """Return a mesh with the nodes of quadratic cells, numbered as in `Problem`."""
     kinds: dict[type[skfem.Mesh], type[skfem.Mesh]] = {
         skfem.MeshTri1: skfem.MeshTri2,
         skfem.MeshQuad1: skfem.MeshQuad2,
@@ -79,11 +81,13 @@ def _quadratic(mesh: skfem.Mesh) -> skfem.Mesh:
     return mesh if kind is None else kind.from_mesh(mesh)
 
 
-def _written(mesh: skfem.Mesh, fields: Mapping[str, Array]) -> meshio.Mesh:
-    """Return a body with its fields as meshio writes them, see `write_mesh`."""
+def _to_meshio(mesh: skfem.Mesh, fields: Mapping[str, Array]) -> meshio.Mesh:
+    """Return a mesh of meshio with nodal fields; arguments as in `write_mesh`."""
     counts = {len(field) for field in fields.values()} or {mesh.p.shape[1]}
     if len(counts) > 1:
-        raise ValueError(f"fields at {', '.join(map(str, sorted(counts)))} nodes: of one body each")
+        raise ValueError(
+            f"fields = arrays of {', '.join(map(str, sorted(counts)))} nodes must be equally long"
+        )
     (nodes,) = counts
     kind, cells = flat_cells(mesh, nodes)
     whole = mesh if nodes == mesh.p.shape[1] else _quadratic(mesh)
@@ -92,35 +96,36 @@ def _written(mesh: skfem.Mesh, fields: Mapping[str, Array]) -> meshio.Mesh:
 
 
 def _spatial(field: Array) -> Array:
-    """Return a field with three components, tensors (N, 3, 3) with nine."""
+    """Return a vector field padded to three components, and a tensor field (N, 3, 3) as (N, 9)."""
     if field.ndim == 3:
         return field.reshape(len(field), -1)
     return field if field.ndim == 1 else np.pad(field, ((0, 0), (0, 3 - field.shape[1])))
 
 
 def write_mesh(path: Path, mesh: skfem.Mesh, fields: Mapping[str, Array]) -> None:
-    """Write a mesh, its tags and fields at its nodes, in any format of meshio.
+    """Write a mesh, its tags and nodal fields in a format of meshio.
 
     Args:
-        path: A file; its folder is made if there is none. Tags need cell data (.vtu, .vtk).
-        mesh: The body.
-        fields: By name, (N,), (N, D) or (N, 3, 3). Where N is that of quadratic cells on the mesh
-            (`Problem.points` of degree 2), cells are written quadratic.
+        path: File; its suffix selects the format, and its folder is created. Tags need a format
+            with cell data (.vtu, .vtk).
+        mesh: The body [m].
+        fields: Arrays (N,), (N, D) or (N, 3, 3) by name. If N is the number of nodes of quadratic
+            cells (`Problem.points` of degree 2), quadratic cells are written.
 
     Raises:
-        ValueError: N is of another body, or not the same for all.
+        ValueError: N does not fit the mesh, or the lengths differ.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    meshio.write(path, _written(mesh, fields))
+    meshio.write(path, _to_meshio(mesh, fields))
 
 
 def write_mesh_exactly(path: Path, mesh: skfem.Mesh) -> None:
-    """Write a mesh and its tags as VTU, so that `load` returns it to the last bit.
+    """Write a mesh and its tags as VTU, so that `read_mesh` returns the same bits.
 
-    Cells keep the sense in which they list their nodes, which `write_mesh` does not promise.
+    Unlike `write_mesh` it does not reorder the nodes of cells.
 
     Args:
-        path: A file, of any name.
+        path: File of any name.
         mesh: The body [m].
     """
     exact = to_meshio(mesh)
@@ -130,27 +135,27 @@ def write_mesh_exactly(path: Path, mesh: skfem.Mesh) -> None:
 
 
 def _quoted(name: str) -> str:
-    """Return a name as an attribute of XML in ASCII, which meshio leaves to its callers."""
+    """Return a name escaped for an XML attribute in ASCII; meshio does not escape names."""
     marks = {mark: f"&#{ord(mark)};" for mark in '"\t\n\r'}
     return escape(name, marks).encode("ascii", "xmlcharrefreplace").decode()
 
 
 def write_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Array]]) -> list[Path]:
-    """Write the same fields of several loads for ParaView, the number of the load as its time.
+    """Write the fields of several loads as a time series for ParaView.
 
-    A VTU file for each beside `NAME.pvd`, which opens them as one, and all in `NAME.xdmf`: numbers
-    in `NAME.h5` where h5py is installed, else inside.
+    Writes one VTU file per load, their collection `NAME.pvd`, and `NAME.xdmf` with all loads. The
+    numbers of the latter are in `NAME.h5` if h5py is installed. The time is the index of the load.
 
     Args:
-        path: Folder and NAME; the folder is made if there is none.
-        mesh: The body.
-        steps: Fields of each load, see `write_mesh`.
+        path: Folder and NAME; the folder is created.
+        mesh: The body [m].
+        steps: Fields of each load as in `write_mesh`.
 
     Returns:
-        The files to open: collection and XDMF.
+        Paths of the PVD and XDMF files.
     """
     names = [f"{path.name}_{k:03d}.vtu" for k in range(len(steps))]
-    bodies = [_written(mesh, fields) for fields in steps]
+    bodies = [_to_meshio(mesh, fields) for fields in steps]
     path.parent.mkdir(parents=True, exist_ok=True)
     for name, body in zip(names, bodies, strict=True):
         meshio.write(path.with_name(name), body)
@@ -165,11 +170,11 @@ def write_series(path: Path, mesh: skfem.Mesh, steps: Sequence[Mapping[str, Arra
 
 
 def write_collection(path: Path, files: Sequence[tuple[float, str]]) -> None:
-    """Write a PVD file, which opens VTU files as a series in ParaView.
+    """Write a PVD file, a collection of VTU files for ParaView.
 
     Args:
-        path: Of the PVD file.
-        files: Time of each, and its name from the folder of `path`.
+        path: The PVD file.
+        files: Time and name of each VTU file, relative to the folder of `path`.
     """
     lines = [f'<DataSet timestep="{time:.6g}" file={quoteattr(name)}/>' for time, name in files]
     head = '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">'

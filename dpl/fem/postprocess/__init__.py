@@ -1,4 +1,4 @@
-"""What is derived from a displacement: stresses, energies, the surface."""
+"""Stresses, energies and the surface of a body, computed from displacements."""
 
 from typing import TYPE_CHECKING
 

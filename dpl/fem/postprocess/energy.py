@@ -1,4 +1,4 @@
-"""The energy of a body under loads, its scale and its slopes, for many displacements at once."""
+"""Potential energy of a body under loads, its gradient and its scale, in batches."""
 
 import warnings
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from dpl.fem.problem import Problem
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
 
-ENTRIES = 16_000  # numbers of a displacement at once: few enough for their strains to fit a cache
-REMEMBERED = 1_000_000  # loads whose scale is kept
-SPANNING = (0.0, 0.2, 0.4)  # Poisson's ratios whose K(0) span all others'
-STEP = 1e-5  # of the displacement gradient, where differences of forces stand for the tangent [-]
+ENTRIES = 16_000  # entries of displacements per evaluation, so that strains fit into the cache
+CACHE_SIZE = 1_000_000  # loads whose work is cached
+BASIS_RATIOS = (0.0, 0.2, 0.4)  # Poisson's ratios whose K(0) span those of all others
+STEP = 1e-5  # step of the displacement gradient in difference quotients of forces [-]
 
 
 @dataclass(frozen=True, eq=False)
 class RestStiffness:
-    """A body at rest, made once, when first asked for.
+    """Stiffness K(0) of a body at rest, assembled and factorised at the first use.
 
     Attributes:
         problem: The body.
@@ -31,18 +31,18 @@ class RestStiffness:
 
     @classmethod
     def of(cls, problem: Problem, known: "RestStiffness | None") -> "RestStiffness":
-        """Return the rest of a body: the known one if that is its."""
+        """Return `known` if it belongs to the body, else a new object."""
         return known if known is not None and known.problem is problem else cls(problem)
 
     def product(self, field: Tensor, poisson: Tensor | None = None) -> Tensor:
-        """Return K(0) v, (B, N, D) [-], of v (B, N, D); zero where held.
+        """Return K(0) v, (B, N, D) [-]; zero at fixed degrees of freedom.
 
-        At rest every law is Hooke's, K(0) = lambda K1 + mu K2 + springs: that of any Poisson's
-        ratio is a sum of those of three.
+        At rest every law is Hooke's, K(0) = lambda K1 + mu K2 + foundation. K(0) of any Poisson's
+        ratio is therefore a linear combination of three.
 
         Args:
-            field: v.
-            poisson: Of the loads, (B, P) [-]; P = 0 if left out.
+            field: v, (B, N, D) [-].
+            poisson: Poisson's ratios of the loads, (B, P) [-]; P = 0 by default.
         """
         problem = self.problem
         if poisson is None or not poisson.shape[-1]:
@@ -56,21 +56,25 @@ class RestStiffness:
         law = problem.material.at(poisson.flatten())
         moduli = [torch.as_tensor(m).flatten().to(field) for m in (law.lam, law.mu)]
         moduli.append(torch.ones_like(moduli[0]))
-        known = [(m.lam, m.mu, 1.0) for m in (problem.material.at(nu) for nu in SPANNING)]
+        known = [(m.lam, m.mu, 1.0) for m in (problem.material.at(nu) for nu in BASIS_RATIOS)]
         shares = torch.linalg.solve(field.new_tensor(known).T, torch.stack(moduli))  # (3, B)
         parts = torch.stack([rest.product(field) for rest in self._spanning])
         return torch.einsum("kb,kbnd->bnd", shares, parts)
 
     @cached_property
     def _spanning(self) -> "list[RestStiffness]":
-        return [RestStiffness(self.problem.at(nu)) for nu in SPANNING]
+        return [RestStiffness(self.problem.at(nu)) for nu in BASIS_RATIOS]
 
-    def work(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
-        """Return f.K(0)^-1 f / 2, the work of f (B, N, D) on its linear answer, (B,) [-].
+    def linear_strain_energy(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
+        """Return f.K(0)^-1 f / 2, the strain energy of the linear solution, (B,) [-].
 
-        To about 1e-3: it is a scale. One solve with a stored factor, on the processor, for a force
-        that is new; those of a data set come again every epoch and are remembered by their hash.
-        With Poisson's ratios (B, 1) of their own, the first time takes a factor for each.
+        The relative error is about 1e-3, because the value is used as a scale only. Results are
+        cached by the hash of the force, since the forces of a data set recur every epoch. A new
+        force takes one solve on the CPU, and a new Poisson's ratio one factorisation.
+
+        Args:
+            force: f, (B, N, D) [-].
+            poisson: Poisson's ratios of the loads, (B, P) [-]; P = 0 by default.
         """
         problem, found = self._linear.problem, []
         poisson = force.new_zeros(1, 0) if poisson is None else poisson
@@ -78,7 +82,7 @@ class RestStiffness:
             right = problem.restrict(one)
             key = hash(right.tobytes() + own.numpy().tobytes())
             if key not in self._works:
-                if len(self._works) >= REMEMBERED:
+                if len(self._works) >= CACHE_SIZE:
                     self._works.clear()
                 factor = self._linear.at(own[None]).factor
                 self._works[key] = float(right @ factor.solve(right, 1e-3)) / 2
@@ -90,7 +94,7 @@ class RestStiffness:
         return {}
 
     def energy(self, poisson: Tensor) -> Tensor:
-        """Return W(0), (1,) or (B,) [-], which is not zero for every law."""
+        """Return the strain energy at rest W(0), (1,) or (B,) [-]; it is not zero for every law."""
         if not poisson.shape[-1]:
             return self._energy
         body = self.problem.at(poisson)
@@ -104,8 +108,8 @@ class RestStiffness:
 
     @cached_property
     def _linear(self) -> LinearSolver:
-        here = self.problem.points.device.type == "cpu"
-        return LinearSolver(self.problem if here else self.problem.to("cpu"))
+        on_cpu = self.problem.points.device.type == "cpu"
+        return LinearSolver(self.problem if on_cpu else self.problem.to("cpu"))
 
     @cached_property
     def _matrix(self) -> csr_array:
@@ -117,7 +121,9 @@ class RestStiffness:
     def _on_device(self) -> Tensor:
         whole, device = self._matrix, self.problem.points.device
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch calls its sparse matrices a beta
+            warnings.simplefilter(
+                "ignore"
+            )  # torch warns that its sparse matrices are in beta state
             return torch.sparse_csr_tensor(
                 torch.from_numpy(whole.indptr),
                 torch.from_numpy(whole.indices),
@@ -127,14 +133,14 @@ class RestStiffness:
             )
 
     def __getstate__(self) -> dict[str, object]:
-        """Pickle without matrix and factor."""
+        """Return the state without matrix and factor."""
         return {"problem": self.problem}
 
 
 def potential_energy(
     displacement: Tensor, load: Load, problem: Problem, rest: RestStiffness
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return W(u) - W(0) - f.u, (B,) [-], its slope (B, N, D), and whether all det F > 0, (B,)."""
+    """Return W(u) - W(0) - f.u (B,), its gradient (B, N, D), and a mask of det F > 0 (B,)."""
     force, own = load.force, load.poisson.expand(len(displacement), -1)
     internal, volume = problem.at(own).evaluate(displacement)
     slope = torch.where(problem.free, internal - force, 0.0)
@@ -149,11 +155,11 @@ def potential_energy(
 def tangent_product(problem: Problem, displacement: Tensor, direction: Tensor) -> Tensor:
     """Return K(u) v on free degrees of freedom, (B, N, D) [-], by a central difference of forces.
 
-    Two evaluations, by compiled loops a quarter as long as the tangent and a thirtieth as long as a
-    derivative of tensors; to about 1e-8 of |K| |v|.
+    The error is about 1e-8 |K| |v|. Two evaluations of the compiled forces take less time than the
+    tangent or automatic differentiation.
     """
-    steepness = problem.dN.abs().max() * direction.abs().amax(dim=(1, 2))
-    length = (STEP / steepness.clamp(min=torch.finfo(steepness.dtype).tiny))[:, None, None]
+    gradient_norm = problem.dN.abs().max() * direction.abs().amax(dim=(1, 2))
+    length = (STEP / gradient_norm.clamp(min=torch.finfo(gradient_norm.dtype).tiny))[:, None, None]
     ahead = problem.evaluate(displacement + length * direction).internal
     behind = problem.evaluate(displacement - length * direction).internal
     return torch.where(problem.free, (ahead - behind) / (2 * length), 0.0)

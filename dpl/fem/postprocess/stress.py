@@ -1,4 +1,4 @@
-"""Fields that engineers look at: Cauchy and von Mises stress, volume ratio, at points and nodes."""
+"""Cauchy stress, von Mises stress and volume ratio at quadrature points and nodes."""
 
 from typing import NamedTuple
 
@@ -9,11 +9,11 @@ from dpl.fem.problem import Problem
 
 
 class Fields(NamedTuple):
-    """What a displacement does to the body, at its nodes; see `fields`.
+    """Nodal fields of a displacement; see `fields`.
 
     Attributes:
         stress: Cauchy stress over E, (B, N, 3, 3) [-].
-        von_mises: Its von Mises stress over E, (B, N) [-].
+        von_mises: Von Mises stress over E, (B, N) [-].
         volume_ratio: det F, (B, N) [-].
     """
 
@@ -25,8 +25,8 @@ class Fields(NamedTuple):
 def fields(problem: Problem, displacement: Tensor) -> Fields:
     """Return stress and volume ratio at the nodes under displacements (B, N, D) [-].
 
-    Nodal values are means of those of the cells around, weighted by their volumes; the von Mises
-    stress is that of the nodal stress. min det F of a solve is over quadrature points and lower.
+    Nodal values are volume-weighted means over the adjacent cells. The von Mises stress is that of
+    the nodal stress. min det F of a solution is taken over quadrature points and therefore lower.
     """
     F = deformation_gradient(problem, displacement)
     stress = at_nodes(problem, cauchy(problem, displacement))
@@ -42,7 +42,7 @@ def deformation_gradient(problem: Problem, displacement: Tensor) -> Tensor:
 def cauchy(problem: Problem, displacement: Tensor) -> Tensor:
     """Return the Cauchy stress P F^T / det F over E at the quadrature points, (B, E, Q, 3, 3) [-].
 
-    In 2D that of plane strain, with its component out of the plane.
+    In 2D it is that of plane strain and includes the component out of the plane.
     """
     F = deformation_gradient(problem, displacement)
     stress = problem.stress(displacement) @ F.mT
@@ -50,17 +50,17 @@ def cauchy(problem: Problem, displacement: Tensor) -> Tensor:
 
 
 def von_mises(stress: Tensor) -> Tensor:
-    """Return sqrt(3/2 s : s) of stresses (..., 3, 3), s their deviators; (...)."""
+    """Return sqrt(3/2 s : s), shape (...), of stresses (..., 3, 3) with deviators s."""
     mean = stress.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
     deviator = stress - mean[..., None, None] * torch.eye(3, dtype=stress.dtype).to(stress)
     return (1.5 * deviator.square().sum(dim=(-2, -1))).sqrt()
 
 
 def at_nodes(problem: Problem, values: Tensor) -> Tensor:
-    """Return values at quadrature points (B, E, Q, ...) as values at nodes (B, N, ...).
+    """Return nodal values (B, N, ...) of values at quadrature points (B, E, Q, ...).
 
-    At each node the mean over the cells around it, weighted by their volumes: the lumped L2
-    projection of cell means (Zienkiewicz, Zhu 1987).
+    A nodal value is the volume-weighted mean over the adjacent cells: the lumped L2 projection of
+    cell means (Zienkiewicz, Zhu 1987).
     """
     batch, count, _, *rest = values.shape
     share = problem.dV.expand(count, -1)  # (E, Q)

@@ -1,20 +1,16 @@
 """The surface of a mesh, as triangles or lines."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import skfem
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    pass
-
 
 def surface(mesh: skfem.Mesh) -> NDArray[np.int_]:
-    """Return what is seen of a mesh as polygons of vertices, (P, corners), in turn around each.
+    """Return the boundary facets of a mesh in 3D, its cells in 2D, as polygons (P, corners).
 
-    In 3D the facets on the boundary, in 2D the cells; anticlockwise seen from outside, in 2D from
-    above.
+    The vertices of a polygon are in counterclockwise order seen from outside, in 2D from above.
     """
     points = mesh.p.T
     if mesh.dim() == 2:
@@ -35,24 +31,24 @@ def surface(mesh: skfem.Mesh) -> NDArray[np.int_]:
 def _sides(
     points: NDArray[np.float64], polygons: NDArray[np.int_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return vectors from the first corner of polygons to the next two, (D, P) each."""
+    """Return the vectors from the first corner of polygons to the next two, (D, P) each."""
     a, b, c = (points[polygons[:, k]] for k in range(3))
     return (b - a).T, (c - a).T
 
 
 def coarse(points: NDArray[Any], polygons: NDArray[np.int_], most: int) -> NDArray[np.int_]:
-    """Return no more than so many polygons (P, corners) on some of the same points.
+    """Return at most `most` polygons (P, corners) that approximate the given ones.
 
-    Points in one cell of a grid become one of them; polygons that fall together go. The grid is
-    made coarser until they are few enough.
+    Vertex clustering: the points in each cell of a grid are replaced by one of them, and degenerate
+    or duplicate polygons are removed. The grid is coarsened until the number is reached.
 
     Source: Rossignac, Borrel (1993), Multi-resolution 3D approximations for rendering complex
-    scenes, for clusters of vertices.
+    scenes.
 
     Args:
-        points: (N, D).
-        polygons: Of indices of points.
-        most: 1 or more.
+        points: Vertices, (N, D).
+        polygons: Indices of points, (P, corners).
+        most: Maximum number of polygons, at least 1.
     """
     if len(polygons) <= most:
         return polygons
@@ -72,7 +68,7 @@ def coarse(points: NDArray[Any], polygons: NDArray[np.int_], most: int) -> NDArr
 
 
 def triangles(polygons: NDArray[np.int_]) -> NDArray[np.int_]:
-    """Return polygons (P, corners) as triangles, (T, 3), which turn as they do."""
+    """Return a triangulation (T, 3) of polygons (P, corners) with the same orientation."""
     corners = polygons.shape[1]
     fans = [polygons[:, [0, k, k + 1]] for k in range(1, corners - 1)]
     flat = np.concatenate(fans)

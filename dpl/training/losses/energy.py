@@ -90,7 +90,7 @@ class PotentialEnergyLoss(Loss):
         """See `Loss`."""
         self._rest = rest = RestStiffness.of(physics.problem, self._rest)
         with torch.no_grad():
-            scale = clamp_scale(rest.work(batch.force, batch.poisson), self.floor)
+            scale = clamp_scale(rest.linear_strain_energy(batch.force, batch.poisson), self.floor)
             energy, slope, sound = potential_energy(prediction, batch.load, physics.problem, rest)
             if not sound.all():
                 image = rest.product(prediction, batch.poisson)

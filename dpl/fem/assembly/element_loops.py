@@ -1,0 +1,235 @@
+"""Compiled loops over the cells of a body: internal force, tangent and det F.
+
+`SIMD_WIDTH` cells are processed at once, one per SIMD lane. The operations at a quadrature point
+are in `dpl.fem.assembly.constitutive_kernels`. Tests compare the loops with the tensor operations
+of `TensorAssembly`.
+"""
+
+import inspect
+import sys
+
+import numpy as np
+from numba import njit
+
+from dpl.fem.assembly import constitutive_kernels as point
+from dpl.fem.assembly import numba_laws, simd
+from dpl.fem.assembly.simd import SIMD_WIDTH, load, sqrt, store
+
+SOURCES = "".join(inspect.getsource(m) for m in (simd, numba_laws, point, sys.modules[__name__]))
+
+
+@njit
+def gather(field, cells, start, count, out):
+    """Copy a nodal field (N, D) to rows 3 a + i of `out`, one cell per lane."""
+    for lane in range(SIMD_WIDTH):
+        cell = start + min(lane, count - 1)
+        for a in range(cells.shape[1]):
+            for i in range(field.shape[1]):
+                out[3 * a + i, lane] = field[cells[cell, a], i]
+
+
+@njit
+def gather_shape(dN, dV, start, count, g, weight):
+    """Copy gradients to g (Q, 3 a + j, lane) and volumes to weight (zero in unused lanes).
+
+    Equal cells share one set. It is copied for the first block and for an incomplete block.
+    """
+    several = dN.shape[0] > 1
+    if not several and start > 0 and count == SIMD_WIDTH:
+        return
+    for q in range(dN.shape[1]):
+        for lane in range(SIMD_WIDTH):
+            cell = start + min(lane, count - 1) if several else 0
+            weight[q, lane] = dV[cell, q] if lane < count else 0.0
+            for a in range(dN.shape[2]):
+                for j in range(dN.shape[3]):
+                    g[q, 3 * a + j, lane] = dN[cell, q, a, j]
+
+
+@njit
+def gradient(ue, g, H):
+    """Set H (rows 3 i + j) to sum_a u_a g_a^T."""
+    for i in range(3):
+        u = load(ue, i)
+        h0, h1, h2 = u * load(g, 0), u * load(g, 1), u * load(g, 2)
+        for r in range(3, g.shape[0], 3):
+            u = load(ue, r + i)
+            h0 = h0 + u * load(g, r)
+            h1 = h1 + u * load(g, r + 1)
+            h2 = h2 + u * load(g, r + 2)
+        store(H, 3 * i, h0)
+        store(H, 3 * i + 1, h1)
+        store(H, 3 * i + 2, h2)
+
+
+@njit
+def add_forces(F, S, weight, g, P, fe):
+    """Add the nodal forces of stress F S at a point of volume `weight` to fe (rows 3 a + i)."""
+    for i in range(3):
+        for j in range(3):
+            stress = load(F, 3 * i) * load(S, point.VOIGT[0, j])
+            stress = stress + load(F, 3 * i + 1) * load(S, point.VOIGT[1, j])
+            stress = stress + load(F, 3 * i + 2) * load(S, point.VOIGT[2, j])
+            store(P, 3 * i + j, weight * stress)
+    for a in range(g.shape[0] // 3):
+        g0, g1, g2 = load(g, 3 * a), load(g, 3 * a + 1), load(g, 3 * a + 2)
+        for i in range(3):
+            force = load(P, 3 * i) * g0 + load(P, 3 * i + 1) * g1 + load(P, 3 * i + 2) * g2
+            store(fe, 3 * a + i, load(fe, 3 * a + i) + force)
+
+
+@njit
+def add_stiffness(A, g, dim, C, K):
+    """Add g_a A g_b to K for all pairs of nodes a <= b, rows (pair, i, k)."""
+    first = 0
+    for b in range(g.shape[0] // 3):
+        g0, g1, g2 = load(g, 3 * b), load(g, 3 * b + 1), load(g, 3 * b + 2)
+        for r in range(27):
+            store(C, r, load(A, 3 * r) * g0 + load(A, 3 * r + 1) * g1 + load(A, 3 * r + 2) * g2)
+        for i in range(dim):
+            r = 9 * i
+            c0, c1, c2 = load(C, r), load(C, r + 1), load(C, r + 2)
+            d0, d1, d2 = load(C, r + 3), load(C, r + 4), load(C, r + 5)
+            e0, e1, e2 = load(C, r + 6), load(C, r + 7), load(C, r + 8)
+            for a in range(b + 1):
+                g0, g1, g2 = load(g, 3 * a), load(g, 3 * a + 1), load(g, 3 * a + 2)
+                at = first + (a * dim + i) * dim
+                store(K, at, load(K, at) + g0 * c0 + g1 * c1 + g2 * c2)
+                store(K, at + 1, load(K, at + 1) + g0 * d0 + g1 * d1 + g2 * d2)
+                if dim == 3:
+                    store(K, at + 2, load(K, at + 2) + g0 * e0 + g1 * e1 + g2 * e2)
+        first += (b + 1) * dim * dim
+
+
+@njit
+def minimum(values, count, low):
+    """Return the minimum of `low` and `count` values; NaN counts as -inf."""
+    for lane in range(count):
+        value = values[0, lane]
+        low = min(low, value if value == value else -np.inf)
+    return low
+
+
+@njit
+def scatter(fe, cells, start, count, force):
+    """Add the nodal forces of a block of cells to force (N, D)."""
+    for lane in range(count):
+        for a in range(cells.shape[1]):
+            for i in range(force.shape[1]):
+                force[cells[start + lane, a], i] += fe[3 * a + i, lane]
+
+
+@njit(error_model="numpy", cache=True)
+def add_force(law, c, needs, finite, u, cells, dN, dV, force):
+    """Add the internal force of displacements u (N, D) to force (N, D); return min det F - 1."""
+    rows, Q = 3 * cells.shape[1], dN.shape[1]
+    ue, fe, g = (
+        np.zeros((rows, SIMD_WIDTH)),
+        np.zeros((rows, SIMD_WIDTH)),
+        np.zeros((Q, rows, SIMD_WIDTH)),
+    )
+    H, P, D = np.zeros((9, SIMD_WIDTH)), np.zeros((9, SIMD_WIDTH)), np.zeros((36, SIMD_WIDTH))
+    e, X, S = np.zeros((6, SIMD_WIDTH)), np.zeros((6, SIMD_WIDTH)), np.zeros((6, SIMD_WIDTH))
+    weight, scratch, low = np.zeros((Q, SIMD_WIDTH)), np.zeros((26, SIMD_WIDTH)), np.inf
+    for start in range(0, len(cells), SIMD_WIDTH):
+        count = min(SIMD_WIDTH, len(cells) - start)
+        gather(u, cells, start, count, ue)
+        gather_shape(dN, dV, start, count, g, weight)
+        fe[:] = 0.0
+        for q in range(Q):
+            gradient(ue, g[q], H)
+            j = point.volume_change(H)
+            store(scratch, 0, j)
+            low = minimum(scratch, count, low)
+            point.strain(H, finite, e)
+            point.stress(law, c, needs, e, j, X, S, scratch, D, False)
+            for r in range(9):
+                store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
+            add_forces(H, S, load(weight, q), g[q], P, fe)
+        scatter(fe, cells, start, count, force)
+    return low
+
+
+@njit(error_model="numpy", cache=True)
+def add_system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values):
+    """Add the force to (N, D) and the tangent to (nnz + 1,) at displacements u (N, D).
+
+    With `gap` (blocks, Q, 6, SIMD_WIDTH) stress and moduli are evaluated at the strain of u minus
+    the gap, and the stress is extrapolated linearly to the strain of u. Returns the minimum of
+    det C - 1 of the reduced strains, infinity without a gap.
+    """
+    n, Q, dim = cells.shape[1], dN.shape[1], dN.shape[3]
+    ue, fe, g = (
+        np.zeros((3 * n, SIMD_WIDTH)),
+        np.zeros((3 * n, SIMD_WIDTH)),
+        np.zeros((Q, 3 * n, SIMD_WIDTH)),
+    )
+    H, P, D = np.zeros((9, SIMD_WIDTH)), np.zeros((9, SIMD_WIDTH)), np.zeros((36, SIMD_WIDTH))
+    e, X, S, T = (
+        np.zeros((6, SIMD_WIDTH)),
+        np.zeros((6, SIMD_WIDTH)),
+        np.zeros((6, SIMD_WIDTH)),
+        np.zeros((6, SIMD_WIDTH)),
+    )
+    A, C, K = (
+        np.zeros((81, SIMD_WIDTH)),
+        np.zeros((27, SIMD_WIDTH)),
+        np.zeros((places.shape[1], SIMD_WIDTH)),
+    )
+    weight, scratch, low = np.zeros((Q, SIMD_WIDTH)), np.zeros((26, SIMD_WIDTH)), np.inf
+    for start in range(0, len(cells), SIMD_WIDTH):
+        block, count = start // SIMD_WIDTH, min(SIMD_WIDTH, len(cells) - start)
+        gather(u, cells, start, count, ue)
+        gather_shape(dN, dV, start, count, g, weight)
+        fe[:] = 0.0
+        K[:] = 0.0
+        for q in range(Q):
+            gradient(ue, g[q], H)
+            point.strain(H, finite, e)
+            mixed = len(gap) > 0
+            j = point.volume_change(H)
+            if mixed:
+                for v in range(6):
+                    store(e, v, load(e, v) - load(gap[block, q], v))
+                square = point.square(e)
+                store(scratch, 0, square)
+                low = minimum(scratch, count, low)
+                j = square / (1.0 + sqrt(1.0 + square))
+            point.stress(law, c, needs, e, j, X, S, scratch, D, True)
+            for r in range(9):
+                store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
+            point.push_forward(H, D, S, load(weight, q), finite, T, A)
+            if mixed:
+                for v in range(6):
+                    stress = load(S, v)
+                    for w in range(6):
+                        half = 0.5 if w < 3 else 1.0
+                        stress = stress + half * load(D, 6 * v + w) * load(gap[block, q], w)
+                    store(S, v, stress)
+            add_forces(H, S, load(weight, q), g[q], P, fe)
+            add_stiffness(A, g[q], dim, C, K)
+        scatter(fe, cells, start, count, force)
+        for r in range(places.shape[1]):
+            for lane in range(count):
+                values[places[block, r, lane]] += K[r, lane]
+    return low
+
+
+@njit(error_model="numpy", cache=True)
+def update_gap(law, gap, length, update, cells, dN, dV):
+    """Return (1 - length) gap + length^2 dH^T dH of a step (N, D), (blocks, Q, 6, SIMD_WIDTH)."""
+    rows, Q = 3 * cells.shape[1], dN.shape[1]
+    updated = np.zeros((-(-len(cells) // SIMD_WIDTH), Q, 6, SIMD_WIDTH))
+    ue, g = np.zeros((rows, SIMD_WIDTH)), np.zeros((Q, rows, SIMD_WIDTH))
+    H, weight = np.zeros((9, SIMD_WIDTH)), np.zeros((Q, SIMD_WIDTH))
+    for start in range(0, len(cells), SIMD_WIDTH):
+        block, count = start // SIMD_WIDTH, min(SIMD_WIDTH, len(cells) - start)
+        gather(update, cells, start, count, ue)
+        gather_shape(dN, dV, start, count, g, weight)
+        for q in range(Q):
+            gradient(ue, g[q], H)
+            if len(gap) > 0:
+                for v in range(6):
+                    store(updated[block, q], v, (1.0 - length) * load(gap[block, q], v))
+            point.quadratic(H, length * length, updated[block, q])
+    return updated
