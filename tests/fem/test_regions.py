@@ -101,7 +101,7 @@ def test_cylinder_about_z_is_a_disc_in_2d():
         (lambda: Cylinder(0, -1.0), "radius = -1.0"),
         (lambda: Cylinder(0, 1.0, [0, 0])(np.zeros((4, 3))), "must have 3 coordinates"),
         (lambda: Tag(7), "in quotes"),
-        (lambda: Tag(""), "must be a text"),
+        (lambda: Tag(""), "must be a string"),
     ],
 )
 def test_invalid_region_is_an_error(build, message):
