@@ -96,7 +96,8 @@ class Scene:
         steps = []
         for load in loads:
             displacement = solve(self.solver, load).displacement
-            steps.append(self.linear.at(load.poisson).corotational.steps(displacement))
+            preconditioner = self.linear.at(load.poisson).corotational
+            steps.append(preconditioner.count_iterations(displacement))
         return replace(self.newton, corotational=sum(steps) <= MAX_MEAN_STEPS * len(steps))
 
     @property

@@ -1,4 +1,4 @@
-"""Laws of K(0)'s factor turned with the nodes: what it turns by, and Newton's answers with it."""
+"""Laws of the corotational preconditioner, and of Newton with it."""
 
 import math
 from dataclasses import replace
@@ -45,7 +45,7 @@ def bend(problem, total):
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("angle", [0.0, 1e-3, 1.0, 3.0])
-def test_nodes_turn_by_the_rotation_of_their_gradient(dim, degree, angle):
+def test_nodes_are_rotated_by_the_rotation_of_their_gradient(dim, degree, angle):
     problem = body(dim, degree=degree)
     axis = np.array([1.0, 2.0, 3.0]) / math.sqrt(14)
     if dim == 3:
@@ -54,64 +54,64 @@ def test_nodes_turn_by_the_rotation_of_their_gradient(dim, degree, angle):
         turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     stretch = np.diag([1.3, 0.8, 1.1][:dim])
     u = problem.points @ torch.from_numpy(turn @ stretch - np.eye(dim)).T
-    turned = LinearSolver(problem).corotational.at(u[None])
+    rotated = LinearSolver(problem).corotational.at(u[None])
     whole = problem.free.all(dim=1).numpy()
-    assert np.allclose(turned.rotations[whole], turn, atol=1e-8)
+    assert np.allclose(rotated.rotations[whole], turn, atol=1e-8)
     assert np.array_equal(
-        turned.rotations[~whole], np.broadcast_to(np.eye(dim), turned.rotations[~whole].shape)
+        rotated.rotations[~whole], np.broadcast_to(np.eye(dim), rotated.rotations[~whole].shape)
     )
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_node_held_in_one_direction_turns_across_it(axis):
+def test_a_node_fixed_in_one_direction_is_rotated_about_it(axis):
     sides = [None, None, None]
     sides[axis] = 0.0
     problem = body(supports=[DirichletBC(Plane(1, "min"), sides)])
     turn = Rotation.from_rotvec(0.7 * np.eye(3)[axis]).as_matrix()
     u = problem.points @ torch.from_numpy(turn - np.eye(3)).T
-    turned = LinearSolver(problem).corotational.at(u[None])
+    rotated = LinearSolver(problem).corotational.at(u[None])
     partly = (problem.free.sum(dim=1) == 2).numpy()
     assert partly.sum() > 10
-    assert np.allclose(turned.rotations[partly], turn, atol=1e-8)
+    assert np.allclose(rotated.rotations[partly], turn, atol=1e-8)
 
 
-def test_a_node_held_in_two_directions_does_not_turn():
+def test_a_node_fixed_in_two_directions_is_not_rotated():
     problem = body(supports=[DirichletBC(Plane(1, "min"), [0.0, 0.0, None])])
     turn = Rotation.from_rotvec([0.2, 0.3, 0.4]).as_matrix()
     u = problem.points @ torch.from_numpy(turn - np.eye(3)).T
-    turned = LinearSolver(problem).corotational.at(u[None])
+    rotated = LinearSolver(problem).corotational.at(u[None])
     fixed = (problem.free.sum(dim=1) < 2).numpy()
-    assert np.array_equal(turned.rotations[fixed], np.tile(np.eye(3), (fixed.sum(), 1, 1)))
+    assert np.array_equal(rotated.rotations[fixed], np.tile(np.eye(3), (fixed.sum(), 1, 1)))
 
 
-def test_nodes_of_an_inverted_body_do_not_turn():
+def test_nodes_of_an_inverted_body_are_not_rotated():
     problem = body()
-    turned = LinearSolver(problem).corotational.at(-2.0 * problem.points[None])
-    assert np.array_equal(turned.rotations, np.broadcast_to(np.eye(3), turned.rotations.shape))
+    rotated = LinearSolver(problem).corotational.at(-2.0 * problem.points[None])
+    assert np.array_equal(rotated.rotations, np.broadcast_to(np.eye(3), rotated.rotations.shape))
 
 
-def test_at_rest_it_is_the_inverse_of_the_stiffness():
+def test_at_rest_the_preconditioner_is_the_inverse_of_the_stiffness():
     problem = body()
     linear = LinearSolver(problem)
     zero = torch.zeros(1, *problem.shape, dtype=torch.float64)
     right = np.random.default_rng(0).standard_normal(problem.pattern.size)
     ours, exact = linear.corotational.at(zero).apply(right), linear.factor.solve(right)
     assert np.linalg.norm(ours - exact) < 1e-4 * np.linalg.norm(exact)
-    assert linear.corotational.steps(zero) == 1
+    assert linear.corotational.count_iterations(zero) == 1
 
 
 @pytest.mark.parametrize("backend", ["auto", "superlu"])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_it_is_symmetric_and_positive(dim, backend):
+def test_the_preconditioner_is_symmetric_and_positive_definite(dim, backend):
     problem = body(dim)
     random = np.random.default_rng(1)
     u = torch.from_numpy(0.02 * random.standard_normal((1, *problem.shape)))
-    turned = LinearSolver(problem, linear=backend).corotational.at(u)
+    rotated = LinearSolver(problem, linear=backend).corotational.at(u)
     for _ in range(5):
         x, y = random.standard_normal((2, problem.pattern.size))
-        size = np.linalg.norm(x) * np.linalg.norm(turned.apply(y))
-        assert abs(y @ turned.apply(x) - x @ turned.apply(y)) < 1e-5 * size
-        assert x @ turned.apply(x) > 0
+        size = np.linalg.norm(x) * np.linalg.norm(rotated.apply(y))
+        assert abs(y @ rotated.apply(x) - x @ rotated.apply(y)) < 1e-5 * size
+        assert x @ rotated.apply(x) > 0
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_it_is_symmetric_and_positive(dim, backend):
     ids=str,
 )
 @pytest.mark.parametrize("mixed", [True, False])
-def test_newton_has_the_same_answer_with_it(options, mixed):
+def test_newton_has_the_same_solution_with_the_preconditioner(options, mixed):
     problem = body(**options)
     load = bend(problem, 1e-4 if problem.shape[1] == 3 else 5e-4)
     plain = Newton(problem, mixed_integration=mixed)
@@ -140,18 +140,18 @@ def test_newton_has_the_same_answer_with_it(options, mixed):
     assert (ours.factorisations < theirs.factorisations).all()
 
 
-def test_far_from_rest_it_is_far_better_than_the_factor_as_it_is(monkeypatch):
+def test_rotation_halves_the_iterations_far_from_rest(monkeypatch):
     problem = body()
     answer = solve(Newton(problem), bend(problem, 4e-4)).displacement
-    turning = LinearSolver(problem).corotational
-    turned = turning.steps(answer)
-    monkeypatch.setattr(type(turning), "at", lambda self, u: self.factor)
-    assert turned <= 8
-    assert turning.steps(answer) > 2 * turned
+    preconditioner = LinearSolver(problem).corotational
+    rotated = preconditioner.count_iterations(answer)
+    monkeypatch.setattr(type(preconditioner), "at", lambda self, u: self.factor)
+    assert rotated <= 8
+    assert preconditioner.count_iterations(answer) > 2 * turned
 
 
-def test_where_it_does_not_contract_a_factor_takes_over():
-    """A plate a hundredth thick: strains through the thickness resist every wrong rotation."""
+def test_a_tangent_is_factorised_where_the_preconditioner_is_poor():
+    """In a plate of thickness 1/100 the errors of the rotations cause large strains."""
     problem = Problem.build(box([1.0, 0.2, 0.01], [17, 5, 2]), NH, fixed=Plane(0, "min"))
     force = Traction(Plane(0, "max"), [0.0, 0.0, -1e-3]).on(problem)
     load = Load(force[None], torch.ones(1, dtype=torch.float64))
@@ -162,7 +162,7 @@ def test_where_it_does_not_contract_a_factor_takes_over():
     assert torch.allclose(ours.displacement, theirs.displacement, rtol=0, atol=1e-8)
 
 
-def test_without_a_factor_stability_is_not_claimed():
+def test_stability_is_unknown_without_a_factor():
     problem = body()
     load = bend(problem, 2e-4)
     ours, theirs = solve(Newton(problem, corotational=True), load), solve(Newton(problem), load)
@@ -172,7 +172,7 @@ def test_without_a_factor_stability_is_not_claimed():
     assert ours.status.tolist() == [int(Status.CONVERGED)]
 
 
-def test_moved_supports_go_with_it():
+def test_moved_supports_work_with_the_preconditioner():
     shift = DirichletBC(Plane(0, "max"), [0.0, 0.0, -0.6])
     problem = body(supports=[shift])
     none = Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
@@ -181,7 +181,7 @@ def test_moved_supports_go_with_it():
     assert torch.allclose(ours.displacement, theirs.displacement, rtol=0, atol=1e-8)
 
 
-def test_other_attributes_keep_the_factor_of_rest():
+def test_replaced_attributes_keep_the_linear_solver():
     newton = Newton(body())
     other = replace(newton, tol=1e-3, corotational=True)
     assert (other.tol, other.corotational) == (1e-3, True)
@@ -197,20 +197,20 @@ def test_another_backend_or_body_has_a_linear_solver_of_its_own():
         assert other.linear_solver.linear == other.linear
 
 
-def test_a_load_of_nothing_needs_no_tangent():
+def test_the_preconditioner_maps_zero_to_zero():
     problem = body()
     right = problem.restrict(torch.zeros(problem.shape, dtype=torch.float64))
     zero = torch.zeros(1, *problem.shape, dtype=torch.float64)
     assert not LinearSolver(problem).corotational.at(zero).apply(right).any()
 
 
-def test_frames_outlive_the_memory_of_the_problem():
-    """Sending a problem to a process moves its tensors: what compiled loops read is a copy."""
+def test_rotations_do_not_depend_on_the_memory_of_the_problem():
+    """Sending a problem to a process moves its tensors, so compiled loops read copies."""
     problem = body()
-    turning = Newton(problem).linear_solver.corotational
+    preconditioner = Newton(problem).linear_solver.corotational
     u = 0.1 * problem.points.roll(1, dims=1)[None] * problem.free
-    before = turning.at(u).rotations.copy()
-    kept = turning._means[2]
+    before = preconditioner.at(u).rotations.copy()
+    kept = preconditioner._cell_means[2]
     assert kept.ctypes.data != problem.cells.data_ptr()
     ForkingPickler.dumps(problem)
-    assert np.array_equal(turning.at(u).rotations, before)
+    assert np.array_equal(preconditioner.at(u).rotations, before)

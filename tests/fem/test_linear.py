@@ -635,7 +635,9 @@ def test_backend_that_is_not_installed_is_an_error_that_says_how_to_get_it(hide,
 
 
 def test_unknown_backend_is_an_error_that_names_the_known(stiffness):
-    with pytest.raises(ValueError, match=r"linear = 'umfpack' must be auto, band, band32, pardiso"):
+    with pytest.raises(
+        ValueError, match=r"linear = 'umfpack' must be one of auto, band, band32, pardiso"
+    ):
         make_backend(stiffness[0], "umfpack")
 
 

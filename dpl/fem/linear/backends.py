@@ -1,17 +1,14 @@
-"""K x = r for the sparse symmetric tangents of a problem: several backends behind one function.
+"""Selection of the backend that solves K x = r with sparse symmetric tangents.
 
-The symbolic work (ordering, structure) is done once per backend object, the numbers per call.
+A backend object does the symbolic work (ordering, structure) once; each call does the numerical
+work.
 """
 
 import importlib.util
 from collections.abc import Callable
 
 from dpl.fem.linear.banded import BandedCholesky, MixedPrecisionBandedCholesky, band_storage
-from dpl.fem.linear.interface import (
-    Array,
-    Backend,
-    Pattern,
-)
+from dpl.fem.linear.interface import Array, Backend, Pattern
 from dpl.fem.linear.krylov import CG, multigrid_installed
 from dpl.fem.linear.pardiso import Pardiso
 from dpl.fem.linear.superlu import SuperLU
@@ -19,7 +16,7 @@ from dpl.version import install
 
 
 def installed_backends() -> list[str]:
-    """Return the names of the backends that can be used here."""
+    """Return the names of the installed backends."""
     missing = set() if importlib.util.find_spec("pypardiso") else {"pardiso"}
     return [name for name in BACKENDS if name not in missing]
 
@@ -30,11 +27,11 @@ def make_backend(pattern: Pattern, name: str = "auto", near_null: Array | None =
     Args:
         pattern: Structure of the matrices.
         name: "band", "band32", "pardiso", "superlu", "cg", or "auto", see `select_backend`.
-        near_null: Fields that cost no energy, (n, k), see `TensorAssembly.near_null`; "cg" needs
-            them.
+        near_null: Rigid body modes, (n, k), see `TensorAssembly.near_null`; "cg" needs them for
+            multigrid.
 
     Raises:
-        ValueError: No such backend, or it is not installed.
+        ValueError: The backend is unknown or not installed.
     """
     return BACKENDS[select_backend(name, pattern, near_null)](pattern, near_null)
 
@@ -46,35 +43,34 @@ def select_backend(
     *,
     many_rhs: bool = False,
 ) -> str:
-    """Return the name of the backend that a name stands for.
+    """Return the name of the backend, with "auto" replaced by the backend it selects.
 
-    "auto" depends on the pattern and on what is installed, never on a clock: it stays "auto"
-    where no pattern is given.
+    "auto" selects by the pattern and the installed packages, not by timings, so that results are
+    reproducible. Without a pattern it stays "auto".
 
     Args:
         name: As for `make_backend`.
         pattern: Structure of the matrices.
-        near_null: Fields that cost no energy, (n, k), see `TensorAssembly.near_null`.
-        lasting: One factor is to answer many right-hand sides: it may cost more if they cost less.
+        near_null: Rigid body modes, (n, k), see `TensorAssembly.near_null`.
+        many_rhs: Whether one factor solves for many right-hand sides: the factorisation may then
+            cost more if each solve costs less.
 
     Raises:
-        ValueError: No such backend, or it is not installed.
+        ValueError: The backend is unknown or not installed.
     """
     if name not in (*BACKENDS, "auto"):
-        raise ValueError(f"linear = {name!r} must be auto, {', '.join(BACKENDS)}")
+        raise ValueError(f"linear = {name!r} must be one of auto, {', '.join(BACKENDS)}")
     if name != "auto" and name not in installed_backends():
         raise ValueError(f"linear = {name!r} is not installed: {install(name)}")
     return name if name != "auto" or pattern is None else _automatic(pattern, near_null, many_rhs)
 
 
-# Measured on beams, cubes, stars, plates of 1,000 to 100,000 degrees of freedom: a band costs n b^2
-# operations, a sparse factor of a solid about n^2 slower ones, so b^2 / n decides.
+# A banded factorisation takes n b^2 operations, a sparse one of a solid about n^2 slower ones, so
+# b^2 / n decides. Thresholds from beams, cubes, stars and plates of 1,000 to 100,000 unknowns.
 BAND_COST_RATIO = {"pardiso": 22, "superlu": 100, "cg": 10}  # b^2 / n below which a band is faster
-MULTIGRID = {"pardiso": 100_000, "superlu": 30_000}  # n from which on multigrid is faster
-MANY_RHS_FACTOR = (
-    3.0  # times that where one factor answers many right-hand sides: it must fit in memory
-)
-FLOAT32_BANDWIDTH = 250  # b from which on float32 saves more than the iterations on it cost
+MULTIGRID = {"pardiso": 100_000, "superlu": 30_000}  # n above which multigrid is faster
+MANY_RHS_FACTOR = 3.0  # multiplies MULTIGRID if one factor solves for many right-hand sides
+FLOAT32_BANDWIDTH = 250  # b from which float32 saves more than its iterations cost
 
 
 def _automatic(pattern: Pattern, near_null: Array | None, many_rhs: bool) -> str:
@@ -86,7 +82,7 @@ def _automatic(pattern: Pattern, near_null: Array | None, many_rhs: bool) -> str
     if "band" in names:
         half = band_storage(pattern).half
         if half**2 < BAND_COST_RATIO[best] * pattern.size:
-            # In float32 factorising is faster, a solve to all digits is not.
+            # float32 makes the factorisation faster, but not a solve to full accuracy
             return "band32" if half >= FLOAT32_BANDWIDTH and not many_rhs else "band"
     return best
 

@@ -1,4 +1,4 @@
-"""Banded Cholesky (LAPACK): the fastest direct solver for slender bodies, with SciPy alone."""
+"""Banded Cholesky factors by LAPACK, the fastest direct solver for slender bodies."""
 
 import weakref
 from collections.abc import Callable
@@ -30,14 +30,14 @@ from dpl.system.threads import blas
 
 
 class BandStorage(NamedTuple):
-    """Where a pattern's entries lie in the storage of a band, (n, half + 1), row after row.
+    """Places of a pattern's entries in band storage, (n, half + 1), row by row.
 
-    Row j holds the lower triangle's column j from the diagonal down, as LAPACK wants it.
+    Row j contains column j of the lower triangle from the diagonal down, as LAPACK expects it.
 
     Attributes:
-        order: Old number of each new unknown, (n,); None: as they are.
-        half: Half-bandwidth b, the farthest that an entry lies from the diagonal.
-        place: For each entry its flat place, (nnz,).
+        order: Old number of each new unknown, (n,); None: unchanged.
+        half: Half-bandwidth b, the largest distance of an entry from the diagonal.
+        place: Flat index of each entry in the storage, (nnz,).
     """
 
     order: NDArray[np.int32] | None
@@ -46,10 +46,11 @@ class BandStorage(NamedTuple):
 
 
 def band_storage(pattern: Pattern, sweeps: int = 50) -> BandStorage:
-    """Return the layout in the pattern's own order or in a new one, whichever is narrower.
+    """Return the storage in the pattern's order or in a new one, whichever is narrower.
 
-    Reverse Cuthill-McKee (George 1971), then sweeps in which each unknown moves to the middle of
-    its farthest neighbours (node centroids, Lim, Rodrigues, Xiao 2006), until ten gain nothing.
+    The new order is reverse Cuthill-McKee (George 1971), followed by sweeps of node centroids
+    (Lim, Rodrigues, Xiao 2006, Eur. J. Oper. Res. 174): each unknown moves to the middle of its
+    farthest neighbours, until ten sweeps bring no gain.
     """
     n = pattern.size
     rows, columns = row_numbers(pattern), pattern.indices
@@ -89,17 +90,16 @@ def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
         float32[::1](Typed(float32, 2, "C", readonly=True), Typed(float32, 1, "C", readonly=True)),
     ],
     cache=True,
-    fastmath={"reassoc", "contract"},  # sums in vector registers, one for each lane
+    fastmath={"reassoc", "contract"},  # allows sums in vector registers
 )
 def banded_triangular_solve(L, right):  # type: ignore[no-untyped-def]
     """Return x, (n,), with L L^T x = right, four columns of L at a time.
 
-    LAPACK's xPBTRS calls xTBSV, which calls a vector operation for each column and reads and writes
-    the answer each time; this does so once for four.
+    LAPACK's xPBTRS reads and writes x once per column; this loop does so once per four columns.
 
     Args:
-        L: See `BandedFactor`; zero where a column ends below the last row.
-        right: (n,), of the same dtype.
+        L: Storage of the factor, (n, b + 1), see `BandedFactor`; zero beyond the last row.
+        right: Right-hand side, (n,), of the same dtype.
     """
     n, w = L.shape
     x = np.zeros(n + w + 3, L.dtype)
@@ -155,11 +155,11 @@ def banded_triangular_solve(L, right):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True, eq=False)
 class BandedFactor(DirectFactor):
-    """Banded Cholesky factor; in float64 it is a backend's factor as it is.
+    """Banded Cholesky factor L of a positive definite matrix.
 
     Attributes:
         storage: L, (n, b + 1), see `BandStorage`.
-        order: See `BandStorage`.
+        order: Order of the unknowns, see `BandStorage`.
         negative_pivots: 0.
     """
 
@@ -182,12 +182,12 @@ class BandedFactor(DirectFactor):
         return self.solve(right)
 
     def to_float32(self) -> "BandedFactor":
-        """Return the factor in float32, half as long to read."""
+        """Return the factor in float32, in half the memory."""
         return replace(self, storage=self.storage.astype(np.float32))
 
 
 class BandedCholesky:
-    """Banded Cholesky in float64; a matrix that is not positive definite goes to another backend.
+    """Banded Cholesky in float64; another backend factorises indefinite matrices.
 
     Source: Anderson et al. (1999), LAPACK Users' Guide, xPBTRF.
     """
@@ -195,11 +195,11 @@ class BandedCholesky:
     dtype: type[np.floating[Any]] = np.float64
 
     def __init__(self, pattern: Pattern, indefinite: Callable[[Pattern], Backend]) -> None:
-        """Prepare.
+        """Store the pattern.
 
         Args:
             pattern: Structure of the matrices.
-            indefinite: Makes the backend for matrices that are not positive definite.
+            indefinite: Constructor of the backend for matrices that are not positive definite.
         """
         self.pattern, self.indefinite = pattern, indefinite
         self._storage: NDArray[Any] | None = None
@@ -211,7 +211,7 @@ class BandedCholesky:
 
     @cached_property
     def layout(self) -> BandStorage:
-        """Order and places, found once."""
+        """Order and places of the entries."""
         return band_storage(self.pattern)
 
     @cached_property
@@ -225,13 +225,13 @@ class BandedCholesky:
         return self._cholesky(values) or self.other.factorise(values)
 
     def _cholesky(self, values: Array) -> BandedFactor | None:
-        """Return the factor; None: not positive definite, or not for sure."""
+        """Return the factor; None if the matrix may not be positive definite."""
         layout = self.layout
-        if self._storage is None or self._last() is not None:  # a living factor keeps its storage
+        if self._storage is None or self._last() is not None:  # still used by a factor
             self._storage = np.empty((self.pattern.size, layout.half + 1), self.dtype)
         storage = self._storage
-        storage.fill(0)  # all of it: the last factor has filled the band
-        storage.ravel()[layout.place] = values.astype(self.dtype, copy=False)  # cast, then scatter
+        storage.fill(0)  # the last factorisation has filled the whole band
+        storage.ravel()[layout.place] = values.astype(self.dtype, copy=False)
         diagonal = storage[:, 0].copy()
         factorise = dpbtrf if self.dtype == np.float64 else spbtrf
         with blas().limit(limits=1):
@@ -246,18 +246,18 @@ class BandedCholesky:
 class MixedPrecisionBandedCholesky(BandedCholesky):
     """Banded Cholesky in float32 as preconditioner of conjugate gradients in float64.
 
-    Half the time and memory of `BandedCholesky`, which takes over where float32 does not do.
-    Diagonal scaling would save nothing: what Cholesky loses to rounding does not depend on it
-    (Demmel 1989), and float32 holds stiffnesses 70 orders of magnitude apart.
+    It takes half the time and memory of `BandedCholesky`, which replaces it where float32 is not
+    accurate enough. Diagonal scaling would not help: the rounding errors of Cholesky do not depend
+    on it (Demmel 1989), and float32 covers stiffnesses 70 orders of magnitude apart.
     """
 
     dtype = np.float32
 
     @cached_property
     def other(self) -> Backend:
-        """The same in float64."""
+        """Backend in float64."""
         exact = BandedCholesky(self.pattern, self.indefinite)
-        exact.__dict__["layout"] = self.layout
+        exact.layout = self.layout
         return exact
 
     def factorise(self, values: Array) -> Factor:
@@ -275,25 +275,21 @@ class MixedPrecisionBandedCholesky(BandedCholesky):
 
 
 class MixedPrecisionFactor(DirectFactor):
-    """A matrix with its factor in float32, and in float64 once a solve has needed that.
+    """A matrix with its factor in float32, and one in float64 after a solve that needed it."""
 
-    Attributes:
-        negative_pivots: 0, or what the float64 factor counts once a solve has asked for it.
-    """
-
-    MAX_ITER = 25  # beyond, a float64 factor is cheaper
+    MAX_ITER = 25  # more iterations cost more than a float64 factor
 
     def __init__(
         self, parent: MixedPrecisionBandedCholesky, values: Array, rough: BandedFactor, scale: float
     ) -> None:
-        """Take entries (nnz,) and the factor of entries / scale."""
+        """Store the entries (nnz,) and the factor of entries / scale."""
         self.parent, self.values, self.rough, self.scale = parent, values, rough, scale
         self.product = SymmetricProduct(parent.pattern, values)
         self.exact: Factor | None = None
 
     @property
     def negative_pivots(self) -> int:
-        """Number of negative eigenvalues, as far as known."""
+        """Negative pivots of the float64 factor, 0 while there is none."""
         return 0 if self.exact is None else self.exact.negative_pivots or 0
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
@@ -306,7 +302,7 @@ class MixedPrecisionFactor(DirectFactor):
         return self.exact.solve(right)
 
     def apply(self, right: Array) -> Array:
-        """Return K^-1 right, (n,), to float32, see `Factor.apply`."""
+        """Return K^-1 right, (n,), in the accuracy of float32."""
         size = np.abs(right).max() or 1.0  # of order one, so that float32 holds it
         return self.rough.solve((right / size).astype(np.float32)).astype(np.float64) * (
             size / self.scale

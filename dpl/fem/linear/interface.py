@@ -10,9 +10,9 @@ Array = NDArray[np.float64]
 
 
 class Pattern(Protocol):
-    """Where a symmetric matrix has entries: the upper triangle in CSR, each row from its diagonal.
+    """Sparsity pattern of a symmetric matrix: the upper triangle in CSR.
 
-    Every row has its diagonal entry, and columns are sorted.
+    Every row starts with its diagonal entry, and columns are sorted.
     """
 
     @property
@@ -32,7 +32,7 @@ class Pattern(Protocol):
 
 
 class SingularMatrix(ArithmeticError):
-    """The matrix has no usable factorisation, or an iteration on it does not end."""
+    """The matrix has no usable factorisation, or an iterative solve does not converge."""
 
 
 class Stability(NamedTuple):
@@ -69,7 +69,7 @@ class Factor(Protocol):
         ...
 
     def apply(self, right: Array) -> Array:
-        """Return roughly K^-1 right, (n,): a fixed symmetric map, a preconditioner."""
+        """Return an approximation of K^-1 right, (n,), by a fixed symmetric preconditioner."""
         ...
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
@@ -77,11 +77,11 @@ class Factor(Protocol):
 
         Args:
             right: Right-hand side, (n,).
-            rtol: ||right - K x|| / ||right|| where iterative backends stop [-]; direct ones go
-                to rounding.
+            rtol: ||right - K x|| / ||right|| at which iterative backends stop [-]; direct ones
+                solve to rounding.
 
         Raises:
-            SingularMatrix: An iterative backend met negative curvature or did not converge.
+            SingularMatrix: An iterative backend found negative curvature or did not converge.
         """
         ...
 
@@ -95,25 +95,24 @@ class DirectFactor:
 
 
 class Backend(Protocol):
-    """Factorises matrices of one pattern, on one thread; can be pickled, without its factors."""
+    """Factorisation of matrices of one pattern, on one thread. Pickling omits the factors."""
 
     def factorise(self, values: Array) -> Factor:
-        """Return the factor of the matrix with entries values (nnz,) on the pattern.
+        """Return the factor of the matrix with entries `values` (nnz,) on the pattern.
 
-        It serves as long as it lives, whatever the backend factorises next and whatever becomes
-        of `values`.
+        The factor stays valid when the backend factorises other matrices and when `values` change.
 
         Raises:
-            SingularMatrix: An exact zero pivot, or entries that are not finite.
+            SingularMatrix: A pivot is exactly zero, or entries are not finite.
         """
         ...
 
 
 class SymmetricProduct:
-    """x -> K x from the upper triangle of K alone."""
+    """Product K x from the upper triangle of K."""
 
     def __init__(self, pattern: Pattern, values: Array) -> None:
-        """Take entries (nnz,); they are not copied."""
+        """Store the entries (nnz,) without a copy."""
         shape = (pattern.size, pattern.size)
         self.upper = csr_array((values, pattern.indices, pattern.indptr), shape=shape)
         self.lower = self.upper.T  # a view
@@ -128,7 +127,7 @@ class SymmetricProduct:
 
 
 def full_matrix(pattern: Pattern, values: Array) -> csr_array:
-    """Return the whole symmetric matrix (n, n) of upper-triangle entries (nnz,)."""
+    """Return the full symmetric matrix (n, n) of upper-triangle entries (nnz,)."""
     upper = csr_array((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
     lower = upper.T.tocsr()
     lower.setdiag(0)
@@ -142,10 +141,10 @@ def row_numbers(pattern: Pattern) -> NDArray[np.int32]:
 
 
 def require_finite(values: Array) -> None:
-    """Refuse entries that are not finite.
+    """Check that all entries are finite.
 
     Raises:
-        SingularMatrix: There is one.
+        SingularMatrix: An entry is not.
     """
     if not np.isfinite(values).all():
         raise SingularMatrix("the matrix has entries that are not finite")

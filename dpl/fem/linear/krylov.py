@@ -1,4 +1,4 @@
-"""Conjugate gradients, alone or with algebraic multigrid: little memory, for very large bodies."""
+"""Conjugate gradients, with diagonal or algebraic multigrid preconditioner, for large bodies."""
 
 import importlib
 import importlib.util
@@ -26,11 +26,11 @@ from dpl.fem.linear.interface import (
 )
 
 Map = Callable[[Array], Array]  # (n,) -> (n,)
-DEFINITENESS_TOL = 1e-6  # relative residual of noise below which every eigenvalue has been met
+DEFINITENESS_TOL = 1e-6  # relative residual of a random system that proves definiteness
 
 
 class NotDefinite(SingularMatrix):
-    """A matrix that is known to have an eigenvalue that is not above zero."""
+    """The matrix has an eigenvalue that is negative or zero."""
 
 
 def conjugate_gradients(
@@ -44,17 +44,19 @@ def conjugate_gradients(
 ) -> Array:
     """Return x, (n,), with ||right - K x|| <= rtol ||right||.
 
-    Source: Hestenes, Stiefel (1952); Saad (2003), Iterative Methods, algorithm 9.1. The residual
-    is the one that the recursion carries: the true one ends where rounding ends it.
+    The residual is that of the recurrence; rounding limits the true one.
+
+    Source: Hestenes, Stiefel (1952), J. Res. Natl. Bur. Stand. 49; Saad (2003), Iterative Methods
+    for Sparse Linear Systems, algorithm 9.1.
 
     Args:
-        product: x -> K x.
-        precondition: r -> approximately K^-1 r, symmetric positive definite.
+        product: Function x -> K x.
+        precondition: Function r -> M^-1 r, symmetric positive definite, near K^-1 r.
         right: Right-hand side, (n,).
-        rtol: Where to stop [-].
-        max_iter: Products to spend at most.
-        doubtful: Give up as soon as the residual, shrinking as it has on average, would not be
-            there in time.
+        rtol: Relative residual at which to stop [-].
+        max_iter: Largest number of iterations.
+        abort_if_slow: Stop after three or more iterations if the residual, at its mean rate of
+            convergence, would not reach `rtol` within `max_iter`.
 
     Raises:
         SingularMatrix: K is not positive definite, or `max_iter` is not enough.
@@ -65,8 +67,8 @@ def conjugate_gradients(
         return x
     unit = 2.0 ** np.clip(np.frexp(largest)[1], -1021, 1023)  # else squares under- or overflow
     residual = right / unit
-    before_all = np.linalg.norm(residual)
-    enough = rtol * before_all
+    initial = np.linalg.norm(residual)
+    target = rtol * initial
     z = precondition(residual)
     direction, rz = z.copy(), residual @ z
     for k in range(1, max_iter + 1):
@@ -77,10 +79,10 @@ def conjugate_gradients(
         length = rz / curvature
         x += length * direction
         residual -= length * image
-        left = np.linalg.norm(residual)
-        if left <= enough:
+        norm = np.linalg.norm(residual)
+        if norm <= target:
             return unit * x
-        if abort_if_slow and k >= 3 and (left / before_all) ** (max_iter / k) > rtol:
+        if abort_if_slow and k >= 3 and (norm / initial) ** (max_iter / k) > rtol:
             break
         z = precondition(residual)
         rz, before = residual @ z, rz
@@ -90,25 +92,26 @@ def conjugate_gradients(
 
 
 def smallest_ritz_value(product: Map, precondition: Map, size: int, steps: int = 8) -> float:
-    """Return about the lowest eigenvalue of M^-1 K, -inf where it is certainly not positive.
+    """Return the smallest Ritz value of M^-1 K, -inf if K is not positive definite.
 
-    M^-1 is the preconditioner, of a matrix near K: all eigenvalues but a few are near 1, and those
-    show in a few Lanczos steps from a fixed vector of noise. More than three are taken only where
-    the lowest is below 1/2.
+    M is a matrix near K, so that all eigenvalues but a few are near 1 and a few Lanczos steps from
+    a fixed random vector find the others. More than three steps are taken only if the smallest
+    Ritz value is below 1/2.
 
-    Source: Saad (2003), Iterative Methods, section 6.7.3 (Ritz values from conjugate gradients).
+    Source: Saad (2003), Iterative Methods for Sparse Linear Systems, section 6.7.3 (Ritz values
+    from conjugate gradients).
 
     Args:
-        product: x -> K x.
-        precondition: r -> M^-1 r, symmetric positive definite.
+        product: Function x -> K x.
+        precondition: Function r -> M^-1 r, symmetric positive definite.
         size: n.
-        steps: Steps at most.
+        steps: Largest number of Lanczos steps.
     """
     residual = np.random.default_rng(0).standard_normal(size)
     z = precondition(residual)
     direction, rz = z.copy(), float(residual @ z)
     diagonal: list[float] = []
-    beside: list[float] = []
+    off_diagonal: list[float] = []
     least, carried = float("inf"), 0.0
     for k in range(min(steps, size)):
         image = product(direction)
@@ -117,7 +120,7 @@ def smallest_ritz_value(product: Map, precondition: Map, size: int, steps: int =
             return -np.inf
         length = rz / curvature
         diagonal.append(1 / length + carried)
-        least = float(eigvalsh_tridiagonal(diagonal, beside)[0])
+        least = float(eigvalsh_tridiagonal(diagonal, off_diagonal)[0])
         if k >= 2 and least > 0.5:
             break
         residual -= length * image
@@ -127,7 +130,7 @@ def smallest_ritz_value(product: Map, precondition: Map, size: int, steps: int =
             break
         ratio = rz / before
         carried = ratio / length
-        beside.append(math.sqrt(ratio) / length)
+        off_diagonal.append(math.sqrt(ratio) / length)
         direction *= ratio
         direction += z
     return least
@@ -138,9 +141,9 @@ class CGFactor:
     """A matrix and its preconditioner.
 
     Attributes:
-        product: x -> K x.
-        precondition: r -> approximately K^-1 r.
-        max_iter: Conjugate gradient steps a solve may take.
+        product: Function x -> K x.
+        precondition: Function r -> M^-1 r, near K^-1 r.
+        max_iter: Largest number of iterations of a solve.
         negative_pivots: None, not counted; see `stability`.
     """
 
@@ -171,7 +174,7 @@ class CGFactor:
         return Stability(0, exact=True)
 
     def apply(self, right: Array) -> Array:
-        """Return the preconditioner's answer, (n,)."""
+        """Return M^-1 right, (n,)."""
         return self.precondition(right)
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
@@ -184,14 +187,15 @@ class CGFactor:
 
 @dataclass(frozen=True, eq=False)
 class CG:
-    """Conjugate gradients for positive definite matrices; others raise, in `solve` if not before.
+    """Conjugate gradients for positive definite matrices; `solve` raises for others.
 
-    With the near-nullspace and pyamg: preconditioned by smoothed aggregation (Vanek, Mandel,
-    Brezina 1996), whose steps hardly grow with the body. Otherwise by the diagonal.
+    With pyamg and the near-nullspace the preconditioner is smoothed aggregation (Vanek, Mandel,
+    Brezina 1996, Computing 56), whose number of iterations hardly grows with the body. Otherwise
+    it is the diagonal.
 
     Attributes:
         pattern: Structure of the matrices.
-        near_null: Fields that cost no energy, (n, k), see `TensorAssembly.near_null`.
+        near_null: Rigid body modes, (n, k), see `TensorAssembly.near_null`.
     """
 
     pattern: Pattern
@@ -202,7 +206,9 @@ class CG:
         require_finite(values)
         product = SymmetricProduct(self.pattern, values.copy())
         if not (product.diagonal > 0).all():
-            raise SingularMatrix("the matrix is not positive definite: its diagonal is not")
+            raise SingularMatrix(
+                "the matrix is not positive definite: its diagonal is not positive"
+            )
         if self.near_null is not None and multigrid_installed():
             return CGFactor(product, self._multigrid(values, self.near_null), max_iter=300)
         inverse = 1 / product.diagonal
@@ -210,7 +216,7 @@ class CG:
 
     def _multigrid(self, values: Array, near_null: Array) -> Map:
         pyamg: Any = importlib.import_module("pyamg")
-        whole = csr_matrix(full_matrix(self.pattern, values))  # pyamg wants SciPy's older classes
+        whole = csr_matrix(full_matrix(self.pattern, values))  # pyamg needs spmatrix, not sparray
         hierarchy = pyamg.smoothed_aggregation_solver(
             whole.tobsr((self._block, self._block)),
             B=near_null,
@@ -227,7 +233,7 @@ class CG:
 
     @cached_property
     def _block(self) -> int:
-        """D where all nodes have D degrees of freedom that couple in full, else 1."""
+        """Block size: D if all nodes have D fully coupled degrees of freedom, else 1."""
         n, nnz = self.pattern.size, len(self.pattern.indices)
         dim = {6: 3, 3: 2}.get(0 if self.near_null is None else self.near_null.shape[1], 1)
         if n % dim:
@@ -238,5 +244,5 @@ class CG:
 
 
 def multigrid_installed() -> bool:
-    """Return whether pyamg is there."""
+    """Return whether pyamg is installed."""
     return importlib.util.find_spec("pyamg") is not None

@@ -1,4 +1,4 @@
-"""An order of nodes in which neighbours are near, the same on every machine."""
+"""Bandwidth-reducing order of unknowns, the same on every machine."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,11 +7,13 @@ from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 
 
 def reduce_bandwidth(graph: csr_array) -> NDArray[np.int32]:
-    """Return the reverse Cuthill-McKee order (n,) of a symmetric graph (George 1971).
+    """Return the reverse Cuthill-McKee order (n,) of a symmetric graph.
 
-    SciPy's begins at the node of lowest degree which an unstable sort happens to put first: at
-    another one on another processor. So each part of the graph gets a loose end, at the first of
-    its nodes of lowest degree; that is where it begins, and what is left out afterwards.
+    SciPy starts at a node of lowest degree, which an unstable sort selects differently on other
+    processors. Each connected part therefore gets an extra node of degree 1 at its first node of
+    lowest degree, where the order then starts; the extra node is removed afterwards.
+
+    Source: George (1971), Computer implementation of the finite element method, Stanford.
     """
     parts, label = connected_components(graph, directed=False)
     degree = np.diff(graph.indptr)

@@ -19,7 +19,7 @@ from dpl.fem.linear.interface import (
 
 @dataclass(frozen=True, eq=False)
 class PardisoFactor(DirectFactor):
-    """LDL^T factor inside MKL, which holds one at a time: an older one is made anew when asked."""
+    """LDL^T factor. MKL stores one at a time; solving with an older one factorises it again."""
 
     parent: "Pardiso"
     matrix: csr_array
@@ -30,24 +30,27 @@ class PardisoFactor(DirectFactor):
         return self.parent.solve(self.matrix, right)
 
     def apply(self, right: Array) -> Array:
-        """Return `solve`, if MKL still holds this factor.
+        """Return `solve`, if MKL still stores this factor.
 
         Raises:
-            SingularMatrix: It holds another one.
+            SingularMatrix: MKL stores another one.
         """
-        if self.parent.held is not self.matrix:
-            raise SingularMatrix("MKL holds the factor of another matrix")
+        if self.parent.factorised is not self.matrix:
+            raise SingularMatrix("MKL stores the factor of another matrix")
         return self.solve(right)
 
 
 class Pardiso:
-    """MKL PARDISO (Schenk, Gaertner 2004), symmetric indefinite, where installed."""
+    """MKL PARDISO for symmetric indefinite matrices.
+
+    Source: Schenk, Gaertner (2004), Future Gener. Comput. Syst. 20.
+    """
 
     def __init__(self, pattern: Pattern) -> None:
-        """Prepare; the analysis runs with the first matrix."""
+        """Store the pattern; the analysis runs with the first matrix."""
         self.pattern = pattern
         self._solver: Any = None
-        self.held: csr_array | None = None  # the matrix whose factor MKL holds
+        self.factorised: csr_array | None = None  # matrix whose factor MKL stores
 
     def __reduce__(self) -> tuple[type["Pardiso"], tuple[Pattern]]:
         """Pickle without MKL's handle."""
@@ -64,26 +67,26 @@ class Pardiso:
 
     def solve(self, matrix: csr_array, right: Array) -> Array:
         """Return x, (n,), with K x = right, for a matrix that has been factorised before."""
-        if self.held is not matrix:
+        if self.factorised is not matrix:
             self._factorise(matrix)
-        return self._call(33, matrix, np.ascontiguousarray(right))  # MKL knows no strides
+        return self._call(33, matrix, np.ascontiguousarray(right))  # MKL ignores strides
 
     def _factorise(self, matrix: csr_array) -> None:
-        self.held = None
+        self.factorised = None
         if self._solver is None:
             from pypardiso import PyPardisoSolver
 
             self._solver = PyPardisoSolver(mtype=-2)
             for place, setting in SETTINGS.items():
                 self._solver.set_iparm(place, setting)
-            # Found by a search through the whole environment, a second or more: once is enough.
+            # Each process searches the whole environment for MKL, a second or more, if not told.
             os.environ.setdefault("PYPARDISO_MKL_RT", self._solver.libmkl._name)
             weakref.finalize(self, self._solver.free_memory, everything=True)
             self._call(11, matrix, np.zeros(self.pattern.size))
         self._call(22, matrix, np.zeros(self.pattern.size))
-        if self._solver.get_iparm(14):  # MKL replaces pivots it cannot use and says nothing
+        if self._solver.get_iparm(14):  # MKL replaces zero pivots silently
             raise SingularMatrix(f"{self._solver.get_iparm(14)} pivots are zero to rounding")
-        self.held = matrix
+        self.factorised = matrix
 
     def _call(self, phase: int, matrix: csr_array, right: Array) -> Array:
         from pypardiso.pardiso_wrapper import PyPardisoError
@@ -100,10 +103,10 @@ class Pardiso:
             self._solver.libmkl.MKL_Set_Num_Threads_Local(before)
 
 
-# MKL's iparm, counted from 1; by default it gives up pivots below 1e-8 ||A||, which slender bodies
-# have that are far from singular.
+# MKL's iparm, counted from 1. By default MKL replaces pivots below 1e-8 ||A||, which occur in
+# slender bodies far from singular.
 SETTINGS = {
-    1: 1,  # these settings, not the defaults
+    1: 1,  # use these settings instead of the defaults
     2: 2,  # nested dissection
     8: 0,  # no refinement: Newton refines, and a step would cost as much as two solves
     10: 13,  # pivots below 1e-13 ||A|| are zero

@@ -1,4 +1,4 @@
-"""Sparse LU factors by SuperLU (Li, 2005), as SciPy has it."""
+"""Sparse LU factors by SuperLU (Li 2005, ACM Trans. Math. Softw. 31), part of SciPy."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -45,13 +45,16 @@ class SuperLUFactor(DirectFactor):
 
 @dataclass(frozen=True, eq=False)
 class SuperLU:
-    """SciPy's SuperLU in symmetric mode (Li, Demmel 2003): on every machine."""
+    """SuperLU in symmetric mode, which is always installed.
+
+    Source: Li, Demmel (2003), ACM Trans. Math. Softw. 29.
+    """
 
     pattern: Pattern
 
     @cached_property
     def _plan(self) -> tuple[NDArray[np.int_], csc_array, NDArray[np.int_]]:
-        """Minimum-degree order, structure of the reordered matrix, where its entries come from."""
+        """Minimum-degree order, structure of the reordered matrix, source of each entry."""
         n, count = self.pattern.size, len(self.pattern.indices)
         rows, columns = row_numbers(self.pattern), self.pattern.indices
         model = np.where(rows == columns, 4.0 * count, -1.0)  # any positive definite values
@@ -80,5 +83,5 @@ class SuperLU:
 
 
 def _symmetric(order: str) -> dict[str, Any]:
-    """Return the settings for which SuperLU keeps to diagonal pivots."""
+    """Return the settings with which SuperLU pivots on the diagonal."""
     return {"permc_spec": order, "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}

@@ -1,4 +1,4 @@
-"""Equilibrium from a good guess without a tangent: K(0)^-1, turned, on residuals, accelerated."""
+"""Anderson acceleration of a fixed-point iteration with the corotated inverse of K(0)."""
 
 import time
 from collections.abc import Iterator
@@ -14,25 +14,25 @@ from dpl.fem.solvers.corotational import CorotatedFactor
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.solvers.solution import Load, Solution, evaluate_solution, run_lockstep
 
-WINDOW = 5  # steps in which the residual has to halve
+WINDOW = 5  # iterations in which the residual has to halve
 
 
 @dataclass(frozen=True, eq=False)
 class AndersonSolver:
-    """Fixed-point steps u + M R(u), M the inverse of K(0) in the guess's turned frame.
+    """Anderson acceleration of u + M R(u), M the corotated inverse of K(0) at the guess.
 
-    Each costs a residual and a solve with a factor that is there. Among the mixtures of earlier
-    iterates the one with the smallest residual is stepped from, which on a linear problem is
-    GMRES. It ends unfinished where the residual does not halve in five steps, or an element would
-    invert: then Newton is to take over.
+    An iteration costs one residual and one solve with the stored factor of K(0). It starts from
+    the linear combination of earlier iterates with the smallest residual, which is GMRES on a
+    linear problem. The iteration stops without convergence if the residual does not halve in five
+    iterations or an element inverts; continue with Newton then.
 
     Source: Anderson (1965), J. ACM 12; as a multisecant quasi-Newton method: Fang, Saad (2009),
     Numer. Linear Algebra Appl. 16, equation 24.
 
     Attributes:
-        newton: Whose body, tolerance and factor of K(0) it takes.
-        memory: Earlier iterates that are mixed.
-        max_iter: Steps at most.
+        newton: Solver whose body, tolerance and factor of K(0) are used.
+        memory: Number of earlier iterates that are combined.
+        max_iter: Largest number of iterations.
     """
 
     newton: Newton
@@ -46,15 +46,15 @@ class AndersonSolver:
 
     @property
     def tol(self) -> float:
-        """Residual ratio below which an answer counts as converged [-]."""
+        """Relative residual below which a solution counts as converged [-]."""
         return self.newton.tol
 
     def iterate(self, load: Load, *, guess: Tensor) -> Iterator[Solution]:
-        """Yield the guess and the state after each step; loads one by one, in step.
+        """Yield the guess and the state after each iteration; loads in lockstep.
 
         Args:
-            load: What acts.
-            guess: Where to start, (B, N, D) [-].
+            load: The load.
+            guess: Displacement to start from, (B, N, D) [-].
         """
         pairs = zip(load.unbatch(), guess.split(1), strict=True)
         yield from run_lockstep([self._member(single, u) for single, u in pairs])
@@ -68,23 +68,23 @@ class AndersonSolver:
         yield state
         if state.converged or not state.volume_ratio > 0:
             return
-        turned = newton.linear_solver.corotational.at(u)
-        ratios = [float(state.residual)]
-        past = _Past(self.memory, len(right))
+        factor = newton.linear_solver.corotational.at(u)
+        residuals = [float(state.residual)]
+        history = _History(self.memory, len(right))
         while count < self.max_iter:
-            step = past.step(right, turned)
+            step = history.step(right, factor)
             u, count, before = u + problem.extend(step)[None], count + 1, right
             state, right = self._state(load, u, count, start)
             yield state
-            ratios.append(float(state.residual))
-            lost = not state.volume_ratio > 0 or not ratios[-1] < 10 * ratios[0]
-            slow = count >= WINDOW and not min(ratios[-WINDOW:]) < 0.5 * ratios[-WINDOW - 1]
-            if state.converged or lost or slow:
+            residuals.append(float(state.residual))
+            diverges = not state.volume_ratio > 0 or not residuals[-1] < 10 * residuals[0]
+            slow = count >= WINDOW and not min(residuals[-WINDOW:]) < 0.5 * residuals[-WINDOW - 1]
+            if state.converged or diverges or slow:
                 return
-            past.add(step, right - before)
+            history.add(step, right - before)
 
     def _state(self, load: Load, u: Tensor, count: int, start: float) -> tuple[Solution, Array]:
-        """Return a displacement as a solution, with what is out of balance there, (n,)."""
+        """Return a displacement as a solution, and the residual force f - f_int(u), (n,)."""
         problem = self.problem.at(load.poisson)
         internal, _ = evaluation = problem.evaluate(u)
         state = evaluate_solution(
@@ -95,33 +95,33 @@ class AndersonSolver:
         return state, problem.restrict((load.force - internal)[0])
 
 
-class _Past:
-    """The last steps, what they did to the residual, and the products of the latter."""
+class _History:
+    """Last steps, the changes of the residual that they caused, and the changes' Gram matrix."""
 
     def __init__(self, memory: int, size: int) -> None:
-        """Make room for so many steps (n,)."""
-        self.moves, self.changes = np.empty((memory, size)), np.empty((memory, size))
+        """Allocate `memory` steps (n,)."""
+        self.steps, self.changes = np.empty((memory, size)), np.empty((memory, size))
         self.gram = np.empty((memory, memory))
         self.count = 0
 
-    def add(self, move: Array, change: Array) -> None:
-        """Remember a step and what it did, in the place of the oldest if there is no other."""
-        place = self.count % len(self.moves)
-        self.moves[place], self.changes[place] = move, change
+    def add(self, step: Array, change: Array) -> None:
+        """Store a step and its change of the residual, in place of the oldest if full."""
+        row = self.count % len(self.steps)
+        self.steps[row], self.changes[row] = step, change
         self.count += 1
-        kept = min(self.count, len(self.moves))
-        self.gram[place, :kept] = self.gram[:kept, place] = self.changes[:kept] @ change
+        n = min(self.count, len(self.steps))
+        self.gram[row, :n] = self.gram[:n, row] = self.changes[:n] @ change
 
-    def step(self, right: Array, turned: CorotatedFactor) -> Array:
-        """Return the step (n,) from the mixture of iterates with the smallest residual.
+    def step(self, right: Array, factor: CorotatedFactor) -> Array:
+        """Return the step (n,) from the combination of iterates with the smallest residual.
 
         Args:
-            right: The residual now, (n,).
-            turned: M.
+            right: Residual at the last iterate, (n,).
+            factor: M.
         """
-        kept = min(self.count, len(self.moves))
-        if not kept:
-            return turned.apply(right)
-        moves, changes = self.moves[:kept], self.changes[:kept]
-        mix = np.linalg.lstsq(self.gram[:kept, :kept], changes @ right, rcond=1e-13)[0]
-        return turned.apply(right - mix @ changes) - mix @ moves
+        n = min(self.count, len(self.steps))
+        if not n:
+            return factor.apply(right)
+        steps, changes = self.steps[:n], self.changes[:n]
+        weights = np.linalg.lstsq(self.gram[:n, :n], changes @ right, rcond=1e-13)[0]
+        return factor.apply(right - weights @ changes) - weights @ steps

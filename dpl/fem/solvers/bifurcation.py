@@ -1,4 +1,4 @@
-"""Unstable equilibria: the directions in which they give way, and where these lead."""
+"""Buckling: unstable directions of an equilibrium and its post-buckling branches."""
 
 from dataclasses import replace
 
@@ -20,14 +20,14 @@ def unstable_directions(newton: Newton, solution: Solution) -> Tensor:
 
     Args:
         newton: The solver.
-        solution: Its answer to one load, B = 1, with a status of UNSTABLE.
+        solution: Its solution for one load, B = 1, with status UNSTABLE.
 
     Raises:
-        ValueError: The answer is not known to be unstable.
+        ValueError: The solution is not known to be unstable.
     """
     count = int(solution.negative_pivots[0])
     if count < 1:
-        raise ValueError("the answer has no negative pivots: there is no unstable direction")
+        raise ValueError("the solution has no negative pivots: there is no unstable direction")
     problem = newton.problem
     values = problem.linearise(solution.displacement).tangent[0].numpy()
     factor = make_backend(problem.pattern, newton.linear).factorise(values)
@@ -36,7 +36,7 @@ def unstable_directions(newton: Newton, solution: Solution) -> Tensor:
     start = np.random.default_rng(0).standard_normal(size)
     lowest, vectors = eigsh(
         full_matrix(problem.pattern, values),
-        min(2 * count + 4, size - 1),  # around zero lie positive ones too
+        min(2 * count + 4, size - 1),  # eigenvalues around zero include positive ones
         sigma=0.0,
         OPinv=inverse,
         v0=start,
@@ -49,36 +49,36 @@ def unstable_directions(newton: Newton, solution: Solution) -> Tensor:
 def post_buckling_branches(
     newton: Newton, load: Load, solution: Solution, *, imperfection: float = 0.02
 ) -> list[Solution]:
-    """Return the answers that an unstable one gives way to, pushed in its first direction.
+    """Return the equilibria of the branches that leave the primary path in its first direction.
 
-    A column beyond its critical load bends to either side: two answers, one for each sign. The load
-    is applied once more with a small force in that direction, which bends the body before it can
-    buckle; from there Newton goes on without that force. Where directions are equally soft, as
-    for a square section, an answer may give way to another one in turn: its status says so.
+    A column beyond its critical load buckles to either side: two solutions, one for each sign. The
+    load is applied in ten steps with a small force in the unstable direction, which bends the body
+    before it buckles; Newton then continues without that force. Where several directions are
+    equally soft, as for a square section, a branch may be unstable itself; its status shows it.
 
     Args:
         newton: The solver.
         load: One load, B = 1.
-        solution: Its unstable answer.
+        solution: Its unstable solution.
         imperfection: Norm of the small force over that of the load [-].
 
     Raises:
-        ValueError: The answer is not known to be unstable.
+        ValueError: The solution is not known to be unstable.
     """
-    newton = replace(newton, mixed_integration=True)  # plain Newton falls back to what gave way
+    newton = replace(newton, mixed_integration=True)  # plain Newton returns to the primary path
     direction = unstable_directions(newton, solution)[:1]
     push = imperfection * newton.problem.acting(load.force).norm() * direction / direction.norm()
-    answers = []
+    branches = []
     for sign in (1.0, -1.0):
-        bent = newton.problem.prescribed[None]
+        u = newton.problem.prescribed[None]
         for part in np.linspace(0.1, 1.0, 10):
-            pushed = load._replace(force=part * (load.force + sign * push))
-            bent = _end(newton, pushed, bent).displacement
-        answers.append(_end(newton, load, bent))
-    return answers
+            perturbed = load._replace(force=part * (load.force + sign * push))
+            u = _solve_from(newton, perturbed, u).displacement
+        branches.append(_solve_from(newton, load, u))
+    return branches
 
 
-def _end(newton: Newton, load: Load, guess: Tensor) -> Solution:
-    """Return where Newton ends, from a guess."""
+def _solve_from(newton: Newton, load: Load, guess: Tensor) -> Solution:
+    """Return the last solution of Newton from a guess."""
     *_, last = newton.iterate(load, guess=guess)
     return last

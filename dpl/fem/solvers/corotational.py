@@ -1,6 +1,7 @@
-"""The factor of K(0), turned with the nodes of a body: a preconditioner for tangents far from rest.
+"""Corotational preconditioner: the factor of K(0), rotated node by node.
 
-Where rotations are large and strains are not, the tangent is K(0) with its nodes turned, nearly.
+Under large rotations and small strains the tangent is close to K(0) in the rotated frames of the
+nodes (stiffness warping).
 """
 
 from contextlib import suppress
@@ -17,124 +18,125 @@ from dpl.fem.linear.interface import Array, Factor, SingularMatrix, SymmetricPro
 from dpl.fem.linear.krylov import conjugate_gradients
 from dpl.fem.problem import Problem
 
-POLAR = 20  # iterations of a polar decomposition at most; near a rotation it takes three
-ENOUGH = 1e-5  # change by the last one after which the error is of its square
+MAX_POLAR_ITER = 20  # of a polar decomposition; near a rotation it takes three iterations
+POLAR_TOL = 1e-5  # change of an iteration below which the error is below rounding (its square)
 
 FIELD = Typed(float64, 2, "A", readonly=True)  # (N, D)
 TENSORS = Typed(float64, 3, "A", readonly=True)  # (N, D, D)
 VALUES = Typed(float64, 1, "A", readonly=True)
-PLACES = Typed(int64, 2, "A", readonly=True)
+INDICES = Typed(int64, 2, "A", readonly=True)
 OUT = Typed(float64, 3, "A")
 
 
 @dataclass(frozen=True, eq=False)
 class CorotationalPreconditioner:
-    """How the nodes of a body have turned.
+    """Preconditioner R K(0)^-1 R^T with the rotations R of the nodes.
+
+    Source: Mueller, Dorsey, McMillan, Jagnow, Cutler (2002), Stable real-time deformations,
+    section 3.2.
 
     Attributes:
         problem: The body.
-        factor: Of its K(0).
+        factor: Factor of its K(0).
     """
 
     problem: Problem
     factor: Factor
 
     def at(self, displacement: Tensor) -> "CorotatedFactor":
-        """Return the factor of K(0), turned as the body is at a displacement (1, N, D) [-].
+        """Return the factor of K(0), rotated as the body is at a displacement (1, N, D) [-].
 
-        A node turns by the rotation of its mean deformation gradient, one that is held in one
-        direction only across that, one that is held in two not at all.
-
-        Source: Mueller, Dorsey, McMillan, Jagnow, Cutler (2002), Stable real-time deformations,
-        section 3.2 (K(0), turned node by node).
+        A node is rotated by the rotation of its mean deformation gradient. A node fixed in one
+        direction is rotated about that direction only, a node fixed in two is not rotated.
         """
-        slopes, volumes, cells = self._means
+        gradients, volumes, cells = self._cell_means
         rotations = np.zeros((*self.problem.shape, self.problem.shape[1]))
-        _gradients(displacement[0].numpy(), cells, slopes, volumes, rotations)
-        _rotations(rotations, self._places)
-        return CorotatedFactor(self.factor, rotations, self._places)
+        _sum_gradients(displacement[0].numpy(), cells, gradients, volumes, rotations)
+        _to_rotations(rotations, self._dofs)
+        return CorotatedFactor(self.factor, rotations, self._dofs)
 
-    def steps(self, displacement: Tensor, *, rtol: float = 1e-3, most: int = 50) -> int:
-        """Return the conjugate gradient steps that the tangent at a displacement (1, N, D) takes.
+    def count_iterations(
+        self, displacement: Tensor, *, rtol: float = 1e-3, max_iter: int = 50
+    ) -> int:
+        """Return the conjugate gradient iterations with the tangent at (1, N, D) and this factor.
 
-        From noise, with the turned factor of K(0); `most` where it takes more.
+        The right-hand side is random; the result is at most `max_iter`.
         """
         tangent = self.problem.linearise(displacement).tangent[0].numpy()
         product = SymmetricProduct(self.problem.pattern, tangent)
-        noise = np.random.default_rng(0).standard_normal(self.problem.pattern.size)
-        turned, count = self.at(displacement), 0
+        right = np.random.default_rng(0).standard_normal(self.problem.pattern.size)
+        factor, count = self.at(displacement), 0
 
-        def counted(residual: Array) -> Array:
+        def apply(residual: Array) -> Array:
             nonlocal count
             count += 1
-            return turned.apply(residual)
+            return factor.apply(residual)
 
         with suppress(SingularMatrix):
-            conjugate_gradients(product, counted, noise, rtol, most)
+            conjugate_gradients(product, apply, right, rtol, max_iter)
             return count
-        return most
+        return max_iter
 
     @cached_property
-    def _means(self) -> tuple[Array, Array, NDArray[np.int64]]:
+    def _cell_means(self) -> tuple[Array, Array, NDArray[np.int64]]:
         """Mean gradients of the shape functions (E or 1, A, D), volumes (E or 1,), cells."""
         dN, dV = self.problem.dN.numpy(), self.problem.dV.numpy()
         volumes = dV.sum(axis=1)
-        slopes = np.einsum("eqaj,eq->eaj", dN, dV) / volumes[:, None, None]
+        gradients = np.einsum("eqaj,eq->eaj", dN, dV) / volumes[:, None, None]
         # a copy: sending the problem to a process moves the memory of its tensors
-        return slopes, volumes, self.problem.cells.numpy().copy(order="C")
+        return gradients, volumes, self.problem.cells.numpy().copy(order="C")
 
     @cached_property
-    def _places(self) -> NDArray[np.int64]:
-        """Where each degree of freedom is among the free ones, -1 where it is held, (N, D)."""
+    def _dofs(self) -> NDArray[np.int64]:
+        """Number of each degree of freedom among the free ones, -1 where fixed, (N, D)."""
         free = self.problem.free.numpy()
-        places = np.full(free.shape, -1, dtype=np.int64)
-        places[free] = np.arange(free.sum())
-        return places
+        dofs = np.full(free.shape, -1, dtype=np.int64)
+        dofs[free] = np.arange(free.sum())
+        return dofs
 
 
 @dataclass(frozen=True, eq=False)
 class CorotatedFactor:
-    """K(0)^-1 in a body's turned frame: symmetric and, as K(0) is, positive definite.
+    """R K(0)^-1 R^T, symmetric, and positive definite if K(0) is.
 
     Attributes:
-        factor: Of K(0).
-        rotations: Of the nodes, (N, D, D).
-        places: Where each degree of freedom is among the free ones, -1 where it is held, (N, D).
-        negative_pivots: Those of K(0).
+        factor: Factor of K(0).
+        rotations: Rotations R of the nodes, (N, D, D).
+        dofs: Number of each degree of freedom among the free ones, -1 where fixed, (N, D).
     """
 
     factor: Factor
     rotations: Array
-    places: NDArray[np.int64]
+    dofs: NDArray[np.int64]
 
     @property
     def negative_pivots(self) -> int | None:
-        """Those of K(0)."""
+        """Negative pivots of K(0)."""
         return self.factor.negative_pivots
 
     def apply(self, right: Array) -> Array:
         """Return R K(0)^-1 R^T right, (n,)."""
-        inner = np.empty_like(right)
-        _turn(self.rotations, self.places, right, True, inner)
-        answer = self.factor.apply(inner)
-        _turn(self.rotations, self.places, answer, False, inner)
-        return inner
+        out = np.empty_like(right)
+        _rotate(self.rotations, self.dofs, right, True, out)
+        solved = self.factor.apply(out)
+        _rotate(self.rotations, self.dofs, solved, False, out)
+        return out
 
 
-# One signature each, compiled at once: two processes that save several of one function's to numba's
-# cache at the same time could take each other's machine code for their own.
-@njit([void(FIELD, PLACES, TENSORS, VALUES, OUT)], cache=True)
-def _gradients(u, cells, slopes, volumes, F):
-    """Set F (N, D, D) to the sums, over the cells of a node, of volume times mean gradient."""
+# One explicit signature each: numba's cache can mix up the machine code of several signatures of a
+# function when two processes save them at the same time.
+@njit([void(FIELD, INDICES, TENSORS, VALUES, OUT)], cache=True)
+def _sum_gradients(u, cells, gradients, volumes, F):
+    """Set F (N, D, D) to the sum of volume times mean gradient over the cells of each node."""
     dim = u.shape[1]
     mean = np.empty((dim, dim))
     for e in range(cells.shape[0]):
-        own = e if slopes.shape[0] > 1 else 0
+        own = e if gradients.shape[0] > 1 else 0
         for i in range(dim):
             for j in range(dim):
                 mean[i, j] = 1.0 if i == j else 0.0
                 for a in range(cells.shape[1]):
-                    mean[i, j] += u[cells[e, a], i] * slopes[own, a, j]
+                    mean[i, j] += u[cells[e, a], i] * gradients[own, a, j]
         for a in range(cells.shape[1]):
             for i in range(dim):
                 for j in range(dim):
@@ -143,7 +145,7 @@ def _gradients(u, cells, slopes, volumes, F):
 
 @njit
 def _plane(X, a, b, R):
-    """Set rows and columns a and b of R to the rotation of those of X, unless they invert."""
+    """Set rows and columns a and b of R to the rotation of that block of X if its det > 0."""
     cosine, sine = X[a, a] + X[b, b], X[b, a] - X[a, b]
     size = np.sqrt(cosine**2 + sine**2)
     if X[a, a] * X[b, b] - X[a, b] * X[b, a] > 0 and size > 0:
@@ -164,14 +166,14 @@ def _cofactors(X, out):
 
 @njit
 def _polar(X, R):
-    """Set R to the rotation of X (3, 3), which is overwritten; leave it unless det X > 0.
+    """Set R to the rotation of X (3, 3) if det X > 0; overwrite X.
 
     Source: Higham (1986), SIAM J. Sci. Stat. Comput. 7: X <- (s X + X^-T / s) / 2.
     """
     inverse = np.empty((3, 3))  # transposed
     change = 1.0
-    for _ in range(POLAR):
-        if change < ENOUGH:
+    for _ in range(MAX_POLAR_ITER):
+        if change < POLAR_TOL:
             break
         det = _cofactors(X, inverse)
         if not det > 0:
@@ -192,18 +194,18 @@ def _polar(X, R):
     R[:] = X
 
 
-@njit([void(OUT, PLACES)], cache=True)
-def _rotations(F, places):
-    """Set each gradient (N, D, D), up to a positive factor, to its node's rotation.
+@njit([void(OUT, INDICES)], cache=True)
+def _to_rotations(F, dofs):
+    """Replace each gradient (N, D, D), known up to a positive factor, by its rotation.
 
-    Of a node with two free components, only the rotation in their plane; of one with fewer, none.
+    A node with two free components gets the rotation in their plane, one with fewer the identity.
     """
     dim = F.shape[1]
     R = np.empty((dim, dim))
     for n in range(F.shape[0]):
         count, last = 0, -1
         for i in range(dim):
-            if places[n, i] >= 0:
+            if dofs[n, i] >= 0:
                 count += 1
             else:
                 last = i
@@ -219,17 +221,17 @@ def _rotations(F, places):
         F[n] = R
 
 
-@njit([void(TENSORS, PLACES, VALUES, boolean, Typed(float64, 1, "A"))], cache=True)
-def _turn(rotations, places, values, back, out):
-    """Set out (n,) to the free values (n,), turned node by node; by the transposed with `back`."""
-    dim = places.shape[1]
-    for n in range(places.shape[0]):
+@njit([void(TENSORS, INDICES, VALUES, boolean, Typed(float64, 1, "A"))], cache=True)
+def _rotate(rotations, dofs, values, transpose, out):
+    """Set out (n,) to the free values (n,), rotated node by node with R or R^T."""
+    dim = dofs.shape[1]
+    for n in range(dofs.shape[0]):
         for i in range(dim):
-            if places[n, i] < 0:
+            if dofs[n, i] < 0:
                 continue
             total = 0.0
             for j in range(dim):
-                if places[n, j] >= 0:
-                    turn = rotations[n, j, i] if back else rotations[n, i, j]
-                    total += turn * values[places[n, j]]
-            out[places[n, i]] = total
+                if dofs[n, j] >= 0:
+                    entry = rotations[n, j, i] if transpose else rotations[n, i, j]
+                    total += entry * values[dofs[n, j]]
+            out[dofs[n, i]] = total

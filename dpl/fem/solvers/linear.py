@@ -1,4 +1,4 @@
-"""K(0)^-1, the compliance of a body at rest: its factor, and the linear answer to a load."""
+"""Linear elastic solution K(0)^-1 f with one stored factor of K(0)."""
 
 import time
 from collections.abc import Iterator
@@ -20,11 +20,12 @@ MAX_CLONES = 4  # solvers of other Poisson's ratios that are kept with their fac
 
 @dataclass(frozen=True, eq=False)
 class LinearSolver:
-    """The linear answer K(0)^-1 f: exact for infinitesimal loads, one solve with a stored factor.
+    """Linear elastic solution K(0)^-1 f, the limit of small loads: one solve with a stored factor.
 
     Attributes:
         problem: The body.
-        tol: Residual ratio below which the answer counts as converged [-]; at least 1e-15, below 1.
+        tol: Relative residual below which a solution counts as converged [-]; at least 1e-15,
+            below 1.
         linear: Backend of the sparse solves, see `dpl.fem.linear.make_backend`.
         parent: Solver of the same mesh with another Poisson's ratio, whose backends are used.
     """
@@ -38,7 +39,7 @@ class LinearSolver:
         """Check the tolerance.
 
         Raises:
-            ValueError: It is out of range.
+            ValueError: The tolerance is out of range.
         """
         check_tol(self.tol)
 
@@ -51,10 +52,10 @@ class LinearSolver:
 
     @cached_property
     def corotational(self) -> CorotationalPreconditioner:
-        """What turns the factor of K(0) with the nodes; in float32 where it is a band."""
+        """Preconditioner from the factor of K(0), in float32 if that is banded."""
         factor = self.factor
-        rough = factor.to_float32() if isinstance(factor, BandedFactor) else factor
-        return CorotationalPreconditioner(self.problem, rough)
+        small = factor.to_float32() if isinstance(factor, BandedFactor) else factor
+        return CorotationalPreconditioner(self.problem, small)
 
     @cached_property
     def backend(self) -> Backend:
@@ -72,11 +73,14 @@ class LinearSolver:
         return make_backend(pattern, name, modes)
 
     def at(self, poisson: Tensor | float) -> "LinearSolver":
-        """Return the linear answer of the body of another Poisson's ratio, see `Problem.at`."""
+        """Return the linear solver of the body with another Poisson's ratio, see `Problem.at`."""
         return self.of(self.problem.at(poisson))
 
     def of(self, problem: Problem) -> "LinearSolver":
-        """Return the linear answer of a body that differs in Poisson's ratio only."""
+        """Return the linear solver of a body that differs in Poisson's ratio only.
+
+        The solvers of the last `MAX_CLONES` bodies are kept.
+        """
         if problem is self.problem:
             return self
         if problem not in self._clones:
@@ -96,20 +100,20 @@ class LinearSolver:
         return self if problem is self.problem else replace(self, problem=problem, parent=self)
 
     def iterate(self, load: Load) -> Iterator[Solution]:
-        """Yield the linear answer.
+        """Yield the linear solution.
 
         Raises:
-            ValueError: The force is none for this body, see `check_force`.
+            ValueError: The force does not fit the body, see `check_force`.
         """
         check_force(self.problem, load)
         start = time.perf_counter()
         pairs = zip(load.force, load.poisson.expand(len(load.force), -1), strict=True)
-        answer = torch.stack([self.at(nu[None]).solve(force) for force, nu in pairs])
-        seconds = (time.perf_counter() - start) / len(answer)
-        yield evaluate_solution(self.problem, answer, load, self.tol, iterations=1, seconds=seconds)
+        u = torch.stack([self.at(nu[None]).solve(force) for force, nu in pairs])
+        seconds = (time.perf_counter() - start) / len(u)
+        yield evaluate_solution(self.problem, u, load, self.tol, iterations=1, seconds=seconds)
 
     def solve(self, force: Tensor) -> Tensor:
-        """Return K(0)^-1 f, (N, D) [-], for f (N, D) [-]; zero where held."""
+        """Return K(0)^-1 f, (N, D) [-], for f (N, D) [-]; zero at supports."""
         return self.problem.extend(self.factor.solve(self.problem.restrict(force)))
 
     def __getstate__(self) -> dict[str, object]:
