@@ -147,7 +147,7 @@ def test_rotation_halves_the_iterations_far_from_rest(monkeypatch):
     rotated = preconditioner.count_iterations(answer)
     monkeypatch.setattr(type(preconditioner), "at", lambda self, u: self.factor)
     assert rotated <= 8
-    assert preconditioner.count_iterations(answer) > 2 * turned
+    assert preconditioner.count_iterations(answer) > 2 * rotated
 
 
 def test_a_tangent_is_factorised_where_the_preconditioner_is_poor():
