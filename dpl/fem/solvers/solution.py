@@ -1,4 +1,4 @@
-"""What every solver takes and gives: Load, Solution, and the one sentence they all say."""
+"""Interface of all solvers: Load, Solution, Status and Solver."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dpl.fem.problem import Evaluation, Problem
 
-LEAST_TOL = 1e-15  # below it, rounding decides whether an answer is accepted [-]
+LEAST_TOL = 1e-15  # relative residual below which rounding decides on convergence [-]
 
 
 class _Load(NamedTuple):
@@ -24,45 +24,45 @@ class Load(_Load):
 
     Attributes:
         force: Nodal forces over E L^2 (E L in 2D), (B, N, D) [-].
-        young: Young's moduli E that these stand for, (B,) [Pa]; no answer depends on them.
-        poisson: Poisson's ratios of the bodies, (B, P) [-]: P = 1 where each load has its own, else
-            P = 0, which may be left out.
+        young: Young's moduli E, (B,) [Pa]; dimensionless solutions do not depend on them.
+        poisson: Poisson's ratios of the bodies, (B, P) [-]: P = 1 if each load has its own ratio,
+            else P = 0, which may be left out.
     """
 
     __slots__ = ()
 
     def __new__(cls, force: Tensor, young: Tensor, poisson: Tensor | None = None) -> "Load":
-        """Take the columns; Poisson's ratios (B,) too."""
+        """Create a load; Poisson's ratios may be (B,) or (B, P)."""
         return super().__new__(cls, force, young, as_column(young, poisson))
 
     def unbatch(self) -> "list[Load]":
-        """Return each load alone, B = 1."""
+        """Return the loads one by one, B = 1."""
         parts = (slice(k, k + 1) for k in range(len(self.force)))
         return [Load(*(column[part] for column in self)) for part in parts]
 
 
 def as_column(young: Tensor, poisson: Tensor | None) -> Tensor:
-    """Return Poisson's ratios (B,) or (B, P) as (B, P), P = 0 if left out, of moduli (B,)."""
+    """Return Poisson's ratios (B,) or (B, P) as (B, P); P = 0 for None, with `young` (B,)."""
     if poisson is None:
         return young.new_zeros(*young.shape, 0)
     return poisson[..., None] if poisson.dim() == young.dim() else poisson
 
 
 class Status(IntEnum):
-    """What is known of an answer."""
+    """Status of a solution."""
 
-    CONVERGED = 0  # in balance, nothing inverted, and stable as far as it was examined
-    UNSTABLE = 1  # in balance, but not a minimum of the energy: the tangent has negative pivots
-    NO_VALID_EQUILIBRIUM = 2  # the path of equilibria from rest ends below the whole load
-    NOT_CONVERGED = 3  # iterations ran out, or go on
+    CONVERGED = 0  # equilibrium without inverted elements, not known to be unstable
+    UNSTABLE = 1  # equilibrium whose tangent has negative pivots: no minimum of the energy
+    NO_VALID_EQUILIBRIUM = 2  # load steps below the smallest one fail before the whole load
+    NOT_CONVERGED = 3  # more iterations follow, or their limit was reached
 
     def __str__(self) -> str:
-        """Return it in words."""
+        """Return the status in lower-case words."""
         return self.name.lower().replace("_", " ")
 
 
 class Solution(NamedTuple):
-    """Displacements under a load, with what is known of them.
+    """Displacements under a load with residual, stability and cost.
 
     Attributes:
         displacement: Over L, (B, N, D) [-].
@@ -70,12 +70,13 @@ class Solution(NamedTuple):
             `Problem.relative_residual_of`.
         volume_ratio: min det F at `displacement`, (B,) [-].
         status: `Status` as a number, (B,).
-        negative_pivots: Negative eigenvalues of the tangent there, (B,); -1: not examined.
-        iterations: Linear solves so far, with a tangent or with what stands for one, (B,).
-        factorisations: Tangents factorised so far, (B,); that of the rest state is the scene's.
+        negative_pivots: Number of negative eigenvalues of the tangent there, (B,); 1 if there are
+            some, not counted; -1 if unknown.
+        iterations: Iterations so far, one linear solve each, (B,).
+        factorisations: Tangents factorised so far, without K(0), (B,).
         load_factor: Part of the load for which an equilibrium is known, (B,) [-].
         seconds: Time so far, (B,) [s].
-        from_guess: Whether it goes on from a guess that was given, (B,).
+        from_guess: Whether the iterates continue from the given guess, (B,).
     """
 
     displacement: Tensor
@@ -91,44 +92,47 @@ class Solution(NamedTuple):
 
     @property
     def converged(self) -> Tensor:
-        """Whether it is in balance to the solver's tolerance and nothing is inverted, (B,)."""
+        """Whether the state is an equilibrium to the tolerance without inverted elements, (B,)."""
         return self.status <= Status.UNSTABLE
 
     @property
     def stable(self) -> Tensor:
-        """Whether it is in balance and not known to be unstable, (B,)."""
+        """Whether the state is an equilibrium and not known to be unstable, (B,)."""
         return self.status == Status.CONVERGED
 
 
 def check_force(problem: Problem, load: Load) -> None:
-    """Check that a load can act on a body. Forces that are not finite can: nothing balances them.
+    """Check shape and type of a load's force; forces that are not finite are allowed.
 
     Raises:
-        ValueError: The force is not (B, N, D) of the body with B of 1 or more, or not float64.
+        ValueError: The force is not (B, N, D) with B of 1 or more, or not float64.
     """
     shape, wanted = tuple(load.force.shape), tuple(problem.shape)
     if len(shape) != 3 or shape[1:] != wanted or not shape[0]:
-        raise ValueError(f"force: its shape {shape} must be {('B', *wanted)}, B of 1 or more")
+        raise ValueError(f"force.shape = {shape} must be {('B', *wanted)}, B of 1 or more")
     if load.force.dtype != torch.float64:
-        raise ValueError(f"force: {load.force.dtype} must be torch.float64")
+        raise ValueError(f"force.dtype = {load.force.dtype} must be torch.float64")
 
 
 def check_tol(tol: float) -> None:
-    """Check a tolerance of residual ratios.
+    """Check a tolerance of relative residuals.
 
     Raises:
-        ValueError: It is not at least `LEAST_TOL` and below 1.
+        ValueError: The tolerance is below `LEAST_TOL` or not below 1.
     """
     if not LEAST_TOL <= tol < 1:
         raise ValueError(f"tol = {tol} must be at least {LEAST_TOL:g} and below 1")
 
 
 def check_steps(solver: Any, parts: Sequence[str]) -> None:
-    """Check the numbers of a solver that steps: tol, `parts`, and factor_reuse_tol,
-    max_iter, max_total_iter.
+    """Check the ranges of a solver's tol, factor_reuse_tol, max_iter, max_total_iter and `parts`.
+
+    Args:
+        solver: The solver.
+        parts: Names of attributes that must lie between 0 and 1.
 
     Raises:
-        ValueError: One is out of range.
+        ValueError: An attribute is out of range.
     """
     check_tol(solver.tol)
     for name in parts:
@@ -142,33 +146,33 @@ def check_steps(solver: Any, parts: Sequence[str]) -> None:
 
 
 class Solver(Protocol):
-    """Anything that answers which displacement balances a load."""
+    """Solver of the equilibrium equations."""
 
     def iterate(self, load: Load) -> Iterator[Solution]:
-        """Yield ever better answers; the last one is the answer."""
+        """Yield the iterates; the last one is the solution."""
         ...
 
 
 def solve(solver: Solver, load: Load) -> Solution:
-    """Return the last solution that a solver yields."""
+    """Return the last iterate of a solver."""
     *_, last = solver.iterate(load)
     return last
 
 
 def concatenate(parts: Sequence[Solution]) -> Solution:
-    """Return solutions as one batch."""
+    """Return several solutions as one batch."""
     return Solution(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
 def run_lockstep(members: Sequence[Iterator[Solution]]) -> Iterator[Solution]:
-    """Yield the solutions of single loads as batches; a load that has ended repeats its end."""
+    """Yield the iterates of single loads as batches; a load that has ended repeats its last one."""
     states = [next(member) for member in members]
     while True:
         yield concatenate(states)
-        news = [next(member, None) for member in members]
-        if all(new is None for new in news):
+        following = [next(member, None) for member in members]
+        if all(state is None for state in following):
             return
-        states = [old if new is None else new for old, new in zip(states, news, strict=True)]
+        states = [new or old for old, new in zip(states, following, strict=True)]
 
 
 def evaluate_solution(
@@ -182,17 +186,18 @@ def evaluate_solution(
     from_guess: bool = False,
     evaluation: Evaluation | None = None,
 ) -> Solution:
-    """Return a displacement (B, N, D) as the solution it is: evaluated, nothing believed.
+    """Evaluate residual and min det F at a displacement and return them as a solution.
 
     Args:
         problem: The body.
-        displacement: Over L [-].
-        load: What acts.
-        tol: Residual ratio below which it counts as converged [-], at least `LEAST_TOL`, below 1.
-        iterations: Spent on it.
-        seconds: Spent on it [s].
-        from_guess: Whether it goes on from a guess.
-        evaluation: The body at the displacement, if that is there already.
+        displacement: Displacement over L, (B, N, D) [-].
+        load: The load.
+        tol: Relative residual below which it counts as converged [-], at least `LEAST_TOL`, below
+            1.
+        iterations: Value of `Solution.iterations`.
+        seconds: Value of `Solution.seconds` [s].
+        from_guess: Value of `Solution.from_guess`.
+        evaluation: Internal force and min det F at the displacement, if known.
 
     Raises:
         ValueError: `tol` is out of range.
