@@ -222,7 +222,7 @@ def test_a_scene_of_one_refuses_to_predict_for_another(scene, few):
 
 
 def test_a_reduced_basis_refuses_a_range(wide, few):
-    with pytest.raises(ValueError, match="poisson: reduced stiffness"):
+    with pytest.raises(ValueError, match=r"poisson = .* must be one number"):
         PODGalerkin.fit(wide.problem, few.displacement, 2)
 
 

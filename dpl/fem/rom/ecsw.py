@@ -1,4 +1,4 @@
-"""Hyper-reduction: few weighted cells that stand for all, seen from a basis."""
+"""Hyper-reduction by energy-conserving sampling and weighting (ECSW): few weighted cells."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -13,16 +13,16 @@ from dpl.fem.linear.interface import full_matrix
 from dpl.fem.problem import Problem
 
 Array = NDArray[np.float64]
-BLOCK = 16  # states whose cell forces are worked on at a time
+BLOCK = 16  # states whose cell forces are in memory at a time
 
 
 class Cubature(NamedTuple):
-    """Cells that stand for all.
+    """Weighted cells whose reduced forces approximate those of all cells.
 
     Attributes:
         cells: Numbers of the cells, ascending, (C,).
-        weights: How many cells each stands for, (C,), above 0.
-        error: Relative error of what they were chosen to reproduce [-].
+        weights: Positive weights, (C,).
+        error: Relative error of the reduced forces at the states they were fitted to [-].
     """
 
     cells: Tensor
@@ -31,23 +31,22 @@ class Cubature(NamedTuple):
 
 
 def cubature(problem: Problem, vectors: Tensor, states: Tensor, tolerance: float) -> Cubature:
-    """Return few weighted cells that give the reduced forces of all at some states.
+    """Return weighted cells that reproduce the reduced forces of all cells at some states.
 
-    What is reproduced is the part beyond linear, each state's relative to the whole of its
-    reduced force: sum_e w_e V_e^T (f_e(u) - K_e(0) u_e), in the norm in which K(0) is the identity.
-    (Whole forces in the Euclidean norm take about twice the cells for answers as accurate, on the
-    paper's beam.)
+    The nonlinear part sum_e w_e V_e^T (f_e(u) - K_e(0) u_e) is fitted, each state relative to its
+    whole reduced force, in the norm in which K(0) is the identity. (Fitting whole forces in the
+    Euclidean norm takes about twice the cells for the same accuracy on the paper's beam.)
 
     Source: Farhat, Avery, Chapman, Cortial (2014), Int. J. Numer. Methods Eng. 98, section 3.
 
     Args:
         problem: The body.
         vectors: V, (N, D, R).
-        states: Displacements, (S, N, D); E^2 numbers of memory whatever S is.
+        states: Displacements, (S, N, D); the memory is E^2 numbers for any S.
         tolerance: Root of the mean square of the relative errors [-], not below 1e-6.
 
     Raises:
-        ValueError: `tolerance` is not between 0 and 1, or the body is free to move.
+        ValueError: `tolerance` is not between 0 and 1, or the body has rigid body modes.
     """
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance = {tolerance} must lie between 0 and 1")
@@ -75,23 +74,23 @@ def cubature(problem: Problem, vectors: Tensor, states: Tensor, tolerance: float
 
 
 def nonnegative(gram: Array, tolerance: float, scale: float) -> Cubature:
-    """Return few weights w > 0 with ||G w - G 1|| <= tolerance * scale, from G^T G.
+    """Return sparse weights w > 0 with ||G w - G 1|| <= tolerance * scale, from G^T G.
 
-    Greedy active sets, ended as soon as the tolerance is met: the column most aligned with the
-    residual enters, columns that would get weights below zero leave.
+    Active-set method that stops when the tolerance is met: the column most aligned with the
+    residual enters, columns whose weights would be negative leave.
 
-    Source: Lawson, Hanson (1974), Solving Least Squares Problems, chapter 23; ended early as in
+    Source: Lawson, Hanson (1974), Solving Least Squares Problems, chapter 23; early stop as in
     Farhat, Avery, Chapman, Cortial (2014), Int. J. Numer. Methods Eng. 98, algorithm 1.
 
     Args:
         gram: G^T G, (E, E).
-        tolerance: Not below 1e-6: G^T G does not show smaller residuals.
-        scale: What the error is relative to, above 0.
+        tolerance: Relative error [-], not below 1e-6, which G^T G cannot resolve.
+        scale: Norm that the error is relative to, above 0.
     """
     count, target = len(gram), gram.sum(axis=1)
     size = np.sqrt(gram.diagonal())
     size[size == 0] = np.inf
-    rows, factor = np.empty((count, count)), np.empty((count, count))  # pages come when written
+    rows, factor = np.empty((count, count)), np.empty((count, count))  # memory used when written
     kept, weights, barred = np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(count, dtype=bool)
     gradient = target
     error = float(np.sqrt(max(target.sum(), 0.0))) / scale
@@ -114,11 +113,11 @@ def nonnegative(gram: Array, tolerance: float, scale: float) -> Cubature:
             else:
                 weights = best
                 break
-        else:  # a sum of those that are there
+        else:  # linearly dependent on the others
             kept, weights = kept[:-1], weights[:-1]
         if new in kept:
             barred[:] = False
-        else:  # rounding let it in
+        else:  # entered because of rounding
             barred[new] = True
         gradient = target - weights @ rows[: len(kept)]
         rest = np.ones(count)
@@ -131,7 +130,7 @@ def nonnegative(gram: Array, tolerance: float, scale: float) -> Cubature:
 
 
 def _factorised(factor: Array, gram: Array, kept: NDArray[np.int64], first: int) -> bool:
-    """Set rows `first` and on of the Cholesky factor of gram[kept, kept]; False if it has none."""
+    """Set rows from `first` of the Cholesky factor of gram[kept, kept]; False if singular."""
     old, new = kept[:first], kept[first:]
     block = gram[np.ix_(new, new)]
     if first:
@@ -152,15 +151,16 @@ def _solved(factor: Array, right: Array) -> Array:
 
 
 class ReducedMesh:
-    """Some cells of a body, each with nodes of its own, seen from a basis.
+    """Weighted cells of a body, without common nodes, with a basis at their nodes.
 
     Attributes:
-        problem: The cells, their volumes times their weights.
+        nodes: Nodes of the body at the nodes of the cells, (C A,).
+        problem: The cells, their volumes multiplied by their weights.
         basis: V at their nodes, (C A D, R).
     """
 
     def __init__(self, problem: Problem, vectors: Tensor, cells: Tensor, weights: Tensor) -> None:
-        """Take the body, V (N, D, R), and numbers (C,) and weights (C,) of cells."""
+        """Select cells by numbers (C,), with weights (C,), of a body with basis V (N, D, R)."""
         per_cell, dim = problem.cells.shape[1], problem.shape[1]
         nodes = problem.cells[cells].flatten()
         fields = len(nodes), dim
@@ -202,7 +202,7 @@ class ReducedMesh:
         return upper.view(-1, self._size, self._size)
 
     def reduced(self, upper: Tensor) -> Tensor:
-        """Return V^T K V, (R, R), to the accuracy of float32: half the time of float64."""
+        """Return V^T K V, (R, R), in the accuracy of float32, in half the time of float64."""
         rows = self._single.view(len(upper), self._size, -1)
         product = self._single.T @ (upper.float() @ rows).flatten(0, 1)
         return (product + product.T).double()
@@ -222,7 +222,7 @@ def whitening(problem: Problem, vectors: Tensor) -> Tensor:
     """Return L^-T, (R, R), with L L^T = V^T K(0) V.
 
     Raises:
-        ValueError: That is not positive definite.
+        ValueError: V^T K(0) V is not positive definite.
     """
     rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
     stiffness = full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())
@@ -230,5 +230,5 @@ def whitening(problem: Problem, vectors: Tensor) -> Tensor:
     reduced = torch.from_numpy(basis.T @ (stiffness @ basis))
     lower, failed = torch.linalg.cholesky_ex((reduced + reduced.T) / 2)
     if failed:
-        raise ValueError("V^T K(0) V is not positive definite: is the body free to move?")
+        raise ValueError("V^T K(0) V must be positive definite; fix the rigid body modes")
     return torch.linalg.solve_triangular(lower, torch.eye(len(lower)).double(), upper=False).T

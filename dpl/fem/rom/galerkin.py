@@ -1,6 +1,4 @@
-"""POD-Galerkin, hyper-reduced: Newton in a few coordinates on a few weighted cells, the classic
-rival of neural surrogates.
-"""
+"""Hyper-reduced POD-Galerkin: Newton in the coordinates of a subspace on few weighted cells."""
 
 import math
 import time
@@ -29,15 +27,15 @@ from dpl.fem.solvers.solution import Load, Solution, check_steps, evaluate_solut
 
 
 class Reduced(NamedTuple):
-    """What Newton in reduced coordinates found.
+    """Solution in reduced coordinates.
 
     Attributes:
-        displacement: (N, D) [-].
-        coordinates: Of the displacement less prescribed and linear parts, in V, (R,) [-].
-        residual: Reduced residual ratio under the whole load [-].
-        load_factor: Part of the load that the coordinates balance [-].
-        iterations: Steps that were taken.
-        factorisations: Reduced tangents made, that of the rest state excepted.
+        displacement: Displacement over L, (N, D) [-].
+        coordinates: Coordinates in V of the displacement minus the offset, (R,) [-].
+        residual: Reduced relative residual under the whole load [-].
+        load_factor: Part of the load for which a reduced equilibrium was found [-].
+        iterations: Number of iterations.
+        factorisations: Number of reduced tangents, without that at rest.
     """
 
     displacement: Tensor
@@ -50,43 +48,43 @@ class Reduced(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PODGalerkin:
-    """Galerkin's equilibrium in a subspace: u = offset + V c with V^T R(u) = 0.
+    """Galerkin projection of the equilibrium onto a subspace: u = offset + V c, V^T R(u) = 0.
 
-    The offset is the displacement of the supports, or with `lift` the whole linear answer
-    K(0)^-1 f, so that V has only to hold what is nonlinear.
+    The offset is the displacement of the supports, or with `lift` the linear solution K(0)^-1 f,
+    so that V only has to contain the nonlinear part.
 
     With a `cubature`, sums over all cells become sums over a few weighted ones, except for their
-    linear part: V^T f_int(u) = V^T K(0) u + sum_e w_e V_e^T (f_e(u) - K_e(0) u_e). Forces so made
-    still have an energy, and small loads are answered as by all cells.
+    linear part: V^T f_int(u) = V^T K(0) u + sum_e w_e V_e^T (f_e(u) - K_e(0) u_e). These forces
+    still derive from an energy, and are exact for small loads.
 
-    Newton's steps, with mixed integration points where the law can, are shortened where they would
-    invert one of the cells, and fall back to load steps as in `Newton`. A tangent serves further
-    steps, updated by Broyden's rank one, as long as they pay. Residuals are measured in the norm
-    in which K(0) is the identity, ||L^-1 V^T R|| / ||L^-1 V^T f|| with L L^T = V^T K(0) V: to
-    first order the relative error in the energy norm within the subspace.
+    Newton's method, with mixed integration points if the law supports them, shortens steps that
+    invert one of the cells, and uses load steps as `Newton` does. An inverse tangent is reused with
+    Broyden updates of rank one while the residual halves. The reduced relative residual is
+    ||L^-1 V^T R|| / ||L^-1 V^T f|| with L L^T = V^T K(0) V: to first order the relative error in
+    the energy norm within the subspace.
 
-    The answer is judged on the whole body: it is converged where it balances the load to `tol`
-    there, which an answer in a subspace seldom does.
+    The solution counts as converged if it balances the load on the whole body to `tol`, which a
+    solution in a subspace seldom does.
 
     Source: Farhat, Avery, Chapman, Cortial (2014), Int. J. Numer. Methods Eng. 98 (ECSW).
 
     Attributes:
         problem: The body.
-        vectors: V, orthonormal, zero where held, (N, D, R) [-].
-        cubature: The cells that stand for all; None: all of them.
-        lift: The linear answer, if V is a basis of what is beyond it.
-        tol: Residual ratio ||R_free|| / ||f|| below which an answer counts as converged [-], see
-            `Problem.relative_residual_of`; at least 1e-15, below 1.
-        reduced_tol: Reduced residual ratio that ends the iterations [-].
-        max_iter: Steps per load step before it is halved.
-        max_total_iter: Steps in all before a load is given up.
-        min_load_step: Load step, as a part of the load, below which to give up [-].
-        min_detF_ratio: Part of det F that one step may leave of the smallest one [-].
-        factor_reuse_tol: Reduced residual ratio below which a tangent serves the next step too [-].
+        vectors: V, orthonormal, zero at fixed degrees of freedom, (N, D, R) [-].
+        cubature: Weighted cells; None: all cells.
+        lift: Linear solver, if V is a basis of the displacement minus the linear solution.
+        tol: Relative residual ||R_free|| / ||f|| below which a solution counts as converged [-],
+            see `Problem.relative_residual_of`; at least 1e-15, below 1.
+        reduced_tol: Reduced relative residual at which the iterations stop [-].
+        max_iter: Iterations per load step before the step is halved.
+        max_total_iter: Iterations in all before a load is given up.
+        min_load_step: Load step, as a part of the load, below which a load is given up [-].
+        min_detF_ratio: Smallest ratio of min det F after and before a step [-].
+        factor_reuse_tol: Reduced relative residual below which an inverse tangent is reused [-].
 
     Raises:
-        ValueError: V is none of this body, an attribute is out of range, or, at the first load, the
-            body is free to move.
+        ValueError: V does not fit the body, an attribute is out of range, or, at the first load,
+            the body has rigid body modes.
     """
 
     problem: Problem
@@ -112,20 +110,20 @@ class PODGalerkin:
         states: int = 256,
         lift: LinearSolver | None = None,
     ) -> Self:
-        """Return the solver whose basis and cells are made from displacements in equilibrium.
+        """Return the solver with basis and cells computed from equilibria.
 
         Args:
             problem: The body.
-            snapshots: Displacements, each in balance with some load, (S, N, D) [-].
-            rank: R.
-            tolerance: Relative error of the snapshots' reduced forces that the choice of cells may
-                make [-], see `cubature`; None: all cells.
-            states: From so many of the snapshots, evenly spread, the cells are chosen.
-            lift: The linear answer, to be added to what the subspace holds.
+            snapshots: Displacements in equilibrium, (S, N, D) [-].
+            rank: Dimension R of the subspace.
+            tolerance: Relative error of the snapshots' reduced forces with the chosen cells [-],
+                see `cubature`; None: all cells.
+            states: Number of evenly spaced snapshots from which the cells are chosen.
+            lift: Linear solver whose solution is added to the subspace.
 
         Raises:
-            ValueError: `rank` is not between 1 and the number of snapshots, or of free degrees of
-                freedom.
+            ValueError: `rank` is not between 1 and the number of snapshots, or exceeds the number
+                of free degrees of freedom.
         """
         refuse_range(problem)
         basis = pod(beyond_linear(problem, snapshots, lift), rank).vectors
@@ -147,41 +145,42 @@ class PODGalerkin:
         lift: LinearSolver | None = None,
         **options: Any,
     ) -> Self:
-        """Return the solver in a subspace that is there, with cells chosen at some states.
+        """Return the solver in a given subspace, with cells chosen at some states.
 
         Args:
             problem: The body.
-            vectors: V, orthonormal, zero where held, (N, D, R) [-].
-            states: Displacements in equilibrium, (S, N, D) [-]; the subspace's part of them counts.
+            vectors: V, orthonormal, zero at fixed degrees of freedom, (N, D, R) [-].
+            states: Displacements in equilibrium, (S, N, D) [-]; they are projected onto V.
             tolerance: See `cubature`.
-            lift: The linear answer, to be added to what the subspace holds.
-            options: Attributes of the solver.
+            lift: Linear solver whose solution is added to the subspace.
+            options: Other attributes of the solver.
         """
-        rest, basis = beyond_linear(problem, states, lift), vectors[problem.free]
-        held = states.clone()
-        held[:, problem.free] -= rest - (rest @ basis) @ basis.T
-        return cls(problem, vectors, cubature(problem, vectors, held, tolerance), lift, **options)
+        nonlinear, basis = beyond_linear(problem, states, lift), vectors[problem.free]
+        projected = states.clone()
+        projected[:, problem.free] -= nonlinear - (nonlinear @ basis) @ basis.T
+        cells = cubature(problem, vectors, projected, tolerance)
+        return cls(problem, vectors, cells, lift, **options)
 
     def __post_init__(self) -> None:
         """Check the ranges.
 
         Raises:
-            ValueError: An attribute is out of range, or V is none of this body.
+            ValueError: An attribute is out of range, or V does not fit the body.
         """
         refuse_range(self.problem)
         check_steps(self, parts=("reduced_tol", "min_detF_ratio", "min_load_step"))
         if tuple(self.vectors.shape[:2]) != self.problem.shape:
             found, wanted = tuple(self.vectors.shape), (*self.problem.shape, "R")
-            raise ValueError(f"vectors of shape {found} must have {wanted}")
+            raise ValueError(f"vectors.shape = {found} must be {wanted}")
 
     def iterate(self, load: Load) -> Iterator[Solution]:
-        """Yield the answer; iterations and factorisations are those of reduced tangents.
+        """Yield the solution; iterations and factorisations count reduced tangents.
 
         Raises:
-            ValueError: Loads bring Poisson's ratios of their own.
+            ValueError: Loads have their own Poisson's ratios.
         """
         if load.poisson.shape[-1]:
-            raise ValueError("poisson: loads with their own need dpl.fem.Newton")
+            raise ValueError("load.poisson must be empty; use dpl.fem.Newton")
         found, seconds = [], []
         for force in load.force:
             start = time.perf_counter()
@@ -197,87 +196,88 @@ class PODGalerkin:
     def reduced(self, force: Tensor) -> Reduced:
         """Return the equilibrium in the subspace under a force (N, D) [-].
 
-        Where none is found, that under the largest part of the load for which one was.
+        Where none is found, it is that under the largest part of the load for which one was.
         """
-        model, count = self._model, _Count()
-        task = model.task(force)
-        state = model.state(task, torch.zeros_like(task.load), 0.0)
+        model, count = self.reduced_problem, _Count()
+        load = model.reduce(force)
+        state = model.state(load, torch.zeros_like(load.force), 0.0)
         steps = LoadStepping(self.min_load_step)
-        if not task.moves and model.ratio(task, state, 1.0) < self.reduced_tol:
+        if not load.has_offset and model.relative_residual(load, state, 1.0) < self.reduced_tol:
             steps.accept()
         while steps.factor < 1 and not steps.exhausted and count.iterations < self.max_total_iter:
-            end = self._corrected(task, state, steps.target, count)
+            end = self._newton(load, state, steps.target, count)
             if end is None:
                 steps.reject()
             else:
                 state = end
                 steps.accept()
         return Reduced(
-            displacement=model.whole(state.y).add_(task.offset, alpha=steps.factor),
+            displacement=model.displacement(state.y).add_(load.offset, alpha=steps.factor),
             coordinates=model.coordinates(state.y),
-            residual=model.ratio(task, state, 1.0),
+            residual=model.relative_residual(load, state, 1.0),
             load_factor=steps.factor,
             iterations=count.iterations,
             factorisations=count.factorisations,
         )
 
     def correct(self, force: Tensor, guess: Tensor, *, steps: int = 1) -> Tensor:
-        """Return a displacement (N, D) nearer to balance with a force (N, D) than a guess (N, D).
+        """Return a displacement (N, D) with a smaller residual than a guess (N, D).
 
-        Each step evaluates all cells once and looks in the subspace for the displacement at which
-        the chosen cells feel what is out of balance more than before: the coarse step of a full
-        approximation scheme. So the choice of cells costs speed of convergence and not accuracy;
-        what the subspace does not hold of the error stays. A step that is not found, or comes from
-        where a cell is inverted, is not taken.
+        Each step evaluates all cells once and solves the reduced problem for the displacement whose
+        reduced internal force exceeds the present one by the residual: the coarse-grid step of a
+        full approximation scheme. The choice of cells therefore affects the speed of convergence
+        and not the accuracy; the part of the error outside the subspace remains. The steps end
+        where the reduced problem has no solution or a cell is inverted.
 
         Source: Brandt (1977), Math. Comput. 31, section 5.
 
         Args:
-            force: [-].
-            guess: [-].
-            steps: At most; each takes an evaluation of all cells.
+            force: Nodal force, (N, D) [-].
+            guess: Displacement, (N, D) [-].
+            steps: Largest number of steps.
         """
-        model, problem = self._model, self.problem
-        scale, none = norm(model.load(force)) or 1.0, torch.zeros_like(model.pull)
+        model, problem = self.reduced_problem, self.problem
+        scale = norm(model.project(force)) or 1.0
+        none = torch.zeros_like(model.reduced_support_force)
         answer = guess
         for _ in range(steps):
             internal, volume = problem.evaluate(answer[None])
             if not volume > 0:
                 break
-            unbalanced = model.load(torch.where(problem.free, force - internal[0], 0.0))
+            residual = model.project(torch.where(problem.free, force - internal[0], 0.0))
             at_cells = answer[model.cells.nodes].flatten()
-            task = ReducedLoad(none, scale, True, answer, at_cells, none, none)
-            state = model.state(task, none, 1.0)
-            task = task._replace(load=state.internal + unbalanced)
-            end = self._corrected(task, state, 1.0, _Count())
+            load = ReducedLoad(none, scale, True, answer, at_cells, none, none)
+            state = model.state(load, none, 1.0)
+            load = load._replace(force=state.internal + residual)
+            end = self._newton(load, state, 1.0, _Count())
             if end is None:
                 break
-            answer = answer + model.whole(end.y)
+            answer = answer + model.displacement(end.y)
         return answer
 
-    def _corrected(
-        self, task: ReducedLoad, state: ReducedState, target: float, count: "_Count"
+    def _newton(
+        self, load: ReducedLoad, state: ReducedState, target: float, count: "_Count"
     ) -> ReducedState | None:
-        """Return the equilibrium under `target` times a load, None where steps do not lead."""
-        model = self._model
-        inverse, ratio, before = None, model.ratio(task, state, target), math.inf
+        """Return the equilibrium under `target` times a load, None if Newton does not converge."""
+        model = self.reduced_problem
+        inverse, ratio, before = None, model.relative_residual(load, state, target), math.inf
         for _ in range(self.max_iter):
-            jump = target - state.part if task.moves else 0.0
+            jump = target - state.offset_factor if load.has_offset else 0.0
             if inverse is None or jump or not ratio < min(self.factor_reuse_tol, before / 2):
                 count.factorisations += not state.at_rest
-                inverse, right = model.tangent(task, state, target, jump)
+                inverse, right = model.tangent(load, state, target, jump)
                 if inverse is None:
                     return None
             else:
-                right = target * task.load - state.internal
+                right = target * load.force - state.internal
             step = inverse @ right
-            new = self._stepped(task, state, step, jump, target)
+            new = self._update(load, state, step, jump, target)
             count.iterations += 1
             if new is None:
                 return None
-            before, ratio = ratio, model.ratio(task, new, target)
-            if new.part == target or not task.moves:
-                short = 1e-2 * self.reduced_tol * target * task.scale
+            before, ratio = ratio, model.relative_residual(load, new, target)
+            if new.offset_factor == target or not load.has_offset:
+                short = 1e-2 * self.reduced_tol * target * load.scale
                 if ratio < self.reduced_tol or (not jump and norm(step) < short):
                     return new
             if count.iterations >= self.max_total_iter:
@@ -289,41 +289,42 @@ class PODGalerkin:
             state = new
         return None
 
-    def _stepped(
-        self, task: ReducedLoad, state: ReducedState, step: Tensor, jump: float, target: float
+    def _update(
+        self, load: ReducedLoad, state: ReducedState, step: Tensor, jump: float, target: float
     ) -> ReducedState | None:
-        """Return the state after the longest of the steps 1, 1/2, 1/4, ... that inverts nothing."""
+        """Return the state after the longest of the steps 1, 1/2, ... that inverts no cell."""
 
         def state_after(length: float) -> ReducedState:
-            part = target if jump and length == 1 else state.part + length * jump
-            return self._model.state(task, state.y + length * step, part)._replace(length=length)
+            part = target if jump and length == 1 else state.offset_factor + length * jump
+            after = self.reduced_problem.state(load, state.y + length * step, part)
+            return after._replace(length=length)
 
         return longest_valid_step(state_after, self.min_detF_ratio * min(state.volume_ratio, 1.0))
 
     @cached_property
-    def _model(self) -> ReducedProblem:
+    def reduced_problem(self) -> ReducedProblem:
         return ReducedProblem(self.problem, self.vectors, self.cubature, self.lift)
 
     def __getstate__(self) -> dict[str, object]:
-        """Pickle without what is computed from the rest."""
+        """Pickle without cached properties."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 @dataclass
 class _Count:
-    """What one load has cost so far."""
+    """Cost of one load."""
 
     iterations: int = 0
     factorisations: int = 0
 
 
 def _broyden(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
-    """Return an inverse that maps the change of the force to the step that made it.
+    """Return the updated inverse, which maps the change of the force to the step that caused it.
 
     Source: Broyden (1965), Math. Comp. 19, the first method in Sherman's and Morrison's form.
     """
-    moved = inverse @ change
-    scale = step @ moved
-    if not scale.abs() > 1e-8 * step.norm() * moved.norm():
+    predicted = inverse @ change
+    scale = step @ predicted
+    if not scale.abs() > 1e-8 * step.norm() * predicted.norm():
         return inverse
-    return inverse + torch.outer((step - moved) / scale, step @ inverse)
+    return inverse + torch.outer((step - predicted) / scale, step @ inverse)

@@ -1,14 +1,14 @@
-"""Proper orthogonal decomposition: the subspace that is closest to snapshots."""
+"""Proper orthogonal decomposition of snapshots."""
 
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-CHUNK = 512  # snapshots, or columns of them, that are worked on at a time
-LARGE = 2000  # size of a Gram matrix above which sketches are faster,
-FEW = 0.25  # if so small a part of that size is sketched
-SPARE = 32  # modes that are sketched besides those asked for
+CHUNK = 512  # snapshots, or columns of them, in memory as float64 at a time
+MIN_SKETCH_SIZE = 2000  # size of a Gram matrix above which a randomised SVD is faster
+MAX_SKETCH_PART = 0.25  # largest part of that size for which it is
+OVERSAMPLING = 32  # additional modes of the randomised SVD
 
 
 class POD(NamedTuple):
@@ -25,21 +25,20 @@ class POD(NamedTuple):
 
 
 def pod(snapshots: Tensor, rank: int) -> POD:
-    """Return the subspace that is closest to snapshots in the mean square, as a basis.
+    """Return the basis of the subspace that is closest to snapshots in the mean square.
 
-    From the eigenvectors of the smaller Gram matrix, made in float64 a part at a time: singular
-    values are right to about 1e-8 of the largest. Where that matrix is large and few modes are
-    wanted, from sketches of the snapshots, in the precision that they have, single at least: the
-    last modes are mixed with those left out, and the subspace is as close to a part in a thousand.
-    Nothing is subtracted: pass deviations from a mean to have those. Largest components are
-    positive.
+    The modes are eigenvectors of the smaller Gram matrix, computed in float64; singular values are
+    accurate to about 1e-8 of the largest. If that matrix is large and few modes are requested, a
+    randomised SVD in the precision of the snapshots, at least float32, is used instead: its last
+    modes are mixed with omitted ones, and the projection error is larger by a part in a thousand.
+    No mean is subtracted. The largest component of each mode is positive.
 
-    Sources: Sirovich (1987), Quart. Appl. Math. 45, the method of snapshots; Halko, Martinsson,
-    Tropp (2011), SIAM Rev. 53, algorithm 4.4, sketches.
+    Sources: Sirovich (1987), Quart. Appl. Math. 45 (method of snapshots); Halko, Martinsson, Tropp
+    (2011), SIAM Rev. 53, algorithm 4.4 (randomised SVD).
 
     Args:
         snapshots: (S, n), of any floating type.
-        rank: R.
+        rank: Number of modes R.
 
     Raises:
         ValueError: `rank` is not between 1 and min(S, n), or a snapshot is not finite.
@@ -51,7 +50,8 @@ def pod(snapshots: Tensor, rank: int) -> POD:
             f"the smaller of {count} snapshots and their {size} components"
         )
     smaller = min(count, size)
-    sketched = smaller > LARGE and rank + SPARE <= FEW * smaller
+    few = rank + OVERSAMPLING <= MAX_SKETCH_PART * smaller
+    sketched = smaller > MIN_SKETCH_SIZE and few
     vectors, values = (_sketched if sketched else _exact)(snapshots, rank)
     largest = vectors.gather(0, vectors.abs().argmax(dim=0, keepdim=True))
     return POD(vectors * largest.sign(), values)
@@ -69,18 +69,18 @@ def _exact(snapshots: Tensor, rank: int) -> POD:
         raise ValueError("snapshots are not finite")
     squares, vectors = torch.linalg.eigh(gram)
     vectors = vectors.flip(1)[:, :rank]
-    if wide:  # images of the small ones are orthogonal only to rounding of the large ones
+    if wide:  # rounding errors of large modes make small ones lose orthogonality
         parts = [part.double().T @ vectors for part in snapshots.split(CHUNK, dim=1)]
         vectors = torch.linalg.qr(torch.cat(parts))[0]
     return POD(vectors, squares.flip(0).clamp(min=0).sqrt())
 
 
 def _sketched(snapshots: Tensor, rank: int) -> POD:
-    """Return the modes (n, R), of any sign, and leading singular values from sketches."""
+    """Return the modes (n, R), of any sign, and leading singular values by a randomised SVD."""
     if not all(part.isfinite().all() for part in snapshots.split(CHUNK)):
         raise ValueError("snapshots are not finite")
     some = snapshots if snapshots.dtype == torch.float64 else snapshots.float()
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(0)
-        _, values, vectors = torch.svd_lowrank(some, q=rank + SPARE, niter=3)
+        _, values, vectors = torch.svd_lowrank(some, q=rank + OVERSAMPLING, niter=3)
     return POD(torch.linalg.qr(vectors[:, :rank].double())[0], values[:rank].double())

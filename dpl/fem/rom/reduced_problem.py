@@ -1,4 +1,4 @@
-"""A body in a subspace: its forces and tangents in few coordinates, from few weighted cells."""
+"""Reduced problem: forces and tangents of a body in a subspace, from weighted cells."""
 
 import math
 from typing import Any, NamedTuple
@@ -10,65 +10,75 @@ from dpl.fem.problem import Problem
 from dpl.fem.rom.ecsw import Cubature, ReducedMesh, whitening
 from dpl.fem.solvers.linear import LinearSolver
 
-LIFT = 1e-6  # residual ratio to which the linear answer is found where the subspace adds to it
+LIFT_TOL = 1e-6  # relative residual of the linear solution to which the subspace adds [-]
 
 
 class ReducedLoad(NamedTuple):
     """A load in reduced coordinates.
 
     Attributes:
-        load: V^T f, (R,).
-        scale: Norm of what the first step has to balance, without lift.
-        moves: Whether there is an offset.
-        offset: Where u starts from at full load, (N, D).
-        at_cells: The same at the cells' nodes, (C A D,).
-        pull: V^T K(0) offset, (R,).
-        rest: What of it the cells do not say, (R,).
+        force: W^T f, (R,).
+        scale: Norm of the residual of the first step, without lift.
+        has_offset: Whether the offset is not zero.
+        offset: Displacement to which the subspace adds at full load, (N, D).
+        cell_offset: Offset at the cells' nodes, (C A D,).
+        offset_force: W^T K(0) offset, (R,).
+        offset_error: Difference of `offset_force` and its sum over the cells, (R,).
     """
 
-    load: Tensor
+    force: Tensor
     scale: float
-    moves: bool
+    has_offset: bool
     offset: Tensor
-    at_cells: Tensor
-    pull: Tensor
-    rest: Tensor
+    cell_offset: Tensor
+    offset_force: Tensor
+    offset_error: Tensor
 
 
 class ReducedState(NamedTuple):
-    """An iterate, evaluated once, and the part of the offset that is in it."""
+    """An evaluated iterate.
+
+    Attributes:
+        y: Coordinates in W, (R,).
+        offset_factor: Part of the offset that is applied [-].
+        cell_displacement: Displacement of the cells, (1, C A, D).
+        internal: Reduced internal force, (R,).
+        volume_ratio: min det F of the cells [-].
+        length: Length of the step that led here, 1 for a full one.
+        gap: Strain gap of the mixed integration points, see `Problem.update_strain_gap`.
+    """
 
     y: Tensor
-    part: float
-    field: Tensor
+    offset_factor: float
+    cell_displacement: Tensor
     internal: Tensor
     volume_ratio: float
-    length: float = 1.0  # of the step that led here
+    length: float = 1.0
     gap: Any = None
 
     @property
     def at_rest(self) -> bool:
-        """Whether nothing has moved: the tangent is the identity."""
-        return self.part == 0 and not self.y.any()
+        """Whether the displacement is zero, where the tangent is the identity."""
+        return self.offset_factor == 0 and not self.y.any()
 
 
 class ReducedProblem:
-    """A body seen from a subspace V by a few of its cells: what all loads share.
+    """A body in a subspace V, integrated over a few weighted cells.
 
     Attributes:
         problem: The body.
-        lift: The linear answer, if V is a basis of what is beyond it.
+        lift: Linear solver, if V is a basis of the displacement minus the linear solution.
         cells: The cells, with the basis W = V L^-T in which K(0) is the identity.
-        stiffness: K(0) W of these cells alone, (C A D, R).
-        rest: I less W^T K(0) W of these cells, (R, R).
-        supports: K(0) prescribed, (N, D); zero where supports do not move.
-        pull: The same in W, (R,).
+        stiffness: K(0) W of the cells, (C A D, R).
+        stiffness_error: I - W^T K(0) W of the cells, (R, R).
+        support_force: K(0) prescribed, (N, D); zero if no support is moved.
+        reduced_support_force: W^T K(0) prescribed, (R,).
     """
 
     def __init__(
         self, problem: Problem, vectors: Tensor, chosen: Cubature | None, lift: LinearSolver | None
     ) -> None:
-        """Take the body, V (N, D, R), the cells that stand for all, and the linear answer."""
+        """Reduce a body to V (N, D, R) and to the chosen cells; None: all cells."""
         self.problem, self.lift = problem, lift
         self._white = whitening(problem, vectors)
         white = vectors @ self._white
@@ -77,20 +87,22 @@ class ReducedProblem:
         self.cells = ReducedMesh(problem, white, cells, weights.double())
         self.stiffness = self.cells.product(self.cells.at_rest(), self.cells.basis)
         rank = vectors.shape[2]
-        self.rest = torch.eye(rank, dtype=torch.float64) - self.cells.basis.T @ self.stiffness
+        self.stiffness_error = (
+            torch.eye(rank, dtype=torch.float64) - self.cells.basis.T @ self.stiffness
+        )
         self._white_rows = white.flatten(0, 1)
-        self.supports = _support_force(problem)
-        self.pull = self.load(self.supports)
+        self.support_force = _support_force(problem)
+        self.reduced_support_force = self.project(self.support_force)
 
-    def load(self, force: Tensor) -> Tensor:
+    def project(self, force: Tensor) -> Tensor:
         """Return W^T f, (R,), of f (N, D)."""
         return force.flatten() @ self._white_rows
 
     def internal(self, force: Tensor, y: Tensor) -> Tensor:
-        """Return the internal force of all cells, (R,), from that of the chosen ones."""
-        return force + self.rest @ y
+        """Return the reduced internal force of the body, (R,), from that of the chosen cells."""
+        return force + self.stiffness_error @ y
 
-    def whole(self, y: Tensor) -> Tensor:
+    def displacement(self, y: Tensor) -> Tensor:
         """Return the displacement (N, D) of coordinates in W."""
         return (self._white_rows @ y).view(self.problem.shape)
 
@@ -98,66 +110,78 @@ class ReducedProblem:
         """Return coordinates in V, (R,), of those in W."""
         return self._white @ y
 
-    def task(self, force: Tensor) -> ReducedLoad:
-        """Return what a load (N, D) is in reduced coordinates."""
+    def reduce(self, force: Tensor) -> ReducedLoad:
+        """Return a load (N, D) in reduced coordinates."""
         problem = self.problem
-        load, pull = self.load(force), self.pull
-        scale = norm(load - pull)
+        reduced, pull = self.project(force), self.reduced_support_force
+        scale = norm(reduced - pull)
         offset, moves = problem.prescribed, self.lift is not None or problem.moved_supports
         if self.lift is not None:
-            offset = offset + _linear_answer(self.lift, force - self.supports)
-            pull = load
-        at_cells = offset[self.cells.nodes].flatten() if moves else offset
-        rest = pull - at_cells @ self.stiffness if moves else pull
-        return ReducedLoad(load, scale if scale > 0 else 1.0, moves, offset, at_cells, pull, rest)
+            offset = offset + _linear_solution(self.lift, force - self.support_force)
+            pull = reduced
+        cell_offset = offset[self.cells.nodes].flatten() if moves else offset
+        error = pull - cell_offset @ self.stiffness if moves else pull
+        scale = scale if scale > 0 else 1.0
+        return ReducedLoad(reduced, scale, moves, offset, cell_offset, pull, error)
 
-    def state(self, task: ReducedLoad, y: Tensor, part: float) -> ReducedState:
-        """Return coordinates with what is known of them; `part` of the offset is there."""
+    def state(self, load: ReducedLoad, y: Tensor, offset_factor: float) -> ReducedState:
+        """Return the evaluated state at coordinates y (R,) with a part of the offset."""
         cells = self.cells
         values = cells.basis @ y
-        if task.moves:
-            values += part * task.at_cells
+        if load.has_offset:
+            values += offset_factor * load.cell_offset
         field = cells.field(values)
         force, volume = cells.problem.evaluate(field)
         internal = self.internal(cells.project(force), y)
-        if task.moves:
-            internal += part * task.rest
-        return ReducedState(y, part, field, internal, float(volume))
+        if load.has_offset:
+            internal += offset_factor * load.offset_error
+        return ReducedState(y, offset_factor, field, internal, float(volume))
 
-    def ratio(self, task: ReducedLoad, state: ReducedState, target: float) -> float:
-        """Return the reduced residual ratio under `target` times a load."""
-        return norm(target * task.load - state.internal) / (target * task.scale)
+    def relative_residual(self, load: ReducedLoad, state: ReducedState, target: float) -> float:
+        """Return the reduced relative residual under `target` times a load."""
+        return norm(target * load.force - state.internal) / (target * load.scale)
 
     def tangent(
-        self, task: ReducedLoad, state: ReducedState, target: float, jump: float
+        self, load: ReducedLoad, state: ReducedState, target: float, jump: float
     ) -> tuple[Tensor | None, Tensor]:
-        """Return the tangent's inverse, None if it has none, and what a step has to balance."""
+        """Return the inverse of the tangent, None if singular, and the right-hand side of a step.
+
+        Args:
+            load: The load.
+            state: The state.
+            target: Load factor.
+            jump: Part of the offset that the step adds.
+        """
         cells = self.cells
         if state.at_rest:
-            return torch.eye(len(state.y), dtype=torch.float64), target * (task.load - task.pull)
-        system = cells.problem.linearise(state.field, state.gap)
+            return torch.eye(len(state.y), dtype=torch.float64), target * (
+                load.force - load.offset_force
+            )
+        system = cells.problem.linearise(state.cell_displacement, state.gap)
         if not system.valid:
-            system = cells.problem.linearise(state.field)
+            system = cells.problem.linearise(state.cell_displacement)
         upper = cells.tangents(system.tangent[0])
-        right = target * task.load - self.internal(cells.project(system.force), state.y)
-        if task.moves:
-            right -= state.part * task.rest
+        right = target * load.force - self.internal(cells.project(system.force), state.y)
+        if load.has_offset:
+            right -= state.offset_factor * load.offset_error
         if jump:
-            right -= jump * (cells.project(cells.product(upper, task.at_cells)) + task.rest)
-        inverse, failed = torch.linalg.inv_ex(cells.reduced(upper) + self.rest)
+            right -= jump * (
+                cells.project(cells.product(upper, load.cell_offset)) + load.offset_error
+            )
+        inverse, failed = torch.linalg.inv_ex(cells.reduced(upper) + self.stiffness_error)
         return (None if failed else inverse), right
 
     def update_strain_gap(self, state: ReducedState, new: ReducedState) -> ReducedState:
-        """Return the state after a step with the gap that its mixed points have."""
+        """Return the state after a step with the strain gap of its mixed integration points."""
         problem = self.cells.problem
         if not problem.supports_mip:
             return new
-        update = (new.field - state.field) / new.length
+        update = (new.cell_displacement - state.cell_displacement) / new.length
         return new._replace(gap=problem.update_strain_gap(state.gap, new.length, update))
 
 
 def norm(vector: Tensor) -> float:
-    """Return the Euclidean norm of a vector (R,); no square of an entry over- or underflows."""
+    """Return the Euclidean norm of a vector (R,), without overflow or underflow of squares."""
     largest = float(vector.abs().amax())
     if not 0 < largest < math.inf:
         return largest
@@ -165,22 +189,26 @@ def norm(vector: Tensor) -> float:
 
 
 def refuse_range(problem: Problem) -> None:
-    """Raise where the law has a range of Poisson's ratios: what is reduced here has one."""
+    """Check that the law has a single Poisson's ratio.
+
+    Raises:
+        ValueError: It has a range of them.
+    """
     if (span := problem.material.poisson_range) is not None:
         raise ValueError(
-            f"poisson: reduced stiffness and cells are those of one, not of a range, {list(span)}; "
-            "take Problem.at or dpl.fem.Newton"
+            f"poisson = {list(span)} must be one number, because reduced stiffness and cells "
+            "depend on it; use Problem.at or dpl.fem.Newton"
         )
 
 
 def beyond_linear(problem: Problem, snapshots: Tensor, lift: LinearSolver | None) -> Tensor:
-    """Return what moves of displacements in equilibrium, less their linear answers, (S, n)."""
+    """Return equilibria (S, N, D) minus their linear solutions at free DOFs, (S, n)."""
     rest = snapshots[:, problem.free].double()
     if lift is not None:
         supports = _support_force(problem)
         for row, u in zip(rest, snapshots, strict=True):
             force = problem.evaluate(u[None]).internal[0] - supports
-            row -= _linear_answer(lift, force)[problem.free]
+            row -= _linear_solution(lift, force)[problem.free]
     return rest
 
 
@@ -192,7 +220,7 @@ def _support_force(problem: Problem) -> Tensor:
     return problem.tangent_product(rest, problem.prescribed[None])[0]
 
 
-def _linear_answer(lift: LinearSolver, force: Tensor) -> Tensor:
-    """Return K(0)^-1 f, (N, D); what it is short of, the subspace adds."""
+def _linear_solution(lift: LinearSolver, force: Tensor) -> Tensor:
+    """Return K(0)^-1 f, (N, D), to `LIFT_TOL`; the subspace corrects the error."""
     problem = lift.problem
-    return problem.extend(lift.factor.solve(problem.restrict(force), LIFT))
+    return problem.extend(lift.factor.solve(problem.restrict(force), LIFT_TOL))
