@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dpl.fem.rom.pod import LARGE, pod
+from dpl.fem.rom.pod import MIN_SKETCH_SIZE, pod
 from dpl.fem.symmetry import Symmetry, images
 
 MAX_SNAPSHOTS = 16_000  # images of samples from which a basis is computed
@@ -53,7 +53,7 @@ def invariant_pod(snapshots: Tensor, dofs: Tensor, group: Sequence[Symmetry], ra
     members = max(1, len(group))
     stride = -(-len(snapshots) * members // MAX_SNAPSHOTS)
     some = snapshots[::stride]
-    some = some.float() if members * len(some) > LARGE else some
+    some = some.float() if members * len(some) > MIN_SKETCH_SIZE else some
     every = torch.cat([image_columns(some, dofs, group, k) for k in range(members)])
     modes = pod(every, min(rank, *every.shape)).vectors.double()
     basis = _invariant_subspace(modes, dofs, group)
