@@ -31,7 +31,7 @@ from dpl.fem import (
     solve,
 )
 from dpl.fem.linear import BACKENDS, SuperLU
-from dpl.fem.solvers.newton import forcing_term
+from dpl.fem.solvers.factor_reuse import forcing_term
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
 LENGTH = 100.0  # of the paper's beam [m]

@@ -162,3 +162,22 @@ def stability_at(problem: Problem, backend: Backend, displacement: Tensor) -> St
         return backend.factorise(tangent[0].numpy()).stability()
     except SingularMatrix:  # at the critical load itself
         return UNSTABLE
+
+
+def forcing_term(residual: float, previous: float, *, tol: float, corotational: bool) -> float:
+    """Return the relative residual at which the linear solve of a Newton step may stop [-].
+
+    It is as large as the convergence of Newton's method allows.
+
+    Source: Eisenstat, Walker (1996), SIAM J. Sci. Comput. 17, choice 2.
+
+    Args:
+        residual: Relative residual of the state [-].
+        previous: The same one iteration earlier; NaN in the first iteration.
+        tol: Relative residual of a solution [-].
+        corotational: Whether the first step from a state may be inexact.
+    """
+    enough = 0.1 * tol / residual if residual > 0 else 0.0
+    first = 1e-3 if corotational else 0.0
+    earned = 0.01 * (residual / previous) ** 2 if previous > 0 else first
+    return max(1e-12, enough, min(1e-3, earned))

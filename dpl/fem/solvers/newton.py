@@ -13,7 +13,7 @@ from torch import Tensor
 from dpl.fem.linear.backends import select_backend
 from dpl.fem.linear.interface import UNKNOWN, SingularMatrix, Stability
 from dpl.fem.problem import Problem
-from dpl.fem.solvers.factor_reuse import TangentSolver, stability_at
+from dpl.fem.solvers.factor_reuse import TangentSolver, forcing_term, stability_at
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.load_stepping import LoadStepping, longest_valid_step
 from dpl.fem.solvers.solution import Load, Solution, Status, check_force, check_steps, run_lockstep
@@ -295,25 +295,6 @@ class Newton:
     def __getstate__(self) -> dict[str, object]:
         """Pickle without factors."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
-
-
-def forcing_term(residual: float, previous: float, *, tol: float, corotational: bool) -> float:
-    """Return the relative residual at which the linear solve of a Newton step may stop [-].
-
-    It is as large as the convergence of Newton's method allows.
-
-    Source: Eisenstat, Walker (1996), SIAM J. Sci. Comput. 17, choice 2.
-
-    Args:
-        residual: Relative residual of the state [-].
-        previous: The same one iteration earlier; NaN in the first iteration.
-        tol: Relative residual of a solution [-].
-        corotational: Whether the first step from a state may be inexact.
-    """
-    enough = 0.1 * tol / residual if residual > 0 else 0.0
-    first = 1e-3 if corotational else 0.0
-    earned = 0.01 * (residual / previous) ** 2 if previous > 0 else first
-    return max(1e-12, enough, min(1e-3, earned))
 
 
 class _State(NamedTuple):
