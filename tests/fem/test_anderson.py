@@ -1,4 +1,4 @@
-"""Laws of equilibrium without tangents: Newton's answers from good guesses, an honest end else."""
+"""Laws of Anderson acceleration: Newton's solution from good guesses, an early stop otherwise."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ def end(solver, load, guess):
     ],
     ids=str,
 )
-def test_from_a_good_guess_the_answer_is_newtons(options):
+def test_a_good_guess_leads_to_the_solution_of_newton(options):
     newton, load = case(**options)
     exact = solve(newton, load).displacement
     assert exact.norm(dim=-1).max() > 0.05, "or it would prove nothing"
@@ -60,7 +60,7 @@ def test_from_a_good_guess_the_answer_is_newtons(options):
     assert 1 <= int(answer.iterations) <= 20
 
 
-def test_on_a_linear_problem_one_step_is_enough():
+def test_a_linear_problem_takes_one_iteration():
     newton, load = case()
     tiny = load._replace(force=1e-7 * load.force)
     answer = end(AndersonSolver(replace(newton, tol=1e-4)), tiny, torch.zeros_like(load.force))
@@ -69,7 +69,7 @@ def test_on_a_linear_problem_one_step_is_enough():
 
 
 @pytest.mark.parametrize("kind", ["nan", "inverted", "far"])
-def test_from_a_useless_guess_it_ends_soon_and_unconverged(kind):
+def test_a_poor_guess_ends_early_without_convergence(kind):
     newton, load = case()
     exact = solve(newton, load).displacement
     guess = {
@@ -83,7 +83,7 @@ def test_from_a_useless_guess_it_ends_soon_and_unconverged(kind):
     assert len(states) == 1 or kind == "far"
 
 
-def test_supports_are_moved_whatever_is_guessed():
+def test_supports_are_moved_for_any_guess():
     newton, load = case(supports=[DirichletBC(Plane(0, "max"), [0.0, 0.0, -0.3])])
     exact = solve(newton, load).displacement
     guess = exact + 1e-4 * torch.randn(exact.shape, generator=torch.Generator().manual_seed(0))
@@ -93,7 +93,7 @@ def test_supports_are_moved_whatever_is_guessed():
     assert answer.converged.all()
 
 
-def test_a_batch_is_its_members():
+def test_a_batch_is_solved_like_its_members():
     newton, load = case()
     both = Load(torch.cat([load.force, 0.5 * load.force]), torch.ones(2, dtype=torch.float64))
     guess = 1.002 * solve(newton, both).displacement
@@ -104,7 +104,7 @@ def test_a_batch_is_its_members():
         assert int(whole.iterations[k]) == int(alone.iterations)
 
 
-def test_a_memory_of_nothing_contracts_more_slowly():
+def test_convergence_is_slower_without_memory():
     newton, load = case()
     guess = 1.003 * solve(newton, load).displacement
     long, short = (end(AndersonSolver(newton, memory=memory), load, guess) for memory in (12, 1))

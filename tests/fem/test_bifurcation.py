@@ -1,4 +1,4 @@
-"""A column beyond its critical load: found unstable, and what it gives way to."""
+"""Laws of buckling: a column beyond its critical load, its unstable directions and branches."""
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ from dpl.fem.solvers import unstable_directions
 
 @pytest.fixture(scope="module")
 def column() -> Newton:
-    """A column 10 x 1 x 0.8 of quadratic hexahedra, nu = 0, held at its foot."""
+    """A column 10 x 1 x 0.8 of quadratic hexahedra, nu = 0, clamped at its foot."""
     mesh = box([10.0, 1.0, 0.8], [11, 2, 2])
     law = SaintVenantKirchhoff(0.0)
     return Newton(Problem.build(mesh, law, fixed=Plane(0, "min"), degree=2))
@@ -61,7 +61,7 @@ def test_unstable_directions_lower_the_energy(column, pressed):
     assert soft[2] > 100 * soft[1]  # it bends about its weak axis first
 
 
-def test_column_gives_way_to_either_side(column, pressed):
+def test_column_buckles_to_either_side(column, pressed):
     load, straight = pressed
     left, right = post_buckling_branches(column, load, straight)
     problem = column.problem
@@ -79,7 +79,7 @@ def test_column_gives_way_to_either_side(column, pressed):
     assert tips[0] * tips[1] < 0
 
 
-def test_stable_answer_has_no_unstable_direction(column):
+def test_stable_solution_has_no_unstable_direction(column):
     force = Traction(Plane(0, "max"), [1e-5, 0.0, 0.0]).on(column.problem)
     load = Load(force[None], torch.ones(1, dtype=torch.float64))
     answer = solve(column, load)

@@ -1,4 +1,4 @@
-"""Laws of the differentiable equilibrium: its slopes are those of whole solves."""
+"""Laws of the differentiable equilibrium: gradients equal difference quotients of solves."""
 
 import pickle
 
@@ -43,7 +43,7 @@ def force(problem, pull):
 
 @pytest.fixture(scope="module")
 def way(problem):
-    """A direction of forces, of no symmetry, on held nodes too."""
+    """A direction of forces without symmetry, on fixed nodes too."""
     return noise(2, *problem.shape, seed=1)
 
 
@@ -56,7 +56,7 @@ def loaded(force):
 
 
 def seen(displacement):
-    """Some smooth number of each answer, (B,)."""
+    """Return a smooth functional of each solution, (B,)."""
     weight = noise(*displacement.shape[1:], seed=2)
     return (displacement * weight).sum(dim=(1, 2)) + displacement.square().sum(dim=(1, 2))
 
@@ -65,14 +65,14 @@ def slope_of(function, step):
     return (function(step) - function(-step)) / (2 * step)
 
 
-def test_the_answer_is_that_of_newton(equilibrium, force):
+def test_the_solution_is_that_of_newton(equilibrium, force):
     answer = equilibrium(loaded(force))
     assert torch.equal(answer, solve(equilibrium.newton, loaded(force)).displacement)
     assert answer.dtype == torch.float64
     assert not answer.requires_grad
 
 
-def test_the_gradient_by_forces_is_that_of_whole_solves(equilibrium, force, way):
+def test_the_gradient_by_forces_is_the_difference_quotient(equilibrium, force, way):
     inner = force.clone().requires_grad_()
     (slope,) = torch.autograd.grad(seen(equilibrium(loaded(inner))).sum(), inner)
     size = float(force[0].norm() / way[0].norm())
@@ -86,14 +86,14 @@ def test_the_gradient_by_forces_is_that_of_whole_solves(equilibrium, force, way)
     assert torch.allclose(found, expected, rtol=1e-5, atol=0)
 
 
-def test_forces_on_held_nodes_change_nothing(problem, equilibrium, force):
+def test_forces_on_fixed_nodes_have_no_gradient(problem, equilibrium, force):
     inner = force.clone().requires_grad_()
     (slope,) = torch.autograd.grad(seen(equilibrium(loaded(inner))).sum(), inner)
     assert (slope[:, ~problem.free] == 0).all()
     assert (slope[:, problem.free] != 0).any()
 
 
-def test_the_gradient_by_young_and_by_newtons_is_that_of_whole_solves(scene, batch):
+def test_the_gradient_by_young_and_force_is_the_difference_quotient(scene, batch):
     """Through `Scene.load_of`: u/L depends on f/(E L^2) alone, so f df + E dE = 0 as well."""
     equilibrium = DifferentiableSolve(Newton(scene.problem, tol=1e-12, linear="superlu"))
     young = torch.tensor([4500.0, 9000.0], dtype=torch.float64)
@@ -120,7 +120,7 @@ def test_a_batch_has_the_gradients_of_its_members(equilibrium, force):
         assert torch.allclose(whole[k], slope[0], rtol=1e-9, atol=1e-12 * float(slope.abs().max()))
 
 
-def test_a_gradient_costs_one_factor_however_often_it_is_asked_for(equilibrium, force, monkeypatch):
+def test_repeated_gradients_take_one_factorisation(equilibrium, force, monkeypatch):
     answer = equilibrium(loaded(force.clone().requires_grad_()))
     made = []
     factorise = SuperLU.factorise
@@ -141,7 +141,7 @@ def test_linear_bodies_have_the_same_gradient_everywhere(beam, pull):
     assert torch.allclose(slope[1], adjoint, rtol=1e-8, atol=1e-10)
 
 
-def test_moved_supports_and_springs_take_part(pull):
+def test_moved_supports_and_springs_are_included(pull):
     ends = [
         DirichletBC(Plane(0, "max"), [5.0, None, None]),
         RobinBC(Plane(2, "min"), 1e-4),
@@ -159,8 +159,8 @@ def test_moved_supports_and_springs_take_part(pull):
     assert float((slope * way).sum()) * size == pytest.approx(float(expected), rel=1e-5)
 
 
-def test_a_balanced_column_beyond_its_critical_load_has_a_gradient(beam):
-    """Its tangent is indefinite, and yet the way in which it answers is a matter of one solve."""
+def test_an_unstable_column_has_a_gradient(beam):
+    """The tangent is indefinite and not singular."""
     problem = beam(NeoHookeanLn(0.3), n=8, m=1)
     equilibrium = DifferentiableSolve(Newton(problem, tol=1e-12, linear="superlu"))
     tip = (problem.points[:, 0] == problem.points[:, 0].max()).double()
@@ -180,7 +180,7 @@ def test_a_balanced_column_beyond_its_critical_load_has_a_gradient(beam):
     assert float(slope) == pytest.approx(float(expected), rel=1e-5)
 
 
-def test_a_guess_shortens_the_solve_and_changes_neither_answer_nor_gradient(equilibrium, force):
+def test_a_guess_saves_iterations_and_changes_neither_solution_nor_gradient(equilibrium, force):
     cold = loaded(force.clone().requires_grad_())
     warm = loaded(force.clone().requires_grad_())
     first = equilibrium(cold)
@@ -194,7 +194,7 @@ def test_a_guess_shortens_the_solve_and_changes_neither_answer_nor_gradient(equi
     assert torch.allclose(*slopes, rtol=1e-7, atol=1e-9)
 
 
-def test_loads_without_an_answer_are_refused_by_number(problem, force):
+def test_error_names_the_loads_without_a_solution(problem, force):
     equilibrium = DifferentiableSolve(Newton(problem, linear="superlu", max_total_iter=2))
     hopeless = torch.cat([0 * force[:1], 100 * force[1:]]).requires_grad_()
     with pytest.raises(ValueError, match="of 2 loads, load 1: not converged"):
@@ -202,7 +202,7 @@ def test_loads_without_an_answer_are_refused_by_number(problem, force):
     assert equilibrium.solution(loaded(hopeless)).converged.tolist() == [True, False]
 
 
-def test_a_critical_load_has_no_gradient_and_says_so(equilibrium, force, monkeypatch):
+def test_a_critical_load_has_no_gradient(equilibrium, force, monkeypatch):
     def critical(backend, values):
         raise SingularMatrix("a pivot is zero")
 
@@ -212,7 +212,7 @@ def test_a_critical_load_has_no_gradient_and_says_so(equilibrium, force, monkeyp
         answer.sum().backward()
 
 
-def test_forces_of_single_precision_get_gradients_of_theirs(equilibrium, force):
+def test_float32_forces_get_float32_gradients(equilibrium, force):
     single = force.float().requires_grad_()
     answer = equilibrium(loaded(single))
     assert answer.dtype == torch.float64
@@ -220,7 +220,7 @@ def test_forces_of_single_precision_get_gradients_of_theirs(equilibrium, force):
     assert single.grad.dtype == torch.float32
 
 
-def test_it_can_be_pickled(equilibrium, force):
+def test_a_differentiable_solve_can_be_pickled(equilibrium, force):
     equilibrium(loaded(force.clone().requires_grad_())).sum().backward()
     twin = pickle.loads(pickle.dumps(equilibrium))
     assert torch.equal(twin(loaded(force)), equilibrium(loaded(force)))

@@ -1,4 +1,4 @@
-"""Laws of factors that serve for more than one tangent: the same answers, for less work."""
+"""Laws of factor reuse: the same solutions with fewer factorisations."""
 
 import math
 import pickle
@@ -42,7 +42,7 @@ def load_of(*forces: Tensor) -> Load:
 
 
 def pair(problem: Problem, load: Load, guess: Tensor | None = None, **options):
-    """Return the answers with a factor for every tangent and with as few as usual."""
+    """Return the solutions without and with factor reuse."""
     answers = []
     for reuse in (0.0, Newton(problem).factor_reuse_tol):
         solver = Newton(problem, **{"linear": "superlu", "factor_reuse_tol": reuse, **options})
@@ -52,13 +52,13 @@ def pair(problem: Problem, load: Load, guess: Tensor | None = None, **options):
 
 
 def check(every: Solution, few: Solution, *, steps: int = 1, fewer: bool = True) -> None:
-    """Assert that two answers are one, and that the second took less work.
+    """Assert that two solutions are equal and that the second took less work.
 
     Args:
-        every: With a factor for every tangent.
-        few: With as few as usual.
-        steps: Load steps, each of which may take one iteration more.
-        fewer: Whether some factor must have been spared.
+        every: Solution without factor reuse.
+        few: Solution with factor reuse.
+        steps: Load steps, each of which may take one more iteration.
+        fewer: Whether there must be fewer factorisations.
     """
     assert few.status.tolist() == every.status.tolist()
     assert (few.load_factor - every.load_factor).abs().max() < 1e-3
@@ -78,7 +78,7 @@ def mixed(request) -> bool:
 
 
 @pytest.mark.parametrize("q", [1.0, 20.0, 80.0])
-def test_answer_of_any_law_does_not_depend_on_reuse(beam, pull, any_law, mixed, q):
+def test_solution_of_any_law_does_not_depend_on_reuse(beam, pull, any_law, mixed, q):
     problem = beam(any_law)
     every, few = pair(problem, load_of(pull(problem, q)[0]), mixed_integration=mixed)
     assert every.converged.all()
@@ -88,7 +88,7 @@ def test_answer_of_any_law_does_not_depend_on_reuse(beam, pull, any_law, mixed, 
 @pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("size", [0.01, 0.1])
-def test_answer_on_any_element_does_not_depend_on_reuse(grid, cell, degree, size):
+def test_solution_on_any_element_does_not_depend_on_reuse(grid, cell, degree, size):
     mesh = grid(cell, 3, 0.2, inside=True)
     problem = Problem.build(mesh, NH, fixed=Plane(0, "min"), degree=degree)
     across = [0.0] * (mesh.dim() - 1) + [size]
@@ -99,7 +99,7 @@ def test_answer_on_any_element_does_not_depend_on_reuse(grid, cell, degree, size
 
 @pytest.mark.parametrize("name", installed_backends())
 @pytest.mark.parametrize(("cells", "q"), [((8, 2), 5.0), ((8, 2), 160.0), ((16, 4), 40.0)])
-def test_answer_of_any_backend_does_not_depend_on_reuse(beam, pull, name, cells, q):
+def test_solution_of_any_backend_does_not_depend_on_reuse(beam, pull, name, cells, q):
     problem = beam(NH, *cells)
     every, few = pair(problem, load_of(pull(problem, q)[0]), linear=name)
     assert every.converged.all()
@@ -122,7 +122,7 @@ def test_large_load_that_takes_steps_does_not_depend_on_reuse(beam, pull, mixed,
 
 
 @pytest.mark.parametrize("q", [400.0, 1000.0])
-def test_load_without_an_answer_has_none_with_reuse(beam, pull, mixed, q):
+def test_load_without_a_solution_has_none_with_reuse(beam, pull, mixed, q):
     problem = beam(SVK)
     options = {"min_load_step": 2.0**-6, "mixed_integration": mixed}
     every, few = pair(problem, load_of(pull(problem, q)[0]), **options)
@@ -146,7 +146,7 @@ def test_moved_supports_are_followed_with_reuse(law, mixed):
 
 
 @pytest.mark.parametrize("part", [0.5, 0.9, 1.0001, -0.2])
-def test_guess_is_improved_to_the_same_answer_with_reuse(beam, pull, law, part):
+def test_guess_leads_to_the_same_solution_with_reuse(beam, pull, law, part):
     problem = beam(law)
     load = load_of(pull(problem, 20.0)[0])
     answer = solve(
@@ -170,7 +170,7 @@ def test_more_reuse_means_fewer_factors(beam, pull, reuse):
 
 
 @pytest.mark.parametrize("q", [5.0, 40.0, 160.0])
-def test_factors_are_counted_as_they_are_made(beam, pull, counted, q):
+def test_factorisations_are_counted(beam, pull, counted, q):
     problem = beam(NH)
     solver, load = Newton(problem, linear="superlu"), load_of(pull(problem, q)[0])
     solver.linear_solver.factor  # noqa: B018  the scene's
@@ -180,8 +180,8 @@ def test_factors_are_counted_as_they_are_made(beam, pull, counted, q):
     assert answer.factorisations.item() < answer.iterations.item() - 1
 
 
-def test_without_reuse_every_tangent_has_its_own_factor(beam, pull, monkeypatch):
-    """And none serves as a preconditioner."""
+def test_without_reuse_every_tangent_is_factorised(beam, pull, monkeypatch):
+    """No factor is used as a preconditioner."""
     problem = beam(NH)
     monkeypatch.setattr(SuperLUFactor, "apply", None)
     answer = solve(
@@ -192,7 +192,7 @@ def test_without_reuse_every_tangent_has_its_own_factor(beam, pull, monkeypatch)
 
 
 @pytest.mark.parametrize("reuse", [0.01, 0.1, 0.5])
-def test_factor_serves_only_below_the_residual_that_is_asked_for(beam, pull, reuse):
+def test_factors_are_reused_only_below_factor_reuse_tol(beam, pull, reuse):
     problem = beam(NH)
     solver = Newton(problem, linear="superlu", factor_reuse_tol=reuse)
     made, before = [], 1.0
@@ -205,21 +205,21 @@ def test_factor_serves_only_below_the_residual_that_is_asked_for(beam, pull, reu
     assert any(n == 0 for n, ratio in zip(new[1:], ratios[1:], strict=True) if ratio < reuse)
 
 
-def test_preconditioner_that_does_not_help_is_replaced_after_its_patience(
+def test_poor_preconditioner_is_replaced_after_the_largest_number_of_steps(
     beam, pull, monkeypatch, counted
 ):
-    """It costs a few products, and neither an iteration nor the answer."""
+    """It costs a few products; iterations and solution are the same."""
     problem = beam(NH)
     load = load_of(pull(problem, 40.0)[0])
     every, few = pair(problem, load)
     steps = []
     original = reuse_module.conjugate_gradients
 
-    def hopeless(product, precondition, right, rtol, max_iter, **_):
+    def poor_preconditioner(product, precondition, right, rtol, max_iter, **_):
         steps.append(max_iter)
         return original(product, lambda r: r, right, rtol, max_iter)
 
-    monkeypatch.setattr(reuse_module, "conjugate_gradients", hopeless)
+    monkeypatch.setattr(reuse_module, "conjugate_gradients", poor_preconditioner)
     answer = solve(Newton(problem, linear="superlu"), load)
     assert answer.converged.all()
     assert answer.iterations.item() == every.iterations.item()
@@ -255,7 +255,7 @@ def test_batch_with_reuse_solves_like_its_members(beam, pull):
 
 
 @pytest.mark.skipif("pardiso" not in installed_backends(), reason="pardiso is not installed")
-def test_members_of_a_batch_do_not_factorise_behind_the_count(beam, pull, monkeypatch):
+def test_factorisations_of_a_batch_are_all_counted(beam, pull, monkeypatch):
     calls, original = [], Pardiso._factorise
 
     def count(self, matrix):
@@ -271,10 +271,8 @@ def test_members_of_a_batch_do_not_factorise_behind_the_count(beam, pull, monkey
 
 
 @pytest.mark.parametrize("reuse", [0.0, 0.1])
-def test_storage_of_a_factor_that_is_not_used_again_is_that_of_the_next(
-    beam, pull, monkeypatch, reuse
-):
-    """A band is the largest thing that a solve holds: two of them are twice the memory."""
+def test_the_next_factor_takes_the_storage_of_an_unused_one(beam, pull, monkeypatch, reuse):
+    """Band storage needs most of the memory of a solve; two would double it."""
     problem, places, original = beam(NH), [], BandedCholesky._cholesky
 
     def watched(self, values):
@@ -362,8 +360,8 @@ def test_load_below_a_critical_one_is_stable_whatever_is_reused(name, part):
 
 @pytest.mark.parametrize("P", [2.1, 2.5, 4.0])
 @pytest.mark.parametrize("linear", ["superlu", "band"])
-def test_factor_with_negative_pivots_is_never_used_again(monkeypatch, P, linear):
-    """Conjugate gradients want a positive definite preconditioner."""
+def test_factor_with_negative_pivots_is_never_reused(monkeypatch, P, linear):
+    """Conjugate gradients need a positive definite preconditioner."""
     problem, unit = column(SaintVenantKirchhoff(0.0))
     used, met, original = [], [], SuperLU.factorise
 
@@ -380,7 +378,7 @@ def test_factor_with_negative_pivots_is_never_used_again(monkeypatch, P, linear)
     solver = Newton(problem, tol=1e-10, linear=linear, factor_reuse_tol=1e6)
     answer = solve(solver, load_of(P * unit))
     assert answer.status.item() == Status.UNSTABLE
-    assert [count for count in met if count > 0][:2] == [2, 2]  # one would have been near
+    assert [count for count in met if count > 0][:2] == [2, 2]
     assert not any(used)
 
 

@@ -1,4 +1,4 @@
-"""Laws of the sparse solves: every backend answers, counts and refuses alike."""
+"""Laws of the sparse solves, for every backend."""
 
 import importlib.util
 import pickle
@@ -33,7 +33,7 @@ System = tuple[Pattern, np.ndarray]
 
 
 class Structure(NamedTuple):
-    """All that a backend wants to know of a pattern."""
+    """Pattern of a matrix."""
 
     size: int
     indptr: np.ndarray
@@ -48,19 +48,19 @@ def need(name: str) -> str:
 
 @pytest.fixture(params=KNOWN)
 def name(request) -> str:
-    """Each backend that is installed here."""
+    """Each installed backend."""
     return need(request.param)
 
 
 @pytest.fixture(params=DIRECT)
 def direct(request) -> str:
-    """Each backend that is installed here and solves any matrix that is not singular."""
+    """Each installed backend that solves indefinite matrices."""
     return need(request.param)
 
 
 @pytest.fixture
 def hide(monkeypatch) -> Callable[..., None]:
-    """Makes packages look as if they were not installed."""
+    """Function that makes packages look as if they were not installed."""
     find = importlib.util.find_spec
 
     def hide(*packages: str) -> None:
@@ -131,7 +131,7 @@ def shifted(pattern: Pattern, values: np.ndarray, shift: float) -> np.ndarray:
 
 
 def error(solver: Backend, pattern: Pattern, values: np.ndarray) -> float:
-    """Return the relative error of a solve whose answer is known."""
+    """Return the relative error of a solve with a known solution."""
     answer = np.random.default_rng(0).normal(size=pattern.size)
     found = solver.factorise(values).solve(full_matrix(pattern, values) @ answer)
     return float(np.linalg.norm(found - answer) / np.linalg.norm(answer))
@@ -150,8 +150,8 @@ def test_positive_definite_matrix_is_solved_to_rounding(name, stiffness):
     assert solver.factorise(values).negative_pivots == (None if name == "cg" else 0)
 
 
-def test_conjugate_gradients_tell_definite_matrices_from_others(body):
-    """By a solve for noise, which holds all directions."""
+def test_conjugate_gradients_detect_indefinite_matrices(body):
+    """By a solve with a random right-hand side, which has a component along every eigenvector."""
     pattern, values = system(body)
     eigenvalues = np.linalg.eigvalsh(full_matrix(pattern, values).toarray())
     for near_null in (None, motions(body)):
@@ -177,15 +177,15 @@ def test_indefinite_matrix_is_solved_and_its_negative_eigenvalues_are_counted(di
     assert eigenvalues[2] - eigenvalues[1] > 1e-3 * eigenvalues[2]  # count = 2 has run
 
 
-def test_backend_serves_matrix_after_matrix(name, stiffness):
-    """The symbolic work is shared; the numbers must not be."""
+def test_backend_solves_one_matrix_after_another(name, stiffness):
+    """Only the symbolic work is shared."""
     pattern, values = stiffness
     solver = make_backend(pattern, name)
     for scale in (1.0, 1e-6, 1e6):
         assert error(solver, pattern, scale * values) < 1e-10
 
 
-def test_factor_outlives_the_next_factorisation_and_its_entries(name, stiffness):
+def test_factor_stays_valid_after_the_next_factorisation(name, stiffness):
     pattern, values = stiffness
     solver, right = make_backend(pattern, name), np.ones(pattern.size)
     entries = values.copy()
@@ -198,7 +198,7 @@ def test_factor_outlives_the_next_factorisation_and_its_entries(name, stiffness)
     assert np.array_equal(first.solve(right), expected)
 
 
-def test_storage_of_a_dead_factor_is_used_again(stiffness):
+def test_storage_of_an_unused_factor_is_reused(stiffness):
     pattern, values = stiffness
     solver = make_backend(pattern, "band")
     first = solver.factorise(values)
@@ -209,7 +209,7 @@ def test_storage_of_a_dead_factor_is_used_again(stiffness):
     assert np.shares_memory(solver.factorise(values).storage, storage)
 
 
-def test_right_hand_side_stays_as_it_is(name, stiffness):
+def test_right_hand_side_is_not_changed(name, stiffness):
     pattern, values = stiffness
     right = np.ones(pattern.size)
     kept = values.copy()
@@ -220,8 +220,7 @@ def test_right_hand_side_stays_as_it_is(name, stiffness):
     assert np.array_equal(first, second)
 
 
-def test_right_hand_side_may_be_a_column_of_many(name, stiffness):
-    """Not one after the other in memory."""
+def test_right_hand_side_may_have_strides(name, stiffness):
     pattern, values = stiffness
     many = np.random.default_rng(0).standard_normal((pattern.size, 3))
     factor = make_backend(pattern, name).factorise(values)
@@ -230,7 +229,7 @@ def test_right_hand_side_may_be_a_column_of_many(name, stiffness):
         assert factor.solve(right) == pytest.approx(expected, rel=1e-9)
 
 
-def test_no_load_has_no_answer_but_zero(name, stiffness):
+def test_zero_right_hand_side_has_the_solution_zero(name, stiffness):
     pattern, values = stiffness
     assert not make_backend(pattern, name).factorise(values).solve(np.zeros(pattern.size)).any()
 
@@ -266,7 +265,7 @@ def test_singular_matrix_is_an_error_of_conjugate_gradients_when_it_is_solved(ki
         make_backend(pattern, "cg").factorise(values).solve(np.ones(6))
 
 
-def test_backend_recovers_from_a_matrix_it_refused(name, stiffness):
+def test_backend_works_after_a_matrix_that_it_refused(name, stiffness):
     pattern, values = stiffness
     solver = make_backend(pattern, name)
     with pytest.raises(SingularMatrix):
@@ -301,7 +300,7 @@ def maps(solver: Backend, pattern: Pattern, values: np.ndarray) -> tuple[np.ndar
 
 
 def needs_multigrid(name: str) -> None:
-    """Skip where conjugate gradients have the diagonal alone, which is near no inverse."""
+    """Skip where conjugate gradients have the diagonal preconditioner, a poor inverse."""
     if name == "cg" and not multigrid_installed():
         pytest.skip("pyamg is not installed")
 
@@ -325,14 +324,14 @@ def test_applied_factor_is_symmetric_positive_definite_and_near_the_inverse(
     assert np.abs(spread - 1).max() < NEAR.get(name, 1e-8)
 
 
-def test_diagonal_serves_as_a_factor_where_there_is_no_multigrid(stiffness):
+def test_the_preconditioner_without_multigrid_is_the_diagonal(stiffness):
     pattern, values = stiffness
     applied, K = maps(make_backend(pattern, "cg"), pattern, values)
     assert np.allclose(applied, np.diag(1 / K.diagonal()), rtol=1e-14, atol=0)
 
 
 def test_applied_factor_is_a_fixed_linear_map(name, body, stiffness):
-    """Whatever is solved or factorised between; it takes nothing and it leaves its argument."""
+    """It depends on no solve or factorisation between, and does not change its argument."""
     pattern, values = stiffness
     solver = make_backend(pattern, name, motions(body))
     factor = solver.factorise(values)
@@ -358,8 +357,8 @@ def test_applied_factor_does_not_depend_on_the_size_of_the_right_hand_side(name,
     assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
 
 
-def test_applied_factor_of_a_neighbour_is_a_preconditioner(name, body, stiffness, bend):
-    """Few conjugate gradient steps on one tangent with the factor of another."""
+def test_factor_of_a_near_tangent_is_a_preconditioner(name, body, stiffness, bend):
+    """Conjugate gradients with the factor of another tangent take few steps."""
     needs_multigrid(name)
     pattern, values = stiffness
     solver = make_backend(pattern, name, motions(body))
@@ -387,7 +386,7 @@ def of_contrast(contrast: float) -> Problem:
 
 @pytest.mark.parametrize("contrast", [1e-6, 1e3, 1e6, 1e9])
 def test_stiffnesses_far_apart_are_solved_to_rounding(direct, contrast):
-    """None refines; the residual is that of Newton's next step."""
+    """Without iterative refinement."""
     pattern, values = system(of_contrast(contrast))
     right = np.random.default_rng(0).normal(size=pattern.size)
     x = make_backend(pattern, direct).factorise(values).solve(right)
@@ -400,7 +399,7 @@ def test_stiffnesses_far_apart_are_solved_to_rounding(direct, contrast):
 
 
 @pytest.mark.parametrize("name", ["band", "band32"])
-def test_band_of_a_shuffled_mesh_is_found_again(name, shuffled):
+def test_bandwidth_of_a_shuffled_mesh_is_reduced(name, shuffled):
     pattern, values = system(shuffled)
     layout = band_storage(pattern)
     own = (pattern.indices - np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))).max()
@@ -410,14 +409,14 @@ def test_band_of_a_shuffled_mesh_is_found_again(name, shuffled):
     assert error(make_backend(pattern, name), pattern, values) < 1e-10
 
 
-def test_numbering_that_is_narrow_is_kept(stiffness):
+def test_narrow_numbering_is_kept(stiffness):
     pattern, _ = stiffness
     layout = band_storage(pattern)
     assert layout.order is None
     assert layout.half == 3 * (9 + 3 + 1) + 2  # a node's farthest neighbour, its last component
 
 
-def test_float32_factor_answers_in_float64_without_another(stiffness):
+def test_float32_factor_solves_to_float64_accuracy(stiffness):
     pattern, values = stiffness
     factor = make_backend(pattern, "band32").factorise(values)
     answer = np.random.default_rng(0).normal(size=pattern.size)
@@ -427,7 +426,7 @@ def test_float32_factor_answers_in_float64_without_another(stiffness):
     assert np.linalg.norm(found - answer) < 1e-10 * np.linalg.norm(answer)
 
 
-def test_stiff_and_soft_unknowns_fit_into_float32(stiffness):
+def test_float32_covers_stiff_and_soft_unknowns(stiffness):
     """Demmel (1989): diagonal scaling changes nothing in the rounding of Cholesky."""
     pattern, values = stiffness
     scale = 10 ** np.random.default_rng(4).uniform(-12, 12, pattern.size)
@@ -441,7 +440,7 @@ def test_stiff_and_soft_unknowns_fit_into_float32(stiffness):
 
 
 @pytest.mark.parametrize("smallest", [1e-6, 1e-9, -1e-9, 1e-12])
-def test_matrix_too_delicate_for_float32_is_solved_in_float64(smallest):
+def test_nearly_singular_matrix_is_solved_in_float64(smallest):
     pattern, values = of_eigenvalues(np.array([smallest, *np.linspace(1, 2, 40)]))
     right = np.random.default_rng(0).normal(size=pattern.size)
     factor = make_backend(pattern, "band32").factorise(values)
@@ -451,7 +450,7 @@ def test_matrix_too_delicate_for_float32_is_solved_in_float64(smallest):
     assert factor.negative_pivots == (smallest < 0)
 
 
-def test_float64_factor_stays_for_the_solves_after_the_one_that_needed_it(stiffness):
+def test_float64_factor_is_kept_for_later_solves(stiffness):
     pattern, values = stiffness
     factor = make_backend(pattern, "band32").factorise(values)
     right = np.ones(pattern.size)
@@ -466,7 +465,7 @@ def test_float64_factor_stays_for_the_solves_after_the_one_that_needed_it(stiffn
 
 
 @pytest.mark.parametrize("name", ["band32", "cg"])
-def test_iteration_stops_where_it_is_told_to(name, shuffled, monkeypatch):
+def test_iteration_stops_at_the_tolerance(name, shuffled, monkeypatch):
     pattern, values = system(shuffled)
     factor = make_backend(pattern, name, motions(shuffled)).factorise(values)
     products, multiply = [], SymmetricProduct.__call__
@@ -486,7 +485,7 @@ def test_iteration_stops_where_it_is_told_to(name, shuffled, monkeypatch):
     assert costs[0] < costs[-1]
 
 
-def test_product_needs_the_upper_triangle_alone(stiffness):
+def test_product_needs_only_the_upper_triangle(stiffness):
     pattern, values = stiffness
     x = np.random.default_rng(0).normal(size=pattern.size)
     expected = full_matrix(pattern, values) @ x
@@ -502,15 +501,15 @@ def test_negative_curvature_is_an_error(body):
             make_backend(pattern, "cg", near_null).factorise(moved).solve(np.ones(pattern.size))
 
 
-def test_iteration_that_does_not_end_is_an_error(stiffness):
+def test_iteration_that_does_not_converge_is_an_error(stiffness):
     product = SymmetricProduct(*stiffness)
     right = np.ones(len(product.diagonal))
     with pytest.raises(SingularMatrix, match="no convergence to 1e-12 in 3"):
         conjugate_gradients(product, lambda r: r, right, 1e-12, 3)
 
 
-def test_rigid_motions_cost_no_energy(body):
-    """On a body that nothing holds."""
+def test_rigid_body_modes_have_no_energy(body):
+    """On a body without supports."""
     free = Problem.build(box([100.0, 25.0, 25.0], [5, 3, 3]), NeoHookeanLn(0.3))
     pattern, values = system(free)
     fields = motions(free)
@@ -520,7 +519,7 @@ def test_rigid_motions_cost_no_energy(body):
     assert motions(body).shape == (system(body)[0].size, 6)
 
 
-def test_multigrid_needs_hardly_more_steps_for_larger_bodies(beam):
+def test_multigrid_iterations_hardly_grow_with_the_body(beam):
     """Smoothed aggregation, Vanek, Mandel, Brezina (1996)."""
     pytest.importorskip("pyamg")
     steps = []
@@ -541,8 +540,8 @@ def test_multigrid_needs_hardly_more_steps_for_larger_bodies(beam):
     assert steps[1] < 30
 
 
-def test_multigrid_serves_bodies_that_slide():
-    """Supports that hold single components: nodes have different numbers of unknowns."""
+def test_multigrid_works_with_sliding_supports():
+    """Nodes then have different numbers of unknowns."""
     pytest.importorskip("pyamg")
     mesh = box([1.0, 1.0, 1.0], [6, 6, 6])
     held = mesh.p.T == 0  # each side slides on its plane
@@ -551,8 +550,8 @@ def test_multigrid_serves_bodies_that_slide():
     assert error(make_backend(pattern, "cg", motions(problem)), pattern, values) < 1e-10
 
 
-def test_multigrid_leaves_numpys_random_numbers_alone(body):
-    """And so gives the same answer each time."""
+def test_multigrid_draws_no_random_numbers(body):
+    """Its result is therefore reproducible."""
     pytest.importorskip("pyamg")
     pattern, values = system(body)
     np.random.seed(3)  # noqa: NPY002  the global state is what must stay
@@ -584,7 +583,7 @@ def test_compact_body_gets_a_sparse_factor(hide):
     assert select_backend("auto", wide) == "superlu"
 
 
-def test_very_large_body_gets_multigrid_where_its_rigid_motions_are_known(monkeypatch, hide):
+def test_very_large_body_with_known_rigid_body_modes_gets_multigrid(monkeypatch, hide):
     pytest.importorskip("pyamg")
     wide, fields = of_band(800, 400), np.ones((800, 6))
     monkeypatch.setattr(backends, "MULTIGRID", {"pardiso": 799, "superlu": 799})
@@ -595,7 +594,7 @@ def test_very_large_body_gets_multigrid_where_its_rigid_motions_are_known(monkey
     assert select_backend("auto", wide, fields) != "cg"
 
 
-def test_factor_that_lasts_is_direct_for_longer_and_never_in_float32(monkeypatch, hide):
+def test_backend_for_many_right_hand_sides_stays_direct_longer_in_float64(monkeypatch, hide):
     pytest.importorskip("pyamg")
     wide, fields = of_band(800, 400), np.ones((800, 6))
     for largest, name in ((799, "direct"), (266, "cg")):  # three times 266 is below 800
@@ -607,18 +606,18 @@ def test_factor_that_lasts_is_direct_for_longer_and_never_in_float32(monkeypatch
     assert select_backend("auto", of_band(8000, 300), many_rhs=True) == "band"
 
 
-def test_choice_is_between_the_backends_that_are_installed(monkeypatch):
+def test_selection_is_among_the_installed_backends(monkeypatch):
     monkeypatch.setattr(backends, "installed_backends", lambda: ["superlu"])
     assert select_backend("auto", of_band(200, 5)) == "superlu"
     assert type(make_backend(of_band(200, 5))).__name__ == "SuperLU"
 
 
-def test_choice_waits_for_the_pattern():
+def test_auto_stays_auto_without_a_pattern():
     assert select_backend("auto") == "auto"
     assert [select_backend(name) for name in installed_backends()] == installed_backends()
 
 
-def test_superlu_stands_in_where_pardiso_is_not_installed(hide, stiffness):
+def test_superlu_replaces_pardiso_where_that_is_not_installed(hide, stiffness):
     pattern, values = stiffness
     hide("pypardiso")
     assert installed_backends() == [name for name in BACKENDS if name != "pardiso"]
@@ -628,13 +627,13 @@ def test_superlu_stands_in_where_pardiso_is_not_installed(hide, stiffness):
     assert factor.negative_pivots > 0
 
 
-def test_backend_that_is_not_installed_is_an_error_that_says_how_to_get_it(hide, stiffness):
+def test_error_names_the_package_of_a_backend_that_is_not_installed(hide, stiffness):
     hide("pypardiso")
     with pytest.raises(ValueError, match=r"not installed: pip install .*\[pardiso\]"):
         make_backend(stiffness[0], "pardiso")
 
 
-def test_unknown_backend_is_an_error_that_names_the_known(stiffness):
+def test_error_lists_the_backends_for_an_unknown_one(stiffness):
     with pytest.raises(
         ValueError, match=r"linear = 'umfpack' must be one of auto, band, band32, pardiso"
     ):
@@ -664,7 +663,7 @@ def test_full_matrix_mirrors_the_upper_triangle(stiffness):
         ("sse", "Prescott", None),
     ],
 )
-def test_slow_kernels_on_a_fast_cpu_are_pointed_out(monkeypatch, tmp_path, flags, kernels, advice):
+def test_slow_kernels_on_a_fast_cpu_are_reported(monkeypatch, tmp_path, flags, kernels, advice):
     (tmp_path / "cpuinfo").write_text(f"processor : 0\nflags : {flags}\n")
     library = {"internal_api": "openblas", "architecture": kernels}
     monkeypatch.delenv("OPENBLAS_CORETYPE", raising=False)
@@ -683,8 +682,8 @@ def test_slow_kernels_on_a_fast_cpu_are_pointed_out(monkeypatch, tmp_path, flags
     ("size", "half"),
     [(1, 0), (2, 1), (3, 2), (5, 4), (7, 3), (9, 1), (16, 2), (40, 6), (41, 7), (43, 42)],
 )
-def test_four_columns_at_a_time_substitute_as_lapack_does(size, half, dtype):
-    """Of any size and width, those that four do not divide included."""
+def test_banded_triangular_solve_is_that_of_lapack(size, half, dtype):
+    """For sizes and widths that are no multiples of four too."""
     random = np.random.default_rng(0)
     lower = np.zeros((size, half + 1), dtype)
     lower[:, 1:] = random.standard_normal((size, half)) / (half + 1)

@@ -1,4 +1,4 @@
-"""Laws of POD-Galerkin: the best subspace, equilibrium in it, few cells that stand for all."""
+"""Laws of POD-Galerkin: the best subspace, equilibrium in it, hyper-reduction to few cells."""
 
 import pickle
 from dataclasses import replace
@@ -66,7 +66,7 @@ def newton(beam) -> Newton:
 
 @pytest.fixture(scope="module")
 def snapshots(newton) -> torch.Tensor:
-    """Sixty answers to random loads of three modes, deflections of up to 0.4 L."""
+    """Solutions for sixty random loads of three modes, deflections of up to 0.4 L."""
     return solve(
         newton, ModalLoads(newton.linear_solver, n_modes=3).sample(0, range(60))
     ).displacement
@@ -80,18 +80,18 @@ def unseen(newton) -> Load:
 
 @pytest.fixture(scope="module")
 def truth(newton, unseen) -> torch.Tensor:
-    """Their answers."""
+    """Their solutions."""
     return solve(newton, unseen).displacement
 
 
 @pytest.fixture(params=[False, True], ids=["alone", "lifted"])
 def lift(request, newton) -> LinearSolver | None:
-    """Without and with the linear answer."""
+    """None, and the linear solver."""
     return newton.linear_solver if request.param else None
 
 
 @pytest.mark.parametrize("shape", [(7, 40), (40, 7), (12, 12)], ids=str)
-def test_basis_is_orthonormal_and_leaves_the_tail_of_singular_values(shape):
+def test_projection_error_is_the_tail_of_the_singular_values(shape):
     fields = noise(*shape) @ torch.diag(0.5 ** torch.arange(shape[1], dtype=torch.float64))
     exact = torch.linalg.svdvals(fields)
     for rank in range(1, 6):
@@ -104,7 +104,7 @@ def test_basis_is_orthonormal_and_leaves_the_tail_of_singular_values(shape):
         assert (vectors.gather(0, vectors.abs().argmax(0, keepdim=True)) > 0).all()
 
 
-def test_small_singular_values_are_found_and_their_vectors_orthogonal():
+def test_vectors_of_small_singular_values_are_orthogonal():
     left, right = (torch.linalg.qr(noise(n, 8, seed=n))[0] for n in (30, 90))
     sizes = 10.0 ** -torch.arange(8, dtype=torch.float64)
     for fields in (left * sizes @ right.T, right * sizes @ left.T):
@@ -134,7 +134,7 @@ def test_snapshots_that_are_not_finite_are_refused(monkeypatch, large):
 
 @pytest.mark.parametrize("shape", [(160, 400), (400, 160)], ids=str)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
-def test_sketches_leave_hardly_more_than_the_best_basis(monkeypatch, shape, dtype):
+def test_randomised_basis_is_nearly_the_best_one(monkeypatch, shape, dtype):
     fields = (noise(*shape) @ torch.diag(0.8 ** torch.arange(shape[1]).double())).to(dtype)
     best = pod(fields, 6)
     monkeypatch.setattr("dpl.fem.rom.pod.MIN_SKETCH_SIZE", 100)
@@ -202,7 +202,7 @@ def test_error_falls_with_the_rank(newton, snapshots, unseen, truth, lift):
     assert found[-1] < 2e-3
 
 
-def test_lifted_answer_is_more_accurate(newton, snapshots, unseen, truth):
+def test_solution_with_lift_is_more_accurate(newton, snapshots, unseen, truth):
     alone, lifted = (
         PODGalerkin.fit(newton.problem, snapshots, 15, tolerance=None, lift=lift)
         for lift in (None, newton.linear_solver)
@@ -239,7 +239,7 @@ def test_few_positive_weights_reproduce_the_forces_of_snapshots(newton, snapshot
     assert error.square().mean().sqrt() < 3e-2  # in another norm than that of the choice
 
 
-def test_fewer_cells_answer_nearly_the_same(newton, snapshots, unseen, lift):
+def test_few_cells_give_nearly_the_same_solution(newton, snapshots, unseen, lift):
     solvers = {
         tolerance: PODGalerkin.fit(newton.problem, snapshots, 8, tolerance=tolerance, lift=lift)
         for tolerance in (None, 1e-2, 1e-3)
@@ -252,8 +252,8 @@ def test_fewer_cells_answer_nearly_the_same(newton, snapshots, unseen, lift):
     assert counts[0] < counts[1] < 32
 
 
-def test_small_loads_are_answered_as_by_all_cells(newton, snapshots, unseen):
-    """The linear part is that of the whole body, whatever cells are chosen."""
+def test_few_cells_are_exact_for_small_loads(newton, snapshots, unseen):
+    """The linear part is that of the whole body for any cells."""
     load = load_of(1e-7 * unseen.force)
     whole = PODGalerkin.fit(newton.problem, snapshots, 8, tolerance=None)
     poor = replace(whole, cubature=Cubature(torch.tensor([3]), torch.tensor([2.0]), 1.0))
@@ -261,7 +261,7 @@ def test_small_loads_are_answered_as_by_all_cells(newton, snapshots, unseen):
     assert errors(*answers).max() < 1e-5
 
 
-def test_no_cell_is_needed_by_a_linear_law(beam, pull):
+def test_a_linear_law_needs_no_cells(beam, pull):
     problem = beam(LinearElastic(0.3), 4, 1)
     rest = LinearSolver(problem, linear="superlu")
     fields = torch.stack([rest.solve(pull(problem, q)[0]) for q in (1.0, 2.0)])
@@ -293,8 +293,8 @@ def test_forces_of_weighted_cells_have_an_energy(newton, snapshots):
     assert_close(tangent @ way, (ahead.internal - back.internal) / 2e-6, rtol=1e-5, atol=1e-5)
 
 
-def test_small_strains_are_those_of_the_identity(newton, snapshots):
-    """K(0) is the identity in the coordinates that the steps are taken in, cells or not."""
+def test_stiffness_at_rest_is_the_identity(newton, snapshots):
+    """With all cells and with few, in the coordinates of the iteration."""
     for tolerance in (None, 1e-2):
         solver = PODGalerkin.fit(newton.problem, snapshots, 6, tolerance=tolerance)
         task = solver.reduced_problem.reduce(torch.zeros(newton.problem.shape, dtype=torch.float64))
@@ -303,7 +303,7 @@ def test_small_strains_are_those_of_the_identity(newton, snapshots):
 
 
 @pytest.mark.parametrize("lifted", [False, True])
-def test_moved_supports_pull_the_subspace_along(lifted):
+def test_moved_supports_are_an_offset_of_the_subspace(lifted):
     """A bar stretched in steps of its ends, as far as Newton goes."""
     mesh = box([1.0, 1.0, 1.0], [3, 3, 3])
     ends = [DirichletBC(Plane(0, "min")), DirichletBC(Plane(0, "max"), [0.5, 0.0, 0.0])]
@@ -320,7 +320,7 @@ def test_moved_supports_pull_the_subspace_along(lifted):
 
 
 @pytest.mark.parametrize("tolerance", [None, 1e-3])
-def test_springs_count(newton, tolerance):
+def test_springs_are_included(newton, tolerance):
     mesh = box([100.0, 25.0, 25.0], [5, 2, 2])
     problem = Problem.build(mesh, NH, supports=[RobinBC(Plane(0, "min"), 0.05)])
     solver = Newton(problem, linear="superlu", tol=1e-10)
@@ -359,7 +359,7 @@ def test_zero_load_costs_nothing(newton, snapshots):
     assert not answer.displacement.any()
 
 
-def test_batch_is_its_members(newton, snapshots, unseen, lift):
+def test_batch_is_solved_like_its_members(newton, snapshots, unseen, lift):
     solver = PODGalerkin.fit(newton.problem, snapshots, 8, tolerance=1e-2, lift=lift)
     batch = solve(solver, unseen)
     for k in range(len(unseen.force)):
@@ -368,14 +368,14 @@ def test_batch_is_its_members(newton, snapshots, unseen, lift):
             assert torch.equal(getattr(member, name)[0], getattr(batch, name)[k]), name
 
 
-def test_pickled_solver_answers_the_same(newton, snapshots, unseen):
+def test_pickled_solver_has_the_same_solutions(newton, snapshots, unseen):
     solver = PODGalerkin.fit(newton.problem, snapshots, 8, lift=newton.linear_solver)
     answer = solve(solver, unseen)
     copy = pickle.loads(pickle.dumps(solver))
     assert torch.equal(solve(copy, unseen).displacement, answer.displacement)
 
 
-def test_reuse_of_tangents_changes_only_the_way(newton, snapshots, unseen):
+def test_reuse_of_tangents_changes_no_solution(newton, snapshots, unseen):
     solver = PODGalerkin.fit(newton.problem, snapshots, 8)
     fresh, reused = (
         solve(replace(solver, factor_reuse_tol=reuse, reduced_tol=1e-9), unseen)
@@ -391,7 +391,7 @@ def test_wrong_rank_is_refused(newton, snapshots, rank):
         PODGalerkin.fit(newton.problem, snapshots, rank)
 
 
-def test_body_that_is_free_to_move_is_refused(unseen):
+def test_body_with_rigid_body_modes_is_refused(unseen):
     problem = Problem.build(box([1.0, 1.0, 1.0], [2, 2, 2]), NH)
     solver = PODGalerkin(problem, rigid_body_modes(problem.points)[0])
     with pytest.raises(ValueError, match="fix the rigid body modes"):
@@ -425,20 +425,20 @@ def test_basis_of_another_body_is_refused(newton, beam, snapshots):
 
 @pytest.fixture(scope="module")
 def corrector(newton, snapshots) -> PODGalerkin:
-    """A solver whose cells are chosen roughly."""
+    """A solver with few cells of low accuracy."""
     return PODGalerkin.fit(newton.problem, snapshots, 12, tolerance=1e-2)
 
 
 def astray(solver: PODGalerkin, truth: torch.Tensor, size: float) -> torch.Tensor:
-    """Return answers with errors in the subspace, each of a size relative to the largest answer."""
+    """Return solutions with errors in the subspace, relative to the largest solution."""
     way = solver.vectors @ noise(solver.vectors.shape[2], len(truth))
     way = way.movedim(2, 0)
     way = way / way.flatten(1).norm(dim=1)[:, None, None]
     return truth + size * truth.flatten(1).norm(dim=1)[:, None, None] * way
 
 
-def test_a_correction_finds_what_the_subspace_holds_of_an_error(newton, unseen, truth):
-    """With all modes it is Newton's answer, whatever the guess."""
+def test_a_correction_removes_the_error_in_the_subspace(newton, unseen, truth):
+    """With all modes the result is Newton's solution for any guess."""
     solver = PODGalerkin(newton.problem, everything(newton.problem))
     for force, u, guess in zip(unseen.force, truth, astray(solver, truth, 0.02), strict=True):
         assert_close(solver.correct(force, guess), u, rtol=0, atol=1e-4 * float(u.abs().max()))
@@ -457,12 +457,12 @@ def test_each_correction_by_few_cells_leaves_a_small_part_of_the_error(corrector
     assert float(found[3].max()) < 1e-2 * float(found[0].min())
 
 
-def test_the_exact_answer_is_not_corrected(corrector, unseen, truth):
+def test_the_exact_solution_is_not_corrected(corrector, unseen, truth):
     for force, u in zip(unseen.force, truth, strict=True):
         assert_close(corrector.correct(force, u, steps=3), u, rtol=0, atol=1e-8)
 
 
-def test_what_the_subspace_does_not_hold_stays(corrector, unseen, truth):
+def test_errors_outside_the_subspace_remain(corrector, unseen, truth):
     free, basis = corrector.problem.free, corrector.vectors[corrector.problem.free]
     guess = truth[0].clone()
     guess[free] += 1e-3 * noise(int(free.sum()))
@@ -473,7 +473,7 @@ def test_what_the_subspace_does_not_hold_stays(corrector, unseen, truth):
     assert not (found - guess)[~free].any()
 
 
-def test_an_inverted_guess_is_handed_back(corrector, unseen, truth):
+def test_an_inverted_guess_is_returned_unchanged(corrector, unseen, truth):
     guess = torch.where(corrector.problem.free, 0.5 * noise(*truth[0].shape), 0.0)
     assert not corrector.problem.evaluate(guess[None])[1] > 0
     assert torch.equal(corrector.correct(unseen.force[0], guess), guess)
