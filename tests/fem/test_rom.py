@@ -275,19 +275,22 @@ def test_a_linear_law_needs_no_cells(beam, pull):
 def test_forces_of_weighted_cells_have_an_energy(newton, snapshots):
     """The reduced tangent is the slope of the reduced force, and symmetric."""
     solver = PODGalerkin.fit(newton.problem, snapshots, 6, tolerance=1e-2)
-    task = solver.reduced_problem.reduce(torch.zeros(newton.problem.shape, dtype=torch.float64))
+    load = solver.reduced_problem.reduce(torch.zeros(newton.problem.shape, dtype=torch.float64))
     y, way = 3e-3 * noise(6), noise(6, seed=1)
     at, ahead, back = (
-        solver.reduced_problem.state(task, y + h * way, 0.0) for h in (0.0, 1e-6, -1e-6)
+        solver.reduced_problem.state(load, y + h * way, 0.0) for h in (0.0, 1e-6, -1e-6)
     )
     cells, rest = solver.reduced_problem.cells, solver.reduced_problem.stiffness_error
 
     def energy(state):
-        return cells.problem.energy(state.field).item() + (state.y @ rest @ state.y).item() / 2
+        return (
+            cells.problem.energy(state.cell_displacement).item()
+            + (state.y @ rest @ state.y).item() / 2
+        )
 
     slope = (energy(ahead) - energy(back)) / 2e-6
     assert slope == pytest.approx((at.internal @ way).item(), rel=1e-6)
-    system = cells.problem.linearise(at.field)
+    system = cells.problem.linearise(at.cell_displacement)
     tangent = cells.reduced(cells.tangents(system.tangent[0])) + rest
     assert_close(tangent, tangent.T, rtol=0, atol=1e-6)
     assert_close(tangent @ way, (ahead.internal - back.internal) / 2e-6, rtol=1e-5, atol=1e-5)
@@ -297,9 +300,9 @@ def test_stiffness_at_rest_is_the_identity(newton, snapshots):
     """With all cells and with few, in the coordinates of the iteration."""
     for tolerance in (None, 1e-2):
         solver = PODGalerkin.fit(newton.problem, snapshots, 6, tolerance=tolerance)
-        task = solver.reduced_problem.reduce(torch.zeros(newton.problem.shape, dtype=torch.float64))
+        load = solver.reduced_problem.reduce(torch.zeros(newton.problem.shape, dtype=torch.float64))
         y = 1e-9 * noise(6)
-        assert_close(solver.reduced_problem.state(task, y, 0.0).internal, y, rtol=1e-5, atol=1e-15)
+        assert_close(solver.reduced_problem.state(load, y, 0.0).internal, y, rtol=1e-5, atol=1e-15)
 
 
 @pytest.mark.parametrize("lifted", [False, True])
