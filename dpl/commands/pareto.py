@@ -13,7 +13,6 @@ from rich.table import Table
 from dpl import config
 from dpl.commands.cli import command
 from dpl.evaluation import tables
-from dpl.system.threads import available_cores
 
 if TYPE_CHECKING:
     from dpl.evaluation.pareto import Discretisation, Point
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
 def main(cfg: DictConfig) -> None:
     """Measure all solvers and the networks of a folder of runs; write rows and a figure."""
     from dpl.evaluation import pareto
+    from dpl.system.threads import available_cores
 
     config.check(cfg)
     others = _discretisations(cfg)

@@ -99,7 +99,7 @@ def test_without_onnx_the_message_names_the_extra(script, trained, monkeypatch):
     monkeypatch.setattr(onnx_graph, "missing_packages", lambda: ["onnx"])
     ended = script("export", "run=runs/first", cwd=trained)
     assert ended.status == 2
-    assert "error: parts: model needs onnx: pip install" in ended.err
+    assert "error: outputs: model needs onnx: pip install" in ended.err
     assert "outputs=[results]" in ended.err
 
 
