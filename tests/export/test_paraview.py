@@ -120,7 +120,7 @@ def test_tetrahedra_are_written_right_handed(make_scene_of, tmp_path, name):
 
 def test_fields_of_another_size_raise_an_error(tmp_path):
     mesh = box([1.0, 1.0, 1.0], [2, 2, 2])
-    with pytest.raises(ValueError, match="9 nodes are of another body"):
+    with pytest.raises(ValueError, match="arrays of 9 nodes must have those of the mesh"):
         write_mesh(tmp_path / "body.vtu", mesh, {"x": np.zeros(9)})
     with pytest.raises(ValueError, match="8, 27"):
         write_mesh(tmp_path / "body.vtu", mesh, {"x": np.zeros(8), "y": np.zeros(27)})
