@@ -15,6 +15,7 @@ from dpl.data import OfflineData, OnlineData, Store
 from dpl.data.storage.integrity import verify
 from dpl.data.storage.shard import decode_shard
 from dpl.evaluation import evaluate
+from dpl.evaluation.report import measure
 from dpl.fem import (
     DifferentiableSolve,
     LinearElastic,
@@ -480,7 +481,7 @@ def test_a_network_that_is_told_poissons_ratio_is_clearly_better(make_scene, tmp
     assert errors[FCNN] < 0.6 * errors[Untold]
 
 
-def test_latent_trains_in_coordinates_and_is_evaluated(wide, sets, tmp_path):
+def test_latent_trains_in_coordinates_and_is_evaluated(wide, sets, tmp_path, monkeypatch):
     torch.manual_seed(0)
     net = Latent(wide, rank=60, coordinates=15, width=32, blocks=1)
     adam = partial(torch.optim.Adam, lr=3e-3)
@@ -501,8 +502,20 @@ def test_latent_trains_in_coordinates_and_is_evaluated(wide, sets, tmp_path):
     told = median_error(module, test)
     assert told < float(RelativeL2().measure(linear, test).median()) / 2
     assert told < median_error(module, test._replace(poisson=0 * test.poisson + 0.3)) / 2
+    solvers = {}
+    monkeypatch.setattr(
+        "dpl.evaluation.report.measure",
+        lambda named, *rest: solvers.update(named) or measure(named, *rest),
+    )
     rows = evaluate(module, Sample(*(column[:6] for column in test)), tmp_path)
     assert {row.solver: row.converged for row in rows}["hybrid Newton"] == 6
+    linear_solvers = [
+        solvers["linear"],
+        solvers["Newton from zero"].linear_solver,
+        solvers["hybrid Newton"].newton.linear_solver,
+        solvers["hybrid, best rule"].newton.linear_solver,
+    ]
+    assert len(set(map(id, linear_solvers))) == 4, "no solver reuses a factor of another one"
 
 
 # ------------------------------------------------------------------ configuration

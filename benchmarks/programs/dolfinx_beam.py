@@ -2,7 +2,7 @@
 
 A program of its own, for the Python that has dolfinx 0.5 (Debian 12: python3-dolfinx):
 
-    python scripts/benchmark.py peers.dolfinx=/usr/bin/python3
+    python scripts/benchmark.py reference_codes.dolfinx=/usr/bin/python3
 
 Reads scenes as JSON from standard input, writes seconds, iterations and the tip of each,
 and the shared libraries that are loaded, as JSON.

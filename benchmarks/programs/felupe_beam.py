@@ -2,7 +2,7 @@
 
 A program of its own, for a Python that has felupe 11 (python3 -m venv, pip install felupe):
 
-    python scripts/benchmark.py peers.felupe=path/to/python
+    python scripts/benchmark.py reference_codes.felupe=path/to/python
 
 SuperLU, felupe's default, solves the linear systems or, where pypardiso is installed beside it,
 PARDISO for symmetric indefinite matrices, as felupe's guide to external solvers has it: each solve

@@ -12,7 +12,7 @@ from rich.table import Table
 from torch import Tensor
 
 from dpl.evaluation.timing import Latency, describe, latencies, percentiles, time_interleaved
-from dpl.fem import Problem, Solution, Solver
+from dpl.fem import LinearSolver, Newton, Problem, Solution, Solver
 from dpl.fem import write_mesh as write_mesh
 from dpl.inference import Direct, Hybrid, Simulator, default_hybrid
 from dpl.scene import Sample
@@ -171,11 +171,12 @@ def evaluate(
     newton = replace(scene.newton, tol=tol)
     # with a range of Poisson's ratios every load has its own K(0); no solver reuses another's
     shared = scene.loads.poisson_range is None
-    own = scene if shared else replace(scene, solver=replace(scene.newton))
+    own = scene if shared else replace(scene, solver=_without_factors(scene.newton))
+    plain = newton if shared else _without_factors(newton)
     solvers: dict[str, Solver] = {
         "linear": replace(newton.linear_solver, tol=tol),
         "network": Direct(surrogate.predict, scene.problem, tol),
-        "hybrid Newton": Hybrid(surrogate.predict, newton if shared else replace(newton), "paper"),
+        "hybrid Newton": Hybrid(surrogate.predict, plain, "paper"),
         "hybrid, best rule": default_hybrid(surrogate.predict, own, tol),
         "Newton from zero": newton,
     }
@@ -188,6 +189,11 @@ def evaluate(
     save(rows, folder / "evaluation.json")
     _draw(surrogate, test, displacements, folder)
     return rows
+
+
+def _without_factors(newton: Newton) -> Newton:
+    """Return the solver with a linear solver of its own, which has no factor yet."""
+    return replace(newton, linear_solver=LinearSolver(newton.problem, newton.tol, newton.linear))
 
 
 def _draw(

@@ -539,7 +539,7 @@ def test_a_run_that_names_what_is_not_ours_is_not_called(copied, path, tmp_path)
         {"_target_": "dpl.system.files.append_jsonl", "path": "harm", "line": {}},
         {"_target_": "dpl.fem.write_mesh", "mesh": {}, "path": "harm.vtk"},
         {"_target_": "dpl.fem.identity.partial", "func": "os.system"},
-        {"_target_": "benchmarks.peers.measured_peer", "python": "sh", "program": "harm"},
+        {"_target_": "benchmarks.peers.time_reference_code", "python": "sh", "program": "harm"},
         {"_target_": "torch.optim.lr_scheduler.partial", "func": "os.system"},
         {
             "_target_": "lightning.pytorch.cli.instantiate_class",
@@ -572,7 +572,7 @@ def test_nothing_of_the_trainer_of_a_run_is_called(copied, monkeypatch, key):
 @pytest.mark.parametrize(
     "name",
     [
-        "dpl.config.build.importlib.import_module",  # not ours, though the name begins with `dpl.`
+        "dpl.config.validation.importlib.import_module",  # a foreign module behind `dpl.`
         "dpl.config.load_run",
         "dpl.fem.write_mesh",  # writes
         "dpl.evaluation.tables.write",

@@ -1,5 +1,7 @@
 """Laws of shards: decoded loads equal encoded ones, and damaged shards are refused."""
 
+import hashlib
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,7 @@ from safetensors.torch import load, save
 from dpl.data.solving.solve import LoadKey, SolvedLoad
 from dpl.data.storage import store as store_module
 from dpl.data.storage.manifest import entry_of_load, merge_entries
-from dpl.data.storage.pending import PendingLoads
+from dpl.data.storage.pending import DIGEST_SIZE, PendingLoads
 from dpl.data.storage.shard import concatenate, decode_shard, encode_load, select, to_dense
 from dpl.data.storage.store import runs
 
@@ -96,6 +98,18 @@ def test_a_pending_load_is_a_shard_of_one_load_with_its_line_of_the_manifest(tmp
     assert entry == line(rejected)
     assert select(columns, rejected.job, entry).reason == "diverged"
     assert list(pending.files()) == [LoadKey((7, 1), k) for k in (3, 4, 5)]
+
+
+def test_a_pending_load_has_the_split_and_the_number_of_its_file(tmp_path):
+    """The line of JSON inside could name a path outside the data set."""
+    pending = PendingLoads(tmp_path / "pending", {"val": (7, 1)}, lambda points: points[:, 2:])
+    path = pending.write(solved(3))
+    content = path.read_bytes()[DIGEST_SIZE:].replace(b'"split": "val"', b'"split": "../val"')
+    content = content.replace(b'"first": 3', b'"first": 4')
+    path.write_bytes(hashlib.sha256(path.name.encode() + content).digest() + content)
+    assert list(pending.files().values()) == [path]
+    entry, _ = pending.read(path)
+    assert (entry["split"], entry["first"]) == ("val", 3)
 
 
 def change(name, values):

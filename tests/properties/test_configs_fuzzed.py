@@ -250,8 +250,8 @@ FOREIGN = [  # what would do harm, and how it would be called
     {"_target_": "dpl.config.build.sys.exit", "_args_": [3]},
     {"_target_": "dpl.config.instantiate", "cfg": {"x": {"_target_": "os.getcwd"}}, "key": "x"},
     {"_target_": "dpl.config.load_run", "folder": "evil", "trust": True},
-    {"_target_": "dpl.config.build.importlib", "name": "antigravity"},
-    {"_target_": "dpl.scene.partial", "func": "os.system"},
+    {"_target_": "dpl.config.validation.importlib", "name": "antigravity"},
+    {"_target_": "dpl.scene.replace", "func": "os.system"},
     {"_target_": "dpl.system.files.append_jsonl", "path": "harm", "line": {"a": 1}},
     {"_target_": "dpl.system.files.atomic_write", "path": "harm"},
     {
@@ -259,7 +259,7 @@ FOREIGN = [  # what would do harm, and how it would be called
         "mesh": {"_target_": "dpl.fem.box"},
         "path": "harm.vtk",
     },
-    {"_target_": "benchmarks.peers.measured_peer", "python": "touch", "program": "harm"},
+    {"_target_": "benchmarks.peers.time_reference_code", "python": "touch", "program": "harm"},
     {
         "_target_": "lightning.pytorch.cli.instantiate_class",
         "args": ["touch harm"],

@@ -54,9 +54,14 @@ class PendingLoads:
         return path
 
     def read(self, path: Path) -> tuple[dict[str, Any], Columns]:
-        """Return manifest entry and columns of a load that `files` has found."""
+        """Return manifest entry and columns of a load that `files` has found.
+
+        Split and number are those of the file's name: its content may come from somebody else, and
+        both are part of the path of the shard.
+        """
+        split, number = path.stem.split("-")
         entry, _, columns = path.read_bytes()[DIGEST_SIZE:].partition(b"\n")
-        return json.loads(entry), load(columns)
+        return {**json.loads(entry), "split": split, "first": int(number)}, load(columns)
 
     def files(self) -> dict[LoadKey, Path]:
         """Return the files by load; remove damaged ones.

@@ -136,8 +136,8 @@ class Writer:
         while files and all(job in pending for job in files[0]):
             paths = [pending.pop(job) for job in files.pop(0)]
             self._write_shard(paths)
-            for path in paths:
-                path.unlink()
+            for path in paths:  # a writer that starts now also removes loads that have a shard
+                path.unlink(missing_ok=True)
 
     def _write_shard(self, paths: Sequence[Path]) -> None:
         """Write a shard of pending loads, then its line of the manifest."""
