@@ -162,9 +162,10 @@ def home(tmp_path_factory):
 def trained(script, tiny_training, home):
     """A folder with a run of the paper's network and one of the flagship."""
     if not (home / "runs").exists():
-        for name, more in {"fcnn": [], "latent": ["model.blocks=1"]}.items():
+        latent = ["experiment=latent", "model.blocks=1"]
+        for name, more in {"fcnn": ["model=fcnn"], "latent": latent}.items():
             common = ["data.folder=data", "trainer.max_epochs=1", f"run=runs/tiny/{name}"]
-            ended = script("train", *tiny_training, *common, f"model={name}", *more, cwd=home)
+            ended = script("train", *tiny_training, *common, *more, cwd=home)
             assert ended.status == 0, ended.err
     return home
 

@@ -115,7 +115,7 @@ def test_a_run_is_not_overwritten(trained, script, tiny_training, home):
 def test_a_run_goes_on_where_it_was_left(trained, script, tiny_training, home):
     overrides = [*tiny_training, "trainer.max_epochs=4", "run=runs/second"]
     assert script("train", *overrides, "+trainer.max_steps=4", cwd=home).status == 0
-    ended = script("train", *overrides, "ckpt_path=last", cwd=home)
+    ended = script("train", *overrides, "+trainer.max_steps=-1", "ckpt_path=last", cwd=home)
     assert ended.status == 0, ended.err
     assert "16 of 16" not in ended.out, "no load is solved again"
     steps = []
