@@ -448,8 +448,8 @@ def test_members_use_their_own_guess(law, beam, pull):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda force: force.float(), "float64"),
-        (lambda force: force.long(), "float64"),
+        (lambda force: force.float(), "dtype"),
+        (lambda force: force.long(), "dtype"),
         (lambda force: force[0], "shape"),
         (lambda force: force[:, 1:], "shape"),
         (lambda force: force[..., 1:], "shape"),
@@ -461,7 +461,7 @@ def test_force_of_another_kind_or_shape_is_an_error_that_says_so(beam, pull, cha
     problem = beam(NH, 2, 1)
     solver, load = newton(problem), load_of(change(pull(problem, 20.0)))
     for each in (solver, solver.linear_solver):
-        with pytest.raises(ValueError, match=f"force: .*{message}"):
+        with pytest.raises(ValueError, match=rf"force\.{message} = "):
             solve(each, load)
 
 
