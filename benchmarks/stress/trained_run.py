@@ -14,7 +14,7 @@ from benchmarks.verification.report import Row
 from dpl import Scene
 from dpl.fem import Load, Solution
 from dpl.inference import Answer, Simulator, default_hybrid
-from dpl.inference.simulator import SLACK
+from dpl.inference.simulator import ROUNDOFF
 from dpl.training import Surrogate
 
 AMPLITUDES = (1e-9, 1e-6, 1e-3, 0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 25.0)  # over the training range
@@ -89,12 +89,12 @@ class AmplitudeSweep:
 def simulator_answers(sweep: AmplitudeSweep, tol: float | None, auditor: Auditor) -> Outcome:
     """Check the answers of the simulator, without or with a tolerance."""
     series = "network" if tol is None else f"simulator to {tol:g}"
-    rows, failures, levels, tiers = list[Row](), list[str](), list[LoadLevel](), list[str]()
+    rows, failures, levels, methods = list[Row](), list[str](), list[LoadLevel](), list[str]()
     for step in sweep.steps:
         answer = sweep.ask(step, tol)
         u = answer.displacement[None] / sweep.scene.length
         error = _relative_error(u, step.exact)
-        tiers.append(answer.method)
+        methods.append(answer.method)
         levels.append(
             LoadLevel(
                 *(series, step.amplitude, answer.residual, answer.volume_ratio),
@@ -111,7 +111,7 @@ def simulator_answers(sweep: AmplitudeSweep, tol: float | None, auditor: Auditor
                 failures.append(f"{place}: {answer.summary}")
             elif step.exact.stable.all():
                 rows.append(Row(f"{place}: off Newton's answer", f"< {ERROR}", error))
-    return classify(_summary(levels, tiers), rows, failures=failures, levels=levels)
+    return classify(_summary(levels, methods), rows, failures=failures, levels=levels)
 
 
 def _checks(
@@ -135,7 +135,7 @@ def _checks(
         "an estimate is reported as one",
         answer.converged or words.startswith(("NOT VALID", "an estimate")),
     )
-    outside = step.amplitude > 1 + SLACK
+    outside = step.amplitude > 1 + ROUNDOFF
     yield (
         "a load out of range is reported",
         bool(answer.out_of_distribution) == outside or answer.out_of_span > 1e-3,
@@ -193,14 +193,14 @@ def _relative_error(u: torch.Tensor, exact: Solution) -> float:
     return float((u - exact.displacement).norm() / exact.displacement.norm())
 
 
-def _summary(levels: list[LoadLevel], tiers: list[str]) -> str:
+def _summary(levels: list[LoadLevel], methods: list[str]) -> str:
     """Return the largest error of each amplitude and the methods that answered as text."""
     errors: dict[float, list[float]] = {}
     for step in levels:
         errors.setdefault(step.amplitude, []).append(step.error)
     shown = ", ".join(f"{a:g}: {max(e):.1e}" for a, e in errors.items())
-    who = ", ".join(f"{tiers.count(tier)} {tier}" for tier in dict.fromkeys(tiers))
-    return f"largest error at amplitude {shown}; answered by {who}"
+    used = ", ".join(f"{methods.count(method)} {method}" for method in dict.fromkeys(methods))
+    return f"largest error at amplitude {shown}; answered by {used}"
 
 
 def cases(surrogate: Surrogate, *, count: int = 2) -> list[Case]:

@@ -1,4 +1,4 @@
-"""Solvers with a network in them: its answer alone, and as the start of Newton."""
+"""Solvers with a network: the prediction alone, and Newton started from the prediction."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from dpl.scene import Scene
 
 Predict = Callable[[Load], Tensor]  # -> displacement (B, N, D) [-]
 RULES = ("natural_monotonicity", "paper")
-SECOND = 0.1  # part of the displacement that the second correction may be in any case
+SECOND_CORRECTION = 0.1  # norm, over that of the displacement, that is always allowed [-]
 
 
 class Corrector(Protocol):
@@ -26,22 +26,23 @@ class Corrector(Protocol):
 
     @property
     def tol(self) -> float:
-        """Residual ratio below which an answer counts as converged [-]."""
+        """Relative residual below which a solution counts as converged [-]."""
         ...
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
-        """Yield the start and the state after each iteration."""
+        """Yield the initial state and the state after each iteration."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Direct:
-    """The prediction alone, judged.
+    """The prediction of a network with its residual and min det F.
 
     Attributes:
-        predict: From a load to displacements over L.
+        predict: Function from a load to displacements, (B, N, D) [-].
         problem: The body.
-        tol: Residual ratio below which the answer counts as converged [-]; at least 1e-15, below 1.
+        tol: Relative residual below which the prediction counts as converged [-]; at least 1e-15,
+            below 1.
     """
 
     predict: Predict
@@ -64,31 +65,33 @@ class Direct:
 
 @dataclass(frozen=True, eq=False)
 class Hybrid:
-    """Network guess, Newton correction: the answer is as exact as Newton's.
+    """Newton started from the prediction of a network; solutions are as accurate as Newton's.
 
-    The prediction is the answer if it balances the load. One that is not finite or inverts an
-    element is never picked: what follows is the classic path from rest, bit for bit.
+    A prediction whose residual is below the tolerance is returned. If the prediction is not finite
+    or inverts an element, Newton starts from zero; the iterates are then the same bit for bit as
+    without a network.
 
-    `rule="paper"`: one classic step is taken from rest, and Newton goes on from the prediction
-    where its residual is smaller than that after the step, else from the step.
+    `rule="paper"`: one Newton iteration is made from zero. Newton continues from the prediction if
+    its residual is smaller than that after this iteration, else from this iteration.
 
-    `rule="natural_monotonicity"`: Newton goes on from the prediction as long as its corrections
-    contract. The first must be less than half of the displacement that it leads to, ||du|| < ||u +
-    du|| / 2, where from rest the two are equal; each that follows, less than half of the one
-    before. The second may also be a tenth of the displacement: the first removes what stiff
-    directions resist and shows only then what soft ones lack. If not, Newton starts again from
-    rest. Corrections, unlike residuals, do not depend on how stiff the body is against an error.
+    `rule="natural_monotonicity"`: Newton continues from the prediction while its corrections du
+    contract. The first one must satisfy ||du|| < ||u + du|| / 2 (from zero, ||du|| = ||u + du||).
+    Each later one must be less than half of the one before. The second one may
+    also be a tenth of the displacement, because the first one removes the error in stiff directions
+    and only then the error in soft directions enters the corrections. Otherwise Newton starts again
+    from zero. Unlike residuals, corrections do not depend on the stiffness of the body against an
+    error.
 
-    With `steps`, those are tried first from a prediction, and Newton goes on from the best of them.
+    With `steps`, Anderson iterations are made first; Newton continues from the best of them.
 
     Source: Odot, Haferssas, Cotin (2022), DeepPhysics, algorithm 2; Deuflhard (2011), Newton
     Methods for Nonlinear Problems, section 3.2 (natural monotonicity).
 
     Attributes:
-        predict: From a load to displacements over L.
-        newton: The corrector.
-        rule: How a prediction is picked.
-        steps: Cheaper ones that a good prediction is improved by; None: Newton at once.
+        predict: Function from a load to displacements, (B, N, D) [-].
+        newton: Newton's method.
+        rule: Criterion by which Newton continues from the prediction, one of `RULES`.
+        steps: Iterations without tangents that precede Newton; None: no such iterations.
     """
 
     predict: Predict
@@ -106,10 +109,11 @@ class Hybrid:
             raise ValueError(f"rule = {self.rule!r} must be {' or '.join(RULES)}")
 
     def iterate(self, load: Load) -> Iterator[Solution]:
-        """Yield the prediction, or rest where it is useless, and what Newton makes of it.
+        """Yield the initial state and the state after each iteration.
 
-        By the paper's rule the prediction comes first in any case, then the state after the classic
-        step. What is discarded counts: the classic step, or corrections of the prediction.
+        The initial state is the prediction, or zero if the prediction is not finite or inverts an
+        element. By the rule of the paper it is the prediction in any case, followed by the state
+        after one iteration from zero. Discarded iterations are included in the counts.
         """
         guesses = _prediction(self.predict, load)
         member = self._by_paper if self.rule == "paper" else self._by_corrections
@@ -121,7 +125,7 @@ class Hybrid:
         )
 
     def _by_paper(self, load: Load, guess: Tensor) -> Iterator[Solution]:
-        """Yield the states under one load."""
+        """Yield the states under one load by the rule of the paper."""
         predicted = evaluate_solution(
             self.newton.problem, guess, load, self.newton.tol, from_guess=True
         )
@@ -140,7 +144,7 @@ class Hybrid:
         yield from _after(first, self.newton.iterate(load, guess=guess))
 
     def _by_corrections(self, load: Load, guess: Tensor) -> Iterator[Solution]:
-        """Yield the states under one load."""
+        """Yield the states under one load by natural monotonicity, after `steps`."""
         if self.steps is None or not self.newton.problem.acting(load.force).any():
             yield from self._corrected(load, guess)
             return
@@ -154,11 +158,11 @@ class Hybrid:
             return
         states = self._corrected(load, guess if least is None else least.displacement)
         if least is not None:
-            next(states)  # it has been yielded
+            next(states)  # this state has been yielded
         yield from _after(state, states)
 
     def _corrected(self, load: Load, guess: Tensor) -> Iterator[Solution]:
-        """Yield Newton's states from a guess while its corrections contract, else from rest."""
+        """Yield Newton's states from a guess while its corrections contract, else from zero."""
         states = self.newton.iterate(load, guess=guess)
         last = next(states)
         yield last
@@ -166,7 +170,7 @@ class Hybrid:
         for k, state in enumerate(states):
             size = float((state.displacement - last.displacement).norm())
             whole = float(state.displacement.norm())
-            allowed = max(0.5 * min(before, whole), SECOND * whole if k == 1 else 0.0)
+            allowed = max(0.5 * min(before, whole), SECOND_CORRECTION * whole if k == 1 else 0.0)
             contracts = bool(state.from_guess) and size < allowed
             if last.from_guess and not (contracts or state.converged):
                 classic = self.newton.iterate(load)
@@ -178,29 +182,34 @@ class Hybrid:
 
 
 def default_hybrid(predict: Predict, scene: Scene, tol: float | None = None) -> Hybrid:
-    """Return the hybrid that suits a scene.
+    """Return the hybrid solver of a scene.
 
-    Where K(0)'s factor, turned, stands for those of tangents, steps without tangents come first.
+    Anderson iterations precede Newton if the corotated factor of K(0) is a good preconditioner, see
+    `Scene.corrector`.
 
     Args:
-        predict: From a load to displacements over L.
-        scene: What is simulated.
-        tol: Residual ratio [-]; the scene's if left out.
+        predict: Function from a load to displacements, (B, N, D) [-].
+        scene: The scene.
+        tol: Relative residual [-]; None: that of the scene.
     """
     newton = scene.corrector if tol is None else replace(scene.corrector, tol=tol)
     return Hybrid(predict, newton, steps=AndersonSolver(newton) if newton.corotational else None)
 
 
 def prefer_prediction(predicted: Solution, first: Solution) -> bool:
-    """Return whether Newton goes on from the prediction: ||R(u_p)|| < ||R(u_1)||, nothing inverted.
+    """Return True if ||R(u_p)|| < ||R(u_1)|| and the prediction u_p inverts no element.
 
-    Written so that a residual that is not a number never picks.
+    The result is False for a residual that is NaN.
+
+    Args:
+        predicted: The prediction u_p of one load.
+        first: The state u_1 after one iteration from zero.
     """
     return bool(predicted.volume_ratio > 0) and bool(predicted.residual < first.residual)
 
 
 def _after(spent: Solution, states: Iterator[Solution]) -> Iterator[Solution]:
-    """Yield states with what was spent before them added."""
+    """Yield states with the iterations, factorisations and time of an earlier state added."""
     for state in states:
         yield state._replace(
             iterations=state.iterations + spent.iterations,

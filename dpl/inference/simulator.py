@@ -1,4 +1,4 @@
-"""What an engineer holds: a force goes in; out come a displacement and what it is worth."""
+"""Simulator: from forces [N] to displacements [m] with a report of their quality."""
 
 import math
 import time
@@ -22,32 +22,34 @@ from dpl.system.threads import one_thread
 from dpl.training import Surrogate
 
 Correct = Callable[[Tensor, Tensor], Tensor]  # force (N, D), displacement (N, D) -> displacement
-SMALL = 0.05  # amplitude below which the linear answer is worth a look
-STRANGE = 1e-3  # part of a force, not made of the training's modes, that counts as none
-SLACK = 1e-9  # rounding in amplitudes
+MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
+MAX_OUT_OF_SPAN = 1e-3  # relative projection residual of forces of the load family [-]
+ROUNDOFF = 1e-9  # relative error of amplitudes [-]
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A displacement and what it is worth; for several loads each field is an array, (B, ...).
+    """A displacement with its quality; for several loads each field is an array, (B, ...).
 
     Attributes:
-        displacement: (N, D) [m]; of the kind that the force was, NumPy or torch.
+        displacement: (N, D) [m], a NumPy array or a tensor as the force.
         residual: ||R_free|| / ||f||, evaluated at the displacement [-], see
             `Problem.relative_residual_of`.
-        volume_ratio: min det F there [-]; at 0 or below an element is inverted.
-        converged: Whether the residual is below the tolerance that was asked for (without one, the
-            scene's) and nothing is inverted. False too where rounding does not allow it.
-        negative_pivots: Negative eigenvalues of the tangent there; -1: not examined.
+        volume_ratio: min det F [-]; an element is inverted if it is not above 0.
+        converged: True if the residual is below the tolerance of the call (without one, that of
+            the scene) and no element is inverted. It is False also where rounding does not allow
+            this residual.
+        negative_pivots: Number of negative eigenvalues of the tangent; -1: not examined.
         amplitude: Largest modal load over the largest of the training [-], see
             `ModalLoads.project`.
-        out_of_span: Part of the force that is not made of the training's modes [-].
-        out_of_distribution: Whether the load lies outside the range of the training.
-        method: What computed the result: "rest", "linear", "network", "corrected", "hybrid" or
-            "full Newton".
+        out_of_span: Norm of the part of the force that is no combination of the modes of the
+            training, over that of the force [-].
+        out_of_distribution: True if the load lies outside the training range.
+        method: Method that computed the result: "rest", "linear", "network", "corrected",
+            "hybrid" or "full Newton".
         iterations: Linear solves with a tangent.
         milliseconds: Wall time [ms]; of several loads, the share of each.
-        summary: The fields above in words.
+        summary: Residual, stability and range in words.
     """
 
     displacement: Any
@@ -65,40 +67,42 @@ class Answer:
 
 
 class Simulator:
-    """A trained surrogate with the mechanics behind it: as exact as is asked for, and says so.
+    """Simulator of a scene with a trained surrogate and the solvers of the scene.
 
-    Called with a force alone it answers with the network and how far that is out of balance. With a
-    tolerance it goes on, tier by tier, until the answer keeps it; with a budget, while there is
-    time. The answer before is remembered, for the next call may be near it.
+    Called with a force alone, it returns the prediction with its residual. With a tolerance, it
+    tries network, linear solution, hybrid and Newton in this order until the tolerance is met; with
+    a budget, while there is time. It keeps the last displacement as an initial guess of the next
+    call (`warm`).
 
     Attributes:
-        surrogate: The network.
-        correct: What improves a prediction without a solve of full size; None: nothing.
+        surrogate: The surrogate.
+        correct: Correction of a prediction without a solve of full size; None: no correction.
     """
 
     def __init__(self, surrogate: Surrogate, *, correct: Correct | None = None) -> None:
-        """Take a surrogate on the CPU.
+        """Store the surrogate and build the corrector of its scene.
 
         Args:
-            surrogate: Trained.
-            correct: From a force (N, D) [-] and a displacement (N, D) [-] to a better one.
+            surrogate: A trained surrogate on the CPU.
+            correct: Function from a force (N, D) [-] and a displacement (N, D) [-] to a better
+                displacement (N, D) [-].
         """
         self.surrogate, self.correct = surrogate.eval(), correct
         self._before: tuple[Tensor, Tensor] | None = None  # Poisson's ratios, displacement
         self._pace = 0.0  # time of an iteration [s]
-        self.scene.corrector  # noqa: B018  # made here, not on the first answer's time
+        self.scene.corrector  # noqa: B018  # built here, so that the first call is not slower
 
     @classmethod
     def corrected(
         cls, surrogate: Surrogate, states: Tensor, *, rank: int = 60, tolerance: float = 1e-2
     ) -> Self:
-        """Return the simulator that corrects predictions by equilibrium in the network's modes.
+        """Return a simulator that corrects predictions by equilibrium in the modes of the network.
 
         Args:
-            surrogate: On the CPU, with a network between coordinates.
+            surrogate: A trained surrogate on the CPU whose network is `Correctable`.
             states: Displacements of training samples, (S, N, D) [-].
-            rank: Modes in which to correct.
-            tolerance: Of the choice of cells, see `dpl.fem.rom.cubature`.
+            rank: Number of modes of the correction.
+            tolerance: Tolerance of the hyper-reduction, see `dpl.fem.rom.cubature`.
 
         Raises:
             ValueError: The network has no modes, or a number is out of range.
@@ -111,7 +115,7 @@ class Simulator:
 
     @property
     def scene(self) -> Scene:
-        """What it answers for."""
+        """The scene of the surrogate."""
         return self.surrogate.scene
 
     def __call__(
@@ -125,24 +129,25 @@ class Simulator:
         warm: bool = False,
         stability: bool = False,
     ) -> Answer:
-        """Return the displacement under nodal forces, with what it is worth.
+        """Return the displacement under nodal forces with its quality.
 
         Args:
-            force: (N, D) or, several, (B, N, D) [N] (2D: [N/m]); what acts on held degrees of
-                freedom does nothing. Integers and floating-point numbers of any width are taken,
-                in NumPy arrays, nested lists or dense tensors on any device; the answer has no
-                gradient with respect to them.
-            young: E, one number or (B,) [Pa]; may be left out where the scene has one.
-            poisson: Poisson's ratios, alike [-]; only where the law has a range of them.
-            tol: Residual ratio that the answer is to keep [-], at least 1e-15 and below 1.
-            budget_ms: Wall time that each load may take [ms]: no iteration is begun that would,
-                by those before, go beyond it.
-            warm: Start from the last answer where that is nearer than the network's.
-            stability: Factorise the tangent at the answer, which tells whether it is stable.
+            force: Nodal forces, (N, D) or, for several loads, (B, N, D) [N] (2D: [N/m]); forces on
+                fixed degrees of freedom have no effect. Integers and floating-point numbers of any
+                width are accepted, in NumPy arrays, nested lists or dense tensors on any device;
+                the result has no gradient with respect to them.
+            young: Young's modulus, one number or (B,) [Pa]; optional if the scene has only one.
+            poisson: Poisson's ratio, one number or (B,) [-]; only if the law has a range of them.
+            tol: Relative residual of the result [-], at least 1e-15 and below 1.
+            budget_ms: Wall time of each load [ms]. An iteration is not started if the time of the
+                last iteration exceeds the rest of the budget.
+            warm: Start from the last displacement if it is nearer to equilibrium than the
+                prediction.
+            stability: Factorise the tangent at the result to determine its stability.
 
         Raises:
-            ValueError: Something has another shape, holds no real numbers (booleans, text, complex
-                and masked entries are none), is not finite or out of range.
+            ValueError: An argument has a wrong shape, contains values that are no real numbers
+                (booleans, text, complex numbers, masked entries) or not finite, or is out of range.
         """
         begin = time.perf_counter()
         given = _numbers("force", force)
@@ -155,26 +160,32 @@ class Simulator:
         count = len(load.force)
         with one_thread(), torch.inference_mode():
             predictions = self.surrogate.predict(load)
-            amplitude, strange = self.scene.loads.project(load.force)
+            amplitude, out_of_span = self.scene.loads.project(load.force)
             shared = (time.perf_counter() - begin) / count
             found = []
             for k, single in enumerate(load.unbatch()):
-                ask = _Ask(tol, budget_ms, warm, time.perf_counter() - shared)
-                tier, state = self._best(single, predictions[k : k + 1], float(amplitude[k]), ask)
+                request = _Request(tol, budget_ms, warm, time.perf_counter() - shared)
+                method, state = self._solve(
+                    single, predictions[k : k + 1], float(amplitude[k]), request
+                )
                 if stability:
-                    state = self._examined(single, state)
+                    state = self._with_stability(single, state)
                 self._before = single.poisson, state.displacement
-                found.append((tier, state, 1e3 * (time.perf_counter() - ask.begin)))
-        tiers, states, times = zip(*found, strict=True)
+                found.append((method, state, 1e3 * (time.perf_counter() - request.begin)))
+        methods, states, times = zip(*found, strict=True)
         state = concatenate(states)
         kept = state.converged & (state.residual < wanted)
-        outside = (amplitude > 1 + SLACK) | (strange > STRANGE) | self._elsewhere(load)
+        outside = (
+            (amplitude > 1 + ROUNDOFF)
+            | (out_of_span > MAX_OUT_OF_SPAN)
+            | self._outside_modulus_range(load)
+        )
         words = [
             "no load: at rest"
-            if tier == "rest"
-            else _verdict(one, bool(ok), float(a), float(s), bool(out))
-            for tier, one, ok, a, s, out in zip(
-                *(tiers, states, kept, amplitude, strange, outside), strict=True
+            if method == "rest"
+            else _summary(one, bool(ok), float(a), float(s), bool(out))
+            for method, one, ok, a, s, out in zip(
+                *(methods, states, kept, amplitude, out_of_span, outside), strict=True
             )
         ]
         answer = {
@@ -184,9 +195,9 @@ class Simulator:
             "converged": kept,
             "negative_pivots": state.negative_pivots,
             "amplitude": amplitude,
-            "out_of_span": strange,
+            "out_of_span": out_of_span,
             "out_of_distribution": outside,
-            "method": list(tiers),
+            "method": list(methods),
             "iterations": state.iterations,
             "milliseconds": torch.tensor(times, dtype=torch.float64),
             "summary": words,
@@ -194,7 +205,7 @@ class Simulator:
         return _like(answer, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
 
     def _load(self, force: Tensor, young: Any, poisson: Any) -> Load:
-        """Return what was asked as a dimensionless load."""
+        """Return the arguments of a call as a dimensionless load."""
         shape, scene = self.scene.problem.shape, self.scene
         if force.shape[-2:] != shape or force.ndim not in (2, 3) or not force.numel():
             words = f"({shape[0]}, {shape[1]}) or (B, {shape[0]}, {shape[1]})"
@@ -229,8 +240,8 @@ class Simulator:
             )
         return load
 
-    def _elsewhere(self, load: Load) -> Tensor:
-        """Return for which loads a modulus that the network takes lies outside its range, (B,)."""
+    def _outside_modulus_range(self, load: Load) -> Tensor:
+        """Return True for loads with an input modulus of the network out of range, (B,)."""
         loads, takes = self.scene.loads, getattr(self.surrogate.net, "extra_inputs", ())
         spans = {"young": loads.young_range, "poisson": loads.poisson_range}
         outside = torch.zeros(len(load.force), dtype=torch.bool)
@@ -240,33 +251,34 @@ class Simulator:
             outside |= ((values < low) | (values > high)).any(dim=1)
         return outside
 
-    def _best(
-        self, load: Load, prediction: Tensor, amplitude: float, ask: "_Ask"
+    def _solve(
+        self, load: Load, prediction: Tensor, amplitude: float, request: "_Request"
     ) -> tuple[str, Solution]:
-        """Return the first answer that does, else the best that there was."""
+        """Return the first solution that meets the tolerance, else the best one, and its method."""
         scene = self.scene
-        tol = scene.solver.tol if ask.tol is None else ask.tol
+        tol = scene.solver.tol if request.tol is None else request.tol
         if not load.force.any() and not scene.problem.moved_supports:
             return "rest", evaluate_solution(scene.problem, torch.zeros_like(prediction), load, tol)
         found: tuple[str, Solution] | None = None
-        for tier, last in self._tiers(load, prediction, amplitude, tol, ask):
+        for method, last in self._candidates(load, prediction, amplitude, tol, request):
             if found is None or _rank(last) <= _rank(found[1]):
-                found = tier, last
-            if last.converged or ask.over(self._pace):  # a residual that rounding ends, too
+                found = method, last
+            # converged also if rounding allows no smaller residual
+            if last.converged or request.over(self._pace):
                 break
         assert found is not None
-        tier, state = found
-        return tier, state._replace(status=last.status, load_factor=last.load_factor)
+        method, state = found
+        return method, state._replace(status=last.status, load_factor=last.load_factor)
 
-    def _tiers(
-        self, load: Load, prediction: Tensor, amplitude: float, tol: float, ask: "_Ask"
+    def _candidates(
+        self, load: Load, prediction: Tensor, amplitude: float, tol: float, request: "_Request"
     ) -> Iterator[tuple[str, Solution]]:
-        """Yield ever better answers, each with who gave it."""
+        """Yield the solutions of the methods, the cheapest method first, with their names."""
         problem = self.scene.problem
         yield "network", evaluate_solution(problem, prediction, load, tol, from_guess=True)
-        if ask.tol is None and ask.budget_ms is None:
+        if request.tol is None and request.budget_ms is None:
             return
-        if amplitude < SMALL:
+        if amplitude < MAX_LINEAR_AMPLITUDE:
             answer = self.scene.linear.at(load.poisson).solve(load.force[0])[None]
             yield "linear", evaluate_solution(problem, answer, load, tol)
         guess = prediction
@@ -275,7 +287,7 @@ class Simulator:
             yield "corrected", evaluate_solution(problem, guess, load, tol, from_guess=True)
         newton = replace(self.scene.corrector, tol=tol)
         guesses = [guess] if guess is prediction else [guess, prediction]
-        if ask.warm and self._before is not None and torch.equal(self._before[0], load.poisson):
+        if request.warm and self._before is not None and torch.equal(self._before[0], load.poisson):
             guesses.append(self._before[1])
         start = guess if len(guesses) == 1 else nearest(newton, load, guesses)
         clock = time.perf_counter()
@@ -283,12 +295,12 @@ class Simulator:
             if int(state.iterations):
                 now = time.perf_counter()
                 self._pace, clock = now - clock, now
-            elif not state.converged:  # where it starts, judged before
+            elif not state.converged:  # the initial state, which has been evaluated
                 continue
             yield "hybrid" if state.from_guess else "full Newton", state
 
-    def _examined(self, load: Load, state: Solution) -> Solution:
-        """Return an answer with the negative eigenvalues of its tangent."""
+    def _with_stability(self, load: Load, state: Solution) -> Solution:
+        """Return a solution with the number of negative eigenvalues of its tangent."""
         if not state.converged or int(state.negative_pivots) >= 0:
             return state
         stability = self.scene.newton.at(load.poisson).stability(state.displacement)
@@ -300,8 +312,8 @@ class Simulator:
         )
 
 
-class _Ask(NamedTuple):
-    """What is asked of an answer, and since when."""
+class _Request(NamedTuple):
+    """Options of a call and the time of its start [s]."""
 
     tol: float | None
     budget_ms: float | None
@@ -309,40 +321,42 @@ class _Ask(NamedTuple):
     begin: float
 
     def over(self, ahead: float) -> bool:
-        """Return whether the budget does not hold for so long [s]."""
+        """Return True if this time from now [s] exceeds the budget."""
         if self.budget_ms is None:
             return False
         return 1e3 * (time.perf_counter() - self.begin + ahead) > self.budget_ms
 
 
 def nearest(newton: Newton, load: Load, guesses: list[Tensor]) -> Tensor:
-    """Return the guess (1, N, D) that equilibrium is nearest to, as far as K(0) can tell.
+    """Return the guess (1, N, D) with the smallest estimated distance from equilibrium.
 
-    The smallest ||M R(u)||, with M the inverse of K(0), turned as the body is: about a Newton
-    correction, and not how stiff the body is against an error. One that inverts an element or is
-    not finite is not taken unless all are like that.
+    The distance is ||M R(u)|| with the corotated inverse M of K(0), an approximate Newton
+    correction, which unlike the residual does not depend on the stiffness against an error. It is
+    infinite for a guess that inverts an element or is not finite.
     """
-    turning = newton.at(load.poisson).linear_solver.corotational
+    preconditioner = newton.at(load.poisson).linear_solver.corotational
 
     def distance(guess: Tensor) -> float:
-        internal, volume = turning.problem.evaluate(guess)
+        internal, volume = preconditioner.problem.evaluate(guess)
         if not bool(volume > 0):
             return math.inf
-        right = turning.problem.restrict((load.force - internal)[0])
-        return float(np.linalg.norm(turning.at(guess).apply(right)))
+        right = preconditioner.problem.restrict((load.force - internal)[0])
+        return float(np.linalg.norm(preconditioner.at(guess).apply(right)))
 
     return min(guesses, key=distance)
 
 
 def _rank(state: Solution) -> tuple[bool, bool, float]:
-    """Return what answers are ordered by: converged, not inverted, balanced."""
+    """Return the key by which solutions are sorted: converged, not inverted, residual."""
     residual = float(state.residual)
-    upright = bool(state.volume_ratio > 0)
-    return not bool(state.converged), not upright, residual if residual == residual else math.inf
+    valid = bool(state.volume_ratio > 0)
+    return not bool(state.converged), not valid, residual if residual == residual else math.inf
 
 
-def _verdict(state: Solution, kept: bool, amplitude: float, strange: float, outside: bool) -> str:
-    """Return what one answer is worth, in words; `kept`: whether it keeps the tolerance."""
+def _summary(
+    state: Solution, kept: bool, amplitude: float, out_of_span: float, outside: bool
+) -> str:
+    """Return the summary of one solution; `kept`: the tolerance is met."""
     residual = float(state.residual)
     if kept:
         words = f"in balance to {residual:.1e} of the load, nothing inverted"
@@ -361,18 +375,18 @@ def _verdict(state: Solution, kept: bool, amplitude: float, strange: float, outs
         words += f"; no equilibrium found beyond {float(state.load_factor):.2f} of the load"
     if not outside:
         return words
-    if strange > STRANGE:
-        return words + f"; {strange:.0%} of the load is unlike the training's"
-    if amplitude > 1 + SLACK:
+    if out_of_span > MAX_OUT_OF_SPAN:
+        return words + f"; {out_of_span:.0%} of the load is unlike the training's"
+    if amplitude > 1 + ROUNDOFF:
         return words + f"; the load is {amplitude:.2g} times the training's largest"
     return words + "; a modulus lies outside the training's range"
 
 
 def _numbers(name: str, value: Any) -> Tensor:
-    """Return what was given as a tensor in float64 on the processor, a copy.
+    """Return a copy of an argument as a float64 tensor on the CPU.
 
     Raises:
-        ValueError: It holds something else than real numbers.
+        ValueError: It contains values that are no real numbers.
     """
     refused = f"{name} must be real numbers"
     if isinstance(value, Tensor):
@@ -388,8 +402,8 @@ def _numbers(name: str, value: Any) -> Tensor:
         )
         numbers = np.array(array, np.float64, order="C", subok=False) if real else None
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:
-        told = str(error).partition("\n")[0]
-        raise ValueError(f"{refused}; {told}") from error
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"{refused}; {reason}") from error
     if numbers is None:
         raise ValueError(f"{refused}, not {array.dtype}")
     if np.ma.is_masked(value):
@@ -402,10 +416,10 @@ def _real(value: object) -> bool:
 
 
 def _number(name: str, value: Any) -> float | None:
-    """Return one number that was given, None for None.
+    """Return an argument as a number, None for None.
 
     Raises:
-        ValueError: It is something else.
+        ValueError: It is not one number.
     """
     if value is None:
         return None
@@ -416,7 +430,7 @@ def _number(name: str, value: Any) -> float | None:
 
 
 def _column(name: str, value: Any, count: int) -> Tensor:
-    """Return one number, or one for each load, as (B,)."""
+    """Return an argument that is one number or one for each load, (B,)."""
     column = _numbers(name, value)
     if column.numel() not in (1, count) or column.ndim > 1:
         given = f"{column.numel()} numbers for {count} loads, of shape {tuple(column.shape)}"
@@ -427,7 +441,7 @@ def _column(name: str, value: Any, count: int) -> Tensor:
 
 
 def _like(answer: dict[str, Any], *, numpy: bool, single: bool) -> Answer:
-    """Return the fields as what was given: NumPy or torch, one load or several."""
+    """Return the answer in NumPy or torch, for one load or several, as the force was given."""
     for field in fields(Answer):
         value = answer[field.name]
         if single:
