@@ -108,15 +108,15 @@ def measure(
 ) -> Iterator[tuple[Result, Tensor]]:
     """Yield a row and the relative L2 errors of the loads (S,), for each method and set of loads.
 
-    Every load is asked alone, on one thread; each method has all loads of a set in a row, as in
-    use, so that its weights stay in the cache.
+    Loads are predicted one at a time on one thread. Each method predicts all loads of a set in
+    succession, as in use, so that its weights stay in the cache.
 
     Args:
-        methods: Named.
-        sets: Loads with the truth, named.
-        newton: What goes on from each prediction.
-        generation_minutes: Wall time of the samples.
-        repeats: Times that each load is asked.
+        methods: Methods by name.
+        sets: Loads with their solutions, by name.
+        newton: Solver that continues from each prediction.
+        generation_minutes: Wall time of the generation of the samples [min].
+        repeats: Number of predictions of each load.
     """
     for title, batch in sets.items():
         singles = batch.load.unbatch()

@@ -173,8 +173,8 @@ def time_reference_code(python: str, program: Path, repeats: int) -> dict[str, T
         repeats: Timed solves of each case.
 
     Raises:
-        OSError: There is no such Python, the program failed, its answer is wrong, or its BLAS is
-            the reference one or cannot be told.
+        OSError: There is no such Python, the program failed, its result is wrong, or its BLAS is
+            the reference implementation or unknown.
     """
     cases = {
         name: {

@@ -100,16 +100,18 @@ def invalid_prediction(name: str, auditor: Auditor) -> Outcome:
         state = auditor.solve(hybrid(guess), problem, load)
         same = torch.equal(state.displacement, classic.displacement)
         rows += [
-            Row(f"{way}: classic answer, bit for bit", "1", float(same), 0),
-            Row(f"{way}: picked", "0", float(state.from_guess), 0),
+            Row(f"{way}: Newton's solution, bit for bit", "1", float(same), 0),
+            Row(f"{way}: prediction used", "0", float(state.from_guess), 0),
             Row(
-                f"{way}: iterations over the classic ones",
+                f"{way}: iterations more than Newton",
                 *("0", float(state.iterations - classic.iterations), 0),
             ),
         ]
     (alone,) = Direct(constant_prediction(guess), problem).iterate(load)
     rows.append(Row("network alone: converged", "0", float(alone.converged), 0))
-    return classify(f"classic answer in {int(classic.iterations)} iterations, not picked", rows)
+    return classify(
+        f"Newton's solution in {int(classic.iterations)} iterations, prediction not used", rows
+    )
 
 
 def poor_prediction(name: str, auditor: Auditor) -> Outcome:
@@ -155,7 +157,12 @@ def noisy_prediction(size: float, auditor: Auditor) -> Outcome:
         if way == "paper":
             wanted = bool(alone.volume_ratio > 0) and float(alone.residual) < float(first.residual)
             rows.append(
-                Row("paper: picked", f"{int(wanted)}", float(prefer_prediction(*states[:2])), 0)
+                Row(
+                    "paper: prediction used",
+                    f"{int(wanted)}",
+                    float(prefer_prediction(*states[:2])),
+                    0,
+                )
             )
     taken = int(corrected.iterations)
     if taken > int(count) if size < 1e-2 else taken <= 6:  # at 1e-2 the draw decides how many
@@ -288,7 +295,7 @@ def cases() -> list[Case]:
     expected = "an error, or the answer of float64; none in float32"
     found.append(Case("T18", "Newton, given forces in float32", expected, float32_forces))
     for name in INVALID:
-        expected = "the classic answer bit for bit, at its cost; not picked"
+        expected = "Newton's solution bit for bit, with as many iterations; prediction not used"
         found.append(Case("T19", f"prediction {name}", expected, partial(invalid_prediction, name)))
     for name in ("huge", "minus", "half", "zero"):
         found.append(
@@ -300,7 +307,7 @@ def cases() -> list[Case]:
             )
         )
     for size, (printed, count) in NOISE.items():
-        expected = f"|R|/|f| {printed}, {count} plain iterations; picked where below 95.6"
+        expected = f"|R|/|f| {printed}, {count} plain iterations; prediction used if below 95.6"
         found.append(Case("T20", f"noise of {size:g} L", expected, partial(noisy_prediction, size)))
     expected = "|R|/|f| 8.96, .818, .081: none converged"
     found.append(

@@ -164,9 +164,11 @@ def hybrid(sweep: AmplitudeSweep, auditor: Auditor) -> Outcome:
             failures.append(f"{step.amplitude:g}: {levels[-1].status}")
         elif step.exact.stable.all():
             rows.append(Row(f"{step.amplitude:g}: off Newton's answer", f"< {ERROR}", error))
-    picked = f"{sum(r.status == 'converged' for r in levels)} of {len(levels)} converged"
+    converged = f"{sum(r.status == 'converged' for r in levels)} of {len(levels)} converged"
     most = max(r.iterations for r in levels)
-    return classify(f"{picked}, at most {most} iterations", rows, failures=failures, levels=levels)
+    return classify(
+        f"{converged}, at most {most} iterations", rows, failures=failures, levels=levels
+    )
 
 
 def newton(sweep: AmplitudeSweep, auditor: Auditor) -> Outcome:

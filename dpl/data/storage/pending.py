@@ -56,8 +56,8 @@ class PendingLoads:
     def read(self, path: Path) -> tuple[dict[str, Any], Columns]:
         """Return manifest entry and columns of a load that `files` has found.
 
-        Split and number are those of the file's name: its content may come from somebody else, and
-        both are part of the path of the shard.
+        Split and number are those of the file's name: the content may come from another
+        machine, and both are part of the path of the shard.
         """
         split, number = path.stem.split("-")
         entry, _, columns = path.read_bytes()[DIGEST_SIZE:].partition(b"\n")

@@ -233,7 +233,7 @@ class RandomLoads(LoadFamily):
         return self.problem.acting(own)
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
-        """Return ||f|| / `largest_force`, (B,), and zeros: no force is told from the family's."""
+        """Return ||f|| / `largest_force`, (B,), and zeros: all forces count as in range."""
         amplitude = self.own_force(force).flatten(1).norm(dim=1) / self.largest_force
         return amplitude, torch.zeros_like(amplitude)
 
