@@ -21,7 +21,7 @@ def main(cfg: DictConfig) -> None:
     from dpl.evaluation import newton_starts
 
     config.check(cfg)
-    runs = config.load_runs(cfg.run, cfg.networks)
+    runs = config.load_runs(cfg.run, cfg.networks, trust=cfg.trust)
     scene = next(iter(runs.values()))[1].scene
     networks = {name: surrogate.predict for name, (_, surrogate) in runs.items()}
     sets = newton_starts.load_sets(scene, cfg.count, cfg.n_far_loads)

@@ -12,6 +12,6 @@ from dpl.commands.cli import command
 def main(cfg: DictConfig) -> None:
     """Print and write the errors and run times of a surrogate on its test set."""
     config.check(cfg)
-    trained, surrogate = config.load_run(cfg.run)
+    trained, surrogate = config.load_run(cfg.run, trust=cfg.trust)
     test = config.load_data(trained, surrogate.scene).samples("test")
     evaluation.evaluate(surrogate, test, Path(cfg.run), tol=cfg.tol)

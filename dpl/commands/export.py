@@ -44,7 +44,7 @@ def main(cfg: DictConfig) -> None:
         raise config.ConfigError(
             f"outputs: model needs {', '.join(absent)}: {install('onnx')}, or use outputs=[results]"
         )
-    _, surrogate = config.load_run(cfg.run)
+    _, surrogate = config.load_run(cfg.run, trust=cfg.trust)
     folder = Path(cfg.run) / "export" if cfg.folder is None else Path(cfg.folder)
     if "model" in cfg.outputs:
         export_model(cfg, surrogate, folder)

@@ -82,7 +82,7 @@ def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
     from dpl.inference import Direct, default_hybrid
     from dpl.models import Correctable
 
-    runs = config.load_runs(cfg.run)
+    runs = config.load_runs(cfg.run, trust=cfg.trust)
     first, surrogate = next(iter(runs.values()))
     scene = surrogate.scene
     data = config.load_data(first, scene)
@@ -102,6 +102,6 @@ def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
             solvers[f"{name}, corrected"] = Direct(method.predict, scene.problem)
         solvers[f"{name}, hybrid"] = default_hybrid(predict, scene)
         if torch.cuda.is_available():
-            copy = config.load_run(Path(cfg.run) / name, scene=scene)[1]
+            copy = config.load_run(Path(cfg.run) / name, trust=cfg.trust, scene=scene)[1]
             solvers[f"{name}, GPU"] = Direct(pareto.on_gpu(copy), scene.problem)
     return scene, solvers, data.samples("test")

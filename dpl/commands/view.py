@@ -56,7 +56,7 @@ def load_body(cfg: DictConfig) -> "Body":
 
     torch.set_num_threads(1)
     try:
-        return Body(dpl.load(cfg.run, corrected=cfg.galerkin_correction))
+        return Body(dpl.load(cfg.run, trust=cfg.trust, corrected=cfg.galerkin_correction))
     except config.ConfigError:
         raise
     except ValueError as error:

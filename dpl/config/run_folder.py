@@ -333,13 +333,14 @@ def load(folder: str | Path, *, trust: bool = False, corrected: bool = False) ->
 
 
 def load_runs(
-    folder: str | Path, names: Sequence[str] | None = None
+    folder: str | Path, names: Sequence[str] | None = None, *, trust: bool = False
 ) -> dict[str, tuple[DictConfig, "Surrogate"]]:
     """Return the configurations and surrogates of the runs in a folder; they share one scene.
 
     Args:
         folder: Folder of the folders of the runs.
         names: Names of the runs; all if left out.
+        trust: See `load_run`.
 
     Raises:
         ConfigError: There are none, or one cannot be used or belongs to another scene.
@@ -351,7 +352,7 @@ def load_runs(
     runs: dict[str, tuple[DictConfig, Surrogate]] = {}
     scene = None
     for name in names:
-        runs[name] = load_run(Path(folder) / name, scene=scene)
+        runs[name] = load_run(Path(folder) / name, trust=trust, scene=scene)
         scene = runs[name][1].scene
     return runs
 

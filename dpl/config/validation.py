@@ -23,7 +23,7 @@ KEYS: dict[str, Any] = {  # types of the keys of all commands
     **dict.fromkeys(("data", "model", "loss", "optimizer", "trainer"), dict),
     **dict.fromkeys(("callbacks", "logger", "paths", "extras"), dict | None),
     **{"scheduler": dict | None, "seed": int, "ckpt_path": str | None, "tags": Sequence[str]},
-    **{"run": str | None, "folder": str, "tol": float},
+    **{"run": str | None, "trust": bool, "folder": str, "tol": float},
     **{"action": str, "shard": int, "shards": int},
     **{"outputs": Sequence[str], "linear": Sequence[str], "reference_codes": dict},
     **dict.fromkeys(("repeats", "count", "workers", "samples", "n_far_loads"), int),
@@ -170,7 +170,7 @@ def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
     Raises:
         ConfigError: It does not exist, cannot be called or is not trusted.
     """
-    foreign = f"{path} names {name}, which is none of this package's; not called"
+    foreign = f"{path} names {name}, which is none of this package's; not called without trust=true"
     if not isinstance(name, str):
         raise ConfigError(f"{path}._target_ = {name!r} must be a text")
     if not trust and not name.startswith(OWN_PACKAGES):

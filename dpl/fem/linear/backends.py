@@ -14,6 +14,8 @@ from dpl.fem.linear.pardiso import Pardiso
 from dpl.fem.linear.superlu import SuperLU
 from dpl.version import install
 
+BackendFactory = Callable[[Pattern, Array | None], Backend]  # of a pattern and near-null fields
+
 
 def installed_backends() -> list[str]:
     """Return the names of the installed backends."""
@@ -21,29 +23,36 @@ def installed_backends() -> list[str]:
     return [name for name in BACKENDS if name not in missing]
 
 
-def make_backend(pattern: Pattern, name: str = "auto", near_null: Array | None = None) -> Backend:
+def make_backend(
+    pattern: Pattern, name: str | BackendFactory = "auto", near_null: Array | None = None
+) -> Backend:
     """Return a backend for matrices of a pattern.
 
     Args:
         pattern: Structure of the matrices.
-        name: "band", "band32", "pardiso", "superlu", "cg", or "auto", see `select_backend`.
+        name: "band", "band32", "pardiso", "superlu", "cg", "auto", see `select_backend`, or a
+            function of `pattern` and `near_null` that returns a backend.
         near_null: Rigid body modes, (n, k), see `TensorAssembly.near_null`; "cg" needs them for
             multigrid.
 
     Raises:
         ValueError: The backend is unknown or not installed.
     """
-    return BACKENDS[select_backend(name, pattern, near_null)](pattern, near_null)
+    chosen = select_backend(name, pattern, near_null)
+    make = BACKENDS[chosen] if isinstance(chosen, str) else chosen
+    return make(pattern, near_null)
 
 
 def select_backend(
-    name: str,
+    name: str | BackendFactory,
     pattern: Pattern | None = None,
     near_null: Array | None = None,
     *,
     many_rhs: bool = False,
-) -> str:
+) -> str | BackendFactory:
     """Return the name of the backend, with "auto" replaced by the backend it selects.
+
+    A function, see `make_backend`, is returned as it is.
 
     "auto" selects by the pattern and the installed packages, not by timings, so that results are
     reproducible. Without a pattern it stays "auto".
@@ -58,6 +67,8 @@ def select_backend(
     Raises:
         ValueError: The backend is unknown or not installed.
     """
+    if callable(name):
+        return name
     if name not in (*BACKENDS, "auto"):
         raise ValueError(f"linear = {name!r} must be one of auto, {', '.join(BACKENDS)}")
     if name != "auto" and name not in installed_backends():
@@ -92,7 +103,7 @@ def _indefinite(pattern: Pattern) -> Backend:
     return Pardiso(pattern) if "pardiso" in installed_backends() else SuperLU(pattern)
 
 
-BACKENDS: dict[str, Callable[[Pattern, Array | None], Backend]] = {
+BACKENDS: dict[str, BackendFactory] = {
     "band": lambda pattern, near_null: BandedCholesky(pattern, _indefinite),
     "band32": lambda pattern, near_null: MixedPrecisionBandedCholesky(pattern, _indefinite),
     "pardiso": lambda pattern, near_null: Pardiso(pattern),

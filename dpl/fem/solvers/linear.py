@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from dpl.fem.linear.backends import make_backend, select_backend
+from dpl.fem.linear.backends import BackendFactory, make_backend, select_backend
 from dpl.fem.linear.banded import BandedFactor
 from dpl.fem.linear.interface import Backend, Factor
 from dpl.fem.problem import Problem
@@ -32,7 +32,7 @@ class LinearSolver:
 
     problem: Problem
     tol: float = 1e-8
-    linear: str = "auto"
+    linear: str | BackendFactory = "auto"
     parent: "LinearSolver | None" = field(default=None, repr=False)
 
     def __post_init__(self) -> None:

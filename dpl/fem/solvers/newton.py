@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dpl.fem.linear.backends import select_backend
+from dpl.fem.linear.backends import BackendFactory, select_backend
 from dpl.fem.linear.interface import UNKNOWN, SingularMatrix, Stability
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.factor_reuse import TangentSolver, forcing_term, stability_at
@@ -70,7 +70,7 @@ class Newton:
     min_load_step: float = 2.0**-10
     intermediate_tol: float = 1e-2
     min_detF_ratio: float = 0.2
-    linear: str = "auto"
+    linear: str | BackendFactory = "auto"
     mixed_integration: bool = True
     factor_reuse_tol: float = 0.1
     corotational: bool = False
