@@ -187,7 +187,7 @@ def test_a_part_of_a_user_is_trained_evaluated_viewed_and_exported(script, home,
     run("evaluate", "run=runs/a", "trust=true")
     rows = {row["solver"] for row in json.loads((home / "runs/a/evaluation.json").read_text())}
     assert "Newton from zero" in rows
-    run("export", "run=runs/a", "trust=true", "parts=[results]", "count=1")
+    run("export", "run=runs/a", "trust=true", "outputs=[results]", "count=1")
     assert list((home / "runs/a/export/results").glob("*.vtu"))
     view(config.load_run(home / "runs/a", trust=True)[1])
 
