@@ -13,7 +13,9 @@ from dpl.fem.materials.tensors import (
 
 
 def polynomial_derivatives(c: Any, i1: Any, i2: Any, m1: Any, q: Any, qJ: Any) -> tuple[Any, ...]:
-    """Return the slopes of c0 x + c1 x^2 + c2 x^3 + c3 y + U(J), x = Ib1 - 3, y = Ib2 - 3.
+    """Return `invariant_derivatives` of c0 x + c1 x^2 + c2 x^3 + c3 y + U(J).
+
+    Here x = Ib1 - 3 and y = Ib2 - 3.
 
     Args:
         c: Moduli.
@@ -32,7 +34,7 @@ def polynomial_derivatives(c: Any, i1: Any, i2: Any, m1: Any, q: Any, qJ: Any) -
     return rest, W2, p, f11 * m * m, 0.0, W22, W1J, -4 / 3 * W2, pJ
 
 
-def _isochoric(H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def isochoric_invariants(H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return Ib1 - 3, Ib2 - 3 and J - 1, (...,) [-], of H (..., 3, 3)."""
     e, j = 2 * green_lagrange(H), volume_change(H)
     i1, second, _ = invariants(e)

@@ -6,9 +6,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.neo_hookean import as_column
 from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
 from dpl.fem.materials.tensors import (
+    broadcast_modulus,
     dyad,
     symmetric_product,
     trace,
@@ -19,10 +19,11 @@ from dpl.fem.materials.tensors import (
 class LinearElastic(SaintVenantKirchhoff):
     """Linear elasticity: lambda/2 (tr eps)^2 + mu eps:eps, eps = (H + H^T)/2.
 
-    Source: Bonet, Wood (2008), eq. 6.29 at small strains. Exact where rotations are small. The
-    tangent is the same for all loads: one Newton step answers a load under which det F stays above
-    `Newton.keep` everywhere. Below that steps are shortened, and there is no answer where det F of
-    the linear one is not above 0.
+    Exact where rotations are small. The tangent does not depend on the displacement: one Newton
+    iteration solves any load under which det F stays above `Newton.min_detF_ratio` everywhere.
+    Below that the step is shortened. There is no solution where the linear one has det F <= 0.
+
+    Source: Bonet, Wood (2008), eq. 6.29 at small strains.
     """
 
     finite: ClassVar[bool] = False
@@ -35,13 +36,15 @@ class LinearElastic(SaintVenantKirchhoff):
     def stress(self, H: Tensor) -> Tensor:
         """Return lambda tr eps I + 2 mu eps, see `Material.stress`."""
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        return (self.lam * trace(H))[..., None, None] * eye + as_column(self.mu, 2) * (H + H.mT)
+        return (self.lam * trace(H))[..., None, None] * eye + broadcast_modulus(self.mu, 2) * (
+            H + H.mT
+        )
 
     def tangent(self, H: Tensor) -> Tensor:
         """Return Hooke's moduli, see `Material.tangent`."""
         eye = torch.eye(3, dtype=H.dtype, device=H.device)
-        hooke = as_column(self.lam, 4) * dyad(eye, eye)
-        hooke = hooke + 2 * as_column(self.mu, 4) * symmetric_product(eye)
+        hooke = broadcast_modulus(self.lam, 4) * dyad(eye, eye)
+        hooke = hooke + 2 * broadcast_modulus(self.mu, 4) * symmetric_product(eye)
         return hooke.expand(*H.shape, 3, 3)
 
     @property

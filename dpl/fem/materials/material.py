@@ -222,12 +222,12 @@ class YoungPoissonMaterial(Material):
 class InvariantBasedMaterial(Material):
     """Law of the invariants, W(I1, I2, J) of C = F^T F, with its `invariant_derivatives`.
 
-    The slopes are plain arithmetic on numbers of any kind: tensors here, lanes of a processor in
-    `dpl.fem.assembly.element_loops`. With X = C^-1, the stress they stand for is
+    `invariant_derivatives` is plain arithmetic on numbers of any kind: tensors here, SIMD vectors
+    in `dpl.fem.assembly.element_loops`. With X = C^-1, the stress is
 
         S = (rest + 2 W2 i1) I - 4 W2 E - p (I - X),   I - X = 2 E X,
 
-    in which nothing cancels at rest.
+    where rest, W2 and p are the first of these derivatives. No terms cancel at zero strain.
 
     Attributes:
         finite: False for the one law whose strain is the symmetric part of H.
@@ -237,7 +237,7 @@ class InvariantBasedMaterial(Material):
 
     @property
     def constants(self) -> tuple[float, ...]:
-        """Moduli that the slopes take."""
+        """Moduli that `invariant_derivatives` takes."""
         raise NotImplementedError
 
     @staticmethod

@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor
 
-from dpl.fem.materials.isochoric import _isochoric, polynomial_derivatives
+from dpl.fem.materials.isochoric import isochoric_invariants, polynomial_derivatives
 from dpl.fem.materials.material import InvariantBasedMaterial, check_moduli
 
 
@@ -35,7 +35,7 @@ class MooneyRivlinK2(InvariantBasedMaterial):
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
-        i1, i2, j = _isochoric(H)
+        i1, i2, j = isochoric_invariants(H)
         return self.c10 * i1 + self.c01 * i2 + self.bulk / 2 * j.square()
 
     @property

@@ -1,4 +1,4 @@
-"""The laws, their moduli over Young's modulus; names say the volumetric term."""
+"""Neo-Hookean laws. The end of a name says which volumetric term the law has."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.isochoric import _isochoric, polynomial_derivatives
+from dpl.fem.materials.isochoric import isochoric_invariants, polynomial_derivatives
 from dpl.fem.materials.material import InvariantBasedMaterial, YoungPoissonMaterial
 from dpl.fem.materials.tensors import (
     trace,
@@ -50,7 +50,7 @@ class NeoHookeanIsoK2(YoungPoissonMaterial, InvariantBasedMaterial):
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
-        i1, _, j = _isochoric(H)
+        i1, _, j = isochoric_invariants(H)
         return self.mu / 2 * i1 + self.bulk / 2 * j.square()
 
     @property
@@ -77,7 +77,7 @@ class NeoHookeanIsoK4(NeoHookeanIsoK2):
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
-        i1, _, j = _isochoric(H)
+        i1, _, j = isochoric_invariants(H)
         return self.mu / 2 * i1 + self.bulk / 4 * (j * (2 + j) - 2 * torch.log1p(j))
 
     @staticmethod
@@ -125,8 +125,3 @@ class StableNeoHookean(YoungPoissonMaterial, InvariantBasedMaterial):
         p = volume - 3 / 4 * c[0]
         W11 = c[0] / 2 * near * near
         return rest, 0.0, p, W11, 0.0, 0.0, 0.0, 0.0, J * (c[1] * (1 + 2 * j) - 3 / 4 * c[0])
-
-
-def as_column(modulus: float, axes: int) -> Any:
-    """Return a modulus as a factor on tensors with so many components at each point."""
-    return modulus[(..., *[None] * axes)] if isinstance(modulus, Tensor) else modulus

@@ -1,5 +1,7 @@
 """Small tensor algebra on (..., 3, 3), exact where F is close to I."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -57,3 +59,11 @@ def symmetric_product(A: Tensor) -> Tensor:
     """Return (A_ik A_jl + A_il A_jk)/2, (..., 3, 3, 3, 3)."""
     product = A[..., :, None, :, None] * A[..., None, :, None, :]
     return (product + product.transpose(-1, -2)) / 2
+
+
+def broadcast_modulus(modulus: Any, axes: int) -> Any:
+    """Return a modulus with `axes` trailing axes of length 1; a number stays a number.
+
+    Moduli of a batch are (B, 1, 1); with two more axes they multiply tensors (B, E, Q, 3, 3).
+    """
+    return modulus[(..., *[None] * axes)] if isinstance(modulus, Tensor) else modulus

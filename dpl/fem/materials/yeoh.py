@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor
 
-from dpl.fem.materials.isochoric import _isochoric, polynomial_derivatives
+from dpl.fem.materials.isochoric import isochoric_invariants, polynomial_derivatives
 from dpl.fem.materials.material import InvariantBasedMaterial, check_moduli
 
 
@@ -34,7 +34,7 @@ class YeohK2(InvariantBasedMaterial):
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
-        i1, _, j = _isochoric(H)
+        i1, _, j = isochoric_invariants(H)
         return i1 * (self.c10 + i1 * (self.c20 + i1 * self.c30)) + self.bulk / 2 * j.square()
 
     @property
