@@ -197,12 +197,12 @@ def view(surrogate):
     body, scene = Body(Simulator(surrogate)), surrogate.scene
     assert isinstance(scene.loads, LoadFamily)
     assert isinstance(scene.solver, ReferenceSolver)
-    settings, asked = ViewSettings(), body.sample(0)
-    frame = body.answer(asked, settings)
-    (*_, last) = body.newton(asked, settings, frame)
+    settings, request = ViewSettings(), body.sample(0)
+    frame = body.solve(request, settings)
+    (*_, last) = body.newton_frames(request, settings, frame)
     assert last.converged
     patch = body.patch(int(scene.problem.points[:, 0].argmax()), 0.4)
-    force = patch.towards(torch.tensor([0.0, 0.0, 1e-3], dtype=torch.float64))
+    force = patch.force_along(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 0.5)
     assert bool(force.any())
 
 
