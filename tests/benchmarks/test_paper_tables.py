@@ -113,9 +113,9 @@ def test_corrections_bring_answers_nearer_and_leave_the_network_alone(scene, bat
         for parameter in module.net.parameters():
             parameter.mul_(0.3)
     plain = methods.Method(module.predict, len(batch.force), 2.0, 5)
-    tier = methods.corrected(module, plain, batch, rank=20, tolerance=1e-4, steps=2)
+    corrected = methods.corrected(module, plain, batch, rank=20, tolerance=1e-4, steps=2)
     with torch.no_grad():
-        first, after, again = (m.predict(batch.load) for m in (plain, tier, plain))
+        first, after, again = (m.predict(batch.load) for m in (plain, corrected, plain))
     assert torch.equal(first, again)
     assert getattr(module.net, "linear_tol", 5e-4) == 5e-4
     module.net.linear_tol = 0.0  # corrections start from the exact linear part
@@ -124,8 +124,8 @@ def test_corrections_bring_answers_nearer_and_leave_the_network_alone(scene, bat
     before, after = sizes(start - batch.displacement), sizes(after - batch.displacement)
     assert float(after.median()) < 0.1 * float(before.median())
     assert (after <= before * (1 + 1e-9)).all()
-    assert (tier.samples, tier.parameters) == (plain.samples, 5)
-    assert tier.training_minutes > 2
+    assert (corrected.samples, corrected.parameters) == (plain.samples, 5)
+    assert corrected.training_minutes > 2
 
 
 def test_the_rom_comes_near_the_truth(scene, batch):

@@ -274,7 +274,7 @@ def test_the_training_range_can_be_checked_without_this_package(write_export):
     modes = read_raw(folder / "modes.f64", meta["range"]["modes"]["shape"])
     load = scene.loads.sample((0, 13), range(6))
     load = Load(torch.cat([load.force, 3 * load.force, torch.ones_like(load.force)]), load.young)
-    amplitude, strange = scene.loads.project(load.force)
+    amplitude, out_of_span = scene.loads.project(load.force)
     for k, force in enumerate(load.force.numpy()):
         force.reshape(-1)[meta["dofs"]["fixed"]] = 0.0
         acting = force.any(axis=1)
@@ -282,7 +282,7 @@ def test_the_training_range_can_be_checked_without_this_package(write_export):
         right = force[acting].reshape(-1)
         q = np.linalg.lstsq(shapes, right, rcond=None)[0]
         rest = np.linalg.norm(right - shapes @ q) / np.linalg.norm(force)
-        assert abs(rest - float(strange[k])) < 1e-6
+        assert abs(rest - float(out_of_span[k])) < 1e-6
         if k < 6:
             assert abs(q).max() == pytest.approx(float(amplitude[k]), rel=1e-6)
             assert np.linalg.norm(force) <= meta["range"]["largest_force"]

@@ -205,9 +205,9 @@ def test_where_a_load_lies_does_not_depend_on_forces_on_held_nodes(newton):
 def test_where_a_load_lies_scales_with_it(newton, power):
     loads = ModalLoads(newton.linear_solver, n_modes=3)
     force, size = loads.sample(0, range(3)).force, 10.0**power
-    amplitude, strange = loads.project(size * force)
+    amplitude, out_of_span = loads.project(size * force)
     assert_close(amplitude / size, loads.project(force)[0], rtol=1e-9, atol=0)
-    assert (strange < 1e-9).all()
+    assert (out_of_span < 1e-9).all()
 
 
 def test_the_size_of_a_load_in_a_data_set_is_that_on_free_nodes(make_scene):

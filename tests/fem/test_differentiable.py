@@ -196,10 +196,10 @@ def test_a_guess_saves_iterations_and_changes_neither_solution_nor_gradient(equi
 
 def test_error_names_the_loads_without_a_solution(problem, force):
     equilibrium = DifferentiableSolve(Newton(problem, linear="superlu", max_total_iter=2))
-    hopeless = torch.cat([0 * force[:1], 100 * force[1:]]).requires_grad_()
+    too_large = torch.cat([0 * force[:1], 100 * force[1:]]).requires_grad_()
     with pytest.raises(ValueError, match="of 2 loads, load 1: not converged"):
-        equilibrium(loaded(hopeless))
-    assert equilibrium.solution(loaded(hopeless)).converged.tolist() == [True, False]
+        equilibrium(loaded(too_large))
+    assert equilibrium.solution(loaded(too_large)).converged.tolist() == [True, False]
 
 
 def test_a_critical_load_has_no_gradient(equilibrium, force, monkeypatch):

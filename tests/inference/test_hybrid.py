@@ -161,7 +161,7 @@ def test_the_counters_see_what_newton_assembles(rule, scene, loads, counted):
 
 
 @pytest.mark.parametrize("name", [name for name in STUBS if name != "exact"])
-def test_the_prediction_is_picked_exactly_where_its_residual_is_smaller(scene, loads, stubs, name):
+def test_the_prediction_is_used_exactly_where_its_residual_is_smaller(scene, loads, stubs, name):
     load, problem = first_of(loads), scene.problem
     guess = stubs[name][-1:]
     predicted, first, *rest = hybrid(scene, loads, stubs[name], "paper").iterate(load)
@@ -170,15 +170,15 @@ def test_the_prediction_is_picked_exactly_where_its_residual_is_smaller(scene, l
     assert torch.equal(first.displacement, classic.displacement)
     ratio_p = float(problem.relative_residual(guess, load.force))
     ratio_1 = float(problem.relative_residual(classic.displacement, load.force))
-    upright = bool(problem.volume_ratio(guess) > 0)
-    picked = upright and ratio_p < ratio_1  # False where ratio_p is NaN
-    assert prefer_prediction(predicted, first) == picked
-    start = guess if picked else classic.displacement
+    valid = bool(problem.volume_ratio(guess) > 0)
+    used = valid and ratio_p < ratio_1  # False where ratio_p is NaN
+    assert prefer_prediction(predicted, first) == used
+    start = guess if used else classic.displacement
     assert any(torch.equal(state.displacement, start) for state in (first, *rest))
 
 
 @pytest.mark.parametrize(
-    ("ratio_p", "ratio_1", "volume", "picked"),
+    ("ratio_p", "ratio_1", "volume", "used"),
     [
         (0.5, 1.0, 0.9, True),
         (1.0, 1.0, 0.9, False),
@@ -191,9 +191,7 @@ def test_the_prediction_is_picked_exactly_where_its_residual_is_smaller(scene, l
         (0.5, 1.0, torch.nan, False),
     ],
 )
-def test_the_pick_rule_is_a_smaller_residual_with_nothing_inverted(
-    ratio_p, ratio_1, volume, picked
-):
+def test_the_pick_rule_is_a_smaller_residual_with_nothing_inverted(ratio_p, ratio_1, volume, used):
     def state(ratio, volume):
         zero = torch.zeros(1, dtype=torch.int64)
         return Solution(
@@ -209,10 +207,10 @@ def test_the_pick_rule_is_a_smaller_residual_with_nothing_inverted(
             from_guess=torch.zeros(1, dtype=torch.bool),
         )
 
-    assert prefer_prediction(state(ratio_p, volume), state(ratio_1, 0.9)) is picked
+    assert prefer_prediction(state(ratio_p, volume), state(ratio_1, 0.9)) is used
 
 
-def test_a_zero_prediction_is_picked_though_it_knows_nothing(scene, loads, stubs):
+def test_a_zero_prediction_is_used_if_its_residual_is_smaller(scene, loads, stubs):
     """The rule measures residuals, not quality: the first Newton step of a soft bar overshoots."""
     predicted, first, *_ = hybrid(scene, loads, stubs["zero"], "paper").iterate(first_of(loads))
     assert float(predicted.residual) == pytest.approx(1.0)
@@ -459,13 +457,13 @@ def test_it_is_said_what_goes_on_from_a_guess(scene, loads, stubs, rule):
         assert bool(last.from_guess) == guessed
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_steps_come_first_where_a_turned_factor_serves(scene, turned):
-    corrector = replace(scene.solver, corotational=turned)
+@pytest.mark.parametrize("corotational", [False, True])
+def test_anderson_iterations_precede_newton_if_the_corrector_is_corotational(scene, corotational):
+    corrector = replace(scene.solver, corotational=corotational)
     suited = default_hybrid(lambda load: load.force, SimpleNamespace(corrector=corrector))
     assert suited.newton is corrector
-    assert (suited.steps is not None) == turned
-    if turned:
+    assert (suited.steps is not None) == corotational
+    if corotational:
         assert suited.steps.newton is corrector
 
 

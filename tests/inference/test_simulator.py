@@ -224,13 +224,13 @@ def test_how_far_a_load_lies_outside_is_said(scene):
     assert "2.5 times the training's largest" in answer.summary
     inner = torch.zeros(scene.problem.shape, dtype=torch.float64)
     inner[~scene.problem.boundary] = 1.0
-    strange = sim(inner)
-    assert strange.out_of_distribution
-    assert strange.out_of_span == pytest.approx(1.0)
-    assert "unlike the training's" in strange.summary
+    inside = sim(inner)
+    assert inside.out_of_distribution
+    assert inside.out_of_span == pytest.approx(1.0)
+    assert "unlike the training's" in inside.summary
 
 
-def test_stability_is_examined_where_it_is_asked_for(scene, forces):
+def test_stability_is_examined_on_request(scene, forces):
     sim = simulator_of(scene)
     plain, examined = sim(forces[0], tol=1e-8), sim(forces[0], tol=1e-8, stability=True)
     assert examined.negative_pivots == 0

@@ -116,9 +116,9 @@ def test_the_amplitude_of_a_patch_load_is_that_of_the_training(body):
         if not body.scene.problem.free[node].any():
             continue
         force = body.patch(node, 0.4).force_along(torch.tensor([0.0, 1.0, 1.0]).double(), 0.7)
-        amplitude, strange = body.scene.loads.project(force[None])
+        amplitude, out_of_span = body.scene.loads.project(force[None])
         assert float(amplitude) <= 0.7 + 1e-6
-        assert float(strange) < 1e-9
+        assert float(out_of_span) < 1e-9
     still = body.patch(node, 0.4).force_along(torch.zeros(3).double(), 0.7)
     assert not still.any()
 
