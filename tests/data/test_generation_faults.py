@@ -51,6 +51,10 @@ class Slow(ModalLoads):
             time.sleep(self.pause)
         return super().points(seed, indices)
 
+    def identity(self):
+        """Return the options that determine the loads: not pause and gate."""
+        return {k: v for k, v in super().identity().items() if k not in ("pause", "gate")}
+
 
 @pytest.fixture
 def slow(monkeypatch, tiny):
