@@ -385,6 +385,8 @@ NUMBERS = {  # format: file, a node of it, the same with the number of another, 
     "gmsh22": ("cube.msh", "\n4 0.0", "\n3 0.0", r"1 node numbers .* more than once: 3"),
     "gmsh": ("cube.msh", "\n4\n5\n", "\n3\n5\n", r"1 node numbers .* more than once: 3"),
     "abaqus": ("cube.inp", "\n4, 0.0", "\n3, 0.0", r"1 node numbers .* more than once: 3"),
+    "permas": ("cube.dato", "\n4 0.0", "\n3 0.0", r"1 node numbers .* more than once: 3"),
+    "avsucd": ("cube.avs", "\n4 0.0", "\n3 0.0", r"1 node numbers .* more than once: 3"),
     "nastran": (
         *("cube.bdf", "BEGIN BULK\n", "BEGIN BULK\nGRID,3,,9.0,9.0,9.0\n"),
         r"1 node numbers .* more than once: 3",

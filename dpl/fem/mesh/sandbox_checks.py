@@ -19,6 +19,13 @@ CONVERT = "which is not read; convert it with 'meshio convert' if you trust it"
 GMSH_NODES = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 6: 6, 7: 5, 8: 3, 9: 6, 10: 9, 11: 10, 12: 27}
 GMSH_NODES |= {13: 18, 14: 14, 15: 1, 16: 8, 17: 20, 18: 15, 19: 13}  # by type of element
 
+PERMAS = ("$COOR", r"^\$*COOR[^\n]*\n([^$!]*)")
+NODE_BLOCKS = {  # name and pattern of the blocks of nodes, by suffix
+    ".inp": ("*NODE", r"^\*\s*NODE\s*(?:,[^\n]*)?\n([^*]*)"),
+    ".dato": PERMAS,
+    ".post": PERMAS,
+}
+
 
 class Refused(ValueError):
     """A file that is not read; the message says why."""
@@ -38,8 +45,10 @@ def check_file(path: Path) -> None:
             parser.ParseFile(file)
     if suffix == ".xml":  # rows that it declares and does not list would be undefined numbers
         raise Refused(f"its format is DOLFIN XML, {CONVERT}")
-    if suffix == ".inp":
-        _check_abaqus(path.read_text(errors="replace"))
+    if suffix in NODE_BLOCKS:
+        _check_node_blocks(*NODE_BLOCKS[suffix], path.read_text(errors="replace"))
+    if suffix == ".avs":
+        _check_avs(path.read_text(errors="replace"))
     if suffix == ".msh":
         _check_gmsh(path.read_bytes())
 
@@ -59,13 +68,21 @@ def _check_unique(numbers: Any) -> None:
         )
 
 
-def _check_abaqus(text: str) -> None:
-    """Refuse Abaqus files of which meshio would lose nodes."""
-    blocks = re.findall(r"^\*\s*NODE\s*(?:,[^\n]*)?\n([^*]*)", text, re.M | re.I)
+def _check_node_blocks(name: str, pattern: str, text: str) -> None:
+    """Refuse Abaqus and PERMAS files of which meshio would lose nodes."""
+    blocks = re.findall(pattern, text, re.M | re.I)
     if len(blocks) > 1:
-        raise Refused(f"it holds {len(blocks)} blocks *NODE; join them in one")
+        raise Refused(f"it holds {len(blocks)} blocks {name}; join them in one")
     for block in blocks:
-        _check_unique([int(line.partition(",")[0]) for line in block.splitlines() if line.strip()])
+        rows = [line.replace(",", " ").split() for line in block.splitlines() if line.strip()]
+        _check_unique([int(row[0]) for row in rows])
+
+
+def _check_avs(text: str) -> None:
+    """Refuse AVS-UCD files that list a node number twice."""
+    rows = [line.split() for line in text.splitlines() if line.partition("#")[0].strip()]
+    if rows:
+        _check_unique([int(float(row[0])) for row in rows[1 : 1 + int(rows[0][0])]])
 
 
 def _check_gmsh(data: bytes) -> None:
