@@ -73,29 +73,29 @@ class Problem(TensorAssembly):
     ) -> Self:
         """Return the problem of a body.
 
-        Geometry is evaluated from an origin near the body, so that far from zero nothing is lost
-        but the digits that the coordinates themselves lack. Regions and fields see the coordinates
-        of `mesh`.
+        Geometry is evaluated from an origin near the body, so that a body far from zero loses no
+        more digits than its coordinates lack. Regions and fields use the coordinates of `mesh`.
 
         Args:
-            mesh: scikit-fem mesh [m]. Its own degree, if higher, takes the place of `degree`.
+            mesh: scikit-fem mesh [m]. A quadratic mesh overrides `degree`.
             material: The law.
-            fixed: What is held: a region (all components of its nodes), or nodes (N,), or
-                degrees of freedom (N, D).
-            prescribed: Displacement over `length` where fixed, (N, D); zero if left out.
-            supports: Prescribed displacements and springs besides; of two on one degree of freedom
-                the later counts.
-            degree: 1 or 2.
-            mean_dilatation: Let the points of a cell share its mean volume ratio, so that nearly
-                incompressible bodies of linear quadrilaterals and hexahedra do not lock.
+            fixed: Fixed part: a region (all components of its nodes), nodes (N,), or degrees of
+                freedom (N, D).
+            prescribed: Displacement over `length` at fixed degrees of freedom, (N, D) [-]; zero
+                if left out.
+            supports: Further prescribed displacements and springs; the last one on a degree of
+                freedom counts.
+            degree: Degree of the displacement, 1 or 2.
+            mean_dilatation: Use the mean volume ratio of each cell, so that nearly incompressible
+                bodies of linear quadrilaterals and hexahedra do not lock.
             length: L [m]; the longest side of the body if left out.
 
         Raises:
-            ValueError: `degree` is neither 1 nor 2, no such cells, a region is empty, or
-                `mean_dilatation` is asked of cells that it does nothing for.
+            ValueError: `degree` is neither 1 nor 2, the cell type is unknown, a region is empty, or
+                `mean_dilatation` has no effect on the cells.
 
         Warns:
-            UserWarning: Linear elements will lock: see `advice`.
+            UserWarning: Linear elements will lock, see `locking_warnings`.
         """
         if degree not in (1, 2):
             raise ValueError(f"degree = {degree} must be 1 or 2")
@@ -106,7 +106,7 @@ class Problem(TensorAssembly):
         basis = basis_of(mesh, degree)
         if mean_dilatation and (degree == 2 or basis.dx.shape[1] == 1):
             raise ValueError(
-                "mean_dilatation: is for linear quadrilaterals and hexahedra; "
+                "mean_dilatation: applies to linear quadrilaterals and hexahedra only; "
                 "set degree=2 instead, quadratic elements hardly lock"
             )
         given, springs = assemble_constraints(
@@ -131,12 +131,12 @@ class Problem(TensorAssembly):
             springs=springs,
             mean_dilatation=mean_dilatation,
         )
-        for line in problem.advice():
+        for line in problem.locking_warnings():
             warnings.warn(line, stacklevel=2)
         return problem
 
-    def advice(self) -> list[str]:
-        """Return where linear elements will be far too stiff, a line each."""
+    def locking_warnings(self) -> list[str]:
+        """Return one line for each reason why linear elements will lock."""
         lines, shape = [], self.mesh.elem.refdom.name.lower()
         constant = self.dV.shape[1] == 1
         nu = (self.material.poisson_range or (self.material.poisson_ratio,))[-1]
@@ -152,21 +152,21 @@ class Problem(TensorAssembly):
         return lines
 
     def at(self, poisson: Tensor | float) -> Self:
-        """Return the body of another Poisson's ratio: mesh, pattern and compiled loops are shared.
+        """Return the problem with another Poisson's ratio; mesh, pattern and kernels are shared.
 
         Args:
-            poisson: Poisson's ratio [-]; or those of loads, (B, P): with P = 0 the body itself,
-                with P = 1 and B > 1 one of which each member of a batch has its own. Such a one has
-                energy, forces and residuals, but is linearised one by one.
+            poisson: Poisson's ratio [-], or those of loads, (B, P) [-]. P = 0 returns the problem
+                itself. With P = 1 and B > 1 each member of a batch has its own ratio: such a
+                problem has energies, forces and residuals, but no tangent.
 
         Raises:
-            ValueError: Loads say none and the body has a range, or the law has none.
+            ValueError: The law has a range and the loads have no ratio, or the law has no ratio.
         """
         if isinstance(poisson, Tensor) and not poisson.shape[-1]:
             if (span := self.material.poisson_range) is not None:
                 raise ValueError(
-                    f"poisson: the body has a range of them, {list(span)}, and the load does not "
-                    "say which: Load(force, young, poisson)"
+                    f"poisson is a range {list(span)}; give each load its ratio: "
+                    "Load(force, young, poisson)"
                 )
             return self
         if isinstance(poisson, Tensor) and len(poisson) != 1:
@@ -199,9 +199,9 @@ class Problem(TensorAssembly):
 
     @property
     def reference(self) -> Self:
-        """The body in the middle of the range of Poisson's ratios; itself if there is none.
+        """The problem at the centre of the range of Poisson's ratios; itself without a range.
 
-        What all loads share is its: modes, scales, largest loads.
+        Modes, scales and largest loads are those of this problem.
         """
         return self if self.material.poisson_range is None else self.at(self._middle)
 
@@ -216,7 +216,7 @@ class Problem(TensorAssembly):
         return field
 
     def residual(self, displacement: Tensor, force: Tensor) -> Tensor:
-        """Return f_int - f where free and zero where held, (B, N, D) [-]."""
+        """Return f_int - f at free degrees of freedom, zero at fixed ones, (B, N, D) [-]."""
         return torch.where(self.free, self.internal_force(displacement) - force, 0.0)
 
     def evaluate(self, displacement: Tensor) -> Evaluation:
@@ -235,9 +235,9 @@ class Problem(TensorAssembly):
         return Evaluation(internal, torch.tensor(lowest, dtype=torch.float64))
 
     def acting(self, force: Tensor) -> Tensor:
-        """Return what of a force (B, N, D) acts on free degrees of freedom: all that has an effect.
+        """Return a force (B, N, D) [-] at free degrees of freedom, where it has an effect.
 
-        On held ones the result is 0, or NaN where the force is not finite.
+        At fixed ones the result is 0, or NaN where the force is not finite.
         """
         return force * self.free
 
@@ -246,17 +246,17 @@ class Problem(TensorAssembly):
         return self.relative_residual_of(self.evaluate(displacement).internal, force)
 
     def relative_residual_of(self, internal: Tensor, force: Tensor) -> Tensor:
-        """Return ||R_free|| / ||f||, (B,) [-]: the one criterion by which answers are judged.
+        """Return ||R_free|| / ||f||, (B,) [-], the criterion of equilibrium of all solvers.
 
-        ||f|| is the norm of the forces on free degrees of freedom. Forces on held ones do no work
-        and change no displacement, so they do not count. Where supports are moved, the reactions
+        ||f|| is the norm of the forces on free degrees of freedom. Forces on fixed ones do no
+        work and change no displacement, so they do not count. Where supports are moved, reactions
         do work: ||f|| is then at least the norm of the reactions on the degrees of freedom whose
         prescribed displacement is not 0. Reactions of supports that are not moved never count.
 
         Norms are taken of multiples of the largest force, so that no square underflows or
         overflows. Without forces the result is ||R_free|| itself. It is NaN for a force that is
-        not finite, on held degrees of freedom too, and for one whose largest entry is below
-        `FAINT`, of which no residual can be computed.
+        not finite, also on fixed degrees of freedom, and for a force whose largest entry is below
+        `FAINT`, since its residual cannot be computed.
 
         Source: OptiStruct 2020, Nonlinear Convergence Criteria (its relative error in loads counts
         "nodal reactions due to specified displacements").
@@ -290,10 +290,10 @@ class Problem(TensorAssembly):
         return (residual / unit[:, None]).norm(dim=1) / size, size * unit
 
     def roundoff_bound(self, displacement: Tensor) -> Tensor:
-        """Return what rounding alone can make of ||R_free||, (B,) [-].
+        """Return a bound of the rounding error of ||R_free||, (B,) [-].
 
-        A bound from magnitudes: every nodal force is a sum of products of displacement, gradient,
-        modulus and gradient. On slivers it exceeds any tolerance.
+        The bound follows from magnitudes: every nodal force is a sum of products of displacement,
+        gradient, modulus and gradient. On slivers it exceeds any tolerance.
         """
         return self._rounding * displacement.abs().amax(dim=(1, 2))
 
@@ -305,14 +305,14 @@ class Problem(TensorAssembly):
             moduli, each = 1.0, moduli.flatten()
         terms = moduli * (self.dV[..., None] * size * size.sum(-1, keepdim=True)).sum(1)
         terms = terms.expand(len(self.cells), -1)[None, ..., None]
-        assemble_constraints = ~self.free.any(dim=1)
+        fixed = ~self.free.any(dim=1)
         summed = self._sum_at_nodes(terms.expand(-1, -1, -1, self.shape[1]))[0, :, 0]
-        summed = torch.where(assemble_constraints, 0.0, summed)
+        summed = torch.where(fixed, 0.0, summed)
         return torch.finfo(torch.float64).eps * float(summed.norm()) * each
 
     @cached_property
     def moved_supports(self) -> bool:
-        """Whether some prescribed displacement is not zero."""
+        """True if a prescribed displacement is not zero."""
         return bool((self.prescribed != 0).any())
 
     def linearise(self, displacement: Tensor, gap: Any = None) -> System:

@@ -823,13 +823,14 @@ def test_linear_cells_that_will_lock_are_warned_of(grid, cell, remedy):
     """The warning starts at a Poisson's ratio of 0.45."""
     with pytest.warns(UserWarning, match=f"lock at Poisson's ratio 0.45: .*{remedy}"):
         Problem.build(grid(cell), NeoHookeanLn(0.45))
-    assert Problem.build(grid(cell), NeoHookeanLn(0.449)).advice() == []
-    assert Problem.build(grid(cell), NeoHookeanLn(0.49), degree=2).advice() == []
+    assert Problem.build(grid(cell), NeoHookeanLn(0.449)).locking_warnings() == []
+    assert Problem.build(grid(cell), NeoHookeanLn(0.49), degree=2).locking_warnings() == []
 
 
 def test_what_mean_dilatation_has_cured_is_not_warned_of(grid):
     for cell in ("quad", "hexahedron"):
-        assert Problem.build(grid(cell), NeoHookeanLn(0.49), mean_dilatation=True).advice() == []
+        problem = Problem.build(grid(cell), NeoHookeanLn(0.49), mean_dilatation=True)
+        assert problem.locking_warnings() == []
 
 
 def test_locking_of_a_law_without_poisson_ratio_is_seen_too(grid):
@@ -846,10 +847,10 @@ def test_thin_linear_cells_are_warned_of():
             warnings.simplefilter("always", UserWarning)
             problem = Problem.build(mesh, NH)
         advice = [str(one.message) for one in caught if one.category is UserWarning]
-        assert advice == problem.advice()
+        assert advice == problem.locking_warnings()
         assert len(advice) == lines
         assert all("aspect ratio 20 lock in bending: set degree=2" in line for line in advice)
-        assert Problem.build(mesh, NH, degree=2).advice() == []
+        assert Problem.build(mesh, NH, degree=2).locking_warnings() == []
 
 
 def test_residual_at_the_level_of_rounding_is_balance(bent):
