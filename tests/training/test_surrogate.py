@@ -43,12 +43,8 @@ def surrogate(scene, loss=None, *, seed=0, lr=1e-3, scheduler=warmup_cosine):
 def trainer(folder, *callbacks, **options):
     defaults = {"accelerator": "cpu", "logger": False, "num_sanity_val_steps": 0}
     quiet = {"enable_progress_bar": False, "enable_model_summary": False}
-    nodes = OmegaConf.load(CONF / "trainer" / "default.yaml").callbacks
-    checkpoints = [
-        instantiate(OmegaConf.merge(node, {"dirpath": str(folder)}))
-        for node in nodes
-        if node._target_.endswith(("ModelCheckpoint", "BestWeights"))
-    ]
+    nodes = OmegaConf.load(CONF / "callbacks" / "none.yaml").values()
+    checkpoints = [instantiate(node, dirpath=str(folder)) for node in nodes]
     return L.Trainer(
         callbacks=[*checkpoints, *callbacks],
         plugins=[AtomicCheckpointIO()],
