@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from dpl.data.dataset import DataSet
     from dpl.data.online import OnlineData
     from dpl.evaluation.report import evaluate
+    from dpl.inference.answer import Answer
     from dpl.inference.hybrid import Direct, Hybrid
-    from dpl.inference.simulator import Answer, Simulator
+    from dpl.inference.simulator import Simulator
     from dpl.models.cnn import CNN
     from dpl.models.fcnn import FCNN
     from dpl.models.gnn import GNN

@@ -14,7 +14,7 @@ from benchmarks.verification.report import Row
 from dpl import Scene
 from dpl.fem import Load, Solution
 from dpl.inference import Answer, Simulator, default_hybrid
-from dpl.inference.simulator import ROUNDOFF
+from dpl.inference.answer import ROUNDOFF
 from dpl.training import Surrogate
 
 AMPLITUDES = (1e-9, 1e-6, 1e-3, 0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 25.0)  # over the training range

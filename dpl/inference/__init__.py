@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
+    from dpl.inference.answer import Answer
     from dpl.inference.hybrid import Corrector, Direct, Hybrid, default_hybrid, prefer_prediction
-    from dpl.inference.simulator import Answer, Simulator, nearest
+    from dpl.inference.simulator import Simulator, nearest
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

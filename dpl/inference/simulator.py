@@ -3,8 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
-from numbers import Real
+from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -15,6 +14,8 @@ from torch import Tensor
 from dpl.fem import Load, Newton, Solution, Status, evaluate_solution
 from dpl.fem.problem import FAINT
 from dpl.fem.solvers import check_tol, concatenate
+from dpl.inference.answer import MAX_OUT_OF_SPAN, ROUNDOFF, Answer, answer_like, summarise
+from dpl.inference.arguments import as_number, as_numbers, per_load
 from dpl.inference.hybrid import default_hybrid
 from dpl.models import Correctable
 from dpl.scene import Scene
@@ -23,47 +24,6 @@ from dpl.training import Surrogate
 
 Correct = Callable[[Tensor, Tensor], Tensor]  # force (N, D), displacement (N, D) -> displacement
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
-MAX_OUT_OF_SPAN = 1e-3  # relative projection residual of forces of the load family [-]
-ROUNDOFF = 1e-9  # relative error of amplitudes [-]
-
-
-@dataclass(frozen=True)
-class Answer:
-    """A displacement with its quality; for several loads each field is an array, (B, ...).
-
-    Attributes:
-        displacement: (N, D) [m], a NumPy array or a tensor as the force.
-        residual: ||R_free|| / ||f||, evaluated at the displacement [-], see
-            `Problem.relative_residual_of`.
-        volume_ratio: min det F [-]; an element is inverted if it is not above 0.
-        converged: True if the residual is below the tolerance of the call (without one, that of
-            the scene) and no element is inverted. It is False also where rounding does not allow
-            this residual.
-        negative_pivots: Number of negative eigenvalues of the tangent; -1: not examined.
-        amplitude: Largest modal load over the largest of the training [-], see
-            `ModalLoads.project`.
-        out_of_span: Norm of the part of the force that is no combination of the modes of the
-            training, over that of the force [-].
-        out_of_distribution: True if the load lies outside the training range.
-        method: Method that computed the result: "rest", "linear", "network", "corrected",
-            "hybrid" or "full Newton".
-        iterations: Linear solves with a tangent.
-        milliseconds: Wall time [ms]; of several loads, the share of each.
-        summary: Residual, stability and range in words.
-    """
-
-    displacement: Any
-    residual: Any
-    volume_ratio: Any
-    converged: Any
-    negative_pivots: Any
-    amplitude: Any
-    out_of_span: Any
-    out_of_distribution: Any
-    method: Any
-    iterations: Any
-    milliseconds: Any
-    summary: Any
 
 
 class Simulator:
@@ -150,9 +110,9 @@ class Simulator:
                 (booleans, text, complex numbers, masked entries) or not finite, or is out of range.
         """
         begin = time.perf_counter()
-        given = _numbers("force", force)
+        given = as_numbers("force", force)
         load = self._load(given, young, poisson)
-        tol, budget_ms = _number("tol", tol), _number("budget_ms", budget_ms)
+        tol, budget_ms = as_number("tol", tol), as_number("budget_ms", budget_ms)
         wanted = self.scene.solver.tol if tol is None else tol
         check_tol(wanted)
         if budget_ms is not None and not 0 < budget_ms < math.inf:
@@ -183,7 +143,7 @@ class Simulator:
         words = [
             "no load: at rest"
             if method == "rest"
-            else _summary(one, bool(ok), float(a), float(s), bool(out))
+            else summarise(one, bool(ok), float(a), float(s), bool(out))
             for method, one, ok, a, s, out in zip(
                 *(methods, states, kept, amplitude, out_of_span, outside), strict=True
             )
@@ -202,7 +162,7 @@ class Simulator:
             "milliseconds": torch.tensor(times, dtype=torch.float64),
             "summary": words,
         }
-        return _like(answer, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
+        return answer_like(answer, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
 
     def _load(self, force: Tensor, young: Any, poisson: Any) -> Load:
         """Return the arguments of a call as a dimensionless load."""
@@ -217,7 +177,7 @@ class Simulator:
         low, high = scene.loads.young_range
         if young is None and low < high:
             raise ValueError(f"young: the scene has a range, {low:g} to {high:g} Pa; say which")
-        moduli = _column("young", low if young is None else young, len(force))
+        moduli = per_load("young", low if young is None else young, len(force))
         if not (moduli > 0).all():
             raise ValueError("young: a modulus is not above 0 Pa")
         span = scene.loads.poisson_range
@@ -226,7 +186,7 @@ class Simulator:
                 "its own, and needs none" if span is None else f"a range, {list(span)}: say which"
             )
             raise ValueError(f"poisson: the law has {words}")
-        ratios = None if poisson is None else _column("poisson", poisson, len(force))
+        ratios = None if poisson is None else per_load("poisson", poisson, len(force))
         if ratios is not None and not ((ratios > -1) & (ratios < 0.5)).all():
             raise ValueError("poisson: a ratio is not between -1 and 0.5")
         load = scene.load_of(force, moduli, ratios)
@@ -351,107 +311,3 @@ def _rank(state: Solution) -> tuple[bool, bool, float]:
     residual = float(state.residual)
     valid = bool(state.volume_ratio > 0)
     return not bool(state.converged), not valid, residual if residual == residual else math.inf
-
-
-def _summary(
-    state: Solution, kept: bool, amplitude: float, out_of_span: float, outside: bool
-) -> str:
-    """Return the summary of one solution; `kept`: the tolerance is met."""
-    residual = float(state.residual)
-    if kept:
-        words = f"in balance to {residual:.1e} of the load, nothing inverted"
-    elif not float(state.volume_ratio) > 0:
-        words = "NOT VALID: an element is inverted"
-    else:
-        words = f"an estimate, out of balance by {residual:.1e} of the load"
-        words += ", the least that rounding allows" if state.converged else ""
-    if bool(state.converged):
-        pivots = int(state.negative_pivots)
-        if pivots > 0:
-            words += f", UNSTABLE ({pivots} negative eigenvalues)"
-        else:
-            words += ", stable" if pivots == 0 else ", stability not examined"
-    if int(state.status) == Status.NO_VALID_EQUILIBRIUM:
-        words += f"; no equilibrium found beyond {float(state.load_factor):.2f} of the load"
-    if not outside:
-        return words
-    if out_of_span > MAX_OUT_OF_SPAN:
-        return words + f"; {out_of_span:.0%} of the load is unlike the training's"
-    if amplitude > 1 + ROUNDOFF:
-        return words + f"; the load is {amplitude:.2g} times the training's largest"
-    return words + "; a modulus lies outside the training's range"
-
-
-def _numbers(name: str, value: Any) -> Tensor:
-    """Return a copy of an argument as a float64 tensor on the CPU.
-
-    Raises:
-        ValueError: It contains values that are no real numbers.
-    """
-    refused = f"{name} must be real numbers"
-    if isinstance(value, Tensor):
-        if value.layout != torch.strided or value.is_meta or value.is_quantized:
-            raise ValueError(f"{refused}; this tensor has no dense values")
-        if value.is_complex() or value.dtype == torch.bool:
-            raise ValueError(f"{refused}, not {value.dtype}")
-        return value.detach().to("cpu", torch.float64, copy=True)
-    try:
-        array = np.asarray(value)
-        real = array.dtype.kind in "iuf" or (
-            array.dtype.kind == "O" and all(map(_real, array.flat))
-        )
-        numbers = np.array(array, np.float64, order="C", subok=False) if real else None
-    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
-        reason = str(error).partition("\n")[0]
-        raise ValueError(f"{refused}; {reason}") from error
-    if numbers is None:
-        raise ValueError(f"{refused}, not {array.dtype}")
-    if np.ma.is_masked(value):
-        raise ValueError(f"{refused}; masked entries have no value, fill them")
-    return torch.from_numpy(numbers)
-
-
-def _real(value: object) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def _number(name: str, value: Any) -> float | None:
-    """Return an argument as a number, None for None.
-
-    Raises:
-        ValueError: It is not one number.
-    """
-    if value is None:
-        return None
-    number = _numbers(name, value)
-    if number.ndim:
-        raise ValueError(f"{name} must be one number; its shape is {tuple(number.shape)}")
-    return float(number)
-
-
-def _column(name: str, value: Any, count: int) -> Tensor:
-    """Return an argument that is one number or one for each load, (B,)."""
-    column = _numbers(name, value)
-    if column.numel() not in (1, count) or column.ndim > 1:
-        given = f"{column.numel()} numbers for {count} loads, of shape {tuple(column.shape)}"
-        raise ValueError(f"{name}: {given}; give one number, or one for each load")
-    if not column.isfinite().all():
-        raise ValueError(f"{name}: a number is not finite")
-    return column.reshape(-1).expand(count).clone()
-
-
-def _like(answer: dict[str, Any], *, numpy: bool, single: bool) -> Answer:
-    """Return the answer in NumPy or torch, for one load or several, as the force was given."""
-    for field in fields(Answer):
-        value = answer[field.name]
-        if single:
-            value = value[0]
-            if isinstance(value, Tensor) and value.ndim == 0:
-                value = value.item()
-        if isinstance(value, Tensor):
-            value = value.clone()  # an ordinary tensor, not one of inference
-            value = value.numpy() if numpy else value
-        elif numpy and isinstance(value, list):
-            value = np.array(value)
-        answer[field.name] = value
-    return Answer(**answer)

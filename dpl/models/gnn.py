@@ -1,6 +1,5 @@
 """Graph network on the nodes of the mesh and a hierarchy of clusters."""
 
-import math
 from itertools import pairwise
 
 import numpy as np
@@ -8,8 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu
 
-from dpl.models.graph import Floats, Graph, Integers, hierarchy, means
-from dpl.models.message_passing import Messages
+from dpl.models.graph import Graph, Integers, hierarchy, means
+from dpl.models.message_passing import Level, Messages
 from dpl.models.poisson_interpolation import normalise_poisson
 from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
@@ -126,38 +125,6 @@ class GNN(nn.Module):
         else:
             lines.append(f"no clusters: {self.sizes[0]} nodes with messages to neighbours only")
         return lines
-
-
-class Level(nn.Module):
-    """The graph of a level as tensors, and the encoder of its inputs."""
-
-    receiver: Tensor
-    sender: Tensor
-    features: Tensor
-    flags: Tensor
-
-    def __init__(self, graph: Graph, flags: Floats, nodes: int, width: int, *, first: bool) -> None:
-        """Take a graph, flags of its K members (K, D + 1) and the number of nodes of the mesh."""
-        super().__init__()
-        count, dim = graph.points.shape
-        self.register_buffer("receiver", torch.from_numpy(graph.receiver))
-        self.register_buffer("sender", torch.from_numpy(graph.sender))
-        self.register_buffer("features", torch.from_numpy(graph.features()).float())
-        self.register_buffer("flags", torch.from_numpy(flags).float())
-        self.complete = graph.complete
-        self.first = first
-        self.spacing = graph.spacing
-        self.mean_degree = len(graph.sender) / count
-        # geometric mean of the scales of a nodal force and of the sum over a cluster
-        self.load_scale = math.sqrt(count / nodes)
-        self.load = nn.Linear(dim if first else dim + dim * dim, width, bias=False)
-        self.place = nn.Sequential(nn.Linear(dim + 1, width), nn.GELU(), nn.Linear(width, width))
-
-    def forward(self, force: Tensor, moment: Tensor) -> Tensor:
-        """Return the state (K, B, width) under forces (K, B, D) and moments (K, B, D D)."""
-        if not self.first:
-            force = torch.cat([force, moment / self.spacing], dim=-1)
-        return self.load(force * self.load_scale) + self.place(self.flags)[:, None]
 
 
 class Step(nn.Module):

@@ -1,16 +1,48 @@
-"""Messages between the neighbours of a graph: continuous filters of relative positions."""
+"""Levels of a multigrid graph and the messages between their nodes: continuous filters."""
 
-from typing import TYPE_CHECKING, Any
+import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import gelu
 
-if TYPE_CHECKING:
-    from dpl.models.gnn import Level
+from dpl.models.graph import Floats, Graph
 
 CACHE = 2**17  # numbers of a block of messages that fit into the cache of a processor
+
+
+class Level(nn.Module):
+    """The graph of a level as tensors, and the encoder of its inputs."""
+
+    receiver: Tensor
+    sender: Tensor
+    features: Tensor
+    flags: Tensor
+
+    def __init__(self, graph: Graph, flags: Floats, nodes: int, width: int, *, first: bool) -> None:
+        """Take a graph, flags of its K members (K, D + 1) and the number of nodes of the mesh."""
+        super().__init__()
+        count, dim = graph.points.shape
+        self.register_buffer("receiver", torch.from_numpy(graph.receiver))
+        self.register_buffer("sender", torch.from_numpy(graph.sender))
+        self.register_buffer("features", torch.from_numpy(graph.features()).float())
+        self.register_buffer("flags", torch.from_numpy(flags).float())
+        self.complete = graph.complete
+        self.first = first
+        self.spacing = graph.spacing
+        self.mean_degree = len(graph.sender) / count
+        # geometric mean of the scales of a nodal force and of the sum over a cluster
+        self.load_scale = math.sqrt(count / nodes)
+        self.load = nn.Linear(dim if first else dim + dim * dim, width, bias=False)
+        self.place = nn.Sequential(nn.Linear(dim + 1, width), nn.GELU(), nn.Linear(width, width))
+
+    def forward(self, force: Tensor, moment: Tensor) -> Tensor:
+        """Return the state (K, B, width) under forces (K, B, D) and moments (K, B, D D)."""
+        if not self.first:
+            force = torch.cat([force, moment / self.spacing], dim=-1)
+        return self.load(force * self.load_scale) + self.place(self.flags)[:, None]
 
 
 class Messages(nn.Module):
@@ -31,7 +63,7 @@ class Messages(nn.Module):
         self.aggregate = nn.Linear(width, width, bias=False)
         self.leave = nn.Linear(width, width)
 
-    def forward(self, level: "Level", state: Tensor) -> Tensor:
+    def forward(self, level: Level, state: Tensor) -> Tensor:
         """Return the updated state (K, B, width)."""
         weight = self.filter(level.features) / level.mean_degree  # (P, width)
         sent, own = self.enter(state).chunk(2, dim=-1)

@@ -1,0 +1,97 @@
+"""Answers of the simulator and their summaries in words."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from dpl.fem import Solution, Status
+
+MAX_OUT_OF_SPAN = 1e-3  # relative projection residual of forces of the load family [-]
+ROUNDOFF = 1e-9  # relative error of amplitudes [-]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A displacement with its quality; for several loads each field is an array, (B, ...).
+
+    Attributes:
+        displacement: (N, D) [m], a NumPy array or a tensor as the force.
+        residual: ||R_free|| / ||f||, evaluated at the displacement [-], see
+            `Problem.relative_residual_of`.
+        volume_ratio: min det F [-]; an element is inverted if it is not above 0.
+        converged: True if the residual is below the tolerance of the call (without one, that of
+            the scene) and no element is inverted. It is False also where rounding does not allow
+            this residual.
+        negative_pivots: Number of negative eigenvalues of the tangent; -1: not examined.
+        amplitude: Largest modal load over the largest of the training [-], see
+            `ModalLoads.project`.
+        out_of_span: Norm of the part of the force that is no combination of the modes of the
+            training, over that of the force [-].
+        out_of_distribution: True if the load lies outside the training range.
+        method: Method that computed the result: "rest", "linear", "network", "corrected",
+            "hybrid" or "full Newton".
+        iterations: Linear solves with a tangent.
+        milliseconds: Wall time [ms]; of several loads, the share of each.
+        summary: Residual, stability and range in words.
+    """
+
+    displacement: Any
+    residual: Any
+    volume_ratio: Any
+    converged: Any
+    negative_pivots: Any
+    amplitude: Any
+    out_of_span: Any
+    out_of_distribution: Any
+    method: Any
+    iterations: Any
+    milliseconds: Any
+    summary: Any
+
+
+def summarise(
+    state: Solution, kept: bool, amplitude: float, out_of_span: float, outside: bool
+) -> str:
+    """Return the summary of one solution; `kept`: the tolerance is met."""
+    residual = float(state.residual)
+    if kept:
+        words = f"in balance to {residual:.1e} of the load, nothing inverted"
+    elif not float(state.volume_ratio) > 0:
+        words = "NOT VALID: an element is inverted"
+    else:
+        words = f"an estimate, out of balance by {residual:.1e} of the load"
+        words += ", the least that rounding allows" if state.converged else ""
+    if bool(state.converged):
+        pivots = int(state.negative_pivots)
+        if pivots > 0:
+            words += f", UNSTABLE ({pivots} negative eigenvalues)"
+        else:
+            words += ", stable" if pivots == 0 else ", stability not examined"
+    if int(state.status) == Status.NO_VALID_EQUILIBRIUM:
+        words += f"; no equilibrium found beyond {float(state.load_factor):.2f} of the load"
+    if not outside:
+        return words
+    if out_of_span > MAX_OUT_OF_SPAN:
+        return words + f"; {out_of_span:.0%} of the load is unlike the training's"
+    if amplitude > 1 + ROUNDOFF:
+        return words + f"; the load is {amplitude:.2g} times the training's largest"
+    return words + "; a modulus lies outside the training's range"
+
+
+def answer_like(answer: dict[str, Any], *, numpy: bool, single: bool) -> Answer:
+    """Return the answer in NumPy or torch, for one load or several, as the force was given."""
+    for field in fields(Answer):
+        value = answer[field.name]
+        if single:
+            value = value[0]
+            if isinstance(value, Tensor) and value.ndim == 0:
+                value = value.item()
+        if isinstance(value, Tensor):
+            value = value.clone()  # an ordinary tensor, not one of inference
+            value = value.numpy() if numpy else value
+        elif numpy and isinstance(value, list):
+            value = np.array(value)
+        answer[field.name] = value
+    return Answer(**answer)
