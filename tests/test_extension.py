@@ -21,8 +21,7 @@ from scipy.linalg import ldl, solve
 from torch import nn
 
 import dpl.fem as fem
-from dpl.fem.linear import full_matrix
-from dpl.fem.linear.interface import DirectFactor, SingularMatrix
+from dpl.fem.linear import DirectFactor, SingularMatrix, full_matrix
 from dpl.fem.materials.tensors import trace, volume_change
 from dpl.training import Loss
 

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from dpl.fem.linear.banded import BandedCholesky, MixedPrecisionBandedCholesky
     from dpl.fem.linear.interface import (
         Backend,
+        DirectFactor,
         Factor,
         Pattern,
         SingularMatrix,
