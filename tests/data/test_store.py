@@ -984,6 +984,25 @@ def test_collect_writes_whole_shards_of_pending_loads(data, fresh, scene, monkey
     assert fresh.digest("train", 8) == data.store.digest("train", 8)
 
 
+def test_a_pending_load_is_read_like_one_of_a_shard(data, fresh, scene):
+    Writer(fresh).create()
+    fresh.pending.write(solve_load(scene, LoadKey((0, 0), 3)))
+    pending, stored = fresh.reader("train")(3), data.store.reader("train")(3)
+    assert np.array_equal(pending.displacement, stored.displacement)
+    assert np.array_equal(pending.force, stored.force)
+    assert pending.accepted
+    assert fresh.reader("train")(2) is None
+
+
+def test_the_summary_states_mean_iterations_and_size(copy):
+    shards = [line for line in copy.shards() if line["split"] == "train"]
+    mean = sum(line["iterations"] for line in shards) / sum(line["tried"] for line in shards)
+    assert f"{mean:.1f} Newton iterations" in copy.summary()
+    with (copy.folder / "large.safetensors").open("wb") as file:
+        file.truncate(30_000_000)  # sparse
+    assert "sessions, 30 MB" in copy.summary()
+
+
 def test_the_time_per_load_is_the_mean_over_all_sessions(copy):
     (copy.folder / "journal.jsonl").unlink()
     assert copy.seconds_per_load() is None
