@@ -150,10 +150,9 @@ class Scene:
         return hashlib.sha256(json.dumps(self.identity(), sort_keys=True).encode()).hexdigest()
 
     def matches(self, identity: Any) -> bool:
-        """Return whether an identity that was written down is this scene's; 1 equals 1.0.
+        """Return True if a stored identity equals that of this scene.
 
-        The fingerprints of equal identities may differ: older versions did not make integers that
-        stand for real numbers floats.
+        Identities are compared as they are read from JSON: tuples as lists, 1 equal to 1.0.
         """
         return bool(_plain(identity) == _plain(self.identity()))
 
@@ -176,7 +175,7 @@ class Scene:
         )
 
     def skipped_work(self) -> list[str]:
-        """Return what this scene does not need and what is therefore skipped, a line each."""
+        """Return one line for each computation that this scene does not need."""
         problem, loads = self.problem, self.loads
         cells, points = len(problem.cells), problem.dV.shape[1]
         low, high = loads.young_range

@@ -69,7 +69,7 @@ def _copy_mesh(cfg: DictConfig, folder: Path) -> None:
 
 
 def _has_mesh_file(cfg: DictConfig) -> bool:
-    """Return whether the mesh of a configuration is read from a file."""
+    """Return True if a configuration reads its mesh from a file."""
     return hydra.utils.get_object(cfg.mesh._target_) is load_mesh
 
 

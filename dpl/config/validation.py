@@ -141,7 +141,7 @@ def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = Tr
 
 
 def _is_call(path: str) -> bool:
-    """Return whether the value at a path must be a call."""
+    """Return True if the value at a path must be a mapping with `_target_`."""
     key, *below = path.split(".")
     return len(below) == (key in SEVERAL) and key in EXPECTED_TYPES
 
@@ -196,10 +196,10 @@ def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
 
 
 def _is_trusted_function(target: Any) -> bool:
-    """Return whether a function is public in this package and gives one of `TRUSTED_RESULTS`.
+    """Return True for public functions of dpl whose annotated result is in `TRUSTED_RESULTS`.
 
-    Its folder lists the public functions, its annotation says what it returns: a new mesh function,
-    sampling distribution or schedule needs no other entry.
+    A function is public if the `__init__.py` of its folder lists it. A new mesh function, sampling
+    distribution or schedule therefore needs no entry in a list of trusted functions.
     """
     module = getattr(target, "__module__", None) or ""
     if not inspect.isfunction(target) or not module.startswith("dpl."):
@@ -216,9 +216,10 @@ def _is_trusted_function(target: Any) -> bool:
 
 
 def is_instance_of(kind: type, names: set[str]) -> bool:
-    """Return whether a class is one of these or derived from them, none of them imported.
+    """Return True if a class, or one of its base classes, has one of these qualified names.
 
-    A class with all members of a protocol among them counts as one of it.
+    It is also True for a class with all members of a named protocol. Classes are compared by name
+    because the named modules need not be imported.
     """
     if not names.isdisjoint(f"{base.__module__}.{base.__qualname__}" for base in kind.__mro__):
         return True
@@ -292,7 +293,7 @@ def _signature(target: Callable[..., Any]) -> tuple[set[str], dict[str, Any]]:
 
 
 def matches_type(value: Any, hint: Any) -> bool:
-    """Return whether a YAML value matches a type hint; another call matches every hint."""
+    """Return True if a YAML value matches a type hint; a mapping with `_target_` always does."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
         return any(matches_type(value, argument) for argument in arguments)

@@ -270,7 +270,7 @@ class Problem(TensorAssembly):
     def is_equilibrium(
         self, displacement: Tensor, internal: Tensor, force: Tensor, tol: float
     ) -> Tensor:
-        """Return whether the relative residual is below tol or below its roundoff bound, (B,)."""
+        """Return True where the relative residual is below tol or the roundoff bound, (B,)."""
         ratio, scale = self._measured(internal, force)
         return (ratio < tol) | (
             (ratio < 1e-4) & (ratio * scale <= self.roundoff_bound(displacement))

@@ -65,7 +65,10 @@ class Factor(Protocol):
         ...
 
     def stability(self) -> Stability:
-        """Return what is known of negative eigenvalues; an iterative backend spends a solve."""
+        """Return the known bound of the number of negative eigenvalues.
+
+        Iterative backends need a linear solve for it.
+        """
         ...
 
     def apply(self, right: Array) -> Array:

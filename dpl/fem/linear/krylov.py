@@ -153,7 +153,7 @@ class CGFactor:
     negative_pivots: None = None
 
     def stability(self) -> Stability:
-        """Return whether the matrix is positive definite; unknown if the solve does not converge.
+        """Return stable or unstable, or `UNKNOWN` if the solve does not converge.
 
         CG detects negative curvature only in the Krylov space of its right-hand side, so this
         solves with a random one, which has a component along every eigenvector. The residual
@@ -244,5 +244,5 @@ class CG:
 
 
 def multigrid_installed() -> bool:
-    """Return whether pyamg is installed."""
+    """Return True if pyamg is installed."""
     return importlib.util.find_spec("pyamg") is not None

@@ -146,7 +146,7 @@ class TangentSolver:
         return stability_at(self.linear_solver.problem, self.backend, u)
 
     def _ritz_value_is_small(self) -> bool:
-        """Return whether the last tangent, solved with a stale factor, may be indefinite."""
+        """Return True if the last tangent, solved with a stale factor, may be indefinite."""
         if self._factor is None or self._tangent is None:
             return False
         with suppress(SingularMatrix):

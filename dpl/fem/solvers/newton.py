@@ -253,7 +253,7 @@ class Newton:
         return state.residuals[factor]
 
     def _is_balanced(self, state: "_State", force: Tensor, factor: float, tol: float) -> bool:
-        """Return whether a state balances `factor` times a load, to a tolerance or to rounding."""
+        """Return True if a state balances `factor` times a load, to a tolerance or to rounding."""
         if not state.volume_ratio > 0 or state.support_step.any():
             return False
         if (residual := self._residual(state, force, factor)) < tol:
