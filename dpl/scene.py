@@ -122,6 +122,14 @@ class Scene:
         poisson = None if poisson is None else poisson.double()
         return Load(dimensionless, young.double(), poisson)
 
+    def si_inputs(self, load: Load) -> dict[str, Tensor]:
+        """Return the arguments of `load_of` that give a load, by name."""
+        inputs = {
+            "force": load.force * (load.young * self.force_unit)[:, None, None],
+            "young": load.young,
+        }
+        return inputs | ({"poisson": load.poisson[:, 0]} if load.poisson.shape[1] else {})
+
     def identity(self) -> dict[str, object]:
         """Return everything that decides a sample, as plain data; arrays as their SHA-256.
 

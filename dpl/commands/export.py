@@ -122,7 +122,7 @@ def _reference_error(folder: Path, graph: "ExportGraph", session: "OnnxSession")
     from dpl.export import comparison, read_reference
 
     stored = read_reference(folder)
-    found = session(*(stored[name] for name in graph.inputs))
+    found = session(**{name: stored[name] for name in graph.inputs})
     return float(comparison.relative_differences(found.displacement, stored["displacement"]).max())
 
 

@@ -1,12 +1,10 @@
 """Comparison of an ONNX graph with its surrogate: largest differences and latencies."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.evaluation import latency
@@ -18,7 +16,7 @@ CHECK_STREAM = (0, 11)  # random stream of the loads of the comparison
 IN_RANGE = "in range"
 AMPLITUDES = {"small": 1e-3, "tiny": 1e-9, "large": 10.0}  # factors on loads in the training range
 N_OUTSIDE = 4  # loads of each kind outside the training range
-BATCH = 32  # batch size for which times are measured
+BATCHES = (1, 32)  # batch sizes for which times are measured
 
 
 class CheckLoads(NamedTuple):
@@ -26,20 +24,15 @@ class CheckLoads(NamedTuple):
 
     Attributes:
         kinds: Kind of each load, B entries.
-        force: (B, N, D) [N].
-        young: (B,) [Pa].
-        poisson: (B,) [-]; None if the law has a single Poisson's ratio.
+        inputs: Inputs of the graph by name, B of each, see `Scene.si_inputs`.
     """
 
     kinds: list[str]
-    force: Tensor
-    young: Tensor
-    poisson: Tensor | None
+    inputs: dict[str, Tensor]
 
-    def inputs(self, selection: slice | list[int] = slice(None)) -> tuple[Tensor, ...]:
-        """Return the inputs of the graph for a selection of loads."""
-        columns = (self.force, self.young, self.poisson)
-        return tuple(column[selection] for column in columns if column is not None)
+    def select(self, selection: slice | list[int]) -> dict[str, Tensor]:
+        """Return the inputs of a selection of loads."""
+        return {name: column[selection] for name, column in self.inputs.items()}
 
 
 @dataclass(frozen=True)
@@ -70,10 +63,8 @@ class BatchLatency:
 
     Attributes:
         batch: Loads per call.
-        torch_p50: Median wall time of a call of the surrogate [ms].
-        torch_p99: 99th percentile of the same [ms].
-        onnxruntime_p50: Median wall time of a call of the graph [ms].
-        onnxruntime_p99: 99th percentile of the same [ms].
+        torch_p50, torch_p99: Percentiles of the wall time of a call of the surrogate [ms].
+        onnxruntime_p50, onnxruntime_p99: The same of the graph [ms].
     """
 
     batch: int
@@ -84,41 +75,30 @@ class BatchLatency:
 
 
 def sample_check_loads(scene: Scene, count: int) -> CheckLoads:
-    """Return loads in the training range, scaled loads, zero loads, nodal forces and noise.
-
-    Args:
-        scene: The scene.
-        count: Number of loads in the training range.
-    """
+    """Return `count` loads in the training range, scaled and zero loads, nodal forces and noise."""
     loads = scene.loads
-    parts = [(IN_RANGE, loads.sample(CHECK_STREAM, range(count)))]
-    for kind, amplitude in AMPLITUDES.items():
-        parts.append((kind, loads.sample(CHECK_STREAM, range(N_OUTSIDE), amplitude=amplitude)))
     some = loads.sample(CHECK_STREAM, range(N_OUTSIDE))
-    parts.append(("zero", some._replace(force=torch.zeros_like(some.force))))
-    parts += [(kind, some._replace(force=force)) for kind, force in _foreign_forces(scene).items()]
-    kinds = [kind for kind, load in parts for _ in load.force]
-    load = Load(*(torch.cat(column) for column in zip(*(load for _, load in parts), strict=True)))
-    force = load.force * (load.young * scene.force_unit)[:, None, None]
-    poisson = load.poisson[:, 0] if load.poisson.shape[1] else None
-    return CheckLoads(kinds, force, load.young, poisson)
+    parts = {IN_RANGE: loads.sample(CHECK_STREAM, range(count))}
+    parts |= {kind: some._replace(force=a * some.force) for kind, a in AMPLITUDES.items()}
+    parts |= {kind: some._replace(force=force) for kind, force in _foreign_forces(scene).items()}
+    kinds = [kind for kind, load in parts.items() for _ in load.force]
+    load = Load(*map(torch.cat, zip(*parts.values(), strict=True)))
+    return CheckLoads(kinds, scene.si_inputs(load))
 
 
 def _foreign_forces(scene: Scene) -> dict[str, Tensor]:
-    """Return forces on single nodes and white noise on all nodes, (N_OUTSIDE, N, D) [-] each."""
+    """Return no forces, forces on single nodes, and white noise, (N_OUTSIDE, N, D) [-] each."""
     random = torch.Generator().manual_seed(11)
-    shape = (N_OUTSIDE, *scene.problem.shape)
     nodes = scene.loads.loadable_dofs.any(dim=1).nonzero()[:, 0]
-    nodal = torch.zeros(shape, dtype=torch.float64)
-    for k in range(N_OUTSIDE):
+    zero = torch.zeros(N_OUTSIDE, *scene.problem.shape, dtype=torch.float64)
+    nodal = zero.clone()
+    for force in nodal:
         node = nodes[int(torch.randint(len(nodes), (1,), generator=random))]
-        nodal[k, node] = torch.randn(shape[2], generator=random, dtype=torch.float64)
-    noise = torch.randn(shape, generator=random, dtype=torch.float64)
+        force[node] = torch.randn(force.shape[1], generator=random, dtype=torch.float64)
+    noise = torch.randn(zero.shape, generator=random, dtype=torch.float64)
     size = 0.1 * scene.loads.largest_force
-    return {
-        kind: size * force / force.flatten(1).norm(dim=1)[:, None, None]
-        for kind, force in (("on a node", nodal), ("noise", noise))
-    }
+    nodal, noise = (f * size / f.flatten(1).norm(dim=1)[:, None, None] for f in (nodal, noise))
+    return {"zero": zero, "on a node": nodal, "noise": noise}
 
 
 def compare_outputs(
@@ -129,97 +109,60 @@ def compare_outputs(
     All loads are evaluated at once, then the first three, then each load alone, to detect a graph
     with a fixed batch size. The outputs for local loads are compared with the representation in the
     basis. A load that only one of the two marks as local has an infinite difference.
-
-    Args:
-        graph: The graph, evaluated by torch.
-        session: The ONNX file, evaluated by onnxruntime.
-        loads: The loads.
     """
     count = len(loads.kinds)
     largest, local_error = np.zeros(count), np.zeros(count)
     local = np.zeros(count, dtype=bool)
     for part in (slice(0, count), slice(0, 3), *(slice(k, k + 1) for k in range(count))):
-        inputs = loads.inputs(part)
+        inputs = loads.select(part)
         with torch.inference_mode():
-            in_basis, *flags = graph(*inputs)
-            surrogate = graph.surrogate(*inputs)
-        found = session(*(column.numpy() for column in inputs))
-        expected = flags[0].numpy() if flags else np.zeros(len(found.local), dtype=bool)
-        error = relative_differences(found.displacement, in_basis.numpy())
-        full_error = relative_differences(found.displacement, surrogate.numpy())
+            in_basis, *flags = (output.numpy() for output in graph(**inputs))
+            surrogate = graph.surrogate(**inputs).numpy()
+        found = session(**inputs)
+        error = relative_differences(found.displacement, in_basis)
+        full_error = relative_differences(found.displacement, surrogate)
         error = np.where(found.local, error, np.maximum(error, full_error))
-        error = np.where(found.local == expected, error, np.inf)
+        error[found.local != (flags[0] if flags else False)] = np.inf
         largest[part] = np.maximum(largest[part], error)
-        local_error[part] = np.where(found.local, np.maximum(local_error[part], full_error), np.nan)
+        local_error[part] = np.maximum(local_error[part], full_error)
         local[part] = found.local
-    return [
-        _summarise(
-            kind, np.array([one == kind for one in loads.kinds]), largest, local, local_error
-        )
-        for kind in dict.fromkeys(loads.kinds)
-    ]
-
-
-def _summarise(
-    kind: str,
-    selected: NDArray[np.bool_],
-    largest: Array,
-    local: NDArray[np.bool_],
-    local_error: Array,
-) -> OutputDifference:
-    """Return the row of one kind, whose loads are `selected`, (B,)."""
-    marked = selected & local
-    errors = local_error[marked] if marked.any() else np.array([np.nan])
-    return OutputDifference(
-        kind,
-        int(selected.sum()),
-        float(largest[selected].max()),
-        int(marked.sum()),
-        float(errors.max()),
-        float(np.median(errors)),
-    )
+    rows = []
+    for kind in dict.fromkeys(loads.kinds):
+        own = np.array([one == kind for one in loads.kinds])
+        marked = local_error[own & local]
+        worst, middle = (marked.max(), np.median(marked)) if len(marked) else (np.nan, np.nan)
+        numbers = int(own.sum()), float(largest[own].max()), len(marked)
+        rows.append(OutputDifference(kind, *numbers, float(worst), float(middle)))
+    return rows
 
 
 def relative_differences(found: Array, expected: Array) -> Array:
     """Return ||a - b|| / ||b|| of fields (B, N, D), (B,) [-]; 0 where both are zero."""
-    difference = np.sqrt(((found - expected) ** 2).sum(axis=(1, 2)))
-    size = np.sqrt((expected**2).sum(axis=(1, 2)))
+    difference, size = (np.sqrt((x**2).sum(axis=(1, 2))) for x in (found - expected, expected))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(difference == 0, 0.0, difference / size)
     return np.where(np.isfinite(ratio), ratio, np.inf)
 
 
 def measure_latency(
-    graph: ExportGraph,
-    session: OnnxSession,
-    loads: CheckLoads,
-    *,
-    calls: int,
-    batches: Sequence[int] = (1, BATCH),
+    graph: ExportGraph, session: OnnxSession, loads: CheckLoads, *, calls: int
 ) -> list[BatchLatency]:
-    """Return the latencies of surrogate and graph on loads in the training range.
+    """Return latencies of surrogate and graph on loads in the training range, `calls` or more.
 
     Local loads are left out, because the graph does less for them. If all are local, all are used.
-
-    Args:
-        graph: The graph whose surrogate is timed.
-        session: The ONNX file.
-        loads: The loads.
-        calls: Smallest number of calls of each.
-        batches: Numbers of loads per call.
     """
-    local = session(*(column.numpy() for column in loads.inputs())).local
+    local = session(**loads.inputs).local
     usual = [k for k, kind in enumerate(loads.kinds) if kind == IN_RANGE and not local[k]]
     usual = usual or list(range(len(local)))
     rows = []
-    for batch in batches:
+    for batch in BATCHES:
         size = min(batch, len(usual))
         starts = range(0, len(usual) - size + 1, size)
-        inputs = [loads.inputs(usual[start : start + size]) for start in starts]
-        arrays = [tuple(column.numpy() for column in part) for part in inputs]
+        inputs = [loads.select(usual[start : start + size]) for start in starts]
+        arrays = [{name: column.numpy() for name, column in part.items()} for part in inputs]
         repeats = -(-calls // len(inputs))
-        torch_time = latency(lambda part: graph.surrogate(*part), inputs, repeats=repeats)
-        onnx_time = latency(lambda part: session(*part), arrays, repeats=repeats)
-        times = (torch_time.p50, torch_time.p99, onnx_time.p50, onnx_time.p99)
+        surrogate = latency(lambda part: graph.surrogate(**part), inputs, repeats=repeats)
+        onnx = latency(lambda part: session(**part), arrays, repeats=repeats)
+        times = (surrogate.p50, surrogate.p99, onnx.p50, onnx.p99)
         rows.append(BatchLatency(size, *(round(time, 4) for time in times)))
     return rows

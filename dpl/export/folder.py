@@ -31,23 +31,16 @@ RAW = np.dtype("<f8")
 def write_folder(
     folder: Path, surrogate: Surrogate, reference: Reference, meta: Mapping[str, Any]
 ) -> None:
-    """Write all files except the graph and the report.
-
-    Args:
-        folder: The folder; created if it does not exist.
-        surrogate: The surrogate whose weights are written.
-        reference: The reference load and its solutions.
-        meta: Contents of meta.json.
-    """
+    """Write all files except the graph and the report; `meta` are the contents of meta.json."""
     scene, loads = surrogate.scene, surrogate.scene.loads
     (folder / "reference").mkdir(parents=True, exist_ok=True)
-    for name, field in reference.fields().items():
+    for name, field in reference.fields.items():
         write_raw(folder / "reference" / f"{name}.f64", field)
     if isinstance(loads, HasModes):
         write_raw(folder / "modes.f64", loads.modal_forces.numpy())
-    checkpoint: dict[str, Any] = {"state_dict": surrogate.state_dict()}
-    checkpoint |= {"scene": scene.fingerprint, "identity": scene.identity()}
-    checkpoints.write(checkpoint, folder / "weights.safetensors")
+    scenery = {"scene": scene.fingerprint, "identity": scene.identity()}
+    weights = folder / "weights.safetensors"
+    checkpoints.write({"state_dict": surrogate.state_dict(), **scenery}, weights)
     lines = (f" {json.dumps(key)}: {json.dumps(value)}" for key, value in meta.items())
     with atomic_write(folder / "meta.json") as file:
         file.write(("{\n" + ",\n".join(lines) + "\n}\n").encode())
@@ -100,15 +93,11 @@ def verify_folder(
     Raises:
         ValueError: A file differs.
     """
-    if read_metadata(folder) != json.loads(json.dumps(meta)):
-        raise ValueError(f"{folder / 'meta.json'} differs from what was written")
-    found = read_reference(folder)
-    for name, field in reference.fields().items():
-        if not np.array_equal(found[name], field):
-            raise ValueError(f"{folder / 'reference' / name}.f64 differs from what was written")
     weights = checkpoints.read(folder / "weights.safetensors")["state_dict"]
+    same = {"meta.json": read_metadata(folder) == json.loads(json.dumps(meta))}
+    for name, field in read_reference(folder).items():
+        same[f"reference/{name}.f64"] = np.array_equal(field, reference.fields.get(name))
     for name, tensor in surrogate.state_dict().items():
-        if not torch.equal(weights[name], tensor):
-            raise ValueError(
-                f"{folder / 'weights.safetensors'}: {name} differs from what was written"
-            )
+        same[f"weights.safetensors: {name}"] = torch.equal(weights[name], tensor)
+    if changed := [name for name, is_same in same.items() if not is_same]:
+        raise ValueError(f"{folder / changed[0]} differs from what was written")

@@ -46,29 +46,22 @@ def describe(
         path: Path of the ONNX file.
         reference: The reference load and its solutions.
         tol: Largest relative difference of ONNX and torch [-].
-        errors: Errors of the network on the test set, see `dpl.training.metrics`; None if the run
-            was not evaluated.
+        errors: Errors of the network on the test set, see `dpl.training.metrics`, if evaluated.
     """
     module, scene = graph.surrogate, graph.surrogate.scene
-    loads, variables = scene.loads, _variables(scene)
+    loads, problem = scene.loads, scene.problem
     count = sum(parameter.numel() for parameter in module.net.parameters())
     return {
         "format": FORMAT,
         "dpl": __version__,
         "scene": scene.fingerprint,
         "network": {"name": type(module.net).__name__, "parameters": count},
-        "model": {
-            "file": path.name,
-            "opset": onnx_opset(path),
-            "inputs": [{"name": name, **variables[name]} for name in graph.inputs],
-            "outputs": [{"name": name, **variables[name]} for name in graph.outputs],
-            "tolerance": tol,
-        },
+        "model": {**_model(graph, path), "tolerance": tol},
         "units": {"length": "m", "force": _force_unit(scene), "stress": "Pa", "young": "Pa"},
         "dofs": {
-            "count": scene.problem.free.numel(),
+            "count": problem.free.numel(),
             "order": "node-major: D * node + component; components x, y, z",
-            "fixed": _indices(~scene.problem.free),
+            "fixed": _indices(~problem.free),
             "loadable": _indices(loads.loadable_dofs),
         },
         "scales": {
@@ -82,20 +75,24 @@ def describe(
         "range": _range(scene),
         "errors": errors,
         "reference": reference.describe(),
-        "mesh": _mesh(scene.problem),
+        "mesh": _mesh(problem),
     }
 
 
-def _variables(scene: Scene) -> dict[str, dict[str, Any]]:
-    """Return shape, type and unit of each input and output of the graph."""
+def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
+    """Return file and operator set, and name, shape, type and unit of each input and output."""
+    scene = graph.surrogate.scene
     loads, field = scene.loads, ["B", *scene.problem.shape]
-    return {
+    known: dict[str, dict[str, Any]] = {
         "force": {"shape": field, "type": "float64", "unit": _force_unit(scene)},
         "young": {"shape": ["B"], "type": "float64", "unit": "Pa", "range": loads.young_range},
         "poisson": {"shape": ["B"], "type": "float64", "unit": "1", "range": loads.poisson_range},
         "displacement": {"shape": field, "type": "float64", "unit": "m"},
         "local": {"shape": ["B"], "type": "bool", "unit": "1", "meaning": LOCAL},
     }
+    both = {"inputs": graph.inputs, "outputs": graph.outputs}
+    named = {key: [{"name": name, **known[name]} for name in names] for key, names in both.items()}
+    return {"file": path.name, "opset": onnx_opset(path), **named}
 
 
 def _force_unit(scene: Scene) -> str:

@@ -22,7 +22,6 @@ from dpl.models import FlagsLocalLoads
 from dpl.training import Surrogate
 
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
-VERBOSE_LOGGERS = ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")
 LOCAL = "local"  # output that marks loads for which dpl would use the factor of K(0)
 Array = NDArray[np.float64]
 
@@ -48,9 +47,8 @@ def missing_packages() -> list[str]:
 class ExportGraph(nn.Module):
     """Surrogate without control flow that depends on the values of a load.
 
-    A `FlagsLocalLoads` network solves local loads with a sparse factor of K(0), which is not a
-    tensor operation. The
-    graph represents these loads in the basis like all others, and a second output marks them.
+    A `FlagsLocalLoads` network solves local loads with a sparse factor of K(0), which is no tensor
+    operation. The graph represents them in the basis like all others; a second output marks them.
 
     Attributes:
         surrogate: The trained surrogate.
@@ -97,18 +95,15 @@ class ExportGraph(nn.Module):
 
 
 def export_onnx(graph: ExportGraph, path: Path) -> None:
-    """Write a graph as an ONNX file; weights above 2 GB go to `<path>.data`.
-
-    Args:
-        graph: The graph.
-        path: Path of the ONNX file. Older files at this path are removed.
+    """Write a graph as an ONNX file; weights above 2 GB go to `<path>.data`. Replaces older files.
 
     Raises:
         ValueError: The network has control flow that depends on values, or a fixed batch size.
     """
     import onnx
 
-    example = _example_inputs(graph)
+    scene = graph.surrogate.scene
+    example = tuple(scene.si_inputs(scene.loads.sample((0, 0), range(3))).values())
     batch = torch.export.Dim("B", min=1)
     shapes = tuple({0: batch} for _ in example)
     with _silence_exporter():
@@ -136,29 +131,16 @@ def export_onnx(graph: ExportGraph, path: Path) -> None:
     onnx.checker.check_model(str(path))
 
 
-def _example_inputs(graph: ExportGraph) -> tuple[Tensor, ...]:
-    """Return the inputs of three loads, with which the graph is traced."""
-    scene = graph.surrogate.scene
-    load = scene.loads.sample((0, 0), range(3))
-    force = load.force * (load.young * scene.force_unit)[:, None, None]
-    poisson = () if scene.loads.poisson_range is None else (load.poisson[:, 0],)
-    return (force, load.young, *poisson)
-
-
 @contextlib.contextmanager
 def _silence_exporter() -> Iterator[None]:
-    """Suppress warnings and log records below ERROR of the exporter."""
-    loggers = [logging.getLogger(name) for name in VERBOSE_LOGGERS]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
+    """Suppress warnings and log records below ERROR."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        logging.disable(before)
 
 
 class OnnxSession:
@@ -181,9 +163,10 @@ class OnnxSession:
         self.inputs = [one.name for one in self._session.get_inputs()]
         self.outputs = [one.name for one in self._session.get_outputs()]
 
-    def __call__(self, *arrays: Array) -> GraphOutput:
-        """Return the outputs for the inputs: force (B, N, D) [N], young (B,) [Pa], ..."""
-        found: list[Any] = self._session.run(None, dict(zip(self.inputs, arrays, strict=True)))
+    def __call__(self, **inputs: Array | Tensor) -> GraphOutput:
+        """Return the outputs for the inputs of `ExportGraph.forward`, by name."""
+        arrays = {name: np.asarray(column) for name, column in inputs.items()}
+        found: list[Any] = self._session.run(None, arrays)
         if LOCAL not in self.outputs:
             found.append(np.zeros(len(found[0]), dtype=bool))
         return GraphOutput(*found)

@@ -40,7 +40,7 @@ def write_results(
 
     Args:
         surrogate: The surrogate.
-        load: Dimensionless loads, B of them.
+        load: The loads.
         path: Path of the series, without a suffix.
         solve_reference: Also write the finite-element displacement and the error.
 
@@ -59,16 +59,9 @@ def write_results(
         step = nodal_fields(scene, single, prediction, truth)
         steps.append({name: field.numpy() for name, field in step.items()})
         error = torch.nan if truth is None else float((prediction - truth).norm() / truth.norm())
-        rows.append(
-            ResultRow(
-                k,
-                float(single.young),
-                float(step["displacement [m]"].norm(dim=1).max()),
-                float(step["von Mises stress [Pa]"].max()),
-                float(step["det F"].min()),
-                error,
-            )
-        )
+        moved = float(step["displacement [m]"].norm(dim=1).max())
+        inside = float(step["von Mises stress [Pa]"].max()), float(step["det F"].min())
+        rows.append(ResultRow(k, float(single.young), moved, *inside, error))
     return rows, write_series(path, scene.problem.mesh_in_metres, steps)
 
 
