@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
 from dpl import config
 from dpl.commands.cli import command
@@ -65,13 +63,14 @@ def _discretisations(cfg: DictConfig) -> list["Discretisation"]:
 
 
 def _show(title: str, rows: list["Point"]) -> None:
-    table = Table(title, "iteration", "threads", "ms", "p99", "error", "max error", "||R||/||f||")
+    columns = (title, "iteration", "threads", "ms", "p99", "error", "max error", "||R||/||f||")
+    cells = []
     for row in rows:
         times = f"{row.ms:.2f}", f"{row.ms_p99:.2f}"
         errors = f"{row.error:.1e}", f"{row.max_error:.1e}", f"{row.residual:.1e}"
         name = "" if row.iteration else row.solver
-        table.add_row(name, str(row.iteration), str(row.threads), *times, *errors)
-    Console(width=150).print(table)
+        cells.append([name, str(row.iteration), str(row.threads), *times, *errors])
+    tables.show_cells("", columns, cells)
 
 
 def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:

@@ -3,6 +3,7 @@
 Extends experiment 4 of Odot, Haferssas, Cotin (2022), DeepPhysics.
 """
 
+import itertools
 import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -99,22 +100,17 @@ class Summary(Setting):
 
 
 def load_sets(scene: Scene, count: int, far: int) -> dict[str, Load]:
-    """Return sets of loads by name.
-
-    Args:
-        scene: The scene.
-        count: Number of test loads ("in range"), and of loads scaled by 1 to 2 ("twice").
-        far: Number of loads scaled by 3, and of loads scaled by 5.
+    """Return sets of loads by name: `count` test loads ("in range") and as many scaled by 1 to 2
+    ("twice"), `far` loads scaled by 3 and by 5 each.
     """
     part = torch.linspace(0, 1, count, dtype=torch.float64)
     factors = {"in range": 1 + 0 * part, "twice": 1 + part}
     factors |= {f"{k} times": torch.full((far,), float(k)).double() for k in (3, 5)}
     sets = {}
     for name, factor in factors.items():
-        if not len(factor):
-            continue
-        drawn = scene.loads.sample((0, STREAMS[name]), range(len(factor)))
-        sets[name] = drawn._replace(force=factor[:, None, None] * drawn.force)
+        if len(factor):
+            drawn = scene.loads.sample((0, STREAMS[name]), range(len(factor)))
+            sets[name] = drawn._replace(force=factor[:, None, None] * drawn.force)
     return sets
 
 
@@ -129,9 +125,9 @@ def solvers_of(
         tol: Relative residual [-].
         max_total_iter: Maximum number of iterations; None for that of the scene's solver.
     """
-    settings: dict[str, Any] = {"tol": tol}
-    settings |= {} if max_total_iter is None else {"max_total_iter": max_total_iter}
-    robust, quick = replace(scene.newton, **settings), replace(scene.corrector, **settings)
+    budget = max_total_iter or scene.newton.max_total_iter
+    robust = replace(scene.newton, tol=tol, max_total_iter=budget)
+    quick = replace(scene.corrector, tol=tol, max_total_iter=budget)
     plain = PlainNewton(robust)
     solvers: dict[tuple[str, str], Solver] = {
         ("plain Newton", ""): plain,
@@ -145,9 +141,8 @@ def solvers_of(
         solvers["hybrid, paper's rule", name] = Hybrid(predict, plain, "paper")
         solvers["hybrid, best rule, factors", name] = Hybrid(predict, robust)
         solvers["hybrid, best rule", name] = Hybrid(predict, quick)
-        solvers["hybrid, without tangents", name] = Hybrid(
-            predict, quick, steps=AndersonSolver(quick)
-        )
+        anderson = AndersonSolver(quick)
+        solvers["hybrid, without tangents", name] = Hybrid(predict, quick, steps=anderson)
     return solvers
 
 
@@ -182,7 +177,7 @@ def measure(
     return trials
 
 
-def summary(trials: Iterable[Trial]) -> list[Summary]:
+def summary(trials: Sequence[Trial]) -> list[Summary]:
     """Return a summary for each solver, set of loads and tolerance.
 
     The sets "in range" and "twice" are also combined into the set of the paper, `BOTH`.
@@ -191,9 +186,8 @@ def summary(trials: Iterable[Trial]) -> list[Summary]:
         trials: Results; the loads of a set have the same order for all solvers.
     """
     groups: dict[tuple[str, float], dict[tuple[str, str], list[Trial]]] = {}
-    every = list(trials)
-    both = [replace(trial, loads=BOTH) for trial in every if trial.loads in ("in range", "twice")]
-    for trial in [*both, *every]:
+    both = [replace(trial, loads=BOTH) for trial in trials if trial.loads in ("in range", "twice")]
+    for trial in [*both, *trials]:
         group = groups.setdefault((trial.loads, trial.tol), {})
         group.setdefault((trial.solver, trial.network), []).append(trial)
     return [
@@ -202,24 +196,26 @@ def summary(trials: Iterable[Trial]) -> list[Summary]:
 
 
 def _summarise(trials: Sequence[Trial], reference: Sequence[Trial]) -> Summary:
+    def reduced(reduce: Callable[[list[Any]], float], values: Iterable[Any]) -> Any:
+        found = list(values)
+        return reduce(found) if found else None
+
     first, count = trials[0], len(trials)
     done = [trial for trial in trials if trial.converged]
-    row = Summary(
-        first.solver, first.network, first.loads, first.tol, count, 100 * len(done) / count,
-        100 * sum(trial.used_prediction for trial in trials) / count if first.network else None,
-    )  # fmt: skip
-    if not done:
-        return row
     both = [pair for pair in zip(trials, reference, strict=True) if all(t.converged for t in pair)]
-    ratio = sum(own.ms for own, _ in both) / sum(ref.ms for _, ref in both) if both else None
-    return replace(
-        row,
-        iterations=statistics.mean(trial.iterations for trial in done),
-        max_iterations=max(trial.iterations for trial in done),
-        factorisations=statistics.mean(trial.factorisations for trial in done),
-        ms=statistics.median(trial.ms for trial in done),
-        time_ratio=ratio,
-        deviation=max(own.deviation for own, _ in both) if both else None,
+    used = 100 * sum(trial.used_prediction for trial in trials) / count
+    return Summary(
+        *(first.solver, first.network, first.loads, first.tol, count),
+        converged=100 * len(done) / count,
+        used_prediction_pct=used if first.network else None,
+        iterations=reduced(statistics.mean, (trial.iterations for trial in done)),
+        max_iterations=reduced(max, (trial.iterations for trial in done)),
+        factorisations=reduced(statistics.mean, (trial.factorisations for trial in done)),
+        ms=reduced(statistics.median, (trial.ms for trial in done)),
+        time_ratio=sum(own.ms for own, _ in both) / sum(ref.ms for _, ref in both)
+        if both
+        else None,
+        deviation=reduced(max, (own.deviation for own, _ in both)),
     )
 
 
@@ -249,8 +245,8 @@ def draw(trials: Sequence[Trial], path: Path) -> None:
     networks = list(dict.fromkeys(network for _, network in names))
     styles: dict[str, str] = {}
     for network in networks:
-        same = [solver for solver, other in names if other == network]
-        styles |= {s: LINE_STYLES[k % len(LINE_STYLES)] for k, s in enumerate(reversed(same))}
+        same = [solver for solver, other in reversed(names) if other == network]
+        styles |= dict(zip(same, itertools.cycle(LINE_STYLES), strict=False))
     figure = Figure(figsize=(3.6 * len(tols) + 2.6, 3.8), layout="constrained")
     axes = figure.subplots(1, len(tols), sharex=True, sharey=True, squeeze=False)[0]
     for ax, tol in zip(axes, tols, strict=True):
@@ -259,18 +255,15 @@ def draw(trials: Sequence[Trial], path: Path) -> None:
             taken = sorted(trial.ms for trial in own if trial.converged)
             part = [100 * k / len(own) for k in range(1, len(taken) + 1)]
             colour = f"C{networks.index(network)}" if network else "0.3"
+            width = 2 if solver == "hybrid, without tangents" else 1.2
+            style = {"color": colour, "ls": styles[solver], "lw": width}
             label = f"{solver}, {network}" if network else solver
-            ax.step(
-                taken, part, where="post", color=colour, ls=styles[solver],
-                label=label, lw=2 if solver == "hybrid, without tangents" else 1.2,
-            )  # fmt: skip
+            ax.step(taken, part, where="post", label=label, **style)
         ax.set_xscale("log")
         ax.xaxis.set_minor_formatter(NullFormatter())
-        ax.set_ylim(0, 102)
+        ax.set(ylim=(0, 102), xlabel="time [ms]")
         ax.set_title(f"to ||R|| / ||f|| < {tol:g}", fontsize=10)
-        ax.set_xlabel("time [ms]")
         ax.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("converged loads [%]")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right center", fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
     figure.savefig(path, dpi=130)

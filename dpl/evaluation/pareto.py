@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Cells = tuple[int, ...]
+MARKERS = {"corrected": "D", "hybrid": "s", "GPU": "*"}  # of methods; "o" for others
 COLOURS = [f"C{k}" for k in range(10) if k != 7]  # without grey, the colour of references
 
 
@@ -54,7 +55,7 @@ class Point:
         iteration: Index of the iterate; a load with fewer iterates keeps its last one.
         is_final: This is the last iterate of all loads.
         threads: Threads of torch and BLAS.
-        device: Device of the network.
+        device: Device of the other computations than the network's.
         loads: Number of loads.
         ms: Median wall time up to this iterate, with its residual and min det F, one load at a time
             [ms].
@@ -82,7 +83,6 @@ def points(
     batch: Sample,
     *,
     threads: int = 1,
-    device: str = "cpu",
     tick: Callable[[], None] = lambda: None,
 ) -> list[Point]:
     """Return run times and errors of all iterates of solvers, one load at a time.
@@ -93,7 +93,6 @@ def points(
         solvers: Solvers by name.
         batch: Loads with reference solutions.
         threads: Threads of torch; with 1 BLAS has one thread too, otherwise its default.
-        device: Device of the networks, for the record.
         tick: Called after each solver.
     """
     singles = batch.load.unbatch()
@@ -110,20 +109,9 @@ def points(
                 displacement = torch.cat([state.displacement for _, state in iterates])
                 error = RelativeL2().measure(displacement, batch)
                 residual = torch.cat([state.residual for _, state in iterates])
-                found.append(
-                    Point(
-                        name,
-                        k,
-                        k == count - 1,
-                        threads,
-                        device,
-                        len(singles),
-                        *percentiles(times),
-                        float(median(error)),
-                        float(error.max()),
-                        float(median(residual)),
-                    )
-                )
+                record = name, k, k == count - 1, threads, "cpu", len(singles)
+                errors = float(median(error)), float(error.max()), float(median(residual))
+                found.append(Point(*record, *percentiles(times), *errors))
             tick()
     return found
 
@@ -151,10 +139,7 @@ def on_gpu(surrogate: Surrogate) -> Callable[[Load], Tensor]:
 
 
 def draw(
-    rows: Sequence[Point],
-    meshes: Sequence[Discretisation],
-    floor: float | None,
-    file: Path,
+    rows: Sequence[Point], meshes: Sequence[Discretisation], floor: float | None, file: Path
 ) -> None:
     """Draw run time against error: one line or dot for each solver.
 
@@ -168,19 +153,17 @@ def draw(
 
     figure = Figure(figsize=(9.5, 5.2), layout="constrained")
     ax = figure.subplots()
-    named: set[str] = set()
-    families = list(dict.fromkeys(_family(row.solver) for row in rows))
+    colours: dict[str, str] = {}
     for name in dict.fromkeys(row.solver for row in rows):
         own = [row for row in rows if row.solver == name and row.error < 1]
         x, y = [row.ms for row in own], [max(row.error, 1e-12) for row in own]
-        method = name.partition(", ")[2]
-        colour = "0.1" if _family(name) == "Newton" else COLOURS[families.index(_family(name)) % 9]
-        marker = {"corrected": "D", "hybrid": "s", "GPU": "*"}.get(method, "o")
-        shown = not method or method == "GPU"  # other marks are explained below
-        label = name.partition(" to ")[0] if shown and _family(name) not in named else None
-        named.add(_family(name))
-        ax.loglog(x, y, color=colour, lw=1.2, marker=marker, ms=4, label=label)
-        ax.loglog(x[-1:], y[-1:], color=colour, marker=marker, ms=8)
+        family, _, method = name.partition(", ")
+        family = family.partition(" to ")[0]
+        label = None if family in colours else family
+        free = "0.1" if family == "Newton" else COLOURS[len(colours) % len(COLOURS)]
+        style = {"color": colours.setdefault(family, free), "marker": MARKERS.get(method, "o")}
+        ax.loglog(x, y, lw=1.2, ms=4, label=label, **style)
+        ax.loglog(x[-1:], y[-1:], ms=8, **style)
     for marker, method in (("D", "corrected"), ("s", "hybrid: each iterate")):
         ax.plot([], [], color="0.5", ls="", marker=marker, label=f"the same, {method}")
     _draw_meshes(ax, meshes)
@@ -204,20 +187,12 @@ def _draw_meshes(ax: "Axes", meshes: Sequence[Discretisation]) -> None:
         family = [mesh for mesh in meshes if mesh.degree == degree]
         if not family:
             continue
-        ax.loglog(
-            [mesh.ms for mesh in family],
-            [mesh.error for mesh in family],
-            color="0.55", ls=":", marker=marker, ms=5, mfc="none",
-            label=f"Newton, {name} meshes, against\nthe limit (degrees of freedom)",
-        )  # fmt: skip
+        label = f"Newton, {name} meshes, against\nthe limit (degrees of freedom)"
+        style = {"color": "0.55", "ls": ":", "marker": marker, "ms": 5, "mfc": "none"}
+        ax.loglog([m.ms for m in family], [m.error for m in family], label=label, **style)
         away = 4, 4 if degree == 1 else -10
         for mesh in family:
             ax.annotate(
                 f"{mesh.dofs:,}", (mesh.ms, mesh.error), fontsize=7, color="0.4",
                 textcoords="offset points", xytext=away,
             )  # fmt: skip
-
-
-def _family(solver: str) -> str:
-    """Return the part of a name that solvers of one colour share."""
-    return solver.partition(", ")[0].partition(" to ")[0]

@@ -26,19 +26,10 @@ class PlainNewton:
     max_iter: int = 20
 
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
-        """Yield the initial state and the state after each iteration of all loads.
-
-        Args:
-            load: The loads.
-            guess: Initial displacements, (B, N, D) [-]; zero if None.
-        """
-        guesses = torch.zeros_like(load.force) if guess is None else guess
-        yield from run_lockstep(
-            [
-                self._member(single, u[None], guess is not None)
-                for single, u in zip(load.unbatch(), guesses, strict=True)
-            ]
-        )
+        """Yield the state of all loads at a guess (B, N, D) [-], or zero, and after each step."""
+        starts = torch.zeros_like(load.force) if guess is None else guess
+        pairs = zip(load.unbatch(), starts, strict=True)
+        return run_lockstep([self._member(one, u[None], guess is not None) for one, u in pairs])
 
     @property
     def problem(self) -> Problem:
@@ -51,7 +42,7 @@ class PlainNewton:
         return self.solver.tol
 
     def _member(self, load: Load, u: Tensor, guessed: bool) -> Iterator[Solution]:
-        problem, start = self.solver.problem, time.perf_counter()
+        problem, start = self.problem, time.perf_counter()
         backend = self.solver.linear_solver.tangent_backend
         for k in range(self.max_iter + 1):
             state = evaluate_solution(problem, u, load, self.tol, iterations=k, from_guess=guessed)

@@ -7,13 +7,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import torch
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
+from dpl.evaluation.tables import show_cells
 from dpl.evaluation.timing import Latency, describe, latencies, percentiles, time_interleaved
-from dpl.fem import LinearSolver, Newton, Problem, Solution, Solver
-from dpl.fem import write_mesh as write_mesh
+from dpl.fem import LinearSolver, Newton, Problem, Solver, write_mesh
 from dpl.inference import Direct, Hybrid, Simulator, default_hybrid
 from dpl.scene import Sample
 from dpl.system.threads import one_thread
@@ -61,58 +59,36 @@ def measure(
         batch: Loads with reference solutions.
         problem: The problem.
     """
-    timed = time_interleaved(solvers, batch.load)
-    rows = [_result(name, *found, batch, problem) for name, found in timed.items()]
+    timed, rows = time_interleaved(solvers, batch.load), []
+    for name, (solution, times) in timed.items():
+        errors = default_metrics(problem)
+        errors.update(solution.displacement, batch)
+        numbers = {key: float(value) for key, value in errors.compute().items()}
+        iterations = solution.iterations.double()
+        counts = int(solution.converged.sum()), len(solution.converged)
+        steps = float(iterations.mean()), int(iterations.max())
+        rows.append(SolverResult(name, numbers, *counts, *steps, *percentiles(times)))
     return rows, {name: solution.displacement for name, (solution, _) in timed.items()}
-
-
-def _result(
-    name: str, solution: Solution, times: Tensor, batch: Sample, problem: Problem
-) -> SolverResult:
-    errors = default_metrics(problem)
-    errors.update(solution.displacement, batch)
-    ms, ms_p99 = percentiles(times)
-    return SolverResult(
-        solver=name,
-        errors={key: float(value) for key, value in errors.compute().items()},
-        converged=int(solution.converged.sum()),
-        loads=len(solution.converged),
-        iterations=float(solution.iterations.double().mean()),
-        max_iterations=int(solution.iterations.max()),
-        ms=ms,
-        ms_p99=ms_p99,
-    )
 
 
 def show(rows: Sequence[SolverResult], title: str) -> None:
     """Print rows as a table."""
-    table = Table(title=title, title_justify="left")
     columns = (
         "solver", "e_mean", "e_max", "SNR min [dB]", "rel. L2 median", "max",
         "||R||/||f||", "min det F", "converged", "iterations", "max", "p50 [ms]", "p99 [ms]",
     )  # fmt: skip
-    for column in columns:
-        table.add_column(column, justify="left" if column == "solver" else "right")
+    cells = []
     for row in rows:
         e = row.errors
-        table.add_row(
-            row.solver,
-            f"{e['e_mean']:.1e}",
-            f"{e['e_max']:.1e}",
-            f"{e['SNR_min']:.1f}",
-            f"{e['rel_L2_median']:.2%}"
-            if e["rel_L2_median"] > 1e-5
-            else f"{e['rel_L2_median']:.0e}",
-            f"{e['rel_L2_worst']:.1%}" if e["rel_L2_worst"] > 1e-4 else f"{e['rel_L2_worst']:.0e}",
-            f"{e['residual']:.1e}",
-            f"{e['min_det_F']:.2f}",
-            f"{row.converged}/{row.loads}",
-            f"{row.iterations:.1f}",
-            f"{row.max_iterations}",
-            f"{row.ms:.1f}",
-            f"{row.ms_p99:.1f}",
-        )
-    Console(width=max(Console().width, 160)).print(table)
+        middle, worst = e["rel_L2_median"], e["rel_L2_worst"]
+        cells.append([
+            row.solver, f"{e['e_mean']:.1e}", f"{e['e_max']:.1e}", f"{e['SNR_min']:.1f}",
+            f"{middle:.2%}" if middle > 1e-5 else f"{middle:.0e}",
+            f"{worst:.1%}" if worst > 1e-4 else f"{worst:.0e}",
+            f"{e['residual']:.1e}", f"{e['min_det_F']:.2f}", f"{row.converged}/{row.loads}",
+            f"{row.iterations:.1f}", f"{row.max_iterations}", f"{row.ms:.1f}", f"{row.ms_p99:.1f}",
+        ])  # fmt: skip
+    show_cells(title, columns, cells)
 
 
 def compare(folder: Path) -> None:
@@ -126,10 +102,8 @@ def compare(folder: Path) -> None:
     found = sorted(folder.rglob("evaluation.json"))
     if not found:
         raise FileNotFoundError(f"{folder} contains no evaluated run")
-    table = Table(title=str(folder), title_justify="left")
     names = ("e_mean", "e_max", "SNR_min", "rel_L2_median", "rel_L2_worst", "residual")
-    for column in ("run", *names, "hybrid iterations", "hybrid ms / Newton ms"):
-        table.add_column(column, justify="left" if column == "run" else "right")
+    runs: list[list[str]] = []
     groups: dict[str, list[list[float]]] = {}
     for path in found:
         rows = {row["solver"]: row for row in json.loads(path.read_text())}
@@ -137,13 +111,15 @@ def compare(folder: Path) -> None:
         ratio = hybrid["ms"] / rows["Newton from zero"]["ms"]
         numbers = [*(network[name] for name in names), hybrid["iterations"], ratio]
         name = str(path.parent.relative_to(folder))
-        table.add_row(name, *(f"{number:.3g}" for number in numbers))
+        runs.append([name, *(f"{number:.3g}" for number in numbers)])
         groups.setdefault(re.sub(r",?seed=\d+,?", "", name), []).append(numbers)
-    table.add_section()
-    for name, members in groups.items():
-        medians = median(torch.tensor(members)).tolist()
-        table.add_row(f"median of {len(members)}: {name}", *(f"{number:.3g}" for number in medians))
-    Console(width=max(Console().width, 160)).print(table)
+    medians = [
+        [f"median of {len(members)}: {name}"]
+        + [f"{number:.3g}" for number in median(torch.tensor(members)).tolist()]
+        for name, members in groups.items()
+    ]
+    columns = ("run", *names, "hybrid iterations", "hybrid ms / Newton ms")
+    show_cells(str(folder), columns, runs, medians)
 
 
 def save(rows: Sequence[SolverResult], path: Path) -> None:
@@ -156,9 +132,8 @@ def evaluate(
 ) -> list[SolverResult]:
     """Evaluate a surrogate on test loads: print and save a table of five solvers.
 
-    The solvers are the linear solver, the network, hybrid Newton with the rule of the paper and
-    with the default rule, and Newton from zero. They solve one load at a time on one thread. The
-    latencies of `sim(force)` and of the bare network are measured as well. Writes
+    Hybrid Newton has the rule of the paper and the default one. All solve one load at a time on one
+    thread. The latencies of `sim(force)` and of the bare network are measured as well. Writes
     `evaluation.json`, `shapes.png` and `worst.vtu`.
 
     Args:
@@ -212,15 +187,12 @@ def _draw(
     figure = plot_deformed(scene.problem, test.displacement[chosen], shown, names=names)
     figure.savefig(folder / "shapes.png", dpi=150)
     worst = int(order[-1])
-    length, force_unit = scene.length, scene.force_unit * float(test.young[worst])
+    length, truth, found = scene.length, test.displacement[worst], network[worst]
     fields = {
-        "displacement [m]": length * test.displacement[worst],
-        "network [m]": length * network[worst],
-        "error [m]": length * (network[worst] - test.displacement[worst]).norm(dim=1),
-        "force [N]": force_unit * test.force[worst],
+        "displacement [m]": length * truth,
+        "network [m]": length * found,
+        "error [m]": length * (found - truth).norm(dim=1),
+        "force [N]": scene.si_inputs(test.load)["force"][worst],
     }
-    write_mesh(
-        folder / "worst.vtu",
-        scene.problem.mesh_in_metres,
-        {name: field.numpy() for name, field in fields.items()},
-    )
+    arrays = {name: field.numpy() for name, field in fields.items()}
+    write_mesh(folder / "worst.vtu", scene.problem.mesh_in_metres, arrays)

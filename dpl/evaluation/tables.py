@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, fields
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -27,11 +27,19 @@ READERS: dict[Any, Callable[[str], Any]] = {
 
 def show(rows: Sequence[Any], title: str) -> None:
     """Print rows of a dataclass, one column for each field."""
+    columns = [field.name.replace("_", " ") for field in fields(rows[0])]
+    show_cells(title, columns, [[text(value, 3) for value in astuple(row)] for row in rows])
+
+
+def show_cells(title: str, columns: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:
+    """Print rows of text with lines between sections; the first column is aligned to the left."""
     table = Table(title=title, title_justify="left")
-    for field in fields(rows[0]):
-        table.add_column(field.name.replace("_", " "))
-    for row in rows:
-        table.add_row(*(text(value, 3) for value in asdict(row).values()))
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="right" if number else "left")
+    for rows in sections:
+        for row in rows:
+            table.add_row(*row)
+        table.add_section()
     Console(width=max(Console().width, 200)).print(table)
 
 
@@ -41,7 +49,7 @@ def write(rows: Sequence[Any], path: Path) -> None:
     lines = io.StringIO(newline="")
     writer = csv.writer(lines)
     writer.writerow([field.name for field in fields(rows[0])])
-    writer.writerows([text(value, 4) for value in asdict(row).values()] for row in rows)
+    writer.writerows([text(value, 4) for value in astuple(row)] for row in rows)
     with atomic_write(path) as file:
         file.write(lines.getvalue().encode())
 

@@ -42,8 +42,8 @@ class Latency:
 def latency(answer: Callable[[T], object], loads: Sequence[T], *, repeats: int = 1) -> Latency:
     """Return the latency of a callable.
 
-    The callable is warmed up with a few loads. It is then called with all loads in a row, so that
-    its weights stay in the cache as in use.
+    After a few loads that are not counted, it is called with all loads in a row, so that its
+    weights stay in the cache as in use.
 
     Args:
         answer: Callable of a single load.
@@ -77,13 +77,7 @@ def latencies(simulator: Simulator, load: Load) -> dict[str, Latency]:
         simulator: The simulator, called without a tolerance.
         load: The loads, B of them.
     """
-    unit = simulator.scene.force_unit * load.young
-    columns = {"force": unit[:, None, None] * load.force, "young": load.young}
-    if load.poisson.shape[1]:
-        columns["poisson"] = load.poisson[:, 0]
-    arguments: list[dict[str, Any]] = [
-        {name: column[k : k + 1] for name, column in columns.items()} for k in range(len(unit))
-    ]
+    arguments: list[Any] = [simulator.scene.si_inputs(single) for single in load.unbatch()]
     return {
         SIMULATOR: latency(lambda one: simulator(**one), arguments),
         NETWORK: latency(lambda one: simulator.surrogate(**one), arguments),
@@ -129,8 +123,5 @@ def time_interleaved(
 
 def time_iterates(solver: Solver, load: Load) -> list[tuple[float, Solution]]:
     """Return all iterates of a solver, each with the wall time up to it [ms]."""
-    found = []
     start = time.perf_counter()
-    for state in solver.iterate(load):
-        found.append((1e3 * (time.perf_counter() - start), state))
-    return found
+    return [(1e3 * (time.perf_counter() - start), state) for state in solver.iterate(load)]

@@ -96,7 +96,7 @@ def verify_folder(
     weights = checkpoints.read(folder / "weights.safetensors")["state_dict"]
     same = {"meta.json": read_metadata(folder) == json.loads(json.dumps(meta))}
     for name, field in read_reference(folder).items():
-        same[f"reference/{name}.f64"] = np.array_equal(field, reference.fields.get(name))
+        same[f"reference/{name}.f64"] = np.array_equal(field, reference.fields[name])
     for name, tensor in surrogate.state_dict().items():
         same[f"weights.safetensors: {name}"] = torch.equal(weights[name], tensor)
     if changed := [name for name, is_same in same.items() if not is_same]:
