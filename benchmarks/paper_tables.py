@@ -93,7 +93,7 @@ def load_sets(scene: Scene, test: Sample, count: int = 50) -> dict[str, Sample]:
         load = drawn._replace(force=factor[:, None, None] * drawn.force)
         answer = solve(scene.solver, load)
         sound = answer.status == int(Status.CONVERGED)
-        sample = Sample(load.force, answer.displacement, load.young, load.poisson)
+        sample = Sample(load.force, answer.displacement, load.young, load.parameters)
         sets[name] = Sample(*(column[sound] for column in sample))
     return sets
 

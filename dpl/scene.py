@@ -29,7 +29,7 @@ class _Sample(NamedTuple):
     force: Tensor
     displacement: Tensor
     young: Tensor
-    poisson: Tensor
+    parameters: Tensor
 
 
 class Sample(_Sample):
@@ -39,22 +39,21 @@ class Sample(_Sample):
         force: (B, N, D) [-].
         displacement: (B, N, D) [-].
         young: (B,) [Pa].
-        poisson: Poisson's ratios, (B, P) [-]: P = 1 where the law has a range of them, else P = 0,
-            which may be left out.
+        parameters: Values of the ranges of the law, (B, P); may be left out if it has none.
     """
 
     __slots__ = ()
 
     def __new__(
-        cls, force: Tensor, displacement: Tensor, young: Tensor, poisson: Tensor | None = None
+        cls, force: Tensor, displacement: Tensor, young: Tensor, parameters: Tensor | None = None
     ) -> "Sample":
-        """Take the columns; Poisson's ratios (B,) too."""
-        return super().__new__(cls, force, displacement, young, as_column(young, poisson))
+        """Take the columns; parameters may be (B,) or (B, P)."""
+        return super().__new__(cls, force, displacement, young, as_column(young, parameters))
 
     @property
     def load(self) -> Load:
         """The loads alone."""
-        return Load(self.force, self.young, self.poisson)
+        return Load(self.force, self.young, self.parameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +95,7 @@ class Scene:
         steps = []
         for load in loads:
             displacement = solve(self.solver, load).displacement
-            preconditioner = self.linear.at(load.poisson).corotational
+            preconditioner = self.linear.with_parameters(load.parameters).corotational
             steps.append(preconditioner.count_iterations(displacement))
         return replace(self.newton, corotational=sum(steps) <= MAX_MEAN_STEPS * len(steps))
 
@@ -110,17 +109,17 @@ class Scene:
         """L^(D-1) [m^2 in 3D, m in 2D]: forces are this times E times the dimensionless ones."""
         return self.length ** (self.problem.shape[1] - 1)
 
-    def load_of(self, force: Tensor, young: Tensor, poisson: Tensor | None = None) -> Load:
+    def load_of(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Load:
         """Return nodal forces (B, N, D) [N] (2D: [N/m]) on bodies of moduli (B,) [Pa] as a load.
 
         Args:
             force: What acts.
             young: E.
-            poisson: Poisson's ratios, (B,) [-]; wanted where the law has a range of them.
+            parameters: Values of the ranges of the law, (B,) or (B, P); required if it has any.
         """
         dimensionless = force.double() / (young.double()[:, None, None] * self.force_unit)
-        poisson = None if poisson is None else poisson.double()
-        return Load(dimensionless, young.double(), poisson)
+        parameters = None if parameters is None else parameters.double()
+        return Load(dimensionless, young.double(), parameters)
 
     def si_inputs(self, load: Load) -> dict[str, Tensor]:
         """Return the arguments of `load_of` that give a load, by name."""
@@ -128,7 +127,7 @@ class Scene:
             "force": load.force * (load.young * self.force_unit)[:, None, None],
             "young": load.young,
         }
-        return inputs | ({"poisson": load.poisson[:, 0]} if load.poisson.shape[1] else {})
+        return inputs | ({"parameters": load.parameters} if load.parameters.shape[1] else {})
 
     def identity(self) -> dict[str, object]:
         """Return everything that decides a sample, as plain data; arrays as their SHA-256.
@@ -189,11 +188,10 @@ class Scene:
         low, high = loads.young_range
         young = f"E = {low:.4g} Pa" if low == high else f"E from {low:.4g} to {high:.4g} Pa"
         lines = [f"no E input, no samples per E: u/L depends on f/(E L^2) only ({young})"]
-        if (span := loads.poisson_range) is not None:
-            middle = problem.reference.material.poisson_ratio
+        for name, ends in loads.parameter_ranges.items():
             lines.append(
-                f"one set of modes and scales for Poisson's ratios {span[0]:.4g} to {span[1]:.4g}: "
-                f"those of {middle:.4g}; each load has its own, an input, and a K(0) of its own"
+                f"one set of modes and scales for {name} = {ends[0]:.4g} to {ends[1]:.4g}, those "
+                f"of {sum(ends) / 2:.4g}; each load has its own, an input, and a K(0) of its own"
             )
         if problem.springs is None:
             lines.append("no springs, nothing of theirs assembled")
@@ -208,7 +206,7 @@ class Scene:
             f"{2 * len(problem.pattern.indices) - problem.pattern.size:,}: "
             "symmetric, pattern and ordering analysed once"
         )
-        if span is None:
+        if not loads.parameter_ranges:
             lines.append(
                 "K(0) factorised once for modes, linear answers and every first Newton step"
             )

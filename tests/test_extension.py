@@ -11,6 +11,7 @@ from dpl.viewer import Body
 from dpl.viewer.frames import ViewSettings
 
 PARTS = """
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,10 +29,15 @@ from dpl.training import Loss
 
 @dataclass(frozen=True)
 class Law(fem.YoungPoissonMaterial):
+    ranged = ("poisson", "stiffening")
+
+    stiffening: float | Sequence[float] = 0.0
+
     def energy(self, H):
         log_J = torch.log1p(volume_change(H))
         first = 2 * trace(H) + H.square().sum((-2, -1))
-        return self.mu / 2 * (first - 2 * log_J) + self.lam / 2 * log_J.square()
+        more = self.stiffening * first.square().square()
+        return self.mu / 2 * (first - 2 * log_J) + self.lam / 2 * log_J.square() + more
 
 
 def bar(length=4.0):
@@ -132,6 +138,7 @@ class Dense:
 
 OPTIONS = {
     "material/own": "_target_: my_parts.Law\npoisson: 0.3\n",
+    "material/ranges": "_target_: my_parts.Law\npoisson: [0.2, 0.3]\nstiffening: [0.0, 2.0]\n",
     "mesh/own": "_target_: my_parts.bar\nlength: 3.0\n",
     "loads/bimodal": "defaults: [modal, _self_]\n"
     "distribution: {_target_: my_parts.bimodal, _partial_: true, gap: 0.3}\n",
@@ -144,6 +151,7 @@ OPTIONS = {
 }
 CHOICES = {
     "law": ["material=own"],
+    "law with ranges": ["material=ranges"],
     "mesh function": ["mesh=own"],
     "sampling distribution": ["loads=bimodal"],
     "load family": ["loads=tip"],

@@ -83,7 +83,7 @@ class Auditor:
     ) -> None:
         """Check the status, residual and stability that a solution reports."""
         self.solves += len(load.force)
-        body = problem.at(load.poisson)
+        body = problem.with_parameters(load.parameters)
         u, factor = state.displacement, state.load_factor[:, None, None]
         internal, volume = body.internal_force(u), body.volume_ratio(u)
         good = body.is_equilibrium(u, internal, load.force, 1.01 * tol) & (volume > 0)
@@ -143,7 +143,7 @@ class AuditedSolver:
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
         """Yield the states of the solver."""
         more = {} if guess is None else {"guess": guess}
-        body = self.problem.at(load.poisson)
+        body = self.problem.with_parameters(load.parameters)
         for state in self.solver.iterate(load, **more):
             self.auditor.check_iterate(body, state)
             yield state

@@ -230,7 +230,7 @@ def float32_forces(auditor: Auditor) -> Outcome:
     """Solve with forces in float32: no solution may have that precision."""
     newton, load, truth = bent_beam()
     try:
-        state = solve(newton, Load(load.force.float(), load.young, load.poisson))
+        state = solve(newton, Load(load.force.float(), load.young, load.parameters))
     except (RuntimeError, TypeError, ValueError) as error:
         return classify(f"{type(error).__name__}: {error}")
     off = float((state.displacement.double() - truth).abs().max())

@@ -82,8 +82,8 @@ class AmplitudeSweep:
         """Return the answer of the simulator to a load, [N] to [m]."""
         load = step.load
         newtons = load.force[0] * load.young[0] * self.scene.force_unit
-        poisson = load.poisson[0] if load.poisson.shape[-1] else None
-        return self.simulator(newtons, young=load.young, poisson=poisson, tol=tol)
+        parameters = load.parameters
+        return self.simulator(newtons, young=load.young, parameters=parameters, tol=tol)
 
 
 def simulator_answers(sweep: AmplitudeSweep, tol: float | None, auditor: Auditor) -> Outcome:
@@ -118,7 +118,7 @@ def _checks(
     sweep: AmplitudeSweep, step: Step, answer: Answer, u: torch.Tensor
 ) -> Iterator[tuple[str, bool]]:
     """Yield statements of an answer and True where they hold."""
-    problem = sweep.scene.problem.at(step.load.poisson)
+    problem = sweep.scene.problem.with_parameters(step.load.parameters)
     internal, volume = problem.internal_force(u), float(problem.volume_ratio(u))
     ratio = float(problem.relative_residual_of(internal, step.load.force))
     near = abs(answer.residual - ratio) <= 1e-3 * ratio + 1e-12

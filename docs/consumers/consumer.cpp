@@ -22,7 +22,7 @@ int main(int argc, char** argv) {
   Ort::AllocatorWithDefaultOptions memory;
   const auto cpu = Ort::MemoryInfo::CreateCpu(OrtArenaAllocator, OrtMemTypeDefault);
 
-  // force (B, N, D) [N], young (B,) [Pa] and, if the law has a range, poisson (B,)
+  // force (B, N, D) [N], young (B,) [Pa] and, if the law has ranges, parameters (B, P)
   std::vector<std::string> names;
   std::vector<std::vector<double>> data;
   std::vector<Ort::Value> inputs;

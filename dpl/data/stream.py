@@ -130,7 +130,7 @@ class OnlineSamples(IterableDataset):
             torch.from_numpy(solved.force),
             torch.from_numpy(solved.displacement),
             self.scene.loads.young_at(point[None])[0],
-            self.scene.loads.poisson_at(point[None])[0],
+            self.scene.loads.parameters_at(point[None])[0],
         )
         return DrawnSample(sample, torch.tensor(solved.job.number), point)
 

@@ -38,8 +38,10 @@ def linear(scene: Scene) -> Method:
     """Return the linear solution K(0)^-1 f."""
 
     def predict(load: Load) -> Tensor:
-        pairs = zip(load.force, load.poisson, strict=True)
-        return torch.stack([scene.linear.at(nu[None]).solve(force) for force, nu in pairs])
+        members = load.unbatch()
+        return torch.stack(
+            [scene.linear.with_parameters(one.parameters).solve(one.force[0]) for one in members]
+        )
 
     return Method(predict)
 

@@ -45,7 +45,9 @@ class PlainNewton:
         problem, start = self.problem, time.perf_counter()
         backend = self.solver.linear_solver.tangent_backend
         for k in range(self.max_iter + 1):
-            state = evaluate_solution(problem, u, load, self.tol, iterations=k, from_guess=guessed)
+            state = evaluate_solution(
+                self.problem, u, load, self.tol, iterations=k, from_guess=guessed
+            )
             yield state._replace(
                 factorisations=torch.tensor([k]),
                 seconds=torch.tensor([time.perf_counter() - start], dtype=torch.float64),

@@ -144,8 +144,8 @@ def evaluate(
     """
     scene = surrogate.scene
     newton = replace(scene.newton, tol=tol)
-    # with a range of Poisson's ratios every load has its own K(0); no solver reuses another's
-    shared = scene.loads.poisson_range is None
+    # with ranges of the law every load has its own K(0); no solver reuses another's
+    shared = not scene.loads.parameter_ranges
     own = scene if shared else replace(scene, solver=_without_factors(scene.newton))
     plain = newton if shared else _without_factors(newton)
     solvers: dict[str, Solver] = {

@@ -14,7 +14,7 @@ from dpl.fem.postprocess import triangles
 from dpl.scene import Scene
 from dpl.version import __version__
 
-FORMAT = 2  # version of the keys of meta.json
+FORMAT = 3  # version of the keys of meta.json
 RANGE = (
     "f: a force over E L^(D-1), minus `constant_force`, and 0 at fixed degrees of freedom. "
     "q: the least-squares fit of `modes` to f at the nodes where f is not zero. "
@@ -71,7 +71,7 @@ def describe(
             "displacement": float(module.displacement_scale),
             "meaning": SCALING,
         },
-        "material": {**_law(scene), "young": loads.young_range, "poisson": loads.poisson_range},
+        "material": {**_law(scene), "young": loads.young_range, **loads.parameter_ranges},
         "range": _range(scene),
         "errors": errors,
         "reference": reference.describe(),
@@ -86,7 +86,12 @@ def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
     known: dict[str, dict[str, Any]] = {
         "force": {"shape": field, "type": "float64", "unit": _force_unit(scene)},
         "young": {"shape": ["B"], "type": "float64", "unit": "Pa", "range": loads.young_range},
-        "poisson": {"shape": ["B"], "type": "float64", "unit": "1", "range": loads.poisson_range},
+        "parameters": {
+            "shape": ["B", len(loads.parameter_ranges)],
+            "type": "float64",
+            "unit": "1",
+            "ranges": loads.parameter_ranges,
+        },
         "displacement": {"shape": field, "type": "float64", "unit": "m"},
         "local": {"shape": ["B"], "type": "bool", "unit": "1", "meaning": LOCAL},
     }

@@ -65,8 +65,8 @@ class ExportGraph(nn.Module):
     @property
     def inputs(self) -> list[str]:
         """Names of the inputs, in order."""
-        span = self.surrogate.scene.loads.poisson_range
-        return ["force", "young"] + ([] if span is None else ["poisson"])
+        ranges = self.surrogate.scene.loads.parameter_ranges
+        return ["force", "young", "parameters"] if ranges else ["force", "young"]
 
     @property
     def outputs(self) -> list[str]:
@@ -74,17 +74,17 @@ class ExportGraph(nn.Module):
         return ["displacement", LOCAL] if self.has_local_output else ["displacement"]
 
     def forward(
-        self, force: Tensor, young: Tensor, poisson: Tensor | None = None
+        self, force: Tensor, young: Tensor, parameters: Tensor | None = None
     ) -> tuple[Tensor, ...]:
         """Return displacements (B, N, D) [m], and the mask `local` (B,) if `has_local_output`.
 
         Args:
             force: (B, N, D) [N]; in 2D [N/m].
             young: (B,) [Pa].
-            poisson: (B,) [-]; required if the law has a range of Poisson's ratios.
+            parameters: (B, P); required if the law has ranges.
         """
         module = self.surrogate
-        load = module.scene.load_of(force, young, poisson)
+        load = module.scene.load_of(force, young, parameters)
         scaled, more = module.scale_inputs(load)
         if not isinstance(module.net, FlagsLocalLoads):
             return (module.scene.length * module.unscale_outputs(module.net(scaled, **more)),)

@@ -78,7 +78,7 @@ def nodal_fields(
     """
     young = float(load.young)
     newton = "N" if scene.problem.shape[1] == 3 else "N/m"
-    stress = fields(scene.problem.at(load.poisson), displacement[None])
+    stress = fields(scene.problem.with_parameters(load.parameters), displacement[None])
     found = {
         f"force [{newton}]": young * scene.force_unit * load.force[0],
         "displacement [m]": scene.length * displacement,

@@ -21,7 +21,7 @@ from dpl.fem.materials.tensors import volume_change
 from dpl.fem.mesh.generators import aspect_ratio, longest_side, near_origin
 from dpl.fem.mesh.regions import Region
 
-MAX_CLONES = 64  # bodies of other Poisson's ratios that are kept
+MAX_CLONES = 64  # bodies of other parameters that are kept
 FAINT = 1e-292  # largest force below which arithmetic rounds to an absolute precision [-]
 
 
@@ -139,7 +139,8 @@ class Problem(TensorAssembly):
         """Return one line for each reason why linear elements will lock."""
         lines, shape = [], self.mesh.elem.refdom.name.lower()
         constant = self.dV.shape[1] == 1
-        nu = (self.material.poisson_range or (self.material.poisson_ratio,))[-1]
+        highest = [[high for _, high in self.material.parameter_ranges.values()]]
+        nu = self.material.with_parameters(torch.tensor(highest).double()).poisson_ratio
         if self.degree == 1 and nu >= 0.45 and not self.mean_dilatation:
             remedy = "degree=2" if constant else "degree=2 or mean_dilatation=true"
             lines.append(f"linear {shape} elements lock at Poisson's ratio {nu:.4g}: set {remedy}")
@@ -151,59 +152,56 @@ class Problem(TensorAssembly):
             )
         return lines
 
-    def at(self, poisson: Tensor | float) -> Self:
-        """Return the problem with another Poisson's ratio; mesh, pattern and kernels are shared.
+    def with_parameters(self, parameters: Tensor) -> Self:
+        """Return the problem with other parameters; mesh, pattern and kernels are shared.
 
         Args:
-            poisson: Poisson's ratio [-], or those of loads, (B, P) [-]. P = 0 returns the problem
-                itself. With P = 1 and B > 1 each member of a batch has its own ratio: such a
-                problem has energies, forces and residuals, but no tangent.
+            parameters: Values of the ranges of the law, (B, P), see `Material.parameter_ranges`.
+                P = 0 returns the problem itself. With B > 1 each member of a batch has its own:
+                such a problem has energies, forces and residuals, but no tangent.
 
         Raises:
-            ValueError: The law has a range and the loads have no ratio, or the law has no ratio.
+            ValueError: The law has another number of ranges, or does not allow a value.
         """
-        if isinstance(poisson, Tensor) and not poisson.shape[-1]:
-            if (span := self.material.poisson_range) is not None:
-                raise ValueError(
-                    f"poisson is a range {list(span)}; give each load its ratio: "
-                    "Load(force, young, poisson)"
-                )
+        ranges = self.material.parameter_ranges
+        if parameters.shape[-1] != len(ranges):
+            raise ValueError(
+                f"a load has {parameters.shape[-1]} parameters and the law has ranges of "
+                f"{list(ranges)}; give Load(force, young, parameters) one value for each"
+            )
+        if not ranges:
             return self
-        if isinstance(poisson, Tensor) and len(poisson) != 1:
-            return self._clone(poisson.detach().to(self.points.device, torch.float64))
-        one = float(poisson)
-        if one not in self._clones:
+        parameters = parameters.detach().to(self.points.device, torch.float64)
+        if len(parameters) > 1:
+            return self.with_material(self.material.with_parameters(parameters))
+        values = tuple(parameters[0].tolist())
+        if values not in self._clones:
             if len(self._clones) >= MAX_CLONES:
                 self._clones.clear()
-            self._clones[one] = self._clone(one)
-        return self._clones[one]
+            self._clones[values] = self.with_material(self.material.with_parameters(parameters))
+        return self._clones[values]
 
-    def _clone(self, poisson: Tensor | float) -> Self:
-        twin = replace(self, material=self.material.at(poisson))
+    def with_material(self, material: Material) -> Self:
+        """Return the body of another law; mesh and pattern are shared, for the same law kernels."""
+        twin = replace(self, material=material)
         for name in ("pattern", "moved_supports", "_operator"):
             twin.__dict__[name] = getattr(self, name)
-        if self.material.poisson_range is None:
-            twin.__dict__["_first"] = self.__dict__.get("_first", self)
-        elif isinstance(poisson, Tensor) or poisson != self._middle:
-            twin.__dict__["_first"] = self.reference
+        if type(material) is type(self.material):
+            twin.__dict__["_first"] = self
         return twin
 
     @cached_property
-    def _clones(self) -> dict[float, Self]:
+    def _clones(self) -> dict[tuple[float, ...], Self]:
         return {}
 
-    @property
-    def _middle(self) -> float:
-        low, high = self.material.poisson_range or (0.0, 0.0)
-        return (low + high) / 2
-
-    @property
+    @cached_property
     def reference(self) -> Self:
-        """The problem at the centre of the range of Poisson's ratios; itself without a range.
+        """The problem at the centre of the ranges of the law; itself without a range.
 
         Modes, scales and largest loads are those of this problem.
         """
-        return self if self.material.poisson_range is None else self.at(self._middle)
+        ranges = self.material.parameter_ranges.values()
+        return self.with_parameters(torch.tensor([[sum(ends) / 2 for ends in ranges]]).double())
 
     def restrict(self, field: Tensor) -> NDArray[np.float64]:
         """Return the values, (n,), of a nodal field (N, D) at the free degrees of freedom."""
@@ -374,7 +372,8 @@ class Problem(TensorAssembly):
         law = self.material
         if self.mean_dilatation or not isinstance(law, InvariantBasedMaterial):
             return None
-        if (first := self.__dict__.get("_first")) is not None and first._compiled is not None:
+        first = self.__dict__.get("_first", self).reference
+        if first is not self and first._compiled is not None:
             return first._compiled.with_moduli(law)
         # Copies: sending a problem to a worker process moves the memory of its tensors.
         cells, dN, dV = (tensor.numpy().copy() for tensor in (self.cells, self.dN, self.dV))

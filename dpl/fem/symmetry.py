@@ -100,7 +100,7 @@ def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
     springs, body = (
         problem.springs,
         problem.reference,
-    )  # isotropic: symmetries do not depend on Poisson's ratio
+    )  # isotropic: symmetries do not depend on constants
     cells = body if springs is None else replace(body, springs=None)
     operators: list[Callable[[Tensor], Tensor]] = [
         lambda field: torch.where(problem.free, field, 0.0),

@@ -1,5 +1,6 @@
 """Conversion of the arguments of a call to float64 tensors."""
 
+from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any
 
@@ -64,3 +65,30 @@ def per_load(name: str, value: Any, count: int) -> Tensor:
     if not column.isfinite().all():
         raise ValueError(f"{name}: a number is not finite")
     return column.reshape(-1).expand(count).clone()
+
+
+def named_columns(name: str, value: Any, names: Sequence[str], count: int) -> Tensor:
+    """Return an argument that gives values by name, or all as an array, as columns (B, P).
+
+    Args:
+        name: Name of the argument.
+        value: Mapping from names to one number or (B,); an array (B, P); None for no values.
+        names: The P names.
+        count: B.
+
+    Raises:
+        ValueError: A value is missing or not asked for, or has a wrong shape.
+    """
+    if isinstance(value, Mapping):
+        if set(value) != set(names):
+            raise ValueError(f"{name} = {dict(value)} must be one value for each of {list(names)}")
+        columns = [per_load(f"{name}.{key}", value[key], count) for key in names]
+        return torch.stack(columns, 1) if columns else torch.zeros(count, 0).double()
+    table = torch.zeros(count, 0).double() if value is None else as_numbers(name, value)
+    if tuple(table.shape) != (count, len(names)):
+        found = "missing" if value is None else f"of shape {tuple(table.shape)}"
+        raise ValueError(
+            f"{name} must be one value for each of {list(names)}, by name or as an array "
+            f"({count}, {len(names)}); it is {found}"
+        )
+    return table

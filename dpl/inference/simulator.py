@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
@@ -15,7 +15,7 @@ from dpl.fem import Load, Newton, Solution, Status, evaluate_solution
 from dpl.fem.problem import FAINT
 from dpl.fem.solvers import check_tol, concatenate
 from dpl.inference.answer import MAX_OUT_OF_SPAN, ROUNDOFF, Answer, answer_like, summarise
-from dpl.inference.arguments import as_number, as_numbers, per_load
+from dpl.inference.arguments import as_number, as_numbers, named_columns, per_load
 from dpl.inference.hybrid import default_hybrid
 from dpl.models import Correctable
 from dpl.scene import Scene
@@ -48,7 +48,7 @@ class Simulator:
                 displacement (N, D) [-].
         """
         self.surrogate, self.correct = surrogate.eval(), correct
-        self._before: tuple[Tensor, Tensor] | None = None  # Poisson's ratios, displacement
+        self._before: tuple[Tensor, Tensor] | None = None  # parameters, displacement
         self._pace = 0.0  # time of an iteration [s]
         self.scene.corrector  # noqa: B018  # built here, so that the first call is not slower
 
@@ -83,7 +83,7 @@ class Simulator:
         force: ArrayLike | Tensor,
         *,
         young: float | ArrayLike | Tensor | None = None,
-        poisson: float | ArrayLike | Tensor | None = None,
+        parameters: Mapping[str, float | ArrayLike | Tensor] | ArrayLike | Tensor | None = None,
         tol: float | None = None,
         budget_ms: float | None = None,
         warm: bool = False,
@@ -97,7 +97,8 @@ class Simulator:
                 width are accepted, in NumPy arrays, nested lists or dense tensors on any device;
                 the result has no gradient with respect to them.
             young: Young's modulus, one number or (B,) [Pa]; optional if the scene has only one.
-            poisson: Poisson's ratio, one number or (B,) [-]; only if the law has a range of them.
+            parameters: A value for each range of the law, one number or (B,), by its name such as
+                `{"poisson": 0.4}`; or all as an array (B, P).
             tol: Relative residual of the result [-], at least 1e-15 and below 1.
             budget_ms: Wall time of each load [ms]. An iteration is not started if the time of the
                 last iteration exceeds the rest of the budget.
@@ -111,7 +112,7 @@ class Simulator:
         """
         begin = time.perf_counter()
         given = as_numbers("force", force)
-        load = self._load(given, young, poisson)
+        load = self._load(given, young, parameters)
         tol, budget_ms = as_number("tol", tol), as_number("budget_ms", budget_ms)
         wanted = self.scene.solver.tol if tol is None else tol
         check_tol(wanted)
@@ -130,7 +131,7 @@ class Simulator:
                 )
                 if stability:
                     state = self._with_stability(single, state)
-                self._before = single.poisson, state.displacement
+                self._before = single.parameters, state.displacement
                 found.append((method, state, 1e3 * (time.perf_counter() - request.begin)))
         methods, states, times = zip(*found, strict=True)
         state = concatenate(states)
@@ -164,7 +165,7 @@ class Simulator:
         }
         return answer_like(answer, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
 
-    def _load(self, force: Tensor, young: Any, poisson: Any) -> Load:
+    def _load(self, force: Tensor, young: Any, parameters: Any) -> Load:
         """Return the arguments of a call as a dimensionless load."""
         shape, scene = self.scene.problem.shape, self.scene
         if force.shape[-2:] != shape or force.ndim not in (2, 3) or not force.numel():
@@ -180,16 +181,10 @@ class Simulator:
         moduli = per_load("young", low if young is None else young, len(force))
         if not (moduli > 0).all():
             raise ValueError("young: a modulus is not above 0 Pa")
-        span = scene.loads.poisson_range
-        if (span is None) != (poisson is None):
-            words = (
-                "its own, and needs none" if span is None else f"a range, {list(span)}: say which"
-            )
-            raise ValueError(f"poisson: the law has {words}")
-        ratios = None if poisson is None else per_load("poisson", poisson, len(force))
-        if ratios is not None and not ((ratios > -1) & (ratios < 0.5)).all():
-            raise ValueError("poisson: a ratio is not between -1 and 0.5")
-        load = scene.load_of(force, moduli, ratios)
+        ranges = scene.loads.parameter_ranges
+        values = named_columns("parameters", parameters, list(ranges), len(force))
+        scene.problem.material.with_parameters(values)  # refuses values that it does not allow
+        load = scene.load_of(force, moduli, values)
         sizes = load.force.abs().amax(dim=(1, 2))
         lost = (sizes < FAINT) & force.any(dim=2).any(dim=1)
         if bool(lost.any()) or not sizes.isfinite().all():
@@ -203,12 +198,12 @@ class Simulator:
     def _outside_modulus_range(self, load: Load) -> Tensor:
         """Return True for loads with an input modulus of the network out of range, (B,)."""
         loads, takes = self.scene.loads, getattr(self.surrogate.net, "extra_inputs", ())
-        spans = {"young": loads.young_range, "poisson": loads.poisson_range}
+        pairs = list(zip(load.parameters.T, loads.parameter_ranges.values(), strict=True))
+        if "young" in takes:
+            pairs.append((load.young, loads.young_range))
         outside = torch.zeros(len(load.force), dtype=torch.bool)
-        for name in takes:
-            low, high = spans[name] or (-math.inf, math.inf)
-            values = getattr(load, name).reshape(len(outside), -1)
-            outside |= ((values < low) | (values > high)).any(dim=1)
+        for values, (low, high) in pairs:
+            outside |= (values < low) | (values > high)
         return outside
 
     def _solve(
@@ -239,7 +234,7 @@ class Simulator:
         if request.tol is None and request.budget_ms is None:
             return
         if amplitude < MAX_LINEAR_AMPLITUDE:
-            answer = self.scene.linear.at(load.poisson).solve(load.force[0])[None]
+            answer = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
             yield "linear", evaluate_solution(problem, answer, load, tol)
         guess = prediction
         if self.correct is not None and bool(guess.isfinite().all()):
@@ -247,7 +242,11 @@ class Simulator:
             yield "corrected", evaluate_solution(problem, guess, load, tol, from_guess=True)
         newton = replace(self.scene.corrector, tol=tol)
         guesses = [guess] if guess is prediction else [guess, prediction]
-        if request.warm and self._before is not None and torch.equal(self._before[0], load.poisson):
+        if (
+            request.warm
+            and self._before is not None
+            and torch.equal(self._before[0], load.parameters)
+        ):
             guesses.append(self._before[1])
         start = guess if len(guesses) == 1 else nearest(newton, load, guesses)
         clock = time.perf_counter()
@@ -263,7 +262,7 @@ class Simulator:
         """Return a solution with the number of negative eigenvalues of its tangent."""
         if not state.converged or int(state.negative_pivots) >= 0:
             return state
-        stability = self.scene.newton.at(load.poisson).stability(state.displacement)
+        stability = self.scene.newton.with_parameters(load.parameters).stability(state.displacement)
         pivots = stability.negative_pivots
         status = Status.UNSTABLE if stability.least else Status.CONVERGED
         return state._replace(
@@ -294,7 +293,7 @@ def nearest(newton: Newton, load: Load, guesses: list[Tensor]) -> Tensor:
     correction, which unlike the residual does not depend on the stiffness against an error. It is
     infinite for a guess that inverts an element or is not finite.
     """
-    preconditioner = newton.at(load.poisson).linear_solver.corotational
+    preconditioner = newton.with_parameters(load.parameters).linear_solver.corotational
 
     def distance(guess: Tensor) -> float:
         internal, volume = preconditioner.problem.evaluate(guess)

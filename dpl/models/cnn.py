@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from dpl.fem import Problem
 from dpl.models.grid import Immersion, Permutation, cubic_grid, filling, own_grid
-from dpl.models.poisson_interpolation import normalise_poisson
+from dpl.models.poisson_interpolation import normalise_parameters
 from dpl.scene import Scene
 from dpl.system.memory import refuse_beyond
 
@@ -74,9 +74,9 @@ class CNN(nn.Module):
         self.immersion = Permutation(points, shape) if shape == own else Immersion(points, shape)
         constant = self._constant(problem, shape)
         self.register_buffer("constant", constant, persistent=False)
-        self.poisson_range = scene.loads.poisson_range
-        self.extra_inputs = () if self.poisson_range is None else ("poisson",)
-        self.net = UNet(dim + len(constant) + len(self.extra_inputs), dim, sizes, widths)
+        self.parameter_ranges = scene.loads.parameter_ranges
+        self.extra_inputs = ("parameters",) if self.parameter_ranges else ()
+        self.net = UNet(dim + len(constant) + len(self.parameter_ranges), dim, sizes, widths)
 
     def _constant(self, problem: Problem, shape: tuple[int, ...]) -> Tensor:
         """Return the constant channels that are not uniform, (C, *shape)."""
@@ -92,19 +92,19 @@ class CNN(nn.Module):
         varying = [channel for channel in channels if channel.min() < channel.max()]
         return torch.stack(varying) if varying else share[:0]
 
-    def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
+    def forward(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
 
         Args:
             force: Scaled nodal forces.
-            poisson: Poisson's ratios, (B, 1) [-]; required if the law has a range of them.
+            parameters: Parameters of the law, (B, P); required if it has ranges.
         """
         constant = self.constant.expand(force.shape[0], *self.constant.shape)
         fields = [self.immersion.spread(force), constant]
-        if self.poisson_range is not None:
-            ratio = normalise_poisson(poisson, self.poisson_range, force)
+        if self.parameter_ranges:
+            values = normalise_parameters(parameters, self.parameter_ranges, force)
             sides = fields[0].shape[2:]
-            fields.append(ratio.view(-1, 1, *[1] * len(sides)).expand(-1, -1, *sides))
+            fields.append(values.view(*values.shape, *[1] * len(sides)).expand(-1, -1, *sides))
         return self.immersion.read(self.net(torch.cat(fields, 1)))
 
     def skipped_work(self) -> list[str]:

@@ -5,7 +5,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from dpl.models.poisson_interpolation import normalise_poisson
+from dpl.models.poisson_interpolation import normalise_parameters
 from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 
@@ -65,10 +65,11 @@ class FCNN(nn.Module):
         self.young_max = high  # [Pa]
         self.young_mean = (low + high) / 2  # [Pa]
         self.young_scale = (high - low) / 2 or high  # [Pa]; without a range the modulus itself
-        self.poisson_range = scene.loads.poisson_range
-        varying = {"young": young, "poisson": self.poisson_range is not None}
+        self.parameter_ranges = scene.loads.parameter_ranges
+        varying = {"young": young, "parameters": bool(self.parameter_ranges)}
         self.extra_inputs = tuple(name for name, enters in varying.items() if enters)
-        n_inputs, n_outputs = int(inputs.sum()) + len(self.extra_inputs), int(outputs.sum())
+        n_inputs = int(inputs.sum()) + young + len(self.parameter_ranges)
+        n_outputs = int(outputs.sum())
         sizes = [n_inputs, *[width or n_outputs] * (layers - 1), n_outputs]
         self.parameters_needed = count_parameters(sizes)
         all_sizes = [everything.numel()] * (layers + 1)
@@ -85,14 +86,14 @@ class FCNN(nn.Module):
         self.stages = nn.Sequential(*stages)
 
     def forward(
-        self, force: Tensor, young: Tensor | None = None, poisson: Tensor | None = None
+        self, force: Tensor, young: Tensor | None = None, parameters: Tensor | None = None
     ) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
 
         Args:
             force: Scaled nodal forces.
             young: Young's moduli, (B,) [Pa]; required if they are an input, else ignored.
-            poisson: Poisson's ratios, (B, 1) [-]; required if the law has a range of them.
+            parameters: Parameters of the law, (B, P); required if it has ranges.
 
         Raises:
             ValueError: A required input is None.
@@ -106,9 +107,9 @@ class FCNN(nn.Module):
             stiffness = (young / self.young_max).to(force.dtype)[:, None]
             normalised = ((young - self.young_mean) / self.young_scale).to(force.dtype)[:, None]
             inputs = torch.cat([stiffness * inputs, normalised], dim=1)
-        if self.poisson_range is not None:
-            ratio = normalise_poisson(poisson, self.poisson_range, force)
-            inputs = torch.cat([inputs, ratio], dim=1)
+        if self.parameter_ranges:
+            values = normalise_parameters(parameters, self.parameter_ranges, force)
+            inputs = torch.cat([inputs, values], dim=1)
         whole = torch.zeros_like(force).flatten(1)
         return whole.index_copy(1, self.output_index, self.stages(inputs)).view_as(force)
 

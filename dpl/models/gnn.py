@@ -9,7 +9,7 @@ from torch.nn.functional import gelu
 
 from dpl.models.graph import Graph, Integers, hierarchy, means
 from dpl.models.message_passing import Level, Messages
-from dpl.models.poisson_interpolation import normalise_poisson
+from dpl.models.poisson_interpolation import normalise_parameters
 from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 
@@ -76,26 +76,28 @@ class GNN(nn.Module):
         )
         self.sizes = [len(graph.points) for graph in graphs]
         self.complete = graphs[-1].complete
-        self.poisson_range = scene.loads.poisson_range
-        self.extra_inputs = () if self.poisson_range is None else ("poisson",)
-        self.moduli = nn.ModuleList(nn.Linear(1, wide) for wide in widths if self.extra_inputs)
+        self.parameter_ranges = scene.loads.parameter_ranges
+        self.extra_inputs = ("parameters",) if self.parameter_ranges else ()
+        self.moduli = nn.ModuleList(
+            nn.Linear(len(self.parameter_ranges), wide) for wide in widths if self.parameter_ranges
+        )
         self.passes = nn.ModuleList(Pass(dim, widths) for _ in range(passes))
         self.decode = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, dim))
 
-    def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
+    def forward(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
 
         Args:
             force: Scaled nodal forces.
-            poisson: Poisson's ratios, (B, 1) [-]; required if the law has a range of them.
+            parameters: Parameters of the law, (B, P); required if it has ranges.
         """
         states = [
             level(*load) for level, load in zip(self.levels, self.resultants(force), strict=True)
         ]
-        if self.poisson_range is not None:
-            ratio = normalise_poisson(poisson, self.poisson_range, force)
+        if self.parameter_ranges:
+            values = normalise_parameters(parameters, self.parameter_ranges, force)
             pairs = zip(states, self.moduli, strict=True)
-            states = [state + encoder(ratio)[None] for state, encoder in pairs]
+            states = [state + encoder(values)[None] for state, encoder in pairs]
         for v_cycle in self.passes:
             states = v_cycle(states, self.levels, self.steps)
         return self.decode(states[0]).transpose(0, 1)

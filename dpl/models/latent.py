@@ -116,25 +116,27 @@ class Latent(PODNet):
         """Return the sizes of linear solutions in the basis of the displacement."""
         return LoadEncoding(rank, PoissonInterpolation(self.scene.linear).count, own_basis=False)
 
-    def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
+    def forward(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
         """See `PODNet.forward`."""
-        linear, learnt, local = self._parts(force, poisson)
+        linear, learnt, local = self._parts(force, parameters)
         if not local.any():
             return self.field(linear + learnt, force)
         predicted = self.field(torch.where(local[:, None], learnt, linear + learnt), force)
         exact = _LinearSolve.apply(force[local][:, self.load_dofs].double(), self)
-        exact = self.interpolation.interpolate(exact, None if poisson is None else poisson[local])
+        exact = self.interpolation.interpolate(
+            exact, None if parameters is None else parameters[local]
+        )
         exact = scatter_fields(exact, self.free_dofs).to(predicted)
         return predicted.index_add(0, local.nonzero()[:, 0], exact)
 
     def forward_in_basis(
-        self, force: Tensor, poisson: Tensor | None = None
+        self, force: Tensor, parameters: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return displacements (B, N, D) within the basis and a mask of local loads, (B,).
 
         `forward` returns the same displacements for loads that are not local.
         """
-        linear, learnt, local = self._parts(force, poisson)
+        linear, learnt, local = self._parts(force, parameters)
         return self.field(linear + learnt, force), local
 
     @property
@@ -148,21 +150,23 @@ class Latent(PODNet):
         net.linear_tol = 0.0
         return net
 
-    def _parts(self, force: Tensor, poisson: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def _parts(self, force: Tensor, parameters: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Return coordinates of linear and learnt part (B, R), and a mask of local loads, (B,)."""
         images = self.input_orbits.images(force)
-        linear = self.encode_loads(images, poisson)
-        learnt = self.symmetrised_output(self.append_poisson(linear @ self.input_map, poisson))
-        return linear, learnt, self._is_local(images, linear, poisson)
+        linear = self.encode_loads(images, parameters)
+        learnt = self.symmetrised_output(
+            self.append_parameters(linear @ self.input_map, parameters)
+        )
+        return linear, learnt, self._is_local(images, linear, parameters)
 
-    def encode_loads(self, images: Tensor, poisson: Tensor | None) -> Tensor:
+    def encode_loads(self, images: Tensor, parameters: Tensor | None) -> Tensor:
         """Return coordinates of linear solutions (B, R); see `PODNet.encode_loads`."""
         read = (images @ self.load_basis.to(images)).unflatten(2, (self.interpolation.count, -1))
         inverse_actions = self.inverse_output_actions.to(images)
         every = [sum_over_images(one, inverse_actions) for one in read.unbind(2)]
-        return self.interpolation.interpolate(torch.cat(every, dim=1), poisson)
+        return self.interpolation.interpolate(torch.cat(every, dim=1), parameters)
 
-    def projection_residual_estimate(self, images: Tensor, poisson: Tensor | None) -> Tensor:
+    def projection_residual_estimate(self, images: Tensor, parameters: Tensor | None) -> Tensor:
         """Return estimates (B,) of the squared projection residuals of linear solutions.
 
         The estimate is the mean square of the products of the residual with random fields and all
@@ -170,22 +174,22 @@ class Latent(PODNet):
 
         Args:
             images: Images of the loads at the representatives, (B, G, n' D).
-            poisson: Poisson's ratios, (B, P) [-].
+            parameters: Parameters of the law, (B, P).
         """
         products = images @ self.probe_matrix.to(images)
         products = products.unflatten(2, (-1, len(self.group_products)))  # (B, G, K F, G)
         products = products.movedim(1, 2).flatten(2)[..., self.group_products].sum(dim=3)
-        return self.interpolation.interpolate(products.flatten(1), poisson).square().mean(dim=1)
+        return self.interpolation.interpolate(products.flatten(1), parameters).square().mean(dim=1)
 
-    def _is_local(self, images: Tensor, linear: Tensor, poisson: Tensor | None) -> Tensor:
+    def _is_local(self, images: Tensor, linear: Tensor, parameters: Tensor | None) -> Tensor:
         """Return the mask of loads whose projection residual is too large, (B,).
 
         Args:
             images: Images of the loads at the representatives, (B, G, n' D).
             linear: Coordinates of the linear solutions, (B, R).
-            poisson: Poisson's ratios, (B, P) [-].
+            parameters: Parameters of the law, (B, P).
         """
-        residual = self.projection_residual_estimate(images, poisson)
+        residual = self.projection_residual_estimate(images, parameters)
         return residual >= self.linear_tol**2 * (linear.square().sum(dim=1) + residual)
 
     def network(self, inputs: Tensor) -> Tensor:
@@ -216,7 +220,7 @@ class Latent(PODNet):
         """Compute the basis; see `TrainsInCoordinates`."""
         self.linear_unit.fill_(unit)
         force, displacement = self._columns(samples)
-        linear = self.linear_solutions(force, samples.poisson, rtol=1e-12)
+        linear = self.linear_solutions(force, samples.parameters, rtol=1e-12)
         size = displacement.norm(dim=1)
         weight = torch.where(size > 0, size.clamp(min=1e-12) ** -0.5, 0.0)
         nonlinear = weight[:, None] * (displacement - linear)
@@ -282,20 +286,22 @@ class Latent(PODNet):
     def _reduce(self, samples: Sample) -> tuple[Tensor, Tensor, Tensor]:
         """See `PODNet._reduce`; the linear part of local loads has no projection error."""
         images = self.input_orbits.images(samples.force)
-        linear = self.encode_loads(images, samples.poisson)
+        linear = self.encode_loads(images, samples.parameters)
         whole = self.coordinates(samples.displacement)
         error = squared_projection_error(samples.displacement, whole)
-        local = self._is_local(images, linear, samples.poisson)
+        local = self._is_local(images, linear, samples.parameters)
         if local.any():
             force = samples.force[local][:, self.load_dofs]
-            exact = self.linear_solutions(force, samples.poisson[local])
+            exact = self.linear_solutions(force, samples.parameters[local])
             nonlinear = samples.displacement[local] - scatter_fields(exact, self.free_dofs)
             error[local] = squared_projection_error(nonlinear, self.coordinates(nonlinear))
         return linear, whole - linear, error
 
-    def linear_solutions(self, force: Tensor, poisson: Tensor, rtol: float = LINEAR_RTOL) -> Tensor:
+    def linear_solutions(
+        self, force: Tensor, parameters: Tensor, rtol: float = LINEAR_RTOL
+    ) -> Tensor:
         """Return scaled linear solutions (S, outputs) of forces (S, inputs)."""
-        parts = zip(force.split(256), poisson.split(256), strict=True)
+        parts = zip(force.split(256), parameters.split(256), strict=True)
         return torch.cat(
             [self.interpolation.interpolate(self.solve_linear(f, rtol), nu) for f, nu in parts]
         )

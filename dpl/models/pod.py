@@ -15,7 +15,7 @@ from dpl.models.invariant_basis import (
     pad_columns,
     scatter_fields,
 )
-from dpl.models.poisson_interpolation import normalise_poisson
+from dpl.models.poisson_interpolation import normalise_parameters
 from dpl.models.reduced_samples import (
     ReducedDataset,
     ReducedSamples,
@@ -139,8 +139,8 @@ class PODNet(nn.Module):
         coordinates = min(coordinates, int(self.load_dofs.sum()))
         encoding = self._load_encoding(rank, coordinates)
         coordinates = min(coordinates, encoding.size)
-        self.poisson_range = scene.loads.poisson_range
-        self.extra_inputs = () if self.poisson_range is None else ("poisson",)
+        self.parameter_ranges = scene.loads.parameter_ranges
+        self.extra_inputs = ("parameters",) if self.parameter_ranges else ()
         weights = self._count_parameters(coordinates, rank, width) + 2 * blocks * width * (
             width + 1
         )
@@ -185,27 +185,28 @@ class PODNet(nn.Module):
         """See `TrainsInCoordinates`."""
         return bool(self.group)
 
-    def forward(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
+    def forward(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
 
         Args:
             force: Scaled nodal forces.
-            poisson: Poisson's ratios, (B, 1) [-]; required if the law has a range of them.
+            parameters: Parameters of the law, (B, P); required if it has ranges.
         """
-        encoded = self.encode_loads(self.input_orbits.images(force), poisson)
-        inputs = self.append_poisson(encoded @ self.input_map, poisson)
+        encoded = self.encode_loads(self.input_orbits.images(force), parameters)
+        inputs = self.append_parameters(encoded @ self.input_map, parameters)
         return self.field(self.symmetrised_output(inputs), force)
 
-    def encode_loads(self, images: Tensor, poisson: Tensor | None) -> Tensor:
+    def encode_loads(self, images: Tensor, parameters: Tensor | None) -> Tensor:
         """Return coordinates (B, C) of loads from their images, (B, G, n' D)."""
         read = images @ self.load_basis.to(images)
         return sum_over_images(read, self.inverse_load_actions.to(images))
 
-    def append_poisson(self, inputs: Tensor, poisson: Tensor | None) -> Tensor:
-        """Return inputs (B, M), with normalised Poisson's ratios if the law has a range of them."""
-        if self.poisson_range is None:
+    def append_parameters(self, inputs: Tensor, parameters: Tensor | None) -> Tensor:
+        """Return inputs (B, M), with normalised parameters if the law has ranges."""
+        if not self.parameter_ranges:
             return inputs
-        return torch.cat([inputs, normalise_poisson(poisson, self.poisson_range, inputs)], dim=1)
+        values = normalise_parameters(parameters, self.parameter_ranges, inputs)
+        return torch.cat([inputs, values], dim=1)
 
     def field(self, coordinates: Tensor, like: Tensor) -> Tensor:
         """Return displacements (B, N, D), shaped like `like`, of coordinates (B, R)."""
@@ -348,7 +349,7 @@ class PODNet(nn.Module):
 
     def _encode_chunk(self, samples: Sample) -> ReducedSamples:
         read, targets, error = self._reduce(samples)
-        inputs = self.append_poisson(read @ self.input_map.to(read), samples.poisson)
+        inputs = self.append_parameters(read @ self.input_map.to(read), samples.parameters)
         square = samples.displacement.flatten(1).square().sum(1)
         encoded = ReducedSamples(
             inputs=inputs.float(),
@@ -366,5 +367,5 @@ class PODNet(nn.Module):
             errors (S,).
         """
         targets = self.coordinates(samples.displacement)
-        read = self.encode_loads(self.input_orbits.images(samples.force), samples.poisson)
+        read = self.encode_loads(self.input_orbits.images(samples.force), samples.parameters)
         return read, targets, squared_projection_error(samples.displacement, targets)

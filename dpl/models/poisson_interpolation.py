@@ -1,6 +1,7 @@
-"""Poisson's ratio as an input of networks, and interpolation of K(0)^-1 over its range."""
+"""Parameters of the law as inputs of networks, and interpolation of K(0)^-1 over its range."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -12,24 +13,25 @@ from dpl.fem import LinearSolver
 
 INTERPOLATION_TOL = 1e-5  # target relative error of linear solutions between nodes [-]
 MAX_NODES = 16
-MISSING = "poisson is an input of this network; give Poisson's ratios, (B, 1)"
 
 
-def normalise_poisson(poisson: Tensor | None, span: tuple[float, float], like: Tensor) -> Tensor:
-    """Return Poisson's ratios mapped linearly from a range to [-1, 1], (B, 1).
+def normalise_parameters(
+    parameters: Tensor | None, ranges: Mapping[str, tuple[float, float]], like: Tensor
+) -> Tensor:
+    """Return parameters of the law mapped linearly from their ranges to [-1, 1], (B, P).
 
     Args:
-        poisson: Poisson's ratios, (B, 1) [-].
-        span: The range.
+        parameters: Parameters of the law, (B, P).
+        ranges: Range of each, by name.
         like: Tensor of the dtype and device to return.
 
     Raises:
-        ValueError: `poisson` is None.
+        ValueError: `parameters` is None.
     """
-    if poisson is None:
-        raise ValueError(MISSING)
-    low, high = span
-    return ((2 * poisson - (low + high)) / (high - low)).to(like)
+    if parameters is None:
+        raise ValueError(f"parameters are an input of this network; give {list(ranges)}, (B, P)")
+    low, high = parameters.new_tensor(list(ranges.values())).T
+    return ((2 * parameters - (low + high)) / (high - low)).to(like)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +51,24 @@ class PoissonInterpolation:
 
     linear: LinearSolver
 
+    def __post_init__(self) -> None:
+        """Check the law.
+
+        Raises:
+            ValueError: The law has a range of another constant.
+        """
+        if others := set(self.linear.problem.material.parameter_ranges) - {"poisson"}:
+            raise ValueError(
+                f"material.{min(others)} is a range, and K(0)^-1 is interpolated over Poisson's "
+                f"ratio only; set material.{min(others)} to a number or choose another model"
+            )
+
     @cached_property
     def nodes(self) -> list[float]:
         """Poisson's ratios of the nodes, (K,) [-]; empty if the law has a single one."""
-        if (span := self.linear.problem.material.poisson_range) is None:
+        if not self.linear.problem.material.parameter_ranges:
             return []
-        centre = self._centre
+        centre, span = self._centre, self._span
         a = float(_mapped(span[1], centre))
         count = math.ceil(-math.log(INTERPOLATION_TOL) / math.log(1 / self.rate))
         count = min(max(count, 3), MAX_NODES)
@@ -63,17 +77,19 @@ class PoissonInterpolation:
         return [(one - 1) / (1 + 2 * one) for one in z]
 
     @property
+    def _span(self) -> tuple[float, float]:
+        return self.linear.problem.material.parameter_ranges.get("poisson", (0.0, 0.0))
+
+    @property
     def _centre(self) -> float:
         """The constant c of the class."""
-        span = self.linear.problem.material.poisson_range or (0.0, 0.0)
-        low, high = ((1 + nu) / (1 - 2 * nu) for nu in span)
+        low, high = ((1 + nu) / (1 - 2 * nu) for nu in self._span)
         return math.sqrt(low * high)
 
     @property
     def rate(self) -> float:
         """1/rho, the factor by which another node reduces the error [-]."""
-        span = self.linear.problem.material.poisson_range or (0.0, 0.0)
-        a = float(_mapped(span[1], self._centre))
+        a = float(_mapped(self._span[1], self._centre))
         return a / (1 + math.sqrt(1 - a * a))
 
     @property
@@ -84,10 +100,10 @@ class PoissonInterpolation:
     @cached_property
     def solvers(self) -> list[LinearSolver]:
         """Solvers at the nodes; each factorises K(0) on first use."""
-        problem = self.linear.problem
         if not self.nodes:
             return [self.linear]
-        return [replace(self.linear, problem=problem.at(nu)) for nu in self.nodes]
+        bodies = [self.linear.problem.with_parameters(torch.tensor([[nu]])) for nu in self.nodes]
+        return [replace(self.linear, problem=body) for body in bodies]
 
     def weights(self, poisson: Tensor | None, like: Tensor) -> Tensor:
         """Return the Lagrange weights of the nodes, (B, K).
@@ -102,7 +118,7 @@ class PoissonInterpolation:
         if not self.nodes:
             return like.new_ones(len(like), 1)
         if poisson is None:
-            raise ValueError(MISSING)
+            raise ValueError("poisson is an input of this network; give Poisson's ratios, (B, 1)")
         known = torch.tensor(self.nodes, dtype=poisson.dtype, device=poisson.device)
         known, place = _mapped(known, self._centre), _mapped(poisson, self._centre)
         own = torch.eye(self.count, dtype=torch.bool, device=poisson.device)

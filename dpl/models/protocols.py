@@ -83,7 +83,7 @@ class FlagsLocalLoads(Protocol):
         ...
 
     def forward_in_basis(
-        self, force: Tensor, poisson: Tensor | None = None
+        self, force: Tensor, parameters: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return displacements (B, N, D) within the basis, and a mask of local loads, (B,)."""
         ...

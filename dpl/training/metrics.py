@@ -126,7 +126,9 @@ class ResidualRatio(_PerLoad):
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
         """See `_PerLoad`."""
-        ratio = self.problem.at(batch.poisson).relative_residual(prediction, batch.force)
+        ratio = self.problem.with_parameters(batch.parameters).relative_residual(
+            prediction, batch.force
+        )
         return torch.nan_to_num(ratio, nan=torch.inf)
 
     def reduce(self, values: Tensor) -> Tensor:

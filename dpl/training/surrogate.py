@@ -28,7 +28,7 @@ class Surrogate(L.LightningModule):
 
     Attributes:
         net: Module from scaled forces (B, N, D) to scaled displacements (B, N, D). Its optional
-            attribute `extra_inputs` names further inputs: "young", "poisson".
+            attribute `extra_inputs` names further inputs: "young", "parameters".
         scene: The scene.
         loss: The loss.
         batch_errors: Relative L2 errors of the last training batch, (B,); None before the first.
@@ -54,20 +54,19 @@ class Surrogate(L.LightningModule):
                 schedule, stepped every batch; None for a constant learning rate.
 
         Raises:
-            ValueError: The law has a range of Poisson's ratios and the network no such input.
+            ValueError: The law has ranges and the network no input for parameters.
         """
         super().__init__()
         self.net, self.loss, self.scene = net, loss, scene
         self.batch_errors: Tensor | None = None
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
-        span = scene.loads.poisson_range
-        self._poisson_columns = int(span is not None)
-        if span is not None and "poisson" not in getattr(net, "extra_inputs", ()):
-            raise ValueError(
-                f"material.poisson is a range, {list(span)}, and {type(net).__name__} has no input "
-                "for Poisson's ratio; set material.poisson to a number or choose another model"
-            )
+        for name, ends in scene.loads.parameter_ranges.items():
+            if "parameters" not in getattr(net, "extra_inputs", ()):
+                raise ValueError(
+                    f"material.{name} is a range, {list(ends)}, and {type(net).__name__} has no "
+                    f"input for it; set material.{name} to a number or choose another model"
+                )
         force_scale, displacement_scale = scales(scene)
         self.register_buffer("force_scale", force_scale)
         self.register_buffer("displacement_scale", displacement_scale)
@@ -78,15 +77,15 @@ class Surrogate(L.LightningModule):
         self.val_metrics = default_metrics(scene.problem).clone(prefix="val/")
         self.test_metrics = default_metrics(scene.problem).clone(prefix="test/")
 
-    def forward(self, force: Tensor, young: Tensor, poisson: Tensor | None = None) -> Tensor:
+    def forward(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return displacements (B, N, D) [m] under nodal forces (B, N, D) [N].
 
         Args:
             force: Nodal forces, (B, N, D) [N].
             young: Young's moduli, (B,) [Pa].
-            poisson: Poisson's ratios, (B,) [-]; required if the law has a range of them.
+            parameters: Parameters of the law, (B, P); required if it has ranges.
         """
-        return self.scene.length * self.predict(self.scene.load_of(force, young, poisson))
+        return self.scene.length * self.predict(self.scene.load_of(force, young, parameters))
 
     def predict(self, load: Load) -> Tensor:
         """Return displacements over L, (B, N, D) [-], float64."""
@@ -97,16 +96,12 @@ class Surrogate(L.LightningModule):
         """Return the inputs of the network: scaled forces (B, N, D), and its extra inputs by name.
 
         Raises:
-            ValueError: The load has no Poisson's ratios although the law has a range, or has them
-                although the law has a single one.
+            ValueError: The load has not one parameter for each range of the law.
         """
         scaled = (self._effective_force(load.force) / self.force_scale).to(self.dtype)
-        if load.poisson.shape[-1] != self._poisson_columns:
-            raise ValueError(
-                "Load.poisson is missing: the law has a range of Poisson's ratios"
-                if self._poisson_columns
-                else "Load.poisson must be empty: the law has a single Poisson's ratio"
-            )
+        if load.parameters.shape[-1] != len(names := list(self.scene.loads.parameter_ranges)):
+            found = load.parameters.shape[-1]
+            raise ValueError(f"Load.parameters has {found} columns; the law has ranges of {names}")
         return scaled, {name: getattr(load, name) for name in getattr(self.net, "extra_inputs", ())}
 
     def _effective_force(self, force: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from dpl.viewer import panel
 from dpl.viewer.frames import QUANTITIES, TOLERANCES, Body, ColourScale, Frame, ViewSettings
 from dpl.viewer.recording import MAX_FRAMES, Recording
 
+LABELS = {"poisson": "Poisson's ratio"}  # of parameters
 NETWORK, BUDGET = "network", "best within the budget"
 METHODS = {NETWORK: None, **{f"residual below {tol:.0e}": tol for tol in TOLERANCES}}
 Callback = Callable[[Any], Any]
@@ -22,7 +23,7 @@ class Controls:
 
     Attributes:
         radius, direction, amplitude, unlimited, uniform: The patch load.
-        young, poisson: The moduli; `poisson` is None if the law has a single Poisson's ratio.
+        young, parameters: Young's modulus, and the parameters of the law with a range by name.
         sample, reset: Buttons for a random load and for no load.
         method, budget, galerkin, quantity, edges, show_newton: Method and display.
         record, save: Buttons of the recording.
@@ -63,10 +64,12 @@ class Controls:
         self.amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
         low, high = body.young_range
         self.young = gui.add_slider("E [Pa]", low, high, (high - low) / 500, body.young)
-        self.poisson = None
-        if loads.poisson_range is not None and body.poisson is not None:
-            low, high = map(float, loads.poisson_range)
-            self.poisson = gui.add_slider("Poisson's ratio", low, high, 1e-3, body.poisson)
+        self.parameters = {
+            name: gui.add_slider(LABELS.get(name, name), *ends, (ends[1] - ends[0]) / 200, value)
+            for (name, ends), value in zip(
+                loads.parameter_ranges.items(), body.parameters.values(), strict=True
+            )
+        }
         self.unlimited = gui.add_checkbox(
             "no amplitude limit",
             False,
@@ -105,9 +108,8 @@ class Controls:
         """Set the callbacks of the widgets that change load, moduli or settings."""
         for control in (self.direction, self.amplitude, self.uniform, self.radius):
             control.on_update(catch_errors(on_load))
-        for control in (self.young, self.poisson):
-            if control is not None:
-                control.on_update(catch_errors(on_moduli))
+        for control in (self.young, *self.parameters.values()):
+            control.on_update(catch_errors(on_moduli))
         for control in (
             *(self.method, self.budget, self.galerkin, self.quantity, self.edges),
             self.show_newton,

@@ -1,5 +1,6 @@
 """Modal loads on a patch of the body that move a point in a requested direction."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -19,12 +20,12 @@ class LoadRequest(NamedTuple):
     Attributes:
         force: (N, D) [N], in 2D [N/m].
         young: Young's modulus [Pa].
-        poisson: Poisson's ratio [-]; None if the law has a single one.
+        parameters: Value of each range of the law, by name.
     """
 
     force: Tensor
     young: float
-    poisson: float | None
+    parameters: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)

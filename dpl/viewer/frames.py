@@ -1,7 +1,7 @@
 """Requests, solutions and the surface values that the viewer shows; independent of the browser."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -91,7 +91,7 @@ class Body:
         scene: Its scene.
         surface: Surface of the body.
         young: Default Young's modulus, the middle of the training range [Pa].
-        poisson: Default Poisson's ratio, alike [-]; None if the law has a single one.
+        parameters: Default parameters of the law by name, alike.
     """
 
     def __init__(self, simulator: Simulator) -> None:
@@ -100,8 +100,8 @@ class Body:
         self.scene = simulator.scene
         self.surface = Surface.of(self.scene.problem)
         self.young = sum(self.scene.loads.young_range) / 2
-        span = self.scene.loads.poisson_range
-        self.poisson = None if span is None else sum(span) / 2
+        ranges = self.scene.loads.parameter_ranges
+        self.parameters = {name: sum(ends) / 2 for name, ends in ranges.items()}
         self._without_galerkin = simulator
         if self.has_galerkin:
             self._without_galerkin = Simulator(simulator.surrogate)
@@ -124,41 +124,43 @@ class Body:
         return self.young * self.scene.force_unit
 
     def request(
-        self, force: Tensor, young: float | None = None, poisson: float | None = None
+        self,
+        force: Tensor,
+        young: float | None = None,
+        parameters: Mapping[str, float] | None = None,
     ) -> LoadRequest:
         """Return the request of a dimensionless force (N, D) plus the constant force of the scene.
 
         The force [N] does not depend on `young`, so that a softer body has larger displacements.
 
         Raises:
-            ValueError: A modulus is out of its range.
+            ValueError: A value is out of its range.
         """
         young = self.young if young is None else young
         low, high = self.young_range
         if not low * (1 - 1e-9) <= young <= high * (1 + 1e-9):
             raise ValueError(f"young = {young:g} must lie between {low:g} and {high:g} Pa")
-        span = self.scene.loads.poisson_range
-        if span is None:
-            poisson = None
-        else:
-            poisson = self.poisson if poisson is None else poisson
-            if poisson is None or not span[0] <= poisson <= span[1]:
-                raise ValueError(f"poisson = {poisson:g} must lie between {span[0]} and {span[1]}")
+        parameters = {**self.parameters, **(parameters or {})}
+        for name, (low, high) in self.scene.loads.parameter_ranges.items():
+            if not low <= parameters[name] <= high:
+                raise ValueError(f"{name} = {parameters[name]:g} must lie between {low} and {high}")
         constant = self.scene.loads.constant_force
         total = force if constant is None else force + constant
-        return LoadRequest(total * self.force_unit, young, poisson)
+        return LoadRequest(total * self.force_unit, young, parameters)
 
-    def zero_load(self, young: float | None = None, poisson: float | None = None) -> LoadRequest:
+    def zero_load(
+        self, young: float | None = None, parameters: Mapping[str, float] | None = None
+    ) -> LoadRequest:
         """Return the request without a force of the user."""
         force = torch.zeros(self.scene.problem.shape, dtype=torch.float64)
-        return self.request(force, young, poisson)
+        return self.request(force, young, parameters)
 
     def sample(self, index: int) -> LoadRequest:
         """Return a random load of the training distribution."""
         load = self.scene.loads.sample(SAMPLE_STREAM, [index])
         young = float(load.young)
-        poisson = float(load.poisson) if load.poisson.numel() else None
-        return LoadRequest(load.force[0] * young * self.scene.force_unit, young, poisson)
+        parameters = dict(zip(self.parameters, load.parameters[0].tolist(), strict=True))
+        return LoadRequest(load.force[0] * young * self.scene.force_unit, young, parameters)
 
     def patch(self, node: int, radius: float, *, uniform: bool = False) -> Patch:
         """Return the loads of a patch. The last patch is cached, because it takes several solves.
@@ -178,9 +180,9 @@ class Body:
 
     def load(self, request: LoadRequest) -> Load:
         """Return the dimensionless load of a request, with B = 1."""
-        poisson = None if request.poisson is None else torch.tensor([request.poisson]).double()
         young = torch.tensor([request.young]).double()
-        return self.scene.load_of(request.force[None], young, poisson)
+        parameters = torch.tensor([list(request.parameters.values())]).double()
+        return self.scene.load_of(request.force[None], young, parameters)
 
     def solve(self, request: LoadRequest, settings: ViewSettings) -> Frame:
         """Return the frame of a request, computed by the simulator."""
@@ -198,10 +200,10 @@ class Body:
         return simulator(
             request.force,
             young=request.young,
-            poisson=request.poisson,
             tol=settings.tol,
             budget_ms=settings.budget_ms,
             warm=warm,
+            parameters=request.parameters,
         )
 
     def newton_frames(
@@ -247,9 +249,9 @@ class Body:
     ) -> Floats:
         """Return the values of a quantity on the surface, (S,), of displacements (N, D) [m]."""
         if quantity == STRESS:
-            u, poisson = displacement / self.scene.length, self.load(request).poisson
+            u, parameters = displacement / self.scene.length, self.load(request).parameters
             with torch.inference_mode():
-                return request.young * self.surface.von_mises(u, poisson)
+                return request.young * self.surface.von_mises(u, parameters)
         field = displacement
         if quantity == ERROR and reference is not None:
             field = displacement - reference

@@ -3,7 +3,7 @@
 import contextlib
 import io
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from dpl.viewer.recording import Recording
 from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
-Load = Callable[[float | None, float | None], LoadRequest]  # E [Pa], Poisson's ratio -> request
+Load = Callable[[float | None, Mapping[str, float]], LoadRequest]  # E [Pa], parameters -> request
 DISTANCE, DISTANCE_OF_TWO = 0.8, 1.25  # factors on the distance of the camera
 PICK_RADIUS = 0.02  # distance of a ray to the points that it may pick, beyond the nearest, over L
 
@@ -153,9 +153,9 @@ class Page:
         patch = self._patch(node)
         max_amplitude = None if self.controls.unlimited.value else 1.0
 
-        def load(young: float | None, poisson: float | None) -> LoadRequest:
+        def load(young: float | None, parameters: Mapping[str, float]) -> LoadRequest:
             force = patch().force_towards(target, max_amplitude=max_amplitude)
-            return self.body.request(force, young, poisson)
+            return self.body.request(force, young, parameters)
 
         self._show_direction(target)
         self._submit(load)
@@ -191,8 +191,9 @@ class Page:
         direction = torch.tensor(self.controls.direction.value[:dim]).double()
         amplitude = self.controls.amplitude.value
 
-        def load(young: float | None, poisson: float | None) -> LoadRequest:
-            return self.body.request(patch().force_along(direction, amplitude), young, poisson)
+        def load(young: float | None, parameters: Mapping[str, float]) -> LoadRequest:
+            force = patch().force_along(direction, amplitude)
+            return self.body.request(force, young, parameters)
 
         self._submit(load)
 
@@ -201,13 +202,13 @@ class Page:
         self._n_samples += 1
         request = self.body.sample(self._n_samples)
         self.controls.young.value = float(np.clip(request.young, *self.body.young_range))
-        if self.controls.poisson is not None and request.poisson is not None:
-            self.controls.poisson.value = request.poisson
+        for name, value in request.parameters.items():
+            self.controls.parameters[name].value = value
 
-        def load(young: float | None, poisson: float | None) -> LoadRequest:
+        def load(young: float | None, parameters: Mapping[str, float]) -> LoadRequest:
             return request._replace(
                 young=request.young if young is None else young,
-                poisson=None if request.poisson is None else poisson,
+                parameters=parameters,
             )
 
         self.controls.follows_frame = True
@@ -279,9 +280,9 @@ class Page:
     def _submit(self, load: Load | None = None) -> None:
         """Submit a load, or the last one, with the moduli of the sliders."""
         self._load = self._load if load is None else load
-        poisson = self.controls.poisson
-        moduli = self.controls.young.value, None if poisson is None else poisson.value
-        self.worker.submit(partial(self._load, *moduli))
+        sliders = self.controls.parameters
+        parameters = {name: slider.value for name, slider in sliders.items()}
+        self.worker.submit(partial(self._load, self.controls.young.value, parameters))
         self._mark_patch()
 
     def _mark_patch(self) -> None:

@@ -74,14 +74,14 @@ class Surface:
         """Return the deformed positions over L, (S, 3) [-], of displacements (N, D) [-]."""
         return self.undeformed + _to_3d(displacement.numpy()[self.nodes])
 
-    def von_mises(self, displacement: Tensor, poisson: Tensor) -> Floats:
+    def von_mises(self, displacement: Tensor, parameters: Tensor) -> Floats:
         """Return the von Mises stress over E at the nodes of the surface, (S,) [-].
 
         Args:
             displacement: Displacement over L, (N, D) [-].
-            poisson: Poisson's ratio as in a load, (1, P) [-].
+            parameters: Parameters as in a load, (1, P).
         """
-        body, cells = self.problem.at(poisson), self.adjacent_cells
+        body, cells = self.problem.with_parameters(parameters), self.adjacent_cells
         if body is not self.problem:
             cells = replace(cells, material=body.material)
         return fields(cells, displacement[None]).von_mises[0].numpy()[self.nodes]

@@ -38,9 +38,9 @@ def solved(number, *, nodes=(0, 3), accepted=True):
     )
 
 
-def content(*loads, n_poisson=0):
-    """Return a shard; the Poisson's ratios are the last coordinates of the points."""
-    ratio = lambda one: torch.from_numpy(one.point)[None, DIMENSION - n_poisson :]  # noqa: E731
+def content(*loads, n_parameters=0):
+    """Return a shard; the parameters are the last coordinates of the points."""
+    ratio = lambda one: torch.from_numpy(one.point)[None, DIMENSION - n_parameters :]  # noqa: E731
     return save(concatenate([encode_load(one, ratio(one)) for one in loads]))
 
 
@@ -60,7 +60,7 @@ def test_a_decoded_load_equals_the_encoded_one():
     shard = decode_shard(content(*loads), SHAPE, DIMENSION)
     for one in loads:
         assert same(select(shard, one.job, line(*loads)), one)
-    assert shard["poisson"].shape == (3, 0)
+    assert shard["parameters"].shape == (3, 0)
     assert shard["iterations"].tolist() == [8, 9, 10]
 
 
@@ -76,14 +76,14 @@ def test_a_rejected_load_is_decoded_with_its_reason():
     assert same(select(shard, loads[2].job, line(*loads)), loads[2])
 
 
-def test_poissons_ratios_are_kept_where_loads_have_their_own():
+def test_parameters_are_kept_where_loads_have_their_own():
     loads = [solved(5), solved(6)]
-    whole = content(*loads, n_poisson=1)
+    whole = content(*loads, n_parameters=1)
     points = torch.from_numpy(np.stack([one.point for one in loads]))
-    assert torch.equal(decode_shard(whole, SHAPE, DIMENSION, 1)["poisson"], points[:, -1:])
-    with pytest.raises(ValueError, match="poisson has shape"):
+    assert torch.equal(decode_shard(whole, SHAPE, DIMENSION, 1)["parameters"], points[:, -1:])
+    with pytest.raises(ValueError, match="parameters has shape"):
         decode_shard(whole, SHAPE, DIMENSION, 0)
-    with pytest.raises(ValueError, match="poisson has shape"):
+    with pytest.raises(ValueError, match="parameters has shape"):
         decode_shard(content(*loads), SHAPE, DIMENSION, 1)
 
 

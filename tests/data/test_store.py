@@ -624,7 +624,7 @@ def test_a_read_only_folder_can_only_be_read(copy, environment):
         "from types import SimpleNamespace as N; import json; "
         "card = json.loads((folder / 'scene.json').read_text()); "
         "scene = N(fingerprint=card['fingerprint'], identity=lambda: card['scene'], "
-        "problem=N(shape=(45, 3)), loads=N(n_random=7, poisson_range=None, "
+        "problem=N(shape=(45, 3)), loads=N(n_random=7, parameter_ranges={}, "
         "young_at=lambda point: point[:, -1])); "
         "store = Store(folder, scene, 0); "
         "assert len(store.load('train', 12).force) == 12; "

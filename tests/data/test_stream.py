@@ -483,7 +483,7 @@ def unsolved(monkeypatch):
 
     monkeypatch.setattr("dpl.data.stream.solve_load", fake)
     loads = SimpleNamespace(
-        young_at=lambda points: points[:, -1], poisson_at=lambda points: points[:, :0]
+        young_at=lambda points: points[:, -1], parameters_at=lambda points: points[:, :0]
     )
     return SimpleNamespace(loads=loads)
 

@@ -45,7 +45,7 @@ def make_surrogate(make, scene, seed=0, **options):
     if isinstance(surrogate.net, PODNet):
         load = scene.loads.sample((0, 1), range(8))
         truth = solve(scene.solver, load).displacement
-        surrogate.fit_bases(Sample(load.force, truth, load.young, load.poisson))
+        surrogate.fit_bases(Sample(load.force, truth, load.young, load.parameters))
     return surrogate.eval()
 
 

@@ -746,10 +746,11 @@ def test_stability_is_not_known_before_newton_ends(beam, pull):
 def test_the_solver_of_another_poissons_ratio_shares_what_does_not_depend_on_it(beam, pull):
     problem = beam(NeoHookeanLn([0.2, 0.4]), 4, 1)
     newton = Newton(problem, linear="superlu", tol=1e-9)
-    clone = newton.at(0.25)
+    ratio = torch.tensor([[0.25]], dtype=torch.float64)
+    clone = newton.with_parameters(ratio)
     assert clone.tol == 1e-9
-    assert clone.problem is problem.at(0.25)
+    assert clone.problem is problem.with_parameters(ratio)
     assert clone.linear_solver.problem is clone.problem
-    assert clone.linear_solver is newton.linear_solver.of(clone.problem)
+    assert clone.linear_solver is newton.linear_solver.with_parameters(ratio)
     for name in ("backend", "tangent_backend"):
         assert getattr(clone.linear_solver, name) is getattr(newton.linear_solver, name)

@@ -523,12 +523,14 @@ def test_a_poisson_ratio_that_no_solid_has_is_refused(make_scene, ratio):
     scene = make_scene(poisson=[0.2, 0.4])
     sim = Simulator(Surrogate(FCNN(scene, width=4), MSE(), scene))
     force = scene.loads.sample((0, 9), [0]).force[0] * E * scene.force_unit
-    with pytest.raises(ValueError, match=r"poisson: a ratio is not between -1 and 0\.5"):
-        sim(force, poisson=ratio)
-    with pytest.raises(ValueError, match="poisson: the law has a range"):
+    with pytest.raises(ValueError, match=r"poisson = .* must lie between -1 and 0\.5"):
+        sim(force, parameters={"poisson": ratio})
+    with pytest.raises(
+        ValueError, match=r"parameters must be one value for each of \['poisson'\].*; it is missing"
+    ):
         sim(force)
     for inside in (-0.9, 0.3, 0.49):
-        assert sim(force, poisson=inside).out_of_distribution == (inside != 0.3)
+        assert sim(force, parameters=[[inside]]).out_of_distribution == (inside != 0.3)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
@@ -555,7 +557,11 @@ def test_a_force_that_is_not_finite_on_a_held_node_is_refused(scene, forces, bad
         ({"young": [1.0, 2.0]}, "young: 2 numbers for 1 loads"),
         ({"young": [[E]]}, "young: 1 numbers for 1 loads"),
         ({"young": math.inf}, "young: a number is not finite"),
-        ({"poisson": 0.3}, "poisson: the law has its own"),
+        (
+            {"parameters": {"poisson": 0.3}},
+            r"parameters = {'poisson': 0.3} must be .* each of \[\]",
+        ),
+        ({"parameters": [[0.3]]}, r"parameters must be .* of \[\].* it is of shape \(1, 1\)"),
     ],
     ids=str,
 )

@@ -329,7 +329,7 @@ def test_a_shard_with_wrong_numbers_and_a_right_digest_is_refused_or_found(scene
         if how == "gone":
             del columns[which]
         elif how == "more":
-            columns["poisson"] = torch.zeros(4, 1, dtype=torch.float64)
+            columns["parameters"] = torch.zeros(4, 1, dtype=torch.float64)
         elif how != "header":
             if how in ENDLESS and not columns[which].is_floating_point():
                 which = "values" if name.startswith("modes") else "displacement"

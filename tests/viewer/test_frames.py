@@ -88,7 +88,7 @@ def test_stress_at_the_surface_is_that_of_the_whole_body(body, make_scene):
         load = scene.loads.sample((0, 4), [1])
         u = scene.linear.solve(load.force[0])
         exact = fields(scene.problem, u[None]).von_mises[0].numpy()[surface.nodes]
-        assert surface.von_mises(u, load.poisson) == pytest.approx(exact, rel=1e-12)
+        assert surface.von_mises(u, load.parameters) == pytest.approx(exact, rel=1e-12)
 
 
 def test_the_dragged_point_moves_to_the_target(body, patch_load):
@@ -197,7 +197,7 @@ def test_ranges_of_moduli_are_those_of_the_scene(make_scene, make_body):
     body = make_body(make_scene(young=[1e6, 3e6]))
     assert body.young_range == (1e6, 3e6)
     assert body.young == 2e6
-    assert body.poisson is None
+    assert body.parameters == {}
     assert 1e6 <= body.sample(1).young <= 3e6
 
 
@@ -208,14 +208,14 @@ def test_poissons_ratio_changes_the_solution(make_scene, make_body):
     force = body.patch(node, 0.4).force_towards(torch.tensor([0.0, 0.0, 0.1]).double())
     values = [
         body.solve(
-            body.request(force, None, nu), ViewSettings(quantity=STRESS, tol=1e-8)
+            body.request(force, None, {"poisson": nu}), ViewSettings(quantity=STRESS, tol=1e-8)
         ).values.max()
         for nu in (0.2, 0.4)
     ]
     assert values[0] != pytest.approx(values[1], rel=1e-3)
     with pytest.raises(ValueError, match=r"poisson = 0.45 must lie between"):
-        body.request(force, None, 0.45)
-    request = body.request(force, None, 0.25)
+        body.request(force, None, {"poisson": 0.45})
+    request = body.request(force, None, {"poisson": 0.25})
     assert list(body.newton_frames(request, ViewSettings(), body.solve(request, ViewSettings())))[
         -1
     ].converged

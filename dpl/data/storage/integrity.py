@@ -175,11 +175,11 @@ def check_shard(scene: Scene, stream: tuple[int, int], shard: Columns) -> str:
     forces, roundoff = to_dense(shard, problem.shape), 1e-9 * loads.largest_force
     if not torch.allclose(forces, loads.loads_at(points).force, rtol=1e-6, atol=roundoff):
         return "holds loads that this scene does not draw"
-    poisson = loads.poisson_at(points)
-    if not torch.allclose(shard["poisson"], poisson, rtol=0, atol=1e-12):
-        return "holds other Poisson's ratios than its seed draws"
+    parameters = loads.parameters_at(points)
+    if not torch.allclose(shard["parameters"], parameters, rtol=0, atol=1e-12):
+        return "holds other parameters than its seed draws"
     for k, (u, force) in enumerate(zip(shard["displacement"], forces, strict=True)):
-        body = problem.at(shard["poisson"][k, None])
+        body = problem.with_parameters(shard["parameters"][k, None])
         internal, volume = body.evaluate(u[None])
         balanced = body.is_equilibrium(u[None], internal, force[None], scene.solver.tol)
         if not (bool(volume > 0) and bool(balanced)):

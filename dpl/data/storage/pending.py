@@ -34,19 +34,19 @@ class PendingLoads:
     Attributes:
         folder: The folder; created by the first `write`.
         streams: Seed of each split.
-        poisson_at: From points (B, d) to Poisson's ratios (B, P).
+        parameters_at: From points (B, d) to parameters (B, P).
     """
 
     folder: Path
     streams: dict[str, tuple[int, int]]
-    poisson_at: Callable[[Tensor], Tensor]
+    parameters_at: Callable[[Tensor], Tensor]
 
     def write(self, solved: SolvedLoad) -> Path:
         """Write a load; return the path of its file."""
         self.folder.mkdir(exist_ok=True)
         (split,) = (name for name, seed in self.streams.items() if seed == solved.job.seed)
         path = self.folder / f"{split}-{solved.job.number:06d}.load"
-        columns = encode_load(solved, self.poisson_at(torch.from_numpy(solved.point)[None]))
+        columns = encode_load(solved, self.parameters_at(torch.from_numpy(solved.point)[None]))
         content = json.dumps(entry_of_load(split, solved)).encode() + b"\n" + save(columns)
         # not synced: `files` removes a file that a crash of the machine has damaged
         with atomic_write(path, sync=False) as file:

@@ -19,15 +19,15 @@ Columns = dict[str, Tensor]
 
 INTEGERS = dict.fromkeys(("index", "n_loaded_nodes", "iterations"), torch.int64)
 INTEGERS["node"] = torch.int32
-FINITE = {"point", "nodal_force", "displacement", "poisson"}  # columns of a sample
+FINITE = {"point", "nodal_force", "displacement", "parameters"}  # columns of a sample
 
 
-def encode_load(solved: SolvedLoad, poisson: Tensor) -> Columns:
+def encode_load(solved: SolvedLoad, parameters: Tensor) -> Columns:
     """Return the columns of a shard of one load; they have no rows if the load is rejected.
 
     Args:
         solved: The load.
-        poisson: Its Poisson's ratio, (1, P), P = 0 where all loads have the same.
+        parameters: Its parameters, (1, P), see `LoadFamily.parameter_ranges`.
     """
     columns = {
         "index": torch.tensor([solved.job.number]),
@@ -37,7 +37,7 @@ def encode_load(solved: SolvedLoad, poisson: Tensor) -> Columns:
         "residual": torch.tensor([solved.residual], dtype=torch.float64),
         "volume_ratio": torch.tensor([solved.volume_ratio], dtype=torch.float64),
         "iterations": torch.tensor([solved.iterations]),
-        "poisson": poisson.contiguous(),
+        "parameters": parameters.contiguous(),
     }
     return columns if solved.accepted else {name: c[:0] for name, c in columns.items()}
 
@@ -48,7 +48,7 @@ def concatenate(parts: Sequence[Columns]) -> Columns:
 
 
 def decode_shard(
-    content: bytes, shape: tuple[int, ...], dimension: int, n_poisson: int = 0
+    content: bytes, shape: tuple[int, ...], dimension: int, n_parameters: int = 0
 ) -> Columns:
     """Return the columns of a shard.
 
@@ -56,7 +56,7 @@ def decode_shard(
         content: Content of the file.
         shape: (N, D).
         dimension: d, number of coordinates of the point that a load is drawn from.
-        n_poisson: P, 1 where each load has its own Poisson's ratio, else 0.
+        n_parameters: P, number of parameters of a load.
 
     Raises:
         ValueError: A column is missing or has a wrong shape, type or value. The message continues
@@ -64,13 +64,15 @@ def decode_shard(
     """
     try:
         shard = load(content)
-        _check_columns(shard, shape, dimension, n_poisson)
+        _check_columns(shard, shape, dimension, n_parameters)
     except (SafetensorError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"is damaged: {error}") from None
     return shard
 
 
-def _check_columns(shard: Columns, shape: tuple[int, ...], dimension: int, n_poisson: int) -> None:
+def _check_columns(
+    shard: Columns, shape: tuple[int, ...], dimension: int, n_parameters: int
+) -> None:
     """Raise ValueError or KeyError where `decode_shard` must."""
     count, n_loaded_nodes = len(shard["index"]), int(shard["n_loaded_nodes"].sum())
     shapes = {
@@ -83,7 +85,7 @@ def _check_columns(shard: Columns, shape: tuple[int, ...], dimension: int, n_poi
         "residual": (count,),
         "volume_ratio": (count,),
         "iterations": (count,),
-        "poisson": (count, n_poisson),
+        "parameters": (count, n_parameters),
     }
     for name, expected in shapes.items():
         column = shard[name]

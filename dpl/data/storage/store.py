@@ -43,7 +43,7 @@ from dpl.data.storage.shard import Columns, decode_shard, select, to_dense
 from dpl.scene import Sample, Scene
 from dpl.system.files import DataSetError, read_regular_file
 
-FORMAT = 3
+FORMAT = 4
 MODES = "modes.safetensors"
 HEADER = 100_000  # largest size of a shard without its numbers [bytes]
 SHARD_SIZE = 64  # loads in one file
@@ -71,7 +71,7 @@ class Store:
     def pending(self) -> PendingLoads:
         """Solved loads whose shard is not complete."""
         streams = {name: self.stream(name) for name in STREAMS}
-        return PendingLoads(self.folder / "pending", streams, self.scene.loads.poisson_at)
+        return PendingLoads(self.folder / "pending", streams, self.scene.loads.parameters_at)
 
     def shards(self) -> list[dict[str, Any]]:
         """Return the lines of all manifests, sorted; empty if there is no data set yet.
@@ -169,11 +169,11 @@ class Store:
             raise DataSetError(f"{self.folder} holds no {split} samples")
         shape = self.scene.problem.shape
         force = torch.cat([to_dense(part, shape) for part in parts])[rows]
-        displacement, point, poisson = (
+        displacement, point, parameters = (
             torch.cat([part[name] for part in parts])[rows]
-            for name in ("displacement", "point", "poisson")
+            for name in ("displacement", "point", "parameters")
         )
-        return Sample(force, displacement, self.scene.loads.young_at(point), poisson)
+        return Sample(force, displacement, self.scene.loads.young_at(point), parameters)
 
     def _read_shard(self, line: Mapping[str, Any]) -> Columns:
         """Return the columns of a shard.
@@ -219,8 +219,8 @@ class Store:
     def decode(self, content: bytes) -> Columns:
         """Return the columns of a shard of this scene, see `decode_shard`."""
         loads = self.scene.loads
-        n_poisson = int(loads.poisson_range is not None)
-        return decode_shard(content, self.scene.problem.shape, loads.n_random, n_poisson)
+        shape, n_parameters = self.scene.problem.shape, len(loads.parameter_ranges)
+        return decode_shard(content, shape, loads.n_random, n_parameters)
 
     def reader(self, split: str) -> Callable[[int], SolvedLoad | None]:
         """Return a function from the number of a load to the load, None if it is not solved yet."""

@@ -78,9 +78,7 @@ class Kernels:
         """
         law, needs, finite = self._law
         if len(self._constants) > 1:
-            raise ValueError(
-                "Poisson's ratio must be the same for all loads; linearise them one by one"
-            )
+            raise ValueError("parameters must be the same for all loads; linearise them one by one")
         gap = self._no_gap if gap is None else gap
         arrays = (self.cells, self.dN, self.dV, self.places)
         moduli = self._constants[0]

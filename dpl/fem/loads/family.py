@@ -37,8 +37,8 @@ class LoadFamily(Protocol):
         ...
 
     @property
-    def poisson_range(self) -> tuple[float, float] | None:
-        """Smallest and largest Poisson's ratio [-]; None if the law has one for all loads."""
+    def parameter_ranges(self) -> Mapping[str, tuple[float, float]]:
+        """Ranges of the parameters of the law, by name; empty if it has none."""
         ...
 
     @property
@@ -72,8 +72,8 @@ class LoadFamily(Protocol):
         """Return the Young's moduli of points (B, d), (B,) [Pa]."""
         ...
 
-    def poisson_at(self, points: Tensor) -> Tensor:
-        """Return the Poisson's ratios of points (B, d), (B, P) [-]; P = 0 if the law has one."""
+    def parameters_at(self, points: Tensor) -> Tensor:
+        """Return the parameters of the law of points (B, d), (B, P), see `parameter_ranges`."""
         ...
 
     def sample(
@@ -174,9 +174,9 @@ class RandomLoads(LoadFamily):
         return float(moduli[0]), float(moduli[-1])
 
     @property
-    def poisson_range(self) -> tuple[float, float] | None:
-        """Smallest and largest Poisson's ratio [-]; None if the law has one for all loads."""
-        return self.problem.material.poisson_range
+    def parameter_ranges(self) -> Mapping[str, tuple[float, float]]:
+        """Ranges of the parameters of the law, by name; empty if it has none."""
+        return self.problem.material.parameter_ranges
 
     @property
     def loadable_dofs(self) -> Tensor:
@@ -185,12 +185,8 @@ class RandomLoads(LoadFamily):
 
     @property
     def n_random(self) -> int:
-        """d: the numbers of a force, Young's modulus, and Poisson's ratio where it has a range."""
-        return self.n_force + 1 + self._n_poisson
-
-    @property
-    def _n_poisson(self) -> int:
-        return int(self.poisson_range is not None)
+        """d: the numbers of a force, Young's modulus, and the parameters with a range."""
+        return self.n_force + 1 + len(self.parameter_ranges)
 
     def points(self, seed: int | Sequence[int], indices: Sequence[int]) -> Tensor:
         """Return the points of the unit cube of loads `indices` of a stream, (B, d)."""
@@ -202,17 +198,18 @@ class RandomLoads(LoadFamily):
         force = torch.stack([self.force_at(point[: self.n_force].numpy()) for point in points])
         if self.constant_force is not None:
             force = force + self.constant_force
-        return Load(force, self.young_at(points), self.poisson_at(points))
+        return Load(force, self.young_at(points), self.parameters_at(points))
 
     def young_at(self, points: Tensor) -> Tensor:
         """Return the Young's moduli of points (B, d), (B,) [Pa]."""
         low, high = self.young_range
-        return low + (high - low) * points[:, -1 - self._n_poisson]
+        return low + (high - low) * points[:, self.n_force]
 
-    def poisson_at(self, points: Tensor) -> Tensor:
-        """Return the Poisson's ratios of points (B, d), (B, P) [-]; P = 0 if the law has one."""
-        low, high = self.poisson_range or (0.0, 0.0)
-        return low + (high - low) * points[:, points.shape[1] - self._n_poisson :]
+    def parameters_at(self, points: Tensor) -> Tensor:
+        """Return the parameters of the law of points (B, d), (B, P), see `parameter_ranges`."""
+        ranges = points.new_tensor(list(self.parameter_ranges.values())).reshape(-1, 2)
+        low, high = ranges.T
+        return low + (high - low) * points[:, self.n_force + 1 :]
 
     def sample(
         self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0

@@ -31,7 +31,7 @@ class ModalLoads(RandomLoads):
     random distance of a random node.
 
     The point of a load has one number per mode, then centre, radius and amplitude, then Young's
-    modulus and, where the law has a range, Poisson's ratio.
+    modulus and, where the law has ranges, its parameters.
 
     Attributes:
         n_modes: Smallest number of modes. A cluster of close eigenvalues is never divided, so that

@@ -8,7 +8,8 @@ its stress as a difference of terms that cancel at rest.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Self, cast
+from itertools import product
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -53,7 +54,12 @@ class Material:
     A law is its `energy`; `stress` and `tangent` follow by automatic differentiation. A subclass
     may give its `response` to strains as well: the two then follow from that, and Newton can take
     strains as unknowns. A law of the invariants (`InvariantBasedMaterial`) is compiled too.
+
+    Attributes:
+        ranged: Names of the constants that may be ranges [low, high].
     """
+
+    ranged: ClassVar[tuple[str, ...]] = ()
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density over E, (...,) [-], of H (..., 3, 3) [-]."""
@@ -113,29 +119,69 @@ class Material:
         return self.tangent(torch.zeros(1, 3, 3, dtype=torch.float64))[0]
 
     @property
-    def poisson_range(self) -> tuple[float, float] | None:
-        """Smallest and largest Poisson's ratio [-] of a law with a range of them; None: it is one.
+    def parameter_ranges(self) -> dict[str, tuple[float, float]]:
+        """Ranges of the constants of which each load has values of its own, by name.
 
-        A law with a range has no moduli: it answers nothing before `at` has made it one.
+        A law with ranges has no moduli: it answers nothing before `with_parameters`.
         """
-        return None
+        values = {name: getattr(self, name) for name in self.ranged}
+        return {name: tuple(v) for name, v in values.items() if isinstance(v, Sequence)}
 
     @property
     def is_batched(self) -> bool:
-        """Whether each member of a batch has moduli of its own, see `at`."""
-        return False
+        """True if each member of a batch has constants of its own, see `with_parameters`."""
+        return any(isinstance(getattr(self, name), Tensor) for name in self.ranged)
 
-    def at(self, poisson: float | Tensor) -> Self:
-        """Return the law with another Poisson's ratio.
+    def with_parameters(self, parameters: Tensor) -> Self:
+        """Return the law with values in place of its ranges.
 
         Args:
-            poisson: Poisson's ratio [-]; or those of the members of a batch, (B,), which strains
-                (B, E, Q, 3, 3) are then taken for.
+            parameters: Values in the order of `parameter_ranges`, (B, P). With B > 1 each member
+                of a batch has its own, and the law takes strains (B, E, Q, 3, 3).
 
         Raises:
-            ValueError: The law has none, or it lies outside (-1, 0.5).
+            ValueError: The law has another number of ranges, or does not allow a value.
         """
-        raise ValueError(f"poisson: {type(self).__name__} has no Poisson's ratio among its moduli")
+        names = tuple(self.parameter_ranges)
+        if parameters.shape[-1] != len(names):
+            raise ValueError(f"parameters: {type(self).__name__} has ranges of {list(names)}")
+        if not names:
+            return self
+        law: Any = self  # a dataclass if it has ranges
+        if len(parameters) == 1:
+            return replace(law, **dict(zip(names, parameters[0].tolist(), strict=True)))
+        for extreme in (parameters.amin(0), parameters.amax(0)):
+            self.with_parameters(extreme[None])
+        # beside cells and points, so that numbers of a point, (B, E, Q), take their own
+        columns = parameters.T[..., None, None]
+        return replace(law, **dict(zip(names, columns, strict=True)))
+
+    def __post_init__(self) -> None:
+        """Check the constants of a dataclass, and both ends of its ranges.
+
+        Raises:
+            ValueError: The law does not allow a value, or a range is none.
+        """
+        if self.is_batched:
+            return
+        ranges = self.parameter_ranges
+        for name, ends in ranges.items():
+            if len(ends) != 2 or not ends[0] < ends[1]:
+                raise ValueError(
+                    f"{name} = {list(ends)} must be a range [low, high], low below high"
+                )
+            object.__setattr__(self, name, tuple(map(float, ends)))
+        if not ranges:
+            self.check_constants()
+        for corner in product(*ranges.values()) if ranges else ():
+            self.with_parameters(torch.tensor([corner], dtype=torch.float64))
+
+    def check_constants(self) -> None:
+        """Check the values of the constants.
+
+        Raises:
+            ValueError: The law does not allow a value.
+        """
 
 
 @dataclass(frozen=True)
@@ -147,28 +193,13 @@ class YoungPoissonMaterial(Material):
             load has its own.
     """
 
+    ranged: ClassVar[tuple[str, ...]] = ("poisson",)
+
     poisson: float | Sequence[float]
 
-    def __post_init__(self) -> None:
-        """Check the range.
-
-        Raises:
-            ValueError: `poisson` lies outside (-1, 0.5), is no finite number, or no range.
-        """
-        if isinstance(self.poisson, Tensor):
-            if not ((self.poisson > -1.0) & (self.poisson < 0.5)).all():
-                raise ValueError("poisson must lie between -1 and 0.5 (both excluded) throughout")
-            return
-        if isinstance(self.poisson, Sequence):
-            low, high = self.poisson if len(self.poisson) == 2 else (math.nan, math.nan)
-            if not -1.0 < low < high < 0.5:
-                raise ValueError(
-                    f"poisson = {list(self.poisson)} must be a range [low, high], low below high, "
-                    "between -1 and 0.5 (both excluded)"
-                )
-            object.__setattr__(self, "poisson", (float(low), float(high)))
-            return
-        if not (math.isfinite(self.poisson) and -1.0 < self.poisson < 0.5):
+    def check_constants(self) -> None:
+        """See `Material.check_constants`."""
+        if not -1.0 < self._one < 0.5:
             raise ValueError(
                 f"poisson = {self.poisson} must lie between -1 and 0.5 (both excluded)"
             )
@@ -189,34 +220,18 @@ class YoungPoissonMaterial(Material):
         return self.lam + 2 / 3 * self.mu
 
     @property
-    def poisson_range(self) -> tuple[float, float] | None:
-        """See `Material.poisson_range`."""
-        return self.poisson if isinstance(self.poisson, tuple) else None
-
-    @property
-    def is_batched(self) -> bool:
-        """See `Material.is_batched`."""
-        return isinstance(self.poisson, Tensor)
-
-    def at(self, poisson: float | Tensor) -> Self:
-        """See `Material.at`."""
-        # beside cells and points, so that numbers of a point, (B, E, Q), take their own
-        own: Any = poisson.view(-1, 1, 1) if isinstance(poisson, Tensor) else poisson
-        return replace(self, poisson=own)
-
-    @property
     def _one(self) -> float:
         """Poisson's ratio; (B, 1, 1) of a batch, which goes through the same arithmetic.
 
         Raises:
             ValueError: It is a range.
         """
-        if isinstance(self.poisson, tuple):
+        if isinstance(self.poisson, Sequence):
             raise ValueError(
-                f"poisson = {list(self.poisson)} is a range, and this needs one: each load brings "
-                "its own (Load.poisson), a body of one is Problem.at"
+                f"poisson = {list(self.poisson)} is a range; choose a value with "
+                "Problem.with_parameters, or give Load.parameters for each load"
             )
-        return cast(float, self.poisson)
+        return self.poisson
 
 
 class InvariantBasedMaterial(Material):

@@ -25,12 +25,8 @@ class MooneyRivlinK2(InvariantBasedMaterial):
     c01: float
     bulk: float
 
-    def __post_init__(self) -> None:
-        """Check the range.
-
-        Raises:
-            ValueError: The body would not resist shear or compression.
-        """
+    def check_constants(self) -> None:
+        """See `Material.check_constants`: the body must resist shear and compression."""
         check_moduli("2 (c10 + c01)", 2 * (self.c10 + self.c01), self.bulk, vars(self).values())
 
     def energy(self, H: Tensor) -> Tensor:

@@ -31,13 +31,8 @@ class OgdenK2(Material):
     exponents: Sequence[float]
     bulk: float
 
-    def __post_init__(self) -> None:
-        """Check the range.
-
-        Raises:
-            ValueError: Not as many exponents as moduli, an exponent of 0, or a body that would not
-                resist shear or compression.
-        """
+    def check_constants(self) -> None:
+        """See `Material.check_constants`: as many exponents as moduli, none 0, and resistance."""
         if len(self.shear) != len(self.exponents) or not all(self.exponents):
             raise ValueError(
                 f"exponents = {list(self.exponents)} must be {len(self.shear)} numbers other than 0"

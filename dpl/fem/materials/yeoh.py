@@ -24,12 +24,8 @@ class YeohK2(InvariantBasedMaterial):
     c30: float
     bulk: float
 
-    def __post_init__(self) -> None:
-        """Check the range.
-
-        Raises:
-            ValueError: The body would not resist shear or compression.
-        """
+    def check_constants(self) -> None:
+        """See `Material.check_constants`: the body must resist shear and compression."""
         check_moduli("2 c10", 2 * self.c10, self.bulk, vars(self).values())
 
     def energy(self, H: Tensor) -> Tensor:

@@ -9,13 +9,14 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.linear.interface import full_matrix
+from dpl.fem.materials import LinearElastic
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
 
 ENTRIES = 16_000  # entries of displacements per evaluation, so that strains fit into the cache
 CACHE_SIZE = 1_000_000  # loads whose work is cached
-BASIS_RATIOS = (0.0, 0.2, 0.4)  # Poisson's ratios whose K(0) span those of all others
+HOOKEAN = tuple(map(LinearElastic, (0.0, 0.2, 0.4)))  # laws whose K(0) span those of all others
 STEP = 1e-5  # step of the displacement gradient in difference quotients of forces [-]
 
 
@@ -34,18 +35,18 @@ class RestStiffness:
         """Return `known` if it belongs to the body, else a new object."""
         return known if known is not None and known.problem is problem else cls(problem)
 
-    def product(self, field: Tensor, poisson: Tensor | None = None) -> Tensor:
+    def product(self, field: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return K(0) v, (B, N, D) [-]; zero at fixed degrees of freedom.
 
-        At rest every law is Hooke's, K(0) = lambda K1 + mu K2 + foundation. K(0) of any Poisson's
-        ratio is therefore a linear combination of three.
+        At rest every law is Hooke's, K(0) = lambda K1 + mu K2 + foundation. K(0) of any
+        parameters is therefore a linear combination of three.
 
         Args:
             field: v, (B, N, D) [-].
-            poisson: Poisson's ratios of the loads, (B, P) [-]; P = 0 by default.
+            parameters: Parameters of the loads, (B, P); P = 0 by default.
         """
         problem = self.problem
-        if poisson is None or not poisson.shape[-1]:
+        if parameters is None or not parameters.shape[-1]:
             free, image = problem.free, torch.zeros_like(field)
             columns = field.detach()[:, free].T
             if field.device.type == "cpu":
@@ -53,38 +54,38 @@ class RestStiffness:
             else:
                 image[:, free] = (self._on_device @ columns).T
             return image
-        law = problem.material.at(poisson.flatten())
+        law = problem.with_parameters(parameters).material
         moduli = [torch.as_tensor(m).flatten().to(field) for m in (law.lam, law.mu)]
         moduli.append(torch.ones_like(moduli[0]))
-        known = [(m.lam, m.mu, 1.0) for m in (problem.material.at(nu) for nu in BASIS_RATIOS)]
+        known = [(hooke.lam, hooke.mu, 1.0) for hooke in HOOKEAN]
         shares = torch.linalg.solve(field.new_tensor(known).T, torch.stack(moduli))  # (3, B)
         parts = torch.stack([rest.product(field) for rest in self._spanning])
         return torch.einsum("kb,kbnd->bnd", shares, parts)
 
     @cached_property
     def _spanning(self) -> "list[RestStiffness]":
-        return [RestStiffness(self.problem.at(nu)) for nu in BASIS_RATIOS]
+        return [RestStiffness(self.problem.with_material(hooke)) for hooke in HOOKEAN]
 
-    def linear_strain_energy(self, force: Tensor, poisson: Tensor | None = None) -> Tensor:
+    def linear_strain_energy(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return f.K(0)^-1 f / 2, the strain energy of the linear solution, (B,) [-].
 
         The relative error is about 1e-3, because the value is used as a scale only. Results are
         cached by the hash of the force, since the forces of a data set recur every epoch. A new
-        force takes one solve on the CPU, and a new Poisson's ratio one factorisation.
+        force takes one solve on the CPU, and new parameters one factorisation.
 
         Args:
             force: f, (B, N, D) [-].
-            poisson: Poisson's ratios of the loads, (B, P) [-]; P = 0 by default.
+            parameters: Parameters of the loads, (B, P); P = 0 by default.
         """
         problem, found = self._linear.problem, []
-        poisson = force.new_zeros(1, 0) if poisson is None else poisson
-        for one, own in zip(force.cpu(), poisson.cpu().expand(len(force), -1), strict=True):
+        parameters = force.new_zeros(1, 0) if parameters is None else parameters
+        for one, own in zip(force.cpu(), parameters.cpu().expand(len(force), -1), strict=True):
             right = problem.restrict(one)
             key = hash(right.tobytes() + own.numpy().tobytes())
             if key not in self._works:
                 if len(self._works) >= CACHE_SIZE:
                     self._works.clear()
-                factor = self._linear.at(own[None]).factor
+                factor = self._linear.with_parameters(own[None]).factor
                 self._works[key] = float(right @ factor.solve(right, 1e-3)) / 2
             found.append(self._works[key])
         return torch.tensor(found, dtype=force.dtype, device=force.device)
@@ -93,14 +94,14 @@ class RestStiffness:
     def _works(self) -> dict[int, float]:
         return {}
 
-    def energy(self, poisson: Tensor) -> Tensor:
+    def energy(self, parameters: Tensor) -> Tensor:
         """Return the strain energy at rest W(0), (1,) or (B,) [-]; it is not zero for every law."""
-        if not poisson.shape[-1]:
+        if not parameters.shape[-1]:
             return self._energy
-        body = self.problem.at(poisson)
+        body = self.problem.with_parameters(parameters)
         nothing = body.points.new_zeros(1, 1, 1, 3, 3)
         volume = body.dV.expand(len(body.cells), -1).sum()
-        return volume * body.material.energy(nothing).flatten().expand(len(poisson))
+        return volume * body.material.energy(nothing).flatten().expand(len(parameters))
 
     @cached_property
     def _energy(self) -> Tensor:
@@ -141,12 +142,14 @@ def potential_energy(
     displacement: Tensor, load: Load, problem: Problem, rest: RestStiffness
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return W(u) - W(0) - f.u (B,), its gradient (B, N, D), and a mask of det F > 0 (B,)."""
-    force, own = load.force, load.poisson.expand(len(displacement), -1)
-    internal, volume = problem.at(own).evaluate(displacement)
+    force, own = load.force, load.parameters.expand(len(displacement), -1)
+    internal, volume = problem.with_parameters(own).evaluate(displacement)
     slope = torch.where(problem.free, internal - force, 0.0)
     count = max(1, ENTRIES // displacement[0].numel())
     parts = zip(displacement.split(count), own.split(count), strict=True)
-    strain = torch.cat([problem.at(nu).energy(part) for part, nu in parts]) - rest.energy(own)
+    strain = torch.cat(
+        [problem.with_parameters(nu).energy(part) for part, nu in parts]
+    ) - rest.energy(own)
     energy = strain - (force * displacement).sum(dim=(1, 2))
     sound = (volume > 0) & energy.isfinite() & slope.flatten(1).isfinite().all(dim=1)
     return energy, slope, sound

@@ -177,10 +177,10 @@ class PODGalerkin:
         """Yield the solution; iterations and factorisations count reduced tangents.
 
         Raises:
-            ValueError: Loads have their own Poisson's ratios.
+            ValueError: Loads have parameters of their own.
         """
-        if load.poisson.shape[-1]:
-            raise ValueError("load.poisson must be empty; use dpl.fem.Newton")
+        if load.parameters.shape[-1]:
+            raise ValueError("load.parameters must be empty; use dpl.fem.Newton")
         found, seconds = [], []
         for force in load.force:
             start = time.perf_counter()

@@ -189,15 +189,15 @@ def norm(vector: Tensor) -> float:
 
 
 def refuse_range(problem: Problem) -> None:
-    """Check that the law has a single Poisson's ratio.
+    """Check that the law has no ranges.
 
     Raises:
-        ValueError: It has a range of them.
+        ValueError: It has one.
     """
-    if (span := problem.material.poisson_range) is not None:
+    for name, ends in problem.material.parameter_ranges.items():
         raise ValueError(
-            f"poisson = {list(span)} must be one number, because reduced stiffness and cells "
-            "depend on it; use Problem.at or dpl.fem.Newton"
+            f"{name} = {list(ends)} must be one number, because reduced stiffness and cells "
+            "depend on it; use Problem.with_parameters or dpl.fem.Newton"
         )
 
 

@@ -61,7 +61,7 @@ class AndersonSolver:
 
     def _member(self, load: Load, guess: Tensor) -> Iterator[Solution]:
         start = time.perf_counter()
-        newton = self.newton.at(load.poisson)
+        newton = self.newton.with_parameters(load.parameters)
         problem, count = newton.problem, 0
         u = torch.where(problem.free, guess, problem.prescribed)
         state, right = self._state(load, u, count, start)
@@ -85,10 +85,10 @@ class AndersonSolver:
 
     def _state(self, load: Load, u: Tensor, count: int, start: float) -> tuple[Solution, Array]:
         """Return a displacement as a solution, and the residual force f - f_int(u), (n,)."""
-        problem = self.problem.at(load.poisson)
+        problem = self.problem.with_parameters(load.parameters)
         internal, _ = evaluation = problem.evaluate(u)
         state = evaluate_solution(
-            problem, u, load, self.tol,
+            self.problem, u, load, self.tol,
             iterations=count, seconds=time.perf_counter() - start, from_guess=True,
             evaluation=evaluation,
         )  # fmt: skip

@@ -44,17 +44,17 @@ class DifferentiableSolve:
 
         Raises:
             ValueError: A load of the batch has no solution (see `solution`), the load is not on
-                the CPU, or Poisson's ratios require a gradient.
+                the CPU, or its parameters require a gradient.
             SingularMatrix: In the backward pass, if the tangent at a solution is singular, that is
                 at a critical load.
         """
         if load.force.device.type != "cpu":
             raise ValueError(f"load.force is on {load.force.device} and must be on the cpu")
-        if load.poisson.requires_grad:
+        if load.parameters.requires_grad:
             raise ValueError(
-                "load.poisson requires a gradient; solutions are differentiable in forces only"
+                "load.parameters requires a gradient; solutions are differentiable in forces only"
             )
-        return _Equilibrium.apply(load.force.double(), load.poisson, guess, self)
+        return _Equilibrium.apply(load.force.double(), load.parameters, guess, self)
 
     def solution(self, load: Load, *, guess: Tensor | None = None) -> Solution:
         """Return Newton's solution, without derivatives."""
@@ -62,20 +62,23 @@ class DifferentiableSolve:
             *_, last = self.newton.iterate(load, guess=guess)
         return last
 
-    def factors(self, displacement: Tensor, poisson: Tensor | None = None) -> list[Factor]:
+    def factors(self, displacement: Tensor, parameters: Tensor | None = None) -> list[Factor]:
         """Return the factors of the tangents at displacements (B, N, D) [-], one each.
 
         Args:
             displacement: Displacements of the tangents.
-            poisson: Poisson's ratios of the loads, (B, P) [-].
+            parameters: Parameters of the law, (B, P).
 
         Raises:
             SingularMatrix: A tangent is singular.
         """
         problem = self.newton.problem
-        ratios = displacement.new_zeros(1, 0) if poisson is None else poisson
-        pairs = zip(displacement, ratios.expand(len(displacement), -1), strict=True)
-        tangents = [problem.at(nu[None]).linearise(u[None]).tangent[0] for u, nu in pairs]
+        if parameters is None:
+            parameters = displacement.new_zeros(len(displacement), 0)
+        tangents = [
+            problem.with_parameters(own).linearise(u).tangent[0]
+            for u, own in zip(displacement.split(1), parameters.split(1), strict=True)
+        ]
         backend = self.newton.linear_solver.tangent_backend
         return [backend.factorise(tangent.numpy()) for tangent in tangents]
 
@@ -85,16 +88,20 @@ class _Equilibrium(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, force: Tensor, poisson: Tensor, guess: Tensor | None, parent: DifferentiableSolve
+        ctx: Any,
+        force: Tensor,
+        parameters: Tensor,
+        guess: Tensor | None,
+        parent: DifferentiableSolve,
     ) -> Tensor:
         guess = None if guess is None else guess.detach()
-        load = Load(force.detach(), torch.ones(len(force), dtype=torch.float64), poisson)
+        load = Load(force.detach(), torch.ones(len(force), dtype=torch.float64), parameters)
         answer = parent.solution(load, guess=guess)
         if not answer.converged.all():
             lost = (~answer.converged).nonzero().flatten().tolist()
             states = ", ".join(f"load {k}: {Status(int(answer.status[k]))}" for k in lost)
             raise ValueError(f"no equilibrium to differentiate; of {len(force)} loads, {states}")
-        ctx.parent, ctx.poisson, ctx.factors = parent, poisson, None
+        ctx.parent, ctx.parameters, ctx.factors = parent, parameters, None
         ctx.save_for_backward(answer.displacement)
         return answer.displacement
 
@@ -104,7 +111,7 @@ class _Equilibrium(torch.autograd.Function):
         problem = ctx.parent.newton.problem
         if ctx.factors is None:  # kept: each row of a Jacobian needs them
             (displacement,) = ctx.saved_tensors
-            ctx.factors = ctx.parent.factors(displacement, ctx.poisson)
+            ctx.factors = ctx.parent.factors(displacement, ctx.parameters)
         solved = [
             problem.extend(factor.solve(problem.restrict(one)))
             for factor, one in zip(ctx.factors, gradient, strict=True)

@@ -15,7 +15,7 @@ from dpl.fem.problem import Problem
 from dpl.fem.solvers.corotational import CorotationalPreconditioner
 from dpl.fem.solvers.solution import Load, Solution, check_force, check_tol, evaluate_solution
 
-MAX_CLONES = 4  # solvers of other Poisson's ratios that are kept with their factors
+MAX_CLONES = 4  # solvers of other parameters that are kept with their factors
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class LinearSolver:
         tol: Relative residual below which a solution counts as converged [-]; at least 1e-15,
             below 1.
         linear: Backend of the sparse solves, see `dpl.fem.linear.make_backend`.
-        parent: Solver of the same mesh with another Poisson's ratio, whose backends are used.
+        parent: Solver of the same mesh with other parameters, whose backends are used.
     """
 
     problem: Problem
@@ -72,15 +72,12 @@ class LinearSolver:
         name = select_backend(self.linear, pattern, modes, many_rhs=many_rhs)
         return make_backend(pattern, name, modes)
 
-    def at(self, poisson: Tensor | float) -> "LinearSolver":
-        """Return the linear solver of the body with another Poisson's ratio, see `Problem.at`."""
-        return self.of(self.problem.at(poisson))
-
-    def of(self, problem: Problem) -> "LinearSolver":
-        """Return the linear solver of a body that differs in Poisson's ratio only.
+    def with_parameters(self, parameters: Tensor) -> "LinearSolver":
+        """Return the solver of the body with other parameters, see `Problem.with_parameters`.
 
         The solvers of the last `MAX_CLONES` bodies are kept.
         """
+        problem = self.problem.with_parameters(parameters)
         if problem is self.problem:
             return self
         if problem not in self._clones:
@@ -107,8 +104,10 @@ class LinearSolver:
         """
         check_force(self.problem, load)
         start = time.perf_counter()
-        pairs = zip(load.force, load.poisson.expand(len(load.force), -1), strict=True)
-        u = torch.stack([self.at(nu[None]).solve(force) for force, nu in pairs])
+        members = [
+            self.with_parameters(one.parameters).solve(one.force[0]) for one in load.unbatch()
+        ]
+        u = torch.stack(members)
         seconds = (time.perf_counter() - start) / len(u)
         yield evaluate_solution(self.problem, u, load, self.tol, iterations=1, seconds=seconds)
 

@@ -105,12 +105,12 @@ class Newton:
             ValueError: The force does not fit the body, see `check_force`.
         """
         check_force(self.problem, load)
-        forces, ratios = self.problem.acting(load.force), load.poisson.expand(len(load.force), -1)
-        guesses = [None] * len(forces) if guess is None else guess.split(1)
+        members = load._replace(force=self.problem.acting(load.force)).unbatch()
+        guesses = [None] * len(members) if guess is None else guess.split(1)
         yield from run_lockstep(
             [
-                self.at(nu[None])._apply_load(force[None], start)
-                for force, nu, start in zip(forces, ratios, guesses, strict=True)
+                self.with_parameters(one.parameters)._apply_load(one.force, start)
+                for one, start in zip(members, guesses, strict=True)
             ]
         )
 
@@ -118,15 +118,15 @@ class Newton:
         """Return class name and tolerance; the other options only change the iterations."""
         return {"name": type(self).__name__, "tol": float(self.tol)}
 
-    def at(self, poisson: Tensor | float) -> "Newton":
-        """Return the solver of the body with another Poisson's ratio, see `Problem.at`.
+    def with_parameters(self, parameters: Tensor) -> "Newton":
+        """Return the solver of the body with other parameters, see `Problem.with_parameters`.
 
-        It has a factor of K(0) of its own; the linear solvers of the last few ratios are kept.
+        It has a factor of K(0) of its own; the linear solvers of the last few bodies are kept.
         """
-        problem = self.problem.at(poisson)
-        if problem is self.problem:
+        linear = self.linear_solver.with_parameters(parameters)
+        if linear is self.linear_solver:
             return self
-        return replace(self, problem=problem, linear_solver=self.linear_solver.of(problem))
+        return replace(self, problem=linear.problem, linear_solver=linear)
 
     def stability(self, displacement: Tensor) -> Stability:
         """Return the stability of the tangent at (1, N, D); a singular one counts as unstable."""

@@ -13,8 +13,8 @@ class ReferenceSolver(Protocol):
     """Solver of a scene. Data sets and comparisons hold its solutions.
 
     Any class with these attributes can be the solver of a scene. The configuration calls it with
-    the keyword `problem`. A load brings its own Poisson's ratio where the law has a range:
-    `problem.at(load.poisson)` is its body.
+    the keyword `problem`. A load brings its own parameters where the law has ranges:
+    `problem.with_parameters(load.parameters)` is its body.
     """
 
     @property

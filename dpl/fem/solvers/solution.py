@@ -16,7 +16,7 @@ LEAST_TOL = 1e-15  # relative residual below which rounding decides on convergen
 class _Load(NamedTuple):
     force: Tensor
     young: Tensor
-    poisson: Tensor
+    parameters: Tensor
 
 
 class Load(_Load):
@@ -25,27 +25,28 @@ class Load(_Load):
     Attributes:
         force: Nodal forces over E L^2 (E L in 2D), (B, N, D) [-].
         young: Young's moduli E, (B,) [Pa]; dimensionless solutions do not depend on them.
-        poisson: Poisson's ratios of the bodies, (B, P) [-]: P = 1 if each load has its own ratio,
-            else P = 0, which may be left out.
+        parameters: Values of the ranges of the law, (B, P), see `Material.parameter_ranges`; may
+            be left out if it has none, P = 0.
     """
 
     __slots__ = ()
 
-    def __new__(cls, force: Tensor, young: Tensor, poisson: Tensor | None = None) -> "Load":
-        """Create a load; Poisson's ratios may be (B,) or (B, P)."""
-        return super().__new__(cls, force, young, as_column(young, poisson))
+    def __new__(cls, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> "Load":
+        """Create a load; parameters may be (B,) or (B, P)."""
+        return super().__new__(cls, force, young, as_column(young, parameters))
 
     def unbatch(self) -> "list[Load]":
         """Return the loads one by one, B = 1."""
-        parts = (slice(k, k + 1) for k in range(len(self.force)))
-        return [Load(*(column[part] for column in self)) for part in parts]
+        count = len(self.force)
+        columns = self.force, self.young.expand(count), self.parameters.expand(count, -1)
+        return [Load(*parts) for parts in zip(*(c.split(1) for c in columns), strict=True)]
 
 
-def as_column(young: Tensor, poisson: Tensor | None) -> Tensor:
-    """Return Poisson's ratios (B,) or (B, P) as (B, P); P = 0 for None, with `young` (B,)."""
-    if poisson is None:
+def as_column(young: Tensor, parameters: Tensor | None) -> Tensor:
+    """Return parameters (B,) or (B, P) as (B, P); P = 0 for None, with `young` (B,)."""
+    if parameters is None:
         return young.new_zeros(*young.shape, 0)
-    return poisson[..., None] if poisson.dim() == young.dim() else poisson
+    return parameters[..., None] if parameters.dim() == young.dim() else parameters
 
 
 class Status(IntEnum):
@@ -203,7 +204,7 @@ def evaluate_solution(
         ValueError: `tol` is out of range.
     """
     check_tol(tol)
-    problem = problem.at(load.poisson)
+    problem = problem.with_parameters(load.parameters)
     internal, volume = evaluation or problem.evaluate(displacement)
     ratio = problem.relative_residual_of(internal, load.force)
     balanced = (ratio < tol) & (volume > 0)

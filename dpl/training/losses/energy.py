@@ -43,7 +43,7 @@ class EnergyNormLoss(Loss):
         self._rest = rest = RestStiffness.of(physics.problem, self._rest)
         with torch.no_grad():
             fields = torch.cat([prediction - batch.displacement, batch.displacement])
-            images = rest.product(fields, torch.cat([batch.poisson, batch.poisson]))
+            images = rest.product(fields, torch.cat([batch.parameters, batch.parameters]))
             error, size = (fields * images).sum(dim=(1, 2)).chunk(2)
             size = clamp_scale(size, self.floor if self.relative else torch.inf)
             slope = 2 * images[: len(prediction)] / size[:, None, None]
@@ -90,10 +90,12 @@ class PotentialEnergyLoss(Loss):
         """See `Loss`."""
         self._rest = rest = RestStiffness.of(physics.problem, self._rest)
         with torch.no_grad():
-            scale = clamp_scale(rest.linear_strain_energy(batch.force, batch.poisson), self.floor)
+            scale = clamp_scale(
+                rest.linear_strain_energy(batch.force, batch.parameters), self.floor
+            )
             energy, slope, sound = potential_energy(prediction, batch.load, physics.problem, rest)
             if not sound.all():
-                image = rest.product(prediction, batch.poisson)
+                image = rest.product(prediction, batch.parameters)
                 energy = torch.where(sound, energy, (prediction * image).sum(dim=(1, 2)) / 2)
                 slope = torch.where(sound[:, None, None], slope, image)
             self.terms = {"inverted": 1 - sound.double().mean()}

@@ -22,7 +22,7 @@ class LossContext(NamedTuple):
 
     Attributes:
         problem: The finite-element problem, on the device of the batch. Where the law has a range
-            of Poisson's ratios, the problem of a batch is `problem.at(batch.poisson)`.
+            the problem of a batch is `problem.with_parameters(batch.parameters)`.
         largest_force: ||Phi q_max||, by which the paper divides residuals, () [-].
     """
 

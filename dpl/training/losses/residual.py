@@ -87,7 +87,7 @@ def residual_norm(prediction: Tensor, batch: Sample, physics: LossContext) -> Te
     inverted so far that the law has no stress, the norm is not finite. Such samples get the largest
     finite norm of the batch (1 if there is none) and a zero gradient.
     """
-    problem = physics.problem.at(batch.poisson)
+    problem = physics.problem.with_parameters(batch.parameters)
     residual = torch.where(problem.free, problem.evaluate(prediction).internal - batch.force, 0.0)
     length = residual.flatten(1).norm(dim=1)
     norm, sound = length / physics.largest_force, length.isfinite()
