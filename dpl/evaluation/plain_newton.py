@@ -42,7 +42,8 @@ class PlainNewton:
         return self.solver.tol
 
     def _member(self, load: Load, u: Tensor, guessed: bool) -> Iterator[Solution]:
-        problem, start = self.problem, time.perf_counter()
+        problem = self.problem.with_parameters(load.parameters)
+        start = time.perf_counter()
         backend = self.solver.linear_solver.tangent_backend
         for k in range(self.max_iter + 1):
             state = evaluate_solution(

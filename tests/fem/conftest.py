@@ -6,21 +6,15 @@ import numpy as np
 import pytest
 import skfem
 import torch
+from laws import LAWS
 from torch import Tensor
 
 from dpl.fem import (
-    LinearElastic,
     Material,
-    MooneyRivlinK2,
-    NeoHookeanIsoK2,
-    NeoHookeanIsoK4,
     NeoHookeanLn,
-    OgdenK2,
     Plane,
     Problem,
     SaintVenantKirchhoff,
-    StableNeoHookean,
-    YeohK2,
     box,
     rectangle,
 )
@@ -28,17 +22,6 @@ from dpl.fem.linear import SuperLU
 from dpl.fem.loads import traction
 
 YOUNG, LENGTH = 4500.0, 100.0  # of the paper's beam [Pa], [m]
-LAWS = {  # with their constants
-    "linear": LinearElastic(0.3),
-    "SVK": SaintVenantKirchhoff(0.3),
-    "NH-ln": NeoHookeanLn(0.3),
-    "NHiso-k2": NeoHookeanIsoK2(0.3),
-    "NHiso-k4": NeoHookeanIsoK4(0.3),
-    "SNH": StableNeoHookean(0.3),
-    "MR": MooneyRivlinK2(0.15, 0.05, 2.0),
-    "Yeoh": YeohK2(0.2, -0.02, 0.005, 2.0),
-    "Ogden3": OgdenK2((0.3, 0.1, 0.02), (1.3, 5.0, -2.0), 2.0),
-}
 KINDS = [(cell, d) for cell in ("triangle", "quad", "tetra", "hexahedron") for d in (1, 2)]
 
 
