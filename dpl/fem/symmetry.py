@@ -40,12 +40,9 @@ class Symmetry(NamedTuple):
 
 
 def images(field: Tensor, group: Sequence[Symmetry], which: Tensor) -> Tensor:
-    """Return the image of each nodal field under a member of a group, (B, N, D).
+    """Return the images of nodal fields (B, N, D) under the members `which` (B,) of a group.
 
-    Args:
-        field: Nodal fields, (B, N, D).
-        group: Symmetries, the identity first.
-        which: Index of the member for each field, (B,).
+    The identity is the first member.
     """
     image = field.clone()
     for k, symmetry in enumerate(group[1:], 1):
@@ -67,9 +64,8 @@ def products(group: Sequence[Symmetry]) -> Tensor:
 def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetry]:
     """Return the symmetry group of a body in a reproducible order, the identity first.
 
-    A symmetry maps nodes to nodes, commutes with the boundary conditions and with the internal
-    force, and is therefore one of mesh, law and foundation. This is tested on the nodes and on two
-    fixed displacements.
+    A symmetry maps nodes to nodes and commutes with the boundary conditions and with the internal
+    force, which is tested on two fixed displacements.
 
     Args:
         problem: The body. A body with coincident nodes has the identity only.
@@ -88,19 +84,15 @@ def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetr
         )
 
     motions = _motions(points, np.count_nonzero(problem.free.cpu().numpy(), axis=1))
-    found = [s for s in (Symmetry(*(a.to(fields.device) for a in m)) for m in motions) if holds(s)]
-    if not found:
-        one = torch.eye(points.shape[1], dtype=torch.float64), torch.arange(len(points))
-        return [Symmetry(*(part.to(fields.device) for part in one))]
+    one = torch.eye(points.shape[1], dtype=torch.float64), torch.arange(len(points))
+    moved = [Symmetry(*(part.to(fields.device) for part in pair)) for pair in (*motions, one)]
+    found = list(filter(holds, moved[:-1])) or moved[-1:]
     return sorted(_closed(found), key=lambda symmetry: symmetry.source.tolist())
 
 
 def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
     """Return the operators that commute with a symmetry: constraints, cells and foundation."""
-    springs, body = (
-        problem.springs,
-        problem.reference,
-    )  # isotropic: symmetries do not depend on constants
+    springs, body = problem.springs, problem.reference  # laws are isotropic for all constants
     cells = body if springs is None else replace(body, springs=None)
     operators: list[Callable[[Tensor], Tensor]] = [
         lambda field: torch.where(problem.free, field, 0.0),
@@ -124,23 +116,19 @@ def _fields(problem: Problem, points: Array) -> Tensor:
 
 def _same(found: Tensor, expected: Tensor) -> bool:
     """Return True if fields (..., N, D) are equal up to rounding; False if they contain NaN."""
-    error, size = ((x.abs().amax(dim=(-2, -1))) for x in (found - expected, expected))
+    error, size = (x.abs().amax(dim=(-2, -1)) for x in (found - expected, expected))
     return bool((error <= SAME * size).all())
 
 
 def _motions(points: Array, marks: NDArray[np.int_]) -> list[tuple[Tensor, Tensor]]:
-    """Return all isometries about the origin that map nodes to nodes, as in `Symmetry`.
+    """Return all isometries about the origin that map nodes (N, D) to nodes, as in `Symmetry`.
 
-    Args:
-        points: Nodes, (N, D) [-].
-        marks: Integer property that a node shares with its image, (N,).
+    A node and its image have the same mark, (N,).
     """
     distance = _classes(np.linalg.norm(points, axis=1))
     kinds = np.unique(np.stack([distance, marks]), axis=1, return_inverse=True)[1].ravel()
     tree, candidates = KDTree(points), _candidates(points, kinds)
-    probes = (
-        points[:: 1 + len(points) // 16] @ candidates.mT
-    )  # (C, 16, D), a fast test of a few nodes
+    probes = points[:: 1 + len(points) // 16] @ candidates.mT  # (C, 16, D): a fast first test
     candidates = candidates[np.isfinite(tree.query(probes, distance_upper_bound=NEAR)[0]).all(1)]
     motions = []
     for Q in candidates:

@@ -24,7 +24,8 @@ from dpl.fem.linear import (
     multigrid_installed,
     select_backend,
 )
-from dpl.fem.linear.banded import MixedPrecisionFactor, band_storage, banded_triangular_solve
+from dpl.fem.linear.banded import MixedPrecisionFactor, banded_triangular_solve
+from dpl.fem.linear.ordering import band_storage
 from dpl.system.blas import slow_blas
 
 KNOWN = ["band", "band32", "pardiso", "superlu", "cg"]

@@ -105,11 +105,6 @@ class FoundationMatrix(NamedTuple):
 Support = DirichletBC | RobinBC
 
 
-def concatenate_foundations(springs: Sequence[FoundationMatrix]) -> FoundationMatrix | None:
-    """Return the sum of several matrices, None for an empty list."""
-    return FoundationMatrix(*map(torch.cat, zip(*springs, strict=True))) if springs else None
-
-
 def assemble_constraints(
     basis: skfem.Basis,
     scale: float,
@@ -144,6 +139,6 @@ def assemble_constraints(
         if isinstance(support, DirichletBC):
             value = support.on(basis, scale, origin)
             given = np.where(np.isnan(value), given, value)
-    return given, concatenate_foundations(
-        [s.on(basis, scale, origin) for s in supports if isinstance(s, RobinBC)]
-    )
+    springs = [s.on(basis, scale, origin) for s in supports if isinstance(s, RobinBC)]
+    total = FoundationMatrix(*map(torch.cat, zip(*springs, strict=True))) if springs else None
+    return given, total

@@ -59,6 +59,39 @@ def square(e):
 
 
 @njit
+def reduce_strain(gap, e):
+    """Subtract a strain gap (6, SIMD_WIDTH) from e; return det C - 1."""
+    for v in range(6):
+        store(e, v, load(e, v) - load(gap, v))
+    return square(e)
+
+
+@njit
+def extrapolate(D, gap, S):
+    """Add the stress D gap / 2 to S."""
+    for v in range(6):
+        stress = load(S, v)
+        for w in range(6):
+            half = 0.5 if w < 3 else 1.0
+            stress = stress + half * load(D, 6 * v + w) * load(gap, w)
+        store(S, v, stress)
+
+
+@njit
+def invert(e, X):
+    """Set X to C^-1, where C = I + e."""
+    e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
+    e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
+    inverse = 1.0 / (1.0 + square(e))
+    store(X, 0, (1.0 + e1 + e2 + (e1 * e2 - e4 * e4)) * inverse)
+    store(X, 1, (1.0 + e0 + e2 + (e0 * e2 - e5 * e5)) * inverse)
+    store(X, 2, (1.0 + e0 + e1 + (e0 * e1 - e3 * e3)) * inverse)
+    store(X, 3, (e4 * e5 - e3 - e3 * e2) * inverse)
+    store(X, 4, (e3 * e5 - e4 - e0 * e4) * inverse)
+    store(X, 5, (e3 * e4 - e5 - e1 * e5) * inverse)
+
+
+@njit
 def stress(law, c, needs, e, j, X, S, scratch, D, moduli):
     """Set S and X = C^-1, and with `moduli` D = dS/dE (rows 6 I + J), at e with det F = 1 + j.
 
@@ -67,63 +100,60 @@ def stress(law, c, needs, e, j, X, S, scratch, D, moduli):
     e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
     e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
     i1 = e0 + e1 + e2
-    m0, m1, m2 = e1 * e2 - e4 * e4, e0 * e2 - e5 * e5, e0 * e1 - e3 * e3
-    second = m0 + m1 + m2
+    i2 = 2.0 * i1 + (e1 * e2 - e4 * e4 + (e0 * e2 - e5 * e5) + (e0 * e1 - e3 * e3))
     if needs > 0:
-        inverse = 1.0 / (1.0 + square(e))
-        store(X, 0, (1.0 + e1 + e2 + m0) * inverse)
-        store(X, 1, (1.0 + e0 + e2 + m1) * inverse)
-        store(X, 2, (1.0 + e0 + e1 + m2) * inverse)
-        store(X, 3, (e4 * e5 - e3 - e3 * e2) * inverse)
-        store(X, 4, (e3 * e5 - e4 - e0 * e4) * inverse)
-        store(X, 5, (e3 * e4 - e5 - e1 * e5) * inverse)
+        invert(e, X)
     store(scratch, 0, j)
     if needs > 1:
         for lane in range(SIMD_WIDTH):
             scratch[0, lane] = math.log1p(scratch[0, lane])
             if needs > 2:
                 scratch[1, lane] = math.expm1(-2 / 3 * scratch[0, lane])
-    i2 = 2.0 * i1 + second
     derivatives = derivatives_of(law, c, i1, i2, j, load(scratch, 0), load(scratch, 1))
-    rest, W2, p, W11, W12, W22, W1J, W2J, pJ = derivatives
+    rest, W2, p = derivatives[:3]
     pressure = rest + 2.0 * W2 * i1
     for v in range(6):
         stress = -2.0 * W2 * load(e, v)
         if v < 3:
             stress = stress + pressure
         if needs > 0:  # - p e X
-            i, k = 3 * FIRST[v], SECOND[v]
+            k = SECOND[v]
             product = 0.0 * i1
             for n in range(3):
                 product = product + load(e, VOIGT[FIRST[v], n]) * load(X, VOIGT[n, k])
             stress = stress - p * product
         store(S, v, stress)
     if moduli:
-        for v in range(6):
-            normal = 2.0 if v < 3 else 0.0
-            t2 = normal * (2.0 + i1) - 2.0 * load(e, v)
-            x = load(X, v)
-            store(scratch, 2 + v, t2)
-            store(scratch, 8 + v, W11 * normal + W12 * t2 + W1J * x)
-            store(scratch, 14 + v, W12 * normal + W22 * t2 + W2J * x)
-            store(scratch, 20 + v, W1J * normal + W2J * t2 + pJ * x)
-        for v in range(6):
-            i, k = FIRST[v], SECOND[v]
-            for w in range(v, 6):
-                m, n = FIRST[w], SECOND[w]
-                d = load(scratch, 8 + v) * (2.0 if w < 3 else 0.0)
-                d = d + load(scratch, 14 + v) * load(scratch, 2 + w)
-                d = d + load(scratch, 20 + v) * load(X, w)
-                d = d - p * (
-                    load(X, VOIGT[i, m]) * load(X, VOIGT[k, n])
-                    + load(X, VOIGT[i, n]) * load(X, VOIGT[k, m])
-                )
-                if v == w and v > 2:
-                    d = d - 2.0 * W2
-                if v != w and w < 3:
-                    d = d + 4.0 * W2
-                store(D, 6 * v + w, d)
-                store(D, 6 * w + v, d)
+        differentiate(derivatives, i1, e, X, scratch, D)
+
+
+@njit
+def differentiate(derivatives, i1, e, X, scratch, D):
+    """Set D to dS/dE, from the invariant derivatives."""
+    _, W2, p, W11, W12, W22, W1J, W2J, pJ = derivatives
+    for v in range(6):
+        normal = 2.0 if v < 3 else 0.0
+        t2 = normal * (2.0 + i1) - 2.0 * load(e, v)
+        x = load(X, v)
+        store(scratch, 2 + v, t2)
+        store(scratch, 8 + v, W11 * normal + W12 * t2 + W1J * x)
+        store(scratch, 14 + v, W12 * normal + W22 * t2 + W2J * x)
+        store(scratch, 20 + v, W1J * normal + W2J * t2 + pJ * x)
+    for v in range(6):
+        i, k = FIRST[v], SECOND[v]
+        for w in range(v, 6):
+            m, n = FIRST[w], SECOND[w]
+            d = load(scratch, 8 + v) * (2.0 if w < 3 else 0.0)
+            d = d + load(scratch, 14 + v) * load(scratch, 2 + w)
+            d = d + load(scratch, 20 + v) * load(X, w)
+            first = load(X, VOIGT[i, m]) * load(X, VOIGT[k, n])
+            d = d - p * (first + load(X, VOIGT[i, n]) * load(X, VOIGT[k, m]))
+            if v == w and v > 2:
+                d = d - 2.0 * W2
+            if v != w and w < 3:
+                d = d + 4.0 * W2
+            store(D, 6 * v + w, d)
+            store(D, 6 * w + v, d)
 
 
 @njit

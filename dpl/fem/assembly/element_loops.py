@@ -19,6 +19,12 @@ SOURCES = "".join(inspect.getsource(m) for m in (simd, numba_laws, point, sys.mo
 
 
 @njit
+def rows(count):
+    """Return a workspace of vectors, (count, SIMD_WIDTH)."""
+    return np.zeros((count, SIMD_WIDTH))
+
+
+@njit
 def gather(field, cells, start, count, out):
     """Copy a nodal field (N, D) to rows 3 a + i of `out`, one cell per lane."""
     for lane in range(SIMD_WIDTH):
@@ -119,109 +125,65 @@ def scatter(fe, cells, start, count, force):
                 force[cells[start + lane, a], i] += fe[3 * a + i, lane]
 
 
-@njit(error_model="numpy", cache=True)
-def add_force(law, c, needs, finite, u, cells, dN, dV, force):
-    """Add the internal force of displacements u (N, D) to force (N, D); return min det F - 1."""
-    rows, Q = 3 * cells.shape[1], dN.shape[1]
-    ue, fe, g = (
-        np.zeros((rows, SIMD_WIDTH)),
-        np.zeros((rows, SIMD_WIDTH)),
-        np.zeros((Q, rows, SIMD_WIDTH)),
-    )
-    H, P, D = np.zeros((9, SIMD_WIDTH)), np.zeros((9, SIMD_WIDTH)), np.zeros((36, SIMD_WIDTH))
-    e, X, S = np.zeros((6, SIMD_WIDTH)), np.zeros((6, SIMD_WIDTH)), np.zeros((6, SIMD_WIDTH))
-    weight, scratch, low = np.zeros((Q, SIMD_WIDTH)), np.zeros((26, SIMD_WIDTH)), np.inf
-    for start in range(0, len(cells), SIMD_WIDTH):
-        count = min(SIMD_WIDTH, len(cells) - start)
-        gather(u, cells, start, count, ue)
-        gather_shape(dN, dV, start, count, g, weight)
-        fe[:] = 0.0
-        for q in range(Q):
-            gradient(ue, g[q], H)
-            j = point.volume_change(H)
-            store(scratch, 0, j)
-            low = minimum(scratch, count, low)
-            point.strain(H, finite, e)
-            point.stress(law, c, needs, e, j, X, S, scratch, D, False)
-            for r in range(9):
-                store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
-            add_forces(H, S, load(weight, q), g[q], P, fe)
-        scatter(fe, cells, start, count, force)
-    return low
+@njit
+def scatter_entries(K, places, count, values):
+    """Add the entries of the matrices of a block of cells to values (nnz + 1,)."""
+    for r in range(K.shape[0]):
+        for lane in range(count):
+            values[places[r, lane]] += K[r, lane]
 
 
 @njit(error_model="numpy", cache=True)
 def add_system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values):
-    """Add the force to (N, D) and the tangent to (nnz + 1,) at displacements u (N, D).
+    """Add force to (N, D) and, unless empty, tangent to (nnz + 1,) at displacements u (N, D).
 
     With `gap` (blocks, Q, 6, SIMD_WIDTH) stress and moduli are evaluated at the strain of u minus
     the gap, and the stress is extrapolated linearly to the strain of u. Returns the minimum of
-    det C - 1 of the reduced strains, infinity without a gap.
+    det F - 1, with a gap that of det C - 1 of the reduced strains.
     """
     n, Q, dim = cells.shape[1], dN.shape[1], dN.shape[3]
-    ue, fe, g = (
-        np.zeros((3 * n, SIMD_WIDTH)),
-        np.zeros((3 * n, SIMD_WIDTH)),
-        np.zeros((Q, 3 * n, SIMD_WIDTH)),
-    )
-    H, P, D = np.zeros((9, SIMD_WIDTH)), np.zeros((9, SIMD_WIDTH)), np.zeros((36, SIMD_WIDTH))
-    e, X, S, T = (
-        np.zeros((6, SIMD_WIDTH)),
-        np.zeros((6, SIMD_WIDTH)),
-        np.zeros((6, SIMD_WIDTH)),
-        np.zeros((6, SIMD_WIDTH)),
-    )
-    A, C, K = (
-        np.zeros((81, SIMD_WIDTH)),
-        np.zeros((27, SIMD_WIDTH)),
-        np.zeros((places.shape[1], SIMD_WIDTH)),
-    )
-    weight, scratch, low = np.zeros((Q, SIMD_WIDTH)), np.zeros((26, SIMD_WIDTH)), np.inf
+    mixed, moduli = len(gap) > 0, len(values) > 0
+    ue, fe, g, weight = rows(3 * n), rows(3 * n), np.zeros((Q, 3 * n, SIMD_WIDTH)), rows(Q)
+    H, P, D, A, C = rows(9), rows(9), rows(36), rows(81), rows(27)
+    e, X, S, T = rows(6), rows(6), rows(6), rows(6)
+    K, scratch, low = rows(places.shape[1]), rows(26), np.inf
     for start in range(0, len(cells), SIMD_WIDTH):
         block, count = start // SIMD_WIDTH, min(SIMD_WIDTH, len(cells) - start)
         gather(u, cells, start, count, ue)
         gather_shape(dN, dV, start, count, g, weight)
         fe[:] = 0.0
-        K[:] = 0.0
+        if moduli:
+            K[:] = 0.0
         for q in range(Q):
             gradient(ue, g[q], H)
             point.strain(H, finite, e)
-            mixed = len(gap) > 0
-            j = point.volume_change(H)
+            change = point.volume_change(H)
             if mixed:
-                for v in range(6):
-                    store(e, v, load(e, v) - load(gap[block, q], v))
-                square = point.square(e)
-                store(scratch, 0, square)
-                low = minimum(scratch, count, low)
-                j = square / (1.0 + sqrt(1.0 + square))
-            point.stress(law, c, needs, e, j, X, S, scratch, D, True)
+                change = point.reduce_strain(gap[block, q], e)
+            store(scratch, 0, change)
+            low = minimum(scratch, count, low)
+            j = change / (1.0 + sqrt(1.0 + change)) if mixed else change
+            point.stress(law, c, needs, e, j, X, S, scratch, D, moduli)
             for r in range(9):
                 store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
-            point.push_forward(H, D, S, load(weight, q), finite, T, A)
+            if moduli:
+                point.push_forward(H, D, S, load(weight, q), finite, T, A)
+                add_stiffness(A, g[q], dim, C, K)
             if mixed:
-                for v in range(6):
-                    stress = load(S, v)
-                    for w in range(6):
-                        half = 0.5 if w < 3 else 1.0
-                        stress = stress + half * load(D, 6 * v + w) * load(gap[block, q], w)
-                    store(S, v, stress)
+                point.extrapolate(D, gap[block, q], S)
             add_forces(H, S, load(weight, q), g[q], P, fe)
-            add_stiffness(A, g[q], dim, C, K)
         scatter(fe, cells, start, count, force)
-        for r in range(places.shape[1]):
-            for lane in range(count):
-                values[places[block, r, lane]] += K[r, lane]
+        if moduli:
+            scatter_entries(K, places[block], count, values)
     return low
 
 
 @njit(error_model="numpy", cache=True)
 def update_gap(law, gap, length, update, cells, dN, dV):
     """Return (1 - length) gap + length^2 dH^T dH of a step (N, D), (blocks, Q, 6, SIMD_WIDTH)."""
-    rows, Q = 3 * cells.shape[1], dN.shape[1]
+    n, Q = cells.shape[1], dN.shape[1]
     updated = np.zeros((-(-len(cells) // SIMD_WIDTH), Q, 6, SIMD_WIDTH))
-    ue, g = np.zeros((rows, SIMD_WIDTH)), np.zeros((Q, rows, SIMD_WIDTH))
-    H, weight = np.zeros((9, SIMD_WIDTH)), np.zeros((Q, SIMD_WIDTH))
+    ue, g, weight, H = rows(3 * n), np.zeros((Q, 3 * n, SIMD_WIDTH)), rows(Q), rows(9)
     for start in range(0, len(cells), SIMD_WIDTH):
         block, count = start // SIMD_WIDTH, min(SIMD_WIDTH, len(cells) - start)
         gather(update, cells, start, count, ue)

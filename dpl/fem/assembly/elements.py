@@ -76,8 +76,6 @@ def gradients(basis: skfem.Basis) -> tuple[NDArray[np.float64], NDArray[np.float
     """Return dN (E, Q, A, D) and dV (E, Q) of a basis; with E = 1 if all cells are equal."""
     stacked = np.stack([b[0].grad for b in basis.basis])  # (A, D, E, Q)
     dN, dV = stacked.transpose(2, 3, 0, 1), basis.dx
-    if np.allclose(dN, dN[:1], rtol=0, atol=1e-11 * np.abs(dN).max()) and np.allclose(
-        dV, dV[:1], rtol=1e-11
-    ):
-        return dN[:1], dV[:1]
-    return dN, dV
+    same = np.allclose(dN, dN[:1], rtol=0, atol=1e-11 * np.abs(dN).max())
+    equal = same and np.allclose(dV, dV[:1], rtol=1e-11)
+    return (dN[:1], dV[:1]) if equal else (dN, dV)

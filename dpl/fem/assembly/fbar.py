@@ -11,13 +11,9 @@ from dpl.fem.materials.tensors import inverse_transpose, volume_change
 
 
 def fbar_gradient(material: Material, H: Tensor, dV: Tensor, dim: int) -> Tensor:
-    """Return the displacement gradient with the mean volume ratio, (B, E, Q, 3, 3) [-].
+    """Return the displacement gradient H, (B, E, Q, 3, 3) [-], with the mean volume ratio.
 
-    Args:
-        material: The law.
-        H: Displacement gradient, (B, E, Q, 3, 3) [-].
-        dV: Volumes of the points, (E or 1, Q) [-].
-        dim: D.
+    The volumes dV of the points are (E or 1, Q) [-].
     """
     return _fbar(H, dV, dim)[0] if finite(material) else _bbar(H, dV, dim)
 

@@ -2,7 +2,7 @@
 
 import contextlib
 import copy
-from collections.abc import Iterator
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.material import InvariantBasedMaterial
 
 Array = NDArray[np.float64]
+NO_GAP = np.zeros((0, 0, 0, SIMD_WIDTH))
+NO_VALUES = np.zeros(0)
 
 
 class Kernels:
@@ -48,7 +50,6 @@ class Kernels:
             float(material.finite),
         )
         self._constants = np.array([material.constants])  # (1 or B, constants)
-        self._no_gap = np.zeros((0, 0, 0, SIMD_WIDTH))
 
     def with_moduli(self, material: InvariantBasedMaterial) -> "Kernels":
         """Return the kernels of the same body with other moduli of the same law."""
@@ -65,10 +66,8 @@ class Kernels:
             out: Internal force, (N, D).
             member: Index of the moduli, where each member of a batch has its own.
         """
-        law, needs, finite = self._law
         moduli = self._constants[member if len(self._constants) > 1 else 0]
-        arrays = (self.cells, self.dN, self.dV)
-        return 1 + self._call(element_loops.add_force, law, moduli, needs, finite, u, *arrays, out)
+        return self._add(moduli, u, NO_GAP, out, NO_VALUES)
 
     def system(self, u: Array, gap: Array | None, out: Array, values: Array) -> float:
         """Add force (N, D) and tangent (nnz + 1,) at u; return min det C of mixed points.
@@ -76,57 +75,46 @@ class Kernels:
         Raises:
             ValueError: The members of a batch have different moduli.
         """
-        law, needs, finite = self._law
         if len(self._constants) > 1:
             raise ValueError("parameters must be the same for all loads; linearise them one by one")
-        gap = self._no_gap if gap is None else gap
+        lowest = self._add(self._constants[0], u, NO_GAP if gap is None else gap, out, values)
+        return math.inf if gap is None else lowest
+
+    def _add(self, moduli: Array, u: Array, gap: Array, out: Array, values: Array) -> float:
+        law, needs, finite = self._law
         arrays = (self.cells, self.dN, self.dV, self.places)
-        moduli = self._constants[0]
         system = element_loops.add_system
-        return 1 + self._call(system, law, moduli, needs, finite, u, gap, *arrays, out, values)
+        return 1 + _call(system, law, moduli, needs, finite, u, gap, *arrays, out, values)
 
     def update_strain_gap(self, gap: Array | None, length: float, update: Array) -> Array:
         """Return the strain of u minus the strain of the mixed integration points after a step."""
-        gap = self._no_gap if gap is None else gap
-        law, *_ = self._law
-        arrays = (self.cells, self.dN, self.dV)
-        return self._call(element_loops.update_gap, law, gap, length, update, *arrays)
-
-    def _call(self, kernel: Any, *arguments: Any) -> Any:
-        """Return the result of a kernel; lock numba's cache at its first call."""
-        variant = (kernel, arguments[0].kind.name)
-        if variant in _LOADED:
-            return kernel(*arguments)
-        with _cache_lock(Path(kernel.stats.cache_path)):
-            result = kernel(*arguments)
-        _LOADED.add(variant)
-        return result
+        gap, kernel = NO_GAP if gap is None else gap, element_loops.update_gap
+        return _call(kernel, self._law[0], gap, length, update, self.cells, self.dN, self.dV)
 
 
 _LOADED: set[tuple[Any, str]] = set()  # kernels and laws compiled or loaded by this process
 
 
-@contextlib.contextmanager
-def _cache_lock(folder: Path) -> Iterator[None]:
-    """Lock numba's cache on disk against other processes.
+def _call(kernel: Any, law: Law, *arguments: Any) -> Any:
+    """Return the result of a kernel; lock numba's cache on disk at its first call.
 
     Two processes that save kernels of different laws at the same time would choose the same file
     name, and one law would then run the code of the other.
     """
-    try:
-        import fcntl
+    variant = (kernel, law.kind.name)
+    with contextlib.ExitStack() as stack:
+        # no lock on other systems, or in a read-only folder, where numba does not save
+        with contextlib.suppress(ImportError, OSError):
+            if variant not in _LOADED:
+                import fcntl
 
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / "kernels.lock").open("w")
-    except (
-        ImportError,
-        OSError,
-    ):  # no such locks on this system, or a read-only folder, where numba does not save
-        yield
-        return
-    with lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+                folder = Path(kernel.stats.cache_path)
+                folder.mkdir(parents=True, exist_ok=True)
+                lock = stack.enter_context((folder / "kernels.lock").open("w"))
+                fcntl.flock(lock, fcntl.LOCK_EX)
+        result = kernel(law, *arguments)
+    _LOADED.add(variant)
+    return result
 
 
 def _in_blocks(places: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -8,14 +8,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit, types
-from numba.extending import (
-    NativeValue,
-    models,
-    overload,
-    register_model,
-    typeof_impl,
-    unbox,
-)
+from numba.extending import NativeValue, models, overload, register_model, typeof_impl, unbox
 
 from dpl.fem.materials.material import InvariantBasedMaterial
 

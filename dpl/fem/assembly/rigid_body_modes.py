@@ -29,10 +29,7 @@ def unconstrained_modes(
 ) -> list[str]:
     """Return the names of the rigid body modes that the boundary conditions do not constrain.
 
-    Args:
-        points: Nodes of the body, (N, D).
-        free: Mask of the free degrees of freedom, (N, D).
-        springs: Elastic foundation.
+    Nodes (N, D), the mask of free degrees of freedom (N, D) and the foundation define the body.
     """
     motions, names = rigid_body_modes(points)
     fixed = motions[~free].numpy()  # (fixed degrees of freedom, motions)

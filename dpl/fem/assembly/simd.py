@@ -21,12 +21,8 @@ _FLAGS = ("contract", "reassoc", "nsz")  # allow fused multiply-adds, preserve N
 class SIMDVector(types.Type):
     """numba's type of a vector register."""
 
-    def __init__(self) -> None:
-        """Set the name that numba's cache uses."""
-        super().__init__(name=f"SIMDVector({SIMD_WIDTH})")
 
-
-SIMD_VECTOR = SIMDVector()
+SIMD_VECTOR = SIMDVector(f"SIMDVector({SIMD_WIDTH})")  # the name that numba's cache uses
 
 
 @register_model(SIMDVector)
@@ -108,13 +104,10 @@ def _operator(function: Any, instruction: str) -> None:
         return None
 
 
-for _function, _instruction in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
-):
-    _operator(_function, _instruction)
+_operator(operator.add, "fadd")
+_operator(operator.sub, "fsub")
+_operator(operator.mul, "fmul")
+_operator(operator.truediv, "fdiv")
 
 
 @overload(operator.neg)

@@ -34,7 +34,7 @@ class Pattern:
     def build(cls, cells: Integers, free: NDArray[np.bool_]) -> "Pattern":
         """Return the pattern of cells (E, A) with a mask of free degrees of freedom (N, D)."""
         nodes = len(free)
-        a, b = _pairs(cells.shape[1])
+        b, a = np.tril_indices(cells.shape[1])
         p, q = cells[:, a], cells[:, b]
         codes, entry = np.unique(np.minimum(p, q) * nodes + np.maximum(p, q), return_inverse=True)
         place, indptr, indices = _places(codes // nodes, codes % nodes, free)
@@ -72,7 +72,7 @@ class Pattern:
     def _kept(self) -> tuple[Integers, Integers]:
         cells, pairs, dim, _ = self.places.shape
         count = int((8 * pairs + 1) ** 0.5) // 2  # pairs = A (A + 1)/2
-        a, b = _pairs(count)
+        b, a = np.tril_indices(count)
         i, k = np.indices((dim, dim))
         local = ((a[:, None, None] * dim + i) * dim + k) * count + b[:, None, None]
         source = np.arange(cells)[:, None, None, None] * (count * dim) ** 2 + local
@@ -85,12 +85,6 @@ def _numbered(free: NDArray[np.bool_]) -> Integers:
     number = np.full(free.shape, -1)
     number[free] = np.arange(free.sum())
     return number
-
-
-def _pairs(count: int) -> tuple[Integers, Integers]:
-    """Return the pairs a <= b < count, b slowest."""
-    b, a = np.tril_indices(count)
-    return a, b
 
 
 def _places(

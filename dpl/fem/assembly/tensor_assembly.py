@@ -110,9 +110,7 @@ class TensorAssembly:
 
     def energy(self, displacement: Tensor) -> Tensor:
         """Return the strain energy over E L^D, including that of the foundation, (B,) [-]."""
-        H = self.gradient(displacement)
-        if self.mean_dilatation:
-            H = fbar_gradient(self.material, H, self.dV, self.shape[1])
+        H = self._effective_gradient(displacement)
         energy = (self.material.energy(H) * self.dV).sum((-2, -1))
         if self.springs is not None:
             pull = self.springs.force(displacement)
@@ -167,10 +165,13 @@ class TensorAssembly:
 
     def stress(self, displacement: Tensor) -> Tensor:
         """Return the first Piola-Kirchhoff stress over E at the quadrature points, (B,E,Q,3,3)."""
+        return self.material.stress(self._effective_gradient(displacement))
+
+    def _effective_gradient(self, displacement: Tensor) -> Tensor:
         H = self.gradient(displacement)
-        if self.mean_dilatation:
-            H = fbar_gradient(self.material, H, self.dV, self.shape[1])
-        return self.material.stress(H)
+        if not self.mean_dilatation:
+            return H
+        return fbar_gradient(self.material, H, self.dV, self.shape[1])
 
     @cached_property
     def pattern(self) -> Pattern:

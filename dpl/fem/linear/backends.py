@@ -7,9 +7,10 @@ work.
 import importlib.util
 from collections.abc import Callable
 
-from dpl.fem.linear.banded import BandedCholesky, MixedPrecisionBandedCholesky, band_storage
+from dpl.fem.linear.banded import BandedCholesky, MixedPrecisionBandedCholesky
 from dpl.fem.linear.interface import Array, Backend, Pattern
 from dpl.fem.linear.krylov import CG, multigrid_installed
+from dpl.fem.linear.ordering import band_storage
 from dpl.fem.linear.pardiso import Pardiso
 from dpl.fem.linear.superlu import SuperLU
 from dpl.version import install
@@ -52,15 +53,11 @@ def select_backend(
 ) -> str | BackendFactory:
     """Return the name of the backend, with "auto" replaced by the backend it selects.
 
-    A function, see `make_backend`, is returned as it is.
-
     "auto" selects by the pattern and the installed packages, not by timings, so that results are
-    reproducible. Without a pattern it stays "auto".
+    reproducible. Without a pattern it stays "auto". A function is returned as it is.
 
     Args:
-        name: As for `make_backend`.
-        pattern: Structure of the matrices.
-        near_null: Rigid body modes, (n, k), see `TensorAssembly.near_null`.
+        name, pattern, near_null: As for `make_backend`.
         many_rhs: Whether one factor solves for many right-hand sides: the factorisation may then
             cost more if each solve costs less.
 

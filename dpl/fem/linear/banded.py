@@ -4,14 +4,13 @@ import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import float32, float64, njit
 from numba.types import Array as Typed
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbtrf, spbtrf
-from scipy.sparse import csr_matrix
 
 from dpl.fem.linear.interface import (
     Array,
@@ -22,66 +21,10 @@ from dpl.fem.linear.interface import (
     SingularMatrix,
     SymmetricProduct,
     require_finite,
-    row_numbers,
 )
 from dpl.fem.linear.krylov import conjugate_gradients
-from dpl.fem.linear.ordering import reduce_bandwidth
+from dpl.fem.linear.ordering import BandStorage, band_storage
 from dpl.system.threads import blas
-
-
-class BandStorage(NamedTuple):
-    """Places of a pattern's entries in band storage, (n, half + 1), row by row.
-
-    Row j contains column j of the lower triangle from the diagonal down, as LAPACK expects it.
-
-    Attributes:
-        order: Old number of each new unknown, (n,); None: unchanged.
-        half: Half-bandwidth b, the largest distance of an entry from the diagonal.
-        place: Flat index of each entry in the storage, (nnz,).
-    """
-
-    order: NDArray[np.int32] | None
-    half: int
-    place: NDArray[np.intp]
-
-
-def band_storage(pattern: Pattern, sweeps: int = 50) -> BandStorage:
-    """Return the storage in the pattern's order or in a new one, whichever is narrower.
-
-    The new order is reverse Cuthill-McKee (George 1971), followed by sweeps of node centroids
-    (Lim, Rodrigues, Xiao 2006, Eur. J. Oper. Res. 174): each unknown moves to the middle of its
-    farthest neighbours, until ten sweeps bring no gain.
-    """
-    n = pattern.size
-    rows, columns = row_numbers(pattern), pattern.indices
-    order, half = None, int((columns - rows).max(initial=0))
-    ones = np.ones(len(rows), dtype=np.int8)
-    upper = csr_matrix((ones, columns, pattern.indptr), shape=(n, n))
-    graph = upper + upper.T
-    trial, idle = reduce_bandwidth(graph), 0
-    for _ in range(sweeps):
-        rank = _inverse(trial)
-        neighbours = rank[graph.indices]
-        last = np.maximum.reduceat(neighbours, graph.indptr[:-1])
-        first = np.minimum.reduceat(neighbours, graph.indptr[:-1])
-        width = int(max((last - rank).max(), (rank - first).max()))
-        idle += 1
-        if width < half:
-            order, half, idle = trial, width, 0
-        if order is None or idle > 10:
-            break
-        trial = np.argsort(last + first, kind="stable").astype(np.int32)
-    if order is not None:
-        rank = _inverse(order)
-        rows, columns = rank[rows], rank[columns]
-    column = np.minimum(rows, columns).astype(np.intp)
-    return BandStorage(order, half, column * half + np.maximum(rows, columns))
-
-
-def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order), dtype=order.dtype)
-    return rank
 
 
 @njit(
@@ -170,16 +113,12 @@ class BandedFactor(DirectFactor):
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right, to the rounding of the storage."""
         ordered = right if self.order is None else right[self.order]
-        answer = banded_triangular_solve(
-            self.storage, np.ascontiguousarray(ordered, self.storage.dtype)
-        )
+        ordered = np.ascontiguousarray(ordered, self.storage.dtype)
         x = np.empty_like(right)
-        x[slice(None) if self.order is None else self.order] = answer
+        x[... if self.order is None else self.order] = banded_triangular_solve(
+            self.storage, ordered
+        )
         return x
-
-    def apply(self, right: Array) -> Array:
-        """Return `solve`."""
-        return self.solve(right)
 
     def to_float32(self) -> "BandedFactor":
         """Return the factor in float32, in half the memory."""
@@ -195,12 +134,7 @@ class BandedCholesky:
     dtype: type[np.floating[Any]] = np.float64
 
     def __init__(self, pattern: Pattern, indefinite: Callable[[Pattern], Backend]) -> None:
-        """Store the pattern.
-
-        Args:
-            pattern: Structure of the matrices.
-            indefinite: Constructor of the backend for matrices that are not positive definite.
-        """
+        """Store the pattern, and a constructor of a backend for indefinite matrices."""
         self.pattern, self.indefinite = pattern, indefinite
         self._storage: NDArray[Any] | None = None
         self._last: Callable[[], BandedFactor | None] = lambda: None
@@ -247,8 +181,7 @@ class MixedPrecisionBandedCholesky(BandedCholesky):
     """Banded Cholesky in float32 as preconditioner of conjugate gradients in float64.
 
     It takes half the time and memory of `BandedCholesky`, which replaces it where float32 is not
-    accurate enough. Diagonal scaling would not help: the rounding errors of Cholesky do not depend
-    on it (Demmel 1989), and float32 covers stiffnesses 70 orders of magnitude apart.
+    accurate enough. Diagonal scaling would not help (Demmel 1989).
     """
 
     dtype = np.float32
@@ -304,6 +237,5 @@ class MixedPrecisionFactor(DirectFactor):
     def apply(self, right: Array) -> Array:
         """Return K^-1 right, (n,), in the accuracy of float32."""
         size = np.abs(right).max() or 1.0  # of order one, so that float32 holds it
-        return self.rough.solve((right / size).astype(np.float32)).astype(np.float64) * (
-            size / self.scale
-        )
+        rough = self.rough.solve((right / size).astype(np.float32)).astype(np.float64)
+        return rough * (size / self.scale)

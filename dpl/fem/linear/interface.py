@@ -18,17 +18,14 @@ class Pattern(Protocol):
     @property
     def size(self) -> int:
         """n, the number of rows."""
-        ...
 
     @property
     def indptr(self) -> NDArray[np.int32]:
         """Start of each row among the entries, (n + 1,)."""
-        ...
 
     @property
     def indices(self) -> NDArray[np.int32]:
         """Column of each entry, (nnz,)."""
-        ...
 
 
 class SingularMatrix(ArithmeticError):
@@ -62,18 +59,15 @@ class Factor(Protocol):
     @property
     def negative_pivots(self) -> int | None:
         """Number of negative eigenvalues; None where the backend does not count them."""
-        ...
 
     def stability(self) -> Stability:
         """Return the known bound of the number of negative eigenvalues.
 
         Iterative backends need a linear solve for it.
         """
-        ...
 
     def apply(self, right: Array) -> Array:
         """Return an approximation of K^-1 right, (n,), by a fixed symmetric preconditioner."""
-        ...
 
     def solve(self, right: Array, rtol: float = 1e-12) -> Array:
         """Return x, (n,), with K x = right.
@@ -86,11 +80,14 @@ class Factor(Protocol):
         Raises:
             SingularMatrix: An iterative backend found negative curvature or did not converge.
         """
-        ...
 
 
 class DirectFactor:
-    """Base of the factors that count negative pivots."""
+    """Base of the factors that count negative pivots and whose solves are exact to rounding."""
+
+    def apply(self: Factor, right: Array) -> Array:
+        """Return `solve`."""
+        return self.solve(right)
 
     def stability(self: Factor) -> Stability:
         """Return the number of negative pivots."""
@@ -108,7 +105,6 @@ class Backend(Protocol):
         Raises:
             SingularMatrix: A pivot is exactly zero, or entries are not finite.
         """
-        ...
 
 
 class SymmetricProduct:
@@ -144,10 +140,6 @@ def row_numbers(pattern: Pattern) -> NDArray[np.int32]:
 
 
 def require_finite(values: Array) -> None:
-    """Check that all entries are finite.
-
-    Raises:
-        SingularMatrix: An entry is not.
-    """
+    """Raise `SingularMatrix` unless all entries are finite."""
     if not np.isfinite(values).all():
         raise SingularMatrix("the matrix has entries that are not finite")

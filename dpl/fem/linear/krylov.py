@@ -94,16 +94,14 @@ def conjugate_gradients(
 def smallest_ritz_value(product: Map, precondition: Map, size: int, steps: int = 8) -> float:
     """Return the smallest Ritz value of M^-1 K, -inf if K is not positive definite.
 
-    M is a matrix near K, so that all eigenvalues but a few are near 1 and a few Lanczos steps from
-    a fixed random vector find the others. More than three steps are taken only if the smallest
-    Ritz value is below 1/2.
+    M is near K, so that all eigenvalues but a few are near 1 and a few Lanczos steps from a fixed
+    random vector find the others. More than three are taken only if the smallest is below 1/2.
 
     Source: Saad (2003), Iterative Methods for Sparse Linear Systems, section 6.7.3 (Ritz values
     from conjugate gradients).
 
     Args:
-        product: Function x -> K x.
-        precondition: Function r -> M^-1 r, symmetric positive definite.
+        product, precondition: As of `conjugate_gradients`.
         size: n.
         steps: Largest number of Lanczos steps.
     """
@@ -206,9 +204,7 @@ class CG:
         require_finite(values)
         product = SymmetricProduct(self.pattern, values.copy())
         if not (product.diagonal > 0).all():
-            raise SingularMatrix(
-                "the matrix is not positive definite: its diagonal is not positive"
-            )
+            raise SingularMatrix("the matrix is not positive definite by its diagonal")
         if self.near_null is not None and multigrid_installed():
             return CGFactor(product, self._multigrid(values, self.near_null), max_iter=300)
         inverse = 1 / product.diagonal

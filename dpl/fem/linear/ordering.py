@@ -1,9 +1,13 @@
-"""Bandwidth-reducing order of unknowns, the same on every machine."""
+"""Bandwidth-reducing order of unknowns, the same on every machine, and band storage."""
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import block_array, csr_array
+from scipy.sparse import block_array, csr_array, csr_matrix
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
+
+from dpl.fem.linear.interface import Pattern, row_numbers
 
 
 def reduce_bandwidth(graph: csr_array) -> NDArray[np.int32]:
@@ -28,3 +32,58 @@ def reduce_bandwidth(graph: csr_array) -> NDArray[np.int32]:
         order = reverse_cuthill_mckee(longer, symmetric_mode=True)
         orders.append(nodes[order[order < len(nodes)]])
     return np.concatenate(orders).astype(np.int32)
+
+
+class BandStorage(NamedTuple):
+    """Places of a pattern's entries in band storage, (n, half + 1), row by row.
+
+    Row j contains column j of the lower triangle from the diagonal down, as LAPACK expects it.
+
+    Attributes:
+        order: Old number of each new unknown, (n,); None: unchanged.
+        half: Half-bandwidth b, the largest distance of an entry from the diagonal.
+        place: Flat index of each entry in the storage, (nnz,).
+    """
+
+    order: NDArray[np.int32] | None
+    half: int
+    place: NDArray[np.intp]
+
+
+def band_storage(pattern: Pattern, sweeps: int = 50) -> BandStorage:
+    """Return the storage in the pattern's order or in a new one, whichever is narrower.
+
+    The new order is reverse Cuthill-McKee (George 1971), followed by sweeps of node centroids
+    (Lim, Rodrigues, Xiao 2006, Eur. J. Oper. Res. 174): each unknown moves to the middle of its
+    farthest neighbours, until ten sweeps bring no gain.
+    """
+    n = pattern.size
+    rows, columns = row_numbers(pattern), pattern.indices
+    order, half = None, int((columns - rows).max(initial=0))
+    ones = np.ones(len(rows), dtype=np.int8)
+    upper = csr_matrix((ones, columns, pattern.indptr), shape=(n, n))
+    graph = upper + upper.T
+    trial, idle = reduce_bandwidth(graph), 0
+    for _ in range(sweeps):
+        rank = _inverse(trial)
+        neighbours = rank[graph.indices]
+        last = np.maximum.reduceat(neighbours, graph.indptr[:-1])
+        first = np.minimum.reduceat(neighbours, graph.indptr[:-1])
+        width = int(max((last - rank).max(), (rank - first).max()))
+        idle += 1
+        if width < half:
+            order, half, idle = trial, width, 0
+        if order is None or idle > 10:
+            break
+        trial = np.argsort(last + first, kind="stable").astype(np.int32)
+    if order is not None:
+        rank = _inverse(order)
+        rows, columns = rank[rows], rank[columns]
+    column = np.minimum(rows, columns).astype(np.intp)
+    return BandStorage(order, half, column * half + np.maximum(rows, columns))
+
+
+def _inverse(order: NDArray[np.int32]) -> NDArray[np.int32]:
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order), dtype=order.dtype)
+    return rank

@@ -8,13 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from dpl.fem.linear.interface import (
-    Array,
-    DirectFactor,
-    Pattern,
-    SingularMatrix,
-    require_finite,
-)
+from dpl.fem.linear.interface import Array, DirectFactor, Pattern, SingularMatrix, require_finite
 
 
 @dataclass(frozen=True, eq=False)

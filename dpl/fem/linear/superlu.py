@@ -16,7 +16,6 @@ from dpl.fem.linear.interface import (
     SingularMatrix,
     full_matrix,
     require_finite,
-    row_numbers,
 )
 
 
@@ -38,10 +37,6 @@ class SuperLUFactor(DirectFactor):
         x[self.order] = self.lu.solve(right[self.order])
         return x
 
-    def apply(self, right: Array) -> Array:
-        """Return `solve`."""
-        return self.solve(right)
-
 
 @dataclass(frozen=True, eq=False)
 class SuperLU:
@@ -55,21 +50,15 @@ class SuperLU:
     @cached_property
     def _plan(self) -> tuple[NDArray[np.int_], csc_array, NDArray[np.int_]]:
         """Minimum-degree order, structure of the reordered matrix, source of each entry."""
-        n, count = self.pattern.size, len(self.pattern.indices)
-        rows, columns = row_numbers(self.pattern), self.pattern.indices
-        model = np.where(rows == columns, 4.0 * count, -1.0)  # any positive definite values
+        count = len(self.pattern.indices)
+        model = np.full(count, -1.0)  # any positive definite values
+        model[self.pattern.indptr[:-1]] = 4.0 * count
         whole = full_matrix(self.pattern, model).tocsc()
         order = np.argsort(splu(whole, **_symmetric("MMD_AT_PLUS_A")).perm_c)
-        place = np.empty(n, dtype=np.int64)
-        place[order] = np.arange(n)
-        off = np.flatnonzero(rows != columns)
-        r = place[np.concatenate([rows, columns[off]])]
-        c = place[np.concatenate([columns, rows[off]])]
-        source = np.concatenate([np.arange(count), off])
-        by_column = np.lexsort([r, c])
-        indptr = np.searchsorted(c[by_column], np.arange(n + 1))
-        structure = csc_array((np.zeros(len(r)), r[by_column], indptr), shape=(n, n))
-        return order, structure, source[by_column]
+        numbers = full_matrix(self.pattern, np.arange(1.0, count + 1)).tocsc()
+        structure = numbers[:, order][order]
+        structure.sort_indices()
+        return order, structure, structure.data.astype(np.int64) - 1
 
     def factorise(self, values: Array) -> SuperLUFactor:
         """Return the factor, see `Backend.factorise`."""

@@ -79,22 +79,15 @@ def longest_side(points: NDArray[np.float64]) -> float:
     """
     centred = points - points.mean(axis=0)
     principal = centred @ np.linalg.svd(centred, full_matrices=False)[2].T
-    boxes = [np.ptp(points, axis=0), np.ptp(principal, axis=0)]
-    return float(
-        min(boxes, key=lambda sides: np.prod(sides) * (1 + 1e-9 * (sides is boxes[1]))).max()
-    )
+    along, turned = np.ptp(points, axis=0), np.ptp(principal, axis=0)
+    larger = np.prod(along) > np.prod(turned) * (1 + 1e-9)
+    return float((turned if larger else along).max())
 
 
 def near_origin(mesh: skfem.Mesh) -> tuple[skfem.Mesh, NDArray[np.float64]]:
-    """Return a mesh moved towards the origin by integer multiples of its size.
+    """Return a mesh [m] moved towards zero by integer multiples of its size, and its origin.
 
-    The coordinates of a mesh that contains the origin are not changed.
-
-    Args:
-        mesh: The mesh [m].
-
-    Returns:
-        The moved mesh, and its origin in the coordinates of `mesh`, (D,) [m].
+    The origin (D,) [m] is in the coordinates of `mesh`. A mesh that contains zero is not moved.
     """
     low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
     size = (high - low).max()

@@ -59,14 +59,10 @@ def propeller(
         ValueError: A number is out of range, or blades would touch or fold.
         MemoryError: The mesh would not fit in memory.
     """
-    diameters = {
-        "bore_diameter": bore_diameter,
-        "hub_diameter": hub_diameter,
-        "diameter": diameter,
-    }
-    pairs = {"chord": chord, "thickness": thickness}
-    _check_ranges({**diameters, "hub_length": hub_length}, pairs, blades, pitch_angle, cells)
-    radii, blades = [d / 2 for d in diameters.values()], int(blades)
+    lengths = {"bore_diameter": bore_diameter, "hub_diameter": hub_diameter, "diameter": diameter}
+    radii, pairs = [d / 2 for d in lengths.values()], {"chord": chord, "thickness": thickness}
+    _check_ranges({**lengths, "hub_length": hub_length}, pairs, blades, pitch_angle, cells)
+    blades = int(blades)
     blade = _blade(radii, hub_length, blades, pitch_angle, chord, thickness, cells)
     hub = _hub(radii, hub_length, blades, pitch_angle[0], thickness[0], cells)
     try:
@@ -87,27 +83,23 @@ def _check_ranges(
     cells: Sequence[int],
 ) -> None:
     for key, value in lengths.items():
-        if not (math.isfinite(value) and value > 0):
+        if not 0 < value < math.inf:
             raise ValueError(f"{key} = {value} must be a positive length [m]")
-    for inner, outer in itertools.pairwise(("bore_diameter", "hub_diameter", "diameter")):
-        if lengths[inner] >= lengths[outer]:
-            raise ValueError(
-                f"{inner} = {lengths[inner]} must be less than {outer} = {lengths[outer]} [m]"
-            )
-    for key, pair in pairs.items():
-        if len(pair) != 2 or not all(math.isfinite(value) and value > 0 for value in pair):
-            raise ValueError(f"{key} = {list(pair)} must be 2 positive lengths [m]")
-    if len(pitch_angle) != 2 or not all(0 < angle < 90 for angle in pitch_angle):
-        raise ValueError(
-            f"pitch_angle = {list(pitch_angle)} must be 2 angles between 0 and 90 [degrees]"
-        )
+    for (inner, small), (outer, large) in itertools.pairwise(list(lengths.items())[:3]):
+        if small >= large:
+            raise ValueError(f"{inner} = {small} must be less than {outer} = {large} [m]")
+    for key, pair, bound, kind in (
+        *((key, pair, math.inf, "positive lengths [m]") for key, pair in pairs.items()),
+        ("pitch_angle", pitch_angle, 90, "angles between 0 and 90 [degrees]"),
+    ):
+        if len(pair) != 2 or not all(0 < value < bound for value in pair):
+            raise ValueError(f"{key} = {list(pair)} must be 2 {kind}")
     if blades != int(blades) or blades < 2:
         raise ValueError(f"blades = {blades} must be a integer of at least 2")
     if len(cells) != 5 or not all(n == int(n) and n >= 1 for n in cells):
         raise ValueError(f"cells = {list(cells)} must be 5 integers of at least 1")
     t, g, w, c, s = map(int, cells)
-    nodes = blades * (c + 1) * ((t + g) * (w + 1) + (t + 1) * s)
-    refuse_mesh(int(nodes), "mesh.cells")
+    refuse_mesh(int(blades) * (c + 1) * ((t + g) * (w + 1) + (t + 1) * s), "mesh.cells")
 
 
 def _hub(
@@ -142,24 +134,16 @@ def _blade(
 ) -> Points:
     """Return the points of the first blade without its root, (3, span, through, along)."""
     through, _, _, along, span = map(int, cells)
-    rho, t, s = np.meshgrid(  # along the blade, through it, along the chord
-        np.linspace(0, 1, span + 1),
-        np.linspace(-0.5, 0.5, through + 1),
-        np.linspace(-0.5, 0.5, along + 1),
-        indexing="ij",
-    )
+    across = (np.linspace(-0.5, 0.5, count + 1) for count in (through, along))
+    rho, t, s = np.meshgrid(np.linspace(0, 1, span + 1), *across, indexing="ij")
     root, tip = np.tan(np.radians(pitch_angle))
     radius = radii[1] * (1 - rho) + radii[2] * rho
     beta = np.arctan((radii[1] * root * (1 - rho) + radii[2] * tip * rho) / radius)
     depth = thickness[0] * (1 - rho) + thickness[1] * rho
     if (depth / np.sin(beta) >= 0.99 * 2 * math.pi / blades * radius).any():
         raise ValueError(f"thickness = {list(thickness)} leaves no room between {blades} blades")
-    widths = (hub_length * math.hypot(1, 1 / root), *chord)  # a parabola through all three
-    width = (
-        widths[0] * (1 - rho) * (1 - 2 * rho)
-        + widths[1] * 4 * rho * (1 - rho)
-        + widths[2] * rho * (2 * rho - 1)
-    )
+    width = hub_length * math.hypot(1, 1 / root) * (1 - rho) * (1 - 2 * rho)
+    width += chord[0] * 4 * rho * (1 - rho) + chord[1] * rho * (2 * rho - 1)  # a parabola
     # At the hub a section is a parallelogram with its thickness along the circumference. Towards
     # the tip it becomes a lens with blunt edges and its thickness normal to the chord.
     start = np.clip(rho / 0.4, 0, 1)

@@ -2,13 +2,13 @@
 
 import warnings
 from pathlib import Path
-from typing import Any
 
 import meshio
 import numpy as np
 import skfem
 from numpy.typing import NDArray
-from skfem.io.meshio import from_meshio
+from skfem.io.meshio import HEX_MAPPING, from_meshio
+from skfem.refdom import Refdom, RefHex
 
 from dpl.fem.mesh.sandbox import read
 from dpl.fem.mesh.tags import add_tags
@@ -25,21 +25,6 @@ CELLS = {  # supported types of cells in meshio: dimension, nodes
     "triangle": (2, 3),
     "triangle6": (2, 6),
 }
-CORNERS: dict[str, Any] = {  # vertices of the reference cells in VTK order
-    "hexahedron": [
-        (0, 0, 0),
-        (1, 0, 0),
-        (1, 1, 0),
-        (0, 1, 0),
-        (0, 0, 1),
-        (1, 0, 1),
-        (1, 1, 1),
-        (0, 1, 1),
-    ],
-    "tetra": [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)],
-    "quad": [(0, 0), (1, 0), (1, 1), (0, 1)],
-    "triangle": [(0, 0), (1, 0), (0, 1)],
-}
 Numbers = NDArray[np.int_]
 Array = NDArray[np.float64]
 
@@ -47,9 +32,8 @@ Array = NDArray[np.float64]
 def read_mesh(path: str | Path) -> skfem.Mesh:
     """Return the mesh of a file, validated by `check_mesh`.
 
-    The cells of the highest dimension are kept in their order, nodes without a cell are dropped,
-    and a planar mesh with constant third coordinate becomes a 2D mesh. Cells with inverted node
-    order are reordered.
+    The cells of the highest dimension are kept in their order, those of inverted node order are
+    reordered, nodes without a cell are dropped, and a mesh of constant z becomes a 2D mesh.
 
     Named parts become scikit-fem's `mesh.boundaries` (facets) and `mesh.subdomains` (cells), which
     `dpl.fem.Tag` selects:
@@ -87,11 +71,7 @@ def read_mesh(path: str | Path) -> skfem.Mesh:
 
 
 def to_mesh(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
-    """Return the validated mesh of the content of a file, and a clause for each repair.
-
-    Raises:
-        ValueError: The mesh is invalid.
-    """
+    """Return the validated mesh of the content of a file, and a clause for each repair."""
     kind = _cell_type(raw)
     dim, width = CELLS[kind]
     points = np.asarray(raw.points, dtype=np.float64)
@@ -111,7 +91,7 @@ def to_mesh(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:
     mesh = from_meshio(meshio.Mesh(points, [(kind, compact)]))
     corners = np.unique(cells[:, : len(mesh.t)])  # vertex k is node corners[k] of the file
     mesh = add_tags(check_mesh(mesh, numbers=corners), raw, kind, corners)
-    return mesh, _repairs(kind, points[compact], len(raw.points) - len(used))
+    return mesh, _repairs(mesh.elem.refdom, points[compact], len(raw.points) - len(used))
 
 
 def _cell_type(raw: meshio.Mesh) -> str:
@@ -133,9 +113,10 @@ def _cell_type(raw: meshio.Mesh) -> str:
     return kinds[0]
 
 
-def _repairs(kind: str, nodes: Array, unused: int) -> list[str]:
-    """Return a clause for each repair of cells with nodes at (E, A, D)."""
-    corners = np.array(CORNERS[kind.rstrip("0123456789")], dtype=np.float64)
+def _repairs(shape: type[Refdom], nodes: Array, unused: int) -> list[str]:
+    """Return a clause for each repair of cells with nodes at (E, A, D) in VTK order."""
+    # scikit-fem's axes of a hexahedron are those of VTK in reverse
+    corners = shape.p.T[HEX_MAPPING[:8], ::-1] if shape is RefHex else shape.p.T
     # Jacobian at the centre of a cell: least-squares fit to its vertices
     fit = np.linalg.pinv(corners - corners.mean(axis=0))
     J = fit @ nodes[:, : len(corners)]  # (E, D, D)
@@ -162,19 +143,13 @@ def _check_range(cells: Numbers, nodes: int) -> None:
 
 
 def _planar(points: NDArray[np.float64], used: Numbers) -> NDArray[np.float64]:
-    """Return the used points (N, 2) of a mesh in a plane of constant third coordinate.
-
-    Raises:
-        ValueError: The third coordinate is not constant; the message lists the nodes.
-    """
+    """Return the used points (N, 2) of a mesh in a plane of constant third coordinate."""
     points = points[used]
     if points.shape[1] == 3:
         bad = np.flatnonzero(~(np.abs(points[:, 2]) <= LARGEST))
         if len(bad):  # NaN would pass the comparison of distances
-            raise ValueError(
-                f"coordinates of {len(bad)} nodes are not finite or above {LARGEST:.0e} m: "
-                + listed(used[bad])
-            )
+            flaw = f"{len(bad)} nodes are not finite or above {LARGEST:.0e} m"
+            raise ValueError(f"coordinates of {flaw}: {listed(used[bad])}")
         away = np.abs(points[:, 2] - points[0, 2])
         bad = np.flatnonzero(away > 1e-9 * np.ptp(points, axis=0).max())
         if len(bad):

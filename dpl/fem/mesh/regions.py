@@ -32,17 +32,14 @@ class Plane:
 
     def __post_init__(self) -> None:
         """Check the attributes."""
-        if self.axis not in (0, 1, 2):
-            raise ValueError(f"axis = {self.axis} must be 0, 1 or 2")
+        _check_axis(self.axis)
         if isinstance(self.at, str) and self.at not in ("min", "max"):
             raise ValueError(f"at = {self.at!r} must be min, max or a coordinate [m]")
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return a mask (N,) of the points (N, D) [m] in the region."""
-        if self.axis >= points.shape[1]:
-            raise ValueError(
-                f"axis = {self.axis} must be less than {points.shape[1]}, the dimension"
-            )
+        if self.axis >= (dim := points.shape[1]):
+            raise ValueError(f"axis = {self.axis} must be less than {dim}, the dimension")
         x = points[:, self.axis]
         at = {"min": x.min(), "max": x.max()}[self.at] if isinstance(self.at, str) else self.at
         return np.abs(x - at) <= SLACK * np.ptp(points, axis=0).max()
@@ -64,11 +61,9 @@ class Box:
 
     def __post_init__(self) -> None:
         """Check the attributes."""
-        fits = len(self.lower) == len(self.upper)
-        if not fits or not all(a <= b for a, b in zip(self.lower, self.upper, strict=True)):
-            raise ValueError(
-                f"lower = {list(self.lower)} must not be above upper = {list(self.upper)}"
-            )
+        lower, upper = list(self.lower), list(self.upper)
+        if len(lower) != len(upper) or not (np.array(lower) <= upper).all():
+            raise ValueError(f"lower = {lower} must not be above upper = {upper}")
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return a mask (N,) of the points (N, D) [m] in the region."""
@@ -95,13 +90,11 @@ class Sphere:
 
     def __post_init__(self) -> None:
         """Check the attributes."""
-        _check_ball("centre", self.centre, self.radius)
+        _check_ball(self.centre, self.radius)
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return a mask (N,) of the points (N, D) [m] in the region."""
-        _check_dimension("centre", self.centre, points)
-        distance = np.linalg.norm(points - np.array(self.centre, dtype=np.float64), axis=1)
-        return distance <= _tolerant_radius(self.radius, points)
+        return _in_ball(points, self.centre, self.radius, range(points.shape[1]))
 
 
 @dataclass(frozen=True)
@@ -125,17 +118,14 @@ class Cylinder:
 
     def __post_init__(self) -> None:
         """Check the attributes."""
-        if self.axis not in (0, 1, 2):
-            raise ValueError(f"axis = {self.axis} must be 0, 1 or 2")
-        _check_ball("centre", () if self.centre is None else self.centre, self.radius)
+        _check_axis(self.axis)
+        _check_ball(self.centre or (), self.radius)
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return a mask (N,) of the points (N, D) [m] in the region."""
         centre = [0.0] * points.shape[1] if self.centre is None else self.centre
-        _check_dimension("centre", centre, points)
         across = [i for i in range(points.shape[1]) if i != self.axis]
-        distance = np.linalg.norm((points - np.array(centre, dtype=np.float64))[:, across], axis=1)
-        return distance <= _tolerant_radius(self.radius, points)
+        return _in_ball(points, centre, self.radius, across)
 
 
 @dataclass(frozen=True)
@@ -224,16 +214,14 @@ def facets_in(
             does not return a mask (N,).
     """
     boundary = mesh.boundary_facets()
-    tagged = region.facets(mesh) if isinstance(region, Tag) else None
-    if tagged is not None:
-        facets = np.intersect1d(boundary, tagged)
+    if not isinstance(region, Tag):
+        inside = _inside(region, (mesh.p.T + origin) * scale)[mesh.facets[:, boundary]].all(axis=0)
+    elif (tagged := region.facets(mesh)) is not None:
+        inside = np.isin(boundary, tagged)
     else:
-        if isinstance(region, Tag):
-            inside = np.zeros(mesh.p.shape[1], dtype=bool)
-            inside[mesh.t[:, mesh.subdomains[region.name]]] = True
-        else:
-            inside = _inside(region, (mesh.p.T + origin) * scale)
-        facets = boundary[inside[mesh.facets[:, boundary]].all(axis=0)]
+        vertices = mesh.t[:, mesh.subdomains[region.name]]
+        inside = np.isin(mesh.facets[:, boundary], vertices).all(axis=0)
+    facets = boundary[inside]
     if not len(facets):
         raise ValueError(f"{_name(region)} holds no facet of the boundary")
     return facets
@@ -253,14 +241,25 @@ def _name(region: Region) -> str:
     return getattr(region, "__name__", None) or repr(region)
 
 
-def _tolerant_radius(radius: float, points: NDArray[np.float64]) -> float:
-    """Return a radius with tolerances for its own rounding and for that of large coordinates."""
-    return radius * (1 + SLACK) + 4 * float(np.finfo(np.float64).eps * np.abs(points).max())
+def _in_ball(
+    points: NDArray[np.float64], centre: Sequence[float], radius: float, axes: Sequence[int]
+) -> NDArray[np.bool_]:
+    """Return a mask (N,) of the points (N, D) at most a radius from a centre along some axes."""
+    _check_dimension("centre", centre, points)
+    away = (points - np.array(centre, dtype=np.float64))[:, list(axes)]
+    # tolerances for the rounding of the radius and for that of large coordinates
+    slack = radius * SLACK + 4 * np.finfo(np.float64).eps * np.abs(points).max()
+    return np.linalg.norm(away, axis=1) <= radius + slack
 
 
-def _check_ball(name: str, centre: Sequence[float], radius: float) -> None:
+def _check_axis(axis: int) -> None:
+    if axis not in (0, 1, 2):
+        raise ValueError(f"axis = {axis} must be 0, 1 or 2")
+
+
+def _check_ball(centre: Sequence[float], radius: float) -> None:
     if not all(map(math.isfinite, centre)):
-        raise ValueError(f"{name} = {list(centre)} must be finite coordinates [m]")
+        raise ValueError(f"centre = {list(centre)} must be finite coordinates [m]")
     if not (math.isfinite(radius) and radius > 0):
         raise ValueError(f"radius = {radius} must be a positive length [m]")
 

@@ -55,12 +55,7 @@ def read(path: Path) -> meshio.Mesh:
                 answer = _decode(answer, arrays)
     except subprocess.TimeoutExpired:
         answer = {"error": LATE}
-    except (
-        EOFError,
-        OSError,
-        ValueError,
-        zipfile.BadZipFile,
-    ):  # the program ended before its answer
+    except (EOFError, OSError, ValueError, zipfile.BadZipFile):  # it ended before its answer
         late = done.returncode == -getattr(signal, "SIGXCPU", 0)
         answer = {"error": LATE if late else f"the reader crashed (status {done.returncode})"}
     if "error" in answer:

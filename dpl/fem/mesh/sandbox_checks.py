@@ -16,8 +16,8 @@ import numpy as np
 from meshio.vtu._vtu import VtuReader
 
 CONVERT = "which is not read; convert it with 'meshio convert' if you trust it"
-GMSH_NODES = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 6: 6, 7: 5, 8: 3, 9: 6, 10: 9, 11: 10, 12: 27}
-GMSH_NODES |= {13: 18, 14: 14, 15: 1, 16: 8, 17: 20, 18: 15, 19: 13}  # by type of element
+NODES = (2, 3, 4, 4, 8, 6, 5, 3, 6, 9, 10, 27, 18, 14, 1, 8, 20, 15, 13)
+GMSH_NODES = dict(enumerate(NODES, start=1))  # by type of element
 
 PERMAS = ("$COOR", r"^\$*COOR[^\n]*\n([^$!]*)")
 NODE_BLOCKS = {  # name and pattern of the blocks of nodes, by suffix
@@ -62,10 +62,8 @@ def _check_unique(numbers: Any) -> None:
     found, count = np.unique(numbers, return_counts=True)
     twice = [str(int(number)) for number in found[count > 1]]
     if twice:
-        raise Refused(
-            f"{len(twice)} node numbers are listed more than once: {', '.join(twice[:5])}; "
-            "number each node once"
-        )
+        listed = f"{len(twice)} node numbers are listed more than once: {', '.join(twice[:5])}"
+        raise Refused(f"{listed}; number each node once")
 
 
 def _check_node_blocks(name: str, pattern: str, text: str) -> None:

@@ -7,16 +7,7 @@ import numpy as np
 import skfem
 from numpy.typing import NDArray
 
-SIDES = {  # vertices of a facet by its type in meshio, which lists vertices first
-    "line": 2,
-    "line3": 2,
-    "triangle": 3,
-    "triangle6": 3,
-    "triangle7": 3,
-    "quad": 4,
-    "quad8": 4,
-    "quad9": 4,
-}
+SIDES = {"line": 2, "triangle": 3, "quad": 4}  # vertices of a facet, which come first
 MAX_VALUES = 1000  # distinct values of an integer field that becomes tags
 
 Numbers = NDArray[np.int_]
@@ -46,12 +37,11 @@ def add_tags(mesh: skfem.Mesh, raw: meshio.Mesh, kind: str, corners: Numbers) ->
         _check_indices(f"{block.type} cells", block.data, len(vertex))
         indices.append(count + np.arange(len(block.data)) if kept else None)
         count += len(block.data) if kept else 0
-        fits = not kept and SIDES.get(block.type) == width
+        fits = not kept and SIDES.get(block.type.rstrip("0123456789")) == width
         known.append(_find_facets(mesh, vertex[block.data[:, :width]]) if fits else None)
     for name, b, members in _cell_sets(raw):
-        _check_indices(
-            f"the set {name!r}", members, len(raw.cells[b].data) if b < len(indices) else 0
-        )
+        size = len(raw.cells[b].data) if b < len(indices) else 0
+        _check_indices(f"the set {name!r}", members, size)
         if (own := indices[b]) is not None:
             cells.setdefault(name, []).append(own[members])
         elif (side := known[b]) is not None:
@@ -93,19 +83,15 @@ def _cell_sets(raw: meshio.Mesh) -> Iterator[tuple[str, int, Numbers]]:
                     yield name, b, np.asarray(members, dtype=np.int64)
     groups = {tuple(key): name for name, key in raw.field_data.items() if np.size(key) == 2}
     for field, blocks in raw.cell_data.items():
-        if field.startswith("skfem:"):
-            if field.startswith("skfem:s:"):
-                for b, mask in enumerate(blocks):
-                    yield field.removeprefix("skfem:s:"), b, np.flatnonzero(mask)
-            continue
-        for b, number, members in _values(blocks):
+        saved = field.startswith("skfem:")
+        for b, number, members in () if saved else _values(blocks):
             if field != "gmsh:physical":
                 yield f"{field}={number}", b, members
             elif number:  # 0: no group
                 yield groups.get((number, raw.cells[b].dim), str(number)), b, members
-        if _is_mask(blocks):
+        if field.startswith("skfem:s:") or (not saved and _is_mask(blocks)):
             for b, mask in enumerate(blocks):
-                yield field, b, np.flatnonzero(mask)
+                yield field.removeprefix("skfem:s:"), b, np.flatnonzero(mask)
 
 
 def _saved_facets(raw: meshio.Mesh) -> Iterator[tuple[str, int, Numbers]]:

@@ -47,17 +47,15 @@ def listed(numbers: Numbers, most: int = 5) -> str:
 
 
 def _check_nodes(mesh: skfem.Mesh, numbers: Numbers) -> None:
-    bad = np.flatnonzero(~np.isfinite(mesh.p).all(axis=0))
-    if len(bad):
-        raise ValueError(f"coordinates of {len(bad)} nodes are not finite: {_nodes(bad, numbers)}")
-    bad = np.flatnonzero((np.abs(mesh.p) > LARGEST).any(axis=0))
-    if len(bad):
-        raise ValueError(
-            f"coordinates of {len(bad)} nodes are above {LARGEST:.0e} m: {_nodes(bad, numbers)}"
-        )
-    bad = np.flatnonzero(np.bincount(mesh.t.ravel(), minlength=mesh.nvertices) == 0)
-    if len(bad):
-        raise ValueError(f"{len(bad)} nodes belong to no cell: {_nodes(bad, numbers)}")
+    finite, used = np.isfinite(mesh.p).all(axis=0), np.bincount(mesh.t.ravel())
+    for subject, bad, flaw in (
+        ("coordinates of ", ~finite, "are not finite"),
+        ("coordinates of ", (np.abs(mesh.p) > LARGEST).any(axis=0), f"are above {LARGEST:.0e} m"),
+        ("", np.pad(used, (0, mesh.nvertices - len(used))) == 0, "belong to no cell"),
+    ):
+        if bad.any():
+            where = _nodes(np.flatnonzero(bad), numbers)
+            raise ValueError(f"{subject}{bad.sum()} nodes {flaw}: {where}")
 
 
 def _check_lists(mesh: skfem.Mesh) -> None:
@@ -109,8 +107,9 @@ def _check_sides(mesh: skfem.Mesh, sense: NDArray[np.float64]) -> None:
     total = np.bincount(mesh.t2f.ravel(), weights=signs.ravel())
     folded = (shared == 2) & (np.abs(total) > 1)  # both cells lie on the same face of the side
     if folded.any():
-        all_of_them = (folded | (shared == 1))[mesh.t2f].all(axis=0) & folded[mesh.t2f].any(axis=0)
-        bad = np.flatnonzero(all_of_them if any(all_of_them) else folded[mesh.t2f].any(axis=0))
+        some = folded[mesh.t2f].any(axis=0)
+        whole = some & (folded | (shared == 1))[mesh.t2f].all(axis=0)
+        bad = np.flatnonzero(whole if whole.any() else some)
         raise ValueError(
             f"{len(bad)} cells are inverted, folded over their neighbours: {listed(bad)}"
         )
@@ -119,8 +118,8 @@ def _check_sides(mesh: skfem.Mesh, sense: NDArray[np.float64]) -> None:
 def _outward(mesh: skfem.Mesh, side: list[int]) -> NDArray[np.int_]:
     """Return the orientation of a local side in all cells, (E,): 1 or -1.
 
-    It is the sense of rotation of its vertices seen from outside the cell, starting from the vertex
-    of the lowest number. The two cells of a side must have opposite orientations.
+    It is the sense of rotation of its vertices, from that of the lowest number, seen from outside
+    the cell. The two cells of a side must have opposite orientations.
     """
     p = mesh.elem.refdom.p[:, side]  # (D, corners)
     along, away = p[:, 1] - p[:, 0], p.mean(axis=1) - mesh.elem.refdom.p.mean(axis=1)
@@ -138,9 +137,8 @@ def _outward(mesh: skfem.Mesh, side: list[int]) -> NDArray[np.int_]:
 def _check_coincidence(mesh: skfem.Mesh, numbers: Numbers) -> None:
     """Raise for coincident nodes, including those of quadratic edges."""
     close = 1e-9 * np.ptp(mesh.p, axis=1).max()
-    _, place, count = np.unique(
-        np.round(mesh.p / (10 * close)), axis=1, return_inverse=True, return_counts=True
-    )
+    grid = np.round(mesh.p / (10 * close))
+    _, place, count = np.unique(grid, axis=1, return_inverse=True, return_counts=True)
     if count.max() > CROWD:
         bad = np.flatnonzero(place.ravel() == count.argmax())
         raise ValueError(
@@ -222,8 +220,7 @@ def _distance(
     warped (bilinear) quads Gauss-Newton finds them; for the others its first step is exact.
     """
     corners = sides.shape[1]
-    a, b = sides[:, 0], sides[:, 1]
-    d = sides[:, -1] if corners > 2 else a
+    a, b, d = sides[:, 0], sides[:, 1], sides[:, -1] if corners > 2 else sides[:, 0]
     twist = a - b + sides[:, 2] - d if corners == 4 else np.zeros_like(a)
     s = t = np.full(points.shape[1], 0.5 if corners == 4 else 0.0)
     for _ in range(6 if corners == 4 else 1):
@@ -244,28 +241,28 @@ def _distance(
 
 
 def _check_pieces(mesh: skfem.Mesh) -> None:
-    links = np.ones(mesh.t[1:].size)
-    graph = coo_array((links, (np.tile(mesh.t[0], len(mesh.t) - 1), mesh.t[1:].ravel())))
-    graph.resize((mesh.nvertices,) * 2)
-    pieces, member = connected_components(graph, directed=False)
+    links = np.stack([np.tile(mesh.t[0], len(mesh.t) - 1), mesh.t[1:].ravel()])
+    pieces, _, sizes = _components(links, mesh.nvertices)
     if pieces > 1:
-        sizes = listed(np.sort(np.bincount(member))[::-1], 8)
         raise ValueError(
             f"the body is in {pieces} pieces (of {sizes} nodes); join or separate them"
         )
 
 
+def _components(links: Numbers, size: int) -> tuple[int, Numbers, str]:
+    """Return number, members (size,) and listed sizes of the parts connected by links (2, n)."""
+    graph = coo_array((np.ones(links.shape[1]), links), shape=(size, size))
+    parts, member = connected_components(graph, directed=False)
+    return parts, member, listed(np.sort(np.bincount(member))[::-1], 8)
+
+
 def _check_joints(mesh: skfem.Mesh, numbers: Numbers) -> None:
     """Raise unless cells are connected by sides: parts that touch in nodes or edges are hinged."""
-    pairs = mesh.f2t[:, mesh.f2t[1] >= 0]
-    graph = coo_array((np.ones(pairs.shape[1]), pairs), shape=(mesh.nelements,) * 2)
-    parts, member = connected_components(graph, directed=False)
+    parts, member, sizes = _components(mesh.f2t[:, mesh.f2t[1] >= 0], mesh.nelements)
     if parts > 1:
-        both = np.unique(
-            np.stack([mesh.t, np.broadcast_to(member, mesh.t.shape)]).reshape(2, -1), axis=1
-        )
+        pairs = np.stack([mesh.t.ravel(), np.tile(member, len(mesh.t))])
+        both = np.unique(pairs, axis=1)
         touching = np.flatnonzero(np.bincount(both[0]) > 1)
-        sizes = listed(np.sort(np.bincount(member))[::-1], 8)
         raise ValueError(
             f"the body is in {parts} parts (of {sizes} cells) that touch only in nodes or edges: "
             f"{_nodes(touching, numbers)}; join them by sides of cells or separate them"

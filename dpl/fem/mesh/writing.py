@@ -13,18 +13,13 @@ from meshio.xdmf import TimeSeriesWriter
 from numpy.typing import NDArray
 from skfem.io.meshio import to_meshio
 
-MIRRORED = {  # node order after an exchange of the first two corners
-    "tetra": [1, 0, 2, 3],
-    "tetra10": [1, 0, 2, 3, 4, 6, 5, 8, 7, 9],
-}
+MIRRORED = [1, 0, 2, 3, 4, 6, 5, 8, 7, 9]  # exchange of the first two corners of a tetrahedron
 Numbers = NDArray[np.int_]
 Array = NDArray[np.float64]
 
 
 def flat_cells(mesh: skfem.Mesh, nodes: int) -> tuple[str, Numbers]:
-    """Return the type of the cells in meshio and their nodes in VTK order, (E, A).
-
-    Left-handed tetrahedra are reordered to right-handed ones.
+    """Return the type of the cells in meshio and their nodes in VTK order, (E, A), right-handed.
 
     Args:
         mesh: The body.
@@ -42,7 +37,7 @@ def flat_cells(mesh: skfem.Mesh, nodes: int) -> tuple[str, Numbers]:
     (block,) = to_meshio(mesh, encode_cell_data=False).cells
     left, cells = _left_handed(mesh), block.data.copy()
     if left.any():
-        cells[left] = cells[left][:, MIRRORED[block.type]]
+        cells[left] = cells[left][:, MIRRORED[: cells.shape[1]]]
     return block.type, cells
 
 
@@ -71,24 +66,16 @@ def _tags(mesh: skfem.Mesh) -> dict[str, list[Array]]:
 
 def _quadratic(mesh: skfem.Mesh) -> skfem.Mesh:
     """Return a mesh with the nodes of quadratic cells, numbered as in `Problem`."""
-    kinds: dict[type[skfem.Mesh], type[skfem.Mesh]] = {
-        skfem.MeshTri1: skfem.MeshTri2,
-        skfem.MeshQuad1: skfem.MeshQuad2,
-        skfem.MeshTet1: skfem.MeshTet2,
-        skfem.MeshHex1: skfem.MeshHex2,
-    }
-    kind = kinds.get(type(mesh))
-    return mesh if kind is None else kind.from_mesh(mesh)
+    name = type(mesh).__name__
+    return getattr(skfem, f"{name[:-1]}2").from_mesh(mesh) if name.endswith("1") else mesh
 
 
 def _to_meshio(mesh: skfem.Mesh, fields: Mapping[str, Array]) -> meshio.Mesh:
     """Return a mesh of meshio with nodal fields; arguments as in `write_mesh`."""
-    counts = {len(field) for field in fields.values()} or {mesh.p.shape[1]}
-    if len(counts) > 1:
-        raise ValueError(
-            f"fields = arrays of {', '.join(map(str, sorted(counts)))} nodes must be equally long"
-        )
-    (nodes,) = counts
+    nodes, *others = sorted({len(field) for field in fields.values()} or {mesh.p.shape[1]})
+    if others:
+        counts = ", ".join(map(str, [nodes, *others]))
+        raise ValueError(f"fields = arrays of {counts} nodes must be equally long")
     kind, cells = flat_cells(mesh, nodes)
     whole = mesh if nodes == mesh.p.shape[1] else _quadratic(mesh)
     data = {name: _spatial(field) for name, field in fields.items()}

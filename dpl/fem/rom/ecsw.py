@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_solve, solve_triangular
 from torch import Tensor
 
 from dpl.fem.linear.interface import full_matrix
@@ -145,9 +145,7 @@ def _factorised(factor: Array, gram: Array, kept: NDArray[np.int64], first: int)
 
 
 def _solved(factor: Array, right: Array) -> Array:
-    lower = factor[: len(right), : len(right)]
-    half = solve_triangular(lower, right, lower=True, check_finite=False)
-    return solve_triangular(lower, half, lower=True, trans=1, check_finite=False)
+    return cho_solve((factor[: len(right), : len(right)], True), right, check_finite=False)
 
 
 class ReducedMesh:
@@ -219,11 +217,7 @@ class ReducedMesh:
 
 
 def whitening(problem: Problem, vectors: Tensor) -> Tensor:
-    """Return L^-T, (R, R), with L L^T = V^T K(0) V.
-
-    Raises:
-        ValueError: V^T K(0) V is not positive definite.
-    """
+    """Return L^-T, (R, R), with L L^T = V^T K(0) V; raise a ValueError if there is none."""
     rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
     stiffness = full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())
     basis = vectors[problem.free].numpy()

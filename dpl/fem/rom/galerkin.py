@@ -18,6 +18,7 @@ from dpl.fem.rom.reduced_problem import (
     ReducedProblem,
     ReducedState,
     beyond_linear,
+    broyden,
     norm,
     refuse_range,
 )
@@ -31,15 +32,12 @@ class Reduced(NamedTuple):
 
     Attributes:
         displacement: Displacement over L, (N, D) [-].
-        coordinates: Coordinates in V of the displacement minus the offset, (R,) [-].
         residual: Reduced relative residual under the whole load [-].
         load_factor: Part of the load for which a reduced equilibrium was found [-].
-        iterations: Number of iterations.
-        factorisations: Number of reduced tangents, without that at rest.
+        iterations, factorisations: Number of iterations, and of reduced tangents except at rest.
     """
 
     displacement: Tensor
-    coordinates: Tensor
     residual: float
     load_factor: float
     iterations: int
@@ -55,11 +53,10 @@ class PODGalerkin:
 
     With a `cubature`, sums over all cells become sums over a few weighted ones, except for their
     linear part: V^T f_int(u) = V^T K(0) u + sum_e w_e V_e^T (f_e(u) - K_e(0) u_e). These forces
-    still derive from an energy, and are exact for small loads.
+    derive from an energy, and are exact for small loads.
 
-    Newton's method, with mixed integration points if the law supports them, shortens steps that
-    invert one of the cells, and uses load steps as `Newton` does. An inverse tangent is reused with
-    Broyden updates of rank one while the residual halves. The reduced relative residual is
+    Newton's method shortens steps and applies load steps as `Newton` does. An inverse tangent is
+    reused with Broyden updates while the residual halves. The reduced relative residual is
     ||L^-1 V^T R|| / ||L^-1 V^T f|| with L L^T = V^T K(0) V: to first order the relative error in
     the energy norm within the subspace.
 
@@ -73,13 +70,10 @@ class PODGalerkin:
         vectors: V, orthonormal, zero at fixed degrees of freedom, (N, D, R) [-].
         cubature: Weighted cells; None: all cells.
         lift: Linear solver, if V is a basis of the displacement minus the linear solution.
-        tol: Relative residual ||R_free|| / ||f|| below which a solution counts as converged [-],
-            see `Problem.relative_residual_of`; at least 1e-15, below 1.
+        tol: Relative residual below which a solution counts as converged [-], see
+            `Problem.relative_residual_of`; at least 1e-15, below 1.
         reduced_tol: Reduced relative residual at which the iterations stop [-].
-        max_iter: Iterations per load step before the step is halved.
-        max_total_iter: Iterations in all before a load is given up.
-        min_load_step: Load step, as a part of the load, below which a load is given up [-].
-        min_detF_ratio: Smallest ratio of min det F after and before a step [-].
+        max_iter, max_total_iter, min_load_step, min_detF_ratio: As of `Newton`.
         factor_reuse_tol: Reduced relative residual below which an inverse tangent is reused [-].
 
     Raises:
@@ -113,17 +107,14 @@ class PODGalerkin:
         """Return the solver with basis and cells computed from equilibria.
 
         Args:
-            problem: The body.
+            problem, lift: Attributes of the solver.
             snapshots: Displacements in equilibrium, (S, N, D) [-].
             rank: Dimension R of the subspace.
-            tolerance: Relative error of the snapshots' reduced forces with the chosen cells [-],
-                see `cubature`; None: all cells.
+            tolerance: Relative error of their reduced forces [-], see `cubature`; None: all cells.
             states: Number of evenly spaced snapshots from which the cells are chosen.
-            lift: Linear solver whose solution is added to the subspace.
 
         Raises:
-            ValueError: `rank` is not between 1 and the number of snapshots, or exceeds the number
-                of free degrees of freedom.
+            ValueError: `rank` is out of range, see `pod`.
         """
         refuse_range(problem)
         basis = pod(beyond_linear(problem, snapshots, lift), rank).vectors
@@ -148,12 +139,9 @@ class PODGalerkin:
         """Return the solver in a given subspace, with cells chosen at some states.
 
         Args:
-            problem: The body.
-            vectors: V, orthonormal, zero at fixed degrees of freedom, (N, D, R) [-].
+            problem, vectors, lift, options: Attributes of the solver.
             states: Displacements in equilibrium, (S, N, D) [-]; they are projected onto V.
             tolerance: See `cubature`.
-            lift: Linear solver whose solution is added to the subspace.
-            options: Other attributes of the solver.
         """
         nonlinear, basis = beyond_linear(problem, states, lift), vectors[problem.free]
         projected = states.clone()
@@ -162,11 +150,7 @@ class PODGalerkin:
         return cls(problem, vectors, cells, lift, **options)
 
     def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            ValueError: An attribute is out of range, or V does not fit the body.
-        """
+        """Check the ranges."""
         refuse_range(self.problem)
         check_steps(self, parts=("reduced_tol", "min_detF_ratio", "min_load_step"))
         if tuple(self.vectors.shape[:2]) != self.problem.shape:
@@ -213,7 +197,6 @@ class PODGalerkin:
                 steps.accept()
         return Reduced(
             displacement=model.displacement(state.y).add_(load.offset, alpha=steps.factor),
-            coordinates=model.coordinates(state.y),
             residual=model.relative_residual(load, state, 1.0),
             load_factor=steps.factor,
             iterations=count.iterations,
@@ -225,8 +208,7 @@ class PODGalerkin:
 
         Each step evaluates all cells once and solves the reduced problem for the displacement whose
         reduced internal force exceeds the present one by the residual: the coarse-grid step of a
-        full approximation scheme. The choice of cells therefore affects the speed of convergence
-        and not the accuracy; the part of the error outside the subspace remains. The steps end
+        full approximation scheme. The part of the error outside the subspace remains. The steps end
         where the reduced problem has no solution or a cell is inverted.
 
         Source: Brandt (1977), Math. Comput. 31, section 5.
@@ -258,7 +240,7 @@ class PODGalerkin:
     def _newton(
         self, load: ReducedLoad, state: ReducedState, target: float, count: "_Count"
     ) -> ReducedState | None:
-        """Return the equilibrium under `target` times a load, None if Newton does not converge."""
+        """Return the equilibrium under `target` times a load, None without convergence."""
         model = self.reduced_problem
         inverse, ratio, before = None, model.relative_residual(load, state, target), math.inf
         for _ in range(self.max_iter):
@@ -285,7 +267,7 @@ class PODGalerkin:
             if ratio >= self.factor_reuse_tol:
                 new = model.update_strain_gap(state, new)
             elif not jump:
-                inverse = _broyden(inverse, new.y - state.y, new.internal - state.internal)
+                inverse = broyden(inverse, new.y - state.y, new.internal - state.internal)
             state = new
         return None
 
@@ -316,15 +298,3 @@ class _Count:
 
     iterations: int = 0
     factorisations: int = 0
-
-
-def _broyden(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
-    """Return the updated inverse, which maps the change of the force to the step that caused it.
-
-    Source: Broyden (1965), Math. Comp. 19, the first method in Sherman's and Morrison's form.
-    """
-    predicted = inverse @ change
-    scale = step @ predicted
-    if not scale.abs() > 1e-8 * step.norm() * predicted.norm():
-        return inverse
-    return inverse + torch.outer((step - predicted) / scale, step @ inverse)

@@ -43,13 +43,12 @@ def pod(snapshots: Tensor, rank: int) -> POD:
     Raises:
         ValueError: `rank` is not between 1 and min(S, n), or a snapshot is not finite.
     """
-    count, size = snapshots.shape
-    if not 1 <= rank <= min(count, size):
+    (count, size), smaller = snapshots.shape, min(snapshots.shape)
+    if not 1 <= rank <= smaller:
         raise ValueError(
-            f"rank = {rank} must lie between 1 and {min(count, size)}, "
+            f"rank = {rank} must lie between 1 and {smaller}, "
             f"the smaller of {count} snapshots and their {size} components"
         )
-    smaller = min(count, size)
     few = rank + OVERSAMPLING <= MAX_SKETCH_PART * smaller
     sketched = smaller > MIN_SKETCH_SIZE and few
     vectors, values = (_sketched if sketched else _exact)(snapshots, rank)

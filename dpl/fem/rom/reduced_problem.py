@@ -80,16 +80,14 @@ class ReducedProblem:
     ) -> None:
         """Reduce a body to V (N, D, R) and to the chosen cells; None: all cells."""
         self.problem, self.lift = problem, lift
-        self._white = whitening(problem, vectors)
-        white = vectors @ self._white
+        white = vectors @ whitening(problem, vectors)
         every = torch.arange(len(problem.cells))
         cells, weights = (every, torch.ones(len(every))) if chosen is None else chosen[:2]
         self.cells = ReducedMesh(problem, white, cells, weights.double())
         self.stiffness = self.cells.product(self.cells.at_rest(), self.cells.basis)
         rank = vectors.shape[2]
-        self.stiffness_error = (
-            torch.eye(rank, dtype=torch.float64) - self.cells.basis.T @ self.stiffness
-        )
+        one = torch.eye(rank, dtype=torch.float64)
+        self.stiffness_error = one - self.cells.basis.T @ self.stiffness
         self._white_rows = white.flatten(0, 1)
         self.support_force = _support_force(problem)
         self.reduced_support_force = self.project(self.support_force)
@@ -105,10 +103,6 @@ class ReducedProblem:
     def displacement(self, y: Tensor) -> Tensor:
         """Return the displacement (N, D) of coordinates in W."""
         return (self._white_rows @ y).view(self.problem.shape)
-
-    def coordinates(self, y: Tensor) -> Tensor:
-        """Return coordinates in V, (R,), of those in W."""
-        return self._white @ y
 
     def reduce(self, force: Tensor) -> ReducedLoad:
         """Return a load (N, D) in reduced coordinates."""
@@ -154,9 +148,8 @@ class ReducedProblem:
         """
         cells = self.cells
         if state.at_rest:
-            return torch.eye(len(state.y), dtype=torch.float64), target * (
-                load.force - load.offset_force
-            )
+            right = target * (load.force - load.offset_force)
+            return torch.eye(len(state.y), dtype=torch.float64), right
         system = cells.problem.linearise(state.cell_displacement, state.gap)
         if not system.valid:
             system = cells.problem.linearise(state.cell_displacement)
@@ -165,9 +158,8 @@ class ReducedProblem:
         if load.has_offset:
             right -= state.offset_factor * load.offset_error
         if jump:
-            right -= jump * (
-                cells.project(cells.product(upper, load.cell_offset)) + load.offset_error
-            )
+            pull = cells.project(cells.product(upper, load.cell_offset))
+            right -= jump * (pull + load.offset_error)
         inverse, failed = torch.linalg.inv_ex(cells.reduced(upper) + self.stiffness_error)
         return (None if failed else inverse), right
 
@@ -180,6 +172,18 @@ class ReducedProblem:
         return new._replace(gap=problem.update_strain_gap(state.gap, new.length, update))
 
 
+def broyden(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
+    """Return the updated inverse, which maps the change of the force to the step that caused it.
+
+    Source: Broyden (1965), Math. Comp. 19, the first method in Sherman's and Morrison's form.
+    """
+    predicted = inverse @ change
+    scale = step @ predicted
+    if not scale.abs() > 1e-8 * step.norm() * predicted.norm():
+        return inverse
+    return inverse + torch.outer((step - predicted) / scale, step @ inverse)
+
+
 def norm(vector: Tensor) -> float:
     """Return the Euclidean norm of a vector (R,), without overflow or underflow of squares."""
     largest = float(vector.abs().amax())
@@ -189,11 +193,7 @@ def norm(vector: Tensor) -> float:
 
 
 def refuse_range(problem: Problem) -> None:
-    """Check that the law has no ranges.
-
-    Raises:
-        ValueError: It has one.
-    """
+    """Raise a ValueError if the law has ranges."""
     for name, ends in problem.material.parameter_ranges.items():
         raise ValueError(
             f"{name} = {list(ends)} must be one number, because reduced stiffness and cells "

@@ -85,14 +85,13 @@ class AndersonSolver:
 
     def _state(self, load: Load, u: Tensor, count: int, start: float) -> tuple[Solution, Array]:
         """Return a displacement as a solution, and the residual force f - f_int(u), (n,)."""
-        problem = self.problem.with_parameters(load.parameters)
-        internal, _ = evaluation = problem.evaluate(u)
+        evaluation = self.problem.with_parameters(load.parameters).evaluate(u)
         state = evaluate_solution(
             self.problem, u, load, self.tol,
             iterations=count, seconds=time.perf_counter() - start, from_guess=True,
             evaluation=evaluation,
         )  # fmt: skip
-        return state, problem.restrict((load.force - internal)[0])
+        return state, self.problem.restrict((load.force - evaluation.internal)[0])
 
 
 class _History:
@@ -115,9 +114,7 @@ class _History:
     def step(self, right: Array, factor: CorotatedFactor) -> Array:
         """Return the step (n,) from the combination of iterates with the smallest residual.
 
-        Args:
-            right: Residual at the last iterate, (n,).
-            factor: M.
+        The residual at the last iterate is `right` (n,); the factor is that of M.
         """
         n = min(self.count, len(self.steps))
         if not n:

@@ -73,12 +73,8 @@ def post_buckling_branches(
         u = newton.problem.prescribed[None]
         for part in np.linspace(0.1, 1.0, 10):
             perturbed = load._replace(force=part * (load.force + sign * push))
-            u = _solve_from(newton, perturbed, u).displacement
-        branches.append(_solve_from(newton, load, u))
+            *_, last = newton.iterate(perturbed, guess=u)
+            u = last.displacement
+        *_, last = newton.iterate(load, guess=u)
+        branches.append(last)
     return branches
-
-
-def _solve_from(newton: Newton, load: Load, guess: Tensor) -> Solution:
-    """Return the last solution of Newton from a guess."""
-    *_, last = newton.iterate(load, guess=guess)
-    return last

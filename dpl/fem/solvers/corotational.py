@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import boolean, float64, int64, njit, void
+from numba import float64, int64, njit, void
 from numba.types import Array as Typed
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.linear.interface import Array, Factor, SingularMatrix, SymmetricProduct
@@ -46,14 +47,16 @@ class CorotationalPreconditioner:
     def at(self, displacement: Tensor) -> "CorotatedFactor":
         """Return the factor of K(0), rotated as the body is at a displacement (1, N, D) [-].
 
-        A node is rotated by the rotation of its mean deformation gradient. A node fixed in one
-        direction is rotated about that direction only, a node fixed in two is not rotated.
+        A node has the rotation of its mean deformation gradient. A node fixed in one direction is
+        rotated about that direction only, a node fixed in two is not rotated.
         """
         gradients, volumes, cells = self._cell_means
         rotations = np.zeros((*self.problem.shape, self.problem.shape[1]))
         _sum_gradients(displacement[0].numpy(), cells, gradients, volumes, rotations)
-        _to_rotations(rotations, self._dofs)
-        return CorotatedFactor(self.factor, rotations, self._dofs)
+        _to_rotations(rotations, self.problem.pattern.number)
+        kept, indices, indptr = self._structure
+        R = csr_array((rotations[kept], indices, indptr), shape=(self.problem.pattern.size,) * 2)
+        return CorotatedFactor(self.factor, rotations, R)
 
     def count_iterations(
         self, displacement: Tensor, *, rtol: float = 1e-3, max_iter: int = 50
@@ -65,16 +68,15 @@ class CorotationalPreconditioner:
         tangent = self.problem.linearise(displacement).tangent[0].numpy()
         product = SymmetricProduct(self.problem.pattern, tangent)
         right = np.random.default_rng(0).standard_normal(self.problem.pattern.size)
-        factor, count = self.at(displacement), 0
+        factor, calls = self.at(displacement), []
 
         def apply(residual: Array) -> Array:
-            nonlocal count
-            count += 1
+            calls.append(residual)
             return factor.apply(residual)
 
         with suppress(SingularMatrix):
             conjugate_gradients(product, apply, right, rtol, max_iter)
-            return count
+            return len(calls)
         return max_iter
 
     @cached_property
@@ -87,12 +89,12 @@ class CorotationalPreconditioner:
         return gradients, volumes, self.problem.cells.numpy().copy(order="C")
 
     @cached_property
-    def _dofs(self) -> NDArray[np.int64]:
-        """Number of each degree of freedom among the free ones, -1 where fixed, (N, D)."""
-        free = self.problem.free.numpy()
-        dofs = np.full(free.shape, -1, dtype=np.int64)
-        dofs[free] = np.arange(free.sum())
-        return dofs
+    def _structure(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+        """Mask of the entries of R at free degrees of freedom, their columns and rows in CSR."""
+        free, number = self.problem.free.numpy(), self.problem.pattern.number
+        kept = free[:, :, None] & free[:, None, :]
+        columns = np.broadcast_to(number[:, None, :], kept.shape)[kept]
+        return kept, columns, np.concatenate([[0], kept.sum(axis=2)[free].cumsum()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +104,12 @@ class CorotatedFactor:
     Attributes:
         factor: Factor of K(0).
         rotations: Rotations R of the nodes, (N, D, D).
-        dofs: Number of each degree of freedom among the free ones, -1 where fixed, (N, D).
+        matrix: R at free degrees of freedom, (n, n).
     """
 
     factor: Factor
     rotations: Array
-    dofs: NDArray[np.int64]
+    matrix: csr_array
 
     @property
     def negative_pivots(self) -> int | None:
@@ -116,11 +118,7 @@ class CorotatedFactor:
 
     def apply(self, right: Array) -> Array:
         """Return R K(0)^-1 R^T right, (n,)."""
-        out = np.empty_like(right)
-        _rotate(self.rotations, self.dofs, right, True, out)
-        solved = self.factor.apply(out)
-        _rotate(self.rotations, self.dofs, solved, False, out)
-        return out
+        return self.matrix @ self.factor.apply(self.matrix.T @ right)
 
 
 # One explicit signature each: numba's cache can mix up the machine code of several signatures of a
@@ -219,19 +217,3 @@ def _to_rotations(F, dofs):
         elif count == 3:
             _polar(F[n], R)
         F[n] = R
-
-
-@njit([void(TENSORS, INDICES, VALUES, boolean, Typed(float64, 1, "A"))], cache=True)
-def _rotate(rotations, dofs, values, transpose, out):
-    """Set out (n,) to the free values (n,), rotated node by node with R or R^T."""
-    dim = dofs.shape[1]
-    for n in range(dofs.shape[0]):
-        for i in range(dim):
-            if dofs[n, i] < 0:
-                continue
-            total = 0.0
-            for j in range(dim):
-                if dofs[n, j] >= 0:
-                    entry = rotations[n, j, i] if transpose else rotations[n, i, j]
-                    total += entry * values[dofs[n, j]]
-            out[dofs[n, i]] = total

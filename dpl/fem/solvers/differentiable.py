@@ -16,14 +16,12 @@ from dpl.fem.solvers.solution import Load, Solution, Status
 class DifferentiableSolve:
     """Displacement u(f) with f_int(u) = f, differentiable with respect to f.
 
-    The forward pass is a Newton solve. In the backward pass K(u) du = df holds on free degrees of
-    freedom, so a gradient g with respect to u becomes K(u)^-1 g with respect to f: one solve with
-    the symmetric tangent at the solution, which is factorised at the first gradient. Torch
-    differentiates the operations that f is computed from, such as `Scene.load_of`.
+    The forward pass is a Newton solve. In the backward pass a gradient g with respect to u becomes
+    K(u)^-1 g with respect to f, since K(u) du = df on free degrees of freedom. The tangent at the
+    solution is factorised at the first gradient.
 
     The derivative is that of the branch of equilibria on which the solution lies, stable or not.
-    Fixed degrees of freedom, moved supports included, do not depend on the load. There are no
-    second derivatives.
+    There are no second derivatives.
 
     Source: the implicit function theorem; Giles, Pierce (2000), Flow Turbul. Combust. 65, section
     2.1, for the adjoint.
@@ -39,8 +37,7 @@ class DifferentiableSolve:
 
         Args:
             load: The load; differentiable in `force`, (B, N, D) [-].
-            guess: Displacement to start from, (B, N, D) [-], such as the solution of a similar
-                load; zero if left out.
+            guess: Displacement to start from, (B, N, D) [-]; zero if left out.
 
         Raises:
             ValueError: A load of the batch has no solution (see `solution`), the load is not on

@@ -54,20 +54,14 @@ def select_preconditioner(
 class TangentSolver:
     """Solver of K(u) x = r for the successive tangents of one load.
 
-    A factor preconditions conjugate gradients on later tangents until these need too many steps;
-    then a tangent is factorised.
+    A factor preconditions conjugate gradients on later tangents until these need too many steps.
 
     Attributes:
-        factorisations: Tangents factorised so far; K(0) is not counted.
+        factorisations: Tangents factorised so far, without K(0).
     """
 
     def __init__(self, linear_solver: LinearSolver, *, corotational: bool) -> None:
-        """Start without a factor.
-
-        Args:
-            linear_solver: Provides the problem, the factor of K(0) and the backend of tangents.
-            corotational: Whether to use the corotated factor of K(0).
-        """
+        """Start without a factor; `corotational` allows the corotated factor of K(0)."""
         self.linear_solver, self.backend = linear_solver, linear_solver.tangent_backend
         self.factorisations = 0
         self._corotational = corotational
@@ -79,20 +73,13 @@ class TangentSolver:
     def _pattern(self) -> Pattern:
         return self.linear_solver.problem.pattern
 
-    def solve_at_rest(self, right: Array, rtol: float) -> Array:
-        """Return K(0)^-1 of a right-hand side (n,), to a relative residual.
-
-        Raises:
-            SingularMatrix: K(0) has no factor.
-        """
-        self._last, self._factor = Preconditioner.REST, None
-        return self.linear_solver.factor.solve(right, rtol)
-
-    def solve(self, tangent: Array, u: Tensor, right: Array, rtol: float, *, near: bool) -> Array:
+    def solve(
+        self, tangent: Array | None, u: Tensor, right: Array, rtol: float, *, near: bool
+    ) -> Array:
         """Return K(u)^-1 of a right-hand side (n,), to a relative residual.
 
         Args:
-            tangent: Entries of K(u), (nnz,).
+            tangent: Entries of K(u), (nnz,); None: K(0).
             u: Displacement, (1, N, D) [-].
             right: Right-hand side, (n,).
             rtol: Relative residual at which conjugate gradients stop [-].
@@ -101,6 +88,9 @@ class TangentSolver:
         Raises:
             SingularMatrix: The tangent has no factor.
         """
+        if tangent is None:
+            self._last, self._factor = Preconditioner.REST, None
+            return self.linear_solver.factor.solve(right, rtol)
         kind = select_preconditioner(
             self._last,
             near=near,
@@ -127,9 +117,8 @@ class TangentSolver:
     def stability(self, u: Tensor) -> Stability:
         """Return the stability of the equilibrium (1, N, D) that the last solve led to.
 
-        The tangent there is factorised only if it may be indefinite: if the last factor has
-        negative pivots or its backend does not count them, or if a Ritz value shows an eigenvalue
-        far below the stale factor's.
+        The tangent there is factorised only if the last factor has negative pivots or its backend
+        does not count them, or if a Ritz value shows an eigenvalue far below the stale factor's.
         """
         if self._last is Preconditioner.REST:
             known = self.linear_solver.factor.stability()
@@ -172,8 +161,7 @@ def forcing_term(residual: float, previous: float, *, tol: float, corotational: 
     Source: Eisenstat, Walker (1996), SIAM J. Sci. Comput. 17, choice 2.
 
     Args:
-        residual: Relative residual of the state [-].
-        previous: The same one iteration earlier; NaN in the first iteration.
+        residual, previous: Relative residuals of this state and of the last [-]; NaN if none.
         tol: Relative residual of a solution [-].
         corotational: Whether the first step from a state may be inexact.
     """

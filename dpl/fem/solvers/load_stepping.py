@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 
 @dataclass
@@ -42,16 +42,7 @@ class LoadStepping:
         self.step = (self.target - self.factor) / 2
 
 
-class HasVolumeRatio(Protocol):
-    """State of a body with its smallest volume ratio."""
-
-    @property
-    def volume_ratio(self) -> Any:
-        """Min det F [-]."""
-        ...
-
-
-State = TypeVar("State", bound=HasVolumeRatio)
+State = TypeVar("State", bound=Any)
 
 
 def longest_valid_step(
@@ -60,7 +51,8 @@ def longest_valid_step(
     """Return the state after the longest of the steps 1, 1/2, 1/4, ... that inverts no element.
 
     Args:
-        state_after: Function from the length of a step, 1 for the full one, to the state after it.
+        state_after: Function from the length of a step, 1 for the full one, to the state after it,
+            whose `volume_ratio` is min det F [-].
         min_volume_ratio: Bound that min det F has to exceed [-].
         halvings: Number of halvings of the step that are tried.
 

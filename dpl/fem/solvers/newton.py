@@ -26,41 +26,38 @@ class Newton:
     """Newton-Raphson with a guard against inverted elements and automatic load stepping.
 
     Full steps on the whole load come first. A step that would reduce det F at a quadrature point
-    below `min_detF_ratio` of its value is halved until it does not. There is no line search on the
-    residual norm, because on the way to large rotations the norm rises a hundredfold before it
-    falls. Where the iterations do not converge, the load is applied in steps: a step that fails is
-    halved, one that succeeds is doubled. Intermediate states need only `intermediate_tol`.
+    below `min_detF_ratio` of its value is halved until it does not. Where the iterations do not
+    converge, the load is applied in steps: a step that fails is halved, one that succeeds is
+    doubled. Intermediate states need only `intermediate_tol`.
 
-    An equilibrium whose tangent has negative pivots is no minimum of the energy, for example a
-    straight column beyond its critical load; its status is UNSTABLE. The tangent at the solution is
-    factorised only if the last tangent on the way had negative pivots or may have had some, so
-    that a solution within 1e-4 of a critical load may pass as stable.
+    An equilibrium whose tangent has negative pivots is no minimum of the energy; its status is
+    UNSTABLE. The tangent at the solution is factorised only if the last tangent had negative pivots
+    or may have had some: a solution within 1e-4 of a critical load may pass as stable.
 
     Source: Wriggers (2008), Nonlinear Finite Element Methods, sections 5.1 and 5.3.
+
+    Raises:
+        ValueError: An attribute is out of range, or the backend is not installed.
 
     Attributes:
         problem: The body.
         tol: Relative residual ||R_free|| / ||f|| of a solution [-], see
             `Problem.relative_residual_of`; at least 1e-15, below 1. Where rounding does not allow
-            it, on very thin cells, a solution whose residual no longer falls counts as converged,
-            with a warning.
+            it, a solution whose residual no longer falls counts as converged, with a warning.
         max_iter: Iterations per load step before the step is halved.
         max_total_iter: Iterations in all before a load is given up.
-        min_load_step: Load step, as a part of the load, below which a load is given up [-].
+        min_load_step: Part of the load below which a load step is given up [-].
         intermediate_tol: Relative residual at intermediate load factors [-].
         min_detF_ratio: Smallest ratio of min det F after and before a step [-].
         linear: Backend of the sparse solves, see `dpl.fem.linear.make_backend`.
         mixed_integration: Treat the strains at the quadrature points as independent unknowns
-            (Magisano, Leonetti, Garcea 2017), for laws that support it: fewer iterations and far
-            larger steps.
-        factor_reuse_tol: Relative residual below which the last factor is reused as
-            preconditioner of conjugate gradients on the new tangent [-]; 0: every tangent is
-            factorised.
+            (Magisano, Leonetti, Garcea 2017), for laws that support it: fewer iterations.
+        factor_reuse_tol: Relative residual below which the last factor preconditions conjugate
+            gradients on the new tangent [-]; 0: every tangent is factorised.
         corotational: Precondition conjugate gradients with the factor of K(0), rotated with the
-            nodes, and factorise only tangents for which they are too slow. Stability is then known
-            only where a tangent was factorised.
+            nodes. Stability is then known only where a tangent was factorised.
         linear_solver: Solver with the factor of K(0), which every first step from zero uses.
-            Solvers made by `dataclasses.replace` share it unless `problem` or `linear` change.
+            `dataclasses.replace` keeps it unless `problem` or `linear` change.
     """
 
     problem: Problem
@@ -77,11 +74,7 @@ class Newton:
     linear_solver: LinearSolver = field(default=None, repr=False)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        """Check the ranges and make the linear solver if none fits.
-
-        Raises:
-            ValueError: An attribute is out of range, or the backend is not installed.
-        """
+        """Check the ranges and make the linear solver if none fits."""
         check_steps(self, parts=("intermediate_tol", "min_detF_ratio", "min_load_step"))
         select_backend(self.linear)
         given = self.linear_solver
@@ -92,14 +85,12 @@ class Newton:
     def iterate(self, load: Load, *, guess: Tensor | None = None) -> Iterator[Solution]:
         """Yield the state before the first update and after each one.
 
-        Members of a batch are solved one by one, in lockstep; a member that has ended repeats its
-        last state. A member that does not converge ends with its last equilibrium under a part of
-        the load.
+        The loads of a batch are solved in lockstep, see `run_lockstep`. One that does not converge
+        ends with its last equilibrium under a part of the load.
 
         Args:
             load: The load.
-            guess: Displacement to start from, (B, N, D) [-]; zero if left out, and where the guess
-                inverts an element.
+            guess: Displacement to start from, (B, N, D) [-]; zero where it inverts an element.
 
         Raises:
             ValueError: The force does not fit the body, see `check_force`.
@@ -107,11 +98,9 @@ class Newton:
         check_force(self.problem, load)
         members = load._replace(force=self.problem.acting(load.force)).unbatch()
         guesses = [None] * len(members) if guess is None else guess.split(1)
+        pairs = zip(members, guesses, strict=True)
         yield from run_lockstep(
-            [
-                self.with_parameters(one.parameters)._apply_load(one.force, start)
-                for one, start in zip(members, guesses, strict=True)
-            ]
+            [self.with_parameters(f.parameters)._apply_load(f.force, u) for f, u in pairs]
         )
 
     def identity(self) -> dict[str, Any]:
@@ -119,10 +108,7 @@ class Newton:
         return {"name": type(self).__name__, "tol": float(self.tol)}
 
     def with_parameters(self, parameters: Tensor) -> "Newton":
-        """Return the solver of the body with other parameters, see `Problem.with_parameters`.
-
-        It has a factor of K(0) of its own; the linear solvers of the last few bodies are kept.
-        """
+        """Return the solver of the body with other parameters, see `Problem.with_parameters`."""
         linear = self.linear_solver.with_parameters(parameters)
         if linear is self.linear_solver:
             return self
@@ -134,11 +120,10 @@ class Newton:
 
     def _apply_load(self, force: Tensor, guess: Tensor | None) -> Iterator[Solution]:
         """Yield the states under one load (1, N, D), applied in steps if necessary."""
-        run = _Run(
-            TangentSolver(self.linear_solver, corotational=self.corotational),
-            LoadStepping(self.min_load_step),
-        )
-        state = base = self._undeformed(force)
+        tangents = TangentSolver(self.linear_solver, corotational=self.corotational)
+        run, zero = _Run(tangents, LoadStepping(self.min_load_step)), torch.zeros_like(force)
+        one, supports = torch.ones(1, dtype=force.dtype), self.problem.prescribed[None]
+        state = base = _State(zero, zero, one, supports, {})  # at rest, needs no evaluation
         if (start := self._initial(force, guess)) is not None:
             state, run.from_guess = start, True
         yield self._report(state, force, run)
@@ -159,9 +144,8 @@ class Newton:
                 steps.reject()
             spent = run.iterations >= self.max_total_iter
             if steps.exhausted or (spent and not self._is_balanced(state, force, 1.0, self.tol)):
-                lost = steps.exhausted
-                end = Status.NO_VALID_EQUILIBRIUM if lost else Status.NOT_CONVERGED
-                yield self._report(base, force, run, end)
+                lost = Status.NO_VALID_EQUILIBRIUM if steps.exhausted else Status.NOT_CONVERGED
+                yield self._report(base, force, run, lost)
                 return
             move = (steps.target - steps.factor) * self.problem.prescribed[None]
             state = state._replace(support_step=move)
@@ -192,11 +176,7 @@ class Newton:
     def _solve(
         self, state: "_State", force: Tensor, tangents: TangentSolver, rtol: float, *, near: bool
     ) -> Tensor:
-        """Return the full Newton step (1, N, D) under a force, with the step of the supports.
-
-        Raises:
-            SingularMatrix: The tangent has no factor.
-        """
+        """Return the full Newton step (1, N, D) under a force, with the step of the supports."""
         problem, u = self.problem, state.displacement
         internal, tangent = state.internal, None
         if u.any():
@@ -207,10 +187,7 @@ class Newton:
         if state.support_step.any():
             right = right - problem.tangent_product(u, state.support_step)
         values = problem.restrict(right[0])
-        if tangent is None:
-            step = tangents.solve_at_rest(values, rtol)
-        else:
-            step = tangents.solve(tangent, u, values, rtol, near=near)
+        step = tangents.solve(tangent, u, values, rtol, near=near)
         return problem.extend(step)[None] + state.support_step
 
     def _update(self, state: "_State", update: Tensor, *, halvings: int) -> "_State | None":
@@ -222,25 +199,18 @@ class Newton:
 
         bound = self.min_detF_ratio * min(float(state.volume_ratio), 1.0)
         new = longest_valid_step(state_after, bound, halvings=halvings)
-        if new is not None and self.mixed_integration and self.problem.supports_mip:
-            gap = self.problem.update_strain_gap(state.gap, new.length, update)
-            return new._replace(gap=gap)
-        return new
+        if new is None or not (self.mixed_integration and self.problem.supports_mip):
+            return new
+        return new._replace(gap=self.problem.update_strain_gap(state.gap, new.length, update))
 
     def _initial(self, force: Tensor, guess: Tensor | None) -> "_State | None":
         """Return the state of a guess; None where it is zero, inverted or there is no load."""
-        if guess is None or not guess.any():
-            return None
-        if not (force.any() or self.problem.moved_supports):
+        loaded = force.any() or self.problem.moved_supports
+        if guess is None or not guess.any() or not loaded:
             return None
         u = torch.where(self.problem.free, guess, self.problem.prescribed)
         start = self._evaluate(u, torch.zeros_like(force))
         return start if start.volume_ratio > 0 else None
-
-    def _undeformed(self, force: Tensor) -> "_State":
-        """Return the state at zero displacement, which needs no evaluation."""
-        zero, one = torch.zeros_like(force), torch.ones(1, dtype=force.dtype)
-        return _State(zero, zero, one, self.problem.prescribed[None], {})
 
     def _evaluate(self, displacement: Tensor, support_step: Tensor) -> "_State":
         return _State(displacement, *self.problem.evaluate(displacement), support_step, {})
@@ -305,9 +275,9 @@ class _State(NamedTuple):
         internal: f_int(u), (1, N, D) [-].
         volume_ratio: min det F, (1,) [-].
         support_step: Displacement that the next step has to add at the supports, (1, N, D) [-].
-        residuals: Relative residuals by load factor, evaluated once.
+        residuals: Relative residuals by load factor.
         gap: Strain gap of the mixed integration points, see `Problem.update_strain_gap`.
-        length: Length of the step that led here, 1 for a full one.
+        length: Length of the last step, 1 for a full one.
         previous: Relative residual before that step [-].
     """
 

@@ -20,22 +20,17 @@ class ReferenceSolver(Protocol):
     @property
     def problem(self) -> Problem:
         """Body."""
-        ...
 
     @property
     def tol(self) -> float:
         """Relative residual below which a solution counts as converged [-]."""
-        ...
 
     @property
     def linear_solver(self) -> LinearSolver:
         """Linear solver with the factor of K(0) that the whole scene shares."""
-        ...
 
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield the solutions of the iterations; the last one is the result."""
-        ...
 
     def identity(self) -> dict[str, Any]:
         """Return the options that determine the solutions, as plain data."""
-        ...

@@ -116,24 +116,17 @@ def check_force(problem: Problem, load: Load) -> None:
 
 
 def check_tol(tol: float) -> None:
-    """Check a tolerance of relative residuals.
-
-    Raises:
-        ValueError: The tolerance is below `LEAST_TOL` or not below 1.
-    """
+    """Raise a ValueError unless a tolerance is at least `LEAST_TOL` and below 1."""
     if not LEAST_TOL <= tol < 1:
         raise ValueError(f"tol = {tol} must be at least {LEAST_TOL:g} and below 1")
 
 
 def check_steps(solver: Any, parts: Sequence[str]) -> None:
-    """Check the ranges of a solver's tol, factor_reuse_tol, max_iter, max_total_iter and `parts`.
+    """Raise a ValueError if an option of a solver is out of range.
 
     Args:
-        solver: The solver.
+        solver: Has tol, factor_reuse_tol, max_iter and max_total_iter.
         parts: Names of attributes that must lie between 0 and 1.
-
-    Raises:
-        ValueError: An attribute is out of range.
     """
     check_tol(solver.tol)
     for name in parts:
@@ -151,7 +144,6 @@ class Solver(Protocol):
 
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield the iterates; the last one is the solution."""
-        ...
 
 
 def solve(solver: Solver, load: Load) -> Solution:
@@ -193,11 +185,8 @@ def evaluate_solution(
         problem: The body.
         displacement: Displacement over L, (B, N, D) [-].
         load: The load.
-        tol: Relative residual below which it counts as converged [-], at least `LEAST_TOL`, below
-            1.
-        iterations: Value of `Solution.iterations`.
-        seconds: Value of `Solution.seconds` [s].
-        from_guess: Value of `Solution.from_guess`.
+        tol: Relative residual below which it counts as converged [-], see `check_tol`.
+        iterations, seconds, from_guess: Values of the attributes of `Solution`.
         evaluation: Internal force and min det F at the displacement, if known.
 
     Raises:
