@@ -27,8 +27,7 @@ class Newton:
 
     Full steps on the whole load come first. A step that would reduce det F at a quadrature point
     below `min_detF_ratio` of its value is halved until it does not. Where the iterations do not
-    converge, the load is applied in steps: a step that fails is halved, one that succeeds is
-    doubled. Intermediate states need only `intermediate_tol`.
+    converge, the load is applied in steps, which are halved or doubled as they fail or succeed.
 
     An equilibrium whose tangent has negative pivots is no minimum of the energy; its status is
     UNSTABLE. The tangent at the solution is factorised only if the last tangent had negative pivots
@@ -56,8 +55,8 @@ class Newton:
             gradients on the new tangent [-]; 0: every tangent is factorised.
         corotational: Precondition conjugate gradients with the factor of K(0), rotated with the
             nodes. Stability is then known only where a tangent was factorised.
-        linear_solver: Solver with the factor of K(0), which every first step from zero uses.
-            `dataclasses.replace` keeps it unless `problem` or `linear` change.
+        linear_solver: Solver with the factor of K(0); `dataclasses.replace` keeps it unless
+            `problem` or `linear` change.
     """
 
     problem: Problem
@@ -98,10 +97,9 @@ class Newton:
         check_force(self.problem, load)
         members = load._replace(force=self.problem.acting(load.force)).unbatch()
         guesses = [None] * len(members) if guess is None else guess.split(1)
-        pairs = zip(members, guesses, strict=True)
-        yield from run_lockstep(
-            [self.with_parameters(f.parameters)._apply_load(f.force, u) for f, u in pairs]
-        )
+        solvers = (self.with_parameters(member.parameters) for member in members)
+        each = zip(solvers, members, guesses, strict=True)
+        yield from run_lockstep([newton._apply_load(f.force, u) for newton, f, u in each])
 
     def identity(self) -> dict[str, Any]:
         """Return class name and tolerance; the other options only change the iterations."""
