@@ -1,22 +1,25 @@
-"""Rendering of frames without a display: a depth-buffered rasterizer, captions and a legend."""
+"""Images of frames without a display: the surface from far to near, captions and a legend."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib import font_manager
-from numba import njit
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgba_array
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from dpl.viewer.frames import QUANTITIES
-from dpl.viewer.surface import SMOOTH, Floats, Surface, triangle_normals, vertex_normals
+from dpl.viewer.surface import Floats, Surface, contour_bands, triangle_normals, vertex_normals
 
 COLOUR_MAPS = {"displacement": "viridis", "von Mises stress": "turbo", "error against FE": "magma"}
 N_BANDS = 12
-BACKGROUND, TEXT, TEXT_GREY, OUTLINE = (250, 250, 252), (32, 36, 48), (70, 74, 88), (205, 209, 218)
-SUPERSAMPLING = 2  # pixels of the depth buffer per pixel of the image, in each direction
+GRAZING = -0.2  # smallest distance of the camera above a visible face, over L
+BACKGROUND, TEXT, TEXT_GREY, OUTLINE = "#fafafc", "#202430", "#464a58", "#cdd1da"
 Bytes = NDArray[np.uint8]
 
 
@@ -37,8 +40,8 @@ class Camera:
         field_of_view: Vertical angle of view [rad].
     """
 
-    position: tuple[float, float, float]
-    look_at: tuple[float, float, float]
+    position: Floats
+    look_at: Floats
     field_of_view: float = 0.6
 
     @classmethod
@@ -49,33 +52,21 @@ class Camera:
             surface: Surface of the body.
             distance: Factor on the distance to the body [-].
         """
-        points = surface.undeformed
-        low, high = points.min(axis=0), points.max(axis=0)
-        centre = (low + high) / 2
-        planar = surface.problem.shape[1] == 2
+        low, high = surface.undeformed.min(axis=0), surface.undeformed.max(axis=0)
+        centre, planar = (low + high) / 2, surface.problem.shape[1] == 2
         direction = np.array([0.0, -0.02, 1.0] if planar else [0.62, -1.0, 0.48])
         length = 1.45 * distance * (0.45 + float(np.linalg.norm(high - low)))
-        x, y, z = (centre + length * direction / np.linalg.norm(direction)).tolist()
-        a, b, c = centre.tolist()
-        return cls((x, y, z), (a, b, c))
-
-    def axes(self) -> Floats:
-        """Return the unit vectors right, up and forward, (3, 3)."""
-        forward = np.subtract(self.look_at, self.position)
-        forward = forward / np.linalg.norm(forward)
-        right = np.cross(forward, (0.0, 0.0, 1.0))
-        if np.linalg.norm(right) < 1e-6:
-            right = np.array([1.0, 0.0, 0.0])
-        right = right / np.linalg.norm(right)
-        return np.stack([right, np.cross(right, forward), forward])
+        return cls(centre + length * direction / np.linalg.norm(direction), centre)
 
     def project(self, points: Floats, width: int, height: int) -> Floats:
-        """Return column [pixel], row [pixel] and depth over L of points (n, 3), (n, 3)."""
-        local = (points - self.position) @ self.axes().T
+        """Return column [pixel], row [pixel] and depth over L of points (..., 3), (..., 3)."""
+        forward = self.look_at - self.position
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        axes = np.stack([right, np.cross(right, forward), forward])
+        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+        x, y, depth = np.moveaxis((points - self.position) @ axes.T, -1, 0)
         scale = height / (2 * np.tan(self.field_of_view / 2))
-        column = width / 2 + scale * local[:, 0] / local[:, 2]
-        row = height / 2 - scale * local[:, 1] / local[:, 2]
-        return np.stack([column, row, local[:, 2]], axis=1)
+        return np.stack([width / 2 + scale * x / depth, height / 2 - scale * y / depth, depth], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,140 +95,83 @@ class Renderer:
             quantity: Name of the quantity.
             captions: Lines of text in the upper left corner, the first one in large letters.
         """
-        width, height = (SUPERSAMPLING * side for side in self.size)
-        surface = self.surface
-        depth = np.full((height, width), np.inf)
-        value = np.zeros((height, width))
-        normal = np.zeros((height, width, 3))
-        pixels = self.camera.project(points, width, height)
-        levels = np.nan_to_num(values / top if top > 0 else 0 * values)
-        normals = _corner_normals(points, surface)
-        _fill_triangles(pixels, surface.triangles, levels, normals, depth, value, normal)
-        colours = self._shade(value, normal, quantity)
-        background = np.asarray(BACKGROUND, float)
-        canvas = np.where(np.isfinite(depth)[..., None], colours, background)
-        _draw_lines(pixels, surface.edges, depth, canvas, 0.22, np.asarray(TEXT, float))
-        outline = self.camera.project(surface.undeformed, width, height)
-        colour = np.asarray(OUTLINE, float)
-        _draw_lines(outline, surface.feature_edges, depth, canvas, 0.75, colour)
-        image = Image.fromarray(np.asarray(canvas, dtype=np.uint8))
-        image = image.resize(self.size, Image.Resampling.LANCZOS)
-        _draw_captions(image, captions)
-        _draw_legend(image, quantity, top)
-        return image
+        width, height = self.size
+        dpi = height / 5.4
+        figure = Figure((width / dpi, 5.4), dpi=dpi, facecolor=BACKGROUND)
+        canvas = FigureCanvasAgg(figure)
+        ax = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
+        ax.set_axis_off()
+        levels = N_BANDS * np.nan_to_num(values / top if top > 0 else 0 * values)
+        ax.add_collection(self._polygons(np.nan_to_num(points), levels, quantity))
+        _draw_captions(figure, captions)
+        _draw_legend(figure, quantity, top)
+        canvas.draw()
+        return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
-    def _shade(self, value: Floats, normal: Floats, quantity: str) -> Floats:
-        """Return colours (height, width, 3) of values in [0, 1], lit from beside the camera."""
-        band = np.clip((value * N_BANDS).astype(int), 0, N_BANDS - 1)
-        to_camera = np.subtract(self.camera.position, self.camera.look_at)
+    def _polygons(self, points: Floats, levels: Floats, quantity: str) -> PolyCollection:
+        """Return triangles and edges from far to near, those that face away first."""
+        surface, camera = self.surface, self.camera
+        bands = contour_bands(points, surface.triangles, levels, N_BANDS)
+        soup = np.concatenate(bands)
+        normals = triangle_normals(soup, np.arange(len(soup)).reshape(-1, 3))
+        to_camera = camera.position - camera.look_at
         light = to_camera / np.linalg.norm(to_camera) + np.array([-0.25, 0.1, 0.75])
-        light = light / np.linalg.norm(light)
-        brightness = 0.52 + 0.5 * np.abs(normal @ light)
-        return np.clip(band_colours(quantity).astype(float)[band] * brightness[..., None], 0, 255)
+        brightness = 0.52 + 0.5 * np.abs(normals @ light) / np.linalg.norm(light)
+        colours = np.repeat(band_colours(quantity), [len(band) // 3 for band in bands], axis=0)
+        shades = np.clip(colours * brightness[:, None], 0, 255) / 255
+        edges, outline = points[surface.edges], surface.undeformed[surface.feature_edges]
+        sides = vertex_normals(points, surface.triangles)[surface.edges].mean(axis=1)
+        lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
+        layers = (  # polygons, normals, colours, and shifts towards the camera
+            (soup.reshape(-1, 3, 3), normals, np.insert(shades, 3, 1.0, axis=1), 0.0),
+            (edges, sides, to_rgba_array([TEXT] * len(edges), 0.22), lengths),
+            (outline, 0 * outline[:, 0], to_rgba_array([OUTLINE] * len(outline), 0.75), 0.0),
+        )
+        corners = np.concatenate([polygons[:, [0, 1, -1]] for polygons, *_ in layers])
+        normals, rgba = (np.concatenate([layer[k] for layer in layers]) for k in (1, 2))
+        pixels = camera.project(corners, *self.size)
+        shifts = np.concatenate([np.broadcast_to(layer[3], len(layer[0])) for layer in layers])
+        depth = pixels[..., 2].mean(axis=1) - shifts
+        faces_camera = (normals * (camera.position - corners[:, 0])).sum(axis=1) >= GRAZING
+        order = np.lexsort((-depth, faces_camera))
+        flat: Any = pixels[order, :, :2]
+        return PolyCollection(flat, facecolors=rgba[order], edgecolors="face", linewidths=0.5)
 
 
-def _corner_normals(points: Floats, surface: Surface) -> Floats:
-    """Return a normal at each corner of each triangle, (T, 3, 3).
-
-    Vertex normals give smooth shading; at sharp edges the normal of the triangle is used.
-    """
-    own = triangle_normals(points, surface.triangles)[:, None]
-    mean = vertex_normals(points, surface.triangles)[surface.triangles]
-    sharp = (mean * own).sum(axis=2, keepdims=True) < SMOOTH
-    return np.where(sharp, own, mean)
-
-
-@njit(cache=True)
-def _fill_triangles(pixels, triangles, levels, normals, depth, value, normal):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write depth, value and normal of the nearest triangle to each pixel."""
-    height, width = depth.shape
-    for t in range(len(triangles)):
-        i, j, k = triangles[t]
-        ax, ay, az = pixels[i]
-        bx, by, bz = pixels[j]
-        cx, cy, cz = pixels[k]
-        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if area == 0.0 or not (az > 0 and bz > 0 and cz > 0):
-            continue
-        left = max(int(np.floor(min(ax, bx, cx))), 0)
-        right = min(int(np.ceil(max(ax, bx, cx))), width - 1)
-        top = max(int(np.floor(min(ay, by, cy))), 0)
-        bottom = min(int(np.ceil(max(ay, by, cy))), height - 1)
-        for row in range(top, bottom + 1):
-            for column in range(left, right + 1):
-                x, y = column + 0.5, row + 0.5
-                w = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / area
-                u = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) / area
-                v = 1.0 - w - u
-                if w < 0 or u < 0 or v < 0:
-                    continue
-                z = 1.0 / (w / az + u / bz + v / cz)
-                if z < depth[row, column]:
-                    depth[row, column] = z
-                    w, u, v = w * z / az, u * z / bz, v * z / cz
-                    value[row, column] = w * levels[i] + u * levels[j] + v * levels[k]
-                    for axis in range(3):
-                        normal[row, column, axis] = (
-                            w * normals[t, 0, axis]
-                            + u * normals[t, 1, axis]
-                            + v * normals[t, 2, axis]
-                        )
-
-
-@njit(cache=True)
-def _draw_lines(pixels, lines, depth, canvas, opacity, colour):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Blend lines that are not hidden into an image."""
-    height, width = depth.shape
-    for n in range(len(lines)):
-        i, j = lines[n]
-        ax, ay, az = pixels[i]
-        bx, by, bz = pixels[j]
-        steps = int(max(abs(bx - ax), abs(by - ay))) + 1
-        for step in range(steps):
-            share = step / steps
-            x, y = ax + share * (bx - ax), ay + share * (by - ay)
-            z = 1.0 / ((1 - share) / az + share / bz)
-            if not (0 <= x < width and 0 <= y < height):
-                continue
-            column, row = int(x), int(y)
-            if z * 0.996 < depth[row, column]:
-                for axis in range(3):
-                    old = canvas[row, column, axis]
-                    canvas[row, column, axis] = old + opacity * (colour[axis] - old)
-
-
-def _font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
-    weight = "bold" if bold else "normal"
-    found = font_manager.findfont(font_manager.FontProperties(family="DejaVu Sans", weight=weight))
-    return ImageFont.truetype(found, size)
-
-
-def _draw_captions(image: Image.Image, captions: Sequence[str]) -> None:
+def _draw_captions(figure: Figure, captions: Sequence[str]) -> None:
     """Draw lines of text in the upper left corner."""
-    draw = ImageDraw.Draw(image)
-    unit = image.height / 540
-    row = 18 * unit
+    width, height = figure.get_size_inches()
+    below = 0.18  # [inch]
     for number, line in enumerate(captions):
-        title = number == 0
-        size = round((25 if title else 17) * unit)
-        font, colour = _font(size, bold=title), TEXT if title else TEXT_GREY
-        draw.text((22 * unit, row), line, fill=colour, font=font)
-        row += 1.5 * size
+        size, colour, weight = (17, TEXT_GREY, "normal") if number else (25, TEXT, "bold")
+        place = 0.22 / width, 1 - below / height
+        figure.text(*place, line, color=colour, size=0.72 * size, weight=weight, va="top")
+        below += 0.015 * size
 
 
-def _draw_legend(image: Image.Image, quantity: str, top: float) -> None:
+def _draw_legend(figure: Figure, quantity: str, top: float) -> None:
     """Draw the colour bar at the right edge."""
-    draw = ImageDraw.Draw(image)
-    unit = image.height / 540
-    left, high, low = image.width - 92 * unit, 120 * unit, image.height - 60 * unit
-    step = (low - high) / N_BANDS
-    font = _font(round(14 * unit))
-    for k, colour in enumerate(band_colours(quantity)):
-        y = low - (k + 1) * step
-        draw.rectangle((left, y, left + 18 * unit, y + step), fill=tuple(int(c) for c in colour))
-    for k in range(0, N_BANDS + 1, 3):
-        label, place = f"{top * k / N_BANDS:.3g}", (left + 24 * unit, low - k * step)
-        draw.text(place, label, fill=TEXT_GREY, font=font, anchor="lm")
+    width, height = figure.get_size_inches()
+    bar = figure.add_axes((1 - 0.92 / width, 0.6 / height, 0.18 / width, 1 - 1.8 / height))
+    bar.imshow(band_colours(quantity)[::-1, None], aspect="auto", extent=(0, 1, 0, N_BANDS))
+    ticks = range(0, N_BANDS + 1, 3)
+    labels = [f"{top * k / N_BANDS:.3g}" for k in ticks]
+    bar.set(xticks=[], yticks=ticks, yticklabels=labels, frame_on=False)
+    bar.tick_params(
+        right=False,
+        left=False,
+        labelright=True,
+        labelleft=False,
+        labelsize=10,
+        labelcolor=TEXT_GREY,
+    )
     title = f"{quantity} [{QUANTITIES[quantity]}]"
-    place = (image.width - 22 * unit, high - 22 * unit)
-    draw.text(place, title, fill=TEXT, font=font, anchor="rm")
+    figure.text(
+        1 - 0.22 / width,
+        1 - 0.98 / height,
+        title,
+        color=TEXT,
+        size=10,
+        ha="right",
+        va="center",
+    )

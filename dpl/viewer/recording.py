@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -187,7 +188,7 @@ def _palette(quantities: set[str]) -> Image.Image:
     """
     shades = np.linspace(0.45, 1.05, 16 // len(quantities))[:, None, None]
     bands = [np.clip(shades * band_colours(quantity), 0, 255) for quantity in sorted(quantities)]
-    greys = np.linspace(BACKGROUND, TEXT, 40)
+    greys = 255 * np.linspace(to_rgb(BACKGROUND), to_rgb(TEXT), 40)
     colours = np.concatenate([*(shade.reshape(-1, 3) for shade in bands), greys]).round()
     image = Image.new("P", (1, 1))
     image.putpalette(colours.astype(np.uint8).tobytes())
