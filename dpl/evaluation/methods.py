@@ -72,22 +72,12 @@ def pod_galerkin(scene: Scene, train: Sample, *, rank: int, tolerance: float) ->
 
 def network(surrogate: Surrogate, folder: Path, samples: int) -> Method:
     """Return the network of the run in a folder."""
-    return Method(
-        surrogate.predict,
-        samples,
-        training_minutes(folder),
-        sum(p.numel() for p in surrogate.net.parameters()),
-    )
+    count = sum(p.numel() for p in surrogate.net.parameters())
+    return Method(surrogate.predict, samples, training_minutes(folder), count)
 
 
 def corrected(
-    surrogate: Surrogate,
-    method: Method,
-    train: Sample,
-    *,
-    rank: int,
-    tolerance: float,
-    steps: int,
+    surrogate: Surrogate, method: Method, train: Sample, *, rank: int, tolerance: float, steps: int
 ) -> Method:
     """Return a network whose predictions are corrected by Galerkin iterations in its modes.
 

@@ -117,13 +117,9 @@ def load_sets(scene: Scene, count: int, far: int) -> dict[str, Load]:
 def solvers_of(
     scene: Scene, networks: Mapping[str, Predict], tol: float, *, max_total_iter: int | None = None
 ) -> dict[tuple[str, str], Solver]:
-    """Return the solvers to compare, by name and network.
+    """Return the solvers to compare, by name and network, for a relative residual `tol` [-].
 
-    Args:
-        scene: The scene, which provides problem and linear solver.
-        networks: Predictions by name of the network.
-        tol: Relative residual [-].
-        max_total_iter: Maximum number of iterations; None for that of the scene's solver.
+    They iterate at most `max_total_iter` times, by default as often as the scene's solver.
     """
     budget = max_total_iter or scene.newton.max_total_iter
     robust = replace(scene.newton, tol=tol, max_total_iter=budget)
@@ -155,12 +151,8 @@ def measure(
 ) -> list[Trial]:
     """Return the results of all solvers for all loads, one load at a time on one thread.
 
-    Args:
-        solvers: Solvers by name and network; must contain `REFERENCE` from rest.
-        title: Name of the set of loads.
-        load: The loads, B of them.
-        tol: Tolerance of the solvers, for the record [-].
-        tick: Called after each load.
+    The solvers, by name and network, contain `REFERENCE` from rest. `title` and `tol` are those of
+    the loads and the solvers, for the record. `tick` is called after each load.
     """
     with one_thread(), torch.inference_mode():
         timed = time_interleaved(solvers, load, tick)
@@ -180,10 +172,8 @@ def measure(
 def summary(trials: Sequence[Trial]) -> list[Summary]:
     """Return a summary for each solver, set of loads and tolerance.
 
-    The sets "in range" and "twice" are also combined into the set of the paper, `BOTH`.
-
-    Args:
-        trials: Results; the loads of a set have the same order for all solvers.
+    The sets "in range" and "twice" are also combined into the set of the paper, `BOTH`. The loads
+    of a set have the same order for all solvers.
     """
     groups: dict[tuple[str, float], dict[tuple[str, str], list[Trial]]] = {}
     both = [replace(trial, loads=BOTH) for trial in trials if trial.loads in ("in range", "twice")]
@@ -232,10 +222,6 @@ def draw(trials: Sequence[Trial], path: Path) -> None:
 
     Source: Dolan, More (2002), Benchmarking optimization software with performance profiles; here
     with absolute times.
-
-    Args:
-        trials: Results to draw.
-        path: Image file to write.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter

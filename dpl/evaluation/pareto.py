@@ -87,13 +87,8 @@ def points(
 ) -> list[Point]:
     """Return run times and errors of all iterates of solvers, one load at a time.
 
-    Each solver is warmed up, then solves all loads in a row.
-
-    Args:
-        solvers: Solvers by name.
-        batch: Loads with reference solutions.
-        threads: Threads of torch; with 1 BLAS has one thread too, otherwise its default.
-        tick: Called after each solver.
+    Each solver is warmed up, then solves all loads in a row; `tick` is called after each. With one
+    thread of torch BLAS has one too, otherwise its default.
     """
     singles = batch.load.unbatch()
     found = []
@@ -141,13 +136,10 @@ def on_gpu(surrogate: Surrogate) -> Callable[[Load], Tensor]:
 def draw(
     rows: Sequence[Point], meshes: Sequence[Discretisation], floor: float | None, file: Path
 ) -> None:
-    """Draw run time against error: one line or dot for each solver.
+    """Draw run time against error of the iterates of solvers: a line or dot for each solver.
 
-    Args:
-        rows: Iterates of solvers, all with the same number of threads.
-        meshes: Errors of Newton on other meshes, relative to the limit under refinement.
-        floor: Discretisation error of the mesh of the solvers [-]; None if it is not known.
-        file: Image file to write.
+    Errors of Newton on other meshes and the discretisation error of the mesh of the solvers,
+    `floor` [-], are relative to the limit under refinement.
     """
     from matplotlib.figure import Figure
 

@@ -53,11 +53,6 @@ def measure(
     """Return the results and the displacements (B, N, D) [-] of each solver.
 
     Loads are solved one at a time, see `dpl.evaluation.timing.time_interleaved`.
-
-    Args:
-        solvers: Solvers by name.
-        batch: Loads with reference solutions.
-        problem: The problem.
     """
     timed, rows = time_interleaved(solvers, batch.load), []
     for name, (solution, times) in timed.items():

@@ -55,11 +55,7 @@ def write(rows: Sequence[Any], path: Path) -> None:
 
 
 def read(kind: type[Row], path: Path) -> list[Row]:
-    """Return the rows of a CSV file written by `write`.
-
-    Args:
-        kind: Dataclass of the rows; its fields are str, int, float, bool or tuple[int, ...].
-        path: Path of the file.
+    """Return the rows of a CSV file written by `write`, whose dataclass has fields of `READERS`.
 
     Raises:
         ValueError: The file has other columns.

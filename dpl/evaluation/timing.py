@@ -40,15 +40,10 @@ class Latency:
 
 
 def latency(answer: Callable[[T], object], loads: Sequence[T], *, repeats: int = 1) -> Latency:
-    """Return the latency of a callable.
+    """Return the latency of a callable of a single load, called `repeats` times with each load.
 
     After a few loads that are not counted, it is called with all loads in a row, so that its
     weights stay in the cache as in use.
-
-    Args:
-        answer: Callable of a single load.
-        loads: One or more loads.
-        repeats: Number of calls for each load.
     """
     times = []
     with one_thread(), torch.inference_mode():
@@ -72,10 +67,6 @@ def latencies(simulator: Simulator, load: Load) -> dict[str, Latency]:
 
     `sim(force)` predicts, evaluates the residual and min det F, and checks whether the load lies in
     the training range. The bare network, `surrogate(force, young)`, only predicts.
-
-    Args:
-        simulator: The simulator, called without a tolerance.
-        load: The loads, B of them.
     """
     arguments: list[Any] = [simulator.scene.si_inputs(single) for single in load.unbatch()]
     return {
@@ -97,12 +88,7 @@ def time_interleaved(
     """Return the solutions and the wall times (B,) [ms] of each solver.
 
     Every solver is warmed up with the first load. Solvers are then timed alternately on each load,
-    which cancels drifts of the CPU frequency.
-
-    Args:
-        solvers: Solvers by name.
-        load: The loads, B of them.
-        tick: Called after each load.
+    which cancels drifts of the CPU frequency; `tick` is called after each load.
     """
     solutions: dict[K, list[Solution]] = {name: [] for name in solvers}
     times: dict[K, list[float]] = {name: [] for name in solvers}

@@ -12,6 +12,7 @@ from dpl.fem import HasModes, Problem, surface
 from dpl.fem.mesh.writing import flat_cells
 from dpl.fem.postprocess import triangles
 from dpl.scene import Scene
+from dpl.training import Surrogate
 from dpl.version import __version__
 
 FORMAT = 3  # version of the keys of meta.json
@@ -41,12 +42,8 @@ def describe(
 ) -> dict[str, Any]:
     """Return the contents of meta.json.
 
-    Args:
-        graph: The exported graph.
-        path: Path of the ONNX file.
-        reference: The reference load and its solutions.
-        tol: Largest relative difference of ONNX and torch [-].
-        errors: Errors of the network on the test set, see `dpl.training.metrics`, if evaluated.
+    `tol` is the largest relative difference of ONNX and torch [-]; `errors` are those of the test
+    set, see `dpl.training.metrics`, if the run was evaluated.
     """
     module, scene = graph.surrogate, graph.surrogate.scene
     loads, problem = scene.loads, scene.problem
@@ -64,13 +61,7 @@ def describe(
             "fixed": _indices(~problem.free),
             "loadable": _indices(loads.loadable_dofs),
         },
-        "scales": {
-            "length": scene.length,
-            "force_unit": scene.force_unit,
-            "force": float(module.force_scale),
-            "displacement": float(module.displacement_scale),
-            "meaning": SCALING,
-        },
+        "scales": _scales(module),
         "material": {**_law(scene), "young": loads.young_range, **loads.parameter_ranges},
         "range": _range(scene),
         "errors": errors,
@@ -98,6 +89,16 @@ def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
     both = {"inputs": graph.inputs, "outputs": graph.outputs}
     named = {key: [{"name": name, **known[name]} for name in names] for key, names in both.items()}
     return {"file": path.name, "opset": onnx_opset(path), **named}
+
+
+def _scales(module: Surrogate) -> dict[str, Any]:
+    return {
+        "length": module.scene.length,
+        "force_unit": module.scene.force_unit,
+        "force": float(module.force_scale),
+        "displacement": float(module.displacement_scale),
+        "meaning": SCALING,
+    }
 
 
 def _force_unit(scene: Scene) -> str:

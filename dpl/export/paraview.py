@@ -38,14 +38,9 @@ def write_results(
 ) -> tuple[list[ResultRow], list[Path]]:
     """Write predictions as a series of VTU files, a PVD collection and an XDMF file.
 
-    Args:
-        surrogate: The surrogate.
-        load: The loads.
-        path: Path of the series, without a suffix.
-        solve_reference: Also write the finite-element displacement and the error.
-
-    Returns:
-        One row for each load, and the paths of the PVD and the XDMF file.
+    `path` is that of the series, without a suffix. With `solve_reference` the finite-element
+    displacement and the error are written too. Returns one row for each load, and the paths of the
+    PVD and the XDMF file.
     """
     scene = surrogate.scene
     rows, steps = [], []
@@ -70,11 +65,7 @@ def nodal_fields(
 ) -> dict[str, Tensor]:
     """Return named fields at the nodes in SI units, (N, ...), for one load.
 
-    Args:
-        scene: The scene.
-        load: One dimensionless load.
-        displacement: Displacement over L, (N, D) [-].
-        reference: Finite-element displacement over L, (N, D) [-].
+    Both displacements, that to show and the finite-element one, are over L, (N, D) [-].
     """
     young = float(load.young)
     newton = "N" if scene.problem.shape[1] == 3 else "N/m"

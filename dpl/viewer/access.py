@@ -68,13 +68,11 @@ class AccessPolicy:
             OSError: The port is in use, or the host does not exist.
         """
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        bound = socket.socket(family, socket.SOCK_STREAM)
-        try:
+        with contextlib.ExitStack() as on_error:
+            bound = on_error.enter_context(socket.socket(family, socket.SOCK_STREAM))
             bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             bound.bind((host, port))
-        except OSError:
-            bound.close()
-            raise
+            on_error.pop_all()
         return cls(bound, host, tuple(name.lower() for name in allowed_hosts))
 
     @property
@@ -195,15 +193,14 @@ def check_server(policy: AccessPolicy) -> None:
     Raises:
         RuntimeError: A response has another status than the policy requires.
     """
-    own = f"127.0.0.1:{policy.port}"
-    path = f"/{policy.token}/"
+    path, own = f"/{policy.token}/", {"Host": f"127.0.0.1:{policy.port}"}
     upgrade = {"Connection": "Upgrade", "Upgrade": "websocket"}
     cases = [
-        (200, path, {"Host": own}),
-        (403, "/", {"Host": own}),
+        (200, path, own),
+        (403, "/", own),
         (421, path, {"Host": f"rebound.example:{policy.port}"}),
-        (403, path, {"Host": own, "Origin": "http://foreign.example", **upgrade}),
-        (403, path, {"Host": own, **upgrade}),
+        (403, path, {**own, "Origin": "http://foreign.example", **upgrade}),
+        (403, path, {**own, **upgrade}),
     ]
     for status, path, headers in cases:
         if (found := request_status(policy, path, **headers)) != status:

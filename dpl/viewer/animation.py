@@ -11,57 +11,42 @@ from dpl.viewer.rasterizer import Camera, Renderer
 from dpl.viewer.recording import FRAME_RATE, write_animation
 
 DURATION = 5  # [s]
+RADIUS = 0.45  # of the patch over L [-]
+DEFLECTION = 0.33  # linear displacement of the centre of the patch over L [-]
 
 
-def animate_load(
-    body: Body,
-    path: Path,
-    *,
-    size: tuple[int, int] = (720, 405),
-    radius: float = 0.45,
-    deflection: float = 0.33,
-) -> None:
+def animate_load(body: Body, path: Path, *, size: tuple[int, int] = (720, 405)) -> None:
     """Write a looping animation of the network's predictions for a load that rotates once.
 
     The load acts on a patch around the point farthest from the supports. Colours show the von Mises
-    stress. The caption has the median time, and residual and error of each frame.
-
-    Args:
-        body: The body.
-        path: Path of a .gif or .mp4 file.
-        size: Width and height [pixel].
-        radius: Radius of the patch over L [-].
-        deflection: Linear displacement of the centre of the patch over L [-].
+    stress. The caption has the median time, and residual and error of each frame. `path` ends with
+    .gif or .mp4; `size` is width and height [pixel].
     """
-    frames = circular_load(body, radius=radius, deflection=deflection)
+    frames = circular_load(body)
     median = float(np.median([frame.answer.milliseconds for frame in frames if frame.answer]))
     count = math.prod(body.scene.problem.shape)
 
     def captions(frame: Frame) -> list[str]:
+        exact = body.solve(frame.request, ViewSettings(tol=body.scene.solver.tol)).displacement
+        error = float((frame.displacement - exact).norm() / exact.norm().clamp(min=1e-300))
         return [
             f"sim(force): {median:.1f} ms",
             f"{count:,} degrees of freedom",
             f"relative residual {frame.residual:.1e}",
-            f"displacement error {100 * relative_error(body, frame):.1g} %",
+            f"displacement error {100 * error:.1g} %",
         ]
 
     camera = Camera.facing(body.surface, distance=0.82)
     write_animation(path, frames, Renderer(body.surface, camera, size), captions)
 
 
-def relative_error(body: Body, frame: Frame) -> float:
-    """Return ||u - u_FE|| / ||u_FE|| [-], with u_FE to the tolerance of the scene."""
-    exact = body.solve(frame.request, ViewSettings(tol=body.scene.solver.tol)).displacement
-    return float((frame.displacement - exact).norm() / exact.norm().clamp(min=1e-300))
-
-
-def circular_load(body: Body, *, radius: float, deflection: float) -> list[Frame]:
+def circular_load(body: Body) -> list[Frame]:
     """Return the predictions for a load that rotates once in `DURATION`.
 
     The load acts at the node farthest from the fixed nodes. It rotates in the plane of the two
     smallest extents of the body; in 2D it oscillates along the smallest one.
     """
-    patch = body.patch(_farthest_node(body), radius)
+    patch = body.patch(_farthest_node(body), RADIUS)
     points = body.scene.problem.points.numpy()
     axes = np.argsort(np.ptp(points, axis=0))[: points.shape[1] - 1]
     settings = ViewSettings(quantity=STRESS)
@@ -70,7 +55,7 @@ def circular_load(body: Body, *, radius: float, deflection: float) -> list[Frame
         angle = 2 * math.pi * k / count
         target = torch.zeros(points.shape[1], dtype=torch.float64)
         for axis, component in zip(axes.tolist(), (math.sin(angle), math.cos(angle)), strict=False):
-            target[axis] = deflection * component
+            target[axis] = DEFLECTION * component
         frames.append(body.solve(body.request(patch.force_towards(target)), settings))
     return frames
 

@@ -3,9 +3,9 @@
 import numpy as np
 import viser
 
-from dpl.viewer.frames import Body
-from dpl.viewer.rasterizer import N_BANDS, band_colours
-from dpl.viewer.surface import Floats, contour_bands
+from dpl.viewer.frames import Frame
+from dpl.viewer.rasterizer import N_BANDS, band_colours, colour_bands
+from dpl.viewer.surface import Surface
 
 DARK, GREY = (28, 32, 44), (160, 166, 178)
 DRAG_MESH = "/drag"
@@ -22,62 +22,39 @@ class BodyNode:
     """One body in the browser: one mesh per colour band, edges, and a transparent mesh to drag.
 
     Attributes:
-        root: Name of its frame in the scene tree.
         frame: The frame, which has position and visibility.
         drag_mesh: Mesh that receives mouse events; None if the body cannot be dragged.
     """
 
-    def __init__(self, server: LocalServer, root: str, body: Body, *, draggable: bool) -> None:
-        """Add the nodes to the scene.
-
-        Args:
-            server: The server of the page.
-            root: Name of the frame.
-            body: The body.
-            draggable: Add the mesh that receives mouse events.
-        """
-        self.root, self._server, self._surface = root, server, body.surface
-        scene, surface = server.scene, body.surface
+    def __init__(
+        self, server: LocalServer, root: str, surface: Surface, *, draggable: bool
+    ) -> None:
+        """Add the nodes to the scene below a frame `root`."""
+        self._server, self._surface = server, surface
+        scene, points = server.scene, surface.undeformed
         self.frame = scene.add_frame(root, show_axes=False)
         empty = np.zeros((3, 3)), np.array([[0, 1, 2]])
+        solid = {"flat_shading": True, "side": "double", "cast_shadow": True}
         self._bands = [
-            scene.add_mesh_simple(
-                f"{root}/band{k}", *empty, flat_shading=True, side="double", cast_shadow=True
-            )
-            for k in range(N_BANDS)
+            scene.add_mesh_simple(f"{root}/band{k}", *empty, **solid) for k in range(N_BANDS)
         ]
         self._is_empty = [True] * N_BANDS
         style = {"thickness": 1.0, "thickness_units": "screen"}
-        points = surface.undeformed
         self._edges = scene.add_line_segments(f"{root}/edges", points[surface.edges], DARK, **style)
         outline = points[surface.feature_edges]
         scene.add_line_segments(f"{root}/undeformed", outline, GREY, **style)
         self.drag_mesh = None
         if draggable:
+            clear = {"opacity": 0.0, "side": "double", "cast_shadow": False}
             self.drag_mesh = scene.add_mesh_simple(
-                root + DRAG_MESH,
-                points,
-                surface.triangles,
-                opacity=0.0,
-                side="double",
-                cast_shadow=False,
-                receive_shadow=False,
+                root + DRAG_MESH, points, surface.triangles, receive_shadow=False, **clear
             )
 
-    def show(self, points: Floats, values: Floats, top: float, quantity: str, edges: bool) -> None:
-        """Update the nodes to a deformed surface.
-
-        Args:
-            points: Positions over L, (S, 3).
-            values: Values of the quantity, (S,).
-            top: Upper end of the colour scale.
-            quantity: Name of the quantity.
-            edges: Show the edges of facets.
-        """
-        levels = np.nan_to_num(values / top * N_BANDS if top > 0 else np.zeros_like(values))
-        points = np.nan_to_num(points)
-        bands = contour_bands(points, self._surface.triangles, levels, N_BANDS)
-        colours = band_colours(quantity)
+    def show(self, frame: Frame, top: float, *, edges: bool) -> None:
+        """Show a frame; `top`: upper end of the colour scale; `edges`: with the edges of facets."""
+        points = np.nan_to_num(frame.points)
+        bands = colour_bands(self._surface, frame, top)
+        colours = band_colours(frame.quantity)
         with self._server.atomic():
             for k, (handle, soup) in enumerate(zip(self._bands, bands, strict=True)):
                 was_empty, self._is_empty[k] = self._is_empty[k], not len(soup)

@@ -1,21 +1,17 @@
 """Controls and readings in the panel of the page."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from viser import ViserServer
 
 from dpl.fem import HasModes
 from dpl.viewer import panel
-from dpl.viewer.frames import QUANTITIES, TOLERANCES, Body, ColourScale, Frame, ViewSettings
+from dpl.viewer.frames import QUANTITIES, TOLERANCES, Body, Frame, ViewSettings
 from dpl.viewer.recording import MAX_FRAMES, Recording
 
 LABELS = {"poisson": "Poisson's ratio"}  # of parameters
 NETWORK, BUDGET = "network", "best within the budget"
 METHODS = {NETWORK: None, **{f"residual below {tol:.0e}": tol for tol in TOLERANCES}}
-Callback = Callable[[Any], Any]
 
 
 class Controls:
@@ -27,6 +23,7 @@ class Controls:
         sample, reset: Buttons for a random load and for no load.
         method, budget, galerkin, quantity, edges, show_newton: Method and display.
         record, save: Buttons of the recording.
+        of_load, of_moduli, of_settings: The widgets that change load, moduli or settings.
         follows_frame: True while a drag or a random load determines the load, so that the slider
             shows the amplitude of the frame.
     """
@@ -51,6 +48,10 @@ class Controls:
             self._state = gui.add_html(panel.message(f"Files are saved in {folder}", "inherit"))
             self.save = gui.add_button_group("save as", ("VTU", "GIF", "MP4"))
         self.follows_frame = False
+        self.of_load = (self.direction, self.amplitude, self.uniform, self.radius)
+        self.of_moduli = (self.young, *self.parameters.values())
+        shown = (self.quantity, self.edges, self.show_newton)
+        self.of_settings = (self.method, self.budget, self.galerkin, *shown)
 
     def _add_load_controls(self) -> None:
         gui, body, loads = self._gui, self._body, self._body.scene.loads
@@ -70,51 +71,24 @@ class Controls:
                 loads.parameter_ranges.items(), body.parameters.values(), strict=True
             )
         }
-        self.unlimited = gui.add_checkbox(
-            "no amplitude limit",
-            False,
-            hint="let a drag exceed the largest load of the training",
-        )
-        self.uniform = gui.add_checkbox(
-            "uniform force",
-            False,
-            hint="equal forces on all nodes of the patch, outside the training range",
-        )
+        hint = "let a drag exceed the largest load of the training"
+        self.unlimited = gui.add_checkbox("no amplitude limit", False, hint=hint)
+        hint = "equal forces on all nodes of the patch, outside the training range"
+        self.uniform = gui.add_checkbox("uniform force", False, hint=hint)
         self.sample = gui.add_button("Random training load")
         self.reset = gui.add_button("Reset", color="gray")
 
     def _add_method_controls(self) -> None:
-        gui = self._gui
+        gui, galerkin = self._gui, self._body.has_galerkin
         self.method = gui.add_dropdown("method", (*METHODS, BUDGET))
         self.budget = gui.add_number("budget [ms]", 20.0, min=0.1, max=10_000.0)
+        hint = "correct the prediction in the modes of the network before Newton"
         self.galerkin = gui.add_checkbox(
-            "Galerkin correction",
-            self._body.has_galerkin,
-            visible=self._body.has_galerkin,
-            hint="correct the prediction in the modes of the network before Newton",
+            "Galerkin correction", galerkin, visible=galerkin, hint=hint
         )
         self.quantity = gui.add_dropdown("colours", tuple(QUANTITIES))
         self.edges = gui.add_checkbox("mesh edges", True)
         self.show_newton = gui.add_checkbox("compare Newton", False)
-
-    def connect(
-        self,
-        catch_errors: Callable[[Callback], Callback],
-        *,
-        on_load: Callback,
-        on_moduli: Callback,
-        on_settings: Callback,
-    ) -> None:
-        """Set the callbacks of the widgets that change load, moduli or settings."""
-        for control in (self.direction, self.amplitude, self.uniform, self.radius):
-            control.on_update(catch_errors(on_load))
-        for control in (self.young, *self.parameters.values()):
-            control.on_update(catch_errors(on_moduli))
-        for control in (
-            *(self.method, self.budget, self.galerkin, self.quantity, self.edges),
-            self.show_newton,
-        ):
-            control.on_update(catch_errors(on_settings))
 
     def settings(self) -> ViewSettings:
         """Return method and quantity.
@@ -131,20 +105,17 @@ class Controls:
             bool(self.show_newton.value),
         )
 
-    def show_frame(self, frame: Frame, scale: ColourScale, frame_rate: float) -> None:
+    def show_frame(self, frame: Frame, top: float, frame_rate: float) -> None:
         """Update result, legend and, if a drag determined the load, the amplitude."""
-        finite = frame.values[np.isfinite(frame.values)]
-        low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
         self._result.content = panel.result_table(frame, frame_rate)
-        self._legend.content = panel.legend(frame.quantity, scale.top, low, high)
+        self._legend.content = panel.legend(frame, top)
         if self.follows_frame and frame.answer is not None:
             limit = float(self.amplitude.max)
             self.amplitude.value = round(min(float(frame.answer.amplitude), limit), 2)
 
-    def show_newton_frame(self, frame: Frame | None, *, visible: bool) -> None:
+    def show_newton_frame(self, frame: Frame | None, visible: bool) -> None:
         """Update the table of Newton, or hide it."""
-        self._newton.content = panel.newton_table(frame)
-        self._newton.visible = visible
+        self._newton.content, self._newton.visible = panel.newton_table(frame), visible
 
     def show_error(self, text: str) -> None:
         """Show why a request cannot be solved; an empty text removes the message."""
@@ -153,9 +124,8 @@ class Controls:
     def show_recording(self, recording: Recording) -> None:
         """Update the label of the record button."""
         running, count = recording.running, len(recording)
-        self.record.label = (
-            f"Stop ({count} of {MAX_FRAMES} frames)" if running else "Start recording"
-        )
+        stop = f"Stop ({count} of {MAX_FRAMES} frames)"
+        self.record.label = stop if running else "Start recording"
         if running:
             self.show_state(f"{count} frames", "inherit")
 

@@ -72,14 +72,10 @@ class Patch:
         return torch.stack([linear.solve(load)[self.node] for load in self.unit_loads], dim=1)
 
     def force_towards(self, displacement: Tensor, *, max_amplitude: float | None = 1.0) -> Tensor:
-        """Return the force whose linear response moves the centre by a displacement, (N, D) [-].
+        """Return the force (N, D) [-] whose linear response moves the centre by `displacement`.
 
-        Of all such forces the one with the smallest amplitudes, by ridge regression.
-
-        Args:
-            displacement: Displacement of the centre over L, (D,) [-].
-            max_amplitude: Largest amplitude of a unit load; larger forces are scaled down. None: no
-                limit.
+        Of all such forces the one with the smallest amplitudes, by ridge regression; it is scaled
+        down to `max_amplitude` of a unit load. The displacement is over L, (D,) [-].
         """
         C = self.compliance
         square = C @ C.T
@@ -91,11 +87,9 @@ class Patch:
         return torch.einsum("m,mnd->nd", amplitudes, self.unit_loads)
 
     def force_along(self, direction: Tensor, amplitude: float) -> Tensor:
-        """Return the force whose linear response moves the centre in a direction, (N, D) [-].
+        """Return the force (N, D) [-] whose linear response moves the centre in a direction (D,).
 
-        Args:
-            direction: (D,), of any length; zero gives zero force.
-            amplitude: Largest amplitude of a unit load; up to 1 it is in the training range.
+        Up to an amplitude of 1 of each unit load it is in the training range.
         """
         size = float(direction.norm())
         if size == 0:

@@ -4,56 +4,44 @@ import numpy as np
 import viser
 
 from dpl.viewer.rasterizer import Camera
-from dpl.viewer.surface import Floats
+from dpl.viewer.surface import Surface
+
+THEME = {"show_logo": False, "show_share_button": False, "control_width": "large"}
+GROUND = {
+    "width": 6.0,
+    "height": 6.0,
+    "cell_size": 0.1,
+    "section_size": 0.5,
+    "cell_color": (226, 228, 233),
+    "section_color": (200, 204, 212),
+    "plane_color": (246, 247, 249),
+    "shadow_opacity": 0.18,
+    "fade_distance": 7.0,
+}
 
 
-def add_environment(
-    server: viser.ViserServer, camera: Camera, low: Floats, high: Floats, *, planar: bool
-) -> None:
-    """Set the theme and the initial camera, and add lights and ground.
-
-    Args:
-        server: The server of the page.
-        camera: Initial camera of a browser.
-        low: Lower corner of the bounding box of the undeformed body over L, (3,).
-        high: Upper corner.
-        planar: True for a body in 2D, which lies in the ground plane.
-    """
-    gui, scene = server.gui, server.scene
-    gui.configure_theme(
-        show_logo=False,
-        show_share_button=False,
-        brand_color=(37, 99, 235),
-        control_width="large",
-    )
-    gui.main_panel.dock_right()
-    gui.main_panel.set_width(370)
+def add_environment(server: viser.ViserServer, camera: Camera, surface: Surface) -> None:
+    """Set theme and initial camera, and add lights and ground; a body in 2D lies in the ground."""
+    server.gui.configure_theme(brand_color=(37, 99, 235), **THEME)
+    server.gui.main_panel.dock_right()
+    server.gui.main_panel.set_width(370)
     server.initial_camera.position = camera.position
     server.initial_camera.look_at = camera.look_at
     server.initial_camera.fov = camera.field_of_view
+    scene, points = server.scene, surface.undeformed
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, planar = (low + high) / 2, surface.problem.shape[1] == 2
     scene.configure_environment_map(None)
     scene.configure_default_lights(False)
     scene.add_light_ambient("/ambient", intensity=1.9)
-    to_camera = np.subtract(camera.position, camera.look_at)
-    for name, direction, intensity, shadow in (
-        ("sun", np.array([-0.3, 0.25, 1.0]), 1.5, True),
-        ("headlight", to_camera, 1.4, False),
+    for name, direction, intensity in (
+        ("/sun", np.array([-0.3, 0.25, 1.0]), 1.5),
+        ("/headlight", camera.position - camera.look_at, 1.4),
     ):
-        position = (low + high) / 2 + 4 * direction / np.linalg.norm(direction)
+        position, shadow = middle + 4 * direction / np.linalg.norm(direction), name == "/sun"
         scene.add_light_directional(
-            f"/{name}", intensity=intensity, position=position, cast_shadow=shadow
+            name, intensity=intensity, position=position, cast_shadow=shadow
         )
-    scene.add_grid(
-        "/ground",
-        width=6.0,
-        height=6.0,
-        cell_size=0.1,
-        section_size=0.5,
-        cell_color=(226, 228, 233),
-        section_color=(200, 204, 212),
-        plane_color=(246, 247, 249),
-        plane_opacity=0.0 if planar else 0.6,
-        shadow_opacity=0.18,
-        fade_distance=7.0,
-        position=(*((low + high) / 2)[:2], float(low[2]) - (0.01 if planar else 0.45)),
-    )
+    opacity, below = (0.0, 0.01) if planar else (0.6, 0.45)
+    position = (*middle[:2], float(low[2]) - below)
+    scene.add_grid("/ground", plane_opacity=opacity, position=position, **GROUND)

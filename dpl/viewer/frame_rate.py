@@ -20,8 +20,7 @@ from dpl.viewer.body_node import DRAG_MESH
 from dpl.viewer.drag_loads import LoadRequest
 from dpl.viewer.frames import QUANTITIES, Body, ViewSettings
 from dpl.viewer.page import Page
-from dpl.viewer.rasterizer import N_BANDS
-from dpl.viewer.surface import contour_bands
+from dpl.viewer.rasterizer import colour_bands
 
 TIMED_FRAMES = 40
 START_UP = 0.5  # time before frames are counted, in which the scene is sent [s]
@@ -52,12 +51,10 @@ def measure_frames(
 ) -> tuple[list[FrameTimes], dict[str, timing.Latency]]:
     """Return the frame times for a rotating load, and the latencies of the simulator.
 
-    Args:
-        page: The page to which a client connects.
-        seconds: Time for which frames are counted, per quantity [s].
+    A client connects to the page and counts frames for `seconds` [s] per quantity.
     """
     body = page.body
-    loads = [frame.request for frame in circular_load(body, radius=0.45, deflection=0.3)]
+    loads = [frame.request for frame in circular_load(body)]
     columns = zip(*map(body.load, loads), strict=True)
     latencies = timing.latencies(body.simulator, Load(*map(torch.cat, columns)))
     rows = []
@@ -80,8 +77,7 @@ def _frame_times(
         start = time.perf_counter()
         frame = body.solve(load, settings)
         solved = time.perf_counter()
-        levels = frame.values / max(float(frame.values.max()), 1e-300) * N_BANDS
-        contour_bands(frame.points, body.surface.triangles, levels, N_BANDS)
+        colour_bands(body.surface, frame, float(frame.values.max()))
         end = time.perf_counter()
         yield 1e3 * (solved - start), 1e3 * (end - solved)
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,6 @@ import torch
 from torch import Tensor
 
 from dpl.fem import Load, Solution
-from dpl.fem.solvers import check_tol
 from dpl.inference import Answer, Simulator
 from dpl.system.threads import one_thread
 from dpl.viewer.drag_loads import LoadRequest, Patch
@@ -42,17 +42,13 @@ class ViewSettings:
     show_newton: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values.
+        """Check the quantity; the simulator checks the numbers.
 
         Raises:
-            ValueError: A value is out of range.
+            ValueError: The quantity is unknown.
         """
         if self.quantity not in QUANTITIES:
             raise ValueError(f"quantity = {self.quantity!r} must be {' or '.join(QUANTITIES)}")
-        if self.tol is not None:
-            check_tol(self.tol)
-        if self.budget_ms is not None and not 0 < self.budget_ms < math.inf:
-            raise ValueError(f"budget_ms = {self.budget_ms} must be finite and above 0")
 
 
 class Frame(NamedTuple):
@@ -92,6 +88,8 @@ class Body:
         surface: Surface of the body.
         young: Default Young's modulus, the middle of the training range [Pa].
         parameters: Default parameters of the law by name, alike.
+        patch: Function from node, radius and `uniform` to a `Patch`. It caches the last one, which
+            takes several solves.
     """
 
     def __init__(self, simulator: Simulator) -> None:
@@ -102,10 +100,8 @@ class Body:
         self.young = sum(self.scene.loads.young_range) / 2
         ranges = self.scene.loads.parameter_ranges
         self.parameters = {name: sum(ends) / 2 for name, ends in ranges.items()}
-        self._without_galerkin = simulator
-        if self.has_galerkin:
-            self._without_galerkin = Simulator(simulator.surrogate)
-        self._patch: Patch | None = None
+        self._without_galerkin = Simulator(simulator.surrogate) if self.has_galerkin else simulator
+        self.patch = lru_cache(maxsize=1)(partial(Patch, self.scene))
 
     @property
     def has_galerkin(self) -> bool:
@@ -117,11 +113,6 @@ class Body:
         """Smallest and largest Young's modulus of a request [Pa]."""
         low, high = self.scene.loads.young_range
         return (low, high) if low < high else (low / YOUNG_FACTOR, high * YOUNG_FACTOR)
-
-    @property
-    def force_unit(self) -> float:
-        """Force of a dimensionless force of 1 at the default Young's modulus [N], in 2D [N/m]."""
-        return self.young * self.scene.force_unit
 
     def request(
         self,
@@ -146,7 +137,7 @@ class Body:
                 raise ValueError(f"{name} = {parameters[name]:g} must lie between {low} and {high}")
         constant = self.scene.loads.constant_force
         total = force if constant is None else force + constant
-        return LoadRequest(total * self.force_unit, young, parameters)
+        return LoadRequest(total * (self.young * self.scene.force_unit), young, parameters)
 
     def zero_load(
         self, young: float | None = None, parameters: Mapping[str, float] | None = None
@@ -162,22 +153,6 @@ class Body:
         parameters = dict(zip(self.parameters, load.parameters[0].tolist(), strict=True))
         return LoadRequest(load.force[0] * young * self.scene.force_unit, young, parameters)
 
-    def patch(self, node: int, radius: float, *, uniform: bool = False) -> Patch:
-        """Return the loads of a patch. The last patch is cached, because it takes several solves.
-
-        Raises:
-            ValueError: The node does not exist, or the radius is out of range.
-        """
-        count = self.scene.problem.shape[0]
-        if not 0 <= node < count:
-            raise ValueError(f"node = {node} must be 0 to {count - 1}")
-        if not 0 <= radius < math.inf:
-            raise ValueError(f"radius = {radius} must be 0 or more and finite")
-        key, cached = (node, radius, uniform), self._patch
-        if cached is None or (cached.node, cached.radius, cached.uniform) != key:
-            self._patch = cached = Patch(self.scene, *key)
-        return cached
-
     def load(self, request: LoadRequest) -> Load:
         """Return the dimensionless load of a request, with B = 1."""
         young = torch.tensor([request.young]).double()
@@ -187,11 +162,11 @@ class Body:
     def solve(self, request: LoadRequest, settings: ViewSettings) -> Frame:
         """Return the frame of a request, computed by the simulator."""
         answer = self._simulate(request, settings)
-        reference = None
+        reference: Tensor | float = 0.0
         if settings.quantity == ERROR:
             exact = ViewSettings(tol=self.scene.solver.tol)
             reference = self._simulate(request, exact, warm=True).displacement
-        return self._frame(request, settings.quantity, answer.displacement, reference, answer)
+        return self._frame(request, settings.quantity, answer.displacement, answer, reference)
 
     def _simulate(
         self, request: LoadRequest, settings: ViewSettings, *, warm: bool = False
@@ -210,28 +185,34 @@ class Body:
         self, request: LoadRequest, settings: ViewSettings, reference: Frame
     ) -> Iterator[Frame]:
         """Yield the iterates of Newton from zero displacement; errors are against `reference`."""
+        exact = reference.displacement if settings.quantity == ERROR else 0.0
         with one_thread():
             for state in self.scene.solver.iterate(self.load(request)):
                 displacement = self.scene.length * state.displacement[0]
-                yield self._frame(
-                    request, settings.quantity, displacement, reference.displacement, state
-                )
+                yield self._frame(request, settings.quantity, displacement, state, exact)
 
     def _frame(
         self,
         request: LoadRequest,
         quantity: str,
         displacement: Tensor,
-        reference: Tensor | None,
         result: Answer | Solution,
+        reference: Tensor | float,
     ) -> Frame:
-        """Return the frame of displacements (N, D) [m]."""
+        """Return the frame of displacements (N, D) [m]; values are relative to `reference`."""
+        u = displacement / self.scene.length
         answer = result if isinstance(result, Answer) else None
+        if quantity == STRESS:
+            with torch.inference_mode():
+                stress = self.surface.von_mises(u, self.load(request).parameters)
+            values = request.young * stress
+        else:
+            values = (displacement - reference).norm(dim=1).numpy()[self.surface.nodes]
         return Frame(
             request,
             displacement,
-            self.surface.deformed_points(displacement / self.scene.length),
-            self._values(displacement, reference, request, quantity),
+            self.surface.deformed_points(u),
+            values,
             quantity,
             answer,
             int(result.iterations) if answer is None else -1,
@@ -239,23 +220,6 @@ class Body:
             float(result.volume_ratio),
             bool(result.converged),
         )
-
-    def _values(
-        self,
-        displacement: Tensor,
-        reference: Tensor | None,
-        request: LoadRequest,
-        quantity: str,
-    ) -> Floats:
-        """Return the values of a quantity on the surface, (S,), of displacements (N, D) [m]."""
-        if quantity == STRESS:
-            u, parameters = displacement / self.scene.length, self.load(request).parameters
-            with torch.inference_mode():
-                return request.young * self.surface.von_mises(u, parameters)
-        field = displacement
-        if quantity == ERROR and reference is not None:
-            field = displacement - reference
-        return field.norm(dim=1).numpy()[self.surface.nodes]
 
 
 class ColourScale:

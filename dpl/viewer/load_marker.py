@@ -3,8 +3,8 @@
 import numpy as np
 
 from dpl.viewer.body_node import LocalServer
-from dpl.viewer.frames import Body, Frame
-from dpl.viewer.surface import Floats, vertex_normals
+from dpl.viewer.frames import Frame
+from dpl.viewer.surface import Floats, Surface, vertex_normals
 
 MAX_DOTS = 120
 DOT_SIZE = 0.008  # diameter of a dot over L [-]
@@ -20,21 +20,15 @@ class LoadMarker:
         mask: Loaded nodes of the surface, (S,).
     """
 
-    def __init__(self, server: LocalServer, body: Body) -> None:
+    def __init__(self, server: LocalServer, surface: Surface) -> None:
         """Add the nodes to the scene."""
-        self._server, self._body = server, body
-        self.mask = np.zeros(len(body.surface.nodes), dtype=bool)
+        self._server, self._surface = server, surface
+        self.mask = np.zeros(len(surface.nodes), dtype=bool)
         self._dots = server.scene.add_point_cloud(
             "/patch", np.zeros((1, 3)), RED, point_size=DOT_SIZE, point_shape="circle"
         )
-        self._arrow = server.scene.add_arrows(
-            "/arrow",
-            np.zeros((1, 2, 3)),
-            RED,
-            shaft_radius=0.008,
-            head_radius=0.022,
-            head_length=0.05,
-        )
+        sizes = {"shaft_radius": 0.008, "head_radius": 0.022, "head_length": 0.05}
+        self._arrow = server.scene.add_arrows("/arrow", np.zeros((1, 2, 3)), RED, **sizes)
         self._arrow.visible = False
 
     def show(self, frame: Frame) -> None:
@@ -50,7 +44,7 @@ class LoadMarker:
 
     def _dot_positions(self, points: Floats) -> Floats:
         """Return positions above the surface, so that the surface does not hide half of a dot."""
-        normals = vertex_normals(points, self._body.surface.triangles)
+        normals = vertex_normals(points, self._surface.triangles)
         dots = (points + DOT_SIZE / 2 * normals)[self.mask]
         return dots[:: len(dots) // MAX_DOTS + 1]
 
@@ -58,7 +52,7 @@ class LoadMarker:
         """Return start and end of the arrow, (2, 3). It starts at the centre of the forces."""
         total = np.pad(force.sum(axis=0), (0, 3 - force.shape[1]))
         direction = total / max(float(np.linalg.norm(total)), 1e-300)
-        weights = np.linalg.norm(force[self._body.surface.nodes], axis=1)
+        weights = np.linalg.norm(force[self._surface.nodes], axis=1)
         start = points.T @ (weights / max(weights.sum(), 1e-300))
         length = ARROW_LENGTH[0] + ARROW_LENGTH[1] * min(amplitude, MAX_AMPLITUDE)
         return np.stack([start, start + length * direction]).astype(np.float32)

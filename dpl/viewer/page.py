@@ -27,6 +27,7 @@ from dpl.viewer.worker import Worker
 
 Load = Callable[[float | None, Mapping[str, float]], LoadRequest]  # E [Pa], parameters -> request
 DISTANCE, DISTANCE_OF_TWO = 0.8, 1.25  # factors on the distance of the camera
+SUFFIXES = {"VTU": ".pvd", "GIF": ".gif", "MP4": ".mp4"}
 PICK_RADIUS = 0.02  # distance of a ray to the points that it may pick, beyond the nearest, over L
 
 
@@ -41,47 +42,37 @@ class Page:
         controls: Widgets of the panel.
         recording: Recording of the shown frames.
         folder: Folder of recordings.
-        frame: The most recent frame; None before the first.
-        newton_frame: The most recent iterate of Newton; None if there is none for this load.
+        frame: The most recent frame, if there is one.
+        newton_frame: The most recent iterate of Newton for this load, if there is one.
         node: Node at the centre of the patch.
     """
 
     def __init__(self, body: Body, policy: AccessPolicy, *, title: str, folder: Path) -> None:
         """Start the server behind an access policy, and the worker.
 
-        Args:
-            body: The body.
-            policy: Access policy with the bound socket.
-            title: Title of the panel.
-            folder: Folder of recordings.
-
         Raises:
             RuntimeError: The server does not enforce the policy.
         """
         self.body, self.folder, self._policy = body, folder, policy
         with serve_with(policy), contextlib.redirect_stdout(io.StringIO()):
-            self.server = LocalServer(
-                host=policy.host, port=policy.port, label="dpl", verbose=False
-            )
-        try:
-            check_server(policy)
-        except BaseException:
-            self.close()
-            raise
-        self.recording = Recording(body)
+            self.server = LocalServer(policy.host, policy.port, label="dpl", verbose=False)
+        self.recording, self._scale = Recording(body), ColourScale()
         self.frame: Frame | None = None
         self.newton_frame: Frame | None = None
-        self._scale = ColourScale()
         self._error, self._changed = "", False
         self._load: Load = body.zero_load
         self.node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
         self._drag: tuple[int, Floats, Tensor] | None = None  # node, position, displacement
         self._n_samples = 0
+        self.worker = Worker(body, self._show, self._show_newton, self._show_error)
+        try:
+            check_server(policy)
+        except BaseException:
+            self.close()
+            raise
         self._build_scene()
-        self._build_controls(title)
-        self.worker = Worker(
-            body, self._show, on_newton=self._show_newton, on_error=self._show_error
-        )
+        self.controls = Controls(self.server, body, title, folder)
+        self._connect()
         self._mark_patch()
         self.worker.start()
 
@@ -92,8 +83,7 @@ class Page:
 
     def close(self) -> None:
         """Stop worker and server."""
-        if hasattr(self, "worker"):
-            self.worker.stop()
+        self.worker.stop()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
@@ -102,37 +92,35 @@ class Page:
         points = surface.undeformed
         low, high = points.min(axis=0), points.max(axis=0)
         self.camera = Camera.facing(surface, distance=DISTANCE)
-        planar = self.body.scene.problem.shape[1] == 2
-        add_environment(server, self.camera, low, high, planar=planar)
-        self._body_node = BodyNode(server, "/body", self.body, draggable=True)
-        self._newton_node = BodyNode(server, "/newton", self.body, draggable=False)
+        add_environment(server, self.camera, surface)
+        self._body_node = BodyNode(server, "/body", surface, draggable=True)
+        self._newton_node = BodyNode(server, "/newton", surface, draggable=False)
         self._newton_offset = np.array([0.0, float(high[1] - low[1]) + 0.7, 0.0])
         self._newton_node.frame.position = self._newton_offset
         self._newton_node.frame.visible = False
-        corner = np.array([low[0], low[1], high[2] + 0.12])
-        server.scene.add_label("/newton/label", "Newton from zero", position=corner)
-        self._label = server.scene.add_label(
-            "/body/label", "selected method", position=corner, visible=False
-        )
-        self._marker = LoadMarker(server, self.body)
-        drag_mesh, catch = self._body_node.drag_mesh, self._policy.log.catch_errors
+        corner, add_label = (low[0], low[1], high[2] + 0.12), server.scene.add_label
+        add_label("/newton/label", "Newton from zero", position=corner)
+        self._label = add_label("/body/label", "selected method", position=corner, visible=False)
+        self._marker = LoadMarker(server, surface)
+
+    def _connect(self) -> None:
+        """Connect the events of the browser with the methods below."""
+        controls, catch = self.controls, self._policy.log.catch_errors
+        drag_mesh = self._body_node.drag_mesh
         assert drag_mesh is not None
         drag_mesh.on_drag("left")(catch(self.drag))
         drag_mesh.on_click(catch(self.click))
-
-    def _build_controls(self, title: str) -> None:
-        controls = self.controls = Controls(self.server, self.body, title, self.folder)
-        catch = self._policy.log.catch_errors
-        controls.connect(
-            catch,
-            on_load=self.apply_controls,
-            on_moduli=lambda event: None if event.client is None else self._submit(),
-            on_settings=self.apply_settings,
-        )
-        controls.sample.on_click(catch(self.sample))
-        controls.reset.on_click(catch(self.reset))
-        controls.record.on_click(catch(self._toggle_recording))
-        controls.save.on_click(catch(self._save))
+        for control, callback in (
+            *((control, self.apply_controls) for control in controls.of_load),
+            *((control, self._apply_moduli) for control in controls.of_moduli),
+            *((control, self.apply_settings) for control in controls.of_settings),
+        ):
+            control.on_update(catch(callback))
+        for button, callback in (
+            *((controls.sample, self.sample), (controls.reset, self.reset)),
+            *((controls.record, self._toggle_recording), (controls.save, self._save)),
+        ):
+            button.on_click(catch(callback))
 
     # --- events of the browser
 
@@ -152,13 +140,8 @@ class Page:
             self._drag = None
         patch = self._patch(node)
         max_amplitude = None if self.controls.unlimited.value else 1.0
-
-        def load(young: float | None, parameters: Mapping[str, float]) -> LoadRequest:
-            force = patch().force_towards(target, max_amplitude=max_amplitude)
-            return self.body.request(force, young, parameters)
-
         self._show_direction(target)
-        self._submit(load)
+        self._submit_force(lambda: patch().force_towards(target, max_amplitude=max_amplitude))
 
     def _show_direction(self, target: Tensor) -> None:
         """Set direction and, with the next frame, amplitude to those of a drag."""
@@ -190,12 +173,11 @@ class Page:
         dim = self.body.scene.problem.shape[1]
         direction = torch.tensor(self.controls.direction.value[:dim]).double()
         amplitude = self.controls.amplitude.value
+        self._submit_force(lambda: patch().force_along(direction, amplitude))
 
-        def load(young: float | None, parameters: Mapping[str, float]) -> LoadRequest:
-            force = patch().force_along(direction, amplitude)
-            return self.body.request(force, young, parameters)
-
-        self._submit(load)
+    def _apply_moduli(self, event: Any) -> None:
+        if event.client is not None:
+            self._submit()
 
     def sample(self, event: Any) -> None:
         """Apply a random load of the training distribution with its moduli."""
@@ -224,12 +206,7 @@ class Page:
 
     def apply_settings(self, event: Any) -> None:
         """Solve and show the same load with the selected method and quantity."""
-        old = self.worker.settings
-        try:
-            settings = self.controls.settings()
-        except ValueError as error:
-            self._show_error(str(error))
-            return
+        old, settings = self.worker.settings, self.controls.settings()
         if settings.quantity != old.quantity:
             self._scale = ColourScale()
         if settings.show_newton != old.show_newton:
@@ -247,23 +224,20 @@ class Page:
             client.camera.look_at = camera.look_at + offset
 
     def _toggle_recording(self, event: Any) -> None:
-        if self.recording.running:
-            self.recording.stop()
-        else:
-            self.recording.start()
+        (self.recording.stop if self.recording.running else self.recording.start)()
         self._changed = True
 
     def _save(self, event: Any) -> None:
         """Write the recording into the folder; send animations to the browser too."""
         self.recording.stop()
-        kind = event.target.value
+        suffix = SUFFIXES[event.target.value]  # no part of a path comes from the browser
         self.controls.show_state(f"Writing {len(self.recording)} frames ...")
         try:
-            if kind == "VTU":
+            if suffix == ".pvd":
                 path = self.recording.save_series(self.folder)
             else:
                 renderer = Renderer(self.body.surface, Camera.facing(self.body.surface))
-                path = self.recording.save_animation(self.folder, renderer, f".{kind.lower()}")
+                path = self.recording.save_animation(self.folder, renderer, suffix)
                 if event.client is not None:
                     event.client.send_file_download(path.name, path.read_bytes())
             self.controls.show_state(f"Written: {path}", panel.GOOD)
@@ -276,6 +250,10 @@ class Page:
         """Return a function that makes the patch of a node with the values of the controls."""
         radius, uniform = self.controls.radius.value, self.controls.uniform.value
         return partial(self.body.patch, node, radius, uniform=uniform)
+
+    def _submit_force(self, make_force: Callable[[], Tensor]) -> None:
+        """Submit a dimensionless force (N, D), which the worker makes."""
+        self._submit(lambda *moduli: self.body.request(make_force(), *moduli))
 
     def _submit(self, load: Load | None = None) -> None:
         """Submit a load, or the last one, with the moduli of the sliders."""
@@ -294,20 +272,17 @@ class Page:
     def _show(self, frame: Frame) -> None:
         """Show a frame; runs in the thread of the worker."""
         self.frame, self._changed, self._error = frame, True, ""
-        top = self._scale.update(frame.values)
-        edges = self.controls.edges.value
-        self._body_node.show(frame.points, frame.values, top, frame.quantity, edges)
+        top, edges = self._scale.update(frame.values), self.controls.edges.value
+        self._body_node.show(frame, top, edges=edges)
         self._marker.show(frame)
         self.server.flush()  # viser would otherwise wait for its next update interval
         self.recording.add(frame, time.monotonic())
 
     def _show_newton(self, frame: Frame | None) -> None:
         """Show an iterate of Newton; runs in the thread of the worker."""
-        self._changed = True
-        self.newton_frame = frame
+        self.newton_frame, self._changed = frame, True
         if frame is not None:
-            top, edges = self._scale.top, self.controls.edges.value
-            self._newton_node.show(frame.points, frame.values, top, frame.quantity, edges)
+            self._newton_node.show(frame, self._scale.top, edges=self.controls.edges.value)
 
     def _show_error(self, text: str) -> None:
         self._error, self._changed = text, True
@@ -317,8 +292,7 @@ class Page:
         if not self._changed or self.frame is None:
             return
         self._changed = False
-        self.controls.show_frame(self.frame, self._scale, self.worker.frame_rate)
-        visible = self.worker.settings.show_newton
-        self.controls.show_newton_frame(self.newton_frame, visible=visible)
+        self.controls.show_frame(self.frame, self._scale.top, self.worker.frame_rate)
+        self.controls.show_newton_frame(self.newton_frame, self.worker.settings.show_newton)
         self.controls.show_error(self._error)
         self.controls.show_recording(self.recording)

@@ -2,6 +2,8 @@
 
 import html
 
+import numpy as np
+
 from dpl.viewer.frames import QUANTITIES, Frame
 from dpl.viewer.rasterizer import N_BANDS, band_colours
 
@@ -20,32 +22,26 @@ def result_table(frame: Frame, frame_rate: float) -> str:
     assert answer is not None
     colour = GOOD if frame.converged else WARNING if frame.volume_ratio > 0 else BAD
     outside = answer.out_of_distribution
+    span = f"{'outside' if outside else 'inside'}, amplitude {answer.amplitude:.2f}"
     rows = [
         _row("computed by", str(answer.method), "font-weight:600"),
         _row("time", f"{answer.milliseconds:.1f} ms", "font-weight:600"),
         _row("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{colour}"),
         _row("min det F", f"{frame.volume_ratio:.3f}"),
         _row("linear solves", f"{answer.iterations}"),
-        _row(
-            "training range",
-            f"{'outside' if outside else 'inside'}, amplitude {answer.amplitude:.2f}",
-            f"color:{BAD if outside else GOOD}",
-        ),
+        _row("training range", span, f"color:{BAD if outside else GOOD}"),
         _row("frames per second", f"{frame_rate:.0f}"),
-    ]
-    summary = (
         f'<div style="margin-top:6px;padding:6px 9px;border-radius:6px;border-left:3px solid '
-        f'{colour};background:{colour}14;line-height:1.35">{html.escape(str(answer.summary))}</div>'
-    )
-    return BOX.format("".join(rows) + summary)
+        f'{colour};background:{colour}14;line-height:1.35">{html.escape(answer.summary)}</div>',
+    ]
+    return BOX.format("".join(rows))
 
 
 def newton_table(frame: Frame | None) -> str:
     """Return state, iteration and residual of an iterate of Newton; None before the first."""
     if frame is None:
         return BOX.format(_row("Newton from zero", "starts when the load is constant"))
-    colour = GOOD if frame.converged else WARNING
-    state = "converged" if frame.converged else "iterating"
+    colour, state = (GOOD, "converged") if frame.converged else (WARNING, "iterating")
     rows = [
         _row("Newton from zero", state, f"color:{colour};font-weight:600"),
         _row("iteration", str(frame.iteration)),
@@ -54,16 +50,14 @@ def newton_table(frame: Frame | None) -> str:
     return BOX.format("".join(rows))
 
 
-def legend(quantity: str, top: float, low: float, high: float) -> str:
-    """Return the colour bar of a quantity and its range on the surface.
+def legend(frame: Frame, top: float) -> str:
+    """Return the colour bar, which ends at `top`, and the range of the values on the surface.
 
-    Args:
-        quantity: Name of the quantity.
-        top: Upper end of the colour scale; 0: all values are zero, and the bar has no numbers.
-        low: Smallest value on the surface.
-        high: Largest value on the surface.
+    A bar that ends at 0 has no numbers, as all values are zero.
     """
-    unit = QUANTITIES[quantity]
+    quantity, unit = frame.quantity, QUANTITIES[frame.quantity]
+    finite = frame.values[np.isfinite(frame.values)]
+    low, high = (finite.min(), finite.max()) if len(finite) else (0.0, 0.0)
     cells = "".join(
         f'<span style="flex:1;background:rgb({r},{g},{b})"></span>'
         for r, g, b in band_colours(quantity).tolist()

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from dpl.viewer.frames import QUANTITIES
+from dpl.viewer.frames import QUANTITIES, Frame
 from dpl.viewer.surface import Floats, Surface, contour_bands, triangle_normals, vertex_normals
 
 COLOUR_MAPS = {"displacement": "viridis", "von Mises stress": "turbo", "error against FE": "magma"}
@@ -28,6 +28,12 @@ def band_colours(quantity: str) -> Bytes:
     first, last = (0.06, 0.94) if COLOUR_MAPS[quantity] == "turbo" else (0.12, 0.98)
     found = matplotlib.colormaps[COLOUR_MAPS[quantity]](np.linspace(first, last, N_BANDS))[:, :3]
     return np.asarray(np.round(255 * found), dtype=np.uint8)
+
+
+def colour_bands(surface: Surface, frame: Frame, top: float) -> list[Floats]:
+    """Return the corners of the triangles of each band of colours, see `contour_bands`."""
+    levels = np.nan_to_num(frame.values / top * N_BANDS if top > 0 else 0 * frame.values)
+    return contour_bands(np.nan_to_num(frame.points), surface.triangles, levels, N_BANDS)
 
 
 @dataclass(frozen=True)
@@ -46,12 +52,7 @@ class Camera:
 
     @classmethod
     def facing(cls, surface: Surface, *, distance: float = 1.0) -> "Camera":
-        """Return a camera in front of a body with space for its deformation.
-
-        Args:
-            surface: Surface of the body.
-            distance: Factor on the distance to the body [-].
-        """
+        """Return a camera in front of a body; `distance` is a factor on the usual distance [-]."""
         low, high = surface.undeformed.min(axis=0), surface.undeformed.max(axis=0)
         centre, planar = (low + high) / 2, surface.problem.shape[1] == 2
         direction = np.array([0.0, -0.02, 1.0] if planar else [0.62, -1.0, 0.48])
@@ -83,41 +84,32 @@ class Renderer:
     camera: Camera
     size: tuple[int, int] = (960, 540)
 
-    def render(
-        self, points: Floats, values: Floats, top: float, quantity: str, captions: Sequence[str]
-    ) -> Image.Image:
-        """Return the image of a deformed surface.
-
-        Args:
-            points: Positions over L, (S, 3).
-            values: Values at the points, (S,).
-            top: Upper end of the colour scale.
-            quantity: Name of the quantity.
-            captions: Lines of text in the upper left corner, the first one in large letters.
-        """
+    def render(self, frame: Frame, top: float, captions: Sequence[str]) -> Image.Image:
+        """Return the image of a frame with a colour scale from 0 to `top` and lines of text."""
         width, height = self.size
         dpi = height / 5.4
         figure = Figure((width / dpi, 5.4), dpi=dpi, facecolor=BACKGROUND)
         canvas = FigureCanvasAgg(figure)
         ax = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
         ax.set_axis_off()
-        levels = N_BANDS * np.nan_to_num(values / top if top > 0 else 0 * values)
-        ax.add_collection(self._polygons(np.nan_to_num(points), levels, quantity))
+        ax.add_collection(self._polygons(frame, top))
         _draw_captions(figure, captions)
-        _draw_legend(figure, quantity, top)
+        _draw_legend(figure, frame.quantity, top)
         canvas.draw()
         return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
-    def _polygons(self, points: Floats, levels: Floats, quantity: str) -> PolyCollection:
+    def _polygons(self, frame: Frame, top: float) -> PolyCollection:
         """Return triangles and edges from far to near, those that face away first."""
-        surface, camera = self.surface, self.camera
-        bands = contour_bands(points, surface.triangles, levels, N_BANDS)
+        surface, camera, points = self.surface, self.camera, np.nan_to_num(frame.points)
+        bands = colour_bands(surface, frame, top)
         soup = np.concatenate(bands)
         normals = triangle_normals(soup, np.arange(len(soup)).reshape(-1, 3))
         to_camera = camera.position - camera.look_at
         light = to_camera / np.linalg.norm(to_camera) + np.array([-0.25, 0.1, 0.75])
         brightness = 0.52 + 0.5 * np.abs(normals @ light) / np.linalg.norm(light)
-        colours = np.repeat(band_colours(quantity), [len(band) // 3 for band in bands], axis=0)
+        colours = np.repeat(
+            band_colours(frame.quantity), [len(band) // 3 for band in bands], axis=0
+        )
         shades = np.clip(colours * brightness[:, None], 0, 255) / 255
         edges, outline = points[surface.edges], surface.undeformed[surface.feature_edges]
         sides = vertex_normals(points, surface.triangles)[surface.edges].mean(axis=1)

@@ -3,6 +3,7 @@
 import contextlib
 import inspect
 import logging
+import math
 import sys
 import threading
 import time
@@ -25,17 +26,13 @@ class RateLimitedHandler(logging.Handler):
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """Create the handler and its logger.
-
-        Args:
-            clock: Function that returns the time [s].
-        """
+        """Create the handler and its logger; `clock` returns the time [s]."""
         super().__init__(logging.ERROR)
         self.logger = logging.Logger("dpl.viewer", logging.ERROR)
         self.logger.addHandler(self)
         self._clock = clock
         self._count_lock = threading.Lock()
-        self._last_line: float | None = None
+        self._last_line = -math.inf
         self._n_omitted = 0
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -43,20 +40,14 @@ class RateLimitedHandler(logging.Handler):
         self.report(record.getMessage(), record.exc_info[1] if record.exc_info else None)
 
     def report(self, message: str, error: BaseException | None = None) -> None:
-        """Print a failure in one line, or count it if the last line is too recent.
-
-        Args:
-            message: Description of the failed operation.
-            error: Its exception.
-        """
+        """Print a failure and its exception in one line, or count it if the last is too recent."""
         with self._count_lock:
             now = self._clock()
-            if self._last_line is not None and now - self._last_line < MIN_INTERVAL:
+            if now - self._last_line < MIN_INTERVAL:
                 self._n_omitted += 1
                 return
             omitted = f" ({self._n_omitted} more were not printed)" if self._n_omitted else ""
-            self._last_line = now
-            self._n_omitted = 0
+            self._last_line, self._n_omitted = now, 0
         cause = "" if error is None else f": {type(error).__name__}: {error}"
         line = "".join(c if c.isprintable() else " " for c in f"{message}{cause}")
         line = " ".join(line.split())[:MAX_CHARACTERS].encode("ascii", "backslashreplace").decode()
@@ -64,17 +55,12 @@ class RateLimitedHandler(logging.Handler):
 
     def catch_errors(self, callback: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """Return a callback, or a coroutine function, whose exceptions are reported here."""
-        if inspect.iscoroutinefunction(callback):
+        if not inspect.iscoroutinefunction(callback):
+            return self._report_errors()(callback)
 
-            async def call_async(event: Any) -> None:
-                with self._report_errors():
-                    await callback(event)
-
-            return call_async
-
-        def call(event: Any) -> None:
+        async def call(event: Any) -> None:
             with self._report_errors():
-                callback(event)
+                await callback(event)
 
         return call
 

@@ -2,12 +2,13 @@
 
 import threading
 from collections.abc import Callable, Iterator
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.colors import to_rgb
-from numpy.typing import NDArray
 from PIL import Image
 
 from dpl.export.paraview import nodal_fields
@@ -68,17 +69,16 @@ class Recording:
         Raises:
             ValueError: The recording is empty.
         """
-        frames, scene = self._recorded_frames(), self.body.scene
-        mesh = scene.problem.mesh_in_metres
-        path = free_path(folder, "recording", ".pvd")
+        scene = self.body.scene
+        path = self._free_path(folder, ".pvd")
         files = []
-        for number, (time, frame) in enumerate(frames):
+        for number, (time, frame) in enumerate(self.frames()):
             load = self.body.load(frame.request)
             with torch.inference_mode():
                 fields = nodal_fields(scene, load, frame.displacement / scene.length)
-            name = f"{path.stem}/frame_{number:04d}.vtu"
-            write_mesh(folder / name, mesh, {key: field.numpy() for key, field in fields.items()})
-            files.append((time, name))
+            files.append((time, f"{path.stem}/frame_{number:04d}.vtu"))
+            arrays = {name: field.numpy() for name, field in fields.items()}
+            write_mesh(folder / files[-1][1], scene.problem.mesh_in_metres, arrays)
         write_collection(path, files)
         return path
 
@@ -88,15 +88,19 @@ class Recording:
         Raises:
             ValueError: The recording is empty, or the format is unknown.
         """
-        path = free_path(folder, "recording", suffix)
-        write_animation(path, resample(self._recorded_frames()), renderer)
+        path = self._free_path(folder, suffix)
+        write_animation(path, resample(self.frames()), renderer, default_captions)
         return path
 
-    def _recorded_frames(self) -> list[tuple[float, Frame]]:
-        frames = self.frames()
-        if not frames:
+    def _free_path(self, folder: Path, suffix: str) -> Path:
+        """Return the first unused path of recording-001, ..., with and without the suffix."""
+        if not self._frames:
             raise ValueError("the recording is empty; start recording first")
-        return frames
+        for number in range(1, 10_000):
+            path = folder / f"recording-{number:03d}{suffix}"
+            if not path.exists() and not path.with_suffix("").exists():
+                return path
+        raise ValueError(f"{folder} contains 9999 recordings; remove some")
 
 
 def resample(frames: list[tuple[float, Frame]]) -> list[Frame]:
@@ -120,21 +124,12 @@ def default_captions(frame: Frame) -> list[str]:
 
 
 def write_animation(
-    path: Path,
-    frames: list[Frame],
-    renderer: Renderer,
-    captions: Callable[[Frame], list[str]] = default_captions,
+    path: Path, frames: list[Frame], renderer: Renderer, captions: Callable[[Frame], list[str]]
 ) -> None:
     """Write frames, `FRAME_RATE` per second, as an animation; a GIF loops.
 
-    Args:
-        path: Path of a .gif or .mp4 file.
-        frames: At least one frame.
-        renderer: Renderer of the images.
-        captions: Function that returns the lines of text for a frame.
-
     Raises:
-        ValueError: The format is unknown.
+        ValueError: The path does not end with one of `FORMATS`.
     """
     if path.suffix not in FORMATS:
         raise ValueError(f"path = {path.name} must end with {' or '.join(FORMATS)}")
@@ -146,35 +141,34 @@ def write_animation(
         _write_gif(path, images, {frame.quantity for frame in frames})
 
 
-def _write_gif(path: Path, images: Iterator[NDArray[np.uint8]], quantities: set[str]) -> None:
+def _render(
+    frames: list[Frame], renderer: Renderer, captions: Callable[[Frame], list[str]]
+) -> Iterator[Image.Image]:
+    """Yield the images of frames with one colour scale for all."""
+    top = ColourScale().update(np.concatenate([frame.values for frame in frames]))
+    for _, (frame, *again) in groupby(frames, key=id):
+        image = renderer.render(frame, top, captions(frame))
+        yield from [image] * (1 + len(again))
+
+
+def _write_gif(path: Path, images: Iterator[Image.Image], quantities: set[str]) -> None:
     palette = _palette(quantities)
-    first, *others = (
-        Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE)
-        for image in images
-    )
+    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    options: dict[str, Any] = {"duration": round(1000 / FRAME_RATE), "loop": 0, "optimize": False}
     with atomic_write(path) as file:
-        first.save(
-            file,
-            format="GIF",
-            save_all=True,
-            append_images=others,
-            duration=round(1000 / FRAME_RATE),
-            loop=0,
-            optimize=False,
-        )
+        first.save(file, format="GIF", save_all=True, append_images=others, **options)
 
 
-def _write_mp4(path: Path, images: Iterator[NDArray[np.uint8]], size: tuple[int, int]) -> None:
+def _write_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int]) -> None:
     import imageio_ffmpeg
 
     part = path.with_name(f".{path.stem}.part.mp4")
-    writer = imageio_ffmpeg.write_frames(
-        str(part), size, fps=FRAME_RATE, quality=7, macro_block_size=2
-    )
+    options = {"fps": FRAME_RATE, "quality": 7, "macro_block_size": 2}
+    writer = imageio_ffmpeg.write_frames(str(part), size, **options)
     writer.send(None)
     try:
         for image in images:
-            writer.send(np.ascontiguousarray(image))
+            writer.send(image.tobytes())
         writer.close()
         part.replace(path)
     finally:
@@ -193,27 +187,3 @@ def _palette(quantities: set[str]) -> Image.Image:
     image = Image.new("P", (1, 1))
     image.putpalette(colours.astype(np.uint8).tobytes())
     return image
-
-
-def _render(
-    frames: list[Frame], renderer: Renderer, captions: Callable[[Frame], list[str]]
-) -> Iterator[NDArray[np.uint8]]:
-    """Yield the images of frames with one colour scale for all."""
-    top = ColourScale().update(np.concatenate([frame.values for frame in frames]))
-    last: tuple[Frame, NDArray[np.uint8]] | None = None
-    for frame in frames:
-        if last is None or frame is not last[0]:
-            image = renderer.render(
-                frame.points, frame.values, top, frame.quantity, captions(frame)
-            )
-            last = frame, np.asarray(image)
-        yield last[1]
-
-
-def free_path(folder: Path, stem: str, suffix: str) -> Path:
-    """Return the first unused path of stem-001, stem-002, ..., with and without the suffix."""
-    for number in range(1, 10_000):
-        name = f"{stem}-{number:03d}"
-        if not any((folder / f"{name}{s}").exists() for s in (suffix, "")):
-            return folder / f"{name}{suffix}"
-    raise ValueError(f"{folder} contains 9999 recordings; remove some")

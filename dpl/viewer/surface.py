@@ -92,56 +92,44 @@ class Surface:
 
 
 def contour_bands(points: Floats, triangles: Ints, levels: Floats, count: int) -> list[Floats]:
-    """Return the parts of a triangulated surface between consecutive contour lines.
+    """Return the parts of a surface with levels from k to k + 1, for K = `count` bands.
 
-    Values are interpolated linearly in each triangle.
-
-    Args:
-        points: Positions, (S, 3).
-        triangles: Indices of points, (T, 3).
-        levels: Values at the points, (S,). Band k contains values between k and k + 1.
-        count: Number of bands, K.
-
-    Returns:
-        The corners of the triangles of each band: K arrays of shape (3 n_k, 3).
+    Levels at the points, (S,), are interpolated linearly in triangles (T, 3) of points (S, 3). The
+    result are the corners of the triangles of each band: K arrays of shape (3 n_k, 3).
     """
     levels = np.clip(levels, 0.0, count * (1 - 1e-9))
     order = np.argsort(levels[triangles], axis=1, kind="stable")
-    reversed_ = order[:, 1] == (order[:, 0] + 2) % 3  # sorting reversed the orientation
-    sorted_ = np.take_along_axis(triangles, order, axis=1)
-    lowest, highest = levels[sorted_[:, 0]].astype(int), levels[sorted_[:, 2]].astype(int)
-    owner = np.repeat(np.arange(len(triangles)), highest - lowest + 1)
-    first = np.cumsum(highest - lowest + 1) - (highest - lowest + 1)
-    band = lowest[owner] + np.arange(len(owner)) - first[owner]
-    p0, p1, p2 = (points[sorted_[owner, k]] for k in range(3))
-    v0, v1, v2 = (levels[sorted_[owner, k]] for k in range(3))
-    low, high = np.maximum(band, v0), np.minimum(band + 1, v2)
-
-    def on_long_side(level: Floats) -> Floats:
-        return _interpolate(p0, p2, v0, v2, level)
+    flip = order[:, 1] == (order[:, 0] + 2) % 3  # sorting reversed the orientation
+    corners = np.take_along_axis(triangles, order, axis=1)
+    lowest, highest = levels[corners[:, [0, 2]]].astype(int).T
+    repeats = highest - lowest + 1
+    owner = np.repeat(np.arange(len(triangles)), repeats)
+    band = lowest[owner] + np.arange(len(owner)) - (np.cumsum(repeats) - repeats)[owner]
+    p0, p1, p2 = (points[corners[owner, k]] for k in range(3))
+    v0, v1, v2 = (levels[corners[owner, k]] for k in range(3))
 
     def on_short_sides(level: Floats) -> Floats:
-        below = ((level <= v1) & (v0 < v1))[:, None]
-        return np.where(
-            below, _interpolate(p0, p1, v0, v1, level), _interpolate(p1, p2, v1, v2, level)
-        )
+        before = ((level <= v1) & (v0 < v1))[:, None]
+        below, above = (p0, p1, v0, v1, level), (p1, p2, v1, v2, level)
+        return np.where(before, _interpolate(*below), _interpolate(*above))
 
-    a, b, c, e = on_long_side(low), on_long_side(high), on_short_sides(high), on_short_sides(low)
-    flat = (v0 == v2)[:, None]  # the whole triangle is in one band
-    b, c, e = np.where(flat, p2, b), np.where(flat, p1, c), np.where(flat, p0, e)
-    kink = (low < v1) & (v1 < high)
+    low, high = np.maximum(band, v0), np.minimum(band + 1, v2)
+    a, b = _interpolate(p0, p2, v0, v2, low), _interpolate(p0, p2, v0, v2, high)
+    b = np.where((v0 == v2)[:, None], p2, b)  # the whole triangle is in one band
+    c, e = on_short_sides(high), on_short_sides(low)
+    kink = (low < v1) & (v1 < high)  # p1 is a corner between c and e
     d = np.where(kink[:, None], p1, e)
-    # the polygon a, b, c, d, e as a triangle fan; d is a corner (kink) or equal to e
-    flip = reversed_[owner]
-    pieces = [(a, c, b), (a, d, c), (a[kink], e[kink], d[kink])]
-    flips, bands = [flip, flip, flip[kink]], [band, band, band[kink]]
-    soup = np.stack([np.concatenate(column) for column in zip(*pieces, strict=True)], axis=1)
-    flipped, owner_band = np.concatenate(flips), np.concatenate(bands)
+    soup = np.concatenate([  # a fan around a
+        np.stack([a, c, b], axis=1), np.stack([a, d, c], axis=1), np.stack([a, e, d], axis=1)[kink]
+    ])  # fmt: skip
+    source = np.concatenate([np.arange(len(a)), np.arange(len(a)), np.flatnonzero(kink)])
+    flipped, band = flip[owner[source]], band[source]
     soup[flipped] = soup[flipped][:, [0, 2, 1]]
-    proper = _is_proper(soup)  # a contour through a corner gives degenerate triangles
-    soup, owner_band = soup[proper], owner_band[proper]
-    order = np.argsort(owner_band, kind="stable")
-    starts = np.searchsorted(owner_band[order], np.arange(1, count))
+    sides = soup - np.roll(soup, 1, axis=1)
+    proper = (sides != 0).any(axis=2).all(axis=1)  # a contour can pass a corner
+    soup, band = soup[proper], band[proper]
+    order = np.argsort(band, kind="stable")
+    starts = np.searchsorted(band[order], np.arange(1, count))
     return [part.reshape(-1, 3) for part in np.split(soup[order], starts)]
 
 
@@ -149,12 +137,6 @@ def _interpolate(p: Floats, q: Floats, v: Floats, w: Floats, level: Floats) -> F
     """Return the points of segments pq, with values v at p and w at q, at a level."""
     share = np.divide(level - v, w - v, out=np.zeros_like(v), where=w > v)
     return p + np.clip(share, 0.0, 1.0)[:, None] * (q - p)
-
-
-def _is_proper(soup: Floats) -> NDArray[np.bool_]:
-    """Return the mask of triangles (T, 3, 3) with three different corners, (T,)."""
-    sides = soup - np.roll(soup, 1, axis=1)
-    return np.asarray((sides != 0).any(axis=2).all(axis=1))
 
 
 def triangle_normals(points: Floats, triangles: Ints) -> Floats:

@@ -27,9 +27,9 @@ class Worker(threading.Thread):
         self,
         body: Body,
         on_frame: Callable[[Frame], None],
-        *,
         on_newton: Callable[[Frame | None], None] = lambda frame: None,
         on_error: Callable[[str], None] = lambda message: None,
+        *,
         max_rate: float = 60.0,
         smoothing_time: float = 0.06,
         min_frame_time: float = 0.35,
@@ -46,10 +46,9 @@ class Worker(threading.Thread):
             min_frame_time: Shortest time for which an iterate of Newton is shown [s].
         """
         super().__init__(name="viewer", daemon=True)
-        self.body, self._on_frame = body, on_frame
-        self._on_newton, self._on_error = on_newton, on_error
+        self.body, self.min_frame_time = body, min_frame_time
+        self._on_frame, self._on_newton, self._on_error = on_frame, on_newton, on_error
         self._max_rate, self._smoothing_time = max_rate, smoothing_time
-        self.min_frame_time = min_frame_time
         self._changed = threading.Condition()
         self._make_request: MakeRequest = body.zero_load
         self._settings = ViewSettings()
@@ -59,15 +58,10 @@ class Worker(threading.Thread):
     def submit(
         self, make_request: MakeRequest | None = None, settings: ViewSettings | None = None
     ) -> None:
-        """Replace the request, the settings or both.
-
-        Args:
-            make_request: Function that returns the request; it runs in this thread.
-            settings: Method and quantity.
-        """
+        """Replace the request, which is made in this thread, the settings or both."""
         with self._changed:
-            self._make_request = self._make_request if make_request is None else make_request
-            self._settings = self._settings if settings is None else settings
+            self._make_request = make_request or self._make_request
+            self._settings = settings or self._settings
             self._submitted += 1
             self._changed.notify_all()
 

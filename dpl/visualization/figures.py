@@ -44,24 +44,19 @@ def plot_deformed(
     polygons, points = surface(problem.mesh), problem.points.cpu().numpy()
     if max_polygons:
         polygons = coarse(points, polygons, max_polygons)
-    true = truth.detach().cpu().numpy()
-    fields = [field.detach().cpu().numpy() for _, field in predictions]
+    true, *fields = (u.detach().cpu().numpy() for u in (truth, *(u for _, u in predictions)))
     errors = [np.linalg.norm(field - true, axis=2) for field in fields]
     figure, axes = _grid(len(fields), len(true), points.shape[1], names, upright=upright)
     scale = _error_scale(np.concatenate(errors))
     extent = np.concatenate([points[None] + true, points[None]])
-    for row, (label, _) in enumerate(predictions):
-        for column in range(len(true)):
-            ax = axes[row, column]
-            error = errors[row][column][polygons].mean(axis=1)
-            colours = scale.to_rgba(error)
-            shape = (points + fields[row][column])[polygons]
-            _draw(ax, shape, facecolors=colours, edgecolors="none")
-            wireframe = (points + true[column])[polygons]
-            _draw(ax, wireframe, facecolors="none", edgecolors="0.4", linewidths=0.3)
-            _set_extent(ax, extent, zoom=1.4 if upright else 1.1)
-            title = [names[column]] if row == 0 and names else []
-            ax.set_title("\n".join(filter(None, [*title, label])), fontsize=9)
+    for (row, column), ax in np.ndenumerate(axes):
+        colours = scale.to_rgba(errors[row][column][polygons].mean(axis=1))
+        shape, wireframe = points + fields[row][column], points + true[column]
+        _draw(ax, shape[polygons], facecolors=colours, edgecolors="none")
+        _draw(ax, wireframe[polygons], facecolors="none", edgecolors="0.4", linewidths=0.3)
+        _set_extent(ax, extent, zoom=1.4 if upright else 1.1)
+        title = [names[column]] if row == 0 and names else []
+        ax.set_title("\n".join(filter(None, [*title, predictions[row][0]])), fontsize=9)
     _add_colour_bar(figure, axes, scale, upright=upright)
     return figure
 
@@ -96,12 +91,12 @@ def _error_scale(error: NDArray[Any]) -> "ScalarMappable":
 
 def _add_colour_bar(figure: "Figure", axes: Any, scale: "ScalarMappable", *, upright: bool) -> None:
     label = "distance from the true position / L"
-    if upright:
-        height = figure.get_figheight()
-        below = figure.add_axes((0.1, 0.45 / height, 0.8, 0.1 / height))
-        figure.colorbar(scale, cax=below, orientation="horizontal", label=label).minorticks_off()
-    else:
+    if not upright:
         figure.colorbar(scale, ax=axes, label=label, shrink=0.8)
+        return
+    height = figure.get_figheight()
+    below = figure.add_axes((0.1, 0.45 / height, 0.8, 0.1 / height))
+    figure.colorbar(scale, cax=below, orientation="horizontal", label=label).minorticks_off()
 
 
 def draw_body(
@@ -208,6 +203,4 @@ def plot_errors(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "
 
 def error_colours(error: NDArray[Any]) -> NDArray[np.uint8]:
     """Return RGB colours (N, 3) of distances (N,) on the colour scale of `plot_deformed`."""
-    scale = _error_scale(error)
-    rgba = scale.to_rgba(error)
-    return (rgba[:, :3] * 255).round().astype(np.uint8)
+    return (_error_scale(error).to_rgba(error)[:, :3] * 255).round().astype(np.uint8)

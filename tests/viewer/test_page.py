@@ -133,6 +133,17 @@ def test_the_galerkin_correction_is_offered_if_the_simulator_has_one(page, body,
         other.close()
 
 
+def test_no_part_of_the_path_of_a_recording_comes_from_the_browser(page, tmp_path):
+    assert page.worker.wait(240)
+    page._toggle_recording(None)
+    page.reset(None)
+    assert page.worker.wait(240)
+    event = SimpleNamespace(client=None, target=SimpleNamespace(value="x/../../stolen.GIF"))
+    with pytest.raises(KeyError):
+        page._save(event)
+    assert list(tmp_path.rglob("*.gif")) == []
+
+
 def test_error_messages_are_escaped(page):
     assert page.worker.wait(240)
     page._show_error("<script>")

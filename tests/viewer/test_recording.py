@@ -95,11 +95,11 @@ def test_an_empty_recording_is_not_written(body, tmp_path):
 def test_an_image_shows_the_deformed_body(body):
     renderer = Renderer(body.surface, Camera.facing(body.surface), (320, 180))
     frame = body.solve(body.sample(1), ViewSettings())
-    picture = np.asarray(renderer.render(frame.points, frame.values, 1.0, frame.quantity, []))
+    picture = np.asarray(renderer.render(frame, 1.0, []))
     background = picture[0, 0].astype(int)
     drawn = np.abs(picture.astype(int) - background).sum(axis=2) > 30
     assert 0.05 < drawn[:, :250].mean() < 0.6
-    again = renderer.render(body.surface.undeformed, frame.values, 1.0, frame.quantity, [])
+    again = renderer.render(frame._replace(points=body.surface.undeformed), 1.0, [])
     assert np.abs(np.asarray(again).astype(int) - picture).max() > 50
 
 
