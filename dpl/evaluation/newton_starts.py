@@ -100,9 +100,7 @@ class Summary(Setting):
 
 
 def load_sets(scene: Scene, count: int, far: int) -> dict[str, Load]:
-    """Return sets of loads by name: `count` test loads ("in range") and as many scaled by 1 to 2
-    ("twice"), `far` loads scaled by 3 and by 5 each.
-    """
+    """Return `count` test loads, as many scaled by 1 to 2, and `far` loads scaled by 3 and by 5."""
     part = torch.linspace(0, 1, count, dtype=torch.float64)
     factors = {"in range": 1 + 0 * part, "twice": 1 + part}
     factors |= {f"{k} times": torch.full((far,), float(k)).double() for k in (3, 5)}

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from dpl.viewer.frames import STRESS, Body, Frame, ViewSettings
-from dpl.viewer.rasterizer import Camera, Renderer
 from dpl.viewer.recording import FRAME_RATE, write_animation
+from dpl.viewer.renderer import Camera, Renderer
 
 DURATION = 5  # [s]
 RADIUS = 0.45  # of the patch over L [-]

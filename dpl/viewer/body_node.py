@@ -4,7 +4,7 @@ import numpy as np
 import viser
 
 from dpl.viewer.frames import Frame
-from dpl.viewer.rasterizer import N_BANDS, band_colours, colour_bands
+from dpl.viewer.renderer import N_BANDS, band_colours, colour_bands
 from dpl.viewer.surface import Surface
 
 DARK, GREY = (28, 32, 44), (160, 166, 178)

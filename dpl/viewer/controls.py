@@ -7,7 +7,7 @@ from viser import ViserServer
 from dpl.fem import HasModes
 from dpl.viewer import panel
 from dpl.viewer.frames import QUANTITIES, TOLERANCES, Body, Frame, ViewSettings
-from dpl.viewer.recording import MAX_FRAMES, Recording
+from dpl.viewer.recording import MAX_FRAMES, SUFFIXES, Recording
 
 LABELS = {"poisson": "Poisson's ratio"}  # of parameters
 NETWORK, BUDGET = "network", "best within the budget"
@@ -46,7 +46,7 @@ class Controls:
         with gui.add_folder("Record", expand_by_default=False):
             self.record = gui.add_button("Start recording", color="red")
             self._state = gui.add_html(panel.message(f"Files are saved in {folder}", "inherit"))
-            self.save = gui.add_button_group("save as", ("VTU", "GIF", "MP4"))
+            self.save = gui.add_button_group("save as", tuple(SUFFIXES))
         self.follows_frame = False
         self.of_load = (self.direction, self.amplitude, self.uniform, self.radius)
         self.of_moduli = (self.young, *self.parameters.values())

@@ -3,7 +3,7 @@
 import numpy as np
 import viser
 
-from dpl.viewer.rasterizer import Camera
+from dpl.viewer.renderer import Camera
 from dpl.viewer.surface import Surface
 
 THEME = {"show_logo": False, "show_share_button": False, "control_width": "large"}

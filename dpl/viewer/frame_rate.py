@@ -20,7 +20,7 @@ from dpl.viewer.body_node import DRAG_MESH
 from dpl.viewer.drag_loads import LoadRequest
 from dpl.viewer.frames import QUANTITIES, Body, ViewSettings
 from dpl.viewer.page import Page
-from dpl.viewer.rasterizer import colour_bands
+from dpl.viewer.renderer import colour_bands
 
 TIMED_FRAMES = 40
 START_UP = 0.5  # time before frames are counted, in which the scene is sent [s]

@@ -20,14 +20,13 @@ from dpl.viewer.drag_loads import LoadRequest, Patch
 from dpl.viewer.environment import add_environment
 from dpl.viewer.frames import Body, ColourScale, Frame
 from dpl.viewer.load_marker import LoadMarker
-from dpl.viewer.rasterizer import Camera, Renderer
-from dpl.viewer.recording import Recording
+from dpl.viewer.recording import SUFFIXES, Recording
+from dpl.viewer.renderer import Camera, Renderer
 from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
 Load = Callable[[float | None, Mapping[str, float]], LoadRequest]  # E [Pa], parameters -> request
 DISTANCE, DISTANCE_OF_TWO = 0.8, 1.25  # factors on the distance of the camera
-SUFFIXES = {"VTU": ".pvd", "GIF": ".gif", "MP4": ".mp4"}
 PICK_RADIUS = 0.02  # distance of a ray to the points that it may pick, beyond the nearest, over L
 
 

@@ -5,7 +5,7 @@ import html
 import numpy as np
 
 from dpl.viewer.frames import QUANTITIES, Frame
-from dpl.viewer.rasterizer import N_BANDS, band_colours
+from dpl.viewer.renderer import N_BANDS, band_colours
 
 GOOD, WARNING, BAD = "#15803d", "#b45309", "#b91c1c"
 ROW = (

@@ -16,11 +16,12 @@ from dpl.fem import write_mesh
 from dpl.fem.mesh import write_collection
 from dpl.system.files import atomic_write
 from dpl.viewer.frames import Body, ColourScale, Frame
-from dpl.viewer.rasterizer import BACKGROUND, TEXT, Renderer, band_colours
+from dpl.viewer.renderer import BACKGROUND, TEXT, Renderer, band_colours
 
 MAX_FRAMES = 900  # frames of a recording, 30 s at 30 frames per second
 FRAME_RATE = 20  # frames per second of an animation
 FORMATS = (".gif", ".mp4")
+SUFFIXES = {"VTU": ".pvd", "GIF": ".gif", "MP4": ".mp4"}
 
 
 class Recording:

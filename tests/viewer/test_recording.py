@@ -9,8 +9,8 @@ from PIL import Image
 
 from dpl.viewer.animation import animate_load
 from dpl.viewer.frames import ViewSettings
-from dpl.viewer.rasterizer import Camera, Renderer
 from dpl.viewer.recording import FRAME_RATE, MAX_FRAMES, Recording, resample
+from dpl.viewer.renderer import Camera, Renderer
 
 
 @pytest.fixture

@@ -36,7 +36,7 @@ def colour_bands(surface: Surface, frame: Frame, top: float) -> list[Floats]:
     return contour_bands(np.nan_to_num(frame.points), surface.triangles, levels, N_BANDS)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """Perspective camera.
 
