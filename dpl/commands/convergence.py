@@ -44,7 +44,7 @@ def main(cfg: DictConfig) -> None:
             tick = partial(progress.advance, bar)
             trials += newton_starts.measure(solvers, name, sets[name], tol, tick)
             tables.write(trials, raw)
-    rows = newton_starts.paper() + newton_starts.summary(trials)
+    rows = newton_starts.PAPER + newton_starts.summary(trials)
     stem = Path(cfg.folder) / cfg.name
     tables.show(rows, f"{cfg.name}, one load at a time, 1 thread")
     tables.write(rows, stem.with_suffix(".csv"))

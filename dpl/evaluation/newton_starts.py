@@ -27,9 +27,6 @@ REFERENCE = "robust Newton"  # solver with which times and displacements are com
 STREAMS = {"in range": 2, "twice": 4, "3 times": 7, "5 times": 8}
 BOTH = "in range and twice"  # the set of loads in the paper
 
-# Odot, Haferssas, Cotin (2022), table 5: converged [%], prediction used [%], mean iterations
-PAPER = {"paper: Newton": (46, None, 6.1), "paper: hybrid Newton": (71, 66, 5.0)}
-
 
 @dataclass(frozen=True)
 class Setting:
@@ -97,6 +94,13 @@ class Summary(Setting):
     ms: float | None = None
     time_ratio: float | None = None
     deviation: float | None = None
+
+
+# Odot, Haferssas, Cotin (2022), table 5: 50 loads in range and 50 of up to twice the range
+PAPER = [
+    Summary("paper: Newton", "", BOTH, math.nan, 100, 46, None, 6.1),
+    Summary("paper: hybrid Newton", "", BOTH, math.nan, 100, 71, 66, 5.0),
+]
 
 
 def load_sets(scene: Scene, count: int, far: int) -> dict[str, Load]:
@@ -205,14 +209,6 @@ def _summarise(trials: Sequence[Trial], reference: Sequence[Trial]) -> Summary:
         else None,
         deviation=reduced(max, (own.deviation for own, _ in both)),
     )
-
-
-def paper() -> list[Summary]:
-    """Return the results of the paper: 50 loads in range and 50 of up to twice the range."""
-    return [
-        Summary(name, "", BOTH, math.nan, 100, converged, used, iterations)
-        for name, (converged, used, iterations) in PAPER.items()
-    ]
 
 
 def draw(trials: Sequence[Trial], path: Path) -> None:

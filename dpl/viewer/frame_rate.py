@@ -2,7 +2,6 @@
 
 import statistics
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -18,7 +17,7 @@ from dpl.fem import Load
 from dpl.viewer.animation import circular_load
 from dpl.viewer.body_node import DRAG_MESH
 from dpl.viewer.drag_loads import LoadRequest
-from dpl.viewer.frames import QUANTITIES, Body, ViewSettings
+from dpl.viewer.frames import QUANTITIES, ViewSettings
 from dpl.viewer.page import Page
 from dpl.viewer.renderer import colour_bands
 
@@ -59,27 +58,19 @@ def measure_frames(
     latencies = timing.latencies(body.simulator, Load(*map(torch.cat, columns)))
     rows = []
     for quantity in QUANTITIES:
-        settings = ViewSettings(quantity=quantity)
-        times = zip(*_frame_times(body, loads, settings), strict=True)
-        solve_ms, bands_ms = map(statistics.median, times)
+        settings, times = ViewSettings(quantity=quantity), []
+        for load in loads[:TIMED_FRAMES]:
+            start = time.perf_counter()
+            frame = body.solve(load, settings)
+            solved = time.perf_counter()
+            colour_bands(body.surface, frame, float(frame.values.max()))
+            times.append((1e3 * (solved - start), 1e3 * (time.perf_counter() - solved)))
         page.worker.submit(settings=settings)
         frames, size = _received(page, loads, seconds)
+        solve_ms, bands_ms = map(statistics.median, zip(*times, strict=True))
         rates = frames / seconds, size / seconds / 1e6
         rows.append(FrameTimes(quantity, solve_ms, bands_ms, *rates))
     return rows, latencies
-
-
-def _frame_times(
-    body: Body, loads: list[LoadRequest], settings: ViewSettings
-) -> Iterator[tuple[float, float]]:
-    """Yield the times of the solution and of the colour bands for each load [ms]."""
-    for load in loads[:TIMED_FRAMES]:
-        start = time.perf_counter()
-        frame = body.solve(load, settings)
-        solved = time.perf_counter()
-        colour_bands(body.surface, frame, float(frame.values.max()))
-        end = time.perf_counter()
-        yield 1e3 * (solved - start), 1e3 * (end - solved)
 
 
 def _received(page: Page, loads: list[LoadRequest], seconds: float) -> tuple[int, int]:

@@ -107,22 +107,21 @@ class Renderer:
         to_camera = camera.position - camera.look_at
         light = to_camera / np.linalg.norm(to_camera) + np.array([-0.25, 0.1, 0.75])
         brightness = 0.52 + 0.5 * np.abs(normals @ light) / np.linalg.norm(light)
-        colours = np.repeat(
-            band_colours(frame.quantity), [len(band) // 3 for band in bands], axis=0
-        )
+        counts = [len(band) // 3 for band in bands]
+        colours = np.repeat(band_colours(frame.quantity), counts, axis=0)
         shades = np.clip(colours * brightness[:, None], 0, 255) / 255
         edges, outline = points[surface.edges], surface.undeformed[surface.feature_edges]
         sides = vertex_normals(points, surface.triangles)[surface.edges].mean(axis=1)
         lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
+        none = np.zeros((len(outline), 3))
         layers = (  # polygons, normals, colours, and shifts towards the camera
-            (soup.reshape(-1, 3, 3), normals, np.insert(shades, 3, 1.0, axis=1), 0.0),
+            (soup.reshape(-1, 3, 3), normals, np.insert(shades, 3, 1.0, axis=1), 0 * shades[:, 0]),
             (edges, sides, to_rgba_array([TEXT] * len(edges), 0.22), lengths),
-            (outline, 0 * outline[:, 0], to_rgba_array([OUTLINE] * len(outline), 0.75), 0.0),
+            (outline, none, to_rgba_array([OUTLINE] * len(outline), 0.75), none[:, 0]),
         )
         corners = np.concatenate([polygons[:, [0, 1, -1]] for polygons, *_ in layers])
-        normals, rgba = (np.concatenate([layer[k] for layer in layers]) for k in (1, 2))
+        normals, rgba, shifts = (np.concatenate([layer[k] for layer in layers]) for k in (1, 2, 3))
         pixels = camera.project(corners, *self.size)
-        shifts = np.concatenate([np.broadcast_to(layer[3], len(layer[0])) for layer in layers])
         depth = pixels[..., 2].mean(axis=1) - shifts
         faces_camera = (normals * (camera.position - corners[:, 0])).sum(axis=1) >= GRAZING
         order = np.lexsort((-depth, faces_camera))
@@ -149,21 +148,7 @@ def _draw_legend(figure: Figure, quantity: str, top: float) -> None:
     ticks = range(0, N_BANDS + 1, 3)
     labels = [f"{top * k / N_BANDS:.3g}" for k in ticks]
     bar.set(xticks=[], yticks=ticks, yticklabels=labels, frame_on=False)
-    bar.tick_params(
-        right=False,
-        left=False,
-        labelright=True,
-        labelleft=False,
-        labelsize=10,
-        labelcolor=TEXT_GREY,
-    )
-    title = f"{quantity} [{QUANTITIES[quantity]}]"
-    figure.text(
-        1 - 0.22 / width,
-        1 - 0.98 / height,
-        title,
-        color=TEXT,
-        size=10,
-        ha="right",
-        va="center",
-    )
+    bar.yaxis.tick_right()
+    bar.tick_params(length=0, labelsize=10, labelcolor=TEXT_GREY)
+    title, place = f"{quantity} [{QUANTITIES[quantity]}]", (1 - 0.22 / width, 1 - 0.98 / height)
+    figure.text(*place, title, color=TEXT, size=10, ha="right", va="center")

@@ -146,7 +146,7 @@ def test_trials_summaries_and_figure_are_written(scene, loads, networks, tmp_pat
         replace(t, ms=0.0, deviation=0.0) for t in trials
     ]
     assert [t.ms for t in again] == pytest.approx([t.ms for t in trials], rel=1e-3)
-    write(newton_starts.paper() + summary(trials), tmp_path / "a.csv")
+    write(newton_starts.PAPER + summary(trials), tmp_path / "a.csv")
     newton_starts.draw(trials, tmp_path / "a.png")
     written = list(csv.DictReader((tmp_path / "a.csv").open()))
     assert len(written) == 2 + 2 * (4 + 2 * 4)
