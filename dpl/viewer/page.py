@@ -25,7 +25,7 @@ from dpl.viewer.renderer import Camera, Renderer
 from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
-Load = Callable[[float | None, Mapping[str, float]], LoadRequest]  # E [Pa], parameters -> request
+Load = Callable[[float, Mapping[str, float]], LoadRequest]  # E [Pa], parameters -> request
 DISTANCE, DISTANCE_OF_TWO = 0.8, 1.25  # factors on the distance of the camera
 PICK_RADIUS = 0.02  # distance of a ray to the points that it may pick, beyond the nearest, over L
 
@@ -185,15 +185,8 @@ class Page:
         self.controls.young.value = float(np.clip(request.young, *self.body.young_range))
         for name, value in request.parameters.items():
             self.controls.parameters[name].value = value
-
-        def load(young: float | None, parameters: Mapping[str, float]) -> LoadRequest:
-            return request._replace(
-                young=request.young if young is None else young,
-                parameters=parameters,
-            )
-
         self.controls.follows_frame = True
-        self._submit(load)
+        self._submit(lambda young, given: request._replace(young=young, parameters=given))
         self._marker.mask = request.force.any(dim=1).numpy()[self.body.surface.nodes]
 
     def reset(self, event: Any) -> None:
