@@ -29,54 +29,13 @@ def orthogonal(matrix: Tensor) -> Tensor:
     return x.T if tall else x
 
 
-class Orthogonal(torch.optim.Optimizer):
-    """Muon, orthogonalised momentum, for matrices only.
-
-    Differs from `torch.optim.Muon` in the precision of matrix products: bfloat16 on GPUs only,
-    since CPUs without bfloat16 emulate it far slower than float32.
-
-    Source: Jordan et al. (2024); step size of Liu et al. (2025), Muon is scalable for LLM training,
-    section 2.2.
-    """
-
-    def __init__(
-        self, params: Iterable[nn.Parameter], *, lr: float, momentum: float, weight_decay: float
-    ) -> None:
-        """Take matrices, learning rate, momentum and decoupled weight decay."""
-        super().__init__(params, {"lr": lr, "momentum": momentum, "weight_decay": weight_decay})
-
-    @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """Update every matrix with a gradient; return the result of the closure."""
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
-        for group in self.param_groups:
-            for matrix in group["params"]:
-                if matrix.grad is not None:
-                    self._update(matrix, **group)
-        return loss
-
-    def _update(
-        self, matrix: Tensor, lr: float, momentum: float, weight_decay: float, **_: Any
-    ) -> None:
-        state, gradient = self.state[matrix], matrix.grad
-        assert gradient is not None
-        if not state:
-            state["momentum_buffer"] = torch.zeros_like(matrix)
-        mean = state["momentum_buffer"].lerp_(gradient, 1 - momentum)
-        update = gradient.lerp(mean, momentum)
-        update = orthogonal(update.bfloat16() if update.is_cuda else update)
-        matrix.mul_(1 - lr * weight_decay)
-        matrix.add_(update, alpha=-0.2 * lr * math.sqrt(max(matrix.shape)))
-
-
-class Muon(torch.optim.Optimizer):
-    """Muon for weight matrices, Adam for biases, slopes and convolutions.
+class Muon(torch.optim.AdamW):
+    """Muon, orthogonalised momentum, for weight matrices; Adam for biases, slopes and convolutions.
 
     Both have the same learning rate: the steps of Muon are scaled to the root mean square of Adam's
-    steps. An accurate fit of a smooth function takes fewer steps than with Adam.
+    steps. An accurate fit of a smooth function takes fewer steps than with Adam. Differs from
+    `torch.optim.Muon` in the precision of matrix products: bfloat16 on GPUs only, since CPUs
+    without bfloat16 emulate it far slower than float32.
 
     Source: Jordan et al. (2024), Muon: an optimizer for hidden layers in neural networks; step size
     of Liu et al. (2025), Muon is scalable for LLM training, section 2.2.
@@ -91,7 +50,7 @@ class Muon(torch.optim.Optimizer):
         betas: tuple[float, float] = (0.9, 0.99),
         weight_decay: float = 0.0,
     ) -> None:
-        """Assign the parameters to the two optimisers.
+        """Take all parameters.
 
         Args:
             params: All parameters.
@@ -105,36 +64,48 @@ class Muon(torch.optim.Optimizer):
         """
         if not 0 <= momentum < 1:
             raise ValueError(f"momentum = {momentum} must be 0 or more and less than 1")
-        every = list(params)
-        matrices = [p for p in every if p.ndim == 2]
-        others = [p for p in every if p.ndim != 2]
-        self.parts: list[torch.optim.Optimizer] = []
-        if matrices:
-            self.parts.append(
-                Orthogonal(matrices, lr=lr, momentum=momentum, weight_decay=weight_decay)
-            )
-        if others:
-            adam = torch.optim.AdamW(others, lr=lr, betas=betas, weight_decay=weight_decay)
-            self.parts.append(adam)
-        # share the dictionaries of the parts, so that schedules change their learning rates
-        super().__init__([group for part in self.parts for group in part.param_groups], {"lr": lr})
+        super().__init__(params, lr=lr, betas=betas, weight_decay=weight_decay)
+        self.defaults["momentum"] = momentum
+        for group in self.param_groups:
+            group["momentum"] = momentum
 
+    @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """Step both optimisers; return the result of the closure."""
+        """Update every parameter with a gradient; return the result of the closure."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        for part in self.parts:
-            part.step()
+        groups = self.param_groups
+        for group in groups:
+            for parameter in group["params"]:
+                if parameter.ndim == 2 and parameter.grad is not None:
+                    self._update(parameter, parameter.grad, **group)
+        try:  # Adam updates the others
+            self.param_groups = [
+                {**group, "params": [p for p in group["params"] if p.ndim != 2]} for group in groups
+            ]
+            super().step()
+        finally:
+            self.param_groups = groups
         return loss
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return the states of both optimisers."""
-        return {"parts": [part.state_dict() for part in self.parts]}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the states of both optimisers."""
-        for part, state in zip(self.parts, state_dict["parts"], strict=True):
-            part.load_state_dict(state)
-        self.param_groups = [group for part in self.parts for group in part.param_groups]
+    def _update(
+        self,
+        matrix: Tensor,
+        gradient: Tensor,
+        *,
+        lr: float,
+        momentum: float,
+        weight_decay: float,
+        **_: Any,
+    ) -> None:
+        state = self.state[matrix]
+        if not state:
+            state["momentum_buffer"] = torch.zeros_like(matrix)
+            state["step"] = torch.zeros(())  # Adam expects it in every restored state
+        mean = state["momentum_buffer"].lerp_(gradient, 1 - momentum)
+        update = gradient.lerp(mean, momentum)
+        update = orthogonal(update.bfloat16() if update.is_cuda else update)
+        matrix.mul_(1 - lr * weight_decay)
+        matrix.add_(update, alpha=-0.2 * lr * math.sqrt(max(matrix.shape)))
