@@ -41,15 +41,14 @@ def main(cfg: DictConfig) -> float | None:
     import torch
 
     from dpl.evaluation import evaluate
-    from dpl.training import Diverged
-    from dpl.training.callbacks import hparams
+    from dpl.training import Diverged, LogHyperparameters
 
     cfg = config.resumed_config(cfg, HydraConfig.get().overrides.task)
     config.check(cfg)
     cli.apply_extras(cfg)
     folder = Path(cfg.folder)
     scene, data, surrogate, trainer = parts(cfg)
-    session = hparams.LogHyperparameters(config.hyperparameters(cfg))
+    session = LogHyperparameters(config.hyperparameters(cfg))
     trainer.callbacks.append(session)
     if trainer.is_global_zero:
         config.show_skipped_work(scene, data, surrogate)

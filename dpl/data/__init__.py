@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from dpl.data.online import OnlineData
     from dpl.data.replay_buffer import ReplayBuffer
     from dpl.data.storage.store import Store
-    from dpl.data.storage.writer import Writer
     from dpl.data.stream import OnlineSamples
     from dpl.system.files import DataSetError
 else:

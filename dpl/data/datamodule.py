@@ -9,11 +9,12 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 from torch.utils.data.distributed import DistributedSampler
 
-from dpl.data.dataset import DataSet, check_range
+from dpl.data.dataset import DataSet
 from dpl.data.replay_buffer import ReplayBuffer, transform
 from dpl.fem import symmetries
 from dpl.fem.symmetry import Symmetry
 from dpl.scene import Sample, Scene
+from dpl.system.checks import check_range
 
 MAX_COUNT = 10**9  # of batches, and of samples in a batch
 
@@ -62,20 +63,14 @@ class OfflineData(L.LightningDataModule):
         workers: int = 2,
         timeout: float | None = 600.0,
     ) -> None:
-        """Check the arguments; nothing is read or solved before `prepare_data`.
+        """Check the arguments, those of `DataSet` and the following.
+
+        Nothing is read or solved before `prepare_data`.
 
         Args:
-            scene: Scene of the loads.
-            folder: Folder of the data set; None: named after the scene's fingerprint and the seed.
-            seed: Seed of the loads.
             shuffle_seed: Seed of the order of the batches.
-            train: Number of loads to train on.
-            val: Number of loads to validate on.
-            test: Number of loads to test on.
             batch_size: Samples in a batch.
             symmetry: Train also on the images of each sample under the symmetries of the body.
-            workers: Number of processes that solve; 0: solve in this process.
-            timeout: Time limit for a load [s]; None: no limit.
 
         Raises:
             ValueError: A number is out of range.
@@ -83,9 +78,7 @@ class OfflineData(L.LightningDataModule):
         super().__init__()
         check_range(1, MAX_COUNT, val=val, test=test, batch_size=batch_size)
         check_range(0, 2**32 - 1, shuffle_seed=shuffle_seed)
-        self.dataset = DataSet(
-            scene, folder, seed, train, val, test, workers=workers, timeout=timeout
-        )
+        self.dataset = DataSet(scene, folder, seed, train, val, test, workers, timeout)
         self.store = self.dataset.store
         self.scene = scene
         self.batch_size = batch_size
@@ -134,15 +127,14 @@ class OfflineData(L.LightningDataModule):
 
         The order is a function of `shuffle_seed` and epoch, so that a run can be resumed.
         """
-        module = getattr(self.trainer, "lightning_module", None)
+        module, samples = getattr(self.trainer, "lightning_module", None), self.samples("train")
         encode = getattr(module, "encode", lambda samples, images: None)
-        data = encode(self.samples("train"), images=len(self.group) > 1)
+        data = encode(samples, images=len(self.group) > 1)
         if data is None:
-            data = Samples(self.samples("train"), self.group)
+            data = Samples(samples, self.group)
         rank, world_size = self.rank_and_world_size
-        sampler: DistributedSampler = DistributedSampler(
-            data, num_replicas=world_size, rank=rank, shuffle=True, seed=self._shuffle_seed
-        )
+        seed = self._shuffle_seed
+        sampler: DistributedSampler = DistributedSampler(data, world_size, rank, seed=seed)
         return self._loader(data, sampler)
 
     def val_dataloader(self) -> DataLoader:

@@ -1,39 +1,35 @@
 """A data set with the sizes that are wanted, and its generation with progress and interruption."""
 
+import hashlib
+import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeRemainingColumn,
-    track,
-)
+import numpy as np
+import torch
+from rich import progress
+from safetensors.torch import save
 
-from dpl.data.solving.solve import LoadKey
-from dpl.data.solving.worker_pool import GracefulShutdown
+from dpl.data.solving.solve import LoadKey, SolvedLoad
+from dpl.data.solving.worker_pool import GracefulShutdown, solve_loads
 from dpl.data.storage.acceptance import bias_warning
 from dpl.data.storage.integrity import repair, verify
 from dpl.data.storage.journal import Session
-from dpl.data.storage.store import Store
-from dpl.data.storage.writer import Writer
+from dpl.data.storage.manifest import merge_entries, read_manifest, rewrite, shard_name, tried_loads
+from dpl.data.storage.pending import clean_partial_files
+from dpl.data.storage.shard import concatenate
+from dpl.data.storage.store import FORMAT, MODES, Store, runs
 from dpl.scene import Scene
+from dpl.system.checks import check_range
+from dpl.system.files import append_jsonl, exclusive_lock, write_file
+from dpl.version import __version__
 
 MAX_LOADS = 10**7  # in a split
 MAX_WORKERS = 1024
-
-
-def check_range(low: float, high: float, **values: float) -> None:
-    """Raise ValueError if a value, named by its keyword, is not in [low, high]."""
-    for name, value in values.items():
-        if not low <= value <= high:
-            raise ValueError(f"{name} = {value} must lie between {low:,} and {high:,}")
 
 
 @dataclass(frozen=True)
@@ -65,18 +61,13 @@ class DataSet:
     shards: int = 1
 
     def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            ValueError: A number is out of range.
-        """
+        """Raise ValueError if a number is out of range."""
         check_range(0, 2**32 - 1, seed=self.seed)
         check_range(0, MAX_LOADS, **self.sizes)
         check_range(0, MAX_WORKERS, workers=self.workers)
         if self.timeout is not None and not self.timeout > 0:
             raise ValueError(f"timeout = {self.timeout} must be above 0 [s], or null")
-        if self.shards < 1:
-            raise ValueError(f"shards = {self.shards} must be 1 or more")
+        check_range(1, shards=self.shards)
         check_range(0, self.shards - 1, shard=self.shard)
 
     @cached_property
@@ -119,52 +110,150 @@ class DataSet:
             DataSetError: The folder holds something else, or another process writes there.
             KeyboardInterrupt: The run was interrupted.
         """
-        missing = self.missing()
-        if any(missing.values()):
-            self._solve(missing)
+        self._solve_with_progress(self.missing())
         if warning := bias_warning(self.store.acceptance()):
             print(f"warning: {warning}", file=sys.stderr)
         return self.store
 
-    def _solve(self, missing: Mapping[str, Sequence[int]]) -> None:
+    def _solve_with_progress(self, missing: Mapping[str, Sequence[int]]) -> None:
         """Solve these loads, by split, under a progress bar."""
         columns = (
-            TextColumn("solving {task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[news]}"),
-            TimeRemainingColumn(),
+            progress.TextColumn("solving loads"),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TextColumn("{task.fields[news]}"),
+            progress.TimeRemainingColumn(),
         )
         jobs = {
             LoadKey(self.store.stream(split), number)
             for split, numbers in missing.items()
             for number in numbers
         }
+        if not jobs:
+            return
         completed = len(jobs & self.store.pending.files().keys())
         session = Session(workers=self.workers)
-        with GracefulShutdown() as stop, Progress(*columns, refresh_per_second=2) as progress:
-            bar = progress.add_task("loads", total=len(jobs), completed=completed, news="")
-            writer = Writer(self.store, self.shard, self.shards)
-            solving = writer.fill(missing, workers=self.workers, timeout=self.timeout, stop=stop)
+        with GracefulShutdown() as stop, progress.Progress(*columns, refresh_per_second=2) as bars:
+            bar = bars.add_task("", total=len(jobs), completed=completed, news="")
             try:
-                with closing(solving):  # ends the workers first
+                with closing(self.solve(missing, stop)) as solving:  # ends the workers first
                     for solved in solving:
                         news = session.count(solved.accepted, solved.seconds)
-                        progress.update(bar, advance=1, news=news)
+                        bars.update(bar, advance=1, news=news)
             finally:
                 session.append_to_journal(self.store.folder)
             stop.exit()
 
-    def verify(self) -> Iterator[str]:
-        """Yield one line for each flaw of the data set.
+    @property
+    def _manifest(self) -> Path:
+        """Path of the manifest of this writer."""
+        part = "" if self.shards == 1 else f"-{self.shard}-of-{self.shards}"
+        return self.store.folder / f"manifest{part}.jsonl"
 
-        Flaws are those of `dpl.data.storage.integrity.verify`, and missing loads.
+    def create(self) -> None:
+        """Write `scene.json` and the modes if they are missing.
+
+        Raises:
+            DataSetError: The folder holds something else.
+        """
+        folder, scene = self.store.folder, self.scene
+        self.store.shards()
+        if (folder / "scene.json").exists():
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        write_file(folder / MODES, save(dict(scene.loads.arrays())))
+        card = {
+            "format": FORMAT,
+            "fingerprint": scene.fingerprint,
+            "scene": scene.identity(),
+            "seed": self.seed,
+            "versions": {"dpl": __version__, "torch": torch.__version__, "numpy": np.__version__},
+        }
+        write_file(folder / "scene.json", json.dumps(card, indent=1).encode())
+
+    def solve(
+        self, missing: Mapping[str, Sequence[int]], stop: GracefulShutdown | None = None
+    ) -> Generator[SolvedLoad, None, None]:
+        """Solve loads that are missing, by split; yield each as soon as it is solved.
+
+        Each solved load is written to a pending file at once, and a shard as soon as all its loads
+        are solved, in order. Pending loads of an interrupted run are not solved again.
+
+        Args:
+            missing: Numbers of the loads, by split.
+            stop: Once it is true, no further load is started.
+
+        Raises:
+            DataSetError: The folder holds something else, or another process writes there.
+        """
+        self.create()
+        store = self.store
+        with exclusive_lock(store.folder, self.shard, self.shards):
+            clean_partial_files(store.folder)
+            pending = store.pending.files()
+            tried = {
+                LoadKey(store.stream(line["split"]), number)
+                for line in store.shards()
+                for number in tried_loads(line)
+            }
+            for job in pending.keys() & tried:  # killed between writing a shard and this removal
+                pending.pop(job).unlink(missing_ok=True)
+            files = []
+            for split, numbers in missing.items():
+                key = partial(LoadKey, store.stream(split))
+                new = [number for number in numbers if key(number) not in tried]
+                files += [[key(number) for number in run] for run in runs(new)]
+            jobs = [job for file in files for job in file if job not in pending]
+            self._write_complete_shards(files, pending)
+            for solved in solve_loads(
+                self.scene, jobs, workers=self.workers, timeout=self.timeout, stop=stop
+            ):
+                pending[solved.job] = store.pending.write(solved)
+                yield solved
+                self._write_complete_shards(files, pending)
+            rewrite(self._manifest, read_manifest(self._manifest))
+            if self.shards == 1:
+                with suppress(OSError):  # it is not empty
+                    store.pending.folder.rmdir()
+
+    def collect(self, split: str) -> None:
+        """Write the pending loads of a split that make whole shards.
+
+        Raises:
+            DataSetError: Another process writes there.
+        """
+        store = self.store
+        with exclusive_lock(store.folder, self.shard, self.shards):
+            pending = store.pending.files()
+            mine = {job for job in pending if job.seed == store.stream(split)}
+            count = max((job.number for job in mine), default=-1) + 1
+            found = runs(store.missing(split, count), whole=True)
+            files = [[LoadKey(store.stream(split), number) for number in run] for run in found]
+            self._write_complete_shards([file for file in files if mine.issuperset(file)], pending)
+
+    def _write_complete_shards(
+        self, files: list[list[LoadKey]], pending: dict[LoadKey, Path]
+    ) -> None:
+        """Write the first shards whose loads are all pending; remove them from both arguments."""
+        while files and all(job in pending for job in files[0]):
+            paths = [pending.pop(job) for job in files.pop(0)]
+            entries, columns = zip(*map(self.store.pending.read, paths), strict=True)
+            entry, content = merge_entries(entries), save(concatenate(columns))
+            name = shard_name(entry["split"], entry["first"])
+            write_file(self.store.folder / name, content)
+            sha256 = hashlib.sha256(content).hexdigest()
+            append_jsonl(self._manifest, {"file": name, "sha256": sha256, **entry})
+            for path in paths:  # a writer that starts now also removes loads that have a shard
+                path.unlink(missing_ok=True)
+
+    def verify(self) -> Iterator[str]:
+        """Yield one line for each flaw of the data set, and for missing loads.
 
         Raises:
             DataSetError: There is no data set.
         """
         files = len(self.store.shards()) + 1
-        for part, flaw in track(verify(self.store), "verifying files", total=files):
+        for part, flaw in progress.track(verify(self.store), "verifying files", total=files):
             if flaw:
                 yield f"{self.store.folder / part.file} {flaw}"
         for split, numbers in self.missing().items():
@@ -175,10 +264,7 @@ class DataSet:
                 )
 
     def repair(self) -> Store:
-        """Make damaged files again, also beyond the sizes wanted; return the data set.
-
-        One line is printed for each flaw.
-        """
+        """Make damaged files again, also beyond the sizes wanted, and print the flaws."""
         flaws = repair(self.store)
         missing = self.missing()
         for part, action in flaws:
@@ -188,6 +274,5 @@ class DataSet:
         for split, numbers in missing.items():
             if numbers:
                 print(f"{len(numbers)} loads of {split} are missing and are solved")
-        if any(missing.values()):
-            self._solve(missing)
+        self._solve_with_progress(missing)
         return self.fill()

@@ -6,11 +6,10 @@ import torch
 from torch import Tensor
 
 from dpl.data.datamodule import MAX_COUNT, OfflineData
-from dpl.data.dataset import check_range
 from dpl.data.replay_buffer import ReplayBuffer, StreamRates
-from dpl.data.storage.writer import Writer
 from dpl.data.stream import HardExamples, OnlineSamples
 from dpl.scene import Scene
+from dpl.system.checks import check_range
 from dpl.system.files import DataSetError
 from dpl.system.memory import machine, refuse_beyond
 from dpl.system.threads import available_cores
@@ -50,7 +49,7 @@ class OnlineData(OfflineData):
             cache: Write solved loads to the data set, and read those that it has.
             workers: Number of processes that solve; 0: solve in this process, between the steps.
             batch_size: Samples in a batch.
-            kwargs: folder, seed, val, test, symmetry, timeout of `OfflineData`.
+            kwargs: folder, seed, val, test, symmetry, timeout, see `OfflineData`.
 
         Raises:
             ValueError: A number is out of range, or options exclude each other.
@@ -80,7 +79,7 @@ class OnlineData(OfflineData):
         self._hard_example_fraction = hard_example_fraction
         self.rates: StreamRates | None = None
         self._replay: ReplayBuffer | None = None
-        self._produced = self._first = 0  # samples and loads of the run that this one resumes
+        self._first = 0  # number of loads of the run that this one resumes
 
     def skipped_work(self) -> list[str]:
         """Return one line for each kind of work that is not needed."""
@@ -129,13 +128,13 @@ class OnlineData(OfflineData):
         self.rates = rates
         if self._cache and self.rank_and_world_size[0] == 0:
             with suppress(DataSetError):  # another process writes: wait for the next epoch
-                Writer(self.store).collect("train")
+                self.dataset.collect("train")
 
     def prepare_data(self) -> None:
         """Solve the missing loads of validation and test."""
         super().prepare_data()
         if self._cache:
-            Writer(self.store).create()
+            self.dataset.create()
 
     def teardown(self, stage: str) -> None:
         """Stop the workers."""
@@ -143,22 +142,20 @@ class OnlineData(OfflineData):
             self._replay.close()
 
     def state_dict(self) -> dict[str, int]:
-        """Return numbers of samples and loads that all training processes have taken.
+        """Return the number of loads that all training processes have taken.
 
         Other processes have taken as many samples, but may have met more rejected loads. The number
         of loads that this process has taken beyond its samples is therefore added once more.
         """
-        produced, next_index = self._produced, self._first
+        next_index = self._first
         if self._replay is not None:
-            produced += self._replay.produced
             next_index = max(next_index, self._replay.next_index)
             world_size = self.rank_and_world_size[1]
             if world_size > 1:
                 beyond = next_index - self._first - world_size * self._replay.produced
                 next_index += world_size * max(1, self.workers) + max(0, beyond)
-        return {"produced": produced, "next_index": next_index}
+        return {"next_index": next_index}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
         """Continue a stream where it was left; no load is drawn twice."""
-        self._produced = state_dict["produced"]
         self._first = state_dict["next_index"]

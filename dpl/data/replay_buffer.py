@@ -5,6 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,6 +37,7 @@ class StreamRates(NamedTuple):
     buffer: int
 
 
+@dataclass(eq=False)
 class ReplayBuffer:
     """Batches from the last samples of a stream, each used a bounded number of times.
 
@@ -45,65 +47,53 @@ class ReplayBuffer:
     as often. Batches are therefore a function of the stream and not of relative speeds. One pass
     is an epoch of `batches` batches; the stream continues from epoch to epoch.
 
-    A worker that dies is replaced, and the loads that it was solving are solved again.
+    Workers start in the first pass. A worker that dies is replaced, and the loads that it was
+    solving are solved again.
 
     Attributes:
+        stream: Source of the samples.
+        workers: Number of processes that solve; 0: solve in this process, between the steps.
+        batch_size: Samples in a batch.
+        batches: Batches in a pass.
+        new_per_round: New samples per round.
+        reuse: Maximum number of uses of a sample.
+        capacity: Number of samples that the buffer keeps.
+        group: Symmetries of the body, identity first: each use is that of a random image.
+        errors: Returns the surrogate's errors on the last batch, (B,); called only if the stream
+            has hard examples.
+        report: Called with the rates at the end of each pass.
         produced: Number of samples taken from the stream so far.
         next_index: Upper bound of the numbers of these loads, plus one.
         rates: Rates of the last epoch; None before its end.
     """
 
-    def __init__(
-        self,
-        stream: OnlineSamples,
-        *,
-        workers: int,
-        batch_size: int,
-        batches: int,
-        new_per_round: int,
-        reuse: int,
-        capacity: int,
-        group: Sequence[Symmetry] = (),
-        errors: Callable[[], Tensor | None] = lambda: None,
-        report: Callable[[StreamRates], None] = lambda rates: None,
-    ) -> None:
-        """Store the arguments; workers start in the first pass.
+    stream: OnlineSamples
+    _: KW_ONLY
+    workers: int
+    batch_size: int
+    batches: int
+    new_per_round: int
+    reuse: int
+    capacity: int
+    group: Sequence[Symmetry] = ()
+    errors: Callable[[], Tensor | None] = lambda: None
+    report: Callable[[StreamRates], None] = lambda rates: None
+    produced: int = field(default=0, init=False)
+    next_index: int = field(default=0, init=False)
+    rates: StreamRates | None = field(default=None, init=False)
 
-        Args:
-            stream: Source of the samples.
-            workers: Number of processes that solve; 0: solve in this process, between the steps.
-            batch_size: Samples in a batch.
-            batches: Batches in a pass.
-            new_per_round: New samples per round.
-            reuse: Maximum number of uses of a sample.
-            capacity: Number of samples that the buffer keeps.
-            group: Symmetries of the body, identity first: each use is that of a random image.
-            errors: Returns the surrogate's errors on the last batch, (B,); called only if the
-                stream has hard examples.
-            report: Called with the rates at the end of each pass.
-        """
-        self.produced = self.next_index = 0
-        self.rates: StreamRates | None = None
-        self._source = stream
-        self._workers = workers
-        self._group = group
-        self._batches = batches
-        self._batch_size = batch_size
-        self._new_per_round = new_per_round
-        self._reuse = reuse
-        self._errors = errors
-        self._report = report
-        self._buffer = _Buffer(capacity, reuse)
+    def __post_init__(self) -> None:
+        """Start without samples and without workers."""
+        self._buffer = _Buffer(self.capacity, self.reuse)
         self._stream: Any = None
         self._endless: Iterator[Sample] | None = None
         self._generator = torch.Generator().manual_seed(0)
-        self._used = 0
+        self._used = self._restarts = 0
         self._waited = 0.0
-        self._restarts = 0
 
     def __len__(self) -> int:
         """Return the number of batches in an epoch."""
-        return self._batches
+        return self.batches
 
     def __iter__(self) -> Iterator[Sample]:
         """Yield the batches of one epoch."""
@@ -111,9 +101,9 @@ class ReplayBuffer:
             self._start()
             self._endless = self._draw()
         start, produced, used, waited = time.monotonic(), self.produced, self._used, self._waited
-        for k, batch in enumerate(itertools.islice(self._endless, self._batches), 1):
-            if k == self._batches:  # before the last batch, after which no code of this loop runs
-                used += self._batch_size if k > 1 else 0  # the last batch is not used yet
+        for k, batch in enumerate(itertools.islice(self._endless, self.batches), 1):
+            if k == self.batches:  # before the last batch, after which no code of this loop runs
+                used += self.batch_size if k > 1 else 0  # the last batch is not used yet
                 seconds = max(time.monotonic() - start, 1e-9)
                 self.rates = StreamRates(
                     produced=(self.produced - produced) / seconds,
@@ -122,18 +112,18 @@ class ReplayBuffer:
                     uses=self._used / max(self.produced, 1),
                     buffer=self._buffer.size,
                 )
-                self._report(self.rates)
+                self.report(self.rates)
             yield batch
 
     def _start(self) -> None:
         """Start the workers."""
         loader = DataLoader(
-            self._source,
+            self.stream,
             # single samples after a crash: the samples that precede a fatal load are not lost
-            batch_size=1 if self._restarts else self._new_per_round,
-            num_workers=self._workers,
+            batch_size=1 if self._restarts else self.new_per_round,
+            num_workers=self.workers,
             collate_fn=_collate,
-            multiprocessing_context=spawn_context() if self._workers else None,
+            multiprocessing_context=spawn_context() if self.workers else None,
             worker_init_fn=_ignore_interrupts,
             generator=torch.Generator(),  # the random numbers of the training stay untouched
         )
@@ -147,35 +137,29 @@ class ReplayBuffer:
 
     def _draw(self) -> Iterator[Sample]:
         """Yield batches without end."""
-        first, stride = self._source.first, self._total_workers
+        first, stride = self.stream.first, max(1, self.workers) * self.stream.world_size
         budget = 0.0  # uses that the samples so far allow
         while (new := self._next_samples()) is not None:
             self.produced += len(new.number)
             self.next_index = max(self.next_index, int(new.number.max()) + 1)
             for number in new.number.tolist():
-                self._source.offsets[(number - first) % stride] = number + stride
-            uses = self._reuse if self._buffer.full else max(1.0, self._reuse / 2)
+                self.stream.offsets[(number - first) % stride] = number + stride
+            uses = self.reuse if self._buffer.size == self.capacity else max(1.0, self.reuse / 2)
             budget += len(new.number) * uses
             self._buffer.put(new)
-            while budget >= self._batch_size and self._buffer.uses_left >= self._batch_size:
-                budget -= self._batch_size
-                chosen = self._buffer.choose(self._batch_size, self._generator)
-                self._used += self._batch_size
-                yield self._random_images(Sample(*(c[chosen] for c in self._buffer.sample)))
-                if self._source.hard_examples is not None:
-                    self._buffer.set_errors(chosen, self._errors())
-                    self._source.hard_examples.update(self._buffer.hardest_points())
-
-    @property
-    def _total_workers(self) -> int:
-        """Number of the workers of all training processes."""
-        return max(1, self._workers) * self._source.world_size
-
-    def _random_images(self, batch: Sample) -> Sample:
-        if not self._group:
-            return batch
-        which = torch.randint(len(self._group), (len(batch.force),), generator=self._generator)
-        return transform(batch, self._group, which)
+            while budget >= self.batch_size and self._buffer.uses_left >= self.batch_size:
+                budget -= self.batch_size
+                chosen = self._buffer.choose(self.batch_size, self._generator)
+                self._used += self.batch_size
+                batch = Sample(*(column[chosen] for column in self._buffer.sample))
+                if self.group:
+                    shape = (self.batch_size,)
+                    which = torch.randint(len(self.group), shape, generator=self._generator)
+                    batch = transform(batch, self.group, which)
+                yield batch
+                if self.stream.hard_examples is not None:
+                    self._buffer.set_errors(chosen, self.errors())
+                    self.stream.hard_examples.update(self._buffer.hardest_points())
 
     def _next_samples(self) -> DrawnSample | None:
         """Return new samples; None at the end of a finite stream. Replace dead workers."""
@@ -187,7 +171,7 @@ class ReplayBuffer:
         except (RuntimeError, OSError, EOFError) as error:  # raised where a worker has died
             self._restarts += 1
             died = "DataLoader worker" in str(error)
-            died |= bool(self._workers) and not isinstance(error, RuntimeError)
+            died |= bool(self.workers) and not isinstance(error, RuntimeError)
             if not died or self._restarts > MAX_CONSECUTIVE_CRASHES:
                 raise
             if self._restarts % MAX_RETRIES == 0:
@@ -199,10 +183,10 @@ class ReplayBuffer:
 
     def _skip_loads(self) -> None:
         """Skip the next load of each worker of this process: one of them kills its worker."""
-        source, first = self._source, self._source.rank * self._workers
-        for index in range(first, first + self._workers):
+        source, first = self.stream, self.stream.rank * self.workers
+        for index in range(first, first + self.workers):
             next_load = source.offsets.get(index, source.first + index)
-            source.offsets[index] = next_load + self._total_workers
+            source.offsets[index] = next_load + self.workers * source.world_size
 
     def close(self) -> None:
         """Stop the workers."""
@@ -220,11 +204,6 @@ class _Buffer:
         self._error = torch.zeros(capacity, dtype=torch.float64)
         self._point = torch.zeros(capacity, 0, dtype=torch.float64)
         self.sample = Sample(*(torch.zeros(0) for _ in Sample._fields))
-
-    @property
-    def full(self) -> bool:
-        """True if each new sample replaces the oldest one."""
-        return self._count >= self._capacity
 
     @property
     def size(self) -> int:
@@ -263,20 +242,14 @@ class _Buffer:
         if errors is not None and len(errors) == len(chosen):
             self._error[chosen] = errors.double().cpu()
 
-    def hardest_points(self, fraction: float = 0.1) -> Tensor:
-        """Return the points of this fraction of the samples with errors, largest first, (H, d)."""
-        count = int(np.ceil(fraction * int(self._error.count_nonzero())))
+    def hardest_points(self) -> Tensor:
+        """Return the points of a tenth of the samples with errors, largest errors first, (H, d)."""
+        count = int(np.ceil(0.1 * int(self._error.count_nonzero())))
         return self._point[self._error.argsort(descending=True)[:count]]
 
 
 def transform(batch: Sample, group: Sequence[Symmetry], which: Tensor) -> Sample:
-    """Return samples transformed by symmetries of the body.
-
-    Args:
-        batch: Samples.
-        group: The symmetries.
-        which: Index of the symmetry of each sample, (B,).
-    """
+    """Return samples transformed by symmetries of the body, `which` of them for each, (B,)."""
     force, displacement = (images(field, group, which) for field in batch[:2])
     return batch._replace(force=force, displacement=displacement)
 

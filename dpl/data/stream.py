@@ -4,6 +4,7 @@ import itertools
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import KW_ONLY, dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from dpl.data.solving.solve import LoadKey, SolvedLoad, failed_load, solve_load
 from dpl.data.solving.worker_pool import STARTUP_GRACE
+from dpl.data.storage.shard import to_dense
 from dpl.data.storage.store import Store
 from dpl.scene import Sample, Scene
 
@@ -34,9 +36,7 @@ class DrawnSample(NamedTuple):
 
 
 class HardExamples:
-    """Points with the largest errors of the surrogate, shared between processes.
-
-    The training process writes them, all worker processes read them.
+    """Points with the largest errors of the surrogate; workers read what the training writes.
 
     Attributes:
         points: Points of the unit cube, of which the first `count` are valid, (H, d), shared.
@@ -64,6 +64,7 @@ class HardExamples:
         return torch.from_numpy(np.minimum(reflected, 2 - reflected).clip(0, 1 - 2.0**-53))
 
 
+@dataclass(eq=False)
 class OnlineSamples(IterableDataset):
     """The accepted loads of an endless stream; each worker process solves its own.
 
@@ -81,30 +82,17 @@ class OnlineSamples(IterableDataset):
         timeout: Time limit for a load in a worker [s]; None: no limit.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        seed: tuple[int, int],
-        first: int = 0,
-        *,
-        rank: int = 0,
-        world_size: int = 1,
-        store: Store | None = None,
-        hard_examples: HardExamples | None = None,
-        hard_example_fraction: float = 0.0,
-        timeout: float | None = None,
-    ) -> None:
-        """Store the arguments, see the class."""
-        self.scene = scene
-        self.seed = seed
-        self.first = first
-        self.rank = rank
-        self.world_size = world_size
-        self.offsets: dict[int, int] = {}
-        self.store = store
-        self.hard_examples = hard_examples
-        self.hard_example_fraction = hard_example_fraction
-        self.timeout = timeout
+    scene: Scene
+    seed: tuple[int, int]
+    first: int = 0
+    _: KW_ONLY
+    rank: int = 0
+    world_size: int = 1
+    store: Store | None = None
+    hard_examples: HardExamples | None = None
+    hard_example_fraction: float = 0.0
+    timeout: float | None = None
+    offsets: dict[int, int] = field(default_factory=dict)
 
     def __iter__(self) -> Iterator[DrawnSample]:
         """Yield single samples, fields of shape (N, D)."""
@@ -115,24 +103,28 @@ class OnlineSamples(IterableDataset):
         read = self.store.reader("train") if self.store else None
         grace = STARTUP_GRACE
         for number in itertools.count(first, workers * self.world_size):
-            solved = read(number) if read else None
-            if solved is None:
+            stored = read(number) if read else None
+            if stored is None:
                 limit = self.timeout + grace if self.timeout and info is not None else None
                 solved, grace = self._solve(number, limit), 0.0
                 if self.store:
                     self.store.pending.write(solved)
-            if solved.accepted:
-                yield self._drawn_sample(solved)
+                if solved.accepted:
+                    fields = (solved.point, solved.force, solved.displacement)
+                    yield self._drawn_sample(number, *map(torch.from_numpy, fields))
+            elif len(stored["index"]):
+                force = to_dense(stored, self.scene.problem.shape)[0]
+                yield self._drawn_sample(
+                    number, stored["point"][0], force, stored["displacement"][0]
+                )
 
-    def _drawn_sample(self, solved: SolvedLoad) -> DrawnSample:
-        point = torch.from_numpy(solved.point)
-        sample = Sample(
-            torch.from_numpy(solved.force),
-            torch.from_numpy(solved.displacement),
-            self.scene.loads.young_at(point[None])[0],
-            self.scene.loads.parameters_at(point[None])[0],
-        )
-        return DrawnSample(sample, torch.tensor(solved.job.number), point)
+    def _drawn_sample(
+        self, number: int, point: Tensor, force: Tensor, displacement: Tensor
+    ) -> DrawnSample:
+        loads = self.scene.loads
+        young, parameters = (at(point[None])[0] for at in (loads.young_at, loads.parameters_at))
+        sample = Sample(force, displacement, young, parameters)
+        return DrawnSample(sample, torch.tensor(number), point)
 
     def _solve(self, number: int, limit: float | None) -> SolvedLoad:
         """Solve a load within a time limit [s]; return it as failed beyond the limit."""

@@ -117,11 +117,7 @@ def _check_regular_file(path: Path, most: float) -> None:
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
-    """Return the JSON objects in the lines of a file; other lines are left out.
-
-    Raises:
-        DataSetError: It is not a regular file, see `read_regular_file`.
-    """
+    """Return the JSON objects in the lines of a file, see `parsed_lines`, without other lines."""
     return [line for line in parsed_lines(path) if line is not None]
 
 
@@ -136,14 +132,13 @@ def parsed_lines(path: Path) -> list[dict[str, Any] | None]:
     content = b""
     with suppress(FileNotFoundError):
         content = read_regular_file(path)
-    return [_parsed(line) for line in content.splitlines()]
-
-
-def _parsed(line: bytes) -> dict[str, Any] | None:
-    with suppress(ValueError, RecursionError):
-        found = json.loads(line)
-        return found if isinstance(found, dict) else None
-    return None
+    found = []
+    for line in content.splitlines():
+        value = None
+        with suppress(ValueError, RecursionError):
+            value = json.loads(line)
+        found.append(value if isinstance(value, dict) else None)
+    return found
 
 
 @contextmanager
@@ -160,13 +155,12 @@ def exclusive_lock(folder: Path, shard: int = 0, shards: int = 1) -> Iterator[No
         with (folder / ".writers").open("a") as gate:
             fcntl.flock(gate, fcntl.LOCK_EX)
             for other in folder.glob(".writer-*"):
-                _, k, n = other.name.split("-")
-                if (int(n) == shards and int(k) != shard) or not (holder := _holder(other)):
-                    continue
-                raise DataSetError(
-                    f"{folder} is being written by {holder}; wait for it, stop it, or choose "
-                    "another data.folder"
-                )
+                k, n = map(int, other.name.split("-")[1:])
+                if (n != shards or k == shard) and (holder := _holder(other)):
+                    raise DataSetError(
+                        f"{folder} is being written by {holder}; wait for it, stop it, or choose "
+                        "another data.folder"
+                    )
             mine = folder / f".writer-{shard}-{shards}"
             file = stack.enter_context(mine.open("w"))
             fcntl.flock(file, fcntl.LOCK_EX)
@@ -179,12 +173,10 @@ def exclusive_lock(folder: Path, shard: int = 0, shards: int = 1) -> Iterator[No
 
 def _holder(path: Path) -> str:
     """Return a description of the process that holds a lock; empty if none does."""
-    try:
-        with path.open("r+") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except FileNotFoundError:
-        return ""
-    except BlockingIOError:
-        with suppress(FileNotFoundError):  # the process has just ended
+    with suppress(FileNotFoundError):  # the process has just ended
+        try:
+            with path.open("r+") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
             return path.read_text() or "another process"
     return ""

@@ -8,9 +8,7 @@ from contextvars import ContextVar
 import torch
 
 NODE_SIZE = 1000  # lower bound of the memory of a node with its row of K(0), in 2D [bytes]
-_MOST: ContextVar[tuple[int, str] | None] = ContextVar(
-    "maximum number of nodes of a mesh", default=None
-)
+_MOST: ContextVar[tuple[int, str] | None] = ContextVar("most nodes of a mesh", default=None)
 
 
 def refuse_beyond(needed: float, limit: float | None, what: str, remedy: str) -> None:
@@ -21,9 +19,6 @@ def refuse_beyond(needed: float, limit: float | None, what: str, remedy: str) ->
         limit: Available memory [GB]; None: that of the GPU, or of the machine if it has no GPU.
         what: Objects that require the memory, a plural noun.
         remedy: Advice for the user.
-
-    Raises:
-        MemoryError: More memory is required than available.
     """
     if limit is None:
         limit = torch.cuda.mem_get_info()[1] / 1e9 if torch.cuda.is_available() else machine()
@@ -47,10 +42,9 @@ def at_most(nodes: int, reason: str) -> Iterator[None]:
 
 
 def refuse_mesh(nodes: int, key: str) -> None:
-    """Raise an error if the stiffness matrix of a mesh with this many nodes exceeds the memory.
+    """Raise MemoryError if the stiffness matrix of a mesh with this many nodes exceeds the memory.
 
     Raises:
-        MemoryError: See `refuse_beyond`.
         ValueError: There are more nodes than `at_most` allows.
     """
     most, reason = _MOST.get() or (nodes, "")

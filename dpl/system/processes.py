@@ -48,21 +48,15 @@ def die_with_parent(parent: int) -> None:
 
 
 class _Popen(popen_spawn_posix.Popen):
-    """Starts a process that calls `die_with_parent` before it imports anything else.
-
-    A process of `multiprocessing` first imports the main module and the modules of its task, which
-    takes seconds. The call is therefore part of the command line of its interpreter.
-    """
+    """Starts a process whose command line calls `die_with_parent`, before imports of seconds."""
 
     def _launch(self, process_obj: Any) -> None:
         plain = spawn.get_command_line
 
         def command_line(**fields: Any) -> list[str]:
             words = plain(**fields)
-            if "-c" in words:
-                place = words.index("-c") + 1
-                call = f"{inspect.getsource(die_with_parent)}\ndie_with_parent({os.getpid()})\n"
-                words[place] = call + words[place]
+            call = f"{inspect.getsource(die_with_parent)}\ndie_with_parent({os.getpid()})\n"
+            words[words.index("-c") + 1] = call + words[words.index("-c") + 1]
             return words
 
         with _starting:
@@ -74,9 +68,7 @@ class _Popen(popen_spawn_posix.Popen):
 
 
 class _Process(SpawnProcess):
-    @staticmethod
-    def _Popen(process_obj: Any) -> _Popen:
-        return _Popen(process_obj)
+    _Popen = _Popen
 
 
 class _Context(SpawnContext):
@@ -86,9 +78,9 @@ class _Context(SpawnContext):
 def spawn_context() -> SpawnContext:
     """Return a multiprocessing context that spawns workers which end with this process.
 
-    Workers are not forked, because forking a process with BLAS threads can hang it. Processes of
-    joblib have a start method that their own workers do not know; it is replaced by "spawn".
+    Workers are not forked, because forking a process with BLAS threads can hang it.
     """
+    # processes of joblib have a start method that their own workers do not know
     if multiprocessing.get_start_method() not in multiprocessing.get_all_start_methods():
         multiprocessing.set_start_method("spawn", force=True)
     return _Context()

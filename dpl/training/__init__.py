@@ -5,16 +5,15 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.training.callbacks.hparams import LogHyperparameters, LogLearningRate
     from dpl.training.callbacks.nonfinite_gradients import Diverged, SkipNonFiniteGradients
+    from dpl.training.callbacks.tensorboard import LogHyperparameters, LogLearningRate
     from dpl.training.callbacks.throughput import ThroughputMonitor
     from dpl.training.callbacks.training_time import TrainingTime
     from dpl.training.callbacks.worst_cases import WorstCasePlots
     from dpl.training.checkpoints import AtomicCheckpointIO, BestWeights
     from dpl.training.losses.energy import EnergyNormLoss, PotentialEnergyLoss
-    from dpl.training.losses.loss import Loss, LossContext
+    from dpl.training.losses.loss import BlendedLoss, Loss, LossContext
     from dpl.training.losses.residual import LrPlus, LrStar
-    from dpl.training.losses.schedule import BlendedLoss
     from dpl.training.losses.supervised import MSE, RMSELoss
     from dpl.training.metrics import (
         MaxError,

@@ -56,15 +56,14 @@ def read(path: Path) -> dict[str, Any]:
         ValueError: The file is damaged, no checkpoint, or compressed.
         OSError: The file cannot be opened.
     """
-    if path.stat().st_size > MAX_BYTES:
-        size = path.stat().st_size / 1e9
-        raise ValueError(f"has {size:.3g} GB; the maximum is {MAX_BYTES / 1e9:g} GB")
+    if (size := path.stat().st_size) > MAX_BYTES:
+        raise ValueError(f"has {size / 1e9:.3g} GB; the maximum is {MAX_BYTES / 1e9:g} GB")
     try:
         if path.suffix == WEIGHTS:
             return _weights(path)
         with zipfile.ZipFile(path) as archive:  # torch does not compress
             unpacked = sum(member.file_size for member in archive.infolist())
-        if unpacked > path.stat().st_size:
+        if unpacked > size:
             raise ValueError(f"unpacks to {unpacked / 1e9:.3g} GB; a checkpoint is not compressed")
         found = torch.load(path, map_location="cpu", weights_only=True)
     except UnpicklingError as error:  # torch's message advises weights_only=False
@@ -89,8 +88,7 @@ def epochs(checkpoint: Mapping[str, Any]) -> int:
         raise ValueError(
             f"cannot be resumed: it contains no {', '.join(sorted(missing))}; resume from last.ckpt"
         )
-    epoch = checkpoint.get("epoch")
-    if not isinstance(epoch, int):
+    if not isinstance(epoch := checkpoint.get("epoch"), int):
         raise ValueError(f"has epoch = {epoch!r}, which must be an integer")
     return epoch + 1
 
@@ -105,11 +103,7 @@ def _weights(path: Path) -> dict[str, Any]:
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Lightning plugin that calls `write` and `read`.
-
-    Lightning writes to the default temporary folder first. If that is on another file system, a
-    process that is killed while writing leaves a partial file under the final name.
-    """
+    """Lightning plugin that calls `write` and `read`; Lightning's own files can be partial."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None
@@ -120,11 +114,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def load_checkpoint(
         self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Return a checkpoint on the CPU.
-
-        Raises:
-            ValueError: The file cannot be used; the message contains its path.
-        """
+        """Return a checkpoint on the CPU; the message of an error contains the path."""
         try:
             return read(Path(path))
         except ValueError as error:
@@ -132,13 +122,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 def writes_loadable(callback: Any, trainer: L.Trainer, folder: str | Path) -> bool:
-    """Return True if a callback writes a checkpoint from which a run can be loaded.
-
-    Args:
-        callback: A callback of the trainer.
-        trainer: The trainer, before the training.
-        folder: Folder of the run.
-    """
+    """Return True if a callback writes a checkpoint from which a run's `folder` is loaded."""
     if not isinstance(callback, ModelCheckpoint) or callback.save_top_k == 0:
         return False
     if callback.monitor is not None and not _validates(trainer):
@@ -152,16 +136,11 @@ def writes_loadable(callback: Any, trainer: L.Trainer, folder: str | Path) -> bo
 def _validates(trainer: L.Trainer) -> bool:
     """Return True if the training has at least one validation."""
     every, most = trainer.check_val_every_n_epoch, trainer.max_epochs
-    return trainer.limit_val_batches != 0 and (
-        every is None or most is None or most == -1 or every <= most
-    )
+    return trainer.limit_val_batches != 0 and (every is None or most in (None, -1) or every <= most)
 
 
 class BestWeights(ModelCheckpoint):
-    """Writes the weights with the smallest validation error as a safetensors file.
-
-    Infinite and NaN errors are ignored.
-    """
+    """Writes the weights with the smallest finite validation error as a safetensors file."""
 
     FILE_EXTENSION = WEIGHTS
 

@@ -5,6 +5,7 @@ Every metric is updated with (prediction, batch): displacements over L, (B, N, D
 Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 3.1.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -28,10 +29,15 @@ def median(values: Tensor) -> Tensor:
 
 
 class _PerLoad(Metric):
-    """Base class: stores one number per load and reduces them in `compute`."""
+    """Base class: stores one number per load and reduces them in `compute`.
+
+    Attributes:
+        reduce: From the numbers of all loads (S,) to the metric ().
+    """
 
     full_state_update = False
     values: list[Tensor]
+    reduce: Callable[[Tensor], Tensor]
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -49,9 +55,11 @@ class _PerLoad(Metric):
         """Return one number per load, (B,)."""
         raise NotImplementedError
 
-    def reduce(self, values: Tensor) -> Tensor:
-        """Return the metric () from the numbers of all loads (S,)."""
-        raise NotImplementedError
+
+class _OfProblem(_PerLoad):
+    def __init__(self, problem: Problem, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.problem = problem
 
 
 class MeanError(_PerLoad):
@@ -60,25 +68,21 @@ class MeanError(_PerLoad):
     It decreases like 1/sqrt(N) under refinement and must not be compared across meshes.
     """
 
+    reduce = staticmethod(torch.mean)
+
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
         """See `_PerLoad`."""
-        return _error(prediction, batch).norm(dim=1) / prediction[0].numel()
-
-    def reduce(self, values: Tensor) -> Tensor:
-        """See `_PerLoad`."""
-        return values.mean()
+        return _error(prediction, batch) / prediction[0].numel()
 
 
 class MaxError(_PerLoad):
     """e_max: the largest nodal error ||u - v|| over all nodes and loads, over L."""
 
+    reduce = staticmethod(torch.max)
+
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
         """See `_PerLoad`."""
         return (prediction - batch.displacement).norm(dim=2).amax(dim=1)
-
-    def reduce(self, values: Tensor) -> Tensor:
-        """See `_PerLoad`."""
-        return values.max()
 
 
 class MinSNR(_PerLoad):
@@ -87,18 +91,16 @@ class MinSNR(_PerLoad):
     The formula in the paper has a factor of 10, its tables have 20; `printed` selects 10.
     """
 
+    reduce = staticmethod(torch.min)
+
     def __init__(self, *, printed: bool = False, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.factor = 10 if printed else 20
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
         """See `_PerLoad`."""
-        ratio = prediction.flatten(1).norm(dim=1) / _error(prediction, batch).norm(dim=1)
+        ratio = prediction.flatten(1).norm(dim=1) / _error(prediction, batch)
         return self.factor * ratio.log10()
-
-    def reduce(self, values: Tensor) -> Tensor:
-        """See `_PerLoad`."""
-        return values.min()
 
 
 class RelativeL2(_PerLoad):
@@ -106,23 +108,17 @@ class RelativeL2(_PerLoad):
 
     def __init__(self, *, worst: bool = False, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.worst = worst
+        self.reduce = torch.max if worst else median
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
         """See `_PerLoad`."""
-        return _error(prediction, batch).norm(dim=1) / batch.displacement.flatten(1).norm(dim=1)
-
-    def reduce(self, values: Tensor) -> Tensor:
-        """See `_PerLoad`."""
-        return values.max() if self.worst else median(values)
+        return _error(prediction, batch) / batch.displacement.flatten(1).norm(dim=1)
 
 
-class ResidualRatio(_PerLoad):
+class ResidualRatio(_OfProblem):
     """Median over loads of the relative residual ||R_free(u)|| / ||f||."""
 
-    def __init__(self, problem: Problem, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.problem = problem
+    reduce = staticmethod(median)
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
         """See `_PerLoad`."""
@@ -131,25 +127,15 @@ class ResidualRatio(_PerLoad):
         )
         return torch.nan_to_num(ratio, nan=torch.inf)
 
-    def reduce(self, values: Tensor) -> Tensor:
-        """See `_PerLoad`."""
-        return median(values)
 
-
-class MinVolumeRatio(_PerLoad):
+class MinVolumeRatio(_OfProblem):
     """min det F over quadrature points and loads; 0 or less means an inverted element."""
 
-    def __init__(self, problem: Problem, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.problem = problem
+    reduce = staticmethod(torch.min)
 
     def measure(self, prediction: Tensor, batch: Sample) -> Tensor:
         """See `_PerLoad`."""
         return self.problem.volume_ratio(prediction)
-
-    def reduce(self, values: Tensor) -> Tensor:
-        """See `_PerLoad`."""
-        return values.min()
 
 
 def default_metrics(problem: Problem) -> MetricCollection:
@@ -170,7 +156,8 @@ def default_metrics(problem: Problem) -> MetricCollection:
 
 
 def _error(prediction: Tensor, batch: Sample) -> Tensor:
-    return (prediction - batch.displacement).flatten(1)
+    """Return the norms of the errors, (B,)."""
+    return (prediction - batch.displacement).flatten(1).norm(dim=1)
 
 
 class PerLoadErrors(NamedTuple):
@@ -205,8 +192,9 @@ class PerLoadErrors(NamedTuple):
 
     def title(self, load: int) -> str:
         """Return the caption of a load: its errors and their ranks."""
-        orders = self._order(self.relative), self._order(self.largest)
-        first, second = (_describe_rank(order.index(load) + 1, len(order)) for order in orders)
+        ranks = (self._order(errors).index(load) + 1 for errors in (self.relative, self.largest))
+        count = len(self.relative)
+        first, second = (ORDINALS.get(rank, f"rank {rank} of {count}") for rank in ranks)
         return (
             f"load {load}, max displacement {self.size[load]:.2g} L\n"
             f"relative L2 {100 * self.relative[load]:.3g} %: {first}\n"
@@ -218,7 +206,3 @@ class PerLoadErrors(NamedTuple):
         """Return loads by descending error; NaN counts as infinite."""
         known = torch.nan_to_num(errors, nan=torch.inf)
         return known.argsort(descending=True, stable=True).tolist()
-
-
-def _describe_rank(rank: int, count: int) -> str:
-    return ORDINALS.get(rank, f"rank {rank} of {count}")

@@ -1,9 +1,11 @@
 """The LightningModule: a network with scales, loss, metrics and optimiser."""
 
+import random
 from collections.abc import Callable, Iterable
 from typing import Any, cast
 
 import lightning as L
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -12,9 +14,8 @@ from dpl.models.protocols import TrainsInCoordinates
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.scene import Sample, Scene
 from dpl.training.losses.loss import Loss, LossContext
-from dpl.training.losses.supervised import SquaredErrorLoss
+from dpl.training.losses.supervised import MSE
 from dpl.training.metrics import default_metrics
-from dpl.training.rng_state import random_states, set_random_states
 
 SCALE_STREAM = 3  # random stream of the loads for the scales; samples use smaller numbers
 
@@ -22,9 +23,8 @@ SCALE_STREAM = 3  # random stream of the loads for the scales; samples use small
 class Surrogate(L.LightningModule):
     """A network that predicts the displacement in equilibrium with a load.
 
-    `predict` is the only border between float64 mechanics and the float32 network: it scales and
-    casts loads, evaluates the network, scales displacements back and sets fixed degrees of freedom
-    to zero. `forward` takes newtons and pascals and returns metres.
+    `predict` is the only border between float64 mechanics and the float32 network. `forward` takes
+    newtons and pascals and returns metres.
 
     Attributes:
         net: Module from scaled forces (B, N, D) to scaled displacements (B, N, D). Its optional
@@ -46,7 +46,7 @@ class Surrogate(L.LightningModule):
         """Combine a network, a loss and a scene.
 
         Args:
-            net: The network.
+            net: The network, see the class.
             loss: The loss.
             scene: The scene.
             optimizer: Function of the parameters that returns an optimiser.
@@ -67,12 +67,10 @@ class Surrogate(L.LightningModule):
                     f"material.{name} is a range, {list(ends)}, and {type(net).__name__} has no "
                     f"input for it; set material.{name} to a number or choose another model"
                 )
-        force_scale, displacement_scale = scales(scene)
-        self.register_buffer("force_scale", force_scale)
-        self.register_buffer("displacement_scale", displacement_scale)
-        self.register_buffer(
-            "largest_force", torch.tensor(scene.loads.largest_force, dtype=torch.float64)
-        )
+        largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
+        names = ("force_scale", "displacement_scale", "largest_force")
+        for name, value in zip(names, (*scales(scene), largest_force), strict=True):
+            self.register_buffer(name, value)
         self.physics = LossContext(scene.problem, self.largest_force)
         self.val_metrics = default_metrics(scene.problem).clone(prefix="val/")
         self.test_metrics = default_metrics(scene.problem).clone(prefix="test/")
@@ -105,10 +103,7 @@ class Surrogate(L.LightningModule):
         return scaled, {name: getattr(load, name) for name in getattr(self.net, "extra_inputs", ())}
 
     def _effective_force(self, force: Tensor) -> Tensor:
-        """Return forces (B, N, D) whose values on fixed degrees of freedom are those in training.
-
-        Forces there have no effect on the body, so they must not change the prediction.
-        """
+        """Return forces (B, N, D) with the values of training on fixed degrees of freedom."""
         problem, constant = self.physics.problem, self.scene.loads.constant_force
         force = problem.acting(force)
         if constant is None:
@@ -129,7 +124,8 @@ class Surrogate(L.LightningModule):
 
     @property
     def _trains_in_coordinates(self) -> bool:
-        return isinstance(self.net, TrainsInCoordinates) and isinstance(self.loss, SquaredErrorLoss)
+        of_squares = hasattr(self.loss, "from_squared_errors")
+        return of_squares and isinstance(self.net, TrainsInCoordinates)
 
     def training_step(self, batch: Sample | ReducedSamples, batch_idx: int) -> Tensor:
         """Return the loss of a batch, ()."""
@@ -148,11 +144,9 @@ class Surrogate(L.LightningModule):
         """Return the loss of a batch in reduced coordinates, ()."""
         net = cast(TrainsInCoordinates, self.net)
         error = (net.network(batch.inputs) - batch.targets).square().sum(dim=1)
-        error = error + batch.squared_error
         square = self.displacement_scale**2
-        error = square * error / self.scene.problem.free.numel()
-        loss = cast(SquaredErrorLoss, self.loss)
-        return loss.from_squared_errors(error, square * batch.mean_square)
+        error = square * (error + batch.squared_error) / self.scene.problem.free.numel()
+        return cast(MSE, self.loss).from_squared_errors(error, square * batch.mean_square)
 
     def encode(self, samples: Sample, *, images: bool = False) -> ReducedDataset | None:
         """Return training samples (S, N, D) in reduced coordinates.
@@ -161,13 +155,8 @@ class Surrogate(L.LightningModule):
         coordinates plus the squared projection error. A loss that is a function of squared errors
         therefore needs no fields.
 
-        Args:
-            samples: The samples.
-            images: The images of the samples under the symmetries of the body are wanted.
-
-        Returns:
-            The reduced samples; None if the network or the loss needs fields, or if images are
-            wanted and the network does not compute them.
+        Returns None if the network or the loss needs fields, or if `images` of the samples under
+        the symmetries of the body are wanted and the network does not compute them.
         """
         if not self._trains_in_coordinates:
             return None
@@ -222,18 +211,17 @@ class Surrogate(L.LightningModule):
         if self._scheduler is None:
             return optimizer
         steps = int(self.trainer.estimated_stepping_batches)
-        scheduler = self._scheduler(optimizer, total_steps=steps)
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
-        }
+        schedule = {"scheduler": self._scheduler(optimizer, total_steps=steps), "interval": "step"}
+        return {"optimizer": optimizer, "lr_scheduler": schedule}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the identity of the scene and the states of random number generators."""
-        checkpoint["scene"] = self.scene.fingerprint
-        checkpoint["identity"] = self.scene.identity()
-        checkpoint["nodes"] = self.scene.problem.shape[0]
-        checkpoint["random"] = random_states()
+        checkpoint |= {
+            "scene": self.scene.fingerprint,
+            "identity": self.scene.identity(),
+            "nodes": self.scene.problem.shape[0],
+            "random": random_states(),
+        }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Check that the checkpoint belongs to this scene.
@@ -259,13 +247,33 @@ class Surrogate(L.LightningModule):
 def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:
     """Return the scales of forces and displacements, scalars [-].
 
-    The scales are root mean squares over the first `count` loads of a separate random stream:
-    of forces over loadable degrees of freedom, of linear solutions over free degrees of freedom.
-    They need no training sample and are the same for online and offline training. A single number
-    each preserves the proportions of forces and displacements within the body.
+    They are root mean squares over the first `count` loads of a separate random stream: of forces
+    over loadable degrees of freedom, of linear solutions over free degrees of freedom.
     """
     force = scene.loads.sample((0, SCALE_STREAM), range(count)).force
     displacement = torch.stack([scene.linear.reference.solve(one) for one in force])
     force = force[:, scene.loads.loadable_dofs]
     displacement = displacement[:, scene.problem.free]
     return force.square().mean().sqrt(), displacement.square().mean().sqrt()
+
+
+def random_states() -> dict[str, Any]:
+    """Return the states of all random number generators of this process as tensors and numbers."""
+    kind, keys, *rest = np.random.get_state()  # noqa: NPY002 - which other packages use
+    return {
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        "numpy": [kind, torch.from_numpy(np.asarray(keys).astype(np.int64)), *rest],
+        "python": random.getstate(),
+    }
+
+
+def set_random_states(states: dict[str, Any]) -> None:
+    """Restore the states returned by `random_states`."""
+    kind, keys, *rest = states["numpy"]
+    torch.set_rng_state(states["torch"].cpu())
+    if states["cuda"] and torch.cuda.device_count() == len(states["cuda"]):
+        torch.cuda.set_rng_state_all([state.cpu() for state in states["cuda"]])
+    np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))  # noqa: NPY002
+    version, numbers, gauss = states["python"]
+    random.setstate((version, tuple(numbers), gauss))

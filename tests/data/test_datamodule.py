@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from dpl import Sample
-from dpl.data import DataSet, OfflineData, OnlineData, Samples, Writer
+from dpl.data import DataSet, OfflineData, OnlineData, Samples
 from dpl.data.replay_buffer import StreamRates
 from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.data.storage.integrity import verify
@@ -409,7 +409,7 @@ def test_loads_are_drawn_near_the_load_with_the_largest_error(scene, online):
     told.batch_errors = torch.arange(4.0)
     assert sorted(forces([first])) == sorted(drawn(scene, 4))
     next(iter(stream))
-    worst = module._replay._source.hard_examples
+    worst = module._replay.stream.hard_examples
     assert int(worst.count) == 1
     load = scene.loads.loads_at(worst.points[:1])
     assert torch.equal(load.force[0], first.force[3])
@@ -422,13 +422,13 @@ def test_a_resumed_stream_continues_with_the_next_load(online):
     module = online()
     first = set(forces(module.train_dataloader()))
     state = module.state_dict()
-    assert state == {"produced": 12, "next_index": 12}
+    assert state == {"next_index": 12}
     resumed = online()
     resumed.load_state_dict(state)
     assert resumed.state_dict() == state
     second = set(forces(resumed.train_dataloader()))
     assert not first & second
-    assert resumed.state_dict() == {"produced": 24, "next_index": 24}
+    assert resumed.state_dict() == {"next_index": 24}
 
 
 def test_a_resumed_stream_draws_no_load_twice_where_some_are_rejected(online, monkeypatch):
@@ -485,7 +485,7 @@ def test_a_data_set_started_online_and_completed_offline_has_the_same_bytes(
     sizes = {"train": 100, "val": 1, "test": 1, "workers": 0}
     one = DataSet(scene, str(tmp_path / "d"), **sizes)
     solved = []
-    for got in Writer(one.store).fill(one.missing(), workers=0):
+    for got in one.solve(one.missing()):
         solved.append(got.job.number)
     assert solved == list(range(80, 100)), "no load is solved again"
     other = DataSet(scene, str(tmp_path / "offline"), **sizes)
@@ -667,13 +667,13 @@ def test_training_takes_no_more_samples_than_it_uses(online, fitted):
     module = online()
     trainer = fitted(module, epochs=2)
     assert trainer.global_step == 6
-    assert module.state_dict() == {"produced": 24, "next_index": 24}
+    assert module.state_dict() == {"next_index": 24}
 
 
 def test_hard_examples_are_found_during_training(online, fitted):
     module = online(hard_example_fraction=0.5, batches=8, reuse=2, new_per_round=4)
     fitted(module, epochs=2)
-    worst = module._replay._source.hard_examples
+    worst = module._replay.stream.hard_examples
     assert int(worst.count) > 0
     assert ((worst.points[: int(worst.count)] >= 0) & (worst.points[: int(worst.count)] < 1)).all()
 
@@ -689,7 +689,7 @@ def test_a_stream_does_not_raise_the_number_of_threads(online):
 
 
 def test_the_stream_has_the_seed_of_the_training_split(online):
-    stream = online().train_dataloader()._source
+    stream = online().train_dataloader().stream
     assert stream.seed == (0, 0)
     truth = solve_load(stream.scene, LoadKey((0, 0), 0))
     one = next(iter(stream))

@@ -7,7 +7,7 @@ import signal
 
 import pytest
 
-from dpl.data import DataSet, Writer
+from dpl.data import DataSet
 from dpl.data.solving.solve import failed_load, solve_load
 from dpl.data.storage.pending import PendingLoads
 from dpl.fem import SaintVenantKirchhoff
@@ -375,7 +375,7 @@ def test_a_second_writer_is_refused_with_process_and_machine_of_the_first(
     script, tiny, scene_of, tmp_path
 ):
     wanted = DataSet(scene_of(*tiny), str(tmp_path / "d"), train=4, val=0, test=0, workers=0)
-    running = Writer(wanted.store).fill({"train": range(4)}, workers=0)
+    running = wanted.solve({"train": range(4)})
     next(running)
     ended = script("generate", *tiny, "data.folder=d", "data.workers=0", cwd=tmp_path)
     running.close()

@@ -677,7 +677,7 @@ def test_the_loads_of_a_dead_worker_are_solved_again(replay, monkeypatch):
         begun.append(dict(source.offsets))
         stream._stream = iter([]) if len(begun) > 1 else two()
 
-    stream._workers = 2
+    stream.workers = 2
     monkeypatch.setattr(stream, "_start", start)
     assert sorted(places(next(iter(stream)))) == [0, 2]
     assert next(iter(stream), None) is None

@@ -56,13 +56,7 @@ class SolvedLoad(NamedTuple):
 
 
 def solve_load(scene: Scene, job: LoadKey, *, point: Tensor | None = None) -> SolvedLoad:
-    """Draw and solve a load.
-
-    Args:
-        scene: Scene of the load.
-        job: Identifier of the load.
-        point: Point of the unit cube to draw the load from, (d,); None: that of the stream.
-    """
+    """Draw and solve a load, from a point of the unit cube (d,); None: that of the stream."""
     load, where = _draw(scene, job, point)
     start = time.perf_counter()
     with one_thread():

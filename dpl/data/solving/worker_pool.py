@@ -16,10 +16,8 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
 from types import FrameType
 from typing import Any
 
@@ -102,19 +100,20 @@ def solve_loads(
         while todo and not stop:
             yield solve_load(scene, todo.pop())
         return
-    with WorkerPool(scene, min(workers, len(todo)), timeout) as pool:
+    limit = math.inf if timeout is None else timeout
+    with _worker_pool(scene, min(workers, len(todo))) as pool:
         crashes: Counter[LoadKey] = Counter()
         consecutive = 0
-        while pool.busy or (todo and not stop):
-            while todo and pool.idle and not stop:
-                pool.submit(todo.pop())
-            if not pool.busy:  # the stop was requested after the condition of the outer loop
+        while True:
+            for worker in pool:
+                if worker.job is None and todo and not stop:
+                    worker.submit(todo.pop(), limit)
+            if not any(worker.job for worker in pool):
                 break
-            solved, crashed, late = pool.wait()
+            solved, crashed, late = _wait(pool)
             yield from solved
             for job in late:
-                reason = f"timed out after {timeout:g} s"
-                yield failed_load(scene, job, reason, seconds=timeout or 0.0)
+                yield failed_load(scene, job, f"timed out after {limit:g} s", seconds=limit)
             consecutive = 0 if solved else consecutive + len(crashed)
             if consecutive >= MAX_CONSECUTIVE_CRASHES:
                 raise RuntimeError(f"{consecutive} workers died in a row; see the errors above")
@@ -126,105 +125,87 @@ def solve_loads(
                     yield failed_load(scene, job, f"its worker died {MAX_RETRIES} times")
 
 
-@dataclass(eq=False)
 class _Worker:
     """A worker process.
 
     Attributes:
-        process: The process.
-        pipe: Connection to it.
         job: Load that it solves; None: it is idle.
         deadline: Time at which the load counts as timed out [s].
-        warm: True after its first load.
     """
 
-    process: BaseProcess
-    pipe: Connection
-    job: LoadKey | None = None
-    deadline: float = math.inf
-    warm: bool = False
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._start()
+
+    def _start(self) -> None:
+        context = spawn_context()
+        self.pipe, far_end = context.Pipe()
+        process = context.Process(target=_work, args=(far_end, self._scene), daemon=True)
+        with block_signals(signal.SIGINT, signal.SIGTERM):
+            process.start()
+        far_end.close()
+        self.process = process
+        self.job: LoadKey | None = None
+        self.deadline = math.inf
+        self._grace = STARTUP_GRACE
+
+    def submit(self, job: LoadKey, limit: float) -> None:
+        """Start to solve a load."""
+        self.job, self.deadline = job, time.monotonic() + limit + self._grace
+        self._grace = 0.0
+        with contextlib.suppress(BrokenPipeError):  # `_wait` detects that it died while idle
+            self.pipe.send(job)
 
     def kill(self) -> None:
         self.process.kill()
         self.process.join()
         self.pipe.close()
 
+    def replace(self) -> LoadKey:
+        """Replace the process; return its load."""
+        job = self.job
+        assert job is not None
+        self.kill()
+        self._start()
+        return job
 
-class WorkerPool:
-    """Worker processes with a pipe each; a context manager that ends them all."""
 
-    def __init__(self, scene: Scene, size: int, timeout: float | None) -> None:
-        self._context = spawn_context()
-        self._scene = scene
-        self._size = size
-        self._timeout = math.inf if timeout is None else timeout
-        self._workers: list[_Worker] = []
+@contextlib.contextmanager
+def _worker_pool(scene: Scene, size: int) -> Iterator[list[_Worker]]:
+    """Yield worker processes, which end with the context and with this process."""
+    workers: list[_Worker] = []
 
-    def __enter__(self) -> "WorkerPool":
-        atexit.register(self._kill_all)  # runs before multiprocessing's, which joins the workers
-        for _ in range(self._size):
-            self._spawn()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._kill_all()
-        atexit.unregister(self._kill_all)
-
-    def _kill_all(self) -> None:
-        for worker in self._workers:
+    def kill_all() -> None:
+        for worker in workers:
             worker.process.kill()
-        while self._workers:
-            self._workers.pop().kill()
+        while workers:
+            workers.pop().kill()
 
-    def _spawn(self) -> None:
-        pipe, far_end = self._context.Pipe()
-        process = self._context.Process(target=_work, args=(far_end, self._scene), daemon=True)
-        with block_signals(signal.SIGINT, signal.SIGTERM):
-            process.start()
-        far_end.close()
-        self._workers.append(_Worker(process, pipe))
+    atexit.register(kill_all)  # runs before multiprocessing's, which joins the workers
+    try:
+        for _ in range(size):
+            workers.append(_Worker(scene))
+        yield workers
+    finally:
+        kill_all()
+        atexit.unregister(kill_all)
 
-    @property
-    def idle(self) -> list[_Worker]:
-        return [worker for worker in self._workers if worker.job is None]
 
-    @property
-    def busy(self) -> list[_Worker]:
-        return [worker for worker in self._workers if worker.job is not None]
-
-    def submit(self, job: LoadKey) -> None:
-        """Send a load to an idle worker."""
-        worker = self.idle[-1]
-        worker.job = job
-        grace = 0.0 if worker.warm else STARTUP_GRACE
-        worker.deadline = time.monotonic() + self._timeout + grace
-        with contextlib.suppress(BrokenPipeError):  # `wait` detects that it died while idle
-            worker.pipe.send(job)
-
-    def wait(self) -> tuple[list[SolvedLoad], list[LoadKey], list[LoadKey]]:
-        """Wait for an event; return solved loads, loads of dead workers, and timed-out loads."""
-        solved, crashed = [], []
-        busy = {worker.pipe: worker for worker in self.busy}
-        left = min(worker.deadline for worker in busy.values()) - time.monotonic()
-        for pipe in connection.wait(list(busy), None if math.isinf(left) else max(0.0, left)):
-            worker = busy[pipe]  # type: ignore[index]
-            try:
-                solved.append(worker.pipe.recv())
-            except (EOFError, ConnectionResetError):
-                crashed.append(self._replace(worker))
-                continue
-            worker.job, worker.warm = None, True
-        now = time.monotonic()
-        late = [self._replace(worker) for worker in self.busy if worker.deadline < now]
-        return solved, crashed, late
-
-    def _replace(self, worker: _Worker) -> LoadKey:
-        """Replace a worker; return its load."""
-        assert worker.job is not None
-        self._workers.remove(worker)
-        worker.kill()
-        self._spawn()
-        return worker.job
+def _wait(workers: list[_Worker]) -> tuple[list[SolvedLoad], list[LoadKey], list[LoadKey]]:
+    """Wait for an event; return solved loads, loads of dead workers, and timed-out loads."""
+    solved, crashed = [], []
+    busy = {worker.pipe: worker for worker in workers if worker.job}
+    left = min(worker.deadline for worker in busy.values()) - time.monotonic()
+    for pipe in connection.wait(list(busy), None if math.isinf(left) else max(0.0, left)):
+        worker = busy[pipe]  # type: ignore[index]
+        try:
+            solved.append(worker.pipe.recv())
+            worker.job = None
+        except (EOFError, ConnectionResetError):
+            crashed.append(worker.replace())
+    now = time.monotonic()
+    late = [worker.replace() for worker in workers if worker.job and worker.deadline < now]
+    return solved, crashed, late
 
 
 def _work(pipe: Connection, scene: Scene) -> None:

@@ -33,16 +33,11 @@ def amplitude_bins(amplitudes: Sequence[float], accepted: Sequence[bool]) -> lis
     """Return the bins of equal width from 0 to the largest amplitude that are not empty."""
     if not len(amplitudes):
         return []
-    largest = max(amplitudes) or 1.0
-    edges = np.linspace(0.0, largest, BINS + 1)
-    place = np.clip(np.digitize(amplitudes, edges) - 1, 0, BINS - 1)
-    tried = np.bincount(place, minlength=BINS)
-    kept = np.bincount(place, weights=np.asarray(accepted, dtype=float), minlength=BINS)
-    return [
-        AmplitudeBin(float(edges[k]), float(edges[k + 1]), int(tried[k]), int(kept[k]))
-        for k in range(BINS)
-        if tried[k]
-    ]
+    limits = (0.0, max(amplitudes) or 1.0)
+    tried, edges = np.histogram(amplitudes, BINS, limits)
+    kept, _ = np.histogram(np.asarray(amplitudes)[np.asarray(accepted)], BINS, limits)
+    bins = zip(edges[:-1].tolist(), edges[1:].tolist(), tried.tolist(), kept.tolist(), strict=True)
+    return [AmplitudeBin(*part) for part in bins if part[2]]
 
 
 def acceptance_table(bins: Sequence[AmplitudeBin]) -> list[str]:
@@ -52,10 +47,9 @@ def acceptance_table(bins: Sequence[AmplitudeBin]) -> list[str]:
     heads = [f"{part.high:.2f}" for part in bins]
     cells = [f"{part.accepted}/{part.tried}" for part in bins]
     widths = [max(len(a), len(b)) for a, b in zip(heads, cells, strict=True)]
-    rows = (("amplitude up to", heads), ("accepted", cells))
     return [
         f"{name:>15}  " + "  ".join(text.rjust(w) for text, w in zip(row, widths, strict=True))
-        for name, row in rows
+        for name, row in (("amplitude up to", heads), ("accepted", cells))
     ]
 
 

@@ -10,10 +10,15 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from dpl.data.storage.manifest import STREAMS, invalid_lines, read_manifest, tried_loads
+from dpl.data.storage.manifest import (
+    STREAMS,
+    invalid_lines,
+    read_manifest,
+    rewrite,
+    tried_loads,
+)
 from dpl.data.storage.shard import Columns, to_dense
 from dpl.data.storage.store import MODES, SHARD_SIZE, Store
-from dpl.data.storage.writer import rewrite
 from dpl.scene import Scene
 from dpl.system.files import (
     DataSetError,
@@ -45,10 +50,8 @@ class Part(NamedTuple):
 def verify(store: Store) -> Iterator[tuple[Part, str]]:
     """Yield each file of a data set with its flaw; empty if it has none.
 
-    The files are the modes, the shards that a manifest names, the manifests with invalid lines, and
-    the shards that no manifest names. A shard has no flaw if its bytes have the digest of the
-    manifest, its loads are those that the scene draws, and each displacement, evaluated again,
-    is in equilibrium to the tolerance with det F > 0.
+    A shard has no flaw if its bytes have the digest of the manifest, its loads are those that the
+    scene draws, and each displacement is in equilibrium to the tolerance with det F > 0.
 
     Raises:
         DataSetError: There is no data set.
@@ -68,12 +71,8 @@ def verify(store: Store) -> Iterator[tuple[Part, str]]:
         yield _part(line), flaw
     for manifest in store.manifests():
         if invalid := invalid_lines(manifest):
-            number, reason = invalid[0]
-            yield (
-                Part(manifest.name),
-                f"has {len(invalid)} lines that describe no shard; the first is line {number}, "
-                f"which {reason}",
-            )
+            flaw = f"has {len(invalid)} lines that describe no shard; the first is line "
+            yield Part(manifest.name), flaw + "{}, which {}".format(*invalid[0])
     for path in _unnamed_shards(store):
         yield _unnamed_part(store, path), "is named by no manifest"
 
@@ -81,8 +80,7 @@ def verify(store: Store) -> Iterator[tuple[Part, str]]:
 def repair(store: Store) -> list[tuple[Part, str]]:
     """Remove damaged files from a data set; return each with its flaw and the action taken.
 
-    Shards with loads that failed because of the machine are removed as well. The loads of a removed
-    shard are missing afterwards.
+    Shards with loads that failed because of the machine are removed as well.
 
     Raises:
         DataSetError: Another process writes there.
@@ -91,9 +89,8 @@ def repair(store: Store) -> list[tuple[Part, str]]:
         return []
     with exclusive_lock(store.folder):
         flaws = {part: flaw for part, flaw in verify(store) if flaw}
-        for line in store.shards():
-            if _failed_by_machine(line):
-                flaws.setdefault(_part(line), "holds loads that failed because of the machine")
+        for line in filter(_failed_by_machine, store.shards()):
+            flaws.setdefault(_part(line), "holds loads that failed because of the machine")
         damaged = {part.file for part in flaws}
         if MODES in damaged:
             write_file(store.folder / MODES, save(dict(store.scene.loads.arrays())))
@@ -110,18 +107,18 @@ def repair(store: Store) -> list[tuple[Part, str]]:
             if _failed_by_machine(store.pending.read(path)[0]):
                 path.unlink()
         sync_folder(store.folder)
-    return [(part, f"{flaw}; {_action(store, part)}") for part, flaw in flaws.items()]
+    return [(part, f"{flaw}; {_action(part)}") for part, flaw in flaws.items()]
 
 
 def _failed_by_machine(line: Mapping[str, Any]) -> bool:
     return any(one["reason"].startswith(MACHINE_FAILURES) for one in line["rejected"])
 
 
-def _action(store: Store, part: Part) -> str:
+def _action(part: Part) -> str:
     """Return the action of `repair` for a damaged file."""
     if part.file == MODES:
         return "it is written again"
-    if part.file in {path.name for path in store.manifests()}:
+    if part.file.endswith(".jsonl") and not part.split:
         return "these lines are removed"
     again = f", and its {len(part.loads)} loads are solved again" if part.loads else ""
     return f"it is removed{again}"
@@ -159,13 +156,7 @@ def check_modes(scene: Scene, stored: Mapping[str, Tensor]) -> str:
 
 
 def check_shard(scene: Scene, stream: tuple[int, int], shard: Columns) -> str:
-    """Return the first flaw of a shard; empty if there is none.
-
-    Args:
-        scene: Scene of the data set.
-        stream: Seed of the shard's loads.
-        shard: Columns of the shard.
-    """
+    """Return the first flaw of a shard of loads with the seed `stream`; empty if there is none."""
     problem, loads = scene.problem, scene.loads
     if not len(shard["index"]):
         return ""

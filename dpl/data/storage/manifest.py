@@ -1,18 +1,16 @@
 """Manifest of a data set: a line of JSON for each shard, checked when it is read."""
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from dpl.data.solving.solve import SolvedLoad
-from dpl.system.files import parsed_lines
+from dpl.system.files import parsed_lines, write_file
 
 STREAMS = {"train": 0, "val": 1, "test": 2}  # disjoint streams of one seed
-KEYS = {
-    *("file", "sha256", "split", "first", "tried", "accepted"),
-    *("iterations", "amplitudes", "rejected"),
-}
+STRINGS, INTEGERS = ("file", "sha256", "split"), ("first", "tried", "accepted", "iterations")
 NAME = re.compile(r"[\w.-][\w./-]{0,199}")  # of a shard
 UPPER_LIMIT = 1e15  # of a number in a manifest or a journal
 
@@ -44,30 +42,29 @@ def merge_entries(entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def read_manifest(manifest: Path) -> list[dict[str, Any]]:
     """Return the valid lines of a manifest; the loads of the others are solved again."""
-    return [line for line in parsed_lines(manifest) if line is not None and not _flaw_of(line)]
+    return [line for line in parsed_lines(manifest) if line and not _flaw_of(line)]
 
 
 def invalid_lines(manifest: Path) -> list[tuple[int, str]]:
     """Return the number (from 1) of each line that `read_manifest` leaves out, and the reason."""
-    flaws = (
-        "is not a JSON object" if line is None else _flaw_of(line)
-        for line in parsed_lines(manifest)
-    )
+    flaws = map(_flaw_of, parsed_lines(manifest))
     return [(number, flaw) for number, flaw in enumerate(flaws, 1) if flaw]
 
 
-def _flaw_of(line: Mapping[str, Any]) -> str:
+def _flaw_of(line: Mapping[str, Any] | None) -> str:
     """Return the reason why a line describes no shard; empty if it is valid."""
-    if absent := KEYS - line.keys():
+    if line is None:
+        return "is not a JSON object"
+    if absent := {*STRINGS, *INTEGERS, "amplitudes", "rejected"} - line.keys():
         return f"lacks {', '.join(sorted(absent))}"
-    for key in ("file", "sha256", "split"):
+    for key in STRINGS:
         if not isinstance(line[key], str):
             return f"has a {key} that is not a string"
     if line["split"] not in STREAMS:
         return "names a split that does not exist"
     if not NAME.fullmatch(line["file"]):
         return "names a file that is not in the folder of the data set"
-    for key in ("first", "tried", "accepted", "iterations"):
+    for key in INTEGERS:
         if not (type(line[key]) is int and 0 <= line[key] < 2**53):
             return f"has a number {key} out of range"
     if "/" not in line["file"] and line["file"] != shard_name(line["split"], line["first"]):
@@ -96,12 +93,7 @@ def _flaw_of_loads(line: Mapping[str, Any]) -> str:
 
 
 def shard_name(split: str, first: int) -> str:
-    """Return the name of the file of a shard.
-
-    Args:
-        split: Split of its loads.
-        first: Number of its first load.
-    """
+    """Return the name of the file of a shard, from split and number of its first load."""
     return f"{split}-{first:06d}.safetensors"
 
 
@@ -124,3 +116,10 @@ def accepted_loads(line: Mapping[str, Any]) -> list[int]:
 def sort_key(line: Mapping[str, Any]) -> tuple[int, int]:
     """Return the position of a line in the manifest: by split, then by first load."""
     return STREAMS[line["split"]], line["first"]
+
+
+def rewrite(manifest: Path, lines: Sequence[dict[str, Any]]) -> None:
+    """Write these lines, sorted, to a manifest that exists and differs."""
+    text = "".join(json.dumps(line) + "\n" for line in sorted(lines, key=sort_key)).encode()
+    if manifest.exists() and manifest.read_bytes() != text:
+        write_file(manifest, text)

@@ -54,11 +54,8 @@ class PendingLoads:
         return path
 
     def read(self, path: Path) -> tuple[dict[str, Any], Columns]:
-        """Return manifest entry and columns of a load that `files` has found.
-
-        Split and number are those of the file's name: the content may come from another
-        machine, and both are part of the path of the shard.
-        """
+        """Return manifest entry and columns of a load that `files` has found."""
+        # the content may come from another machine, and both are part of the path of a shard
         split, number = path.stem.split("-")
         entry, _, columns = path.read_bytes()[DIGEST_SIZE:].partition(b"\n")
         return {**json.loads(entry), "split": split, "first": int(number)}, load(columns)
@@ -71,9 +68,9 @@ class PendingLoads:
         """
         found = {}
         for path in sorted(self.folder.glob("*.load")):
-            if not (name := NAME.fullmatch(path.name)) or name[1] not in self.streams:
-                continue
-            if path.is_symlink():  # not followed: its load is solved again
+            name = NAME.fullmatch(path.name)
+            # a symbolic link is not followed: its load is solved again
+            if not name or name[1] not in self.streams or path.is_symlink():
                 continue
             with suppress(FileNotFoundError):  # another writer has moved it into a shard
                 content = read_regular_file(path)
@@ -82,11 +79,6 @@ class PendingLoads:
                 else:
                     path.unlink()
         return found
-
-    def remove_if_empty(self) -> None:
-        """Remove the folder if it is empty."""
-        with suppress(OSError):
-            self.folder.rmdir()
 
 
 def _digest(path: Path, content: bytes) -> bytes:

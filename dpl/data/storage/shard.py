@@ -5,20 +5,19 @@ columns of its loads.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
-import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
 
-from dpl.data.solving.solve import LoadKey, SolvedLoad
+from dpl.data.solving.solve import SolvedLoad
 
 Columns = dict[str, Tensor]
 
 INTEGERS = dict.fromkeys(("index", "n_loaded_nodes", "iterations"), torch.int64)
 INTEGERS["node"] = torch.int32
+OF_NODES = {"node", "nodal_force"}  # columns with a row for each loaded node
 FINITE = {"point", "nodal_force", "displacement", "parameters"}  # columns of a sample
 
 
@@ -64,16 +63,17 @@ def decode_shard(
     """
     try:
         shard = load(content)
-        _check_columns(shard, shape, dimension, n_parameters)
+        flaw = _flaw_of_columns(shard, shape, dimension, n_parameters)
     except (SafetensorError, KeyError, TypeError, RuntimeError) as error:
-        raise ValueError(f"is damaged: {error}") from None
+        flaw = str(error)
+    if flaw:
+        raise ValueError(f"is damaged: {flaw}")
     return shard
 
 
-def _check_columns(
+def _flaw_of_columns(
     shard: Columns, shape: tuple[int, ...], dimension: int, n_parameters: int
-) -> None:
-    """Raise ValueError or KeyError where `decode_shard` must."""
+) -> str:
     count, n_loaded_nodes = len(shard["index"]), int(shard["n_loaded_nodes"].sum())
     shapes = {
         "index": (count,),
@@ -90,62 +90,25 @@ def _check_columns(
     for name, expected in shapes.items():
         column = shard[name]
         if (tuple(column.shape), column.dtype) != (expected, INTEGERS.get(name, torch.float64)):
-            found = f"{tuple(column.shape)}, {column.dtype}"
-            raise ValueError(f"is damaged: {name} has shape and type {found}")
+            return f"{name} has shape and type {tuple(column.shape)}, {column.dtype}"
         if name in FINITE and not column.isfinite().all():
-            raise ValueError(f"is damaged: {name} is not finite")
+            return f"{name} is not finite"
     if not ((shard["n_loaded_nodes"] >= 0) & (shard["n_loaded_nodes"] <= shape[0])).all():
-        raise ValueError("is damaged: a number of loaded nodes is negative or exceeds N")
+        return "a number of loaded nodes is negative or exceeds N"
     if not ((shard["node"] >= 0) & (shard["node"] < shape[0])).all():
-        raise ValueError("is damaged: a loaded node does not exist")
+        return "a loaded node does not exist"
+    return ""
 
 
-def select(shard: Columns, job: LoadKey, line: Mapping[str, Any]) -> SolvedLoad:
-    """Return one load of a shard, with its wall time unknown (0 s).
-
-    Args:
-        shard: Columns of the shard.
-        job: The load, which is one of the shard's tried loads.
-        line: Line of the manifest for the shard. It gives the amplitude and, for a rejected load
-            (which has no arrays), the reason.
-    """
-    amplitude = line["amplitudes"][job.number - line["first"]]
-    rows = (shard["index"] == job.number).nonzero()[:, 0]
-    if not len(rows):
-        (found,) = (one for one in line["rejected"] if one["index"] == job.number)
-        none = np.zeros(0)
-        return SolvedLoad(
-            job, none, none, none, amplitude, False, np.nan, np.nan, found["load_factor"], 0, 0.0,
-            found["reason"],
-        )  # fmt: skip
-    row = int(rows[0])
-    displacement = shard["displacement"][row].numpy()
-    first = int(shard["n_loaded_nodes"][:row].sum())
-    nodes = slice(first, first + int(shard["n_loaded_nodes"][row]))
-    force = np.zeros_like(displacement)
-    force[shard["node"][nodes].numpy()] = shard["nodal_force"][nodes].numpy()
-    return SolvedLoad(
-        job=job,
-        point=shard["point"][row].numpy(),
-        force=force,
-        displacement=displacement,
-        amplitude=amplitude,
-        accepted=True,
-        residual=float(shard["residual"][row]),
-        volume_ratio=float(shard["volume_ratio"][row]),
-        load_factor=1.0,
-        iterations=int(shard["iterations"][row]),
-        seconds=0.0,
-        reason="",
-    )
+def select(shard: Columns, number: int) -> Columns:
+    """Return the columns of one load of a shard; they have no rows if the load was rejected."""
+    row = shard["index"] == number
+    node = torch.repeat_interleave(row, shard["n_loaded_nodes"])
+    return {name: c[node if name in OF_NODES else row] for name, c in shard.items()}
 
 
 def to_sparse(force: Tensor) -> Columns:
-    """Return forces (B, N, D) as three columns.
-
-    `n_loaded_nodes` (B,) counts the loaded nodes of each load; `node` and `nodal_force` are their
-    numbers and forces, load after load.
-    """
+    """Return forces (B, N, D) as numbers of loaded nodes (B,), their numbers and their forces."""
     loaded = force.ne(0).any(dim=-1)
     return {
         "n_loaded_nodes": loaded.sum(dim=1),

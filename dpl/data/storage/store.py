@@ -8,9 +8,8 @@
     FOLDER/journal.jsonl         one line per session: date, machine, duration
     FOLDER/pending/              solved loads whose shard is not complete, one file each
 
-Files are written beside their destination, synced and renamed. A shard that no manifest names is
-ignored. The manifest holds nothing that depends on a clock: the same loads give the same bytes for
-any number of workers and after any interruption.
+A shard that no manifest names is ignored. The same loads give the same bytes for any number of
+workers and after any interruption.
 """
 
 import hashlib
@@ -28,16 +27,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
 
-from dpl.data.solving.solve import LoadKey, SolvedLoad
+from dpl.data.solving.solve import LoadKey
 from dpl.data.storage.acceptance import AmplitudeBin, acceptance_table, amplitude_bins
 from dpl.data.storage.journal import read_sessions
-from dpl.data.storage.manifest import (
-    STREAMS,
-    accepted_loads,
-    read_manifest,
-    sort_key,
-    tried_loads,
-)
+from dpl.data.storage.manifest import STREAMS, accepted_loads, read_manifest, sort_key, tried_loads
 from dpl.data.storage.pending import PendingLoads
 from dpl.data.storage.shard import Columns, decode_shard, select, to_dense
 from dpl.scene import Sample, Scene
@@ -84,16 +77,16 @@ class Store:
             raise DataSetError(f"data.folder = {self.folder} must be a folder; choose another")
         names = {path.name for path in self.folder.iterdir()} if self.folder.exists() else set()
         if card.name not in names:
-            if not {name for name in names if name[0] != "."} <= {MODES}:
-                raise DataSetError(
-                    f"{self.folder} is not empty and no data set; choose another data.folder"
-                )
-            return []
+            if {name for name in names if name[0] != "."} <= {MODES}:
+                return []
+            raise DataSetError(
+                f"{self.folder} is not empty and no data set; choose another data.folder"
+            )
         try:
             self._check(json.loads(read_regular_file(card)))
-        except DataSetError:
-            raise
         except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+            if isinstance(error, DataSetError):
+                raise
             raise DataSetError(
                 f"{card} is damaged ({error}); choose another data.folder or remove this one"
             ) from None
@@ -117,8 +110,7 @@ class Store:
             raise DataSetError(
                 f"{self.folder} is a data set of another scene: its fingerprint is "
                 f"{card['fingerprint'][:12]}, this scene's is {self.scene.fingerprint[:12]} "
-                f"({'; '.join(found)}); choose another "
-                "data.folder or restore the scene"
+                f"({'; '.join(found)}); choose another data.folder or restore the scene"
             )
         if card["seed"] != self.seed:
             raise DataSetError(
@@ -129,12 +121,8 @@ class Store:
     def missing(self, split: str, count: int, shard: int = 0, shards: int = 1) -> list[int]:
         """Return which of the first `count` loads of a split have not been tried.
 
-        Args:
-            split: train, val or test.
-            count: Number of loads.
-            shard: Index of the writer among `shards` writers, who take blocks of `SHARD_SIZE`
-                loads in turn; only its loads are returned.
-            shards: Number of writers.
+        Of several writers `shards`, who take blocks of `SHARD_SIZE` loads in turn, only the loads
+        of writer `shard` are returned.
         """
         tried = {number for line in self._shards_of(split) for number in tried_loads(line)}
         return [
@@ -146,29 +134,19 @@ class Store:
     def _shards_of(self, split: str) -> list[dict[str, Any]]:
         return [line for line in self.shards() if line["split"] == split]
 
-    def tried(self) -> set[LoadKey]:
-        """Return the loads that are in a shard or were rejected."""
-        return {
-            LoadKey(self.stream(line["split"]), number)
-            for line in self.shards()
-            for number in tried_loads(line)
-        }
-
     def load(self, split: str, count: int) -> Sample:
         """Return the accepted ones of the first `count` loads of a split, in order.
 
         Raises:
             DataSetError: A shard is damaged, or there are no samples.
         """
-        lines = [line for line in self._shards_of(split) if line["first"] < count]
-        parts = [self._read_shard(line) for line in lines]
+        parts = [self._read_shard(line) for line in self._shards_of(split) if line["first"] < count]
         number = np.concatenate([np.zeros(0, int), *(part["index"].numpy() for part in parts)])
         rows = np.unique(number, return_index=True)[1]  # two writers may have solved the same load
         rows = rows[number[rows] < count]
         if not len(rows):
             raise DataSetError(f"{self.folder} holds no {split} samples")
-        shape = self.scene.problem.shape
-        force = torch.cat([to_dense(part, shape) for part in parts])[rows]
+        force = torch.cat([to_dense(part, self.scene.problem.shape) for part in parts])[rows]
         displacement, point, parameters = (
             torch.cat([part[name] for part in parts])[rows]
             for name in ("displacement", "point", "parameters")
@@ -176,11 +154,7 @@ class Store:
         return Sample(force, displacement, self.scene.loads.young_at(point), parameters)
 
     def _read_shard(self, line: Mapping[str, Any]) -> Columns:
-        """Return the columns of a shard.
-
-        Raises:
-            DataSetError: It is damaged.
-        """
+        """Return the columns of a shard; raise DataSetError if it is damaged."""
         try:
             return self.read_shard(line)
         except ValueError as error:
@@ -190,12 +164,7 @@ class Store:
             ) from None
 
     def read_shard(self, line: Mapping[str, Any]) -> Columns:
-        """Return the columns of a shard, see `decode_shard`.
-
-        Raises:
-            ValueError: It is damaged. The message continues a sentence that starts with the name
-                of the file.
-        """
+        """Return the columns of a shard; raise ValueError if it is damaged, see `decode_shard`."""
         path = self.folder / line["file"]
         if path.parent != self.folder:
             raise ValueError("is not in the folder of the data set and is not read")
@@ -222,25 +191,26 @@ class Store:
         shape, n_parameters = self.scene.problem.shape, len(loads.parameter_ranges)
         return decode_shard(content, shape, loads.n_random, n_parameters)
 
-    def reader(self, split: str) -> Callable[[int], SolvedLoad | None]:
-        """Return a function from the number of a load to the load, None if it is not solved yet."""
+    def reader(self, split: str) -> Callable[[int], Columns | None]:
+        """Return a function from the number of a load to its columns, None if it is not solved yet.
+
+        The columns have no rows if the load was rejected.
+        """
         lines = {number: line for line in self._shards_of(split) for number in tried_loads(line)}
         pending = self.pending.files()
         shard: Columns = {}
         current: dict[str, Any] | None = None  # line of `shard`
 
-        def read(number: int) -> SolvedLoad | None:
+        def read(number: int) -> Columns | None:
             nonlocal shard, current
-            job = LoadKey(self.stream(split), number)
-            if (line := lines.get(number)) is None:
-                with suppress(FileNotFoundError):  # another process has moved it into a shard
-                    if path := pending.get(job):
-                        entry, columns = self.pending.read(path)
-                        return select(columns, job, entry)
-                return None
-            if current is not line:
-                shard, current = self._read_shard(line), line
-            return select(shard, job, line)
+            if line := lines.get(number):
+                if current is not line:
+                    shard, current = self._read_shard(line), line
+                return select(shard, number)
+            with suppress(FileNotFoundError):  # another process has moved it into a shard
+                if path := pending.get(LoadKey(self.stream(split), number)):
+                    return select(self.pending.read(path)[1], number)
+            return None
 
         return read
 
@@ -252,11 +222,7 @@ class Store:
         return found.hexdigest()
 
     def modes(self) -> dict[str, Tensor]:
-        """Return the stored arrays of the load family, such as modes, see `LoadFamily.arrays`.
-
-        Raises:
-            DataSetError: Their file is damaged.
-        """
+        """Return the stored `LoadFamily.arrays`; raise DataSetError if their file is damaged."""
         path = self.folder / MODES
         expected = self.scene.loads.arrays()
         most = HEADER + 16 * sum(array.numel() for array in expected.values())
@@ -270,33 +236,33 @@ class Store:
 
     def acceptance(self) -> list[AmplitudeBin]:
         """Return the numbers of tried and accepted loads by amplitude, over all splits."""
-        amplitudes: list[float] = []
-        accepted: list[bool] = []
-        for line in self.shards():
-            kept = set(accepted_loads(line))
-            amplitudes += line["amplitudes"]
-            accepted += [number in kept for number in tried_loads(line)]
-        return amplitude_bins(amplitudes, accepted)
+        lines = self.shards()
+        amplitudes = [amplitude for line in lines for amplitude in line["amplitudes"]]
+        kept = (np.isin(tried_loads(line), accepted_loads(line)) for line in lines)
+        return amplitude_bins(amplitudes, np.concatenate([np.zeros(0, bool), *kept]).tolist())
 
     def summary(self) -> str:
         """Return a table of tried and accepted loads, by split and by amplitude."""
         lines = [str(self.folder)]
         for split in STREAMS:
             shards = self._shards_of(split)
-            tried, accepted = (sum(line[key] for line in shards) for key in ("tried", "accepted"))
+            tried, accepted, iterations = (
+                sum(line[key] for line in shards) for key in ("tried", "accepted", "iterations")
+            )
             if tried:
-                mean = sum(line["iterations"] for line in shards) / tried
                 lines.append(
-                    f"  {split}: {accepted} of {tried} loads accepted, {mean:.1f} Newton iterations"
+                    f"  {split}: {accepted} of {tried} loads accepted, "
+                    f"{iterations / tried:.1f} Newton iterations"
                 )
         lines += [f"  {row}" for row in acceptance_table(self.acceptance())]
         sessions = read_sessions(self.folder)
-        if loads := sum(one["loads"] for one in sessions):
-            core = sum(one["core_seconds"] for one in sessions) / loads
-            wall = sum(one["seconds"] for one in sessions)
+        loads, wall, core = (
+            sum(one[key] for one in sessions) for key in ("loads", "seconds", "core_seconds")
+        )
+        if loads:
             size = sum(path.lstat().st_size for path in self.folder.glob("*.safetensors")) / 1e6
             lines.append(
-                f"  {core:.3f} s per load on one core, {wall:.0f} s of wall time in "
+                f"  {core / loads:.3f} s per load on one core, {wall:.0f} s of wall time in "
                 f"{len(sessions)} sessions, {size:.0f} MB"
             )
         return "\n".join(lines)
@@ -309,11 +275,9 @@ class Store:
 
 
 def runs(numbers: Sequence[int], *, whole: bool = False) -> Iterator[list[int]]:
-    """Yield the loads of each file: consecutive numbers, never across a multiple of SHARD_SIZE.
+    """Yield the loads of each file, of `numbers` in ascending order.
 
-    Args:
-        numbers: Numbers of loads, ascending.
-        whole: Yield runs of SHARD_SIZE loads only.
+    They are consecutive and never across a multiple of SHARD_SIZE; `whole`: SHARD_SIZE loads only.
     """
     run: list[int] = []
     for number in [*numbers, None]:

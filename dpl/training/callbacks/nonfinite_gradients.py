@@ -6,6 +6,8 @@ from typing import Any
 import lightning as L
 import torch
 
+from dpl.system.checks import check_range
+
 
 class Diverged(ArithmeticError):
     """Raised when the gradients of many consecutive steps are not finite."""
@@ -15,8 +17,7 @@ class SkipNonFiniteGradients(L.Callback):
     """Skips optimiser steps with non-finite gradients and stops a training that diverged.
 
     Every infinite or NaN sample, loss or gradient makes the gradient norm non-finite, and a step
-    with it would make all weights NaN. Such a step changes neither weights nor momenta. The number
-    of skipped steps is logged as `skipped_steps` and stored in checkpoints.
+    with it would make all weights NaN. The number of skipped steps is logged as `skipped_steps`.
 
     Attributes:
         patience: Number of consecutive skipped steps that stops the training.
@@ -29,8 +30,7 @@ class SkipNonFiniteGradients(L.Callback):
         Raises:
             ValueError: `patience` is less than 1.
         """
-        if patience < 1:
-            raise ValueError(f"patience = {patience} must be 1 or more")
+        check_range(1, patience=patience)
         self.patience = patience
         self.skipped_steps = 0
         self._consecutive = 0

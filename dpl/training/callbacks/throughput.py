@@ -15,19 +15,9 @@ from dpl.data import OnlineData
 
 
 class ThroughputMonitor(L.Callback):
-    """Logs throughput and memory once per epoch; the time of validation does not count.
+    """Logs throughput and memory [GB] once per epoch; the time of validation does not count.
 
-    - `rate/steps`: Optimiser steps per second.
-    - `rate/consumed`: Samples per second that the optimiser reads.
-    - `memory/process`: Resident memory of this process [GB].
-    - `memory/gpu`: Peak memory on a GPU [GB].
-
-    With a stream of samples also:
-
-    - `rate/produced`: Samples per second that the workers solve.
-    - `online/waiting`: Fraction of the time in which the optimiser waits for samples.
-    - `online/uses`: Mean number of times that a sample is read.
-    - `online/buffer`: Samples in the replay buffer.
+    docs/monitoring.md describes each tag. The rates of a stream are those of `StreamRates`.
     """
 
     def __init__(self) -> None:

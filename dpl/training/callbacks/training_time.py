@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import torch
@@ -25,23 +26,16 @@ class TrainingTime(L.Callback):
         """Start the clock."""
         self._start = time.perf_counter()
 
-    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Write the line."""
-        self._write(trainer, pl_module)
-
-    def on_exception(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
-    ) -> None:
-        """Write the line of an interrupted session."""
-        self._write(trainer, pl_module)
-
-    def _write(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
+        """Write the line, also that of an interrupted session."""
         if trainer.is_global_zero and self._start:
             line = {
                 "seconds": round(time.perf_counter() - self._start, 3),
                 "steps": trainer.global_step,
                 "threads": torch.get_num_threads(),
-                "device": str(module.device),
+                "device": str(pl_module.device),
             }
             append_jsonl(self.path, line)
             self._start = 0.0
+
+    on_exception = on_fit_end

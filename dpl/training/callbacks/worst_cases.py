@@ -1,7 +1,4 @@
-"""Write pictures and meshes of the validation loads with the largest errors for TensorBoard.
-
-docs/monitoring.md describes each tag.
-"""
+"""Write pictures and meshes of the validation loads with the largest errors for TensorBoard."""
 
 import time
 from typing import TYPE_CHECKING, Any
@@ -14,6 +11,7 @@ from torch import Tensor
 from dpl.fem import surface
 from dpl.fem.postprocess import coarse, triangles
 from dpl.scene import Sample, Scene
+from dpl.system.checks import check_range
 from dpl.training.callbacks.tensorboard import last_step, tensorboard_writers
 from dpl.training.metrics import MaxError, PerLoadErrors, RelativeL2
 from dpl.visualization import error_colours, plot_deformed, plot_errors
@@ -35,16 +33,8 @@ MESH_STYLE = {  # three.js options of meshes in the browser
 class WorstCasePlots(L.Callback):
     """Draws the validation loads with the largest errors for TensorBoard.
 
-    - `validation/shapes`: the loads with the largest relative and the largest absolute error, and
-      the load with the median relative error of the others.
-    - `validation/errors`: the errors of all loads.
-    - `validation/worst`: a mesh of the load with the largest absolute error. The prediction is
-      coloured by its error (yellow: the largest error; blue: a thousandth of it or less); the
-      reference is shown below it in grey.
-    - `time/pictures`: fraction of the training time that drawing took.
-
     Pictures are drawn after `every`, 2 `every`, 4 `every`, ... validations and at the end of the
-    training.
+    training. docs/monitoring.md describes each tag.
     """
 
     def __init__(
@@ -61,10 +51,7 @@ class WorstCasePlots(L.Callback):
         Raises:
             ValueError: A number is less than 1.
         """
-        numbers = {"every": every, "loads": loads, "max_polygons": max_polygons}
-        for name, number in numbers.items():
-            if number < 1:
-                raise ValueError(f"{name} = {number} must be 1 or more")
+        check_range(1, every=every, loads=loads, max_polygons=max_polygons)
         self.loads = loads
         self.meshes = meshes
         self.max_polygons = max_polygons
@@ -104,19 +91,15 @@ class WorstCasePlots(L.Callback):
             return
         start = time.perf_counter()
         step = self._drawn_step = last_step(trainer)
-        training = module.training
+        training, data = module.training, trainer.datamodule
         module.eval()
-        shapes, errors, mesh = self._pictures(
-            module, trainer.datamodule.samples("val"), trainer.datamodule.batch_size
-        )
+        shapes, errors, mesh = self._pictures(module, data.samples("val"), data.batch_size)
         module.train(training)
         for writer in writers:
             writer.add_figure("validation/shapes", shapes, step)
             writer.add_figure("validation/errors", errors, step)
             if mesh:
-                writer.add_mesh(
-                    "validation/worst", **mesh, config_dict=MESH_STYLE, global_step=step
-                )
+                writer.add_mesh("validation/worst", **mesh, global_step=step)
         self._drawing_time += time.perf_counter() - start
         fraction = self._drawing_time / (time.perf_counter() - self._start)
         for writer in writers:
@@ -124,7 +107,7 @@ class WorstCasePlots(L.Callback):
 
     def _pictures(
         self, module: Any, samples: Sample, batch_size: int
-    ) -> tuple["Figure", "Figure", dict[str, Tensor] | None]:
+    ) -> tuple["Figure", "Figure", dict[str, Any] | None]:
         """Return the figures of shapes and errors, and the mesh of the largest absolute error."""
         errors = per_sample_errors(module, samples, batch_size)
         selected = errors.select(self.loads)
@@ -139,11 +122,9 @@ class WorstCasePlots(L.Callback):
             max_polygons=self.max_polygons,
         )
         worst = selected.index(errors.largest_absolute)
-        mesh = None
-        if self.meshes and predicted[worst].isfinite().all():
-            mesh = side_by_side_mesh(
-                module.scene, predicted[worst], some.displacement[worst], self.max_polygons
-            )
+        pair, mesh = (predicted[worst], some.displacement[worst]), None
+        if self.meshes and pair[0].isfinite().all():
+            mesh = side_by_side_mesh(module.scene, *pair, self.max_polygons)
         return shapes, plot_errors(errors.relative, errors.size, selected), mesh
 
 
@@ -154,21 +135,15 @@ def per_sample_errors(module: Any, samples: Sample, batch_size: int) -> PerLoadE
     for columns in zip(*(column.split(batch_size) for column in samples), strict=True):
         batch = Sample(*columns)
         prediction = _predict(module, batch)
-        size = batch.displacement.norm(dim=2).amax(dim=1)
-        parts.append(
-            PerLoadErrors(
-                relative.measure(prediction, batch), largest.measure(prediction, batch), size
-            )
-        )
+        errors = (metric.measure(prediction, batch) for metric in (relative, largest))
+        parts.append((*errors, batch.displacement.norm(dim=2).amax(dim=1)))
     return PerLoadErrors(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
 def side_by_side_mesh(
     scene: Scene, prediction: Tensor, reference: Tensor, max_polygons: int
-) -> dict[str, Tensor]:
+) -> dict[str, Any]:
     """Return a mesh for TensorBoard: the predicted surface, and the reference surface below it.
-
-    The first half of the vertices belongs to the prediction, the second half to the reference.
 
     Args:
         scene: The scene of both displacements.
@@ -177,11 +152,8 @@ def side_by_side_mesh(
         max_polygons: Maximum number of polygons, see `dpl.fem.postprocess.coarse`.
 
     Returns:
-        The arguments of `SummaryWriter.add_mesh`:
-
-        - vertices: (1, V, 3) [m].
-        - colors: (1, V, 3), 0 to 255.
-        - faces: Triangles, (1, F, 3).
+        Arguments of `SummaryWriter.add_mesh`: vertices (1, V, 3) [m], those of the prediction
+        first; colors (1, V, 3), 0 to 255; faces, triangles (1, F, 3); config_dict.
     """
     points = scene.problem.points.cpu().numpy()
     polygons = coarse(points, surface(scene.problem.mesh), max_polygons)
@@ -199,6 +171,7 @@ def side_by_side_mesh(
     both = np.concatenate(shapes)
     shapes[1][:, 1] -= 1.1 * np.ptp(both[:, 1])
     return {
+        "config_dict": MESH_STYLE,
         "vertices": torch.from_numpy(np.concatenate(shapes)).float()[None],
         "colors": torch.from_numpy(paint)[None],
         "faces": torch.from_numpy(np.concatenate([faces, faces + len(used)])).int()[None],

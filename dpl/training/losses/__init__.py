@@ -6,9 +6,8 @@ from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
     from dpl.training.losses.energy import EnergyNormLoss, PotentialEnergyLoss
-    from dpl.training.losses.loss import Loss, LossContext, clamp_scale, squared_error
+    from dpl.training.losses.loss import BlendedLoss, Loss, LossContext, clamp_scale, squared_error
     from dpl.training.losses.residual import LrPlus, LrStar, residual_norm
-    from dpl.training.losses.schedule import BlendedLoss
     from dpl.training.losses.supervised import MSE, RMSELoss
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

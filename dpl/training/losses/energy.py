@@ -5,13 +5,8 @@ from torch import Tensor
 
 from dpl.fem.postprocess import RestStiffness, potential_energy
 from dpl.scene import Sample
-from dpl.training.losses.loss import (
-    Loss,
-    LossContext,
-    PrescribedGradient,
-    check_floor,
-    clamp_scale,
-)
+from dpl.system.checks import check_range
+from dpl.training.losses.loss import Loss, LossContext, PrescribedGradient, clamp_scale
 
 
 class EnergyNormLoss(Loss):
@@ -21,6 +16,8 @@ class EnergyNormLoss(Loss):
     have a large stiffness-weighted norm and cost Newton its first iterations; this loss weights
     them accordingly. An evaluation is one product with the sparse matrix K(0), assembled once.
     """
+
+    saves = ("no finite-element evaluation in training: K(0) is assembled once",)
 
     def __init__(self, *, relative: bool = True, floor: float = 1e-2) -> None:
         """Choose the weighting.
@@ -34,8 +31,8 @@ class EnergyNormLoss(Loss):
             ValueError: `floor` is out of range.
         """
         super().__init__()
-        self.relative = relative
-        self.floor = check_floor(floor)
+        check_range(0, 1, floor=floor)
+        self.relative, self.floor = relative, floor
         self._rest: RestStiffness | None = None
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
@@ -48,10 +45,6 @@ class EnergyNormLoss(Loss):
             size = clamp_scale(size, self.floor if self.relative else torch.inf)
             slope = 2 * images[: len(prediction)] / size[:, None, None]
         return PrescribedGradient.apply(prediction, error / size, slope).mean()
-
-    def skipped_work(self) -> list[str]:
-        """See `Loss`."""
-        return ["no finite-element evaluation in training: K(0) is assembled once"]
 
 
 class PotentialEnergyLoss(Loss):
@@ -66,12 +59,13 @@ class PotentialEnergyLoss(Loss):
     with another loss, see `BlendedLoss`.
 
     Where elements are inverted, the energy is NaN or has minima with inverted elements. The loss of
-    such a sample is u^T K(0) u / 2 on the same scale, without the load. It is positive and
-    decreases towards u = 0, where no element is inverted. With the load it would decrease towards
-    the linear solution, which can have inverted elements.
+    such a sample is u^T K(0) u / 2 on the same scale, without the load, which would pull towards
+    the linear solution: it can have inverted elements, u = 0 has none.
 
     Source: Samaniego, Anitescu, Goswami et al. (2020), CMAME 362, for energies as losses.
     """
+
+    saves = ("no displacement of the data set in the loss: it is the potential energy",)
 
     def __init__(self, *, floor: float = 1e-2) -> None:
         """Choose the weighting.
@@ -83,7 +77,8 @@ class PotentialEnergyLoss(Loss):
             ValueError: `floor` is out of range.
         """
         super().__init__()
-        self.floor = check_floor(floor)
+        check_range(0, 1, floor=floor)
+        self.floor = floor
         self._rest: RestStiffness | None = None
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
@@ -98,11 +93,6 @@ class PotentialEnergyLoss(Loss):
                 image = rest.product(prediction, batch.parameters)
                 energy = torch.where(sound, energy, (prediction * image).sum(dim=(1, 2)) / 2)
                 slope = torch.where(sound[:, None, None], slope, image)
+            slope = slope / scale[:, None, None]
             self.terms = {"inverted": 1 - sound.double().mean()}
-        return PrescribedGradient.apply(
-            prediction, energy / scale, slope / scale[:, None, None]
-        ).mean()
-
-    def skipped_work(self) -> list[str]:
-        """See `Loss`."""
-        return ["no displacement of the data set in the loss: it is the potential energy"]
+        return PrescribedGradient.apply(prediction, energy / scale, slope).mean()

@@ -1,9 +1,8 @@
-"""The base class of losses, and functions that they share.
+"""The base class of losses, functions that they share, and a blend of two losses.
 
-A loss is a callable (prediction, batch, physics) -> scalar and a Lightning callback. The
-LightningModule registers it with the trainer (`configure_callbacks`), so that a loss can anneal
-between epochs and log its terms. Losses with mechanics take gradients from the compiled forces of
-`Problem.evaluate`; automatic differentiation takes 3 to 17 times as long.
+A loss is a callable (prediction, batch, physics) -> scalar and a Lightning callback, which can
+anneal between epochs and log its terms. Losses with mechanics take gradients from the compiled
+forces of `Problem.evaluate`; automatic differentiation takes 3 to 17 times as long.
 """
 
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from dpl.fem import Problem
 from dpl.scene import Sample
+from dpl.system.checks import check_range
 
 
 class LossContext(NamedTuple):
@@ -35,7 +35,10 @@ class Loss(L.Callback):
 
     Attributes:
         terms: Scalars of the last batch, logged as `loss/NAME`.
+        saves: Work that this loss saves, one line each.
     """
+
+    saves: tuple[str, ...] = ()
 
     def __init__(self) -> None:
         """Start without terms."""
@@ -51,7 +54,59 @@ class Loss(L.Callback):
 
     def skipped_work(self) -> list[str]:
         """Return the work that this loss saves, one line each."""
-        return []
+        return list(self.saves)
+
+
+class BlendedLoss(Loss):
+    """(1 - weight) first + weight second, with a weight that rises from 0 to 1.
+
+    Attributes:
+        weight: Current weight of the second loss [-].
+    """
+
+    def __init__(self, first: Loss, second: Loss, *, epochs: int, start: int = 0) -> None:
+        """Choose the two losses and the schedule of the weight.
+
+        Args:
+            first: Loss up to the epoch `start`.
+            second: Loss from the epoch `start + epochs` on; should have the magnitude of `first`.
+            epochs: Number of epochs in which the weight rises linearly from 0 to 1.
+            start: Epoch in which the weight begins to rise.
+
+        Raises:
+            ValueError: A number is out of range.
+        """
+        super().__init__()
+        check_range(1, epochs=epochs)
+        check_range(0, start=start)
+        self.first, self.second = first, second
+        self._epochs = epochs
+        self._start = start
+        self.weight = 0.0
+
+    def on_train_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Set the weight of the epoch, and the weights of both losses."""
+        passed = (trainer.current_epoch - self._start) / self._epochs
+        self.weight = min(1.0, max(0.0, passed))
+        for loss in (self.first, self.second):
+            loss.on_train_epoch_start(trainer, module)
+
+    def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
+        """See `Loss`; a loss of weight 0 is not evaluated."""
+        total = prediction.new_zeros(())
+        self.terms = {"weight": total + self.weight}
+        parts = {"first": (1 - self.weight, self.first), "second": (self.weight, self.second)}
+        for name, (weight, loss) in parts.items():
+            if weight > 0:
+                value = loss(prediction, batch, physics)
+                total = total + weight * value
+                self.terms |= {name: value}
+                self.terms |= {f"{name}/{term}": scalar for term, scalar in loss.terms.items()}
+        return total
+
+    def skipped_work(self) -> list[str]:
+        """Return the work that both losses save, one line each."""
+        return [line for line in self.first.skipped_work() if line in self.second.skipped_work()]
 
 
 def squared_error(prediction: Tensor, batch: Sample) -> Tensor:
@@ -72,17 +127,6 @@ def clamp_scale(sizes: Tensor, floor: float) -> Tensor:
     mean = sizes.mean()
     sizes = mean.expand_as(sizes) if floor == torch.inf else torch.maximum(sizes, floor * mean)
     return torch.where(sizes > 0, sizes, 1.0)
-
-
-def check_floor(floor: float) -> float:
-    """Return `floor` for `clamp_scale` if it lies in [0, 1].
-
-    Raises:
-        ValueError: `floor` lies outside [0, 1].
-    """
-    if not 0 <= floor <= 1:
-        raise ValueError(f"floor = {floor} must lie between 0 and 1")
-    return floor
 
 
 class PrescribedGradient(torch.autograd.Function):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dpl.fem.postprocess import tangent_product
 from dpl.scene import Sample
+from dpl.system.checks import check_range
 from dpl.training.losses.loss import Loss, LossContext, PrescribedGradient, squared_error
 
 
@@ -18,6 +19,8 @@ class LrStar(Loss):
     As in the paper, the residual norm is averaged over the batch and scales the gradient of the
     whole batch. With `per_sample` it also weights the samples of a batch relative to each other.
     """
+
+    saves = ("no backward pass through the residual: it is a constant weight",)
 
     def __init__(self, *, per_sample: bool = False) -> None:
         """Choose the weighting.
@@ -35,10 +38,6 @@ class LrStar(Loss):
         weight = weight if self.per_sample else weight.mean()
         self.terms = {"mse": error.mean(), "residual": weight.mean()}
         return (error * weight).mean()
-
-    def skipped_work(self) -> list[str]:
-        """See `Loss`."""
-        return ["no backward pass through the residual: it is a constant weight"]
 
 
 class LrPlus(Loss):
@@ -59,12 +58,8 @@ class LrPlus(Loss):
             ValueError: A number is negative.
         """
         super().__init__()
-        if weight < 0 or warmup_epochs < 0:
-            raise ValueError(
-                f"weight = {weight}, warmup_epochs = {warmup_epochs} must be 0 or more"
-            )
-        self._final = weight
-        self._warmup = warmup_epochs
+        check_range(0, weight=weight, warmup_epochs=warmup_epochs)
+        self._final, self._warmup = weight, warmup_epochs
         self.weight = weight if warmup_epochs == 0 else 0.0
 
     def on_train_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:

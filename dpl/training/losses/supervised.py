@@ -1,29 +1,18 @@
 """Supervised losses: squared errors of displacements."""
 
-from typing import Protocol, runtime_checkable
-
 from torch import Tensor
 
 from dpl.scene import Sample
-from dpl.training.losses.loss import Loss, LossContext, check_floor, clamp_scale, squared_error
+from dpl.system.checks import check_range
+from dpl.training.losses.loss import Loss, LossContext, clamp_scale, squared_error
 
 SMALLEST_SQUARE = 1e-24  # added to squared errors: the root has no gradient at zero [-]
 
 
-@runtime_checkable
-class SquaredErrorLoss(Protocol):
-    """A loss that is a function of the squared errors of samples.
-
-    Networks with the capability `TrainsInCoordinates` train without fields on such a loss.
-    """
-
-    def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
-        """Return the loss () of mean squared errors (B,) and mean squared displacements (B,)."""
-        ...
-
-
 class MSE(Loss):
     """Mean squared error of u/L over all degrees of freedom."""
+
+    saves = ("no finite-element evaluation in training: the loss has no residual term",)
 
     def __init__(self, *, relative: float = 0.0, floor: float = 1e-2) -> None:
         """Choose the weighting.
@@ -37,10 +26,8 @@ class MSE(Loss):
             ValueError: A number is out of range.
         """
         super().__init__()
-        if not 0 <= relative <= 1:
-            raise ValueError(f"relative = {relative} must lie between 0 and 1")
-        self.relative = relative
-        self.floor = check_floor(floor)
+        check_range(0, 1, relative=relative, floor=floor)
+        self.relative, self.floor = relative, floor
 
     def __call__(self, prediction: Tensor, batch: Sample, physics: LossContext) -> Tensor:
         """See `Loss`."""
@@ -48,15 +35,15 @@ class MSE(Loss):
         return self.from_squared_errors(squared_error(prediction, batch), size)
 
     def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
-        """See `SquaredErrorLoss`."""
+        """Return the loss () of mean squared errors (B,) and mean squared displacements (B,).
+
+        A network with the capability `TrainsInCoordinates` trains without fields on a loss that has
+        this method.
+        """
         return self._weighted(error, size).mean()
 
     def _weighted(self, error: Tensor, size: Tensor) -> Tensor:
         return error / clamp_scale(size, self.floor) ** self.relative if self.relative else error
-
-    def skipped_work(self) -> list[str]:
-        """See `Loss`."""
-        return ["no finite-element evaluation in training: the loss has no residual term"]
 
 
 class RMSELoss(MSE):
