@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem import Load, Solution
+from dpl.fem.solvers import check_tol
 from dpl.inference import Answer, Simulator
 from dpl.system.threads import one_thread
 from dpl.viewer.drag_loads import LoadRequest, Patch
@@ -42,13 +43,15 @@ class ViewSettings:
     show_newton: bool = False
 
     def __post_init__(self) -> None:
-        """Check the quantity; the simulator checks the numbers.
+        """Check quantity and tolerance; the simulator checks the budget.
 
         Raises:
-            ValueError: The quantity is unknown.
+            ValueError: The quantity is unknown, or the tolerance is out of range.
         """
         if self.quantity not in QUANTITIES:
             raise ValueError(f"quantity = {self.quantity!r} must be {' or '.join(QUANTITIES)}")
+        if self.tol is not None:
+            check_tol(self.tol)
 
 
 class Frame(NamedTuple):

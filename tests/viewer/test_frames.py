@@ -185,6 +185,8 @@ def test_invalid_requests_raise_an_error(body):
         body.zero_load(young=1.0)
     with pytest.raises(ValueError, match="quantity = 'heat'"):
         ViewSettings(quantity="heat")
+    with pytest.raises(ValueError, match="tol = nan"):
+        ViewSettings(tol=float("nan"))
 
 
 def test_ranges_of_moduli_are_those_of_the_scene(make_scene, make_body):
