@@ -12,8 +12,9 @@ if TYPE_CHECKING:
     from dpl.fem.loads.forces import BodyForce, Traction
     from dpl.fem.loads.modal import ModalLoads
     from dpl.fem.loads.modal_basis import Modes, eigenmodes
+    from dpl.fem.materials.invariant_based import InvariantBasedMaterial
     from dpl.fem.materials.linear_elastic import LinearElastic
-    from dpl.fem.materials.material import InvariantBasedMaterial, Material, YoungPoissonMaterial
+    from dpl.fem.materials.material import Material, YoungPoissonMaterial
     from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
     from dpl.fem.materials.neo_hookean import (
         NeoHookeanIsoK2,

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -14,15 +14,15 @@ from torch import Tensor
 
 from dpl.fem.assembly.boundary_conditions import Support, assemble_constraints
 from dpl.fem.assembly.elements import QUADRATIC, basis_of, gradients
+from dpl.fem.assembly.equilibrium import EquilibriumCriterion
 from dpl.fem.assembly.kernels import Kernels
-from dpl.fem.assembly.tensor_assembly import TensorAssembly
-from dpl.fem.materials.material import InvariantBasedMaterial, Material
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.material import Material
 from dpl.fem.materials.tensors import volume_change
 from dpl.fem.mesh.generators import aspect_ratio, longest_side, near_origin
 from dpl.fem.mesh.regions import Region
 
 MAX_CLONES = 64  # bodies of other parameters that are kept
-FAINT = 1e-292  # largest force below which arithmetic rounds to an absolute precision [-]
 
 
 class Evaluation(NamedTuple):
@@ -51,7 +51,7 @@ class System(NamedTuple):
     valid: Tensor
 
 
-class Problem(TensorAssembly):
+class Problem(EquilibriumCriterion):
     """Static equilibrium of one body, see `TensorAssembly`; build it with `Problem.build`.
 
     `evaluate`, `linearise` and `update_strain_gap` say what its tensor operations say, without
@@ -232,86 +232,9 @@ class Problem(TensorAssembly):
         internal = self._with_springs(internal, displacement)
         return Evaluation(internal, torch.tensor(lowest, dtype=torch.float64))
 
-    def acting(self, force: Tensor) -> Tensor:
-        """Return a force (B, N, D) [-] at free degrees of freedom, where it has an effect.
-
-        At fixed ones the result is 0, or NaN where the force is not finite.
-        """
-        return force * self.free
-
     def relative_residual(self, displacement: Tensor, force: Tensor) -> Tensor:
         """Return ||R_free|| / ||f||, (B,) [-], see `relative_residual_of`."""
         return self.relative_residual_of(self.evaluate(displacement).internal, force)
-
-    def relative_residual_of(self, internal: Tensor, force: Tensor) -> Tensor:
-        """Return ||R_free|| / ||f||, (B,) [-], the criterion of equilibrium of all solvers.
-
-        ||f|| is the norm of the forces on free degrees of freedom. Forces on fixed ones do no
-        work and change no displacement, so they do not count. Where supports are moved, reactions
-        do work: ||f|| is then at least the norm of the reactions on the degrees of freedom whose
-        prescribed displacement is not 0. Reactions of supports that are not moved never count.
-
-        Norms are taken of multiples of the largest force, so that no square underflows or
-        overflows. Without forces the result is ||R_free|| itself. It is NaN for a force that is
-        not finite, also on fixed degrees of freedom, and for a force whose largest entry is below
-        `FAINT`, since its residual cannot be computed.
-
-        Source: OptiStruct 2020, Nonlinear Convergence Criteria (its relative error in loads counts
-        "nodal reactions due to specified displacements").
-
-        Args:
-            internal: f_int, (B, N, D) [-].
-            force: f, (B, N, D) [-].
-        """
-        return self._measured(internal, force)[0]
-
-    def is_equilibrium(
-        self, displacement: Tensor, internal: Tensor, force: Tensor, tol: float
-    ) -> Tensor:
-        """Return True where the relative residual is below tol or the roundoff bound, (B,)."""
-        ratio, scale = self._measured(internal, force)
-        return (ratio < tol) | (
-            (ratio < 1e-4) & (ratio * scale <= self.roundoff_bound(displacement))
-        )
-
-    def _measured(self, internal: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `relative_residual_of` and the ||f|| that it is relative to, (B,) [-]."""
-        loads = [self.acting(force).flatten(1)]
-        if self.moved_supports:
-            loads.append((internal * (self.prescribed != 0)).flatten(1))
-        unit = reduce(torch.maximum, [load.abs().amax(1) for load in loads])  # NaN if an entry is
-        unit = torch.where(unit == 0, 1.0, unit)
-        unit = torch.where((unit >= FAINT) & (unit < torch.inf), unit, torch.nan)
-        size = reduce(torch.maximum, [(load / unit[:, None]).norm(dim=1) for load in loads])
-        size = torch.where(size == 0, 1.0, size)
-        residual = self.acting(internal - force).flatten(1)
-        return (residual / unit[:, None]).norm(dim=1) / size, size * unit
-
-    def roundoff_bound(self, displacement: Tensor) -> Tensor:
-        """Return a bound of the rounding error of ||R_free||, (B,) [-].
-
-        The bound follows from magnitudes: every nodal force is a sum of products of displacement,
-        gradient, modulus and gradient. On slivers it exceeds any tolerance.
-        """
-        return self._rounding * displacement.abs().amax(dim=(1, 2))
-
-    @cached_property
-    def _rounding(self) -> float | Tensor:
-        size = self.dN.norm(dim=-1)  # (E or 1, Q, A)
-        moduli, each = self.material.lam + 2 * self.material.mu, 1.0
-        if isinstance(moduli, Tensor):
-            moduli, each = 1.0, moduli.flatten()
-        terms = moduli * (self.dV[..., None] * size * size.sum(-1, keepdim=True)).sum(1)
-        terms = terms.expand(len(self.cells), -1)[None, ..., None]
-        fixed = ~self.free.any(dim=1)
-        summed = self._sum_at_nodes(terms.expand(-1, -1, -1, self.shape[1]))[0, :, 0]
-        summed = torch.where(fixed, 0.0, summed)
-        return torch.finfo(torch.float64).eps * float(summed.norm()) * each
-
-    @cached_property
-    def moved_supports(self) -> bool:
-        """True if a prescribed displacement is not zero."""
-        return bool((self.prescribed != 0).any())
 
     def linearise(self, displacement: Tensor, gap: Any = None) -> System:
         """Return the linearised equilibrium at (1, N, D), without derivatives.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dpl.fem import Load, Newton, Solution, Status, evaluate_solution
-from dpl.fem.problem import FAINT
+from dpl.fem.assembly.equilibrium import FAINT
 from dpl.fem.solvers import check_tol, concatenate
 from dpl.inference.answer import MAX_OUT_OF_SPAN, ROUNDOFF, Answer, answer_like, summarise
 from dpl.inference.arguments import as_number, as_numbers, named_columns, per_load

@@ -6,7 +6,8 @@ Source: Nagtegaal, Parks, Rice (1974), CMAME 4; Simo, Taylor, Pister (1985), CMA
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.material import InvariantBasedMaterial, Material
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.material import Material
 from dpl.fem.materials.tensors import inverse_transpose, volume_change
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dpl.fem.assembly import element_loops
 from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.assembly.simd import SIMD_WIDTH
-from dpl.fem.materials.material import InvariantBasedMaterial
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 
 Array = NDArray[np.float64]
 NO_GAP = np.zeros((0, 0, 0, SIMD_WIDTH))

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit, types
 from numba.extending import NativeValue, models, overload, register_model, typeof_impl, unbox
 
-from dpl.fem.materials.material import InvariantBasedMaterial
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 
 
 class _LawType(types.Type):

@@ -5,13 +5,9 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
+    from dpl.fem.materials.invariant_based import InvariantBasedMaterial
     from dpl.fem.materials.linear_elastic import LinearElastic
-    from dpl.fem.materials.material import (
-        InvariantBasedMaterial,
-        Material,
-        Response,
-        YoungPoissonMaterial,
-    )
+    from dpl.fem.materials.material import Material, Response, YoungPoissonMaterial
     from dpl.fem.materials.mooney_rivlin import MooneyRivlinK2
     from dpl.fem.materials.neo_hookean import (
         NeoHookeanIsoK2,

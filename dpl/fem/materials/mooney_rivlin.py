@@ -5,8 +5,9 @@ from typing import Any
 
 from torch import Tensor
 
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.isochoric import isochoric_invariants, polynomial_derivatives
-from dpl.fem.materials.material import InvariantBasedMaterial, check_moduli
+from dpl.fem.materials.material import check_moduli
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.isochoric import isochoric_invariants, polynomial_derivatives
-from dpl.fem.materials.material import InvariantBasedMaterial, YoungPoissonMaterial
+from dpl.fem.materials.material import YoungPoissonMaterial
 from dpl.fem.materials.tensors import (
     trace,
     volume_change,

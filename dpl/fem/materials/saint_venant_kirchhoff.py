@@ -5,7 +5,8 @@ from typing import Any
 
 from torch import Tensor
 
-from dpl.fem.materials.material import InvariantBasedMaterial, YoungPoissonMaterial
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.material import YoungPoissonMaterial
 from dpl.fem.materials.tensors import (
     green_lagrange,
     trace,
