@@ -85,7 +85,7 @@ def test_every_law_answers_loads_on_every_kind_of_mesh(scene_of, material, mesh)
 
 
 @pytest.mark.parametrize("material", options("material"))
-def test_laws_share_young_and_parameters_at_rest(material):
+def test_laws_share_young_and_poisson_at_rest(material):
     law = instantiate(OmegaConf.load(CONF / "material" / f"{material}.yaml"))
     if not isinstance(law, YoungPoissonMaterial):  # moduli of its own: C10, C01, ...
         assert 0 < law.poisson_ratio < 0.5

@@ -501,7 +501,7 @@ def test_batch_is_solved_like_its_members(body, data):
     data=st.data(),
 )
 @counted
-def test_loads_with_their_own_parameters_ratio_are_solved_like_bodies_of_one(
+def test_loads_with_their_own_parameters_are_solved_like_bodies_of_one(
     body, kind, ratios, data
 ):
     some = Newton(
