@@ -14,7 +14,7 @@ from dpl.models.protocols import TrainsInCoordinates
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.scene import Sample, Scene
 from dpl.training.losses.loss import Loss, LossContext
-from dpl.training.losses.supervised import MSE
+from dpl.training.losses.supervised import SquaredErrorLoss
 from dpl.training.metrics import default_metrics
 
 SCALE_STREAM = 3  # random stream of the loads for the scales; samples use smaller numbers
@@ -124,8 +124,7 @@ class Surrogate(L.LightningModule):
 
     @property
     def _trains_in_coordinates(self) -> bool:
-        of_squares = hasattr(self.loss, "from_squared_errors")
-        return of_squares and isinstance(self.net, TrainsInCoordinates)
+        return isinstance(self.net, TrainsInCoordinates) and isinstance(self.loss, SquaredErrorLoss)
 
     def training_step(self, batch: Sample | ReducedSamples, batch_idx: int) -> Tensor:
         """Return the loss of a batch, ()."""
@@ -146,7 +145,8 @@ class Surrogate(L.LightningModule):
         error = (net.network(batch.inputs) - batch.targets).square().sum(dim=1)
         square = self.displacement_scale**2
         error = square * (error + batch.squared_error) / self.scene.problem.free.numel()
-        return cast(MSE, self.loss).from_squared_errors(error, square * batch.mean_square)
+        loss = cast(SquaredErrorLoss, self.loss)
+        return loss.from_squared_errors(error, square * batch.mean_square)
 
     def encode(self, samples: Sample, *, images: bool = False) -> ReducedDataset | None:
         """Return training samples (S, N, D) in reduced coordinates.

@@ -1,5 +1,7 @@
 """Supervised losses: squared errors of displacements."""
 
+from typing import Protocol, runtime_checkable
+
 from torch import Tensor
 
 from dpl.scene import Sample
@@ -7,6 +9,15 @@ from dpl.system.checks import check_range
 from dpl.training.losses.loss import Loss, LossContext, clamp_scale, squared_error
 
 SMALLEST_SQUARE = 1e-24  # added to squared errors: the root has no gradient at zero [-]
+
+
+@runtime_checkable
+class SquaredErrorLoss(Protocol):
+    """Loss of squared errors, on which a `TrainsInCoordinates` network trains without fields."""
+
+    def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
+        """Return the loss () of mean squared errors (B,) and mean squared displacements (B,)."""
+        ...
 
 
 class MSE(Loss):
@@ -35,11 +46,7 @@ class MSE(Loss):
         return self.from_squared_errors(squared_error(prediction, batch), size)
 
     def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
-        """Return the loss () of mean squared errors (B,) and mean squared displacements (B,).
-
-        A network with the capability `TrainsInCoordinates` trains without fields on a loss that has
-        this method.
-        """
+        """See `SquaredErrorLoss`."""
         return self._weighted(error, size).mean()
 
     def _weighted(self, error: Tensor, size: Tensor) -> Tensor:
@@ -54,5 +61,5 @@ class RMSELoss(MSE):
     """
 
     def from_squared_errors(self, error: Tensor, size: Tensor) -> Tensor:
-        """See `MSE`."""
+        """See `SquaredErrorLoss`."""
         return (self._weighted(error, size) + SMALLEST_SQUARE).sqrt().mean()
