@@ -1,4 +1,4 @@
-"""The version, and how more of the package is installed.
+"""The version, the folder of the configurations, and how more of the package is installed.
 
 Kept apart from the package's front, so that files that record the version can read it.
 """
@@ -8,6 +8,8 @@ from pathlib import Path
 __version__ = "0.1.0"
 
 ROOT = Path(__file__).parents[1]
+# in a wheel inside the package, in a checkout beside it
+CONF = next(filter(Path.is_dir, [ROOT / "dpl" / "conf"]), ROOT / "conf")
 
 
 def install(extra: str) -> str:

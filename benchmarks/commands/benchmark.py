@@ -5,17 +5,25 @@ cases=[generation], cases=[sizes]; errors of other meshes: cases=[discretisation
 displacements of the test loads: cases=[deflections] count=100.
 """
 
+from collections.abc import Sequence
+
 from omegaconf import DictConfig
 
 from benchmarks.commands import CONF
-from dpl import config
 from dpl.commands.cli import command
 
+KEYS = (
+    (Sequence[str], "linear"),
+    (Sequence[str] | None, "cases"),
+    (dict, "reference_codes"),
+    (int, "workers", 0, 1024),
+    (Sequence[int], "cells_across", 1, 1000),
+)
 
-@command("benchmark", conf=CONF)
+
+@command("benchmark", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
     """Time the chosen cases, print tables and write the rows to a folder."""
     from benchmarks import mechanics
 
-    config.check(cfg)
     mechanics.run(cfg)

@@ -17,7 +17,6 @@ def main(cfg: DictConfig) -> None:
     from dpl.evaluation.tables import show
     from dpl.models import Correctable
 
-    config.check(cfg)
     runs = config.load_runs(cfg.run)
     first, surrogate = next(iter(runs.values()))
     scene = surrogate.scene

@@ -8,7 +8,9 @@ is 1 if resources grow, the rate falls or processes are left over.
 import gc
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from omegaconf import DictConfig
 
@@ -16,11 +18,11 @@ from benchmarks.commands import CONF
 from dpl import config
 from dpl.commands import cli
 
+KEYS = ((float, "minutes", 1e-2, 1e6), (Sequence[Literal["training", "simulator"]], "workloads"))
 RECORDS = 360  # of each workload
-WORKLOADS = ("training", "simulator")
 
 
-@cli.command("soak", conf=CONF)
+@cli.command("soak", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
     """Train, simulate and record the resources of both."""
     # Worker processes import this file and need none of these imports.
@@ -28,13 +30,8 @@ def main(cfg: DictConfig) -> None:
     from dpl.evaluation import tables as table
     from dpl.inference import Simulator
 
-    config.check(cfg)
-    if not cfg.minutes > 0:
-        raise config.ConfigError(f"minutes = {cfg.minutes} must be above 0")
-    if not cfg.workloads or not set(cfg.workloads) <= set(WORKLOADS):
-        raise config.ConfigError(
-            f"workloads = {cfg.workloads} must be some of {', '.join(WORKLOADS)}"
-        )
+    if not cfg.workloads:
+        raise config.ConfigError("workloads = [] must contain training, simulator or both")
     folder, seconds = Path(cfg.folder), 60.0 * cfg.minutes
     rows: list = []
     wrong: list[str] = []

@@ -5,6 +5,7 @@ outcome is silently wrong.
 """
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -15,16 +16,16 @@ from dpl import config
 from dpl.commands.cli import command
 from dpl.evaluation import tables as table
 
+KEYS = ((Sequence[str] | None, "cases"),)
 COLOURS = {"as expected": "green", "reported": "yellow", "silently wrong": "bold red"}
 
 
-@command("stress", conf=CONF)
+@command("stress", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
     """Run the cases; rows are written after each case, the figure at the end."""
     from benchmarks import stress
     from benchmarks.stress.drawing import draw
 
-    config.check(cfg)
     try:
         cases = stress.select_cases(cfg.cases)
     except ValueError as error:

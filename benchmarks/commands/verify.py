@@ -4,6 +4,7 @@ cases=[cook,elastica] solves some of them; the page keeps the results of the oth
 """
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -12,14 +13,15 @@ from benchmarks.commands import CONF
 from dpl import config
 from dpl.commands.cli import command
 
+KEYS = ((Sequence[str] | None, "cases"),)
 
-@command("verify", conf=CONF)
+
+@command("verify", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
     """Solve the chosen cases and write the page of all cases."""
     from benchmarks import verification
     from dpl.system.threads import one_thread
 
-    config.check(cfg)
     cases = list(verification.CASES) if cfg.cases is None else cfg.cases
     if unknown := [name for name in cases if name not in verification.CASES]:
         known = ", ".join(verification.CASES)

@@ -8,7 +8,6 @@ import logging
 import math
 import os
 import sys
-import typing
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -20,51 +19,53 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from dpl.commands import dry_run, help_text
-from dpl.config import CONF, ConfigError
+from dpl.config import CONF, ConfigError, Keys
 from dpl.system.files import DataSetError
 from dpl.version import install
-
-R = typing.TypeVar("R")
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of the shell
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
 def command(
-    name: str, rehearse: Callable[[DictConfig], Any] | None = None, conf: Path = CONF
-) -> Callable[[Callable[[DictConfig], R]], Callable[[], R]]:
+    name: str,
+    rehearse: Callable[[DictConfig], Any] | None = None,
+    conf: Path = CONF,
+    keys: Keys = (),
+) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
     """Return a decorator that turns a function of a configuration into a command.
 
-    The configuration is `NAME.yaml`, composed by Hydra from the command line. All jobs are checked
-    before the first one starts. Invalid input ends the command with one line and status 2, Ctrl-C
-    with status 130.
+    All jobs are checked before the first one starts. Invalid input ends the command with one line
+    and status 2, Ctrl-C with status 130.
 
     Args:
-        name: Name of the configuration.
+        name: Name of the configuration, which Hydra composes from `NAME.yaml` and the command line.
         rehearse: Builds the objects of a job without computing, see `dpl.commands.dry_run.check`.
         conf: Folder of the configuration. Its `hydra.searchpath` may contain `${oc.env:DPL_CONF}`,
             the folder of the configurations of this package.
+        keys: Keys of the configuration besides `dpl.config.validation.KEYS`, in the same form.
     """
 
-    def decorate(task: Callable[[DictConfig], R]) -> Callable[[], R]:
-        @functools.wraps(task)
-        def guarded(cfg: DictConfig) -> R:
-            with readable_errors():
-                return task(cfg)
-
-        started = hydra.main(version_base="1.3", config_path=str(conf), config_name=name)(guarded)
+    def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
+        guarded = functools.wraps(task)(readable_errors()(task))
+        by_hydra = hydra.main(version_base="1.3", config_path=str(conf), config_name=name)(guarded)
 
         @functools.wraps(task)
-        def main() -> R:
+        def main() -> None:
             os.environ["DPL_CONF"] = str(CONF)
-            check_sweep(sys.argv[1:])
             with readable_errors():
-                if {"-h", "--help"} & set(sys.argv[1:]):
-                    about = sys.modules[task.__module__].__doc__ or ""
-                    print(help_text.page(name, conf, about, sys.argv[1:]))
-                    sys.exit()
-                dry_run.check(name, conf, sys.argv[1:], rehearse)
-            return started()
+                args = dry_run.arguments_of(sys.argv[1:], name, conf)
+                check_sweep(args.overrides)
+                if args.hydra_help or args.shell_completion or args.experimental_rerun:
+                    return by_hydra()
+                with dry_run.initialized(args) as engine:
+                    if args.help:
+                        about = sys.modules[task.__module__].__doc__ or ""
+                        return print(help_text.page(args.config_name, about, args.overrides))
+                    cfg = dry_run.check(args, rehearse, keys)
+                    if not args.cfg and args.info is None:
+                        return dry_run.run(engine, args, guarded, cfg)
+            return by_hydra()
 
         return main
 
@@ -85,8 +86,7 @@ def readable_errors() -> Iterator[None]:
             _drop_empty(Path(HydraConfig.get().runtime.output_dir))
         sys.exit(2)
     except (OSError, RuntimeError) as error:
-        cause = _failed_access(error)
-        if cause is None:
+        if (cause := _failed_access(error)) is None:
             raise
         print(f"error: {_describe(cause)}", file=sys.stderr)
         sys.exit(2)
@@ -96,10 +96,7 @@ def readable_errors() -> Iterator[None]:
 
 
 def _failed_access(error: BaseException | None) -> OSError | None:
-    """Return the failed file access that caused an error, None for other causes.
-
-    PyTorch's archive writer and the loggers raise other errors after it.
-    """
+    """Return the failed file access after which PyTorch or a logger raised another error."""
     while error is not None:
         if isinstance(error, OSError) and error.errno is not None:
             return error
@@ -109,49 +106,38 @@ def _failed_access(error: BaseException | None) -> OSError | None:
 
 def _describe(error: OSError) -> str:
     """Return one line with the failed file access and the remedy."""
-    where = f" for {error.filename}" if error.filename else ""
+    problem, remedy = error.strerror, "choose another folder or repair this one"
     if error.errno in FULL:
-        problem, remedy = f"no space left{where}", "free some space"
+        problem, remedy = "no space left", "free some space"
     elif error.errno in FORBIDDEN:
-        problem = f"no permission to write{where}"
+        problem = "no permission to write"
         remedy = "choose another folder or change its permissions"
-    else:
-        problem = f"{error.strerror}{where}"
-        remedy = "choose another folder or repair this one"
-    return f"{problem}; existing files are intact: {remedy} and run the same command again"
+    where = f" for {error.filename}" if error.filename else ""
+    return f"{problem}{where}; existing files are intact: {remedy} and run the same command again"
 
 
 def _drop_empty(folder: Path) -> None:
     """Remove the empty folders that Hydra created for a run that did not start."""
-    here = Path.cwd()
     with contextlib.suppress(OSError):  # not empty
-        while here in folder.parents:
+        while Path.cwd() in folder.parents:
             folder.rmdir()
             folder = folder.parent
 
 
-def check_sweep(arguments: Sequence[str]) -> None:
-    """Exit with one line and status 2 if a command line needs Optuna and it is not installed.
-
-    Hydra would list the installed sweepers without saying how to install this one.
-    """
+def check_sweep(overrides: Sequence[str]) -> None:
+    """Raise a `ConfigError` with the remedy if a command line needs Optuna and it is missing."""
     needs = ("hparams_search=", "+hparams_search=", "hydra/sweeper=optuna")
-    if not any(argument.startswith(needs) for argument in arguments):
+    if not any(one.startswith(needs) for one in overrides):
         return
     try:
         importlib.import_module("hydra_plugins.hydra_optuna_sweeper._impl")
     except ImportError as error:
         reason = f"Optuna cannot be used ({error}): {install('sweep')}"
-        print(f"error: hparams_search: {reason}", file=sys.stderr)
-        sys.exit(2)
+        raise ConfigError(f"hparams_search: {reason}") from error
 
 
 def apply_extras(cfg: DictConfig) -> None:
-    """Apply the group `extras`: print the configuration, ask for tags, silence warnings.
-
-    Raises:
-        ConfigError: A run without tags, and `extras.enforce_tags`.
-    """
+    """Apply the group `extras`: print the configuration, ask for tags, silence warnings."""
     extras = cfg.get("extras") or {}
     if extras.get("ignore_warnings"):
         warnings.filterwarnings("ignore")
@@ -197,32 +183,17 @@ def check_trainer(trainer: Any, cfg: DictConfig) -> None:
         )
 
 
-def failed(error: Exception) -> float:
-    """Print an error and return infinity to a sweep, which continues with its next run.
-
-    Raises:
-        ConfigError: Outside a sweep.
-    """
-    if HydraConfig.get().mode != RunMode.MULTIRUN:
-        raise ConfigError(str(error)) from error
-    print(f"error: {error}", file=sys.stderr)
-    return math.inf
-
-
 def best_error(trainer: Any) -> float | None:
     """Return the smallest validation e_mean of a training [-], which a search minimises.
 
-    It is infinite if the training diverged before its first validation, None without validation.
-
-    Raises:
-        ConfigError: A search has no validation.
+    It is infinite if the training diverged before its first validation, None without validation,
+    which is a `ConfigError` in a search.
     """
     for kept in trainer.checkpoint_callbacks:
         score = getattr(kept, "best_model_score", None)
         if getattr(kept, "monitor", None) == "val/e_mean" and score is not None:
             return float(score) if math.isfinite(score) else math.inf
-    hydra_now = HydraConfig.get()
-    if hydra_now.mode == RunMode.MULTIRUN and "direction" in hydra_now.sweeper:
+    if HydraConfig.get().mode == RunMode.MULTIRUN and "direction" in HydraConfig.get().sweeper:
         raise ConfigError(
             "trainer.check_val_every_n_epoch: no epoch was validated, and the search has no value "
             "to minimise; validate more often or train longer"

@@ -11,8 +11,5 @@ from dpl.commands.cli import command
 @command("evaluate")
 def main(cfg: DictConfig) -> None:
     """Print a table of all evaluated runs below a folder."""
-    config.check(cfg)
-    try:
+    with config.error_in("run", FileNotFoundError):
         evaluation.compare(Path(cfg.run))
-    except FileNotFoundError as error:
-        raise config.ConfigError(f"run: {error}") from error

@@ -20,7 +20,6 @@ def main(cfg: DictConfig) -> None:
     """Measure all solvers on all loads; write rows, machine and figure."""
     from dpl.evaluation import newton_starts
 
-    config.check(cfg)
     runs = config.load_runs(cfg.run, cfg.networks, trust=cfg.trust)
     scene = next(iter(runs.values()))[1].scene
     networks = {name: surrogate.predict for name, (_, surrogate) in runs.items()}
@@ -33,7 +32,7 @@ def main(cfg: DictConfig) -> None:
     with Progress() as progress:
         bar = progress.add_task("loads", total=sum(len(sets[name].force) for _, name in tasks))
         for tol, name in tasks:
-            budget = cfg.budget if name.endswith("times") else None
+            budget = cfg.max_far_iterations if name.endswith("times") else None
             solvers = newton_starts.solvers_of(scene, networks, tol, max_total_iter=budget)
             known = {(t.solver, t.network): t for t in trials if (t.tol, t.loads) == (tol, name)}
             count = len(sets[name].force)

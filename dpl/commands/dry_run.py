@@ -4,16 +4,16 @@ import contextlib
 import itertools
 import logging
 import tempfile
-import typing
 from argparse import Namespace
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_config_search_path, get_args_parser
+from hydra._internal.utils import create_config_search_path, get_args_parser, run_and_report
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.utils import configure_log
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -27,99 +27,109 @@ REMOTE = "submitit"  # launchers on other machines, whose hardware may differ
 SAME = ("seed", "run", "folder")  # keys on which the validity of a job does not depend
 
 
-def check(
-    name: str,
-    conf: Path,
-    arguments: Sequence[str],
-    rehearse: Callable[[DictConfig], Any] | None = None,
-) -> None:
-    """Compose and check every job of a command line.
+def arguments_of(line: Sequence[str], name: str, conf: Path) -> Namespace:
+    """Return the flags and overrides of a command line.
 
     Args:
-        name: Name of the command's configuration.
-        conf: Folder of the configurations.
-        arguments: Command line without the name of the program.
-        rehearse: Builds the objects of a job without computing. It is called for the jobs of a
-            sweep on this machine; a single job builds its objects when it runs.
-
-    Raises:
-        ConfigError: An override, a job or its folder is invalid.
-    """
-    args = arguments_of(arguments)
-    if args.help or args.hydra_help or args.shell_completion or args.experimental_rerun:
-        return
-    with initialized(args.config_path or conf, args.config_dir):
-        first, jobs = _jobs(args.config_name or name, args.overrides, args.multirun)
-        if args.cfg or args.info is not None:
-            return
-        sweep = jobs is not None
-        place = _folder(first, "sweep" if sweep else "run")
-        every = [_job(cfg) for cfg in jobs or [first]]
-    for cfg in every:
-        config.check(cfg)
-    if sweep and rehearse is not None and REMOTE not in str(first.hydra.launcher):
-        logging.disable(logging.INFO)  # trainers describe the machine again in each job
-        try:
-            for cfg in _different(every):
-                rehearse(cfg)
-        finally:
-            logging.disable(logging.NOTSET)
-    try_folder(place)
-
-
-def arguments_of(line: Sequence[str]) -> Namespace:
-    """Return the flags and overrides of a command line.
+        line: The command line without the name of the program.
+        name: Name of the command's configuration; `--config-name` replaces it.
+        conf: Folder of the configurations; `--config-path` replaces it.
 
     Raises:
         ConfigError: A flag does not exist.
     """
+
+    def refuse(message: str) -> NoReturn:
+        raise ConfigError(
+            f"{message}; flags such as -m stand before or after all KEY=VALUE, see --help"
+        )
+
     parser = get_args_parser()
-    parser.error = _unreadable
+    parser.error = refuse
+    parser.set_defaults(config_name=name, config_path=str(conf))
     return parser.parse_args(line)
 
 
-def _unreadable(message: str) -> NoReturn:
-    raise ConfigError(
-        f"{message}; flags such as -m stand before or after all KEY=VALUE, see --help"
-    )
-
-
 @contextlib.contextmanager
-def initialized(conf: str | Path, config_dir: str | None) -> Iterator[None]:
-    """Let Hydra search a folder of configurations and the folder of `--config-dir`.
-
-    Raises:
-        ConfigError: The second folder does not exist.
-    """
-    search = create_config_search_path(str(Path(conf).absolute()))
-    if config_dir is not None:
-        own = Path(config_dir).absolute()
+def initialized(args: Namespace) -> Iterator[Hydra]:
+    """Let Hydra search the folder of the configurations and that of `--config-dir`."""
+    search = create_config_search_path(str(Path(args.config_path).absolute()))
+    if args.config_dir is not None:
+        own = Path(args.config_dir).absolute()
         if not own.is_dir():
-            raise ConfigError(f"--config-dir = {config_dir} must be an existing folder")
+            raise ConfigError(f"--config-dir = {args.config_dir} must be an existing folder")
         search.prepend("command-line", f"file://{own}", SearchPathQuery(provider="schema"))
-    Hydra.create_main_hydra2("check", search)
     try:
-        yield
+        yield Hydra.create_main_hydra2(args.config_name, search)
     finally:
         GlobalHydra.instance().clear()
 
 
-def _jobs(
-    name: str, lines: Sequence[str], multirun: bool
-) -> tuple[DictConfig, Iterable[DictConfig] | None]:
+def check(
+    args: Namespace,
+    rehearse: Callable[[DictConfig], Any] | None = None,
+    keys: config.Keys = (),
+) -> DictConfig | None:
+    """Compose and check every job of a command line.
+
+    Args:
+        args: Flags and overrides.
+        rehearse: Builds the objects of a job without computing. It is called for the jobs of a
+            sweep on this machine; a single job builds its objects when it runs.
+        keys: Keys of the command, see `dpl.config.validation.check`.
+
+    Returns:
+        The configuration of a single job with the node `hydra`, None for a sweep.
+
+    Raises:
+        ConfigError: An override, a job or its folder is invalid.
+    """
+    first, jobs = _jobs(args)
+    if args.cfg or args.info is not None:
+        return None
+    place = _folder(first, "run" if jobs is None else "sweep")
+    every = [_job(cfg) for cfg in ([first] if jobs is None else jobs)]
+    for cfg in every:
+        config.check(cfg, keys=keys)
+    if jobs is not None and rehearse is not None and REMOTE not in str(first.hydra.launcher):
+        different = {
+            str({k: v for k, v in OmegaConf.to_container(cfg).items() if k not in SAME}): cfg
+            for cfg in every
+        }
+        logging.disable(logging.INFO)  # trainers describe the machine again in each job
+        try:
+            for cfg in different.values():
+                rehearse(cfg)
+        finally:
+            logging.disable(logging.NOTSET)
+    try_folder(place)
+    return first if jobs is None else None
+
+
+def run(
+    engine: Hydra, args: Namespace, task: Callable[[DictConfig], Any], cfg: DictConfig | None
+) -> None:
+    """Run the jobs of a command line; `cfg` is the result of `check`."""
+    if cfg is None:
+        lines = [*args.overrides, "hydra.mode=MULTIRUN"]
+        run_and_report(lambda: engine.multirun(args.config_name, task, lines))
+    else:
+        configure_log(cfg.hydra.hydra_logging, cfg.hydra.verbose)
+        engine.compose_config = lambda **_: cfg
+        run_and_report(lambda: engine.run(args.config_name, task, args.overrides))
+
+
+def _jobs(args: Namespace) -> tuple[DictConfig, list[DictConfig] | None]:
     """Return the configuration without swept keys and the configurations of the jobs of a sweep.
 
     The jobs of a search are not known in advance. They are represented by one job for each end or
     option of each range, with the first values of the other ranges.
-
-    Raises:
-        ConfigError: An override is invalid, or a sweep has no value.
     """
-    every = [overrides.parsed(line) for line in lines]
+    every = [overrides.parsed(line) for line in args.overrides]
     fixed = [one.input_line for one in every if not one.is_sweep_override()]
     swept = [one for one in every if one.is_sweep_override()]
-    first = overrides.composed(name, fixed)
-    if not multirun and first.hydra.mode != RunMode.MULTIRUN:
+    first = overrides.composed(args.config_name, fixed)
+    if not args.multirun and first.hydra.mode != RunMode.MULTIRUN:
         if swept:
             raise ConfigError(
                 f"{swept[0].input_line} names several values; add -m to run them one after the "
@@ -132,7 +142,7 @@ def _jobs(
     search = first.hydra.sweeper._target_ != BASIC
     values = [overrides.values(one, search=search) for one in swept]
     chosen = _one_by_one(values) if search else itertools.product(*values)
-    return first, [overrides.composed(name, [*fixed, *job]) for job in chosen]
+    return first, [overrides.composed(args.config_name, [*fixed, *job]) for job in chosen]
 
 
 def _one_by_one(values: list[list[str]]) -> Iterator[tuple[str, ...]]:
@@ -152,23 +162,8 @@ def _job(cfg: DictConfig) -> DictConfig:
     return job
 
 
-def _different(jobs: Iterable[DictConfig]) -> Iterator[DictConfig]:
-    """Yield the jobs that differ in more than seed and folder."""
-    seen = set()
-    for job in jobs:
-        written = typing.cast("dict[str, Any]", OmegaConf.to_container(job, resolve=False))
-        content = repr([(key, value) for key, value in written.items() if key not in SAME])
-        if content not in seen:
-            yield job
-        seen.add(content)
-
-
 def _folder(cfg: DictConfig, mode: str) -> Path:
-    """Return the folder of a run or a sweep.
-
-    Raises:
-        ConfigError: `run` is not a text.
-    """
+    """Return the folder of a run or a sweep, which depends on `run`."""
     try:
         return Path(cfg.hydra[mode].dir)
     except OmegaConfBaseException:
@@ -177,11 +172,7 @@ def _folder(cfg: DictConfig, mode: str) -> Path:
 
 
 def try_folder(folder: Path) -> None:
-    """Create a folder and a file in it, and remove both again.
-
-    Raises:
-        ConfigError: The folder cannot be written.
-    """
+    """Create a folder and a file in it, and remove both; raise a `ConfigError` if that fails."""
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -192,6 +183,5 @@ def try_folder(folder: Path) -> None:
             f"run = {folder} cannot be written: {error.strerror}; name another folder"
         ) from error
     finally:
-        for path in new:
-            if path.is_dir():
-                path.rmdir()
+        for path in filter(Path.is_dir, new):
+            path.rmdir()

@@ -11,7 +11,6 @@ from dpl.commands.cli import command
 @command("evaluate")
 def main(cfg: DictConfig) -> None:
     """Print and write the errors and run times of a surrogate on its test set."""
-    config.check(cfg)
     trained, surrogate = config.load_run(cfg.run, trust=cfg.trust)
     test = config.load_data(trained, surrogate.scene).samples("test")
     evaluation.evaluate(surrogate, test, Path(cfg.run), tol=cfg.tol)

@@ -9,35 +9,27 @@ import time
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from omegaconf import DictConfig
 
-from dpl import config
+import dpl
+from dpl import config, export
 from dpl.commands.cli import command
 from dpl.evaluation import tables
 from dpl.system.files import atomic_write
 from dpl.version import install
 
-if TYPE_CHECKING:
-    from dpl.export.comparison import BatchLatency, OutputDifference
-    from dpl.export.onnx_graph import ExportGraph, OnnxSession
-    from dpl.training import Surrogate
-
-OUTPUTS = ("model", "results")
 RESULT_STREAM = (0, 12)  # random stream of the loads in results
 
 
 @command("export")
 def main(cfg: DictConfig) -> None:
-    """Write the parts that `parts` names."""
+    """Write the parts that `outputs` names."""
     from dpl.export.onnx_graph import missing_packages
 
-    config.check(cfg)
-    if unknown := [part for part in cfg.outputs if part not in OUTPUTS]:
-        raise config.ConfigError(f"outputs = {unknown[0]!r} must be one of {', '.join(OUTPUTS)}")
     if not cfg.outputs:
-        raise config.ConfigError(f"outputs = [] must contain one of {', '.join(OUTPUTS)}")
+        raise config.ConfigError("outputs = [] must contain model, results or both")
     if "results" in cfg.outputs and cfg.count < 1:
         raise config.ConfigError(f"count = {cfg.count} must be 1 or more; or use outputs=[model]")
     if "model" in cfg.outputs and (absent := missing_packages()):
@@ -52,49 +44,35 @@ def main(cfg: DictConfig) -> None:
         export_results(cfg, surrogate, folder / "results")
 
 
-def export_model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
+def export_model(cfg: DictConfig, surrogate: "dpl.Surrogate", folder: Path) -> None:
     """Write the graph and its folder, compare the graph with torch, and measure latencies."""
-    from dpl.export import (
-        ExportGraph,
-        OnnxSession,
-        comparison,
-        export_onnx,
-        verify_folder,
-        write_folder,
-    )
     from dpl.export.metadata import describe
     from dpl.export.reference import solve_reference
 
-    graph, path = ExportGraph(surrogate), folder / "model.onnx"
+    graph, path = export.ExportGraph(surrogate), folder / "model.onnx"
     start = time.perf_counter()
-    try:
-        export_onnx(graph, path)
-    except ValueError as error:
-        raise config.ConfigError(f"run: {error}") from error
+    with config.error_in("run"):
+        export.export_onnx(graph, path)
     seconds = time.perf_counter() - start
-    session = OnnxSession(path)
-    loads = comparison.sample_check_loads(surrogate.scene, cfg.samples)
-    differences = comparison.compare_outputs(graph, session, loads)
     reference = solve_reference(graph)
     meta = describe(graph, path, reference, tol=cfg.tol, errors=_test_errors(Path(cfg.run)))
-    write_folder(folder, surrogate, reference, meta)
-    verify_folder(folder, surrogate, reference, meta)
-    reference_error = _reference_error(folder, graph, session)
-    largest = max(reference_error, *(row.max_error for row in differences))
-    times = comparison.measure_latency(graph, session, loads, calls=cfg.repeats)
-    report = {
-        "network": type(surrogate.net).__name__,
-        "passed": largest <= cfg.tol,
-        "tolerance": cfg.tol,
-        "largest_error": largest,
-        "reference_error": reference_error,
-        **_report(cfg, surrogate, path, differences, times),
-        "export_seconds": round(seconds, 2),
+    export.write_folder(folder, surrogate, reference, meta)
+    export.verify_folder(folder, surrogate, reference, meta)
+    report = _report(cfg, graph, export.OnnxSession(path), path) | {
+        "export_seconds": round(seconds, 2)
     }
     with atomic_write(folder / "report.json") as file:
         file.write((json.dumps(report, indent=1) + "\n").encode())
+    largest = report["largest_error"]
     if not report["passed"]:
-        _remove_model(path, largest, cfg.tol)
+        for part in folder.glob("model.onnx*"):
+            part.unlink()
+        print(
+            f"error: ONNX and torch differ by {largest:.2g}, more than tol = {cfg.tol:g}; {path} "
+            "was removed",
+            file=sys.stderr,
+        )
+        sys.exit(1)
     if graph.has_local_output:
         print(
             "output 'local' marks loads whose linear solution has a projection error above "
@@ -105,54 +83,43 @@ def export_model(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
     print(f"largest difference {largest:.1e}; {path}, {megabytes:.3g} MB, {seconds:.1f} s to write")
 
 
-def _remove_model(path: Path, difference: float, tol: float) -> None:
-    """Remove the ONNX files, print why, and exit with status 1."""
-    for part in path.parent.glob("model.onnx*"):
-        part.unlink()
-    print(
-        f"error: ONNX and torch differ by {difference:.2g}, more than tol = {tol:g}; {path} was "
-        "removed",
-        file=sys.stderr,
-    )
-    sys.exit(1)
-
-
-def _reference_error(folder: Path, graph: "ExportGraph", session: "OnnxSession") -> float:
-    """Return the relative difference of ONNX and the reference displacement on disk [-]."""
-    from dpl.export import comparison, read_reference
-
-    stored = read_reference(folder)
-    found = session(**{name: stored[name] for name in graph.inputs})
-    return float(comparison.relative_differences(found.displacement, stored["displacement"]).max())
-
-
 def _report(
-    cfg: DictConfig,
-    surrogate: "Surrogate",
-    path: Path,
-    differences: list["OutputDifference"],
-    times: list["BatchLatency"],
+    cfg: DictConfig, graph: "export.ExportGraph", session: "export.OnnxSession", path: Path
 ) -> dict[str, Any]:
-    """Print differences and latencies, and return them with versions and file size."""
+    """Measure and print differences and latencies; return them with versions and file size."""
     from dpl.evaluation import timing
-    from dpl.export.comparison import CHECK_STREAM
-    from dpl.export.onnx_graph import PACKAGES, onnx_opset
-    from dpl.inference import Simulator
+    from dpl.export import comparison
+    from dpl.export.onnx_graph import PACKAGES
 
-    sample = surrogate.scene.loads.sample(CHECK_STREAM, range(cfg.samples))
-    latencies = timing.latencies(Simulator(surrogate), sample)
+    surrogate = graph.surrogate
+    loads = comparison.sample_check_loads(surrogate.scene, cfg.samples)
+    differences = comparison.compare_outputs(graph, session, loads)
+    stored = export.read_reference(path.parent)
+    found = session(**{name: stored[name] for name in graph.inputs})
+    distance = comparison.relative_differences(found.displacement, stored["displacement"])
+    reference_error = float(distance.max())
+    largest = max(reference_error, *(row.max_error for row in differences))
+    times = comparison.measure_latency(graph, session, loads, calls=cfg.repeats)
+    sample = surrogate.scene.loads.sample(comparison.CHECK_STREAM, range(cfg.samples))
+    latencies = timing.latencies(dpl.Simulator(surrogate), sample)
     tables.show(differences, "ONNX against torch")
     tables.show(times, "network, loads in the training range that are not local [ms], 1 thread")
     print(timing.describe(latencies))
     rows = [asdict(row) for row in differences]
     return {
-        "loads": [{key: _json_number(value) for key, value in row.items()} for row in rows],
+        "network": type(surrogate.net).__name__,
+        "passed": largest <= cfg.tol,
+        "tolerance": cfg.tol,
+        "largest_error": largest,
+        "reference_error": reference_error,
+        # None instead of NaN, which JSON lacks
+        "loads": [{k: v if v == v else None for k, v in row.items()} for row in rows],
         "milliseconds": [asdict(row) for row in times],
         "latency": {name: asdict(one) for name, one in latencies.items()},
         "threads": 1,
         "repeats": cfg.repeats,
         "bytes": sum(file.stat().st_size for file in path.parent.glob("model.onnx*")),
-        "opset": onnx_opset(path),
+        "opset": export.onnx_opset(path),
         "machine": tables.machine(),
         "versions": {name: version(name) for name in ("torch", *PACKAGES)},
     }
@@ -173,21 +140,13 @@ def _test_errors(folder: Path) -> dict[str, float] | None:
         ) from error
 
 
-def _json_number(value: Any) -> Any:
-    """Return a value for JSON, with None instead of NaN."""
-    return value if value == value else None
-
-
-def export_results(cfg: DictConfig, surrogate: "Surrogate", folder: Path) -> None:
+def export_results(cfg: DictConfig, surrogate: "dpl.Surrogate", folder: Path) -> None:
     """Write predictions for random loads as files for ParaView."""
-    from dpl.export import write_results
-
     for old in folder.glob("results_[0-9]*.vtu"):  # an earlier series may have been longer
         old.unlink()
     load = surrogate.scene.loads.sample(RESULT_STREAM, range(cfg.count))
-    rows, files = write_results(
-        surrogate, load, folder / "results", solve_reference=cfg.solve_reference
-    )
+    path = folder / "results"
+    rows, files = export.write_results(surrogate, load, path, solve_reference=cfg.solve_reference)
     tables.write(rows, folder / "results.csv")
     tables.show(rows, "predictions of the network")
     print(f"for ParaView: {' or '.join(map(str, files))}")

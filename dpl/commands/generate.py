@@ -1,28 +1,16 @@
 """Generate, verify or repair a data set: python scripts/generate.py data.train=4000."""
 
 import sys
-from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
+import dpl
 from dpl import config
 from dpl.commands.cli import command
 
-if TYPE_CHECKING:
-    from dpl.data import DataSet
-    from dpl.scene import Scene
 
-ACTIONS = ("generate", "verify", "repair")
-
-
-def parts(cfg: DictConfig) -> tuple["Scene", "DataSet"]:
-    """Return the scene and the data set of a configuration without solving or writing.
-
-    Raises:
-        ConfigError: One of them cannot be built.
-    """
-    if cfg.action not in ACTIONS:
-        raise config.ConfigError(f"action = {cfg.action!r} must be one of {', '.join(ACTIONS)}")
+def parts(cfg: DictConfig) -> tuple["dpl.Scene", "dpl.DataSet"]:
+    """Return the scene and the data set of a configuration without solving or writing."""
     scene = config.build_scene(cfg)
     return scene, config.instantiate(cfg, "data", scene=scene)
 
@@ -30,7 +18,6 @@ def parts(cfg: DictConfig) -> tuple["Scene", "DataSet"]:
 @command("generate", rehearse=parts)
 def main(cfg: DictConfig) -> None:
     """Generate the missing loads of a data set, or verify or repair it."""
-    config.check(cfg)
     scene, data = parts(cfg)
     config.show_skipped_work(scene, data)
     if cfg.action == "verify":

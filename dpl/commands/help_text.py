@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
-from dpl.commands import dry_run, overrides
+from dpl.commands import overrides
 from dpl.config import comments
 from dpl.config.validation import HYDRA_KEYS
 
@@ -22,74 +22,61 @@ FLAGS = {
 }
 
 
-def page(name: str, conf: Path, about: str, arguments: Sequence[str]) -> str:
-    """Return the help of a command line.
+def page(name: str, about: str, lines: Sequence[str]) -> str:
+    """Return the help of a command, see `dpl.commands.overrides` for Hydra's state.
 
     Args:
         name: Name of the command's configuration.
-        conf: Folder of the configurations.
         about: Docstring of the command's module.
-        arguments: Command line. The keys are those of the chosen options.
+        lines: Overrides. The keys are those of the chosen options.
 
     Raises:
         ConfigError: An override cannot be applied.
     """
-    args = dry_run.arguments_of(arguments)
-    with dry_run.initialized(args.config_path or conf, args.config_dir):
-        single = [one for one in args.overrides if not overrides.parsed(one).is_sweep_override()]
-        cfg = overrides.composed(name, single)
-        chosen = {str(group): cfg.hydra.runtime.choices[group] for group in _groups(cfg)}
-        options = {group: overrides.options(group) for group in chosen}
-        files = _files(name, chosen, overrides.folders())
-    told = {row.key: row.comment for file in files for row in file.rows if row.comment}
-    groups = {group: text for file in files for group, text in file.groups.items()}
-    lines = about.splitlines()
+    single = [line for line in lines if not overrides.parsed(line).is_sweep_override()]
+    cfg = overrides.composed(name, single)
+    heads, told = _comments(name, single, cfg)
+    chosen = {k: v for k, v in cfg.hydra.runtime.choices.items() if not k.startswith("hydra")}
+    text = about.splitlines()
     if chosen:
-        lines += ["", "GROUP=OPTION chooses an option of a group; * is chosen:", ""]
+        text += ["", "GROUP=OPTION chooses an option of a group; * is chosen:", ""]
     for group, option in sorted(chosen.items()):
-        names = ", ".join(f"{one}*" if one == option else one for one in options[group])
-        lines += _entry(group, f"{groups[group]}: {names}" if group in groups else names)
-    lines += ["", "KEY=VALUE changes a value, +KEY=VALUE adds one, ~KEY removes one:", ""]
-    heads = {file.path.parent.as_posix(): file for file in files}
+        known = overrides.options(name, group)
+        names = ", ".join(f"{one}*" if one == option else one for one in known)
+        comment = told.get(f"defaults.{group}")
+        text += _entry(group, f"{comment}: {names}" if comment else names)
+    text += ["", "KEY=VALUE changes a value, +KEY=VALUE adds one, ~KEY removes one:", ""]
     values = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=False))
     del values["hydra"]
     for key, value in sorted(values.items(), key=lambda item: item[0] in heads):
         if key in heads:
             call = f" ({value['_target_']})" if "_target_" in value else ""
-            lines += ["", *_wrapped(f"{key}={chosen[key]}{call}: {heads[key].about}", "", "  ")]
+            text += ["", *_wrapped(f"{key}={chosen[key]}{call}: {heads[key]}", "", "  ")]
         for place, one in _leaves(key, value):
             owner = place.removesuffix("._target_")
-            lines += _entry(f"{place} = {one}", told.get(place) or told.get(owner, ""))
-    lines += ["", "Flags:", ""]
+            text += _entry(f"{place} = {one}", told.get(place) or told.get(owner, ""))
+    text += ["", "Flags:", ""]
     for flag, does in FLAGS.items():
-        lines += _entry(flag, does)
-    return "\n".join(lines)
+        text += _entry(flag, does)
+    return "\n".join(text)
 
 
-def _groups(cfg: Any) -> list[str]:
-    """Return the groups of a command, without those of Hydra."""
-    return [group for group in cfg.hydra.runtime.choices if not group.startswith("hydra")]
-
-
-def _files(name: str, chosen: dict[str, Any], folders: Sequence[Path]) -> list[comments.ConfigFile]:
-    """Return the files that a configuration is composed of; later ones overwrite earlier ones."""
-    found: list[comments.ConfigFile] = []
-
-    def add(path: str) -> None:
-        folder = next((one for one in folders if (one / f"{path}.yaml").is_file()), None)
-        if folder is None:
-            return
-        file = comments.read(folder / f"{path}.yaml", folder)
-        for default in file.defaults:
-            if ":" not in default and default != "_self_":
-                add((Path(path).parent / default).as_posix())
-        found.append(file)
-
-    add(name)
-    for group, options in chosen.items():
-        for option in options if isinstance(options, list) else [options]:
-            add(f"{group}/{option}")
-    return found
+def _comments(
+    name: str, lines: list[str], cfg: DictConfig
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the comments of the chosen options by group, and those of keys."""
+    sources = cfg.hydra.runtime.config_sources
+    folders = [Path(one.path) for one in sources if one.schema == "file"]
+    heads: dict[str, str] = {}
+    told: dict[str, str] = {}
+    for part in overrides.defaults(name, lines):  # later ones overwrite earlier ones
+        paths = (folder / f"{part.config_path}.yaml" for folder in folders)
+        if path := next(filter(Path.is_file, paths), None):
+            head, found = comments.read(path.read_text(encoding="utf-8"))
+            prefix = f"{part.package}." if part.package else ""
+            heads[str(part.config_path).rpartition("/")[0]] = head
+            told |= {prefix + key: comment for key, comment in found.items()}
+    return heads, told
 
 
 def _leaves(path: str, node: Any) -> Iterator[tuple[str, str]]:
@@ -105,14 +92,12 @@ def _leaves(path: str, node: Any) -> Iterator[tuple[str, str]]:
 def _text(value: Any) -> str:
     """Return a value as written on the command line."""
     if isinstance(value, dict):
-        inner = (f"{key}: {_text(one)}" for key, one in value.items())
-        return f"{{{', '.join(inner)}}}"
+        return f"{{{', '.join(f'{key}: {_text(one)}' for key, one in value.items())}}}"
     if isinstance(value, list):
         return f"[{', '.join(map(_text, value))}]"
-    words = {None: "null", True: "true", False: "false", "": "''"}
-    if value is None or isinstance(value, bool | str):
-        return words.get(value, str(value))
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:g}"
+    return {"None": "null", "True": "true", "False": "false", "": "''"}.get(str(value), str(value))
 
 
 def _entry(left: str, comment: str) -> list[str]:

@@ -1,21 +1,22 @@
 """Parse and compose the overrides of a command line; explain invalid ones in one line.
 
 Hydra explains an invalid override in several lines, with advice that the next check may refuse.
-This module raises one `ConfigError` instead. All functions need an initialised Hydra
-(`hydra.initialize_config_dir`).
+All functions need an initialised Hydra (`dpl.commands.dry_run.initialized`).
 """
 
 import contextlib
+import difflib
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.default_element import ResultDefault
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -26,12 +27,23 @@ EXTRAS = {"hydra/launcher": "launch", "hydra/sweeper": "sweep"}  # groups with o
 REFUSED = (HydraException, OmegaConfBaseException, ValueError, AssertionError, TypeError)
 
 
-def parsed(line: str) -> Override:
-    """Return an override.
+def _loader() -> Any:
+    return GlobalHydra.instance().config_loader()
 
-    Raises:
-        ConfigError: It cannot be parsed.
-    """
+
+def options(name: str, group: str) -> list[str]:
+    """Return the options of a group of a command; none if the group does not exist."""
+    path = group.partition("@")[0]
+    return sorted(_loader().get_group_options(path, ObjectType.CONFIG, config_name=name))
+
+
+def defaults(name: str, lines: list[str]) -> list[ResultDefault]:
+    """Return the files that a configuration is composed of, in their order."""
+    return list(_loader().compute_defaults_list(name, lines, RunMode.RUN).defaults)
+
+
+def parsed(line: str) -> Override:
+    """Return an override; raise a `ConfigError` if it cannot be parsed."""
     try:
         return OverridesParser.create(config_loader=_loader()).parse_override(line)
     except HydraException as error:
@@ -44,38 +56,28 @@ def parsed(line: str) -> Override:
 def composed(name: str, lines: Sequence[str]) -> DictConfig:
     """Return the configuration of a command with overrides, including the node `hydra`.
 
-    Raises:
-        ConfigError: An override cannot be applied.
+    Raises a `ConfigError` if an override cannot be applied.
     """
     try:
         cfg = hydra.compose(name, overrides=list(lines), return_hydra_config=True)
     except REFUSED as error:
         raise ConfigError(_reason(name, [parsed(line) for line in lines], error)) from error
     added = [one.partition("=")[0].lstrip("+") for one in lines if one.startswith("+")]
-    if new := [key for key in added if "." not in key and not options(key)]:
+    if new := [key for key in added if "." not in key and not options(name, key)]:
         known = {str(key) for key in hydra.compose(name)}
-        for key in new:
-            if key not in known:
-                told = validation.suggestion(key, known)
-                raise ConfigError(f"{key}: this command has no such key; {told}")
+        for key in set(new) - known:
+            told = validation.suggestion(key, known)
+            raise ConfigError(f"{key}: this command has no such key; {told}")
     return cfg
 
 
 def values(one: Override, *, search: bool) -> list[str]:
-    """Return one override for each value of a sweep over a key.
-
-    Args:
-        one: The override.
-        search: Return the ends of a range.
-
-    Raises:
-        ConfigError: There is no value, or it is a range without a search.
-    """
+    """Return one override for each value of a sweep, and for the ends of a range in a search."""
     if one.is_discrete_sweep():
-        found = [f"{one.get_key_element()}={value}" for value in one.sweep_string_iterator()]
+        found = list(one.sweep_string_iterator())
     elif search and one.is_interval_sweep():
         interval: Any = one.value()
-        found = [f"{one.get_key_element()}={value}" for value in (interval.start, interval.end)]
+        found = [interval.start, interval.end]
     else:
         raise ConfigError(
             f"{one.input_line} is a range for a search; name its values, or add "
@@ -83,52 +85,35 @@ def values(one: Override, *, search: bool) -> list[str]:
         )
     if not found:
         raise ConfigError(f"{one.input_line} must name one value or more; it names none")
-    return found
-
-
-def _loader() -> Any:
-    return GlobalHydra.instance().config_loader()
-
-
-def options(group: str) -> list[str]:
-    """Return the options of a group; none if the group does not exist."""
-    return sorted(_loader().get_group_options(group.partition("@")[0], ObjectType.CONFIG))
-
-
-def folders() -> list[Path]:
-    """Return the folders in which Hydra searches for configurations."""
-    search = _loader().get_search_path().get_path()
-    return [Path(one.path.removeprefix("file://")) for one in search if "://" not in one.path[7:]]
+    return [f"{one.get_key_element()}={value}" for value in found]
 
 
 def _reason(name: str, asked: list[Override], error: Exception) -> str:
     """Return one line that explains why overrides cannot be applied."""
-    groups = [one for one in asked if options(one.key_or_group)]
+    groups = [one for one in asked if options(name, one.key_or_group)]
     with contextlib.suppress(*REFUSED):
         chosen = set(hydra.compose(name, return_hydra_config=True).hydra.runtime.choices)
-        found = [_bad_option(one, chosen, str(error)) for one in groups]
-        if told := next(filter(None, found), None):
-            return told
+        for one in groups:
+            if told := _bad_option(one, options(name, one.key_or_group), chosen, str(error)):
+                return told
         ways = [one for one in asked if one.key_or_group == "hydra.searchpath"]
         lines = [one.input_line for one in (*ways, *groups)]
         base = hydra.compose(name, overrides=lines, return_hydra_config=True)
-        found = [_bad_key(one, base) for one in asked if one not in groups]
-        if told := next(filter(None, found), None):
-            return told
+        for one in asked:
+            if one not in groups and (told := _bad_key(one, base)):
+                return told
     told = str(error).partition("Config search path")[0]
     return " ".join(line.strip() for line in told.splitlines() if "://" not in line)
 
 
-def _bad_option(one: Override, chosen: set[str], error: str) -> str | None:
+def _bad_option(one: Override, known: list[str], chosen: set[str], error: str) -> str | None:
     """Return the problem of the choice of an option, None if it is valid.
 
-    Args:
-        one: The choice.
-        chosen: Groups of the command.
-        error: Hydra's message, which names a missing option.
+    `known` are the options of the group, `chosen` the groups of the command. Hydra's message names
+    a missing option.
     """
     value, group = one.value(), one.key_or_group
-    known, adds = options(group), one.is_add() or one.is_force_add()
+    adds = one.is_add() or one.is_force_add()
     if adds and group in chosen:
         return f"{group}: an option is chosen already; write {one.input_line.lstrip('+')}"
     if not adds and group not in chosen:
@@ -136,12 +121,12 @@ def _bad_option(one: Override, chosen: set[str], error: str) -> str | None:
     missing = f"{group}/{value}" in error or not isinstance(value, str)
     if one.is_delete() or isinstance(value, list) or value in known or not missing:
         return None
-    near = validation.nearest_name(str(value), known)
-    told = f"{group} = {'null' if value is None else value}: there is no such option; "
-    told += f"did you mean {near}? " if near else ""
-    told += f"{group} is one of {', '.join(known)}"
-    told += f"; ~{group} leaves it out" if value is None else ""
-    return told + (f"; more come with {install(EXTRAS[group])}" if group in EXTRAS else "")
+    near = difflib.get_close_matches(str(value), known, 1)
+    told = [f"{group} = {'null' if value is None else value}: there is no such option"]
+    told += [f"{f'did you mean {near[0]}? ' if near else ''}{group} is one of {', '.join(known)}"]
+    told += [f"~{group} leaves it out"] if value is None else []
+    told += [f"more come with {install(EXTRAS[group])}"] if group in EXTRAS else []
+    return "; ".join(told)
 
 
 def _bad_key(one: Override, base: DictConfig) -> str | None:
@@ -156,18 +141,18 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
     place = ""
     for part in key.split("."):
         known = _below(node)
-        if part in known and OmegaConf.is_list(node) and one.is_delete() and key == place + part:
+        is_last = key == place + part
+        if part in known and is_last and OmegaConf.is_list(node) and one.is_delete():
             return f"{key} is an entry of a list, which cannot be removed; write the whole list"
-        if part in known:
-            node, place = known[part], f"{place}{part}."
-            continue
-        if adds:
+        if part not in known and adds:
             return None
-        more = validation.options_of(node) if OmegaConf.is_dict(node) else set()
-        if key == place + part and part in more and not one.is_delete():
-            return f"{key} is not in this configuration; add it with +{one.input_line}"
-        names = {name for name in known if name[0] != "_"} - {"hydra"} | more
-        return f"{key}: there is no such key; {validation.suggestion(part, names, place)}"
+        if part not in known:
+            more = validation.options_of(node) if OmegaConf.is_dict(node) else set()
+            if is_last and part in more and not one.is_delete():
+                return f"{key} is not in this configuration; add it with +{one.input_line}"
+            names = {name for name in known if name[0] != "_"} - {"hydra"} | more
+            return f"{key}: there is no such key; {validation.suggestion(part, names, place)}"
+        node, place = known[part], f"{place}{part}."
     return None
 
 

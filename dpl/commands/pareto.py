@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 from rich.progress import Progress
 
-from dpl import config
+import dpl
+from dpl import config, fem, inference, models
 from dpl.commands.cli import command
 from dpl.evaluation import tables
 
 if TYPE_CHECKING:
     from dpl.evaluation.pareto import Discretisation, Point
-    from dpl.fem import Solver
-    from dpl.scene import Sample, Scene
 
 
 @command("pareto")
@@ -24,7 +23,6 @@ def main(cfg: DictConfig) -> None:
     from dpl.evaluation import pareto
     from dpl.system.threads import available_cores
 
-    config.check(cfg)
     others = _discretisations(cfg)
     scene, solvers, batch = _solvers(cfg)
     rows: list[Point] = []
@@ -47,19 +45,13 @@ def main(cfg: DictConfig) -> None:
 
 
 def _discretisations(cfg: DictConfig) -> list["Discretisation"]:
-    """Return the errors of other meshes to draw; none without a file.
-
-    Raises:
-        ConfigError: The file does not exist or has other columns.
-    """
+    """Return the errors of other meshes to draw; none without a file."""
     from dpl.evaluation.pareto import Discretisation
 
     if cfg.discretisation is None:
         return []
-    try:
+    with config.error_in("discretisation", OSError, ValueError):
         return tables.read(Discretisation, Path(cfg.discretisation))
-    except (OSError, ValueError) as error:
-        raise config.ConfigError(f"discretisation: {error}") from error
 
 
 def _show(title: str, rows: list["Point"]) -> None:
@@ -73,13 +65,11 @@ def _show(title: str, rows: list["Point"]) -> None:
     tables.show_cells("", columns, cells)
 
 
-def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
+def _solvers(cfg: DictConfig) -> tuple["dpl.Scene", dict[str, "fem.Solver"], "dpl.Sample"]:
     """Return the scene of the runs, all solvers including their networks, and the test loads."""
     import torch
 
     from dpl.evaluation import methods, pareto
-    from dpl.inference import Direct, default_hybrid
-    from dpl.models import Correctable
 
     runs = config.load_runs(cfg.run, trust=cfg.trust)
     first, surrogate = next(iter(runs.values()))
@@ -87,20 +77,20 @@ def _solvers(cfg: DictConfig) -> tuple["Scene", dict[str, "Solver"], "Sample"]:
     data = config.load_data(first, scene)
     train = data.samples("train")
     robust = scene.newton
-    solvers: dict[str, Solver] = {"linear": scene.linear}
+    solvers: dict[str, fem.Solver] = {"linear": scene.linear}
     solvers |= {f"Newton to {tol:g}": replace(robust, tol=tol) for tol in (1e-3, 1e-6, 1e-8)}
     if cfg.galerkin:
         model = config.instantiate(cfg, "galerkin")(scene, train)
-        solvers["POD-Galerkin"] = Direct(model.predict, scene.problem)
+        solvers["POD-Galerkin"] = dpl.Direct(model.predict, scene.problem)
     for name, (trained, surrogate) in runs.items():
         predict = surrogate.predict
-        solvers[name] = Direct(predict, scene.problem)
-        if cfg.corrected and isinstance(surrogate.net, Correctable):
+        solvers[name] = dpl.Direct(predict, scene.problem)
+        if cfg.corrected and isinstance(surrogate.net, models.Correctable):
             row = methods.network(surrogate, Path(cfg.run) / name, trained.data.train)
             method = config.instantiate(cfg, "corrected")(surrogate, row, train)
-            solvers[f"{name}, corrected"] = Direct(method.predict, scene.problem)
-        solvers[f"{name}, hybrid"] = default_hybrid(predict, scene)
+            solvers[f"{name}, corrected"] = dpl.Direct(method.predict, scene.problem)
+        solvers[f"{name}, hybrid"] = inference.default_hybrid(predict, scene)
         if torch.cuda.is_available():
             copy = config.load_run(Path(cfg.run) / name, trust=cfg.trust, scene=scene)[1]
-            solvers[f"{name}, GPU"] = Direct(pareto.on_gpu(copy), scene.problem)
+            solvers[f"{name}, GPU"] = dpl.Direct(pareto.on_gpu(copy), scene.problem)
     return scene, solvers, data.samples("test")

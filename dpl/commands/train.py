@@ -2,27 +2,22 @@
 
 import math
 import signal
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from dpl import config
+import dpl
+from dpl import config, evaluation, training
 from dpl.commands import cli
 from dpl.system.files import DataSetError
 
-if TYPE_CHECKING:
-    from dpl.scene import Scene
-    from dpl.training import Surrogate
 
-
-def parts(cfg: DictConfig) -> tuple["Scene", Any, "Surrogate", Any]:
-    """Return scene, data, surrogate and trainer of a run without solving or writing.
-
-    Raises:
-        ConfigError: One of them cannot be built, or the run cannot be resumed.
-    """
+def parts(cfg: DictConfig) -> tuple["dpl.Scene", Any, "dpl.Surrogate", Any]:
+    """Return scene, data, surrogate and trainer of a run without solving or writing."""
     resumed = config.check_resumed(cfg)
     scene = config.build_scene(config.with_mesh_of_resumed(cfg))
     data = config.instantiate(cfg, "data", scene=scene)
@@ -37,18 +32,25 @@ def parts(cfg: DictConfig) -> tuple["Scene", Any, "Surrogate", Any]:
 @cli.command("train", rehearse=parts)
 def main(cfg: DictConfig) -> float | None:
     """Train and evaluate a surrogate; return its smallest validation e_mean [-] to a search."""
-    # imported here, since worker processes import this module without needing them
-    import torch
-
-    from dpl.evaluation import evaluate
-    from dpl.training import Diverged, LogHyperparameters
-
     cfg = config.resumed_config(cfg, HydraConfig.get().overrides.task)
     config.check(cfg)
     cli.apply_extras(cfg)
+    try:
+        return _train(cfg)
+    except training.Diverged as error:
+        if HydraConfig.get().mode != RunMode.MULTIRUN:
+            raise config.ConfigError(str(error)) from error
+        print(f"error: {error}", file=sys.stderr)
+        return math.inf  # a sweep continues with its next run
+
+
+def _train(cfg: DictConfig) -> float | None:
+    # imported here, since worker processes import this module without needing them
+    import torch
+
     folder = Path(cfg.folder)
     scene, data, surrogate, trainer = parts(cfg)
-    session = LogHyperparameters(config.hyperparameters(cfg))
+    session = training.LogHyperparameters(config.hyperparameters(cfg))
     trainer.callbacks.append(session)
     if trainer.is_global_zero:
         config.show_skipped_work(scene, data, surrogate)
@@ -56,23 +58,16 @@ def main(cfg: DictConfig) -> float | None:
             config.save_config(cfg, folder)
     try:
         trainer.fit(surrogate, datamodule=data, ckpt_path=cfg.ckpt_path or None, weights_only=True)
-    except Diverged as error:
-        return cli.failed(error)
     except SystemExit as leaving:  # Lightning turns Ctrl-C into it
         if leaving.code == 128 + signal.SIGTERM:
             raise
         raise KeyboardInterrupt from leaving
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        if (
-            session.begun
-            or not cfg.ckpt_path
-            or isinstance(error, config.ConfigError | DataSetError)
-        ):
+        ours = isinstance(error, config.ConfigError | DataSetError | training.Diverged)
+        if session.begun or not cfg.ckpt_path or ours:
             raise
-        reason = f"{type(error).__name__}: {error}"
-        raise config.ConfigError(
-            f"ckpt_path = {cfg.ckpt_path} cannot be resumed: {reason}"
-        ) from error
+        reason = f"cannot be resumed: {type(error).__name__}: {error}"
+        raise config.ConfigError(f"ckpt_path = {cfg.ckpt_path} {reason}") from error
     finally:
         data.teardown("fit")  # Lightning does not call it after Ctrl-C
     if torch.distributed.is_initialized():  # only the first process evaluates
@@ -80,10 +75,10 @@ def main(cfg: DictConfig) -> float | None:
     if not trainer.is_global_zero or trainer.fast_dev_run:
         return None
     _, best = config.load_run(folder, trust=True, scene=scene)
-    rows = evaluate(best, data.samples("test"), folder)
+    rows = evaluation.evaluate(best, data.samples("test"), folder)
     network = next(row for row in rows if row.solver == "network")
     if not math.isfinite(network.errors["e_mean"]):
         told = f"training has diverged: the answers of the network in {folder} are not finite; "
-        return cli.failed(Diverged(told + "lower optimizer.lr"))
+        raise training.Diverged(told + "lower optimizer.lr")
     session.finish(trainer, network.errors)
     return cli.best_error(trainer)

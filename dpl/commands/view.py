@@ -4,36 +4,37 @@ import errno
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from dpl import config
+import dpl
+from dpl import config, viewer
 from dpl.commands.cli import command
 from dpl.version import install
-
-if TYPE_CHECKING:
-    from dpl.viewer import AccessPolicy, Body, Page
 
 
 @command("view")
 def main(cfg: DictConfig) -> None:
     """Serve the page until Ctrl-C; with `animation` write an animation instead."""
-    config.check(cfg)
+    from dpl.evaluation.tables import show
+    from dpl.evaluation.timing import describe
+
     if cfg.animation:
         write_animation(load_body(cfg), Path(cfg.animation))
         return
     try:
-        from dpl.viewer import Page
+        from dpl.viewer.frame_rate import measure_frames
     except ImportError as error:
         raise config.ConfigError(
             f"the viewer cannot be imported ({error}): {install('viewer')}"
         ) from error
     policy = bind(cfg)
-    page = Page(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
+    page = viewer.Page(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
     try:
         if cfg.profile:
-            print_profile(page)
+            rows, latencies = measure_frames(page)
+            show(rows, "times per frame on the server, and frames received by a client")
+            print(describe(latencies))
             return
         print(f"the page is at {policy.url}  (Ctrl-C ends it)", flush=True)
         while True:
@@ -43,41 +44,23 @@ def main(cfg: DictConfig) -> None:
         page.close()
 
 
-def load_body(cfg: DictConfig) -> "Body":
-    """Return the body of the run.
-
-    Raises:
-        ConfigError: `galerkin_correction` is set, and the network has no modes.
-    """
+def load_body(cfg: DictConfig) -> "viewer.Body":
+    """Return the body of the run; `galerkin_correction` needs a network with modes."""
     import torch
 
-    import dpl
-    from dpl.viewer import Body
-
     torch.set_num_threads(1)
+    with config.error_in("galerkin_correction"):
+        return viewer.Body(dpl.load(cfg.run, trust=cfg.trust, corrected=cfg.galerkin_correction))
+
+
+def bind(cfg: DictConfig) -> "viewer.AccessPolicy":
+    """Return the access policy with a bound socket."""
     try:
-        return Body(dpl.load(cfg.run, trust=cfg.trust, corrected=cfg.galerkin_correction))
-    except config.ConfigError:
-        raise
-    except ValueError as error:
-        raise config.ConfigError(f"galerkin_correction: {error}") from error
-
-
-def bind(cfg: DictConfig) -> "AccessPolicy":
-    """Return the access policy with a bound socket.
-
-    Raises:
-        ConfigError: The socket cannot be bound.
-    """
-    from dpl.viewer import AccessPolicy
-
-    try:
-        policy = AccessPolicy.bind(cfg.host, cfg.port, cfg.allowed_hosts)
+        policy = viewer.AccessPolicy.bind(cfg.host, cfg.port, cfg.allowed_hosts)
     except OSError as error:
+        message = f"host = {cfg.host}, port = {cfg.port} cannot be bound: {error.strerror}"
         if error.errno == errno.EADDRINUSE:
             message = f"port = {cfg.port} is in use; choose another, or port=0 for any free port"
-        else:
-            message = f"host = {cfg.host}, port = {cfg.port} cannot be bound: {error.strerror}"
         raise config.ConfigError(message) from error
     if policy.is_public:
         print(
@@ -88,23 +71,8 @@ def bind(cfg: DictConfig) -> "AccessPolicy":
     return policy
 
 
-def print_profile(page: "Page") -> None:
-    """Measure and print frame times, frame rates and latencies."""
-    from dpl.evaluation.tables import show
-    from dpl.evaluation.timing import describe
-    from dpl.viewer.frame_rate import measure_frames
-
-    rows, latencies = measure_frames(page)
-    show(rows, "times per frame on the server, and frames received by a client")
-    print(describe(latencies))
-
-
-def write_animation(body: "Body", path: Path) -> None:
-    """Write an animation of a rotating load.
-
-    Raises:
-        ConfigError: The format is unknown, or the package that writes it is not installed.
-    """
+def write_animation(body: "viewer.Body", path: Path) -> None:
+    """Write an animation of a rotating load."""
     from dpl.viewer.animation import animate_load
     from dpl.viewer.recording import FORMATS
 

@@ -10,22 +10,21 @@ if TYPE_CHECKING:
         build_surrogate,
         build_trainer,
         check,
+        error_in,
         hyperparameters,
         instantiate,
         show_skipped_work,
         to_container,
     )
-    from dpl.config.folder import CONF
-    from dpl.config.run_folder import (
+    from dpl.config.resume import (
         check_resumed,
         check_weights,
-        load_data,
-        load_run,
-        load_runs,
         resumed_config,
         save_config,
         with_mesh_of_resumed,
     )
-    from dpl.config.validation import ConfigError
+    from dpl.config.run_folder import load_data, load_run, load_runs
+    from dpl.config.validation import ConfigError, Keys
+    from dpl.version import CONF
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

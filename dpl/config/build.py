@@ -8,7 +8,7 @@ import functools
 import sys
 import typing
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import hydra
@@ -17,32 +17,45 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from dpl import training
 from dpl.config import validation
 from dpl.config.validation import ConfigError
-from dpl.fem import SingularMatrix
+from dpl.fem import Problem, SingularMatrix
 from dpl.scene import Scene
 from dpl.system.blas import slow_blas
 
 if typing.TYPE_CHECKING:
     import lightning as L
 
-    from dpl.fem import Problem
-    from dpl.training import Surrogate
-
-
 SCENE = (  # keys of a scene; those of a surrogate
     *("mesh", "degree", "mean_dilatation", "supports", "forces"),
     *("material", "young", "loads", "solver"),
 )
 NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")
+NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its result
+    *("run", "folder", "ckpt_path", "data.folder"),
+    *("callbacks", "logger", "paths", "extras", "trainer.plugins"),
+}
+CANNOT_BE_MADE = (  # errors of a call with invalid arguments
+    *(InstantiationException, ValueError, TypeError, ArithmeticError, LookupError),
+    *(RuntimeError, MemoryError, OSError),
+)
+
+
+@contextlib.contextmanager
+def error_in(key: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Turn a ValueError, or errors of these kinds, into a `ConfigError` that names a key."""
+    kinds = kinds or (ValueError,)
+    try:
+        yield
+    except ConfigError:
+        raise
+    except kinds as error:
+        raise ConfigError(f"{key}: {error}") from error
 
 
 def to_container(cfg: DictConfig) -> dict[str, Any]:
-    """Return a configuration as a dictionary without interpolations.
-
-    Raises:
-        ConfigError: A value is missing.
-    """
+    """Return a configuration without interpolations; raise a `ConfigError` for a missing value."""
     try:
         return typing.cast(
             "dict[str, Any]", OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
@@ -55,22 +68,31 @@ def to_container(cfg: DictConfig) -> dict[str, Any]:
 
 
 def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
-    """Return the hyperparameters of a run, flat, see `dpl.config.validation.columns`.
+    """Return the hyperparameters of a run, flat: keys of the command line and their values.
 
-    Raises:
-        ConfigError: A value is missing.
+    A call has the key of its node and the name of its class (`model`: FCNN). Null, empty lists and
+    `NOT_IDENTITY` are left out.
     """
-    return dict(validation.columns(to_container(cfg)))
+    return dict(_columns(to_container(cfg), ""))
 
 
-def check(cfg: DictConfig, *, trust: bool = True) -> None:
-    """Check a configuration without calling anything, see `dpl.config.validation.check`.
+def _columns(node: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
+    for key, value in node.items():
+        place = f"{path}.{key}" if path else key
+        if value in (None, []) or place in NOT_IDENTITY:
+            continue
+        if isinstance(value, dict):
+            yield from _columns(value, place)
+        elif key == "_target_":
+            yield path, value.rpartition(".")[2]
+        elif not key.startswith("_"):
+            yield place, str(value) if isinstance(value, list) else value
 
-    Raises:
-        ConfigError: A key, a type, a range or a called object is invalid.
-    """
+
+def check(cfg: DictConfig, *, trust: bool = True, keys: validation.Keys = ()) -> None:
+    """Check a configuration without calling anything, see `dpl.config.validation.check`."""
     written = typing.cast("dict[str, Any]", OmegaConf.to_container(cfg))
-    validation.check(written, to_container(cfg), trust=trust)
+    validation.check(written, to_container(cfg), trust=trust, keys=keys)
 
 
 def instantiate(cfg: DictConfig, key: str, /, **more: Any) -> Any:
@@ -88,27 +110,32 @@ def instantiate(cfg: DictConfig, key: str, /, **more: Any) -> Any:
     require_keys(cfg, key)
     made = _made(cfg[key], key, more)
     is_region = callable(made) and key == "fixed"  # a region may be any function of points
-    partial = is_region or (not more and isinstance(made, functools.partial))
-    if (
-        key in validation.EXPECTED_TYPES
-        and not partial
-        and not validation.is_instance_of(type(made), validation.EXPECTED_TYPES[key])
-    ):
-        raise ConfigError(f"{key} gives {_a(made)}; it must give {_expected(key, type(made))}")
-    return made
+    is_partial = not more and isinstance(made, functools.partial)
+    return made if is_region or is_partial else _of_kind(made, key, key)
 
 
-def _made(node: Any, key: str, more: dict[str, Any]) -> Any:
+def _made(node: Any, place: str, more: dict[str, Any]) -> Any:
     try:
         made = hydra.utils.instantiate(node, _convert_="all")
         return made(**more) if more else made
-    except InstantiationException as error:
-        cause = error.__cause__ or error
-        raise ConfigError(f"{key}: {cause or type(cause).__name__}") from error
-    except (ValueError, TypeError, ArithmeticError, LookupError) as error:
-        raise ConfigError(f"{key}: {error}") from error
-    except (RuntimeError, MemoryError, OSError) as error:
-        raise ConfigError(f"{key}: {error or type(error).__name__}") from error
+    except CANNOT_BE_MADE as error:
+        wrapped = isinstance(error, InstantiationException) and error.__cause__
+        cause = wrapped or error
+        raise ConfigError(f"{place}: {str(cause) or type(cause).__name__}") from error
+
+
+def _of_kind(made: Any, key: str, place: str) -> Any:
+    """Return an object; raise a `ConfigError` if a key must give another type."""
+    kinds = validation.EXPECTED_TYPES.get(key)
+    if kinds is None or validation.is_instance_of(type(made), kinds):
+        return made
+    told = [" or ".join(sorted(kind.rpartition(".")[2] for kind in kinds))]
+    for protocol in sorted(kinds & validation.PROTOCOLS):
+        missing = ", ".join(sorted(validation.missing_members(type(made), protocol)))
+        told.append(f"which has {missing}; see dpl.fem.{protocol.rpartition('.')[2]}")
+    raise ConfigError(
+        f"{place} gives an object of {type(made).__name__}; it must give {', '.join(told)}"
+    )
 
 
 def require_keys(cfg: DictConfig, *keys: str) -> None:
@@ -118,75 +145,41 @@ def require_keys(cfg: DictConfig, *keys: str) -> None:
             raise ConfigError(f"{key} is missing")
 
 
-def _a(made: Any) -> str:
-    return f"an object of {type(made).__name__}"
-
-
-def _expected(key: str, found: type) -> str:
-    """Return the types that a key stands for, and which members of a protocol a class lacks."""
-    kinds = validation.EXPECTED_TYPES[key]
-    lines = [" or ".join(sorted(kind.rpartition(".")[2] for kind in kinds))]
-    for protocol in sorted(kinds & validation.PROTOCOLS):
-        missing = sorted(validation.missing_members(found, protocol))
-        lines.append(f"which has {', '.join(missing)}; see dpl.fem.{protocol.rpartition('.')[2]}")
-    return ", ".join(lines)
-
-
 def build_scene(cfg: DictConfig) -> Scene:
-    """Return the scene of a configuration.
-
-    Raises:
-        ConfigError: The scene cannot be built; the message names the key.
-    """
-    from dpl.fem import Problem
-
+    """Return the scene of a configuration; raise a `ConfigError` that names the invalid key."""
     require_keys(cfg, *SCENE)
-    material = instantiate(cfg, "material")
+    problem = _problem(cfg)
+    solver = instantiate(cfg, "solver", problem=problem)
+    young = OmegaConf.to_container(cfg.young) if isinstance(cfg.young, ListConfig) else cfg.young
+    with error_in("forces"):
+        forces = [part.on(problem) for part in _parts(cfg, "forces")]
+    always = torch.stack(forces).sum(dim=0) if forces else None
+    linear = solver.linear_solver
+    loads = instantiate(cfg, "loads", linear=linear, young=young, constant_force=always)
+    singular = "material, mesh, fixed or supports: K(0) cannot be used"
+    with error_in("loads"), error_in(singular, SingularMatrix):
+        loads.largest_force  # noqa: B018  # raises if the body does not allow these loads
+    return Scene(problem, loads, solver)
+
+
+def _problem(cfg: DictConfig) -> Problem:
     with _shown_warnings():
-        mesh = instantiate(cfg, "mesh")
-    fixed = instantiate(cfg, "fixed") if cfg.get("fixed") is not None else None
-    if cfg.degree not in (1, 2):
-        raise ConfigError(f"degree = {cfg.degree} must be 1 or 2")
-    if not isinstance(cfg.mean_dilatation, bool):
-        raise ConfigError(f"mean_dilatation = {cfg.mean_dilatation!r} must be true or false")
-    with _shown_warnings():
+        mesh, material = (instantiate(cfg, key) for key in ("mesh", "material"))
+        fixed = instantiate(cfg, "fixed") if cfg.get("fixed") is not None else None
+        options = {key: cfg[key] for key in ("degree", "mean_dilatation")}
+        supports = _parts(cfg, "supports")
         try:
-            problem = Problem.build(
-                mesh,
-                material,
-                fixed=fixed,
-                supports=_parts(cfg, "supports"),
-                degree=cfg.degree,
-                mean_dilatation=cfg.mean_dilatation,
-            )
+            problem = Problem.build(mesh, material, fixed=fixed, supports=supports, **options)
         except ValueError as error:
-            key = "fixed or supports" if cfg.supports else "fixed"
             message = str(error)
-            key = "mean_dilatation" if message.startswith("mean_dilatation") else key
-            raise ConfigError(f"{key}: {message.removeprefix('mean_dilatation: ')}") from error
+            key = "fixed or supports: " if cfg.supports else "fixed: "
+            named = message.startswith(tuple(options))
+            raise ConfigError(message if named else key + message) from error
     if not problem.free.any():
         raise ConfigError("fixed or supports: all nodes are fixed; fix fewer nodes")
     if loose := problem.unconstrained_rigid_body_modes():
         raise ConfigError(f"fixed: {len(loose)} rigid modes are unconstrained: {', '.join(loose)}")
-    solver = instantiate(cfg, "solver", problem=problem)
-    young = OmegaConf.to_container(cfg.young) if isinstance(cfg.young, ListConfig) else cfg.young
-    if not validation.matches_type(young, float | Sequence[float]):
-        raise ConfigError(f"young = {young!r} must be a modulus [Pa] or a range [low, high]")
-    loads = instantiate(
-        cfg,
-        "loads",
-        linear=solver.linear_solver,
-        young=young,
-        constant_force=_constant_force(cfg, problem),
-    )
-    try:
-        loads.largest_force  # noqa: B018  # raises if the body does not allow these loads
-    except ValueError as error:
-        raise ConfigError(f"loads: {error}") from error
-    except SingularMatrix as error:
-        message = f"material, mesh, fixed or supports: K(0) cannot be used: {error}"
-        raise ConfigError(message) from error
-    return Scene(problem, loads, solver)
+    return problem
 
 
 @contextlib.contextmanager
@@ -208,31 +201,15 @@ def _parts(cfg: DictConfig, key: str) -> list[Any]:
         raise ConfigError(
             f"{key} = {node!r} must be a mapping of names to calls: {key}: {{name: {{...}}}}"
         )
-    parts = {str(name): _made(node[name], f"{key}.{name}", {}) for name in node if node[name]}
-    for name, part in parts.items():
-        if not validation.is_instance_of(type(part), validation.EXPECTED_TYPES[key]):
-            kinds = _expected(key, type(part))
-            raise ConfigError(f"{key}.{name} gives {_a(part)}; it must give {kinds}")
-    return list(parts.values())
+    places = {name: f"{key}.{name}" for name in node if node[name]}
+    return [_of_kind(_made(node[name], place, {}), key, place) for name, place in places.items()]
 
 
-def _constant_force(cfg: DictConfig, problem: "Problem") -> torch.Tensor | None:
-    """Return the force that is part of every load, (N, D) [-]; None without `forces`."""
-    try:
-        forces = [part.on(problem) for part in _parts(cfg, "forces")]
-    except ValueError as error:
-        raise ConfigError(f"forces: {error}") from error
-    return torch.stack(forces).sum(dim=0) if forces else None
-
-
-def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
+def build_surrogate(cfg: DictConfig, scene: Scene) -> "training.Surrogate":
     """Return the untrained surrogate of a configuration; its weights are a function of `seed`.
 
-    Raises:
-        ConfigError: The surrogate cannot be built; the message names the key.
+    Raises a `ConfigError` that names the key if it cannot be built.
     """
-    from dpl.training import Surrogate
-
     require_keys(cfg, *NETWORK)
     # optimiser and schedule are built once for one number: they fail before any solve
     trial = instantiate(cfg, "optimizer", params=[torch.nn.Parameter(torch.zeros(1))])
@@ -242,18 +219,12 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "Surrogate":
     parts = instantiate(cfg, "model", scene=scene), instantiate(cfg, "loss")
     optimizer = instantiate(cfg, "optimizer")
     scheduler = instantiate(cfg, "scheduler") if cfg.scheduler else None
-    try:
-        return Surrogate(*parts, scene, optimizer=optimizer, scheduler=scheduler)
-    except ValueError as error:
-        raise ConfigError(f"model: {error}") from error
+    with error_in("model"):
+        return training.Surrogate(*parts, scene, optimizer=optimizer, scheduler=scheduler)
 
 
 def build_trainer(cfg: DictConfig) -> "L.Trainer":
-    """Return the trainer of a configuration with its callbacks and loggers.
-
-    Raises:
-        ConfigError: One of them cannot be built.
-    """
+    """Return the trainer of a configuration with its callbacks and loggers."""
     require_keys(cfg, "trainer")
     callbacks, loggers = (_parts(cfg, key) for key in ("callbacks", "logger"))
     return typing.cast(

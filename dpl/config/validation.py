@@ -1,7 +1,6 @@
-"""Check configurations: keys, types, ranges, and the objects that they may call.
+"""Check keys, types and ranges of configurations, and the objects that they may call.
 
-Signatures are the schema: the options of a call are the arguments of the class or function that its
-`_target_` names.
+Signatures are the schema: the options of a call are the arguments of its `_target_`.
 """
 
 import contextlib
@@ -13,46 +12,39 @@ import types
 import typing
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-WHOLE, NAMES = Sequence[int], Sequence[str] | None
-KEYS: dict[str, Any] = {  # types of the keys of all commands
-    **dict.fromkeys(("mesh", "material", "loads", "solver"), dict),
-    **dict.fromkeys(("fixed", "supports", "forces"), dict | None),
-    **{"degree": int, "mean_dilatation": bool, "young": float | Sequence[float]},
-    **dict.fromkeys(("data", "model", "loss", "optimizer", "trainer"), dict),
-    **dict.fromkeys(("callbacks", "logger", "paths", "extras"), dict | None),
-    **{"scheduler": dict | None, "seed": int, "ckpt_path": str | None, "tags": Sequence[str]},
-    **{"run": str | None, "trust": bool, "folder": str, "tol": float},
-    **{"action": str, "shard": int, "shards": int},
-    **{"outputs": Sequence[str], "linear": Sequence[str], "reference_codes": dict},
-    **dict.fromkeys(("repeats", "count", "workers", "samples", "n_far_loads"), int),
-    **{"name": str, "galerkin": dict | None, "corrected": dict | None},
-    **{"networks": NAMES, "tols": Sequence[float], "resume": bool, "cases": NAMES},
-    **{"solve_reference": bool, "discretisation": str | None},
-    **{"threads": Sequence[int | None], "cells_across": WHOLE, "budget": int},
-    **{"minutes": float, "workloads": Sequence[str]},
-    **{"host": str, "port": int, "allowed_hosts": Sequence[str]},
-    **{"animation": str | None, "profile": bool, "galerkin_correction": bool},
-}
-RANGES = {  # smallest and largest values of keys
-    **{"repeats": (1, 10**6), "samples": (1, 10**6), "shards": (1, math.inf)},
-    **{
-        "count": (0, 10**6),
-        "n_far_loads": (0, 10**6),
-        "workers": (0, 1024),
-        "seed": (0, 2**32 - 1),
-    },
-    **{"budget": (1, 10**6), "minutes": (1e-2, 1e6), "port": (0, 65535)},
-    **{"tol": (1e-15, 1), "tols": (1e-15, 1), "cells_across": (1, 10**3), "threads": (1, 10**4)},
-    **{"young": (1e-30, 1e30)},  # [Pa]
-}
-TRAINING_RANGES = {  # the same for keys of a training; 1e-30 stands for "above 0"
-    **{"data.train": (1, 10**7), "optimizer.lr": (1e-30, 1e6)},
-    **{f"trainer.{key}": (1, 10**9) for key in ("max_epochs", "max_steps")},
-    **{"trainer.check_val_every_n_epoch": (1, 10**9), "trainer.log_every_n_steps": (0, 10**9)},
-    **{"trainer.limit_train_batches": (1e-30, 10**9)},
-}
+Keys = Sequence[tuple[Any, ...]]  # rows of type, names, and smallest and largest value of keys
+KEYS: Keys = (  # of all commands
+    (dict, "mesh material loads solver data model loss optimizer trainer"),
+    (dict | None, "fixed supports forces scheduler callbacks logger paths extras"),
+    (dict | None, "galerkin corrected"),
+    (bool, "mean_dilatation trust resume solve_reference profile galerkin_correction"),
+    (str, "name host"),
+    (Literal["generate", "verify", "repair"], "action"),
+    (Sequence[Literal["model", "results"]], "outputs"),
+    (str | None, "run folder ckpt_path discretisation animation"),
+    (Sequence[str], "tags allowed_hosts"),
+    (Sequence[str] | None, "networks"),
+    (int, "degree", 1, 2),
+    (int, "shard"),
+    (int, "repeats samples max_far_iterations", 1, 10**6),
+    (int, "count n_far_loads", 0, 10**6),
+    (int, "shards", 1, math.inf),
+    (int, "seed", 0, 2**32 - 1),
+    (int, "port", 0, 65535),
+    (float, "tol", 1e-15, 1),
+    (Sequence[float], "tols", 1e-15, 1),
+    (Sequence[int | None], "threads", 1, 10**4),
+    (float | Sequence[float], "young", 1e-30, 1e30),  # [Pa]
+)
+TRAINING: Keys = (  # of a training; the types are those of signatures, 1e-30 stands for "above 0"
+    (object, "data.train", 1, 10**7),
+    (object, "optimizer.lr", 1e-30, 1e6),
+    (object, "trainer.max_epochs trainer.max_steps trainer.check_val_every_n_epoch", 1, 10**9),
+    (object, "trainer.log_every_n_steps", 0, 10**9),
+    (object, "trainer.limit_train_batches", 1e-30, 10**9),
+)
 UNLIMITED = {"trainer.max_epochs", "trainer.max_steps"}  # keys for which -1 means no limit
 EXPECTED_TYPES = {  # base classes of the object that the call under a key returns
     "mesh": {"skfem.mesh.mesh.Mesh"},
@@ -84,18 +76,6 @@ TRUSTED_RESULTS = {  # of functions that a run may name: they compute and have n
 OWN_PACKAGES = ("dpl.", "torch.optim.")  # packages of these classes
 HYDRA_KEYS = {"_target_", "_partial_", "_recursive_", "_convert_"}  # options of Hydra in a call
 
-NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its result
-    *("run", "folder", "ckpt_path", "data.folder"),
-    *("callbacks", "logger", "paths", "extras", "trainer.plugins"),
-}
-MAY_CHANGE_ON_RESUME = {  # keys of the length of a run and of the machine
-    *(f"trainer.max_{unit}" for unit in ("epochs", "steps", "time")),
-    *(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy")),
-    *("trainer.log_every_n_steps", "trainer.check_val_every_n_epoch", "trainer.profiler"),
-    *("trainer.enable_progress_bar", "trainer.enable_model_summary"),
-    *("data.workers", "data.timeout", "tags"),
-}
-
 
 class ConfigError(ValueError):
     """An invalid configuration; the message names key, problem and remedy in one line."""
@@ -105,7 +85,9 @@ class ConfigError(ValueError):
         super().__init__(" ".join(filter(None, map(str.strip, message.splitlines()))))
 
 
-def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = True) -> None:
+def check(
+    written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = True, keys: Keys = ()
+) -> None:
     """Check a configuration against the signatures of its calls without calling anything.
 
     Args:
@@ -114,30 +96,34 @@ def check(written: dict[str, Any], resolved: dict[str, Any], *, trust: bool = Tr
         trust: Allow calls of any object. Otherwise only classes of this package and of PyTorch's
             optimisers, and public functions of this package that return a mesh, an array or a
             scheduler.
+        keys: Keys of the command besides `KEYS`, in the same form.
 
     Raises:
         ConfigError: A key is unknown, a value has the wrong type, is not finite or is out of range,
             or an object does not exist or is not trusted.
     """
-    if unknown := sorted({str(key) for key in resolved} - set(KEYS)):
-        raise ConfigError(f"{unknown[0]}: there is no such key; {suggestion(unknown[0], KEYS)}")
+    known = _by_name((*KEYS, *keys))
+    if unknown := sorted({str(key) for key in resolved} - set(known)):
+        raise ConfigError(f"{unknown[0]}: there is no such key; {suggestion(unknown[0], known)}")
     for node in (written, resolved):  # `written` first: it names the key that was set
         for path, value in iter_nodes(node):
             if isinstance(value, float) and not math.isfinite(value):
                 raise ConfigError(f"{path} = {value} is not a finite number")
             if isinstance(value, int) and not -(2**63) <= value < 2**63:
                 raise ConfigError(f"{path} = {value} does not fit into 64 bits")
-    for key, value in resolved.items():
-        _check_top(key, value)
-    trained = TRAINING_RANGES if "trainer" in resolved else {}
+    if "trainer" in resolved:
+        known |= _by_name(TRAINING)
     for path, node in iter_nodes(resolved):
-        if path in trained and not (path in UNLIMITED and node == -1):
-            least, most = trained[path]
-            _check_range(path, node, least, most, " or be -1" * (path in UNLIMITED))
+        if path in known:
+            _check_value(path, node, *known[path])
         if isinstance(node, dict) and "_target_" in node:
             _check_call(path, node, _target(path, node["_target_"], trust=trust))
         elif _is_call(path) and node is not None:
             raise ConfigError(f"{path} = {node!r} must be a call: its _target_ is missing")
+
+
+def _by_name(keys: Keys) -> dict[str, tuple[Any, ...]]:
+    return {name: (kind, *limits) for kind, names, *limits in keys for name in names.split()}
 
 
 def _is_call(path: str) -> bool:
@@ -146,30 +132,22 @@ def _is_call(path: str) -> bool:
     return len(below) == (key in SEVERAL) and key in EXPECTED_TYPES
 
 
-def _check_top(key: str, value: Any) -> None:
-    """Check type and range of the value of a top-level key."""
-    if key == "folder" and value is None:  # of commands that write nothing
-        return
+def _check_value(
+    key: str, value: Any, hint: Any, least: float = -math.inf, most: float = math.inf
+) -> None:
+    """Check the type of a value, and the range of a number or of each number of a list."""
     plain = {} if isinstance(value, dict) else value  # calls are checked by their signatures
-    if not matches_type(plain, KEYS[key]):
-        raise ConfigError(f"{key} = {value!r} must be {_describe(KEYS[key])}")
-    _check_range(key, value, *RANGES.get(key, (-math.inf, math.inf)))
-
-
-def _check_range(key: str, value: Any, least: float, most: float, more: str = "") -> None:
-    """Check a number, or each number of a list, against a range."""
+    if not matches_type(plain, hint):
+        raise ConfigError(f"{key} = {value!r} must be {_describe(hint)}")
     for one in value if isinstance(value, list) else [value]:
-        if isinstance(one, int | float) and not least <= one <= most:
-            span = f"between {least:g} and {most:.10g}"
-            raise ConfigError(f"{key} = {value} must lie {span}{more}")
+        unlimited = key in UNLIMITED and one == -1
+        if isinstance(one, int | float) and not least <= one <= most and not unlimited:
+            span = f"between {least:g} and {most:.10g}{' or be -1' if key in UNLIMITED else ''}"
+            raise ConfigError(f"{key} = {value} must lie {span}")
 
 
 def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
-    """Return the class or function that a call names.
-
-    Raises:
-        ConfigError: It does not exist, cannot be called or is not trusted.
-    """
+    """Return the class or function that a call names."""
     foreign = f"{path} names {name}, which is none of this package's; not called without trust=true"
     if not isinstance(name, str):
         raise ConfigError(f"{path}._target_ = {name!r} must be a text")
@@ -177,31 +155,26 @@ def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
         raise ConfigError(foreign)
     try:
         module, _, attribute = name.rpartition(".")
-        target = getattr(importlib.import_module(module), attribute)
+        target: Callable[..., Any] = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError):
         raise ConfigError(f"{path}._target_ = {name!r} does not exist") from None
     if not callable(target):
         raise ConfigError(f"{path}._target_ = {name!r} cannot be called")
-    if not trust:
-        if inspect.isclass(target):
-            kinds = set().union(*EXPECTED_TYPES.values())
-            ours = f"{target.__module__}.".startswith(OWN_PACKAGES) and is_instance_of(
-                target, kinds
-            )
-        else:
-            ours = _is_trusted_function(target)
-        if not ours:
-            raise ConfigError(foreign)
-    return typing.cast("Callable[..., Any]", target)
+    if not trust and not _is_trusted(target):
+        raise ConfigError(foreign)
+    return target
 
 
-def _is_trusted_function(target: Any) -> bool:
-    """Return True for public functions of dpl whose annotated result is in `TRUSTED_RESULTS`.
+def _is_trusted(target: Any) -> bool:
+    """Return True for classes of parts, and functions that return one of `TRUSTED_RESULTS`.
 
-    A function is public if the `__init__.py` of its folder lists it. A new mesh function, sampling
-    distribution or schedule therefore needs no entry in a list of trusted functions.
+    The functions are the public ones of dpl, which the `__init__.py` of their folder lists. A new
+    mesh function, sampling distribution or schedule therefore needs no entry in a list.
     """
     module = getattr(target, "__module__", None) or ""
+    if inspect.isclass(target):
+        kinds = set().union(*EXPECTED_TYPES.values())
+        return f"{module}.".startswith(OWN_PACKAGES) and is_instance_of(target, kinds)
     if not inspect.isfunction(target) or not module.startswith("dpl."):
         return False
     folder = importlib.import_module(module.rpartition(".")[0])
@@ -216,10 +189,9 @@ def _is_trusted_function(target: Any) -> bool:
 
 
 def is_instance_of(kind: type, names: set[str]) -> bool:
-    """Return True if a class, or one of its base classes, has one of these qualified names.
+    """Return True if a class has a base class, or all members of a protocol, of one of the names.
 
-    It is also True for a class with all members of a named protocol. Classes are compared by name
-    because the named modules need not be imported.
+    Classes are compared by qualified name because the named modules need not be imported.
     """
     if not names.isdisjoint(f"{base.__module__}.{base.__qualname__}" for base in kind.__mro__):
         return True
@@ -258,21 +230,10 @@ def options_of(node: Mapping[str, Any]) -> set[str]:
     return set()
 
 
-def nearest_name(name: str, known: Collection[str]) -> str | None:
-    """Return the most similar known name, None if none is similar."""
-    return next(iter(difflib.get_close_matches(name, known, 1)), None)
-
-
 def suggestion(name: str, known: Collection[str], place: str = "") -> str:
-    """Return an advice for an unknown name: the most similar known name, or all of them.
-
-    Args:
-        name: The unknown name.
-        known: The known names.
-        place: Prefix of the advised name.
-    """
-    if found := nearest_name(name, known):
-        return f"did you mean {place}{found}?"
+    """Return an advice for an unknown name: the most similar known name at a place, or all."""
+    if near := difflib.get_close_matches(name, known, 1):
+        return f"did you mean {place}{near[0]}?"
     return f"there are {', '.join(sorted(known))}"
 
 
@@ -299,32 +260,29 @@ def matches_type(value: Any, hint: Any) -> bool:
         return any(matches_type(value, argument) for argument in arguments)
     if isinstance(value, dict) and "_target_" in value:
         return True  # another call
-    if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool)
-    if origin is typing.Literal:
+    if origin is Literal:
         return value in arguments
     if origin is tuple and Ellipsis not in arguments:
         many = isinstance(value, list) and len(value) == len(arguments)
         return many and all(map(matches_type, value, arguments))
     if origin in (Sequence, Iterable, list, tuple):
         return isinstance(value, list) and all(matches_type(item, arguments[0]) for item in value)
-    if origin is Callable:
+    kind = origin or hint
+    kind = {float: (int, float), Path: str, Callable: (), Any: object}.get(kind, kind)
+    if hint in (int, float) and isinstance(value, bool):
         return False
-    if hint is Path:
-        return isinstance(value, str)
-    if isinstance(origin or hint, type) and hint is not object:
-        return isinstance(value, origin or hint)
-    return True
+    return not isinstance(kind, type | tuple) or isinstance(value, kind)
 
 
 def _describe(hint: Any) -> str:
+    """Return a type hint in words."""
     names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
     names |= {Path: "a path", types.NoneType: "null", dict: "a call or several by name"}
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
-        return " or ".join(_describe(argument) for argument in arguments)
+        return " or ".join(map(_describe, arguments))
+    if origin is Literal:
+        return f"one of {', '.join(map(str, arguments))}"
     if origin is Sequence:
         return f"a list, each {_describe(arguments[0])}"
     return names.get(hint, str(hint))
@@ -340,39 +298,3 @@ def iter_nodes(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         entries = enumerate(node)
     for key, value in entries:
         yield from iter_nodes(value, f"{path}.{key}" if path else str(key))
-
-
-def columns(node: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the hyperparameters of a run, flat: keys of the command line and their values.
-
-    A call has the key of its node and the name of its class (`model`: FCNN). Null, empty lists and
-    `NOT_IDENTITY` are left out.
-    """
-    for key, value in node.items():
-        place = f"{path}.{key}" if path else key
-        if value in (None, []) or place in NOT_IDENTITY:
-            continue
-        if isinstance(value, dict):
-            yield from columns(value, place)
-        elif key == "_target_":
-            yield path, value.rpartition(".")[2]
-        elif not key.startswith("_"):
-            yield place, str(value) if isinstance(value, list) else value
-
-
-def changes(theirs: dict[str, Any], ours: dict[str, Any]) -> list[str]:
-    """Return the differences that a resumed run must not have from its configuration, as lines."""
-    before, now = dict(_leaves(theirs)), dict(_leaves(ours))
-    free = tuple(f"{key}." for key in (*NOT_IDENTITY, *MAY_CHANGE_ON_RESUME))
-    return [
-        f"{key} was {before.get(key)}, is {now.get(key)}"
-        for key in sorted(before.keys() | now.keys())
-        if before.get(key) != now.get(key) and not f"{key}.".startswith(free)
-    ]
-
-
-def _leaves(node: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the paths and values of a node that are neither mappings nor lists."""
-    for path, value in iter_nodes(node):
-        if not isinstance(value, dict | list):
-            yield path, value

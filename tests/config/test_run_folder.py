@@ -18,8 +18,9 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import OmegaConf
 from safetensors.torch import save_file
 
+from benchmarks.commands import benchmark, soak, stress, verify
 from dpl.commands import cli
-from dpl.config import ConfigError, build, run_folder, validation
+from dpl.config import ConfigError, build, resume, run_folder, validation
 from dpl.training import checkpoints
 
 ROOT = Path(__file__).parents[2]
@@ -188,16 +189,21 @@ BAD_COMMANDS = {
     "benchmark samples=1000000000000": r"samples = 10+ must lie between 1 and",
     "benchmark reference_codes=text": r"reference_codes = 'text' must be",
     "stress cases=T2": r"cases = 'T2' must be a list, each a text or null",
+    "convergence max_far_iterations=0": r"max_far_iterations = 0 must lie between 1 and",
+    "soak folder=. minutes=0": r"minutes = 0 must lie between 0\.01 and",
     "view run=x profile={_target_:builtins.dict}": r"profile = .* must be true or false",
     "verify cases=3": r"cases = 3 must be a list, each a text",
 }
+
+
+KEYS = {one.__name__.rpartition(".")[2]: one.KEYS for one in (benchmark, soak, stress, verify)}
 
 
 @pytest.mark.parametrize("line", BAD_COMMANDS)
 def test_what_a_command_is_told_is_held_to_what_it_must_be(compose, line):
     command, *overrides = line.split()
     with pytest.raises(ConfigError, match=BAD_COMMANDS[line]):
-        build.check(compose(*overrides, command=command))
+        build.check(compose(*overrides, command=command), keys=KEYS.get(command, ()))
 
 
 @pytest.mark.parametrize("override", BAD_TRAINING)
@@ -450,7 +456,7 @@ def _trained(folder, *overrides):
     scene = build.build_scene(cfg)
     surrogate = build.build_surrogate(cfg, scene)
     trainer = build.build_trainer(cfg)
-    run_folder.save_config(cfg, folder)
+    resume.save_config(cfg, folder)
     trainer.fit(surrogate, datamodule=build.instantiate(cfg, "data", scene=scene))
     return surrogate
 
@@ -505,7 +511,7 @@ def test_a_run_is_not_overwritten(trained, compose):
     before = (folder / "config.yaml").read_text()
     cfg = compose("folder=.", "young=1", command="train")
     with pytest.raises(ConfigError, match="resume it with ckpt_path=last"):
-        run_folder.save_config(cfg, folder)
+        resume.save_config(cfg, folder)
     assert (folder / "config.yaml").read_text() == before
 
 
@@ -688,9 +694,9 @@ def test_a_run_may_be_resumed_for_longer_and_elsewhere(resumed, override):
     cfg, key = resumed(override), override.partition("=")[0]
     before = OmegaConf.load(f"{cfg.folder}/config.yaml")
     assert OmegaConf.select(before, key) != OmegaConf.select(cfg, key)
-    assert run_folder.check_resumed(cfg)["epoch"] == 0
+    assert resume.check_resumed(cfg)["epoch"] == 0
     with pytest.raises(ConfigError, match=r"model\.width"):
-        run_folder.check_resumed(resumed(override, "model.width=17"))
+        resume.check_resumed(resumed(override, "model.width=17"))
 
 
 @pytest.mark.parametrize(
@@ -710,7 +716,7 @@ def test_a_run_may_be_resumed_for_longer_and_elsewhere(resumed, override):
 )
 def test_a_run_is_not_resumed_with_another_configuration(resumed, override, told):
     with pytest.raises(ConfigError, match="is of another configuration") as refusal:
-        run_folder.check_resumed(resumed(override))
+        resume.check_resumed(resumed(override))
     assert told in str(refusal.value)
 
 
@@ -720,7 +726,7 @@ def resumed_config(compose):
 
     def resumed_config(folder, *overrides):
         lines = [f"folder={folder}", "ckpt_path=last", *overrides]
-        return run_folder.resumed_config(compose(*lines, command="train"), lines)
+        return resume.resumed_config(compose(*lines, command="train"), lines)
 
     return resumed_config
 
@@ -733,7 +739,7 @@ def test_a_run_is_resumed_with_the_configuration_that_lies_in_it(trained, resume
     assert (cfg.trainer.max_epochs, cfg.trainer.check_val_every_n_epoch) == (7, 1)
     assert "early_stopping" in cfg.callbacks, "those of the command line"
     build.check(cfg)
-    assert run_folder.check_resumed(cfg)["epoch"] == 0
+    assert resume.check_resumed(cfg)["epoch"] == 0
 
 
 @pytest.mark.parametrize(
@@ -748,7 +754,7 @@ def test_a_resumed_run_names_only_what_the_command_line_changes(
     trained, resumed_config, override, told
 ):
     with pytest.raises(ConfigError, match=told):
-        run_folder.check_resumed(resumed_config(trained[0], override))
+        resume.check_resumed(resumed_config(trained[0], override))
 
 
 def test_a_resumed_run_calls_only_trusted_objects_or_those_of_the_command_line(
@@ -770,15 +776,15 @@ def test_an_experiment_on_the_command_line_is_compared_as_a_whole(trained, resum
     found = resumed_config(trained[0], "experiment=beam_svk")
     assert found.mesh.nodes == [40, 10, 10]
     with pytest.raises(ConfigError, match=r"configuration: data\.batch_size was 8, is 64; "):
-        run_folder.check_resumed(found)
+        resume.check_resumed(found)
 
 
 def test_a_run_that_is_not_there_is_not_resumed_but_begun(compose, tmp_path):
     path = f"{tmp_path}/nowhere.ckpt"
     cfg = compose(f"folder={tmp_path}", f"ckpt_path={path}", command="train")
     with pytest.raises(ConfigError, match=r"nowhere\.ckpt does not exist; leave it out"):
-        run_folder.check_resumed(cfg)
-    run_folder.check_resumed(compose(f"folder={tmp_path}", "ckpt_path=last", command="train"))
+        resume.check_resumed(cfg)
+    resume.check_resumed(compose(f"folder={tmp_path}", "ckpt_path=last", command="train"))
 
 
 @pytest.mark.parametrize("harm", ["empty", "truncated", "text", "weights", "pickle", "folder"])
@@ -794,7 +800,7 @@ def test_a_checkpoint_that_cannot_be_resumed_is_refused_in_one_line(resumed, cop
     else:
         torch.save({**checkpoints.read(path), "more": Path(path)}, path)
     with pytest.raises(ConfigError, match=r"^ckpt_path(:| =)") as refusal:
-        run_folder.check_resumed(resumed(f"ckpt_path={path}"))
+        resume.check_resumed(resumed(f"ckpt_path={path}"))
     assert "\n" not in str(refusal.value)
     assert "weights_only" not in str(refusal.value)
 
@@ -803,9 +809,9 @@ def test_a_run_is_not_resumed_for_fewer_epochs_than_it_has_done(resumed, copied)
     path = copied / "checkpoints" / "last.ckpt"
     found = {**checkpoints.read(path), "epoch": 4}
     checkpoints.write(found, path)
-    run_folder.check_resumed(resumed(f"ckpt_path={path}", "trainer.max_epochs=5"))
+    resume.check_resumed(resumed(f"ckpt_path={path}", "trainer.max_epochs=5"))
     with pytest.raises(ConfigError, match=r"^trainer\.max_epochs = 4 must be 5 or more; the run"):
-        run_folder.check_resumed(resumed(f"ckpt_path={path}", "trainer.max_epochs=4"))
+        resume.check_resumed(resumed(f"ckpt_path={path}", "trainer.max_epochs=4"))
 
 
 FOREIGN = {  # what is changed in a checkpoint -> what the one line says

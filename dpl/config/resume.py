@@ -1,0 +1,170 @@
+"""Begin or resume a training run: write its configuration, compare it with that of the run."""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+from dpl import training
+from dpl.config import validation
+from dpl.config.build import NOT_IDENTITY, error_in, instantiate, to_container
+from dpl.config.run_folder import MESH, has_mesh_file, read_config, with_copied_mesh
+from dpl.config.validation import ConfigError
+from dpl.fem import write_mesh_exactly
+from dpl.system.files import atomic_write
+
+OF_THE_SESSION = {"run", "folder", "ckpt_path", "callbacks", "logger", "paths", "extras"}
+MAY_CHANGE_ON_RESUME = {  # keys of the length of a run and of the machine
+    *(f"trainer.max_{unit}" for unit in ("epochs", "steps", "time")),
+    *(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy")),
+    *("trainer.log_every_n_steps", "trainer.check_val_every_n_epoch", "trainer.profiler"),
+    *("trainer.enable_progress_bar", "trainer.enable_model_summary"),
+    *("data.workers", "data.timeout", "tags"),
+}
+
+
+def save_config(cfg: DictConfig, folder: Path) -> None:
+    """Write a configuration without interpolations, and a copy of its mesh file, to a folder.
+
+    Raises a `ConfigError` if the folder contains another run that is not resumed.
+    """
+    if (folder / "checkpoints" / "last.ckpt").exists() and not cfg.ckpt_path:
+        raise ConfigError(
+            f"run = {folder} contains a run; resume it with ckpt_path=last or choose another folder"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    source = with_mesh_of_resumed(cfg)
+    if has_mesh_file(source) and Path(source.mesh.path) != folder / MESH:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # printed when the mesh was read first
+            mesh = instantiate(source, "mesh")
+        with atomic_write(folder / MESH) as file:
+            write_mesh_exactly(Path(file.name), mesh)
+    (folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(to_container(cfg))))
+
+
+def _resumed(cfg: DictConfig) -> Path | None:
+    """Return the path of the checkpoint to resume, None for a new run."""
+    last = Path(cfg.folder) / "checkpoints" / "last.ckpt"
+    if cfg.ckpt_path == "last":
+        return last if last.exists() else None
+    return Path(cfg.ckpt_path) if cfg.ckpt_path else None
+
+
+def resumed_config(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """Return the configuration of the run to resume, changed by the command line.
+
+    It is `cfg`, that of the command line, where no run is resumed, and where the command line names
+    an option that changes several groups, such as `experiment`: it then has to repeat all of them.
+
+    Raises:
+        ConfigError: The configuration of the run cannot be read, or it calls an object outside this
+            package that the command line does not name.
+    """
+    checkpoint = _resumed(cfg)
+    path = None if checkpoint is None else checkpoint.parent.parent / "config.yaml"
+    if path is None or not path.is_file():
+        return cfg
+    asked = to_container(cfg)
+    before = read_config(path)
+    kept = {key: value for key, value in before.items() if key not in OF_THE_SESSION}
+    if "trainer" in kept and "trainer" in asked:
+        own = ("_target_", "_partial_", "plugins")  # calls, never those of the file
+        kept["trainer"] |= {key: asked["trainer"].get(key) for key in own}
+    unnamed = {k: v for k, v in kept.items() if k != "trainer" and v != asked.get(k)}
+    try:
+        validation.check(unnamed, unnamed, trust=False)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}; repeat the overrides of the run") from error
+    found, given = OmegaConf.create({**asked, **kept}), OmegaConf.create(asked)
+    for one in OverridesParser.create().parse_overrides(list(overrides)):
+        key = one.key_or_group
+        root = key.partition(".")[0]
+        if root in OF_THE_SESSION or root.startswith("hydra"):
+            continue
+        if one.is_delete():
+            owner, _, name = key.rpartition(".")
+            (OmegaConf.select(found, owner) if owner else found).pop(name, None)
+        elif root not in asked:
+            return cfg
+        else:
+            OmegaConf.update(found, key, OmegaConf.select(given, key), merge=False)
+    return found
+
+
+def with_mesh_of_resumed(cfg: DictConfig) -> DictConfig:
+    """Return a configuration that reads its mesh from the copy in the run to resume, if any."""
+    checkpoint = _resumed(cfg)
+    return cfg if checkpoint is None else with_copied_mesh(cfg, checkpoint.parent.parent)
+
+
+def check_resumed(cfg: DictConfig) -> dict[str, Any] | None:
+    """Return the checkpoint to resume; None for a new run.
+
+    `ckpt_path=last` starts a run that has no checkpoint yet, so that a job has one command line.
+
+    Raises:
+        ConfigError: The checkpoint cannot be resumed, or its run has another configuration.
+    """
+    from dpl.training import checkpoints
+
+    if (path := _resumed(cfg)) is None:
+        return None
+    if not path.is_file():
+        raise ConfigError(f"ckpt_path = {path} does not exist; leave it out to start a new run")
+    before = path.parent.parent / "config.yaml"
+    ours = to_container(cfg)
+    if before.is_file() and (changed := _changes(read_config(before), ours)):
+        raise ConfigError(
+            f"ckpt_path: {path} is of another configuration: {'; '.join(changed)}; "
+            "set them back, or begin a run of another name"
+        )
+    try:
+        found = checkpoints.read(path)
+        done = checkpoints.epochs(found)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"ckpt_path = {path} cannot be resumed: it {error}") from error
+    most = cfg.trainer.get("max_epochs")
+    if most is not None and 0 <= most < done:
+        raise ConfigError(
+            f"trainer.max_epochs = {most} must be {done} or more; the run in ckpt_path = {path} "
+            "has done as many"
+        )
+    return found
+
+
+def check_weights(surrogate: "training.Surrogate", checkpoint: dict[str, Any]) -> None:
+    """Raise a `ConfigError` if the checkpoint to resume is of another scene or network."""
+    with error_in("ckpt_path", ValueError, TypeError, AttributeError):
+        surrogate.on_load_checkpoint(checkpoint)
+    ours, theirs = (
+        {name: tuple(t.shape) for name, t in state.items() if isinstance(t, torch.Tensor)}
+        for state in (surrogate.state_dict(), checkpoint["state_dict"])
+    )
+    if differing := sorted(dict(ours.items() ^ theirs.items())):
+        raise ConfigError(
+            f"ckpt_path: the checkpoint is of another network: {differing[0]} has shape "
+            f"{theirs.get(differing[0])} there, {ours.get(differing[0])} here"
+        )
+
+
+def _changes(theirs: dict[str, Any], ours: dict[str, Any]) -> list[str]:
+    """Return the differences that a resumed run must not have from its configuration, as lines."""
+    before, now = (
+        {
+            path: value
+            for path, value in validation.iter_nodes(node)
+            if not isinstance(value, dict | list)
+        }
+        for node in (theirs, ours)
+    )
+    free = tuple(f"{key}." for key in (*NOT_IDENTITY, *MAY_CHANGE_ON_RESUME))
+    return [
+        f"{key} was {before.get(key)}, is {now.get(key)}"
+        for key in sorted(before.keys() | now.keys())
+        if before.get(key) != now.get(key) and not f"{key}.".startswith(free)
+    ]
