@@ -29,7 +29,7 @@ def main(cfg: DictConfig) -> None:
     from dpl.export.onnx_graph import missing_packages
 
     if not cfg.outputs:
-        raise config.ConfigError("outputs = [] must contain model, results or both")
+        raise config.ConfigError("outputs = [] must contain one of model, results")
     if "results" in cfg.outputs and cfg.count < 1:
         raise config.ConfigError(f"count = {cfg.count} must be 1 or more; or use outputs=[model]")
     if "model" in cfg.outputs and (absent := missing_packages()):
