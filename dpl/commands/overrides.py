@@ -137,17 +137,17 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
         groups = _loader().get_group_options(parent, ObjectType.GROUP)
         told = validation.suggestion(key, {f"{parent}/{group}" for group in groups})
         return f"{key}: there is no such group; {told}"
-    node: Any = base
+    node: Any = OmegaConf.to_container(base)
     place = ""
     for part in key.split("."):
         known = _below(node)
         is_last = key == place + part
-        if part in known and is_last and OmegaConf.is_list(node) and one.is_delete():
+        if part in known and is_last and isinstance(node, list) and one.is_delete():
             return f"{key} is an entry of a list, which cannot be removed; write the whole list"
         if part not in known and adds:
             return None
         if part not in known:
-            more = validation.options_of(node) if OmegaConf.is_dict(node) else set()
+            more = validation.options_of(node) if isinstance(node, dict) else set()
             if is_last and part in more and not one.is_delete():
                 return f"{key} is not in this configuration; add it with +{one.input_line}"
             names = {name for name in known if name[0] != "_"} - {"hydra"} | more
@@ -157,8 +157,7 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
 
 
 def _below(node: Any) -> dict[str, Any]:
-    """Return the entries of a node by name or number, without resolving interpolations."""
-    if not OmegaConf.is_config(node) or node._is_none() or node._is_missing():
-        return {}
-    keys = node.keys() if OmegaConf.is_dict(node) else range(len(node))
-    return {str(key): node._get_node(key) for key in keys}
+    """Return the entries of a node by name or number."""
+    if isinstance(node, list):
+        node = dict(enumerate(node))
+    return {str(key): one for key, one in node.items()} if isinstance(node, dict) else {}

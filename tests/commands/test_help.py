@@ -64,3 +64,11 @@ def test_help_of_a_wrong_option_ends_with_one_line(script, tmp_path):
     ended = script("train", "--help", "modle=3", cwd=tmp_path)
     assert ended.status == 2
     assert ended.err == "error: modle: there is no such key; did you mean model?\n"
+
+
+def test_help_of_a_benchmark_lists_options_and_comments_of_the_package(script, tmp_path):
+    told = " ".join(script("soak", "--help", cwd=tmp_path).out.split())
+    assert "network: cnn, fcnn*, gnn, latent, pod" in told
+    assert "optimizer.lr = 0.001 learning rate [-]" in told
+    ended = script("soak", "model=fcm", cwd=tmp_path)
+    assert ended.err.startswith("error: model = fcm: there is no such option; model is one of cnn")

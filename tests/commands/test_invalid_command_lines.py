@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.global_hydra import GlobalHydra
 
 from dpl.commands import dry_run, generate, train
@@ -251,3 +252,16 @@ def test_the_advice_for_extras_works_where_it_is_given(monkeypatch):
     assert version.install("onnx") == "pip install -c constraints.txt -e '.[onnx]'"
     monkeypatch.setattr(version, "ROOT", Path("nowhere/site-packages"))
     assert version.install("onnx") == "pip install 'deepphysics[onnx]'"
+
+
+def test_a_single_job_is_composed_once(script, monkeypatch, tmp_path):
+    composed = []
+    original = ConfigLoaderImpl.load_configuration
+
+    def counted(self, *args, **kwargs):
+        composed.append(args or kwargs)
+        return original(self, *args, **kwargs)
+
+    monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", counted)
+    assert script("evaluate", "run=nowhere", cwd=tmp_path).status == 2
+    assert len(composed) == 1
