@@ -23,13 +23,14 @@ def main(cfg: DictConfig) -> None:
         write_animation(load_body(cfg), Path(cfg.animation))
         return
     try:
+        from dpl.viewer import Page
         from dpl.viewer.frame_rate import measure_frames
     except ImportError as error:
         raise config.ConfigError(
             f"the viewer cannot be imported ({error}): {install('viewer')}"
         ) from error
     policy = bind(cfg)
-    page = viewer.Page(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
+    page = Page(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
     try:
         if cfg.profile:
             rows, latencies = measure_frames(page)

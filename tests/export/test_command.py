@@ -81,7 +81,10 @@ def test_a_graph_with_too_large_a_difference_is_removed(script, trained):
             ["run=runs/none", "outputs=[results]"],
             "run = runs/none has no config.yaml; train it first",
         ),
-        (["run=runs/first", "outputs=[modal]"], "must be a list, each one of model, results"),
+        (
+            ["run=runs/first", "outputs=[modal]"],
+            "outputs = ['modal'] must be a list, each one of model, results",
+        ),
         (["run=runs/first", "outputs=[]"], "outputs = [] must contain one of model, results"),
         (["run=runs/first", "outputs=[results]", "count=0"], "count = 0 must be 1 or more"),
         (["run=runs/first", "tol=0"], "tol = 0 must lie between"),
