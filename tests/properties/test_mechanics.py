@@ -501,9 +501,7 @@ def test_batch_is_solved_like_its_members(body, data):
     data=st.data(),
 )
 @counted
-def test_loads_with_their_own_parameters_are_solved_like_bodies_of_one(
-    body, kind, ratios, data
-):
+def test_loads_with_their_own_parameters_are_solved_like_bodies_of_one(body, kind, ratios, data):
     some = Newton(
         replace(body, law=kind([-0.5, 0.46])).build(), max_total_iter=40, linear="superlu"
     )
