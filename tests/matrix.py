@@ -160,7 +160,7 @@ def differences(found: Mapping[str, tuple[Outcomes, float]]) -> Iterator[str]:
                 yield f"    {kind}: {'; '.join(name for name in kinds if kinds[name] == kind)}"
 
 
-def asked(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+def requested(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
     """Return the options of the command line, and what stands behind `--` for pytest."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -179,8 +179,8 @@ def asked(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run what is asked for, print the table and the differences, and return the exit status."""
-    options, more = asked(arguments)
+    """Run what is requested, print the table and the differences, and return the exit status."""
+    options, more = requested(arguments)
     names = options.names or possible()
     digest = hashlib.sha256("\0".join(more).encode()).hexdigest()[:12]
     folder = ROOT / "build/matrix" / (digest if more else "all")
@@ -203,8 +203,8 @@ def main(arguments: Sequence[str]) -> int:
         else:
             lost.append(f"{title}: no result, exit status {status}; see {result.stem}.log")
     print("", *table(found), *lost, sep="\n")
-    told = list(differences(found))
-    print("", "failed, or not the same:" if told else "no outcome differs", *told, sep="\n")
+    reported = list(differences(found))
+    print("", "failed, or not the same:" if reported else "no outcome differs", *reported, sep="\n")
     return int(bool(lost) or any("failed" in tests.values() for tests, _ in found.values()))
 
 

@@ -226,7 +226,7 @@ def table(results: dict[str, list[dict[str, Any]]]) -> str:
 
 
 def main() -> None:
-    """Judge the mutants of the modules that are asked for."""
+    """Judge the mutants of the requested modules."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("modules", nargs="*", help="files of [tool.mutants.modules]; all")
     parser.add_argument("--sample", type=int, default=0, help="mutants of each module; 0: all")

@@ -284,8 +284,8 @@ def test_the_data_set_keeps_poissons_ratios_where_loads_have_their_own(sets, dat
 
 def test_a_data_set_of_another_range_is_refused(sets, make_scene, scene):
     for other, ours in ((scene, r"0\.3"), (make_scene(poisson=[0.2, 0.3]), r"\[0\.2, 0\.3\]")):
-        told = rf"another scene.*law\.poisson: \[0\.2, 0\.4\] there, {ours} here"
-        with pytest.raises(DataSetError, match=told):
+        reported = rf"another scene.*law\.poisson: \[0\.2, 0\.4\] there, {ours} here"
+        with pytest.raises(DataSetError, match=reported):
             Store(sets.store.folder, other, 0).load("train", 4)
 
 
@@ -508,9 +508,9 @@ def test_latent_trains_in_coordinates_and_is_evaluated(wide, sets, tmp_path, mon
     module.eval()
     test = sets.samples("test")
     linear = solve(wide.linear, test.load).displacement
-    told = median_error(module, test)
-    assert told < float(RelativeL2().measure(linear, test).median()) / 2
-    assert told < median_error(module, test._replace(parameters=0 * test.parameters + 0.3)) / 2
+    reported = median_error(module, test)
+    assert reported < float(RelativeL2().measure(linear, test).median()) / 2
+    assert reported < median_error(module, test._replace(parameters=0 * test.parameters + 0.3)) / 2
     solvers = {}
     monkeypatch.setattr(
         "dpl.evaluation.report.measure",
@@ -537,7 +537,7 @@ def test_a_range_is_an_option_of_the_law(scene_of):
 
 
 @pytest.mark.parametrize(
-    ("override", "told"),
+    ("override", "reported"),
     [
         ("material.poisson=[0.4,0.2]", r"material: poisson = \[0.4, 0.2\] must be a range"),
         ("material.poisson=[0.2,0.5]", r"material: poisson = 0.5 must lie between -1 and 0.5"),
@@ -545,8 +545,8 @@ def test_a_range_is_an_option_of_the_law(scene_of):
         ("material.poisson=[a,b]", r"material.poisson = \['a', 'b'\] must be a number or a list"),
     ],
 )
-def test_a_wrong_range_ends_with_one_line_that_names_the_key(scene_of, override, told):
-    with pytest.raises(run.ConfigError, match=told):
+def test_a_wrong_range_ends_with_one_line_that_names_the_key(scene_of, override, reported):
+    with pytest.raises(run.ConfigError, match=reported):
         scene_of("mesh.nodes=[5,3,3]", override)
 
 

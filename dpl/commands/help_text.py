@@ -35,7 +35,7 @@ def page(name: str, about: str, lines: Sequence[str]) -> str:
     """
     single = [line for line in lines if not overrides.parsed(line).is_sweep_override()]
     cfg = overrides.composed(name, single)
-    heads, told = _comments(name, single, cfg)
+    heads, of_keys = _comments(name, single, cfg)
     chosen = {k: v for k, v in cfg.hydra.runtime.choices.items() if not k.startswith("hydra")}
     text = about.splitlines()
     if chosen:
@@ -43,7 +43,7 @@ def page(name: str, about: str, lines: Sequence[str]) -> str:
     for group, option in sorted(chosen.items()):
         known = overrides.options(name, group)
         names = ", ".join(f"{one}*" if one == option else one for one in known)
-        comment = told.get(f"defaults.{group}")
+        comment = of_keys.get(f"defaults.{group}")
         text += _entry(group, f"{comment}: {names}" if comment else names)
     text += ["", "KEY=VALUE changes a value, +KEY=VALUE adds one, ~KEY removes one:", ""]
     values = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=False))
@@ -54,7 +54,7 @@ def page(name: str, about: str, lines: Sequence[str]) -> str:
             text += ["", *_wrapped(f"{key}={chosen[key]}{call}: {heads[key]}", "", "  ")]
         for place, one in _leaves(key, value):
             owner = place.removesuffix("._target_")
-            text += _entry(f"{place} = {one}", told.get(place) or told.get(owner, ""))
+            text += _entry(f"{place} = {one}", of_keys.get(place) or of_keys.get(owner, ""))
     text += ["", "Flags:", ""]
     for flag, does in FLAGS.items():
         text += _entry(flag, does)
@@ -68,15 +68,15 @@ def _comments(
     sources = cfg.hydra.runtime.config_sources
     folders = [Path(one.path) for one in sources if one.schema == "file"]
     heads: dict[str, str] = {}
-    told: dict[str, str] = {}
+    of_keys: dict[str, str] = {}
     for part in overrides.defaults(name, lines):  # later ones overwrite earlier ones
         paths = (folder / f"{part.config_path}.yaml" for folder in folders)
         if path := next(filter(Path.is_file, paths), None):
             head, found = comments.read(path.read_text(encoding="utf-8"))
             prefix = f"{part.package}." if part.package else ""
             heads[str(part.config_path).rpartition("/")[0]] = head
-            told |= {prefix + key: comment for key, comment in found.items()}
-    return heads, told
+            of_keys |= {prefix + key: comment for key, comment in found.items()}
+    return heads, of_keys
 
 
 def _leaves(path: str, node: Any) -> Iterator[tuple[str, str]]:

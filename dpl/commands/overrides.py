@@ -66,8 +66,8 @@ def composed(name: str, lines: Sequence[str]) -> DictConfig:
     if new := [key for key in added if "." not in key and not options(name, key)]:
         known = {str(key) for key in hydra.compose(name)}
         for key in set(new) - known:
-            told = validation.suggestion(key, known)
-            raise ConfigError(f"{key}: this command has no such key; {told}")
+            message = validation.suggestion(key, known)
+            raise ConfigError(f"{key}: this command has no such key; {message}")
     return cfg
 
 
@@ -88,22 +88,22 @@ def values(one: Override, *, search: bool) -> list[str]:
     return [f"{one.get_key_element()}={value}" for value in found]
 
 
-def _reason(name: str, asked: list[Override], error: Exception) -> str:
+def _reason(name: str, requested: list[Override], error: Exception) -> str:
     """Return one line that explains why overrides cannot be applied."""
-    groups = [one for one in asked if options(name, one.key_or_group)]
+    groups = [one for one in requested if options(name, one.key_or_group)]
     with contextlib.suppress(*REFUSED):
         chosen = set(hydra.compose(name, return_hydra_config=True).hydra.runtime.choices)
         for one in groups:
-            if told := _bad_option(one, options(name, one.key_or_group), chosen, str(error)):
-                return told
-        ways = [one for one in asked if one.key_or_group == "hydra.searchpath"]
+            if message := _bad_option(one, options(name, one.key_or_group), chosen, str(error)):
+                return message
+        ways = [one for one in requested if one.key_or_group == "hydra.searchpath"]
         lines = [one.input_line for one in (*ways, *groups)]
         base = hydra.compose(name, overrides=lines, return_hydra_config=True)
-        for one in asked:
-            if one not in groups and (told := _bad_key(one, base)):
-                return told
-    told = str(error).partition("Config search path")[0]
-    return " ".join(line.strip() for line in told.splitlines() if "://" not in line)
+        for one in requested:
+            if one not in groups and (message := _bad_key(one, base)):
+                return message
+    message = str(error).partition("Config search path")[0]
+    return " ".join(line.strip() for line in message.splitlines() if "://" not in line)
 
 
 def _bad_option(one: Override, known: list[str], chosen: set[str], error: str) -> str | None:
@@ -122,11 +122,13 @@ def _bad_option(one: Override, known: list[str], chosen: set[str], error: str) -
     if one.is_delete() or isinstance(value, list) or value in known or not missing:
         return None
     near = difflib.get_close_matches(str(value), known, 1)
-    told = [f"{group} = {'null' if value is None else value}: there is no such option"]
-    told += [f"{f'did you mean {near[0]}? ' if near else ''}{group} is one of {', '.join(known)}"]
-    told += [f"~{group} leaves it out"] if value is None else []
-    told += [f"more come with {install(EXTRAS[group])}"] if group in EXTRAS else []
-    return "; ".join(told)
+    message = [f"{group} = {'null' if value is None else value}: there is no such option"]
+    message += [
+        f"{f'did you mean {near[0]}? ' if near else ''}{group} is one of {', '.join(known)}"
+    ]
+    message += [f"~{group} leaves it out"] if value is None else []
+    message += [f"more come with {install(EXTRAS[group])}"] if group in EXTRAS else []
+    return "; ".join(message)
 
 
 def _bad_key(one: Override, base: DictConfig) -> str | None:
@@ -135,8 +137,8 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
     if "/" in key:
         parent = key.rpartition("/")[0]
         groups = _loader().get_group_options(parent, ObjectType.GROUP)
-        told = validation.suggestion(key, {f"{parent}/{group}" for group in groups})
-        return f"{key}: there is no such group; {told}"
+        message = validation.suggestion(key, {f"{parent}/{group}" for group in groups})
+        return f"{key}: there is no such group; {message}"
     node: Any = OmegaConf.to_container(base)
     place = ""
     for part in key.split("."):

@@ -78,7 +78,7 @@ def _train(cfg: DictConfig) -> float | None:
     rows = evaluation.evaluate(best, data.samples("test"), folder)
     network = next(row for row in rows if row.solver == "network")
     if not math.isfinite(network.errors["e_mean"]):
-        told = f"training has diverged: the answers of the network in {folder} are not finite; "
-        raise training.Diverged(told + "lower optimizer.lr")
+        message = f"training has diverged: the answers of the network in {folder} are not finite; "
+        raise training.Diverged(message + "lower optimizer.lr")
     session.finish(trainer, network.errors)
     return cli.best_error(trainer)

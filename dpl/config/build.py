@@ -129,12 +129,12 @@ def _of_kind(made: Any, key: str, place: str) -> Any:
     kinds = validation.EXPECTED_TYPES.get(key)
     if kinds is None or validation.is_instance_of(type(made), kinds):
         return made
-    told = [" or ".join(sorted(kind.rpartition(".")[2] for kind in kinds))]
+    message = [" or ".join(sorted(kind.rpartition(".")[2] for kind in kinds))]
     for protocol in sorted(kinds & validation.PROTOCOLS):
         missing = ", ".join(sorted(validation.missing_members(type(made), protocol)))
-        told.append(f"which has {missing}; see dpl.fem.{protocol.rpartition('.')[2]}")
+        message.append(f"which has {missing}; see dpl.fem.{protocol.rpartition('.')[2]}")
     raise ConfigError(
-        f"{place} gives an object of {type(made).__name__}; it must give {', '.join(told)}"
+        f"{place} gives an object of {type(made).__name__}; it must give {', '.join(message)}"
     )
 
 

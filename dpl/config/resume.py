@@ -69,18 +69,18 @@ def resumed_config(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     path = None if checkpoint is None else checkpoint.parent.parent / "config.yaml"
     if path is None or not path.is_file():
         return cfg
-    asked = to_container(cfg)
+    requested = to_container(cfg)
     before = read_config(path)
     kept = {key: value for key, value in before.items() if key not in OF_THE_SESSION}
-    if "trainer" in kept and "trainer" in asked:
+    if "trainer" in kept and "trainer" in requested:
         own = ("_target_", "_partial_", "plugins")  # calls, never those of the file
-        kept["trainer"] |= {key: asked["trainer"].get(key) for key in own}
-    unnamed = {k: v for k, v in kept.items() if k != "trainer" and v != asked.get(k)}
+        kept["trainer"] |= {key: requested["trainer"].get(key) for key in own}
+    unnamed = {k: v for k, v in kept.items() if k != "trainer" and v != requested.get(k)}
     try:
         validation.check(unnamed, unnamed, trust=False)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}; repeat the overrides of the run") from error
-    found, given = OmegaConf.create({**asked, **kept}), OmegaConf.create(asked)
+    found, given = OmegaConf.create({**requested, **kept}), OmegaConf.create(requested)
     for one in OverridesParser.create().parse_overrides(list(overrides)):
         key = one.key_or_group
         root = key.partition(".")[0]
@@ -89,7 +89,7 @@ def resumed_config(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
         if one.is_delete():
             owner, _, name = key.rpartition(".")
             (OmegaConf.select(found, owner) if owner else found).pop(name, None)
-        elif root not in asked:
+        elif root not in requested:
             return cfg
         else:
             OmegaConf.update(found, key, OmegaConf.select(given, key), merge=False)

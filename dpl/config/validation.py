@@ -217,8 +217,8 @@ def _check_call(path: str, node: dict[str, Any], target: Callable[..., Any]) -> 
                 raise ConfigError(f"{path}.{key} = {value!r} must be true or false")
             continue
         if key not in known:
-            told = suggestion(str(key), known, f"{path}.")
-            raise ConfigError(f"{path}.{key}: {node['_target_']} has no such option; {told}")
+            message = suggestion(str(key), known, f"{path}.")
+            raise ConfigError(f"{path}.{key}: {node['_target_']} has no such option; {message}")
         if key in hints and not matches_type(value, hints[key]):
             raise ConfigError(f"{path}.{key} = {value!r} must be {_describe(hints[key])}")
 

@@ -77,7 +77,7 @@ def named_columns(name: str, value: Any, names: Sequence[str], count: int) -> Te
         count: B.
 
     Raises:
-        ValueError: A value is missing or not asked for, or has a wrong shape.
+        ValueError: A value is missing or superfluous, or has a wrong shape.
     """
     if isinstance(value, Mapping):
         if set(value) != set(names):

@@ -1,4 +1,4 @@
-"""Laws of the tables of results: what is measured is what was asked, and nothing is made up."""
+"""Laws of the tables of results: what is measured is what was requested, and nothing is made up."""
 
 import csv
 import json
@@ -185,16 +185,16 @@ def test_one_command_writes_rows_machine_and_figure(trained, script):
     assert [row["loads"] for row in rows] == [
         s for s in ("in range", "twice", "small") for _ in names
     ]
-    told = {row["method"]: row for row in rows if row["loads"] == "in range"}
-    assert (told["fcnn"]["samples"], told["linear"]["samples"]) == ("16", "")
-    assert float(told["latent"]["training_minutes"]) > 0
-    assert float(told["latent"]["e_mean"]) < float(told["linear"]["e_mean"])
+    reported = {row["method"]: row for row in rows if row["loads"] == "in range"}
+    assert (reported["fcnn"]["samples"], reported["linear"]["samples"]) == ("16", "")
+    assert float(reported["latent"]["training_minutes"]) > 0
+    assert float(reported["latent"]["e_mean"]) < float(reported["linear"]["e_mean"])
     machine = json.loads((trained / "benchmarks" / "results" / "tiny.json").read_text())
     assert machine["threads"] == 1
     assert (trained / "benchmarks" / "results" / "tiny.png").read_bytes().startswith(b"\x89PNG")
     rows = json.loads((trained / "runs" / "tiny" / "fcnn" / "evaluation.json").read_text())
     (network,) = (row for row in rows if row["solver"] == "network")
-    assert float(told["fcnn"]["e_mean"]) == pytest.approx(network["errors"]["e_mean"], rel=1e-3)
+    assert float(reported["fcnn"]["e_mean"]) == pytest.approx(network["errors"]["e_mean"], rel=1e-3)
 
 
 def test_reduced_models_may_be_left_out(trained, script):

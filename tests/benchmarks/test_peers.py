@@ -72,7 +72,7 @@ REFERENCE = "/usr/lib/x86_64-linux-gnu/blas/libblas.so.3.11.0"
 
 
 @pytest.mark.parametrize(
-    ("libraries", "told"),
+    ("libraries", "reported"),
     [
         ([REFERENCE, "/usr/lib/x86_64-linux-gnu/libdmumps-5.5.0.so"], "reference BLAS"),
         (["/usr/lib64/libblas.so.3", "/w/numpy.libs/libscipy_openblas64_.so"], "reference BLAS"),
@@ -84,8 +84,8 @@ REFERENCE = "/usr/lib/x86_64-linux-gnu/blas/libblas.so.3.11.0"
         (["/usr/lib/x86_64-linux-gnu/libCombBLAS.so.1.16.0", "/usr/lib/libc.so.6"], None),
     ],
 )
-def test_a_blas_is_named_after_its_file_and_folder(libraries, told):
-    assert blas_detection.name(libraries) == told
+def test_a_blas_is_named_after_its_file_and_folder(libraries, reported):
+    assert blas_detection.name(libraries) == reported
 
 
 def test_a_folder_with_openblas_as_the_blas_is_found(tmp_path):

@@ -20,10 +20,10 @@ PROGRAM = textwrap.dedent(
         for flags in (["--help"], ["--cfg", "job"]):
             sys.argv = [script, *flags]
             GlobalHydra.instance().clear()
-            told = io.StringIO()
-            with contextlib.redirect_stdout(told), contextlib.suppress(SystemExit):
+            reported = io.StringIO()
+            with contextlib.redirect_stdout(reported), contextlib.suppress(SystemExit):
                 runpy.run_path(script, run_name="__main__")
-            assert told.getvalue().strip(), (script, flags)
+            assert reported.getvalue().strip(), (script, flags)
             heavy = {"torch", "lightning", "numba", "skfem", "scipy"} & set(sys.modules)
             assert not heavy, (script, flags, heavy)
     """
@@ -67,8 +67,8 @@ def test_help_of_a_wrong_option_ends_with_one_line(script, tmp_path):
 
 
 def test_help_of_a_benchmark_lists_options_and_comments_of_the_package(script, tmp_path):
-    told = " ".join(script("soak", "--help", cwd=tmp_path).out.split())
-    assert "network: cnn, fcnn*, gnn, latent, pod" in told
-    assert "optimizer.lr = 0.001 learning rate [-]" in told
+    reported = " ".join(script("soak", "--help", cwd=tmp_path).out.split())
+    assert "network: cnn, fcnn*, gnn, latent, pod" in reported
+    assert "optimizer.lr = 0.001 learning rate [-]" in reported
     ended = script("soak", "model=fcm", cwd=tmp_path)
     assert ended.err.startswith("error: model = fcm: there is no such option; model is one of cnn")

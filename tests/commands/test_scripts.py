@@ -385,8 +385,8 @@ def test_the_hparams_tab_shows_the_runs_of_a_sweep_side_by_side(swept):
     runs.Reload()
     provider = MultiplexerDataProvider(runs, str(swept / "sweep"))
     backend = Context(TBContext(data_provider=provider))
-    asked = RequestContext(), backend, ""
-    columns = get_experiment.Handler(*asked, api_pb2.GetExperimentRequest()).run()
+    requested = RequestContext(), backend, ""
+    columns = get_experiment.Handler(*requested, api_pb2.GetExperimentRequest()).run()
     request = api_pb2.ListSessionGroupsRequest(
         start_index=0,
         slice_size=10,
@@ -396,7 +396,7 @@ def test_the_hparams_tab_shows_the_runs_of_a_sweep_side_by_side(swept):
             *({"metric": info.name} for info in columns.metric_infos),
         ],
     )
-    lines = list_session_groups.Handler(*asked, request).run().session_groups
+    lines = list_session_groups.Handler(*requested, request).run().session_groups
 
     names = {info.name for info in columns.hparam_infos}
     assert {"model", "loss", "optimizer.lr", "model.layers", "model.rank", "young"} <= names

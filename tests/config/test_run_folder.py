@@ -434,13 +434,14 @@ def test_hyperparameters_are_flat_and_a_call_goes_by_its_name(compose):
 
 
 @pytest.mark.parametrize(
-    ("score", "told"), [(2e-3, 2e-3), (float("nan"), float("inf")), (float("inf"), float("inf"))]
+    ("score", "reported"),
+    [(2e-3, 2e-3), (float("nan"), float("inf")), (float("inf"), float("inf"))],
 )
-def test_the_best_error_is_the_score_of_the_checkpoint_that_is_kept_for_it(score, told):
+def test_the_best_error_is_the_score_of_the_checkpoint_that_is_kept_for_it(score, reported):
     best, last = ModelCheckpoint(monitor="val/e_mean"), ModelCheckpoint()
     best.best_model_score, last.best_model_score = torch.tensor(score), torch.tensor(1e-9)
     trainer = L.Trainer(logger=False, callbacks=[last, best], accelerator="cpu")
-    assert cli.best_error(trainer) == pytest.approx(told)
+    assert cli.best_error(trainer) == pytest.approx(reported)
 
 
 # ------------------------------------------------------------------ runs
@@ -585,7 +586,7 @@ def test_nothing_of_the_trainer_of_a_run_is_called(copied, monkeypatch, key):
         "dpl.system.files.atomic_write",
         "dpl.fem.mesh.generators.Sequence",
         "torch.optim.Optimizer.__init__.__globals__",
-        "lightning.fabric.utilities.cloud_io._load",  # a pickle, where it is asked to
+        "lightning.fabric.utilities.cloud_io._load",  # a pickle, where it may be read
         "torch.load",
     ],
 )
@@ -613,7 +614,7 @@ BOMB = "\n".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in pairwise(
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("a: &a [lol]\n" + BOMB, "refers to parts of itself"),
         ("seed: ${oc.env:HOME}", "holds an interpolation"),
@@ -625,9 +626,9 @@ BOMB = "\n".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in pairwise(
     ],
     ids=range(7),
 )
-def test_a_configuration_that_no_run_writes_is_refused_by_name(copied, text, told):
+def test_a_configuration_that_no_run_writes_is_refused_by_name(copied, text, reported):
     (copied / "config.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=told) as refusal:
+    with pytest.raises(ConfigError, match=reported) as refusal:
         run_folder.load_run(copied)
     assert "config.yaml" in str(refusal.value)
     assert "\n" not in str(refusal.value)
@@ -675,7 +676,7 @@ def test_a_schedule_over_a_training_without_end_is_refused(tiny_training, script
 
 @pytest.fixture
 def resumed(compose, tiny_training, trained):
-    """The configuration that resumes the run, changed as asked."""
+    """The configuration that resumes the run, changed as requested."""
 
     def resumed(*overrides):
         folder = trained[0]
@@ -700,7 +701,7 @@ def test_a_run_may_be_resumed_for_longer_and_elsewhere(resumed, override):
 
 
 @pytest.mark.parametrize(
-    ("override", "told"),
+    ("override", "reported"),
     [
         ("model.width=17", "model.width was 16, is 17"),
         ("material.poisson=0.25", "material.poisson was 0.3, is 0.25"),
@@ -714,10 +715,10 @@ def test_a_run_may_be_resumed_for_longer_and_elsewhere(resumed, override):
         ("~scheduler", "scheduler"),
     ],
 )
-def test_a_run_is_not_resumed_with_another_configuration(resumed, override, told):
+def test_a_run_is_not_resumed_with_another_configuration(resumed, override, reported):
     with pytest.raises(ConfigError, match="is of another configuration") as refusal:
         resume.check_resumed(resumed(override))
-    assert told in str(refusal.value)
+    assert reported in str(refusal.value)
 
 
 @pytest.fixture
@@ -743,7 +744,7 @@ def test_a_run_is_resumed_with_the_configuration_that_lies_in_it(trained, resume
 
 
 @pytest.mark.parametrize(
-    ("override", "told"),
+    ("override", "reported"),
     [
         ("model.width=17", r"configuration: model\.width was 16, is 17;"),
         ("loss=mse", r"configuration: loss\._target_ was dpl\.training\.LrStar"),
@@ -751,9 +752,9 @@ def test_a_run_is_resumed_with_the_configuration_that_lies_in_it(trained, resume
     ],
 )
 def test_a_resumed_run_names_only_what_the_command_line_changes(
-    trained, resumed_config, override, told
+    trained, resumed_config, override, reported
 ):
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=reported):
         resume.check_resumed(resumed_config(trained[0], override))
 
 
@@ -829,7 +830,7 @@ FOREIGN = {  # what is changed in a checkpoint -> what the one line says
 def test_a_foreign_checkpoint_ends_training_with_one_line(
     copied, script, tiny_training, part, tmp_path
 ):
-    path, (value, told) = copied / "checkpoints" / "last.ckpt", FOREIGN[part]
+    path, (value, reported) = copied / "checkpoints" / "last.ckpt", FOREIGN[part]
     found = checkpoints.read(path)
     more = {"scene": "0f" * 32} if part == "identity" else {}
     checkpoints.write({**found, part: value, **more}, path)
@@ -838,7 +839,7 @@ def test_a_foreign_checkpoint_ends_training_with_one_line(
     ended = script("train", *tiny_training, *quiet, f"ckpt_path={path}", cwd=tmp_path)
     assert ended.status == 2, ended.err
     line = ended.err.strip().splitlines()[-1]
-    assert re.search(f"^error: ckpt_path.*{told}", line), line
+    assert re.search(f"^error: ckpt_path.*{reported}", line), line
     assert "Traceback" not in ended.err
 
 

@@ -163,9 +163,9 @@ def _renamed(path, change):
     data = path.read_bytes()
     (size,) = struct.unpack("<Q", data[:8])
     header = json.loads(data[8 : 8 + size])
-    told = json.loads(header["__metadata__"]["dpl"])
-    change(told)
-    header["__metadata__"]["dpl"] = json.dumps(told)
+    reported = json.loads(header["__metadata__"]["dpl"])
+    change(reported)
+    header["__metadata__"]["dpl"] = json.dumps(reported)
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8)
     path.write_bytes(struct.pack("<Q", len(text)) + text + data[8 + size :])
@@ -197,9 +197,9 @@ MESHES = {
     "propeller": {"_target_": "dpl.fem.propeller", "cells": [90, 90, 90, 90, 90]},
 }
 LIES = {
-    "nothing": lambda told: None,
-    "no number of nodes": lambda told: told.pop("nodes"),
-    "a number that fits": lambda told: told.update(nodes=10**9),
+    "nothing": lambda reported: None,
+    "no number of nodes": lambda reported: reported.pop("nodes"),
+    "a number that fits": lambda reported: reported.update(nodes=10**9),
 }
 
 
@@ -227,9 +227,9 @@ def test_a_mesh_of_more_nodes_than_the_weights_have_is_refused_before_it_is_made
     monkeypatch.setattr(Scene, "__init__", forbidden)
     with pytest.raises(
         ConfigError, match=r"^mesh: mesh\.\w+ = .* nodes must be .* at most; .*best"
-    ) as told:
+    ) as reported:
         run_folder.load_run(handed_on)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(reported.value)
 
 
 def test_a_larger_mesh_file_in_the_folder_is_refused_by_its_nodes(handed_on, part):

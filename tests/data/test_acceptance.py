@@ -75,10 +75,10 @@ def test_the_warning_names_the_bin_with_the_lowest_acceptance_and_a_remedy():
         AmplitudeBin(0.5, 1.0, 40, 10),
         AmplitudeBin(1.0, 1.5, 9, 0),
     ]
-    told = bias_warning(parts)
-    assert "only 10 of 40 loads with amplitudes 0.50 to 1.00 were accepted" in told
-    assert "loads.deflection" in told
-    assert "\n" not in told
+    reported = bias_warning(parts)
+    assert "only 10 of 40 loads with amplitudes 0.50 to 1.00 were accepted" in reported
+    assert "loads.deflection" in reported
+    assert "\n" not in reported
 
 
 def test_the_table_has_one_column_per_bin():

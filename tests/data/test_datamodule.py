@@ -400,13 +400,13 @@ def test_loads_are_drawn_near_the_load_with_the_largest_error(scene, online):
     module = online(
         hard_example_fraction=1.0, batch_size=4, new_per_round=4, batches=1, capacity=64
     )
-    told = SimpleNamespace(batch_errors=None)
+    reported = SimpleNamespace(batch_errors=None)
     module.trainer = SimpleNamespace(
-        lightning_module=told, logger=None, global_rank=0, world_size=1
+        lightning_module=reported, logger=None, global_rank=0, world_size=1
     )
     stream = module.train_dataloader()
     first = next(iter(stream))
-    told.batch_errors = torch.arange(4.0)
+    reported.batch_errors = torch.arange(4.0)
     assert sorted(forces([first])) == sorted(drawn(scene, 4))
     next(iter(stream))
     worst = module._replay.stream.hard_examples

@@ -187,15 +187,15 @@ def test_the_journal_has_a_line_for_each_session_that_solved_something(wanted, c
 
 
 def test_the_summary_tells_splits_amplitudes_and_time(wanted):
-    told = wanted().fill().summary().splitlines()
-    assert told[0].endswith("/d")
-    assert "train: 6 of 6 loads accepted" in told[1]
-    assert "val: 2 of 2 loads accepted" in told[2]
-    assert "test: 2 of 2 loads accepted" in told[3]
-    assert "Newton iterations" in told[1]
-    assert any("amplitude up to" in line for line in told)
-    assert "s per load on one core" in told[-1]
-    assert "MB" in told[-1]
+    reported = wanted().fill().summary().splitlines()
+    assert reported[0].endswith("/d")
+    assert "train: 6 of 6 loads accepted" in reported[1]
+    assert "val: 2 of 2 loads accepted" in reported[2]
+    assert "test: 2 of 2 loads accepted" in reported[3]
+    assert "Newton iterations" in reported[1]
+    assert any("amplitude up to" in line for line in reported)
+    assert "s per load on one core" in reported[-1]
+    assert "MB" in reported[-1]
 
 
 def test_the_summary_of_an_empty_data_set_is_its_folder(wanted):
@@ -297,9 +297,9 @@ def test_repair_makes_damaged_files_again(made, wanted, solved, capsys):
     (made.folder / "val-000000.safetensors").write_bytes(b"")
     capsys.readouterr()
     wanted().repair()
-    told = capsys.readouterr().out
-    assert "val-000000.safetensors is damaged" in told
-    assert "; it is removed, and its 2 loads are solved again" in told
+    reported = capsys.readouterr().out
+    assert "val-000000.safetensors is damaged" in reported
+    assert "; it is removed, and its 2 loads are solved again" in reported
     assert solved == [(1, 0), (1, 1)]
     after = content(made.folder)
     manifests = [sorted(found.pop("manifest.jsonl").splitlines()) for found in (after, before)]
@@ -350,7 +350,7 @@ def test_the_command_verifies_and_repairs_a_set(script, tiny, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("override", "told"),
+    ("override", "reported"),
     [
         ("action=look", "action = 'look' must be one of generate, verify, repair"),
         ("shard=1", "shard = 1"),
@@ -360,14 +360,14 @@ def test_the_command_verifies_and_repairs_a_set(script, tiny, tmp_path):
     ],
 )
 def test_invalid_options_end_with_one_line_and_status_2(
-    script, tiny, scene_of, wanted, tmp_path, override, told
+    script, tiny, scene_of, wanted, tmp_path, override, reported
 ):
     scene = scene_of(*tiny)
     DataSet(scene, str(tmp_path / "d"), train=1, val=0, test=0, workers=0).fill()
     ended = script("generate", *tiny, "data.folder=d", override, cwd=tmp_path)
     assert ended.status == 2
     assert ended.err.startswith("error: ")
-    assert told in ended.err
+    assert reported in ended.err
     assert ended.err.count("\n") == 1
 
 

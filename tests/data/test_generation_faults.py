@@ -402,10 +402,10 @@ def test_a_full_disk_ends_with_one_line_and_a_resume_makes_the_same_bytes(
         "; ".join(steps), *slow(**sizes, workers=workers), cwd=tmp_path, wrap=["unshare", "-rm"]
     )
     assert status == 0, err[-2000:]
-    told = (tmp_path / "full.err").read_text()
-    assert (tmp_path / "full.status").read_text().strip() == "2", told[-2000:]
-    assert told.startswith("error: no space left")
-    assert told.count("\n") == 1
+    reported = (tmp_path / "full.err").read_text()
+    assert (tmp_path / "full.status").read_text().strip() == "2", reported[-2000:]
+    assert reported.startswith("error: no space left")
+    assert reported.count("\n") == 1
     assert (tmp_path / "full.parts").read_text() == ""
     earlier = (tmp_path / "full/manifest.jsonl").read_text().splitlines()
     assert earlier, "not even one shard fitted"

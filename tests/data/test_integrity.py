@@ -59,9 +59,9 @@ def test_verify_finds_a_shard_whose_line_is_lost(copy, data, split, size, capsys
     ]
     capsys.readouterr()
     wanted(copy).repair()
-    told = capsys.readouterr().out
-    assert "is named by no manifest; it is removed, and its" in told
-    assert f"{size} loads of {split} are missing and are solved" in told
+    reported = capsys.readouterr().out
+    assert "is named by no manifest; it is removed, and its" in reported
+    assert f"{size} loads of {split} are missing and are solved" in reported
     assert content(copy.folder) == content(data.store.folder)
     assert list(wanted(copy).verify()) == []
 
@@ -74,7 +74,7 @@ def test_verify_finds_a_lost_manifest(copy, data):
 
 
 @pytest.mark.parametrize(
-    ("lost", "told"),
+    ("lost", "reported"),
     [
         (
             {"train": 13},
@@ -85,10 +85,10 @@ def test_verify_finds_a_lost_manifest(copy, data):
         ({"train": 3, "val": 0}, []),
     ],
 )
-def test_verify_finds_missing_loads(copy, lost, told):
+def test_verify_finds_missing_loads(copy, lost, reported):
     found = list(wanted(copy, **lost).verify())
-    assert len(found) == len(told)
-    assert all(words in line for words, line in zip(told, found, strict=True))
+    assert len(found) == len(reported)
+    assert all(words in line for words, line in zip(reported, found, strict=True))
 
 
 def test_verify_of_a_part_ignores_the_loads_of_other_parts(copy, monkeypatch):
@@ -114,13 +114,13 @@ def test_verify_finds_an_invalid_line_with_its_number(copy, data, harm, why, whi
     name = found[which]["file"]
     found[which] = harm(found[which])
     write(copy, found)
-    told = flaws(copy)
-    assert sorted(told) == sorted(["manifest.jsonl", name])
-    assert told["manifest.jsonl"].startswith(
+    reported = flaws(copy)
+    assert sorted(reported) == sorted(["manifest.jsonl", name])
+    assert reported["manifest.jsonl"].startswith(
         f"has 1 lines that describe no shard; the first is line {which + 1}, which "
     )
-    assert why in told["manifest.jsonl"]
-    assert told[name] == "is named by no manifest"
+    assert why in reported["manifest.jsonl"]
+    assert reported[name] == "is named by no manifest"
     done = {part.file: words for part, words in repair(copy)}
     assert done["manifest.jsonl"].endswith("; these lines are removed")
     wanted(copy).repair()
@@ -131,10 +131,10 @@ def test_invalid_lines_are_counted_for_each_manifest(copy):
     with (copy.folder / "manifest.jsonl").open("a") as file:
         file.write("{\n{}\n")
     (copy.folder / "manifest-1-of-2.jsonl").write_text("torn")
-    told = flaws(copy)
-    assert told["manifest.jsonl"].startswith("has 2 lines")
-    assert "the first is line 4" in told["manifest.jsonl"]
-    assert told["manifest-1-of-2.jsonl"].startswith("has 1 lines")
+    reported = flaws(copy)
+    assert reported["manifest.jsonl"].startswith("has 2 lines")
+    assert "the first is line 4" in reported["manifest.jsonl"]
+    assert reported["manifest-1-of-2.jsonl"].startswith("has 1 lines")
     repair(copy)
     assert flaws(copy) == {}
 
@@ -166,9 +166,9 @@ def test_a_shard_that_no_manifest_names_is_found_and_removed(copy, data, harm):
     else:
         stray.write_bytes(b"nothing" if harm == "no shard" else bytes(copy.max_shard_size(64) + 1))
     assert flaws(copy) == {stray.name: "is named by no manifest"}
-    ((part, told),) = repair(copy)
+    ((part, reported),) = repair(copy)
     assert (part.file, list(part.loads)) == (stray.name, []), "none of its loads is of its name"
-    assert told == "is named by no manifest; it is removed"
+    assert reported == "is named by no manifest; it is removed"
     assert content(copy.folder) == content(data.store.folder)
 
 

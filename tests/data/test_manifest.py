@@ -108,9 +108,9 @@ CASES = [(change, why) for why, changes in IMPOSSIBLE.items() for change in chan
 def test_an_invalid_line_is_left_out_with_its_number_and_the_reason(manifest, change, why):
     path = manifest(LINE, LINE | change)
     assert read_manifest(path) == [LINE]
-    ((number, told),) = invalid_lines(path)
+    ((number, reported),) = invalid_lines(path)
     assert number == 2
-    assert told.startswith(why)
+    assert reported.startswith(why)
 
 
 @pytest.mark.parametrize("name", LINE)

@@ -822,10 +822,10 @@ def test_modes_of_another_precision_are_found(copy):
 
 @pytest.mark.parametrize("line", ["{}", '{"loads": "many"}', "[" * 99_999, '{"loads": NaN}'])
 def test_an_invalid_line_of_the_journal_is_ignored(copy, line):
-    told, a_load = copy.summary(), copy.seconds_per_load()
+    reported, a_load = copy.summary(), copy.seconds_per_load()
     with (copy.folder / "journal.jsonl").open("a") as file:
         file.write(line + "\n")
-    assert (copy.summary(), copy.seconds_per_load()) == (told, a_load)
+    assert (copy.summary(), copy.seconds_per_load()) == (reported, a_load)
 
 
 def test_a_shard_under_the_name_of_another_is_refused(copy):

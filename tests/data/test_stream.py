@@ -381,19 +381,19 @@ def clocked(monkeypatch):
 
 
 def test_the_rates_of_each_epoch_are_reported(replay, clocked):
-    told = []
-    stream = replay(clocked, batches=5, reuse=4, capacity=1000, report=told.append)
+    reported = []
+    stream = replay(clocked, batches=5, reuse=4, capacity=1000, report=reported.append)
     for epoch in range(3):
         for _ in stream:
             pass
-        assert len(told) == epoch + 1
-    assert all(isinstance(rates, StreamRates) for rates in told)
-    assert stream.rates is told[-1]
-    for rates in told:
+        assert len(reported) == epoch + 1
+    assert all(isinstance(rates, StreamRates) for rates in reported)
+    assert stream.rates is reported[-1]
+    for rates in reported:
         assert rates.produced == pytest.approx(1 / 0.005)
         assert 1.5 * rates.produced < rates.consumed < 2.7 * rates.produced  # reuse / 2
         assert rates.waiting == pytest.approx(1), "this loop has nothing else to do"
-    assert told[-1].uses == pytest.approx(2, rel=0.1)
+    assert reported[-1].uses == pytest.approx(2, rel=0.1)
 
 
 def test_an_optimiser_slower_than_the_stream_does_not_wait(replay, clocked):
@@ -497,10 +497,10 @@ def test_new_loads_concentrate_where_the_errors_are_largest(unsolved, replay):
 
     stream = OnlineSamples(unsolved, SEED, hard_examples=HardExamples(2), hard_example_fraction=0.5)
     stream.scene.loads.young_at = lambda points: points[:, 0] + 10 * (points[:, 1] * 1e6).round()
-    told = replay(
+    reported = replay(
         stream, errors=errors, batches=1, new_per_round=16, reuse=4, capacity=256, batch_size=16
     )
-    buffer = told._buffer
+    buffer = reported._buffer
 
     def share():
         points = buffer._point[: min(buffer._count, 256)]
@@ -515,10 +515,10 @@ def test_new_loads_concentrate_where_the_errors_are_largest(unsolved, replay):
 
     buffer.choose = choose
     for _ in range(4):
-        next(iter(told))
+        next(iter(reported))
     early = share()
     for _ in range(400):
-        next(iter(told))
+        next(iter(reported))
     assert early < 0.25, "of the square it is 0.07"
     assert share() > 0.35
 
@@ -556,7 +556,7 @@ def test_errors_are_those_of_the_batch_before(replay):
 
 def test_without_hard_examples_no_error_is_computed(replay):
     def forbidden():
-        raise AssertionError("asked")
+        raise AssertionError("requested")
 
     assert sum(1 for _ in replay(errors=forbidden)) == 10
 
@@ -566,19 +566,21 @@ class Watching(Numbers):
 
     def drawn(self, place):
         one = super().drawn(place)
-        told = torch.cat([self.hard_examples.count.double(), self.hard_examples.points[0]])
-        return one._replace(sample=one.sample._replace(force=told.expand(2, 3)))
+        reported = torch.cat([self.hard_examples.count.double(), self.hard_examples.points[0]])
+        return one._replace(sample=one.sample._replace(force=reported.expand(2, 3)))
 
 
 def test_spawned_workers_see_new_hard_examples(replay):
     stream = Watching(pause=[0.01])
     stream.hard_examples = HardExamples(2)
-    told = replay(stream, workers=1, new_per_round=1, reuse=1, batch_size=1, batches=1, capacity=8)
-    assert next(iter(told)).force[0, 0].tolist() == [0.0, 0.0, 0.0]
+    reported = replay(
+        stream, workers=1, new_per_round=1, reuse=1, batch_size=1, batches=1, capacity=8
+    )
+    assert next(iter(reported)).force[0, 0].tolist() == [0.0, 0.0, 0.0]
     stream.hard_examples.update(torch.tensor([[0.25, 0.75]], dtype=torch.float64))
     stream.hard_examples.update = lambda points: None  # the replay's own: it has no errors to tell
     for _ in range(4):  # those on their way do not know
-        last = next(iter(told)).force[0, 0].tolist()
+        last = next(iter(reported)).force[0, 0].tolist()
     assert last == [1.0, 0.25, 0.75]
 
 
@@ -750,7 +752,7 @@ def test_a_closed_stream_can_be_closed_again(replay):
     next(iter(stream))
     stream.close()
     stream.close()
-    assert len(set(places(next(iter(stream))))) == 8, "it begins again when it is asked"
+    assert len(set(places(next(iter(stream))))) == 8, "it begins again when it is requested"
 
 
 # ------------------------------------------------------------------ workers end with the parent

@@ -29,12 +29,12 @@ class Known:
 
     def __init__(self, problem, batch, answers, counts):
         self.problem, self.batch, self.answers, self.counts = problem, batch, answers, counts
-        self.asked = []
+        self.requested = []
 
     def iterate(self, load):
         assert len(load.force) == 1, "one load at a time"
         (k,) = [k for k, force in enumerate(self.batch.force) if torch.equal(force, load.force[0])]
-        self.asked.append(k)
+        self.requested.append(k)
         yield evaluate_solution(self.problem, torch.zeros_like(load.force), load, 1e-8)
         answer = self.answers[k : k + 1]
         yield evaluate_solution(self.problem, answer, load, 1e-8, iterations=self.counts[k])
@@ -68,7 +68,7 @@ def test_every_solver_is_warmed_up_and_then_timed_alternately(scene, few):
 
     a, b = (Spy(scene.problem, few, few.displacement, [1] * 4) for _ in range(2))
     measure({"a": a, "b": b}, few, scene.problem)
-    assert a.asked == b.asked == [0, 0, 1, 2, 3]
+    assert a.requested == b.requested == [0, 0, 1, 2, 3]
     assert order == [a, b] + [a, b] * 4
 
 
@@ -79,7 +79,7 @@ def test_the_clock_measures_the_solver(scene, few, monkeypatch):
     class Slow(Known):
         def iterate(self, load):
             yield from super().iterate(load)
-            watch.now += 1e-3 * (10 + self.asked[-1])
+            watch.now += 1e-3 * (10 + self.requested[-1])
 
     slow = Slow(scene.problem, few, few.displacement, [1] * 4)
     fast = Known(scene.problem, few, few.displacement, [1] * 4)

@@ -13,22 +13,22 @@ from dpl.training import MSE, Surrogate
 
 @pytest.fixture
 def watch(monkeypatch):
-    """A clock that advances only when told to [s]."""
+    """A clock that advances only when set [s]."""
     watch = SimpleNamespace(now=0.0)
     monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: watch.now))
     return watch
 
 
 def test_percentiles_exclude_the_warm_up(watch):
-    asked = []
+    requested = []
 
     def answer(load):
-        asked.append(load)
-        warm = len(asked) > timing.WARM_UP
+        requested.append(load)
+        warm = len(requested) > timing.WARM_UP
         watch.now += 1e-3 * (load + 1) if warm else 100.0
 
     found = timing.latency(answer, range(101), repeats=2)
-    assert asked == [*range(timing.WARM_UP), *range(101), *range(101)]
+    assert requested == [*range(timing.WARM_UP), *range(101), *range(101)]
     assert found.loads == 101
     assert found.p50 == pytest.approx(51.0)
     assert found.p99 == pytest.approx(100.0)
@@ -55,28 +55,28 @@ def test_simulator_and_bare_network_are_timed_on_the_same_loads(scene, batch, mo
     torch.manual_seed(0)
     surrogate = Surrogate(FCNN(scene, width=8), MSE(), scene).eval()
     simulator = Simulator(surrogate)
-    asked = {"simulator": [], "network": []}
+    requested = {"simulator": [], "network": []}
 
-    def told(name, call):
+    def reported(name, call):
         def listen(self, force, **more):
             answer = call(self, force, **more)
-            asked[name].append((force, answer))
+            requested[name].append((force, answer))
             return answer
 
         return listen
 
-    monkeypatch.setattr(Simulator, "__call__", told("simulator", Simulator.__call__))
-    monkeypatch.setattr(Surrogate, "forward", told("network", Surrogate.forward))
+    monkeypatch.setattr(Simulator, "__call__", reported("simulator", Simulator.__call__))
+    monkeypatch.setattr(Surrogate, "forward", reported("network", Surrogate.forward))
     found = timing.latencies(simulator, batch.load)
     assert list(found) == ["sim(force)", "bare network"]
     assert [one.loads for one in found.values()] == [12, 12]
     unit = scene.force_unit * 4500.0
     newtons = [*range(timing.WARM_UP), *range(12)]
-    for pairs in asked.values():
+    for pairs in requested.values():
         assert len(pairs) == len(newtons)
         for (force, _), k in zip(pairs, newtons, strict=True):
             assert torch.allclose(force, unit * batch.force[k : k + 1], rtol=1e-12)
-    for (_, answer), (_, bare) in zip(asked["simulator"], asked["network"], strict=True):
+    for (_, answer), (_, bare) in zip(requested["simulator"], requested["network"], strict=True):
         assert torch.allclose(answer.displacement, bare, rtol=1e-12)
         assert answer.residual.isfinite().all()
         assert answer.volume_ratio.isfinite().all()

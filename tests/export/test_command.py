@@ -64,8 +64,8 @@ def test_export_writes_the_documented_folder(script, trained):
 
 @pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed (extra onnx)")
 def test_a_graph_with_too_large_a_difference_is_removed(script, trained):
-    asked = ["run=runs/first", "folder=off", "outputs=[model]", "samples=4", "repeats=1"]
-    ended = script("export", *asked, "tol=1e-12", cwd=trained)
+    requested = ["run=runs/first", "folder=off", "outputs=[model]", "samples=4", "repeats=1"]
+    ended = script("export", *requested, "tol=1e-12", cwd=trained)
     assert ended.status == 1
     (line,) = ended.err.strip().splitlines()
     assert line.startswith("error: ONNX and torch differ by ")
@@ -75,7 +75,7 @@ def test_a_graph_with_too_large_a_difference_is_removed(script, trained):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (
             ["run=runs/none", "outputs=[results]"],
@@ -91,10 +91,10 @@ def test_a_graph_with_too_large_a_difference_is_removed(script, trained):
         (["run=runs/first", "solve_reference=2"], "solve_reference = 2 must be true or false"),
     ],
 )
-def test_invalid_input_prints_one_line(script, trained, arguments, told):
+def test_invalid_input_prints_one_line(script, trained, arguments, reported):
     ended = script("export", *arguments, cwd=trained)
     assert ended.status == 2
-    assert f"error: {told}" in ended.err
+    assert f"error: {reported}" in ended.err
     assert len(ended.err.strip().splitlines()) == 1
 
 

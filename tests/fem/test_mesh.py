@@ -351,9 +351,9 @@ INSIDE_OUT = {  # file with cells the other way round, and the words of the warn
 @pytest.mark.parametrize("name", INSIDE_OUT)
 def test_cells_that_are_listed_inside_out_are_read_and_counted_in_a_warning(tmp_path, name):
     """Files differ in it, and so do the tetrahedra of one box."""
-    points, cells, told = INSIDE_OUT[name]
+    points, cells, reported = INSIDE_OUT[name]
     path = write(tmp_path / "part.vtu", points, **{name.removeprefix("one "): cells})
-    with pytest.warns(UserWarning, match=rf"part\.vtu: {told}") as warned:
+    with pytest.warns(UserWarning, match=rf"part\.vtu: {reported}") as warned:
         mesh = read_mesh(path)
     assert len(warned) == 1
     size = np.ptp(points, axis=0)
@@ -397,7 +397,7 @@ NUMBERS = {  # format: file, a node of it, the same with the number of another, 
 @pytest.mark.parametrize("kind", NUMBERS)
 def test_a_node_number_that_is_listed_twice_is_an_error_that_names_it(tmp_path, kind):
     """Meshio would use the last node of that number, wherever it is."""
-    name, own, other, told = NUMBERS[kind]
+    name, own, other, reported = NUMBERS[kind]
     path = tmp_path / name
     binary = {"binary": False} if kind.startswith("gmsh") else {}
     meshio.write(path, meshio.Mesh(CORNERS, [("tetra", TETS)]), file_format=kind, **binary)
@@ -405,7 +405,7 @@ def test_a_node_number_that_is_listed_twice_is_an_error_that_names_it(tmp_path, 
     text = path.read_text()
     assert text.count(own) == 1
     path.write_text(text.replace(own, other))
-    with pytest.raises(ValueError, match=told) as error:
+    with pytest.raises(ValueError, match=reported) as error:
         read_mesh(path)
     assert "\n" not in str(error.value)
 

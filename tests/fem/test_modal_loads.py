@@ -130,9 +130,9 @@ def test_modes_do_not_depend_on_size(beam):
     assert torch.allclose(shapes[0], shapes[2], rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize(("asked", "given"), [(1, 2), (2, 2), (3, 3), (4, 5), (5, 5)])
-def test_a_family_of_modes_is_kept_whole(linear, asked, given):
-    assert len(eigenmodes(linear, asked).values) == given
+@pytest.mark.parametrize(("requested", "given"), [(1, 2), (2, 2), (3, 3), (4, 5), (5, 5)])
+def test_a_family_of_modes_is_kept_whole(linear, requested, given):
+    assert len(eigenmodes(linear, requested).values) == given
 
 
 def test_neighbouring_eigenvalues_are_one_family(monkeypatch):

@@ -718,8 +718,8 @@ def test_slivers_end_where_rounding_ends_them(pull, corner, part, deepest):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         answer = solve(newton(problem), load_of(pull(problem, 20.0)))
-    told = any("rounding allows no less" in str(w.message) for w in caught)
-    assert told == bool(answer.residual > 1e-8) == (part == 1e-8)
+    reported = any("rounding allows no less" in str(w.message) for w in caught)
+    assert reported == bool(answer.residual > 1e-8) == (part == 1e-8)
     assert answer.converged.all()
     assert corner(problem, answer.displacement)[2].item() == pytest.approx(deepest, abs=6e-8)
 

@@ -1,4 +1,4 @@
-"""Laws of the simulator: its answers keep what was asked or say that they do not, in SI units."""
+"""Laws of the simulator: its answers meet the request or say that they do not, in SI units."""
 
 import itertools
 import math
@@ -487,11 +487,11 @@ ABSURD = {
 @pytest.mark.parametrize("name", ["force", "young", "tol", "budget_ms"])
 @pytest.mark.parametrize("kind", ABSURD)
 def test_what_is_no_real_number_is_refused_in_a_line_that_names_it(scene, forces, name, kind):
-    asked = {"force": forces[0].numpy(), name: ABSURD[kind]}
+    requested = {"force": forces[0].numpy(), name: ABSURD[kind]}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(ValueError, match=f"^{name}") as caught:
-            simulator_of(scene)(**asked)
+            simulator_of(scene)(**requested)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 300
 
@@ -566,11 +566,11 @@ def test_a_force_that_is_not_finite_on_a_held_node_is_refused(scene, forces, bad
     ids=str,
 )
 def test_what_cannot_be_asked_is_refused_in_words(scene, forces, arguments, words):
-    asked = {"force": forces[0].numpy()} | arguments
-    if asked["force"] is None:
-        asked["force"] = forces[0].numpy() * np.nan
+    requested = {"force": forces[0].numpy()} | arguments
+    if requested["force"] is None:
+        requested["force"] = forces[0].numpy() * np.nan
     with pytest.raises(ValueError, match=words):
-        simulator_of(scene)(**asked)
+        simulator_of(scene)(**requested)
 
 
 def test_a_range_of_moduli_wants_to_know_which(make_scene):

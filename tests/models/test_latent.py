@@ -160,19 +160,19 @@ def test_probes_estimate_the_projection_residual_of_a_linear_solution(scene, bat
     force = torch.cat([batch.force, sparse(scene, 2), sparse(scene, 60)])
     linear = linear_of(scene, force) * net.linear_unit
     missed = sizes(linear - projected(net, linear))
-    told = net.projection_residual_estimate(net.input_orbits.images(force), None).sqrt()
+    reported = net.projection_residual_estimate(net.input_orbits.images(force), None).sqrt()
     assert float(missed.max() / missed.min()) > 100
-    assert (told / missed > 1 / 3).all()
-    assert (told / missed < 3).all()
+    assert (reported / missed > 1 / 3).all()
+    assert (reported / missed < 3).all()
 
 
 def test_only_loads_with_large_projection_residuals_are_solved(scene, batch, monkeypatch):
-    asked = []
+    requested = []
     original = Latent.solve_linear
     monkeypatch.setattr(
         Latent,
         "solve_linear",
-        lambda net, acting, *how: asked.append(len(acting)) or original(net, acting, *how),
+        lambda net, acting, *how: requested.append(len(acting)) or original(net, acting, *how),
     )
     module = prepared(scene, batch, rank=20, linear_tol=torch.inf)
     force = torch.cat([batch.force, sparse(scene, 2), sparse(scene, 60)])
@@ -180,24 +180,24 @@ def test_only_loads_with_large_projection_residuals_are_solved(scene, batch, mon
     missed = sizes(linear - projected(module.net, linear)) / sizes(linear)
     for tol in (0.0, float(missed.median()), torch.inf):
         module.net.linear_tol = tol
-        asked.clear()
+        requested.clear()
         answer_to(module, force)
         few, many = int((missed > 3 * tol).sum()), int((missed > tol / 3).sum())
-        assert few <= sum(asked) <= many
+        assert few <= sum(requested) <= many
         assert (few, many) != (0, len(force))
 
 
 def test_images_of_a_load_have_equal_projection_residual_estimates(scene, batch):
     net = prepared(scene, batch, rank=20).net
     assert len(net.group) > 1
-    told = []
+    reported = []
     for symmetry in net.group:
-        told.append(
+        reported.append(
             net.projection_residual_estimate(
                 net.input_orbits.images(symmetry.image(batch.force)), None
             )
         )
-    assert torch.allclose(torch.stack(told), told[0].expand(len(told), -1), rtol=1e-4)
+    assert torch.allclose(torch.stack(reported), reported[0].expand(len(reported), -1), rtol=1e-4)
 
 
 def test_a_solve_changes_only_the_part_outside_the_basis(scene, batch):
@@ -444,7 +444,7 @@ def test_a_stream_fits_the_bases_to_the_validation_loads(script, overrides, home
 
 
 def test_skipped_work_of_a_stream_mentions_coordinates_from_disk_only(script, overrides, home):
-    kept = [o for o in overrides("told") if "data.train" not in o]
+    kept = [o for o in overrides("reported") if "data.train" not in o]
     more = ["data=online", "data.batches=1", "data.new_per_round=4", "trainer.max_epochs=1"]
     ended = script("train", *kept, *more, cwd=home)
     assert ended.status == 0
@@ -452,7 +452,7 @@ def test_skipped_work_of_a_stream_mentions_coordinates_from_disk_only(script, ov
 
 
 @pytest.mark.parametrize(
-    ("override", "told"),
+    ("override", "reported"),
     [
         ("model.linear_tol=-1", "model: linear_tol = -1 must be 0 or more"),
         ("model.rank=0", "model: rank = 0 must be 1 or more"),
@@ -466,11 +466,11 @@ def test_skipped_work_of_a_stream_mentions_coordinates_from_disk_only(script, ov
     ],
 )
 def test_a_wrong_option_ends_with_one_line_before_anything_is_solved(
-    script, overrides, tmp_path, override, told
+    script, overrides, tmp_path, override, reported
 ):
     ended = script("train", *overrides("wrong", override), cwd=tmp_path)
     assert ended.status == 2
-    assert ended.err.startswith(f"error: {told}"), ended.err
+    assert ended.err.startswith(f"error: {reported}"), ended.err
     assert ended.err.count("\n") == 1
     assert not (tmp_path / "data").exists()
     assert not (tmp_path / "wrong" / "checkpoints").exists()

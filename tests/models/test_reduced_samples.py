@@ -158,10 +158,10 @@ def test_only_losses_of_squared_errors_train_in_coordinates(build, scene, batch)
 
 
 def test_skipped_work_mentions_coordinates_where_they_are_used(build):
-    told = "no fields in training from disk: the loss is computed in coordinates"
-    assert told in build(PODNet, {}).skipped_work()
-    assert told in build(Latent, {}, RMSELoss()).skipped_work()
-    assert told not in build(Latent, {}, LrStar()).skipped_work()
+    reported = "no fields in training from disk: the loss is computed in coordinates"
+    assert reported in build(PODNet, {}).skipped_work()
+    assert reported in build(Latent, {}, RMSELoss()).skipped_work()
+    assert reported not in build(Latent, {}, LrStar()).skipped_work()
 
 
 # ------------------------------------------------------------------ images

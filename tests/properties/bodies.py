@@ -129,7 +129,7 @@ class Body:
                 supports.append(DirichletBC(self.face(axis, "min"), value))
         options = {"mean_dilatation": self.mean_dilatation, "degree": self.degree} | options
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # linear elements may lock: not what is asked here
+            warnings.simplefilter("ignore")  # linear elements may lock: not the subject here
             return Problem.build(self.mesh, self.law, supports=supports, **options)
 
 

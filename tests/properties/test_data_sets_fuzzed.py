@@ -101,7 +101,7 @@ def same(found: dict, written: dict) -> bool:
 
 
 @contextmanager
-def told(folder: Path) -> Iterator[None]:
+def reported(folder: Path) -> Iterator[None]:
     """Check that an error is one line with a file of the folder and a remedy."""
     try:
         yield
@@ -117,25 +117,25 @@ def law(scene, folder: Path, written: dict, *, trusts_digests: bool = True) -> N
     store = Store(folder, scene, 0)
     flaws = None
     with bounded():
-        with told(folder):
+        with reported(folder):
             flaws = [flaw for _, flaw in verify(store) if flaw]
-        with told(folder):
+        with reported(folder):
             kept = store.modes()
             assert (
                 trusts_digests or flaws or torch.allclose(kept["values"], scene.loads.modes.values)
             )
         for split in STREAMS:
-            with told(folder):
+            with reported(folder):
                 read = store.reader(split)
                 for index in range(SIZES[split]):
                     one = read(index)
                     if one is not None and trusts_digests:
                         there = written[split].displacement[index]
                         assert torch.equal(one["displacement"][0], there)
-        with told(folder):
+        with reported(folder):
             found = samples(scene, folder)
             assert same(found, written) or (not trusts_digests and flaws)
-        with told(folder):
+        with reported(folder):
             repair(store)
             found = samples(scene, folder)
             assert same(found, written)

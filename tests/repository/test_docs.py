@@ -263,14 +263,14 @@ def test_python_and_yaml_that_are_shown_can_be_read():
 def test_the_site_is_made_without_a_warning_and_asks_no_other_host_for_anything(tmp_path):
     site = tmp_path / "site"
     build = ["build", "--strict", "-f", MAKE / "mkdocs.yml", "-d", site]
-    told = subprocess.run(
+    reported = subprocess.run(
         [sys.executable, "-m", "mkdocs", *build],
         env={**os.environ, "NOTEBOOKS": "false", "NO_MKDOCS_2_WARNING": "1"},
         capture_output=True,
         text=True,
         check=False,
     )
-    assert told.returncode == 0, told.stderr
+    assert reported.returncode == 0, reported.stderr
     fetched = re.compile(
         r'<(?:script|img|link|iframe|source)[^>]*(?:src|href)="(?:https?:)?//[^"]+"'
     )

@@ -100,8 +100,8 @@ def test_a_configuration_of_ones_own_stands_beside_those_of_the_wheel(installed,
     own = tmp_path / "mine/material"
     own.mkdir(parents=True)
     (own / "soft.yaml").write_text("_target_: dpl.fem.NeoHookeanLn\npoisson: 0.7\n")
-    asked = ["--config-dir", "mine", "material=soft"]
-    refused = run_from(installed, "generate", *asked, cwd=tmp_path)
+    requested = ["--config-dir", "mine", "material=soft"]
+    refused = run_from(installed, "generate", *requested, cwd=tmp_path)
     assert refused.stderr.startswith("error: material: poisson = 0.7 must")
 
 

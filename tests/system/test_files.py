@@ -133,10 +133,10 @@ def held(folder, *part):
 def test_a_second_writer_is_refused_naming_process_and_machine(tmp_path):
     with exclusive_lock(tmp_path), pytest.raises(DataSetError) as refusal, exclusive_lock(tmp_path):
         pass
-    told = str(refusal.value)
-    assert f"process {os.getpid()} on {socket.gethostname()}" in told
-    assert str(tmp_path) in told
-    assert "\n" not in told
+    reported = str(refusal.value)
+    assert f"process {os.getpid()} on {socket.gethostname()}" in reported
+    assert str(tmp_path) in reported
+    assert "\n" not in reported
 
 
 def test_a_lock_is_released_when_its_writer_ends_or_raises(tmp_path):

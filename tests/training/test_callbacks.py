@@ -441,8 +441,8 @@ def hparams_tab(folder):
     runs.AddRunsFromDirectory(str(folder))
     runs.Reload()
     backend = Context(TBContext(data_provider=MultiplexerDataProvider(runs, str(folder))))
-    asked = RequestContext(), backend, ""
-    columns = get_experiment.Handler(*asked, api_pb2.GetExperimentRequest()).run()
+    requested = RequestContext(), backend, ""
+    columns = get_experiment.Handler(*requested, api_pb2.GetExperimentRequest()).run()
     request = api_pb2.ListSessionGroupsRequest(
         start_index=0,
         slice_size=100,
@@ -455,7 +455,7 @@ def hparams_tab(folder):
             *({"metric": info.name} for info in columns.metric_infos),
         ],
     )
-    lines = list_session_groups.Handler(*asked, request).run().session_groups
+    lines = list_session_groups.Handler(*requested, request).run().session_groups
     return {
         line.hparams["name"].string_value: (
             [session.status for session in line.sessions],

@@ -145,8 +145,8 @@ def test_epochs_counts_finished_epochs_and_needs_the_optimizer_state():
 def test_an_error_that_is_not_finite_is_never_the_best(tmp_path):
     best = BestWeights(dirpath=tmp_path, filename="best", monitor="val/e_mean")
     trainer = L.Trainer(logger=False, callbacks=[best], accelerator="cpu")
-    asked = [best.check_monitor_top_k(trainer, torch.tensor(e)) for e in (nan, inf, -inf, 0.5)]
-    assert asked == [False, False, False, True]
+    requested = [best.check_monitor_top_k(trainer, torch.tensor(e)) for e in (nan, inf, -inf, 0.5)]
+    assert requested == [False, False, False, True]
 
 
 @pytest.mark.parametrize("what", [[], {"state_dict": 1}, {"weights": {}}])
@@ -164,8 +164,8 @@ def test_weights_without_a_header_raise_an_error(tmp_path, header):
 
 
 def test_only_known_keys_of_a_header_are_read(tmp_path):
-    told = {"dpl": json.dumps({"scene": "0f", "state_dict": {}, "random": 1})}
-    save_file(WEIGHTS, tmp_path / "best.safetensors", told)
+    reported = {"dpl": json.dumps({"scene": "0f", "state_dict": {}, "random": 1})}
+    save_file(WEIGHTS, tmp_path / "best.safetensors", reported)
     found = read(tmp_path / "best.safetensors")
     assert found.keys() == {"scene", "state_dict"}
     assert found["state_dict"].keys() == WEIGHTS.keys()

@@ -329,7 +329,7 @@ def test_a_run_resumed_from_a_checkpoint_ends_bit_for_bit_like_an_uninterrupted_
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "reported"),
     [
         ({"momentum": 1.0}, "momentum = 1.0"),
         ({"momentum": -0.1}, "momentum = -0.1"),
@@ -340,10 +340,10 @@ def test_a_run_resumed_from_a_checkpoint_ends_bit_for_bit_like_an_uninterrupted_
     ],
 )
 @pytest.mark.parametrize("build", ["all", "vectors"])
-def test_numbers_out_of_range_raise_an_error_with_their_name(options, told, build):
+def test_numbers_out_of_range_raise_an_error_with_their_name(options, reported, build):
     """Vectors alone suffice; commands validate an optimiser in this way."""
     parameters = network().parameters() if build == "all" else [nn.Parameter(torch.zeros(1))]
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=reported):
         Muon(parameters, **options)
 
 

@@ -63,9 +63,9 @@ def test_a_step_with_nonfinite_gradients_changes_nothing_and_is_counted(
     assert (none.skipped_steps, guard.skipped_steps) == (0, 3)
     assert float(trainer.callback_metrics["skipped_steps"]) == 3
     assert all(map(torch.equal, module.parameters(), clean.parameters()))
-    told = capsys.readouterr().err
-    assert "epoch 0, step 10: gradients are not finite; the step is skipped" in told
-    assert "3 steps were skipped" in told
+    reported = capsys.readouterr().err
+    assert "epoch 0, step 10: gradients are not finite; the step is skipped" in reported
+    assert "3 steps were skipped" in reported
 
 
 def test_a_training_without_finite_gradients_raises_diverged(tmp_path):

@@ -152,17 +152,17 @@ def test_scales_are_a_function_of_the_scene(make_scene, scene):
 
 
 def test_scales_do_not_depend_on_the_data(scene, batch, monkeypatch):
-    asked = []
+    requested = []
     original = type(scene.loads).sample
 
     def watched(loads, seed, indices, **options):
-        asked.append(tuple(seed))
+        requested.append(tuple(seed))
         return original(loads, seed, indices, **options)
 
     monkeypatch.setattr(type(scene.loads), "sample", watched)
     scales(scene)
-    assert asked
-    assert all(stream not in (0, 1, 2) for _, stream in asked)
+    assert requested
+    assert all(stream not in (0, 1, 2) for _, stream in requested)
 
 
 # ------------------------------------------------------------------ the schedule

@@ -57,14 +57,14 @@ def eigenmodes(linear: LinearSolver, count: int) -> Modes:
     stiffness = full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())
     inverse = LinearOperator((size, size), matvec=linear.factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(size)
-    asked = min(count + 8, size - 2)
+    requested = min(count + 8, size - 2)
     try:
-        values, vectors = eigsh(stiffness, asked, sigma=0.0, OPinv=inverse, v0=start, tol=1e-12)
+        values, vectors = eigsh(stiffness, requested, sigma=0.0, OPinv=inverse, v0=start, tol=1e-12)
     except ArpackError as error:
         raise SingularMatrix("its modes cannot be found") from error
     order = np.argsort(values)
     values, vectors = values[order], vectors[:, order]
-    while count < asked and values[count] - values[count - 1] < CLUSTER * values[count]:
+    while count < requested and values[count] - values[count - 1] < CLUSTER * values[count]:
         count += 1
     probes = _probes(problem)
     for space in _eigenspaces(values):
