@@ -3,6 +3,7 @@
 import math
 import multiprocessing
 import resource
+import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -137,7 +138,7 @@ def draw(rows: Sequence[Size], path: Path) -> None:
                 continue
             x, y = zip(*known, strict=True)
             label = f"{case}: DOFs^{exponent(x, y):.2f}" if len(x) > 1 else case
-            ax.loglog(x, y, marker="o", ms=4, color=f"C{number}", label=label)
+            ax.loglog(x, y, marker="o", ms=4, color=f"C{number}", label=textwrap.fill(label, 40))
         ax.set_xlabel("degrees of freedom")
         ax.grid(alpha=0.3)
         low, high = ax.get_ylim()
