@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -10,13 +11,29 @@ import pytest
 import torch
 
 from dpl import Sample
-from dpl.fem import Box, Newton, Plane, SaintVenantKirchhoff, box, rectangle, solve
+from dpl.fem import Box, Newton, Plane, SaintVenantKirchhoff, Tag, box, rectangle, solve
+from dpl.fem.identity import identity_of
 from dpl.fem.loads import log_tail_mixture, logarithmic, normal, symmetric_uniform, uniform01
 from dpl.scene import stack
 
 
 def mild(t, *, factor):
     return factor * symmetric_uniform(t)
+
+
+@dataclass
+class Pull:
+    region: object
+    size: float = 1
+
+
+def test_an_identity_writes_regions_by_name_and_options():
+    written = identity_of(Pull(Tag("tip")))
+    region = {"class": "Tag", "name": "tip"}
+    assert written == {"name": "Pull", "region": region, "size": 1.0}
+    assert json.loads(json.dumps(written)) == written
+    with pytest.raises(TypeError, match=r"Pull\.region is a object, which is no plain data"):
+        identity_of(Pull(object()))
 
 
 def test_the_fingerprint_knows_neither_size_nor_stiffness(make_scene, scene):

@@ -17,6 +17,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from yaml import YAMLError
 
 from dpl.commands import dry_run, help_text
 from dpl.config import CONF, ConfigError, Keys
@@ -84,6 +85,9 @@ def readable_errors() -> Iterator[None]:
         print(f"error: {error}", file=sys.stderr)
         if HydraConfig.initialized():
             _drop_empty(Path(HydraConfig.get().runtime.output_dir))
+        sys.exit(2)
+    except YAMLError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
     except (OSError, RuntimeError) as error:
         if (cause := _failed_access(error)) is None:

@@ -157,7 +157,9 @@ def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
         module, _, attribute = name.rpartition(".")
         target: Callable[..., Any] = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError):
-        raise ConfigError(f"{path}._target_ = {name!r} does not exist") from None
+        raise ConfigError(
+            f"{path}._target_ = {name!r} does not exist, or its folder is not in PYTHONPATH"
+        ) from None
     if not callable(target):
         raise ConfigError(f"{path}._target_ = {name!r} cannot be called")
     if not trust and not _is_trusted(target):

@@ -20,15 +20,25 @@ def identity_of(value: object, *, exclude: Collection[str] = ()) -> dict[str, An
     Args:
         value: The object.
         exclude: Names of options to leave out.
+
+    Raises:
+        TypeError: An option has no form as plain data.
     """
     names = [field.name for field in fields(value)] if is_dataclass(value) else list(vars(value))
     options = {name: plain(getattr(value, name)) for name in names if name not in exclude}
-    return {"name": type(value).__name__, **options}
+    for name, option in options.items():
+        if option is not None and not isinstance(option, bool | float | str | list | dict):
+            raise TypeError(
+                f"{type(value).__name__}.{name} is a {type(option).__name__}, which is no plain "
+                "data; define identity()"
+            )
+    kind = "class" if "name" in options else "name"
+    return {kind: type(value).__name__, **options}
 
 
 def plain(value: Any) -> Any:
     """Return a value as plain data: real numbers as floats, so that 1 and 1.0 are equal, arrays as
-    their SHA-256, functions by name.
+    their SHA-256, dataclasses by name and options, functions by name.
     """
     if isinstance(value, Mapping):
         return {key: plain(one) for key, one in value.items()}
@@ -40,6 +50,8 @@ def plain(value: Any) -> Any:
         return sha256_of(value)
     if isinstance(value, Real) and not isinstance(value, bool):
         return float(value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return identity_of(value)
     return function_name(value) if callable(value) else value
 
 

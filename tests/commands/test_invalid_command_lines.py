@@ -155,6 +155,18 @@ def test_configurations_beside_those_of_the_package_are_checked_too(ask, tmp_pat
         ask("generate", "--config-dir", "mine", "material=sofd")
 
 
+def test_a_file_that_is_no_yaml_ends_with_one_line_that_names_it(script, tmp_path):
+    (tmp_path / "mine/material").mkdir(parents=True)
+    (tmp_path / "mine/material/soft.yaml").write_text(
+        "{_target_: dpl.fem.NeoHookeanLn, poisson: ???}"
+    )
+    ended = script("generate", "--config-dir", "mine", "material=soft", cwd=tmp_path)
+    assert ended.status == 2
+    (line,) = ended.err.strip().splitlines()
+    assert line.startswith("error: ")
+    assert "soft.yaml" in line
+
+
 def test_a_folder_that_is_there_and_what_is_in_it_are_left_alone(tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run/kept").touch()

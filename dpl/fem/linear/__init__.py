@@ -11,8 +11,10 @@ if TYPE_CHECKING:
         Backend,
         DirectFactor,
         Factor,
+        IterativeFactor,
         Pattern,
         SingularMatrix,
+        Stability,
         SymmetricProduct,
         full_matrix,
     )

@@ -94,6 +94,16 @@ class DirectFactor:
         return Stability(self.negative_pivots or 0, exact=True)
 
 
+class IterativeFactor:
+    """Base of the factors that count no pivots: the stability of an equilibrium is unknown."""
+
+    negative_pivots: None = None
+
+    def stability(self) -> Stability:
+        """Return `UNKNOWN`."""
+        return UNKNOWN
+
+
 class Backend(Protocol):
     """Factorisation of matrices of one pattern, on one thread. Pickling omits the factors."""
 
