@@ -1,6 +1,7 @@
 """A user adds a part with one class or function and one YAML file; every command accepts it."""
 
 import json
+import sys
 
 import pytest
 import torch
@@ -173,7 +174,9 @@ def home(tmp_path, monkeypatch):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
     monkeypatch.syspath_prepend(str(tmp_path))
-    return tmp_path
+    monkeypatch.delitem(sys.modules, "my_parts", raising=False)
+    yield tmp_path
+    sys.modules.pop("my_parts", None)
 
 
 @pytest.mark.parametrize("part", CHOICES)

@@ -38,7 +38,8 @@ def exports() -> dict[str, dict[str, str]]:
         if names:
             found[folder.path] = dict(sorted(names.items()))
         for module in sorted(folder.modules.values(), key=lambda one: one.name):
-            collect(module)
+            if not module.is_alias:  # `import dpl` in a module leads back to the package
+                collect(module)
 
     collect(package())
     return found

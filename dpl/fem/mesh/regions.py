@@ -119,7 +119,7 @@ class Cylinder:
     def __post_init__(self) -> None:
         """Check the attributes."""
         _check_axis(self.axis)
-        _check_ball(self.centre or (), self.radius)
+        _check_ball(() if self.centre is None else self.centre, self.radius)
 
     def __call__(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return a mask (N,) of the points (N, D) [m] in the region."""
