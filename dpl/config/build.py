@@ -121,7 +121,9 @@ def _made(node: Any, place: str, more: dict[str, Any]) -> Any:
     except CANNOT_BE_MADE as error:
         wrapped = isinstance(error, InstantiationException) and error.__cause__
         cause = wrapped or error
-        raise ConfigError(f"{place}: {str(cause) or type(cause).__name__}") from error
+        partial = "; set _partial_: true if the caller gives it" if "missing" in str(cause) else ""
+        remedy = partial if isinstance(cause, TypeError) else ""
+        raise ConfigError(f"{place}: {str(cause) or type(cause).__name__}{remedy}") from error
 
 
 def _of_kind(made: Any, key: str, place: str) -> Any:

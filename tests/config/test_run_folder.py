@@ -35,6 +35,7 @@ BAD = {  # override -> what the message must name
     "+material.poison=1": r"material\.poison: .* did you mean material\.poisson\?",
     "material._target_=dpl.fem.mesh.regions.Rubber": r"material\._target_ = .*Rubber' does not",
     "material._target_=nowhere.Rubber": r"material\._target_ = .*nowhere\.Rubber' does not exist",
+    "solver._partial_=false": r"solver: .*missing .*'problem'; set _partial_: true if the caller",
     "young=-1": r"young = -1",
     "young=0": r"young = 0",
     "young=1e308": r"young = 1e\+308 must lie between 1e-30 and 1e\+30",

@@ -158,7 +158,8 @@ class Tag:
             return np.asarray(facets[self.name])
         if self.name in cells:
             return None
-        names = sorted(map(repr, {*facets, *cells}))
+        named_first = sorted({*facets, *cells}, key=lambda name: ("=" in name, name))
+        names = list(map(repr, named_first))
         more = f" and {len(names) - 20} more" if len(names) > 20 else ""
         raise ValueError(f"{self}: the mesh has {', '.join(names[:20]) or 'no tags at all'}{more}")
 
