@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from benchmarks.commands import CONF
 from dpl import config
@@ -69,14 +69,15 @@ def _train(cfg: DictConfig, seconds: float) -> list:
     """Train for a time [s] and return the records."""
     from benchmarks import soak
 
-    scene = config.build_scene(cfg)
+    scene, folder = config.build_scene(cfg), Path(cfg.folder)
     data = config.instantiate(cfg, "data", scene=scene)
     surrogate = config.build_surrogate(cfg, scene)
     trainer = config.build_trainer(cfg)
     cli.check_trainer(trainer, cfg)
     monitor = soak.UsageMonitor(seconds, every=seconds / RECORDS)
     trainer.callbacks.append(monitor)
-    config.save_config(cfg, Path(cfg.folder))
+    own = {name for _, name, *_ in KEYS}  # which a trained run has not
+    config.save_config(OmegaConf.masked_copy(cfg, [key for key in cfg if key not in own]), folder)
     try:
         trainer.fit(surrogate, datamodule=data)
     finally:

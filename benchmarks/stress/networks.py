@@ -71,7 +71,7 @@ def constant_prediction(displacement: Tensor) -> Predict:
 def hybrids(newton: Newton) -> dict[str, Callable[[Tensor], Solver]]:
     """Return hybrid solvers by name, as functions of the prediction (1, N, D) [-]."""
     return {
-        "best": lambda guess: Hybrid(constant_prediction(guess), newton),
+        "natural_monotonicity": lambda guess: Hybrid(constant_prediction(guess), newton),
         "paper": lambda guess: Hybrid(constant_prediction(guess), newton, "paper"),
         "steps": lambda guess: Hybrid(
             constant_prediction(guess), newton, steps=AndersonSolver(newton)
