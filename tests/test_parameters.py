@@ -113,6 +113,15 @@ def test_a_law_without_ranges_has_no_parameters():
         law.with_parameters(values(0.3))
 
 
+def test_a_batch_of_a_law_with_moduli_of_its_own_is_refused_in_words():
+    class Own(YeohK2):
+        ranged = ("bulk",)
+
+    law = Own(0.2, -0.02, 0.005, (1.0, 2.0)).with_parameters(torch.tensor([[1.2], [1.8]]).double())
+    with pytest.raises(ValueError, match="Own: a law with ranges must derive from YoungPoisson"):
+        law.mu  # noqa: B018
+
+
 @pytest.mark.parametrize("law", HOOKEAN)
 def test_a_batch_is_its_members_each_a_body_of_its_own(make_scene, law):
     """By compiled loops and by tensors: forces, energies, rounding."""

@@ -49,7 +49,8 @@ class Material:
     strains as unknowns. A law of the invariants (`InvariantBasedMaterial`) is compiled too.
 
     Attributes:
-        ranged: Names of the constants that may be ranges [low, high].
+        ranged: Names of the constants that may be ranges [low, high]; their law must derive from
+            `YoungPoissonMaterial`, whose moduli at rest are known for a batch.
     """
 
     ranged: ClassVar[tuple[str, ...]] = ()
@@ -109,6 +110,10 @@ class Material:
 
     @property
     def _at_rest(self) -> Tensor:
+        if self.is_batched:
+            raise ValueError(
+                f"{type(self).__name__}: a law with ranges must derive from YoungPoissonMaterial"
+            )
         return self.tangent(torch.zeros(1, 3, 3, dtype=torch.float64))[0]
 
     @property
@@ -166,7 +171,8 @@ class Material:
             object.__setattr__(self, name, tuple(map(float, ends)))
         if not ranges:
             self.check_constants()
-        for corner in product(*ranges.values()) if ranges else ():
+            return
+        for corner in product(*ranges.values()):
             self.with_parameters(torch.tensor([corner], dtype=torch.float64))
 
     def check_constants(self) -> None:
