@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from dpl.fem.postprocess.surface import surface
     from dpl.fem.problem import Problem
     from dpl.fem.rom.galerkin import PODGalerkin
+    from dpl.fem.rom.subspace_newton import SubspaceNewton
     from dpl.fem.solvers.anderson import AndersonSolver
     from dpl.fem.solvers.bifurcation import post_buckling_branches
     from dpl.fem.solvers.differentiable import DifferentiableSolve

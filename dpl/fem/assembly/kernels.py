@@ -84,18 +84,20 @@ class Kernels:
         law, needs, finite = self._law
         arrays = (self.cells, self.dN, self.dV, self.places)
         system = element_loops.add_system
-        return 1 + _call(system, law, moduli, needs, finite, u, gap, *arrays, out, values)
+        return 1 + call_compiled(system, law, moduli, needs, finite, u, gap, *arrays, out, values)
 
     def update_strain_gap(self, gap: Array | None, length: float, update: Array) -> Array:
         """Return the strain of u minus the strain of the mixed integration points after a step."""
         gap, kernel = NO_GAP if gap is None else gap, element_loops.update_gap
-        return _call(kernel, self._law[0], gap, length, update, self.cells, self.dN, self.dV)
+        return call_compiled(
+            kernel, self._law[0], gap, length, update, self.cells, self.dN, self.dV
+        )
 
 
 _LOADED: set[tuple[Any, str]] = set()  # kernels and laws compiled or loaded by this process
 
 
-def _call(kernel: Any, law: Law, *arguments: Any) -> Any:
+def call_compiled(kernel: Any, law: Law, *arguments: Any) -> Any:
     """Return the result of a kernel; lock numba's cache on disk at its first call.
 
     Two processes that save kernels of different laws at the same time would choose the same file

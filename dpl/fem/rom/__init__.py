@@ -9,5 +9,6 @@ if TYPE_CHECKING:
     from dpl.fem.rom.galerkin import PODGalerkin, Reduced
     from dpl.fem.rom.pod import POD
     from dpl.fem.rom.reduced_problem import ReducedProblem
+    from dpl.fem.rom.subspace_newton import SubspaceNewton, SubspaceState
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -1,0 +1,149 @@
+"""Tangent of a body in a subspace, its nonlinear part sampled at one point of each chosen cell."""
+
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dpl.fem.assembly import reduced_loops
+from dpl.fem.assembly.kernels import call_compiled
+from dpl.fem.assembly.numba_laws import Law, required_terms
+from dpl.fem.linear.interface import full_matrix
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.linear_elastic import LinearElastic
+from dpl.fem.materials.material import Material
+from dpl.fem.problem import Problem
+from dpl.fem.rom.ecsw import Cubature, whitening
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+
+class SampledTangent:
+    """W^T K(u) W with W = V L^-T, L L^T = V^T K(0) V, so that it is the identity at rest.
+
+    With a cubature it is W^T K(0) W + sum_e w_e vol_e G_e^T (A(H_e) - A(0)) G_e, where H_e is the
+    mean displacement gradient of the cell, G_e that of W, and A = dP/dF. The sum is zero at rest;
+    only it is sampled, in float32, which suffices because W^T K W has eigenvalues close to one.
+    Without a cubature it is the tangent of the whole body.
+
+    Attributes:
+        problem: The body; its law may have ranges.
+        scale: L^-T, (R, R), at the centres of the ranges.
+        rows: W, (N D, R), in float32.
+    """
+
+    def __init__(self, problem: Problem, vectors: Tensor, cubature: Cubature | None) -> None:
+        """Reduce a body to V (N, D, R) and to weighted cells; None: all cells, not sampled."""
+        self.problem = problem
+        scale = whitening(problem.reference, vectors)
+        white = (vectors @ scale).flatten(0, 1)
+        self.scale = scale.numpy()
+        self.rows: Single = white.float().numpy()
+        self._white = white.numpy()
+        if cubature is not None:
+            self._sample(cubature)
+        self._has_cells = cubature is not None
+
+    def _sample(self, chosen: Cubature) -> None:
+        problem, count = self.problem, len(chosen.cells)
+
+        def of_cells(tensor: Tensor) -> Tensor:
+            return tensor.expand(len(problem.cells), *tensor.shape[1:])[chosen.cells]
+
+        dN, dV = of_cells(problem.dN), of_cells(problem.dV)
+        volume = dV.sum(1)
+        mean = (dN * dV[..., None, None]).sum(1) / volume[:, None, None]  # (C, A, D)
+        nodes = problem.cells[chosen.cells]
+        dim, rank = problem.shape[1], self.rows.shape[1]
+        white = torch.from_numpy(self._white).view(*problem.shape, rank)
+        basis = torch.einsum("cair,caj->cijr", white[nodes], mean)
+        self._nodes = nodes.contiguous().numpy()
+        self._dN = mean[:, None].contiguous().numpy()
+        self._dV = (volume * chosen.weights.double())[:, None].contiguous().numpy()
+        self._basis: Single = basis.reshape(count, dim * dim, rank).float().contiguous().numpy()
+
+    def at(self, problem: Problem, displacement: Tensor) -> Array:
+        """Return the matrix (R, R) at a displacement (N, D) of the body with its parameters.
+
+        Only its symmetric part has a meaning; rounding makes the matrix slightly unsymmetric.
+        """
+        if not self._has_cells:
+            return self._projection(problem, problem.linearise(displacement[None]).tangent[0])
+        product = self._moduli_change_product(problem.material, displacement)
+        rank = product.shape[2]
+        change = self._basis.reshape(-1, rank).T @ product.reshape(-1, rank)
+        return self._at_rest(problem.material) + change
+
+    def _moduli_change_product(self, law: Material, displacement: Tensor) -> Single:
+        """Return w vol (A(H) - A(0)) G, (C, D D, R)."""
+        if not isinstance(law, InvariantBasedMaterial):
+            return self._reference_product(law, displacement)
+        out = np.empty_like(self._basis)
+        constants = np.array(law.constants, dtype=np.float64)
+        u = displacement.contiguous().numpy()
+        call_compiled(
+            reduced_loops.moduli_change_product,
+            *(Law(type(law), reduced_loops.SOURCES), constants),
+            *(self._required_terms, float(law.finite)),
+            *(u, self._nodes, self._dN, self._dV, self._basis, out),
+        )
+        return out
+
+    def _reference_product(self, law: Material, displacement: Tensor) -> Single:
+        """Return the same by tensor operations, for laws without compiled loops."""
+        dim = self.problem.shape[1]
+        at_cells = displacement[torch.from_numpy(self._nodes)]
+        H = torch.einsum("cai,caj->cij", at_cells, torch.from_numpy(self._dN[:, 0]))
+        H = torch.nn.functional.pad(H, (0, 3 - dim, 0, 3 - dim))
+        change = law.tangent(H) - law.tangent(torch.zeros_like(H[:1]))
+        change = (
+            change[:, :dim, :dim, :dim, :dim] * torch.from_numpy(self._dV)[..., None, None, None]
+        )
+        return change.reshape(len(H), dim * dim, dim * dim).float().numpy() @ self._basis
+
+    @cached_property
+    def _required_terms(self) -> int:
+        law = self.problem.reference.material
+        assert isinstance(law, InvariantBasedMaterial)
+        return required_terms(law)
+
+    def _at_rest(self, law: Material) -> Array:
+        """Return W^T K(0) W, (R, R), of a law of the body."""
+        if not self.problem.material.parameter_ranges:
+            return self._one
+        per_shear, per_lame, foundation = self._isotropic
+        return law.mu * per_shear + law.lam * per_lame + foundation
+
+    @cached_property
+    def _one(self) -> Array:
+        return np.eye(len(self.scale))
+
+    @cached_property
+    def _isotropic(self) -> tuple[Array, Array, Array]:
+        """W^T K(0) W per shear modulus and per first Lame parameter, and of the foundation.
+
+        At rest every law is Hooke's, and K(0) is linear in its two constants.
+        """
+        problem, zero = self.problem, torch.zeros(1, *self.problem.shape, dtype=torch.float64)
+
+        def of(poisson: float) -> Array:
+            hooke = problem.with_material(LinearElastic(poisson))
+            return self._projection(hooke, hooke.linearise(zero).tangent[0])
+
+        foundation = np.zeros_like(self.scale)
+        if problem.springs is not None:
+            fields = torch.from_numpy(self._white.T.reshape(-1, *problem.shape).copy())
+            forces = problem.springs.force(fields).flatten(1).numpy()
+            foundation = forces @ self._white
+        per_shear = 2 * (of(0.0) - foundation)  # mu = 1/2, lambda = 0
+        per_lame = (of(0.25) - foundation) / 0.4 - per_shear  # mu = lambda = 0.4
+        return per_shear, per_lame, foundation
+
+    def _projection(self, problem: Problem, tangent: Tensor) -> Array:
+        """Return W^T K W of the entries (nnz,) of a tangent."""
+        free = problem.free.flatten().numpy()
+        white = self._white if free.all() else self._white[free]
+        return white.T @ (full_matrix(problem.pattern, tangent.numpy()) @ white)

@@ -1,0 +1,313 @@
+"""Newton's method in a subspace: a fast correction of predictions."""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import torch
+from scipy.linalg import lapack
+from torch import Tensor
+
+from dpl.fem.problem import Evaluation, Problem
+from dpl.fem.rom.ecsw import Cubature, cubature
+from dpl.fem.rom.sampled_tangent import Array, SampledTangent, Single
+from dpl.fem.solvers.solution import Load, Solution, check_tol, evaluate_solution, run_lockstep
+
+LEAST_EIGENVALUE = 1e-2  # of an indefinite reduced tangent relative to that at rest [-]
+
+
+class SubspaceState(NamedTuple):
+    """An evaluated displacement under one load.
+
+    Attributes:
+        displacement: u, (1, N, D) [-].
+        evaluation: Internal force and min det F at u.
+        error: Estimated error of u within the subspace, relative to ||u|| [-]; infinite where an
+            element is inverted.
+        iterations: Number of steps so far.
+    """
+
+    displacement: Tensor
+    evaluation: Evaluation
+    error: float
+    iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class SubspaceNewton:
+    """Newton's method for V^T R(u + V s) = 0: u is any displacement, V a basis of few modes.
+
+    A step solves (V^T K(u) V) s = V^T (f - f_int(u)). The force is that of the whole body, and so
+    min det F and residual of each iterate are known exactly. The tangent comes from few weighted
+    cells, see `SampledTangent`, which affects the speed of convergence and not the result. Where it
+    is indefinite, as far from equilibrium under large rotations, it is made positive definite. The
+    part of the error outside the subspace remains.
+
+    The norm of a Newton correction, ||s||, estimates the error within the subspace. Steps follow
+    until this estimate, relative to ||u||, falls below `error_tol`.
+
+    A step is accepted if no element is inverted and the restricted natural monotonicity test holds:
+    the correction from the new residual with the same tangent must be shorter than (1 - d/4) ||s||,
+    where d = 1, 1/2, 1/4, ... is the damping factor, the first that passes. If none does, the
+    iteration ends. The last iterate is the one with the smallest estimate; by this measure it is
+    never worse than the guess, for any guess.
+
+    The error in the Euclidean norm is not bounded by this. Steps converge to the minimum of the
+    energy within the subspace, and stiff errors outside the subspace cause soft ones in it. Choose
+    the number of modes such that held-out loads improve.
+
+    Source: Deuflhard (2011), Newton Methods for Nonlinear Problems, section 3.3 (error-oriented
+    descent; algorithm NLEQ-ERR); Nocedal, Wright (2006), Numerical Optimization, section 3.4
+    (eigenvalue modification).
+
+    Attributes:
+        problem: The body; its law may have ranges.
+        vectors: V, orthonormal, zero at fixed degrees of freedom, (N, D, R) [-].
+        cubature: Weighted cells of the tangent; None: the tangent of the whole body.
+        tol: Relative residual below which a solution counts as converged [-], see
+            `Problem.relative_residual_of`; at least 1e-15, below 1.
+        error_tol: Estimated relative error within the subspace at which the steps end [-].
+        max_iter: Largest number of steps.
+        min_damping: Smallest damping factor [-].
+        min_detF_ratio: As of `Newton`: a step must leave this part of min det F [-].
+
+    Raises:
+        ValueError: V does not fit the body, an attribute is out of range, or, at the first load,
+            the body has rigid body modes.
+    """
+
+    problem: Problem
+    vectors: Tensor
+    cubature: Cubature | None = None
+    tol: float = 1e-8
+    error_tol: float = 2e-5
+    max_iter: int = 4
+    min_damping: float = 2.0**-4
+    min_detF_ratio: float = 0.2
+
+    @classmethod
+    def within(
+        cls,
+        problem: Problem,
+        vectors: Tensor,
+        states: Tensor,
+        *,
+        tolerance: float = 3e-2,
+        **options: Any,
+    ) -> Self:
+        """Return the solver in a given subspace, with cells chosen at some states.
+
+        Args:
+            problem, vectors, options: Attributes of the solver.
+            states: Displacements in equilibrium, (S, N, D) [-]; they are projected onto V.
+            tolerance: Relative error of the reduced forces of the chosen cells, see `cubature`.
+        """
+        basis = vectors[problem.free]
+        projected = states.clone()
+        projected[:, problem.free] = (states[:, problem.free] @ basis) @ basis.T
+        cells = cubature(problem.reference, vectors, projected, tolerance)
+        return cls(problem, vectors, cells, **options)
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        check_tol(self.tol)
+        for name in ("error_tol", "min_damping", "min_detF_ratio"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} = {getattr(self, name)} must be above 0 and at most 1")
+        if self.max_iter < 0:
+            raise ValueError(f"max_iter = {self.max_iter} must be 0 or more")
+        if self.vectors.ndim != 3 or tuple(self.vectors.shape[:2]) != self.problem.shape:
+            found, wanted = tuple(self.vectors.shape), (*self.problem.shape, "R")
+            raise ValueError(f"vectors.shape = {found} must be {wanted}")
+        if self.vectors[~self.problem.free].any():
+            raise ValueError("vectors must be zero at fixed degrees of freedom")
+
+    def iterate(
+        self, load: Load, *, guess: Tensor | None = None, evaluation: Evaluation | None = None
+    ) -> Iterator[Solution]:
+        """Yield the guess and the state after each step; loads in lockstep.
+
+        Args:
+            load: The load.
+            guess: Displacement to start from, (B, N, D) [-]; None: zero, except at supports.
+            evaluation: Internal force and min det F at the guess, if known. The guess must then
+                have the displacement of the supports.
+        """
+        loads = load.unbatch()
+        if guess is None:
+            guess = self.problem.prescribed.expand(len(loads), -1, -1)
+        known: list[Evaluation | None] = [None] * len(loads)
+        if evaluation is not None:
+            parts = (part.split(1) for part in evaluation)
+            known = [Evaluation(*pair) for pair in zip(*parts, strict=True)]
+        triples = zip(loads, guess.split(1), known, strict=True)
+        yield from run_lockstep([self._solutions(*triple) for triple in triples])
+
+    def _solutions(
+        self, load: Load, guess: Tensor, evaluation: Evaluation | None
+    ) -> Iterator[Solution]:
+        start = time.perf_counter()
+        for state in self.states(load, guess=guess, evaluation=evaluation):
+            count = state.iterations
+            solution = evaluate_solution(
+                self.problem, state.displacement, load, self.tol,
+                iterations=count, from_guess=True, evaluation=state.evaluation,
+                seconds=time.perf_counter() - start,
+            )  # fmt: skip
+            yield solution._replace(factorisations=torch.tensor([count]))
+            if solution.converged:
+                return
+
+    def states(
+        self, load: Load, *, guess: Tensor, evaluation: Evaluation | None = None
+    ) -> Iterator[SubspaceState]:
+        """Yield the guess and the state after each step under one load, with estimated errors.
+
+        Residual norms and status are not computed; see `iterate` for the arguments, B = 1.
+        """
+        problem = self.problem.with_parameters(load.parameters)
+        if evaluation is None:
+            guess = torch.where(problem.free, guess, problem.prescribed)
+            evaluation = problem.evaluate(guess)
+        state = SubspaceState(guess, evaluation, math.inf, 0)
+        correction = self._correction(problem, load, state)
+        if correction is not None:
+            state = state._replace(error=self._relative(correction.y, guess))
+        yield state
+        best = state
+        while correction is not None and not self._is_last(state):
+            following = self._step(problem, load, state, correction)
+            if following is None:
+                break
+            yield (state := following)
+            best = state if state.error < best.error else best
+            if not self._is_last(state):
+                correction = self._correction(problem, load, state)
+        if best is not state:
+            yield best._replace(iterations=state.iterations)
+
+    def _is_last(self, state: SubspaceState) -> bool:
+        return state.iterations >= self.max_iter or state.error <= self.error_tol
+
+    def correction(
+        self, load: Load, displacement: Tensor, evaluation: Evaluation | None = None
+    ) -> tuple[Tensor, float]:
+        """Return Newton's correction V s, (N, D) [-], and ||s|| / ||u|| [-], without evaluating it.
+
+        The latter estimates the relative error within the subspace. It is infinite, and the
+        correction zero, where an element is inverted.
+
+        Args:
+            load: The load, B = 1.
+            displacement: u, (1, N, D) [-].
+            evaluation: Internal force and min det F at u, if known.
+        """
+        problem = self.problem.with_parameters(load.parameters)
+        evaluation = evaluation or problem.evaluate(displacement)
+        state = SubspaceState(displacement, evaluation, math.inf, 0)
+        correction = self._correction(problem, load, state)
+        if correction is None:
+            return torch.zeros_like(displacement[0]), math.inf
+        return self._update(correction.y), self._relative(correction.y, displacement)
+
+    def _correction(
+        self, problem: Problem, load: Load, state: SubspaceState
+    ) -> "_Correction | None":
+        """Return Newton's correction; None where an element is inverted."""
+        right = self._reduced_residual(load, state.evaluation)
+        if right is None or not state.evaluation.volume_ratio > 0:
+            return None
+        solve = _factorised(self.tangent.at(problem, state.displacement[0]))
+        y = solve(right)
+        return _Correction(y, solve) if np.isfinite(y).all() else None
+
+    def _step(
+        self, problem: Problem, load: Load, state: SubspaceState, correction: "_Correction"
+    ) -> SubspaceState | None:
+        """Return the state after the longest acceptable step, None if there is none."""
+        size, update = self._norm(correction.y), self._update(correction.y)
+        lowest = self.min_detF_ratio * min(float(state.evaluation.volume_ratio), 1.0)
+        damping = 1.0
+        while damping >= self.min_damping:
+            u = state.displacement + damping * update
+            evaluation = problem.evaluate(u)
+            if evaluation.volume_ratio > lowest:
+                right = self._reduced_residual(load, evaluation)
+                y = None if right is None else correction.solve(right)
+                if y is not None and self._norm(y) < (1 - damping / 4) * size:
+                    return SubspaceState(u, evaluation, self._relative(y, u), state.iterations + 1)
+            damping /= 2
+        return None
+
+    def _reduced_residual(self, load: Load, evaluation: Evaluation) -> Array | None:
+        """Return W^T (f - f_int), (R,); None if it is not finite."""
+        residual = (load.force[0] - evaluation.internal[0]).flatten().numpy()
+        return _scaled_product(self.tangent.rows.T, residual)
+
+    def _update(self, y: Array) -> Tensor:
+        """Return the displacement W y, (N, D)."""
+        update = _scaled_product(self.tangent.rows, y)
+        assert update is not None  # corrections are finite
+        return torch.from_numpy(update).view(self.problem.shape)
+
+    def _norm(self, y: Array) -> float:
+        """Return ||s|| of coordinates y in W."""
+        return _norm(self.tangent.scale @ y)
+
+    def _relative(self, y: Array, displacement: Tensor) -> float:
+        """Return ||s|| / ||u||."""
+        size = self._norm(y)
+        return size / _norm(displacement.flatten().numpy()) if size else 0.0
+
+    @cached_property
+    def tangent(self) -> SampledTangent:
+        """The reduced tangent."""
+        return SampledTangent(self.problem, self.vectors, self.cubature)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Pickle without cached properties."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+class _Correction(NamedTuple):
+    """Newton's correction in coordinates of W, (R,), and the inverse of its tangent."""
+
+    y: Array
+    solve: Callable[[Array], Array]
+
+
+def _norm(vector: Array) -> float:
+    """Return the Euclidean norm, without overflow or underflow of squares."""
+    largest = float(np.abs(vector).max())
+    if not 0 < largest < math.inf:
+        return largest
+    return largest * float(np.linalg.norm(vector / largest))
+
+
+def _factorised(matrix: Array) -> Callable[[Array], Array]:
+    """Return the product with the inverse of a tangent, made positive definite.
+
+    Eigenvalues up to `LEAST_EIGENVALUE` become one, which they are at rest. The products of a
+    matrix that is not finite are NaN.
+    """
+    symmetric = (matrix + matrix.T) / 2
+    factor, failed = lapack.dpotrf(symmetric, lower=1, clean=0)
+    if not failed:
+        return lambda right: lapack.dpotrs(factor, right, lower=1)[0]
+    if not np.isfinite(symmetric).all():
+        return lambda right: np.full_like(right, np.nan)
+    values, axes = np.linalg.eigh(symmetric)
+    inverse = 1 / np.where(values > LEAST_EIGENVALUE, values, 1.0)
+    return lambda right: axes @ (inverse * (right @ axes))
+
+
+def _scaled_product(matrix: Single, vector: Array) -> Array | None:
+    """Return A v in float32, None if v is not finite; v is scaled so that no v is too small."""
+    largest = float(np.abs(vector).max())
+    if not 0 < largest < math.inf:
+        return np.zeros(len(matrix)) if largest == 0 else None
+    return largest * (matrix @ (vector / largest).astype(np.float32)).astype(np.float64)
