@@ -70,7 +70,8 @@ class SubspaceNewton:
         cubature: Weighted cells of the tangent; None: the tangent of the whole body.
         tol: Relative residual below which a solution counts as converged [-], see
             `Problem.relative_residual_of`; at least 1e-15, below 1.
-        error_tol: Estimated relative error within the subspace at which the steps end [-].
+        error_tol: Estimated relative error within the subspace at which the steps end [-]. Products
+            with V in float32 resolve errors down to about 1e-7.
         max_iter: Largest number of steps.
         min_damping: Smallest damping factor [-].
         min_detF_ratio: As of `Newton`: a step must leave this part of min det F [-].
@@ -259,9 +260,11 @@ class SubspaceNewton:
         return _norm(self.tangent.scale @ y)
 
     def _relative(self, y: Array, displacement: Tensor) -> float:
-        """Return ||s|| / ||u||."""
-        size = self._norm(y)
-        return size / _norm(displacement.flatten().numpy()) if size else 0.0
+        """Return ||s|| / ||u||; zero if both are, infinite if only u is zero."""
+        size, whole = self._norm(y), _norm(displacement.flatten().numpy())
+        if whole == 0:
+            return math.inf if size else 0.0
+        return size / whole
 
     @cached_property
     def tangent(self) -> SampledTangent:

@@ -1,0 +1,386 @@
+"""Newton's method in a subspace: exact limit, convergence, and no damage by any guess."""
+
+import pickle
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from laws import LAWS
+from torch import Tensor
+from torch.testing import assert_close
+
+from dpl.fem import (
+    DirichletBC,
+    Load,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    PODGalerkin,
+    Problem,
+    RobinBC,
+    SubspaceNewton,
+    box,
+    evaluate_solution,
+    solve,
+)
+from dpl.fem.rom import Cubature
+from dpl.fem.rom.pod import pod
+from dpl.fem.rom.sampled_tangent import SampledTangent
+
+NH = NeoHookeanLn(0.3)
+
+
+def noise(*shape: int, seed: int = 0) -> Tensor:
+    """Return random numbers."""
+    random = torch.Generator().manual_seed(seed)
+    return torch.randn(*shape, generator=random, dtype=torch.float64)
+
+
+def some_modes(problem: Problem, rank: int) -> Tensor:
+    """Return a random orthonormal basis of smooth displacements, (N, D, R)."""
+    linear = Newton(problem, linear="superlu").linear_solver
+    forces = problem.free * noise(rank, *problem.shape)
+    fields = torch.stack([linear.solve(force) for force in forces])
+    vectors = torch.zeros(*problem.shape, rank, dtype=torch.float64)
+    vectors[problem.free] = torch.linalg.qr(fields[:, problem.free].T)[0]
+    return vectors
+
+
+def every_cell(problem: Problem) -> Cubature:
+    """Return all cells with weight one."""
+    count = len(problem.cells)
+    return Cubature(torch.arange(count), torch.ones(count, dtype=torch.float64), 0.0)
+
+
+def errors(answer: Tensor, truth: Tensor) -> Tensor:
+    """Return the relative error of each displacement, (B,)."""
+    return (answer - truth).flatten(1).norm(dim=1) / truth.flatten(1).norm(dim=1)
+
+
+@pytest.fixture(scope="module")
+def newton(beam) -> Newton:
+    """The reference solver of a small beam."""
+    return Newton(beam(NH), linear="superlu", tol=1e-10)
+
+
+@pytest.fixture(scope="module")
+def snapshots(newton) -> Tensor:
+    """Solutions for forty random loads of three modes."""
+    family = ModalLoads(newton.linear_solver, n_modes=3)
+    return solve(newton, family.sample(0, range(40))).displacement
+
+
+@pytest.fixture(scope="module")
+def unseen(newton) -> Load:
+    """Six other loads."""
+    return ModalLoads(newton.linear_solver, n_modes=3).sample(1, range(6))
+
+
+@pytest.fixture(scope="module")
+def truth(newton, unseen) -> Tensor:
+    """Their solutions."""
+    return solve(newton, unseen).displacement
+
+
+@pytest.fixture(scope="module")
+def vectors(newton, snapshots) -> Tensor:
+    """Twelve modes of the solutions."""
+    free = newton.problem.free
+    basis = torch.zeros(*newton.problem.shape, 12, dtype=torch.float64)
+    basis[free] = pod(snapshots[:, free], 12).vectors
+    return basis
+
+
+@pytest.fixture(scope="module")
+def solver(newton, vectors, snapshots) -> SubspaceNewton:
+    """The solver with few cells."""
+    return SubspaceNewton.within(newton.problem, vectors, snapshots, error_tol=1e-9, max_iter=10)
+
+
+def solve_from(solver: SubspaceNewton, load: Load, guess: Tensor) -> Tensor:
+    """Return the last displacements from a guess."""
+    *_, last = solver.iterate(load, guess=guess)
+    return last.displacement
+
+
+def astray(vectors: Tensor, truth: Tensor, size: float, seed: int = 0) -> Tensor:
+    """Return solutions with errors of a relative size in the subspace."""
+    way = (vectors @ noise(vectors.shape[2], len(truth), seed=seed)).movedim(2, 0)
+    lengths = truth.flatten(1).norm(dim=1) / way.flatten(1).norm(dim=1)
+    return truth + size * lengths[:, None, None] * way
+
+
+# ------------------------------------------------------------------ tangent
+
+
+@pytest.mark.parametrize("cell", ["triangle", "tetra"])
+@pytest.mark.parametrize("name", LAWS)
+def test_all_cells_of_one_point_give_the_tangent_of_the_body(name, cell, grid, bend):
+    problem = Problem.build(grid(cell, 2, 0.3, inside=True), LAWS[name], fixed=Plane(0, "min"))
+    vectors, u = some_modes(problem, 4), 0.5 * bend(problem.points)[0]
+    found = SampledTangent(problem, vectors, every_cell(problem)).at(problem, u)
+    exact = SampledTangent(problem, vectors, None).at(problem, u)
+    assert_close(found, exact, rtol=0, atol=2e-6 * abs(exact).max())
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_compiled_and_tensor_moduli_agree(name, kind, grid, bend):
+    """On all elements, at the mean gradients of the cells."""
+    cell, degree = kind
+    mesh = grid(cell, 1 if degree == 2 else 2, 0.3, inside=True)
+    problem = Problem.build(mesh, LAWS[name], fixed=Plane(0, "min"), degree=degree)
+    model = SampledTangent(problem, some_modes(problem, 3), every_cell(problem))
+    u = bend(problem.points)[0]
+    found = model._moduli_change_product(problem.material, u)
+    expected = model._reference_product(problem.material, u)
+    assert_close(found, expected, rtol=0, atol=1e-6 * max(abs(expected).max(), 1e-3))
+
+
+@pytest.mark.parametrize("mean_dilatation", [False, True])
+def test_stiffness_at_rest_with_ranges(mean_dilatation):
+    """Poisson's ratio of the load decides, of quadrature, dilatation and springs."""
+    springs = [RobinBC(Plane(0, "max"), 0.3)]
+    problem = Problem.build(
+        box([1.0, 1.0, 1.0], [3, 3, 3]), NeoHookeanLn((0.1, 0.45)),
+        fixed=Plane(0, "min"), supports=springs, mean_dilatation=mean_dilatation,
+    )  # fmt: skip
+    vectors = some_modes(problem.reference, 5)
+    model = SampledTangent(problem, vectors, every_cell(problem))
+    zero = torch.zeros(problem.shape, dtype=torch.float64)
+    for poisson in (0.1, 0.2, 0.45):
+        body = problem.with_parameters(torch.tensor([[poisson]]))
+        found = torch.from_numpy(model.at(body, zero))
+        expected = by_products(body, vectors @ torch.from_numpy(model.scale))
+        assert_close(found, expected, rtol=0, atol=1e-10)
+
+
+def by_products(body: Problem, white: Tensor) -> Tensor:
+    """Return W^T K(0) W by products with the tangent."""
+    zero, fields = torch.zeros(1, *body.shape, dtype=torch.float64), white.movedim(2, 0)
+    columns = [body.tangent_product(zero, field[None])[0] for field in fields]
+    return torch.stack(columns).flatten(1) @ fields.flatten(1).T
+
+
+# ------------------------------------------------------------------ steps
+
+
+def test_limit_is_the_equilibrium_in_the_subspace(newton, solver, vectors, unseen):
+    exact = PODGalerkin(newton.problem, vectors, reduced_tol=1e-10)
+    projected = torch.stack([exact.reduced(force).displacement for force in unseen.force])
+    guess = astray(vectors, projected, 0.05)
+    assert errors(guess, projected).min() > 1e-2
+    whole = replace(solver, cubature=None)
+    for one in (solver, whole):
+        assert errors(solve_from(one, unseen, guess), projected).max() < 3e-6
+
+
+def test_exact_tangent_converges_quadratically(newton, vectors, unseen):
+    exact = SubspaceNewton(newton.problem, vectors, error_tol=1e-12, max_iter=8)
+    limit = solve_from(exact, unseen, torch.zeros_like(unseen.force))
+    for force, u in zip(unseen.force.split(1), limit.split(1), strict=True):
+        states = exact.states(Load(force, torch.ones(1)), guess=astray(vectors, u, 1e-3))
+        found = [errors(state.displacement, u).item() for state in states][:3]
+        for before, after in pairwise(found):
+            assert after < max(300 * before**2, 1e-6)
+
+
+def test_few_cells_leave_a_small_part_of_the_error(solver, vectors, unseen, truth):
+    assert len(solver.cubature.cells) < len(solver.problem.cells)
+    guess = astray(vectors, truth, 0.02)
+    steps = [s.displacement for s in solver.iterate(unseen, guess=guess)]
+    reach = errors(steps[-1], truth)
+    assert float(errors(steps[1], truth).median()) < 5e-3
+    assert reach.max() < 1e-4
+
+
+def test_estimates_are_those_of_the_error_in_the_subspace(solver, unseen, truth, vectors):
+    limit = solve_from(solver, unseen, truth)
+    guess = astray(vectors, limit, 1e-3)
+    for k, force in enumerate(unseen.force.split(1)):
+        load = Load(force, torch.ones(1))
+        step, error = solver.correction(load, guess[k, None])
+        states = list(solver.states(load, guess=guess[k, None]))
+        assert states[0].error == error
+        assert error == pytest.approx(1e-3, rel=0.2)
+        assert errors((guess[k] + step)[None], limit[k, None]) < 2e-4
+        assert states[-1].error < 3e-6
+
+
+def test_steps_end_at_the_estimated_error(newton, solver, vectors, unseen, truth):
+    loose = SubspaceNewton(newton.problem, vectors, solver.cubature, error_tol=1e-2)
+    limit = solve_from(solver, unseen, truth)
+    near, far = (list(loose.iterate(unseen, guess=astray(vectors, limit, e))) for e in (1e-3, 0.1))
+    assert len(near) == 1
+    assert len(far) > 1
+    assert solve_from(loose, unseen, astray(vectors, limit, 1e-3)).equal(near[0].displacement)
+
+
+def test_errors_outside_the_subspace_remain(solver, vectors, unseen, truth):
+    free, basis = solver.problem.free, vectors[solver.problem.free]
+    guess = truth + torch.where(free, 1e-4 * noise(*truth.shape), 0.0)
+    change = (solve_from(solver, unseen, guess) - guess)[:, free]
+    assert change.any()
+    assert_close(change @ basis @ basis.T, change, rtol=0, atol=1e-6 * float(change.abs().max()))
+
+
+def test_a_known_evaluation_is_not_repeated(solver, unseen, truth, vectors, monkeypatch):
+    guess = astray(vectors, truth, 0.01)
+    evaluation = solver.problem.evaluate(guess)
+    expected = list(solver.iterate(unseen, guess=guess))
+    calls, evaluate = [], Problem.evaluate
+
+    def count(self, u):
+        calls.append(u)
+        return evaluate(self, u)
+
+    monkeypatch.setattr(Problem, "evaluate", count)
+    found = list(solver.iterate(unseen, guess=guess, evaluation=evaluation))
+    for a, b in zip(expected, found, strict=True):
+        assert torch.equal(a.displacement, b.displacement)
+        assert torch.equal(a.residual, b.residual)
+    assert not any(torch.equal(u, g) for u in calls for g in guess.split(1))
+
+
+def test_solutions_are_evaluated_displacements(solver, unseen, truth, vectors):
+    for one in solver.iterate(unseen, guess=astray(vectors, truth, 0.01)):
+        again = evaluate_solution(solver.problem, one.displacement, unseen, solver.tol)
+        assert_close(one.residual, again.residual, rtol=1e-9, atol=0)
+        assert_close(one.volume_ratio, again.volume_ratio, rtol=1e-12, atol=0)
+
+
+# ------------------------------------------------------------------ any guess
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    amplitude=st.floats(0.0, 30.0),
+    size=st.sampled_from([0.0, 1e-3, 0.1, 1.0, 10.0]),
+    rough=st.sampled_from([0.0, 1e-3, 1e-1]),
+    seed=st.integers(0, 100),
+)
+def test_no_guess_becomes_worse(solver, vectors, unseen, truth, amplitude, size, rough, seed):
+    problem, k = solver.problem, seed % len(truth)
+    load = Load(amplitude * unseen.force[k, None], torch.ones(1))
+    guess = astray(vectors, truth[k, None], size, seed)
+    guess = torch.where(problem.free, guess + rough * noise(*guess.shape, seed=seed), 0.0)
+    states = list(solver.states(load, guess=guess))
+    first, last = states[0], states[-1]
+    assert last.error <= first.error
+    assert last.displacement.isfinite().all()
+    if first.evaluation.volume_ratio > 0:
+        assert all(s.evaluation.volume_ratio > 0 for s in states)
+    else:
+        assert len(states) == 1
+        assert torch.equal(last.displacement, guess)
+
+
+def test_inverted_guess_is_returned_unchanged(solver, unseen, truth):
+    guess = torch.where(solver.problem.free, 0.5 * noise(*truth.shape), 0.0)
+    found = list(solver.iterate(unseen, guess=guess))
+    assert len(found) == 1
+    assert (found[0].volume_ratio <= 0).any()
+    assert torch.equal(found[0].displacement, guess)
+    step, error = solver.correction(Load(unseen.force[:1], torch.ones(1)), guess[:1])
+    assert not step.any()
+    assert error == torch.inf
+
+
+@pytest.mark.parametrize("factor", [torch.nan, torch.inf, 1e300, 1e-290])
+def test_extreme_forces_end_as_a_value(solver, unseen, truth, factor):
+    *_, last = solver.iterate(Load(factor * unseen.force, unseen.young), guess=truth)
+    assert last.displacement.isfinite().all()
+    assert not last.converged.any()
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-200])
+def test_accuracy_does_not_depend_on_the_size_of_the_load(solver, unseen, scale):
+    """Where the problem is linear."""
+    small = Load(scale * unseen.force, unseen.young)
+    found = solve_from(solver, small, torch.zeros_like(unseen.force)) / scale
+    unit = solve_from(solver, Load(1e-9 * unseen.force, unseen.young), torch.zeros_like(found))
+    assert_close(found, unit / 1e-9, rtol=0, atol=1e-5 * float(found.abs().max()))
+
+
+def test_zero_load_is_answered_by_zero(solver, newton):
+    zero = torch.zeros(1, *newton.problem.shape, dtype=torch.float64)
+    *_, last = solver.iterate(Load(zero, torch.ones(1)))
+    assert last.converged.all()
+    assert not last.displacement.any()
+
+
+# ------------------------------------------------------------------ bodies
+
+
+@pytest.mark.parametrize("cubature", [False, True])
+def test_loads_with_parameters_of_their_own(cubature, pull):
+    mesh = box([100.0, 25.0, 25.0], [5, 3, 3])
+    problem = Problem.build(mesh, NeoHookeanLn((0.1, 0.4)), fixed=Plane(0, "min"))
+    newton = Newton(problem, linear="superlu", tol=1e-10)
+    force = torch.cat([pull(problem, q) for q in (10.0, 20.0, 30.0)])
+    load = Load(force, torch.ones(3), torch.tensor([0.12, 0.25, 0.38], dtype=torch.float64))
+    truth = solve(newton, load).displacement
+    vectors = torch.zeros(*problem.shape, 3, dtype=torch.float64)
+    vectors[problem.free] = pod(truth[:, problem.free], 3).vectors
+    cells = every_cell(problem) if cubature else None
+    solver = SubspaceNewton(problem, vectors, cells, error_tol=1e-9, max_iter=20)
+    assert errors(solve_from(solver, load, 0.9 * truth), truth).max() < 3e-6
+
+
+@pytest.mark.parametrize("kind", [("quad", 1), ("triangle", 2)], ids=str)
+def test_plane_body_with_moved_support_and_springs(kind, grid):
+    cell, degree = kind
+    ends = [
+        DirichletBC(Plane(0, "min")),
+        DirichletBC(Plane(0, "max"), [0.2, 0.0]),
+        RobinBC(Plane(1, "min"), 0.1),
+    ]
+    problem = Problem.build(grid(cell, 2), NH, supports=ends, degree=degree)
+    force = problem.free * 0.02 * noise(4, *problem.shape)
+    load = Load(force, torch.ones(4))
+    truth = solve(Newton(problem, linear="superlu", tol=1e-10), load).displacement
+    vectors = torch.zeros(*problem.shape, 4, dtype=torch.float64)
+    vectors[problem.free] = pod(truth[:, problem.free], 4).vectors
+    solver = SubspaceNewton(problem, vectors, every_cell(problem), error_tol=1e-9, max_iter=20)
+    guess = torch.where(problem.free, 0.8 * truth, 7.0)  # supports are corrected
+    assert errors(solve_from(solver, load, guess), truth).max() < 3e-6
+    *_, rest = solver.iterate(load)
+    assert errors(rest.displacement, truth).max() < 3e-6
+
+
+# ------------------------------------------------------------------ options
+
+
+def test_batch_is_solved_like_its_members(solver, unseen, truth, vectors):
+    guess = astray(vectors, truth, 0.02)
+    *_, batch = solver.iterate(unseen, guess=guess)
+    for k, load in enumerate(unseen.unbatch()):
+        *_, member = solver.iterate(load, guess=guess[k, None])
+        for name in ("displacement", "residual", "volume_ratio", "iterations", "factorisations"):
+            assert torch.equal(getattr(member, name)[0], getattr(batch, name)[k]), name
+
+
+def test_pickled_solver_has_the_same_solutions(solver, unseen, truth, vectors):
+    guess = astray(vectors, truth, 0.02)
+    copy = pickle.loads(pickle.dumps(solver))
+    assert torch.equal(solve_from(copy, unseen, guess), solve_from(solver, unseen, guess))
+
+
+@pytest.mark.parametrize(
+    "option",
+    [{"tol": 0}, {"error_tol": 0}, {"max_iter": -1}, {"min_damping": 2}, {"min_detF_ratio": 0}],
+    ids=str,
+)
+def test_option_out_of_range_is_an_error_that_names_it(newton, vectors, option):
+    with pytest.raises(ValueError, match=next(iter(option))):
+        SubspaceNewton(newton.problem, vectors, **option)
+
+
+def test_basis_that_does_not_fit_is_refused(newton, beam, vectors):
+    with pytest.raises(ValueError, match=r"vectors\.shape"):
+        SubspaceNewton(beam(NH, 4, 1), vectors)
+    with pytest.raises(ValueError, match="fixed degrees of freedom"):
+        SubspaceNewton(newton.problem, vectors + 1.0)
