@@ -61,6 +61,26 @@ def products(group: Sequence[Symmetry]) -> Tensor:
     return (every[:, :, None] - Q).flatten(3).norm(dim=3).argmin(dim=2)
 
 
+def cell_images(problem: Problem, group: Sequence[Symmetry]) -> Tensor:
+    """Return the cell to which each symmetry maps each cell, (G, E) int64; (1, E) without a group.
+
+    Cells are recognised by their set of nodes, as a sum of random numbers of the nodes.
+    """
+    cells = problem.cells.cpu()
+    if not group:
+        return torch.arange(len(cells))[None]
+    random = torch.Generator().manual_seed(0)
+    names = torch.randint(2**62, (problem.shape[0],), generator=random)  # sums may wrap around
+    order = names[cells].sum(dim=1).sort()
+    images = []
+    for symmetry in group:
+        node = torch.empty_like(symmetry.source).cpu()
+        node[symmetry.source.cpu()] = torch.arange(len(node))
+        found = torch.searchsorted(order.values, names[node[cells]].sum(dim=1))
+        images.append(order.indices[found])
+    return torch.stack(images)
+
+
 def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetry]:
     """Return the symmetry group of a body in a reproducible order, the identity first.
 

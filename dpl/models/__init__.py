@@ -13,6 +13,12 @@ if TYPE_CHECKING:
     from dpl.models.gnn import GNN
     from dpl.models.latent import Latent
     from dpl.models.pod import PODNet
-    from dpl.models.protocols import Correctable, FlagsLocalLoads, TrainsInCoordinates
+    from dpl.models.protocols import (
+        ClosedFormFit,
+        Correctable,
+        FlagsLocalLoads,
+        TrainsInCoordinates,
+    )
+    from dpl.models.unrolled import Unrolled
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -50,6 +50,29 @@ class TrainsInCoordinates(Protocol):
 
 
 @runtime_checkable
+class ClosedFormFit(Protocol):
+    """A model without trained parameters, which is fitted to all samples at once.
+
+    It takes dimensionless forces and returns displacements over L, both float64.
+    `dpl.training.Surrogate` fits it in place of a training of several epochs.
+    """
+
+    def fit(self, samples: Sample, held_out: Sample) -> None:
+        """Fit the model.
+
+        Args:
+            samples: Dimensionless samples to fit to, (S, N, D).
+            held_out: Samples by whose error options are chosen.
+        """
+        ...
+
+    @property
+    def is_fitted(self) -> bool:
+        """True after `fit`, or once a checkpoint has been loaded."""
+        ...
+
+
+@runtime_checkable
 class Correctable(Protocol):
     """A network whose predictions POD-Galerkin iterations in its modes can correct."""
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from dpl.fem import Load
-from dpl.models.protocols import TrainsInCoordinates
+from dpl.models.protocols import ClosedFormFit, TrainsInCoordinates
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.scene import Sample, Scene
 from dpl.training.losses.loss import Loss, LossContext
@@ -69,8 +69,9 @@ class Surrogate(L.LightningModule):
                 )
         largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
         names = ("force_scale", "displacement_scale", "largest_force")
-        for name, value in zip(names, (*scales(scene), largest_force), strict=True):
-            self.register_buffer(name, value)
+        factors = torch.ones(2).double().unbind() if self._is_closed_form else scales(scene)
+        for name, value in zip(names, (*factors, largest_force), strict=True):
+            self.register_buffer(name, value.clone())
         self.physics = LossContext(scene.problem, self.largest_force)
         self.val_metrics = default_metrics(scene.problem).clone(prefix="val/")
         self.test_metrics = default_metrics(scene.problem).clone(prefix="test/")
@@ -96,7 +97,8 @@ class Surrogate(L.LightningModule):
         Raises:
             ValueError: The load has not one parameter for each range of the law.
         """
-        scaled = (self._effective_force(load.force) / self.force_scale).to(self.dtype)
+        scaled = self._effective_force(load.force) / self.force_scale
+        scaled = scaled if self._is_closed_form else scaled.to(self.dtype)
         if load.parameters.shape[-1] != len(names := list(self.scene.loads.parameter_ranges)):
             found = load.parameters.shape[-1]
             raise ValueError(f"Load.parameters has {found} columns; the law has ranges of {names}")
@@ -123,11 +125,18 @@ class Surrogate(L.LightningModule):
         return lines
 
     @property
+    def _is_closed_form(self) -> bool:
+        return isinstance(self.net, ClosedFormFit)
+
+    @property
     def _trains_in_coordinates(self) -> bool:
         return isinstance(self.net, TrainsInCoordinates) and isinstance(self.loss, SquaredErrorLoss)
 
-    def training_step(self, batch: Sample | ReducedSamples, batch_idx: int) -> Tensor:
-        """Return the loss of a batch, ()."""
+    def training_step(self, batch: Sample | ReducedSamples, batch_idx: int) -> Tensor | None:
+        """Return the loss of a batch, (); None for a model that has been fitted."""
+        if self._is_closed_form:
+            self.trainer.should_stop = True
+            return None
         if isinstance(batch, ReducedSamples):
             loss = self._reduced_loss(batch)
         else:
@@ -196,6 +205,9 @@ class Surrogate(L.LightningModule):
         # before later hooks: schedules load the batches, and encoding them takes the bases
         if stage == "fit" and isinstance(self.net, TrainsInCoordinates) and not self.net.is_fitted:
             self.fit_bases(self.trainer.datamodule.snapshots())
+        if stage == "fit" and isinstance(self.net, ClosedFormFit) and not self.net.is_fitted:
+            data = self.trainer.datamodule
+            self.net.fit(data.samples("train"), data.samples("val"))
         for collection in (self.val_metrics, self.test_metrics):
             for metric in collection.values():
                 if hasattr(metric, "problem"):
@@ -205,8 +217,16 @@ class Surrogate(L.LightningModule):
         """Return the loss, which is a callback."""
         return [self.loss]
 
+    def on_train_epoch_start(self) -> None:
+        """Let the last epoch be validated."""
+        last = self.current_epoch + 1 == self.trainer.max_epochs
+        if last or self._is_closed_form:
+            self.trainer.check_val_every_n_epoch = 1
+
     def configure_optimizers(self) -> Any:
-        """Return the optimiser with its schedule."""
+        """Return the optimiser with its schedule; None without parameters."""
+        if self._is_closed_form:
+            return None
         optimizer = self._optimizer(self.parameters())
         if self._scheduler is None:
             return optimizer

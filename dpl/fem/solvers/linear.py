@@ -52,10 +52,14 @@ class LinearSolver:
 
     @cached_property
     def corotational(self) -> CorotationalPreconditioner:
-        """Preconditioner from the factor of K(0), in float32 if that is banded."""
+        """Preconditioner from `float32_factor`."""
+        return CorotationalPreconditioner(self.problem, self.float32_factor)
+
+    @cached_property
+    def float32_factor(self) -> Factor:
+        """Factor of K(0), in float32 if it is banded: about 1e-6 accurate, in a third of the time."""
         factor = self.factor
-        small = factor.to_float32() if isinstance(factor, BandedFactor) else factor
-        return CorotationalPreconditioner(self.problem, small)
+        return factor.to_float32() if isinstance(factor, BandedFactor) else factor
 
     @cached_property
     def backend(self) -> Backend:

@@ -1,0 +1,78 @@
+"""Reduced stiffness at rest as a function of the moduli of the law."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dpl.fem.linear.interface import full_matrix
+from dpl.fem.materials.linear_elastic import LinearElastic
+from dpl.fem.materials.material import Material
+from dpl.fem.problem import Problem
+
+
+@dataclass(frozen=True)
+class ReducedStiffness:
+    """V^T K(0) [V, p] = mu A + lambda B + C, since every law is isotropic at rest.
+
+    p is the prescribed displacement and C is that of the springs.
+
+    Attributes:
+        parts: A, B and C, (3, R, R + 1).
+    """
+
+    parts: Tensor
+
+    @classmethod
+    def of(cls, problem: Problem, modes: Tensor) -> "ReducedStiffness":
+        """Return the stiffness of a body in modes V at its free degrees of freedom, (n, R)."""
+        rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
+        columns = modes.double().numpy()
+        soft, stiff = LinearElastic(0.0), LinearElastic(0.3)
+        products = []
+        for law in (soft, stiff):
+            body = problem.with_material(law)
+            matrix = full_matrix(body.pattern, body.linearise(rest).tangent[0].numpy())
+            own = torch.from_numpy(columns.T @ (matrix @ columns))
+            moved = body.tangent_product(rest, problem.prescribed[None])[0][problem.free]
+            products.append(torch.cat([(own + own.T) / 2, modes.double().T @ moved[:, None]], 1))
+        springs = _springs(problem, modes.double())
+        first, second = products[0] - springs, products[1] - springs
+        mu = first / soft.mu
+        return cls(torch.stack([mu, (second - stiff.mu * mu) / stiff.lam, springs]))
+
+    def solve(self, law: Material, right: Tensor) -> Tensor:
+        """Return the coordinates (B, R) of Galerkin linear solutions.
+
+        Args:
+            law: The law; of a batch, each member has moduli of its own.
+            right: V^T f, (B, R).
+        """
+        whole = self.at(law)
+        right = right - whole[..., -1]
+        if whole.ndim == 2:
+            return torch.linalg.solve(whole[:, :-1], right, left=False)
+        return torch.linalg.solve(whole[..., :-1], right[..., None])[..., 0]
+
+    def at(self, law: Material) -> Tensor:
+        """Return V^T K(0) [V, p], (R, R + 1), or (B, R, R + 1) for a law of a batch."""
+        A, B, C = self.parts
+        mu, lam = (_column(modulus) for modulus in (law.mu, law.lam))
+        return mu * A + lam * B + C
+
+
+def _column(modulus: Any) -> Any:
+    """Return a modulus that multiplies matrices: a number, or (B, 1, 1)."""
+    return modulus.reshape(-1, 1, 1) if isinstance(modulus, Tensor) else modulus
+
+
+def _springs(problem: Problem, modes: Tensor) -> Tensor:
+    """Return V^T C [V, p], (R, R + 1), of the foundation."""
+    count = modes.shape[1]
+    if problem.springs is None:
+        return torch.zeros(count, count + 1, dtype=torch.float64)
+    fields = torch.zeros(count + 1, *problem.shape, dtype=torch.float64)
+    fields[:-1, problem.free] = modes.T
+    fields[-1] = problem.prescribed
+    return modes.T @ problem.springs.force(fields)[:, problem.free].T

@@ -1,0 +1,124 @@
+"""Nonlinear strain and unbalanced stress at a few sample cells of a body.
+
+All functions take displacement gradients H = du/dX (..., 3, 3), in 2D padded with zeros, and are
+differentiable tensor operations that keep their relative accuracy for small H.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dpl.fem.materials.material import Material
+from dpl.fem.materials.tensors import broadcast_modulus, cofactor, trace, volume_change
+from dpl.fem.problem import Problem
+
+POLAR_ITER = 5  # Newton iterations of a polar decomposition
+MIN_VOLUME_RATIO = 0.05  # det F below which a sample counts as undeformed [-]
+SERIES_ANGLE = 0.3  # rotation angle below which sin(t)/t - 1 is its series [rad]
+
+
+class SampleCells(NamedTuple):
+    """Cells at which strain and stress of a displacement in a subspace are evaluated.
+
+    A displacement has R coordinates c and, as the last one, the constant 1, the coordinate of the
+    prescribed displacement.
+
+    Attributes:
+        gradients: Displacement gradients of the coordinates at the C cells, (R + 1, C, D, D).
+    """
+
+    gradients: Tensor
+
+    def gradient(self, coordinates: Tensor) -> Tensor:
+        """Return H at the cells, (B, C, 3, 3), in 2D padded with zeros, of c (B, R)."""
+        R, C, D, _ = self.gradients.shape
+        rows = self.gradients.reshape(R, -1)
+        H = (coordinates @ rows[:-1] + rows[-1]).view(-1, C, D, D)
+        return H if D == 3 else torch.nn.functional.pad(H, (0, 1, 0, 1))
+
+    def first_features(self, linear: Tensor) -> Tensor:
+        """Return `rotated_strain`, (B, C, 1, D, D), of the linear solution's H (B, C, 3, 3)."""
+        D = self.gradients.shape[-1]
+        return rotated_strain(linear)[:, :, None, :D, :D]
+
+    def features(self, law: Material, coordinates: Tensor, linear: Tensor) -> Tensor:
+        """Return `unbalanced_stress`, (B, C, 2, D, D).
+
+        Args:
+            law: The law, see `Material.with_parameters`.
+            coordinates: c, (B, R).
+            linear: H of the linear solution, (B, C, 3, 3).
+        """
+        D = self.gradients.shape[-1]
+        H = self.gradient(coordinates)
+        return unbalanced_stress(law, H[:, :, None], linear[:, :, None])[:, :, 0, :, :D, :D]
+
+
+def cell_gradients(problem: Problem, fields: Tensor, cells: Tensor | None = None) -> Tensor:
+    """Return the mean displacement gradients in cells, (R, C, D, D), of fields (R, N, D).
+
+    Args:
+        problem: The body.
+        fields: Displacements.
+        cells: Numbers of the cells, (C,); None: all.
+    """
+    share = problem.dV / problem.dV.sum(dim=1, keepdim=True)
+    mean = (problem.dN * share[..., None, None]).sum(dim=1).expand(len(problem.cells), -1, -1)
+    nodes = problem.cells if cells is None else problem.cells[cells]
+    return fields[:, nodes].mT @ (mean if cells is None else mean[cells])
+
+
+def rotated_strain(H: Tensor) -> Tensor:
+    """Return exp(W) (I + e) - I - H, (..., 3, 3), with H = e + W, e symmetric and W skew.
+
+    The displacement gradient of the strain e in the frame rotated by W, minus that of the linear
+    theory: of second order in H.
+
+    Source: Huang, Tong, Zhou, Bao, Desbrun (2011), Interactive shape interpolation through
+    controllable dynamic deformation, IEEE TVCG 17 (rotation-strain coordinates).
+    """
+    W, e = (H - H.mT) / 2, (H + H.mT) / 2
+    square = (W * W).sum(dim=(-2, -1), keepdim=True) / 2  # of the angle
+    small = square < SERIES_ANGLE**2
+    angle = torch.where(small, 1.0, square).sqrt()
+    series = -square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))
+    first = torch.where(small, series, angle.sin() / angle - 1)  # sin(t)/t - 1
+    cosine = 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56 * (1 - square / 90)))
+    second = torch.where(small, cosine, (1 - angle.cos()) / angle**2)
+    beyond = first * W + second * (W @ W)  # exp(W) - I - W
+    return beyond + (W + beyond) @ e
+
+
+def unbalanced_stress(law: Material, H: Tensor, linear: Tensor) -> Tensor:
+    """Return [R^T dP, dP], (..., 2, 3, 3), with dP = P(H) - A(0) : linear.
+
+    The linear stress A(0) : linear is in equilibrium with the load, so that dP is the stress which
+    is not. R is the rotation of F = I + H (polar decomposition). Where det F is below
+    `MIN_VOLUME_RATIO`, H counts as zero, so that the result is finite.
+
+    Args:
+        law: The law; of a batch, H is (B, C, 1, 3, 3).
+        H: Displacement gradient.
+        linear: Displacement gradient of the linear solution.
+    """
+    valid = volume_change(H) > MIN_VOLUME_RATIO - 1
+    H = torch.where(valid[..., None, None], H, 0.0)
+    mu, lam = (broadcast_modulus(modulus, 2) for modulus in (law.mu, law.lam))
+    eye = torch.eye(3, dtype=H.dtype, device=H.device)
+    pressure = lam * trace(linear)[..., None, None]
+    stress = law.stress(H) - mu * (linear + linear.mT) - pressure * eye
+    return torch.stack([rotation(H).mT @ stress, stress], dim=-3)
+
+
+def rotation(H: Tensor) -> Tensor:
+    """Return the rotation R (..., 3, 3) of F = I + H, det F > 0.
+
+    Source: Higham (1986), SIAM J. Sci. Stat. Comput. 7: X <- (X + X^-T) / 2.
+    """
+    X = H + torch.eye(3, dtype=H.dtype, device=H.device)
+    for _ in range(POLAR_ITER):
+        minors = cofactor(X)
+        det = (X[..., 0, :] * minors[..., 0, :]).sum(dim=-1)
+        X = (X + minors / det[..., None, None]) / 2
+    return X

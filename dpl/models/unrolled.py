@@ -1,0 +1,267 @@
+"""Unrolled reduced solver: a few iterations in a subspace whose linear maps are fitted to data."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from dpl.fem import symmetries
+from dpl.fem.rom.reduced_stiffness import ReducedStiffness
+from dpl.fem.rom.sampled_stress import SampleCells
+from dpl.models.local_response import LocalResponse, resize_buffers
+from dpl.models.unrolled_fit import (
+    Columns,
+    Maps,
+    fit_maps,
+    fit_modes,
+    linear_solutions,
+    sample_weights,
+)
+from dpl.scene import Sample, Scene
+from dpl.system.checks import check_range
+
+MAX_SIZE = 100_000  # of rank, cells and stages
+
+
+class Unrolled(nn.Module):
+    """Galerkin linear solution and a few quasi-Newton iterations with fitted maps.
+
+    With the R modes V of the displacement and G, which maps their coordinates to displacement
+    gradients at C sample cells:
+
+        c_lin = (V^T K(0) V)^-1 V^T f,   H_lin = G c_lin
+        c_1   = c_lin + phi_0(H_lin) B_0
+        c_k+1 = c_k + phi(G c_k, H_lin) B_k
+
+    phi_0 is the rotated strain of the linear solution minus the linear one (`rotated_strain`), phi
+    the stress that is not balanced, in the present and in the rotated frame (`unbalanced_stress`).
+    The matrices B are found by ridge regression on the training samples, one after the other. Each
+    iteration is a quasi-Newton iteration of the reduced equilibrium: the residual is sampled at
+    a few cells (hyper-reduction), and the preconditioner and the weights of the cells are fitted.
+
+    Rank, cells, ridges and the number of maps are chosen by the error of the held-out samples. The
+    modes and the cells are invariant under the symmetries of the body and the maps commute with
+    them, so that the answer has the symmetries exactly.
+
+    A load whose linear solution the modes do not represent (a local load) gets the missing part
+    from the factor of K(0), see `LocalResponse`.
+
+    The module takes and returns dimensionless float64 fields. It has no trained parameters.
+
+    Sources: Gregor, LeCun (2010), Learning fast approximations of sparse coding, ICML (unrolled
+    iterations); Farhat, Avery, Chapman, Cortial (2014), Int. J. Numer. Methods Eng. 98
+    (hyper-reduction).
+
+    Attributes:
+        scene: The scene to predict.
+        modes: V at free degrees of freedom, (n, R).
+        stiffness: V^T K(0) [V, p] by its dependence on the moduli, see `ReducedStiffness`,
+            (3, R, R + 1); p is the prescribed displacement.
+        cells: Numbers of the sample cells, (C,).
+        gradients: G and the gradients of p, (R + 1, C, D, D).
+        first_map: B_0, (C D D, R).
+        maps: B_1, B_2, ..., (K, 2 C D D, R).
+        fitted: True after `fit`, ().
+    """
+
+    modes: Tensor
+    stiffness: Tensor
+    cells: Tensor
+    gradients: Tensor
+    first_map: Tensor
+    maps: Tensor
+    fitted: Tensor
+    free: Tensor
+    prescribed: Tensor
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        rank: int = 200,
+        cells: int = 160,
+        stages: int = 3,
+        symmetry: bool = True,
+        linear_tol: float = 5e-4,
+    ) -> None:
+        """Build the module; `fit` computes its contents.
+
+        Args:
+            scene: The scene to predict.
+            rank: Largest number of modes of the displacement.
+            cells: Largest number of sample cells; a few more, if symmetries demand it.
+            stages: Largest number of iterations after the first map.
+            symmetry: Find the symmetries of the body and build them into the answer.
+            linear_tol: Relative size of the part of the linear solution that the modes miss, above
+                which it is computed with the factor of K(0). 0: for all loads; infinity: for none.
+
+        Raises:
+            ValueError: A number is out of range.
+        """
+        super().__init__()
+        check_range(1, MAX_SIZE, rank=rank, cells=cells)
+        check_range(0, MAX_SIZE, stages=stages)
+        if not linear_tol >= 0:
+            raise ValueError(f"linear_tol = {linear_tol} must be 0 or more")
+        self.scene = scene
+        self.rank, self.sample_count, self.stages = rank, cells, stages
+        constant = scene.loads.constant_force
+        also = [] if constant is None else [constant]
+        self.group = symmetries(scene.problem, also=also) if symmetry else []
+        self.extra_inputs = ("parameters",) if scene.loads.parameter_ranges else ()
+        self.local = LocalResponse(scene, linear_tol)
+        dim = scene.problem.shape[1]
+        empty = torch.zeros(0, dtype=torch.float64)
+        for name, value in {
+            "modes": torch.zeros(int(scene.problem.free.sum()), 0),
+            "stiffness": empty.view(3, 0, 1),
+            "cells": torch.zeros(0, dtype=torch.int64),
+            "gradients": torch.zeros(1, 0, dim, dim, dtype=torch.float64),
+            "first_map": torch.zeros(0, 0),
+            "maps": torch.zeros(0, 0, 0),
+            "fitted": torch.tensor(False),
+        }.items():
+            self.register_buffer(name, value)
+        self.register_buffer("free", scene.problem.free, persistent=False)
+        self.register_buffer("prescribed", scene.problem.prescribed, persistent=False)
+
+    # ------------------------------------------------------------------ prediction
+
+    def forward(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Return displacements over L (B, N, D) [-] of forces (B, N, D) [-].
+
+        Args:
+            force: Nodal forces.
+            parameters: Parameters of the law, (B, P); required if it has ranges.
+        """
+        given = self._given_parameters(force, parameters)
+        loaded = force[:, self.free]
+        linear, whole = self.coordinates(loaded, given)
+        columns = whole @ self.modes.mT.to(whole)
+        local = self._is_local(loaded, linear)
+        if local.any():
+            galerkin = linear[local] @ self.modes.mT.to(whole)
+            missing = self.local.missing(loaded[local], galerkin, given[local])
+            columns = columns.index_add(0, local.nonzero()[:, 0], missing)
+        return self._field(columns)
+
+    def forward_in_basis(
+        self, force: Tensor, parameters: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return displacements within the modes (B, N, D) and a mask of local loads, (B,)."""
+        loaded = force[:, self.free]
+        linear, whole = self.coordinates(loaded, self._given_parameters(force, parameters))
+        return self._field(whole @ self.modes.mT.to(whole)), self._is_local(loaded, linear)
+
+    @property
+    def flags_local_loads(self) -> bool:
+        """See `FlagsLocalLoads`."""
+        return self.local.tol < torch.inf
+
+    def coordinates(self, loaded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        """Return coordinates (B, R) of the Galerkin linear solution and of the prediction.
+
+        Args:
+            loaded: Forces at free degrees of freedom, (B, n).
+            parameters: Parameters of the law, (B, P).
+        """
+        law = self.scene.problem.material.with_parameters(parameters)
+        stiffness = ReducedStiffness(self.stiffness)
+        linear = stiffness.solve(law, loaded @ self.modes.to(loaded))
+        return linear, self._maps(law, linear)
+
+    def _maps(self, law: Any, linear: Tensor) -> Tensor:
+        matrices = self.first_map.to(linear), list(self.maps.to(linear))
+        return Maps(SampleCells(self.gradients), *matrices)(law, linear)
+
+    def _given_parameters(self, force: Tensor, parameters: Tensor | None) -> Tensor:
+        if parameters is not None:
+            return parameters
+        if self.extra_inputs:
+            names = list(self.scene.loads.parameter_ranges)
+            raise ValueError(f"parameters are an input of this model; give {names}, (B, P)")
+        return force.new_zeros(len(force), 0)
+
+    def _is_local(self, loaded: Tensor, linear: Tensor) -> Tensor:
+        return self.local.is_local(loaded, linear.norm(dim=1))  # the modes are orthonormal
+
+    def _field(self, columns: Tensor) -> Tensor:
+        """Return fields (B, N, D) of values at free degrees of freedom, (B, n)."""
+        fields = self.prescribed.expand(len(columns), -1, -1).to(columns)
+        return fields.masked_scatter(self.free, columns)
+
+    # ------------------------------------------------------------------ fit
+
+    @property
+    def is_fitted(self) -> bool:
+        """True after `fit`, or once a checkpoint has been loaded."""
+        return bool(self.fitted)
+
+    def fit(self, samples: Sample, held_out: Sample) -> None:
+        """Compute modes, sample cells and maps.
+
+        Args:
+            samples: Dimensionless samples to fit to, (S, N, D).
+            held_out: Samples by whose error rank, cells, ridges and number of maps are chosen.
+
+        Raises:
+            ValueError: There are too few samples, or they are not finite.
+        """
+        problem = self.scene.problem
+        answers = linear_solutions(self.scene, samples), linear_solutions(self.scene, held_out)
+        modes = fit_modes(self.scene, samples, answers[0], self.rank, self.group)
+        stiffness = ReducedStiffness.of(problem, modes)
+        self.modes, self.stiffness = modes.float(), stiffness.parts
+        inverse = stiffness.solve(problem.reference.material, torch.eye(modes.shape[1]).double())
+        self.local.fit(modes, inverse, self.group)
+        sets = [
+            self._columns(part, answer)
+            for part, answer in zip((samples, held_out), answers, strict=True)
+        ]
+        numbers, found = fit_maps(
+            problem,
+            modes,
+            self.group,
+            (sets[0], sets[1]),
+            cells=self.sample_count,
+            stages=self.stages,
+        )
+        maps = found.maps
+        self.cells, self.gradients = numbers, maps.cells.gradients
+        self.first_map = maps.first.float()
+        rows = 2 * len(self.first_map)
+        others = [one.float() for one in maps.others] or [torch.zeros(0, rows, modes.shape[1])[0:0]]
+        self.maps = torch.stack(others) if maps.others else torch.zeros(0, rows, modes.shape[1])
+        self.fitted = torch.tensor(True)
+
+    def _columns(self, samples: Sample, answers: Tensor) -> Columns:
+        """Return samples in coordinates; `answers` are their linear solutions, (S, n)."""
+        free, modes = self.free, self.modes.double()
+        displacement, loaded = samples.displacement[:, free], samples.force[:, free]
+        law = self.scene.problem.material.with_parameters(samples.parameters)
+        linear = ReducedStiffness(self.stiffness).solve(law, loaded @ modes)
+        weights = sample_weights(displacement)
+        if self.extra_inputs:  # answers are those of other parameters: leave local loads out
+            target = displacement @ modes
+            weights = torch.where(self._is_local(loaded, linear), 0.0, weights)
+        else:
+            target = linear + (displacement - answers) @ modes
+        return Columns(linear, target, weights, samples.parameters)
+
+    def skipped_work(self) -> list[str]:
+        """Return the work that the model saves, one line each."""
+        members = max(1, len(self.group))
+        lines = ["no gradient descent: the maps are found by linear regression"]
+        if members > 1:
+            lines.append(f"no learning of {members} symmetries: the maps commute with them")
+        if self.flags_local_loads:
+            lines.append(
+                "no modes for near fields: where the modes miss more than "
+                f"{self.local.tol:.2g} of the linear solution, K(0)^-1 f is computed"
+            )
+        return lines
+
+    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """Take the sizes of the checkpoint, which the fit has chosen."""
+        resize_buffers(self, state, prefix)
+        super()._load_from_state_dict(state, prefix, *rest)

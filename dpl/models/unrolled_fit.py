@@ -1,0 +1,233 @@
+"""Fit of `dpl.models.Unrolled` to samples: modes, sample cells and maps."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dpl.fem import Problem
+from dpl.fem.materials.material import Material
+from dpl.fem.rom.reduced_stiffness import ReducedStiffness
+from dpl.fem.rom.sampled_stress import SampleCells, cell_gradients
+from dpl.fem.symmetry import Symmetry, cell_images
+from dpl.models.invariant_basis import group_actions, invariant_pod, scatter_fields
+from dpl.models.stage_regression import GroupAction, Rows, fit_map, weighted_error
+from dpl.scene import Sample, Scene
+
+CHUNK = 512  # samples whose features are computed at a time
+SIZE_EXPONENT = -0.4  # errors count relative to the displacement to this power
+MIN_GAIN = 0.97  # largest ratio of held-out errors for which another map is worth its time
+
+
+class Maps(NamedTuple):
+    """Maps of the iterations at sample cells.
+
+    Attributes:
+        cells: The sample cells.
+        first: B_0, (C D D, R).
+        others: B_1, B_2, ..., (2 C D D, R) each.
+    """
+
+    cells: SampleCells
+    first: Tensor
+    others: Sequence[Tensor]
+
+    def __call__(self, law: Material, linear: Tensor) -> Tensor:
+        """Return coordinates (B, R) of displacements from those of linear solutions (B, R)."""
+        H = self.cells.gradient(linear)
+        c = linear + self.cells.first_features(H).flatten(1) @ self.first
+        for matrix in self.others:
+            c = c + self.cells.features(law, c, H).flatten(1) @ matrix
+        return c
+
+
+class Columns(NamedTuple):
+    """Samples in coordinates of the modes.
+
+    Attributes:
+        linear: Coordinates of the Galerkin linear solution, (S, R).
+        target: Coordinates of the displacement, (S, R); of a local load without the part of the
+            linear solution that the modes miss.
+        weights: Factor of the error of each sample, (S,).
+        parameters: Parameters of the law, (S, P).
+    """
+
+    linear: Tensor
+    target: Tensor
+    weights: Tensor
+    parameters: Tensor
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Everything that is fitted.
+
+    Attributes:
+        modes: V at free degrees of freedom, (n, R).
+        stiffness: V^T K(0) [V, p].
+        numbers: Numbers of the sample cells, (C,).
+        maps: The maps.
+        errors: Weighted held-out errors of the linear solution and after each map.
+        ridges: Ridges of the maps.
+    """
+
+    modes: Tensor
+    stiffness: ReducedStiffness
+    numbers: Tensor
+    maps: Maps
+    errors: list[float]
+    ridges: list[float]
+
+
+def linear_solutions(scene: Scene, samples: Sample) -> Tensor:
+    """Return linear solutions at free degrees of freedom, (S, n); for ranges, of the reference."""
+    linear = scene.linear.reference
+    problem = linear.problem
+    supports = support_force(problem)
+    return torch.stack([linear.solve(force - supports)[problem.free] for force in samples.force])
+
+
+def support_force(problem: Problem) -> Tensor:
+    """Return K(0) p of the prescribed displacement p, (N, D); 0 if no support is moved."""
+    if not problem.moved_supports:
+        return torch.zeros(problem.shape, dtype=torch.float64)
+    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    return problem.tangent_product(rest, problem.prescribed[None])[0]
+
+
+def fit_modes(
+    scene: Scene, samples: Sample, linear: Tensor, rank: int, group: Sequence[Symmetry]
+) -> Tensor:
+    """Return invariant POD modes (n, R), rounded to float32, of linear and nonlinear parts."""
+    free = scene.problem.free
+    displacement = samples.displacement[:, free]
+    weights = sample_weights(displacement)[:, None]
+    snapshots = torch.cat([weights * linear, weights * (displacement - linear)])
+    return invariant_pod(snapshots, free, group, rank).float().double()
+
+
+def sample_weights(displacement: Tensor) -> Tensor:
+    """Return ||u||^-0.4, (S,), of displacements (S, n); 0 for u = 0."""
+    size = displacement.norm(dim=1)
+    return torch.where(size > 0, size.clamp(min=1e-300) ** SIZE_EXPONENT, 0.0)
+
+
+def choose_cells(images: Tensor, count: int) -> Tensor:
+    """Return random cells (C,), C >= count if there are as many, with all their images.
+
+    Args:
+        images: Image of each cell under each symmetry, (G, E).
+        count: Number of cells.
+    """
+    orbit = images.amin(dim=0)  # smallest number of a cell of the orbit
+    names = orbit.unique()
+    order = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(0))]
+    sizes = torch.bincount(orbit, minlength=len(orbit))[order]
+    taken = int((sizes.cumsum(0) < count).sum()) + 1
+    return torch.isin(orbit, order[:taken]).nonzero()[:, 0]
+
+
+class Regression:
+    """Fit of the maps at given sample cells, one after the other.
+
+    Attributes:
+        maps: The maps so far.
+        errors, ridges: See `Fit`.
+    """
+
+    def __init__(
+        self, law: Material, cells: SampleCells, action: GroupAction, fitted: Columns, held: Columns
+    ) -> None:
+        """Start from the linear solution.
+
+        Args:
+            law: The law, perhaps with ranges.
+            cells: The sample cells.
+            action: Symmetries of the cells and the coordinates.
+            fitted, held: Samples to fit to, and to choose by.
+        """
+        self._law, self._cells, self._action = law, cells, action
+        self._sets = fitted, held
+        self._present = [fitted.linear, held.linear]
+        self._matrices: list[Tensor] = []
+        self.errors = [weighted_error(held.target - held.linear, held.weights)]
+        self.ridges: list[float] = []
+
+    @property
+    def maps(self) -> Maps:
+        """The maps so far; without one, a first map of zeros."""
+        count, dim = self._cells.gradients.shape[1:3]
+        none = torch.zeros(count * dim * dim, self._sets[0].linear.shape[1], dtype=torch.float64)
+        return Maps(self._cells, *(self._matrices[:1] or [none]), self._matrices[1:])
+
+    def add_map(self) -> bool:
+        """Fit the next map; return False, without adding it, if it gains too little."""
+        rows = [self._rows(*pair) for pair in zip(self._sets, self._present, strict=True)]
+        found = fit_map(*rows, self._action)
+        if not found.error < MIN_GAIN * self.errors[-1]:
+            return False
+        matrix = found.matrix.float().double()
+        self._matrices.append(matrix)
+        self._present = [
+            c + part.features.flatten(1) @ matrix
+            for c, part in zip(self._present, rows, strict=True)
+        ]
+        self.errors.append(found.error)
+        self.ridges.append(found.ridge)
+        return True
+
+    def _rows(self, samples: Columns, present: Tensor) -> Rows:
+        parts = zip(samples.linear.split(CHUNK), present.split(CHUNK), strict=True)
+        laws = (self._law.with_parameters(p) for p in samples.parameters.split(CHUNK))
+        features = [self._features(law, *part) for law, part in zip(laws, parts, strict=True)]
+        return Rows(torch.cat(features), samples.target - present, samples.weights)
+
+    def _features(self, law: Material, linear: Tensor, present: Tensor) -> Tensor:
+        H = self._cells.gradient(linear)
+        if not self._matrices:
+            return self._cells.first_features(H)
+        return self._cells.features(law, present, H)
+
+
+def fit_maps(
+    problem: Problem,
+    modes: Tensor,
+    group: Sequence[Symmetry],
+    samples: tuple[Columns, Columns],
+    *,
+    cells: int,
+    stages: int,
+) -> tuple[Tensor, Regression]:
+    """Return sample cells (C,) and maps with the smallest held-out error.
+
+    Half as many cells are tried as long as that is better.
+
+    Args:
+        problem: The body.
+        modes: V, (n, R).
+        group: Symmetries of the body.
+        samples: Samples to fit to, and to choose by.
+        cells: Number of sample cells.
+        stages: Largest number of maps after the first.
+    """
+    images = cell_images(problem, group)
+    actions = group_actions(modes, problem.free, group)
+    fields = torch.cat([scatter_fields(modes.T, problem.free), problem.prescribed[None]])
+    rotations = torch.stack([one.rotation for one in group] or [torch.eye(problem.shape[1])])
+    best: tuple[Tensor, Regression] | None = None
+    while cells:
+        numbers = choose_cells(images, cells)
+        place = torch.empty(len(problem.cells), dtype=torch.int64)
+        place[numbers] = torch.arange(len(numbers))
+        action = GroupAction(rotations.double(), place[images[:, numbers]], actions)
+        sample_cells = SampleCells(cell_gradients(problem, fields, numbers))
+        regression = Regression(problem.material, sample_cells, action, *samples)
+        while len(regression.ridges) <= stages and regression.add_map():
+            pass
+        if best is not None and regression.errors[-1] >= best[1].errors[-1]:
+            break
+        best, cells = (numbers, regression), cells // 2
+    assert best is not None
+    return best
