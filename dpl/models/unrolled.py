@@ -1,11 +1,14 @@
 """Unrolled reduced solver: a few iterations in a subspace whose linear maps are fitted to data."""
 
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from dpl.fem import symmetries
+from dpl.fem import InvariantBasedMaterial, symmetries
+from dpl.fem.rom.compiled_maps import CompiledMaps, add_product
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.models.local_response import LocalResponse, resize_buffers
@@ -20,6 +23,8 @@ from dpl.models.unrolled_fit import (
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 
+Array = NDArray[np.float64]
+MAX_COMPILED = 8  # loads for which one compiled call each is faster than tensor operations
 MAX_SIZE = 100_000  # of rank, cells and stages
 
 
@@ -122,6 +127,8 @@ class Unrolled(nn.Module):
             "fitted": torch.tensor(False),
         }.items():
             self.register_buffer(name, value)
+        self._compiled: tuple[Tensor, CompiledMaps] | None = None
+        self._inverted: tuple[tuple[Tensor, Any], tuple[Array, Array]] | None = None
         self.register_buffer("free", scene.problem.free, persistent=False)
         self.register_buffer("prescribed", scene.problem.prescribed, persistent=False)
 
@@ -165,14 +172,61 @@ class Unrolled(nn.Module):
             loaded: Forces at free degrees of freedom, (B, n).
             parameters: Parameters of the law, (B, P).
         """
+        if self._is_compiled(loaded, parameters):
+            return self._compiled_coordinates(loaded, parameters)
         law = self.scene.problem.material.with_parameters(parameters)
         stiffness = ReducedStiffness(self.stiffness)
         linear = stiffness.solve(law, loaded @ self.modes.to(loaded))
-        return linear, self._maps(law, linear)
-
-    def _maps(self, law: Any, linear: Tensor) -> Tensor:
         matrices = self.first_map.to(linear), list(self.maps.to(linear))
-        return Maps(SampleCells(self.gradients), *matrices)(law, linear)
+        return linear, Maps(SampleCells(self.gradients.to(linear)), *matrices)(law, linear)
+
+    def _is_compiled(self, loaded: Tensor, parameters: Tensor) -> bool:
+        """Return True if compiled loops can predict these loads: few, and without derivatives."""
+        tracing = torch.compiler.is_compiling() or torch.jit.is_tracing()
+        if tracing or loaded.device.type != "cpu" or loaded.dtype != torch.float64:
+            return False
+        differentiable = torch.is_grad_enabled() and (
+            loaded.requires_grad or parameters.requires_grad
+        )
+        law = self.scene.problem.material
+        return (
+            len(loaded) <= MAX_COMPILED
+            and not differentiable
+            and isinstance(law, InvariantBasedMaterial)
+        )
+
+    def _compiled_coordinates(self, loaded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        modes, pairs = self.modes.numpy(), []
+        for force, own in zip(loaded.detach(), parameters.detach(), strict=True):
+            law = cast(
+                InvariantBasedMaterial, self.scene.problem.material.with_parameters(own[None])
+            )
+            inverse, supports = self._inverse(law)
+            right = -supports
+            add_product(np.ascontiguousarray(force.numpy()), modes, right)
+            pairs.append(self._compiled_maps(law, inverse, right))
+        linear, whole = (torch.from_numpy(np.stack(column)) for column in zip(*pairs, strict=True))
+        return linear, whole
+
+    @property
+    def _compiled_maps(self) -> CompiledMaps:
+        """Maps as compiled loops take them, for the present buffers."""
+        buffers = self.gradients, self.first_map, self.maps
+        if self._compiled is None or self._compiled[0] is not self.maps:
+            arrays = (buffer.float().numpy() for buffer in buffers)
+            self._compiled = self.maps, CompiledMaps.of(*arrays)
+        return self._compiled[1]
+
+    def _inverse(self, law: InvariantBasedMaterial) -> tuple[Array, Array]:
+        """Return (V^T K(0) V)^-1 (R, R) and V^T K(0) p (R,), kept for the last law."""
+        if self._inverted is None or not (
+            self._inverted[0][0] is self.stiffness and self._inverted[0][1] == law
+        ):
+            whole = ReducedStiffness(self.stiffness).at(law).numpy()
+            inverse = np.ascontiguousarray(np.linalg.inv(whole[:, :-1]))
+            self._inverted = (self.stiffness, law), (inverse, whole[:, -1])
+        inverse, supports = self._inverted[1]
+        return inverse, supports.copy()
 
     def _given_parameters(self, force: Tensor, parameters: Tensor | None) -> Tensor:
         if parameters is not None:
@@ -230,8 +284,8 @@ class Unrolled(nn.Module):
         self.cells, self.gradients = numbers, maps.cells.gradients
         self.first_map = maps.first.float()
         rows = 2 * len(self.first_map)
-        others = [one.float() for one in maps.others] or [torch.zeros(0, rows, modes.shape[1])[0:0]]
-        self.maps = torch.stack(others) if maps.others else torch.zeros(0, rows, modes.shape[1])
+        none = torch.zeros(0, rows, modes.shape[1])
+        self.maps = torch.stack([one.float() for one in maps.others]) if maps.others else none
         self.fitted = torch.tensor(True)
 
     def _columns(self, samples: Sample, answers: Tensor) -> Columns:

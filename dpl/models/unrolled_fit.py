@@ -222,7 +222,8 @@ def fit_maps(
         place = torch.empty(len(problem.cells), dtype=torch.int64)
         place[numbers] = torch.arange(len(numbers))
         action = GroupAction(rotations.double(), place[images[:, numbers]], actions)
-        sample_cells = SampleCells(cell_gradients(problem, fields, numbers))
+        # rounded before the fit: the maps cancel digits, so that G must stay what it is
+        sample_cells = SampleCells(cell_gradients(problem, fields, numbers).float().double())
         regression = Regression(problem.material, sample_cells, action, *samples)
         while len(regression.ridges) <= stages and regression.add_map():
             pass

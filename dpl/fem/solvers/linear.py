@@ -57,7 +57,7 @@ class LinearSolver:
 
     @cached_property
     def float32_factor(self) -> Factor:
-        """Factor of K(0), in float32 if it is banded: about 1e-6 accurate, in a third of the time."""
+        """Factor of K(0), in float32 if it is banded: accurate to about 1e-6."""
         factor = self.factor
         return factor.to_float32() if isinstance(factor, BandedFactor) else factor
 
