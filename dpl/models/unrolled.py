@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from dpl.fem import InvariantBasedMaterial, symmetries
-from dpl.fem.rom.compiled_maps import CompiledMaps, add_product
+from dpl.fem.assembly.sampled_loops import add_product
+from dpl.fem.rom.compiled_maps import CompiledMaps
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.models.local_response import LocalResponse, resize_buffers

@@ -160,12 +160,13 @@ class Regression:
         """The maps so far; without one, a first map of zeros."""
         count, dim = self._cells.gradients.shape[1:3]
         none = torch.zeros(count * dim * dim, self._sets[0].linear.shape[1], dtype=torch.float64)
-        return Maps(self._cells, *(self._matrices[:1] or [none]), self._matrices[1:])
+        first = self._matrices[0] if self._matrices else none
+        return Maps(self._cells, first, self._matrices[1:])
 
     def add_map(self) -> bool:
         """Fit the next map; return False, without adding it, if it gains too little."""
         rows = [self._rows(*pair) for pair in zip(self._sets, self._present, strict=True)]
-        found = fit_map(*rows, self._action)
+        found = fit_map(rows[0], rows[1], self._action)
         if not found.error < MIN_GAIN * self.errors[-1]:
             return False
         matrix = found.matrix.float().double()

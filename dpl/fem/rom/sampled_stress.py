@@ -9,13 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dpl.fem.assembly.sampled_loops import MIN_VOLUME_RATIO, POLAR_ITER, SERIES_ANGLE
 from dpl.fem.materials.material import Material
 from dpl.fem.materials.tensors import broadcast_modulus, cofactor, trace, volume_change
 from dpl.fem.problem import Problem
-
-POLAR_ITER = 5  # Newton iterations of a polar decomposition
-MIN_VOLUME_RATIO = 0.05  # det F below which a sample counts as undeformed [-]
-SERIES_ANGLE = 0.3  # rotation angle below which sin(t)/t - 1 is its series [rad]
 
 
 class SampleCells(NamedTuple):
