@@ -98,7 +98,10 @@ class FlagsLocalLoads(Protocol):
     `forward` solves with the factor of K(0) for these loads, which an ONNX graph cannot contain.
     """
 
-    linear_tol: float  # relative projection residual above which a load is local [-]
+    @property
+    def linear_tol(self) -> float:
+        """Relative projection residual above which a load is local [-]."""
+        ...
 
     @property
     def flags_local_loads(self) -> bool:

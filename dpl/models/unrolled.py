@@ -162,6 +162,11 @@ class Unrolled(nn.Module):
         return self._field(whole @ self.modes.mT.to(whole)), self._is_local(loaded, linear)
 
     @property
+    def linear_tol(self) -> float:
+        """See `FlagsLocalLoads`."""
+        return self.local.tol
+
+    @property
     def flags_local_loads(self) -> bool:
         """See `FlagsLocalLoads`."""
         return self.local.tol < torch.inf

@@ -1,0 +1,244 @@
+"""The unrolled reduced solver: exact limits, symmetry, compiled loops, storage, training."""
+
+import pytest
+import torch
+
+from dpl.config import run_folder
+from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, rectangle, solve
+from dpl.fem.rom.reduced_stiffness import ReducedStiffness
+from dpl.fem.rom.sampled_stress import cell_gradients, rotated_strain, rotation, unbalanced_stress
+from dpl.fem.symmetry import cell_images, symmetries
+from dpl.models import ClosedFormFit, FlagsLocalLoads, Unrolled
+from dpl.models.stage_regression import GroupAction, Rows, fit_map
+from dpl.scene import Sample, Scene
+from dpl.training import MSE, Surrogate
+from tests.laws import COMPILED, LAWS
+
+SMALL = {"rank": 20, "cells": 8, "stages": 2}
+
+
+def scene_on(mesh, law, deflection=0.2):
+    """Return a scene of a body fixed at x = 0."""
+    problem = Problem.build(mesh, law, fixed=Plane(0, 0.0))
+    newton = Newton(problem, linear="superlu")
+    loads = ModalLoads(newton.linear_solver, n_modes=3, deflection=deflection)
+    return Scene(problem, loads, newton)
+
+
+def samples_of(scene, count, seed=0):
+    load = scene.loads.sample(seed, range(count))
+    states = [solve(scene.solver, one).displacement for one in load.unbatch()]
+    return Sample(load.force, torch.cat(states), load.young, load.parameters)
+
+
+def fitted(scene, count=40, **options):
+    net = Unrolled(scene, **{**SMALL, **options})
+    net.fit(samples_of(scene, count), samples_of(scene, 8, seed=1))
+    return net
+
+
+@pytest.fixture(scope="module")
+def beam():
+    return scene_on(box((4, 1, 1), (5, 3, 3)), NeoHookeanLn(0.3))
+
+
+@pytest.fixture(scope="module")
+def net(beam):
+    return fitted(beam)
+
+
+def errors(net, samples):
+    """Return relative errors (S,)."""
+    own = (samples.parameters,) if net.extra_inputs else ()
+    difference = net(samples.force, *own) - samples.displacement
+    return difference.flatten(1).norm(dim=1) / samples.displacement.flatten(1).norm(dim=1)
+
+
+def linear_errors(scene, samples):
+    pairs = zip(samples.force, samples.displacement, strict=True)
+    return torch.stack([(scene.linear.reference.solve(f) - u).norm() / u.norm() for f, u in pairs])
+
+
+def test_it_is_much_nearer_than_the_linear_solution(beam, net):
+    unseen = samples_of(beam, 12, seed=2)
+    assert errors(net, unseen).median() < 0.2 * linear_errors(beam, unseen).median()
+    assert errors(net, unseen).max() < 0.3 * linear_errors(beam, unseen).max()
+
+
+@pytest.mark.parametrize("size", [1e-2, 1e-5, 1e-9])
+def test_small_loads_have_the_linear_solution(beam, net, size):
+    force = size * beam.loads.sample(3, range(4)).force
+    exact = torch.stack([beam.linear.solve(one) for one in force])
+    net = fitted(beam, linear_tol=0.0)
+    error = (net(force) - exact).flatten(1).norm(dim=1) / exact.flatten(1).norm(dim=1)
+    assert error.max() < 2 * size + 1e-6  # the factor for local loads is float32
+
+
+def test_no_load_no_displacement(beam, net):
+    assert not net(torch.zeros(1, *beam.problem.shape).double()).any()
+
+
+def test_images_of_loads_have_images_of_answers(beam, net):
+    force = beam.loads.sample(4, range(3)).force
+    answer = net(force)
+    for symmetry in net.group:
+        turned = net(symmetry.image(force))
+        assert (turned - symmetry.image(answer)).norm() < 1e-5 * answer.norm()
+
+
+def test_compiled_and_tensor_predictions_agree(beam, net):
+    load = beam.loads.sample(5, range(3)).force
+    with torch.enable_grad():
+        tensors = net(load.clone().requires_grad_())
+    assert (net(load) - tensors).norm() < 1e-10 * tensors.norm()
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_every_compiled_law_agrees(name):
+    scene = scene_on(box((2, 1, 1), (3, 2, 2)), LAWS[name])
+    net = fitted(scene, 12, rank=8, cells=4, stages=1)
+    load = scene.loads.sample(5, range(2)).force
+    tensors = net(load.clone().requires_grad_())
+    assert (net(load) - tensors).norm() < 1e-9 * tensors.norm()
+
+
+def test_gradients_with_respect_to_forces(beam, net):
+    force = beam.loads.sample(6, range(1)).force.requires_grad_()
+    direction = torch.randn(force.shape, generator=torch.Generator().manual_seed(0)).double()
+    direction *= force.detach().norm() / direction.norm()
+    (gradient,) = torch.autograd.grad(net(force).square().sum(), force)
+    step = 1e-5
+    ends = [net(force.detach() + s * step * direction).square().sum() for s in (1, -1)]
+    assert float((gradient * direction).sum()) == pytest.approx(
+        float(ends[0] - ends[1]) / (2 * step), rel=1e-3
+    )
+
+
+def test_a_range_of_poissons_ratios():
+    scene = scene_on(box((3, 1, 1), (4, 3, 3)), NeoHookeanLn((0.1, 0.4)))
+    net = fitted(scene, 60)
+    unseen = samples_of(scene, 10, seed=2)
+    assert errors(net, unseen).median() < 0.2 * linear_errors(scene, unseen).median()
+    with pytest.raises(ValueError, match="parameters are an input"):
+        net(unseen.force)
+
+
+def test_a_plane_body():
+    scene = scene_on(rectangle((4, 1), (9, 3)), NeoHookeanLn(0.3), deflection=0.05)
+    net, unseen = fitted(scene), samples_of(scene, 8, seed=2)
+    assert errors(net, unseen).median() < 0.2 * linear_errors(scene, unseen).median()
+
+
+def test_loads_far_out_of_range_stay_finite(beam, net):
+    force = 20 * beam.loads.sample(7, range(5)).force
+    assert net(force).isfinite().all()
+
+
+def test_weights_are_stored_with_the_sizes_of_the_fit(beam, net):
+    other = Unrolled(beam, **SMALL)
+    assert not other.is_fitted
+    other.load_state_dict(net.state_dict())
+    force = beam.loads.sample(8, range(3)).force
+    assert other.is_fitted and torch.equal(other(force), net(force))
+
+
+def test_protocols(net):
+    assert isinstance(net, ClosedFormFit) and isinstance(net, FlagsLocalLoads)
+
+
+def test_the_surrogate_predicts_in_si_units(beam, net):
+    module = Surrogate(net, MSE(), beam)
+    load = beam.loads.sample(9, range(2))
+    assert torch.allclose(module.predict(load), net(load.force), rtol=0, atol=1e-15)
+    assert module.configure_optimizers() is None
+
+
+def test_fewer_maps_where_they_do_not_help(beam):
+    assert len(fitted(beam, 6, stages=30).maps) < 30
+
+
+@pytest.mark.parametrize("wrong", [{"rank": 0}, {"cells": 0}, {"stages": -1}, {"linear_tol": -1}])
+def test_numbers_out_of_range_are_refused(beam, wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Unrolled(beam, **wrong)
+
+
+def test_a_run_is_trained_and_loaded(script, tiny_training, tmp_path):
+    folder = tmp_path / "run"
+    options = [one for one in tiny_training if not one.startswith("model.")]
+    done = script("train", "model=unrolled", *options, f"run={folder}", cwd=tmp_path)
+    assert not done.status, done.err
+    simulator = run_folder.load(folder)
+    scene = simulator.scene
+    load = scene.loads.sample(0, range(1))
+    answer = simulator(**scene.si_inputs(load))
+    assert answer.volume_ratio > 0
+    assert simulator.surrogate.net.is_fitted
+
+
+# ---------------------------------------------------------------- parts
+
+
+def test_rotated_strain_is_the_polar_form():
+    random = torch.Generator().manual_seed(0)
+    H = 0.4 * torch.randn(50, 3, 3, generator=random).double()
+    W, e = (H - H.mT) / 2, (H + H.mT) / 2
+    eye = torch.eye(3).double()
+    expected = torch.linalg.matrix_exp(W) @ (eye + e) - eye - H
+    assert (rotated_strain(H) - expected).abs().max() < 1e-9
+    small = rotated_strain(1e-9 * H)
+    assert (small / 1e-18 - (W @ W / 2 + W @ e)).abs().max() < 1e-6
+
+
+def test_rotation_is_the_polar_factor():
+    random = torch.Generator().manual_seed(0)
+    H = 0.3 * torch.randn(50, 3, 3, generator=random).double()
+    H = H[torch.linalg.det(H + torch.eye(3)) > 0.2]
+    U, _, V = torch.linalg.svd(H + torch.eye(3))
+    assert (rotation(H) - U @ V).abs().max() < 1e-2
+
+
+@pytest.mark.parametrize("name", list(LAWS))
+def test_unbalanced_stress_is_of_second_order(name):
+    H = 1e-6 * torch.randn(4, 3, 3, generator=torch.Generator().manual_seed(0)).double()
+    assert unbalanced_stress(LAWS[name], H, H).abs().max() < 1e-9
+
+
+def test_reduced_stiffness_is_that_of_any_law(beam):
+    modes = torch.linalg.qr(torch.randn(int(beam.problem.free.sum()), 5).double())[0]
+    parts = ReducedStiffness.of(beam.problem, modes)
+    fields = torch.zeros(5, *beam.problem.shape).double()
+    fields[:, beam.problem.free] = modes.T
+    for law in (NeoHookeanLn(0.1), NeoHookeanLn(0.45)):
+        body = beam.problem.with_material(law)
+        rest = torch.zeros_like(fields)
+        product = body.tangent_product(rest, fields)[:, body.free]
+        assert (parts.at(law)[:, :-1] - modes.T @ product.T).abs().max() < 1e-12
+
+
+def test_cell_gradients_of_a_linear_field(beam):
+    H = torch.randn(3, 3).double()
+    field = beam.problem.points @ H.T
+    assert (cell_gradients(beam.problem, field[None]) - H).abs().max() < 1e-12
+
+
+def test_images_of_cells_have_images_of_centres(beam):
+    problem = beam.problem
+    group = symmetries(problem)
+    centres = problem.points[problem.cells].mean(dim=1)
+    middle = problem.points.mean(dim=0)
+    for symmetry, image in zip(group, cell_images(problem, group), strict=True):
+        moved = (centres - middle) @ symmetry.rotation.T + middle
+        assert (centres[image] - moved).abs().max() < 1e-9
+
+
+def test_ridge_regression_finds_an_exact_map():
+    random = torch.Generator().manual_seed(0)
+    features = torch.randn(60, 2, 1, 3, 3, generator=random).double()
+    matrix = torch.randn(18, 4, generator=random).double()
+    rows = Rows(features, features.flatten(1) @ matrix, torch.ones(60).double())
+    one = GroupAction(
+        torch.eye(3)[None].double(), torch.arange(2)[None], torch.eye(4)[None].double()
+    )
+    found = fit_map(rows, rows, one)
+    assert (found.matrix - matrix).abs().max() < 1e-8
