@@ -77,7 +77,7 @@ class Unrolled(nn.Module):
     first_map: Tensor
     maps: Tensor
     fitted: Tensor
-    free: Tensor
+    dofs: Tensor
     prescribed: Tensor
 
     def __init__(
@@ -128,9 +128,11 @@ class Unrolled(nn.Module):
             "fitted": torch.tensor(False),
         }.items():
             self.register_buffer(name, value)
+        self._stiffness = ReducedStiffness(self.stiffness)
         self._compiled: tuple[Tensor, CompiledMaps] | None = None
         self._inverted: tuple[tuple[Tensor, Any], tuple[Array, Array]] | None = None
-        self.register_buffer("free", scene.problem.free, persistent=False)
+        dofs = scene.problem.free.flatten().nonzero()[:, 0]
+        self.register_buffer("dofs", dofs, persistent=False)
         self.register_buffer("prescribed", scene.problem.prescribed, persistent=False)
 
     # ------------------------------------------------------------------ prediction
@@ -143,7 +145,7 @@ class Unrolled(nn.Module):
             parameters: Parameters of the law, (B, P); required if it has ranges.
         """
         given = self._given_parameters(force, parameters)
-        loaded = force[:, self.free]
+        loaded = force.flatten(1)[:, self.dofs]
         linear, whole = self.coordinates(loaded, given)
         columns = whole @ self.modes.mT.to(whole)
         local = self._is_local(loaded, linear)
@@ -157,7 +159,7 @@ class Unrolled(nn.Module):
         self, force: Tensor, parameters: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return displacements within the modes (B, N, D) and a mask of local loads, (B,)."""
-        loaded = force[:, self.free]
+        loaded = force.flatten(1)[:, self.dofs]
         linear, whole = self.coordinates(loaded, self._given_parameters(force, parameters))
         return self._field(whole @ self.modes.mT.to(whole)), self._is_local(loaded, linear)
 
@@ -181,8 +183,7 @@ class Unrolled(nn.Module):
         if self._is_compiled(loaded, parameters):
             return self._compiled_coordinates(loaded, parameters)
         law = self.scene.problem.material.with_parameters(parameters)
-        stiffness = ReducedStiffness(self.stiffness)
-        linear = stiffness.solve(law, loaded @ self.modes.to(loaded))
+        linear = self._stiffness.solve(law, loaded @ self.modes.to(loaded))
         matrices = self.first_map.to(linear), list(self.maps.to(linear))
         return linear, Maps(SampleCells(self.gradients.to(linear)), *matrices)(law, linear)
 
@@ -228,7 +229,7 @@ class Unrolled(nn.Module):
         if self._inverted is None or not (
             self._inverted[0][0] is self.stiffness and self._inverted[0][1] == law
         ):
-            whole = ReducedStiffness(self.stiffness).at(law).numpy()
+            whole = self._stiffness.at(law).numpy()
             inverse = np.ascontiguousarray(np.linalg.inv(whole[:, :-1]))
             self._inverted = (self.stiffness, law), (inverse, whole[:, -1])
         inverse, supports = self._inverted[1]
@@ -240,15 +241,15 @@ class Unrolled(nn.Module):
         if self.extra_inputs:
             names = list(self.scene.loads.parameter_ranges)
             raise ValueError(f"parameters are an input of this model; give {names}, (B, P)")
-        return force.new_zeros(len(force), 0)
+        return force.new_zeros(force.shape[0], 0)
 
     def _is_local(self, loaded: Tensor, linear: Tensor) -> Tensor:
         return self.local.is_local(loaded, linear.norm(dim=1))  # the modes are orthonormal
 
     def _field(self, columns: Tensor) -> Tensor:
         """Return fields (B, N, D) of values at free degrees of freedom, (B, n)."""
-        fields = self.prescribed.expand(len(columns), -1, -1).to(columns)
-        return fields.masked_scatter(self.free, columns)
+        fields = self.prescribed.flatten().to(columns).expand(columns.shape[0], -1)
+        return fields.index_copy(1, self.dofs, columns).unflatten(1, self.prescribed.shape)
 
     # ------------------------------------------------------------------ fit
 
@@ -270,7 +271,7 @@ class Unrolled(nn.Module):
         problem = self.scene.problem
         answers = linear_solutions(self.scene, samples), linear_solutions(self.scene, held_out)
         modes = fit_modes(self.scene, samples, answers[0], self.rank, self.group)
-        stiffness = ReducedStiffness.of(problem, modes)
+        stiffness = self._stiffness = ReducedStiffness.of(problem, modes).prepared()
         self.modes, self.stiffness = modes.float(), stiffness.parts
         inverse = stiffness.solve(problem.reference.material, torch.eye(modes.shape[1]).double())
         self.local.fit(modes, inverse, self.group)
@@ -296,10 +297,12 @@ class Unrolled(nn.Module):
 
     def _columns(self, samples: Sample, answers: Tensor) -> Columns:
         """Return samples in coordinates; `answers` are their linear solutions, (S, n)."""
-        free, modes = self.free, self.modes.double()
-        displacement, loaded = samples.displacement[:, free], samples.force[:, free]
+        modes = self.modes.double()
+        displacement, loaded = (
+            field.flatten(1)[:, self.dofs] for field in (samples.displacement, samples.force)
+        )
         law = self.scene.problem.material.with_parameters(samples.parameters)
-        linear = ReducedStiffness(self.stiffness).solve(law, loaded @ modes)
+        linear = self._stiffness.solve(law, loaded @ modes)
         weights = sample_weights(displacement)
         if self.extra_inputs:  # answers are those of other parameters: leave local loads out
             target = displacement @ modes
@@ -325,3 +328,4 @@ class Unrolled(nn.Module):
         """Take the sizes of the checkpoint, which the fit has chosen."""
         resize_buffers(self, state, prefix)
         super()._load_from_state_dict(state, prefix, *rest)
+        self._stiffness = ReducedStiffness(self.stiffness.detach().cpu().clone()).prepared()

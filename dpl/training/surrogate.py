@@ -1,6 +1,7 @@
 """The LightningModule: a network with scales, loss, metrics and optimiser."""
 
 import random
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any, cast
 
@@ -58,6 +59,7 @@ class Surrogate(L.LightningModule):
         """
         super().__init__()
         self.net, self.loss, self.scene = net, loss, scene
+        self._is_closed_form = isinstance(net, ClosedFormFit)
         self.batch_errors: Tensor | None = None
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
@@ -123,10 +125,6 @@ class Surrogate(L.LightningModule):
         if self._trains_in_coordinates:
             lines.append("no fields in training from disk: the loss is computed in coordinates")
         return lines
-
-    @property
-    def _is_closed_form(self) -> bool:
-        return isinstance(self.net, ClosedFormFit)
 
     @property
     def _trains_in_coordinates(self) -> bool:
@@ -226,6 +224,8 @@ class Surrogate(L.LightningModule):
     def configure_optimizers(self) -> Any:
         """Return the optimiser with its schedule; None without parameters."""
         if self._is_closed_form:
+            for message in (".*configure_optimizers. returned .None", ".*training_step. returned"):
+                warnings.filterwarnings("ignore", message)
             return None
         optimizer = self._optimizer(self.parameters())
         if self._scheduler is None:

@@ -146,10 +146,11 @@ class Material:
         if not names:
             return self
         law: Any = self  # a dataclass if it has ranges
-        if len(parameters) == 1:
-            return replace(law, **dict(zip(names, parameters[0].tolist(), strict=True)))
-        for extreme in (parameters.amin(0), parameters.amax(0)):
-            self.with_parameters(extreme[None])
+        if not torch.compiler.is_compiling():  # a traced graph has no values to check
+            if len(parameters) == 1:
+                return replace(law, **dict(zip(names, parameters[0].tolist(), strict=True)))
+            for extreme in (parameters.amin(0), parameters.amax(0)):
+                self.with_parameters(extreme[None])
         # beside cells and points, so that numbers of a point, (B, E, Q), take their own
         columns = parameters.T[..., None, None]
         return replace(law, **dict(zip(names, columns, strict=True)))

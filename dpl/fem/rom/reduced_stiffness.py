@@ -1,8 +1,10 @@
 """Reduced stiffness at rest as a function of the moduli of the law."""
 
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, Self
 
+import scipy.linalg
 import torch
 from torch import Tensor
 
@@ -42,18 +44,41 @@ class ReducedStiffness:
         mu = first / soft.mu
         return cls(torch.stack([mu, (second - stiff.mu * mu) / stiff.lam, springs]))
 
+    def prepared(self) -> Self:
+        """Return the stiffness with its factors, which a traced graph takes as constants."""
+        if not self._has_springs and self.parts.numel():
+            self._spectrum  # noqa: B018  # computed and kept
+        return self
+
     def solve(self, law: Material, right: Tensor) -> Tensor:
         """Return the coordinates (B, R) of Galerkin linear solutions.
+
+        Without springs A and B are diagonal in one basis, W^T A W = I and W^T B W = diag(b), so
+        that the inverse is W diag(1 / (mu + lambda b)) W^T for all moduli.
 
         Args:
             law: The law; of a batch, each member has moduli of its own.
             right: V^T f, (B, R).
         """
-        whole = self.at(law)
-        right = right - whole[..., -1]
-        if whole.ndim == 2:
-            return torch.linalg.solve(whole[:, :-1], right, left=False)
-        return torch.linalg.solve(whole[..., :-1], right[..., None])[..., 0]
+        if self._has_springs:
+            whole = self.at(law).to(right)
+            right = right - whole[..., -1]
+            return torch.linalg.solve(whole[..., :-1], right[..., None])[..., 0]
+        mu, lam = (_row(modulus) for modulus in (law.mu, law.lam))
+        A, B, _ = self.parts[..., -1].to(right)
+        vectors, values = (part.to(right) for part in self._spectrum)
+        return ((right - mu * A - lam * B) @ vectors / (mu + lam * values)) @ vectors.T
+
+    @cached_property
+    def _has_springs(self) -> bool:
+        return bool(self.parts[2].any())
+
+    @cached_property
+    def _spectrum(self) -> tuple[Tensor, Tensor]:
+        """W, (R, R), and b, (R,), see `solve`."""
+        A, B = (part[:, :-1].numpy() for part in self.parts[:2].cpu())
+        values, vectors = scipy.linalg.eigh(B, A)
+        return torch.from_numpy(vectors), torch.from_numpy(values)
 
     def at(self, law: Material) -> Tensor:
         """Return V^T K(0) [V, p], (R, R + 1), or (B, R, R + 1) for a law of a batch."""
@@ -65,6 +90,11 @@ class ReducedStiffness:
 def _column(modulus: Any) -> Any:
     """Return a modulus that multiplies matrices: a number, or (B, 1, 1)."""
     return modulus.reshape(-1, 1, 1) if isinstance(modulus, Tensor) else modulus
+
+
+def _row(modulus: Any) -> Any:
+    """Return a modulus that multiplies rows: a number, or (B, 1)."""
+    return modulus.reshape(-1, 1) if isinstance(modulus, Tensor) else modulus
 
 
 def _springs(problem: Problem, modes: Tensor) -> Tensor:
