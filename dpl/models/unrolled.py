@@ -67,6 +67,8 @@ class Unrolled(nn.Module):
         gradients: G and the gradients of p, (R + 1, C, D, D).
         first_map: B_0, (C D D, R).
         maps: B_1, B_2, ..., (K, 2 C D D, R).
+        limits: Largest ratio of each correction to the one before, (1 + K,): 1.5 times that of the
+            samples. They keep loads far out of range from running away.
         fitted: True after `fit`, ().
     """
 
@@ -76,6 +78,7 @@ class Unrolled(nn.Module):
     gradients: Tensor
     first_map: Tensor
     maps: Tensor
+    limits: Tensor
     fitted: Tensor
     dofs: Tensor
     prescribed: Tensor
@@ -125,6 +128,7 @@ class Unrolled(nn.Module):
             "gradients": torch.zeros(1, 0, dim, dim, dtype=torch.float64),
             "first_map": torch.zeros(0, 0),
             "maps": torch.zeros(0, 0, 0),
+            "limits": torch.ones(1, dtype=torch.float64),
             "fitted": torch.tensor(False),
         }.items():
             self.register_buffer(name, value)
@@ -184,8 +188,9 @@ class Unrolled(nn.Module):
             return self._compiled_coordinates(loaded, parameters)
         law = self.scene.problem.material.with_parameters(parameters)
         linear = self._stiffness.solve(law, loaded @ self.modes.to(loaded))
+        cells = SampleCells(self.gradients.to(linear))
         matrices = self.first_map.to(linear), list(self.maps.to(linear))
-        return linear, Maps(SampleCells(self.gradients.to(linear)), *matrices)(law, linear)
+        return linear, Maps(cells, *matrices, self.limits)(law, linear)
 
     def _is_compiled(self, loaded: Tensor, parameters: Tensor) -> bool:
         """Return True if compiled loops can predict these loads: few, and without derivatives."""
@@ -220,8 +225,9 @@ class Unrolled(nn.Module):
         """Maps as compiled loops take them, for the present buffers."""
         buffers = self.gradients, self.first_map, self.maps
         if self._compiled is None or self._compiled[0] is not self.maps:
-            arrays = (buffer.float().numpy() for buffer in buffers)
-            self._compiled = self.maps, CompiledMaps.of(*arrays)
+            gradients, first, maps = (buffer.float().numpy() for buffer in buffers)
+            compiled = CompiledMaps.of(gradients, first, maps, self.limits.numpy())
+            self._compiled = self.maps, compiled
         return self._compiled[1]
 
     def _inverse(self, law: InvariantBasedMaterial) -> tuple[Array, Array]:
@@ -289,7 +295,7 @@ class Unrolled(nn.Module):
         )
         maps = found.maps
         self.cells, self.gradients = numbers, maps.cells.gradients
-        self.first_map = maps.first.float()
+        self.first_map, self.limits = maps.first.float(), maps.limits
         rows = 2 * len(self.first_map)
         none = torch.zeros(0, rows, modes.shape[1])
         self.maps = torch.stack([one.float() for one in maps.others]) if maps.others else none

@@ -18,6 +18,7 @@ from dpl.scene import Sample, Scene
 
 CHUNK = 512  # samples whose features are computed at a time
 SIZE_EXPONENT = -0.4  # errors count relative to the displacement to this power
+LIMIT = 1.5  # factor on the largest ratio of corrections in the samples
 MIN_GAIN = 0.97  # largest ratio of held-out errors for which another map is worth its time
 
 
@@ -28,19 +29,33 @@ class Maps(NamedTuple):
         cells: The sample cells.
         first: B_0, (C D D, R).
         others: B_1, B_2, ..., (2 C D D, R) each.
+        limits: Largest ratio of each correction to the one before, (1 + K,); that of the first is
+            to the linear solution.
     """
 
     cells: SampleCells
     first: Tensor
     others: Sequence[Tensor]
+    limits: Tensor
 
     def __call__(self, law: Material, linear: Tensor) -> Tensor:
         """Return coordinates (B, R) of displacements from those of linear solutions (B, R)."""
         H = self.cells.gradient(linear)
-        c = linear + self.cells.first_features(H).flatten(1) @ self.first
-        for matrix in self.others:
-            c = c + self.cells.features(law, c, H).flatten(1) @ matrix
+        step = self.cells.first_features(H).flatten(1) @ self.first
+        step = limit_step(step, linear, self.limits[0])
+        c = linear + step
+        for matrix, limit in zip(self.others, self.limits[1:], strict=True):
+            proposed = self.cells.features(law, c, H).flatten(1) @ matrix
+            step = limit_step(proposed, step, limit)
+            c = c + step
         return c
+
+
+def limit_step(step: Tensor, before: Tensor, limit: Tensor) -> Tensor:
+    """Return steps (B, R), shortened to `limit` times the norm of the steps before (B, R)."""
+    most = limit * before.norm(dim=1, keepdim=True)
+    size = step.norm(dim=1, keepdim=True)
+    return torch.where(size > most, step * (most / size.clamp(min=1e-300)), step)
 
 
 class Columns(NamedTuple):
@@ -151,7 +166,9 @@ class Regression:
         self._law, self._cells, self._action = law, cells, action
         self._sets = fitted, held
         self._present = [fitted.linear, held.linear]
+        self._steps = [fitted.linear, held.linear]
         self._matrices: list[Tensor] = []
+        self._limits: list[Tensor] = []
         self.errors = [weighted_error(held.target - held.linear, held.weights)]
         self.ridges: list[float] = []
 
@@ -161,7 +178,8 @@ class Regression:
         count, dim = self._cells.gradients.shape[1:3]
         none = torch.zeros(count * dim * dim, self._sets[0].linear.shape[1], dtype=torch.float64)
         first = self._matrices[0] if self._matrices else none
-        return Maps(self._cells, first, self._matrices[1:])
+        limits = torch.stack(self._limits or [torch.tensor(1.0, dtype=torch.float64)])
+        return Maps(self._cells, first, self._matrices[1:], limits)
 
     def add_map(self) -> bool:
         """Fit the next map; return False, without adding it, if it gains too little."""
@@ -171,10 +189,14 @@ class Regression:
             return False
         matrix = found.matrix.float().double()
         self._matrices.append(matrix)
-        self._present = [
-            c + part.features.flatten(1) @ matrix
-            for c, part in zip(self._present, rows, strict=True)
+        steps = [part.features.flatten(1) @ matrix for part in rows]
+        sizes = self._steps[0].norm(dim=1)
+        limit = LIMIT * (steps[0].norm(dim=1)[sizes > 0] / sizes[sizes > 0]).max()
+        self._limits.append(limit)
+        self._steps = [
+            limit_step(step, before, limit) for step, before in zip(steps, self._steps, strict=True)
         ]
+        self._present = [c + step for c, step in zip(self._present, self._steps, strict=True)]
         self.errors.append(found.error)
         self.ridges.append(found.ridge)
         return True

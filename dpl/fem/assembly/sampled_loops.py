@@ -121,8 +121,18 @@ def unbalanced_stress(law, c, needs, finite, mu, lam, H, linear, work, out):
             store(out, 3 * i + j, turned)
 
 
+@njit
+def limit_step(step, most):
+    """Shorten a step (R,) to a norm of at most `most`; return its norm."""
+    size = np.sqrt((step * step).sum())
+    if size > most:
+        step *= most / size
+        return most
+    return size
+
+
 @njit(error_model="numpy", cache=True)
-def predict(law, c, needs, finite, mu, lam, right, inverse, G, first, maps, linear, whole):
+def predict(law, c, needs, finite, mu, lam, right, inverse, G, first, maps, limits, linear, whole):
     """Set coordinates (R,) of the linear solution and of the prediction.
 
     Args:
@@ -132,6 +142,7 @@ def predict(law, c, needs, finite, mu, lam, right, inverse, G, first, maps, line
         G: Gradients of the coordinates and of p, (R + 1, blocks 9 width).
         first: B_0, (blocks 9 width, R).
         maps: B_1, ..., (K, blocks 18 width, R).
+        limits: Largest ratio of each correction to the one before, (1 + K,).
         linear, whole: The results.
     """
     linear[:] = inverse @ right
@@ -143,8 +154,10 @@ def predict(law, c, needs, finite, mu, lam, right, inverse, G, first, maps, line
     features, work = np.zeros(HL.shape), np.zeros((100, SIMD_WIDTH))
     for b in range(shape[0]):
         rotated_strain(HL[b], SIMD_WIDTH, features[b], 0)
-    whole[:] = linear
-    add_product(features.reshape(-1), first, whole)
+    step = np.zeros(len(linear))
+    add_product(features.reshape(-1), first, step)
+    size = limit_step(step, limits[0] * np.sqrt((linear * linear).sum()))
+    whole[:] = linear + step
     both = np.zeros((shape[0], 18, SIMD_WIDTH))
     for k in range(maps.shape[0]):
         flat = rest.copy()
@@ -152,4 +165,7 @@ def predict(law, c, needs, finite, mu, lam, right, inverse, G, first, maps, line
         H = flat.reshape(shape)
         for b in range(shape[0]):
             unbalanced_stress(law, c, needs, finite, mu, lam, H[b], HL[b], work, both[b])
-        add_product(both.reshape(-1), maps[k], whole)
+        step[:] = 0.0
+        add_product(both.reshape(-1), maps[k], step)
+        size = limit_step(step, limits[k + 1] * size)
+        whole += step

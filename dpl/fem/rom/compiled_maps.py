@@ -23,15 +23,17 @@ class CompiledMaps:
         gradients: (R + 1, blocks 9 width).
         first: (blocks 9 width, R).
         maps: (K, blocks 18 width, R).
+        limits: Largest ratio of each correction to the one before, (1 + K,).
     """
 
     gradients: Single
     first: Single
     maps: Single
+    limits: Array
 
     @classmethod
-    def of(cls, gradients: Single, first: Single, maps: Single) -> "CompiledMaps":
-        """Return the arrays of G (R + 1, C, D, D), B_0 (C D D, R) and B_k (K, 2 C D D, R)."""
+    def of(cls, gradients: Single, first: Single, maps: Single, limits: Array) -> "CompiledMaps":
+        """Return the arrays of G (R + 1, C, D, D), B_0 (C D D, R), B_k (K, 2 C D D, R), limits."""
         count, dim = gradients.shape[1:3]
         rank = len(gradients) - 1
 
@@ -55,6 +57,7 @@ class CompiledMaps:
             np.ascontiguousarray(blocks(gradients[:, :, None])),
             rows(first, 1),
             np.stack(every) if every else none,
+            limits,
         )
 
     def __call__(
@@ -71,6 +74,6 @@ class CompiledMaps:
         key = Law(type(law), SOURCES)
         constants = np.array(law.constants)
         moduli = required_terms(law), float(law.finite), law.mu, law.lam
-        arrays = (right, inverse, self.gradients, self.first, self.maps, linear, whole)
-        call_compiled(predict, key, constants, *moduli, *arrays)
+        arrays = (self.gradients, self.first, self.maps, self.limits, linear, whole)
+        call_compiled(predict, key, constants, *moduli, right, inverse, *arrays)
         return linear, whole
