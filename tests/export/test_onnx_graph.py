@@ -29,7 +29,7 @@ from dpl.export.onnx_graph import missing_packages
 from dpl.export.reference import solve_reference
 from dpl.fem import Load, rectangle, solve, surface
 from dpl.fem.postprocess import triangles
-from dpl.models import CNN, FCNN, GNN, Latent, PODNet
+from dpl.models import CNN, FCNN, GNN, Latent, PODNet, Unrolled
 from dpl.training import MSE, Surrogate
 
 pytestmark = pytest.mark.skipif(
@@ -46,6 +46,11 @@ def make_surrogate(make, scene, seed=0, **options):
         load = scene.loads.sample((0, 1), range(8))
         truth = solve(scene.solver, load).displacement
         surrogate.fit_bases(Sample(load.force, truth, load.young, load.parameters))
+    if isinstance(surrogate.net, Unrolled):
+        load = scene.loads.sample((0, 1), range(40))
+        truth = solve(scene.solver, load).displacement
+        samples = Sample(load.force, truth, load.young, load.parameters)
+        surrogate.net.fit(samples, samples)
     return surrogate.eval()
 
 
@@ -67,6 +72,8 @@ NETWORKS = {
     "latent": (Latent, {"rank": 16, "width": 16, "linear_tol": 0.01}, {}),
     "latent, quadratic": (Latent, {"rank": 8, "width": 16}, {"nodes": (3, 2, 2), "degree": 2}),
     "latent, poisson": (Latent, {"rank": 8, "width": 16}, {"poisson": [0.2, 0.4]}),
+    "unrolled": (Unrolled, {"rank": 12, "cells": 8, "stages": 1, "linear_tol": 0.01}, {}),
+    "unrolled, poisson": (Unrolled, {"rank": 8, "cells": 8, "stages": 1}, {"poisson": [0.2, 0.4]}),
     "latent, no factor": (Latent, {"rank": 8, "width": 16, "linear_tol": float("inf")}, {}),
 }
 
@@ -105,10 +112,10 @@ def test_onnx_and_torch_agree_for_all_kinds_of_loads_and_batch_sizes(make_graph,
     assert max(row.max_error for row in rows) < 1e-5
 
 
-def test_only_latent_with_a_factor_has_the_output_local(make_graph):
-    for name in ("fcnn", "pod", "latent", "latent, no factor"):
+def test_only_models_with_a_factor_have_the_output_local(make_graph):
+    for name in ("fcnn", "pod", "latent", "unrolled", "latent, no factor"):
         session = OnnxSession(make_graph(name)[1])
-        assert ("local" in session.outputs) == (name == "latent")
+        assert ("local" in session.outputs) == (name in ("latent", "unrolled"))
 
 
 def test_local_loads_are_marked_and_represented_in_the_basis(make_graph):
