@@ -7,7 +7,7 @@ from typing import Protocol, Self, runtime_checkable
 
 from torch import Tensor
 
-from dpl.fem import PODGalerkin
+from dpl.fem import PODGalerkin, SubspaceNewton
 from dpl.models.reduced_samples import ReducedDataset
 from dpl.scene import Sample
 
@@ -76,8 +76,10 @@ class ClosedFormFit(Protocol):
 class Correctable(Protocol):
     """A network whose predictions POD-Galerkin iterations in its modes can correct."""
 
-    def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> PODGalerkin:
-        """Return the solver in the first `rank` modes, see `dpl.fem.PODGalerkin.within`.
+    def galerkin(
+        self, states: Tensor, *, rank: int, tolerance: float
+    ) -> PODGalerkin | SubspaceNewton:
+        """Return the solver in the first `rank` modes, whose `correct` improves a prediction.
 
         Args:
             states: Equilibrium displacements, (S, N, D) [-].

@@ -1,15 +1,16 @@
 """Unrolled reduced solver: a few iterations in a subspace whose linear maps are fitted to data."""
 
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from dpl.fem import InvariantBasedMaterial, symmetries
+from dpl.fem import InvariantBasedMaterial, SubspaceNewton, symmetries
 from dpl.fem.assembly.sampled_loops import add_product
 from dpl.fem.rom.compiled_maps import CompiledMaps
+from dpl.fem.rom.reduced_problem import refuse_range
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.models.local_response import LocalResponse, resize_buffers
@@ -25,6 +26,7 @@ from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 
 Array = NDArray[np.float64]
+CELL_STATES = 256  # states at which the cells of a correction are chosen
 MAX_COMPILED = 8  # loads for which one compiled call each is faster than tensor operations
 MAX_SIZE = 100_000  # of rank, cells and stages
 
@@ -316,6 +318,28 @@ class Unrolled(nn.Module):
         else:
             target = linear + (displacement - answers) @ modes
         return Columns(linear, target, weights, samples.parameters)
+
+    def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> SubspaceNewton:
+        """Return Newton's method in the first modes; see `Correctable`.
+
+        Args:
+            states: Equilibrium displacements, (S, N, D) [-]; cells are chosen at the first 256.
+            rank: Number of modes.
+            tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
+
+        Raises:
+            ValueError: A number is out of range, or the law has ranges.
+        """
+        problem = self.scene.problem
+        refuse_range(problem)
+        vectors = torch.zeros(problem.free.numel(), min(rank, self.modes.shape[1])).double()
+        vectors[self.dofs] = torch.linalg.qr(self.modes[:, :rank].double())[0]
+        fields = vectors.view(*problem.shape, -1)
+        return SubspaceNewton.within(problem, fields, states[:CELL_STATES], tolerance=tolerance)
+
+    def for_correction(self) -> Self:
+        """See `Correctable`."""
+        return self
 
     def skipped_work(self) -> list[str]:
         """Return the work that the model saves, one line each."""

@@ -155,6 +155,16 @@ def test_the_surrogate_predicts_in_si_units(beam, net):
     assert module.configure_optimizers() is None
 
 
+def test_newton_in_its_modes_corrects_it(beam, net):
+    unseen = samples_of(beam, 8, seed=2)
+    solver = net.galerkin(samples_of(beam, 40).displacement, rank=20, tolerance=1e-2)
+    pairs = zip(unseen.force, net(unseen.force), strict=True)
+    better = torch.stack([solver.correct(force, guess) for force, guess in pairs])
+    error = (better - unseen.displacement).flatten(1).norm(dim=1)
+    before = (net(unseen.force) - unseen.displacement).flatten(1).norm(dim=1)
+    assert error.median() < 0.8 * before.median()
+
+
 def test_fewer_maps_where_they_do_not_help(beam):
     assert len(fitted(beam, 6, stages=30).maps) < 30
 

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
@@ -190,6 +190,25 @@ class SubspaceNewton:
                 correction = self._correction(problem, load, state)
         if best is not state:
             yield best._replace(iterations=state.iterations)
+
+    def correct(self, force: Tensor, guess: Tensor, *, steps: int | None = None) -> Tensor:
+        """Return the last displacement (N, D) of `states` from a guess (N, D).
+
+        Args:
+            force: Nodal force, (N, D) [-].
+            guess: Displacement, (N, D) [-].
+            steps: Largest number of steps; None: `max_iter`.
+        """
+        solver = self if steps in (None, self.max_iter) else self._with_steps(steps)
+        load = Load(force[None], torch.ones(1, dtype=torch.float64))
+        *_, last = solver.states(load, guess=guess[None])
+        return last.displacement[0]
+
+    def _with_steps(self, steps: int) -> Self:
+        """Return the solver with another number of steps; the tangent is shared."""
+        other = replace(self, max_iter=steps)
+        other.__dict__["tangent"] = self.tangent
+        return other
 
     def _is_last(self, state: SubspaceState) -> bool:
         return state.iterations >= self.max_iter or state.error <= self.error_tol
