@@ -136,6 +136,7 @@ class Unrolled(nn.Module):
             self.register_buffer(name, value)
         self._stiffness = ReducedStiffness(self.stiffness)
         self._compiled: tuple[Tensor, CompiledMaps] | None = None
+        self._transposed: tuple[Tensor, NDArray[np.float32]] | None = None
         self._inverted: tuple[tuple[Tensor, Any], tuple[Array, Array]] | None = None
         dofs = scene.problem.free.flatten().nonzero()[:, 0]
         self.register_buffer("dofs", dofs, persistent=False)
@@ -153,10 +154,10 @@ class Unrolled(nn.Module):
         given = self._given_parameters(force, parameters)
         loaded = force.flatten(1)[:, self.dofs]
         linear, whole = self.coordinates(loaded, given)
-        columns = whole @ self.modes.mT.to(whole)
+        columns = self._at_free_dofs(whole, loaded)
         local = self._is_local(loaded, linear)
         if local.any():
-            galerkin = linear[local] @ self.modes.mT.to(whole)
+            galerkin = self._at_free_dofs(linear[local], loaded)
             missing = self.local.missing(loaded[local], galerkin, given[local])
             columns = columns.index_add(0, local.nonzero()[:, 0], missing)
         return self._field(columns)
@@ -167,7 +168,8 @@ class Unrolled(nn.Module):
         """Return displacements within the modes (B, N, D) and a mask of local loads, (B,)."""
         loaded = force.flatten(1)[:, self.dofs]
         linear, whole = self.coordinates(loaded, self._given_parameters(force, parameters))
-        return self._field(whole @ self.modes.mT.to(whole)), self._is_local(loaded, linear)
+        columns = self._at_free_dofs(whole, loaded)
+        return self._field(columns), self._is_local(loaded, linear)
 
     @property
     def linear_tol(self) -> float:
@@ -193,6 +195,22 @@ class Unrolled(nn.Module):
         cells = SampleCells(self.gradients.to(linear))
         matrices = self.first_map.to(linear), list(self.maps.to(linear))
         return linear, Maps(cells, *matrices, self.limits)(law, linear)
+
+    def _at_free_dofs(self, coordinates: Tensor, loaded: Tensor) -> Tensor:
+        """Return V c at free degrees of freedom, (B, n), of c (B, R)."""
+        if not self._is_compiled(loaded, coordinates):
+            return coordinates @ self.modes.mT.to(coordinates)
+        rows = np.zeros((len(coordinates), len(self.modes)))
+        for row, c in zip(rows, coordinates.numpy(), strict=True):
+            add_product(c, self._mode_rows, row)
+        return torch.from_numpy(rows)
+
+    @property
+    def _mode_rows(self) -> NDArray[np.float32]:
+        """V^T, (R, n), contiguous, kept for the present modes."""
+        if self._transposed is None or self._transposed[0] is not self.modes:
+            self._transposed = self.modes, np.ascontiguousarray(self.modes.numpy().T)
+        return self._transposed[1]
 
     def _is_compiled(self, loaded: Tensor, parameters: Tensor) -> bool:
         """Return True if compiled loops can predict these loads: few, and without derivatives."""
