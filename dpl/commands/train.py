@@ -11,7 +11,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 import dpl
-from dpl import config, evaluation, training
+from dpl import config, evaluation, models, training
 from dpl.commands import cli
 from dpl.system.files import DataSetError
 
@@ -22,6 +22,9 @@ def parts(cfg: DictConfig) -> tuple["dpl.Scene", Any, "dpl.Surrogate", Any]:
     scene = config.build_scene(config.with_mesh_of_resumed(cfg))
     data = config.instantiate(cfg, "data", scene=scene)
     surrogate = config.build_surrogate(cfg, scene)
+    if isinstance(surrogate.net, models.ClosedFormFit) and not data.dataset.train:
+        name = type(surrogate.net).__name__
+        raise config.ConfigError(f"data: {name} is fitted to solved loads; set data=offline")
     if resumed is not None:
         config.check_weights(surrogate, resumed)
     trainer = config.build_trainer(cfg)

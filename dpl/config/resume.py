@@ -9,7 +9,7 @@ import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from dpl import training
+from dpl import models, training
 from dpl.config import validation
 from dpl.config.build import NOT_IDENTITY, error_in, instantiate, to_container
 from dpl.config.run_folder import MESH, has_mesh_file, read_config, with_copied_mesh
@@ -141,6 +141,11 @@ def check_weights(surrogate: "training.Surrogate", checkpoint: dict[str, Any]) -
     """Raise a `ConfigError` if the checkpoint to resume is of another scene or network."""
     with error_in("ckpt_path", ValueError, TypeError, AttributeError):
         surrogate.on_load_checkpoint(checkpoint)
+    if isinstance(surrogate.net, models.ClosedFormFit):
+        name = type(surrogate.net).__name__
+        raise ConfigError(
+            f"ckpt_path: {name} is fitted in one step and cannot be resumed; remove it"
+        )
     ours, theirs = (
         {name: tuple(t.shape) for name, t in state.items() if isinstance(t, torch.Tensor)}
         for state in (surrogate.state_dict(), checkpoint["state_dict"])

@@ -145,7 +145,7 @@ def load(
         trust: Import and call objects outside this package, such as your own law, that the
             configuration names.
         corrected: Solve for equilibrium in the modes of the network before Newton is tried. Only
-            for `pod` and `latent`; it needs the data set of the run.
+            for `pod`, `latent` and `unrolled`; it needs the data set of the run.
 
     Raises:
         ValueError: There is no finished run, its checkpoint belongs to another scene, it names an

@@ -74,7 +74,7 @@ class ClosedFormFit(Protocol):
 
 @runtime_checkable
 class Correctable(Protocol):
-    """A network whose predictions POD-Galerkin iterations in its modes can correct."""
+    """A model whose predictions Newton iterations in its modes can correct."""
 
     def galerkin(
         self, states: Tensor, *, rank: int, tolerance: float

@@ -27,7 +27,7 @@ from dpl.system.checks import check_range
 
 Array = NDArray[np.float64]
 CELL_STATES = 256  # states at which the cells of a correction are chosen
-MAX_COMPILED = 8  # loads for which one compiled call each is faster than tensor operations
+MAX_COMPILED = 8  # loads; more of them are predicted together by tensor operations
 MAX_SIZE = 100_000  # of rank, cells and stages
 
 
@@ -47,7 +47,7 @@ class Unrolled(nn.Module):
     iteration is a quasi-Newton iteration of the reduced equilibrium: the residual is sampled at
     a few cells (hyper-reduction), and the preconditioner and the weights of the cells are fitted.
 
-    Rank, cells, ridges and the number of maps are chosen by the error of the held-out samples. The
+    Number of cells, ridges and number of maps are chosen by the error of the held-out samples. The
     modes and the cells are invariant under the symmetries of the body and the maps commute with
     them, so that the answer has the symmetries exactly.
 
@@ -289,7 +289,7 @@ class Unrolled(nn.Module):
 
         Args:
             samples: Dimensionless samples to fit to, (S, N, D).
-            held_out: Samples by whose error rank, cells, ridges and number of maps are chosen.
+            held_out: Samples by whose error cells, ridges and number of maps are chosen.
 
         Raises:
             ValueError: There are too few samples, or they are not finite.
@@ -299,7 +299,7 @@ class Unrolled(nn.Module):
         modes = fit_modes(self.scene, samples, answers[0], self.rank, self.group)
         stiffness = self._stiffness = ReducedStiffness.of(problem, modes).prepared()
         self.modes, self.stiffness = modes.float(), stiffness.parts
-        inverse = stiffness.solve(problem.reference.material, torch.eye(modes.shape[1]).double())
+        inverse = torch.linalg.inv(stiffness.at(problem.reference.material)[:, :-1])
         self.local.fit(modes, inverse, self.group)
         sets = [
             self._columns(part, answer)

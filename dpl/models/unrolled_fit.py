@@ -1,7 +1,6 @@
 """Fit of `dpl.models.Unrolled` to samples: modes, sample cells and maps."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -9,7 +8,7 @@ from torch import Tensor
 
 from dpl.fem import Problem
 from dpl.fem.materials.material import Material
-from dpl.fem.rom.reduced_stiffness import ReducedStiffness
+from dpl.fem.rom.reduced_problem import support_force
 from dpl.fem.rom.sampled_stress import SampleCells, cell_gradients
 from dpl.fem.symmetry import Symmetry, cell_images
 from dpl.models.invariant_basis import group_actions, invariant_pod, scatter_fields
@@ -75,41 +74,12 @@ class Columns(NamedTuple):
     parameters: Tensor
 
 
-@dataclass(frozen=True)
-class Fit:
-    """Everything that is fitted.
-
-    Attributes:
-        modes: V at free degrees of freedom, (n, R).
-        stiffness: V^T K(0) [V, p].
-        numbers: Numbers of the sample cells, (C,).
-        maps: The maps.
-        errors: Weighted held-out errors of the linear solution and after each map.
-        ridges: Ridges of the maps.
-    """
-
-    modes: Tensor
-    stiffness: ReducedStiffness
-    numbers: Tensor
-    maps: Maps
-    errors: list[float]
-    ridges: list[float]
-
-
 def linear_solutions(scene: Scene, samples: Sample) -> Tensor:
     """Return linear solutions at free degrees of freedom, (S, n); for ranges, of the reference."""
     linear = scene.linear.reference
     problem = linear.problem
     supports = support_force(problem)
     return torch.stack([linear.solve(force - supports)[problem.free] for force in samples.force])
-
-
-def support_force(problem: Problem) -> Tensor:
-    """Return K(0) p of the prescribed displacement p, (N, D); 0 if no support is moved."""
-    if not problem.moved_supports:
-        return torch.zeros(problem.shape, dtype=torch.float64)
-    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    return problem.tangent_product(rest, problem.prescribed[None])[0]
 
 
 def fit_modes(
@@ -149,7 +119,8 @@ class Regression:
 
     Attributes:
         maps: The maps so far.
-        errors, ridges: See `Fit`.
+        errors: Weighted held-out errors of the linear solution and after each map.
+        ridges: Ridges of the maps.
     """
 
     def __init__(

@@ -10,7 +10,7 @@ from hydra.core.global_hydra import GlobalHydra
 from dpl.commands import dry_run, generate, train
 from dpl.config import ConfigError, build
 
-OPTIONS = "model is one of cnn, fcnn, gnn, latent, pod"
+OPTIONS = "model is one of cnn, fcnn, gnn, latent, pod, unrolled"
 EXPERIMENTS = "experiment is one of beam_nh_loss, beam_poisson, beam_svk, "
 NONSENSE = {  # command line -> what the one line says
     "train experiment=beam_yuong": f"experiment = beam_yuong: .* beam_young\\? {EXPERIMENTS}",

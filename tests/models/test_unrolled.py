@@ -188,6 +188,18 @@ def test_a_run_is_trained_and_loaded(script, tiny_training, tmp_path):
     assert simulator.surrogate.net.is_fitted
 
 
+def test_it_is_neither_resumed_nor_fitted_to_a_stream(script, tiny, tmp_path):
+    sizes = ["data.val=4", "data.test=4", "data.workers=0"]
+    run = ["model=unrolled", *tiny, f"run={tmp_path / 'run'}"]
+    assert not script("train", *run, *sizes, "data.train=16", cwd=tmp_path).status
+    resumed = script("train", f"run={tmp_path / 'run'}", "ckpt_path=last", cwd=tmp_path)
+    assert resumed.status
+    assert "ckpt_path: Unrolled is fitted in one step and cannot be resumed" in resumed.err
+    stream = script("train", *run[:-1], "data=online", f"run={tmp_path / 'b'}", cwd=tmp_path)
+    assert stream.status
+    assert "data: Unrolled is fitted to solved loads; set data=offline" in stream.err
+
+
 # ---------------------------------------------------------------- parts
 
 

@@ -103,6 +103,20 @@ def test_force_and_stiffness_scaled_by_one_factor_give_the_same_displacement(sce
     assert torch.allclose(here, there, rtol=1e-5, atol=1e-6 * float(here.abs().max()))
 
 
+def test_the_last_epoch_is_validated(scene, data):
+    validated = []
+
+    class Spy(L.Callback):
+        def on_validation_end(self, trainer, module):
+            validated.append(trainer.current_epoch)
+
+    options = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+    options |= {"accelerator": "cpu", "num_sanity_val_steps": 0}
+    trainer = L.Trainer(max_epochs=3, check_val_every_n_epoch=2, callbacks=[Spy()], **options)
+    trainer.fit(surrogate(scene), datamodule=data)
+    assert validated == [1, 2]
+
+
 def test_fixed_degrees_of_freedom_have_exactly_zero_displacement(scene, batch):
     module = surrogate(scene).eval()
     wild = Load(batch.force + 1.0, batch.young)  # forces where none can act, too

@@ -40,9 +40,9 @@ def add_product(x, A, y):
 
 
 @njit(error_model="numpy")
-def rotated_strain(H, lane, out, row):
-    """Set rows `row` to row + 8 of out, lane by lane, to the first features of H (9, width)."""
-    for k in range(lane):
+def rotated_strain(H, out):
+    """Set out (9, width) to the first features of H (9, width), lane by lane."""
+    for k in range(SIMD_WIDTH):
         w0 = 0.5 * (H[7, k] - H[5, k])
         w1 = 0.5 * (H[2, k] - H[6, k])
         w2 = 0.5 * (H[3, k] - H[1, k])
@@ -61,12 +61,12 @@ def rotated_strain(H, lane, out, row):
             for j in range(3):
                 total = 0.0
                 for m in range(3):
-                    past = w[i] * w[m] - (square if i == m else 0.0)
-                    past = first * W[i][m] + second * past
+                    nonlinear = w[i] * w[m] - (square if i == m else 0.0)
+                    nonlinear = first * W[i][m] + second * nonlinear
                     strain = 0.5 * (H[3 * m + j, k] + H[3 * j + m, k])
-                    total += (W[i][m] + past) * strain
-                past = w[i] * w[j] - (square if i == j else 0.0)
-                out[row + 3 * i + j, k] = total + first * W[i][j] + second * past
+                    total += (W[i][m] + nonlinear) * strain
+                nonlinear = w[i] * w[j] - (square if i == j else 0.0)
+                out[3 * i + j, k] = total + first * W[i][j] + second * nonlinear
 
 
 @njit
@@ -115,10 +115,10 @@ def unbalanced_stress(law, c, needs, finite, mu, lam, H, linear, work, out):
             store(F, r, 0.5 * load(F, r) + half * load(minors, r))
     for i in range(3):
         for j in range(3):
-            turned = load(F, i) * load(out, 9 + j)
-            turned = turned + load(F, 3 + i) * load(out, 12 + j)
-            turned = turned + load(F, 6 + i) * load(out, 15 + j)
-            store(out, 3 * i + j, turned)
+            rotated = load(F, i) * load(out, 9 + j)
+            rotated = rotated + load(F, 3 + i) * load(out, 12 + j)
+            rotated = rotated + load(F, 6 + i) * load(out, 15 + j)
+            store(out, 3 * i + j, rotated)
 
 
 @njit
@@ -153,7 +153,7 @@ def predict(law, c, needs, finite, mu, lam, right, inverse, G, first, maps, limi
     HL = HL.reshape(shape)
     features, work = np.zeros(HL.shape), np.zeros((100, SIMD_WIDTH))
     for b in range(shape[0]):
-        rotated_strain(HL[b], SIMD_WIDTH, features[b], 0)
+        rotated_strain(HL[b], features[b])
     step = np.zeros(len(linear))
     add_product(features.reshape(-1), first, step)
     size = limit_step(step, limits[0] * np.sqrt((linear * linear).sum()))

@@ -89,7 +89,7 @@ class ReducedProblem:
         one = torch.eye(rank, dtype=torch.float64)
         self.stiffness_error = one - self.cells.basis.T @ self.stiffness
         self._white_rows = white.flatten(0, 1)
-        self.support_force = _support_force(problem)
+        self.support_force = support_force(problem)
         self.reduced_support_force = self.project(self.support_force)
 
     def project(self, force: Tensor) -> Tensor:
@@ -205,14 +205,14 @@ def beyond_linear(problem: Problem, snapshots: Tensor, lift: LinearSolver | None
     """Return equilibria (S, N, D) minus their linear solutions at free DOFs, (S, n)."""
     rest = snapshots[:, problem.free].double()
     if lift is not None:
-        supports = _support_force(problem)
+        supports = support_force(problem)
         for row, u in zip(rest, snapshots, strict=True):
             force = problem.evaluate(u[None]).internal[0] - supports
             row -= _linear_solution(lift, force)[problem.free]
     return rest
 
 
-def _support_force(problem: Problem) -> Tensor:
+def support_force(problem: Problem) -> Tensor:
     """Return K(0) prescribed, (N, D)."""
     if not problem.moved_supports:
         return torch.zeros(problem.shape, dtype=torch.float64)

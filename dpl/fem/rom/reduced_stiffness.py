@@ -12,6 +12,7 @@ from dpl.fem.linear.interface import full_matrix
 from dpl.fem.materials.linear_elastic import LinearElastic
 from dpl.fem.materials.material import Material
 from dpl.fem.problem import Problem
+from dpl.fem.rom.reduced_problem import support_force
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class ReducedStiffness:
             body = problem.with_material(law)
             matrix = full_matrix(body.pattern, body.linearise(rest).tangent[0].numpy())
             own = torch.from_numpy(columns.T @ (matrix @ columns))
-            moved = body.tangent_product(rest, problem.prescribed[None])[0][problem.free]
+            moved = support_force(body)[problem.free]
             products.append(torch.cat([(own + own.T) / 2, modes.double().T @ moved[:, None]], 1))
         springs = _springs(problem, modes.double())
         first, second = products[0] - springs, products[1] - springs

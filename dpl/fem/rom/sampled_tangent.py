@@ -12,10 +12,10 @@ from dpl.fem.assembly.kernels import call_compiled
 from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.linear.interface import full_matrix
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
-from dpl.fem.materials.linear_elastic import LinearElastic
 from dpl.fem.materials.material import Material
 from dpl.fem.problem import Problem
 from dpl.fem.rom.ecsw import Cubature, whitening
+from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -114,33 +114,16 @@ class SampledTangent:
         """Return W^T K(0) W, (R, R), of a law of the body."""
         if not self.problem.material.parameter_ranges:
             return self._one
-        per_shear, per_lame, foundation = self._isotropic
-        return law.mu * per_shear + law.lam * per_lame + foundation
+        return self._stiffness.at(law)[:, :-1].numpy()
 
     @cached_property
     def _one(self) -> Array:
         return np.eye(len(self.scale))
 
     @cached_property
-    def _isotropic(self) -> tuple[Array, Array, Array]:
-        """W^T K(0) W per shear modulus and per first Lame parameter, and of the foundation.
-
-        At rest every law is Hooke's, and K(0) is linear in its two constants.
-        """
-        problem, zero = self.problem, torch.zeros(1, *self.problem.shape, dtype=torch.float64)
-
-        def of(poisson: float) -> Array:
-            hooke = problem.with_material(LinearElastic(poisson))
-            return self._projection(hooke, hooke.linearise(zero).tangent[0])
-
-        foundation = np.zeros_like(self.scale)
-        if problem.springs is not None:
-            fields = torch.from_numpy(self._white.T.reshape(-1, *problem.shape).copy())
-            forces = problem.springs.force(fields).flatten(1).numpy()
-            foundation = forces @ self._white
-        per_shear = 2 * (of(0.0) - foundation)  # mu = 1/2, lambda = 0
-        per_lame = (of(0.25) - foundation) / 0.4 - per_shear  # mu = lambda = 0.4
-        return per_shear, per_lame, foundation
+    def _stiffness(self) -> ReducedStiffness:
+        free = self.problem.free.flatten().numpy()
+        return ReducedStiffness.of(self.problem, torch.from_numpy(self._white[free]))
 
     def _projection(self, problem: Problem, tangent: Tensor) -> Array:
         """Return W^T K W of the entries (nnz,) of a tangent."""
