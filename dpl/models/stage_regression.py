@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dpl.fem.rom.parity import Orbits, Parities
+
 RIDGES = tuple(10.0 ** (-k / 2) for k in range(28, 5, -1))  # relative to the mean square [-]
 WORSE = 1.05  # ratio of held-out errors at which larger ridges are not tried
 
@@ -46,11 +48,15 @@ class GroupAction:
         rotations: Q of each symmetry, (G, D, D).
         positions: Position to which each symmetry maps each sample cell, (G, C).
         coordinates: T of each symmetry, (G, R, R): an image has coordinates c T.
+        parities: Symmetries with diagonal matrices.
+        parity: Parity of each coordinate, (R,).
     """
 
     rotations: Tensor
     positions: Tensor
     coordinates: Tensor
+    parities: Parities
+    parity: Tensor
 
     def image(self, features: Tensor, k: int) -> Tensor:
         """Return the features (S, C, F, D, D) of the images under symmetry k."""
@@ -73,6 +79,52 @@ class GroupAction:
             grams += self.image(half.T.unflatten(1, shape), k).flatten(1)
             products += self.image(product.T.unflatten(1, shape), k).flatten(1).T @ T
         return grams, products
+
+    def by_parity(
+        self, gram: Tensor, product: Tensor, shape: Sequence[int]
+    ) -> "list[NormalEquations]":
+        """Return the normal equations of each parity; arguments as of `average`."""
+        positions = self.positions[self.parities.members]
+        orbits = Orbits.of_tensors(self.parities, positions, shape[1], 1).without_filling()
+        equations = []
+        for p, characters in enumerate(self.parities.characters):
+            own = (self.parity == p).nonzero()[:, 0]
+            half = orbits.folded(orbits.folded(gram, characters).T, characters)
+            right = orbits.folded(product[:, own], characters)
+            equations.append(NormalEquations(half, right, own, characters, orbits))
+        return equations
+
+
+class NormalEquations(NamedTuple):
+    """X^T X b = X^T Y for one value of each orbit of features, scaled to a diagonal of ones.
+
+    Attributes:
+        gram: X^T X, (m, m).
+        product: X^T Y, (m, r).
+        columns: The coordinates of this parity, (r,).
+        characters: Factor of this parity under each symmetry, (M,).
+        orbits: Orbits of the features.
+    """
+
+    gram: Tensor
+    product: Tensor
+    columns: Tensor
+    characters: Tensor
+    orbits: Orbits
+
+    def solve(self, ridge: float) -> Tensor | None:
+        """Return b, (m, r), with a ridge relative to the squares of each feature, None if singular.
+
+        Features without values count as zero.
+        """
+        scale = self.gram.diagonal().clamp(min=0).sqrt()
+        scale = torch.where(scale > 1e-12 * scale.max(), scale, torch.inf)
+        shifted = self.gram / scale[:, None] / scale
+        shifted.diagonal().add_(ridge)
+        factor, failed = torch.linalg.cholesky_ex(shifted)
+        if failed:
+            return None
+        return torch.cholesky_solve(self.product / scale[:, None], factor) / scale[:, None]
 
 
 class RidgeFit(NamedTuple):
@@ -107,16 +159,16 @@ def fit_map(rows: Rows, held_out: Rows, action: GroupAction, start: int = 0) -> 
     X = rows.features.flatten(1) * rows.weights[:, None]
     shape = rows.features.shape[1:]
     gram, product = action.average(X.T @ X, X.T @ (rows.targets * rows.weights[:, None]), shape)
-    scale = gram.diagonal().sqrt().clamp(min=1e-300)
-    gram, product = gram / scale[:, None] / scale, product / scale[:, None]
+    equations = action.by_parity(gram, product, shape)
     best: RidgeFit | None = None
     for ridge in RIDGES[start:]:
-        shifted = gram.clone()
-        shifted.diagonal().add_(ridge * len(gram))
-        factor, failed = torch.linalg.cholesky_ex(shifted)
-        if failed:
+        found = [one.solve(ridge * len(gram)) for one in equations]
+        matrix = torch.zeros_like(product)
+        for one, values in zip(equations, found, strict=True):
+            if values is not None:
+                matrix[:, one.columns] = one.orbits.unfolded(values, one.characters, len(gram))
+        if any(values is None for values in found):
             continue
-        matrix = torch.cholesky_solve(product, factor) / scale[:, None]
         error = held_out.error(matrix)
         if best is None or error < best.error:
             best = RidgeFit(matrix, ridge, error)

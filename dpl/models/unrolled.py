@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from dpl.fem import InvariantBasedMaterial, SubspaceNewton, symmetries
-from dpl.fem.assembly.sampled_loops import add_product
-from dpl.fem.rom.compiled_maps import CompiledMaps
+from dpl.fem.rom.compiled_prediction import CompiledPrediction
 from dpl.fem.rom.reduced_problem import refuse_range
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
@@ -17,9 +16,11 @@ from dpl.models.local_response import LocalResponse, resize_buffers
 from dpl.models.unrolled_fit import (
     Columns,
     Maps,
+    cell_positions,
     fit_maps,
     fit_modes,
     linear_solutions,
+    modes_of_parity,
     sample_weights,
 )
 from dpl.scene import Sample, Scene
@@ -63,6 +64,7 @@ class Unrolled(nn.Module):
     Attributes:
         scene: The scene to predict.
         modes: V at free degrees of freedom, (n, R).
+        parity: Parity of each mode, (R,), see `dpl.fem.rom.parity`.
         stiffness: V^T K(0) [V, p] by its dependence on the moduli, see `ReducedStiffness`,
             (3, R, R + 1); p is the prescribed displacement.
         cells: Numbers of the sample cells, (C,).
@@ -75,6 +77,7 @@ class Unrolled(nn.Module):
     """
 
     modes: Tensor
+    parity: Tensor
     stiffness: Tensor
     cells: Tensor
     gradients: Tensor
@@ -125,6 +128,7 @@ class Unrolled(nn.Module):
         empty = torch.zeros(0, dtype=torch.float64)
         for name, value in {
             "modes": torch.zeros(int(scene.problem.free.sum()), 0),
+            "parity": torch.zeros(0, dtype=torch.int64),
             "stiffness": empty.view(3, 0, 1),
             "cells": torch.zeros(0, dtype=torch.int64),
             "gradients": torch.zeros(1, 0, dim, dim, dtype=torch.float64),
@@ -135,8 +139,7 @@ class Unrolled(nn.Module):
         }.items():
             self.register_buffer(name, value)
         self._stiffness = ReducedStiffness(self.stiffness)
-        self._compiled: tuple[Tensor, CompiledMaps] | None = None
-        self._transposed: tuple[Tensor, NDArray[np.float32]] | None = None
+        self._compiled: tuple[Tensor, CompiledPrediction] | None = None
         self._inverted: tuple[tuple[Tensor, Any], tuple[Array, Array]] | None = None
         dofs = scene.problem.free.flatten().nonzero()[:, 0]
         self.register_buffer("dofs", dofs, persistent=False)
@@ -152,12 +155,14 @@ class Unrolled(nn.Module):
             parameters: Parameters of the law, (B, P); required if it has ranges.
         """
         given = self._given_parameters(force, parameters)
+        if self._is_compiled(force, given):
+            return self._compiled_fields(force, given)
         loaded = force.flatten(1)[:, self.dofs]
         linear, whole = self.coordinates(loaded, given)
-        columns = self._at_free_dofs(whole, loaded)
+        columns = self._at_free_dofs(whole)
         local = self._is_local(loaded, linear)
         if local.any():
-            galerkin = self._at_free_dofs(linear[local], loaded)
+            galerkin = self._at_free_dofs(linear[local])
             missing = self.local.missing(loaded[local], galerkin, given[local])
             columns = columns.index_add(0, local.nonzero()[:, 0], missing)
         return self._field(columns)
@@ -168,7 +173,7 @@ class Unrolled(nn.Module):
         """Return displacements within the modes (B, N, D) and a mask of local loads, (B,)."""
         loaded = force.flatten(1)[:, self.dofs]
         linear, whole = self.coordinates(loaded, self._given_parameters(force, parameters))
-        columns = self._at_free_dofs(whole, loaded)
+        columns = self._at_free_dofs(whole)
         return self._field(columns), self._is_local(loaded, linear)
 
     @property
@@ -188,66 +193,61 @@ class Unrolled(nn.Module):
             loaded: Forces at free degrees of freedom, (B, n).
             parameters: Parameters of the law, (B, P).
         """
-        if self._is_compiled(loaded, parameters):
-            return self._compiled_coordinates(loaded, parameters)
         law = self.scene.problem.material.with_parameters(parameters)
         linear = self._stiffness.solve(law, loaded @ self.modes.to(loaded))
         cells = SampleCells(self.gradients.to(linear))
         matrices = self.first_map.to(linear), list(self.maps.to(linear))
         return linear, Maps(cells, *matrices, self.limits)(law, linear)
 
-    def _at_free_dofs(self, coordinates: Tensor, loaded: Tensor) -> Tensor:
+    def _at_free_dofs(self, coordinates: Tensor) -> Tensor:
         """Return V c at free degrees of freedom, (B, n), of c (B, R)."""
-        if not self._is_compiled(loaded, coordinates):
-            return coordinates @ self.modes.mT.to(coordinates)
-        rows = np.zeros((len(coordinates), len(self.modes)))
-        for row, c in zip(rows, coordinates.numpy(), strict=True):
-            add_product(c, self._mode_rows, row)
-        return torch.from_numpy(rows)
+        return coordinates @ self.modes.mT.to(coordinates)
 
-    @property
-    def _mode_rows(self) -> NDArray[np.float32]:
-        """V^T, (R, n), contiguous, kept for the present modes."""
-        if self._transposed is None or self._transposed[0] is not self.modes:
-            self._transposed = self.modes, np.ascontiguousarray(self.modes.numpy().T)
-        return self._transposed[1]
-
-    def _is_compiled(self, loaded: Tensor, parameters: Tensor) -> bool:
+    def _is_compiled(self, force: Tensor, parameters: Tensor) -> bool:
         """Return True if compiled loops can predict these loads: few, and without derivatives."""
         tracing = torch.compiler.is_compiling() or torch.jit.is_tracing()
-        if tracing or loaded.device.type != "cpu" or loaded.dtype != torch.float64:
+        if tracing or force.device.type != "cpu" or force.dtype != torch.float64:
             return False
         differentiable = torch.is_grad_enabled() and (
-            loaded.requires_grad or parameters.requires_grad
+            force.requires_grad or parameters.requires_grad
         )
         law = self.scene.problem.material
         return (
-            len(loaded) <= MAX_COMPILED
+            self.is_fitted
+            and len(force) <= MAX_COMPILED
             and not differentiable
             and isinstance(law, InvariantBasedMaterial)
         )
 
-    def _compiled_coordinates(self, loaded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        modes, pairs = self.modes.numpy(), []
-        for force, own in zip(loaded.detach(), parameters.detach(), strict=True):
-            law = cast(
-                InvariantBasedMaterial, self.scene.problem.material.with_parameters(own[None])
-            )
-            inverse, supports = self._inverse(law)
-            right = -supports
-            add_product(np.ascontiguousarray(force.numpy()), modes, right)
-            pairs.append(self._compiled_maps(law, inverse, right))
-        linear, whole = (torch.from_numpy(np.stack(column)) for column in zip(*pairs, strict=True))
-        return linear, whole
+    def _compiled_fields(self, force: Tensor, parameters: Tensor) -> Tensor:
+        """Return displacements (B, N, D) of forces (B, N, D), one after the other."""
+        fields, material = [], self.scene.problem.material
+        for one, own in zip(force.detach(), parameters.detach(), strict=True):
+            law = cast(InvariantBasedMaterial, material.with_parameters(own[None]))
+            field, _, is_local = self._prediction(law, *self._inverse(law), one.numpy())
+            if is_local:
+                loaded = one.flatten()[self.dofs].numpy()
+                field.reshape(-1)[self.dofs.numpy()] += self.local.solve(loaded, own)
+            fields.append(torch.from_numpy(field))
+        return torch.stack(fields)
 
     @property
-    def _compiled_maps(self) -> CompiledMaps:
-        """Maps as compiled loops take them, for the present buffers."""
-        buffers = self.gradients, self.first_map, self.maps
+    def _prediction(self) -> CompiledPrediction:
+        """Compiled prediction with the present buffers."""
         if self._compiled is None or self._compiled[0] is not self.maps:
-            gradients, first, maps = (buffer.float().numpy() for buffer in buffers)
-            compiled = CompiledMaps.of(gradients, first, maps, self.limits.numpy())
-            self._compiled = self.maps, compiled
+            problem = self.scene.problem
+            positions = cell_positions(problem, self.group, self.cells)
+            names = ("parity", "modes", "gradients", "first_map", "maps", "limits")
+            prediction = CompiledPrediction.of(
+                self.group,
+                problem.free,
+                self.prescribed,
+                positions=positions,
+                probes=self.local.probes,
+                tol=self.local.tol,
+                **{name: getattr(self, name) for name in names},
+            )
+            self._compiled = self.maps, prediction
         return self._compiled[1]
 
     def _inverse(self, law: InvariantBasedMaterial) -> tuple[Array, Array]:
@@ -257,9 +257,8 @@ class Unrolled(nn.Module):
         ):
             whole = self._stiffness.at(law).numpy()
             inverse = np.ascontiguousarray(np.linalg.inv(whole[:, :-1]))
-            self._inverted = (self.stiffness, law), (inverse, whole[:, -1])
-        inverse, supports = self._inverted[1]
-        return inverse, supports.copy()
+            self._inverted = (self.stiffness, law), (inverse, whole[:, -1].copy())
+        return self._inverted[1]
 
     def _given_parameters(self, force: Tensor, parameters: Tensor | None) -> Tensor:
         if parameters is not None:
@@ -297,6 +296,7 @@ class Unrolled(nn.Module):
         problem = self.scene.problem
         answers = linear_solutions(self.scene, samples), linear_solutions(self.scene, held_out)
         modes = fit_modes(self.scene, samples, answers[0], self.rank, self.group)
+        modes, self.parity = modes_of_parity(modes, problem.free, self.group)
         stiffness = self._stiffness = ReducedStiffness.of(problem, modes).prepared()
         self.modes, self.stiffness = modes.float(), stiffness.parts
         inverse = torch.linalg.inv(stiffness.at(problem.reference.material)[:, :-1])
@@ -309,6 +309,7 @@ class Unrolled(nn.Module):
             problem,
             modes,
             self.group,
+            self.parity,
             (sets[0], sets[1]),
             cells=self.sample_count,
             stages=self.stages,

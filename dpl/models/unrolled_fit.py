@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dpl.fem import Problem
 from dpl.fem.materials.material import Material
+from dpl.fem.rom.parity import Orbits, Parities
 from dpl.fem.rom.reduced_problem import support_force
 from dpl.fem.rom.sampled_stress import SampleCells, cell_gradients
 from dpl.fem.symmetry import Symmetry, cell_images
@@ -91,6 +92,28 @@ def fit_modes(
     weights = sample_weights(displacement)[:, None]
     snapshots = torch.cat([weights * linear, weights * (displacement - linear)])
     return invariant_pod(snapshots, free, group, rank).float().double()
+
+
+def modes_of_parity(
+    modes: Tensor, free: Tensor, group: Sequence[Symmetry]
+) -> tuple[Tensor, Tensor]:
+    """Return modes (n, R) of definite parity, rounded to float32, and their parities (R,)."""
+    parities = Parities.of(group, free.shape[1])
+    members = [group[k] for k in parities.members.tolist()] if group else group
+    rotation, parity = parities.adapted(group_actions(modes, free, members))
+    orbits = Orbits.of_field(parities, group, free)
+    exact = orbits.symmetrised(modes @ rotation, parity, parities)
+    return exact.float().double(), parity
+
+
+def cell_positions(problem: Problem, group: Sequence[Symmetry], cells: Tensor) -> Tensor:
+    """Return the position to which each symmetry maps each of some cells (C,), (G, C).
+
+    The set of the cells is invariant.
+    """
+    place = torch.empty(len(problem.cells), dtype=torch.int64)
+    place[cells] = torch.arange(len(cells))
+    return place[cell_images(problem, group)[:, cells]]
 
 
 def sample_weights(displacement: Tensor) -> Tensor:
@@ -189,6 +212,7 @@ def fit_maps(
     problem: Problem,
     modes: Tensor,
     group: Sequence[Symmetry],
+    parity: Tensor,
     samples: tuple[Columns, Columns],
     *,
     cells: int,
@@ -202,22 +226,27 @@ def fit_maps(
         problem: The body.
         modes: V, (n, R).
         group: Symmetries of the body.
+        parity: Parity of each mode, (R,).
         samples: Samples to fit to, and to choose by.
         cells: Number of sample cells.
         stages: Largest number of maps after the first.
     """
     images = cell_images(problem, group)
     actions = group_actions(modes, problem.free, group)
+    parities = Parities.of(group, problem.shape[1])
     fields = torch.cat([scatter_fields(modes.T, problem.free), problem.prescribed[None]])
+    parity_of_fields = torch.cat([parity, torch.zeros(1, dtype=torch.int64)])
     rotations = torch.stack([one.rotation for one in group] or [torch.eye(problem.shape[1])])
     best: tuple[Tensor, Regression] | None = None
     while cells:
         numbers = choose_cells(images, cells)
-        place = torch.empty(len(problem.cells), dtype=torch.int64)
-        place[numbers] = torch.arange(len(numbers))
-        action = GroupAction(rotations.double(), place[images[:, numbers]], actions)
+        positions = cell_positions(problem, group, numbers)
+        action = GroupAction(rotations.double(), positions, actions, parities, parity)
+        gradients = cell_gradients(problem, fields, numbers)
+        orbits = Orbits.of_tensors(parities, positions[parities.members], 1, 1)
+        columns = orbits.symmetrised(gradients.flatten(1).T, parity_of_fields, parities)
         # rounded before the fit: the maps cancel digits, so that G must stay what it is
-        sample_cells = SampleCells(cell_gradients(problem, fields, numbers).float().double())
+        sample_cells = SampleCells(columns.T.reshape(gradients.shape).float().double())
         regression = Regression(problem.material, sample_cells, action, *samples)
         while len(regression.ridges) <= stages and regression.add_map():
             pass

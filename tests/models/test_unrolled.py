@@ -5,10 +5,12 @@ import torch
 
 from dpl.config import run_folder
 from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, rectangle, solve
+from dpl.fem.rom.parity import Orbits, Parities
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import cell_gradients, rotated_strain, rotation, unbalanced_stress
 from dpl.fem.symmetry import cell_images, symmetries
 from dpl.models import ClosedFormFit, FlagsLocalLoads, Unrolled
+from dpl.models.invariant_basis import scatter_fields
 from dpl.models.stage_regression import GroupAction, Rows, fit_map
 from dpl.scene import Sample, Scene
 from dpl.training import MSE, Surrogate
@@ -262,7 +264,35 @@ def test_ridge_regression_finds_an_exact_map():
     matrix = torch.randn(18, 4, generator=random).double()
     rows = Rows(features, features.flatten(1) @ matrix, torch.ones(60).double())
     one = GroupAction(
-        torch.eye(3)[None].double(), torch.arange(2)[None], torch.eye(4)[None].double()
+        torch.eye(3)[None].double(),
+        torch.arange(2)[None],
+        torch.eye(4)[None].double(),
+        Parities.of([], 3),
+        torch.zeros(4, dtype=torch.int64),
     )
     found = fit_map(rows, rows, one)
     assert (found.matrix - matrix).abs().max() < 1e-8
+
+
+def test_fields_of_definite_parity(beam, net):
+    group, free = symmetries(beam.problem), beam.problem.free
+    parities = Parities.of(group, 3)
+    assert len(parities.members) == 4
+    assert parities.characters.T @ parities.characters == pytest.approx(4 * torch.eye(4))
+    fields = scatter_fields(net.modes.double().T, free)
+    for k, g in enumerate(parities.members.tolist()):
+        factors = parities.characters[net.parity, k]
+        assert torch.equal(group[g].image(fields), factors[:, None, None] * fields)
+
+
+def test_folding_is_the_transpose_of_unfolding(beam):
+    group, free = symmetries(beam.problem), beam.problem.free
+    parities, random = Parities.of(group, 3), torch.Generator().manual_seed(0)
+    orbits, count = Orbits.of_field(parities, group, free), int(free.sum())
+    values = torch.randn(count, 2, generator=random).double()
+    total = torch.zeros(count, 2).double()
+    for characters in parities.characters:
+        folded = orbits.folded(values, characters)
+        own = orbits.unfolded(folded / orbits.weight[:, None], characters, count)
+        total += own / len(characters)
+    assert total == pytest.approx(values), "the parts of all parities add up to a field"

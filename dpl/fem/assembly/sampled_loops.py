@@ -8,9 +8,11 @@ Tests compare the loops with the tensor operations of `dpl.fem.rom.sampled_stres
 
 import inspect
 import sys
+from typing import NamedTuple
 
 import numpy as np
 from numba import float32, float64, njit, void
+from numpy.typing import NDArray
 
 from dpl.fem.assembly import constitutive_kernels as point
 from dpl.fem.assembly import numba_laws, simd
@@ -131,41 +133,192 @@ def limit_step(step, most):
     return size
 
 
+class ModelArrays(NamedTuple):
+    """Arrays of an unrolled reduced solver, by parity p and symmetry g, see `dpl.fem.rom.parity`.
+
+    m: orbits of degrees of freedom; b: orbits of entries of tensors at the sample cells, in blocks
+    of 9 rows, and twice as many in blocks of 18; r: largest number of modes of a parity, R in all.
+
+    Attributes:
+        characters: Factor of parity p under symmetry g, (M, M).
+        dofs: Images of one degree of freedom of each orbit, (M, m).
+        signs: Factors of these images, (M, m).
+        weights: Factors of the orbits in sums over all degrees of freedom, (m,).
+        columns: Positions of the coordinates of each parity, (M, r); R where there are fewer.
+        modes: V, (M, r, m).
+        probes: See `dpl.models.local_response`, (N D, F).
+        gradients: G, (M, r, b).
+        rest: Gradients of the prescribed displacement, (M, b).
+        entry_signs: Factors of the images of entries of G, (M, b).
+        first_signs: The same times weights of the orbits, (M, b).
+        map_signs: The same for two tensors, (M, 2 b).
+        first: B_0, (M, b, r).
+        maps: B_1, ..., (K, M, 2 b, r).
+        limits: Largest ratio of each correction to the one before, (1 + K,).
+    """
+
+    characters: NDArray[np.float64]
+    dofs: NDArray[np.int64]
+    signs: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    columns: NDArray[np.int64]
+    modes: NDArray[np.float32]
+    probes: NDArray[np.float32]
+    gradients: NDArray[np.float32]
+    rest: NDArray[np.float64]
+    entry_signs: NDArray[np.float64]
+    first_signs: NDArray[np.float64]
+    map_signs: NDArray[np.float64]
+    first: NDArray[np.float32]
+    maps: NDArray[np.float32]
+    limits: NDArray[np.float64]
+
+
+@njit(fastmath=True)
+def dot(x, row):
+    """Return the product of a vector and a row of float32."""
+    total = 0.0
+    for j in range(len(x)):
+        total += x[j] * row[j]
+    return total
+
+
+@njit(fastmath=True)
+def split(characters, signs, images, out):
+    """Set `out` (M, b) to the parts of each parity of values (M, b) at all images."""
+    out[:] = 0.0
+    for p in range(len(characters)):
+        for g in range(len(characters)):
+            factor = characters[p, g]
+            for j in range(out.shape[1]):
+                out[p, j] += factor * signs[g, j] * images[g, j]
+
+
+@njit(fastmath=True)
+def join(characters, signs, parts, out):
+    """Add the values at all images of parts (M, b) of each parity to `out` (M, b)."""
+    for g in range(len(characters)):
+        for p in range(len(characters)):
+            factor = characters[p, g]
+            for j in range(out.shape[1]):
+                out[g, j] += factor * signs[g, j] * parts[p, j]
+
+
+@njit
+def of_parity(columns, coordinates, out):
+    """Set `out` (r,) to the coordinates of one parity, zero where there are fewer."""
+    for k in range(len(columns)):
+        out[k] = coordinates[columns[k]] if columns[k] < len(coordinates) else 0.0
+
+
+@njit
+def set_gradients(model, coordinates, own, parts, H):
+    """Set H (M, b) at all images of the sample cells; `own` (r,) and `parts` (M, b) are work."""
+    parts[:] = 0.0
+    for p in range(len(parts)):
+        of_parity(model.columns[p], coordinates, own)
+        add_product(own, model.gradients[p], parts[p])
+    H[:] = model.rest
+    join(model.characters, model.entry_signs, parts, H)
+
+
+@njit
+def set_step(model, signs, matrices, features, parts, own, step):
+    """Set step (R,) to the product of features (M, b) with matrices (M, b, r)."""
+    split(model.characters, signs, features, parts)
+    for p in range(len(parts)):
+        own[:] = 0.0
+        add_product(parts[p], matrices[p], own)
+        for k in range(len(own)):
+            if model.columns[p, k] < len(step):
+                step[model.columns[p, k]] = own[k]
+
+
+@njit
+def reduced_force(model, force, right):
+    """Add V^T f to `right` (R,) for a force (N D,)."""
+    M, m = model.dofs.shape
+    parts = np.zeros((M, m))
+    for g in range(M):
+        for j in range(m):
+            value = force[model.dofs[g, j]]
+            if value != 0.0:
+                value *= model.signs[g, j] * model.weights[j]
+                for p in range(M):
+                    parts[p, j] += model.characters[p, g] * value
+    for p in range(M):
+        for k in range(model.columns.shape[1]):
+            if model.columns[p, k] < len(right):
+                right[model.columns[p, k]] += dot(parts[p], model.modes[p, k])
+
+
+@njit
+def set_field(model, coordinates, field):
+    """Set a field (N D,) to V c at free degrees of freedom."""
+    M, m = model.dofs.shape
+    parts, own = np.zeros((M, m)), np.zeros(model.columns.shape[1])
+    for p in range(M):
+        of_parity(model.columns[p], coordinates, own)
+        add_product(own, model.modes[p], parts[p])
+    for g in range(M):
+        for j in range(m):
+            value = 0.0
+            for p in range(M):
+                value += model.characters[p, g] * parts[p, j]
+            field[model.dofs[g, j]] = model.signs[g, j] * value
+
+
 @njit(error_model="numpy", cache=True)
-def predict(law, c, needs, finite, mu, lam, right, inverse, G, first, maps, limits, linear, whole):
-    """Set coordinates (R,) of the linear solution and of the prediction.
+def predict(law, c, needs, finite, mu, lam, model, force, inverse, supports, tol, field, linear):
+    """Set the field of a prediction and the coordinates of its linear solution.
 
     Args:
         law, c, needs, finite, mu, lam: The law, see `dpl.fem.assembly.kernels`.
-        right: V^T f - V^T K(0) p, (R,).
+        model: The arrays of the model.
+        force: f, (N D,).
         inverse: (V^T K(0) V)^-1, (R, R).
-        G: Gradients of the coordinates and of p, (R + 1, blocks 9 width).
-        first: B_0, (blocks 9 width, R).
-        maps: B_1, ..., (K, blocks 18 width, R).
-        limits: Largest ratio of each correction to the one before, (1 + K,).
-        linear, whole: The results.
+        supports: V^T K(0) p of the prescribed displacement p, (R,).
+        tol: Relative size of the part of the linear solution that the modes miss, above which the
+            load is local.
+        field: Displacement at free degrees of freedom, (N D,); of a local load without V `linear`.
+        linear: Coordinates of the linear solution, (R,).
+
+    Returns:
+        True for a local load.
     """
+    right = -supports
+    reduced_force(model, force, right)
     linear[:] = inverse @ right
-    shape = (G.shape[1] // (9 * SIMD_WIDTH), 9, SIMD_WIDTH)
-    rest = G[-1].astype(np.float64)
-    HL = rest.copy()
-    add_product(linear, G, HL)
-    HL = HL.reshape(shape)
-    features, work = np.zeros(HL.shape), np.zeros((100, SIMD_WIDTH))
-    for b in range(shape[0]):
-        rotated_strain(HL[b], features[b])
+    M, b = model.rest.shape
+    shape = M * b // (9 * SIMD_WIDTH), 9, SIMD_WIDTH
+    own, parts, both = np.zeros(model.columns.shape[1]), np.zeros((M, b)), np.zeros((M, 2 * b))
+    HL, H, features, stress = (
+        np.zeros((M, b)),
+        np.zeros((M, b)),
+        np.zeros(shape),
+        np.zeros((M, 2 * b)),
+    )
+    work, blocks = np.zeros((100, SIMD_WIDTH)), stress.reshape((shape[0], 18, SIMD_WIDTH))
+    set_gradients(model, linear, own, parts, HL)
+    linear_blocks, present = HL.reshape(shape), H.reshape(shape)
+    for k in range(shape[0]):
+        rotated_strain(linear_blocks[k], features[k])
     step = np.zeros(len(linear))
-    add_product(features.reshape(-1), first, step)
-    size = limit_step(step, limits[0] * np.sqrt((linear * linear).sum()))
-    whole[:] = linear + step
-    both = np.zeros((shape[0], 18, SIMD_WIDTH))
-    for k in range(maps.shape[0]):
-        flat = rest.copy()
-        add_product(whole, G, flat)
-        H = flat.reshape(shape)
-        for b in range(shape[0]):
-            unbalanced_stress(law, c, needs, finite, mu, lam, H[b], HL[b], work, both[b])
-        step[:] = 0.0
-        add_product(both.reshape(-1), maps[k], step)
-        size = limit_step(step, limits[k + 1] * size)
+    set_step(model, model.first_signs, model.first, features.reshape((M, b)), parts, own, step)
+    size = limit_step(step, model.limits[0] * np.sqrt((linear * linear).sum()))
+    whole = linear + step
+    for i in range(len(model.maps)):
+        set_gradients(model, whole, own, parts, H)
+        for k in range(shape[0]):
+            unbalanced_stress(
+                law, c, needs, finite, mu, lam, present[k], linear_blocks[k], work, blocks[k]
+            )
+        set_step(model, model.map_signs, model.maps[i], stress, both, own, step)
+        size = limit_step(step, model.limits[i + 1] * size)
         whole += step
+    products = np.zeros(model.probes.shape[1])
+    add_product(force, model.probes, products)
+    missing = (products * products).mean() if len(products) else 0.0
+    is_local = missing > tol * tol * ((linear * linear).sum() + missing)
+    set_field(model, whole - linear if is_local else whole, field)
+    return is_local
