@@ -79,7 +79,7 @@ def network(surrogate: Surrogate, folder: Path, samples: int) -> Method:
 def corrected(
     surrogate: Surrogate, method: Method, train: Sample, *, rank: int, tolerance: float, steps: int
 ) -> Method:
-    """Return a network whose predictions are corrected by Galerkin iterations in its modes.
+    """Return a network whose predictions are corrected by Newton iterations in its modes.
 
     Args:
         surrogate: A surrogate whose network is `Correctable`.
@@ -87,7 +87,7 @@ def corrected(
         train: Training samples.
         rank: Number of modes of the correction.
         tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
-        steps: Number of iterations, see `PODGalerkin.correct`.
+        steps: Number of iterations, see `SubspaceNewton`.
 
     Raises:
         ValueError: A number is out of range.

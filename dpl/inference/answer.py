@@ -1,5 +1,6 @@
 """Answers of the simulator and their summaries in words."""
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -20,6 +21,8 @@ class Answer:
         displacement: (N, D) [m], a NumPy array or a tensor as the force.
         residual: ||R_free|| / ||f||, evaluated at the displacement [-], see
             `Problem.relative_residual_of`.
+        error: Estimated relative error of the displacement [-]: Newton's correction in the modes of
+            the model, and the largest error of held-out loads outside of them. NaN if unknown.
         volume_ratio: min det F [-]; an element is inverted if it is not above 0.
         converged: True if the residual is below the tolerance of the call (without one, that of
             the scene) and no element is inverted. It is False also where rounding does not allow
@@ -39,6 +42,7 @@ class Answer:
 
     displacement: Any
     residual: Any
+    error: Any
     volume_ratio: Any
     converged: Any
     negative_pivots: Any
@@ -52,7 +56,12 @@ class Answer:
 
 
 def summarise(
-    state: Solution, kept: bool, amplitude: float, out_of_span: float, outside: bool
+    state: Solution,
+    kept: bool,
+    error: float,
+    amplitude: float,
+    out_of_span: float,
+    outside: bool,
 ) -> str:
     """Return the summary of one solution; `kept`: the tolerance is met."""
     residual = float(state.residual)
@@ -61,7 +70,8 @@ def summarise(
     elif not float(state.volume_ratio) > 0:
         words = "NOT VALID: an element is inverted"
     else:
-        words = f"an estimate, out of balance by {residual:.1e} of the load"
+        known = f"error about {error:.1e}, " if math.isfinite(error) else ""
+        words = f"an estimate, {known}out of balance by {residual:.1e} of the load"
         words += ", the least that rounding allows" if state.converged else ""
     if bool(state.converged):
         pivots = int(state.negative_pivots)

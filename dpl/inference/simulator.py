@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
@@ -11,43 +11,58 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from dpl.fem import Load, Newton, Solution, Status, evaluate_solution
+from dpl.fem import Load, Newton, Solution, Status, SubspaceNewton, evaluate_solution
 from dpl.fem.assembly.equilibrium import FAINT
 from dpl.fem.solvers import check_tol, concatenate
 from dpl.inference.answer import MAX_OUT_OF_SPAN, ROUNDOFF, Answer, answer_like, summarise
 from dpl.inference.arguments import as_number, as_numbers, named_columns, per_load
 from dpl.inference.hybrid import default_hybrid
-from dpl.models import Correctable
+from dpl.models import Correctable, HasCorrection
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import Surrogate
 
-Correct = Callable[[Tensor, Tensor], Tensor]  # force (N, D), displacement (N, D) -> displacement
+MAX_STEPS = 3  # Newton's steps in the modes of a model
+ERROR = 1e-3  # estimated relative error above which they are made [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
 
 
 class Simulator:
     """Simulator of a scene with a trained surrogate and the solvers of the scene.
 
-    Called with a force alone, it returns the prediction with its residual. With a tolerance, it
-    tries network, linear solution, hybrid and Newton in this order until the tolerance is met; with
-    a budget, while there is time. It keeps the last displacement as an initial guess of the next
-    call (`warm`).
+    Called with a force alone, it returns the prediction with its residual. If the model comes with
+    Newton's method in its modes, it also estimates the error, and makes steps of this method while
+    the estimate is too large. With a tolerance, it tries network, linear solution, hybrid and
+    Newton in this order until the tolerance is met; with a budget, while there is time. It keeps
+    the last displacement as an initial guess of the next call (`warm`).
 
     Attributes:
         surrogate: The surrogate.
-        correct: Correction of a prediction without a solve of full size; None: no correction.
+        newton: Newton's method in the modes of the model; None: predictions are not corrected.
+        steps: Largest number of its steps.
     """
 
-    def __init__(self, surrogate: Surrogate, *, correct: Correct | None = None) -> None:
+    def __init__(
+        self, surrogate: Surrogate, *, newton: SubspaceNewton | None = None, steps: int = MAX_STEPS
+    ) -> None:
         """Store the surrogate and build the corrector of its scene.
 
         Args:
             surrogate: A trained surrogate on the CPU.
-            correct: Function from a force (N, D) [-] and a displacement (N, D) [-] to a better
-                displacement (N, D) [-].
+            newton: Newton's method in the modes of the model; None: that of a model which
+                `HasCorrection`.
+            steps: Largest number of its steps; 0: predictions are not corrected.
+
+        Raises:
+            ValueError: `steps` is negative.
         """
-        self.surrogate, self.correct = surrogate.eval(), correct
+        if steps < 0:
+            raise ValueError(f"steps = {steps} must be 0 or more")
+        if newton is None and isinstance(surrogate.net, HasCorrection):
+            newton = surrogate.net.correction()
+        self.surrogate, self.newton, self.steps = surrogate.eval(), newton, steps
+        if newton is not None:
+            newton.tangent  # noqa: B018  # built here, so that the first call is not slower
         self._before: tuple[Tensor, Tensor] | None = None  # parameters, displacement
         self._pace = 0.0  # time of an iteration [s]
         self.scene.corrector  # noqa: B018  # built here, so that the first call is not slower
@@ -71,7 +86,7 @@ class Simulator:
         if not isinstance(net, Correctable):
             raise ValueError(f"corrected: {type(net).__name__} has no modes to correct in")
         solver = net.galerkin(states, rank=rank, tolerance=tolerance)
-        return cls(surrogate, correct=solver.correct)
+        return cls(surrogate, newton=solver)
 
     @property
     def scene(self) -> Scene:
@@ -86,6 +101,7 @@ class Simulator:
         parameters: Mapping[str, float | ArrayLike | Tensor] | ArrayLike | Tensor | None = None,
         tol: float | None = None,
         budget_ms: float | None = None,
+        error: float | None = None,
         warm: bool = False,
         stability: bool = False,
     ) -> Answer:
@@ -102,6 +118,8 @@ class Simulator:
             tol: Relative residual of the result [-], at least 1e-15 and below 1.
             budget_ms: Wall time of each load [ms]. An iteration is not started if the time of the
                 last iteration exceeds the rest of the budget.
+            error: Estimated relative error [-] above which steps of Newton's method in the modes of
+                the model follow, at most `steps` of them; 1e-3 if left out.
             warm: Start from the last displacement if it is nearer to equilibrium than the
                 prediction.
             stability: Factorise the tangent at the result to determine its stability.
@@ -116,6 +134,9 @@ class Simulator:
         tol, budget_ms = as_number("tol", tol), as_number("budget_ms", budget_ms)
         wanted = self.scene.solver.tol if tol is None else tol
         check_tol(wanted)
+        error = as_number("error", error)
+        if error is not None and not error > 0:
+            raise ValueError(f"error = {error} must be above 0")
         if budget_ms is not None and not 0 < budget_ms < math.inf:
             raise ValueError(f"budget_ms = {budget_ms} must be a number above 0")
         count = len(load.force)
@@ -125,15 +146,17 @@ class Simulator:
             shared = (time.perf_counter() - begin) / count
             found = []
             for k, single in enumerate(load.unbatch()):
-                request = _Request(tol, budget_ms, warm, time.perf_counter() - shared)
-                method, state = self._solve(
+                begin = time.perf_counter() - shared
+                request = _Request(tol, budget_ms, error or ERROR, warm, begin)
+                method, state, estimate = self._solve(
                     single, predictions[k : k + 1], float(amplitude[k]), request
                 )
                 if stability:
                     state = self._with_stability(single, state)
                 self._before = single.parameters, state.displacement
-                found.append((method, state, 1e3 * (time.perf_counter() - request.begin)))
-        methods, states, times = zip(*found, strict=True)
+                taken = 1e3 * (time.perf_counter() - request.begin)
+                found.append((method, state, estimate, taken))
+        methods, states, estimates, times = zip(*found, strict=True)
         state = concatenate(states)
         kept = state.converged & (state.residual < wanted)
         outside = (
@@ -144,14 +167,15 @@ class Simulator:
         words = [
             "no load: at rest"
             if method == "rest"
-            else summarise(one, bool(ok), float(a), float(s), bool(out))
-            for method, one, ok, a, s, out in zip(
-                *(methods, states, kept, amplitude, out_of_span, outside), strict=True
+            else summarise(one, bool(ok), estimate, float(a), float(s), bool(out))
+            for method, one, ok, estimate, a, s, out in zip(
+                *(methods, states, kept, estimates, amplitude, out_of_span, outside), strict=True
             )
         ]
         answer = {
             "displacement": self.scene.length * state.displacement,
             "residual": state.residual,
+            "error": torch.tensor(estimates, dtype=torch.float64),
             "volume_ratio": state.volume_ratio,
             "converged": kept,
             "negative_pivots": state.negative_pivots,
@@ -208,40 +232,42 @@ class Simulator:
 
     def _solve(
         self, load: Load, prediction: Tensor, amplitude: float, request: "_Request"
-    ) -> tuple[str, Solution]:
-        """Return the first solution that meets the tolerance, else the best one, and its method."""
+    ) -> tuple[str, Solution, float]:
+        """Return the first solution that meets the tolerance, else the best one.
+
+        It comes with its method and its estimated relative error, NaN if unknown.
+        """
         scene = self.scene
         tol = scene.solver.tol if request.tol is None else request.tol
         if not load.force.any() and not scene.problem.moved_supports:
-            return "rest", evaluate_solution(scene.problem, torch.zeros_like(prediction), load, tol)
-        found: tuple[str, Solution] | None = None
-        for method, last in self._candidates(load, prediction, amplitude, tol, request):
+            rest = evaluate_solution(scene.problem, torch.zeros_like(prediction), load, tol)
+            return "rest", rest, 0.0
+        found: tuple[str, Solution, float] | None = None
+        for method, last, error in self._candidates(load, prediction, amplitude, tol, request):
             if found is None or _rank(last) <= _rank(found[1]):
-                found = method, last
+                found = method, last, error
             # converged also if rounding allows no smaller residual
             if last.converged or request.over(self._pace):
                 break
         assert found is not None
-        method, state = found
-        return method, state._replace(status=last.status, load_factor=last.load_factor)
+        method, state, error = found
+        return method, state._replace(status=last.status, load_factor=last.load_factor), error
 
     def _candidates(
         self, load: Load, prediction: Tensor, amplitude: float, tol: float, request: "_Request"
-    ) -> Iterator[tuple[str, Solution]]:
-        """Yield the solutions of the methods, the cheapest method first, with their names."""
+    ) -> Iterator[tuple[str, Solution, float]]:
+        """Yield the solutions of the methods, the cheapest first, with names and errors."""
         problem = self.scene.problem
-        yield "network", evaluate_solution(problem, prediction, load, tol, from_guess=True)
+        state, error = self._corrected(load, prediction, tol, request)
+        yield "corrected" if int(state.iterations) else "network", state, error
         if request.tol is None and request.budget_ms is None:
             return
         if amplitude < MAX_LINEAR_AMPLITUDE:
             answer = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
-            yield "linear", evaluate_solution(problem, answer, load, tol)
-        guess = prediction
-        if self.correct is not None and bool(guess.isfinite().all()):
-            guess = self.correct(load.force[0], guess[0])[None]
-            yield "corrected", evaluate_solution(problem, guess, load, tol, from_guess=True)
+            yield "linear", evaluate_solution(problem, answer, load, tol), math.nan
+        guess = state.displacement
         newton = replace(self.scene.corrector, tol=tol)
-        guesses = [guess] if guess is prediction else [guess, prediction]
+        guesses = [guess, prediction] if int(state.iterations) else [guess]
         if (
             request.warm
             and self._before is not None
@@ -256,7 +282,25 @@ class Simulator:
                 self._pace, clock = now - clock, now
             elif not state.converged:  # the initial state, which has been evaluated
                 continue
-            yield "hybrid" if state.from_guess else "full Newton", state
+            yield "hybrid" if state.from_guess else "full Newton", state, math.nan
+
+    def _corrected(
+        self, load: Load, prediction: Tensor, tol: float, request: "_Request"
+    ) -> tuple[Solution, float]:
+        """Return the prediction, corrected by Newton's steps in the modes, and its error."""
+        problem = self.scene.problem
+        if self.newton is None or not bool(prediction.isfinite().all()):
+            return evaluate_solution(problem, prediction, load, tol, from_guess=True), math.nan
+        wanted = request.error if request.tol is None else min(request.error, self.newton.error_tol)
+        states = self.newton.states(load, guess=prediction, error_tol=wanted, max_iter=self.steps)
+        state = next(states)
+        while not request.over(0.0) and (following := next(states, None)) is not None:
+            state = following
+        solution = evaluate_solution(
+            problem, state.displacement, load, tol,
+            iterations=state.iterations, from_guess=True, evaluation=state.evaluation,
+        )  # fmt: skip
+        return solution, state.error + self.newton.outside_error
 
     def _with_stability(self, load: Load, state: Solution) -> Solution:
         """Return a solution with the number of negative eigenvalues of its tangent."""
@@ -276,6 +320,7 @@ class _Request(NamedTuple):
 
     tol: float | None
     budget_ms: float | None
+    error: float
     warm: bool
     begin: float
 

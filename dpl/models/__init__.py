@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         ClosedFormFit,
         Correctable,
         FlagsLocalLoads,
+        HasCorrection,
         TrainsInCoordinates,
     )
     from dpl.models.unrolled import Unrolled

@@ -8,7 +8,7 @@ from typing import NamedTuple, Self, cast
 import torch
 from torch import Tensor, nn
 
-from dpl.fem import PODGalerkin, symmetries
+from dpl.fem import SubspaceNewton, symmetries
 from dpl.models.invariant_basis import (
     group_actions,
     invariant_pod,
@@ -282,8 +282,8 @@ class PODNet(nn.Module):
         fields = self.field(torch.eye(len(self.modes)).to(self.modes), like)
         return fields[:, self.free_dofs]
 
-    def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> PODGalerkin:
-        """Return the Galerkin solver in the first modes; see `Correctable`.
+    def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> SubspaceNewton:
+        """Return Newton's method in the first modes; see `Correctable`.
 
         Args:
             states: Equilibrium displacements, (S, N, D) [-]; cells are chosen at the first 256.
@@ -296,9 +296,7 @@ class PODNet(nn.Module):
         problem = self.scene.problem
         vectors = torch.zeros(*problem.shape, min(rank, len(self.modes)), dtype=torch.float64)
         vectors[problem.free] = torch.linalg.qr(self.basis[:rank].double().cpu().T)[0]
-        return PODGalerkin.within(
-            problem, vectors, states[:CELL_STATES], tolerance=tolerance, reduced_tol=1e-3
-        )
+        return SubspaceNewton.within(problem, vectors, states[:CELL_STATES], tolerance=tolerance)
 
     def for_correction(self) -> Self:
         """See `Correctable`."""

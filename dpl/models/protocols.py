@@ -7,7 +7,7 @@ from typing import Protocol, Self, runtime_checkable
 
 from torch import Tensor
 
-from dpl.fem import PODGalerkin, SubspaceNewton
+from dpl.fem import SubspaceNewton
 from dpl.models.reduced_samples import ReducedDataset
 from dpl.scene import Sample
 
@@ -76,9 +76,7 @@ class ClosedFormFit(Protocol):
 class Correctable(Protocol):
     """A model whose predictions Newton iterations in its modes can correct."""
 
-    def galerkin(
-        self, states: Tensor, *, rank: int, tolerance: float
-    ) -> PODGalerkin | SubspaceNewton:
+    def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> SubspaceNewton:
         """Return the solver in the first `rank` modes, whose `correct` improves a prediction.
 
         Args:
@@ -90,6 +88,15 @@ class Correctable(Protocol):
 
     def for_correction(self) -> Self:
         """Return the network, with shared weights, whose predictions are to be corrected."""
+        ...
+
+
+@runtime_checkable
+class HasCorrection(Protocol):
+    """A model whose fit includes Newton's method in its modes."""
+
+    def correction(self) -> SubspaceNewton | None:
+        """Return Newton's method in the modes; None if it improves no prediction."""
         ...
 
 

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from dpl.fem import InvariantBasedMaterial, SubspaceNewton, symmetries
-from dpl.fem.rom.compiled_prediction import CompiledPrediction
-from dpl.fem.rom.reduced_problem import refuse_range
+from dpl.fem.rom.compiled_prediction import CompiledPrediction, LawArguments, law_arguments
+from dpl.fem.rom.ecsw import Cubature
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.models.local_response import LocalResponse, resize_buffers
+from dpl.models.newton_choice import choose_newton
 from dpl.models.unrolled_fit import (
     Columns,
     Maps,
@@ -73,6 +74,10 @@ class Unrolled(nn.Module):
         maps: B_1, B_2, ..., (K, 2 C D D, R).
         limits: Largest ratio of each correction to the one before, (1 + K,): 1.5 times that of the
             samples. They keep loads far out of range from running away.
+        newton_rank: Number of modes of Newton's method that follows; 0: none, ().
+        newton_cells: Cells of its tangent, (K,).
+        newton_weights: Their weights, (K,).
+        outside_error: Largest relative error that it left at held-out samples, ().
         fitted: True after `fit`, ().
     """
 
@@ -84,6 +89,10 @@ class Unrolled(nn.Module):
     first_map: Tensor
     maps: Tensor
     limits: Tensor
+    newton_rank: Tensor
+    newton_cells: Tensor
+    newton_weights: Tensor
+    outside_error: Tensor
     fitted: Tensor
     dofs: Tensor
     prescribed: Tensor
@@ -135,12 +144,16 @@ class Unrolled(nn.Module):
             "first_map": torch.zeros(0, 0),
             "maps": torch.zeros(0, 0, 0),
             "limits": torch.ones(1, dtype=torch.float64),
+            "newton_rank": torch.tensor(0),
+            "newton_cells": torch.zeros(0, dtype=torch.int64),
+            "newton_weights": empty,
+            "outside_error": torch.tensor(0.0, dtype=torch.float64),
             "fitted": torch.tensor(False),
         }.items():
             self.register_buffer(name, value)
         self._stiffness = ReducedStiffness(self.stiffness)
         self._compiled: tuple[Tensor, CompiledPrediction] | None = None
-        self._inverted: tuple[tuple[Tensor, Any], tuple[Array, Array]] | None = None
+        self._inverted: tuple[tuple[Tensor, Any], tuple[LawArguments, Array, Array]] | None = None
         dofs = scene.problem.free.flatten().nonzero()[:, 0]
         self.register_buffer("dofs", dofs, persistent=False)
         self.register_buffer("prescribed", scene.problem.prescribed, persistent=False)
@@ -224,7 +237,7 @@ class Unrolled(nn.Module):
         fields, material = [], self.scene.problem.material
         for one, own in zip(force.detach(), parameters.detach(), strict=True):
             law = cast(InvariantBasedMaterial, material.with_parameters(own[None]))
-            field, _, is_local = self._prediction(law, *self._inverse(law), one.numpy())
+            field, _, is_local = self._prediction(*self._at_law(law), one.numpy())
             if is_local:
                 loaded = one.flatten()[self.dofs].numpy()
                 field.reshape(-1)[self.dofs.numpy()] += self.local.solve(loaded, own)
@@ -250,14 +263,15 @@ class Unrolled(nn.Module):
             self._compiled = self.maps, prediction
         return self._compiled[1]
 
-    def _inverse(self, law: InvariantBasedMaterial) -> tuple[Array, Array]:
-        """Return (V^T K(0) V)^-1 (R, R) and V^T K(0) p (R,), kept for the last law."""
+    def _at_law(self, law: InvariantBasedMaterial) -> tuple[LawArguments, Array, Array]:
+        """Return the law, (V^T K(0) V)^-1 (R, R) and V^T K(0) p (R,), kept for the last law."""
         if self._inverted is None or not (
             self._inverted[0][0] is self.stiffness and self._inverted[0][1] == law
         ):
             whole = self._stiffness.at(law).numpy()
             inverse = np.ascontiguousarray(np.linalg.inv(whole[:, :-1]))
-            self._inverted = (self.stiffness, law), (inverse, whole[:, -1].copy())
+            known = law_arguments(law), inverse, whole[:, -1].copy()
+            self._inverted = (self.stiffness, law), known
         return self._inverted[1]
 
     def _given_parameters(self, force: Tensor, parameters: Tensor | None) -> Tensor:
@@ -321,6 +335,35 @@ class Unrolled(nn.Module):
         none = torch.zeros(0, rows, modes.shape[1])
         self.maps = torch.stack([one.float() for one in maps.others]) if maps.others else none
         self.fitted = torch.tensor(True)
+        self._fit_newton(samples, held_out)
+
+    def _fit_newton(self, samples: Sample, held_out: Sample) -> None:
+        """Choose modes and cells of Newton's method that follows the maps."""
+        own = (held_out.parameters,) if self.extra_inputs else ()
+        guesses, states = self(held_out.force, *own), samples.displacement
+        vectors = self._orthonormal(self.modes.shape[1])
+        found = choose_newton(self.scene.problem, vectors, states, held_out, guesses)
+        if found is not None and found.cubature is not None:
+            self.newton_rank = torch.tensor(found.vectors.shape[2])
+            self.newton_cells, self.newton_weights = found.cubature.cells, found.cubature.weights
+            self.outside_error = torch.tensor(found.outside_error, dtype=torch.float64)
+
+    def correction(self) -> SubspaceNewton | None:
+        """See `HasCorrection`."""
+        rank = int(self.newton_rank)
+        if not rank:
+            return None
+        cells = Cubature(self.newton_cells, self.newton_weights, 0.0)
+        error = float(self.outside_error)
+        problem = self.scene.problem
+        return SubspaceNewton(problem, self._orthonormal(rank), cells, outside_error=error)
+
+    def _orthonormal(self, rank: int) -> Tensor:
+        """Return the first modes, orthonormal, (N, D, rank)."""
+        problem = self.scene.problem
+        vectors = torch.zeros(problem.free.numel(), min(rank, self.modes.shape[1])).double()
+        vectors[self.dofs] = torch.linalg.qr(self.modes[:, :rank].double())[0]
+        return vectors.view(*problem.shape, -1)
 
     def _columns(self, samples: Sample, answers: Tensor) -> Columns:
         """Return samples in coordinates; `answers` are their linear solutions, (S, n)."""
@@ -347,14 +390,11 @@ class Unrolled(nn.Module):
             tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
 
         Raises:
-            ValueError: A number is out of range, or the law has ranges.
+            ValueError: A number is out of range.
         """
-        problem = self.scene.problem
-        refuse_range(problem)
-        vectors = torch.zeros(problem.free.numel(), min(rank, self.modes.shape[1])).double()
-        vectors[self.dofs] = torch.linalg.qr(self.modes[:, :rank].double())[0]
-        fields = vectors.view(*problem.shape, -1)
-        return SubspaceNewton.within(problem, fields, states[:CELL_STATES], tolerance=tolerance)
+        some = states[:CELL_STATES]
+        modes = self._orthonormal(rank)
+        return SubspaceNewton.within(self.scene.problem, modes, some, tolerance=tolerance)
 
     def for_correction(self) -> Self:
         """See `Correctable`."""

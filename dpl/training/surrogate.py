@@ -116,6 +116,8 @@ class Surrogate(L.LightningModule):
 
     def unscale_outputs(self, output: Tensor) -> Tensor:
         """Return displacements over L (B, N, D) [-], float64, from outputs of the network."""
+        if self._is_closed_form:
+            return output
         displacement = output.double() * self.displacement_scale
         return torch.where(self.physics.problem.free, displacement, 0.0)
 

@@ -103,13 +103,15 @@ class Body:
         self.young = sum(self.scene.loads.young_range) / 2
         ranges = self.scene.loads.parameter_ranges
         self.parameters = {name: sum(ends) / 2 for name, ends in ranges.items()}
-        self._without_galerkin = Simulator(simulator.surrogate) if self.has_galerkin else simulator
+        self._without_galerkin = simulator
+        if self.has_galerkin:
+            self._without_galerkin = Simulator(simulator.surrogate, steps=0)
         self.patch = lru_cache(maxsize=1)(partial(Patch, self.scene))
 
     @property
     def has_galerkin(self) -> bool:
         """True if the simulator can correct predictions in the modes of the network."""
-        return self.simulator.correct is not None
+        return self.simulator.newton is not None
 
     @property
     def young_range(self) -> tuple[float, float]:

@@ -28,7 +28,7 @@ from dpl.fem import (
 )
 from dpl.fem.assembly.rigid_body_modes import rigid_body_modes
 from dpl.fem.rom import Cubature
-from dpl.fem.rom.ecsw import nonnegative
+from dpl.fem.rom.ecsw import cubature, nonnegative
 from dpl.fem.rom.pod import pod
 
 NH = NeoHookeanLn(0.3)
@@ -157,8 +157,9 @@ def test_sparse_weights_reproduce_the_sum():
     columns = noise(12, 400).numpy()
     columns[0] = np.abs(columns[0])
     gram, scale = columns.T @ columns, float(np.linalg.norm(columns.sum(axis=1)))
+    target = gram.sum(axis=1)
     for tolerance in (1e-1, 1e-3, 1e-5):
-        chosen = nonnegative(gram, tolerance, scale)
+        chosen = nonnegative(gram, target, target.sum(), tolerance, scale)
         assert (chosen.weights > 0).all()
         assert len(chosen.cells) <= 12
         sums = columns[:, chosen.cells] @ chosen.weights.numpy()
@@ -423,60 +424,18 @@ def test_basis_of_another_body_is_refused(newton, beam, snapshots):
         PODGalerkin(beam(NH, 4, 1), snapshots[:4].movedim(0, -1))
 
 
-# ------------------------------------------------------------------ corrections
-
-
-@pytest.fixture(scope="module")
-def corrector(newton, snapshots) -> PODGalerkin:
-    """A solver with few cells of low accuracy."""
-    return PODGalerkin.fit(newton.problem, snapshots, 12, tolerance=1e-2)
-
-
-def astray(solver: PODGalerkin, truth: torch.Tensor, size: float) -> torch.Tensor:
-    """Return solutions with errors in the subspace, relative to the largest solution."""
-    way = solver.vectors @ noise(solver.vectors.shape[2], len(truth))
-    way = way.movedim(2, 0)
-    way = way / way.flatten(1).norm(dim=1)[:, None, None]
-    return truth + size * truth.flatten(1).norm(dim=1)[:, None, None] * way
-
-
-def test_a_correction_removes_the_error_in_the_subspace(newton, unseen, truth):
-    """With all modes the result is Newton's solution for any guess."""
-    solver = PODGalerkin(newton.problem, everything(newton.problem))
-    for force, u, guess in zip(unseen.force, truth, astray(solver, truth, 0.02), strict=True):
-        assert_close(solver.correct(force, guess), u, rtol=0, atol=1e-4 * float(u.abs().max()))
-
-
-def test_each_correction_by_few_cells_leaves_a_small_part_of_the_error(corrector, unseen, truth):
-    assert len(corrector.cubature.cells) < len(corrector.problem.cells) / 2
-    guess = astray(corrector, truth, 0.02)
-    found = [errors(guess, truth)]
-    for steps in (1, 2, 3):
-        pairs = zip(unseen.force, guess, strict=True)
-        answer = torch.stack([corrector.correct(f, u, steps=steps) for f, u in pairs])
-        found.append(errors(answer, truth))
-    for before, after in pairwise(found[:3]):
-        assert float((after / before).median()) < 0.15
-    assert float(found[3].max()) < 1e-2 * float(found[0].min())
-
-
-def test_the_exact_solution_is_not_corrected(corrector, unseen, truth):
-    for force, u in zip(unseen.force, truth, strict=True):
-        assert_close(corrector.correct(force, u, steps=3), u, rtol=0, atol=1e-8)
-
-
-def test_errors_outside_the_subspace_remain(corrector, unseen, truth):
-    free, basis = corrector.problem.free, corrector.vectors[corrector.problem.free]
-    guess = truth[0].clone()
-    guess[free] += 1e-3 * noise(int(free.sum()))
-    found = corrector.correct(unseen.force[0], guess, steps=2)
-    change = (found - guess)[free]
-    assert change.any()
-    assert_close(basis @ (basis.T @ change), change, rtol=0, atol=1e-12)
-    assert not (found - guess)[~free].any()
-
-
-def test_an_inverted_guess_is_returned_unchanged(corrector, unseen, truth):
-    guess = torch.where(corrector.problem.free, 0.5 * noise(*truth[0].shape), 0.0)
-    assert not corrector.problem.evaluate(guess[None])[1] > 0
-    assert torch.equal(corrector.correct(unseen.force[0], guess), guess)
+def test_cells_are_chosen_among_candidates(newton, snapshots):
+    """The weighted candidates reproduce the forces of all cells."""
+    problem = newton.problem
+    vectors = PODGalerkin.fit(problem, snapshots, 6, tolerance=None).vectors
+    some = torch.arange(0, len(problem.cells), 2)  # too few for 1e-2
+    basis = vectors[problem.free]
+    states = torch.zeros_like(snapshots)
+    states[:, problem.free] = snapshots[:, problem.free] @ basis @ basis.T
+    chosen = cubature(problem, vectors, states, 1e-2, some)
+    assert torch.isin(chosen.cells, some).all()
+    assert chosen.error < 0.2
+    every = cubature(problem, vectors, states, 1e-2, torch.arange(len(problem.cells)))
+    known = cubature(problem, vectors, states, 1e-2)
+    assert torch.equal(every.cells, known.cells)
+    assert_close(every.weights, known.weights, rtol=1e-3, atol=0)

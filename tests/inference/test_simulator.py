@@ -14,7 +14,7 @@ import torch
 import dpl
 import dpl.inference.simulator as simulator_module
 from dpl.config import build
-from dpl.fem import Status, solve
+from dpl.fem import Status, SubspaceNewton, solve
 from dpl.inference import Hybrid, Simulator, nearest
 from dpl.models import CNN, FCNN, GNN
 from dpl.training import MSE, Surrogate
@@ -154,18 +154,56 @@ def test_small_loads_are_answered_linearly(scene, forces):
     assert answer.converged
 
 
-def test_a_correction_is_taken_where_it_is_better(scene, forces, truth):
-    exact = dict(zip(map(float, forces.flatten(1).norm(dim=1)), truth, strict=True))
+def newton_everywhere(scene, **options):
+    """Return Newton's method in the space of all displacements."""
+    problem = scene.problem
+    count = int(problem.free.sum())
+    vectors = torch.zeros(*problem.shape, count, dtype=torch.float64)
+    vectors[problem.free] = torch.eye(count).double()
+    return SubspaceNewton(problem, vectors, **options)
 
-    def correct(force, displacement):
-        size = float((force * E * scene.force_unit).norm())
-        return exact[min(exact, key=lambda key: abs(key - size))] / scene.length
 
-    good = simulator_of(scene, correct=correct)(forces, tol=1e-6)
-    assert good.method == ["corrected"] * 4
-    worse = simulator_of(scene, correct=lambda force, u: -u)(forces, tol=1e-6)
-    assert worse.converged.all()
-    assert "corrected" not in worse.method
+def test_steps_in_the_modes_follow_while_the_estimated_error_is_large(scene, forces, truth):
+    near = lambda load: 0.97 * solve(scene.solver, load).displacement  # noqa: E731
+    sim = simulator_of(scene, near, newton=newton_everywhere(scene, outside_error=1e-6))
+
+    def errors(answer):
+        return (answer.displacement - truth).flatten(1).norm(dim=1) / truth.flatten(1).norm(dim=1)
+
+    found = [sim(forces, error=wanted) for wanted in (10.0, 0.01, 1e-5)]
+    assert found[0].method == ["network"] * 4
+    assert found[2].method == ["corrected"] * 4
+    assert "corrected" in found[1].method
+    assert (found[1].error <= 0.01 + 1e-6).all()
+    assert (errors(found[1]) < errors(found[0]) / 2).any()
+    assert (errors(found[2]) < 5e-3).all()
+    assert (found[0].error > 0.01).any(), "a part of the displacement is missing"
+    assert (found[0].iterations == 0).all()
+    assert (found[2].iterations >= found[1].iterations).all()
+    assert "error about" in found[1].summary[0]
+    none = simulator_of(scene)(forces)
+    assert none.error.isnan().all()
+    without = simulator_of(scene, near, newton=newton_everywhere(scene), steps=0)(forces)
+    assert without.method == ["network"] * 4
+    assert without.error.isfinite().all()
+
+
+def test_a_step_that_makes_an_answer_worse_is_not_taken(scene, forces, truth):
+    wrong = simulator_of(scene, lambda load: 30 * torch.randn(load.force.shape).double())
+    sim = Simulator(wrong.surrogate, newton=newton_everywhere(scene))
+    answer = sim(forces)
+    assert answer.method == ["network"] * 4
+    assert (answer.error == torch.inf).all()
+    assert all(words.startswith("NOT VALID") for words in answer.summary)
+    assert sim(forces, tol=1e-6).converged.all()
+
+
+@pytest.mark.parametrize(("option", "value"), [("error", 0.0), ("error", -1), ("error", math.nan)])
+def test_an_error_is_above_zero(scene, forces, option, value):
+    with pytest.raises(ValueError, match=f"{option} = .* must be above 0"):
+        simulator_of(scene)(forces, **{option: value})
+    with pytest.raises(ValueError, match="steps = -1 must be 0 or more"):
+        simulator_of(scene, steps=-1)
 
 
 @pytest.fixture
@@ -605,10 +643,10 @@ def test_a_run_between_coordinates_is_corrected_in_its_modes(script, tiny_traini
         ended = script("train", *kind, f"model={name}", f"run=runs/{name}", cwd=tmp_path)
         assert ended.status == 0, ended.err[-2000:]
     sim = dpl.load(tmp_path / "runs" / "pod", corrected=True)
-    assert dpl.load(tmp_path / "runs" / "pod").correct is None
+    assert dpl.load(tmp_path / "runs" / "pod").newton is None
     problem, load = sim.scene.problem, sim.scene.loads.sample((0, 9), range(3))
     for force, exact in zip(load.force, solve(sim.scene.solver, load).displacement, strict=True):
-        fields = 0.97 * exact, sim.correct(force, 0.97 * exact)
+        fields = 0.97 * exact, sim.newton.correct(force, 0.97 * exact)
         before, after = (problem.energy(u[None]) - (force * u).sum() for u in fields)
         assert after < before, "nearer to balance"
     with pytest.raises(ValueError, match="corrected: FCNN has no modes"):

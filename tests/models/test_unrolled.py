@@ -9,8 +9,10 @@ from dpl.fem.rom.parity import Orbits, Parities
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import cell_gradients, rotated_strain, rotation, unbalanced_stress
 from dpl.fem.symmetry import cell_images, symmetries
-from dpl.models import ClosedFormFit, FlagsLocalLoads, Unrolled
+from dpl.inference import Simulator
+from dpl.models import ClosedFormFit, FlagsLocalLoads, HasCorrection, Unrolled
 from dpl.models.invariant_basis import scatter_fields
+from dpl.models.newton_choice import choose_newton
 from dpl.models.stage_regression import GroupAction, Rows, fit_map
 from dpl.scene import Sample, Scene
 from dpl.training import MSE, Surrogate
@@ -296,3 +298,33 @@ def test_folding_is_the_transpose_of_unfolding(beam):
         own = orbits.unfolded(folded / orbits.weight[:, None], characters, count)
         total += own / len(characters)
     assert total == pytest.approx(values), "the parts of all parities add up to a field"
+
+
+def test_the_fit_includes_newton_in_the_modes(beam, net):
+    """Its modes, cells and remaining error are stored; its steps lower the error."""
+    again = Unrolled(beam, **SMALL)
+    again.load_state_dict(net.state_dict())
+    solvers = net.correction(), again.correction()
+    assert isinstance(net, HasCorrection)
+    samples = samples_of(beam, 6, seed=3)
+    sims = [Simulator(Surrogate(one, MSE(), beam)) for one in (net, again)]
+    for sim, one in zip(sims, solvers, strict=True):
+        assert torch.equal(sim.newton.vectors, one.vectors)
+    force = samples.force * beam.force_unit
+    first, second = (sim(force, error=1e-12) for sim in sims)
+    assert torch.equal(first.displacement, second.displacement)
+    plain = sims[0](force, error=10.0)
+    truth = beam.length * samples.displacement
+
+    def error(answer):
+        return ((answer.displacement - truth).flatten(1).norm(dim=1)).mean()
+
+    assert error(first) < error(plain)
+    assert (first.error >= solvers[0].outside_error).all()
+
+
+def test_no_newton_where_it_improves_nothing(beam, net):
+    samples = samples_of(beam, 8, seed=1)
+    modes = net.correction().vectors
+    exact = samples.displacement
+    assert choose_newton(beam.problem, modes, exact, samples, exact) is None

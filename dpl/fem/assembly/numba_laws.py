@@ -39,13 +39,23 @@ class Law:
     @cached_property
     def kind(self) -> _LawType:
         """The law's type in numba."""
-        function = self.material.invariant_derivatives
-        code = repr(_code_of(function)) + self.sources
-        digest = hashlib.sha256(code.encode()).hexdigest()[:16]
-        name = f"{self.material.__qualname__}{digest}"
-        if name not in _COMPILED:
-            _COMPILED[name] = _compile(function)
-        return _LawType(name)
+        if (self.material, self.sources) not in _KINDS:
+            _KINDS[self.material, self.sources] = _kind(self.material, self.sources)
+        return _KINDS[self.material, self.sources]
+
+
+_KINDS: dict[tuple[type[InvariantBasedMaterial], str], _LawType] = {}
+
+
+def _kind(material: type[InvariantBasedMaterial], sources: str) -> _LawType:
+    """Return the type of a law."""
+    function = material.invariant_derivatives
+    code = repr(_code_of(function)) + sources
+    digest = hashlib.sha256(code.encode()).hexdigest()[:16]
+    name = f"{material.__qualname__}{digest}"
+    if name not in _COMPILED:
+        _COMPILED[name] = _compile(function)
+    return _LawType(name)
 
 
 def required_terms(material: InvariantBasedMaterial) -> int:

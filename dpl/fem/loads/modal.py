@@ -17,6 +17,7 @@ from dpl.fem.loads.family import RandomLoads
 from dpl.fem.loads.modal_basis import Array, Modes, eigenmodes
 from dpl.fem.loads.sampling import Quantile, constant, symmetric_uniform, uniform01
 
+LEAST_SQUARE = 1e-13  # singular value of the normal equations over the largest that counts [-]
 MIN_DEFLECTION = 1e-12  # below it the displacement is rounding error [-]
 
 
@@ -95,7 +96,7 @@ class ModalLoads(RandomLoads):
         softest = self.deflection * values[0] / vectors[..., 0].norm(dim=1).max()
         return softest * (values / values[0]) ** self.eigenvalue_exponent
 
-    @property
+    @cached_property
     def modal_forces(self) -> Tensor:
         """Mode times its largest modal load, zero on degrees of freedom without load, (N, D, M)."""
         return torch.where(self.loadable_dofs[..., None], self.modes.vectors, 0.0) * self.q_max
@@ -134,20 +135,25 @@ class ModalLoads(RandomLoads):
         Args:
             force: (B, N, D) [-].
         """
-        fields = self.modal_forces
-        amplitudes, residuals = [], []
-        for f in self.own_force(force):
-            unit = float(f.abs().max())
-            if unit == 0:
-                amplitudes.append(0.0)
-                residuals.append(0.0)
-                continue
-            loaded = f.any(dim=-1)
-            shapes, there = fields[loaded].flatten(0, 1), f[loaded].flatten() / unit
-            q = torch.linalg.lstsq(shapes, there[:, None], driver="gelsd").solution
-            amplitudes.append(unit * float(q.abs().max()))
-            residuals.append(float((there - shapes @ q[:, 0]).norm() / there.norm()))
+        pairs = [self._fit(f) for f in self.own_force(force).numpy()]
+        amplitudes, residuals = zip(*pairs, strict=True)
         return force.new_tensor(amplitudes), force.new_tensor(residuals)
+
+    def _fit(self, force: Array) -> tuple[float, float]:
+        """Return amplitude and residual of one force, (N, D), see `project`."""
+        unit = float(np.abs(force).max())
+        if unit == 0:
+            return 0.0, 0.0
+        loaded = np.flatnonzero(force.any(axis=1))
+        there = force[loaded].ravel() / unit
+        shapes = self.modal_forces.numpy()[loaded].reshape(len(there), -1)
+        U, sizes, Vt = np.linalg.svd(shapes.T @ shapes)
+        inverse = np.where(sizes > LEAST_SQUARE * sizes[0], 1 / np.maximum(sizes, 1e-300), 0.0)
+        q, rest = np.zeros(len(sizes)), there
+        for _ in range(2):  # the second time removes the rounding error of the normal equations
+            q = q + Vt.T @ (inverse * (U.T @ (shapes.T @ rest)))
+            rest = there - shapes @ q
+        return unit * float(np.abs(q).max()), float(np.linalg.norm(rest) / np.linalg.norm(there))
 
     def arrays(self) -> Mapping[str, Tensor]:
         """Return eigenvalues and eigenvectors, see `Modes`."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -19,6 +19,23 @@ from dpl.fem.rom.parity import Orbits, Parities
 from dpl.fem.symmetry import Symmetry
 
 Array = NDArray[np.float64]
+
+
+class LawArguments(NamedTuple):
+    """A law as the first arguments of `predict`."""
+
+    key: Law
+    constants: Array
+    required_terms: int
+    finite: float
+    mu: float
+    lam: float
+
+
+def law_arguments(law: InvariantBasedMaterial) -> LawArguments:
+    """Return a law with numbers as moduli as the arguments of a compiled loop."""
+    moduli = required_terms(law), float(law.finite), float(law.mu), float(law.lam)
+    return LawArguments(Law(type(law), SOURCES), np.array(law.constants, dtype=float), *moduli)
 
 
 @dataclass(frozen=True)
@@ -109,25 +126,23 @@ class CompiledPrediction:
         return cls(arrays, prescribed.numpy(), tol)
 
     def __call__(
-        self, law: InvariantBasedMaterial, inverse: Array, supports: Array, force: Array
+        self, law: LawArguments, inverse: Array, supports: Array, force: Array
     ) -> tuple[Array, Array, bool]:
         """Return the displacement (N, D), coordinates of the linear solution (R,), and locality.
 
         The displacement under a local load lacks the linear solution V c.
 
         Args:
-            law: The law, with numbers as moduli.
+            law: The law, see `law_arguments`.
             inverse: (V^T K(0) V)^-1, (R, R).
             supports: V^T K(0) p, (R,).
             force: Nodal forces, (N, D).
         """
         field, linear = self.prescribed.copy(), np.empty_like(supports)
-        key, constants = Law(type(law), SOURCES), np.array(law.constants)
-        moduli = required_terms(law), float(law.finite), law.mu, law.lam
         flat = np.ascontiguousarray(force).reshape(-1)
         tol = min(self.tol, np.finfo(float).max ** 0.25)
         data = self.arrays, flat, inverse, supports, tol, field.reshape(-1), linear
-        is_local = call_compiled(predict, key, constants, *moduli, *data)
+        is_local = call_compiled(predict, *law, *data)
         return field, linear, is_local
 
 

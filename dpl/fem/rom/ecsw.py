@@ -13,6 +13,7 @@ from dpl.fem.linear.interface import full_matrix
 from dpl.fem.problem import Problem
 
 Array = NDArray[np.float64]
+SMALL = 1e-5  # displacement of the central difference for K(0) u [-]
 BLOCK = 16  # states whose cell forces are in memory at a time
 
 
@@ -30,7 +31,13 @@ class Cubature(NamedTuple):
     error: float
 
 
-def cubature(problem: Problem, vectors: Tensor, states: Tensor, tolerance: float) -> Cubature:
+def cubature(
+    problem: Problem,
+    vectors: Tensor,
+    states: Tensor,
+    tolerance: float,
+    candidates: Tensor | None = None,
+) -> Cubature:
     """Return weighted cells that reproduce the reduced forces of all cells at some states.
 
     The nonlinear part sum_e w_e V_e^T (f_e(u) - K_e(0) u_e) is fitted, each state relative to its
@@ -42,39 +49,55 @@ def cubature(problem: Problem, vectors: Tensor, states: Tensor, tolerance: float
     Args:
         problem: The body.
         vectors: V, (N, D, R).
-        states: Displacements, (S, N, D); the memory is E^2 numbers for any S.
+        states: Displacements, (S, N, D); the memory is C^2 numbers for any S.
         tolerance: Root of the mean square of the relative errors [-], not below 1e-6.
+        candidates: Numbers of the cells to choose from, (C,); None: all.
 
     Raises:
         ValueError: `tolerance` is not between 0 and 1, or the body has rigid body modes.
     """
     if not 0 < tolerance < 1:
         raise ValueError(f"tolerance = {tolerance} must lie between 0 and 1")
-    count, white = len(problem.cells), vectors @ whitening(problem, vectors)
-    every = torch.arange(count)
-    cells = ReducedMesh(problem, white, every, torch.ones(count, dtype=torch.float64))
+    numbers = torch.arange(len(problem.cells)) if candidates is None else candidates
+    count, white = len(numbers), vectors @ whitening(problem, vectors)
+    cells = ReducedMesh(problem, white, numbers, torch.ones(count, dtype=torch.float64))
     upper = cells.at_rest()
     rows = cells.basis.view(count, -1, vectors.shape[2])
-    gram = torch.zeros(count, count, dtype=torch.float64)
-    used = 0
+    gram, target = torch.zeros(count, count).double(), torch.zeros(count).double()
+    body, basis = replace(problem, springs=None), white.flatten(0, 1)
+    size, used = 0.0, 0
     for part in states.split(BLOCK):
-        columns = []
+        columns, totals = [], []
         for u in part:
             values = u[cells.nodes].flatten()
             force = cells.problem.evaluate(cells.field(values)).internal.flatten()
-            scale = (force @ cells.basis).norm()
+            whole = body.evaluate(u[None]).internal.flatten()
+            scale = (whole @ basis).norm()
             beyond = (force - cells.product(upper, values)).view(count, 1, -1)
             if scale > 0:
                 columns.append((beyond @ rows)[:, 0].T / scale)
+                totals.append((whole - _linear_force(body, u)) @ basis / scale)
         used += len(columns)
         if columns:
-            together = torch.cat(columns)
+            together, total = torch.cat(columns), torch.cat(totals)
             gram.addmm_(together.T, together)
-    return nonnegative(gram.numpy(), tolerance, max(used, 1) ** 0.5)
+            target += together.T @ total
+            size += float(total @ total)
+    found = nonnegative(gram.numpy(), target.numpy(), size, tolerance, max(used, 1) ** 0.5)
+    return found._replace(cells=numbers[found.cells])
 
 
-def nonnegative(gram: Array, tolerance: float, scale: float) -> Cubature:
-    """Return sparse weights w > 0 with ||G w - G 1|| <= tolerance * scale, from G^T G.
+def _linear_force(body: Problem, u: Tensor) -> Tensor:
+    """Return K(0) u, (N D,), of u (N, D) by a central difference, to about 1e-9."""
+    step = SMALL / float(u.abs().max())
+    pair = body.evaluate(torch.stack([step * u, -step * u])).internal
+    return (pair[0] - pair[1]).flatten() / (2 * step)
+
+
+def nonnegative(
+    gram: Array, target: Array, size: float, tolerance: float, scale: float
+) -> Cubature:
+    """Return sparse weights w > 0 with ||G w - b|| <= tolerance * scale, from G^T G and G^T b.
 
     Active-set method that stops when the tolerance is met: the column most aligned with the
     residual enters, columns whose weights would be negative leave.
@@ -84,18 +107,20 @@ def nonnegative(gram: Array, tolerance: float, scale: float) -> Cubature:
 
     Args:
         gram: G^T G, (E, E).
+        target: G^T b, (E,).
+        size: b^T b.
         tolerance: Relative error [-], not below 1e-6, which G^T G cannot resolve.
         scale: Norm that the error is relative to, above 0.
     """
-    count, target = len(gram), gram.sum(axis=1)
-    size = np.sqrt(gram.diagonal())
-    size[size == 0] = np.inf
+    count = len(gram)
+    length_of = np.sqrt(gram.diagonal())
+    length_of[length_of == 0] = np.inf
     rows, factor = np.empty((count, count)), np.empty((count, count))  # memory used when written
     kept, weights, barred = np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(count, dtype=bool)
     gradient = target
-    error = float(np.sqrt(max(target.sum(), 0.0))) / scale
+    error = float(np.sqrt(max(size, 0.0))) / scale
     while error > tolerance:
-        gain = np.where(barred, 0.0, gradient / size)
+        gain = np.where(barred, 0.0, gradient / length_of)
         gain[kept] = 0.0
         new = int(gain.argmax())
         if gain[new] <= 0:
@@ -120,9 +145,8 @@ def nonnegative(gram: Array, tolerance: float, scale: float) -> Cubature:
         else:  # entered because of rounding
             barred[new] = True
         gradient = target - weights @ rows[: len(kept)]
-        rest = np.ones(count)
-        rest[kept] -= weights
-        error = float(np.sqrt(max(rest @ gradient, 0.0))) / scale
+        square = size - weights @ (target + gradient)[kept]
+        error = float(np.sqrt(max(square, 0.0))) / scale
     if not len(kept):
         kept, weights = np.zeros(1, dtype=np.int64), np.ones(1)
     order = kept.argsort()

@@ -203,40 +203,6 @@ class PODGalerkin:
             factorisations=count.factorisations,
         )
 
-    def correct(self, force: Tensor, guess: Tensor, *, steps: int = 1) -> Tensor:
-        """Return a displacement (N, D) with a smaller residual than a guess (N, D).
-
-        Each step evaluates all cells once and solves the reduced problem for the displacement whose
-        reduced internal force exceeds the present one by the residual: the coarse-grid step of a
-        full approximation scheme. The part of the error outside the subspace remains. The steps end
-        where the reduced problem has no solution or a cell is inverted.
-
-        Source: Brandt (1977), Math. Comput. 31, section 5.
-
-        Args:
-            force: Nodal force, (N, D) [-].
-            guess: Displacement, (N, D) [-].
-            steps: Largest number of steps.
-        """
-        model, problem = self.reduced_problem, self.problem
-        scale = norm(model.project(force)) or 1.0
-        none = torch.zeros_like(model.reduced_support_force)
-        answer = guess
-        for _ in range(steps):
-            internal, volume = problem.evaluate(answer[None])
-            if not volume > 0:
-                break
-            residual = model.project(torch.where(problem.free, force - internal[0], 0.0))
-            at_cells = answer[model.cells.nodes].flatten()
-            load = ReducedLoad(none, scale, True, answer, at_cells, none, none)
-            state = model.state(load, none, 1.0)
-            load = load._replace(force=state.internal + residual)
-            end = self._newton(load, state, 1.0, _Count())
-            if end is None:
-                break
-            answer = answer + model.displacement(end.y)
-        return answer
-
     def _newton(
         self, load: ReducedLoad, state: ReducedState, target: float, count: "_Count"
     ) -> ReducedState | None:

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
@@ -74,6 +74,8 @@ class SubspaceNewton:
             with V in float32 resolve errors down to about 1e-7.
         max_iter: Largest number of steps.
         min_damping: Smallest damping factor [-].
+        outside_error: Largest relative error outside the subspace at known states [-]; no part of
+            the estimates of an iteration.
         min_detF_ratio: As of `Newton`: a step must leave this part of min det F [-].
 
     Raises:
@@ -88,6 +90,7 @@ class SubspaceNewton:
     error_tol: float = 2e-5
     max_iter: int = 4
     min_damping: float = 2.0**-4
+    outside_error: float = 0.0
     min_detF_ratio: float = 0.2
 
     @classmethod
@@ -98,6 +101,7 @@ class SubspaceNewton:
         states: Tensor,
         *,
         tolerance: float = 3e-2,
+        candidates: Tensor | None = None,
         **options: Any,
     ) -> Self:
         """Return the solver in a given subspace, with cells chosen at some states.
@@ -106,11 +110,12 @@ class SubspaceNewton:
             problem, vectors, options: Attributes of the solver.
             states: Displacements in equilibrium, (S, N, D) [-]; they are projected onto V.
             tolerance: Relative error of the reduced forces of the chosen cells, see `cubature`.
+            candidates: Numbers of the cells to choose from, (C,); None: all.
         """
         basis = vectors[problem.free]
         projected = states.clone()
         projected[:, problem.free] = (states[:, problem.free] @ basis) @ basis.T
-        cells = cubature(problem.reference, vectors, projected, tolerance)
+        cells = cubature(problem.reference, vectors, projected, tolerance, candidates)
         return cls(problem, vectors, cells, **options)
 
     def __post_init__(self) -> None:
@@ -164,12 +169,25 @@ class SubspaceNewton:
                 return
 
     def states(
-        self, load: Load, *, guess: Tensor, evaluation: Evaluation | None = None
+        self,
+        load: Load,
+        *,
+        guess: Tensor,
+        evaluation: Evaluation | None = None,
+        error_tol: float | None = None,
+        max_iter: int | None = None,
     ) -> Iterator[SubspaceState]:
         """Yield the guess and the state after each step under one load, with estimated errors.
 
-        Residual norms and status are not computed; see `iterate` for the arguments, B = 1.
+        Residual norms and status are not computed. See `iterate` for the arguments, B = 1;
+        `error_tol` and `max_iter` replace the attributes of the solver.
         """
+        error_tol = self.error_tol if error_tol is None else error_tol
+        max_iter = self.max_iter if max_iter is None else max_iter
+
+        def is_last(state: SubspaceState) -> bool:
+            return state.iterations >= max_iter or state.error <= error_tol
+
         problem = self.problem.with_parameters(load.parameters)
         if evaluation is None:
             guess = torch.where(problem.free, guess, problem.prescribed)
@@ -180,13 +198,13 @@ class SubspaceNewton:
             state = state._replace(error=self._relative(correction.y, guess))
         yield state
         best = state
-        while correction is not None and not self._is_last(state):
+        while correction is not None and not is_last(state):
             following = self._step(problem, load, state, correction)
             if following is None:
                 break
             yield (state := following)
             best = state if state.error < best.error else best
-            if not self._is_last(state):
+            if not is_last(state):
                 correction = self._correction(problem, load, state)
         if best is not state:
             yield best._replace(iterations=state.iterations)
@@ -199,19 +217,9 @@ class SubspaceNewton:
             guess: Displacement, (N, D) [-].
             steps: Largest number of steps; None: `max_iter`.
         """
-        solver = self if steps in (None, self.max_iter) else self._with_steps(steps)
         load = Load(force[None], torch.ones(1, dtype=torch.float64))
-        *_, last = solver.states(load, guess=guess[None])
+        *_, last = self.states(load, guess=guess[None], max_iter=steps)
         return last.displacement[0]
-
-    def _with_steps(self, steps: int) -> Self:
-        """Return the solver with another number of steps; the tangent is shared."""
-        other = replace(self, max_iter=steps)
-        other.__dict__["tangent"] = self.tangent
-        return other
-
-    def _is_last(self, state: SubspaceState) -> bool:
-        return state.iterations >= self.max_iter or state.error <= self.error_tol
 
     def correction(
         self, load: Load, displacement: Tensor, evaluation: Evaluation | None = None
