@@ -56,7 +56,7 @@ class LocalResponse(nn.Module):
         count = -(-MIN_PROBES // members)
         fields = torch.randn(count, len(modes), generator=random, dtype=torch.float64)
         every = torch.cat([image_columns(fields, free, group, k) for k in range(members)])
-        exact = torch.stack([torch.from_numpy(factor.solve(one.numpy())) for one in every])
+        exact = torch.from_numpy(factor.solve_many(every.numpy()))
         self.probes = (exact.T - modes @ (inverse @ (modes.T @ every.T))).to(self.probes)
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:

@@ -2,14 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from math import fsum
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from dpl.fem.rom.parity import Orbits, Parities
+from dpl.models.irreps import Component
 
 RIDGES = tuple(10.0 ** (-k / 2) for k in range(28, 5, -1))  # relative to the mean square [-]
+ROUNDING = 1e-10  # norm of a feature over the largest below which it is rounding error
 WORSE = 1.05  # ratio of held-out errors at which larger ridges are not tried
 
 
@@ -26,11 +30,6 @@ class Rows(NamedTuple):
     targets: Tensor
     weights: Tensor
 
-    def error(self, matrix: Tensor) -> float:
-        """Return the weighted root mean square of targets minus features times a matrix."""
-        error = self.targets - self.features.flatten(1) @ matrix
-        return weighted_error(error, self.weights)
-
 
 def weighted_error(error: Tensor, weights: Tensor) -> float:
     """Return the root of the mean weighted squares of the rows of errors (S, R); inf for NaN."""
@@ -42,12 +41,13 @@ def weighted_error(error: Tensor, weights: Tensor) -> float:
 class GroupAction:
     """Action of a symmetry group on tensors at sample cells and on coordinates.
 
-    The sample cells are mapped onto themselves. Empty lists stand for the identity alone.
+    The sample cells are mapped onto themselves.
 
     Attributes:
         rotations: Q of each symmetry, (G, D, D).
         positions: Position to which each symmetry maps each sample cell, (G, C).
         coordinates: T of each symmetry, (G, R, R): an image has coordinates c T.
+        representations: Irreducible representations of the group, see `dpl.models.irreps`.
         parities: Symmetries with diagonal matrices.
         parity: Parity of each coordinate, (R,).
     """
@@ -55,76 +55,53 @@ class GroupAction:
     rotations: Tensor
     positions: Tensor
     coordinates: Tensor
+    representations: Sequence[Tensor]
     parities: Parities
     parity: Tensor
 
-    def image(self, features: Tensor, k: int) -> Tensor:
-        """Return the features (S, C, F, D, D) of the images under symmetry k."""
-        Q = self.rotations[k]
-        image = torch.empty_like(features)
-        image[:, self.positions[k]] = Q @ features @ Q.mT
-        return image
+    @cached_property
+    def _sources(self) -> Tensor:
+        """Cell whose tensor each image takes at each representative cell, (G, M)."""
+        sources = self.positions.argsort(dim=1)
+        return sources[:, sources.amin(dim=0) == torch.arange(sources.shape[1])]
 
-    def average(self, gram: Tensor, product: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return X^T X and X^T Y of the rows X, Y and all their images.
+    def components(self, per_cell: int) -> list[Component]:
+        """Return the isotypic components of features with so many values in each cell."""
+        shares = 1 / (self._sources == self._sources[0]).sum(dim=0).double()
+        weights = shares.repeat_interleave(per_cell)
+        return [Component(D, weights) for D in self.representations]
+
+    def with_exact_parity(self, matrix: Tensor, per_cell: int) -> Tensor:
+        """Return a map (C F D D, R) whose columns have their parities without rounding errors.
 
         Args:
-            gram: X^T X of the rows, (C F D D, C F D D).
-            product: X^T Y, (C F D D, R).
+            matrix: The map, with rounding errors.
+            per_cell: Number F of tensors in each cell.
+        """
+        positions = self.positions[self.parities.members]
+        orbits = Orbits.of_tensors(self.parities, positions, per_cell, 1)
+        return orbits.symmetrised(matrix, self.parity, self.parities)
+
+    def images(self, features: Tensor) -> Tensor:
+        """Return the images (S, G, m) of features (S, C, F, D, D) at representative cells."""
+        every = [
+            Q @ features[:, cells] @ Q.mT
+            for Q, cells in zip(self.rotations, self._sources, strict=True)
+        ]
+        return torch.stack(every, dim=1).flatten(2)
+
+    def from_images(self, images: Tensor, shape: Sequence[int]) -> Tensor:
+        """Return the adjoint (r, C F D D) of `images`, applied to (r, G, m).
+
+        Args:
+            images: Factors of the values of the images.
             shape: (C, F, D, D).
         """
-        grams, products = torch.zeros_like(gram), torch.zeros_like(product)
-        for k, T in enumerate(self.coordinates):
-            half = self.image(gram.unflatten(1, shape), k).flatten(1)
-            grams += self.image(half.T.unflatten(1, shape), k).flatten(1)
-            products += self.image(product.T.unflatten(1, shape), k).flatten(1).T @ T
-        return grams, products
-
-    def by_parity(
-        self, gram: Tensor, product: Tensor, shape: Sequence[int]
-    ) -> "list[NormalEquations]":
-        """Return the normal equations of each parity; arguments as of `average`."""
-        positions = self.positions[self.parities.members]
-        orbits = Orbits.of_tensors(self.parities, positions, shape[1], 1).without_filling()
-        equations = []
-        for p, characters in enumerate(self.parities.characters):
-            own = (self.parity == p).nonzero()[:, 0]
-            half = orbits.folded(orbits.folded(gram, characters).T, characters)
-            right = orbits.folded(product[:, own], characters)
-            equations.append(NormalEquations(half, right, own, characters, orbits))
-        return equations
-
-
-class NormalEquations(NamedTuple):
-    """X^T X b = X^T Y for one value of each orbit of features, scaled to a diagonal of ones.
-
-    Attributes:
-        gram: X^T X, (m, m).
-        product: X^T Y, (m, r).
-        columns: The coordinates of this parity, (r,).
-        characters: Factor of this parity under each symmetry, (M,).
-        orbits: Orbits of the features.
-    """
-
-    gram: Tensor
-    product: Tensor
-    columns: Tensor
-    characters: Tensor
-    orbits: Orbits
-
-    def solve(self, ridge: float) -> Tensor | None:
-        """Return b, (m, r), with a ridge relative to the squares of each feature, None if singular.
-
-        Features without values count as zero.
-        """
-        scale = self.gram.diagonal().clamp(min=0).sqrt()
-        scale = torch.where(scale > 1e-12 * scale.max(), scale, torch.inf)
-        shifted = self.gram / scale[:, None] / scale
-        shifted.diagonal().add_(ridge)
-        factor, failed = torch.linalg.cholesky_ex(shifted)
-        if failed:
-            return None
-        return torch.cholesky_solve(self.product / scale[:, None], factor) / scale[:, None]
+        features = images.new_zeros(len(images), *shape)
+        values = images.unflatten(2, (-1, *shape[1:]))
+        for k, (Q, cells) in enumerate(zip(self.rotations.to(images), self._sources, strict=True)):
+            features.index_add_(1, cells, Q.mT @ values[:, k] @ Q)
+        return features.flatten(1)
 
 
 class RidgeFit(NamedTuple):
@@ -141,39 +118,115 @@ class RidgeFit(NamedTuple):
     error: float
 
 
-def fit_map(rows: Rows, held_out: Rows, action: GroupAction, start: int = 0) -> RidgeFit:
+def fit_map(rows: Rows, held_out: Rows, action: GroupAction) -> RidgeFit:
     """Return the linear map from features to targets that predicts held-out rows best.
 
     The map is the ridge regression on the rows and their images under the symmetries, and commutes
-    with them. Each feature is divided by its root mean square before. The ridge is the one of
-    `RIDGES` with the smallest held-out error; larger ones than the first that is clearly worse are
-    not tried.
+    with them. It is found in each isotypic component separately (Schur's lemma), so that the work
+    is that of the rows without their images and of small matrices. Each feature is divided by its
+    root mean square before. The ridge is the one of `RIDGES` with the smallest held-out error;
+    larger ones than the first that is clearly worse are not tried.
 
     Source: Hoerl, Kennard (1970), Ridge regression, Technometrics 12.
 
     Args:
         rows, held_out: Rows to fit to, and to choose the ridge by.
         action: The symmetries.
-        start: Position in `RIDGES` of the first ridge.
+
+    Raises:
+        ValueError: The rows are not finite.
     """
-    X = rows.features.flatten(1) * rows.weights[:, None]
     shape = rows.features.shape[1:]
-    gram, product = action.average(X.T @ X, X.T @ (rows.targets * rows.weights[:, None]), shape)
-    equations = action.by_parity(gram, product, shape)
-    best: RidgeFit | None = None
-    for ridge in RIDGES[start:]:
-        found = [one.solve(ridge * len(gram)) for one in equations]
-        matrix = torch.zeros_like(product)
-        for one, values in zip(equations, found, strict=True):
-            if values is not None:
-                matrix[:, one.columns] = one.orbits.unfolded(values, one.characters, len(gram))
-        if any(values is None for values in found):
+    images = [action.images(part.features) for part in (rows, held_out)]
+    parts = []
+    for component in action.components(shape[1:].numel()):
+        coordinates = component.coordinate_parts(action.coordinates)
+        sets = [
+            _weighted_rows(component, coordinates, part, image)
+            for part, image in zip((rows, held_out), images, strict=True)
+        ]
+        parts.append(_ComponentFit(component, coordinates, *_normal_equations(*sets[0]), *sets[1]))
+    best: list[Tensor] = []
+    chosen, least = 0.0, float("inf")
+    for ridge in RIDGES:
+        matrices = [m for part in parts if (m := part.solve(ridge)) is not None]
+        if len(matrices) < len(parts):
             continue
-        error = held_out.error(matrix)
-        if best is None or error < best.error:
-            best = RidgeFit(matrix, ridge, error)
-        elif error > WORSE * best.error:
+        square = fsum(p.squared_error(m) for p, m in zip(parts, matrices, strict=True))
+        if square < least:
+            best, chosen, least = matrices, ridge, square
+        elif square > WORSE**2 * least:
             break
-    if best is None:
+    if not best:
         raise ValueError("the samples are not finite")
-    return best
+    maps = [p.whole(m, action, shape) for p, m in zip(parts, best, strict=True)]
+    matrix = action.with_exact_parity(torch.stack(maps).sum(dim=0), shape[1])
+    return RidgeFit(matrix, chosen, (least / len(held_out.weights)) ** 0.5)
+
+
+class _ComponentFit(NamedTuple):
+    """Normal equations of an isotypic component, and its held-out rows.
+
+    Attributes:
+        component: The component.
+        coordinates: See `Component.coordinate_parts`, (d, R, R).
+        gram, product: Of features that are divided by `scale`, (p, p) and (p, R).
+        scale: Root sum of squares of each feature, (p,).
+        features, targets: Held-out rows, (S, p) and (S, R).
+    """
+
+    component: Component
+    coordinates: Tensor
+    gram: Tensor
+    product: Tensor
+    scale: Tensor
+    features: Tensor
+    targets: Tensor
+
+    def solve(self, ridge: float) -> Tensor | None:
+        """Return the matrix (p, R) of a ridge; None if the equations are singular."""
+        shifted = self.gram.clone()
+        shifted.diagonal().add_(ridge * len(shifted))
+        factor, failed = torch.linalg.cholesky_ex(shifted)
+        return None if failed else torch.cholesky_solve(self.product, factor) / self.scale[:, None]
+
+    def squared_error(self, matrix: Tensor) -> float:
+        """Return the squared error of the held-out rows."""
+        error = (self.targets - self.features @ matrix).abs().square().sum()
+        return self.component.copies * float(error)
+
+    def whole(self, matrix: Tensor, action: GroupAction, shape: Sequence[int]) -> Tensor:
+        """Return the map from all features to all coordinates, (C F D D, R).
+
+        Args:
+            matrix: Map of the component, (p, R).
+            action: The symmetries.
+            shape: (C, F, D, D).
+        """
+        back = self.component.adjoint(matrix.T).unbind(dim=1)  # (R, G, m) each
+        maps = [
+            action.from_images(own, shape).T @ part.mH
+            for own, part in zip(back, self.coordinates, strict=True)
+        ]
+        return self.component.copies * torch.stack(maps).sum(dim=0).real
+
+
+def _weighted_rows(
+    component: Component, parts: Tensor, rows: Rows, images: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return features (S d, d m) and targets (S d, R) of a component, times the weights."""
+    weights = rows.weights[:, None, None]
+    targets = torch.einsum("sa,jab->sjb", rows.targets.to(parts.dtype), parts)
+    return (component.parts(images) * weights).flatten(0, 1), (targets * weights).flatten(0, 1)
+
+
+def _normal_equations(X: Tensor, Y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return X^H X and X^H Y with the columns of X divided by their norms, and these norms.
+
+    The norm of columns of rounding errors is infinity. There are such columns at cells that
+    symmetries map onto themselves.
+    """
+    gram, product = X.mH @ X, X.mH @ Y
+    scale = gram.diagonal().real.sqrt()
+    scale = torch.where(scale > ROUNDING * scale.max(), scale, torch.inf)
+    return gram / scale[:, None] / scale, product / scale[:, None], scale

@@ -10,17 +10,19 @@ from torch import Tensor, nn
 from dpl.fem import InvariantBasedMaterial, SubspaceNewton, symmetries
 from dpl.fem.rom.compiled_prediction import CompiledPrediction, LawArguments, law_arguments
 from dpl.fem.rom.ecsw import Cubature
+from dpl.fem.rom.reduced_problem import support_force
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.models.local_response import LocalResponse, resize_buffers
 from dpl.models.newton_choice import choose_newton
 from dpl.models.unrolled_fit import (
+    CHUNK,
     Columns,
     Maps,
     cell_positions,
     fit_maps,
     fit_modes,
-    linear_solutions,
+    linear_of_modes,
     modes_of_parity,
     sample_weights,
 )
@@ -308,17 +310,14 @@ class Unrolled(nn.Module):
             ValueError: There are too few samples, or they are not finite.
         """
         problem = self.scene.problem
-        answers = linear_solutions(self.scene, samples), linear_solutions(self.scene, held_out)
-        modes = fit_modes(self.scene, samples, answers[0], self.rank, self.group)
+        modes = fit_modes(self.scene, samples, self.rank, self.group)
         modes, self.parity = modes_of_parity(modes, problem.free, self.group)
         stiffness = self._stiffness = ReducedStiffness.of(problem, modes).prepared()
         self.modes, self.stiffness = modes.float(), stiffness.parts
         inverse = torch.linalg.inv(stiffness.at(problem.reference.material)[:, :-1])
         self.local.fit(modes, inverse, self.group)
-        sets = [
-            self._columns(part, answer)
-            for part, answer in zip((samples, held_out), answers, strict=True)
-        ]
+        solved = None if self.extra_inputs else linear_of_modes(self.scene, modes)
+        sets = [self._columns(part, solved) for part in (samples, held_out)]
         numbers, found = fit_maps(
             problem,
             modes,
@@ -365,8 +364,21 @@ class Unrolled(nn.Module):
         vectors[self.dofs] = torch.linalg.qr(self.modes[:, :rank].double())[0]
         return vectors.view(*problem.shape, -1)
 
-    def _columns(self, samples: Sample, answers: Tensor) -> Columns:
-        """Return samples in coordinates; `answers` are their linear solutions, (S, n)."""
+    def _columns(self, samples: Sample, solved: Tensor | None) -> Columns:
+        """Return samples in coordinates.
+
+        Args:
+            samples: The samples.
+            solved: K(0)^-1 V, (n, R); None if K(0) depends on parameters.
+        """
+        count = len(samples.force)
+        parts = [
+            self._columns_of(Sample(*(column[k : k + CHUNK] for column in samples)), solved)
+            for k in range(0, count, CHUNK)
+        ]
+        return Columns(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+    def _columns_of(self, samples: Sample, solved: Tensor | None) -> Columns:
         modes = self.modes.double()
         displacement, loaded = (
             field.flatten(1)[:, self.dofs] for field in (samples.displacement, samples.force)
@@ -374,11 +386,12 @@ class Unrolled(nn.Module):
         law = self.scene.problem.material.with_parameters(samples.parameters)
         linear = self._stiffness.solve(law, loaded @ modes)
         weights = sample_weights(displacement)
-        if self.extra_inputs:  # answers are those of other parameters: leave local loads out
-            target = displacement @ modes
+        target = displacement @ modes
+        if solved is None:  # the missing part of the linear solution is unknown
             weights = torch.where(self._is_local(loaded, linear), 0.0, weights)
         else:
-            target = linear + (displacement - answers) @ modes
+            supports = support_force(self.scene.problem)[self.scene.problem.free]
+            target = target + linear - (loaded - supports) @ solved
         return Columns(linear, target, weights, samples.parameters)
 
     def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> SubspaceNewton:

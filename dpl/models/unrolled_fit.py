@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,11 +13,13 @@ from dpl.fem.rom.parity import Orbits, Parities
 from dpl.fem.rom.reduced_problem import support_force
 from dpl.fem.rom.sampled_stress import SampleCells, cell_gradients
 from dpl.fem.symmetry import Symmetry, cell_images
-from dpl.models.invariant_basis import group_actions, invariant_pod, scatter_fields
+from dpl.models.invariant_basis import InvariantPOD, group_actions, scatter_fields, stride
+from dpl.models.irreps import representations_of
 from dpl.models.stage_regression import GroupAction, Rows, fit_map, weighted_error
 from dpl.scene import Sample, Scene
 
-CHUNK = 512  # samples whose features are computed at a time
+CHUNK = 256  # samples whose fields or features are computed at a time
+LINEAR_RTOL = 1e-6  # relative residual of linear solutions from which modes are computed
 SIZE_EXPONENT = -0.4  # errors count relative to the displacement to this power
 LIMIT = 1.5  # factor on the largest ratio of corrections in the samples
 MIN_GAIN = 0.97  # largest ratio of held-out errors for which another map is worth its time
@@ -75,23 +78,34 @@ class Columns(NamedTuple):
     parameters: Tensor
 
 
-def linear_solutions(scene: Scene, samples: Sample) -> Tensor:
-    """Return linear solutions at free degrees of freedom, (S, n); for ranges, of the reference."""
+def fit_modes(scene: Scene, samples: Sample, rank: int, group: Sequence[Symmetry]) -> Tensor:
+    """Return invariant POD modes (n, R), rounded to float32, of linear and nonlinear parts.
+
+    For ranges of parameters the linear part is that of the reference body. The factor of K(0) is
+    that in float32, which is accurate enough for modes.
+    """
     linear = scene.linear.reference
-    problem = linear.problem
-    supports = support_force(problem)
-    return torch.stack([linear.solve(force - supports)[problem.free] for force in samples.force])
+    free = linear.problem.free
+    supports = support_force(linear.problem)
+    step = stride(2 * len(samples.force), int(free.sum()))
+    some = range(0, len(samples.force), step)
+    basis = InvariantPOD(free, group, 2 * len(some))
+    for start in range(0, len(some), CHUNK):
+        chosen = list(some[start : start + CHUNK])
+        right = (samples.force[chosen] - supports)[:, free]
+        solved = torch.from_numpy(linear.float32_factor.solve_many(right.numpy(), LINEAR_RTOL))
+        displacement = samples.displacement[chosen][:, free]
+        weights = sample_weights(displacement)[:, None]
+        basis.add(weights * solved)
+        basis.add(weights * (displacement - solved))
+    return basis.modes(rank).float().double()
 
 
-def fit_modes(
-    scene: Scene, samples: Sample, linear: Tensor, rank: int, group: Sequence[Symmetry]
-) -> Tensor:
-    """Return invariant POD modes (n, R), rounded to float32, of linear and nonlinear parts."""
-    free = scene.problem.free
-    displacement = samples.displacement[:, free]
-    weights = sample_weights(displacement)[:, None]
-    snapshots = torch.cat([weights * linear, weights * (displacement - linear)])
-    return invariant_pod(snapshots, free, group, rank).float().double()
+def linear_of_modes(scene: Scene, modes: Tensor) -> Tensor:
+    """Return K(0)^-1 V, (n, R), of the reference body."""
+    factor = scene.linear.reference.factor
+    solved = factor.solve_many(np.ascontiguousarray(modes.T.double().numpy()))
+    return torch.from_numpy(solved).T
 
 
 def modes_of_parity(
@@ -233,6 +247,7 @@ def fit_maps(
     """
     images = cell_images(problem, group)
     actions = group_actions(modes, problem.free, group)
+    representations = representations_of(group)
     parities = Parities.of(group, problem.shape[1])
     fields = torch.cat([scatter_fields(modes.T, problem.free), problem.prescribed[None]])
     parity_of_fields = torch.cat([parity, torch.zeros(1, dtype=torch.int64)])
@@ -241,7 +256,9 @@ def fit_maps(
     while cells:
         numbers = choose_cells(images, cells)
         positions = cell_positions(problem, group, numbers)
-        action = GroupAction(rotations.double(), positions, actions, parities, parity)
+        action = GroupAction(
+            rotations.double(), positions, actions, representations, parities, parity
+        )
         gradients = cell_gradients(problem, fields, numbers)
         orbits = Orbits.of_tensors(parities, positions[parities.members], 1, 1)
         columns = orbits.symmetrised(gradients.flatten(1).T, parity_of_fields, parities)

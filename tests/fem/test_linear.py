@@ -24,7 +24,7 @@ from dpl.fem.linear import (
     multigrid_installed,
     select_backend,
 )
-from dpl.fem.linear.banded import MixedPrecisionFactor, banded_triangular_solve
+from dpl.fem.linear.banded import BandedFactor, MixedPrecisionFactor, banded_triangular_solve
 from dpl.fem.linear.ordering import band_storage
 from dpl.system.blas import slow_blas
 
@@ -149,6 +149,29 @@ def test_positive_definite_matrix_is_solved_to_rounding(name, stiffness):
     solver = make_backend(pattern, name)
     assert error(solver, pattern, values) < 1e-10
     assert solver.factorise(values).negative_pivots == (None if name == "cg" else 0)
+
+
+def test_many_right_hand_sides_are_solved_like_one(name, stiffness):
+    pattern, values = stiffness
+    factor = make_backend(pattern, name).factorise(values)
+    right = np.random.default_rng(0).standard_normal((5, pattern.size))
+    right[1] = 0
+    right[2] *= 1e-200
+    for row, one in zip(factor.solve_many(right), right, strict=True):
+        assert np.abs(row - factor.solve(one)).max() <= 1e-10 * np.abs(row).max()
+
+
+@pytest.mark.parametrize("half", [0, 1, 40, 100])
+def test_blocks_of_a_banded_factor_solve_in_single_precision(half):
+    random = np.random.default_rng(0)
+    lower = random.uniform(-1, 1, (150, half + 1)).astype(np.float32)
+    lower[:, 0] = half + 2
+    for k in range(half + 1):
+        lower[150 - k :, k] = 0
+    factor = BandedFactor(lower, None)
+    right = random.standard_normal((3, 150))
+    for row, one in zip(factor.solve_many(right), right, strict=True):
+        assert np.abs(row - factor.solve(one)).max() <= 1e-5 * np.abs(row).max()
 
 
 def test_conjugate_gradients_detect_indefinite_matrices(body):

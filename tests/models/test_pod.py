@@ -22,7 +22,7 @@ from dpl.fem import (
     solve,
 )
 from dpl.models import Latent, PODNet
-from dpl.models.invariant_basis import image_columns, scatter_fields
+from dpl.models.invariant_basis import InvariantPOD, image_columns, scatter_fields
 from dpl.training import MSE, Surrogate
 from dpl.training.surrogate import scales
 
@@ -221,11 +221,12 @@ def test_samples_beyond_the_maximum_number_of_snapshots_are_thinned_out(
     kind, scene, batch, monkeypatch
 ):
     """Every third of twelve samples is used."""
-    monkeypatch.setattr("dpl.models.invariant_basis.MAX_SNAPSHOTS", 8 * 4)
+    dofs = int(scene.problem.free.sum())
+    monkeypatch.setattr("dpl.models.invariant_basis.MAX_BYTES", 4 * 4 * dofs)
     seen = []
     monkeypatch.setattr(
-        "dpl.models.invariant_basis.image_columns",
-        lambda columns, *more: seen.append(len(columns)) or image_columns(columns, *more),
+        "dpl.models.invariant_basis.InvariantPOD",
+        lambda dofs, group, count: seen.append(count) or InvariantPOD(dofs, group, count),
     )
     net = prepared(kind, scene, batch, rank=20).net
     assert 0 < seen[0] <= 4
@@ -238,7 +239,10 @@ def test_samples_beyond_the_maximum_number_of_snapshots_are_thinned_out(
 
 @NETWORKS
 def test_actions_on_inputs_and_outputs_are_a_group_representation(kind, bar):
-    """The product of two actions is an action; inverse actions are orthogonal."""
+    """The product of two actions is an action; inverse actions are orthogonal.
+
+    Both hold on the modes; directions that no sample has are zero.
+    """
     net = exact(prepared(kind, *bar, **WHOLE))
     order = len(net.group)
     assert order == 8
@@ -247,7 +251,9 @@ def test_actions_on_inputs_and_outputs_are_a_group_representation(kind, bar):
         net.inverse_output_actions[0],
         *(net.inverse_output_actions.mT @ net.inverse_output_actions),
     ):
-        assert torch.allclose(motion, eye(48), rtol=0, atol=1e-5)
+        there = torch.diag((motion.diagonal() > 0.5).double())
+        assert there.trace() > 16
+        assert torch.allclose(motion, there, rtol=0, atol=1e-5)
     for motions in (net.input_actions, net.inverse_output_actions.mT):
         for one in motions:
             far = (motions @ one)[:, None] - motions  # (G, G, r, r)

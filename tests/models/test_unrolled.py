@@ -12,6 +12,7 @@ from dpl.fem.symmetry import cell_images, symmetries
 from dpl.inference import Simulator
 from dpl.models import ClosedFormFit, FlagsLocalLoads, HasCorrection, Unrolled
 from dpl.models.invariant_basis import scatter_fields
+from dpl.models.irreps import representations_of
 from dpl.models.newton_choice import choose_newton
 from dpl.models.stage_regression import GroupAction, Rows, fit_map
 from dpl.scene import Sample, Scene
@@ -269,6 +270,7 @@ def test_ridge_regression_finds_an_exact_map():
         torch.eye(3)[None].double(),
         torch.arange(2)[None],
         torch.eye(4)[None].double(),
+        representations_of([]),
         Parities.of([], 3),
         torch.zeros(4, dtype=torch.int64),
     )

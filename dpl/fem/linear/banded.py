@@ -10,6 +10,7 @@ import numpy as np
 from numba import float32, float64, njit
 from numba.types import Array as Typed
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpbtrf, spbtrf
 
 from dpl.fem.linear.interface import (
@@ -25,6 +26,8 @@ from dpl.fem.linear.interface import (
 from dpl.fem.linear.krylov import conjugate_gradients
 from dpl.fem.linear.ordering import BandStorage, band_storage
 from dpl.system.threads import blas
+
+BLOCK = 64  # columns of a factor in a matrix product
 
 
 @njit(
@@ -96,6 +99,45 @@ def banded_triangular_solve(L, right):  # type: ignore[no-untyped-def]
     return x[:n].copy()
 
 
+def banded_block_solve(L: NDArray[Any], x: NDArray[Any]) -> None:
+    """Replace x (n, k) by the solution of L L^T x = right-hand sides, k at once.
+
+    Blocks of columns of L become dense matrices, so that matrix products do the work and L is read
+    once for all right-hand sides.
+
+    Args:
+        L: Storage of the factor, (n, b + 1), see `BandedFactor`; zero beyond the last row.
+        x: Right-hand sides, (n, k), of the same dtype.
+    """
+    n, width = L.shape
+    starts = range(0, n, BLOCK)
+    for start in starts:
+        panel = _dense_columns(L[start : start + BLOCK])
+        m = len(panel)
+        own, below = x[start : start + m], x[start + m : start + m + width - 1]
+        own[:] = solve_triangular(panel[:, :m], own, trans="T", check_finite=False)
+        below -= panel[:, m : m + len(below)].T @ own
+    for start in reversed(starts):
+        panel = _dense_columns(L[start : start + BLOCK])
+        m = len(panel)
+        own, below = x[start : start + m], x[start + m : start + m + width - 1]
+        own -= panel[:, m : m + len(below)] @ below
+        own[:] = solve_triangular(panel[:, :m], own, check_finite=False)
+
+
+def _dense_columns(L: NDArray[Any]) -> NDArray[Any]:
+    """Return m columns of a factor as dense rows, (m, m + b), the first m of them triangular.
+
+    Args:
+        L: Storage of these columns, (m, b + 1).
+    """
+    m, width = L.shape
+    padded = np.zeros((m, width + m), L.dtype)
+    padded[:, :width] = L
+    length = m + width - 1  # one less than a row of `padded`: each row moves one place to the right
+    return padded.ravel()[: m * length].reshape(m, length)
+
+
 @dataclass(frozen=True, eq=False)
 class BandedFactor(DirectFactor):
     """Banded Cholesky factor L of a positive definite matrix.
@@ -119,6 +161,17 @@ class BandedFactor(DirectFactor):
             self.storage, ordered
         )
         return x
+
+    def solve_many(self, right: Array, rtol: float = 1e-12) -> Array:
+        """Return the solutions, (k, n), to the rounding of the storage, see `Factor.solve_many`."""
+        size = np.abs(right).max(axis=1, keepdims=True, initial=0)
+        size[size == 0] = 1
+        order = slice(None) if self.order is None else self.order
+        ordered = np.ascontiguousarray((right / size)[:, order].T, self.storage.dtype)
+        banded_block_solve(self.storage, ordered)
+        x = np.empty_like(right)
+        x[:, order] = ordered.T
+        return x * size
 
     def to_float32(self) -> "BandedFactor":
         """Return the factor in float32, in half the memory."""

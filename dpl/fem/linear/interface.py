@@ -81,8 +81,22 @@ class Factor(Protocol):
             SingularMatrix: An iterative backend found negative curvature or did not converge.
         """
 
+    def solve_many(self, right: Array, rtol: float = 1e-12) -> Array:
+        """Return the solutions, (k, n), of right-hand sides (k, n), see `solve`."""
 
-class DirectFactor:
+
+class SolvesOneByOne:
+    """Base of factors that solve for several right-hand sides one after the other."""
+
+    def solve_many(self: Factor, right: Array, rtol: float = 1e-12) -> Array:
+        """Return the solutions, (k, n), see `Factor.solve_many`."""
+        solutions = np.empty_like(right)
+        for row, one in zip(solutions, right, strict=True):
+            row[:] = self.solve(one, rtol)
+        return solutions
+
+
+class DirectFactor(SolvesOneByOne):
     """Base of the factors that count negative pivots and whose solves are exact to rounding."""
 
     def apply(self: Factor, right: Array) -> Array:
@@ -94,7 +108,7 @@ class DirectFactor:
         return Stability(self.negative_pivots or 0, exact=True)
 
 
-class IterativeFactor:
+class IterativeFactor(SolvesOneByOne):
     """Base of the factors that count no pivots: the stability of an equilibrium is unknown."""
 
     negative_pivots: None = None

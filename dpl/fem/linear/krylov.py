@@ -18,6 +18,7 @@ from dpl.fem.linear.interface import (
     Array,
     Pattern,
     SingularMatrix,
+    SolvesOneByOne,
     Stability,
     SymmetricProduct,
     full_matrix,
@@ -135,7 +136,7 @@ def smallest_ritz_value(product: Map, precondition: Map, size: int, steps: int =
 
 
 @dataclass(frozen=True, eq=False)
-class CGFactor:
+class CGFactor(SolvesOneByOne):
     """A matrix and its preconditioner.
 
     Attributes:

@@ -37,6 +37,12 @@ class SuperLUFactor(DirectFactor):
         x[self.order] = self.lu.solve(right[self.order])
         return x
 
+    def solve_many(self, right: Array, rtol: float = 1e-12) -> Array:
+        """Return the solutions, (k, n), see `Factor.solve_many`."""
+        x = np.empty_like(right)
+        x[:, self.order] = self.lu.solve(np.ascontiguousarray(right[:, self.order].T)).T
+        return x
+
 
 @dataclass(frozen=True, eq=False)
 class SuperLU:

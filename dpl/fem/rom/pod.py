@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 CHUNK = 512  # snapshots, or columns of them, in memory as float64 at a time
-MIN_SKETCH_SIZE = 2000  # size of a Gram matrix above which a randomised SVD is faster
+MIN_SKETCH_SIZE = 1000  # size of a Gram matrix above which a randomised SVD is faster
 MAX_SKETCH_PART = 0.25  # largest part of that size for which it is
 OVERSAMPLING = 32  # additional modes of the randomised SVD
 
@@ -53,23 +53,24 @@ def pod(snapshots: Tensor, rank: int) -> POD:
     sketched = smaller > MIN_SKETCH_SIZE and few
     vectors, values = (_sketched if sketched else _exact)(snapshots, rank)
     largest = vectors.gather(0, vectors.abs().argmax(dim=0, keepdim=True))
-    return POD(vectors * largest.sign(), values)
+    return POD(vectors * largest.sgn().conj(), values)
 
 
 def _exact(snapshots: Tensor, rank: int) -> POD:
     """Return the modes (n, R), of any sign, and all singular values from a Gram matrix."""
     count, size = snapshots.shape
     wide = count <= size
-    gram = torch.zeros(min(count, size), min(count, size), dtype=torch.float64)
+    dtype = torch.complex128 if snapshots.is_complex() else torch.float64
+    gram = torch.zeros(min(count, size), min(count, size), dtype=dtype)
     for part in snapshots.split(CHUNK, dim=1 if wide else 0):
-        part = part.double()
-        gram.addmm_(part, part.T) if wide else gram.addmm_(part.T, part)
+        part = part.to(dtype)
+        gram.addmm_(part, part.mH) if wide else gram.addmm_(part.mH, part)
     if not gram.isfinite().all():
         raise ValueError("snapshots are not finite")
     squares, vectors = torch.linalg.eigh(gram)
     vectors = vectors.flip(1)[:, :rank]
     if wide:  # rounding errors of large modes make small ones lose orthogonality
-        parts = [part.double().T @ vectors for part in snapshots.split(CHUNK, dim=1)]
+        parts = [part.to(dtype).mH @ vectors for part in snapshots.split(CHUNK, dim=1)]
         vectors = torch.linalg.qr(torch.cat(parts))[0]
     return POD(vectors, squares.flip(0).clamp(min=0).sqrt())
 
@@ -78,8 +79,10 @@ def _sketched(snapshots: Tensor, rank: int) -> POD:
     """Return the modes (n, R), of any sign, and leading singular values by a randomised SVD."""
     if not all(part.isfinite().all() for part in snapshots.split(CHUNK)):
         raise ValueError("snapshots are not finite")
-    some = snapshots if snapshots.dtype == torch.float64 else snapshots.float()
+    dtype = torch.complex128 if snapshots.is_complex() else torch.float64
+    low = torch.complex64 if snapshots.is_complex() else torch.float32
+    some = snapshots if snapshots.dtype == dtype else snapshots.to(low)
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(0)
         _, values, vectors = torch.svd_lowrank(some, q=rank + OVERSAMPLING, niter=3)
-    return POD(torch.linalg.qr(vectors[:, :rank].double())[0], values[:rank].double())
+    return POD(torch.linalg.qr(vectors[:, :rank].to(dtype))[0], values[:rank].double())
