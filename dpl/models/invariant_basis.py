@@ -97,7 +97,7 @@ class InvariantPOD:
         chosen: list[Tensor] = []
         left = rank
         for value, family in families:
-            if len(family) <= left and value > self._noise**2 * families[0][0]:
+            if len(family) <= left and value >= self._noise**2 * families[0][0]:
                 chosen.append(family)
                 left -= len(family)
         if not chosen:
@@ -117,7 +117,7 @@ class InvariantPOD:
         vectors = pod(parts, count).vectors
         values = (parts @ vectors.to(parts.dtype)).norm(dim=0).double()  # more accurate than those
         vectors, values = (
-            part[..., values > self._noise * values.max()] for part in (vectors, values)
+            part[..., values >= self._noise * values.max()] for part in (vectors, values)
         )
         if not len(values):
             return []
