@@ -11,7 +11,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dpl import data, inference, training
+from dpl import data, inference, models, training
 from dpl.config import validation
 from dpl.config.build import (
     SCENE,
@@ -144,15 +144,15 @@ def load(
         folder: Folder of the run, as `runs/...`.
         trust: Import and call objects outside this package, such as your own law, that the
             configuration names.
-        corrected: Solve for equilibrium in the modes of the network before Newton is tried. Only
-            for `pod`, `latent` and `unrolled`; it needs the data set of the run.
+        corrected: Correct predictions by Newton's method in the modes of the network. Only for
+            `pod`, which needs the data set of the run for it; `unrolled` always has this method.
 
     Raises:
         ValueError: There is no finished run, its checkpoint belongs to another scene, it names an
             object that is not trusted, or its network has no modes.
     """
     config, surrogate = load_run(folder, trust=trust)
-    if not corrected:
+    if not corrected or isinstance(surrogate.net, models.HasCorrection):
         return inference.Simulator(surrogate)
     snapshots = load_data(config, surrogate.scene).snapshots()
     return inference.Simulator.corrected(surrogate, snapshots.displacement)

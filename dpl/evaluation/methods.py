@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from dpl.fem import Load, PODGalerkin
 from dpl.inference.hybrid import Predict
-from dpl.models import Correctable
+from dpl.models import Correctable, HasCorrection
 from dpl.scene import Sample, Scene
 from dpl.training import Surrogate
 
@@ -85,7 +85,7 @@ def corrected(
         surrogate: A surrogate whose network is `Correctable`.
         method: The method of the network alone.
         train: Training samples.
-        rank: Number of modes of the correction.
+        rank: Number of modes of the correction; a model which `HasCorrection` has chosen it.
         tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
         steps: Number of iterations, see `SubspaceNewton`.
 
@@ -94,7 +94,8 @@ def corrected(
     """
     net = cast(Correctable, surrogate.net)
     start = time.perf_counter()
-    solver = net.galerkin(train.displacement, rank=rank, tolerance=tolerance)
+    own = net.correction() if isinstance(net, HasCorrection) else None
+    solver = own or net.galerkin(train.displacement, rank=rank, tolerance=tolerance)
     minutes = (method.training_minutes or 0.0) + (time.perf_counter() - start) / 60
     start_from = copy.copy(surrogate)
     start_from._modules = {**surrogate._modules, "net": cast(nn.Module, net.for_correction())}

@@ -12,12 +12,15 @@ from torch import Tensor
 from dpl.evaluation.tables import show_cells
 from dpl.evaluation.timing import Latency, describe, latencies, percentiles, time_interleaved
 from dpl.fem import LinearSolver, Newton, Problem, Solver, write_mesh
-from dpl.inference import Direct, Hybrid, Simulator, default_hybrid
+from dpl.inference import Corrected, Direct, Hybrid, Simulator, default_hybrid
+from dpl.models import HasCorrection
 from dpl.scene import Sample
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2, Surrogate
 from dpl.training.metrics import default_metrics, median
 from dpl.visualization import plot_deformed
+
+LEAST_ERROR = 1e-12  # estimated error at which no step is made [-]
 
 
 @dataclass(frozen=True)
@@ -125,8 +128,9 @@ def save(rows: Sequence[SolverResult], path: Path) -> None:
 def evaluate(
     surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1e-8
 ) -> list[SolverResult]:
-    """Evaluate a surrogate on test loads: print and save a table of five solvers.
+    """Evaluate a surrogate on test loads: print and save a table of solvers.
 
+    A model that `HasCorrection` has a row with one step of Newton's method in its modes.
     Hybrid Newton has the rule of the paper and the default one. All solve one load at a time on one
     thread. The latencies of `sim(force)` and of the bare network are measured as well. Writes
     `evaluation.json`, `shapes.png` and `worst.vtu`.
@@ -146,6 +150,7 @@ def evaluate(
     solvers: dict[str, Solver] = {
         "linear": replace(newton.linear_solver, tol=tol),
         "network": Direct(surrogate.predict, scene.problem, tol),
+        **_step_in_modes(surrogate, tol),
         "hybrid Newton": Hybrid(surrogate.predict, plain, "paper"),
         "hybrid, best rule": default_hybrid(surrogate.predict, own, tol),
         "Newton from zero": newton,
@@ -159,6 +164,17 @@ def evaluate(
     save(rows, folder / "evaluation.json")
     _draw(surrogate, test, displacements, folder)
     return rows
+
+
+def _step_in_modes(surrogate: Surrogate, tol: float) -> dict[str, Solver]:
+    """Return the surrogate with one Newton step in its modes, if it has such a method."""
+    net = surrogate.net
+    newton = net.correction() if isinstance(net, HasCorrection) else None
+    if newton is None:
+        return {}
+    one = replace(newton, tol=tol, max_iter=1, error_tol=LEAST_ERROR)
+    one.tangent  # noqa: B018  # built here, so that the first call is not slower
+    return {"network, 1 step in modes": Corrected(surrogate.predict, one)}
 
 
 def _without_factors(newton: Newton) -> Newton:

@@ -6,7 +6,14 @@ from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
     from dpl.inference.answer import Answer
-    from dpl.inference.hybrid import Corrector, Direct, Hybrid, default_hybrid, prefer_prediction
+    from dpl.inference.hybrid import (
+        Corrected,
+        Corrector,
+        Direct,
+        Hybrid,
+        default_hybrid,
+        prefer_prediction,
+    )
     from dpl.inference.simulator import Simulator, nearest
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -7,7 +7,14 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from dpl.fem import AndersonSolver, Load, Problem, Solution, evaluate_solution
+from dpl.fem import (
+    AndersonSolver,
+    Load,
+    Problem,
+    Solution,
+    SubspaceNewton,
+    evaluate_solution,
+)
 from dpl.fem.solvers import check_tol, run_lockstep
 from dpl.scene import Scene
 
@@ -61,6 +68,23 @@ class Direct:
         """Yield the prediction."""
         prediction = _prediction(self.predict, load)
         yield evaluate_solution(self.problem, prediction, load, self.tol, from_guess=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """The prediction of a network, corrected by Newton's steps in its modes.
+
+    Attributes:
+        predict: Function from a load to displacements, (B, N, D) [-].
+        newton: Newton's method in the modes.
+    """
+
+    predict: Predict
+    newton: SubspaceNewton
+
+    def iterate(self, load: Load) -> Iterator[Solution]:
+        """Yield the prediction and the state after each step."""
+        yield from self.newton.iterate(load, guess=_prediction(self.predict, load))
 
 
 @dataclass(frozen=True, eq=False)
