@@ -342,6 +342,7 @@ class Unrolled(nn.Module):
         guesses, states = self(held_out.force, *own), samples.displacement
         vectors = self._orthonormal(self.modes.shape[1])
         found = choose_newton(self.scene.problem, vectors, states, held_out, guesses)
+        self.newton_rank = torch.tensor(0)
         if found is not None and found.cubature is not None:
             self.newton_rank = torch.tensor(found.vectors.shape[2])
             self.newton_cells, self.newton_weights = found.cubature.cells, found.cubature.weights

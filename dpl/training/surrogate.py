@@ -99,8 +99,9 @@ class Surrogate(L.LightningModule):
         Raises:
             ValueError: The load has not one parameter for each range of the law.
         """
-        scaled = self._effective_force(load.force) / self.force_scale
-        scaled = scaled if self._is_closed_form else scaled.to(self.dtype)
+        scaled = load.force
+        if not self._is_closed_form:
+            scaled = (self._effective_force(scaled) / self.force_scale).to(self.dtype)
         if load.parameters.shape[-1] != len(names := list(self.scene.loads.parameter_ranges)):
             found = load.parameters.shape[-1]
             raise ValueError(f"Load.parameters has {found} columns; the law has ranges of {names}")
