@@ -33,14 +33,15 @@ def main(cfg: DictConfig) -> None:
     if cfg.galerkin:
         compared["POD-Galerkin"] = made("galerkin", scene, train)
     for name, (trained, surrogate) in runs.items():
-        method = methods.network(surrogate, Path(cfg.run) / name, trained.data.train)
+        loads = config.training_loads(trained, scene)
+        method = methods.network(surrogate, Path(cfg.run) / name, loads)
         compared[name] = method
         if cfg.corrected and isinstance(surrogate.net, Correctable):
             compared[name + paper_tables.CORRECTED] = made("corrected", surrogate, method, train)
     sets = paper_tables.load_sets(scene, data.samples("test"), cfg.count)
     rows, errors = paper_tables.paper(cfg.name), {}
     a_load = data.store.seconds_per_load()
-    minutes = None if a_load is None else a_load * sum(data.dataset.sizes.values()) / 60
+    minutes = None if a_load is None else a_load * sum(data.sizes.values()) / 60
     for row, error in paper_tables.measure(
         compared, sets, scene.newton, generation_minutes=minutes
     ):

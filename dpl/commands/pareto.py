@@ -86,7 +86,8 @@ def _solvers(cfg: DictConfig) -> tuple["dpl.Scene", dict[str, "fem.Solver"], "dp
         predict = surrogate.predict
         solvers[name] = dpl.Direct(predict, scene.problem)
         if cfg.corrected and isinstance(surrogate.net, models.Correctable):
-            row = methods.network(surrogate, Path(cfg.run) / name, trained.data.train)
+            loads = config.training_loads(trained, scene)
+            row = methods.network(surrogate, Path(cfg.run) / name, loads)
             method = config.instantiate(cfg, "corrected")(surrogate, row, train)
             solvers[f"{name}, corrected"] = dpl.Direct(method.predict, scene.problem)
         solvers[f"{name}, hybrid"] = inference.default_hybrid(predict, scene)

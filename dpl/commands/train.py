@@ -22,14 +22,37 @@ def parts(cfg: DictConfig) -> tuple["dpl.Scene", Any, "dpl.Surrogate", Any]:
     scene = config.build_scene(config.with_mesh_of_resumed(cfg))
     data = config.instantiate(cfg, "data", scene=scene)
     surrogate = config.build_surrogate(cfg, scene)
-    if isinstance(surrogate.net, models.ClosedFormFit) and not data.dataset.train:
-        name = type(surrogate.net).__name__
-        raise config.ConfigError(f"data: {name} is fitted to solved loads; set data=offline")
+    _check_data(surrogate, data)
     if resumed is not None:
-        config.check_weights(surrogate, resumed)
+        config.check_weights(surrogate, resumed, grows=data.growth is not None)
     trainer = config.build_trainer(cfg)
     cli.check_trainer(trainer, cfg)
+    if data.growth is not None:
+        _check_trainer_of_growth(trainer)
     return scene, data, surrogate, trainer
+
+
+def _check_data(surrogate: "dpl.Surrogate", data: Any) -> None:
+    """Raise a `ConfigError` if a model cannot be trained on this kind of data."""
+    name = type(surrogate.net).__name__
+    if not isinstance(surrogate.net, models.ClosedFormFit):
+        if data.growth is not None:
+            raise config.ConfigError(
+                f"data.train = auto needs a model that is fitted, such as unrolled; {name} is "
+                "trained by gradient descent: set data.train to a number"
+            )
+    elif data.growth is None and not data.dataset.train:
+        raise config.ConfigError(f"data: {name} is fitted to solved loads; set data=offline")
+
+
+def _check_trainer_of_growth(trainer: Any) -> None:
+    """Raise a `ConfigError` if a trainer cannot train on a data set that grows."""
+    if trainer.world_size > 1:
+        raise config.ConfigError("data.train = auto needs one process; set trainer.devices=1")
+    if trainer.limit_val_batches == 0:
+        raise config.ConfigError(
+            "data.train = auto needs held-out errors; set trainer.limit_val_batches above 0"
+        )
 
 
 @cli.command("train", rehearse=parts)
@@ -78,7 +101,7 @@ def _train(cfg: DictConfig) -> float | None:
     if not trainer.is_global_zero or trainer.fast_dev_run:
         return None
     _, best = config.load_run(folder, trust=True, scene=scene)
-    rows = evaluation.evaluate(best, data.samples("test"), folder)
+    rows = evaluation.evaluate(best, config.load_data(cfg, scene).samples("test"), folder)
     network = next(row for row in rows if row.solver == "network")
     if not math.isfinite(network.errors["e_mean"]):
         message = f"training has diverged: the answers of the network in {folder} are not finite; "

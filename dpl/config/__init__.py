@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         save_config,
         with_mesh_of_resumed,
     )
-    from dpl.config.run_folder import load_data, load_run, load_runs
+    from dpl.config.run_folder import load_data, load_run, load_runs, training_loads
     from dpl.config.validation import ConfigError, Keys
     from dpl.version import CONF
 else:

@@ -23,7 +23,7 @@ MAY_CHANGE_ON_RESUME = {  # keys of the length of a run and of the machine
     *(f"trainer.{key}" for key in ("accelerator", "devices", "num_nodes", "strategy")),
     *("trainer.log_every_n_steps", "trainer.check_val_every_n_epoch", "trainer.profiler"),
     *("trainer.enable_progress_bar", "trainer.enable_model_summary"),
-    *("data.workers", "data.timeout", "tags"),
+    *("data.workers", "data.timeout", "data.error", "data.minutes", "data.max_train", "tags"),
 }
 
 
@@ -137,11 +137,24 @@ def check_resumed(cfg: DictConfig) -> dict[str, Any] | None:
     return found
 
 
-def check_weights(surrogate: "training.Surrogate", checkpoint: dict[str, Any]) -> None:
-    """Raise a `ConfigError` if the checkpoint to resume is of another scene or network."""
+def check_weights(
+    surrogate: "training.Surrogate", checkpoint: dict[str, Any], *, grows: bool = False
+) -> None:
+    """Check that the checkpoint to resume is of the same scene and network.
+
+    Args:
+        surrogate: The surrogate, not yet trained.
+        checkpoint: The checkpoint.
+        grows: Whether the data set grows during the training, so that a model is fitted repeatedly.
+
+    Raises:
+        ConfigError: The checkpoint cannot be resumed.
+    """
     with error_in("ckpt_path", ValueError, TypeError, AttributeError):
         surrogate.on_load_checkpoint(checkpoint)
     if isinstance(surrogate.net, models.ClosedFormFit):
+        if grows:  # the sizes of its buffers are results of the fit
+            return
         name = type(surrogate.net).__name__
         raise ConfigError(
             f"ckpt_path: {name} is fitted in one step and cannot be resumed; remove it"

@@ -1,6 +1,7 @@
 """Read the folder of a training run."""
 
 import contextlib
+import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -183,3 +184,14 @@ def load_data(cfg: DictConfig, scene: Scene) -> "data.OfflineData":
     found: data.OfflineData = instantiate(cfg, "data", scene=scene)
     found.prepare_data()
     return found
+
+
+def training_loads(cfg: DictConfig, scene: Scene) -> int | None:
+    """Return the number of training loads of a run; None for a stream.
+
+    If the run has chosen it (`data.train=auto`), it is the number of loads in the data set.
+    """
+    count: int | str | None = cfg.data.get("train")
+    if count == "auto":
+        return len(instantiate(cfg, "data", scene=scene).store.tried("train"))
+    return typing.cast("int | None", count)

@@ -2,19 +2,22 @@
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import lightning as L
 import torch
+from lightning.pytorch.trainer.states import TrainerFn
 from torch.utils.data import DataLoader, Dataset
 from torch.utils.data.distributed import DistributedSampler
 
 from dpl.data.dataset import DataSet
+from dpl.data.growth import Growth
 from dpl.data.replay_buffer import ReplayBuffer, transform
 from dpl.fem import symmetries
 from dpl.fem.symmetry import Symmetry
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
+from dpl.system.threads import leave_cores
 
 MAX_COUNT = 10**9  # of batches, and of samples in a batch
 
@@ -43,9 +46,14 @@ class Samples(Dataset):
 class OfflineData(L.LightningDataModule):
     """A data set on disk; loads that are missing are solved first.
 
+    With `train="auto"` training loads are solved while a model is fitted, see `Growth`; each epoch
+    has more of them.
+
     Attributes:
-        dataset: The data set.
+        dataset: The data set; without training loads if their number is chosen by `growth`.
         store: Its files.
+        growth: Choice of the number of training loads; None if that is given.
+        sizes: Present number of loads of each split.
     """
 
     def __init__(
@@ -55,19 +63,23 @@ class OfflineData(L.LightningDataModule):
         folder: str | None = None,
         seed: int = 0,
         shuffle_seed: int = 0,
-        train: int = 1000,
+        train: int | Literal["auto"] = 1000,
         val: int = 100,
         test: int = 100,
         batch_size: int = 64,
         symmetry: bool = False,
         workers: int = 2,
         timeout: float | None = 600.0,
+        error: float = 1e-3,
+        minutes: float | None = None,
+        max_train: int = 10_000,
     ) -> None:
-        """Check the arguments, those of `DataSet` and the following.
+        """Check the arguments, those of `DataSet` and `Growth` and the following.
 
         Nothing is read or solved before `prepare_data`.
 
         Args:
+            train: Number of loads to train on; "auto": the growth of the data set chooses it.
             shuffle_seed: Seed of the order of the batches.
             batch_size: Samples in a batch.
             symmetry: Train also on the images of each sample under the symmetries of the body.
@@ -78,14 +90,18 @@ class OfflineData(L.LightningDataModule):
         super().__init__()
         check_range(1, MAX_COUNT, val=val, test=test, batch_size=batch_size)
         check_range(0, 2**32 - 1, shuffle_seed=shuffle_seed)
-        self.dataset = DataSet(scene, folder, seed, train, val, test, workers, timeout)
+        count = 0 if train == "auto" else train
+        self.dataset = DataSet(scene, folder, seed, count, val, test, workers, timeout)
+        growth = Growth(self.dataset, error=error, minutes=minutes, max_train=max_train)
+        self.growth = growth if train == "auto" else None
+        self.sizes = dict(self.dataset.sizes)
         self.store = self.dataset.store
         self.scene = scene
         self.batch_size = batch_size
         self.workers = workers
         self.symmetry = symmetry
         self._shuffle_seed = shuffle_seed
-        self._loaded: dict[str, Sample] = {}
+        self._loaded: dict[str, tuple[int, Sample]] = {}  # with the number of loads tried
 
     @cached_property
     def group(self) -> list[Symmetry]:
@@ -103,18 +119,33 @@ class OfflineData(L.LightningDataModule):
         return lines
 
     def prepare_data(self) -> None:
-        """Solve the missing loads."""
+        """Solve the missing loads; those of a growing data set are solved during the training."""
+        if self.growth is not None:
+            if self.trainer is not None and self.trainer.state.fn == TrainerFn.FITTING:
+                return
+            self.sizes["train"] = len(self.store.tried("train"))
         self.dataset.fill()
 
+    def setup(self, stage: str) -> None:
+        """Let the loaders of a growing data set be made again in each epoch."""
+        if self.growth is not None and stage == "fit" and self.trainer is not None:
+            self.trainer.reload_dataloaders_every_n_epochs = 1
+
     def samples(self, split: str) -> Sample:
-        """Return a split, (B, ...) in float64; it is read once."""
-        if split not in self._loaded:
-            self._loaded[split] = self.store.load(split, self.dataset.sizes[split])
-        return self._loaded[split]
+        """Return a split, (B, ...) in float64; each load is read once."""
+        size = self.sizes[split]
+        done, loaded = self._loaded.get(split, (0, None))
+        if loaded is None or size < done:
+            loaded = self.store.load(split, size)
+        elif size > done:
+            more = self.store.load(split, size, first=done)
+            loaded = Sample(*(torch.cat(pair) for pair in zip(loaded, more, strict=True)))
+        self._loaded[split] = size, loaded
+        return loaded
 
     def snapshots(self) -> Sample:
         """Return the samples that bases are made from: training, or else validation, (B, ...)."""
-        return self.samples("train" if self.dataset.sizes["train"] else "val")
+        return self.samples("train" if self.sizes["train"] else "val")
 
     @property
     def rank_and_world_size(self) -> tuple[int, int]:
@@ -125,8 +156,12 @@ class OfflineData(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader | ReplayBuffer:
         """Return shuffled batches of samples and their images, or of the module's encoding of them.
 
-        The order is a function of `shuffle_seed` and epoch, so that a run can be resumed.
+        The order is a function of `shuffle_seed` and epoch, so that a run can be resumed. A growing
+        data set waits for the loads of the epoch.
         """
+        if self.growth is not None:
+            leave_cores(self.workers)
+            self.sizes |= self.growth.next_sizes()
         module, samples = getattr(self.trainer, "lightning_module", None), self.samples("train")
         encode = getattr(module, "encode", lambda samples, images: None)
         data = encode(samples, images=len(self.group) > 1)
@@ -144,6 +179,22 @@ class OfflineData(L.LightningDataModule):
     def test_dataloader(self) -> DataLoader:
         """Return the test batches."""
         return self._loader(Samples(self.samples("test")))
+
+    def teardown(self, stage: str) -> None:
+        """End the workers of a growing data set."""
+        if self.growth is not None:
+            self.growth.close()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of the growth."""
+        return {} if self.growth is None else self.growth.state_dict()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue the growth of an interrupted training."""
+        if self.growth is not None:
+            self.growth.load_state_dict(state_dict)
+            if self.growth.is_finished and self.trainer is not None:
+                self.trainer.should_stop = True
 
     def _loader(self, data: Dataset, sampler: DistributedSampler | None = None) -> DataLoader:
         return DataLoader(

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import sys
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -136,7 +136,8 @@ class DataSet:
         with GracefulShutdown() as stop, progress.Progress(*columns, refresh_per_second=2) as bars:
             bar = bars.add_task("", total=len(jobs), completed=completed, news="")
             try:
-                with closing(self.solve(missing, stop)) as solving:  # ends the workers first
+                # closed first, which ends the workers
+                with closing(self.solve(missing.items(), stop)) as solving:
                     for solved in solving:
                         news = session.count(solved.accepted, solved.seconds)
                         bars.update(bar, advance=1, news=news)
@@ -172,16 +173,16 @@ class DataSet:
         write_file(folder / "scene.json", json.dumps(card, indent=1).encode())
 
     def solve(
-        self, missing: Mapping[str, Sequence[int]], stop: GracefulShutdown | None = None
+        self, loads: Iterable[tuple[str, Sequence[int]]], stop: object = None
     ) -> Generator[SolvedLoad, None, None]:
-        """Solve loads that are missing, by split; yield each as soon as it is solved.
+        """Solve loads that have not been tried; yield each as soon as it is solved.
 
         Each solved load is written to a pending file at once, and a shard as soon as all its loads
         are solved, in order. Pending loads of an interrupted run are not solved again.
 
         Args:
-            missing: Numbers of the loads, by split.
-            stop: Once it is true, no further load is started.
+            loads: Splits with numbers of loads, in the order of the solves; read when they are due.
+            stop: Once its truth value is True, no further load is started.
 
         Raises:
             DataSetError: The folder holds something else, or another process writes there.
@@ -198,19 +199,23 @@ class DataSet:
             }
             for job in pending.keys() & tried:  # killed between writing a shard and this removal
                 pending.pop(job).unlink(missing_ok=True)
-            files = []
-            for split, numbers in missing.items():
-                key = partial(LoadKey, store.stream(split))
-                new = [number for number in numbers if key(number) not in tried]
-                files += [[key(number) for number in run] for run in runs(new)]
-            jobs = [job for file in files for job in file if job not in pending]
-            self._write_complete_shards(files, pending)
+            files: list[list[LoadKey]] = []  # shards whose loads have been read from `loads`
+
+            def jobs() -> Iterator[LoadKey]:
+                for split, numbers in loads:
+                    key = partial(LoadKey, store.stream(split))
+                    new = [number for number in numbers if key(number) not in tried]
+                    for run in runs(new):
+                        files.append([key(number) for number in run])
+                        yield from [job for job in files[-1] if job not in pending]
+
             for solved in solve_loads(
-                self.scene, jobs, workers=self.workers, timeout=self.timeout, stop=stop
+                self.scene, jobs(), workers=self.workers, timeout=self.timeout, stop=stop
             ):
                 pending[solved.job] = store.pending.write(solved)
                 yield solved
                 self._write_complete_shards(files, pending)
+            self._write_complete_shards(files, pending)
             rewrite(self._manifest, read_manifest(self._manifest))
             if self.shards == 1:
                 with suppress(OSError):  # it is not empty

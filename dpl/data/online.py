@@ -1,8 +1,8 @@
 """Lightning data module of samples that are solved while the network trains."""
 
 from contextlib import suppress
+from typing import Any
 
-import torch
 from torch import Tensor
 
 from dpl.data.datamodule import MAX_COUNT, OfflineData
@@ -12,7 +12,7 @@ from dpl.scene import Scene
 from dpl.system.checks import check_range
 from dpl.system.files import DataSetError
 from dpl.system.memory import machine, refuse_beyond
-from dpl.system.threads import available_cores
+from dpl.system.threads import leave_cores
 
 
 class OnlineData(OfflineData):
@@ -91,9 +91,7 @@ class OnlineData(OfflineData):
 
     def train_dataloader(self) -> ReplayBuffer:
         """Return the stream; training is limited to the cores that its workers leave."""
-        # threads of one operation wait for each other, so none may share a core with a worker
-        left = max(1, available_cores() - self.workers)
-        torch.set_num_threads(min(torch.get_num_threads(), left))
+        leave_cores(self.workers)
         rank, world_size = self.rank_and_world_size
         fraction = self._hard_example_fraction
         stream = OnlineSamples(
@@ -141,7 +139,7 @@ class OnlineData(OfflineData):
         if self._replay is not None:
             self._replay.close()
 
-    def state_dict(self) -> dict[str, int]:
+    def state_dict(self) -> dict[str, Any]:
         """Return the number of loads that all training processes have taken.
 
         Other processes have taken as many samples, but may have met more rejected loads. The number
@@ -156,6 +154,6 @@ class OnlineData(OfflineData):
                 next_index += world_size * max(1, self.workers) + max(0, beyond)
         return {"next_index": next_index}
 
-    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue a stream where it was left; no load is drawn twice."""
         self._first = state_dict["next_index"]

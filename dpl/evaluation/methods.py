@@ -70,7 +70,7 @@ def pod_galerkin(scene: Scene, train: Sample, *, rank: int, tolerance: float) ->
     return Method(predict, len(train.force), minutes)
 
 
-def network(surrogate: Surrogate, folder: Path, samples: int) -> Method:
+def network(surrogate: Surrogate, folder: Path, samples: int | None) -> Method:
     """Return the network of the run in a folder."""
     count = sum(p.numel() for p in surrogate.net.parameters())
     return Method(surrogate.predict, samples, training_minutes(folder), count)

@@ -54,11 +54,11 @@ class ClosedFormFit(Protocol):
     """A model without trained parameters, which is fitted to all samples at once.
 
     It takes dimensionless forces and returns displacements over L, both float64.
-    `dpl.training.Surrogate` fits it in place of a training of several epochs.
+    `dpl.training.ClosedFormTraining` fits it in place of a training by gradient descent.
     """
 
     def fit(self, samples: Sample, held_out: Sample) -> None:
-        """Fit the model.
+        """Fit the model, also a fitted one to other samples.
 
         Args:
             samples: Dimensionless samples to fit to, (S, N, D).

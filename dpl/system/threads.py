@@ -15,6 +15,15 @@ def available_cores() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
+def leave_cores(workers: int) -> None:
+    """Limit torch to the cores that worker processes leave, at least one.
+
+    Threads of one operation wait for each other, so none may share a core with a worker.
+    """
+    left = max(1, available_cores() - workers)
+    torch.set_num_threads(min(torch.get_num_threads(), left))
+
+
 @cache
 def blas() -> ThreadpoolController:
     """Return a controller of the BLAS libraries of this process; the search takes milliseconds."""

@@ -14,6 +14,7 @@ from dpl.fem import Load
 from dpl.models.protocols import ClosedFormFit, TrainsInCoordinates
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.scene import Sample, Scene
+from dpl.training.callbacks.closed_form import ClosedFormTraining
 from dpl.training.losses.loss import Loss, LossContext
 from dpl.training.losses.supervised import SquaredErrorLoss
 from dpl.training.metrics import default_metrics
@@ -136,7 +137,6 @@ class Surrogate(L.LightningModule):
     def training_step(self, batch: Sample | ReducedSamples, batch_idx: int) -> Tensor | None:
         """Return the loss of a batch, (); None for a model that has been fitted."""
         if self._is_closed_form:
-            self.trainer.should_stop = True
             return None
         if isinstance(batch, ReducedSamples):
             loss = self._reduced_loss(batch)
@@ -206,22 +206,18 @@ class Surrogate(L.LightningModule):
         # before later hooks: schedules load the batches, and encoding them takes the bases
         if stage == "fit" and isinstance(self.net, TrainsInCoordinates) and not self.net.is_fitted:
             self.fit_bases(self.trainer.datamodule.snapshots())
-        if stage == "fit" and isinstance(self.net, ClosedFormFit) and not self.net.is_fitted:
-            data = self.trainer.datamodule
-            self.net.fit(data.samples("train"), data.samples("val"))
         for collection in (self.val_metrics, self.test_metrics):
             for metric in collection.values():
                 if hasattr(metric, "problem"):
                     metric.problem = problem
 
     def configure_callbacks(self) -> list[L.Callback]:
-        """Return the loss, which is a callback."""
-        return [self.loss]
+        """Return the loss, which is a callback, and that of a model without gradient descent."""
+        return [self.loss, ClosedFormTraining()] if self._is_closed_form else [self.loss]
 
     def on_train_epoch_start(self) -> None:
         """Let the last epoch be validated."""
-        last = self.current_epoch + 1 == self.trainer.max_epochs
-        if last or self._is_closed_form:
+        if self.current_epoch + 1 == self.trainer.max_epochs:
             self.trainer.check_val_every_n_epoch = 1
 
     def configure_optimizers(self) -> Any:

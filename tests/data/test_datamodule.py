@@ -485,7 +485,7 @@ def test_a_data_set_started_online_and_completed_offline_has_the_same_bytes(
     sizes = {"train": 100, "val": 1, "test": 1, "workers": 0}
     one = DataSet(scene, str(tmp_path / "d"), **sizes)
     solved = []
-    for got in one.solve(one.missing()):
+    for got in one.solve(one.missing().items()):
         solved.append(got.job.number)
     assert solved == list(range(80, 100)), "no load is solved again"
     other = DataSet(scene, str(tmp_path / "offline"), **sizes)

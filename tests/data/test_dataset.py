@@ -375,7 +375,7 @@ def test_a_second_writer_is_refused_with_process_and_machine_of_the_first(
     script, tiny, scene_of, tmp_path
 ):
     wanted = DataSet(scene_of(*tiny), str(tmp_path / "d"), train=4, val=0, test=0, workers=0)
-    running = wanted.solve({"train": range(4)})
+    running = wanted.solve([("train", range(4))])
     next(running)
     ended = script("generate", *tiny, "data.folder=d", "data.workers=0", cwd=tmp_path)
     running.close()

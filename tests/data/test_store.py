@@ -76,7 +76,7 @@ def fill(store, missing=None, workers=0, **more):
     """Solve what is missing of the tiny data set; return how many loads that were."""
     if missing is None:
         missing = {split: store.missing(split, size) for split, size in SIZES.items()}
-    return len(list(writer(store, workers=workers).solve(missing, **more)))
+    return len(list(writer(store, workers=workers).solve(missing.items(), **more)))
 
 
 def lines(store, name="manifest.jsonl"):
@@ -301,7 +301,7 @@ def test_a_run_interrupted_anywhere_and_resumed_makes_the_same_bytes(
     whole, store = Store(tmp_path / "whole", scene, 0), Store(tmp_path / "d", scene, 0)
     fill(whole)
     solved.clear()
-    running = writer(store).solve(WANTED)
+    running = writer(store).solve(WANTED.items())
     for _ in range(after):
         next(running)
     running.close()
@@ -315,7 +315,7 @@ def test_a_run_interrupted_anywhere_and_resumed_makes_the_same_bytes(
 
 def test_interrupted_at_every_load_the_bytes_are_the_same(data, fresh, solved):
     while running := writer(fresh).solve(
-        {split: fresh.missing(split, size) for split, size in SIZES.items()}
+        [(split, fresh.missing(split, size)) for split, size in SIZES.items()]
     ):
         if next(running, None) is None:
             break
@@ -337,7 +337,7 @@ def test_pending_files_whose_shard_exists_are_removed(data, fresh, monkeypatch):
 
 
 def test_a_damaged_pending_load_is_solved_again(data, fresh, solved):
-    running = writer(fresh).solve(WANTED)
+    running = writer(fresh).solve(WANTED.items())
     for _ in range(5):
         next(running)
     running.close()
@@ -355,7 +355,7 @@ def test_a_damaged_pending_load_is_solved_again(data, fresh, solved):
 
 
 def test_partial_files_of_killed_processes_are_removed(data, fresh):
-    running = writer(fresh).solve(WANTED)
+    running = writer(fresh).solve(WANTED.items())
     next(running)
     running.close()
     long_ago = time.time() - 3600
@@ -436,7 +436,7 @@ def test_parts_made_by_several_writers_are_the_same_samples(scene, tmp_path, mon
     running = []
     for part in range(2):  # at the same time, a load each in turn
         mine = {split: store.missing(split, size, part, 2) for split, size in SIZES.items()}
-        running.append(writer(store, part, 2).solve(mine))
+        running.append(writer(store, part, 2).solve(mine.items()))
     found = []
     while running:
         for one in list(running):
@@ -458,11 +458,11 @@ def test_parts_made_by_several_writers_are_the_same_samples(scene, tmp_path, mon
 
 
 def test_a_second_writer_of_the_whole_or_of_the_same_part_is_refused(fresh):
-    running = writer(fresh, 0, 2).solve({"train": range(12)})
+    running = writer(fresh, 0, 2).solve([("train", range(12))])
     next(running)
     for part in ((), (0, 2), (1, 3)):
         with pytest.raises(DataSetError, match=f"process {os.getpid()} on "):
-            next(writer(fresh, *part).solve({"train": range(12)}))
+            next(writer(fresh, *part).solve([("train", range(12))]))
     with pytest.raises(DataSetError, match=f"process {os.getpid()} on "):
         repair(fresh)
     running.close()
@@ -485,7 +485,7 @@ def test_a_pending_file_that_another_process_removes_is_ignored(data, fresh):
 def test_an_interrupted_run_keeps_solved_loads(fresh):
     stop = GracefulShutdown()
     found = 0
-    for _ in writer(fresh).solve(WANTED, stop):
+    for _ in writer(fresh).solve(WANTED.items(), stop):
         found += 1
         stop._requested = found == 3
     assert found == 3
@@ -627,7 +627,7 @@ def test_a_read_only_folder_can_only_be_read(copy, environment):
         "card = json.loads((folder / 'scene.json').read_text()); "
         "scene = N(fingerprint=card['fingerprint'], identity=lambda: card['scene'], "
         "problem=N(shape=(45, 3)), loads=N(n_random=7, parameter_ranges={}, "
-        "young_at=lambda point: point[:, -1])); "
+        "young_at=lambda point: point[:, -1], parameters_at=None)); "
         "store = Store(folder, scene, 0); "
         "assert len(store.load('train', 12).force) == 12; "
         "assert store.missing('train', 13) == [12]; DataSet(scene, sys.argv[1]).create(); "

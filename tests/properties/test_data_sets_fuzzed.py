@@ -52,7 +52,7 @@ def sound(scene, tmp_path_factory):
     wanted = {**{split: range(size) for split, size in SIZES.items()}, "train": range(10)}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(store_module, "SHARD_SIZE", 4)
-        list(DataSet(scene, str(folder), workers=0).solve(wanted))
+        list(DataSet(scene, str(folder), workers=0).solve(wanted.items()))
     for number in PENDING:
         store.pending.write(solve_load(scene, LoadKey((0, 0), number)))
     session = {"loads": 18, "seconds": 1.0, "core_seconds": 1.0}

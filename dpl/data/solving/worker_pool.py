@@ -14,8 +14,9 @@ import signal
 import sys
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
+from itertools import islice
 from multiprocessing import connection
 from multiprocessing.connection import Connection
 from types import FrameType
@@ -81,33 +82,35 @@ def solve_loads(
     *,
     workers: int,
     timeout: float | None = None,
-    stop: GracefulShutdown | None = None,
+    stop: object = None,
 ) -> Iterator[SolvedLoad]:
     """Yield solved loads in the order in which they are finished.
 
     Args:
         scene: Scene of the loads.
-        jobs: Identifiers of the loads.
+        jobs: Identifiers of the loads; read a few loads ahead.
         workers: Number of processes, one core each; 0: solve in this process, without time limit.
         timeout: Time limit for a load [s]; the first load of a worker has more. None: no limit.
-        stop: Once it is true, no further load is started.
+        stop: Once its truth value is True, no further load is started.
 
     Raises:
         RuntimeError: Workers die repeatedly.
     """
-    todo, stop = list(jobs)[::-1], GracefulShutdown() if stop is None else stop
+    jobs = iter(jobs)
     if workers == 0:
-        while todo and not stop:
-            yield solve_load(scene, todo.pop())
+        while not stop and (job := next(jobs, None)):
+            yield solve_load(scene, job)
         return
     limit = math.inf if timeout is None else timeout
+    todo = deque(islice(jobs, max(workers, RETRY_DELAY)))
     with _worker_pool(scene, min(workers, len(todo))) as pool:
         crashes: Counter[LoadKey] = Counter()
         consecutive = 0
         while True:
             for worker in pool:
                 if worker.job is None and todo and not stop:
-                    worker.submit(todo.pop(), limit)
+                    worker.submit(todo.popleft(), limit)
+                    todo.extend(islice(jobs, 1))
             if not any(worker.job for worker in pool):
                 break
             solved, crashed, late = _wait(pool)
@@ -120,7 +123,7 @@ def solve_loads(
             for job in crashed:
                 crashes[job] += 1
                 if crashes[job] < MAX_RETRIES:
-                    todo.insert(max(0, len(todo) - RETRY_DELAY), job)
+                    todo.insert(RETRY_DELAY, job)
                 else:
                     yield failed_load(scene, job, f"its worker died {MAX_RETRIES} times")
 

@@ -134,16 +134,23 @@ class Store:
     def _shards_of(self, split: str) -> list[dict[str, Any]]:
         return [line for line in self.shards() if line["split"] == split]
 
-    def load(self, split: str, count: int) -> Sample:
-        """Return the accepted ones of the first `count` loads of a split, in order.
+    def load(self, split: str, count: int, first: int = 0) -> Sample:
+        """Return the accepted ones of loads `first` to `count` - 1 of a split, in order.
+
+        Another thread or process may solve loads of the data set at the same time.
 
         Raises:
             DataSetError: A shard is damaged, or there are no samples.
         """
-        parts = [self._read_shard(line) for line in self._shards_of(split) if line["first"] < count]
+        parts = self._pending_columns(split, first, count)  # before the shards that take them
+        parts += [
+            self._read_shard(line)
+            for line in self._shards_of(split)
+            if line["first"] < count and tried_loads(line).stop > first
+        ]
         number = np.concatenate([np.zeros(0, int), *(part["index"].numpy() for part in parts)])
         rows = np.unique(number, return_index=True)[1]  # two writers may have solved the same load
-        rows = rows[number[rows] < count]
+        rows = rows[(first <= number[rows]) & (number[rows] < count)]
         if not len(rows):
             raise DataSetError(f"{self.folder} holds no {split} samples")
         force = torch.cat([to_dense(part, self.scene.problem.shape) for part in parts])[rows]
@@ -152,6 +159,21 @@ class Store:
             for name in ("displacement", "point", "parameters")
         )
         return Sample(force, displacement, self.scene.loads.young_at(point), parameters)
+
+    def _pending_columns(self, split: str, first: int, count: int) -> list[Columns]:
+        """Return the columns of the pending ones of loads `first` to `count` - 1."""
+        found = []
+        for job, path in self.pending.files().items():
+            if job.seed == self.stream(split) and first <= job.number < count:
+                with suppress(FileNotFoundError):  # its writer has moved it into a shard
+                    found.append(self.pending.read(path)[1])
+        return found
+
+    def tried(self, split: str) -> set[int]:
+        """Return the loads of a split that have been tried, in shards or pending."""
+        # pending loads first, since another thread or process may move them into shards
+        pending = {job.number for job in self.pending.files() if job.seed == self.stream(split)}
+        return pending.union(*map(tried_loads, self._shards_of(split)))
 
     def _read_shard(self, line: Mapping[str, Any]) -> Columns:
         """Return the columns of a shard; raise DataSetError if it is damaged."""

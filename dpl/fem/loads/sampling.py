@@ -6,11 +6,14 @@ every distribution goes with every way to fill the unit cube.
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
-from scipy.stats import qmc
+
+if TYPE_CHECKING:
+    from scipy.stats import qmc
 
 Array = NDArray[np.float64]
 Quantile = Callable[[Array], Array]  # uniform in [0, 1) -> what is drawn, of the same shape
@@ -37,7 +40,9 @@ def sobol(seed: int | Sequence[int], index: int, count: int) -> Array:
 
 
 @lru_cache(maxsize=8)
-def _sobol(seed: tuple[int, ...], count: int) -> qmc.Sobol:
+def _sobol(seed: tuple[int, ...], count: int) -> "qmc.Sobol":
+    from scipy.stats import qmc  # its import of half a second is not needed for other samplings
+
     return qmc.Sobol(count, scramble=True, rng=np.random.default_rng(list(seed)))
 
 

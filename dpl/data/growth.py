@@ -1,0 +1,182 @@
+"""Growth of a training set, with a fit after each step, until a held-out error is met."""
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from dpl.data.background import BackgroundSolver
+from dpl.data.dataset import MAX_LOADS, DataSet
+from dpl.data.learning_curve import CurvePoint, describe, loads_for
+from dpl.data.storage.store import SHARD_SIZE
+from dpl.system.checks import check_range
+
+HELD_OUT = 32  # smallest number of held-out loads, as far as there are as many
+# ratio of the training loads of a fit to those of the one before
+MIN_FACTOR = math.sqrt(2)
+MAX_FACTOR = 4
+
+
+class Growth:
+    """Training loads that are solved in the background while a model is fitted to the first ones.
+
+    After the first `SHARD_SIZE` training loads the model is fitted and its error on held-out loads
+    recorded. The next fit takes `MIN_FACTOR` times as many loads, or more if they are solved
+    already, but not more than the learning curve predicts for the error wanted.
+
+    The loads are those of the data set of the same seed, in the same order.
+
+    Attributes:
+        points: The learning curve.
+    """
+
+    def __init__(
+        self, dataset: DataSet, *, error: float, minutes: float | None, max_train: int
+    ) -> None:
+        """Check the arguments; nothing is solved before `next_sizes`.
+
+        Args:
+            dataset: The data set; its numbers of validation and test loads are those wanted.
+            error: Median over held-out loads of the relative L2 error at which the growth ends [-].
+            minutes: Time after which the growth ends [min]; None: no limit.
+            max_train: Largest number of training loads.
+
+        Raises:
+            ValueError: A number is out of range.
+        """
+        if not 0 < error < math.inf:
+            raise ValueError(f"error = {error} must be above 0")
+        if minutes is not None and not minutes > 0:
+            raise ValueError(f"minutes = {minutes} must be above 0 [min], or null")
+        check_range(1, MAX_LOADS, max_train=max_train)
+        self.points: list[CurvePoint] = []
+        self._dataset = dataset
+        self._error, self._minutes, self._max_train = error, minutes, max_train
+        self._solver: BackgroundSolver | None = None
+        self._start = self._fit_start = time.monotonic()
+        self._fit_seconds = 0.0  # duration of the last fit
+
+    # ------------------------------------------------------------------ sizes
+
+    def held_out(self, train: int) -> int:
+        """Return the number of held-out loads for a number of training loads."""
+        return min(self._dataset.val, max(HELD_OUT, train // 2))
+
+    def _loads(self) -> Iterator[tuple[str, range]]:
+        """Yield splits and loads in the order of the solves; the rest once the growth has ended."""
+        val = 0
+        for train in range(0, self._max_train, SHARD_SIZE):
+            if self.is_finished:
+                break
+            end = min(train + SHARD_SIZE, self._max_train)
+            yield "val", range(val, self.held_out(end))
+            yield "train", range(train, end)
+            val = self.held_out(end)
+        yield "val", range(val, self._dataset.val)
+        yield "test", range(self._dataset.test)
+
+    def next_sizes(self) -> dict[str, int]:
+        """Wait for the loads of the next fit; return the numbers of training and held-out loads.
+
+        Raises:
+            DataSetError: The folder holds something else, or another process writes there.
+            RuntimeError: Workers die repeatedly.
+        """
+        if self.is_finished:
+            return self._sizes(self.points[-1].loads)
+        if self._solver is None:
+            self._start = time.monotonic() - (self.points[-1].seconds if self.points else 0.0)
+            self._solver = BackgroundSolver(self._dataset, self._loads())
+        least, most = self._limits()
+        self._solver.wait(self._sizes(least), until=self._deadline(), show=not self.points)
+        self._fit_start = time.monotonic()
+        available = self._solver.count("train")
+        while available and self._solver.count("val") < self.held_out(available):
+            available = max(0, available - SHARD_SIZE)
+        if available < least:  # the time is over
+            return self._sizes(max(available, self.points[-1].loads if self.points else 1))
+        return self._sizes(max(least, min(most, available // SHARD_SIZE * SHARD_SIZE)))
+
+    def _sizes(self, train: int) -> dict[str, int]:
+        return {"train": train, "val": self.held_out(train)}
+
+    def _limits(self) -> tuple[int, int]:
+        """Return the smallest and the largest number of training loads of the next fit."""
+        if not self.points:
+            first = min(SHARD_SIZE, self._max_train)
+            return first, first
+        last = self.points[-1].loads
+        needed = loads_for(self.points, self._error) or MAX_LOADS
+        least = self._whole_shards(MIN_FACTOR * last)
+        most = self._whole_shards(min(MAX_FACTOR * last, needed))
+        return least, max(least, most)
+
+    def _whole_shards(self, loads: float) -> int:
+        return min(self._max_train, math.ceil(loads / SHARD_SIZE) * SHARD_SIZE)
+
+    def _deadline(self) -> float | None:
+        """Return the time at which a fit has to start to end in time [s]; None: no limit."""
+        if self._minutes is None or not self.points:
+            return None
+        return self._start + 60 * self._minutes - self._fit_seconds
+
+    # ------------------------------------------------------------------ errors
+
+    def record(self, loads: int, errors: Mapping[str, float]) -> str:
+        """Record the held-out errors of a fit.
+
+        Args:
+            loads: Number of training loads.
+            errors: `rel_L2_median`, `rel_L2_worst` and `e_mean`, see `dpl.training.metrics`.
+
+        Returns:
+            The errors and the number of loads that the target is expected to need, in words.
+        """
+        now = time.monotonic()
+        self._fit_seconds = now - self._fit_start
+        median, worst, e_mean = (errors[n] for n in ("rel_L2_median", "rel_L2_worst", "e_mean"))
+        self.points.append(CurvePoint(loads, now - self._start, median, worst, e_mean))
+        line = describe(self.points, self._error)
+        reason = self._limit_reached
+        return f"{line}; {reason}" if reason else line
+
+    @property
+    def is_finished(self) -> bool:
+        """True if the last fit meets the error wanted or a limit is reached."""
+        if not self.points:
+            return False
+        return self.points[-1].median <= self._error or bool(self._limit_reached)
+
+    @property
+    def _limit_reached(self) -> str:
+        """Limit that the last fit has reached, in words; empty if there is none."""
+        last = self.points[-1]
+        if last.median <= self._error:
+            return ""
+        if last.loads >= self._max_train:
+            return f"data.max_train = {self._max_train} reached"
+        # the next fit would take at least as long as the last one
+        if self._minutes is not None and last.seconds + self._fit_seconds >= 60 * self._minutes:
+            return f"data.minutes = {self._minutes:g} reached"
+        return ""
+
+    # ------------------------------------------------------------------ end
+
+    def close(self) -> None:
+        """End the workers; the loads of validation and test are solved if the growth has ended."""
+        if self._solver is None:
+            return
+        try:
+            if self.is_finished:
+                self._solver.wait({"val": self._dataset.val, "test": self._dataset.test}, show=True)
+        finally:
+            self._solver.close()
+            self._solver = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the learning curve as plain data."""
+        return {"points": [list(point) for point in self.points]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue a learning curve."""
+        self.points = [CurvePoint(*point) for point in state["points"]]

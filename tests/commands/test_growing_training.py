@@ -1,0 +1,84 @@
+"""Training on a data set that grows: `train.py model=unrolled data.train=auto`."""
+
+import json
+
+import pytest
+
+from dpl.config import run_folder
+from dpl.training import checkpoints
+
+MODEL = ["model.rank=12", "model.cells=8", "model.stages=1"]
+SIZES = ["data.val=8", "data.test=4", "data.workers=0", "data.folder=data"]
+RUN = ["model=unrolled", "data.train=auto", "logger=csv", "run=run"]
+
+
+@pytest.fixture
+def train(script, tiny, tmp_path):
+    """Return a function that runs the command in a temporary folder."""
+
+    def train(*options):
+        return script("train", *tiny, *options, cwd=tmp_path)
+
+    return train
+
+
+def test_a_run_fits_until_its_end_and_is_resumed_with_more_loads(train, tmp_path):
+    done = train(*RUN, *MODEL, *SIZES, "data.max_train=100", "data.error=1e-9")
+    assert not done.status, done.err
+    assert "64 loads, " in done.out
+    assert "data.max_train = 100 reached" in done.out
+    weights = checkpoints.read(tmp_path / "run/checkpoints/last.ckpt")
+    assert [point[0] for point in weights["OfflineData"]["points"]] == [64, 100]
+    header, *rows = (tmp_path / "run/csv/metrics.csv").read_text().splitlines()
+    curve = [row for row in rows if row.split(",")[header.split(",").index("step")] == "100"]
+    assert "learning_curve/e_mean" in header
+    assert curve, "the step of the learning curve is the number of loads"
+    assert run_folder.load(tmp_path / "run").surrogate.net.is_fitted
+    assert (tmp_path / "run/evaluation.json").exists()
+    resumed = train("run=run", "ckpt_path=last", "data.max_train=150")
+    assert not resumed.status, resumed.err
+    assert "64 loads, " not in resumed.out
+    assert "150 loads, " in resumed.out
+    finished = train("run=run", "ckpt_path=last", "data.error=1.0")
+    assert not finished.status, finished.err
+    assert " loads, " not in finished.out.partition("test loads")[0], "no further fit"
+    sessions = (tmp_path / "data/journal.jsonl").read_text().splitlines()
+    assert sum(json.loads(line)["loads"] for line in sessions) == 150 + 8 + 4
+
+
+def test_the_set_of_a_growing_run_serves_a_run_of_given_size(train, tmp_path):
+    assert not train(*RUN, *MODEL, *SIZES, "data.max_train=20", "data.error=1e-9").status
+    again = train("model=unrolled", "data.train=20", "run=other", "logger=none", *MODEL, *SIZES)
+    assert not again.status, again.err
+    assert "32 of 32 loads not solved again" in again.out
+    weights = [
+        checkpoints.read(tmp_path / run / "checkpoints/best.safetensors")["state_dict"]
+        for run in ("run", "other")
+    ]
+    assert all(weights[0][name].equal(weights[1][name]) for name in weights[0])
+
+
+def test_models_trained_by_gradient_descent_are_refused(train):
+    refused = train("model=fcnn", "data.train=auto")
+    assert refused.status == 2
+    assert refused.err.startswith("error: data.train = auto needs a model that is fitted")
+    assert refused.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("data.train=many", "data.train = 'many' must be a whole number or one of auto"),
+        ("data.error=0", "data: error = 0 must be above 0"),
+        ("data.minutes=-1", "data: minutes = -1 must be above 0 [min], or null"),
+        ("data.max_train=0", "data: max_train = 0 must lie between 1 and 10,000,000"),
+        ("+trainer.limit_val_batches=0", "data.train = auto needs held-out errors"),
+        ("trainer.devices=2", "data.train = auto needs one process; set trainer.devices=1"),
+    ],
+)
+def test_values_are_refused_in_one_line_before_any_solve(train, tmp_path, option, message):
+    cpu = ["trainer.accelerator=cpu"] if "devices" in option else []
+    refused = train("model=unrolled", "data.train=auto", "data.folder=data", option, *cpu)
+    assert refused.status == 2
+    assert message in refused.err
+    assert not (tmp_path / "data").exists()

@@ -1,0 +1,232 @@
+"""Laws of a growing training set: its loads, their number, its limits and its end."""
+
+import multiprocessing
+from types import SimpleNamespace
+
+import pytest
+import torch
+from lightning.pytorch.trainer.states import TrainerFn
+
+from dpl.data import DataSet, OfflineData, background, growth
+from dpl.data.background import BackgroundSolver
+from dpl.data.solving.solve import LoadKey, solve_load
+from dpl.data.storage import store as store_module
+from dpl.data.storage.store import Store
+from dpl.system.files import DataSetError, exclusive_lock
+
+BLOCK = 4
+FITTING = SimpleNamespace(state=SimpleNamespace(fn=TrainerFn.FITTING), global_rank=0, world_size=1)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """Fits begin with four loads; the number of threads, which growth changes, is restored."""
+    for module in (growth, store_module):
+        monkeypatch.setattr(module, "SHARD_SIZE", BLOCK)
+    monkeypatch.setattr(growth, "HELD_OUT", 2)
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def module(scene, tmp_path):
+    """Return a function that builds growing data modules of one folder, as in a training."""
+    made = []
+
+    def module(**options):
+        options = {"train": "auto", "val": 6, "test": 2, "workers": 0, **options}
+        made.append(OfflineData(scene, folder=str(tmp_path / "d"), **options))
+        made[-1].trainer = FITTING
+        made[-1].prepare_data()
+        return made[-1]
+
+    yield module
+    for one in made:
+        one.teardown("fit")
+
+
+def errors(median):
+    return {"rel_L2_median": median, "rel_L2_worst": 2 * median, "e_mean": median}
+
+
+def step(data, median):
+    """Grow the training set and record an error; return the number of training loads."""
+    data.train_dataloader()
+    data.growth.record(data.sizes["train"], errors(median))
+    return data.sizes["train"]
+
+
+def test_each_fit_has_more_loads_of_the_data_set_of_its_seed(module, scene, tmp_path):
+    data = module(max_train=16)
+    found = [step(data, error) for error in (1.0, 0.9, 0.8)]
+    assert found == [4, 8, 12]
+    whole = OfflineData(scene, folder=str(tmp_path / "e"), train=12, val=6, test=1, workers=0)
+    whole.prepare_data()
+    assert torch.equal(data.samples("train").force, whole.samples("train").force)
+    assert torch.equal(data.samples("train").displacement, whole.samples("train").displacement)
+    assert torch.equal(data.samples("val").force, whole.samples("val").force[:6])
+
+
+def test_held_out_loads_grow_with_the_training_loads(module):
+    data = module()
+    sizes = [(step(data, error), len(data.samples("val").force)) for error in (1.0, 0.9, 0.8)]
+    assert sizes == [(4, 2), (8, 4), (12, 6)]
+    assert data.growth.held_out(1000) == 6
+
+
+def test_it_ends_at_the_error_with_all_loads_of_validation_and_test(module):
+    data = module(error=0.5)
+    step(data, 1.0)
+    assert not data.growth.is_finished
+    step(data, 0.4)
+    assert data.growth.is_finished
+    data.teardown("fit")
+    assert not data.store.missing("val", 6)
+    assert not data.store.missing("test", 2)
+
+
+def test_it_ends_at_the_largest_number_of_loads(module):
+    data = module(max_train=6)
+    assert [step(data, error) for error in (1.0, 0.9)] == [4, 6]
+    assert data.growth.is_finished
+
+
+def test_it_ends_before_a_fit_that_would_exceed_the_time(module, monkeypatch):
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(growth.time, "monotonic", lambda: clock.now)
+    data = module(minutes=1.0)
+    data.train_dataloader()
+    clock.now = 20.0
+    assert "data.minutes" not in data.growth.record(4, errors(1.0))
+    assert not data.growth.is_finished
+    data.train_dataloader()
+    clock.now = 45.0
+    assert "data.minutes = 1 reached" in data.growth.record(8, errors(1.0))
+    assert data.growth.is_finished
+
+
+def test_an_interrupted_growth_solves_no_test_loads(module):
+    data = module()
+    step(data, 1.0)
+    data.teardown("fit")
+    assert len(data.store.missing("test", 2)) == 2
+    data.teardown("fit")  # as Lightning and the command both do
+
+
+def test_loads_that_are_there_are_not_solved_again(module, monkeypatch):
+    first = module(max_train=8)
+    assert [step(first, 1.0), step(first, 0.9)] == [4, 8]
+    first.teardown("fit")
+    monkeypatch.setattr("dpl.data.solving.worker_pool.solve_load", None)
+    second = module(max_train=8)
+    assert step(second, 1.0) == 4, "a learning curve starts with few loads"
+    assert step(second, 0.9) == 8
+
+
+def test_loads_that_are_there_speed_up_the_growth(module, scene, tmp_path):
+    DataSet(scene, str(tmp_path / "d"), train=40, val=6, test=2, workers=0).fill()
+    data = module()
+    assert [step(data, error) for error in (1.0, 1.0, 1.0)] == [4, 16, 40]
+
+
+def test_no_more_loads_than_predicted_are_taken(module, scene, tmp_path):
+    DataSet(scene, str(tmp_path / "d"), train=40, val=6, test=2, workers=0).fill()
+    data = module(error=1.0 / 24.5)
+    assert [step(data, 1 / 4), step(data, 1 / 16), data.growth.next_sizes()["train"]] == [4, 16, 28]
+
+
+def test_a_growth_is_continued_from_its_state(module):
+    before = module()
+    step(before, 1.0)
+    before.teardown("fit")
+    after = module()
+    after.load_state_dict(before.state_dict())
+    assert after.growth.points == before.growth.points
+    assert step(after, 0.9) == 8
+
+
+def test_a_finished_growth_is_not_continued(module):
+    before = module(error=0.5)
+    step(before, 0.4)
+    after = module(error=0.5)
+    after.load_state_dict(before.state_dict())
+    after.train_dataloader()
+    assert after.sizes["train"] == 4
+
+
+def test_a_set_that_grew_is_read_as_a_whole_by_later_commands(module):
+    data = module(max_train=8)
+    step(data, 1.0)
+    step(data, 1.0)
+    data.teardown("fit")
+    later = OfflineData(data.scene, folder=str(data.store.folder), **{"train": "auto"}, val=6)
+    later.dataset.fill()
+    later.prepare_data()
+    assert len(later.snapshots().force) == 8
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"error": 0}, {"error": float("nan")}, {"minutes": 0.0}, {"max_train": 0}]
+)
+def test_numbers_out_of_range_are_refused(scene, wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        OfflineData(scene, train="auto", **wrong)
+
+
+# ------------------------------------------------------------------ in the background
+
+
+def test_a_worker_solves_in_the_background(scene, tmp_path):
+    data = DataSet(scene, str(tmp_path / "d"), train=6, val=2, test=0, workers=1)
+    before = multiprocessing.active_children()
+    solver = BackgroundSolver(data, [("val", range(2)), ("train", range(6))])
+    solver.wait({"train": 3, "val": 2})
+    assert solver.count("train") >= 3
+    assert len(data.store.load("train", 3).force) == 3, "pending loads and shards"
+    solver.wait({"train": 9})
+    assert solver.count("train") == 6, "a wait ends with the loads"
+    solver.close()
+    assert multiprocessing.active_children() == before
+    assert len(data.store.load("train", 6).force) == 6
+
+
+def test_a_closed_solver_starts_no_load(scene, tmp_path):
+    data = DataSet(scene, str(tmp_path / "d"), train=10**6, val=0, test=0, workers=1)
+    solver = BackgroundSolver(data, (("train", range(k, k + 1)) for k in range(10**6)))
+    solver.wait({"train": 1})
+    solver.close()
+    assert solver.count("train") < 10**6
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_error_of_the_solver_is_raised_where_it_is_waited_for(scene, tmp_path, workers):
+    data = DataSet(scene, str(tmp_path / "d"), workers=workers)
+    data.create()
+    with exclusive_lock(data.store.folder, 0, 1):
+        solver = BackgroundSolver(data, [("train", range(6))])
+        with pytest.raises(DataSetError):
+            solver.wait({"train": 1})
+        solver.close()
+
+
+def test_a_wait_ends_at_its_time(scene, tmp_path, monkeypatch):
+    data = DataSet(scene, str(tmp_path / "d"), workers=0)
+    solver = BackgroundSolver(data, [("train", range(6))])
+    ticks = iter([0.0, 1.0, 2.0, 3.0])
+    monkeypatch.setattr(background.time, "monotonic", lambda: next(ticks))
+    solver.wait({"train": 6}, until=2.0)
+    assert solver.count("train") == 2
+    solver.close()
+
+
+def test_pending_loads_are_samples(scene, tmp_path):
+    store = Store(tmp_path / "d", scene, 0)
+    data = DataSet(scene, str(store.folder), train=5, val=0, test=0, workers=0)
+    data.fill()
+    for number in (5, 7):
+        store.pending.write(solve_load(scene, LoadKey((0, 0), number)))
+    assert len(store.load("train", 8).force) == 7
+    expected = scene.loads.sample((0, 0), [4, 5, 7]).force
+    assert torch.equal(store.load("train", 8, first=4).force, expected)
+    assert store.tried("train") == {0, 1, 2, 3, 4, 5, 7}
