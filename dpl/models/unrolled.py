@@ -236,15 +236,14 @@ class Unrolled(nn.Module):
 
     def _compiled_fields(self, force: Tensor, parameters: Tensor) -> Tensor:
         """Return displacements (B, N, D) of forces (B, N, D), one after the other."""
-        fields, material = [], self.scene.problem.material
-        for one, own in zip(force.detach(), parameters.detach(), strict=True):
+        fields = self.prescribed.repeat(force.shape[0], 1, 1)
+        material, predict = self.scene.problem.material, self._prediction
+        for one, own, field in zip(force.detach(), parameters.detach(), fields, strict=True):
             law = cast(InvariantBasedMaterial, material.with_parameters(own[None]))
-            field, _, is_local = self._prediction(*self._at_law(law), one.numpy())
-            if is_local:
+            if predict(*self._at_law(law), one.numpy(), field.numpy()):
                 loaded = one.flatten()[self.dofs].numpy()
-                field.reshape(-1)[self.dofs.numpy()] += self.local.solve(loaded, own)
-            fields.append(torch.from_numpy(field))
-        return torch.stack(fields)
+                field.view(-1)[self.dofs] += torch.from_numpy(self.local.solve(loaded, own))
+        return fields
 
     @property
     def _prediction(self) -> CompiledPrediction:
@@ -256,7 +255,6 @@ class Unrolled(nn.Module):
             prediction = CompiledPrediction.of(
                 self.group,
                 problem.free,
-                self.prescribed,
                 positions=positions,
                 probes=self.local.probes,
                 tol=self.local.tol,

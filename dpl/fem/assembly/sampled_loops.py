@@ -269,8 +269,8 @@ def set_field(model, coordinates, field):
 
 
 @njit(error_model="numpy", cache=True)
-def predict(law, c, needs, finite, mu, lam, model, force, inverse, supports, tol, field, linear):
-    """Set the field of a prediction and the coordinates of its linear solution.
+def predict(law, c, needs, finite, mu, lam, model, force, inverse, supports, tol, field):
+    """Set the field of a prediction.
 
     Args:
         law, c, needs, finite, mu, lam: The law, see `dpl.fem.assembly.kernels`.
@@ -280,15 +280,15 @@ def predict(law, c, needs, finite, mu, lam, model, force, inverse, supports, tol
         supports: V^T K(0) p of the prescribed displacement p, (R,).
         tol: Relative size of the part of the linear solution that the modes miss, above which the
             load is local.
-        field: Displacement at free degrees of freedom, (N D,); of a local load without V `linear`.
-        linear: Coordinates of the linear solution, (R,).
+        field: Displacement at free degrees of freedom, (N D,); of a local load without the
+            linear solution in the modes.
 
     Returns:
         True for a local load.
     """
     right = -supports
     reduced_force(model, force, right)
-    linear[:] = inverse @ right
+    linear = inverse @ right
     M, b = model.rest.shape
     shape = M * b // (9 * SIMD_WIDTH), 9, SIMD_WIDTH
     own, parts, both = np.zeros(model.columns.shape[1]), np.zeros((M, b)), np.zeros((M, 2 * b))

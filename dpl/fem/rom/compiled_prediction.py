@@ -44,13 +44,11 @@ class CompiledPrediction:
 
     Attributes:
         arrays: Its matrices, see `ModelArrays`.
-        prescribed: Prescribed displacement, (N, D).
         tol: Relative size of the part of the linear solution that the modes miss, above which a
             load is local.
     """
 
     arrays: ModelArrays
-    prescribed: Array
     tol: float
 
     @classmethod
@@ -58,7 +56,6 @@ class CompiledPrediction:
         cls,
         group: Sequence[Symmetry],
         free: Tensor,
-        prescribed: Tensor,
         *,
         parity: Tensor,
         modes: Tensor,
@@ -75,7 +72,7 @@ class CompiledPrediction:
         Args:
             group: Symmetries of the body.
             free: Mask of free degrees of freedom, (N, D).
-            prescribed, tol: See the class.
+            tol: See the class.
             parity: Parity of each mode, (R,).
             modes: V at free degrees of freedom, (n, R).
             probes: Fields whose products with a force estimate the missing part, (n, F).
@@ -123,12 +120,12 @@ class CompiledPrediction:
             maps=_single(every),
             limits=_double(limits),
         )
-        return cls(arrays, prescribed.numpy(), tol)
+        return cls(arrays, tol)
 
     def __call__(
-        self, law: LawArguments, inverse: Array, supports: Array, force: Array
-    ) -> tuple[Array, Array, bool]:
-        """Return the displacement (N, D), coordinates of the linear solution (R,), and locality.
+        self, law: LawArguments, inverse: Array, supports: Array, force: Array, field: Array
+    ) -> bool:
+        """Set the displacement at free degrees of freedom; return True for a local load.
 
         The displacement under a local load lacks the linear solution V c.
 
@@ -137,13 +134,12 @@ class CompiledPrediction:
             inverse: (V^T K(0) V)^-1, (R, R).
             supports: V^T K(0) p, (R,).
             force: Nodal forces, (N, D).
+            field: Displacement, (N, D), contiguous.
         """
-        field, linear = self.prescribed.copy(), np.empty_like(supports)
         flat = np.ascontiguousarray(force).reshape(-1)
         tol = min(self.tol, np.finfo(float).max ** 0.25)
-        data = self.arrays, flat, inverse, supports, tol, field.reshape(-1), linear
-        is_local = call_compiled(predict, *law, *data)
-        return field, linear, is_local
+        data = self.arrays, flat, inverse, supports, tol, field.reshape(-1)
+        return bool(call_compiled(predict, *law, *data))
 
 
 def _double(tensor: Tensor) -> NDArray[np.float64]:
