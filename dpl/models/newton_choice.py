@@ -9,8 +9,8 @@ from dpl.fem import Load, Problem, SubspaceNewton
 from dpl.scene import Sample
 
 RANKS = (60, 160)  # numbers of modes that are tried, and all modes
-CANDIDATES = 800  # cells to choose from
-STATES = 128  # equilibria at which cells are chosen
+CANDIDATES = 300  # cells to choose from
+STATES = 32  # equilibria at which cells are chosen
 TOLERANCE = 3e-2  # of the reduced forces of these cells [-]
 LOADS = 50  # held-out loads by which the number of modes is chosen
 NEAR_BEST = 1.1  # ratio of errors up to which fewer modes are preferred
