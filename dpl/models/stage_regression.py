@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import fsum
 from typing import NamedTuple
 
 import torch
@@ -32,8 +31,12 @@ class Rows(NamedTuple):
 
 
 def weighted_error(error: Tensor, weights: Tensor) -> float:
-    """Return the root of the mean weighted squares of the rows of errors (S, R); inf for NaN."""
-    mean = float((error * weights[:, None]).square().sum(dim=1).mean().sqrt())
+    """Return the mean of the weighted norms of the rows of errors (S, R); inf for NaN.
+
+    Norms and not squares: a few samples beyond an instability, which no map predicts, would
+    otherwise decide.
+    """
+    mean = float((error * weights[:, None]).norm(dim=1).mean())
     return mean if mean == mean else float("inf")
 
 
@@ -110,7 +113,7 @@ class RidgeFit(NamedTuple):
     Attributes:
         matrix: (C F D D, R).
         ridge: The ridge that was chosen, relative to the squares of each feature [-].
-        error: Weighted root mean square error of the held-out rows.
+        error: Weighted mean error of the held-out rows.
     """
 
     matrix: Tensor
@@ -152,16 +155,17 @@ def fit_map(rows: Rows, held_out: Rows, action: GroupAction) -> RidgeFit:
         matrices = [m for part in parts if (m := part.solve(ridge)) is not None]
         if len(matrices) < len(parts):
             continue
-        square = fsum(p.squared_error(m) for p, m in zip(parts, matrices, strict=True))
-        if square < least:
-            best, chosen, least = matrices, ridge, square
-        elif square > WORSE**2 * least:
+        squares = [p.squared_errors(m) for p, m in zip(parts, matrices, strict=True)]
+        error = float(torch.stack(squares).sum(dim=0).sqrt().mean())
+        if error < least:
+            best, chosen, least = matrices, ridge, error
+        elif error > WORSE * least:
             break
     if not best:
         raise ValueError("the samples are not finite")
     maps = [p.whole(m, action, shape) for p, m in zip(parts, best, strict=True)]
     matrix = action.with_exact_parity(torch.stack(maps).sum(dim=0), shape[1])
-    return RidgeFit(matrix, chosen, (least / len(held_out.weights)) ** 0.5)
+    return RidgeFit(matrix, chosen, least)
 
 
 class _ComponentFit(NamedTuple):
@@ -172,7 +176,7 @@ class _ComponentFit(NamedTuple):
         coordinates: See `Component.coordinate_parts`, (d, R, R).
         gram, product: Of features that are divided by `scale`, (p, p) and (p, R).
         scale: Root sum of squares of each feature, (p,).
-        features, targets: Held-out rows, (S, p) and (S, R).
+        features, targets: Held-out rows, (S d, p) and (S d, R).
     """
 
     component: Component
@@ -190,10 +194,10 @@ class _ComponentFit(NamedTuple):
         factor, failed = torch.linalg.cholesky_ex(shifted)
         return None if failed else torch.cholesky_solve(self.product, factor) / self.scale[:, None]
 
-    def squared_error(self, matrix: Tensor) -> float:
-        """Return the squared error of the held-out rows."""
-        error = (self.targets - self.features @ matrix).abs().square().sum()
-        return self.component.copies * float(error)
+    def squared_errors(self, matrix: Tensor) -> Tensor:
+        """Return the component of the squared error of each held-out sample, (S,)."""
+        error = (self.targets - self.features @ matrix).abs().square().sum(dim=1)
+        return self.component.copies * error.unflatten(0, (-1, len(self.coordinates))).sum(dim=1)
 
     def whole(self, matrix: Tensor, action: GroupAction, shape: Sequence[int]) -> Tensor:
         """Return the map from all features to all coordinates, (C F D D, R).
