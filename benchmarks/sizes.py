@@ -18,7 +18,7 @@ from dpl import Sample, Scene
 from dpl.evaluation import latency
 from dpl.fem import LinearSolver, Load, ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, solve
 from dpl.fem.linear import select_backend
-from dpl.models import FCNN, Latent
+from dpl.models import FCNN, Unrolled
 from dpl.system.threads import one_thread
 from dpl.training import MSE, Surrogate
 
@@ -68,7 +68,7 @@ def _size(cells: int, memory_limit: float, loads: int) -> list[Size]:
 
 
 def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
-    """Yield the rows of one beam; the networks have random weights."""
+    """Yield the rows of one beam; the maps of `unrolled` are fitted to artificial samples."""
     mesh = box(BEAM, [4 * cells + 1, cells + 1, cells + 1])
     problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"))
     newton = Newton(problem, tol=1e-6)
@@ -96,15 +96,15 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
             pass
 
     yield row("Newton, corotational, from a guess with a relative error of 1e-3", hybrid)
-    net = Latent(scene)
+    net = Unrolled(scene)
     surrogate = Surrogate(net, MSE(), scene).eval()
     drawn = scene.loads.sample((0, 0), range(64))
     linear = torch.stack([newton.linear_solver.solve(force) for force in drawn.force])
     bent = linear + linear * linear.norm(dim=-1, keepdim=True)
-    surrogate.fit_bases(Sample(drawn.force, bent, drawn.young))
+    samples = Sample(drawn.force, bent, drawn.young, drawn.parameters)
+    net.fit(samples, samples)
     kept = sum(t.nbytes for t in surrogate.state_dict().values()) / 1e6
-    count = sum(p.numel() for p in net.parameters())
-    yield row("latent", surrogate.predict, parameters=count, memory_mb=kept)
+    yield row("unrolled", surrogate.predict, memory_mb=kept)
     weights = 4 * dofs**2 + 7 * dofs
     if 4e-9 * weights < memory_limit:
         whole = Surrogate(FCNN(scene, all_dofs=True, memory_limit=1e9), MSE(), scene).eval()

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from dpl.models.cnn import CNN
     from dpl.models.fcnn import FCNN
     from dpl.models.gnn import GNN
-    from dpl.models.latent import Latent
     from dpl.models.pod import PODNet
     from dpl.scene import Sample, Scene
     from dpl.system.files import DataSetError

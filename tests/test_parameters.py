@@ -2,7 +2,6 @@
 
 import json
 import pickle
-from functools import partial
 
 import lightning as L
 import numpy as np
@@ -30,8 +29,7 @@ from dpl.fem import (
 )
 from dpl.fem.postprocess import RestStiffness
 from dpl.inference import Hybrid
-from dpl.models import CNN, FCNN, GNN, Latent, PODNet
-from dpl.models.poisson_interpolation import PoissonInterpolation
+from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
 from dpl.training import (
     MSE,
     EnergyNormLoss,
@@ -403,9 +401,8 @@ def by_poisson(module, sample, span=SPAN):
         lambda scene: CNN(scene, channels=2),
         lambda scene: GNN(scene, width=4),
         lambda scene: PODNet(scene, rank=20, coordinates=8, width=16, blocks=1),
-        lambda scene: Latent(scene, rank=20, coordinates=8, width=16, blocks=1),
     ],
-    ids=["fcnn", "cnn", "gnn", "pod", "latent"],
+    ids=["fcnn", "cnn", "gnn", "pod"],
 )
 def test_every_network_hears_poissons_ratio_and_a_batch_is_its_members(build, wide, sets, few):
     torch.manual_seed(0)
@@ -427,27 +424,12 @@ def test_a_network_that_takes_none_is_refused(wide):
         Surrogate(torch.nn.Flatten(), MSE(), wide)
 
 
-@pytest.mark.parametrize("span", [[0.2, 0.4], [0.0, 0.45], [0.1, 0.49]])
-def test_linear_answers_between_nodes_are_those_of_every_poissons_ratio(make_scene, span):
-    scene = make_scene(poisson=span)
-    rests, free = PoissonInterpolation(scene.linear), scene.problem.free
-    force = scene.loads.sample((0, 0), [1]).force[0]
-    right = force[free].numpy()
-    answers = torch.cat([torch.from_numpy(one.factor.solve(right)) for one in rests.solvers])
-    assert all(span[0] <= nu <= span[1] for nu in rests.nodes)
-    for nu in torch.linspace(*span, 7, dtype=torch.float64):
-        exact = scene.linear.with_parameters(nu.view(1, 1)).solve(force)[free]
-        found = rests.interpolate(answers[None], nu.view(1, 1))[0]
-        assert (found - exact).norm() < 1e-5 * exact.norm()
-
-
-@pytest.mark.parametrize("tol", [0, torch.inf])
-def test_small_loads_are_answered_linearly_at_every_poissons_ratio(wide, sets, few, tol):
-    """To the rank of the basis without the factors, exactly with them; however badly trained."""
-    torch.manual_seed(0)
-    net = Latent(wide, rank=90, coordinates=8, width=16, blocks=1, linear_tol=tol, symmetry=False)
+@pytest.mark.parametrize(("tol", "most"), [(0, 1e-3), (torch.inf, 5e-3)])
+def test_small_loads_are_answered_linearly_at_every_poissons_ratio(wide, sets, few, tol, most):
+    """To the tolerance of the factor, or without it to that of Galerkin solutions in the modes."""
+    net = Unrolled(wide, rank=90, cells=8, stages=1, linear_tol=tol, symmetry=False)
+    net.fit(sets.samples("train"), sets.samples("val"))
     module = Surrogate(net, MSE(), wide).eval()
-    module.fit_bases(sets.samples("train"))
     light = few._replace(force=1e-4 * few.force)
     exact = solve(wide.linear, light.load).displacement
     with torch.no_grad():
@@ -457,21 +439,22 @@ def test_small_loads_are_answered_linearly_at_every_poissons_ratio(wide, sets, f
     def error(field):
         return float(((field - exact).flatten(1).norm(dim=1) / exact.flatten(1).norm(dim=1)).max())
 
-    assert error(found) < 1e-3
+    assert error(found) < most
     assert error(found) < error(reference) / 20
 
 
 def test_encoded_samples_are_what_the_network_sees(wide, sets, few):
-    net = Latent(wide, rank=20, coordinates=8, width=16, blocks=1, linear_tol=torch.inf)
+    net = PODNet(wide, rank=20, coordinates=8, width=16, blocks=1)
     module = Surrogate(net, MSE(), wide).eval()
     module.fit_bases(sets.samples("train"))
     encoded = module.encode(few).__getitems__(list(range(4)))
     seen = []
     net.symmetrised_output = lambda inputs: seen.append(inputs) or torch.zeros(len(inputs), 20)
-    linear = module.predict(few.load)
+    zero = module.predict(few.load)
+    assert not zero.any()
     assert torch.allclose(encoded.inputs, seen[0], rtol=1e-3, atol=1e-5)
     assert torch.allclose(encoded.inputs[:, -1:], ((few.parameters - 0.3) / 0.1).float(), atol=1e-6)
-    missed = (few.displacement - linear) / module.displacement_scale
+    missed = few.displacement / module.displacement_scale
     square = encoded.targets.double().square().sum(1) + encoded.squared_error
     assert torch.allclose(missed.square().flatten(1).sum(1), square, rtol=1e-3)
 
@@ -499,13 +482,10 @@ def test_a_network_that_is_told_poissons_ratio_is_clearly_better(make_scene, tmp
     assert errors[FCNN] < 0.6 * errors[Untold]
 
 
-def test_latent_trains_in_coordinates_and_is_evaluated(wide, sets, tmp_path, monkeypatch):
-    torch.manual_seed(0)
-    net = Latent(wide, rank=60, coordinates=15, width=32, blocks=1)
-    adam = partial(torch.optim.Adam, lr=3e-3)
-    module = Surrogate(net, MSE(relative=1.0), wide, optimizer=adam)
+def test_a_solver_with_ranges_is_fitted_and_evaluated(wide, sets, tmp_path, monkeypatch):
+    module = Surrogate(Unrolled(wide, rank=60, cells=16, stages=1), MSE(), wide)
     trainer = L.Trainer(
-        max_epochs=40,
+        max_epochs=1,
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,

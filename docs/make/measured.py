@@ -46,19 +46,11 @@ PARTS = (
     Part(
         "hybrid_newton",
         "Newton from predictions",
-        "python scripts/convergence.py run=runs/beam_svk networks=[latent,fcnn] n_far_loads=0 "
+        "python scripts/convergence.py run=runs/beam_svk networks=[fcnn] n_far_loads=0 "
         "folder=benchmarks/results",
         "The paper's experiment 4: 50 loads in range and 50 of one to two times the range, one at "
         "a time on one thread.",
         split="tol",
-    ),
-    Part(
-        "hybrid_newton_far",
-        "Newton from predictions outside the training range",
-        "python scripts/convergence.py name=hybrid_newton_far run=runs/beam_svk networks=[latent] "
-        "count=0 n_far_loads=8 tols=[1e-6] folder=benchmarks/results",
-        "Loads of three and of five times the range.",
-        split="loads",
     ),
     Part(
         r"pareto_(beam_svk|propeller_nh)",
@@ -87,13 +79,6 @@ PARTS = (
         "The largest nodal displacement of each test load of `beam_svk` and of `propeller_nh`, "
         "over the longest side of the body.",
         tabulated=False,
-    ),
-    Part(
-        r"stress_(\w+)",
-        "A trained run outside its range, `{0}`",
-        "python scripts/stress.py cases=[] run=runs/{0}/latent",
-        "Loads from 1e-9 to 25 times the range.",
-        split="series",
     ),
     Part(
         "soak",

@@ -1,6 +1,5 @@
 """Methods of a comparison: linear, POD-Galerkin, network, corrected network."""
 
-import copy
 import json
 import time
 from dataclasses import dataclass
@@ -8,7 +7,7 @@ from pathlib import Path
 from typing import cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dpl.fem import Load, PODGalerkin
 from dpl.inference.hybrid import Predict
@@ -97,11 +96,9 @@ def corrected(
     own = net.correction() if isinstance(net, HasCorrection) else None
     solver = own or net.galerkin(train.displacement, rank=rank, tolerance=tolerance)
     minutes = (method.training_minutes or 0.0) + (time.perf_counter() - start) / 60
-    start_from = copy.copy(surrogate)
-    start_from._modules = {**surrogate._modules, "net": cast(nn.Module, net.for_correction())}
 
     def predict(load: Load) -> Tensor:
-        pairs = zip(load.force, start_from.predict(load), strict=True)
+        pairs = zip(load.force, surrogate.predict(load), strict=True)
         return torch.stack([solver.correct(f, u, steps=steps) for f, u in pairs])
 
     return Method(predict, method.samples, minutes, method.parameters)

@@ -31,7 +31,7 @@ class GraphOutput(NamedTuple):
 
     Attributes:
         displacement: (B, N, D) [m].
-        local: Mask of loads that the basis of the network cannot represent, (B,). `Latent` solves
+        local: Mask of loads that the basis of the network cannot represent, (B,). dpl solves
             these with the factor of K(0), which the graph does not contain.
     """
 

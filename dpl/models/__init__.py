@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from dpl.models.cnn import CNN
     from dpl.models.fcnn import FCNN
     from dpl.models.gnn import GNN
-    from dpl.models.latent import Latent
     from dpl.models.pod import PODNet
     from dpl.models.protocols import (
         ClosedFormFit,

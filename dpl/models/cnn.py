@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from dpl.fem import Problem
 from dpl.models.grid import Immersion, Permutation, cubic_grid, filling, own_grid
-from dpl.models.poisson_interpolation import normalise_parameters
+from dpl.models.parameters import normalise_parameters
 from dpl.scene import Scene
 from dpl.system.memory import refuse_beyond
 

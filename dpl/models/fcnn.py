@@ -5,7 +5,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from dpl.models.poisson_interpolation import normalise_parameters
+from dpl.models.parameters import normalise_parameters
 from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 

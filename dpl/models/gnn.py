@@ -9,7 +9,7 @@ from torch.nn.functional import gelu
 
 from dpl.models.graph import Graph, Integers, hierarchy, means
 from dpl.models.message_passing import Level, Messages
-from dpl.models.poisson_interpolation import normalise_parameters
+from dpl.models.parameters import normalise_parameters
 from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 

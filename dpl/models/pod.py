@@ -3,7 +3,7 @@
 The bases are fitted to the training samples (`fit_bases`) and stored in buffers of the network.
 """
 
-from typing import NamedTuple, Self, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from dpl.models.invariant_basis import (
     pad_columns,
     scatter_fields,
 )
-from dpl.models.poisson_interpolation import normalise_parameters
+from dpl.models.parameters import normalise_parameters
 from dpl.models.reduced_samples import (
     ReducedDataset,
     ReducedSamples,
@@ -49,21 +49,6 @@ class Block(nn.Module):
         return cast(Tensor, x + self.outer(nn.functional.gelu(self.inner(x))))
 
 
-class LoadEncoding(NamedTuple):
-    """Sizes of the encoding of loads.
-
-    Attributes:
-        size: Number of coordinates of a load, C.
-        evaluations: Number of Poisson's ratios at which the coordinates are computed, K.
-        own_basis: True if loads have a basis of their own; False if they share that of
-            displacements.
-    """
-
-    size: int
-    evaluations: int = 1
-    own_basis: bool = True
-
-
 class PODNet(nn.Module):
     """Residual network from POD coordinates of loads to POD coordinates of displacements.
 
@@ -77,9 +62,9 @@ class PODNet(nn.Module):
     Attributes:
         group: The symmetries, identity first; empty without symmetry.
         modes: Orthonormal modes of the displacement at the representatives of `Orbits`, (R, n D).
-        load_basis: Map from forces at the representatives to coordinates of loads, (n' D, C).
-        inverse_load_actions: T_g^-1 of coordinates of loads, see `Orbits`, (G, C, C).
-        input_map: Map from coordinates of loads to inputs of the network, (C, M).
+        load_basis: Map from forces at the representatives to coordinates of loads, (n' D, M).
+        inverse_load_actions: T_g^-1 of coordinates of loads, see `Orbits`, (G, M, M).
+        input_map: Map from coordinates of loads to inputs of the network, (M, M).
         output_scale: Scale of each output of the network, (R,).
         input_actions: T_g of inputs, (G, M, M).
         inverse_output_actions: T_g^-1 of coordinates of displacements, (G, R, R).
@@ -137,43 +122,30 @@ class PODNet(nn.Module):
         self.output_orbits = Orbits(self.group, self.free_dofs)
         rank = min(rank, int(self.free_dofs.sum()))
         coordinates = min(coordinates, int(self.load_dofs.sum()))
-        encoding = self._load_encoding(rank, coordinates)
-        coordinates = min(coordinates, encoding.size)
         self.parameter_ranges = scene.loads.parameter_ranges
         self.extra_inputs = ("parameters",) if self.parameter_ranges else ()
-        weights = self._count_parameters(coordinates, rank, width) + 2 * blocks * width * (
-            width + 1
-        )
+        inputs = coordinates + len(self.extra_inputs)
+        weights = width * (inputs + 1) + (width + 1) * rank + 2 * blocks * width * (width + 1)
         refuse_weights(weights, None, "take a smaller model.width or model.blocks")
-        self._register_bases(rank, coordinates, encoding)
+        self._register_bases(rank, coordinates)
         self.enter = nn.Linear(self.input_actions.shape[1], width)
         self.blocks = nn.Sequential(*(Block(width) for _ in range(blocks)))
         self.leave = nn.Linear(width, rank)
 
-    def _register_bases(self, rank: int, coordinates: int, encoding: LoadEncoding) -> None:
+    def _register_bases(self, rank: int, coordinates: int) -> None:
         """Register the buffers of the bases, filled with zeros."""
         members, inputs = max(1, len(self.group)), coordinates + len(self.extra_inputs)
-        shapes: dict[str, tuple[int, ...]] = {
+        for name, shape in {
             "modes": (rank, len(self.output_orbits.weights)),
-            "load_basis": (len(self.input_orbits.weights), encoding.size * encoding.evaluations),
-            "input_map": (encoding.size, coordinates),
+            "load_basis": (len(self.input_orbits.weights), coordinates),
+            "inverse_load_actions": (members, coordinates, coordinates),
+            "input_map": (coordinates, coordinates),
             "output_scale": (rank,),
             "input_actions": (members, inputs, inputs),
             "inverse_output_actions": (members, rank, rank),
-        }
-        if encoding.own_basis:
-            shapes["inverse_load_actions"] = (members, encoding.size, encoding.size)
-        for name, shape in shapes.items():
+        }.items():
             self.register_buffer(name, torch.zeros(shape))
         self.register_buffer("fitted", torch.tensor(False))
-
-    def _count_parameters(self, coordinates: int, rank: int, width: int) -> int:
-        """Return the number of parameters outside the residual blocks."""
-        return width * (coordinates + len(self.extra_inputs) + 1) + (width + 1) * rank
-
-    def _load_encoding(self, rank: int, coordinates: int) -> LoadEncoding:
-        """Return the sizes of the encoding of loads for R modes and M inputs."""
-        return LoadEncoding(coordinates)
 
     @property
     def is_fitted(self) -> bool:
@@ -192,12 +164,12 @@ class PODNet(nn.Module):
             force: Scaled nodal forces.
             parameters: Parameters of the law, (B, P); required if it has ranges.
         """
-        encoded = self.encode_loads(self.input_orbits.images(force), parameters)
+        encoded = self.encode_loads(self.input_orbits.images(force))
         inputs = self.append_parameters(encoded @ self.input_map, parameters)
         return self.field(self.symmetrised_output(inputs), force)
 
-    def encode_loads(self, images: Tensor, parameters: Tensor | None) -> Tensor:
-        """Return coordinates (B, C) of loads from their images, (B, G, n' D)."""
+    def encode_loads(self, images: Tensor) -> Tensor:
+        """Return coordinates (B, M) of loads from their images, (B, G, n' D)."""
         read = images @ self.load_basis.to(images)
         return sum_over_images(read, self.inverse_load_actions.to(images))
 
@@ -245,7 +217,7 @@ class PODNet(nn.Module):
 
     # ------------------------------------------------------------------ bases
 
-    def fit_bases(self, samples: Sample, unit: float) -> None:
+    def fit_bases(self, samples: Sample) -> None:
         """Compute the bases; see `TrainsInCoordinates`."""
         force, displacement = self._columns(samples)
         size = displacement.norm(dim=1)
@@ -259,7 +231,7 @@ class PODNet(nn.Module):
         self._set_modes(modes)
         self.load_basis.copy_(self._load_functionals(loads).T)
         actions = group_actions(loads, self.load_dofs, self.group)
-        self._set_scales(force @ loads, displacement @ modes, weight, actions)
+        self._set_scales(force @ loads, displacement @ modes)
         self.inverse_load_actions.copy_(actions.mT)
         self._set_actions(actions, group_actions(modes, self.free_dofs, self.group))
         self.fitted.fill_(True)
@@ -270,7 +242,7 @@ class PODNet(nn.Module):
         self.modes.copy_(self.output_orbits.at_representatives(fields))
 
     def _load_functionals(self, columns: Tensor) -> Tensor:
-        """Return functionals of forces at the representatives, (C, n' D), from (inputs, C)."""
+        """Return functionals of forces at the representatives, (M, n' D), from (inputs, M)."""
         fields = scatter_fields(columns.T, self.load_dofs).to(self.load_basis.device)
         weights = self.input_orbits.weights.to(fields)
         return self.input_orbits.at_representatives(fields) * weights
@@ -298,20 +270,12 @@ class PODNet(nn.Module):
         vectors[problem.free] = torch.linalg.qr(self.basis[:rank].double().cpu().T)[0]
         return SubspaceNewton.within(problem, vectors, states[:CELL_STATES], tolerance=tolerance)
 
-    def for_correction(self) -> Self:
-        """See `Correctable`."""
-        return self
-
-    def _set_scales(
-        self, encoded: Tensor, targets: Tensor, weight: Tensor, actions: Tensor
-    ) -> None:
+    def _set_scales(self, encoded: Tensor, targets: Tensor) -> None:
         """Set the input map and the output scale.
 
         Args:
-            encoded: Coordinates of the training loads, (S, C).
+            encoded: Coordinates of the training loads, (S, M).
             targets: Coordinates of the training displacements, (S, R).
-            weight: Weights of the samples, (S,).
-            actions: T_g of coordinates of loads, (G, C, C).
         """
         self.input_map.copy_(torch.diag(1 / partial_whitening(root_mean_square(encoded))))
         size = root_mean_square(targets)
@@ -346,7 +310,9 @@ class PODNet(nn.Module):
         return ReducedDataset(whole, self.input_actions.cpu(), self.inverse_output_actions.mT.cpu())
 
     def _encode_chunk(self, samples: Sample) -> ReducedSamples:
-        read, targets, error = self._reduce(samples)
+        targets = self.coordinates(samples.displacement)
+        error = squared_projection_error(samples.displacement, targets)
+        read = self.encode_loads(self.input_orbits.images(samples.force))
         inputs = self.append_parameters(read @ self.input_map.to(read), samples.parameters)
         square = samples.displacement.flatten(1).square().sum(1)
         encoded = ReducedSamples(
@@ -356,14 +322,3 @@ class PODNet(nn.Module):
             mean_square=square / self.free_dofs.numel(),
         )
         return ReducedSamples(*(column.cpu() for column in encoded))
-
-    def _reduce(self, samples: Sample) -> tuple[Tensor, Tensor, Tensor]:
-        """Return reduced coordinates of samples (S, N, D).
-
-        Returns:
-            Coordinates of the loads (S, C), targets of the network (S, R), and squared projection
-            errors (S,).
-        """
-        targets = self.coordinates(samples.displacement)
-        read = self.encode_loads(self.input_orbits.images(samples.force), samples.parameters)
-        return read, targets, squared_projection_error(samples.displacement, targets)

@@ -3,7 +3,7 @@
 A network of another package has a capability if it defines the methods; it need not inherit.
 """
 
-from typing import Protocol, Self, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -30,14 +30,8 @@ class TrainsInCoordinates(Protocol):
         """True if `encode` adds the images of the samples under the symmetries of the body."""
         ...
 
-    def fit_bases(self, samples: Sample, unit: float) -> None:
-        """Compute the bases from scaled training samples.
-
-        Args:
-            samples: Scaled forces and displacements, (S, N, D), float64.
-            unit: Scale of forces over scale of displacements: K(0)^-1 f of scaled fields is `unit`
-                times K(0)^-1 f of dimensionless fields.
-        """
+    def fit_bases(self, samples: Sample) -> None:
+        """Compute the bases from scaled training samples (S, N, D), float64."""
         ...
 
     def encode(self, samples: Sample) -> ReducedDataset:
@@ -84,10 +78,6 @@ class Correctable(Protocol):
             rank: Number of modes.
             tolerance: Tolerance of the choice of cells, see `dpl.fem.rom.ecsw`.
         """
-        ...
-
-    def for_correction(self) -> Self:
-        """Return the network, with shared weights, whose predictions are to be corrected."""
         ...
 
 

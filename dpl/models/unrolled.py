@@ -1,6 +1,6 @@
 """Unrolled reduced solver: a few iterations in a subspace whose linear maps are fitted to data."""
 
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -407,10 +407,6 @@ class Unrolled(nn.Module):
         some = states[:CELL_STATES]
         modes = self._orthonormal(rank)
         return SubspaceNewton.within(self.scene.problem, modes, some, tolerance=tolerance)
-
-    def for_correction(self) -> Self:
-        """See `Correctable`."""
-        return self
 
     def skipped_work(self) -> list[str]:
         """Return the work that the model saves, one line each."""

@@ -181,8 +181,7 @@ class Surrogate(L.LightningModule):
 
     def fit_bases(self, samples: Sample) -> None:
         """Fit the bases of the network to training samples (S, N, D)."""
-        unit = float(self.force_scale / self.displacement_scale)
-        cast(TrainsInCoordinates, self.net).fit_bases(self._scale(samples), unit)
+        cast(TrainsInCoordinates, self.net).fit_bases(self._scale(samples))
 
     def validation_step(self, batch: Sample, batch_idx: int) -> None:
         """Update the validation metrics."""

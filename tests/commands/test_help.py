@@ -68,7 +68,7 @@ def test_help_of_a_wrong_option_ends_with_one_line(script, tmp_path):
 
 def test_help_of_a_benchmark_lists_options_and_comments_of_the_package(script, tmp_path):
     reported = " ".join(script("soak", "--help", cwd=tmp_path).out.split())
-    assert "network: cnn, fcnn*, gnn, latent, pod" in reported
+    assert "network: cnn, fcnn*, gnn, pod" in reported
     assert "optimizer.lr = 0.001 learning rate [-]" in reported
     ended = script("soak", "model=fcm", cwd=tmp_path)
     assert ended.err.startswith("error: model = fcm: there is no such option; model is one of cnn")

@@ -10,12 +10,12 @@ from hydra.core.global_hydra import GlobalHydra
 from dpl.commands import dry_run, generate, train
 from dpl.config import ConfigError, build
 
-OPTIONS = "model is one of cnn, fcnn, gnn, latent, pod, unrolled"
+OPTIONS = "model is one of cnn, fcnn, gnn, pod, unrolled"
 EXPERIMENTS = "experiment is one of beam_nh_loss, beam_poisson, beam_svk, "
 NONSENSE = {  # command line -> what the one line says
     "train experiment=beam_yuong": f"experiment = beam_yuong: .* beam_young\\? {EXPERIMENTS}",
     "generate experiment=beam_yuong": f"experiment = beam_yuong: .* beam_young\\? {EXPERIMENTS}",
-    "train hparams_search=latnt": r"^hparams_search = latnt: .* did you mean latent\?",
+    "train hparams_search=podd": r"^hparams_search = podd: .* did you mean pod\?",
     "train modle=fcnn": r"^modle: there is no such key; did you mean model\?$",
     "train +modle=fcnn": r"^modle: this command has no such key; did you mean model\?$",
     "train ~modle": r"^modle: there is no such key; did you mean model\?$",

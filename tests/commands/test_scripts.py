@@ -355,7 +355,7 @@ def configurations(folder):
 def swept(start, tiny_training, tmp_path_factory):
     """Where a sweep over networks and losses ran."""
     home = tmp_path_factory.mktemp("swept")
-    sweep = ["-m", "model=fcnn,latent", "loss=mse,lr_star"]
+    sweep = ["-m", "model=fcnn,pod", "loss=mse,lr_star"]
     process = start("train", *sweep, *tiny_training, "trainer.max_epochs=1", "run=sweep", cwd=home)
     status, _, err = finish(process)
     assert status == 0, err[-2000:]
@@ -367,8 +367,8 @@ def test_a_sweep_over_networks_gives_each_the_loss_that_is_asked_for_and_a_folde
     assert set(runs) == {
         ("FCNN", "MSE", "AdamW"),
         ("FCNN", "LrStar", "AdamW"),
-        ("Latent", "MSE", "AdamW"),
-        ("Latent", "LrStar", "AdamW"),
+        ("PODNet", "MSE", "AdamW"),
+        ("PODNet", "LrStar", "AdamW"),
     }
     judged = {json.loads((folder / "evaluation.json").read_text())[1]["errors"]["e_mean"]
               for folder in runs.values()}  # fmt: skip
@@ -419,7 +419,7 @@ def test_the_hparams_tab_shows_the_runs_of_a_sweep_side_by_side(swept):
             assert errors[f"best/{name}"] == pytest.approx(rows[1]["errors"][name], rel=1e-5)
         width, wanted = line.hparams["model.width"].number_value, 16
         assert width == wanted
-        assert ("model.rank" in line.hparams) == (shown["model"] == "Latent")
+        assert ("model.rank" in line.hparams) == (shown["model"] == "PODNet")
         assert ("model.layers" in line.hparams) == (shown["model"] == "FCNN")
 
 
@@ -428,13 +428,13 @@ def test_every_network_trains_with_either_loss_in_one_command(start, tiny_traini
     """As it stands in the README, but for the size; networks have the widths of their files."""
     sizes = [o for o in tiny_training if not o.startswith("model.")]
     process = start(
-        "train", "-m", "model=fcnn,cnn,gnn,pod,latent", "loss=mse,lr_star", *sizes,
+        "train", "-m", "model=fcnn,cnn,gnn,pod", "loss=mse,lr_star", *sizes,
         "trainer.max_epochs=1", "run=all", cwd=tmp_path,
     )  # fmt: skip
     status, _, err = finish(process)
     assert status == 0, err[-2000:]
     runs = configurations(tmp_path / "all")
-    models = ("FCNN", "CNN", "GNN", "PODNet", "Latent")
+    models = ("FCNN", "CNN", "GNN", "PODNet")
     assert set(runs) == {(model, loss, "AdamW") for model in models for loss in ("MSE", "LrStar")}
     for folder in runs.values():
         rows = json.loads((folder / "evaluation.json").read_text())
@@ -445,14 +445,14 @@ def test_every_network_trains_with_either_loss_in_one_command(start, tiny_traini
 
 @pytest.fixture
 def search(script, tiny_training, tmp_path):
-    """Searches for the flagship's numbers on the tiny scene; returns what ended, and the folder."""
+    """Searches for numbers of a POD network on the tiny scene; returns result and folder."""
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
 
     def search(*overrides):
         sizes = [o for o in tiny_training if not o.startswith("data.batch_size")]
         ended = script(
             "train",
-            "hparams_search=latent",
+            "hparams_search=pod",
             *sizes,
             "trainer.max_epochs=1",
             "run=s",

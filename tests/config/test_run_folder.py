@@ -409,7 +409,7 @@ def test_generation_imports_neither_lightning_nor_matplotlib(tmp_path, environme
 
 
 @pytest.mark.parametrize(
-    "argument", ["hparams_search=latent", "+hparams_search=latent", "hydra/sweeper=optuna"]
+    "argument", ["hparams_search=pod", "+hparams_search=pod", "hydra/sweeper=optuna"]
 )
 def test_a_sweep_without_optuna_says_in_one_line_what_to_install(
     script, monkeypatch, argument, tmp_path
@@ -424,9 +424,9 @@ def test_a_sweep_without_optuna_says_in_one_line_what_to_install(
 
 
 def test_hyperparameters_are_flat_and_a_call_goes_by_its_name(compose):
-    cfg = compose("folder=.", "experiment=latent", "young=[1e6,2e11]", command="train")
+    cfg = compose("folder=.", "experiment=pod", "young=[1e6,2e11]", command="train")
     flat = build.hyperparameters(cfg)
-    assert flat["model"] == "Latent"
+    assert flat["model"] == "PODNet"
     assert (flat["model.width"], flat["optimizer.lr"], flat["loss"]) == (256, 5e-3, "RMSELoss")
     assert flat["young"] == "[1000000.0, 200000000000.0]"
     assert all(isinstance(value, bool | int | float | str) for value in flat.values())

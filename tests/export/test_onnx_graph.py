@@ -29,7 +29,7 @@ from dpl.export.onnx_graph import missing_packages
 from dpl.export.reference import solve_reference
 from dpl.fem import Load, rectangle, solve, surface
 from dpl.fem.postprocess import triangles
-from dpl.models import CNN, FCNN, GNN, Latent, PODNet, Unrolled
+from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
 from dpl.training import MSE, Surrogate
 
 pytestmark = pytest.mark.skipif(
@@ -69,16 +69,18 @@ NETWORKS = {
     "gnn, edges": (GNN, {"width": 8, "levels": 1}, {"nodes": (9, 3, 3)}),
     "gnn, poisson": (GNN, {"width": 8}, {"poisson": [0.2, 0.4]}),
     "pod": (PODNet, {"rank": 8, "width": 16}, {}),
-    "latent": (Latent, {"rank": 16, "width": 16, "linear_tol": 0.01}, {}),
-    "latent, quadratic": (Latent, {"rank": 8, "width": 16}, {"nodes": (3, 2, 2), "degree": 2}),
-    "latent, poisson": (Latent, {"rank": 8, "width": 16}, {"poisson": [0.2, 0.4]}),
     "unrolled": (Unrolled, {"rank": 12, "cells": 8, "stages": 1, "linear_tol": 0.01}, {}),
+    "unrolled, quadratic": (
+        Unrolled,
+        {"rank": 8, "cells": 8, "stages": 1},
+        {"nodes": (3, 2, 2), "degree": 2},
+    ),
+    "unrolled, no factor": (Unrolled, {"rank": 8, "cells": 8, "linear_tol": float("inf")}, {}),
     "unrolled, poisson": (Unrolled, {"rank": 8, "cells": 8, "stages": 1}, {"poisson": [0.2, 0.4]}),
-    "latent, no factor": (Latent, {"rank": 8, "width": 16, "linear_tol": float("inf")}, {}),
 }
 
 
-RARE = {"fcnn, poisson", "cnn, immersed", "gnn, poisson", "latent, no factor"}
+RARE = {"fcnn, poisson", "cnn, immersed", "gnn, poisson", "unrolled, no factor"}
 EVERY = [pytest.param(one, marks=pytest.mark.slow) if one in RARE else one for one in NETWORKS]
 
 
@@ -113,13 +115,13 @@ def test_onnx_and_torch_agree_for_all_kinds_of_loads_and_batch_sizes(make_graph,
 
 
 def test_only_models_with_a_factor_have_the_output_local(make_graph):
-    for name in ("fcnn", "pod", "latent", "unrolled", "latent, no factor"):
+    for name in ("fcnn", "pod", "unrolled", "unrolled, no factor"):
         session = OnnxSession(make_graph(name)[1])
-        assert ("local" in session.outputs) == (name in ("latent", "unrolled"))
+        assert ("local" in session.outputs) == (name == "unrolled")
 
 
 def test_local_loads_are_marked_and_represented_in_the_basis(make_graph):
-    graph, path = make_graph("latent")
+    graph, path = make_graph("unrolled")
     loads = sample_check_loads(graph.surrogate.scene, 8)
     rows = {row.kind: row for row in compare_outputs(graph, OnnxSession(path), loads)}
     assert rows["on a node"].n_local > 0
@@ -151,11 +153,11 @@ def test_a_graph_with_other_weights_is_detected(make_graph):
 
 
 def test_a_graph_that_marks_other_loads_is_detected(make_graph):
-    graph, path = make_graph("latent")
+    graph, path = make_graph("unrolled")
     net = graph.surrogate.net
-    before, net.linear_tol = net.linear_tol, 1e-12
+    before, net.local.tol = net.local.tol, 1e-12
     rows = compare_outputs(graph, OnnxSession(path), sample_check_loads(graph.surrogate.scene, 4))
-    net.linear_tol = before
+    net.local.tol = before
     assert max(row.max_error for row in rows) == np.inf
 
 
@@ -209,7 +211,7 @@ def write_export(make_graph):
     return write_export
 
 
-@pytest.mark.parametrize("name", ["fcnn", "latent, quadratic", "cnn, poisson, 2D"])
+@pytest.mark.parametrize("name", ["fcnn", "unrolled, quadratic", "cnn, poisson, 2D"])
 def test_a_folder_read_back_is_what_was_written(write_export, name):
     graph, folder, reference, meta = write_export(name)
     verify_folder(folder, graph.surrogate, reference, meta)
@@ -243,7 +245,7 @@ def test_a_changed_file_is_detected(write_export, file, change):
 
 
 def test_the_reference_has_the_displacements_of_surrogate_and_finite_elements(write_export):
-    graph, folder, reference, _ = write_export("latent")
+    graph, folder, reference, _ = write_export("unrolled")
     scene, found = graph.surrogate.scene, read_reference(folder)
     assert reference.fe_converged
     assert reference.fe_residual < 1e-8 < reference.residual
@@ -324,7 +326,7 @@ def copy_with_error(folder, tmp_path):
     return other
 
 
-@pytest.mark.parametrize("name", ["fcnn", "cnn, poisson, 2D", "gnn", "pod", "latent"])
+@pytest.mark.parametrize("name", ["fcnn", "cnn, poisson, 2D", "gnn", "pod", "unrolled"])
 def test_the_python_consumer_reproduces_the_reference(write_export, tmp_path, name):
     _, folder, _, _ = write_export(name)
     program = str(CONSUMERS / "consumer.py")
@@ -377,7 +379,7 @@ def consumer(tmp_path_factory):
     return program
 
 
-@pytest.mark.parametrize("name", ["fcnn", "cnn, poisson, 2D", "gnn", "pod", "latent"])
+@pytest.mark.parametrize("name", ["fcnn", "cnn, poisson, 2D", "gnn", "pod", "unrolled"])
 def test_the_cpp_consumer_reproduces_the_reference(consumer, write_export, tmp_path, name):
     _, folder, _, _ = write_export(name)
     for place, status in ((folder, 0), (copy_with_error(folder, tmp_path), 1)):

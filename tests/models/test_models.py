@@ -8,7 +8,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from dpl.fem import Load
-from dpl.models import FCNN, GNN, Latent, PODNet
+from dpl.models import FCNN, GNN, PODNet
 from dpl.models.fcnn import count_parameters
 from dpl.system.memory import refuse_weights
 from dpl.training import MSE, Surrogate
@@ -210,7 +210,6 @@ def test_the_papers_beam_needs_nine_gigabytes():
     ("network", "options"),
     [
         (PODNet, {"width": 10**12}),
-        (Latent, {"width": 10**7}),
         (GNN, {"width": 10**6}),
         (GNN, {"width": 10**12, "passes": 3}),
         (FCNN, {"width": 10**18}),
@@ -231,7 +230,6 @@ def test_a_width_beyond_memory_raises_an_error_before_the_network_is_built(
     ("network", "options"),
     [
         (PODNet, {"blocks": 10**9, "width": 1}),
-        (Latent, {"blocks": 10**30, "width": 1}),
         (GNN, {"passes": 10**9, "width": 1}),
         (FCNN, {"layers": 10**9, "width": 1}),
     ],

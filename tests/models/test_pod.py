@@ -1,4 +1,4 @@
-"""Properties of PODNet, and of Latent where it shares them.
+"""Properties of PODNet.
 
 Properties that hold up to rounding errors are tested in double precision.
 """
@@ -21,14 +21,13 @@ from dpl.fem import (
     rectangle,
     solve,
 )
-from dpl.models import Latent, PODNet
+from dpl.models import PODNet
 from dpl.models.invariant_basis import InvariantPOD, image_columns, scatter_fields
 from dpl.training import MSE, Surrogate
 from dpl.training.surrogate import scales
 
 SMALL = {"width": 16, "blocks": 1}
 WHOLE = {"rank": 1000, "coordinates": 1000, **SMALL}  # no mode is left out
-NETWORKS = pytest.mark.parametrize("kind", [PODNet, Latent])
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -39,10 +38,10 @@ def scales_of_a_scene_once():
         yield
 
 
-def prepared(kind, scene, samples, *, seed=0, **options):
+def prepared(scene, samples, *, seed=0, **options):
     """Return a surrogate in evaluation mode with random weights and fitted bases."""
     torch.manual_seed(seed)
-    module = Surrogate(kind(scene, **{**SMALL, **options}), MSE(), scene)
+    module = Surrogate(PODNet(scene, **{**SMALL, **options}), MSE(), scene)
     module.fit_bases(samples)
     return module.eval()
 
@@ -93,7 +92,7 @@ def eye(size):
 def read(net):
     """Return the coordinates of a unit force on each loadable degree of freedom, (inputs, C)."""
     units = scatter_fields(torch.eye(int(net.load_dofs.sum())), net.load_dofs)
-    return net.encode_loads(net.input_orbits.images(units), None).double()
+    return net.encode_loads(net.input_orbits.images(units)).double()
 
 
 def left_over(basis, net, where):
@@ -112,13 +111,12 @@ def gram_of(net):
     return basis @ basis.T
 
 
-@NETWORKS
 @pytest.mark.parametrize("count", [1, 2, 12])
 @pytest.mark.parametrize("symmetry", [True, False])
 @pytest.mark.parametrize("rank", [100, 108])
-def test_a_basis_is_orthonormal_and_zero_beyond(kind, scene, batch, count, symmetry, rank):
+def test_a_basis_is_orthonormal_and_zero_beyond(scene, batch, count, symmetry, rank):
     """Holds for any number of snapshots; zero columns are not mixed with modes."""
-    net = prepared(kind, scene, some(batch, count), rank=rank, symmetry=symmetry).net
+    net = prepared(scene, some(batch, count), rank=rank, symmetry=symmetry).net
     assert net.basis.shape == (rank, int(scene.problem.free.sum()))
     gram = gram_of(net)
     there = gram.diagonal() > 0.5
@@ -128,13 +126,13 @@ def test_a_basis_is_orthonormal_and_zero_beyond(kind, scene, batch, count, symme
 
 
 def test_modes_of_a_body_without_symmetry_are_ordered_by_size(scene, batch):
-    net = prepared(PODNet, scene, batch, rank=12, symmetry=False).net
+    net = prepared(scene, batch, rank=12, symmetry=False).net
     assert_ordered(net, batch)
 
 
 def test_modes_are_ordered_by_size(scene, batch):
     """Coordinates are also uncorrelated."""
-    assert_ordered(prepared(PODNet, scene, batch, rank=12).net, batch)
+    assert_ordered(prepared(scene, batch, rank=12).net, batch)
 
 
 def assert_ordered(net, samples):
@@ -150,65 +148,60 @@ def assert_ordered(net, samples):
     assert torch.allclose(spread, torch.diag(sizes), rtol=0, atol=1e-5 * float(sizes.max()))
 
 
-@NETWORKS
-def test_a_basis_of_all_modes_represents_every_training_sample(kind, scene, batch):
-    net = prepared(kind, scene, batch, **WHOLE).net
+def test_a_basis_of_all_modes_represents_every_training_sample(scene, batch):
+    net = prepared(scene, batch, **WHOLE).net
     basis = net.basis.double()
     moved = batch.displacement[:, scene.problem.free]
     error = (moved - moved @ basis.T @ basis).norm(dim=1) / moved.norm(dim=1)
     assert float(error.max()) < 1e-5
 
 
-@NETWORKS
-def test_more_modes_reduce_the_projection_error(kind, scene, batch):
+def test_more_modes_reduce_the_projection_error(scene, batch):
     moved = batch.displacement[:, scene.problem.free]
     left = []
     for rank in (4, 12, 40):
-        basis = prepared(kind, scene, batch, rank=rank).net.basis.double()
+        basis = prepared(scene, batch, rank=rank).net.basis.double()
         left.append(float((moved - moved @ basis.T @ basis).norm() / moved.norm()))
     assert left[0] > 3 * left[1] > 9 * left[2] > 0
 
 
-@NETWORKS
-def test_whole_families_of_modes_are_invariant_under_the_symmetries(kind, bar):
+def test_whole_families_of_modes_are_invariant_under_the_symmetries(bar):
     """The first four: bending to both sides, stretching, twisting."""
     scene, samples = bar
-    net = prepared(kind, scene, samples, rank=4).net
+    net = prepared(scene, samples, rank=4).net
     assert len(net.group) == 8
     assert left_over(net.basis, net, net.free_dofs) < 1e-5
 
 
 def test_all_modes_of_few_samples_are_invariant_under_the_symmetries(scene, batch):
-    net = prepared(Latent, scene, some(batch, 2), **WHOLE).net
+    net = prepared(scene, some(batch, 2), **WHOLE).net
     assert left_over(net.basis, net, net.free_dofs) < 1e-5
 
 
 def test_all_modes_of_few_loads_are_invariant_under_the_symmetries(scene, batch):
-    net = prepared(PODNet, scene, some(batch, 2), **WHOLE).net
+    net = prepared(scene, some(batch, 2), **WHOLE).net
     kept = read(net)
     kept = kept[:, kept.abs().amax(dim=0) > 1e-5].T
     assert left_over(kept, net, net.load_dofs) < 1e-5
 
 
-@NETWORKS
-def test_a_basis_of_any_rank_is_invariant_under_the_symmetries(kind, scene, batch):
+def test_a_basis_of_any_rank_is_invariant_under_the_symmetries(scene, batch):
     for rank in (2, 3, 5, 6, 8, 11):
-        net = prepared(kind, scene, batch, rank=rank).net
+        net = prepared(scene, batch, rank=rank).net
         assert left_over(net.basis, net, net.free_dofs) < 1e-5, rank
 
 
 def test_the_basis_of_loads_is_orthonormal_and_represents_them(scene, batch):
-    kept = read(prepared(PODNet, scene, batch, **WHOLE).net)
+    kept = read(prepared(scene, batch, **WHOLE).net)
     kept = kept[:, kept.abs().amax(dim=0) > 1e-5]
     assert torch.allclose(kept.T @ kept, eye(kept.shape[1]), rtol=0, atol=1e-6)
     force = batch.force[:, scene.loads.loadable_dofs]
     assert float((force - force @ kept @ kept.T).norm() / force.norm()) < 1e-5
 
 
-@NETWORKS
-def test_bases_are_a_function_of_the_samples(kind, scene, batch):
+def test_bases_are_a_function_of_the_samples(scene, batch):
     one, same, other = (
-        prepared(kind, scene, samples, seed=seed).net
+        prepared(scene, samples, seed=seed).net
         for seed, samples in enumerate([batch, batch, some(batch, 8)])
     )
     for name, buffer in one.named_buffers():
@@ -216,10 +209,7 @@ def test_bases_are_a_function_of_the_samples(kind, scene, batch):
     assert not torch.equal(one.basis, other.basis)
 
 
-@NETWORKS
-def test_samples_beyond_the_maximum_number_of_snapshots_are_thinned_out(
-    kind, scene, batch, monkeypatch
-):
+def test_samples_beyond_the_maximum_number_of_snapshots_are_thinned_out(scene, batch, monkeypatch):
     """Every third of twelve samples is used."""
     dofs = int(scene.problem.free.sum())
     monkeypatch.setattr("dpl.models.invariant_basis.MAX_BYTES", 4 * 4 * dofs)
@@ -228,7 +218,7 @@ def test_samples_beyond_the_maximum_number_of_snapshots_are_thinned_out(
         "dpl.models.invariant_basis.InvariantPOD",
         lambda dofs, group, count: seen.append(count) or InvariantPOD(dofs, group, count),
     )
-    net = prepared(kind, scene, batch, rank=20).net
+    net = prepared(scene, batch, rank=20).net
     assert 0 < seen[0] <= 4
     basis = net.basis.double()
     assert torch.allclose(basis @ basis.T, eye(20), rtol=0, atol=1e-5)
@@ -237,13 +227,12 @@ def test_samples_beyond_the_maximum_number_of_snapshots_are_thinned_out(
 # ------------------------------------------------------------------ symmetries
 
 
-@NETWORKS
-def test_actions_on_inputs_and_outputs_are_a_group_representation(kind, bar):
+def test_actions_on_inputs_and_outputs_are_a_group_representation(bar):
     """The product of two actions is an action; inverse actions are orthogonal.
 
     Both hold on the modes; directions that no sample has are zero.
     """
-    net = exact(prepared(kind, *bar, **WHOLE))
+    net = exact(prepared(*bar, **WHOLE))
     order = len(net.group)
     assert order == 8
     for motion in (
@@ -262,11 +251,10 @@ def test_actions_on_inputs_and_outputs_are_a_group_representation(kind, bar):
             assert len(nearest.indices.unique()) == order
 
 
-@NETWORKS
 @pytest.mark.parametrize("seed", [0, 1])
-def test_predictions_have_the_symmetries_exactly(kind, bar, seed):
+def test_predictions_have_the_symmetries_exactly(bar, seed):
     scene, samples = bar
-    module = prepared(kind, scene, samples, seed=seed, **WHOLE)
+    module = prepared(scene, samples, seed=seed, **WHOLE)
     force = noise(scene)
     assert asymmetry(module.net, force.float()) < 1e-4
     with torch.no_grad():
@@ -276,24 +264,21 @@ def test_predictions_have_the_symmetries_exactly(kind, bar, seed):
     assert asymmetry(exact(module), force) < 1e-6
 
 
-@NETWORKS
-def test_in_training_mode_outputs_are_not_symmetrised(kind, bar):
+def test_in_training_mode_outputs_are_not_symmetrised(bar):
     scene, samples = bar
-    net = exact(prepared(kind, scene, samples, **WHOLE)).train()
+    net = exact(prepared(scene, samples, **WHOLE)).train()
     assert asymmetry(net, noise(scene)) > 1e-4
 
 
-@NETWORKS
-def test_predictions_have_the_symmetries_for_any_rank(kind, scene, batch):
+def test_predictions_have_the_symmetries_for_any_rank(scene, batch):
     for rank in (2, 3, 5, 6, 8, 11):
-        net = exact(prepared(kind, scene, batch, rank=rank, coordinates=4))
+        net = exact(prepared(scene, batch, rank=rank, coordinates=4))
         assert asymmetry(net, noise(scene)) < 1e-4, rank
 
 
-@NETWORKS
-def test_predictions_have_the_symmetries_for_any_number_of_coordinates(kind, scene, batch):
+def test_predictions_have_the_symmetries_for_any_number_of_coordinates(scene, batch):
     for coordinates in (1, 2, 3, 5, 6, 8, 11):
-        net = exact(prepared(kind, scene, batch, rank=12, coordinates=coordinates))
+        net = exact(prepared(scene, batch, rank=12, coordinates=coordinates))
         assert asymmetry(net, noise(scene)) < 1e-4, coordinates
 
 
@@ -307,27 +292,25 @@ def test_a_rank_that_leaves_no_invariant_mode_raises_an_error(scene, batch):
 
 def test_predictions_with_default_options_have_the_symmetries(scene, batch):
     """The defaults are 60 coordinates and 100 modes, see conf/model/pod.yaml."""
-    assert asymmetry(exact(prepared(PODNet, scene, batch)), noise(scene)) < 1e-4
+    assert asymmetry(exact(prepared(scene, batch)), noise(scene)) < 1e-4
 
 
-@NETWORKS
-def test_symmetry_false_disables_symmetries(kind, bar):
+def test_symmetry_false_disables_symmetries(bar):
     scene, samples = bar
-    net = exact(prepared(kind, scene, samples, symmetry=False, **WHOLE))
+    net = exact(prepared(scene, samples, symmetry=False, **WHOLE))
     assert net.group == []
     assert net.input_actions.shape[0] == net.inverse_output_actions.shape[0] == 1
-    force, group = noise(scene), kind(scene, **SMALL).group
+    force, group = noise(scene), PODNet(scene, **SMALL).group
     with torch.no_grad():
         answer = net(force)
         assert torch.equal(answer, net.train()(force))
         far = group[3].image(answer) - net(group[3].image(force))
     assert float(far.norm() / answer.norm()) > 1e-4
-    assert len(net.skipped_work()) == len(kind(scene, **SMALL).skipped_work()) - 1
+    assert len(net.skipped_work()) == len(PODNet(scene, **SMALL).skipped_work()) - 1
 
 
-@NETWORKS
-def test_skipped_work_contains_the_numbers_of_coordinates_and_symmetries(kind, scene):
-    lines = kind(scene, rank=20, **SMALL).skipped_work()
+def test_skipped_work_contains_the_numbers_of_coordinates_and_symmetries(scene):
+    lines = PODNet(scene, rank=20, **SMALL).skipped_work()
     assert lines[0] == f"20 coordinates learnt instead of {int(scene.problem.free.sum())} " + (
         "displacements"
     )
@@ -352,10 +335,9 @@ def skew(make_scene):
     return scene, solved(scene, 5)
 
 
-@NETWORKS
-def test_predictions_of_a_plane_body_have_its_mirror_symmetry(kind, plane):
+def test_predictions_of_a_plane_body_have_its_mirror_symmetry(plane):
     scene, samples = plane
-    net = exact(prepared(kind, scene, samples, **WHOLE))
+    net = exact(prepared(scene, samples, **WHOLE))
     assert len(net.group) == 2
     force = noise(scene)
     assert net(force).shape == force.shape == (4, 14, 2)
@@ -364,13 +346,12 @@ def test_predictions_of_a_plane_body_have_its_mirror_symmetry(kind, plane):
     assert asymmetry(net.train(), force) > 1e-4
 
 
-@NETWORKS
-def test_a_body_without_symmetry_is_accepted(kind, skew):
+def test_a_body_without_symmetry_is_accepted(skew):
     scene, samples = skew
-    net = exact(prepared(kind, scene, samples, rank=5, coordinates=4))
+    net = exact(prepared(scene, samples, rank=5, coordinates=4))
     assert len(net.group) == 1
     assert net.input_actions.shape == (1, 4, 4)
-    assert len(net.skipped_work()) == (1 if kind is PODNet else 3)
+    assert len(net.skipped_work()) == 1
     basis = net.basis
     assert torch.allclose(basis @ basis.T, eye(5), rtol=0, atol=1e-6)
     with torch.no_grad():
@@ -380,8 +361,7 @@ def test_a_body_without_symmetry_is_accepted(kind, skew):
     assert answer.any()
 
 
-@NETWORKS
-def test_a_body_fixed_in_some_directions_only_is_accepted(kind):
+def test_a_body_fixed_in_some_directions_only_is_accepted():
     """Nodes on rails are fixed in some directions only."""
     ends = [(0, [0.0, None, None]), (1, [None, 0.0, None]), (2, [None, None, 0.0])]
     rails = [DirichletBC(Plane(axis, "min"), value) for axis, value in ends]
@@ -390,7 +370,7 @@ def test_a_body_fixed_in_some_directions_only_is_accepted(kind):
     solver = Newton(problem, linear="superlu")
     scene = Scene(problem, ModalLoads(solver.linear_solver, n_modes=3, young=4500.0), solver)
     assert (problem.free.any(dim=1) & ~problem.free.all(dim=1)).any()
-    module = prepared(kind, scene, solved(scene, 30), **WHOLE)
+    module = prepared(scene, solved(scene, 30), **WHOLE)
     answer = exact(module)(noise(scene))
     assert answer.any()
     assert not answer[:, ~problem.free].any()
@@ -401,10 +381,9 @@ def test_a_body_fixed_in_some_directions_only_is_accepted(kind):
 # ------------------------------------------------------------------ samples
 
 
-@NETWORKS
 @pytest.mark.parametrize("count", [1, 2])
-def test_fewer_snapshots_than_modes_are_accepted(kind, scene, batch, count):
-    module = prepared(kind, scene, some(batch, count), rank=100, symmetry=False)
+def test_fewer_snapshots_than_modes_are_accepted(scene, batch, count):
+    module = prepared(scene, some(batch, count), rank=100, symmetry=False)
     for name, buffer in module.net.named_buffers():
         assert buffer.isfinite().all(), name
     force = noise(scene).float().requires_grad_()
@@ -416,53 +395,47 @@ def test_fewer_snapshots_than_modes_are_accepted(kind, scene, batch, count):
         assert parameter.grad.isfinite().all(), name
 
 
-@NETWORKS
-def test_a_sample_of_zero_displacement_changes_nothing(kind, scene, batch):
+def test_a_sample_of_zero_displacement_changes_nothing(scene, batch):
     """Its weight is zero; it gives neither NaN nor a mode."""
     still = Sample(*(torch.cat([column, column[:1]]) for column in some(batch, 4)))
     still.force[-1], still.displacement[-1] = 0.0, 0.0
-    net = prepared(kind, scene, still, rank=12).net
-    usual = prepared(kind, scene, some(batch, 4), rank=12).net
+    net = prepared(scene, still, rank=12).net
+    usual = prepared(scene, some(batch, 4), rank=12).net
     for name, buffer in net.named_buffers():
         assert buffer.isfinite().all(), name
     projectors = [one.basis.double().T @ one.basis.double() for one in (net, usual)]
     assert torch.allclose(*projectors, rtol=0, atol=1e-5)
 
 
-@NETWORKS
-def test_rank_and_coordinates_are_limited_by_the_degrees_of_freedom(kind, scene, batch):
-    net = prepared(kind, scene, batch, **WHOLE).net
+def test_rank_and_coordinates_are_limited_by_the_degrees_of_freedom(scene, batch):
+    net = prepared(scene, batch, **WHOLE).net
     outputs, inputs = int(scene.problem.free.sum()), int(scene.loads.loadable_dofs.sum())
     assert net.basis.shape == (outputs, outputs)
     assert net.leave.out_features == outputs
     assert net.enter.in_features == inputs
 
 
-def test_a_latent_network_has_at_most_as_many_inputs_as_modes(scene):
-    assert Latent(scene, rank=7, coordinates=60, **SMALL).enter.in_features == 7
+def test_inputs_may_outnumber_modes(scene):
     assert PODNet(scene, rank=7, coordinates=60, **SMALL).enter.in_features == 60
 
 
-@NETWORKS
-def test_without_bases_the_prediction_is_zero_and_is_fitted_is_false(kind, scene, batch):
-    net = kind(scene, **SMALL)
+def test_without_bases_the_prediction_is_zero_and_is_fitted_is_false(scene, batch):
+    net = PODNet(scene, **SMALL)
     assert not net.fitted
-    assert not net(noise(scene).float()).any() or kind is Latent
-    assert prepared(kind, scene, batch).net.fitted
+    assert not net(noise(scene).float()).any()
+    assert prepared(scene, batch).net.fitted
 
 
-@NETWORKS
-def test_the_output_for_a_load_does_not_depend_on_its_batch(kind, scene, batch):
-    net = exact(prepared(kind, scene, batch))
+def test_the_output_for_a_load_does_not_depend_on_its_batch(scene, batch):
+    net = exact(prepared(scene, batch))
     force = noise(scene, 5)
     with torch.no_grad():
         parts = torch.cat([net(one[None]) for one in force])
         assert torch.allclose(net(force), parts, rtol=1e-9, atol=1e-12)
 
 
-@NETWORKS
-def test_gradients_with_respect_to_forces_equal_finite_differences(kind, scene, batch):
-    net = exact(prepared(kind, scene, batch, rank=40))
+def test_gradients_with_respect_to_forces_equal_finite_differences(scene, batch):
+    net = exact(prepared(scene, batch, rank=40))
     force, way = noise(scene).requires_grad_(), noise(scene, seed=1)
     weight = noise(scene, seed=2)
     (slope,) = torch.autograd.grad((weight * net(force)).sum(), force)
@@ -478,19 +451,17 @@ def test_gradients_with_respect_to_forces_equal_finite_differences(kind, scene, 
 # ------------------------------------------------------------------ options
 
 
-@NETWORKS
 @pytest.mark.parametrize(
     "options", [{"rank": 0}, {"coordinates": 0}, {"width": 0}, {"blocks": -1}, {"rank": -3}]
 )
-def test_options_out_of_range_raise_an_error_with_their_name(kind, scene, options):
+def test_options_out_of_range_raise_an_error_with_their_name(scene, options):
     (name, number) = next(iter(options.items()))
     with pytest.raises(ValueError, match=f"{name} = {number} must be"):
-        kind(scene, **options)
+        PODNet(scene, **options)
 
 
-@NETWORKS
-def test_a_network_without_blocks_is_accepted(kind, scene, batch):
-    net = prepared(kind, scene, batch, blocks=0).net
+def test_a_network_without_blocks_is_accepted(scene, batch):
+    net = prepared(scene, batch, blocks=0).net
     assert len(net.blocks) == 0
     assert net(noise(scene).float()).any()
 

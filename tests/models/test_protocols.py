@@ -8,9 +8,9 @@ from dpl.models import (
     FCNN,
     Correctable,
     FlagsLocalLoads,
-    Latent,
     PODNet,
     TrainsInCoordinates,
+    Unrolled,
 )
 from dpl.training import MSE, LrStar, Surrogate
 
@@ -37,8 +37,8 @@ class OwnNet(torch.nn.Module):
     def forward(self, force):
         return self.inner(force)
 
-    def fit_bases(self, samples, unit):
-        self.inner.fit_bases(samples, unit)
+    def fit_bases(self, samples):
+        self.inner.fit_bases(samples)
 
     def encode(self, samples):
         return self.inner.encode(samples)
@@ -53,7 +53,7 @@ class OwnNet(torch.nn.Module):
         (FCNN, (False, False, False)),
         (CNN, (False, False, False)),
         (PODNet, (True, False, True)),
-        (Latent, (True, True, True)),
+        (Unrolled, (True, True, False)),
         (OwnNet, (False, False, True)),
     ],
 )

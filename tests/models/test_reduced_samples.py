@@ -7,20 +7,15 @@ import torch
 
 from dpl import Sample
 from dpl.fem.symmetry import images
-from dpl.models import FCNN, Latent, PODNet
+from dpl.models import FCNN, PODNet
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.training import MSE, LrStar, RMSELoss, Surrogate
 from dpl.training.surrogate import scales
 
 SMALL = {"width": 16, "blocks": 1}
-KINDS = {
-    "pod": (PODNet, {}),
-    "pod, few modes": (PODNet, {"rank": 4, "coordinates": 4}),
-    "latent": (Latent, {}),
-    "latent, few modes": (Latent, {"rank": 4, "coordinates": 4}),
-    "latent, never solved": (Latent, {"rank": 4, "coordinates": 4, "linear_tol": torch.inf}),
-}
-CASES = pytest.mark.parametrize(("kind", "options"), KINDS.values(), ids=KINDS)
+CASES = pytest.mark.parametrize(
+    "options", [{}, {"rank": 4, "coordinates": 4}], ids=["all modes", "few modes"]
+)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -36,9 +31,9 @@ def build(scene, batch, monkeypatch):
     """Builds surrogates in training mode with random weights and fitted bases; logs nothing."""
     monkeypatch.setattr(Surrogate, "log", lambda *_, **__: None)
 
-    def build(kind, options, loss=None):
+    def build(options, loss=None):
         torch.manual_seed(0)
-        module = Surrogate(kind(scene, **SMALL, **options), loss or MSE(), scene)
+        module = Surrogate(PODNet(scene, **SMALL, **options), loss or MSE(), scene)
         module.fit_bases(batch)
         return module.train()
 
@@ -63,10 +58,10 @@ def gradients(module, batch):
 
 @CASES
 def test_squared_errors_of_coordinates_plus_projection_errors_equal_those_of_fields(
-    build, batch, kind, options
+    build, batch, options
 ):
     """Parseval: the basis is orthonormal."""
-    module = build(kind, options)
+    module = build(options)
     part = encoded(module, batch)
     with torch.no_grad():
         field = (module.predict(batch.load) - batch.displacement) / module.displacement_scale
@@ -76,16 +71,16 @@ def test_squared_errors_of_coordinates_plus_projection_errors_equal_those_of_fie
 
 
 @CASES
-def test_mean_square_is_that_of_whole_displacements(build, batch, kind, options):
-    module = build(kind, options)
+def test_mean_square_is_that_of_whole_displacements(build, batch, options):
+    module = build(options)
     size = encoded(module, batch).mean_square * module.displacement_scale**2
     assert torch.allclose(size, batch.displacement.square().mean(dim=(1, 2)), rtol=1e-9)
 
 
 @CASES
-def test_targets_are_the_least_squares_coordinates(build, batch, kind, options):
+def test_targets_are_the_least_squares_coordinates(build, batch, options):
     """The projection error is minimal, and zero with all modes."""
-    module = build(kind, options)
+    module = build(options)
     part = encoded(module, batch)
     assert (part.squared_error >= 0).all()
     left = (part.squared_error / (part.squared_error + part.targets.square().sum(dim=1))).max()
@@ -93,9 +88,8 @@ def test_targets_are_the_least_squares_coordinates(build, batch, kind, options):
 
 
 @pytest.mark.parametrize("count", [1, 2])
-@pytest.mark.parametrize("kind", [PODNet, Latent])
-def test_squared_errors_are_exact_with_fewer_snapshots_than_modes(build, scene, batch, kind, count):
-    module = build(kind, {"symmetry": False})
+def test_squared_errors_are_exact_with_fewer_snapshots_than_modes(build, scene, batch, count):
+    module = build({"symmetry": False})
     few = Sample(*(column[:count] for column in batch))
     module.fit_bases(few)
     part = encoded(module, batch)
@@ -111,17 +105,17 @@ def test_squared_errors_are_exact_with_fewer_snapshots_than_modes(build, scene, 
 
 @CASES
 @pytest.mark.parametrize("loss", [MSE(), MSE(relative=0.5), RMSELoss(relative=0.8, floor=1e-4)])
-def test_the_loss_in_coordinates_equals_the_loss_of_fields(build, batch, kind, options, loss):
-    module = build(kind, options, loss)
+def test_the_loss_in_coordinates_equals_the_loss_of_fields(build, batch, options, loss):
+    module = build(options, loss)
     with torch.no_grad():
         found = float(module.training_step(encoded(module, batch), 0))
         assert found == pytest.approx(float(module.training_step(batch, 0)), rel=1e-4)
 
 
 @CASES
-def test_the_gradient_in_coordinates_equals_that_of_fields(build, batch, kind, options):
+def test_the_gradient_in_coordinates_equals_that_of_fields(build, batch, options):
     """The projection error is constant and has no gradient."""
-    module = build(kind, options, MSE(relative=0.5))
+    module = build(options, MSE(relative=0.5))
     (_, found), (_, expected) = (
         gradients(module, part) for part in (encoded(module, batch), batch)
     )
@@ -129,21 +123,18 @@ def test_the_gradient_in_coordinates_equals_that_of_fields(build, batch, kind, o
 
 
 @CASES
-def test_the_gradient_of_rmse_loss_in_coordinates_equals_that_of_fields(
-    build, batch, kind, options
-):
-    module = build(kind, options, RMSELoss())
+def test_the_gradient_of_rmse_loss_in_coordinates_equals_that_of_fields(build, batch, options):
+    module = build(options, RMSELoss())
     (_, found), (_, expected) = (
         gradients(module, part) for part in (encoded(module, batch), batch)
     )
     assert float((found - expected).norm() / expected.norm()) < 1e-3
 
 
-@pytest.mark.parametrize("kind", [PODNet, Latent])
-def test_a_step_in_coordinates_evaluates_no_field(build, batch, kind, monkeypatch):
-    module = build(kind, {})
+def test_a_step_in_coordinates_evaluates_no_field(build, batch, monkeypatch):
+    module = build({})
     part = encoded(module, batch)
-    monkeypatch.setattr(kind, "forward", None)
+    monkeypatch.setattr(PODNet, "forward", None)
     before = [p.clone() for p in module.parameters()]
     optimizer = torch.optim.SGD(module.parameters(), lr=1.0)
     module.training_step(part, 0).backward()
@@ -152,16 +143,16 @@ def test_a_step_in_coordinates_evaluates_no_field(build, batch, kind, monkeypatc
 
 
 def test_only_losses_of_squared_errors_train_in_coordinates(build, scene, batch):
-    assert build(Latent, {}, LrStar()).encode(batch) is None
+    assert build({}, LrStar()).encode(batch) is None
     assert Surrogate(FCNN(scene, width=8), MSE(), scene).encode(batch) is None
-    assert isinstance(build(Latent, {}, RMSELoss()).encode(batch), ReducedDataset)
+    assert isinstance(build({}, RMSELoss()).encode(batch), ReducedDataset)
 
 
 def test_skipped_work_mentions_coordinates_where_they_are_used(build):
     reported = "no fields in training from disk: the loss is computed in coordinates"
-    assert reported in build(PODNet, {}).skipped_work()
-    assert reported in build(Latent, {}, RMSELoss()).skipped_work()
-    assert reported not in build(Latent, {}, LrStar()).skipped_work()
+    assert reported in build({}).skipped_work()
+    assert reported in build({}, RMSELoss()).skipped_work()
+    assert reported not in build({}, LrStar()).skipped_work()
 
 
 # ------------------------------------------------------------------ images
@@ -174,28 +165,27 @@ def test_images_of_coordinates_are_coordinates_of_images(make_scene):
     linear = torch.stack([scene.linear.solve(one) for one in force])
     bent = linear + 0.1 * linear.roll(1, dims=0)  # what a law may answer; encoding knows none
     samples = Sample(force, bent, torch.full((16,), 4500.0, dtype=torch.float64))
-    for kind in (PODNet, Latent):
-        torch.manual_seed(0)
-        net = kind(scene, rank=48, coordinates=48, **SMALL)
-        module = Surrogate(net, MSE(), scene)
-        module.fit_bases(samples)
-        whole = module.encode(samples)
-        assert len(whole) == 8 * 16
-        for k in range(8):
-            which = torch.full((16,), k)
-            moved = Sample(*(images(f, net.group, which) for f in samples[:2]), samples.young)
-            part = whole.__getitems__(list(range(16 * k, 16 * k + 16)))
-            for found, expected in zip(part, encoded(module, moved), strict=True):
-                size = float(expected.abs().max())
-                assert torch.allclose(found, expected, rtol=1e-3, atol=1e-4 * max(size, 1e-3))
+    torch.manual_seed(0)
+    net = PODNet(scene, rank=48, coordinates=48, **SMALL)
+    module = Surrogate(net, MSE(), scene)
+    module.fit_bases(samples)
+    whole = module.encode(samples)
+    assert len(whole) == 8 * 16
+    for k in range(8):
+        which = torch.full((16,), k)
+        moved = Sample(*(images(f, net.group, which) for f in samples[:2]), samples.young)
+        part = whole.__getitems__(list(range(16 * k, 16 * k + 16)))
+        for found, expected in zip(part, encoded(module, moved), strict=True):
+            size = float(expected.abs().max())
+            assert torch.allclose(found, expected, rtol=1e-3, atol=1e-4 * max(size, 1e-3))
 
 
 def test_without_symmetry_there_is_one_image(build, batch):
-    assert len(build(Latent, {"symmetry": False}).encode(batch)) == 12
+    assert len(build({"symmetry": False}).encode(batch)) == 12
 
 
 def test_the_first_images_are_the_inputs_of_the_network(build, batch):
-    module, seen = build(PODNet, {"rank": 4, "coordinates": 4}), []
+    module, seen = build({"rank": 4, "coordinates": 4}), []
     module.net.symmetrised_output = lambda inputs: (
         seen.append(inputs) or torch.zeros(len(inputs), 4)
     )
@@ -225,7 +215,7 @@ def test_batches_are_fetched_in_any_order():
 
 def test_the_data_module_computes_images_if_the_network_has_no_symmetry(build, scene, data, batch):
     data.symmetry = True
-    module = build(PODNet, {"symmetry": False})
+    module = build({"symmetry": False})
     data.trainer = type("Trainer", (), {"lightning_module": module, "global_rank": 0})()
     data.trainer.world_size = 1
     assert len(data.train_dataloader().dataset) == 8 * 12

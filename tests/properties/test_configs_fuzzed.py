@@ -52,7 +52,6 @@ SCENES = {  # overrides of conf/generate.yaml
 }
 NETWORKS = {  # of conf/train.yaml
     "fcnn": ["model.width=8"],
-    "latent": ["experiment=latent", "model.width=8", "model.rank=10", "model.coordinates=9"],
     "pod": ["experiment=pod", "model.width=8", "model.rank=10", "model.coordinates=9"],
     "cnn": ["model=cnn", "model.channels=2", "loss=lr_plus"],
     "gnn": ["model=gnn", "model.width=4", "loss=energy"],
