@@ -13,6 +13,7 @@ from dpl.models.irreps import Component
 
 RIDGES = tuple(10.0 ** (-k / 2) for k in range(28, 5, -1))  # relative to the mean square [-]
 ROUNDING = 1e-10  # norm of a feature over the largest below which it is rounding error
+COARSE = 4  # every how many ridges are tried first
 WORSE = 1.05  # ratio of held-out errors at which larger ridges are not tried
 
 
@@ -127,8 +128,7 @@ def fit_map(rows: Rows, held_out: Rows, action: GroupAction) -> RidgeFit:
     The map is the ridge regression on the rows and their images under the symmetries, and commutes
     with them. It is found in each isotypic component separately (Schur's lemma), so that the work
     is that of the rows without their images and of small matrices. Each feature is divided by its
-    root mean square before. The ridge is the one of `RIDGES` with the smallest held-out error;
-    larger ones than the first that is clearly worse are not tried.
+    root mean square before. The ridge is one of `RIDGES`, chosen by the held-out error.
 
     Source: Hoerl, Kennard (1970), Ridge regression, Technometrics 12.
 
@@ -149,23 +149,44 @@ def fit_map(rows: Rows, held_out: Rows, action: GroupAction) -> RidgeFit:
             for part, image in zip((rows, held_out), images, strict=True)
         ]
         parts.append(_ComponentFit(component, coordinates, *_normal_equations(*sets[0]), *sets[1]))
-    best: list[Tensor] = []
-    chosen, least = 0.0, float("inf")
-    for ridge in RIDGES:
-        matrices = [m for part in parts if (m := part.solve(ridge)) is not None]
-        if len(matrices) < len(parts):
-            continue
-        squares = [p.squared_errors(m) for p, m in zip(parts, matrices, strict=True)]
-        error = float(torch.stack(squares).sum(dim=0).sqrt().mean())
-        if error < least:
-            best, chosen, least = matrices, ridge, error
-        elif error > WORSE * least:
-            break
-    if not best:
-        raise ValueError("the samples are not finite")
+    best, chosen, least = _best_ridge(parts)
     maps = [p.whole(m, action, shape) for p, m in zip(parts, best, strict=True)]
     matrix = action.with_exact_parity(torch.stack(maps).sum(dim=0), shape[1])
-    return RidgeFit(matrix, chosen, least)
+    return RidgeFit(matrix, RIDGES[chosen], least)
+
+
+def _best_ridge(parts: "Sequence[_ComponentFit]") -> tuple[list[Tensor], int, float]:
+    """Return the matrices of the best ridge, its number in `RIDGES` and its held-out error.
+
+    Every fourth ridge is tried until one is clearly worse, then those around the best one.
+    """
+    best: tuple[list[Tensor], int, float] = ([], 0, float("inf"))
+    tried: set[int] = set()
+
+    def attempt(number: int) -> float:
+        nonlocal best
+        if number in tried or not 0 <= number < len(RIDGES):
+            return float("inf")
+        tried.add(number)
+        matrices = [m for part in parts if (m := part.solve(RIDGES[number])) is not None]
+        if len(matrices) < len(parts):
+            return float("inf")
+        squares = [p.squared_errors(m) for p, m in zip(parts, matrices, strict=True)]
+        error = float(torch.stack(squares).sum(dim=0).sqrt().mean())
+        if error < best[2]:
+            best = matrices, number, error
+        return error
+
+    for number in range(0, len(RIDGES), COARSE):
+        if attempt(number) > WORSE * best[2]:
+            break
+    for step in (COARSE // 2, COARSE // 4):
+        centre = best[1]
+        for number in (centre - step, centre + step):
+            attempt(number)
+    if not best[0]:
+        raise ValueError("the samples are not finite")
+    return best
 
 
 class _ComponentFit(NamedTuple):
