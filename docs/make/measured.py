@@ -67,6 +67,20 @@ PARTS = (
         "One load on refined meshes, compared with the limit by Richardson extrapolation.",
     ),
     Part(
+        "unrolled",
+        "Learning curve and ablation of `unrolled`",
+        "python scripts/ablation.py experiment=beam_nh_loss data.train=1024",
+        "Fits to 64 to 1,024 loads, variants fitted to 512 loads, and the errors of the fit to 512 "
+        "loads on other loads.",
+        split="part",
+    ),
+    Part(
+        "unrolled_method",
+        "Steps of a prediction of `unrolled`",
+        "python scripts/ablation.py experiment=beam_nh_loss data.train=1024",
+        "The test load with the largest displacement.",
+    ),
+    Part(
         "sizes",
         "Cost against degrees of freedom",
         "python scripts/benchmark.py cases=[sizes] repeats=3 folder=benchmarks/results",

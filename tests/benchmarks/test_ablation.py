@@ -1,0 +1,124 @@
+"""Laws of the ablation: variants lack what their names say; errors are those of the model."""
+
+import csv
+
+import matplotlib.image
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import ablation
+from dpl.models import Unrolled
+from dpl.training.metrics import default_metrics
+
+TINY = [
+    *("data.train=12", "data.val=4", "data.test=4", "data.workers=0", "model.rank=12"),
+    *("model.cells=4", "model.stages=1", "counts=[8,12]", "ablation_loads=12", "count=2"),
+    *("options.stages=[0]", "options.cells=[2]", "options.rank=[6]"),
+]
+
+
+@pytest.fixture(scope="module")
+def build(scene):
+    return lambda **options: Unrolled(scene, **{"rank": 12, "cells": 4, "stages": 1, **options})
+
+
+@pytest.fixture(scope="module")
+def sets(scene):
+    """Samples to fit to, and unseen ones."""
+    return [ablation.solved(scene, scene.loads.sample(k, range(n))) for k, n in ((0, 24), (1, 9))]
+
+
+def fitted(variant, build, sets):
+    samples, unseen = sets
+    return ablation.fitted(variant, build, samples, unseen, unseen, ablation.ABLATION)
+
+
+@pytest.mark.parametrize("left_out", ["R^T dP", "dP"])
+def test_a_stress_that_is_left_out_has_zero_maps(build, sets, left_out):
+    kept = next(name for name in ablation.STRESSES if name != left_out)
+    variant = next(one for one in ablation.variants({}) if one.name == f"{kept} only")
+    _, net = fitted(variant, build, sets)
+    _, whole = fitted(ablation.WHOLE, build, sets)
+    for one, is_zero in ((net, True), (whole, False)):
+        assert len(one.maps) == 1
+        dim = one.gradients.shape[-1]
+        by_stress = one.maps[0].unflatten(0, (-1, 2, dim * dim))
+        assert bool((by_stress[:, ablation.STRESSES[left_out]] == 0).all()) == is_zero
+        assert by_stress[:, ablation.STRESSES[kept]].abs().max() > 0
+
+
+def test_the_quadratic_first_feature_changes_the_first_map_alone(build, sets):
+    variant = next(one for one in ablation.variants({}) if "first map" in one.name)
+    row, net = fitted(variant, build, sets)
+    other, whole = fitted(ablation.WHOLE, build, sets)
+    assert torch.equal(net.modes, whole.modes)
+    assert not torch.equal(net.first_map, whole.first_map)
+    assert row.e_mean != other.e_mean
+    assert fitted(ablation.WHOLE, build, sets)[0].e_mean == other.e_mean
+
+
+def test_without_rounding_the_modes_are_float64(build, sets):
+    variant = next(one for one in ablation.variants({}) if "float64" in one.name)
+    assert fitted(variant, build, sets)[1].modes.dtype == torch.float64
+    assert fitted(ablation.WHOLE, build, sets)[1].modes.dtype == torch.float32
+
+
+def test_errors_are_those_of_the_predictions_and_of_a_newton_step(build, sets):
+    row, net = fitted(ablation.Variant("", {"rank": 40, "stages": 0}), build, sets)
+    test = sets[1]
+    assert row.e_mean_corrected < 0.9 * row.e_mean
+    predicted, solver = net(test.force), net.correction()
+    pairs = zip(test.force, predicted, strict=True)
+    corrected = torch.stack([solver.correct(f, u, steps=1) for f, u in pairs])
+    for field, e_mean, worst in (
+        (predicted, row.e_mean, row.rel_L2_worst),
+        (corrected, row.e_mean_corrected, row.rel_L2_worst_corrected),
+    ):
+        metrics = default_metrics(net.scene.problem)
+        metrics.update(field, test)
+        known = metrics.compute()
+        assert e_mean == pytest.approx(float(known["e_mean"]), rel=1e-6)
+        assert worst == pytest.approx(float(known["rel_L2_worst"]), rel=1e-6)
+
+
+def test_the_command_writes_rows_and_figures_and_prints_a_table(script, tiny, tmp_path):
+    ended = script("ablation", *tiny, *TINY, "folder=out", cwd=tmp_path)
+    assert ended.status == 0, ended.err
+    table = ended.out[ended.out.rindex("e_max") :].splitlines()
+    assert max(len(line.rstrip()) for line in table) <= 100
+    with (tmp_path / "out/unrolled.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    parts = [row["part"] for row in rows]
+    assert list(dict.fromkeys(parts)) == list(ablation.PARTS)
+    assert {part: parts.count(part) for part in ablation.PARTS} == {
+        ablation.CURVE: 2,
+        ablation.ABLATION: 9,
+        ablation.OTHER_LOADS: 4,
+    }
+    assert all(np.isfinite(float(row["e_mean"])) for row in rows)
+    same = [row for row in rows if row["variant"] == "all" and row["samples"] == "12"]
+    assert len({row["e_mean"] for row in same}) == 1
+    assert float(rows[1]["data_seconds"]) > float(rows[0]["data_seconds"]) > 0
+    assert {line.split()[0] for line in table if line.strip()} >= {"learning", "all", "areas"}
+    for name in ("unrolled.png", "unrolled_method.png"):
+        pixels = matplotlib.image.imread(tmp_path / "out" / name)
+        assert np.ptp(pixels[..., :3]) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("counts=[8,13]", "data.train = 12 must be 13 or more"),
+        ("model=fcnn", "model must be unrolled"),
+        ("+options.stage=[1]", "'stage'"),
+    ],
+)
+def test_invalid_input_is_refused_before_loads_are_solved(
+    script, tiny, tmp_path, override, message
+):
+    settings = [one for one in TINY if not one.startswith("model.") or "fcnn" not in override]
+    ended = script("ablation", *tiny, *settings, override, "folder=out", cwd=tmp_path)
+    assert ended.status == 2
+    assert message in ended.err
+    assert not (tmp_path / "datasets").exists()
