@@ -118,8 +118,8 @@ class Simulator:
             tol: Relative residual of the result [-], at least 1e-15 and below 1.
             budget_ms: Wall time of each load [ms]. An iteration is not started if the time of the
                 last iteration exceeds the rest of the budget.
-            error: Estimated relative error [-] above which steps of Newton's method in the modes of
-                the model follow, at most `steps` of them; 1e-3 if left out.
+            error: Estimated relative error within the modes of the model [-] above which steps of
+                Newton's method in them follow, at most `steps` of them; 1e-3 if left out.
             warm: Start from the last displacement if it is nearer to equilibrium than the
                 prediction.
             stability: Factorise the tangent at the result to determine its stability.
