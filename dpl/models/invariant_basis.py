@@ -121,17 +121,19 @@ class InvariantPOD:
         )
         if not len(values):
             return []
-        multiplets = self._without_rounding(component, vectors.mH)
-        fields = self._fields(component.images(multiplets))[..., self._dofs]
+        multiplets, kept = self._without_rounding(component, vectors.mH)
+        fields, values = self._fields(component.images(multiplets))[..., self._dofs], values[kept]
         return [
             (float(value) ** 2 / component.size, family)
             for value, family in zip(values, fields, strict=True)
         ]
 
-    def _without_rounding(self, component: Component, multiplets: Tensor) -> Tensor:
+    def _without_rounding(self, component: Component, multiplets: Tensor) -> tuple[Tensor, Tensor]:
         """Return orthonormal multiplets (r, d m), float64, of the first fields of others.
 
         Values at nodes that symmetries map onto themselves then have these symmetries exactly.
+        Rounding errors that are no multiplets are left out; the mask (r,) of the others comes with
+        the multiplets.
         """
         wide = multiplets.to(component.dtype(torch.float64))
         fields = self._fields(component.images(wide)[:, :: component.size])
@@ -139,7 +141,9 @@ class InvariantPOD:
         if component.copies == 2:  # a complex field from its real and imaginary part
             real, imaginary = parts.unflatten(0, (-1, 2)).unbind(dim=1)
             parts = real + 1j * imaginary
-        return torch.linalg.qr(parts.mT)[0].mT
+        sizes = parts.norm(dim=1)
+        kept = sizes > 0.99 * sizes.max()  # the norms of multiplets remain
+        return torch.linalg.qr(parts[kept].mT)[0].mT, kept
 
     def _fields(self, images: Tensor) -> Tensor:
         """Return fields (r, k, N, D) from their images at the representatives, (r, k, G, m)."""
