@@ -19,8 +19,9 @@ class ClosedFormTraining(L.Callback):
     """
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        """Limit an epoch to one batch, and log and validate after each one."""
+        """Limit epochs to one batch; log and validate after each one, not before the first."""
         if stage == "fit":
+            trainer.num_sanity_val_steps = 0
             trainer.limit_train_batches = trainer.log_every_n_steps = 1
             trainer.check_val_every_n_epoch = 1
 
