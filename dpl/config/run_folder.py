@@ -1,10 +1,9 @@
 """Read the folder of a training run."""
 
 import contextlib
-import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 import torch
@@ -194,4 +193,4 @@ def training_loads(cfg: DictConfig, scene: Scene) -> int | None:
     count: int | str | None = cfg.data.get("train")
     if count == "auto":
         return len(instantiate(cfg, "data", scene=scene).store.tried("train"))
-    return typing.cast("int | None", count)
+    return cast("int | None", count)

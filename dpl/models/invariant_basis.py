@@ -32,6 +32,12 @@ def scatter_fields(columns: Tensor, dofs: Tensor) -> Tensor:
     return fields
 
 
+def orthonormal_fields(columns: Tensor, dofs: Tensor) -> Tensor:
+    """Return orthonormal fields (N, D, R), zero outside the mask, that span columns (n, R)."""
+    orthonormal = torch.linalg.qr(columns.double().cpu())[0]
+    return scatter_fields(orthonormal.T, dofs.cpu()).movedim(0, -1).contiguous()
+
+
 def image_columns(columns: Tensor, dofs: Tensor, group: Sequence[Symmetry], k: int) -> Tensor:
     """Return the images (S, n) of fields (S, n) under symmetry k."""
     if k == 0:

@@ -29,13 +29,12 @@ def choose_newton(
         problem: The body.
         modes: V, orthonormal, the most important mode first, (N, D, R).
         states: Equilibria at which cells are chosen, (S, N, D).
-        held_out: Samples by whose errors the number is chosen.
+        held_out: Samples by whose errors the number is chosen; `LOADS` of them are enough.
         guesses: Their predictions, (S, N, D).
     """
     random = torch.randperm(len(problem.cells), generator=torch.Generator().manual_seed(0))
     candidates = random[:CANDIDATES].sort().values
     some = states[:: max(1, len(states) // STATES)][:STATES]
-    few = Sample(*(column[:LOADS] for column in held_out))
     whole = modes.shape[2]
     ranks = [*(rank for rank in RANKS if rank < whole), whole]
     solvers = [
@@ -44,19 +43,19 @@ def choose_newton(
         )
         for rank in ranks
     ]
-    before = float(_errors(few, guesses[:LOADS]).mean())
-    means = [float(_errors(few, _after(one, few, guesses, 1)).mean()) for one in solvers]
+    before = float(_errors(held_out, guesses).mean())
+    means = [float(_errors(held_out, _after(one, held_out, guesses, 1)).mean()) for one in solvers]
     best = min(means)
     if not best < before:
         return None
     chosen = solvers[next(k for k, mean in enumerate(means) if mean <= NEAR_BEST * best)]
-    outside = float(_relative(few, _after(chosen, few, guesses, 3)).max())
+    outside = float(_relative(held_out, _after(chosen, held_out, guesses, 3)).max())
     return replace(chosen, outside_error=outside)
 
 
 def _after(solver: SubspaceNewton, samples: Sample, guesses: Tensor, steps: int) -> Tensor:
     """Return displacements (S, N, D) after some steps, from guesses (S, N, D)."""
-    pairs = zip(samples.load.unbatch(), guesses, strict=False)
+    pairs = zip(samples.load.unbatch(), guesses, strict=True)
     return torch.stack([_last(solver, load, guess, steps) for load, guess in pairs])
 
 

@@ -12,6 +12,7 @@ from dpl.fem import SubspaceNewton, symmetries
 from dpl.models.invariant_basis import (
     group_actions,
     invariant_pod,
+    orthonormal_fields,
     pad_columns,
     scatter_fields,
 )
@@ -266,8 +267,7 @@ class PODNet(nn.Module):
             ValueError: A number is out of range.
         """
         problem = self.scene.problem
-        vectors = torch.zeros(*problem.shape, min(rank, len(self.modes)), dtype=torch.float64)
-        vectors[problem.free] = torch.linalg.qr(self.basis[:rank].double().cpu().T)[0]
+        vectors = orthonormal_fields(self.basis[:rank].T, problem.free)
         return SubspaceNewton.within(problem, vectors, states[:CELL_STATES], tolerance=tolerance)
 
     def _set_scales(self, encoded: Tensor, targets: Tensor) -> None:

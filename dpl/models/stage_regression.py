@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dpl.fem.rom.parity import Orbits, Parities
+from dpl.fem.rom.parity import Parities, SignedOrbits
 from dpl.models.irreps import Component
 
 RIDGES = tuple(10.0 ** (-k / 2) for k in range(28, 5, -1))  # relative to the mean square [-]
@@ -83,7 +83,7 @@ class GroupAction:
             per_cell: Number F of tensors in each cell.
         """
         positions = self.positions[self.parities.members]
-        orbits = Orbits.of_tensors(self.parities, positions, per_cell, 1)
+        orbits = SignedOrbits.of_tensors(self.parities, positions, per_cell, 1)
         return orbits.symmetrised(matrix, self.parity, self.parities)
 
     def images(self, features: Tensor) -> Tensor:

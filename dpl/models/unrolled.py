@@ -10,21 +10,20 @@ from torch import Tensor, nn
 from dpl.fem import InvariantBasedMaterial, SubspaceNewton, symmetries
 from dpl.fem.rom.compiled_prediction import CompiledPrediction, LawArguments, law_arguments
 from dpl.fem.rom.ecsw import Cubature
-from dpl.fem.rom.reduced_problem import support_force
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
+from dpl.fem.symmetry import cell_images
+from dpl.models.invariant_basis import orthonormal_fields
 from dpl.models.local_response import LocalResponse, resize_buffers
-from dpl.models.newton_choice import choose_newton
+from dpl.models.newton_choice import LOADS, choose_newton
 from dpl.models.unrolled_fit import (
-    CHUNK,
-    Columns,
     Maps,
     cell_positions,
     fit_maps,
     fit_modes,
+    in_coordinates,
     linear_of_modes,
     modes_of_parity,
-    sample_weights,
 )
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
@@ -53,7 +52,8 @@ class Unrolled(nn.Module):
 
     Number of cells, ridges and number of maps are chosen by the error of the held-out samples. The
     modes and the cells are invariant under the symmetries of the body and the maps commute with
-    them, so that the answer has the symmetries exactly.
+    them. The answer has the symmetries, those with diagonal matrices exactly and others up to the
+    rounding of modes and maps.
 
     A load whose linear solution the modes do not represent (a local load) gets the missing part
     from the factor of K(0), see `LocalResponse`.
@@ -250,7 +250,7 @@ class Unrolled(nn.Module):
         """Compiled prediction with the present buffers."""
         if self._compiled is None or self._compiled[0] is not self.maps:
             problem = self.scene.problem
-            positions = cell_positions(problem, self.group, self.cells)
+            positions = cell_positions(cell_images(problem, self.group), self.cells)
             names = ("parity", "modes", "gradients", "first_map", "maps", "limits")
             prediction = CompiledPrediction.of(
                 self.group,
@@ -315,7 +315,10 @@ class Unrolled(nn.Module):
         inverse = torch.linalg.inv(stiffness.at(problem.reference.material)[:, :-1])
         self.local.fit(modes, inverse, self.group)
         solved = None if self.extra_inputs else linear_of_modes(self.scene, modes)
-        sets = [self._columns(part, solved) for part in (samples, held_out)]
+        sets = [
+            in_coordinates(problem, modes, stiffness, part, solved, self._is_local)
+            for part in (samples, held_out)
+        ]
         numbers, found = fit_maps(
             problem,
             modes,
@@ -336,10 +339,10 @@ class Unrolled(nn.Module):
 
     def _fit_newton(self, samples: Sample, held_out: Sample) -> None:
         """Choose modes and cells of Newton's method that follows the maps."""
-        own = (held_out.parameters,) if self.extra_inputs else ()
-        guesses, states = self(held_out.force, *own), samples.displacement
+        few = Sample(*(column[:LOADS] for column in held_out))
+        guesses = self(few.force, *((few.parameters,) if self.extra_inputs else ()))
         vectors = self._orthonormal(self.modes.shape[1])
-        found = choose_newton(self.scene.problem, vectors, states, held_out, guesses)
+        found = choose_newton(self.scene.problem, vectors, samples.displacement, few, guesses)
         self.newton_rank = torch.tensor(0)
         if found is not None and found.cubature is not None:
             self.newton_rank = torch.tensor(found.vectors.shape[2])
@@ -358,40 +361,7 @@ class Unrolled(nn.Module):
 
     def _orthonormal(self, rank: int) -> Tensor:
         """Return the first modes, orthonormal, (N, D, rank)."""
-        problem = self.scene.problem
-        vectors = torch.zeros(problem.free.numel(), min(rank, self.modes.shape[1])).double()
-        vectors[self.dofs] = torch.linalg.qr(self.modes[:, :rank].double())[0]
-        return vectors.view(*problem.shape, -1)
-
-    def _columns(self, samples: Sample, solved: Tensor | None) -> Columns:
-        """Return samples in coordinates.
-
-        Args:
-            samples: The samples.
-            solved: K(0)^-1 V, (n, R); None if K(0) depends on parameters.
-        """
-        count = len(samples.force)
-        parts = [
-            self._columns_of(Sample(*(column[k : k + CHUNK] for column in samples)), solved)
-            for k in range(0, count, CHUNK)
-        ]
-        return Columns(*(torch.cat(column) for column in zip(*parts, strict=True)))
-
-    def _columns_of(self, samples: Sample, solved: Tensor | None) -> Columns:
-        modes = self.modes.double()
-        displacement, loaded = (
-            field.flatten(1)[:, self.dofs] for field in (samples.displacement, samples.force)
-        )
-        law = self.scene.problem.material.with_parameters(samples.parameters)
-        linear = self._stiffness.solve(law, loaded @ modes)
-        weights = sample_weights(displacement)
-        target = displacement @ modes
-        if solved is None:  # the missing part of the linear solution is unknown
-            weights = torch.where(self._is_local(loaded, linear), 0.0, weights)
-        else:
-            supports = support_force(self.scene.problem)[self.scene.problem.free]
-            target = target + linear - (loaded - supports) @ solved
-        return Columns(linear, target, weights, samples.parameters)
+        return orthonormal_fields(self.modes[:, :rank], self.scene.problem.free)
 
     def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> SubspaceNewton:
         """Return Newton's method in the first modes; see `Correctable`.

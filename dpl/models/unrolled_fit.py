@@ -1,6 +1,6 @@
 """Fit of `dpl.models.Unrolled` to samples: modes, sample cells and maps."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,8 +9,9 @@ from torch import Tensor
 
 from dpl.fem import Problem
 from dpl.fem.materials.material import Material
-from dpl.fem.rom.parity import Orbits, Parities
+from dpl.fem.rom.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_problem import support_force
+from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells, cell_gradients
 from dpl.fem.symmetry import Symmetry, cell_images
 from dpl.models.invariant_basis import InvariantPOD, group_actions, scatter_fields, stride
@@ -115,25 +116,63 @@ def modes_of_parity(
     parities = Parities.of(group, free.shape[1])
     members = [group[k] for k in parities.members.tolist()] if group else group
     rotation, parity = parities.adapted(group_actions(modes, free, members))
-    orbits = Orbits.of_field(parities, group, free)
+    orbits = SignedOrbits.of_field(parities, group, free)
     exact = orbits.symmetrised(modes @ rotation, parity, parities)
     return exact.float().double(), parity
 
 
-def cell_positions(problem: Problem, group: Sequence[Symmetry], cells: Tensor) -> Tensor:
-    """Return the position to which each symmetry maps each of some cells (C,), (G, C).
+def cell_positions(images: Tensor, cells: Tensor) -> Tensor:
+    """Return the position to which each symmetry maps each of some cells, (G, C).
 
-    The set of the cells is invariant.
+    Args:
+        images: Image of each cell under each symmetry, (G, E).
+        cells: Numbers of cells of an invariant set, (C,).
     """
-    place = torch.empty(len(problem.cells), dtype=torch.int64)
+    place = torch.empty(images.shape[1], dtype=torch.int64)
     place[cells] = torch.arange(len(cells))
-    return place[cell_images(problem, group)[:, cells]]
+    return place[images[:, cells]]
 
 
 def sample_weights(displacement: Tensor) -> Tensor:
     """Return ||u||^-0.4, (S,), of displacements (S, n); 0 for u = 0."""
     size = displacement.norm(dim=1)
     return torch.where(size > 0, size.clamp(min=1e-300) ** SIZE_EXPONENT, 0.0)
+
+
+def in_coordinates(
+    problem: Problem,
+    modes: Tensor,
+    stiffness: ReducedStiffness,
+    samples: Sample,
+    solved: Tensor | None,
+    is_local: Callable[[Tensor, Tensor], Tensor],
+) -> Columns:
+    """Return samples in coordinates of the modes.
+
+    Args:
+        problem: The body.
+        modes: V, (n, R).
+        stiffness: V^T K(0) V.
+        samples: The samples, (S, N, D).
+        solved: K(0)^-1 V, (n, R); None if K(0) depends on parameters. The part of the linear
+            solution that the modes miss is then unknown, and local loads have the weight 0.
+        is_local: Function from forces (B, n) and coordinates of their linear solutions (B, R) to
+            the mask of local loads, (B,).
+    """
+    free, supports = problem.free, support_force(problem)[problem.free]
+    parts = []
+    for start in range(0, len(samples.force), CHUNK):
+        some = Sample(*(column[start : start + CHUNK] for column in samples))
+        displacement, loaded = some.displacement[:, free], some.force[:, free]
+        law = problem.material.with_parameters(some.parameters)
+        linear = stiffness.solve(law, loaded @ modes)
+        weights, target = sample_weights(displacement), displacement @ modes
+        if solved is None:
+            weights = torch.where(is_local(loaded, linear), 0.0, weights)
+        else:
+            target = target + linear - (loaded - supports) @ solved
+        parts.append(Columns(linear, target, weights, some.parameters))
+    return Columns(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
 def choose_cells(images: Tensor, count: int) -> Tensor:
@@ -255,12 +294,12 @@ def fit_maps(
     best: tuple[Tensor, Regression] | None = None
     while cells:
         numbers = choose_cells(images, cells)
-        positions = cell_positions(problem, group, numbers)
+        positions = cell_positions(images, numbers)
         action = GroupAction(
             rotations.double(), positions, actions, representations, parities, parity
         )
         gradients = cell_gradients(problem, fields, numbers)
-        orbits = Orbits.of_tensors(parities, positions[parities.members], 1, 1)
+        orbits = SignedOrbits.of_tensors(parities, positions[parities.members], 1, 1)
         columns = orbits.symmetrised(gradients.flatten(1).T, parity_of_fields, parities)
         # rounded before the fit: the maps cancel digits, so that G must stay what it is
         sample_cells = SampleCells(columns.T.reshape(gradients.shape).float().double())

@@ -7,7 +7,7 @@ import torch
 from dpl.config import run_folder
 from dpl.data import OfflineData
 from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, rectangle, solve
-from dpl.fem.rom.parity import Orbits, Parities
+from dpl.fem.rom.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import cell_gradients, rotated_strain, rotation, unbalanced_stress
 from dpl.fem.symmetry import cell_images, symmetries
@@ -294,7 +294,7 @@ def test_fields_of_definite_parity(beam, net):
 def test_folding_is_the_transpose_of_unfolding(beam):
     group, free = symmetries(beam.problem), beam.problem.free
     parities, random = Parities.of(group, 3), torch.Generator().manual_seed(0)
-    orbits, count = Orbits.of_field(parities, group, free), int(free.sum())
+    orbits, count = SignedOrbits.of_field(parities, group, free), int(free.sum())
     values = torch.randn(count, 2, generator=random).double()
     total = torch.zeros(count, 2).double()
     for characters in parities.characters:

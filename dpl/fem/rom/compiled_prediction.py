@@ -15,7 +15,7 @@ from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.assembly.sampled_loops import SOURCES, ModelArrays, predict
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
-from dpl.fem.rom.parity import Orbits, Parities
+from dpl.fem.rom.parity import Parities, SignedOrbits
 from dpl.fem.symmetry import Symmetry
 
 Array = NDArray[np.float64]
@@ -84,13 +84,13 @@ class CompiledPrediction:
         """
         dim = free.shape[1]
         parities = Parities.of(group, dim)
-        fields = Orbits.of_field(parities, group, free)
+        fields = SignedOrbits.of_field(parities, group, free)
         images = positions[parities.members]
-        one, two = (Orbits.of_tensors(parities, images, k, SIMD_WIDTH) for k in (1, 2))
+        one, two = (SignedOrbits.of_tensors(parities, images, k, SIMD_WIDTH) for k in (1, 2))
         own = [(parity == p).nonzero()[:, 0] for p in range(len(parities.members))]
         most = max(len(columns) for columns in own)
 
-        def by_parity(orbits: Orbits, matrix: Tensor) -> Tensor:
+        def by_parity(orbits: SignedOrbits, matrix: Tensor) -> Tensor:
             """Return the rows of one value of each orbit, by parity, (M, m, r)."""
             parts = [orbits.of_parity(matrix, columns) for columns in own]
             return torch.stack([pad(part, (0, most - part.shape[1])) for part in parts])

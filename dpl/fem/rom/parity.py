@@ -71,7 +71,7 @@ class Parities(NamedTuple):
         return torch.cat(columns, dim=1)[:, place], torch.cat(parities)[place]
 
 
-class Orbits(NamedTuple):
+class SignedOrbits(NamedTuple):
     """Images of one value of each orbit of the values of a field or of tensors at cells.
 
     Attributes:
@@ -86,7 +86,9 @@ class Orbits(NamedTuple):
     weight: Tensor
 
     @classmethod
-    def of_field(cls, parities: Parities, group: Sequence[Symmetry], free: Tensor) -> "Orbits":
+    def of_field(
+        cls, parities: Parities, group: Sequence[Symmetry], free: Tensor
+    ) -> "SignedOrbits":
         """Return the orbits of the degrees of freedom of a mask (N, D), numbered in the mask."""
         nodes, dim = free.shape
         identity = torch.arange(nodes)
@@ -100,7 +102,9 @@ class Orbits(NamedTuple):
         return cls(index, parities.signs[:, axis], 1 / stabiliser.double())
 
     @classmethod
-    def of_tensors(cls, parities: Parities, positions: Tensor, count: int, width: int) -> "Orbits":
+    def of_tensors(
+        cls, parities: Parities, positions: Tensor, count: int, width: int
+    ) -> "SignedOrbits":
         """Return the orbits of `count` tensors (D, D) at each of C cells, in SIMD order.
 
         The values of an orbit are ordered by block of `width` cells, tensor and entry of a 3 x 3
@@ -135,10 +139,10 @@ class Orbits(NamedTuple):
 
         return cls(in_blocks(index), in_blocks(sign), in_blocks(weight))
 
-    def without_filling(self) -> "Orbits":
+    def without_filling(self) -> "SignedOrbits":
         """Return the orbits without the values that only fill a block."""
         used = self.weight > 0
-        return Orbits(self.images[:, used], self.sign[:, used], self.weight[used])
+        return SignedOrbits(self.images[:, used], self.sign[:, used], self.weight[used])
 
     def folded(self, values: Tensor, characters: Tensor) -> Tensor:
         """Return values (m, r) whose products with b equal those of x with `unfolded(b)`.
