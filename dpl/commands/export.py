@@ -76,7 +76,7 @@ def export_model(cfg: DictConfig, surrogate: "dpl.Surrogate", folder: Path) -> N
     if graph.has_local_output:
         print(
             "output 'local' marks loads whose linear solution has a projection error above "
-            f"{surrogate.net.linear_tol:.2g} in the basis of the network. dpl solves these loads "
+            f"{surrogate.net.linear_tol:.2g} in the modes of the graph. dpl solves these loads "
             "with a factor of K(0), which the graph does not contain; see max_local_error."
         )
     megabytes = report["bytes"] / 1e6

@@ -22,7 +22,7 @@ from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import Surrogate
 
-MAX_STEPS = 3  # Newton's steps in the modes of a model
+MAX_STEPS = 6  # Newton's steps in the modes of a model
 ERROR = 1e-3  # estimated relative error above which they are made [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from dpl.fem.rom.parity import Parities, SignedOrbits
 from dpl.fem.rom.pod import MIN_SKETCH_SIZE, pod
 from dpl.fem.symmetry import Symmetry, images
 from dpl.models.irreps import Component, representations_of
@@ -50,6 +51,31 @@ def group_actions(basis: Tensor, dofs: Tensor, group: Sequence[Symmetry]) -> Ten
     """Return the matrices T_g, (G, r, r), of a basis (n, r): images have coordinates c T_g."""
     members = range(max(1, len(group)))
     return torch.stack([image_columns(basis.T, dofs, group, k) @ basis for k in members])
+
+
+def modes_of_parity(
+    modes: Tensor, free: Tensor, group: Sequence[Symmetry]
+) -> tuple[Tensor, Tensor]:
+    """Return modes (n, R) of definite parity, rounded to float32, and their parities (R,)."""
+    parities = Parities.of(group, free.shape[1])
+    members = [group[k] for k in parities.members.tolist()] if group else group
+    rotation, parity = parities.adapted(group_actions(modes, free, members))
+    orbits = SignedOrbits.of_field(parities, group, free)
+    exact = orbits.symmetrised(modes @ rotation, parity, parities)
+    return exact.float().double(), parity
+
+
+def invariant_rank(actions: Tensor, most: int) -> int:
+    """Return the largest k up to `most` for which the first k modes are invariant, or 0.
+
+    Args:
+        actions: Matrices T_g, (G, r, r), see `group_actions`.
+        most: Largest number of modes.
+    """
+    for k in range(most, 0, -1):
+        if float(actions[:, :k, k:].square().sum()) < 0.5:  # a multiplet that is split adds one
+            return k
+    return 0
 
 
 class InvariantPOD:

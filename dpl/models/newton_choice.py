@@ -12,18 +12,18 @@ RANKS = (60, 160)  # numbers of modes that are tried, and all modes
 CANDIDATES = 300  # cells to choose from
 STATES = 32  # equilibria at which cells are chosen
 TOLERANCE = 3e-2  # of the reduced forces of these cells [-]
+MAX_STEPS = 6  # steps whose remaining error counts as that outside the subspace
 LOADS = 50  # held-out loads by which the number of modes is chosen
 NEAR_BEST = 1.1  # ratio of errors up to which fewer modes are preferred
 
 
 def choose_newton(
     problem: Problem, modes: Tensor, states: Tensor, held_out: Sample, guesses: Tensor
-) -> SubspaceNewton | None:
+) -> SubspaceNewton:
     """Return Newton's method in the number of modes that suits held-out loads best.
 
-    The fewest modes are taken whose mean error after one step is nearly the smallest; None if one
-    step improves no guess on average. The largest error after three steps counts as the error
-    outside the subspace.
+    The fewest modes are taken whose mean error after one step is nearly the smallest. The largest
+    error after `MAX_STEPS` steps counts as the error outside the subspace.
 
     Args:
         problem: The body.
@@ -43,13 +43,11 @@ def choose_newton(
         )
         for rank in ranks
     ]
-    before = float(_errors(held_out, guesses).mean())
     means = [float(_errors(held_out, _after(one, held_out, guesses, 1)).mean()) for one in solvers]
     best = min(means)
-    if not best < before:
-        return None
-    chosen = solvers[next(k for k, mean in enumerate(means) if mean <= NEAR_BEST * best)]
-    outside = float(_relative(held_out, _after(chosen, held_out, guesses, 3)).max())
+    number = next(k for k, mean in enumerate(means) if mean <= NEAR_BEST * best)
+    chosen = solvers[number]
+    outside = float(_relative(held_out, _after(chosen, held_out, guesses, MAX_STEPS)).max())
     return replace(chosen, outside_error=outside)
 
 

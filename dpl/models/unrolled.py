@@ -1,48 +1,54 @@
 """Unrolled reduced solver: a few iterations in a subspace whose linear maps are fitted to data."""
 
+from collections.abc import Sequence
 from typing import Any, cast
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from dpl.fem import InvariantBasedMaterial, SubspaceNewton, symmetries
 from dpl.fem.rom.compiled_prediction import CompiledPrediction, LawArguments, law_arguments
 from dpl.fem.rom.ecsw import Cubature
-from dpl.fem.rom.reduced_stiffness import ReducedStiffness
+from dpl.fem.rom.reduced_stiffness import Reduced, ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.fem.symmetry import cell_images
-from dpl.models.invariant_basis import orthonormal_fields
-from dpl.models.local_response import LocalResponse, resize_buffers
+from dpl.models.invariant_basis import (
+    group_actions,
+    invariant_pod,
+    invariant_rank,
+    modes_of_parity,
+    orthonormal_fields,
+)
+from dpl.models.linear_response import LinearResponse, resize_buffers
 from dpl.models.newton_choice import LOADS, choose_newton
 from dpl.models.unrolled_fit import (
     Maps,
     cell_positions,
     fit_maps,
-    fit_modes,
     in_coordinates,
-    linear_of_modes,
-    modes_of_parity,
+    nonlinear_displacement,
+    sample_weights,
 )
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 
-Array = NDArray[np.float64]
 CELL_STATES = 256  # states at which the cells of a correction are chosen
 MAX_COMPILED = 8  # loads; more of them are predicted together by tensor operations
+MIN_RANK = 40  # modes; fewer are not tried
 MAX_SIZE = 100_000  # of rank, cells and stages
+_AtLaw = tuple[LawArguments, Reduced, Reduced]
 
 
 class Unrolled(nn.Module):
-    """Galerkin linear solution and a few quasi-Newton iterations with fitted maps.
+    """Linear solution and a few quasi-Newton iterations with fitted maps.
 
-    With the R modes V of the displacement and G, which maps their coordinates to displacement
+    With R modes V of the nonlinear displacement and G, which maps their coordinates to displacement
     gradients at C sample cells:
 
         c_lin = (V^T K(0) V)^-1 V^T f,   H_lin = G c_lin
-        c_1   = c_lin + phi_0(H_lin) B_0
-        c_k+1 = c_k + phi(G c_k, H_lin) B_k
+        c_1   = phi_0(H_lin) B_0
+        c_k+1 = c_k + phi(G (c_lin + c_k), H_lin) B_k
+        u     = K(0)^-1 f + V c
 
     phi_0 is the rotated strain of the linear solution minus the linear one (`rotated_strain`), phi
     the stress that is not balanced, in the present and in the rotated frame (`unbalanced_stress`).
@@ -50,13 +56,15 @@ class Unrolled(nn.Module):
     iteration is a quasi-Newton iteration of the reduced equilibrium: the residual is sampled at
     a few cells (hyper-reduction), and the preconditioner and the weights of the cells are fitted.
 
-    Number of cells, ridges and number of maps are chosen by the error of the held-out samples. The
-    modes and the cells are invariant under the symmetries of the body and the maps commute with
-    them. The answer has the symmetries, those with diagonal matrices exactly and others up to the
-    rounding of modes and maps.
+    c_lin is the equilibrium of the linear body in the same modes as c. It differs from the linear
+    solution, but the maps only ever see fields in the modes.
 
-    A load whose linear solution the modes do not represent (a local load) gets the missing part
-    from the factor of K(0), see `LocalResponse`.
+    Number of modes and of cells, ridges and number of maps are chosen by the error of the held-out
+    samples. The modes and the cells are invariant under the symmetries of the body and the maps
+    commute with them. The answer has the symmetries, those with diagonal matrices exactly and
+    others up to the rounding of modes and maps.
+
+    K(0)^-1 f is computed with the factor of K(0) or in modes of its own, see `LinearResponse`.
 
     The module takes and returns dimensionless float64 fields. It has no trained parameters.
 
@@ -66,6 +74,7 @@ class Unrolled(nn.Module):
 
     Attributes:
         scene: The scene to predict.
+        linear: The linear solution.
         modes: V at free degrees of freedom, (n, R).
         parity: Parity of each mode, (R,), see `dpl.fem.rom.parity`.
         stiffness: V^T K(0) [V, p] by its dependence on the moduli, see `ReducedStiffness`,
@@ -76,9 +85,9 @@ class Unrolled(nn.Module):
         maps: B_1, B_2, ..., (K, 2 C D D, R).
         limits: Largest ratio of each correction to the one before, (1 + K,): 1.5 times that of the
             samples. They keep loads far out of range from running away.
-        newton_rank: Number of modes of Newton's method that follows; 0: none, ().
-        newton_cells: Cells of its tangent, (K,).
-        newton_weights: Their weights, (K,).
+        newton_modes: Modes of Newton's method that follows, (n, K).
+        newton_cells: Cells of its tangent, (C,).
+        newton_weights: Their weights, (C,).
         outside_error: Largest relative error that it left at held-out samples, ().
         fitted: True after `fit`, ().
     """
@@ -91,7 +100,7 @@ class Unrolled(nn.Module):
     first_map: Tensor
     maps: Tensor
     limits: Tensor
-    newton_rank: Tensor
+    newton_modes: Tensor
     newton_cells: Tensor
     newton_weights: Tensor
     outside_error: Tensor
@@ -107,7 +116,7 @@ class Unrolled(nn.Module):
         cells: int = 160,
         stages: int = 3,
         symmetry: bool = True,
-        linear_tol: float = 5e-4,
+        linear_tol: float | None = None,
     ) -> None:
         """Build the module; `fit` computes its contents.
 
@@ -117,8 +126,9 @@ class Unrolled(nn.Module):
             cells: Largest number of sample cells; a few more, if symmetries demand it.
             stages: Largest number of iterations after the first map.
             symmetry: Find the symmetries of the body and build them into the answer.
-            linear_tol: Relative size of the part of the linear solution that the modes miss, above
-                which it is computed with the factor of K(0). 0: for all loads; infinity: for none.
+            linear_tol: Relative size of the part of the linear solution that modes may miss;
+                beyond it K(0)^-1 f is computed with a factor. 0: for all loads; infinity: for
+                none; None: 0 if that is cheap, else 5e-4.
 
         Raises:
             ValueError: A number is out of range.
@@ -126,7 +136,7 @@ class Unrolled(nn.Module):
         super().__init__()
         check_range(1, MAX_SIZE, rank=rank, cells=cells)
         check_range(0, MAX_SIZE, stages=stages)
-        if not linear_tol >= 0:
+        if linear_tol is not None and not linear_tol >= 0:
             raise ValueError(f"linear_tol = {linear_tol} must be 0 or more")
         self.scene = scene
         self.rank, self.sample_count, self.stages = rank, cells, stages
@@ -134,7 +144,7 @@ class Unrolled(nn.Module):
         also = [] if constant is None else [constant]
         self.group = symmetries(scene.problem, also=also) if symmetry else []
         self.extra_inputs = ("parameters",) if scene.loads.parameter_ranges else ()
-        self.local = LocalResponse(scene, linear_tol)
+        self.linear = LinearResponse(scene, self.group, linear_tol)
         dim = scene.problem.shape[1]
         empty = torch.zeros(0, dtype=torch.float64)
         for name, value in {
@@ -146,7 +156,7 @@ class Unrolled(nn.Module):
             "first_map": torch.zeros(0, 0),
             "maps": torch.zeros(0, 0, 0),
             "limits": torch.ones(1, dtype=torch.float64),
-            "newton_rank": torch.tensor(0),
+            "newton_modes": torch.zeros(int(scene.problem.free.sum()), 0),
             "newton_cells": torch.zeros(0, dtype=torch.int64),
             "newton_weights": empty,
             "outside_error": torch.tensor(0.0, dtype=torch.float64),
@@ -155,7 +165,7 @@ class Unrolled(nn.Module):
             self.register_buffer(name, value)
         self._stiffness = ReducedStiffness(self.stiffness)
         self._compiled: tuple[Tensor, CompiledPrediction] | None = None
-        self._inverted: tuple[tuple[Tensor, Any], tuple[LawArguments, Array, Array]] | None = None
+        self._at_last_law: tuple[tuple[Tensor, Any], _AtLaw] | None = None
         dofs = scene.problem.free.flatten().nonzero()[:, 0]
         self.register_buffer("dofs", dofs, persistent=False)
         self.register_buffer("prescribed", scene.problem.prescribed, persistent=False)
@@ -173,36 +183,30 @@ class Unrolled(nn.Module):
         if self._is_compiled(force, given):
             return self._compiled_fields(force, given)
         loaded = force.flatten(1)[:, self.dofs]
-        linear, whole = self.coordinates(loaded, given)
-        columns = self._at_free_dofs(whole)
-        local = self._is_local(loaded, linear)
-        if local.any():
-            galerkin = self._at_free_dofs(linear[local])
-            missing = self.local.missing(loaded[local], galerkin, given[local])
-            columns = columns.index_add(0, local.nonzero()[:, 0], missing)
-        return self._field(columns)
+        linear = self.linear(loaded, given)
+        return self._field(linear + self._at_free_dofs(self.coordinates(loaded, given)))
 
     def forward_in_basis(
         self, force: Tensor, parameters: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return displacements within the modes (B, N, D) and a mask of local loads, (B,)."""
+        given = self._given_parameters(force, parameters)
         loaded = force.flatten(1)[:, self.dofs]
-        linear, whole = self.coordinates(loaded, self._given_parameters(force, parameters))
-        columns = self._at_free_dofs(whole)
-        return self._field(columns), self._is_local(loaded, linear)
+        linear, local = self.linear.in_modes(loaded, given)
+        return self._field(linear + self._at_free_dofs(self.coordinates(loaded, given))), local
 
     @property
     def linear_tol(self) -> float:
         """See `FlagsLocalLoads`."""
-        return self.local.tol
+        return self.linear.tol
 
     @property
     def flags_local_loads(self) -> bool:
         """See `FlagsLocalLoads`."""
-        return self.local.tol < torch.inf
+        return self.linear.tol < torch.inf
 
-    def coordinates(self, loaded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return coordinates (B, R) of the Galerkin linear solution and of the prediction.
+    def coordinates(self, loaded: Tensor, parameters: Tensor) -> Tensor:
+        """Return coordinates (B, R) of the nonlinear displacement.
 
         Args:
             loaded: Forces at free degrees of freedom, (B, n).
@@ -212,7 +216,7 @@ class Unrolled(nn.Module):
         linear = self._stiffness.solve(law, loaded @ self.modes.to(loaded))
         cells = SampleCells(self.gradients.to(linear))
         matrices = self.first_map.to(linear), list(self.maps.to(linear))
-        return linear, Maps(cells, *matrices, self.limits)(law, linear)
+        return Maps(cells, *matrices, self.limits)(law, linear)
 
     def _at_free_dofs(self, coordinates: Tensor) -> Tensor:
         """Return V c at free degrees of freedom, (B, n), of c (B, R)."""
@@ -241,8 +245,9 @@ class Unrolled(nn.Module):
         for one, own, field in zip(force.detach(), parameters.detach(), fields, strict=True):
             law = cast(InvariantBasedMaterial, material.with_parameters(own[None]))
             if predict(*self._at_law(law), one.numpy(), field.numpy()):
-                loaded = one.flatten()[self.dofs].numpy()
-                field.view(-1)[self.dofs] += torch.from_numpy(self.local.solve(loaded, own))
+                loaded = one.flatten()[None, self.dofs].numpy()
+                exact = self.linear.solve(loaded, own[None])[0]
+                field.view(-1)[self.dofs] += torch.from_numpy(exact)
         return fields
 
     @property
@@ -256,23 +261,20 @@ class Unrolled(nn.Module):
                 self.group,
                 problem.free,
                 positions=positions,
-                probes=self.local.probes,
-                tol=self.local.tol,
+                linear=self.linear.compiled(),
                 **{name: getattr(self, name) for name in names},
             )
             self._compiled = self.maps, prediction
         return self._compiled[1]
 
-    def _at_law(self, law: InvariantBasedMaterial) -> tuple[LawArguments, Array, Array]:
-        """Return the law, (V^T K(0) V)^-1 (R, R) and V^T K(0) p (R,), kept for the last law."""
-        if self._inverted is None or not (
-            self._inverted[0][0] is self.stiffness and self._inverted[0][1] == law
+    def _at_law(self, law: InvariantBasedMaterial) -> _AtLaw:
+        """Return the law and the reduced bodies of both bases, kept for the last law."""
+        if self._at_last_law is None or not (
+            self._at_last_law[0][0] is self.stiffness and self._at_last_law[0][1] == law
         ):
-            whole = self._stiffness.at(law).numpy()
-            inverse = np.ascontiguousarray(np.linalg.inv(whole[:, :-1]))
-            known = law_arguments(law), inverse, whole[:, -1].copy()
-            self._inverted = (self.stiffness, law), known
-        return self._inverted[1]
+            found = law_arguments(law), self._stiffness.inverse(law), self.linear.inverse(law)
+            self._at_last_law = (self.stiffness, law), found
+        return self._at_last_law[1]
 
     def _given_parameters(self, force: Tensor, parameters: Tensor | None) -> Tensor:
         if parameters is not None:
@@ -281,9 +283,6 @@ class Unrolled(nn.Module):
             names = list(self.scene.loads.parameter_ranges)
             raise ValueError(f"parameters are an input of this model; give {names}, (B, P)")
         return force.new_zeros(force.shape[0], 0)
-
-    def _is_local(self, loaded: Tensor, linear: Tensor) -> Tensor:
-        return self.local.is_local(loaded, linear.norm(dim=1))  # the modes are orthonormal
 
     def _field(self, columns: Tensor) -> Tensor:
         """Return fields (B, N, D) of values at free degrees of freedom, (B, n)."""
@@ -307,26 +306,54 @@ class Unrolled(nn.Module):
         Raises:
             ValueError: There are too few samples, or they are not finite.
         """
+        problem, free = self.scene.problem, self.scene.problem.free
+        self.linear.fit(samples.force, self.rank)
+        both = samples, held_out
+        rests = [nonlinear_displacement(problem, part, self.linear) for part in both]
+        weights = sample_weights(samples.displacement[:, free])
+        basis = invariant_pod(weights[:, None] * rests[0], free, self.group, self.rank)
+        every, parity = modes_of_parity(basis, free, self.group)
+        actions = group_actions(every, free, self.group)
+        self.fitted = torch.tensor(True)
+        fits: list[tuple[float, dict[str, Tensor]]] = []
+        rank = every.shape[1]
+        while rank:
+            self.parity = parity[:rank]
+            error = self._fit_maps(every[:, :rank], actions[:, :rank, :rank], both, rests)
+            fits.append((error, dict(self.named_buffers(recurse=False))))
+            rank = invariant_rank(actions, rank // 2) if rank // 2 >= MIN_RANK else 0
+        _, best = min(fits, key=lambda pair: pair[0])
+        for name, buffer in best.items():
+            setattr(self, name, buffer)
+        self._stiffness = ReducedStiffness(self.stiffness).prepared()
+        self._fit_newton(every, *both)
+
+    def _fit_maps(
+        self,
+        modes: Tensor,
+        actions: Tensor,
+        both: tuple[Sample, Sample],
+        rests: Sequence[Tensor],
+    ) -> float:
+        """Fit the maps in some modes (n, R); return the weighted mean error of held-out samples.
+
+        Args:
+            modes: The modes, (n, R).
+            actions: Matrices of the symmetries, (G, R, R), see `group_actions`.
+            both: Samples to fit to, and held-out ones.
+            rests: Their nonlinear displacements, (S, n) each.
+        """
         problem = self.scene.problem
-        modes = fit_modes(self.scene, samples, self.rank, self.group)
-        modes, self.parity = modes_of_parity(modes, problem.free, self.group)
         stiffness = self._stiffness = ReducedStiffness.of(problem, modes).prepared()
         self.modes, self.stiffness = modes.float(), stiffness.parts
-        inverse = torch.linalg.inv(stiffness.at(problem.reference.material)[:, :-1])
-        self.local.fit(modes, inverse, self.group)
-        solved = None if self.extra_inputs else linear_of_modes(self.scene, modes)
-        sets = [
-            in_coordinates(problem, modes, stiffness, part, solved, self._is_local)
-            for part in (samples, held_out)
-        ]
+        fitted, held = (
+            in_coordinates(problem, modes, stiffness, *pair)
+            for pair in zip(both, rests, strict=True)
+        )
+        options = {"cells": self.sample_count, "stages": self.stages}
+        sets = fitted, held
         numbers, found = fit_maps(
-            problem,
-            modes,
-            self.group,
-            self.parity,
-            (sets[0], sets[1]),
-            cells=self.sample_count,
-            stages=self.stages,
+            problem, modes, self.group, (actions, self.parity), sets, **options
         )
         maps = found.maps
         self.cells, self.gradients = numbers, maps.cells.gradients
@@ -334,34 +361,34 @@ class Unrolled(nn.Module):
         rows = 2 * len(self.first_map)
         none = torch.zeros(0, rows, modes.shape[1])
         self.maps = torch.stack([one.float() for one in maps.others]) if maps.others else none
-        self.fitted = torch.tensor(True)
-        self._fit_newton(samples, held_out)
+        squares = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)  # not in V
+        return found.error_with(squares)
 
-    def _fit_newton(self, samples: Sample, held_out: Sample) -> None:
-        """Choose modes and cells of Newton's method that follows the maps."""
+    def _fit_newton(self, every: Tensor, samples: Sample, held_out: Sample) -> None:
+        """Choose modes and cells of Newton's method that follows the maps.
+
+        Args:
+            every: Modes to choose from, the most important one first, (n, R).
+            samples, held_out: See `fit`.
+        """
         few = Sample(*(column[:LOADS] for column in held_out))
         guesses = self(few.force, *((few.parameters,) if self.extra_inputs else ()))
-        vectors = self._orthonormal(self.modes.shape[1])
-        found = choose_newton(self.scene.problem, vectors, samples.displacement, few, guesses)
-        self.newton_rank = torch.tensor(0)
-        if found is not None and found.cubature is not None:
-            self.newton_rank = torch.tensor(found.vectors.shape[2])
-            self.newton_cells, self.newton_weights = found.cubature.cells, found.cubature.weights
-            self.outside_error = torch.tensor(found.outside_error, dtype=torch.float64)
+        problem, states = self.scene.problem, samples.displacement
+        vectors = orthonormal_fields(every, problem.free)
+        found = choose_newton(problem, vectors, states, few, guesses)
+        self.newton_modes = every[:, : found.vectors.shape[2]].float()
+        assert found.cubature is not None  # cells are always chosen
+        self.newton_cells, self.newton_weights = found.cubature.cells, found.cubature.weights
+        self.outside_error = torch.tensor(found.outside_error, dtype=torch.float64)
 
     def correction(self) -> SubspaceNewton | None:
         """See `HasCorrection`."""
-        rank = int(self.newton_rank)
-        if not rank:
+        if not self.newton_modes.shape[1]:
             return None
+        problem, error = self.scene.problem, float(self.outside_error)
+        vectors = orthonormal_fields(self.newton_modes, problem.free)
         cells = Cubature(self.newton_cells, self.newton_weights, 0.0)
-        error = float(self.outside_error)
-        problem = self.scene.problem
-        return SubspaceNewton(problem, self._orthonormal(rank), cells, outside_error=error)
-
-    def _orthonormal(self, rank: int) -> Tensor:
-        """Return the first modes, orthonormal, (N, D, rank)."""
-        return orthonormal_fields(self.modes[:, :rank], self.scene.problem.free)
+        return SubspaceNewton(problem, vectors, cells, outside_error=error)
 
     def galerkin(self, states: Tensor, *, rank: int, tolerance: float) -> SubspaceNewton:
         """Return Newton's method in the first modes; see `Correctable`.
@@ -375,8 +402,9 @@ class Unrolled(nn.Module):
             ValueError: A number is out of range.
         """
         some = states[:CELL_STATES]
-        modes = self._orthonormal(rank)
-        return SubspaceNewton.within(self.scene.problem, modes, some, tolerance=tolerance)
+        problem = self.scene.problem
+        modes = orthonormal_fields(self.modes[:, :rank], problem.free)
+        return SubspaceNewton.within(problem, modes, some, tolerance=tolerance)
 
     def skipped_work(self) -> list[str]:
         """Return the work that the model saves, one line each."""
@@ -384,10 +412,12 @@ class Unrolled(nn.Module):
         lines = ["no gradient descent: the maps are found by linear regression"]
         if members > 1:
             lines.append(f"no learning of {members} symmetries: the maps commute with them")
-        if self.flags_local_loads:
+        if self.linear.is_exact:
+            lines.append("no modes for linear solutions: a factor of K(0) is applied to each load")
+        elif self.flags_local_loads:
             lines.append(
                 "no modes for near fields: where the modes miss more than "
-                f"{self.local.tol:.2g} of the linear solution, K(0)^-1 f is computed"
+                f"{self.linear.tol:.2g} of the linear solution, K(0)^-1 f is computed"
             )
         return lines
 

@@ -1,26 +1,24 @@
-"""Fit of `dpl.models.Unrolled` to samples: modes, sample cells and maps."""
+"""Fit of `dpl.models.Unrolled` to samples: sample cells and maps."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from dpl.fem import Problem
 from dpl.fem.materials.material import Material
 from dpl.fem.rom.parity import Parities, SignedOrbits
-from dpl.fem.rom.reduced_problem import support_force
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells, cell_gradients
 from dpl.fem.symmetry import Symmetry, cell_images
-from dpl.models.invariant_basis import InvariantPOD, group_actions, scatter_fields, stride
+from dpl.models.invariant_basis import scatter_fields
 from dpl.models.irreps import representations_of
+from dpl.models.linear_response import LinearResponse
 from dpl.models.stage_regression import GroupAction, Rows, fit_map, weighted_error
-from dpl.scene import Sample, Scene
+from dpl.scene import Sample
 
 CHUNK = 256  # samples whose fields or features are computed at a time
-LINEAR_RTOL = 1e-6  # relative residual of linear solutions from which modes are computed
 SIZE_EXPONENT = -0.4  # errors count relative to the displacement to this power
 LIMIT = 1.5  # factor on the largest ratio of corrections in the samples
 MIN_GAIN = 0.97  # largest ratio of held-out errors for which another map is worth its time
@@ -43,13 +41,17 @@ class Maps(NamedTuple):
     limits: Tensor
 
     def __call__(self, law: Material, linear: Tensor) -> Tensor:
-        """Return coordinates (B, R) of displacements from those of linear solutions (B, R)."""
+        """Return coordinates (B, R) of nonlinear displacements.
+
+        Args:
+            law: The law, see `Material.with_parameters`.
+            linear: Coordinates of Galerkin linear solutions, (B, R).
+        """
         H = self.cells.gradient(linear)
         step = self.cells.first_features(H).flatten(1) @ self.first
-        step = limit_step(step, linear, self.limits[0])
-        c = linear + step
+        c = step = limit_step(step, linear, self.limits[0])
         for matrix, limit in zip(self.others, self.limits[1:], strict=True):
-            proposed = self.cells.features(law, c, H).flatten(1) @ matrix
+            proposed = self.cells.features(law, linear + c, H).flatten(1) @ matrix
             step = limit_step(proposed, step, limit)
             c = c + step
         return c
@@ -67,8 +69,7 @@ class Columns(NamedTuple):
 
     Attributes:
         linear: Coordinates of the Galerkin linear solution, (S, R).
-        target: Coordinates of the displacement, (S, R); of a local load without the part of the
-            linear solution that the modes miss.
+        target: Coordinates of the nonlinear displacement, (S, R).
         weights: Factor of the error of each sample, (S,).
         parameters: Parameters of the law, (S, P).
     """
@@ -77,48 +78,6 @@ class Columns(NamedTuple):
     target: Tensor
     weights: Tensor
     parameters: Tensor
-
-
-def fit_modes(scene: Scene, samples: Sample, rank: int, group: Sequence[Symmetry]) -> Tensor:
-    """Return invariant POD modes (n, R), rounded to float32, of linear and nonlinear parts.
-
-    For ranges of parameters the linear part is that of the reference body. The factor of K(0) is
-    that in float32, which is accurate enough for modes.
-    """
-    linear = scene.linear.reference
-    free = linear.problem.free
-    supports = support_force(linear.problem)
-    step = stride(2 * len(samples.force), int(free.sum()))
-    some = range(0, len(samples.force), step)
-    basis = InvariantPOD(free, group, 2 * len(some))
-    for start in range(0, len(some), CHUNK):
-        chosen = list(some[start : start + CHUNK])
-        right = (samples.force[chosen] - supports)[:, free]
-        solved = torch.from_numpy(linear.float32_factor.solve_many(right.numpy(), LINEAR_RTOL))
-        displacement = samples.displacement[chosen][:, free]
-        weights = sample_weights(displacement)[:, None]
-        basis.add(weights * solved)
-        basis.add(weights * (displacement - solved))
-    return basis.modes(rank).float().double()
-
-
-def linear_of_modes(scene: Scene, modes: Tensor) -> Tensor:
-    """Return K(0)^-1 V, (n, R), of the reference body."""
-    factor = scene.linear.reference.factor
-    solved = factor.solve_many(np.ascontiguousarray(modes.T.double().numpy()))
-    return torch.from_numpy(solved).T
-
-
-def modes_of_parity(
-    modes: Tensor, free: Tensor, group: Sequence[Symmetry]
-) -> tuple[Tensor, Tensor]:
-    """Return modes (n, R) of definite parity, rounded to float32, and their parities (R,)."""
-    parities = Parities.of(group, free.shape[1])
-    members = [group[k] for k in parities.members.tolist()] if group else group
-    rotation, parity = parities.adapted(group_actions(modes, free, members))
-    orbits = SignedOrbits.of_field(parities, group, free)
-    exact = orbits.symmetrised(modes @ rotation, parity, parities)
-    return exact.float().double(), parity
 
 
 def cell_positions(images: Tensor, cells: Tensor) -> Tensor:
@@ -140,12 +99,7 @@ def sample_weights(displacement: Tensor) -> Tensor:
 
 
 def in_coordinates(
-    problem: Problem,
-    modes: Tensor,
-    stiffness: ReducedStiffness,
-    samples: Sample,
-    solved: Tensor | None,
-    is_local: Callable[[Tensor, Tensor], Tensor],
+    problem: Problem, modes: Tensor, stiffness: ReducedStiffness, samples: Sample, rest: Tensor
 ) -> Columns:
     """Return samples in coordinates of the modes.
 
@@ -154,25 +108,29 @@ def in_coordinates(
         modes: V, (n, R).
         stiffness: V^T K(0) V.
         samples: The samples, (S, N, D).
-        solved: K(0)^-1 V, (n, R); None if K(0) depends on parameters. The part of the linear
-            solution that the modes miss is then unknown, and local loads have the weight 0.
-        is_local: Function from forces (B, n) and coordinates of their linear solutions (B, R) to
-            the mask of local loads, (B,).
+        rest: Their displacements minus the linear solutions, (S, n).
     """
-    free, supports = problem.free, support_force(problem)[problem.free]
     parts = []
-    for start in range(0, len(samples.force), CHUNK):
-        some = Sample(*(column[start : start + CHUNK] for column in samples))
-        displacement, loaded = some.displacement[:, free], some.force[:, free]
-        law = problem.material.with_parameters(some.parameters)
-        linear = stiffness.solve(law, loaded @ modes)
-        weights, target = sample_weights(displacement), displacement @ modes
-        if solved is None:
-            weights = torch.where(is_local(loaded, linear), 0.0, weights)
-        else:
-            target = target + linear - (loaded - supports) @ solved
-        parts.append(Columns(linear, target, weights, some.parameters))
+    for part, own in zip(_chunks(samples), rest.split(CHUNK), strict=True):
+        law = problem.material.with_parameters(part.parameters)
+        linear = stiffness.solve(law, part.force[:, problem.free] @ modes)
+        weights = sample_weights(part.displacement[:, problem.free])
+        parts.append(Columns(linear, own @ modes, weights, part.parameters))
     return Columns(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+
+def _chunks(samples: Sample) -> Iterator[Sample]:
+    for start in range(0, len(samples.force), CHUNK):
+        yield Sample(*(column[start : start + CHUNK] for column in samples))
+
+
+def nonlinear_displacement(problem: Problem, samples: Sample, linear: LinearResponse) -> Tensor:
+    """Return displacements minus linear solutions at free degrees of freedom, (S, n)."""
+    parts = [
+        part.displacement[:, problem.free] - linear(part.force[:, problem.free], part.parameters)
+        for part in _chunks(samples)
+    ]
+    return torch.cat(parts)
 
 
 def choose_cells(images: Tensor, count: int) -> Tensor:
@@ -212,11 +170,11 @@ class Regression:
         """
         self._law, self._cells, self._action = law, cells, action
         self._sets = fitted, held
-        self._present = [fitted.linear, held.linear]
+        self._present = [torch.zeros_like(part.linear) for part in self._sets]
         self._steps = [fitted.linear, held.linear]
         self._matrices: list[Tensor] = []
         self._limits: list[Tensor] = []
-        self.errors = [weighted_error(held.target - held.linear, held.weights)]
+        self.errors = [weighted_error(held.target, held.weights)]
         self.ridges: list[float] = []
 
     @property
@@ -227,6 +185,16 @@ class Regression:
         first = self._matrices[0] if self._matrices else none
         limits = torch.stack(self._limits or [torch.tensor(1.0, dtype=torch.float64)])
         return Maps(self._cells, first, self._matrices[1:], limits)
+
+    def error_with(self, squares: Tensor) -> float:
+        """Return the weighted mean error of held-out samples.
+
+        Args:
+            squares: Squared errors outside the modes, (S,).
+        """
+        held = self._sets[1]
+        inside = (held.target - self._present[1]).square().sum(dim=1)
+        return float(((inside + squares.clamp(min=0)).sqrt() * held.weights).mean())
 
     def add_map(self) -> bool:
         """Fit the next map; return False, without adding it, if it gains too little."""
@@ -258,14 +226,14 @@ class Regression:
         H = self._cells.gradient(linear)
         if not self._matrices:
             return self._cells.first_features(H)
-        return self._cells.features(law, present, H)
+        return self._cells.features(law, linear + present, H)
 
 
 def fit_maps(
     problem: Problem,
     modes: Tensor,
     group: Sequence[Symmetry],
-    parity: Tensor,
+    symmetry: tuple[Tensor, Tensor],
     samples: tuple[Columns, Columns],
     *,
     cells: int,
@@ -279,13 +247,13 @@ def fit_maps(
         problem: The body.
         modes: V, (n, R).
         group: Symmetries of the body.
-        parity: Parity of each mode, (R,).
+        symmetry: Matrices of the symmetries in the modes, (G, R, R), and parities of these, (R,).
         samples: Samples to fit to, and to choose by.
         cells: Number of sample cells.
         stages: Largest number of maps after the first.
     """
     images = cell_images(problem, group)
-    actions = group_actions(modes, problem.free, group)
+    actions, parity = symmetry
     representations = representations_of(group)
     parities = Parities.of(group, problem.shape[1])
     fields = torch.cat([scatter_fields(modes.T, problem.free), problem.prescribed[None]])

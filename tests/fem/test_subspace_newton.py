@@ -206,7 +206,7 @@ def test_estimates_are_those_of_the_error_in_the_subspace(solver, unseen, truth,
         states = list(solver.states(load, guess=guess[k, None]))
         assert states[0].error == error
         assert error == pytest.approx(1e-3, rel=0.2)
-        assert errors((guess[k] + step)[None], limit[k, None]) < 2e-4
+        assert errors((guess[k] + step)[None], limit[k, None]) < 3e-4
         assert states[-1].error < 3e-6
 
 

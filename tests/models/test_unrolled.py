@@ -76,9 +76,8 @@ def test_it_is_much_nearer_than_the_linear_solution(beam, net):
 def test_small_loads_have_the_linear_solution(beam, net, size):
     force = size * beam.loads.sample(3, range(4)).force
     exact = torch.stack([beam.linear.solve(one) for one in force])
-    net = fitted(beam, linear_tol=0.0)
     error = (net(force) - exact).flatten(1).norm(dim=1) / exact.flatten(1).norm(dim=1)
-    assert error.max() < 2 * size + 1e-6  # the factor for local loads is float32
+    assert error.max() < 2 * size + 1e-6  # the factor is float32
 
 
 def test_no_load_no_displacement(beam, net):
@@ -97,7 +96,7 @@ def test_compiled_and_tensor_predictions_agree(beam, net):
     load = beam.loads.sample(5, range(3)).force
     with torch.enable_grad():
         tensors = net(load.clone().requires_grad_())
-    assert (net(load) - tensors).norm() < 1e-10 * tensors.norm()
+    assert (net(load) - tensors).norm() < 1e-5 * tensors.norm()  # float32 factors
 
 
 @pytest.mark.parametrize("name", COMPILED)
@@ -106,7 +105,7 @@ def test_every_compiled_law_agrees(name):
     net = fitted(scene, 12, rank=8, cells=4, stages=1)
     load = scene.loads.sample(5, range(2)).force
     tensors = net(load.clone().requires_grad_())
-    assert (net(load) - tensors).norm() < 1e-9 * tensors.norm()
+    assert (net(load) - tensors).norm() < 1e-5 * tensors.norm()  # float32 factors
 
 
 def test_gradients_with_respect_to_forces(beam, net):
@@ -114,7 +113,7 @@ def test_gradients_with_respect_to_forces(beam, net):
     direction = torch.randn(force.shape, generator=torch.Generator().manual_seed(0)).double()
     direction *= force.detach().norm() / direction.norm()
     (gradient,) = torch.autograd.grad(net(force).square().sum(), force)
-    step = 1e-5
+    step = 1e-3  # the factor is float32
     ends = [net(force.detach() + s * step * direction).square().sum() for s in (1, -1)]
     assert float((gradient * direction).sum()) == pytest.approx(
         float(ends[0] - ends[1]) / (2 * step), rel=1e-3
@@ -327,11 +326,12 @@ def test_the_fit_includes_newton_in_the_modes(beam, net):
     assert (first.error >= solvers[0].outside_error).all()
 
 
-def test_no_newton_where_it_improves_nothing(beam, net):
+def test_newton_estimates_errors_also_where_it_improves_nothing(beam, net):
     samples = samples_of(beam, 8, seed=1)
-    modes = net.correction().vectors
-    exact = samples.displacement
-    assert choose_newton(beam.problem, modes, exact, samples, exact) is None
+    modes, exact = net.correction().vectors, samples.displacement
+    solver = choose_newton(beam.problem, modes, exact, samples, exact)
+    for load, u in zip(samples.load.unbatch(), exact, strict=True):
+        assert next(solver.states(load, guess=u[None])).error < 1e-6
 
 
 def test_the_held_out_error_is_the_mean_norm_of_the_errors_of_the_map(beam, monkeypatch):

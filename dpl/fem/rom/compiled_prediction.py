@@ -12,10 +12,20 @@ from torch.nn.functional import pad
 
 from dpl.fem.assembly.kernels import call_compiled
 from dpl.fem.assembly.numba_laws import Law, required_terms
-from dpl.fem.assembly.sampled_loops import SOURCES, ModelArrays, predict
+from dpl.fem.assembly.sampled_loops import (
+    SOURCES,
+    BasisArrays,
+    LinearArrays,
+    MapArrays,
+    ModelArrays,
+    OrbitArrays,
+    predict,
+)
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.rom.parity import Parities, SignedOrbits
+from dpl.fem.rom.parity_factor import ParityFactor
+from dpl.fem.rom.reduced_stiffness import Reduced
 from dpl.fem.symmetry import Symmetry
 
 Array = NDArray[np.float64]
@@ -43,13 +53,10 @@ class CompiledPrediction:
     """An unrolled reduced solver for one load at a time.
 
     Attributes:
-        arrays: Its matrices, see `ModelArrays`.
-        tol: Relative size of the part of the linear solution that the modes miss, above which a
-            load is local.
+        arrays: Its matrices.
     """
 
     arrays: ModelArrays
-    tol: float
 
     @classmethod
     def of(
@@ -59,87 +66,128 @@ class CompiledPrediction:
         *,
         parity: Tensor,
         modes: Tensor,
-        probes: Tensor,
         positions: Tensor,
         gradients: Tensor,
         first_map: Tensor,
         maps: Tensor,
         limits: Tensor,
-        tol: float,
+        linear: "Linear",
     ) -> Self:
         """Arrange the matrices by parity.
 
         Args:
             group: Symmetries of the body.
             free: Mask of free degrees of freedom, (N, D).
-            tol: See the class.
             parity: Parity of each mode, (R,).
             modes: V at free degrees of freedom, (n, R).
-            probes: Fields whose products with a force estimate the missing part, (n, F).
             positions: Position to which each symmetry maps each sample cell, (G, C).
             gradients: G and the gradients of the prescribed displacement, (R + 1, C, D, D).
             first_map: B_0, (C D D, R).
             maps: B_1, ..., (K, 2 C D D, R).
             limits: Largest ratio of each correction to the one before, (1 + K,).
+            linear: The linear solution.
         """
         dim = free.shape[1]
         parities = Parities.of(group, dim)
         fields = SignedOrbits.of_field(parities, group, free)
         images = positions[parities.members]
         one, two = (SignedOrbits.of_tensors(parities, images, k, SIMD_WIDTH) for k in (1, 2))
-        own = [(parity == p).nonzero()[:, 0] for p in range(len(parities.members))]
-        most = max(len(columns) for columns in own)
-
-        def by_parity(orbits: SignedOrbits, matrix: Tensor) -> Tensor:
-            """Return the rows of one value of each orbit, by parity, (M, m, r)."""
-            parts = [orbits.of_parity(matrix, columns) for columns in own]
-            return torch.stack([pad(part, (0, most - part.shape[1])) for part in parts])
-
+        of_modes, of_linear = _ByParity(parities, parity), _ByParity(parities, linear.parity)
         flat = gradients.flatten(1).T  # (C D D, R + 1)
         rest = torch.where(one.weight > 0, flat[one.images, -1], 0.0)
+        none = torch.zeros(0, *two.images.shape, of_modes.most)
+        others = torch.stack([of_modes.rows(two, matrix) for matrix in maps]) if len(maps) else none
         dofs = free.flatten().nonzero()[:, 0]
-        spread = probes.new_zeros(free.numel(), probes.shape[1])
-        spread[dofs] = probes
-        columns = [pad(c, (0, most - len(c)), value=len(parity)) for c in own]
-        none = torch.zeros(0, *two.images.shape, most)
-        every = torch.stack([by_parity(two, matrix) for matrix in maps]) if len(maps) else none
+        spread = linear.probes.new_zeros(free.numel(), linear.probes.shape[1])
+        spread[dofs] = linear.probes
+        supports = fields.by_parity(linear.supports[free], parities)
         arrays = ModelArrays(
-            characters=parities.characters.numpy(),
-            dofs=_integer(dofs[fields.images]),
-            signs=_double(fields.sign),
-            weights=_double(fields.weight),
-            columns=_integer(torch.stack(columns)),
-            modes=_single(by_parity(fields, modes).mT),
-            probes=_single(spread),
-            gradients=_single(by_parity(one, flat[:, :-1]).mT),
-            rest=_double(rest),
-            entry_signs=_double(one.sign),
-            first_signs=_double(one.sign * one.weight),
-            map_signs=_double(two.sign * two.weight),
-            first=_single(by_parity(one, first_map)),
-            maps=_single(every),
-            limits=_double(limits),
+            orbits=OrbitArrays(
+                characters=parities.characters.numpy(),
+                dofs=_integer(dofs[fields.images]),
+                signs=_double(fields.sign),
+                weights=_double(fields.weight),
+            ),
+            basis=of_modes.basis(fields, modes),
+            maps=MapArrays(
+                gradients=_single(of_modes.rows(one, flat[:, :-1]).mT),
+                rest=_double(rest),
+                entry_signs=_double(one.sign),
+                first_signs=_double(one.sign * one.weight),
+                map_signs=_double(two.sign * two.weight),
+                first=_single(of_modes.rows(one, first_map)),
+                others=_single(others),
+                limits=_double(limits),
+            ),
+            linear=LinearArrays(
+                factor=linear.factor.storage,
+                order=linear.factor.order,
+                supports=_double(supports),
+                basis=of_linear.basis(fields, linear.modes),
+                probes=_single(spread),
+                tol=min(linear.tol, np.finfo(float).max ** 0.25),
+            ),
         )
-        return cls(arrays, tol)
+        return cls(arrays)
 
     def __call__(
-        self, law: LawArguments, inverse: Array, supports: Array, force: Array, field: Array
+        self, law: LawArguments, reduced: Reduced, linear: Reduced, force: Array, field: Array
     ) -> bool:
         """Set the displacement at free degrees of freedom; return True for a local load.
 
-        The displacement under a local load lacks the linear solution V c.
+        The displacement under a local load lacks the linear solution.
 
         Args:
             law: The law, see `law_arguments`.
-            inverse: (V^T K(0) V)^-1, (R, R).
-            supports: V^T K(0) p, (R,).
+            reduced: (V^T K(0) V)^-1, (R, R), and V^T K(0) p, (R,).
+            linear: The same of the modes of linear solutions.
             force: Nodal forces, (N, D).
             field: Displacement, (N, D), contiguous.
         """
         flat = np.ascontiguousarray(force).reshape(-1)
-        tol = min(self.tol, np.finfo(float).max ** 0.25)
-        data = self.arrays, flat, inverse, supports, tol, field.reshape(-1)
+        data = self.arrays, reduced, linear, flat, field.reshape(-1)
         return bool(call_compiled(predict, *law, *data))
+
+
+class Linear(NamedTuple):
+    """The linear solution of a compiled prediction, by a factor or in modes.
+
+    Attributes:
+        factor: Factor of K(0); without rows if the modes are used.
+        supports: K(0) p, (N, D), of the prescribed displacement p.
+        modes: L at free degrees of freedom, (n, R).
+        parity: Parity of each of these modes, (R,).
+        probes: Fields whose products with a force estimate the missing part, (n, F).
+        tol: Relative size of the part of the linear solution that the modes miss, above which a
+            load is local.
+    """
+
+    factor: ParityFactor
+    supports: Tensor
+    modes: Tensor
+    parity: Tensor
+    probes: Tensor
+    tol: float
+
+
+class _ByParity:
+    """Columns of matrices, grouped by their parity."""
+
+    def __init__(self, parities: Parities, parity: Tensor) -> None:
+        """Take the parities of the columns, (R,)."""
+        self._own = [(parity == p).nonzero()[:, 0] for p in range(len(parities.members))]
+        self._count = len(parity)
+        self.most = max(len(columns) for columns in self._own)
+
+    def rows(self, orbits: SignedOrbits, matrix: Tensor) -> Tensor:
+        """Return the rows of one value of each orbit, by parity, (M, m, r), of (n, R)."""
+        parts = [orbits.of_parity(matrix, columns) for columns in self._own]
+        return torch.stack([pad(part, (0, self.most - part.shape[1])) for part in parts])
+
+    def basis(self, orbits: SignedOrbits, modes: Tensor) -> BasisArrays:
+        """Return modes (n, R) by parity."""
+        columns = [pad(c, (0, self.most - len(c)), value=self._count) for c in self._own]
+        return BasisArrays(_integer(torch.stack(columns)), _single(self.rows(orbits, modes).mT))
 
 
 def _double(tensor: Tensor) -> NDArray[np.float64]:

@@ -158,6 +158,11 @@ class SignedOrbits(NamedTuple):
         allowed = (unchanged | (self.images != self.images[0])).all(dim=0)
         return torch.where(allowed[:, None], result, 0.0)  # also against rounding
 
+    def by_parity(self, force: Tensor, parities: Parities) -> Tensor:
+        """Return the products (M, m) of a force (n,) with the field of each orbit and parity."""
+        parts = [self.folded(force[:, None], characters) for characters in parities.characters]
+        return torch.cat(parts, dim=1).T
+
     def unfolded(self, values: Tensor, characters: Tensor, count: int) -> Tensor:
         """Return columns (n, r) of a parity from one value of each orbit (m, r), n = `count`.
 

@@ -4,8 +4,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
 
+import numpy as np
 import scipy.linalg
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.linear.interface import full_matrix
@@ -13,6 +15,8 @@ from dpl.fem.materials.linear_elastic import LinearElastic
 from dpl.fem.materials.material import Material
 from dpl.fem.problem import Problem
 from dpl.fem.rom.reduced_problem import support_force
+
+Reduced = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,11 @@ class ReducedStiffness:
         A, B, _ = self.parts[..., -1].to(right)
         vectors, values = (part.to(right) for part in self._spectrum)
         return ((right - mu * A - lam * B) @ vectors / (mu + lam * values)) @ vectors.T
+
+    def inverse(self, law: Material) -> Reduced:
+        """Return (V^T K(0) V)^-1, (R, R), and V^T K(0) p, (R,), of a law with numbers as moduli."""
+        whole = self.at(law).numpy()
+        return np.ascontiguousarray(np.linalg.inv(whole[:, :-1])), whole[:, -1].copy()
 
     @cached_property
     def _has_springs(self) -> bool:

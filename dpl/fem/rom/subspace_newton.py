@@ -108,14 +108,11 @@ class SubspaceNewton:
 
         Args:
             problem, vectors, options: Attributes of the solver.
-            states: Displacements in equilibrium, (S, N, D) [-]; they are projected onto V.
+            states: Displacements in equilibrium, (S, N, D) [-].
             tolerance: Relative error of the reduced forces of the chosen cells, see `cubature`.
             candidates: Numbers of the cells to choose from, (C,); None: all.
         """
-        basis = vectors[problem.free]
-        projected = states.clone()
-        projected[:, problem.free] = (states[:, problem.free] @ basis) @ basis.T
-        cells = cubature(problem.reference, vectors, projected, tolerance, candidates)
+        cells = cubature(problem.reference, vectors, states, tolerance, candidates)
         return cls(problem, vectors, cells, **options)
 
     def __post_init__(self) -> None:

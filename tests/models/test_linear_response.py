@@ -1,11 +1,11 @@
-"""Local loads: the part of the linear solution that the modes miss is estimated and solved."""
+"""Linear solutions: exact by a factor; in modes, with a solve for local loads."""
 
 import pytest
 import torch
 
 from dpl import Sample
 from dpl.models import Unrolled
-from dpl.models.local_response import LocalResponse
+from dpl.models.linear_response import LinearResponse
 
 
 @pytest.fixture(scope="module")
@@ -36,21 +36,29 @@ def net(scene, batch):
     return fitted(scene, batch, 5e-4)
 
 
+def in_modes(net, force):
+    """Return linear solutions in modes at free degrees of freedom, and the mask of local loads."""
+    loaded = force.flatten(1)[:, net.dofs]
+    return net.linear.in_modes(loaded, loaded.new_zeros(len(loaded), 0))
+
+
+def exact_solutions(scene, net, force):
+    return torch.stack([scene.linear.solve(f).flatten()[net.dofs] for f in force])
+
+
 def relative_missing(net, force):
     """Return norms of the missing parts over those of the Galerkin linear solutions, (B,)."""
-    loaded = force.flatten(1)[:, net.dofs]
-    linear, _ = net.coordinates(loaded, loaded.new_zeros(len(loaded), 0))
-    exact = torch.stack([net.scene.linear.solve(f).flatten()[net.dofs] for f in force])
-    return (exact - linear @ net.modes.double().T).norm(dim=1) / linear.norm(dim=1)
+    linear, _ = in_modes(net, force)
+    return (exact_solutions(net.scene, net, force) - linear).norm(dim=1) / linear.norm(dim=1)
 
 
 def is_local(net, force, tol):
     """Return the mask of local loads for a tolerance, (B,)."""
-    before, net.local.tol = net.local.tol, tol
+    before, net.linear.tol = net.linear.tol, tol
     try:
-        return net.forward_in_basis(force)[1]
+        return in_modes(net, force)[1]
     finally:
-        net.local.tol = before
+        net.linear.tol = before
 
 
 def test_the_estimate_is_within_a_factor_of_three(net, spread):
@@ -63,12 +71,20 @@ def test_the_estimate_is_within_a_factor_of_three(net, spread):
 
 
 def test_only_local_loads_are_solved(net, spread, monkeypatch):
-    solved, original = [], LocalResponse.solve
-    monkeypatch.setattr(LocalResponse, "solve", lambda *args: solved.append(0) or original(*args))
+    solved, original = [], LinearResponse.solve
+
+    def counted(response, loaded, parameters):
+        solved.extend(loaded)
+        return original(response, loaded, parameters)
+
+    monkeypatch.setattr(LinearResponse, "solve", counted)
     marked = int(net.forward_in_basis(spread)[1].sum())
     assert 0 < marked < len(spread)
     net(spread)
     assert len(solved) == marked
+    for force in spread:
+        net(force[None])
+    assert len(solved) == 2 * marked
 
 
 def test_images_of_a_load_are_local_together(net, spread):
@@ -79,15 +95,30 @@ def test_images_of_a_load_are_local_together(net, spread):
     assert all(torch.equal(mask, masks[0]) for mask in masks)
 
 
-def test_a_solve_adds_the_missing_part_of_the_linear_solution(scene, net, spread):
+def test_a_solve_replaces_the_linear_solution_in_modes(scene, net, spread):
     local = spread[net.forward_in_basis(spread)[1]]
-    linear = net.coordinates(local.flatten(1)[:, net.dofs], local.new_zeros(len(local), 0))[0]
-    exact = torch.stack([scene.linear.solve(force) for force in local])
-    missing = exact.flatten(1)[:, net.dofs] - linear @ net.modes.double().T
+    exact, linear = exact_solutions(scene, net, local), in_modes(net, local)[0]
     found = (net(local) - net.forward_in_basis(local)[0]).flatten(1)[:, net.dofs]
-    size = exact.flatten(1).norm(dim=1)
-    assert ((found - missing).norm(dim=1) < 1e-3 * size).all()
-    assert (missing.norm(dim=1) > 1e-3 * size).any()
+    size = exact.norm(dim=1)
+    assert ((found - (exact - linear)).norm(dim=1) < 1e-3 * size).all()
+    assert ((exact - linear).norm(dim=1) > 1e-3 * size).any()
+
+
+def test_a_small_banded_factor_is_applied_to_every_load(scene, batch, spread):
+    """The compiled loops solve by parity, the tensor operations with the whole factor."""
+    net = fitted(scene, batch, None)
+    assert net.linear.is_exact
+    assert len(net.linear.group) > 1
+    assert len(net.linear.compiled().factor.order) < int(scene.problem.free.sum()) / 2
+    small = 1e-6 * spread
+    exact = exact_solutions(scene, net, small)
+    for answer in (net(small), torch.cat([net(one[None]) for one in small])):
+        error = (answer.flatten(1)[:, net.dofs] - exact).norm(dim=1)
+        assert (error < 1e-4 * exact.norm(dim=1)).all()
+    with torch.enable_grad():
+        tensors = net(spread.clone().requires_grad_()).detach()
+    compiled = torch.cat([net(one[None]) for one in spread])
+    assert (compiled - tensors).norm() < 1e-5 * tensors.norm()
 
 
 def test_predictions_of_local_and_other_loads_do_not_depend_on_the_batch(net, spread):
@@ -112,6 +143,6 @@ def test_gradients_of_local_loads_equal_finite_differences(scene, batch):
 
 def test_with_infinite_tolerance_nothing_is_solved(scene, batch, spread, monkeypatch):
     net = fitted(scene, batch, torch.inf)
-    monkeypatch.setattr(LocalResponse, "solve", None)
+    monkeypatch.setattr(LinearResponse, "solve", None)
     assert net(spread).any()
     assert not net.flags_local_loads
