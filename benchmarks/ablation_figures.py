@@ -132,9 +132,9 @@ def _panels(net: Unrolled, test: Sample) -> list[_Panel]:
     load = test.load.unbatch()[k]
     with torch.inference_mode():
         predicted = net(load.force, *((load.parameters,) if net.extra_inputs else ()))
-        c = net.coordinates(load.force.flatten(1)[:, net.dofs], load.parameters)[0]
+        loaded = load.force.flatten(1)[:, net.dofs]
         linear = problem.prescribed.flatten().clone()
-        linear[net.dofs] += (c @ net.modes.double().mT)[0]
+        linear[net.dofs] = net.linear(loaded, load.parameters)[0]
         linear = linear.view(problem.shape)
         unbalanced = problem.residual(predicted, load.force)[0].norm(dim=1)
         solver = net.correction()
@@ -145,9 +145,12 @@ def _panels(net: Unrolled, test: Sample) -> list[_Panel]:
     centres = (problem.points + linear)[problem.cells[net.cells]].mean(dim=1)
     return [
         _Panel("load $f$", values=load.force[0].norm(dim=1)),
-        _Panel("Galerkin linear solution\n$c = (V^T K(0) V)^{-1} V^T f$", linear),
+        _Panel("linear solution\n$K(0)^{-1} f$", linear),
         _Panel(sampled, linear, points=centres),
-        _Panel(f"$c \\leftarrow c + \\varphi B_k$\nwith {1 + len(net.maps)} maps", predicted[0]),
+        _Panel(
+            f"$K(0)^{{-1}} f + V c$\n{1 + len(net.maps)} maps $c \\leftarrow c + \\varphi B_k$",
+            predicted[0],
+        ),
         _Panel("residual\n$r = f - f_{int}(u)$", predicted[0], unbalanced),
         _Panel("Newton step in the modes\n$V^T K(u) V s = V^T r$", last),
     ]

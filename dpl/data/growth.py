@@ -11,6 +11,8 @@ from dpl.data.learning_curve import CurvePoint, describe, loads_for
 from dpl.data.storage.store import SHARD_SIZE
 from dpl.system.checks import check_range
 
+PATIENCE = 2  # fits without gain after which the growth ends
+MIN_GAIN = 0.95  # ratio of errors from which a fit is one without gain
 HELD_OUT = 32  # smallest number of held-out loads, as far as there are as many
 # ratio of the training loads of a fit to those of the one before
 MIN_FACTOR = math.sqrt(2)
@@ -155,6 +157,10 @@ class Growth:
             return ""
         if last.loads >= self._max_train:
             return f"data.max_train = {self._max_train} reached"
+        medians = [point.median for point in self.points]
+        before, recent = medians[:-PATIENCE], medians[-PATIENCE:]
+        if before and min(recent) > MIN_GAIN * min(before):
+            return f"{PATIENCE} fits without gain: more loads no longer reduce the error"
         # the next fit would take at least as long as the last one
         if self._minutes is not None and last.seconds + self._fit_seconds >= 60 * self._minutes:
             return f"data.minutes = {self._minutes:g} reached"

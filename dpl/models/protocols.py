@@ -86,15 +86,16 @@ class HasCorrection(Protocol):
     """A model whose fit includes Newton's method in its modes."""
 
     def correction(self) -> SubspaceNewton | None:
-        """Return Newton's method in the modes; None if it improves no prediction."""
+        """Return Newton's method in the modes; None before the fit."""
         ...
 
 
 @runtime_checkable
 class FlagsLocalLoads(Protocol):
-    """A network that predicts within a basis and detects loads that the basis cannot represent.
+    """A network that can predict within a basis and detects loads that the basis cannot represent.
 
-    `forward` solves with the factor of K(0) for these loads, which an ONNX graph cannot contain.
+    `forward` solves with a factor of K(0), at least for these loads. An ONNX graph cannot contain
+    it.
     """
 
     @property

@@ -106,6 +106,16 @@ def test_it_ends_before_a_fit_that_would_exceed_the_time(module, monkeypatch):
     assert data.growth.is_finished
 
 
+def test_it_ends_after_two_fits_without_gain(module):
+    growth = module(max_train=1000).growth
+    for loads, median in ((64, 0.5), (128, 0.4), (192, 0.39)):
+        assert "without gain" not in growth.record(loads, errors(median))
+    assert not growth.is_finished
+    line = growth.record(320, errors(0.41))
+    assert "2 fits without gain: more loads no longer reduce the error" in line
+    assert growth.is_finished
+
+
 def test_an_interrupted_growth_solves_no_test_loads(module):
     data = module()
     step(data, 1.0)
