@@ -29,6 +29,8 @@ MAX_SIZE = 50_000  # degrees of freedom of a body with such a factor
 MODE_TOL = 5e-4  # default of `tol` where the linear solution is computed in modes
 MAX_LOADS = 1024  # loads whose linear solutions the modes represent
 FEW_LOADS = 256  # the same where only exported graphs use the modes
+FEW_CHECKED = 16  # loads on which the rounding of the factor is measured
+MAX_ROUNDING = 1e-4  # relative error of a linear solution with a factor in float32 [-]
 MIN_PROBES = 16  # random fields that estimate the size of the missing part
 RTOL = 1e-5  # relative residual of a linear solution whose parameters differ from the reference
 MAX_ITER = 200
@@ -52,13 +54,14 @@ class LinearResponse(nn.Module):
     Attributes:
         tol: Norm of the missing part over that of the linear solution above which a load is local
             [-].
-        is_exact: True if the factor is applied to every load.
+        exact: True if the factor is applied to every load, ().
         modes: L at free degrees of freedom, (n, R).
         parity: Parity of each mode, (R,), see `dpl.fem.rom.parity`.
         stiffness: L^T K(0) [L, p], see `ReducedStiffness`, (3, R, R + 1).
         probes: Random fields, multiplied by K(0)^-1 - L (L^T K(0) L)^-1 L^T, (n, F).
     """
 
+    exact: Tensor
     modes: Tensor
     parity: Tensor
     stiffness: Tensor
@@ -71,15 +74,17 @@ class LinearResponse(nn.Module):
             scene: The scene with the factor of K(0).
             group: Symmetries of the body.
             tol: See the attribute. 0: the factor for every load; None: the same if it is small
-                enough and the law has no ranges, else 5e-4.
+                enough and float32 accurate enough, and the law has no ranges, else 5e-4.
         """
         super().__init__()
         self._scene, self.group = scene, group
         ranges = bool(scene.loads.parameter_ranges)
-        self.is_exact = tol == 0 or (tol is None and not ranges and self._is_cheap)
+        self._is_chosen = tol is None
+        exact = tol == 0 or (tol is None and not ranges and self._is_cheap)
         self.tol = tol or MODE_TOL
         count = int(scene.problem.free.sum())
         for name, value in {
+            "exact": torch.tensor(exact),
             "modes": torch.zeros(count, 0),
             "parity": torch.zeros(0, dtype=torch.int64),
             "stiffness": torch.zeros(3, 0, 1, dtype=torch.float64),
@@ -87,6 +92,11 @@ class LinearResponse(nn.Module):
         }.items():
             self.register_buffer(name, value)
         self.reduced = ReducedStiffness(self.stiffness)
+
+    @property
+    def is_exact(self) -> bool:
+        """True if the factor is applied to every load."""
+        return bool(self.exact)
 
     @cached_property
     def _is_cheap(self) -> bool:
@@ -133,6 +143,9 @@ class LinearResponse(nn.Module):
             force: Forces of the training samples, (S, N, D).
             rank: Largest number of modes.
         """
+        self.__dict__.pop("_factor", None)
+        if self.is_exact and self._is_chosen:
+            self.exact = torch.tensor(self._rounding(force[:FEW_CHECKED]) < MAX_ROUNDING)
         most = FEW_LOADS if self.is_exact else MAX_LOADS
         some = force[:: max(1, -(-len(force) // most))][:, self._free]
         some = some[:: stride(len(some), some.shape[1])]
@@ -140,7 +153,7 @@ class LinearResponse(nn.Module):
         solvers = self._corners()
         for k, solver in enumerate(solvers):
             for part in some[k :: len(solvers)].split(CHUNK):
-                basis.add(_solved(solver, part))
+                basis.add(self._solved(solver, part))
         modes, self.parity = modes_of_parity(basis.modes(rank), self._free, self.group)
         problem = self._scene.problem
         self.reduced = ReducedStiffness.of(problem, modes).prepared()
@@ -157,6 +170,17 @@ class LinearResponse(nn.Module):
         inside = modes @ (torch.from_numpy(inverse) @ (modes.T @ every.T))
         self.probes = (exact.T - inside).to(self.probes)
 
+    def _rounding(self, force: Tensor) -> float:
+        """Return the largest relative error of linear solutions with the factor in float32."""
+        loaded = force[:, self._free]
+        right = loaded[loaded.any(dim=1)].numpy()
+        if not len(right):
+            return 0.0
+        reference = self._scene.linear.reference
+        exact = reference.factor.solve_many(right)
+        error = reference.float32_factor.solve_many(right) - exact
+        return float((np.linalg.norm(error, axis=1) / np.linalg.norm(exact, axis=1)).max())
+
     def _corners(self) -> list[LinearSolver]:
         """Return the linear solvers at the ends and centres of all ranges of the law."""
         ranges = self._scene.loads.parameter_ranges.values()
@@ -169,6 +193,7 @@ class LinearResponse(nn.Module):
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
         """Take the sizes of the checkpoint."""
         resize_buffers(self, state, prefix)
+        self.__dict__.pop("_factor", None)
         super()._load_from_state_dict(state, prefix, *rest)
         self.reduced = ReducedStiffness(self.stiffness.detach().cpu().clone()).prepared()
 
@@ -212,9 +237,15 @@ class LinearResponse(nn.Module):
         """
         reference = self._scene.linear.reference
         if not parameters.shape[1]:
-            return _solved(reference, torch.from_numpy(loaded)).numpy()
+            return self._solved(reference, torch.from_numpy(loaded)).numpy()
         rows = [self._solve_one(*pair) for pair in zip(loaded, parameters.cpu(), strict=True)]
         return np.stack(rows)
+
+    def _solved(self, solver: LinearSolver, loaded: Tensor) -> Tensor:
+        """Return K(0)^-1 (f - s), (B, n), of forces (B, n)."""
+        right = loaded - support_force(solver.problem)[solver.problem.free]
+        factor = solver.float32_factor if self.is_exact else solver.factor
+        return torch.from_numpy(factor.solve_many(right.numpy(), RTOL))
 
     def _solve_one(self, loaded: NDArray[np.float64], parameters: Tensor) -> NDArray[np.float64]:
         problem = self._scene.problem.with_parameters(parameters[None])
@@ -224,13 +255,6 @@ class LinearResponse(nn.Module):
         right = loaded - support_force(problem)[self._free].numpy()
         preconditioner = self._scene.linear.reference.float32_factor
         return conjugate_gradients(product, preconditioner.apply, right, RTOL, MAX_ITER)
-
-
-def _solved(solver: LinearSolver, loaded: Tensor) -> Tensor:
-    """Return K(0)^-1 (f - s), (B, n), of forces (B, n), to about 1e-6."""
-    problem = solver.problem
-    right = loaded - support_force(problem)[problem.free]
-    return torch.from_numpy(solver.float32_factor.solve_many(right.numpy(), RTOL))
 
 
 def resize_buffers(module: nn.Module, state: dict[str, Any], prefix: str) -> None:

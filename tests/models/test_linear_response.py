@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dpl import Sample
-from dpl.models import Unrolled
+from dpl.models import Unrolled, linear_response
 from dpl.models.linear_response import LinearResponse
 
 
@@ -119,6 +119,19 @@ def test_a_small_banded_factor_is_applied_to_every_load(scene, batch, spread):
         tensors = net(spread.clone().requires_grad_()).detach()
     compiled = torch.cat([net(one[None]) for one in spread])
     assert (compiled - tensors).norm() < 1e-5 * tensors.norm()
+
+
+def test_modes_are_used_where_float32_is_not_accurate_enough(scene, batch, monkeypatch):
+    monkeypatch.setattr(linear_response, "MAX_ROUNDING", 0.0)
+    net = fitted(scene, batch, None)
+    assert not net.linear.is_exact
+    assert fitted(scene, batch, 0.0).linear.is_exact, "as demanded"
+    again = Unrolled(scene, rank=20, cells=8, stages=1)
+    assert again.linear.is_exact
+    again.load_state_dict(net.state_dict())
+    assert not again.linear.is_exact
+    force = batch.force[:2]
+    assert torch.equal(again(force), net(force))
 
 
 def test_predictions_of_local_and_other_loads_do_not_depend_on_the_batch(net, spread):

@@ -76,8 +76,13 @@ class ReducedStiffness:
 
     def inverse(self, law: Material) -> Reduced:
         """Return (V^T K(0) V)^-1, (R, R), and V^T K(0) p, (R,), of a law with numbers as moduli."""
-        whole = self.at(law).numpy()
-        return np.ascontiguousarray(np.linalg.inv(whole[:, :-1])), whole[:, -1].copy()
+        if self._has_springs:
+            whole = self.at(law).numpy()
+            return np.ascontiguousarray(np.linalg.inv(whole[:, :-1])), whole[:, -1].copy()
+        mu, lam = float(law.mu), float(law.lam)
+        vectors, values = (part.numpy() for part in self._spectrum)
+        A, B, _ = self.parts[..., -1].numpy()
+        return (vectors / (mu + lam * values)) @ vectors.T, mu * A + lam * B
 
     @cached_property
     def _has_springs(self) -> bool:
