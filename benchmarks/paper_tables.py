@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dpl import Sample, Scene
 from dpl.evaluation import Method, latency
-from dpl.evaluation.tables import write, write_machine
+from dpl.evaluation.tables import read, write, write_machine
 from dpl.fem import Load, Newton, Status, solve
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2
@@ -166,6 +166,23 @@ def paper(experiment: str) -> list[Result]:
             )
         )  # fmt: skip
     return rows
+
+
+def with_kept_rows(rows: Sequence[Result], path: Path) -> list[Result]:
+    """Return rows with those of other methods that a file has, in the order of the sets of loads.
+
+    Args:
+        rows: New rows.
+        path: File of earlier rows; may be missing.
+
+    Raises:
+        ValueError: The file has other columns.
+    """
+    measured = {row.method for row in rows}
+    earlier = read(Result, path) if path.is_file() else []
+    kept = [row for row in earlier if row.method not in measured]
+    order = list(dict.fromkeys(row.loads for row in [*rows, *kept]))
+    return sorted([*rows, *kept], key=lambda row: order.index(row.loads))
 
 
 def save(rows: Sequence[Result], errors: Mapping[tuple[str, str], Tensor], stem: Path) -> None:

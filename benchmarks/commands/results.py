@@ -9,7 +9,7 @@ from dpl import config
 from dpl.commands.cli import command
 
 
-@command("results", conf=CONF)
+@command("results", conf=CONF, keys=((bool, "keep"),))
 def main(cfg: DictConfig) -> None:
     """Measure every run of an experiment; write rows, machine and figure."""
     from benchmarks import paper_tables
@@ -47,5 +47,8 @@ def main(cfg: DictConfig) -> None:
     ):
         rows.append(row)
         errors[row.method, row.loads] = error
+    stem = Path(cfg.folder) / cfg.name
+    if cfg.keep:
+        rows = paper_tables.with_kept_rows(rows, stem.with_suffix(".csv"))
     show(rows, f"{cfg.name}, one load at a time, 1 thread")
-    paper_tables.save(rows, errors, Path(cfg.folder) / cfg.name)
+    paper_tables.save(rows, errors, stem)

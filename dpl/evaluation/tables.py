@@ -21,6 +21,8 @@ READERS: dict[Any, Callable[[str], Any]] = {
     int: int,
     float: lambda cell: float(cell or "nan"),
     bool: lambda cell: cell == "True",
+    int | None: lambda cell: int(cell) if cell else None,
+    float | None: lambda cell: float(cell) if cell else None,
     tuple[int, ...]: lambda cell: tuple(int(part) for part in cell.strip("()").split(",") if part),
 }
 

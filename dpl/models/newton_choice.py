@@ -9,12 +9,13 @@ from dpl.fem import Load, Problem, SubspaceNewton
 from dpl.scene import Sample
 
 RANKS = (60, 160)  # numbers of modes that are tried, and all modes
-CANDIDATES = 300  # cells to choose from
+CANDIDATES = 600  # cells to choose from
 STATES = 32  # equilibria at which cells are chosen
 TOLERANCE = 3e-2  # of the reduced forces of these cells [-]
-MAX_STEPS = 6  # steps whose remaining error counts as that outside the subspace
-LOADS = 50  # held-out loads by which the number of modes is chosen
-NEAR_BEST = 1.1  # ratio of errors up to which fewer modes are preferred
+MAX_STEPS = 6
+LOADS = 50  # held-out loads by whose errors the number of modes is chosen
+SUFFICIENT = 5e-4  # largest relative error of these loads for which no more modes are tried [-]
+ERROR = 1e-5  # estimated relative error at which the steps end [-]
 
 
 def choose_newton(
@@ -22,8 +23,8 @@ def choose_newton(
 ) -> SubspaceNewton:
     """Return Newton's method in the number of modes that suits held-out loads best.
 
-    The fewest modes are taken whose mean error after one step is nearly the smallest. The largest
-    error after `MAX_STEPS` steps counts as the error outside the subspace.
+    The fewest modes are taken with which `MAX_STEPS` steps bring every load below `SUFFICIENT`;
+    else those with the smallest largest error. It counts as the error outside the subspace.
 
     Args:
         problem: The body.
@@ -37,34 +38,30 @@ def choose_newton(
     some = states[:: max(1, len(states) // STATES)][:STATES]
     whole = modes.shape[2]
     ranks = [*(rank for rank in RANKS if rank < whole), whole]
-    solvers = [
-        SubspaceNewton.within(
+    best: SubspaceNewton | None = None
+    for rank in ranks:
+        solver = SubspaceNewton.within(
             problem, modes[..., :rank], some, tolerance=TOLERANCE, candidates=candidates
         )
-        for rank in ranks
-    ]
-    means = [float(_errors(held_out, _after(one, held_out, guesses, 1)).mean()) for one in solvers]
-    best = min(means)
-    number = next(k for k, mean in enumerate(means) if mean <= NEAR_BEST * best)
-    chosen = solvers[number]
-    outside = float(_relative(held_out, _after(chosen, held_out, guesses, MAX_STEPS)).max())
-    return replace(chosen, outside_error=outside)
+        worst = float(_relative(held_out, _after(solver, held_out, guesses)).max())
+        if best is None or worst < best.outside_error:
+            best = replace(solver, outside_error=worst)
+        if worst < SUFFICIENT:
+            break
+    assert best is not None
+    return best
 
 
-def _after(solver: SubspaceNewton, samples: Sample, guesses: Tensor, steps: int) -> Tensor:
-    """Return displacements (S, N, D) after some steps, from guesses (S, N, D)."""
+def _after(solver: SubspaceNewton, samples: Sample, guesses: Tensor) -> Tensor:
+    """Return displacements (S, N, D) after the steps, from guesses (S, N, D)."""
     pairs = zip(samples.load.unbatch(), guesses, strict=True)
-    return torch.stack([_last(solver, load, guess, steps) for load, guess in pairs])
+    return torch.stack([_last(solver, load, guess) for load, guess in pairs])
 
 
-def _last(solver: SubspaceNewton, load: Load, guess: Tensor, steps: int) -> Tensor:
-    *_, last = solver.states(load, guess=guess[None], max_iter=steps, error_tol=0.0)
+def _last(solver: SubspaceNewton, load: Load, guess: Tensor) -> Tensor:
+    states = solver.states(load, guess=guess[None], max_iter=MAX_STEPS, error_tol=ERROR)
+    *_, last = states
     return last.displacement[0]
-
-
-def _errors(samples: Sample, displacement: Tensor) -> Tensor:
-    """Return mean absolute errors, (S,)."""
-    return (displacement - samples.displacement).flatten(1).abs().mean(dim=1)
 
 
 def _relative(samples: Sample, displacement: Tensor) -> Tensor:

@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from benchmarks import paper_tables
+from benchmarks.paper_tables import Result
 from dpl.evaluation import methods
+from dpl.evaluation.tables import read, write
 from dpl.fem import solve
 from dpl.models import PODNet
 from dpl.training import MSE, Surrogate
@@ -191,6 +193,20 @@ def test_one_command_writes_rows_machine_and_figure(trained, script):
     rows = json.loads((trained / "runs" / "tiny" / "fcnn" / "evaluation.json").read_text())
     (network,) = (row for row in rows if row["solver"] == "network")
     assert float(reported["fcnn"]["e_mean"]) == pytest.approx(network["errors"]["e_mean"], rel=1e-3)
+
+
+def test_rows_of_other_methods_can_be_kept(trained, script):
+    more = ["galerkin=null", "corrected=null", "folder=kept"]
+    path = trained / "kept" / "tiny.csv"
+    earlier = [Result(name, "in range", 3, samples=7, ms=1.5) for name in ("cnn", "fcnn")]
+    write(earlier, path)
+    assert script("results", *QUICK[:2], *more, "keep=true", cwd=trained).status == 0
+    found = {row.method: row for row in read(Result, path) if row.loads == "in range"}
+    assert set(found) == {"linear", "fcnn", "unrolled", "cnn"}
+    assert found["cnn"] == earlier[0]
+    assert found["fcnn"].samples == 16, "measured again"
+    assert script("results", *QUICK[:2], *more, cwd=trained).status == 0
+    assert {row.method for row in read(Result, path)} == {"linear", "fcnn", "unrolled"}
 
 
 def test_reduced_models_may_be_left_out(trained, script):

@@ -65,12 +65,17 @@ class SampledTangent:
         self._dV = (volume * chosen.weights.double())[:, None].contiguous().numpy()
         self._basis: Single = basis.reshape(count, dim * dim, rank).float().contiguous().numpy()
 
-    def at(self, problem: Problem, displacement: Tensor) -> Array:
+    def at(self, problem: Problem, displacement: Tensor, *, whole: bool = False) -> Array:
         """Return the matrix (R, R) at a displacement (N, D) of the body with its parameters.
 
         Only its symmetric part has a meaning; rounding makes the matrix slightly unsymmetric.
+
+        Args:
+            problem: The body with its parameters.
+            displacement: (N, D) [-].
+            whole: Sum over all cells, not the chosen ones.
         """
-        if not self._has_cells:
+        if whole or not self._has_cells:
             return self._projection(problem, problem.linearise(displacement[None]).tangent[0])
         product = self._moduli_change_product(problem.material, displacement)
         rank = product.shape[2]

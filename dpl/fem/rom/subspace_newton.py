@@ -53,8 +53,9 @@ class SubspaceNewton:
     A step is accepted if no element is inverted and the restricted natural monotonicity test holds:
     the correction from the new residual with the same tangent must be shorter than (1 - d/4) ||s||,
     where d = 1, 1/2, 1/4, ... is the damping factor, the first that passes. If none does, the
-    iteration ends. The last iterate is the one with the smallest estimate; by this measure it is
-    never worse than the guess, for any guess.
+    correction is computed with the tangent of all cells; if none does then, the iteration ends. The
+    last iterate is the one with the smallest estimate; by this measure it is never worse than the
+    guess, for any guess.
 
     The error in the Euclidean norm is not bounded by this. Steps converge to the minimum of the
     energy within the subspace, and stiff errors outside the subspace cause soft ones in it. Choose
@@ -197,6 +198,10 @@ class SubspaceNewton:
         best = state
         while correction is not None and not is_last(state):
             following = self._step(problem, load, state, correction)
+            if following is None and self.cubature is not None:
+                correction = self._correction(problem, load, state, whole=True)
+                if correction is not None:
+                    following = self._step(problem, load, state, correction)
             if following is None:
                 break
             yield (state := following)
@@ -240,13 +245,17 @@ class SubspaceNewton:
         return self._update(correction.y), self._relative(correction.y, displacement)
 
     def _correction(
-        self, problem: Problem, load: Load, state: SubspaceState
+        self, problem: Problem, load: Load, state: SubspaceState, *, whole: bool = False
     ) -> "_Correction | None":
-        """Return Newton's correction; None where an element is inverted."""
+        """Return Newton's correction; None where an element is inverted.
+
+        `whole` stands for the tangent of all cells.
+        """
         right = self._reduced_residual(load, state.evaluation)
         if right is None or not state.evaluation.volume_ratio > 0:
             return None
-        solve = _factorised(self.tangent.at(problem, state.displacement[0]))
+        tangent = self.tangent.at(problem, state.displacement[0], whole=whole)
+        solve = _factorised(tangent)
         y = solve(right)
         return _Correction(y, solve) if np.isfinite(y).all() else None
 
