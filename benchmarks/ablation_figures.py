@@ -66,7 +66,7 @@ def _draw_curve(ax: Any, x: Sequence[float], rows: Sequence[Row]) -> None:
     ax.loglog(x, corrected, "s--", color=COLOURS[1], ms=4, label="and one Newton step in the modes")
     ax.set_ylabel("$e_{mean}$")
     ax.grid(which="both")
-    ax.legend()
+    ax.legend(loc="lower left")
 
 
 def _draw_variants(ax: Any, rows: Sequence[Row]) -> None:
@@ -75,6 +75,7 @@ def _draw_variants(ax: Any, rows: Sequence[Row]) -> None:
     corrected = [row.e_mean_corrected for row in rows]
     ax.plot(corrected, names, "s", color=COLOURS[1], ms=4, label="and one Newton step")
     ax.set_xscale("log")
+    ax.xaxis.set_minor_formatter("")  # labels of minor ticks would overlap
     ax.invert_yaxis()
     ax.grid(which="both")
     ax.set_xlabel("$e_{mean}$")
