@@ -63,17 +63,17 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 def _draw_curve(ax: Any, x: Sequence[float], rows: Sequence[Row]) -> None:
     ax.loglog(x, [row.e_mean for row in rows], "o-", color=COLOURS[0], ms=4, label="prediction")
     corrected = [row.e_mean_corrected for row in rows]
-    ax.loglog(x, corrected, "s--", color=COLOURS[1], ms=4, label="and one Newton step in the modes")
+    ax.loglog(x, corrected, "s--", color=COLOURS[1], ms=4, label="after one step")
     ax.set_ylabel("$e_{mean}$")
     ax.grid(which="both")
-    ax.legend(loc="lower left")
+    ax.legend(loc="upper right")
 
 
 def _draw_variants(ax: Any, rows: Sequence[Row]) -> None:
     names = [row.variant for row in rows]
     ax.plot([row.e_mean for row in rows], names, "o", color=COLOURS[0], ms=5, label="prediction")
     corrected = [row.e_mean_corrected for row in rows]
-    ax.plot(corrected, names, "s", color=COLOURS[1], ms=4, label="and one Newton step")
+    ax.plot(corrected, names, "s", color=COLOURS[1], ms=4, label="after one step")
     ax.set_xscale("log")
     ax.xaxis.set_minor_formatter("")  # labels of minor ticks would overlap
     ax.invert_yaxis()
