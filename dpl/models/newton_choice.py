@@ -14,7 +14,7 @@ STATES = 32  # equilibria at which cells are chosen
 TOLERANCE = 3e-2  # of the reduced forces of these cells [-]
 MAX_STEPS = 6
 LOADS = 50  # held-out loads by whose errors the number of modes is chosen
-SUFFICIENT = 5e-4  # largest relative error of these loads for which no more modes are tried [-]
+SUFFICIENT = 2e-3  # largest relative error of these loads for which no more modes are tried [-]
 ERROR = 1e-5  # estimated relative error at which the steps end [-]
 
 
