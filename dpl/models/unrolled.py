@@ -1,6 +1,5 @@
 """Unrolled reduced solver: a few iterations in a subspace whose linear maps are fitted to data."""
 
-from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
@@ -12,29 +11,15 @@ from dpl.fem.rom.ecsw import Cubature
 from dpl.fem.rom.reduced_stiffness import Reduced, ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.fem.symmetry import cell_images
-from dpl.models.invariant_basis import (
-    group_actions,
-    invariant_pod,
-    invariant_rank,
-    modes_of_parity,
-    orthonormal_fields,
-)
+from dpl.models.invariant_basis import orthonormal_fields
 from dpl.models.linear_response import LinearResponse, resize_buffers
 from dpl.models.newton_choice import LOADS, choose_newton
-from dpl.models.unrolled_fit import (
-    Maps,
-    cell_positions,
-    fit_maps,
-    in_coordinates,
-    nonlinear_displacement,
-    sample_weights,
-)
+from dpl.models.unrolled_fit import Maps, cell_positions, fit_in_best_modes
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
 
 CELL_STATES = 256  # states at which the cells of a correction are chosen
 MAX_COMPILED = 8  # loads; more of them are predicted together by tensor operations
-MIN_RANK = 40  # modes; fewer are not tried
 MAX_SIZE = 100_000  # of rank, cells and stages
 _AtLaw = tuple[LawArguments, Reduced, Reduced]
 
@@ -306,63 +291,17 @@ class Unrolled(nn.Module):
         Raises:
             ValueError: There are too few samples, or they are not finite.
         """
-        problem, free = self.scene.problem, self.scene.problem.free
+        problem = self.scene.problem
         self.linear.fit(samples.force, self.rank)
-        both = samples, held_out
-        rests = [nonlinear_displacement(problem, part, self.linear) for part in both]
-        weights = sample_weights(samples.displacement[:, free])
-        basis = invariant_pod(weights[:, None] * rests[0], free, self.group, self.rank)
-        every, parity = modes_of_parity(basis, free, self.group)
-        actions = group_actions(every, free, self.group)
-        self.fitted = torch.tensor(True)
-        fits: list[tuple[float, dict[str, Tensor]]] = []
-        rank = every.shape[1]
-        while rank:
-            self.parity = parity[:rank]
-            error = self._fit_maps(every[:, :rank], actions[:, :rank, :rank], both, rests)
-            fits.append((error, dict(self.named_buffers(recurse=False))))
-            rank = invariant_rank(actions, rank // 2) if rank // 2 >= MIN_RANK else 0
-        _, best = min(fits, key=lambda pair: pair[0])
-        for name, buffer in best.items():
+        options = {"rank": self.rank, "cells": self.sample_count, "stages": self.stages}
+        best, every = fit_in_best_modes(
+            problem, self.group, self.linear, (samples, held_out), **options
+        )
+        for name, buffer in best._asdict().items():
             setattr(self, name, buffer)
         self._stiffness = ReducedStiffness(self.stiffness).prepared()
-        self._fit_newton(every, *both)
-
-    def _fit_maps(
-        self,
-        modes: Tensor,
-        actions: Tensor,
-        both: tuple[Sample, Sample],
-        rests: Sequence[Tensor],
-    ) -> float:
-        """Fit the maps in some modes (n, R); return the weighted mean error of held-out samples.
-
-        Args:
-            modes: The modes, (n, R).
-            actions: Matrices of the symmetries, (G, R, R), see `group_actions`.
-            both: Samples to fit to, and held-out ones.
-            rests: Their nonlinear displacements, (S, n) each.
-        """
-        problem = self.scene.problem
-        stiffness = self._stiffness = ReducedStiffness.of(problem, modes).prepared()
-        self.modes, self.stiffness = modes.float(), stiffness.parts
-        fitted, held = (
-            in_coordinates(problem, modes, stiffness, *pair)
-            for pair in zip(both, rests, strict=True)
-        )
-        options = {"cells": self.sample_count, "stages": self.stages}
-        sets = fitted, held
-        numbers, found = fit_maps(
-            problem, modes, self.group, (actions, self.parity), sets, **options
-        )
-        maps = found.maps
-        self.cells, self.gradients = numbers, maps.cells.gradients
-        self.first_map, self.limits = maps.first.float(), maps.limits
-        rows = 2 * len(self.first_map)
-        none = torch.zeros(0, rows, modes.shape[1])
-        self.maps = torch.stack([one.float() for one in maps.others]) if maps.others else none
-        squares = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)  # not in V
-        return found.error_with(squares)
+        self.fitted = torch.tensor(True)
+        self._fit_newton(every, samples, held_out)
 
     def _fit_newton(self, every: Tensor, samples: Sample, held_out: Sample) -> None:
         """Choose modes and cells of Newton's method that follows the maps.

@@ -1,4 +1,4 @@
-"""Fit of `dpl.models.Unrolled` to samples: sample cells and maps."""
+"""Fit of `dpl.models.Unrolled` to samples: modes, sample cells and maps."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -12,7 +12,13 @@ from dpl.fem.rom.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells, cell_gradients
 from dpl.fem.symmetry import Symmetry, cell_images
-from dpl.models.invariant_basis import scatter_fields
+from dpl.models.invariant_basis import (
+    group_actions,
+    invariant_pod,
+    invariant_rank,
+    modes_of_parity,
+    scatter_fields,
+)
 from dpl.models.irreps import representations_of
 from dpl.models.linear_response import LinearResponse
 from dpl.models.stage_regression import GroupAction, Rows, fit_map, weighted_error
@@ -20,6 +26,7 @@ from dpl.scene import Sample
 
 CHUNK = 256  # samples whose fields or features are computed at a time
 SIZE_EXPONENT = -0.4  # errors count relative to the displacement to this power
+MIN_RANK = 40  # modes; fewer are not tried
 LIMIT = 1.5  # factor on the largest ratio of corrections in the samples
 MIN_GAIN = 0.97  # largest ratio of held-out errors for which another map is worth its time
 
@@ -279,3 +286,75 @@ def fit_maps(
         best, cells = (numbers, regression), cells // 2
     assert best is not None
     return best
+
+
+class FittedBuffers(NamedTuple):
+    """Buffers of `dpl.models.Unrolled` for the modes that were chosen; see there."""
+
+    modes: Tensor
+    parity: Tensor
+    stiffness: Tensor
+    cells: Tensor
+    gradients: Tensor
+    first_map: Tensor
+    maps: Tensor
+    limits: Tensor
+
+
+def fit_in_best_modes(
+    problem: Problem,
+    group: Sequence[Symmetry],
+    linear: LinearResponse,
+    both: tuple[Sample, Sample],
+    *,
+    rank: int,
+    cells: int,
+    stages: int,
+) -> tuple[FittedBuffers, Tensor]:
+    """Fit the maps in all modes, in half and in a quarter of them.
+
+    Args:
+        problem: The body.
+        group: Symmetries of the body.
+        linear: Linear solutions.
+        both: Samples to fit to, and to choose by.
+        rank: Largest number of modes.
+        cells: Largest number of sample cells.
+        stages: Largest number of maps after the first.
+
+    Returns:
+        The fit with the smallest weighted mean error of held-out samples, and all modes, (n, R).
+    """
+    rests = [nonlinear_displacement(problem, part, linear) for part in both]
+    weights = sample_weights(both[0].displacement[:, problem.free])
+    basis = invariant_pod(weights[:, None] * rests[0], problem.free, group, rank)
+    every, parity = modes_of_parity(basis, problem.free, group)
+    actions = group_actions(every, problem.free, group)
+    fits: list[tuple[float, FittedBuffers]] = []
+    count = every.shape[1]
+    while count:
+        modes, symmetry = every[:, :count], (actions[:, :count, :count], parity[:count])
+        stiffness = ReducedStiffness.of(problem, modes).prepared()
+        fitted, held = (
+            in_coordinates(problem, modes, stiffness, *pair)
+            for pair in zip(both, rests, strict=True)
+        )
+        sets = fitted, held
+        numbers, found = fit_maps(problem, modes, group, symmetry, sets, cells=cells, stages=stages)
+        squares = rests[1].square().sum(dim=1) - held.target.square().sum(dim=1)  # not in V
+        buffers = _buffers(modes, parity[:count], stiffness, numbers, found.maps)
+        fits.append((found.error_with(squares), buffers))
+        count = invariant_rank(actions, count // 2) if count // 2 >= MIN_RANK else 0
+    return min(fits, key=lambda pair: pair[0])[1], every
+
+
+def _buffers(
+    modes: Tensor, parity: Tensor, stiffness: ReducedStiffness, cells: Tensor, maps: Maps
+) -> FittedBuffers:
+    first = maps.first.float()
+    none = torch.zeros(0, 2 * len(first), modes.shape[1])
+    others = torch.stack([one.float() for one in maps.others]) if maps.others else none
+    gradients, limits = maps.cells.gradients, maps.limits
+    return FittedBuffers(
+        modes.float(), parity, stiffness.parts, cells, gradients, first, others, limits
+    )
