@@ -8,8 +8,10 @@ from benchmarks.commands import CONF
 from dpl import config
 from dpl.commands.cli import command
 
+KEYS = ((bool, "keep"),)
 
-@command("results", conf=CONF, keys=((bool, "keep"),))
+
+@command("results", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
     """Measure every run of an experiment; write rows, machine and figure."""
     from benchmarks import paper_tables
