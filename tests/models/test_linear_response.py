@@ -3,7 +3,9 @@
 import pytest
 import torch
 
-from dpl import Sample
+from dpl import Sample, Scene
+from dpl.fem import DirichletBC, ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, solve
+from dpl.fem.rom.reduced_problem import support_force
 from dpl.models import Unrolled, linear_response
 from dpl.models.linear_response import LinearResponse
 
@@ -159,3 +161,28 @@ def test_with_infinite_tolerance_nothing_is_solved(scene, batch, spread, monkeyp
     monkeypatch.setattr(LinearResponse, "solve", None)
     assert net(spread).any()
     assert not net.flags_local_loads
+
+
+@pytest.mark.parametrize("tol", [None, 5e-4])
+def test_a_moved_support_is_part_of_the_linear_solution(tol):
+    moved = DirichletBC(region=Plane(0, 4.0), value=[0.05, None, None])
+    body = Problem.build(
+        box((4, 1, 1), (5, 3, 3)), NeoHookeanLn(0.3), fixed=Plane(0, 0.0), supports=[moved]
+    )
+    newton = Newton(body)
+    scene = Scene(body, ModalLoads(newton.linear_solver, n_modes=3, deflection=0.1), newton)
+    load = scene.loads.sample(0, range(20))
+    states = solve(newton, load).displacement
+    samples = Sample(load.force, states, load.young, load.parameters)
+    net = fitted(scene, samples, tol)
+    force = load.force[:4]
+    loaded = force.flatten(1)[:, net.dofs]
+    linear = body.prescribed.repeat(4, 1, 1)
+    linear.view(4, -1)[:, net.dofs] = net.linear(loaded, loaded.new_zeros(4, 0))
+    balance = body.tangent_product(torch.zeros_like(linear), linear) - force
+    size = force.flatten(1).norm(dim=1) + support_force(body).norm()
+    assert (balance[:, body.free].norm(dim=1) < (1e-5 if tol is None else 0.1) * size).all()
+    compiled = torch.cat([net(one[None]) for one in force])
+    with torch.enable_grad():
+        tensors = net(force.clone().requires_grad_()).detach()
+    assert (compiled - tensors).norm() < 1e-5 * tensors.norm()
