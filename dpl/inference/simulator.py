@@ -18,11 +18,11 @@ from dpl.inference.answer import MAX_OUT_OF_SPAN, ROUNDOFF, Answer, answer_like,
 from dpl.inference.arguments import as_number, as_numbers, named_columns, per_load
 from dpl.inference.hybrid import default_hybrid
 from dpl.models import Correctable, HasCorrection
+from dpl.models.newton_choice import MAX_STEPS
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import Surrogate
 
-MAX_STEPS = 6  # Newton's steps in the modes of a model
 ERROR = 1e-3  # estimated relative error above which they are made [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
 

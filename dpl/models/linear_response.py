@@ -15,11 +15,11 @@ from dpl.fem.linear.interface import SymmetricProduct
 from dpl.fem.linear.krylov import conjugate_gradients
 from dpl.fem.linear.ordering import band_storage
 from dpl.fem.materials.material import Material
-from dpl.fem.rom.compiled_prediction import Linear
+from dpl.fem.rom.compiled_prediction import LinearPrediction
 from dpl.fem.rom.parity import Parities
 from dpl.fem.rom.parity_factor import ParityFactor
 from dpl.fem.rom.reduced_problem import support_force
-from dpl.fem.rom.reduced_stiffness import Reduced, ReducedStiffness
+from dpl.fem.rom.reduced_stiffness import ReducedInverse, ReducedStiffness
 from dpl.fem.symmetry import Symmetry
 from dpl.models.invariant_basis import InvariantPOD, image_columns, modes_of_parity, stride
 from dpl.scene import Scene
@@ -34,7 +34,7 @@ MAX_ROUNDING = 1e-4  # relative error of a linear solution with a factor in floa
 MIN_PROBES = 16  # random fields that estimate the size of the missing part
 RTOL = 1e-5  # relative residual of a linear solution whose parameters differ from the reference
 MAX_ITER = 200
-NOTHING: Reduced = np.zeros((0, 0)), np.zeros(0)
+NO_INVERSE: ReducedInverse = np.zeros((0, 0)), np.zeros(0)
 CHUNK = 256  # loads that are solved at a time
 
 
@@ -115,7 +115,7 @@ class LinearResponse(nn.Module):
             return ParityFactor.none()
         return ParityFactor.of(self._scene.linear.reference.problem, self.group)
 
-    def compiled(self) -> Linear:
+    def compiled(self) -> LinearPrediction:
         """Return the linear solution as a part of a compiled prediction.
 
         Loads that need a solve which compiled loops do not contain are marked as local.
@@ -126,11 +126,11 @@ class LinearResponse(nn.Module):
         probes = self.probes[:, : 0 if len(factor.order) else None]
         supports = support_force(self._scene.problem.reference)
         modes, parity = self.modes[:, :used], self.parity[:used]
-        return Linear(factor, supports, modes, parity, probes, tol)
+        return LinearPrediction(factor, supports, modes, parity, probes, tol)
 
-    def inverse(self, law: Material) -> Reduced:
+    def inverse(self, law: Material) -> ReducedInverse:
         """Return (L^T K(0) L)^-1, (R, R), and L^T K(0) p, (R,), as far as `compiled` uses them."""
-        return self.reduced.inverse(law) if not len(self._factor.order) else NOTHING
+        return self.reduced.inverse(law) if not len(self._factor.order) else NO_INVERSE
 
     # ------------------------------------------------------------------ fit
 

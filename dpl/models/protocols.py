@@ -108,6 +108,10 @@ class FlagsLocalLoads(Protocol):
         """True if some load can be local."""
         ...
 
+    def solves_every_load(self) -> bool:
+        """True if `forward` solves with the factor for all loads, not only local ones."""
+        ...
+
     def forward_in_basis(
         self, force: Tensor, parameters: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from dpl.fem import InvariantBasedMaterial, SubspaceNewton, symmetries
 from dpl.fem.rom.compiled_prediction import CompiledPrediction, LawArguments, law_arguments
 from dpl.fem.rom.ecsw import Cubature
-from dpl.fem.rom.reduced_stiffness import Reduced, ReducedStiffness
+from dpl.fem.rom.reduced_stiffness import ReducedInverse, ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.fem.symmetry import cell_images
 from dpl.models.invariant_basis import orthonormal_fields
@@ -21,7 +21,7 @@ from dpl.system.checks import check_range
 CELL_STATES = 256  # states at which the cells of a correction are chosen
 MAX_COMPILED = 8  # loads; more of them are predicted together by tensor operations
 MAX_SIZE = 100_000  # of rank, cells and stages
-_AtLaw = tuple[LawArguments, Reduced, Reduced]
+_AtLaw = tuple[LawArguments, ReducedInverse, ReducedInverse]
 
 
 class Unrolled(nn.Module):
@@ -189,6 +189,10 @@ class Unrolled(nn.Module):
     def flags_local_loads(self) -> bool:
         """See `FlagsLocalLoads`."""
         return self.linear.tol < torch.inf
+
+    def solves_every_load(self) -> bool:
+        """See `FlagsLocalLoads`."""
+        return self.linear.is_exact
 
     def coordinates(self, loaded: Tensor, parameters: Tensor) -> Tensor:
         """Return coordinates (B, R) of the nonlinear displacement.

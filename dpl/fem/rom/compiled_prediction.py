@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 from dpl.fem.assembly.kernels import call_compiled
 from dpl.fem.assembly.numba_laws import Law, required_terms
-from dpl.fem.assembly.sampled_loops import (
+from dpl.fem.assembly.prediction_loops import (
     SOURCES,
     BasisArrays,
     LinearArrays,
@@ -25,7 +25,7 @@ from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.rom.parity import Parities, SignedOrbits
 from dpl.fem.rom.parity_factor import ParityFactor
-from dpl.fem.rom.reduced_stiffness import Reduced
+from dpl.fem.rom.reduced_stiffness import ReducedInverse
 from dpl.fem.symmetry import Symmetry
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ class CompiledPrediction:
         first_map: Tensor,
         maps: Tensor,
         limits: Tensor,
-        linear: "Linear",
+        linear: "LinearPrediction",
     ) -> Self:
         """Arrange the matrices by parity.
 
@@ -131,7 +131,12 @@ class CompiledPrediction:
         return cls(arrays)
 
     def __call__(
-        self, law: LawArguments, reduced: Reduced, linear: Reduced, force: Array, field: Array
+        self,
+        law: LawArguments,
+        reduced: ReducedInverse,
+        linear: ReducedInverse,
+        force: Array,
+        field: Array,
     ) -> bool:
         """Set the displacement at free degrees of freedom; return True for a local load.
 
@@ -149,7 +154,7 @@ class CompiledPrediction:
         return bool(call_compiled(predict, *law, *data))
 
 
-class Linear(NamedTuple):
+class LinearPrediction(NamedTuple):
     """The linear solution of a compiled prediction, by a factor or in modes.
 
     Attributes:

@@ -16,7 +16,7 @@ from dpl.fem.materials.material import Material
 from dpl.fem.problem import Problem
 from dpl.fem.rom.reduced_problem import support_force
 
-Reduced = tuple[NDArray[np.float64], NDArray[np.float64]]
+ReducedInverse = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class ReducedStiffness:
         vectors, values = (part.to(right) for part in self._spectrum)
         return ((right - mu * A - lam * B) @ vectors / (mu + lam * values)) @ vectors.T
 
-    def inverse(self, law: Material) -> Reduced:
+    def inverse(self, law: Material) -> ReducedInverse:
         """Return (V^T K(0) V)^-1, (R, R), and V^T K(0) p, (R,), of a law with numbers as moduli."""
         if self._has_springs:
             whole = self.at(law).numpy()

@@ -1,0 +1,343 @@
+"""Compiled loops of one prediction of an unrolled reduced solver.
+
+Features and sums are float64 and matrices float32: the sums cancel digits of the features, and the
+matrices are rounded before the next one is fitted. Tests compare the loops with the tensor
+operations of `dpl.models.Unrolled`.
+"""
+
+import inspect
+import sys
+from typing import NamedTuple
+
+import numpy as np
+from numba import float32, float64, njit, void
+from numpy.typing import NDArray
+
+from dpl.fem.assembly import sampled_loops
+from dpl.fem.assembly.sampled_loops import rotated_strain, unbalanced_stress
+from dpl.fem.assembly.simd import SIMD_WIDTH
+from dpl.fem.linear import banded
+from dpl.fem.linear.banded import banded_triangular_solve
+
+SOURCES = sampled_loops.SOURCES + "".join(
+    inspect.getsource(m) for m in (banded, sys.modules[__name__])
+)
+
+
+@njit(void(float64[::1], float32[:, ::1], float64[::1]), fastmath=True, cache=True)
+def add_product(x, A, y):
+    """Add x A to y, (R,), for x (F,) and A (F, R); four rows where x is zero are not read."""
+    n = A.shape[1]
+    i = 0
+    while i + 4 <= len(x):
+        a, b, c, d = x[i], x[i + 1], x[i + 2], x[i + 3]
+        if a != 0.0 or b != 0.0 or c != 0.0 or d != 0.0:
+            for j in range(n):
+                y[j] += a * A[i, j] + b * A[i + 1, j] + c * A[i + 2, j] + d * A[i + 3, j]
+        i += 4
+    while i < len(x):
+        for j in range(n):
+            y[j] += x[i] * A[i, j]
+        i += 1
+
+
+@njit
+def limit_step(step, most):
+    """Shorten a step (R,) to a norm of at most `most`; return its norm."""
+    size = np.sqrt((step * step).sum())
+    if size > most:
+        step *= most / size
+        return most
+    return size
+
+
+class OrbitArrays(NamedTuple):
+    """Degrees of freedom by parity p and symmetry g, see `dpl.fem.rom.parity`.
+
+    Attributes:
+        characters: Factor of parity p under symmetry g, (M, M).
+        dofs: Images of one degree of freedom of each of m orbits, (M, m).
+        signs: Factors of these images, (M, m).
+        weights: Factors of the orbits in sums over all degrees of freedom, (m,).
+    """
+
+    characters: NDArray[np.float64]
+    dofs: NDArray[np.int64]
+    signs: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+
+class BasisArrays(NamedTuple):
+    """R modes by parity; r is the largest number of modes of a parity.
+
+    Attributes:
+        columns: Positions of the coordinates of each parity, (M, r); R where there are fewer.
+        modes: One value of each orbit, (M, r, m).
+    """
+
+    columns: NDArray[np.int64]
+    modes: NDArray[np.float32]
+
+
+class MapArrays(NamedTuple):
+    """Maps of the iterations at the sample cells, by parity.
+
+    b: orbits of entries of tensors at the sample cells, in blocks of 9 rows, and twice as many in
+    blocks of 18.
+
+    Attributes:
+        gradients: G, (M, r, b).
+        rest: Gradients of the prescribed displacement, (M, b).
+        entry_signs: Factors of the images of entries of G, (M, b).
+        first_signs: The same times weights of the orbits, (M, b).
+        map_signs: The same for two tensors, (M, 2 b).
+        first: B_0, (M, b, r).
+        others: B_1, ..., (K, M, 2 b, r).
+        limits: Largest ratio of each correction to the one before, (1 + K,).
+    """
+
+    gradients: NDArray[np.float32]
+    rest: NDArray[np.float64]
+    entry_signs: NDArray[np.float64]
+    first_signs: NDArray[np.float64]
+    map_signs: NDArray[np.float64]
+    first: NDArray[np.float32]
+    others: NDArray[np.float32]
+    limits: NDArray[np.float64]
+
+
+class LinearArrays(NamedTuple):
+    """The linear solution K(0)^-1 (f - s) by a factor or, if that has no rows, in modes.
+
+    Attributes:
+        factor: Factors of K(0) by parity, (M, m, w), see `dpl.fem.rom.parity_factor`.
+        order: Orbit of each row of the factors, (m,).
+        supports: s = K(0) p of the prescribed displacement p, by parity, (M, m).
+        basis: Modes of linear solutions.
+        probes: See `dpl.models.linear_response`, (N D, F).
+        tol: Part of the linear solution that the modes miss, above which a load is local.
+    """
+
+    factor: NDArray[np.float32]
+    order: NDArray[np.int64]
+    supports: NDArray[np.float64]
+    basis: BasisArrays
+    probes: NDArray[np.float32]
+    tol: float
+
+
+class ModelArrays(NamedTuple):
+    """Arrays of an unrolled reduced solver.
+
+    Attributes:
+        orbits: Degrees of freedom.
+        basis: Modes of the nonlinear displacement.
+        maps: Maps of the iterations.
+        linear: The linear solution.
+    """
+
+    orbits: OrbitArrays
+    basis: BasisArrays
+    maps: MapArrays
+    linear: LinearArrays
+
+
+@njit(fastmath=True)
+def dot(x, row):
+    """Return the product of a vector and a row of float32."""
+    total = 0.0
+    for j in range(len(x)):
+        total += x[j] * row[j]
+    return total
+
+
+@njit(fastmath=True)
+def split(characters, signs, images, out):
+    """Set `out` (M, b) to the parts of each parity of values (M, b) at all images."""
+    out[:] = 0.0
+    for p in range(len(characters)):
+        for g in range(len(characters)):
+            factor = characters[p, g]
+            for j in range(out.shape[1]):
+                out[p, j] += factor * signs[g, j] * images[g, j]
+
+
+@njit(fastmath=True)
+def join(characters, signs, parts, out):
+    """Add the values at all images of parts (M, b) of each parity to `out` (M, b)."""
+    for g in range(len(characters)):
+        for p in range(len(characters)):
+            factor = characters[p, g]
+            for j in range(out.shape[1]):
+                out[g, j] += factor * signs[g, j] * parts[p, j]
+
+
+@njit
+def of_parity(columns, coordinates, out):
+    """Set `out` (r,) to the coordinates of one parity, zero where there are fewer."""
+    for k in range(len(columns)):
+        out[k] = coordinates[columns[k]] if columns[k] < len(coordinates) else 0.0
+
+
+@njit
+def set_gradients(model, coordinates, own, parts, H):
+    """Set H (M, b) at all images of the sample cells; `own` (r,) and `parts` (M, b) are work."""
+    parts[:] = 0.0
+    for p in range(len(parts)):
+        of_parity(model.basis.columns[p], coordinates, own)
+        add_product(own, model.maps.gradients[p], parts[p])
+    H[:] = model.maps.rest
+    join(model.orbits.characters, model.maps.entry_signs, parts, H)
+
+
+@njit
+def set_step(model, signs, matrices, features, parts, own, step):
+    """Set step (R,) to the product of features (M, b) with matrices (M, b, r)."""
+    split(model.orbits.characters, signs, features, parts)
+    for p in range(len(parts)):
+        own[:] = 0.0
+        add_product(parts[p], matrices[p], own)
+        for k in range(len(own)):
+            if model.basis.columns[p, k] < len(step):
+                step[model.basis.columns[p, k]] = own[k]
+
+
+@njit
+def force_by_parity(orbits, force):
+    """Return a force (N D,) by parity, (M, m): the products with fields of one orbit."""
+    M, m = orbits.dofs.shape
+    parts = np.zeros((M, m))
+    for g in range(M):
+        for j in range(m):
+            value = force[orbits.dofs[g, j]]
+            if value != 0.0:
+                value *= orbits.signs[g, j] * orbits.weights[j]
+                for p in range(M):
+                    parts[p, j] += orbits.characters[p, g] * value
+    return parts
+
+
+@njit
+def galerkin(basis, inverse, supports, parts):
+    """Return the coordinates (R,) of the Galerkin linear solution of a force by parity (M, m)."""
+    right = -supports
+    for p in range(len(parts)):
+        for k in range(basis.columns.shape[1]):
+            if basis.columns[p, k] < len(right):
+                right[basis.columns[p, k]] += dot(parts[p], basis.modes[p, k])
+    return inverse @ right
+
+
+@njit
+def add_modes(basis, coordinates, values):
+    """Add V c to values by parity (M, m)."""
+    own = np.zeros(basis.columns.shape[1])
+    for p in range(len(values)):
+        of_parity(basis.columns[p], coordinates, own)
+        add_product(own, basis.modes[p], values[p])
+
+
+@njit
+def set_linear_solution(linear, parts, values):
+    """Set values (M, m) to K(0)^-1 (f - s) of a force by parity (M, m)."""
+    right, order = np.zeros(len(linear.order), np.float32), linear.order
+    for p in range(len(parts)):
+        size = 0.0
+        for j in range(len(order)):
+            size = max(size, abs(parts[p, j] - linear.supports[p, j]))
+        if size > 0.0:  # scaled to order one, so that float32 holds it
+            for j in range(len(order)):
+                right[j] = (parts[p, order[j]] - linear.supports[p, order[j]]) / size
+            solved = banded_triangular_solve(linear.factor[p], right)
+            for j in range(len(order)):
+                values[p, order[j]] = size * solved[j]
+
+
+@njit
+def is_local(linear, force, coordinates):
+    """Return True if the modes miss too much of the linear solution with these coordinates."""
+    products = np.zeros(linear.probes.shape[1])
+    add_product(force, linear.probes, products)
+    missing = (products * products).mean() if len(products) else 0.0
+    return missing > linear.tol**2 * ((coordinates * coordinates).sum() + missing)
+
+
+@njit
+def set_field(orbits, values, field):
+    """Set a field (N D,) at free degrees of freedom from values by parity (M, m)."""
+    M, m = orbits.dofs.shape
+    for g in range(M):
+        for j in range(m):
+            value = 0.0
+            for p in range(M):
+                value += orbits.characters[p, g] * values[p, j]
+            field[orbits.dofs[g, j]] = orbits.signs[g, j] * value
+
+
+@njit(error_model="numpy")
+def nonlinear_coordinates(law, c, needs, finite, mu, lam, model, linear):
+    """Return coordinates (R,) of the nonlinear displacement.
+
+    Args:
+        law, c, needs, finite, mu, lam: The law, see `dpl.fem.assembly.kernels`.
+        model: The arrays of the model.
+        linear: Coordinates of the Galerkin linear solution, (R,).
+    """
+    M, b = model.maps.rest.shape
+    shape = M * b // (9 * SIMD_WIDTH), 9, SIMD_WIDTH
+    own = np.zeros(model.basis.columns.shape[1])
+    parts, both = np.zeros((M, b)), np.zeros((M, 2 * b))
+    HL, H, features = np.zeros((M, b)), np.zeros((M, b)), np.zeros(shape)
+    stress, work = np.zeros((M, 2 * b)), np.zeros((100, SIMD_WIDTH))
+    blocks = stress.reshape((shape[0], 18, SIMD_WIDTH))
+    set_gradients(model, linear, own, parts, HL)
+    linear_blocks, present = HL.reshape(shape), H.reshape(shape)
+    for k in range(shape[0]):
+        rotated_strain(linear_blocks[k], features[k])
+    maps, step = model.maps, np.zeros(len(linear))
+    set_step(model, maps.first_signs, maps.first, features.reshape((M, b)), parts, own, step)
+    size = limit_step(step, maps.limits[0] * np.sqrt((linear * linear).sum()))
+    total = step.copy()
+    for i in range(len(maps.others)):
+        set_gradients(model, linear + total, own, parts, H)
+        for k in range(shape[0]):
+            unbalanced_stress(
+                law, c, needs, finite, mu, lam, present[k], linear_blocks[k], work, blocks[k]
+            )
+        set_step(model, maps.map_signs, maps.others[i], stress, both, own, step)
+        size = limit_step(step, maps.limits[i + 1] * size)
+        total += step
+    return total
+
+
+@njit(error_model="numpy", cache=True)
+def predict(law, c, needs, finite, mu, lam, model, reduced, reduced_linear, force, field):
+    """Set the field of a prediction.
+
+    Args:
+        law, c, needs, finite, mu, lam: The law, see `dpl.fem.assembly.kernels`.
+        model: The arrays of the model.
+        reduced: (V^T K(0) V)^-1, (R, R), and V^T K(0) p of the prescribed displacement p, (R,).
+        reduced_linear: The same of the modes of linear solutions.
+        force: f, (N D,).
+        field: Displacement at free degrees of freedom, (N D,); of a local load without the
+            linear solution.
+
+    Returns:
+        True for a local load.
+    """
+    parts = force_by_parity(model.orbits, force)
+    values = np.zeros(parts.shape)
+    local = False
+    if len(model.linear.order):
+        set_linear_solution(model.linear, parts, values)
+    else:
+        coordinates = galerkin(model.linear.basis, reduced_linear[0], reduced_linear[1], parts)
+        local = is_local(model.linear, force, coordinates)
+        if not local:
+            add_modes(model.linear.basis, coordinates, values)
+    linear = galerkin(model.basis, reduced[0], reduced[1], parts)
+    found = nonlinear_coordinates(law, c, needs, finite, mu, lam, model, linear)
+    add_modes(model.basis, found, values)
+    set_field(model.orbits, values, field)
+    return local
