@@ -205,13 +205,18 @@ class Problem(EquilibriumCriterion):
 
     def restrict(self, field: Tensor) -> NDArray[np.float64]:
         """Return the values, (n,), of a nodal field (N, D) at the free degrees of freedom."""
-        return field[self.free].numpy()
+        return field.numpy().reshape(-1)[self._free_numbers]
 
     def extend(self, values: NDArray[np.float64]) -> Tensor:
         """Return the nodal field (N, D) with values (n,) where free and zero elsewhere."""
-        field = torch.zeros(self.shape, dtype=torch.float64)
-        field[self.free] = torch.from_numpy(values)
-        return field
+        field = np.zeros(self.shape)
+        field.reshape(-1)[self._free_numbers] = values
+        return torch.from_numpy(field)
+
+    @cached_property
+    def _free_numbers(self) -> NDArray[np.int64]:
+        """Numbers of the free degrees of freedom, (n,)."""
+        return np.flatnonzero(self.free.numpy())
 
     def residual(self, displacement: Tensor, force: Tensor) -> Tensor:
         """Return f_int - f at free degrees of freedom, zero at fixed ones, (B, N, D) [-]."""

@@ -267,7 +267,7 @@ class Simulator:
             yield "linear", evaluate_solution(problem, answer, load, tol), math.nan
         guess = state.displacement
         newton = replace(self.scene.corrector, tol=tol)
-        guesses = [guess, prediction] if int(state.iterations) else [guess]
+        guesses = [guess]
         if (
             request.warm
             and self._before is not None

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from dpl.fem.rom.parity import Parities, SignedOrbits
+from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.pod import MIN_SKETCH_SIZE, pod
 from dpl.fem.symmetry import Symmetry, images
 from dpl.models.irreps import Component, representations_of

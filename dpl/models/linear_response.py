@@ -15,11 +15,11 @@ from dpl.fem.linear.interface import SymmetricProduct
 from dpl.fem.linear.krylov import conjugate_gradients
 from dpl.fem.linear.ordering import band_storage
 from dpl.fem.materials.material import Material
+from dpl.fem.parity import Parities
 from dpl.fem.rom.compiled_prediction import LinearPrediction
-from dpl.fem.rom.parity import Parities
-from dpl.fem.rom.parity_factor import ParityFactor
 from dpl.fem.rom.reduced_problem import support_force
 from dpl.fem.rom.reduced_stiffness import ReducedInverse, ReducedStiffness
+from dpl.fem.solvers.parity_factor import ParityFactor
 from dpl.fem.symmetry import Symmetry
 from dpl.models.invariant_basis import InvariantPOD, image_columns, modes_of_parity, stride
 from dpl.scene import Scene
@@ -56,7 +56,7 @@ class LinearResponse(nn.Module):
             [-].
         exact: True if the factor is applied to every load, ().
         modes: L at free degrees of freedom, (n, R).
-        parity: Parity of each mode, (R,), see `dpl.fem.rom.parity`.
+        parity: Parity of each mode, (R,), see `dpl.fem.parity`.
         stiffness: L^T K(0) [L, p], see `ReducedStiffness`, (3, R, R + 1).
         probes: Random fields, multiplied by K(0)^-1 - L (L^T K(0) L)^-1 L^T, (n, F).
     """
@@ -109,10 +109,10 @@ class LinearResponse(nn.Module):
         return entries <= MAX_ENTRIES * members
 
     @cached_property
-    def _factor(self) -> ParityFactor:
-        """Factor of K(0) of the reference body; without rows where compiled loops use modes."""
+    def _factor(self) -> ParityFactor | None:
+        """Factor of K(0) of the reference body; None where compiled loops use modes."""
         if not self.is_exact or self._scene.loads.parameter_ranges or not self._is_cheap:
-            return ParityFactor.none()
+            return None
         return ParityFactor.of(self._scene.linear.reference.problem, self.group)
 
     def compiled(self) -> LinearPrediction:
@@ -122,15 +122,15 @@ class LinearResponse(nn.Module):
         """
         factor, count = self._factor, self.modes.shape[1]
         tol = 0.0 if self.is_exact else self.tol
-        used = 0 if len(factor.order) else count  # modes
-        probes = self.probes[:, : 0 if len(factor.order) else None]
+        used = 0 if factor else count  # modes
+        probes = self.probes[:, : 0 if factor else None]
         supports = support_force(self._scene.problem.reference)
         modes, parity = self.modes[:, :used], self.parity[:used]
         return LinearPrediction(factor, supports, modes, parity, probes, tol)
 
     def inverse(self, law: Material) -> ReducedInverse:
         """Return (L^T K(0) L)^-1, (R, R), and L^T K(0) p, (R,), as far as `compiled` uses them."""
-        return self.reduced.inverse(law) if not len(self._factor.order) else NO_INVERSE
+        return self.reduced.inverse(law) if self._factor is None else NO_INVERSE
 
     # ------------------------------------------------------------------ fit
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dpl.fem.rom.parity import Parities, SignedOrbits
+from dpl.fem.parity import Parities, SignedOrbits
 from dpl.models.irreps import Component
 
 RIDGES = tuple(10.0 ** (-k / 2) for k in range(28, 5, -1))  # relative to the mean square [-]

@@ -61,7 +61,7 @@ class Unrolled(nn.Module):
         scene: The scene to predict.
         linear: The linear solution.
         modes: V at free degrees of freedom, (n, R).
-        parity: Parity of each mode, (R,), see `dpl.fem.rom.parity`.
+        parity: Parity of each mode, (R,), see `dpl.fem.parity`.
         stiffness: V^T K(0) [V, p] by its dependence on the moduli, see `ReducedStiffness`,
             (3, R, R + 1); p is the prescribed displacement.
         cells: Numbers of the sample cells, (C,).

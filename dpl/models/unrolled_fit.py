@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dpl.fem import Problem
 from dpl.fem.materials.material import Material
-from dpl.fem.rom.parity import Parities, SignedOrbits
+from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells, cell_gradients
 from dpl.fem.symmetry import Symmetry, cell_images

@@ -7,7 +7,7 @@ import torch
 from dpl.config import run_folder
 from dpl.data import OfflineData
 from dpl.fem import ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, rectangle, solve
-from dpl.fem.rom.parity import Parities, SignedOrbits
+from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import cell_gradients, rotated_strain, rotation, unbalanced_stress
 from dpl.fem.symmetry import cell_images, symmetries

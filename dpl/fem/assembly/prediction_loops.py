@@ -52,7 +52,7 @@ def limit_step(step, most):
 
 
 class OrbitArrays(NamedTuple):
-    """Degrees of freedom by parity p and symmetry g, see `dpl.fem.rom.parity`.
+    """Degrees of freedom by parity p and symmetry g, see `dpl.fem.parity`.
 
     Attributes:
         characters: Factor of parity p under symmetry g, (M, M).
@@ -110,7 +110,7 @@ class LinearArrays(NamedTuple):
     """The linear solution K(0)^-1 (f - s) by a factor or, if that has no rows, in modes.
 
     Attributes:
-        factor: Factors of K(0) by parity, (M, m, w), see `dpl.fem.rom.parity_factor`.
+        factor: Factors of K(0) by parity, (M, m, w), see `dpl.fem.solvers.parity_factor`.
         order: Orbit of each row of the factors, (m,).
         supports: s = K(0) p of the prescribed displacement p, by parity, (M, m).
         basis: Modes of linear solutions.

@@ -23,9 +23,9 @@ from dpl.fem.assembly.prediction_loops import (
 )
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
-from dpl.fem.rom.parity import Parities, SignedOrbits
-from dpl.fem.rom.parity_factor import ParityFactor
+from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedInverse
+from dpl.fem.solvers.parity_factor import ParityFactor
 from dpl.fem.symmetry import Symmetry
 
 Array = NDArray[np.float64]
@@ -101,6 +101,7 @@ class CompiledPrediction:
         spread = linear.probes.new_zeros(free.numel(), linear.probes.shape[1])
         spread[dofs] = linear.probes
         supports = fields.by_parity(linear.supports[free], parities)
+        factor = linear.factor
         arrays = ModelArrays(
             orbits=OrbitArrays(
                 characters=parities.characters.numpy(),
@@ -120,8 +121,8 @@ class CompiledPrediction:
                 limits=_double(limits),
             ),
             linear=LinearArrays(
-                factor=linear.factor.storage,
-                order=linear.factor.order,
+                factor=factor.storage if factor else np.zeros((1, 0, 1), np.float32),
+                order=factor.order if factor else np.zeros(0, np.int64),
                 supports=_double(supports),
                 basis=of_linear.basis(fields, linear.modes),
                 probes=_single(spread),
@@ -158,7 +159,7 @@ class LinearPrediction(NamedTuple):
     """The linear solution of a compiled prediction, by a factor or in modes.
 
     Attributes:
-        factor: Factor of K(0); without rows if the modes are used.
+        factor: Factor of K(0); None if the modes are used.
         supports: K(0) p, (N, D), of the prescribed displacement p.
         modes: L at free degrees of freedom, (n, R).
         parity: Parity of each of these modes, (R,).
@@ -167,7 +168,7 @@ class LinearPrediction(NamedTuple):
             load is local.
     """
 
-    factor: ParityFactor
+    factor: ParityFactor | None
     supports: Tensor
     modes: Tensor
     parity: Tensor

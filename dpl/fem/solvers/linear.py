@@ -11,9 +11,12 @@ from torch import Tensor
 from dpl.fem.linear.backends import BackendFactory, make_backend, select_backend
 from dpl.fem.linear.banded import BandedFactor
 from dpl.fem.linear.interface import Backend, Factor
+from dpl.fem.parity import Parities
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.corotational import CorotationalPreconditioner
+from dpl.fem.solvers.parity_factor import ParityFactor
 from dpl.fem.solvers.solution import Load, Solution, check_force, check_tol, evaluate_solution
+from dpl.fem.symmetry import Symmetry, symmetries
 
 MAX_CLONES = 4  # solvers of other parameters that are kept with their factors
 
@@ -57,9 +60,21 @@ class LinearSolver:
 
     @cached_property
     def float32_factor(self) -> Factor:
-        """Factor of K(0), in float32 if it is banded: accurate to about 1e-6."""
+        """Factor of K(0), in float32 if it is banded: accurate to about 1e-6.
+
+        A body with reflections has one factor for each parity, which are smaller together.
+        """
         factor = self.factor
-        return factor.to_float32() if isinstance(factor, BandedFactor) else factor
+        if not isinstance(factor, BandedFactor):
+            return factor
+        if len(Parities.of(self.symmetries, self.problem.shape[1]).members) > 1:
+            return ParityFactor.of(self.problem, self.symmetries)
+        return factor.to_float32()
+
+    @cached_property
+    def symmetries(self) -> list[Symmetry]:
+        """Symmetries of the body, which no parameters of the law change."""
+        return self.parent.symmetries if self.parent else symmetries(self.problem)
 
     @cached_property
     def backend(self) -> Backend:

@@ -1,10 +1,13 @@
 """Factor of K(0) by parity: one banded Cholesky factor for the fields of each parity.
 
-K(0) maps fields of one parity to forces of the same parity, see `dpl.fem.rom.parity`. With M
+K(0) maps fields of one parity to forces of the same parity, see `dpl.fem.parity`. With M
 symmetries the factors have about M times fewer entries than that of the whole matrix, and a solve
 reads as many fewer.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -13,32 +16,46 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, triu
 from torch import Tensor
 
-from dpl.fem.linear.banded import BandedCholesky, BandedFactor
-from dpl.fem.linear.interface import Backend, Pattern, SingularMatrix, full_matrix
+from dpl.fem.linear.banded import (
+    BandedCholesky,
+    BandedFactor,
+    banded_block_solve,
+    banded_triangular_solve,
+)
+from dpl.fem.linear.interface import (
+    Array,
+    Backend,
+    DirectFactor,
+    Pattern,
+    SingularMatrix,
+    full_matrix,
+)
 from dpl.fem.linear.ordering import band_storage
+from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.problem import Problem
-from dpl.fem.rom.parity import Parities, SignedOrbits
 from dpl.fem.symmetry import Symmetry
 
 
-class ParityFactor(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ParityFactor(DirectFactor):
     """Banded Cholesky factors of K(0) for one value of each of m orbits, M parities.
 
     Attributes:
         storage: Rows of the factors in float32, (M, m, b + 1), see `BandedFactor`.
         order: Orbit of each row, (m,).
+        orbits: Degrees of freedom of each orbit.
+        characters: Factor of each parity under each symmetry, (M, M).
+        negative_pivots: 0.
     """
 
     storage: NDArray[np.float32]
     order: NDArray[np.int64]
+    orbits: SignedOrbits
+    characters: Tensor
+    negative_pivots: int = 0
 
     @classmethod
-    def none(cls) -> Self:
-        """Return a factor without rows, in place of one that is not used."""
-        return cls(np.zeros((1, 0, 1), np.float32), np.zeros(0, np.int64))
-
-    @classmethod
-    def of(cls, problem: Problem, group: list[Symmetry]) -> Self:
+    def of(cls, problem: Problem, group: Sequence[Symmetry]) -> Self:
         """Factorise K(0) of a body.
 
         Raises:
@@ -56,7 +73,40 @@ class ParityFactor(NamedTuple):
         storage = [one.storage for one in factors if isinstance(one, BandedFactor)]
         order = backend.layout.order
         rows = np.arange(pattern.size) if order is None else order.astype(np.int64)
-        return cls(np.stack(storage).astype(np.float32), rows)
+        return cls(np.stack(storage).astype(np.float32), rows, orbits, parities.characters)
+
+    def solve(self, right: Array, rtol: float = 1e-12) -> Array:
+        """Return x, (n,), with K x = right, in the accuracy of float32."""
+        size = np.abs(right).max(initial=0) or 1.0  # of order one, so that float32 holds it
+        images, signs, scales, characters = self._arrays
+        parts = (characters @ (scales * (right / size)[images])).astype(np.float32)
+        solved = np.empty(parts.shape)
+        for p, part in enumerate(parts):
+            solved[p, self.order] = banded_triangular_solve(self.storage[p], part[self.order])
+        x = np.empty_like(right)
+        x[images] = size * (signs * (characters.T @ solved))
+        return x
+
+    def solve_many(self, right: Array, rtol: float = 1e-12) -> Array:
+        """Return the solutions, (k, n), in the accuracy of float32, see `Factor.solve_many`."""
+        size = np.abs(right).max(axis=1, keepdims=True, initial=0)
+        size[size == 0] = 1
+        images, signs, scales, characters = self._arrays
+        parts = characters @ (scales * (right / size)[:, images])  # (k, M, m)
+        solved = np.empty_like(parts)
+        for p, storage in enumerate(self.storage):
+            own = np.ascontiguousarray(parts[:, p, self.order].T, np.float32)
+            banded_block_solve(storage, own)
+            solved[:, p, self.order] = own.T
+        x = np.empty_like(right)
+        x[:, images] = signs * (characters.T @ solved)
+        return x * size
+
+    @cached_property
+    def _arrays(self) -> tuple[NDArray[np.int64], Array, Array, Array]:
+        """Images and signs of the orbits, signs times weights, (M, m), and the characters."""
+        images, signs, weights = (part.numpy() for part in self.orbits)
+        return images, signs, signs * weights, self.characters.numpy()
 
 
 def _block(whole: csr_array, orbits: SignedOrbits, characters: Tensor) -> csr_array:

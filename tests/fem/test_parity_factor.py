@@ -1,0 +1,91 @@
+"""Factors of K(0) by parity: they solve like the factor of the whole matrix and are smaller."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import norm
+
+from dpl.fem import (
+    DirichletBC,
+    LinearSolver,
+    NeoHookeanLn,
+    Plane,
+    Problem,
+    RobinBC,
+    box,
+    rectangle,
+)
+from dpl.fem.linear.banded import BandedFactor
+from dpl.fem.solvers.parity_factor import ParityFactor
+
+NH = NeoHookeanLn(0.3)
+LEFT = Plane(0, "min")
+BODIES = {
+    "beam with a square section": (box([4.0, 1.0, 1.0], [9, 4, 4]), {}, 4),
+    "beam with a rectangular section": (box([4.0, 2.0, 1.0], [9, 4, 3]), {}, 4),
+    "quadratic beam": (box([4.0, 1.0, 1.0], [4, 3, 3]), {"degree": 2}, 4),
+    "plate": (rectangle([4.0, 1.0], [13, 9]), {}, 2),
+    "beam on a foundation": (
+        box([4.0, 1.0, 1.0], [9, 4, 4]),
+        {"supports": [DirichletBC(LEFT), RobinBC(Plane(2, "min"), 0.1)]},
+        2,
+    ),
+}
+
+
+@pytest.fixture(params=BODIES, scope="module")
+def body(request):
+    """Return the linear solver of a symmetric body, and the number of its reflections."""
+    mesh, options, count = BODIES[request.param]
+    options = {"supports": [DirichletBC(LEFT)], **options}
+    return LinearSolver(Problem.build(mesh, NH, **options), linear="band"), count
+
+
+def right_hand_sides(size):
+    """Return random vectors of very different magnitudes."""
+    random = np.random.default_rng(0).standard_normal((4, size))
+    return random * np.array([[1.0], [1e-60], [1e60], [0.0]])
+
+
+def test_the_factor_by_parity_solves_like_the_whole(body):
+    solver, _ = body
+    right = right_hand_sides(solver.problem.pattern.size)
+    factor, exact = solver.float32_factor, solver.factor.solve_many(right)
+    assert isinstance(factor, ParityFactor)
+    for found in (factor.solve_many(right), np.stack([factor.solve(row) for row in right])):
+        assert (norm(found - exact, axis=1) <= 1e-5 * norm(exact, axis=1)).all()
+
+
+def test_the_factor_has_fewer_entries(body):
+    solver, count = body
+    factor = solver.float32_factor
+    assert len(factor.storage) == count
+    assert factor.storage.size < 0.8 * solver.factor.storage.size
+
+
+def test_the_factor_is_symmetric(body):
+    """Conjugate gradients need x^T (M y) = y^T (M x)."""
+    solver, _ = body
+    x, y = np.random.default_rng(1).standard_normal((2, solver.problem.pattern.size))
+    factor = solver.float32_factor
+    left, right = x @ factor.apply(y), y @ factor.apply(x)
+    assert abs(left - right) < 1e-5 * norm(x) * norm(factor.apply(y))
+
+
+def test_a_body_without_reflections_has_one_factor():
+    mesh = box([4.0, 1.0, 1.0], [9, 3, 3])
+    x, y, z = mesh.p
+    crooked = type(mesh)(np.array([x, y + 0.1 * x**2, z + 0.2 * x]), mesh.t)
+    solver = LinearSolver(Problem.build(crooked, NH, fixed=LEFT), linear="band")
+    assert isinstance(solver.float32_factor, BandedFactor)
+
+
+def test_ranges_of_the_law_keep_the_symmetries():
+    law = NeoHookeanLn([0.2, 0.4])
+    problem = Problem.build(box([4.0, 1.0, 1.0], [9, 4, 4]), law, fixed=LEFT)
+    solver = LinearSolver(problem, linear="band")
+    clone = solver.with_parameters(torch.tensor([[0.25]], dtype=torch.float64))
+    assert clone.symmetries is solver.symmetries
+    right = np.random.default_rng(0).standard_normal(problem.pattern.size)
+    exact = clone.factor.solve(right)
+    assert norm(clone.float32_factor.solve(right) - exact) < 1e-5 * norm(exact)
