@@ -17,6 +17,7 @@ from dpl.fem.assembly.rigid_body_modes import rigid_body_modes, unconstrained_mo
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.material import Material
 from dpl.fem.materials.tensors import green_lagrange, volume_change
+from dpl.fem.units import Units
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,8 @@ class TensorAssembly:
         boundary: Mask of the nodes on the boundary, (N,).
         springs: Elastic foundation (Robin conditions), or None.
         mean_dilatation: True if the points of a cell share its mean volume ratio (F-bar).
+        young: Young's modulus by which boundary values are divided [Pa]; None if there is no such
+            modulus, see `dpl.fem.units.Units`. No other quantity depends on it.
     """
 
     mesh: skfem.Mesh
@@ -58,6 +61,7 @@ class TensorAssembly:
     boundary: Tensor
     springs: FoundationMatrix | None = None
     mean_dilatation: bool = False
+    young: float | None = 1.0
 
     def to(self, device: torch.device | str) -> Self:
         """Return the same body with its tensors on a device."""
@@ -78,6 +82,11 @@ class TensorAssembly:
     def basis(self) -> skfem.Basis:
         """scikit-fem's basis of one displacement component."""
         return basis_of(self.mesh, self.degree)
+
+    @property
+    def units(self) -> Units:
+        """L and E, by which boundary values are divided."""
+        return Units(self.length, self.young)
 
     @property
     def mesh_in_metres(self) -> skfem.Mesh:
