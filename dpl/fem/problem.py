@@ -1,6 +1,5 @@
 """Static equilibrium of a body: built from a mesh, evaluated and linearised by compiled loops."""
 
-import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -159,22 +158,6 @@ class Problem(EquilibriumCriterion):
                 "set degree=2"
             )
         return lines
-
-    def check_foundation_modulus(self, young: float) -> None:
-        """Check the Young's modulus [Pa] of a load on this body.
-
-        Elastic foundations have a fixed stiffness, so that their part in K(0) is that of one
-        modulus. Without foundations all moduli are allowed.
-
-        Raises:
-            ValueError: The modulus is not that of the foundations.
-        """
-        if self.springs is None or self.young is None or math.isclose(young, self.young):
-            return
-        raise ValueError(
-            f"young = {young:g} must be {self.young:g} [Pa], by which the stiffness of the elastic "
-            f"foundation is divided; build another body with young = {young:g}"
-        )
 
     def with_parameters(self, parameters: Tensor) -> Self:
         """Return the problem with other parameters; mesh, pattern and kernels are shared.

@@ -8,6 +8,7 @@ import torch
 
 from dpl import ConfigError
 from dpl.config import build
+from dpl.data import OfflineData
 from dpl.fem import DirichletBC, Plane, Problem, RobinBC, Traction, box
 from dpl.fem.units import Units
 from dpl.inference import Simulator
@@ -71,6 +72,13 @@ def test_only_ratios_to_the_modulus_identify_a_scene(scene_of):
     doubled = [line.replace("45.0", "90.0").replace("9.0,", "18.0,") for line in (PULL, BED)]
     assert scene_of(*BAR, *doubled, "young=9e3").fingerprint == usual.fingerprint
     assert scene_of(*BAR, PULL, BED, "young=9e3").fingerprint != usual.fingerprint
+
+
+@pytest.mark.parametrize("line", [PULL, BED, MOVED, None])
+def test_a_plan_says_that_a_data_set_depends_on_boundary_values(scene_of, tmp_path, line):
+    scene = scene_of(*BAR, *([line] if line else []))
+    data = OfflineData(scene, folder=str(tmp_path / "none"), workers=0)
+    assert ("boundary values over E and L" in data.skipped_work()[0]) == (line is not None)
 
 
 def test_prescribed_displacements_allow_a_range_of_moduli(scene_of):

@@ -1,5 +1,6 @@
 """Energy, internal force and tangent of a body as batched tensor operations."""
 
+import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Self
@@ -87,6 +88,22 @@ class TensorAssembly:
     def units(self) -> Units:
         """L and E, by which boundary values are divided."""
         return Units(self.length, self.young)
+
+    def check_foundation_modulus(self, young: float) -> None:
+        """Check the Young's modulus [Pa] of a load on this body.
+
+        Elastic foundations have a fixed stiffness, so that their part in K(0) is that of one
+        modulus. Without foundations all moduli are allowed.
+
+        Raises:
+            ValueError: The modulus is not that of the foundations.
+        """
+        if self.springs is None or self.young is None or math.isclose(young, self.young):
+            return
+        raise ValueError(
+            f"young = {young:g} must be {self.young:g} [Pa], by which the stiffness of the elastic "
+            f"foundation is divided; build another body with young = {young:g}"
+        )
 
     @property
     def mesh_in_metres(self) -> skfem.Mesh:
