@@ -70,6 +70,16 @@ class Scene:
     loads: LoadFamily
     solver: ReferenceSolver
 
+    def __post_init__(self) -> None:
+        """Check that elastic foundations and loads have one Young's modulus.
+
+        Raises:
+            ValueError: The loads have another modulus than the foundations, or a range.
+        """
+        if self.problem.springs is not None:
+            for young in self.loads.young_range:
+                self.problem.check_foundation_modulus(young)
+
     @property
     def linear(self) -> LinearSolver:
         """Linear solver with the one factor of K(0) of the scene."""
@@ -109,12 +119,20 @@ class Scene:
         """L^(D-1) [m^2 in 3D, m in 2D]: forces are this times E times the dimensionless ones."""
         return self.length ** (self.problem.shape[1] - 1)
 
+    @property
+    def has_boundary_values(self) -> bool:
+        """Return True if samples depend on a boundary value, over E or L, besides random loads."""
+        problem = self.problem
+        constant = self.loads.constant_force is not None
+        return constant or problem.springs is not None or problem.moved_supports
+
     def load_of(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Load:
         """Return nodal forces (B, N, D) [N] (2D: [N/m]) on bodies of moduli (B,) [Pa] as a load.
 
         Args:
-            force: What acts.
-            young: E.
+            force: Nodal forces.
+            young: E. On a body on elastic foundations it must be that of the foundations, see
+                `Problem.check_foundation_modulus`, which this function does not call.
             parameters: Values of the ranges of the law, (B,) or (B, P); required if it has any.
         """
         dimensionless = force.double() / (young.double()[:, None, None] * self.force_unit)
@@ -195,8 +213,6 @@ class Scene:
             )
         if problem.springs is None:
             lines.append("no springs, nothing of theirs assembled")
-        elif low < high:
-            lines.append("springs are alpha / E: those of this scene grow with E, see its supports")
         if problem.equal_cells:
             lines.append(f"one set of shape gradients for {cells} equal cells")
         if points == 1:

@@ -12,15 +12,18 @@ from collections.abc import Iterator
 from typing import Any
 
 import hydra
+import skfem
 import torch
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from torch import Tensor
 
 from dpl import training
 from dpl.config import validation
 from dpl.config.validation import ConfigError
 from dpl.fem import Problem, SingularMatrix
+from dpl.fem.units import Units
 from dpl.scene import Scene
 from dpl.system.blas import slow_blas
 
@@ -150,12 +153,10 @@ def require_keys(cfg: DictConfig, *keys: str) -> None:
 def build_scene(cfg: DictConfig) -> Scene:
     """Return the scene of a configuration; raise a `ConfigError` that names the invalid key."""
     require_keys(cfg, *SCENE)
-    problem = _problem(cfg)
-    solver = instantiate(cfg, "solver", problem=problem)
     young = OmegaConf.to_container(cfg.young) if isinstance(cfg.young, ListConfig) else cfg.young
-    with error_in("forces"):
-        forces = [part.on(problem) for part in _parts(cfg, "forces")]
-    always = torch.stack(forces).sum(dim=0) if forces else None
+    problem = _problem(cfg, _one_modulus(young))
+    always = _constant_force(cfg, problem)
+    solver = instantiate(cfg, "solver", problem=problem)
     linear = solver.linear_solver
     loads = instantiate(cfg, "loads", linear=linear, young=young, constant_force=always)
     singular = "material, mesh, fixed or supports: K(0) cannot be used"
@@ -164,12 +165,36 @@ def build_scene(cfg: DictConfig) -> Scene:
     return Scene(problem, loads, solver)
 
 
-def _problem(cfg: DictConfig) -> Problem:
+def _one_modulus(young: float | list[float]) -> float | None:
+    """Return the modulus of all loads [Pa]; None if they have a range of moduli."""
+    moduli = young if isinstance(young, list) else [young]
+    return moduli[0] if len(set(moduli)) == 1 else None
+
+
+def _constant_force(cfg: DictConfig, problem: Problem) -> Tensor | None:
+    """Return the sum of the tractions and body forces, (N, D) [-]; None if there are none."""
+    forces = []
+    for name, part in _parts(cfg, "forces").items():
+        with error_in(f"forces.{name}"):
+            forces.append(part.on(problem))
+    return torch.stack(forces).sum(dim=0) if forces else None
+
+
+def _supports(cfg: DictConfig, mesh: skfem.Mesh, units: Units) -> list[Any]:
+    """Return the supports; raise a `ConfigError` that names the one with an invalid value."""
+    supports = _parts(cfg, "supports")
+    for name, support in supports.items():
+        with error_in(f"supports.{name}"):
+            support.dimensionless(mesh.dim(), units)
+    return list(supports.values())
+
+
+def _problem(cfg: DictConfig, young: float | None) -> Problem:
     with _shown_warnings():
         mesh, material = (instantiate(cfg, key) for key in ("mesh", "material"))
         fixed = instantiate(cfg, "fixed") if cfg.get("fixed") is not None else None
-        options = {key: cfg[key] for key in ("degree", "mean_dilatation")}
-        supports = _parts(cfg, "supports")
+        options = {key: cfg[key] for key in ("degree", "mean_dilatation")} | {"young": young}
+        supports = _supports(cfg, mesh, Units(1.0, young))
         try:
             problem = Problem.build(mesh, material, fixed=fixed, supports=supports, **options)
         except ValueError as error:
@@ -194,17 +219,19 @@ def _shown_warnings() -> Iterator[None]:
         print(f"warning: {line}", file=sys.stderr)
 
 
-def _parts(cfg: DictConfig, key: str) -> list[Any]:
-    """Return the objects of a node that names several; none for {} or null."""
+def _parts(cfg: DictConfig, key: str) -> dict[str, Any]:
+    """Return the objects of a node that names several, by name; none for {} or null."""
     node = cfg.get(key)
     if node is None:
-        return []
+        return {}
     if not isinstance(node, DictConfig):
         raise ConfigError(
             f"{key} = {node!r} must be a mapping of names to calls: {key}: {{name: {{...}}}}"
         )
-    places = {name: f"{key}.{name}" for name in node if node[name]}
-    return [_of_kind(_made(node[name], place, {}), key, place) for name, place in places.items()]
+    places = {str(name): f"{key}.{name}" for name in node if node[name]}
+    return {
+        name: _of_kind(_made(node[name], place, {}), key, place) for name, place in places.items()
+    }
 
 
 def build_surrogate(cfg: DictConfig, scene: Scene) -> "training.Surrogate":
@@ -228,7 +255,7 @@ def build_surrogate(cfg: DictConfig, scene: Scene) -> "training.Surrogate":
 def build_trainer(cfg: DictConfig) -> "L.Trainer":
     """Return the trainer of a configuration with its callbacks and loggers."""
     require_keys(cfg, "trainer")
-    callbacks, loggers = (_parts(cfg, key) for key in ("callbacks", "logger"))
+    callbacks, loggers = (list(_parts(cfg, key).values()) for key in ("callbacks", "logger"))
     return typing.cast(
         "L.Trainer", instantiate(cfg, "trainer", callbacks=callbacks, logger=loggers or False)
     )

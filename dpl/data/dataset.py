@@ -92,8 +92,9 @@ class DataSet:
         """Return one line for each kind of work that is not needed."""
         wanted = sum(self.sizes.values())
         there = wanted - sum(len(self.store.missing(*split)) for split in self.sizes.items())
+        same = " with these boundary values over E and L" if self.scene.has_boundary_values else ""
         lines = [
-            "one data set for every size and Young's modulus of this body: "
+            f"one data set for every size and Young's modulus of this body{same}: "
             f"{self.store.folder}, of scene {self.scene.fingerprint[:12]}"
         ]
         if there:

@@ -21,6 +21,7 @@ from dpl.fem.materials.material import Material
 from dpl.fem.materials.tensors import volume_change
 from dpl.fem.mesh.generators import aspect_ratio, longest_side, near_origin
 from dpl.fem.mesh.regions import Region
+from dpl.fem.units import Units, check_young
 
 MAX_CLONES = 64  # bodies of other parameters that are kept
 
@@ -70,6 +71,7 @@ class Problem(EquilibriumCriterion):
         degree: int = 1,
         mean_dilatation: bool = False,
         length: float | None = None,
+        young: float | None = 1.0,
     ) -> Self:
         """Return the problem of a body.
 
@@ -83,22 +85,26 @@ class Problem(EquilibriumCriterion):
                 freedom (N, D).
             prescribed: Displacement over `length` at fixed degrees of freedom, (N, D) [-]; zero
                 if left out.
-            supports: Further prescribed displacements and springs; the last one on a degree of
-                freedom counts.
+            supports: Further prescribed displacements [m] and elastic foundations [N/m^3]; the last
+                displacement on a degree of freedom counts.
             degree: Degree of the displacement, 1 or 2.
             mean_dilatation: Use the mean volume ratio of each cell, so that nearly incompressible
                 bodies of linear quadrilaterals and hexahedra do not lock.
             length: L [m]; the longest side of the body if left out.
+            young: Young's modulus [Pa] by which boundary values are divided: stiffnesses of
+                foundations, and the tractions and body forces of `dpl.fem.loads`. The default of
+                1 Pa makes them values over E. None refuses them, for loads of several moduli.
 
         Raises:
-            ValueError: `degree` is neither 1 nor 2, the cell type is unknown, a region is empty, or
-                `mean_dilatation` has no effect on the cells.
+            ValueError: `degree` is neither 1 nor 2, the cell type is unknown, a region is empty, a
+                boundary value is invalid, or `mean_dilatation` has no effect on the cells.
 
         Warns:
             UserWarning: Linear elements will lock, see `locking_warnings`.
         """
         if degree not in (1, 2):
             raise ValueError(f"degree = {degree} must be 1 or 2")
+        check_young(young)
         degree = 2 if mesh.elem in QUADRATIC else degree
         length = longest_side(mesh.p.T) if length is None else length
         mesh, origin = near_origin(mesh)
@@ -110,7 +116,7 @@ class Problem(EquilibriumCriterion):
                 "set degree=2 instead, quadratic elements hardly lock"
             )
         given, springs = assemble_constraints(
-            basis, length, supports, origin=origin, fixed=fixed, prescribed=prescribed
+            basis, Units(length, young), supports, origin=origin, fixed=fixed, prescribed=prescribed
         )
         dN, dV = gradients(basis)
         boundary = np.zeros(basis.N, dtype=bool)
@@ -130,6 +136,7 @@ class Problem(EquilibriumCriterion):
             boundary=torch.from_numpy(boundary),
             springs=springs,
             mean_dilatation=mean_dilatation,
+            young=young,
         )
         for line in problem.locking_warnings():
             warnings.warn(line, stacklevel=2)

@@ -205,6 +205,8 @@ class Simulator:
         moduli = per_load("young", low if young is None else young, len(force))
         if not (moduli > 0).all():
             raise ValueError("young: a modulus is not above 0 Pa")
+        for modulus in moduli.tolist():
+            scene.problem.check_foundation_modulus(modulus)
         ranges = scene.loads.parameter_ranges
         values = named_columns("parameters", parameters, list(ranges), len(force))
         scene.problem.material.with_parameters(values)  # refuses values that it does not allow

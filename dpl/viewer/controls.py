@@ -64,7 +64,8 @@ class Controls:
         self.direction = gui.add_vector3("direction", upwards, step=0.1)
         self.amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
         low, high = body.young_range
-        self.young = gui.add_slider("E [Pa]", low, high, (high - low) / 500, body.young)
+        step = (high - low or high) / 500  # low = high on an elastic foundation
+        self.young = gui.add_slider("E [Pa]", low, high, step, body.young)
         self.parameters = {
             name: gui.add_slider(LABELS.get(name, name), *ends, (ends[1] - ends[0]) / 200, value)
             for (name, ends), value in zip(

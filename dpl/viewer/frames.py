@@ -117,7 +117,9 @@ class Body:
     def young_range(self) -> tuple[float, float]:
         """Smallest and largest Young's modulus of a request [Pa]."""
         low, high = self.scene.loads.young_range
-        return (low, high) if low < high else (low / YOUNG_FACTOR, high * YOUNG_FACTOR)
+        if low < high or self.scene.problem.springs is not None:  # foundations fix the modulus
+            return low, high
+        return low / YOUNG_FACTOR, high * YOUNG_FACTOR
 
     def request(
         self,

@@ -231,7 +231,7 @@ def test_bar_on_springs_is_exact_on_every_mesh(kind, count):
 
 
 def test_bar_on_springs_does_not_depend_on_the_unit_of_length(kind):
-    """The stiffness [1/m] and the displacement [m] of a bar of 0.004 m: alpha = 500/m."""
+    """A bar of 0.004 m with alpha / E = 500/m and a displacement in metres."""
     problem = bar(kind, 3, 0.5)
     mesh = problem.mesh.scaled(0.004)
     small = Problem.build(

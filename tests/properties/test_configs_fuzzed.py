@@ -37,9 +37,9 @@ HELD = [
     "+supports.end={_target_: dpl.fem.DirichletBC, "
     "value: [0.0, null, null], "
     "region: {_target_: dpl.fem.Plane, axis: 0, at: max}}",
-    "+supports.soil={_target_: dpl.fem.RobinBC, stiffness: 0.01, "
+    "+supports.soil={_target_: dpl.fem.RobinBC, stiffness: 45.0, "
     "region: {_target_: dpl.fem.Box, lower: [0, 0, 0], upper: [50, 25, 0]}}",
-    "+forces.weight={_target_: dpl.fem.BodyForce, value: [0.0, 0.0, -1e-5]}",
+    "+forces.weight={_target_: dpl.fem.BodyForce, value: [0.0, 0.0, -0.045]}",
 ]
 SCENES = {  # overrides of conf/generate.yaml
     "beam": TINY,

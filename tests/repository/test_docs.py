@@ -11,6 +11,7 @@ from pathlib import Path
 import hydra
 import nbformat
 import pytest
+import torch
 import yaml
 from hydra.core.global_hydra import GlobalHydra
 
@@ -233,7 +234,7 @@ def test_the_examples_of_the_page_on_extensions_work(blocks, monkeypatch):
             surrogate = run.build_surrogate(cfg, scene)
             ends = hydra.compose("train", overrides=[own, "loads=end", "folder=."])
             run.check(ends)
-            assert run.build_scene(ends).loads.largest == 2e-3
+            assert run.build_scene(ends).loads.largest == 9.0
     finally:
         GlobalHydra.instance().clear()
     assert scene.loads.distribution.keywords == {"gap": 0.3}
@@ -241,6 +242,69 @@ def test_the_examples_of_the_page_on_extensions_work(blocks, monkeypatch):
     search = yaml.safe_load((Path.cwd() / "my_conf/hparams_search/modal.yaml").read_text())
     assert set(search["hydra"]["sweeper"]["params"]) == {"model.width", "optimizer.lr"}
     assert search["defaults"][0] == {"override /model": "modal"}
+
+
+@pytest.fixture
+def own_conf(blocks):
+    """Writes the files of a page and composes a training with them."""
+
+    def compose(page, *overrides):
+        if not Path("my_conf").is_dir():
+            blocks(page)
+        GlobalHydra.instance().clear()
+        own = f"hydra.searchpath=[file://{Path.cwd() / 'my_conf'}]"
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            cfg = hydra.compose("train", overrides=[own, "folder=.", *overrides])
+        run.check(cfg)
+        return run.build_scene(cfg)
+
+    yield compose
+    GlobalHydra.instance().clear()
+
+
+def test_the_load_family_of_the_page_on_extensions_is_in_pascals(own_conf):
+    """Samples and fingerprint depend on the traction over E alone."""
+    own = ["loads=end", "mesh.nodes=[5,3,3]"]
+    soft = own_conf("extend.md", *own)
+    stiff = own_conf("extend.md", *own, "loads.largest=18", "young=9e3")
+    assert stiff.fingerprint == soft.fingerprint
+    assert own_conf("extend.md", *own, "young=9e3").fingerprint != soft.fingerprint
+    total = (stiff.loads.axes * 9e3 * stiff.force_unit).sum(dim=1)  # [N], on 25 m x 25 m
+    assert total.diagonal().tolist() == pytest.approx([18 * 625.0] * 3)
+    with pytest.raises(
+        run.ConfigError, match=r"loads: value = \[9\.0, 0\.0, 0\.0\] must be divided"
+    ):
+        own_conf("extend.md", *own, "young=[1e3,2e3]")
+    with pytest.raises(
+        run.ConfigError, match=r"loads: largest = -1 must be a number above 0 \[Pa\]"
+    ):
+        own_conf("extend.md", *own, "loads.largest=-1")
+
+
+def test_the_load_family_of_the_page_on_extensions_is_trained_and_evaluated(
+    blocks, script, tiny_training, tmp_path
+):
+    blocks("extend.md")
+    own = ["--config-dir", "my_conf", "loads=end", "loads.largest=4.5", "run=runs/end"]
+    tiny = [word for word in tiny_training if not word.startswith("loads.")]
+    ended = script("train", *own, *tiny, "trainer.max_epochs=1", cwd=tmp_path)
+    assert ended.status == 0, ended.err
+    ended = script("evaluate", "run=runs/end", "trust=true", cwd=tmp_path)
+    assert ended.status == 0, ended.err
+
+
+def test_the_boundary_values_of_the_page_on_usage_are_in_si_units(own_conf, tmp_path, monkeypatch):
+    """Its Python needs a mesh file; the experiment is a body of 1,100 kg/m^3 on soil."""
+    monkeypatch.chdir(tmp_path)
+    Path("my_conf/experiment").mkdir(parents=True)
+    found = BLOCK.findall((DOCS / "usage.md").read_text(encoding="utf-8"))
+    (text,) = [text for _, name, text in found if name == "my_conf/experiment/soil.yaml"]
+    Path("my_conf/experiment/soil.yaml").write_text(text)
+    scene = own_conf("usage.md", "experiment=soil", "mesh.nodes=[5,3,3]")
+    weight = scene.loads.constant_force.sum(dim=0) * 2e6 * scene.force_unit  # [N]
+    assert weight.tolist() == pytest.approx([0, 0, -1100 * 9.81 / 16], abs=1e-9)
+    pull = scene.problem.springs.force(torch.ones(1, *scene.problem.shape, dtype=torch.float64))
+    assert float(pull[0, :, 2].sum()) * 2e6 == pytest.approx(1e7 / 4)  # 1 m x 0.25 m [N/m]
 
 
 def test_the_quick_start_works_on_a_trained_run(blocks, script, tiny_training, tmp_path):

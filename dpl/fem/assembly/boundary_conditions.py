@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.mesh.regions import Origin, Region, facets_in, nodes_in
+from dpl.fem.units import Units
 
 
 @dataclass(frozen=True)
@@ -26,25 +27,32 @@ class DirichletBC:
     region: Region
     value: Sequence[float | None] | None = None
 
-    def on(self, basis: skfem.Basis, scale: float, origin: Origin = 0.0) -> NDArray[np.float64]:
-        """Return g / scale, (N, D) [-], NaN where a component is free.
+    def dimensionless(self, dim: int, units: Units) -> NDArray[np.float64]:
+        """Return g / L, (D,) [-], NaN where a component is free.
+
+        Raises:
+            ValueError: `value` does not have D entries, or all of them are None.
+        """
+        value = [0.0] * dim if self.value is None else list(self.value)
+        given = [math.nan if g is None else units.displacement(float(g)) for g in value]
+        if len(given) != dim or all(map(math.isnan, given)) or any(map(math.isinf, given)):
+            raise ValueError(f"value = {value} must be {dim} lengths [m]; write null where free")
+        return np.array(given)
+
+    def on(self, basis: skfem.Basis, units: Units, origin: Origin = 0.0) -> NDArray[np.float64]:
+        """Return g / L, (N, D) [-], NaN where a component is free.
 
         Args:
-            basis: Scalar basis of a body, its coordinates divided by `scale`.
-            scale: L [m].
+            basis: Scalar basis of a body, its coordinates divided by L.
+            units: L and E.
             origin: Origin of these coordinates, (D,) [-].
 
         Raises:
-            ValueError: The region contains no node, or `value` does not have D entries, or all of
-                them are None.
+            ValueError: The region contains no node, or `value` is invalid, see `dimensionless`.
         """
-        dim = basis.mesh.dim()
-        value = [0.0] * dim if self.value is None else list(self.value)
-        given = [math.nan if g is None else float(g) / scale for g in value]
-        if len(given) != dim or all(map(math.isnan, given)) or any(map(math.isinf, given)):
-            raise ValueError(f"value = {value} must be {dim} lengths [m]; write null where free")
-        where = nodes_in(self.region, basis, scale, origin)
-        return np.where(where[:, None], np.array(given), math.nan)
+        given = self.dimensionless(basis.mesh.dim(), units)
+        where = nodes_in(self.region, basis, units.length, origin)
+        return np.where(where[:, None], given, math.nan)
 
 
 @dataclass(frozen=True)
@@ -53,34 +61,45 @@ class RobinBC:
 
     Attributes:
         region: The boundary facets.
-        stiffness: alpha over Young's modulus [1/m], one number or one per direction. A foundation
-            with a given alpha [Pa/m] is therefore correct for one Young's modulus only.
+        stiffness: alpha [N/m^3], one number or one per direction.
     """
 
     region: Region
     stiffness: float | Sequence[float]
 
-    def on(self, basis: skfem.Basis, scale: float, origin: Origin = 0.0) -> "FoundationMatrix":
+    def dimensionless(self, dim: int, units: Units) -> NDArray[np.float64]:
+        """Return alpha L / E, (D,) [-].
+
+        Raises:
+            ValueError: `stiffness` is out of range, or the loads have a range of moduli.
+        """
+        words = f"stiffness = {self.stiffness}"
+        one = isinstance(self.stiffness, int | float)
+        stiffness = np.array([self.stiffness] * dim if one else self.stiffness, dtype=np.float64)
+        allowed = np.isfinite(stiffness).all() and (stiffness >= 0).all() and stiffness.any()
+        if stiffness.shape != (dim,) or not allowed:
+            raise ValueError(
+                f"{words} must be a positive number [N/m^3], or {dim} numbers from 0, one for each "
+                "direction and not all 0"
+            )
+        return units.stress_gradient(stiffness, words)
+
+    def on(self, basis: skfem.Basis, units: Units, origin: Origin = 0.0) -> "FoundationMatrix":
         """Return the stiffness matrix over E L^(D - 2); arguments as in `DirichletBC.on`.
 
         Raises:
-            ValueError: The region contains no boundary facet, or `stiffness` is out of range.
+            ValueError: The region contains no boundary facet, or `stiffness` is invalid, see
+                `dimensionless`.
         """
-        dim = basis.mesh.dim()
-        one = isinstance(self.stiffness, int | float)
-        stiffness = np.array([self.stiffness] * dim if one else self.stiffness, dtype=np.float64)
-        if stiffness.shape != (dim,) or not (stiffness >= 0).all() or not stiffness.any():
-            raise ValueError(
-                f"stiffness = {self.stiffness} must be a positive number [1/m], or {dim} of them"
-            )
-        facets = facets_in(self.region, basis.mesh, scale, origin)
+        stiffness = self.dimensionless(basis.mesh.dim(), units)
+        facets = facets_in(self.region, basis.mesh, units.length, origin)
         boundary = skfem.FacetBasis(basis.mesh, basis.elem, facets=facets, intorder=4)
         mass = skfem.BilinearForm(lambda u, v, _: u * v).assemble(boundary).tocoo()
         linked = np.abs(mass.data) > 1e-14 * np.abs(mass.data).max()
         return FoundationMatrix(
             torch.from_numpy(mass.row[linked].astype(np.int64)),
             torch.from_numpy(mass.col[linked].astype(np.int64)),
-            torch.from_numpy(np.outer(mass.data[linked], stiffness * scale)),
+            torch.from_numpy(np.outer(mass.data[linked], stiffness)),
         )
 
 
@@ -107,22 +126,22 @@ Support = DirichletBC | RobinBC
 
 def assemble_constraints(
     basis: skfem.Basis,
-    scale: float,
+    units: Units,
     supports: Sequence[Support],
     *,
     origin: Origin = 0.0,
     fixed: Region | NDArray[np.bool_] | None = None,
     prescribed: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], FoundationMatrix | None]:
-    """Return g / scale, (N, D) [-], NaN where free, and the matrix of the foundations.
+    """Return g / L, (N, D) [-], NaN where free, and the matrix of the foundations.
 
     Args:
-        basis: Scalar basis of a body, its coordinates divided by `scale`.
-        scale: L [m].
+        basis: Scalar basis of a body, its coordinates divided by L.
+        units: L and E.
         supports: Boundary conditions.
         origin: Origin of these coordinates, (D,) [-].
         fixed: Further fixed nodes, as a region or as a mask (N,) or (N, D).
-        prescribed: Displacement of `fixed` over `scale`, (N, D) [-]; default: zero.
+        prescribed: Displacement of `fixed` over L, (N, D) [-]; default: zero.
 
     Raises:
         ValueError: A region is empty, or a boundary condition does not fit the body.
@@ -130,15 +149,17 @@ def assemble_constraints(
     shape = basis.N, basis.mesh.dim()
     given = np.full(shape, np.nan)
     if fixed is not None:
-        where = fixed if isinstance(fixed, np.ndarray) else nodes_in(fixed, basis, scale, origin)
+        where = (
+            fixed if isinstance(fixed, np.ndarray) else nodes_in(fixed, basis, units.length, origin)
+        )
         if not where.any():
             raise ValueError(f"fixed = {fixed} must contain a node of the mesh")
         everywhere = np.broadcast_to(where[:, None] if where.ndim == 1 else where, shape)
         given = np.where(everywhere, 0.0 if prescribed is None else prescribed, np.nan)
     for support in supports:
         if isinstance(support, DirichletBC):
-            value = support.on(basis, scale, origin)
+            value = support.on(basis, units, origin)
             given = np.where(np.isnan(value), given, value)
-    springs = [s.on(basis, scale, origin) for s in supports if isinstance(s, RobinBC)]
+    springs = [s.on(basis, units, origin) for s in supports if isinstance(s, RobinBC)]
     total = FoundationMatrix(*map(torch.cat, zip(*springs, strict=True))) if springs else None
     return given, total

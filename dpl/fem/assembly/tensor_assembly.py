@@ -1,5 +1,6 @@
 """Energy, internal force and tangent of a body as batched tensor operations."""
 
+import math
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Self
@@ -17,6 +18,7 @@ from dpl.fem.assembly.rigid_body_modes import rigid_body_modes, unconstrained_mo
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.material import Material
 from dpl.fem.materials.tensors import green_lagrange, volume_change
+from dpl.fem.units import Units
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,8 @@ class TensorAssembly:
         boundary: Mask of the nodes on the boundary, (N,).
         springs: Elastic foundation (Robin conditions), or None.
         mean_dilatation: True if the points of a cell share its mean volume ratio (F-bar).
+        young: Young's modulus by which boundary values are divided [Pa]; None if there is no such
+            modulus, see `dpl.fem.units.Units`. No other quantity depends on it.
     """
 
     mesh: skfem.Mesh
@@ -58,6 +62,7 @@ class TensorAssembly:
     boundary: Tensor
     springs: FoundationMatrix | None = None
     mean_dilatation: bool = False
+    young: float | None = 1.0
 
     def to(self, device: torch.device | str) -> Self:
         """Return the same body with its tensors on a device."""
@@ -78,6 +83,27 @@ class TensorAssembly:
     def basis(self) -> skfem.Basis:
         """scikit-fem's basis of one displacement component."""
         return basis_of(self.mesh, self.degree)
+
+    @property
+    def units(self) -> Units:
+        """L and E, by which boundary values are divided."""
+        return Units(self.length, self.young)
+
+    def check_foundation_modulus(self, young: float) -> None:
+        """Check the Young's modulus [Pa] of a load on this body.
+
+        Elastic foundations have a fixed stiffness, so that their part in K(0) is that of one
+        modulus. Without foundations all moduli are allowed.
+
+        Raises:
+            ValueError: The modulus is not that of the foundations.
+        """
+        if self.springs is None or self.young is None or math.isclose(young, self.young):
+            return
+        raise ValueError(
+            f"young = {young:g} must be {self.young:g} [Pa], by which the stiffness of the elastic "
+            f"foundation is divided; build another body with young = {young:g}"
+        )
 
     @property
     def mesh_in_metres(self) -> skfem.Mesh:

@@ -95,7 +95,10 @@ class LoadFamily(Protocol):
         ...
 
     def identity(self) -> dict[str, Any]:
-        """Return the options that determine the loads, as plain data, without Young's moduli."""
+        """Return the options that determine the loads, as plain data, without Young's moduli.
+
+        Options in SI units are to be divided by E and L, on whose ratios the samples depend.
+        """
         ...
 
     def skipped_work(self) -> list[str]:

@@ -3,8 +3,9 @@
 What holds the body (clamps, springs) is in `dpl.fem.assembly.boundary_conditions`.
 """
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 import skfem
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from dpl.fem.mesh.regions import Region, facets_in
 from dpl.fem.problem import Problem
+from dpl.fem.units import vector
 
 Field = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # (D, ...) -> (D, ...)
 
@@ -24,46 +26,80 @@ class Traction:
 
     Attributes:
         region: Where.
-        value: Force per area over Young's modulus [-], D numbers.
+        value: Force per area [Pa], D numbers. On a problem with E = 1 Pa, the default of
+            `Problem.build`, this is the force per area over E.
     """
 
     region: Region
     value: Sequence[float]
 
     def on(self, problem: Problem) -> Tensor:
-        """Return the nodal forces (N, D) [-].
+        """Return the nodal forces (N, D) over E L^(D - 1) [-].
 
         Raises:
-            ValueError: The region holds no boundary facet, or `value` has not D numbers.
+            ValueError: The region holds no boundary facet, `value` has not D finite numbers, or the
+                problem has no modulus.
         """
-        return traction(problem, self.region, _constant(problem, self.value), problem.length)
+        value = vector("value", self.value, problem.shape[1], "Pa")
+        stress = problem.units.stress(value, f"value = {list(self.value)}")
+        return traction(problem, self.region, _constant(stress), problem.length)
 
 
 @dataclass(frozen=True)
 class BodyForce:
-    """Dead force per rest volume everywhere, the paper's f: weight, for one.
+    """Dead force per rest volume everywhere, the paper's f, for example weight.
+
+    It is given either by `value`, or by `acceleration` and `density`.
 
     Attributes:
-        value: Force per volume over Young's modulus [1/m], D numbers.
+        value: Force per volume [N/m^3], D numbers. On a problem with E = 1 Pa, the default of
+            `Problem.build`, this is the force per volume over E [1/m].
+        acceleration: Acceleration [m/s^2], D numbers.
+        density: Mass per rest volume [kg/m^3].
     """
 
-    value: Sequence[float]
+    value: Sequence[float] | None = None
+    _: KW_ONLY
+    acceleration: Sequence[float] | None = None
+    density: float | None = None
 
-    def on(self, problem: Problem) -> Tensor:
-        """Return the nodal forces (N, D) [-].
+    def __post_init__(self) -> None:
+        """Check that the force is given once.
 
         Raises:
-            ValueError: `value` has not D numbers.
+            ValueError: The force is given twice or not at all, or `density` is out of range.
         """
-        return problem.length * body_force(problem, _constant(problem, self.value))
+        remedy = "give value [N/m^3] alone, or acceleration [m/s^2] and density [kg/m^3]"
+        for name in ("acceleration", "density"):
+            given = getattr(self, name)
+            if (given is None) == (self.value is None):
+                condition = "be given" if given is None else "be left out where value is given"
+                raise ValueError(f"{name} = {given} must {condition}; {remedy}")
+        if self.density is not None and not 0 < self.density < math.inf:
+            raise ValueError(f"density = {self.density} must be a number above 0 [kg/m^3]")
+
+    def on(self, problem: Problem) -> Tensor:
+        """Return the nodal forces (N, D) over E L^(D - 1) [-].
+
+        Raises:
+            ValueError: `value` or `acceleration` has not D finite numbers, or the problem has no
+                modulus.
+        """
+        dim = problem.shape[1]
+        if self.value is not None:
+            words = f"value = {list(self.value)}"
+            density = vector("value", self.value, dim, "N/m^3")
+        else:
+            assert self.acceleration is not None
+            assert self.density is not None
+            words = f"acceleration = {list(self.acceleration)} times density = {self.density}"
+            density = self.density * vector("acceleration", self.acceleration, dim, "m/s^2")
+        return body_force(problem, _constant(problem.units.stress_gradient(density, words)))
 
 
-def _constant(problem: Problem, value: Sequence[float]) -> Field:
+def _constant(value: NDArray[np.float64]) -> Field:
     """Return the field that is `value` everywhere."""
-    dim = problem.shape[1]
-    if len(value) != dim or not np.isfinite(value).all():
-        raise ValueError(f"value = {list(value)} must be {dim} finite numbers")
-    return lambda x: np.multiply.outer(np.asarray(value, dtype=np.float64), np.ones(x.shape[1:]))
+    return lambda x: np.multiply.outer(value, np.ones(x.shape[1:]))
 
 
 def body_force(problem: Problem, density: Field) -> Tensor:

@@ -1,0 +1,85 @@
+"""Conversion of boundary values in SI units to dimensionless quantities."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Units(NamedTuple):
+    """Length and modulus by which the boundary values of a body are divided.
+
+    All conversions of displacements, tractions, body forces and foundations are methods of this
+    class. Those of nodal forces are `dpl.Scene.load_of` and `dpl.Scene.si_inputs`.
+
+    Attributes:
+        length: L, longest side of the body [m].
+        young: E, Young's modulus [Pa]. With 1 Pa, values in SI units are values over E. None if the
+            loads have a range of moduli: a stress is then not one dimensionless number.
+    """
+
+    length: float
+    young: float | None = 1.0
+
+    def displacement(self, value: float) -> float:
+        """Return a displacement [m] over L [-]."""
+        return value / self.length
+
+    def stress(self, value: NDArray[np.float64], words: str) -> NDArray[np.float64]:
+        """Return stresses [Pa] over E [-].
+
+        Args:
+            value: Stresses, of any shape.
+            words: The option and its value, for the message of an error.
+
+        Raises:
+            ValueError: The loads have a range of moduli.
+        """
+        return value / self._one_modulus(words)
+
+    def stress_gradient(self, value: NDArray[np.float64], words: str) -> NDArray[np.float64]:
+        """Return forces per volume, or stiffnesses of a foundation, [N/m^3] times L / E [-].
+
+        Arguments and errors are those of `stress`.
+        """
+        return value * self.length / self._one_modulus(words)
+
+    def _one_modulus(self, words: str) -> float:
+        if self.young is None:
+            raise ValueError(
+                f"{words} must be divided by one Young's modulus [Pa], and young is a range; "
+                "set young to one number"
+            )
+        return self.young
+
+
+def check_young(young: float | None) -> None:
+    """Check a modulus of `Units`.
+
+    Raises:
+        ValueError: The modulus is not a positive number.
+    """
+    if young is not None and not 0 < young < math.inf:
+        raise ValueError(f"young = {young} must be a number above 0 [Pa]")
+
+
+def vector(name: str, value: Sequence[float], dim: int, unit: str) -> NDArray[np.float64]:
+    """Return the components of a boundary value, (D,).
+
+    Args:
+        name: Name of the option, for the message of an error.
+        value: The components.
+        dim: D.
+        unit: Unit of the components, for the message of an error.
+
+    Raises:
+        ValueError: The components are not D finite numbers.
+    """
+    if len(value) != dim or not np.isfinite(value).all():
+        raise ValueError(
+            f"{name} = {list(value)} must be {dim} finite numbers [{unit}]; "
+            "give one for each direction"
+        )
+    return np.asarray(value, dtype=np.float64)
