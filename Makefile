@@ -1,4 +1,5 @@
-# make train: environment, installation and the main job on the small default scene.
+# make train: environment, installation and the main job: two models of the paper's beam, compared.
+# make demo:  a model of the paper's beam, fitted in half a minute, as a page in the browser.
 # make test:  installation and the checks that CI makes; WORKERS processes share the tests.
 # make mutants: changes of the source that no test notices; ARGS="dpl/training/metrics.py --sample 60".
 # make matrix: the tests under other processor features and thread numbers; see tests/matrix.py.
@@ -7,7 +8,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 WORKERS ?= 2
 
-.PHONY: setup train test lint slow matrix mutants docs wheel clean
+FIRST := runs/first_$(shell date +%Y-%m-%d_%H-%M-%S)
+BEAM := mesh=paper_beam data.val=50 data.test=50
+
+.PHONY: setup train demo test lint slow matrix mutants docs wheel clean
 
 setup: .venv/installed
 
@@ -17,7 +21,16 @@ setup: .venv/installed
 	touch $@
 
 train: setup
-	$(BIN)/python scripts/train.py $(ARGS)
+	$(BIN)/python scripts/train.py $(BEAM) data.train=400 model=unrolled run=$(FIRST)/unrolled $(ARGS)
+	$(BIN)/python scripts/train.py $(BEAM) data.train=400 model=fcnn model.width=512 loss=lr_star trainer.max_epochs=40 run=$(FIRST)/fcnn $(ARGS)
+	$(BIN)/python scripts/compare.py run=$(FIRST)
+
+demo: runs/demo/evaluation.json
+	$(BIN)/python scripts/view.py run=runs/demo
+
+runs/demo/evaluation.json: setup
+	rm -rf runs/demo
+	$(BIN)/python scripts/train.py $(BEAM) data.train=64 model=unrolled run=runs/demo
 
 test: lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m 'not slow and not gpu'

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -16,6 +16,8 @@ from dpl.fem.identity import plain, sha256_of
 from dpl.fem.solvers.solution import as_column
 
 CORRECTOR_STREAM = 6  # stream of the loads on which the corrector is chosen
+DESCRIPTION_STREAM = 7  # stream of the loads by which the load family is described
+FEW = 32  # loads of this stream
 CELLS = {  # scikit-fem's names of shapes and those of bodies, in the plural
     "Hexahedral": "hexahedra",
     "Tetrahedral": "tetrahedra",
@@ -188,23 +190,53 @@ class Scene:
         """
         return _differences(_plain(identity), _plain(self.identity()))
 
-    def body(self) -> str:
-        """Return a line on the body: its extent along the axes [m], nodes, cells, unknowns."""
-        problem = self.problem
+    def describe(self) -> list[tuple[str, str]]:
+        """Return names and values of the body, its supports, its law and its loads."""
+        problem, loads = self.problem, self.loads
         sides = (problem.points.amax(dim=0) - problem.points.amin(dim=0)) * self.length
         cells = CELLS[problem.mesh.elem.refdom.name]
-        return (
-            f"body: {' x '.join(f'{side:.4g}' for side in sides.tolist())} m, "
-            f"{problem.shape[0]:,} nodes, {len(problem.cells):,} {cells}, "
-            f"{problem.points.numel():,} degrees of freedom"
+        fixed = int((~problem.free).any(dim=1).sum())
+        moved = "moved" if problem.moved_supports else "fixed"
+        springs = "" if problem.springs is None else ", an elastic foundation"
+        law = (
+            problem.material if is_dataclass(problem.material) else type(problem.material).__name__
         )
+        force, displacement = self._largest_of_a_few()
+        unit = "N" if problem.shape[1] == 3 else "N/m"
+        return [
+            (
+                "body",
+                f"{' x '.join(f'{side:.4g}' for side in sides.tolist())} m, "
+                f"{problem.shape[0]:,} nodes, {len(problem.cells):,} {cells}, "
+                f"{problem.points.numel():,} degrees of freedom",
+            ),
+            ("supports", f"{fixed:,} nodes {moved}{springs}"),
+            ("law", f"{law}, {_modulus(loads.young_range)}"),
+            (
+                "loads",
+                f"{type(loads).__name__}; the largest of {FEW}: {force:.3g} {unit}, "
+                f"linear deflection {displacement:.3g} m",
+            ),
+        ]
+
+    def _largest_of_a_few(self) -> tuple[float, float]:
+        """Return the largest total force [N] of a few loads, and its linear deflection [m].
+
+        The total is the sum of the magnitudes of the nodal forces.
+        """
+        load = self.loads.sample((0, DESCRIPTION_STREAM), range(FEW))
+        totals = load.force.norm(dim=2).sum(dim=1)
+        k = int(totals.argmax())
+        parameters = load.parameters[k : k + 1]
+        deflection = self.linear.with_parameters(parameters).solve(load.force[k])
+        newtons = float(totals[k] * load.young[k]) * self.force_unit
+        return newtons, float(deflection.norm(dim=1).max()) * self.length
 
     def skipped_work(self) -> list[str]:
         """Return one line for each computation that this scene does not need."""
         problem, loads = self.problem, self.loads
         cells, points = len(problem.cells), problem.dV.shape[1]
-        low, high = loads.young_range
-        young = f"E = {low:.4g} Pa" if low == high else f"E from {low:.4g} to {high:.4g} Pa"
+        young = _modulus(loads.young_range)
         lines = [f"no E input, no samples per E: u/L depends on f/(E L^2) only ({young})"]
         for name, ends in loads.parameter_ranges.items():
             lines.append(
@@ -228,6 +260,12 @@ class Scene:
             )
         lines.append("no factorisation for loads whose linear answer meets the tolerance")
         return lines + loads.skipped_work()
+
+
+def _modulus(ends: tuple[float, float]) -> str:
+    """Return Young's modulus, or its range, as text."""
+    low, high = ends
+    return f"E = {low:.4g} Pa" if low == high else f"E from {low:.4g} to {high:.4g} Pa"
 
 
 def _plain(identity: Any) -> Any:

@@ -197,7 +197,7 @@ def test_a_part_of_a_user_is_trained_evaluated_viewed_and_exported(script, home,
     assert "trust=true" in refused.err
     run("evaluate", "run=runs/a", "trust=true")
     rows = {row["solver"] for row in json.loads((home / "runs/a/evaluation.json").read_text())}
-    assert "Newton from zero" in rows
+    assert "Newton, tol=1e-6" in rows
     outputs = "[model,results]" if part in EXPORTED else "[results]"
     run(
         "export",

@@ -77,8 +77,7 @@ def command(
 def readable_errors() -> Iterator[None]:
     """Turn errors of the configuration and of files into one line and exit status 2."""
     logging.getLogger("skfem").setLevel(logging.WARNING)
-    for name in ("lightning.pytorch", "lightning.fabric"):  # they print without it
-        logging.getLogger(name).propagate = False
+    _quieten_lightning()
     try:
         yield
     except (ConfigError, DataSetError) as error:
@@ -97,6 +96,16 @@ def readable_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def _quieten_lightning() -> None:
+    """Silence messages and warnings of Lightning that a user of a command cannot act on."""
+    for name in ("lightning.pytorch", "lightning.fabric"):  # they print without it
+        logging.getLogger(name).propagate = False
+    for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for message in (".*LeafSpec", "The number of training batches"):
+        warnings.filterwarnings("ignore", message)
 
 
 def _failed_access(error: BaseException | None) -> OSError | None:

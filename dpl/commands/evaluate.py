@@ -13,4 +13,4 @@ def main(cfg: DictConfig) -> None:
     """Print and write the errors and run times of a surrogate on its test set."""
     trained, surrogate = config.load_run(cfg.run, trust=cfg.trust)
     test = config.load_data(trained, surrogate.scene).samples("test")
-    evaluation.evaluate(surrogate, test, Path(cfg.run), tol=cfg.tol)
+    evaluation.evaluate(surrogate, test, Path(cfg.run), tols=cfg.tols)

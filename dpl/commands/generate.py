@@ -19,7 +19,7 @@ def parts(cfg: DictConfig) -> tuple["dpl.Scene", "dpl.DataSet"]:
 def main(cfg: DictConfig) -> None:
     """Generate the missing loads of a data set, or verify or repair it."""
     scene, data = parts(cfg)
-    config.show_skipped_work(scene, data)
+    config.show_plan(scene, data)
     if cfg.action == "verify":
         flaws = list(data.verify())
         print(data.store.summary())

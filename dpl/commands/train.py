@@ -79,7 +79,7 @@ def _train(cfg: DictConfig) -> float | None:
     session = training.LogHyperparameters(config.hyperparameters(cfg))
     trainer.callbacks.append(session)
     if trainer.is_global_zero:
-        config.show_skipped_work(scene, data, surrogate)
+        config.show_plan(scene, data, surrogate, folder=str(folder))
         if not trainer.fast_dev_run:
             config.save_config(cfg, folder)
     try:
@@ -87,6 +87,8 @@ def _train(cfg: DictConfig) -> float | None:
     except SystemExit as leaving:  # Lightning turns Ctrl-C into it
         if leaving.code == 128 + signal.SIGTERM:
             raise
+        if trainer.is_global_zero and session.begun:
+            print(f"to resume: {_script('train')} run={folder} ckpt_path=last", file=sys.stderr)
         raise KeyboardInterrupt from leaving
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         ours = isinstance(error, config.ConfigError | DataSetError | training.Diverged)
@@ -102,9 +104,27 @@ def _train(cfg: DictConfig) -> float | None:
         return None
     _, best = config.load_run(folder, trust=True, scene=scene)
     rows = evaluation.evaluate(best, config.load_data(cfg, scene).samples("test"), folder)
-    network = next(row for row in rows if row.solver == "network")
-    if not math.isfinite(network.errors["e_mean"]):
+    prediction = next(row for row in rows if row.solver == evaluation.PREDICTION)
+    if not math.isfinite(prediction.errors["e_mean"]):
         message = f"training has diverged: the answers of the network in {folder} are not finite; "
         raise training.Diverged(message + "lower optimizer.lr")
-    session.finish(trainer, network.errors)
+    session.finish(trainer, prediction.errors)
+    if HydraConfig.get().mode != RunMode.MULTIRUN:
+        show_next_commands(folder)
     return cli.best_error(trainer)
+
+
+def show_next_commands(folder: Path) -> None:
+    """Print the folder of a run and the commands that use it."""
+    print(f"\nwritten to {folder}; next:")
+    print(f"  {_script('view')} run={folder}      # drag the body in the browser")
+    print(f"  {_script('evaluate')} run={folder}  # the table above")
+    print(f"  tensorboard --logdir {folder}", flush=True)
+
+
+def _script(name: str) -> str:
+    """Return how a command is called: as a script of a checkout or as it is installed."""
+    own = Path(sys.argv[0])
+    if own.suffix == ".py":
+        return f"python {own.with_name(f'{name}.py')}"
+    return f"dpl-{name}"

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
         error_in,
         hyperparameters,
         instantiate,
-        show_skipped_work,
+        show_plan,
         to_container,
     )
     from dpl.config.resume import (
@@ -23,7 +23,13 @@ if TYPE_CHECKING:
         save_config,
         with_mesh_of_resumed,
     )
-    from dpl.config.run_folder import load_data, load_run, load_runs, training_loads
+    from dpl.config.run_folder import (
+        load_data,
+        load_run,
+        load_runs,
+        options_of_run,
+        training_loads,
+    )
     from dpl.config.validation import ConfigError, Keys
     from dpl.version import CONF
 else:

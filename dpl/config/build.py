@@ -6,6 +6,7 @@ Only this folder and `dpl.commands` import Hydra.
 import contextlib
 import functools
 import sys
+import textwrap
 import typing
 import warnings
 from collections.abc import Iterator
@@ -39,6 +40,7 @@ NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its re
     *("run", "folder", "ckpt_path", "data.folder"),
     *("callbacks", "logger", "paths", "extras", "trainer.plugins"),
 }
+WIDTH = 100  # characters of a line of the plan
 CANNOT_BE_MADE = (  # errors of a call with invalid arguments
     *(InstantiationException, ValueError, TypeError, ArithmeticError, LookupError),
     *(RuntimeError, MemoryError, OSError),
@@ -261,11 +263,23 @@ def build_trainer(cfg: DictConfig) -> "L.Trainer":
     )
 
 
-def show_skipped_work(scene: Scene, *parts: Any) -> None:
-    """Print the size of the body and the work that the scene and the parts of a run skip."""
-    lines = [line for part in (scene, *parts) for line in part.skipped_work()]
-    print(scene.body())
-    print("plan: skipped, because this scene does not need it")
-    print("\n".join(f"  - {line}" for line in lines), flush=True)
+def show_plan(scene: Scene, *parts: Any, folder: str | None = None) -> None:
+    """Print what a run computes, where it is written, and the work that it skips.
+
+    Args:
+        scene: The scene.
+        *parts: Further objects whose work is described, such as data and surrogate.
+        folder: Folder of the run.
+    """
+    described = [pair for part in (scene, *parts) for pair in getattr(part, "describe", list)()]
+    if folder is not None:
+        described.append(("run", folder))
+    for name, text in described:
+        print(f"{name:<9} {text}")
+    skipped = [line for part in (scene, *parts) for line in part.skipped_work()]
+    print("skipped, because this scene does not need it:")
+    for line in skipped:
+        print(textwrap.fill(line, WIDTH, initial_indent="  - ", subsequent_indent="    "))
+    sys.stdout.flush()
     if advice := slow_blas():
         print(f"warning: {advice}", file=sys.stderr)

@@ -18,6 +18,7 @@ from dpl.config.build import (
     build_scene,
     build_surrogate,
     check,
+    hyperparameters,
     instantiate,
     require_keys,
 )
@@ -61,6 +62,12 @@ def read_config(path: Path) -> dict[str, Any]:
         reason = " ".join(str(error).split())
         raise ConfigError(f"{path} is not the configuration of a run: {reason}") from error
     return found
+
+
+def options_of_run(folder: Path) -> dict[str, Any]:
+    """Return the hyperparameters of a run, see `hyperparameters`; none without configuration."""
+    path = folder / "config.yaml"
+    return hyperparameters(OmegaConf.create(read_config(path))) if path.is_file() else {}
 
 
 def load_run(

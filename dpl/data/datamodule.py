@@ -111,6 +111,10 @@ class OfflineData(L.LightningDataModule):
         constant = self.scene.loads.constant_force
         return symmetries(self.scene.problem, also=[] if constant is None else [constant])
 
+    def describe(self) -> list[tuple[str, str]]:
+        """Return the numbers of loads, and how many of them have to be solved."""
+        return self.dataset.describe()
+
     def skipped_work(self) -> list[str]:
         """Return one line for each kind of work that is not needed."""
         lines = self.dataset.skipped_work()

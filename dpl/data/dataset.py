@@ -88,6 +88,12 @@ class DataSet:
             for split, size in self.sizes.items()
         }
 
+    def describe(self) -> list[tuple[str, str]]:
+        """Return the numbers of loads, and how many of them have to be solved."""
+        sizes = ", ".join(f"{size:,} {split}" for split, size in self.sizes.items() if size)
+        missing = sum(len(self.store.missing(*split)) for split in self.sizes.items())
+        return [("data", f"loads: {sizes}; {missing:,} of them to be solved")]
+
     def skipped_work(self) -> list[str]:
         """Return one line for each kind of work that is not needed."""
         wanted = sum(self.sizes.values())

@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
+    from dpl.evaluation.comparison import compare
     from dpl.evaluation.methods import Method, corrected, pod_galerkin
-    from dpl.evaluation.report import compare, evaluate
+    from dpl.evaluation.report import PREDICTION, evaluate
     from dpl.evaluation.timing import Latency, latencies, latency
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

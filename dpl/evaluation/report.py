@@ -1,25 +1,27 @@
 """Errors, convergence and run times of solvers on the same test loads."""
 
 import json
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from dpl.evaluation.tables import show_cells
+from dpl.evaluation.tables import power, share, show_cells
 from dpl.evaluation.timing import Latency, describe, latencies, percentiles, time_interleaved
-from dpl.fem import LinearSolver, Newton, Problem, Solver, write_mesh
-from dpl.inference import Corrected, Direct, Hybrid, Simulator, default_hybrid
+from dpl.fem import LinearSolver, Load, Newton, Problem, Solution, Solver, Status, write_mesh
+from dpl.inference import Corrected, Direct, Hybrid, Simulator
 from dpl.models import HasCorrection
-from dpl.scene import Sample
+from dpl.scene import Sample, Scene
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2, Surrogate
-from dpl.training.metrics import default_metrics, median
+from dpl.training.metrics import default_metrics
 from dpl.visualization import plot_deformed
 
+PREDICTION = "prediction"  # name of the row of the bare model
+TOLS = (1e-3, 1e-6)  # relative residuals of simulator and Newton [-]
 LEAST_ERROR = 1e-12  # estimated error at which no step is made [-]
 
 
@@ -50,6 +52,16 @@ class SolverResult:
     latency: Mapping[str, Latency] = field(default_factory=dict)
 
 
+def simulator_row(tol: float) -> str:
+    """Return the name of the row of the simulator with a tolerance."""
+    return f"sim(force, tol={power(tol)})"
+
+
+def newton_row(tol: float) -> str:
+    """Return the name of the row of Newton's method from rest to a tolerance."""
+    return f"Newton, tol={power(tol)}"
+
+
 def measure(
     solvers: Mapping[str, Solver], batch: Sample, problem: Problem
 ) -> tuple[list[SolverResult], dict[str, Tensor]]:
@@ -70,54 +82,20 @@ def measure(
 
 
 def show(rows: Sequence[SolverResult], title: str) -> None:
-    """Print rows as a table."""
+    """Print the most important numbers of rows as a table."""
     columns = (
-        "solver", "e_mean", "e_max", "SNR min [dB]", "rel. L2 median", "max",
-        "||R||/||f||", "min det F", "converged", "iterations", "max", "p50 [ms]", "p99 [ms]",
+        "", "median error", "worst error", "e_mean", "residual", "converged", "iterations",
+        "ms p50", "ms p99",
     )  # fmt: skip
     cells = []
     for row in rows:
         e = row.errors
-        middle, worst = e["rel_L2_median"], e["rel_L2_worst"]
         cells.append([
-            row.solver, f"{e['e_mean']:.1e}", f"{e['e_max']:.1e}", f"{e['SNR_min']:.1f}",
-            f"{middle:.2%}" if middle > 1e-5 else f"{middle:.0e}",
-            f"{worst:.1%}" if worst > 1e-4 else f"{worst:.0e}",
-            f"{e['residual']:.1e}", f"{e['min_det_F']:.2f}", f"{row.converged}/{row.loads}",
-            f"{row.iterations:.1f}", f"{row.max_iterations}", f"{row.ms:.1f}", f"{row.ms_p99:.1f}",
+            row.solver, share(e["rel_L2_median"]), share(e["rel_L2_worst"]), f"{e['e_mean']:.1e}",
+            f"{e['residual']:.1e}", f"{row.converged}/{row.loads}", f"{row.iterations:.1f}",
+            f"{row.ms:.1f}", f"{row.ms_p99:.1f}",
         ])  # fmt: skip
     show_cells(title, columns, cells)
-
-
-def compare(folder: Path) -> None:
-    """Print the errors of the network and the hybrid of all evaluated runs below a folder.
-
-    Runs whose folder names differ only in `seed` form a group, for which medians are printed.
-
-    Raises:
-        FileNotFoundError: No run below the folder has been evaluated.
-    """
-    found = sorted(folder.rglob("evaluation.json"))
-    if not found:
-        raise FileNotFoundError(f"{folder} contains no evaluated run")
-    names = ("e_mean", "e_max", "SNR_min", "rel_L2_median", "rel_L2_worst", "residual")
-    runs: list[list[str]] = []
-    groups: dict[str, list[list[float]]] = {}
-    for path in found:
-        rows = {row["solver"]: row for row in json.loads(path.read_text())}
-        network, hybrid = rows["network"]["errors"], rows["hybrid Newton"]
-        ratio = hybrid["ms"] / rows["Newton from zero"]["ms"]
-        numbers = [*(network[name] for name in names), hybrid["iterations"], ratio]
-        name = str(path.parent.relative_to(folder))
-        runs.append([name, *(f"{number:.3g}" for number in numbers)])
-        groups.setdefault(re.sub(r",?seed=\d+,?", "", name), []).append(numbers)
-    medians = [
-        [f"median of {len(members)}: {name}"]
-        + [f"{number:.3g}" for number in median(torch.tensor(members)).tolist()]
-        for name, members in groups.items()
-    ]
-    columns = ("run", *names, "hybrid iterations", "hybrid ms / Newton ms")
-    show_cells(str(folder), columns, runs, medians)
 
 
 def save(rows: Sequence[SolverResult], path: Path) -> None:
@@ -126,44 +104,77 @@ def save(rows: Sequence[SolverResult], path: Path) -> None:
 
 
 def evaluate(
-    surrogate: Surrogate, test: Sample, folder: Path, *, tol: float = 1e-8
+    surrogate: Surrogate, test: Sample, folder: Path, *, tols: Sequence[float] = TOLS
 ) -> list[SolverResult]:
     """Evaluate a surrogate on test loads: print and save a table of solvers.
 
-    A model that `HasCorrection` has a row with one step of Newton's method in its modes.
-    Hybrid Newton has the rule of the paper and the default one. All solve one load at a time on one
-    thread. The latencies of `sim(force)` and of the bare network are measured as well. Writes
+    The rows are the linear solution, the prediction, for a model that `HasCorrection` the
+    prediction after one step of Newton's method in its modes, the paper's hybrid to the smallest
+    tolerance, and simulator and Newton's method to each tolerance. All solve one load at a time on
+    one thread. The latencies of `sim(force)` and of the bare network are measured as well. Writes
     `evaluation.json`, `shapes.png` and `worst.vtu`.
 
     Args:
         surrogate: A surrogate on the CPU.
         test: Loads with reference solutions.
         folder: Folder of the results.
-        tol: Relative residual of Newton and the hybrid [-].
+        tols: Relative residuals of simulator and Newton [-].
     """
-    scene = surrogate.scene
-    newton = replace(scene.newton, tol=tol)
-    # with ranges of the law every load has its own K(0); no solver reuses another's
-    shared = not scene.loads.parameter_ranges
-    own = scene if shared else replace(scene, solver=_without_factors(scene.newton))
-    plain = newton if shared else _without_factors(newton)
+    scene, simulator = surrogate.scene, Simulator(surrogate)
+    tight = min(tols)
     solvers: dict[str, Solver] = {
-        "linear": replace(newton.linear_solver, tol=tol),
-        "network": Direct(surrogate.predict, scene.problem, tol),
-        **_step_in_modes(surrogate, tol),
-        "hybrid Newton": Hybrid(surrogate.predict, plain, "paper"),
-        "hybrid, best rule": default_hybrid(surrogate.predict, own, tol),
-        "Newton from zero": newton,
+        "linear": replace(_own(scene).linear_solver, tol=tight),
+        PREDICTION: Direct(surrogate.predict, scene.problem, tight),
+        **_step_in_modes(surrogate, tight),
+        f"paper's hybrid, tol={power(tight)}": Hybrid(
+            surrogate.predict, replace(_own(scene), tol=tight), "paper"
+        ),
+        **{simulator_row(tol): _Simulated(simulator, tol) for tol in tols},
+        **{newton_row(tol): replace(_own(scene), tol=tol) for tol in tols},
     }
     with one_thread():
         rows, displacements = measure(solvers, test, scene.problem)
-    latency = latencies(Simulator(surrogate), test.load)
-    rows = [replace(row, latency=latency) if row.solver == "network" else row for row in rows]
-    show(rows, f"{len(test.force)} test loads, one at a time, 1 thread, tol {tol:g}")
+    latency = latencies(simulator, test.load)
+    rows = [replace(row, latency=latency) if row.solver == PREDICTION else row for row in rows]
+    show(rows, f"{len(test.force)} test loads, one at a time, 1 thread; errors are relative L2")
     print(describe(latency))
     save(rows, folder / "evaluation.json")
     _draw(surrogate, test, displacements, folder)
     return rows
+
+
+@dataclass(frozen=True)
+class _Simulated:
+    """The simulator with a tolerance, as a solver.
+
+    Attributes:
+        simulator: The simulator.
+        tol: Relative residual [-].
+    """
+
+    simulator: Simulator
+    tol: float
+
+    def iterate(self, load: Load) -> Iterator[Solution]:
+        """Yield the answer of the simulator."""
+        scene = self.simulator.scene
+        if scene.loads.parameter_ranges:  # each load has its own K(0), and each solver factorises
+            scene.linear.forget_clones()
+        inputs: dict[str, Any] = scene.si_inputs(load)
+        answer = self.simulator(**inputs, tol=self.tol)
+        count = torch.zeros_like(answer.iterations)
+        yield Solution(
+            displacement=answer.displacement / scene.length,
+            residual=answer.residual,
+            volume_ratio=answer.volume_ratio,
+            status=torch.where(answer.converged, int(Status.CONVERGED), int(Status.NOT_CONVERGED)),
+            negative_pivots=answer.negative_pivots,
+            iterations=answer.iterations,
+            factorisations=count,
+            load_factor=answer.converged.double(),
+            seconds=answer.milliseconds / 1e3,
+            from_guess=count.bool(),
+        )
 
 
 def _step_in_modes(surrogate: Surrogate, tol: float) -> dict[str, Solver]:
@@ -174,11 +185,14 @@ def _step_in_modes(surrogate: Surrogate, tol: float) -> dict[str, Solver]:
         return {}
     one = replace(newton, tol=tol, max_iter=1, error_tol=LEAST_ERROR)
     one.tangent  # noqa: B018  # built here, so that the first call is not slower
-    return {"network, 1 step in modes": Corrected(surrogate.predict, one)}
+    return {f"{PREDICTION}, 1 step": Corrected(surrogate.predict, one)}
 
 
-def _without_factors(newton: Newton) -> Newton:
-    """Return the solver with a linear solver of its own, which has no factor yet."""
+def _own(scene: Scene) -> Newton:
+    """Return Newton's method of a scene; with a factor of K(0) of its own if loads differ in it."""
+    newton = scene.newton
+    if not scene.loads.parameter_ranges:
+        return newton
     return replace(newton, linear_solver=LinearSolver(newton.problem, newton.tol, newton.linear))
 
 
@@ -186,7 +200,7 @@ def _draw(
     surrogate: Surrogate, test: Sample, displacements: Mapping[str, Tensor], folder: Path
 ) -> None:
     """Draw the loads with minimum, median and maximum error; write the last one as VTU."""
-    scene, network = surrogate.scene, displacements["network"]
+    scene, network = surrogate.scene, displacements[PREDICTION]
     error = RelativeL2().measure(network, test)
     order = error.argsort()
     chosen = order[[0, (len(order) - 1) // 2, -1]]  # of two middle loads the one with less error
@@ -194,14 +208,14 @@ def _draw(
         f"{name} load: relative L2 {error[k]:.2%}"
         for name, k in zip(("best", "median", "worst"), chosen, strict=True)
     ]
-    shown = [(name, displacements[name][chosen]) for name in ("network", "linear")]
+    shown = [(name, displacements[name][chosen]) for name in (PREDICTION, "linear")]
     figure = plot_deformed(scene.problem, test.displacement[chosen], shown, names=names)
     figure.savefig(folder / "shapes.png", dpi=150)
     worst = int(order[-1])
     length, truth, found = scene.length, test.displacement[worst], network[worst]
     fields = {
         "displacement [m]": length * truth,
-        "network [m]": length * found,
+        "prediction [m]": length * found,
         "error [m]": length * (found - truth).norm(dim=1),
         "force [N]": scene.si_inputs(test.load)["force"][worst],
     }

@@ -10,6 +10,7 @@ from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -34,15 +35,37 @@ def show(rows: Sequence[Any], title: str) -> None:
 
 
 def show_cells(title: str, columns: Sequence[str], *sections: Sequence[Sequence[str]]) -> None:
-    """Print rows of text with lines between sections; the first column is aligned to the left."""
-    table = Table(title=title, title_justify="left")
+    """Print rows of text with lines between sections; the first column is aligned to the left.
+
+    Words of a title stand below each other, so that columns are as narrow as their numbers.
+    """
+    table = Table(
+        title=title or None, title_justify="left", title_style="", box=box.SIMPLE_HEAD,
+        pad_edge=False, padding=(0, 1, 0, 0),
+    )  # fmt: skip
     for number, column in enumerate(columns):
-        table.add_column(column, justify="right" if number else "left")
+        words = column.replace(" ", "\n") if number else column
+        table.add_column(words, justify="right" if number else "left", no_wrap=True)
     for rows in sections:
         for row in rows:
             table.add_row(*row)
         table.add_section()
     Console(width=max(Console().width, 200)).print(table)
+
+
+def share(number: float) -> str:
+    """Return a relative number in percent with two digits, in powers of ten below 0.001 %."""
+    if not number >= 1e-5:
+        return f"{number:.0e}"
+    percent = 100 * number
+    digits = max(0, 1 - math.floor(math.log10(percent)))
+    return f"{percent:.{digits}f} %"
+
+
+def power(number: float) -> str:
+    """Return a number without zeros in its exponent, such as 1e-3 or 2.5e-8."""
+    mantissa, exponent = f"{number:e}".split("e")
+    return f"{float(mantissa):g}e{int(exponent)}"
 
 
 def write(rows: Sequence[Any], path: Path) -> None:

@@ -123,6 +123,18 @@ class Surrogate(L.LightningModule):
         displacement = output.double() * self.displacement_scale
         return torch.where(self.physics.problem.free, displacement, 0.0)
 
+    def describe(self) -> list[tuple[str, str]]:
+        """Return name and size of the network, and the loss."""
+        if self._is_closed_form:
+            return [("model", f"{type(self.net).__name__}, fitted by linear regression")]
+        count = sum(weights.numel() for weights in self.net.parameters())
+        return [
+            (
+                "model",
+                f"{type(self.net).__name__}, {count:,} weights; loss {type(self.loss).__name__}",
+            )
+        ]
+
     def skipped_work(self) -> list[str]:
         """Return the work that network and loss save, one line each."""
         lines = [*getattr(self.net, "skipped_work", list)(), *self.loss.skipped_work()]

@@ -191,7 +191,7 @@ def test_one_command_writes_rows_machine_and_figure(trained, script):
     assert machine["threads"] == 1
     assert (trained / "benchmarks" / "results" / "tiny.png").read_bytes().startswith(b"\x89PNG")
     rows = json.loads((trained / "runs" / "tiny" / "fcnn" / "evaluation.json").read_text())
-    (network,) = (row for row in rows if row["solver"] == "network")
+    (network,) = (row for row in rows if row["solver"] == "prediction")
     assert float(reported["fcnn"]["e_mean"]) == pytest.approx(network["errors"]["e_mean"], rel=1e-3)
 
 

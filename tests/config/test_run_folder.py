@@ -108,7 +108,7 @@ def test_what_cannot_work_is_refused_by_its_key(compose, override, tmp_path):
 
     def start():
         build.check(cfg)
-        build.show_skipped_work(build.build_scene(cfg))
+        build.show_plan(build.build_scene(cfg))
 
     with pytest.raises(ConfigError, match=BAD[override]) as refusal:
         start()

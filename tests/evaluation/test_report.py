@@ -1,7 +1,6 @@
 """Evaluation: counts, times, and files that are written."""
 
 import json
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,7 +11,8 @@ import pytest
 import torch
 
 from dpl import Sample
-from dpl.evaluation import compare, evaluate, timing
+from dpl.evaluation import compare, evaluate
+from dpl.evaluation.comparison import run_names, timing
 from dpl.evaluation.report import SolverResult, measure, save, show
 from dpl.fem import Load, Solution, evaluate_solution
 from dpl.models import FCNN
@@ -106,19 +106,27 @@ def test_saved_rows_can_be_read(scene, few, tmp_path):
 
 
 def test_runs_that_differ_in_the_seed_form_a_group(evaluated, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "100")
     rows, _ = evaluated
     for k, name in enumerate(("loss=mse,seed=0", "loss=mse,seed=1", "loss=lr_star,seed=0")):
         (tmp_path / name).mkdir()
-        network = replace(rows[1], errors={**rows[1].errors, "e_mean": 0.125 * (k + 1)})
-        save([rows[0], network, *rows[2:]], tmp_path / name / "evaluation.json")
+        prediction = replace(rows[1], errors={**rows[1].errors, "e_mean": 0.125 * (k + 1)})
+        save([rows[0], prediction, *rows[2:]], tmp_path / name / "evaluation.json")
     compare(tmp_path)
     lines = capsys.readouterr().out.splitlines()
     (one,) = [line for line in lines if "median of 2: loss=mse" in line]
-    (other,) = [line for line in lines if "median of 1: loss=lr_star" in line]
-    assert re.search(r"\b0\.188\b", one), "the mean of 0.125 and 0.25"
-    assert "0.375" in other
+    assert " 1.9e-01 " in one, "the mean of 0.125 and 0.25"
+    assert not [line for line in lines if "median of" in line and "lr_star" in line]
     assert sum("seed=" in line for line in lines) == 3
+
+
+def test_runs_of_other_names_are_named_by_the_options_that_differ(tmp_path):
+    for name, rate in (("a", 0.1), ("b", 0.2)):
+        (tmp_path / name).mkdir()
+        options = {"model": {"_target_": "dpl.models.FCNN", "width": 8}, "optimizer": {"lr": rate}}
+        (tmp_path / name / "config.yaml").write_text(json.dumps(options))
+    names = run_names(tmp_path, [tmp_path / "a", tmp_path / "b"])
+    assert names == ["a: optimizer.lr=0.1", "b: optimizer.lr=0.2"]
 
 
 def test_a_folder_without_evaluated_runs_raises_an_error(tmp_path):
@@ -148,10 +156,12 @@ def test_an_evaluation_has_four_rows_that_are_saved(evaluated):
     rows, folder = evaluated
     assert [row.solver for row in rows] == [
         "linear",
-        "network",
-        "hybrid Newton",
-        "hybrid, best rule",
-        "Newton from zero",
+        "prediction",
+        "paper's hybrid, tol=1e-6",
+        "sim(force, tol=1e-3)",
+        "sim(force, tol=1e-6)",
+        "Newton, tol=1e-3",
+        "Newton, tol=1e-6",
     ]
     saved = json.loads((folder / "evaluation.json").read_text())
     assert [row["errors"]["e_mean"] for row in saved] == [row.errors["e_mean"] for row in rows]
@@ -160,7 +170,7 @@ def test_an_evaluation_has_four_rows_that_are_saved(evaluated):
 def test_the_network_s_row_has_the_latency_of_the_simulator_and_of_the_bare_network(evaluated):
     folder = evaluated[1]
     for row in json.loads((folder / "evaluation.json").read_text()):
-        if row["solver"] != "network":
+        if row["solver"] != "prediction":
             assert row["latency"] == {}
             continue
         assert list(row["latency"]) == ["sim(force)", "bare network"]
@@ -169,19 +179,20 @@ def test_the_network_s_row_has_the_latency_of_the_simulator_and_of_the_bare_netw
             assert 0 < one["p50"] <= one["p99"]
 
 
-def test_hybrid_and_newton_answer_every_load(evaluated):
-    linear, network, *hybrids, newton = evaluated[0]
-    for hybrid in hybrids:
-        assert hybrid.converged == newton.converged == 4
-        assert hybrid.errors["residual"] < 1e-8
-        assert hybrid.errors["rel_L2_worst"] < 1e-6
-    assert network.iterations == 0
+def test_hybrid_simulator_and_newton_answer_every_load(evaluated):
+    linear, prediction, *others = evaluated[0]
+    for row in others:
+        tol = 1e-3 if "1e-3" in row.solver else 1e-6
+        assert row.converged == 4
+        assert row.errors["residual"] < tol
+        assert row.errors["rel_L2_worst"] < 100 * tol
+        assert row.iterations >= 2
+    assert prediction.iterations == 0
     assert linear.iterations == 1
-    assert newton.iterations >= 2
 
 
-def test_the_tolerance_of_an_evaluation_replaces_that_of_the_scene(surrogate, few, tmp_path):
-    rows = evaluate(surrogate, few, tmp_path, tol=1e-2)
+def test_the_tolerances_of_an_evaluation_replace_that_of_the_scene(surrogate, few, tmp_path):
+    rows = evaluate(surrogate, few, tmp_path, tols=[1e-2])
     newton = rows[-1]
     assert newton.converged == 4
     assert 1e-8 < newton.errors["residual"] < 1e-2
@@ -189,12 +200,13 @@ def test_the_tolerance_of_an_evaluation_replaces_that_of_the_scene(surrogate, fe
 
 
 def test_the_table_prints_every_row(surrogate, few, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "100")
     evaluate(surrogate, few, tmp_path)
     out = capsys.readouterr().out
-    assert "4 test loads, one at a time, 1 thread, tol 1e-08" in out
+    assert "4 test loads, one at a time, 1 thread" in out
+    assert max(len(line.rstrip()) for line in out.splitlines()) <= 100
     assert "latency, 1 thread, 4 loads: sim(force) p50 " in out
-    for words in ("linear", "network", "hybrid Newton", "Newton from zero", "4/4", "p99"):
+    for words in ("linear", "prediction", "paper's hybrid", "Newton, tol=1e-6", "4/4", "p99"):
         assert words in out
 
 
@@ -215,8 +227,8 @@ def test_the_worst_case_is_written_in_si_units(evaluated, surrogate, scene, few)
     assert case.cells_dict["hexahedron"].shape == (16, 8)
     truth = length * few.displacement[worst].numpy()
     assert fields["displacement [m]"] == pytest.approx(truth, abs=1e-9)
-    assert fields["network [m]"] == pytest.approx(length * network[worst].numpy(), abs=1e-5)
-    gap = np.linalg.norm(fields["network [m]"] - fields["displacement [m]"], axis=1)
+    assert fields["prediction [m]"] == pytest.approx(length * network[worst].numpy(), abs=1e-5)
+    gap = np.linalg.norm(fields["prediction [m]"] - fields["displacement [m]"], axis=1)
     assert fields["error [m]"] == pytest.approx(gap, abs=1e-9)
     newtons = few.force[worst].numpy() * 4500.0 * length**2
     assert fields["force [N]"] == pytest.approx(newtons, rel=1e-9, abs=1e-9)

@@ -76,7 +76,7 @@ def test_a_loaded_run_has_the_same_predictions(trained, home, monkeypatch):
         found = module.predict(test.load)
         assert torch.equal(found, again.predict(test.load))
     rows = json.loads((trained / "evaluation.json").read_text())
-    (network,) = (row for row in rows if row["solver"] == "network")
+    (network,) = (row for row in rows if row["solver"] == "prediction")
     error = (found - test.displacement).flatten(1)
     e_mean = float(error.norm(dim=1).mean()) / error.shape[1]
     assert network["errors"]["e_mean"] == pytest.approx(e_mean, rel=1e-5)

@@ -3,6 +3,11 @@
 import contextlib
 import copy
 import math
+import sys
+import threading
+from collections.abc import Iterator
+from functools import cache
+from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +99,8 @@ class Kernels:
         )
 
 
+PATIENCE = 2.0  # time after which a compilation is announced [s]
+COMPILING = "compiling element kernels for this law, once per machine: up to 30 s"
 _LOADED: set[tuple[Any, str]] = set()  # kernels and laws compiled or loaded by this process
 
 
@@ -114,9 +121,28 @@ def call_compiled(kernel: Any, law: Law, *arguments: Any) -> Any:
                 folder.mkdir(parents=True, exist_ok=True)
                 lock = stack.enter_context((folder / "kernels.lock").open("w"))
                 fcntl.flock(lock, fcntl.LOCK_EX)
+            if variant not in _LOADED and parent_process() is None:
+                stack.enter_context(_announced())
         result = kernel(law, *arguments)
     _LOADED.add(variant)
     return result
+
+
+@contextlib.contextmanager
+def _announced() -> Iterator[None]:
+    """Say on stderr that kernels are compiled if the block takes more than two seconds."""
+    timer = threading.Timer(PATIENCE, _announce)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@cache  # once in a process
+def _announce() -> None:
+    print(COMPILING, file=sys.stderr, flush=True)
 
 
 def _in_blocks(places: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -105,6 +105,10 @@ class LinearSolver:
             self._clones[problem] = replace(self, problem=problem, parent=self)
         return self._clones[problem]
 
+    def forget_clones(self) -> None:
+        """Drop the solvers of other parameters, so that their factors are computed again."""
+        self._clones.clear()
+
     @cached_property
     def _clones(self) -> "dict[Problem, LinearSolver]":
         return {}

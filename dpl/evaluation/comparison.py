@@ -1,0 +1,80 @@
+"""Table of evaluated runs, named by the options in which they differ."""
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dpl import config
+from dpl.evaluation.report import PREDICTION, TOLS, newton_row, simulator_row
+from dpl.evaluation.tables import power, share, show_cells
+from dpl.training.metrics import median
+
+MAX_NAME = 46  # characters of the name of a run
+ERRORS = ("rel_L2_median", "rel_L2_worst", "e_mean")
+
+
+def compare(folder: Path) -> None:
+    """Print errors and times of all evaluated runs below a folder.
+
+    Runs that differ only in `seed` form a group, for which medians are printed. The times are
+    those of `sim(force, tol=...)` over those of Newton's method from rest to the same residual.
+
+    Raises:
+        FileNotFoundError: No run below the folder has been evaluated.
+    """
+    found = sorted(folder.rglob("evaluation.json"))
+    if not found:
+        raise FileNotFoundError(f"{folder} contains no evaluated run")
+    names = run_names(folder, [path.parent for path in found])
+    runs: list[list[str]] = []
+    groups: dict[str, list[list[float]]] = {}
+    for path, name in zip(found, names, strict=True):
+        numbers = _numbers({row["solver"]: row for row in json.loads(path.read_text())})
+        runs.append([name, *_cells(numbers)])
+        groups.setdefault(re.sub(r",?\s*seed=\d+", "", name).strip(", "), []).append(numbers)
+    medians = [
+        [f"median of {len(members)}: {name}", *_cells(median(torch.tensor(members)).tolist())]
+        for name, members in groups.items()
+        if len(members) > 1
+    ]
+    times = [f"sim / Newton tol={power(tol)}" for tol in TOLS]
+    columns = (str(folder), "median error", "worst error", "e_mean", "sim(force) [ms]", *times)
+    show_cells("", columns, runs, *([medians] if medians else []))
+
+
+def _numbers(rows: Mapping[str, Any]) -> list[float]:
+    """Return the numbers of a run from the rows of its evaluation by solver; NaN if unknown."""
+    prediction = rows[PREDICTION]
+    latency = prediction["latency"].get("sim(force)", {}).get("p50", math.nan)
+    ratios = []
+    for tol in TOLS:
+        times = [rows.get(row(tol), {}).get("ms", math.nan) for row in (simulator_row, newton_row)]
+        ratios.append(times[0] / times[1])
+    return [*(prediction["errors"][name] for name in ERRORS), latency, *ratios]
+
+
+def _cells(numbers: list[float]) -> list[str]:
+    middle, worst, e_mean, *times = numbers
+    return [share(middle), share(worst), f"{e_mean:.1e}", *(f"{time:.2g}" for time in times)]
+
+
+def run_names(folder: Path, runs: list[Path]) -> list[str]:
+    """Return short names of runs: their folders, and the options in which they differ.
+
+    The folder of a job of a sweep names these options already.
+    """
+    names = [str(run.relative_to(folder)) if run != folder else run.name for run in runs]
+    if all("=" in name for name in names) or len(runs) < 2:
+        return names
+    options = [config.options_of_run(run) for run in runs]
+    shared = set.intersection(*(set(one) for one in options))
+    order = [key for key in options[0] if key in shared]
+    differ = [key for key in order if len({str(one[key]) for one in options}) > 1]
+    details = [", ".join(f"{key}={one[key]}" for key in differ) for one in options]
+    lines = [f"{name}: {more}" if more else name for name, more in zip(names, details, strict=True)]
+    return [line if len(line) <= MAX_NAME else line[: MAX_NAME - 3] + "..." for line in lines]
