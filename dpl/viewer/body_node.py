@@ -13,7 +13,7 @@ from dpl.viewer.renderer import N_BANDS, band_colours, colour_bands
 from dpl.viewer.supports import SUPPORT_COLOUR, SupportSymbols
 from dpl.viewer.surface import Floats, Ints, Surface, vertex_normals
 
-DARK, MIDDLE, GREY = (28, 32, 44), (92, 99, 115), (160, 166, 178)
+DARK, MIDDLE, GREY = (28, 32, 44), (92, 99, 115), (186, 191, 201)
 DRAG_MESH = "/drag"
 LIFT = 1e-3  # distance of edges from the surface over L, so that they are not hidden [-]
 OUTLINE_DISTANCE = 0.01  # displacement over L from which the undeformed outline is shown [-]

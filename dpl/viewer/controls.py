@@ -21,6 +21,7 @@ class Controls:
 
     Attributes:
         radius, direction, amplitude, unlimited, uniform: The patch load.
+        young: Slider of Young's modulus, in a unit with prefix; `modulus` is its value in Pa.
         parameters: Sliders of the parameters of the law with a range, by name.
         sample, reset, fit: Buttons for a random load, for no load and for the camera.
         method, budget, galerkin, quantity, edges, show_newton: Method and display.
@@ -51,7 +52,7 @@ class Controls:
             self.save = gui.add_button_group("save as", tuple(SUFFIXES))
         self.follows_frame = False
         self.of_load = (self.direction, self.amplitude, self.uniform, self.radius)
-        self.of_moduli = (self._young, *self.parameters.values())
+        self.of_moduli = (self.young, *self.parameters.values())
         shown = (self.quantity, self.edges, self.show_newton)
         self.of_settings = (self.method, self.budget, self.galerkin, *shown)
 
@@ -68,7 +69,7 @@ class Controls:
         self._young_unit = unit_for(body.young, "Pa")
         low, high = (value / self._young_unit.factor for value in body.young_range)
         label, middle = f"E [{self._young_unit.name}]", body.young / self._young_unit.factor
-        self._young = gui.add_slider(label, low, high, round_step(low, high), middle)
+        self.young = gui.add_slider(label, low, high, round_step(low, high), middle)
         self.parameters = {
             name: gui.add_slider(LABELS.get(name, name), *ends, round_step(*ends), value)
             for (name, ends), value in zip(
@@ -96,15 +97,15 @@ class Controls:
         self.fit = gui.add_button("Fit the view", color="gray")
 
     @property
-    def young(self) -> float:
+    def modulus(self) -> float:
         """Young's modulus of the slider [Pa]; an assigned value is limited to its range."""
-        value = self._young.value * self._young_unit.factor
+        value = self.young.value * self._young_unit.factor
         return float(np.clip(value, *self._body.young_range))
 
-    @young.setter
-    def young(self, value: float) -> None:
+    @modulus.setter
+    def modulus(self, value: float) -> None:
         within = float(np.clip(value, *self._body.young_range))
-        self._young.value = within / self._young_unit.factor
+        self.young.value = within / self._young_unit.factor
 
     def settings(self) -> ViewSettings:
         """Return method and quantity.

@@ -3,6 +3,7 @@
 import numpy as np
 import viser
 
+from dpl.viewer.camera import UP, Camera
 from dpl.viewer.layout import Layout
 from dpl.viewer.surface import Surface
 
@@ -45,3 +46,11 @@ def add_environment(server: viser.ViserServer, layout: Layout, surface: Surface)
     position = (*middle[:2], layout.ground)
     opacity = 0.0 if layout.planar else 0.6
     scene.add_grid("/ground", plane_opacity=opacity, position=position, **GROUND)
+
+
+def move_camera(client: viser.ClientHandle, camera: Camera) -> None:
+    """Move the camera of a browser."""
+    with client.atomic():
+        client.camera.up_direction = UP
+        client.camera.position = camera.position
+        client.camera.look_at = camera.look_at

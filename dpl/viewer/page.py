@@ -16,10 +16,9 @@ from torch import Tensor
 from dpl.viewer import panel
 from dpl.viewer.access import AccessPolicy, check_server, serve_with
 from dpl.viewer.body_node import BodyNode, LocalServer
-from dpl.viewer.camera import UP
 from dpl.viewer.controls import Controls
 from dpl.viewer.drag_loads import LoadRequest, Patch
-from dpl.viewer.environment import add_environment
+from dpl.viewer.environment import add_environment, move_camera
 from dpl.viewer.frames import Body, ColourScale, Frame
 from dpl.viewer.layout import Layout
 from dpl.viewer.load_marker import LoadMarker
@@ -182,7 +181,7 @@ class Page:
         """Apply a random load of the training distribution with its moduli."""
         self._n_samples += 1
         request = self.body.sample(self._n_samples)
-        self.controls.young = request.young
+        self.controls.modulus = request.young
         for name, value in request.parameters.items():
             self.controls.parameters[name].value = value
         self.controls.follows_frame = True
@@ -195,7 +194,7 @@ class Page:
         """Remove the load and restore the default Young's modulus."""
         self.controls.follows_frame = False
         self.controls.amplitude.value = 0.0
-        self.controls.young = self.body.young
+        self.controls.modulus = self.body.young
         self._submit(self.body.zero_load)
 
     def apply_settings(self, event: Any) -> None:
@@ -224,10 +223,7 @@ class Page:
             both=self.controls.show_newton.value,
             shown=None if self.frame is None else np.nan_to_num(self.frame.points),
         )
-        with client.atomic():
-            client.camera.up_direction = UP
-            client.camera.position = camera.position
-            client.camera.look_at = camera.look_at
+        move_camera(client, camera)
 
     def _toggle_recording(self, event: Any) -> None:
         (self.recording.stop if self.recording.running else self.recording.start)()
@@ -265,7 +261,7 @@ class Page:
         self._load = self._load if load is None else load
         sliders = self.controls.parameters
         parameters = {name: slider.value for name, slider in sliders.items()}
-        self.worker.submit(partial(self._load, self.controls.young, parameters))
+        self.worker.submit(partial(self._load, self.controls.modulus, parameters))
         self._mark_patch()
 
     def _mark_patch(self) -> None:

@@ -25,6 +25,7 @@ from dpl.viewer.units import scaled, unit_for
 COLOUR_MAPS = {"displacement": "viridis", "von Mises stress": "turbo", "error against FE": "magma"}
 INSETS = (0.03, 0.13, 0.05, 0.17)  # margins for legend (right) and captions (above) [-]
 MAX_FITTED = 100  # frames to which a camera is fitted
+SEAM, LINE = 0.5, 0.9  # width of the sides of triangles, which closes gaps, and of lines [point]
 N_BANDS = 12
 NEUTRAL = (188, 194, 204)  # colour of a body at rest
 GRAZING = -0.2  # smallest distance of the camera above a visible face, over L
@@ -130,15 +131,19 @@ class Renderer:
         depth = pixels[..., 2].mean(axis=1) - shifts
         faces_camera = (normals * (camera.position - corners[:, 0])).sum(axis=1) >= GRAZING
         order = np.lexsort((-depth, faces_camera))
+        widths = np.full(len(order), SEAM)
+        widths[len(colours) + len(grey) :] = LINE
         flat: Any = pixels[order, :, :2]
-        return PolyCollection(flat, facecolors=rgba[order], edgecolors="face", linewidths=0.5)
+        return PolyCollection(
+            flat, facecolors=rgba[order], edgecolors="face", linewidths=widths[order]
+        )
 
     def _shaded(self, soup: Floats, colours: NDArray[Any]) -> tuple[Floats, Floats, Floats]:
         """Return corners, normals and RGBA colours of triangles (3 n, 3) with colours (n, 3)."""
         normals = triangle_normals(soup, np.arange(len(soup)).reshape(-1, 3))
         to_camera = self.camera.position - self.camera.look_at
         light = to_camera / np.linalg.norm(to_camera) + np.array([-0.25, 0.1, 0.75])
-        brightness = 0.52 + 0.5 * np.abs(normals @ light) / np.linalg.norm(light)
+        brightness = 0.7 + 0.32 * np.abs(normals @ light) / np.linalg.norm(light)
         shades = np.clip(colours * brightness[:, None], 0, 255) / 255
         return soup.reshape(-1, 3, 3), normals, np.insert(shades, 3, 1.0, axis=1)
 
