@@ -1,5 +1,6 @@
 """Places of the bodies on the page, chosen so that they stay in view and do not overlap."""
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -72,19 +73,19 @@ class Layout:
 
 
 def largest_loads(body: Body, node: int, radius: float) -> Iterator[Frame]:
-    """Yield the frames of the largest loads of the training along the axes, in both directions.
+    """Yield the frames of the largest loads of the training along all axes and diagonals.
 
     Frames with displacements above `MAX_DEFLECTION` are left out, since an untrained network can
     predict any displacement.
     """
-    patch = body.patch(node, radius)
-    for axis in torch.eye(body.scene.problem.shape[1], dtype=torch.float64):
-        for direction in (axis, -axis):
-            request = body.request(patch.force_along(direction, 1.0))
-            frame = body.solve(request, ViewSettings())
-            size = np.abs(frame.points - body.surface.undeformed).max()
-            if size <= MAX_DEFLECTION:  # False for values that are not finite
-                yield frame
+    patch, dim = body.patch(node, radius), body.scene.problem.shape[1]
+    axes = np.concatenate([np.eye(dim), -np.eye(dim)])
+    diagonals = np.array(list(itertools.product((-1.0, 1.0), repeat=dim)))
+    for direction in torch.from_numpy(np.concatenate([axes, diagonals])):
+        frame = body.solve(body.request(patch.force_along(direction, 1.0)), ViewSettings())
+        size = np.abs(frame.points - body.surface.undeformed).max()
+        if size <= MAX_DEFLECTION:  # False for values that are not finite
+            yield frame
 
 
 def label_position(shown: Floats, rest: Floats, *, planar: bool) -> Floats:

@@ -6,7 +6,7 @@ import numpy as np
 
 from dpl.viewer.frames import QUANTITIES, Frame
 from dpl.viewer.renderer import N_BANDS, band_colours
-from dpl.viewer.units import engineering, scaled, unit_for
+from dpl.viewer.units import engineering, scaled, unit_of_scale
 
 GOOD, WARNING, BAD = "#15803d", "#b45309", "#b91c1c"
 ROW = (
@@ -69,7 +69,7 @@ def legend(frame: Frame, top: float) -> str:
     """
     if top <= 0:
         return ""
-    quantity, unit = frame.quantity, unit_for(top, QUANTITIES[frame.quantity])
+    quantity, unit = frame.quantity, unit_of_scale(top, QUANTITIES[frame.quantity])
     finite = frame.values[np.isfinite(frame.values)]
     low, high = (finite.min(), finite.max()) if len(finite) else (0.0, 0.0)
     cells = "".join(

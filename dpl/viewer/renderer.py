@@ -20,7 +20,7 @@ from dpl.viewer.frames import QUANTITIES, Frame
 from dpl.viewer.load_arrow import ARROW_COLOUR, arrow_ends
 from dpl.viewer.supports import SUPPORT_COLOUR, SupportSymbols
 from dpl.viewer.surface import Floats, Surface, contour_bands, triangle_normals, vertex_normals
-from dpl.viewer.units import scaled, unit_for
+from dpl.viewer.units import scaled, unit_of_scale
 
 COLOUR_MAPS = {"displacement": "viridis", "von Mises stress": "turbo", "error against FE": "magma"}
 INSETS = (0.03, 0.13, 0.05, 0.17)  # margins for legend (right) and captions (above) [-]
@@ -188,7 +188,7 @@ def _draw_legend(figure: Figure, quantity: str, top: float) -> None:
     bar = figure.add_axes((1 - 0.92 / width, 0.6 / height, 0.18 / width, 1 - 1.8 / height))
     bar.imshow(band_colours(quantity)[::-1, None], aspect="auto", extent=(0, 1, 0, N_BANDS))
     ticks = range(0, N_BANDS + 1, 3)
-    unit = unit_for(top, QUANTITIES[quantity])
+    unit = unit_of_scale(top, QUANTITIES[quantity])
     labels = [scaled(top * k / N_BANDS, unit.factor) for k in ticks]
     bar.set(xticks=[], yticks=ticks, yticklabels=labels, frame_on=False)
     bar.yaxis.tick_right()

@@ -30,6 +30,11 @@ def unit_for(value: float, unit: str) -> Unit:
     return Unit(PREFIXES[exponent] + unit, 1000.0**exponent)
 
 
+def unit_of_scale(top: float, unit: str) -> Unit:
+    """Return the unit for a scale from 0 to `top`, in which values below `top` lie above 1."""
+    return unit_for(0.99 * top, unit)
+
+
 def engineering(value: float, unit: str) -> str:
     """Return a value with three digits and its unit, such as "1.25 kN" for 1250 and "N"."""
     name, factor = unit_for(value, unit)

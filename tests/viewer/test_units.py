@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from dpl.viewer.units import engineering, round_step, scaled, unit_for
+from dpl.viewer.units import engineering, round_step, scaled, unit_for, unit_of_scale
 
 
 @pytest.mark.parametrize(
@@ -33,15 +33,19 @@ def test_the_prefix_is_a_power_of_a_thousand():
         assert name.endswith("Pa")
 
 
-def test_numbers_of_a_scale_share_its_unit():
-    unit = unit_for(1200.0, "Pa")
-    assert [scaled(1200.0 * k / 4, unit.factor) for k in range(5)] == [
-        "0",
-        "0.3",
-        "0.6",
-        "0.9",
-        "1.2",
-    ]
+@pytest.mark.parametrize(
+    ("top", "name", "ticks"),
+    [
+        (1200.0, "kPa", ["0", "0.3", "0.6", "0.9", "1.2"]),
+        (1000.0, "Pa", ["0", "250", "500", "750", "1000"]),
+        (400.0, "Pa", ["0", "100", "200", "300", "400"]),
+        (5e7, "MPa", ["0", "12.5", "25", "37.5", "50"]),
+    ],
+)
+def test_numbers_of_a_scale_share_its_unit(top, name, ticks):
+    unit = unit_of_scale(top, "Pa")
+    assert unit.name == name
+    assert [scaled(top * k / 4, unit.factor) for k in range(5)] == ticks
 
 
 @pytest.mark.parametrize("span", [(1125.0, 18000.0), (0.25, 4.0), (1.0, 203.0), (1.0, 1.001)])
