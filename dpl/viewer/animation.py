@@ -8,7 +8,7 @@ import torch
 
 from dpl.viewer.frames import STRESS, Body, Frame, ViewSettings
 from dpl.viewer.recording import FRAME_RATE, write_animation
-from dpl.viewer.renderer import Camera, Renderer
+from dpl.viewer.renderer import Renderer
 
 DURATION = 5  # [s]
 RADIUS = 0.45  # of the patch over L [-]
@@ -36,8 +36,7 @@ def animate_load(body: Body, path: Path, *, size: tuple[int, int] = (720, 405)) 
             f"displacement error {100 * error:.1g} %",
         ]
 
-    camera = Camera.facing(body.surface, distance=0.82)
-    write_animation(path, frames, Renderer(body.surface, camera, size), captions)
+    write_animation(path, frames, Renderer.fitting(body.surface, frames, size), captions)
 
 
 def circular_load(body: Body) -> list[Frame]:

@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 from viser import ViserServer
 
 from dpl.fem import HasModes
 from dpl.viewer import panel
 from dpl.viewer.frames import QUANTITIES, TOLERANCES, Body, Frame, ViewSettings
 from dpl.viewer.recording import MAX_FRAMES, SUFFIXES, Recording
+from dpl.viewer.units import round_step, unit_for
 
 LABELS = {"poisson": "Poisson's ratio"}  # of parameters
 NETWORK, BUDGET = "network", "best within the budget"
@@ -19,8 +21,9 @@ class Controls:
 
     Attributes:
         radius, direction, amplitude, unlimited, uniform: The patch load.
-        young, parameters: Young's modulus, and the parameters of the law with a range by name.
-        sample, reset: Buttons for a random load and for no load.
+        young: Slider of Young's modulus, in a unit with prefix; `modulus` is its value in Pa.
+        parameters: Sliders of the parameters of the law with a range, by name.
+        sample, reset, fit: Buttons for a random load, for no load and for the camera.
         method, budget, galerkin, quantity, edges, show_newton: Method and display.
         record, save: Buttons of the recording.
         of_load, of_moduli, of_settings: The widgets that change load, moduli or settings.
@@ -59,21 +62,22 @@ class Controls:
         gui.add_html(panel.message(about, "inherit"))
         span = loads.patch_radius if isinstance(loads, HasModes) else (0.0, 1.0)
         low, high = float(span[0]), max(float(span[1]), 0.05)
-        self.radius = gui.add_slider("patch radius / L", 0.0, high, 0.01, min(max(0.4, low), high))
-        upwards = (0.0, 1.0 if body.scene.problem.shape[1] == 2 else 0.0, 1.0)
+        self.radius = gui.add_slider("radius / L", 0.0, high, 0.01, min(max(0.4, low), high))
+        upwards = (0.0, 1.0, 0.0) if body.scene.problem.shape[1] == 2 else (0.0, 0.0, 1.0)
         self.direction = gui.add_vector3("direction", upwards, step=0.1)
         self.amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
-        low, high = body.young_range
-        step = (high - low or high) / 500  # low = high on an elastic foundation
-        self.young = gui.add_slider("E [Pa]", low, high, step, body.young)
+        self._young_unit = unit_for(body.young, "Pa")
+        low, high = (value / self._young_unit.factor for value in body.young_range)
+        label, middle = f"E [{self._young_unit.name}]", body.young / self._young_unit.factor
+        self.young = gui.add_slider(label, low, high, round_step(low, high), middle)
         self.parameters = {
-            name: gui.add_slider(LABELS.get(name, name), *ends, (ends[1] - ends[0]) / 200, value)
+            name: gui.add_slider(LABELS.get(name, name), *ends, round_step(*ends), value)
             for (name, ends), value in zip(
                 loads.parameter_ranges.items(), body.parameters.values(), strict=True
             )
         }
         hint = "let a drag exceed the largest load of the training"
-        self.unlimited = gui.add_checkbox("no amplitude limit", False, hint=hint)
+        self.unlimited = gui.add_checkbox("no limit", False, hint=hint)
         hint = "equal forces on all nodes of the patch, outside the training range"
         self.uniform = gui.add_checkbox("uniform force", False, hint=hint)
         self.sample = gui.add_button("Random training load")
@@ -88,8 +92,20 @@ class Controls:
             "Galerkin correction", galerkin, visible=galerkin, hint=hint
         )
         self.quantity = gui.add_dropdown("colours", tuple(QUANTITIES))
-        self.edges = gui.add_checkbox("mesh edges", True)
+        self.edges = gui.add_checkbox("mesh edges", False)
         self.show_newton = gui.add_checkbox("compare Newton", False)
+        self.fit = gui.add_button("Fit the view", color="gray")
+
+    @property
+    def modulus(self) -> float:
+        """Young's modulus of the slider [Pa]; an assigned value is limited to its range."""
+        value = self.young.value * self._young_unit.factor
+        return float(np.clip(value, *self._body.young_range))
+
+    @modulus.setter
+    def modulus(self, value: float) -> None:
+        within = float(np.clip(value, *self._body.young_range))
+        self.young.value = within / self._young_unit.factor
 
     def settings(self) -> ViewSettings:
         """Return method and quantity.
@@ -106,9 +122,12 @@ class Controls:
             bool(self.show_newton.value),
         )
 
-    def show_frame(self, frame: Frame, top: float, frame_rate: float) -> None:
-        """Update result, legend and, if a drag determined the load, the amplitude."""
-        self._result.content = panel.result_table(frame, frame_rate)
+    def show_frame(self, frame: Frame, top: float, frame_rate: float, node: int) -> None:
+        """Update result, legend and, if a drag determined the load, the amplitude.
+
+        `node` is the node whose displacement is shown.
+        """
+        self._result.content = panel.result_table(frame, frame_rate, node)
         self._legend.content = panel.legend(frame, top)
         if self.follows_frame and frame.answer is not None:
             limit = float(self.amplitude.max)

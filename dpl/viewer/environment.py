@@ -3,7 +3,8 @@
 import numpy as np
 import viser
 
-from dpl.viewer.renderer import Camera
+from dpl.viewer.camera import UP, Camera
+from dpl.viewer.layout import Layout
 from dpl.viewer.surface import Surface
 
 THEME = {"show_logo": False, "show_share_button": False, "control_width": "large"}
@@ -20,8 +21,9 @@ GROUND = {
 }
 
 
-def add_environment(server: viser.ViserServer, camera: Camera, surface: Surface) -> None:
+def add_environment(server: viser.ViserServer, layout: Layout, surface: Surface) -> None:
     """Set theme and initial camera, and add lights and ground; a body in 2D lies in the ground."""
+    camera = layout.camera()
     server.gui.configure_theme(brand_color=(37, 99, 235), **THEME)
     server.gui.main_panel.dock_right()
     server.gui.main_panel.set_width(370)
@@ -29,19 +31,26 @@ def add_environment(server: viser.ViserServer, camera: Camera, surface: Surface)
     server.initial_camera.look_at = camera.look_at
     server.initial_camera.fov = camera.field_of_view
     scene, points = server.scene, surface.undeformed
-    low, high = points.min(axis=0), points.max(axis=0)
-    middle, planar = (low + high) / 2, surface.problem.shape[1] == 2
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
     scene.configure_environment_map(None)
     scene.configure_default_lights(False)
     scene.add_light_ambient("/ambient", intensity=1.9)
     for name, direction, intensity in (
-        ("/sun", np.array([-0.3, 0.25, 1.0]), 1.5),
-        ("/headlight", camera.position - camera.look_at, 1.4),
+        ("/sun", np.array([-0.3, 0.25, 1.0]), 0.2 if layout.planar else 1.0),
+        ("/headlight", camera.position - camera.look_at, 1.0),
     ):
         position, shadow = middle + 4 * direction / np.linalg.norm(direction), name == "/sun"
         scene.add_light_directional(
             name, intensity=intensity, position=position, cast_shadow=shadow
         )
-    opacity, below = (0.0, 0.01) if planar else (0.6, 0.45)
-    position = (*middle[:2], float(low[2]) - below)
+    position = (*middle[:2], layout.ground)
+    opacity = 0.0 if layout.planar else 0.6
     scene.add_grid("/ground", plane_opacity=opacity, position=position, **GROUND)
+
+
+def move_camera(client: viser.ClientHandle, camera: Camera) -> None:
+    """Move the camera of a browser."""
+    with client.atomic():
+        client.camera.up_direction = UP
+        client.camera.position = camera.position
+        client.camera.look_at = camera.look_at

@@ -18,7 +18,7 @@ from dpl.viewer.drag_loads import LoadRequest, Patch
 from dpl.viewer.surface import Floats, Surface
 
 STRESS, ERROR = "von Mises stress", "error against FE"
-QUANTITIES = {"displacement": "m", STRESS: "Pa", ERROR: "m"}
+QUANTITIES = {"displacement": "m", STRESS: "Pa", ERROR: "m"}  # units without prefix
 TOLERANCES = (1e-3, 1e-6, 1e-8)  # relative residuals that the page offers
 YOUNG_FACTOR = 4.0  # range of E on the page, down and up, if the scene has a single value
 SAMPLE_STREAM = (0, 11)  # random stream of the loads that the page draws
@@ -209,10 +209,12 @@ class Body:
         """Return the frame of displacements (N, D) [m]; values are relative to `reference`."""
         u = displacement / self.scene.length
         answer = result if isinstance(result, Answer) else None
-        if quantity == STRESS:
+        if quantity == STRESS and bool(displacement.any()):  # at rest it is zero up to rounding
             with torch.inference_mode():
                 stress = self.surface.von_mises(u, self.load(request).parameters)
             values = request.young * stress
+        elif quantity == STRESS:
+            values = np.zeros(len(self.surface.nodes))
         else:
             values = (displacement - reference).norm(dim=1).numpy()[self.surface.nodes]
         return Frame(

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import viser
 from torch import Tensor
 
 from dpl.viewer import panel
@@ -17,16 +18,15 @@ from dpl.viewer.access import AccessPolicy, check_server, serve_with
 from dpl.viewer.body_node import BodyNode, LocalServer
 from dpl.viewer.controls import Controls
 from dpl.viewer.drag_loads import LoadRequest, Patch
-from dpl.viewer.environment import add_environment
+from dpl.viewer.environment import add_environment, move_camera
 from dpl.viewer.frames import Body, ColourScale, Frame
+from dpl.viewer.layout import Layout
 from dpl.viewer.load_marker import LoadMarker
 from dpl.viewer.recording import SUFFIXES, Recording
-from dpl.viewer.renderer import Camera, Renderer
 from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
 Load = Callable[[float, Mapping[str, float]], LoadRequest]  # E [Pa], parameters -> request
-DISTANCE, DISTANCE_OF_TWO = 0.8, 1.25  # factors on the distance of the camera
 PICK_RADIUS = 0.02  # distance of a ray to the points that it may pick, beyond the nearest, over L
 
 
@@ -37,7 +37,7 @@ class Page:
         body: The body.
         worker: Thread that solves.
         server: viser server.
-        camera: Initial camera of a browser.
+        layout: Places of the bodies and cameras that show them.
         controls: Widgets of the panel.
         recording: Recording of the shown frames.
         folder: Folder of recordings.
@@ -69,8 +69,9 @@ class Page:
         except BaseException:
             self.close()
             raise
-        self._build_scene()
         self.controls = Controls(self.server, body, title, folder)
+        self.layout = Layout.of(body, self.node, self.controls.radius.value)
+        self._build_scene()
         self._connect()
         self._mark_patch()
         self.worker.start()
@@ -88,18 +89,14 @@ class Page:
 
     def _build_scene(self) -> None:
         server, surface = self.server, self.body.surface
-        points = surface.undeformed
-        low, high = points.min(axis=0), points.max(axis=0)
-        self.camera = Camera.facing(surface, distance=DISTANCE)
-        add_environment(server, self.camera, surface)
-        self._body_node = BodyNode(server, "/body", surface, draggable=True)
-        self._newton_node = BodyNode(server, "/newton", surface, draggable=False)
-        self._newton_offset = np.array([0.0, float(high[1] - low[1]) + 0.7, 0.0])
-        self._newton_node.frame.position = self._newton_offset
+        add_environment(server, self.layout, surface)
+        self._body_node = BodyNode(server, "/body", surface, "selected method", draggable=True)
+        self._body_node.label.visible = False
+        self._newton_node = BodyNode(
+            server, "/newton", surface, "Newton from zero", draggable=False
+        )
+        self._newton_node.frame.position = self.layout.offset
         self._newton_node.frame.visible = False
-        corner, add_label = (low[0], low[1], high[2] + 0.12), server.scene.add_label
-        add_label("/newton/label", "Newton from zero", position=corner)
-        self._label = add_label("/body/label", "selected method", position=corner, visible=False)
         self._marker = LoadMarker(server, surface)
 
     def _connect(self) -> None:
@@ -118,8 +115,10 @@ class Page:
         for button, callback in (
             *((controls.sample, self.sample), (controls.reset, self.reset)),
             *((controls.record, self._toggle_recording), (controls.save, self._save)),
+            (controls.fit, self.fit),
         ):
             button.on_click(catch(callback))
+        self.server.on_client_connect(catch(self._fit_client))
 
     # --- events of the browser
 
@@ -182,18 +181,20 @@ class Page:
         """Apply a random load of the training distribution with its moduli."""
         self._n_samples += 1
         request = self.body.sample(self._n_samples)
-        self.controls.young.value = float(np.clip(request.young, *self.body.young_range))
+        self.controls.modulus = request.young
         for name, value in request.parameters.items():
             self.controls.parameters[name].value = value
         self.controls.follows_frame = True
+        loaded = request.force.any(dim=1).numpy()[self.body.surface.nodes]
+        self.node = self.body.surface.middle_node(loaded)
         self._submit(lambda young, given: request._replace(young=young, parameters=given))
-        self._marker.mask = request.force.any(dim=1).numpy()[self.body.surface.nodes]
+        self._marker.mask = loaded
 
     def reset(self, event: Any) -> None:
         """Remove the load and restore the default Young's modulus."""
         self.controls.follows_frame = False
         self.controls.amplitude.value = 0.0
-        self.controls.young.value = self.body.young
+        self.controls.modulus = self.body.young
         self._submit(self.body.zero_load)
 
     def apply_settings(self, event: Any) -> None:
@@ -207,13 +208,22 @@ class Page:
 
     def _show_second_body(self, visible: bool) -> None:
         """Show or hide the body of Newton, and move the cameras."""
-        self._newton_node.frame.visible = self._label.visible = visible
-        offset = self._newton_offset / 2 if visible else np.zeros(3)
-        distance = DISTANCE_OF_TWO if visible else DISTANCE
-        camera = Camera.facing(self.body.surface, distance=distance)
+        self._newton_node.frame.visible = self._body_node.label.visible = visible
+        self.fit(None)
+
+    def fit(self, event: Any) -> None:
+        """Move the cameras of all browsers so that they show all that is shown."""
         for client in self.server.get_clients().values():
-            client.camera.position = camera.position + offset
-            client.camera.look_at = camera.look_at + offset
+            self._fit_client(client)
+
+    def _fit_client(self, client: viser.ClientHandle) -> None:
+        """Move the camera of a browser so that it shows all that is shown."""
+        camera = self.layout.camera(
+            aspect=client.camera.aspect,
+            both=self.controls.show_newton.value,
+            shown=None if self.frame is None else np.nan_to_num(self.frame.points),
+        )
+        move_camera(client, camera)
 
     def _toggle_recording(self, event: Any) -> None:
         (self.recording.stop if self.recording.running else self.recording.start)()
@@ -228,8 +238,7 @@ class Page:
             if suffix == ".pvd":
                 path = self.recording.save_series(self.folder)
             else:
-                renderer = Renderer(self.body.surface, Camera.facing(self.body.surface))
-                path = self.recording.save_animation(self.folder, renderer, suffix)
+                path = self.recording.save_animation(self.folder, suffix)
                 if event.client is not None:
                     event.client.send_file_download(path.name, path.read_bytes())
             self.controls.show_state(f"Written: {path}", panel.GOOD)
@@ -252,7 +261,7 @@ class Page:
         self._load = self._load if load is None else load
         sliders = self.controls.parameters
         parameters = {name: slider.value for name, slider in sliders.items()}
-        self.worker.submit(partial(self._load, self.controls.young.value, parameters))
+        self.worker.submit(partial(self._load, self.controls.modulus, parameters))
         self._mark_patch()
 
     def _mark_patch(self) -> None:
@@ -284,7 +293,7 @@ class Page:
         if not self._changed or self.frame is None:
             return
         self._changed = False
-        self.controls.show_frame(self.frame, self._scale.top, self.worker.frame_rate)
+        self.controls.show_frame(self.frame, self._scale.top, self.worker.frame_rate, self.node)
         self.controls.show_newton_frame(self.newton_frame, self.worker.settings.show_newton)
         self.controls.show_error(self._error)
         self.controls.show_recording(self.recording)

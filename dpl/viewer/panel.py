@@ -6,6 +6,7 @@ import numpy as np
 
 from dpl.viewer.frames import QUANTITIES, Frame
 from dpl.viewer.renderer import N_BANDS, band_colours
+from dpl.viewer.units import engineering, scaled, unit_of_scale
 
 GOOD, WARNING, BAD = "#15803d", "#b45309", "#b91c1c"
 ROW = (
@@ -16,21 +17,32 @@ ROW = (
 BOX = '<div style="padding:2px 12px 6px;font-size:13.5px">{}</div>'
 
 
-def result_table(frame: Frame, frame_rate: float) -> str:
-    """Return method, time, residual, range check and summary of a result of the simulator."""
+def result_table(frame: Frame, frame_rate: float, node: int) -> str:
+    """Return load, method, time, residual, range check and summary of a result of the simulator.
+
+    `node` is the node whose displacement is shown, the centre of the patch.
+    """
     answer = frame.answer
     assert answer is not None
     colour = GOOD if frame.converged else WARNING if frame.volume_ratio > 0 else BAD
     outside = answer.out_of_distribution
     span = f"{'outside' if outside else 'inside'}, amplitude {answer.amplitude:.2f}"
+    force = frame.request.force
+    total = engineering(float(force.sum(dim=0).norm()), "N" if force.shape[1] == 3 else "N/m")
+    moved = engineering(float(frame.displacement[node].norm()), "m")
     rows = [
+        _row("total force", total, "font-weight:600"),
+        _row("displacement at the hand", moved, "font-weight:600"),
         _row("computed by", str(answer.method), "font-weight:600"),
-        _row("time", f"{answer.milliseconds:.1f} ms", "font-weight:600"),
-        _row("residual ‖R‖/‖f‖", f"{frame.residual:.1e}", f"color:{colour}"),
+        _row("time", f"{answer.milliseconds:.1f} ms, {frame_rate:.0f} fps"),
+        _row(
+            "residual ‖R‖/‖f‖",
+            f"{frame.residual:.1e}" if frame.residual else "0",
+            f"color:{colour}",
+        ),
         _row("min det F", f"{frame.volume_ratio:.3f}"),
         _row("linear solves", f"{answer.iterations}"),
         _row("training range", span, f"color:{BAD if outside else GOOD}"),
-        _row("frames per second", f"{frame_rate:.0f}"),
         f'<div style="margin-top:6px;padding:6px 9px;border-radius:6px;border-left:3px solid '
         f'{colour};background:{colour}14;line-height:1.35">{html.escape(answer.summary)}</div>',
     ]
@@ -53,20 +65,22 @@ def newton_table(frame: Frame | None) -> str:
 def legend(frame: Frame, top: float) -> str:
     """Return the colour bar, which ends at `top`, and the range of the values on the surface.
 
-    A bar that ends at 0 has no numbers, as all values are zero.
+    The result is empty if the bar would end at 0: all values are zero and the body is neutral.
     """
-    quantity, unit = frame.quantity, QUANTITIES[frame.quantity]
+    if top <= 0:
+        return ""
+    quantity, unit = frame.quantity, unit_of_scale(top, QUANTITIES[frame.quantity])
     finite = frame.values[np.isfinite(frame.values)]
     low, high = (finite.min(), finite.max()) if len(finite) else (0.0, 0.0)
     cells = "".join(
         f'<span style="flex:1;background:rgb({r},{g},{b})"></span>'
         for r, g, b in band_colours(quantity).tolist()
     )
-    ticks = "".join(f"<span>{top * k / 4:.3g}</span>" for k in range(5)) if top > 0 else ""
-    span = f"{low:.3g} to {high:.3g} {unit}" if top > 0 else f"0 {unit} everywhere"
+    ticks = "".join(f"<span>{scaled(top * k / 4, unit.factor)}</span>" for k in range(5))
+    span = f"{scaled(low, unit.factor)} to {scaled(high, unit.factor)} {unit.name}"
     return BOX.format(
         f'<div style="display:flex;justify-content:space-between;margin-bottom:4px">'
-        f"<b>{html.escape(quantity)} [{unit}]</b>"
+        f"<b>{html.escape(f'{quantity} [{unit.name}]')}</b>"
         f'<span style="opacity:.62">{N_BANDS} bands</span></div>'
         f'<div style="display:flex;height:14px;border-radius:3px;overflow:hidden">{cells}</div>'
         f'<div style="display:flex;justify-content:space-between;font-size:11.5px;opacity:.75">'

@@ -16,7 +16,8 @@ from dpl.fem import write_mesh
 from dpl.fem.mesh import write_collection
 from dpl.system.files import atomic_write
 from dpl.viewer.frames import Body, ColourScale, Frame
-from dpl.viewer.renderer import BACKGROUND, TEXT, Renderer, band_colours
+from dpl.viewer.load_arrow import ARROW_COLOUR
+from dpl.viewer.renderer import BACKGROUND, NEUTRAL, TEXT, Renderer, band_colours
 
 MAX_FRAMES = 900  # frames of a recording, 30 s at 30 frames per second
 FRAME_RATE = 20  # frames per second of an animation
@@ -83,14 +84,18 @@ class Recording:
         write_collection(path, files)
         return path
 
-    def save_animation(self, folder: Path, renderer: Renderer, suffix: str) -> Path:
+    def save_animation(self, folder: Path, suffix: str, size: tuple[int, int] = (960, 540)) -> Path:
         """Write an animation in real time, ".gif" or ".mp4", and return its path.
+
+        The camera shows the body in all frames; `size` is width and height [pixel].
 
         Raises:
             ValueError: The recording is empty, or the format is unknown.
         """
         path = self._free_path(folder, suffix)
-        write_animation(path, resample(self.frames()), renderer, default_captions)
+        frames = resample(self.frames())
+        renderer = Renderer.fitting(self.body.surface, frames, size)
+        write_animation(path, frames, renderer, default_captions)
         return path
 
     def _free_path(self, folder: Path, suffix: str) -> Path:
@@ -177,14 +182,17 @@ def _write_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int])
 
 
 def _palette(quantities: set[str]) -> Image.Image:
-    """Return one palette for all images: shades of the band colours, and greys.
+    """Return one palette for all images: shades of the band colours, of the arrow and of grey.
 
     With a common palette, unchanged pixels take no space and do not flicker.
     """
     shades = np.linspace(0.45, 1.05, 16 // len(quantities))[:, None, None]
     bands = [np.clip(shades * band_colours(quantity), 0, 255) for quantity in sorted(quantities)]
     greys = 255 * np.linspace(to_rgb(BACKGROUND), to_rgb(TEXT), 40)
-    colours = np.concatenate([*(shade.reshape(-1, 3) for shade in bands), greys]).round()
+    reds = np.linspace(ARROW_COLOUR, (255, 255, 255), 8)
+    neutral = np.clip(np.linspace(0.45, 1.05, 16)[:, None] * NEUTRAL, 0, 255)
+    parts = (*(shade.reshape(-1, 3) for shade in bands), greys, reds, neutral)
+    colours = np.concatenate(parts).round()
     image = Image.new("P", (1, 1))
     image.putpalette(colours.astype(np.uint8).tobytes())
     return image

@@ -1,7 +1,8 @@
-"""Images of frames without a display: the surface from far to near, captions and a legend."""
+"""Images of frames without a display: the body from far to near, its load and a legend."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import matplotlib
@@ -10,21 +11,32 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch
 from numpy.typing import NDArray
 from PIL import Image
 
+from dpl.viewer.camera import Camera
 from dpl.viewer.frames import QUANTITIES, Frame
+from dpl.viewer.load_arrow import ARROW_COLOUR, arrow_ends
+from dpl.viewer.supports import SUPPORT_COLOUR, SupportSymbols
 from dpl.viewer.surface import Floats, Surface, contour_bands, triangle_normals, vertex_normals
+from dpl.viewer.units import scaled, unit_of_scale
 
 COLOUR_MAPS = {"displacement": "viridis", "von Mises stress": "turbo", "error against FE": "magma"}
+INSETS = (0.03, 0.13, 0.05, 0.17)  # margins for legend (right) and captions (above) [-]
+MAX_FITTED = 100  # frames to which a camera is fitted
+SEAM, LINE = 0.5, 0.9  # width of the sides of triangles, which closes gaps, and of lines [point]
 N_BANDS = 12
+NEUTRAL = (188, 194, 204)  # colour of a body at rest
 GRAZING = -0.2  # smallest distance of the camera above a visible face, over L
 BACKGROUND, TEXT, TEXT_GREY, OUTLINE = "#fafafc", "#202430", "#464a58", "#cdd1da"
 Bytes = NDArray[np.uint8]
 
 
-def band_colours(quantity: str) -> Bytes:
-    """Return the RGB colours of the bands, (N_BANDS, 3)."""
+def band_colours(quantity: str, top: float = 1.0) -> Bytes:
+    """Return the RGB colours of the bands, (N_BANDS, 3); all neutral if the scale ends at 0."""
+    if top <= 0:
+        return np.tile(np.asarray(NEUTRAL, dtype=np.uint8), (N_BANDS, 1))
     first, last = (0.06, 0.94) if COLOUR_MAPS[quantity] == "turbo" else (0.12, 0.98)
     found = matplotlib.colormaps[COLOUR_MAPS[quantity]](np.linspace(first, last, N_BANDS))[:, :3]
     return np.asarray(np.round(255 * found), dtype=np.uint8)
@@ -34,40 +46,6 @@ def colour_bands(surface: Surface, frame: Frame, top: float) -> list[Floats]:
     """Return the corners of the triangles of each band of colours, see `contour_bands`."""
     levels = np.nan_to_num(frame.values / top * N_BANDS if top > 0 else 0 * frame.values)
     return contour_bands(np.nan_to_num(frame.points), surface.triangles, levels, N_BANDS)
-
-
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """Perspective camera.
-
-    Attributes:
-        position: Position over L, (3,).
-        look_at: Point at the centre of the image over L, (3,).
-        field_of_view: Vertical angle of view [rad].
-    """
-
-    position: Floats
-    look_at: Floats
-    field_of_view: float = 0.6
-
-    @classmethod
-    def facing(cls, surface: Surface, *, distance: float = 1.0) -> "Camera":
-        """Return a camera in front of a body; `distance` is a factor on the usual distance [-]."""
-        low, high = surface.undeformed.min(axis=0), surface.undeformed.max(axis=0)
-        centre, planar = (low + high) / 2, surface.problem.shape[1] == 2
-        direction = np.array([0.0, -0.02, 1.0] if planar else [0.62, -1.0, 0.48])
-        length = 1.45 * distance * (0.45 + float(np.linalg.norm(high - low)))
-        return cls(centre + length * direction / np.linalg.norm(direction), centre)
-
-    def project(self, points: Floats, width: int, height: int) -> Floats:
-        """Return column [pixel], row [pixel] and depth over L of points (..., 3), (..., 3)."""
-        forward = self.look_at - self.position
-        right = np.cross(forward, (0.0, 0.0, 1.0))
-        axes = np.stack([right, np.cross(right, forward), forward])
-        axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-        x, y, depth = np.moveaxis((points - self.position) @ axes.T, -1, 0)
-        scale = height / (2 * np.tan(self.field_of_view / 2))
-        return np.stack([width / 2 + scale * x / depth, height / 2 - scale * y / depth, depth], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +62,33 @@ class Renderer:
     camera: Camera
     size: tuple[int, int] = (960, 540)
 
+    @classmethod
+    def fitting(
+        cls, surface: Surface, frames: Sequence[Frame], size: tuple[int, int] = (960, 540)
+    ) -> "Renderer":
+        """Return a renderer whose camera shows the body at rest and in all frames, with arrows."""
+        symbols = SupportSymbols.of(surface).vertices(surface.undeformed)
+        arrows = (arrow_ends(surface, frame) for frame in frames)
+        points = np.concatenate([
+            surface.undeformed,
+            symbols,
+            *(np.nan_to_num(frame.points) for frame in frames[:: len(frames) // MAX_FITTED + 1]),
+            *(ends for ends in arrows if ends is not None),
+        ])  # fmt: skip
+        planar, aspect = surface.problem.shape[1] == 2, size[0] / size[1]
+        camera = Camera.fit(points, planar=planar, aspect=aspect, insets=INSETS)
+        return cls(surface, camera, size)
+
+    @cached_property
+    def supports(self) -> SupportSymbols:
+        """Symbols of the supports."""
+        return SupportSymbols.of(self.surface)
+
     def render(self, frame: Frame, top: float, captions: Sequence[str]) -> Image.Image:
-        """Return the image of a frame with a colour scale from 0 to `top` and lines of text."""
+        """Return the image of a frame with the arrow of its load, a legend and lines of text.
+
+        Colours range from 0 to `top`. If `top` is 0, the body is neutral and there is no legend.
+        """
         width, height = self.size
         dpi = height / 5.4
         figure = Figure((width / dpi, 5.4), dpi=dpi, facecolor=BACKGROUND)
@@ -93,30 +96,33 @@ class Renderer:
         ax = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
         ax.set_axis_off()
         ax.add_collection(self._polygons(frame, top))
+        arrow = self._arrow(frame)
+        if arrow is not None:
+            ax.add_patch(arrow)
         _draw_captions(figure, captions)
-        _draw_legend(figure, frame.quantity, top)
+        if top > 0:
+            _draw_legend(figure, frame.quantity, top)
         canvas.draw()
         return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
     def _polygons(self, frame: Frame, top: float) -> PolyCollection:
-        """Return triangles and edges from far to near, those that face away first."""
+        """Return triangles, supports and edges from far to near, those that face away first."""
         surface, camera, points = self.surface, self.camera, np.nan_to_num(frame.points)
         bands = colour_bands(surface, frame, top)
         soup = np.concatenate(bands)
-        normals = triangle_normals(soup, np.arange(len(soup)).reshape(-1, 3))
-        to_camera = camera.position - camera.look_at
-        light = to_camera / np.linalg.norm(to_camera) + np.array([-0.25, 0.1, 0.75])
-        brightness = 0.52 + 0.5 * np.abs(normals @ light) / np.linalg.norm(light)
         counts = [len(band) // 3 for band in bands]
-        colours = np.repeat(band_colours(frame.quantity), counts, axis=0)
-        shades = np.clip(colours * brightness[:, None], 0, 255) / 255
-        edges, outline = points[surface.edges], surface.undeformed[surface.feature_edges]
-        sides = vertex_normals(points, surface.triangles)[surface.edges].mean(axis=1)
+        colours = np.repeat(band_colours(frame.quantity, top), counts, axis=0)
+        symbols = self.supports.vertices(points)[self.supports.triangles].reshape(-1, 3)
+        edges = points[surface.feature_edges]
+        sides = vertex_normals(points, surface.triangles)[surface.feature_edges].mean(axis=1)
         lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
+        outline = surface.undeformed[surface.feature_edges]
         none = np.zeros((len(outline), 3))
+        grey = np.tile(SUPPORT_COLOUR, (len(symbols) // 3, 1))
         layers = (  # polygons, normals, colours, and shifts towards the camera
-            (soup.reshape(-1, 3, 3), normals, np.insert(shades, 3, 1.0, axis=1), 0 * shades[:, 0]),
-            (edges, sides, to_rgba_array([TEXT] * len(edges), 0.22), lengths),
+            (*self._shaded(soup, colours), np.zeros(len(colours))),
+            (*self._shaded(symbols, grey), np.zeros(len(grey))),
+            (edges, sides, to_rgba_array([TEXT] * len(edges), 0.7), lengths),
             (outline, none, to_rgba_array([OUTLINE] * len(outline), 0.75), none[:, 0]),
         )
         corners = np.concatenate([polygons[:, [0, 1, -1]] for polygons, *_ in layers])
@@ -125,19 +131,55 @@ class Renderer:
         depth = pixels[..., 2].mean(axis=1) - shifts
         faces_camera = (normals * (camera.position - corners[:, 0])).sum(axis=1) >= GRAZING
         order = np.lexsort((-depth, faces_camera))
+        widths = np.full(len(order), SEAM)
+        widths[len(colours) + len(grey) :] = LINE
         flat: Any = pixels[order, :, :2]
-        return PolyCollection(flat, facecolors=rgba[order], edgecolors="face", linewidths=0.5)
+        return PolyCollection(
+            flat, facecolors=rgba[order], edgecolors="face", linewidths=widths[order]
+        )
+
+    def _shaded(self, soup: Floats, colours: NDArray[Any]) -> tuple[Floats, Floats, Floats]:
+        """Return corners, normals and RGBA colours of triangles (3 n, 3) with colours (n, 3)."""
+        normals = triangle_normals(soup, np.arange(len(soup)).reshape(-1, 3))
+        to_camera = self.camera.position - self.camera.look_at
+        light = to_camera / np.linalg.norm(to_camera) + np.array([-0.25, 0.1, 0.75])
+        brightness = 0.7 + 0.32 * np.abs(normals @ light) / np.linalg.norm(light)
+        shades = np.clip(colours * brightness[:, None], 0, 255) / 255
+        return soup.reshape(-1, 3, 3), normals, np.insert(shades, 3, 1.0, axis=1)
+
+    def _arrow(self, frame: Frame) -> FancyArrowPatch | None:
+        """Return the arrow of the load, in front of the body; None without a total force."""
+        ends = arrow_ends(self.surface, frame)
+        if ends is None:
+            return None
+        start, end = self.camera.project(ends, *self.size)[:, :2]
+        return FancyArrowPatch(
+            tuple(start),
+            tuple(end),
+            arrowstyle="simple,tail_width=0.22,head_width=0.8,head_length=0.8",
+            mutation_scale=20,
+            shrinkA=0,
+            shrinkB=0,
+            facecolor=np.array(ARROW_COLOUR) / 255,
+            edgecolor="white",
+            linewidth=0.6,
+            zorder=3,
+        )
 
 
 def _draw_captions(figure: Figure, captions: Sequence[str]) -> None:
-    """Draw lines of text in the upper left corner."""
+    """Draw the first caption as a title in the upper left corner, and the others below it."""
     width, height = figure.get_size_inches()
+    title, others = captions[:1], captions[1:]
     below = 0.18  # [inch]
-    for number, line in enumerate(captions):
-        size, colour, weight = (17, TEXT_GREY, "normal") if number else (25, TEXT, "bold")
+    for size, colour, weight, texts in (
+        (25, TEXT, "bold", title),
+        (17, TEXT_GREY, "normal", others),
+    ):
         place = 0.22 / width, 1 - below / height
+        line = " · ".join(texts)
         figure.text(*place, line, color=colour, size=0.72 * size, weight=weight, va="top")
-        below += 0.015 * size
+        below += 0.016 * size
 
 
 def _draw_legend(figure: Figure, quantity: str, top: float) -> None:
@@ -146,9 +188,10 @@ def _draw_legend(figure: Figure, quantity: str, top: float) -> None:
     bar = figure.add_axes((1 - 0.92 / width, 0.6 / height, 0.18 / width, 1 - 1.8 / height))
     bar.imshow(band_colours(quantity)[::-1, None], aspect="auto", extent=(0, 1, 0, N_BANDS))
     ticks = range(0, N_BANDS + 1, 3)
-    labels = [f"{top * k / N_BANDS:.3g}" for k in ticks]
+    unit = unit_of_scale(top, QUANTITIES[quantity])
+    labels = [scaled(top * k / N_BANDS, unit.factor) for k in ticks]
     bar.set(xticks=[], yticks=ticks, yticklabels=labels, frame_on=False)
     bar.yaxis.tick_right()
     bar.tick_params(length=0, labelsize=10, labelcolor=TEXT_GREY)
-    title, place = f"{quantity} [{QUANTITIES[quantity]}]", (1 - 0.22 / width, 1 - 0.98 / height)
+    title, place = f"{quantity} [{unit.name}]", (1 - 0.22 / width, 1 - 0.98 / height)
     figure.text(*place, title, color=TEXT, size=10, ha="right", va="center")

@@ -86,6 +86,15 @@ class Surface:
             cells = replace(cells, material=body.material)
         return fields(cells, displacement[None]).von_mises[0].numpy()[self.nodes]
 
+    def middle_node(self, mask: NDArray[np.bool_]) -> int:
+        """Return the node of the body in the middle of the marked nodes (S,) of the surface.
+
+        It is one of the marked nodes; the one in the middle of all if none is marked.
+        """
+        chosen = np.flatnonzero(mask) if mask.any() else np.arange(len(mask))
+        points = self.undeformed[chosen]
+        return int(self.nodes[chosen[((points - points.mean(axis=0)) ** 2).sum(axis=1).argmin()]])
+
     def nearest_node(self, points: Floats, position: Floats) -> int:
         """Return the node of the body whose position (S, 3) is nearest to a point (3,)."""
         return int(self.nodes[np.argmin(((points - position) ** 2).sum(axis=1))])

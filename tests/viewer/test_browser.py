@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from dpl.viewer.camera import Camera
+
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
@@ -58,7 +60,8 @@ class Browser:
 
     def body(self):
         """Return the position of the centre of the body on the screen [pixel]."""
-        camera = self.page.camera
+        (client,) = self.page.server.get_clients().values()
+        camera = Camera(client.camera.position, client.camera.look_at)
         width = self.view.evaluate("document.querySelector('canvas').clientWidth")
         height = self.view.evaluate("document.querySelector('canvas').clientHeight")
         middle = self.page.frame.points.mean(axis=0, keepdims=True)

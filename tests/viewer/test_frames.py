@@ -91,6 +91,27 @@ def test_stress_at_the_surface_is_that_of_the_whole_body(body, make_scene):
         assert surface.von_mises(u, load.parameters) == pytest.approx(exact, rel=1e-12)
 
 
+def test_recovered_stress_on_linear_tetrahedra_has_no_checkerboard(make_scene):
+    """Pure bending: the stress of each fibre is constant along the beam."""
+    scene = make_scene(cell="tetra", nodes=(17, 5, 5))
+    problem, surface = scene.problem, Surface.of(scene.problem)
+    x, y, z = (problem.points - problem.points.new_tensor([0.0, 0.125, 0.125])).T
+    nu, bend = 0.3, 1e-6
+    u = bend * torch.stack([x * z, -nu * y * z, -(x**2) / 2 - nu * (z**2 - y**2) / 2], dim=1)
+    stress = surface.von_mises(u, torch.zeros(1, 0).double()) / bend
+    points = surface.undeformed
+    inner = (points[:, 0] > 0.1) & (points[:, 0] < 0.9)
+    fibres, index = np.unique(points[inner, 1:].round(6), axis=0, return_inverse=True)
+    for fibre in range(len(fibres)):
+        values = stress[inner][index.ravel() == fibre]
+        assert np.ptp(values) < 0.02 * stress.max()
+
+
+def test_the_stress_of_a_body_at_rest_is_exactly_zero(body):
+    frame = body.solve(body.zero_load(), ViewSettings(quantity=STRESS))
+    assert not frame.values.any()
+
+
 def test_the_dragged_point_moves_to_the_target(body, patch_load):
     node, request = patch_load
     frame = body.solve(request, ViewSettings(tol=1e-8))

@@ -1,6 +1,7 @@
 """Pages of all kinds of bodies, without a browser: drags, clicks and controls."""
 
 import asyncio
+import contextlib
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,9 @@ pytest.importorskip("viser", reason="the extra viewer is not installed")
 from dpl.fem import SubspaceNewton, rectangle
 from dpl.inference import Simulator
 from dpl.viewer import AccessPolicy, Body, Page
+from dpl.viewer.frames import QUANTITIES
+from dpl.viewer.renderer import NEUTRAL
+from dpl.viewer.units import engineering
 
 BODIES = {
     "hexahedra": {},
@@ -94,12 +98,81 @@ def test_the_amplitude_slider_follows_a_drag_and_not_itself(page):
     assert page.controls.amplitude.value == -0.5
 
 
-def test_the_legend_of_an_undeformed_body_has_no_numbers_on_its_scale(page):
+def test_a_body_at_rest_is_neutral_and_has_no_legend(page):
+    assert page.worker.wait(240)
+    node = page._body_node
+    for quantity in QUANTITIES:
+        page.controls.quantity.value = quantity
+        page.apply_settings(None)
+        assert page.worker.wait(240)
+        page.refresh()
+        assert page.controls._legend.content == ""
+        visible = [band for band in node._bands if len(band.vertices) > 3]
+        assert [tuple(band.color) for band in visible] == [NEUTRAL]
+    drag_tip(page, np.array([0.0, 0.0, 0.08]))
+    page.refresh()
+    assert "on the surface" in page.controls._legend.content
+    page.reset(None)
     assert page.worker.wait(240)
     page.refresh()
-    legend = page.controls._legend.content
-    assert "0 m everywhere" in legend
-    assert "<span>0</span>" not in legend
+    assert page.controls._legend.content == ""
+
+
+def test_readings_have_force_and_displacement_at_the_hand(any_page):
+    page = any_page
+    drag_tip(page, np.array([0.0, 0.06, 0.0]))
+    page.refresh()
+    result, frame = page.controls._result.content, page.frame
+    unit = "N/m" if page.body.scene.problem.shape[1] == 2 else "N"
+    assert engineering(float(frame.request.force.sum(dim=0).norm()), unit) in result
+    assert engineering(float(frame.displacement[page.node].norm()), "m") in result
+
+
+def test_the_slider_of_youngs_modulus_has_a_unit_with_prefix(make_scene, make_body, tmp_path):
+    body = make_body(make_scene(young=[1e6, 5e6]))
+    page = Page(body, AccessPolicy.bind("127.0.0.1", 0), title="t", folder=tmp_path)
+    try:
+        slider = page.controls.young
+        assert (slider.label, slider.min, slider.max, slider.value) == ("E [MPa]", 1.0, 5.0, 3.0)
+        assert page.controls.modulus == 3e6
+        page.sample(None)
+        assert page.worker.wait(240)
+        assert page.controls.modulus == pytest.approx(page.frame.request.young)
+        page.controls.modulus = 9e9
+        assert slider.value == 5.0
+    finally:
+        page.close()
+
+
+def test_a_random_load_moves_the_hand_to_a_loaded_node(page):
+    assert page.worker.wait(240)
+    page.sample(None)
+    assert page.worker.wait(240)
+    assert page.frame.request.force[page.node].any()
+
+
+def test_feature_edges_replace_element_edges(any_page):
+    page = any_page
+    node, surface = page._body_node, page.body.surface
+    assert node._edges.visible
+    assert not node._mesh.visible
+    assert len(node._edges.points) == len(surface.feature_edges) < len(surface.edges)
+    assert node._slab.visible
+    page.controls.edges.value = True
+    drag_tip(page, np.array([0.0, 0.05, 0.0]))
+    assert node._mesh.visible
+    assert len(node._mesh.points) == len(surface.edges)
+
+
+def test_the_camera_of_a_browser_is_fitted_to_its_window(page):
+    assert page.worker.wait(240)
+    client = SimpleNamespace(camera=SimpleNamespace(aspect=0.6), atomic=contextlib.nullcontext)
+    for both in (False, True):
+        page.controls.show_newton.value = both
+        page._fit_client(client)
+        expected = page.layout.camera(aspect=0.6, both=both)
+        assert client.camera.position == pytest.approx(expected.position)
+        assert client.camera.look_at == pytest.approx(expected.look_at)
 
 
 def test_dots_lie_above_the_surface(page):

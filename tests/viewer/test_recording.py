@@ -10,7 +10,7 @@ from PIL import Image
 from dpl.viewer.animation import animate_load
 from dpl.viewer.frames import ViewSettings
 from dpl.viewer.recording import FRAME_RATE, MAX_FRAMES, Recording, resample
-from dpl.viewer.renderer import Camera, Renderer
+from dpl.viewer.renderer import Renderer
 
 
 @pytest.fixture
@@ -50,8 +50,7 @@ def test_a_series_contains_forces_displacements_stresses_and_volume_ratios(
 def test_an_animation_has_the_duration_of_the_recording(recording, body, tmp_path, kind):
     if kind == ".mp4":
         pytest.importorskip("imageio_ffmpeg", reason="the extra viewer is not installed")
-    renderer = Renderer(body.surface, Camera.facing(body.surface), (320, 180))
-    path = recording.save_animation(tmp_path, renderer, kind)
+    path = recording.save_animation(tmp_path, kind, (320, 180))
     if kind == ".gif":
         image = Image.open(path)
         times = 0
@@ -92,15 +91,43 @@ def test_an_empty_recording_is_not_written(body, tmp_path):
         Recording(body).save_series(tmp_path)
 
 
-def test_an_image_shows_the_deformed_body(body):
-    renderer = Renderer(body.surface, Camera.facing(body.surface), (320, 180))
+def is_red(picture):
+    red, green, blue = np.moveaxis(picture.astype(int), -1, 0)
+    return (red > 170) & (green < 60) & (blue < 80)
+
+
+def test_an_image_shows_the_deformed_body_and_the_arrow_of_its_load(body):
     frame = body.solve(body.sample(1), ViewSettings())
+    renderer = Renderer.fitting(body.surface, [frame], (640, 360))
     picture = np.asarray(renderer.render(frame, 1.0, []))
     background = picture[0, 0].astype(int)
     drawn = np.abs(picture.astype(int) - background).sum(axis=2) > 30
-    assert 0.05 < drawn[:, :250].mean() < 0.6
-    again = renderer.render(frame._replace(points=body.surface.undeformed), 1.0, [])
-    assert np.abs(np.asarray(again).astype(int) - picture).max() > 50
+    assert 0.05 < drawn[:, :500].mean() < 0.6
+    rest = renderer.render(frame._replace(points=body.surface.undeformed), 1.0, [])
+    assert np.abs(np.asarray(rest).astype(int) - picture).max() > 50
+    assert is_red(picture).sum() > 40, "an arrow of the load"
+    zero = frame.request._replace(force=0 * frame.request.force)
+    unloaded = np.asarray(renderer.render(frame._replace(request=zero), 1.0, []))
+    assert not is_red(unloaded).any()
+
+
+def test_an_image_of_a_body_at_rest_is_grey_and_has_no_legend(body):
+    frame = body.solve(body.zero_load(), ViewSettings())
+    renderer = Renderer.fitting(body.surface, [frame], (640, 360))
+    picture = np.asarray(renderer.render(frame, 0.0, [])).astype(int)
+    assert np.ptp(picture, axis=2).max() < 50, "neutral colours"
+    with_legend = np.asarray(renderer.render(frame, 1.0, []))[:, 560:]
+    assert (picture[:, 560:] == picture[0, 0]).all()
+    assert (with_legend != picture[0, 0]).any()
+
+
+def test_the_camera_of_an_animation_shows_all_frames(body):
+    frames = [body.solve(body.sample(k), ViewSettings()) for k in range(3)]
+    renderer = Renderer.fitting(body.surface, frames, (640, 360))
+    for frame in frames:
+        pixels = renderer.camera.project(frame.points, 640, 360)
+        assert (pixels[:, :2] > 0).all()
+        assert (pixels[:, :2] < (640, 360)).all()
 
 
 @pytest.mark.slow
