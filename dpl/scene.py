@@ -109,7 +109,8 @@ class Scene:
             displacement = solve(self.solver, load).displacement
             preconditioner = self.linear.with_parameters(load.parameters).corotational
             steps.append(preconditioner.count_iterations(displacement))
-        return replace(self.newton, corotational=sum(steps) <= MAX_MEAN_STEPS * len(steps))
+        is_short = sum(steps) <= MAX_MEAN_STEPS * len(steps)
+        return replace(self.newton, corotational=is_short, definite_guess=True)
 
     @property
     def length(self) -> float:

@@ -31,6 +31,7 @@ from dpl.fem import (
     solve,
 )
 from dpl.fem.linear import BACKENDS, SuperLU
+from dpl.fem.linear.banded import BandedCholesky
 from dpl.fem.solvers.factor_reuse import forcing_term
 
 SVK, NH = SaintVenantKirchhoff(0.3), NeoHookeanLn(0.3)
@@ -754,3 +755,25 @@ def test_the_solver_of_another_poissons_ratio_shares_what_does_not_depend_on_it(
     assert clone.linear_solver is newton.linear_solver.with_parameters(ratio)
     for name in ("backend", "tangent_backend"):
         assert getattr(clone.linear_solver, name) is getattr(newton.linear_solver, name)
+
+
+@pytest.mark.parametrize("linear", ["band", "band32", "superlu"])
+def test_a_guess_with_an_indefinite_tangent_is_abandoned_if_wanted(linear, monkeypatch):
+    """A beam compressed by 40 %: its tangent has negative eigenvalues, those of buckling."""
+    problem = Problem.build(
+        box([4.0, 1.0, 1.0], [9, 3, 3]), NeoHookeanLn(0.3), fixed=Plane(0, "min")
+    )
+    force = Traction(Plane(0, "max"), [0.0, 0.0, 1e-3]).on(problem)
+    load = Load(force[None], torch.ones(1, dtype=torch.float64))
+    guess = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    guess[..., 0] = -0.4 * (problem.points[:, 0] - problem.points[:, 0].min())
+    exact = solve(Newton(problem, linear=linear), load)
+    newton = Newton(problem, linear=linear, definite_guess=True)
+    if linear != "superlu":  # bands factorise no indefinite matrix themselves
+        refused = property(lambda backend: pytest.fail("an indefinite tangent was factorised"))
+        monkeypatch.setattr(BandedCholesky, "other", refused)
+    states = list(newton.iterate(load, guess=guess))
+    assert states[0].from_guess
+    assert not states[1].from_guess
+    assert states[-1].converged
+    assert (states[-1].displacement - exact.displacement).norm() < 1e-6 * exact.displacement.norm()

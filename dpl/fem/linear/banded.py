@@ -211,6 +211,13 @@ class BandedCholesky:
         require_finite(values)
         return self._cholesky(values) or self.other.factorise(values)
 
+    def factorise_definite(self, values: Array) -> Factor:
+        """Return the factor, see `DefiniteBackend`."""
+        require_finite(values)
+        if (factor := self._cholesky(values)) is None:
+            raise SingularMatrix("the matrix is not positive definite")
+        return factor
+
     def _cholesky(self, values: Array) -> BandedFactor | None:
         """Return the factor; None if the matrix may not be positive definite."""
         layout = self.layout
@@ -240,7 +247,7 @@ class MixedPrecisionBandedCholesky(BandedCholesky):
     dtype = np.float32
 
     @cached_property
-    def other(self) -> Backend:
+    def other(self) -> BandedCholesky:
         """Backend in float64."""
         exact = BandedCholesky(self.pattern, self.indefinite)
         exact.layout = self.layout
@@ -248,15 +255,23 @@ class MixedPrecisionBandedCholesky(BandedCholesky):
 
     def factorise(self, values: Array) -> Factor:
         """Return the factor, see `Backend.factorise`."""
+        return self._mixed(values) or self.other.factorise(values)
+
+    def factorise_definite(self, values: Array) -> Factor:
+        """Return the factor, see `DefiniteBackend`."""
+        return self._mixed(values) or self.other.factorise_definite(values)
+
+    def _mixed(self, values: Array) -> "MixedPrecisionFactor | None":
+        """Return the factor; None if the matrix may not be positive definite in float32."""
         require_finite(values)
         diagonal = np.abs(values[self.pattern.indptr[:-1]])
         scale = float(np.sqrt(diagonal.max(initial=0)) * np.sqrt(diagonal.min(initial=np.inf)))
         if not 0 < scale < np.inf:
-            return self.other.factorise(values)
+            return None
         with np.errstate(over="ignore"):
             rough = self._cholesky(values / scale)
         if rough is None:
-            return self.other.factorise(values)
+            return None
         return MixedPrecisionFactor(self, values.copy(), rough, scale)
 
 

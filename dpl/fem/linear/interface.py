@@ -1,6 +1,6 @@
 """Interface of the linear backends, their exception, products with symmetric matrices."""
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,6 +128,18 @@ class Backend(Protocol):
 
         Raises:
             SingularMatrix: A pivot is exactly zero, or entries are not finite.
+        """
+
+
+@runtime_checkable
+class DefiniteBackend(Protocol):
+    """Backend that refuses indefinite matrices at less cost than it factorises them."""
+
+    def factorise_definite(self, values: Array) -> Factor:
+        """Return the factor of a positive definite matrix, see `Backend.factorise`.
+
+        Raises:
+            SingularMatrix: The matrix is not positive definite.
         """
 
 

@@ -10,6 +10,7 @@ from dpl.fem.linear.interface import (
     UNSTABLE,
     Array,
     Backend,
+    DefiniteBackend,
     Factor,
     Pattern,
     SingularMatrix,
@@ -74,7 +75,14 @@ class TangentSolver:
         return self.linear_solver.problem.pattern
 
     def solve(
-        self, tangent: Array | None, u: Tensor, right: Array, rtol: float, *, near: bool
+        self,
+        tangent: Array | None,
+        u: Tensor,
+        right: Array,
+        rtol: float,
+        *,
+        near: bool,
+        definite: bool = False,
     ) -> Array:
         """Return K(u)^-1 of a right-hand side (n,), to a relative residual.
 
@@ -84,9 +92,10 @@ class TangentSolver:
             right: Right-hand side, (n,).
             rtol: Relative residual at which conjugate gradients stop [-].
             near: Whether u is near enough to the last iterate to reuse its factor.
+            definite: Refuse an indefinite tangent.
 
         Raises:
-            SingularMatrix: The tangent has no factor.
+            SingularMatrix: The tangent has no factor, or is indefinite and refused.
         """
         if tangent is None:
             self._last, self._factor = Preconditioner.REST, None
@@ -111,7 +120,12 @@ class TangentSolver:
             del apply  # it refers to the factor, whose storage the next one takes
         self._last, self._factor, self._tangent = Preconditioner.FRESH, None, None
         self.factorisations += 1
-        self._factor = self.backend.factorise(tangent)
+        if definite and isinstance(self.backend, DefiniteBackend):
+            self._factor = self.backend.factorise_definite(tangent)
+        else:
+            self._factor = self.backend.factorise(tangent)
+        if definite and self._factor.negative_pivots:
+            raise SingularMatrix("the tangent is indefinite")
         return self._factor.solve(right, rtol)
 
     def stability(self, u: Tensor) -> Stability:

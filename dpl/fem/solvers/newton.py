@@ -55,6 +55,8 @@ class Newton:
             gradients on the new tangent [-]; 0: every tangent is factorised.
         corotational: Precondition conjugate gradients with the factor of K(0), rotated with the
             nodes. Stability is then known only where a tangent was factorised.
+        definite_guess: Start again from rest where the tangent at an iterate from the guess is
+            indefinite. Such iterates seldom lead to a solution, and their tangents cost most.
         linear_solver: Solver with the factor of K(0); `dataclasses.replace` keeps it unless
             `problem` or `linear` change.
     """
@@ -70,6 +72,7 @@ class Newton:
     mixed_integration: bool = True
     factor_reuse_tol: float = 0.1
     corotational: bool = False
+    definite_guess: bool = False
     linear_solver: LinearSolver = field(default=None, repr=False)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
@@ -158,7 +161,7 @@ class Newton:
             rtol = forcing_term(residual, previous, tol=self.tol, corotational=self.corotational)
             near = k > 0 and residual < self.factor_reuse_tol
             try:
-                update = self._solve(state, factor * force, run.tangents, rtol, near=near)
+                update = self._solve(state, factor * force, run, rtol, near=near)
             except SingularMatrix:
                 return
             run.iterations += 1
@@ -172,7 +175,7 @@ class Newton:
                 return
 
     def _solve(
-        self, state: "_State", force: Tensor, tangents: TangentSolver, rtol: float, *, near: bool
+        self, state: "_State", force: Tensor, run: "_Run", rtol: float, *, near: bool
     ) -> Tensor:
         """Return the full Newton step (1, N, D) under a force, with the step of the supports."""
         problem, u = self.problem, state.displacement
@@ -185,7 +188,8 @@ class Newton:
         if state.support_step.any():
             right = right - problem.tangent_product(u, state.support_step)
         values = problem.restrict(right[0])
-        step = tangents.solve(tangent, u, values, rtol, near=near)
+        definite = self.definite_guess and run.from_guess
+        step = run.tangents.solve(tangent, u, values, rtol, near=near, definite=definite)
         return problem.extend(step)[None] + state.support_step
 
     def _update(self, state: "_State", update: Tensor, *, halvings: int) -> "_State | None":
