@@ -79,7 +79,7 @@ def _train(cfg: DictConfig) -> float | None:
     session = training.LogHyperparameters(config.hyperparameters(cfg))
     trainer.callbacks.append(session)
     if trainer.is_global_zero:
-        config.show_plan(scene, data, surrogate, folder=str(folder))
+        config.show_plan(scene, data, surrogate, folder=_from_here(folder))
         if not trainer.fast_dev_run:
             config.save_config(cfg, folder)
     try:
@@ -88,7 +88,10 @@ def _train(cfg: DictConfig) -> float | None:
         if leaving.code == 128 + signal.SIGTERM:
             raise
         if trainer.is_global_zero and session.begun:
-            print(f"to resume: {_script('train')} run={folder} ckpt_path=last", file=sys.stderr)
+            print(
+                f"to resume: {_script('train')} run={_from_here(folder)} ckpt_path=last",
+                file=sys.stderr,
+            )
         raise KeyboardInterrupt from leaving
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         ours = isinstance(error, config.ConfigError | DataSetError | training.Diverged)
@@ -116,10 +119,17 @@ def _train(cfg: DictConfig) -> float | None:
 
 def show_next_commands(folder: Path) -> None:
     """Print the folder of a run and the commands that use it."""
-    print(f"\nwritten to {folder}; next:")
-    print(f"  {_script('view')} run={folder}      # drag the body in the browser")
-    print(f"  {_script('evaluate')} run={folder}  # the table above")
-    print(f"  tensorboard --logdir {folder}", flush=True)
+    here = _from_here(folder)
+    print(f"\nwritten to {here}; next:")
+    print(f"  {_script('view')} run={here}      # drag the body in the browser")
+    print(f"  {_script('evaluate')} run={here}  # the table above")
+    print(f"  tensorboard --logdir {here}", flush=True)
+
+
+def _from_here(folder: Path) -> str:
+    """Return a folder as a path from the working directory if it lies inside."""
+    inside = Path.cwd() in folder.absolute().parents
+    return str(folder.absolute().relative_to(Path.cwd()) if inside else folder)
 
 
 def _script(name: str) -> str:

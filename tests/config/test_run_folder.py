@@ -179,8 +179,8 @@ BAD_TRAINING = {
 
 
 BAD_COMMANDS = {
-    "evaluate run=x tol=small": r"tol = 'small' must be a number",
-    "evaluate run=x tol=0": r"tol = 0 must lie between 1e-15 and 1",
+    "evaluate run=x tols=[small]": r"tols = \['small'\] must be a list, each a number",
+    "evaluate run=x tols=[0]": r"tols = \[0\] must lie between 1e-15 and 1",
     "convergence resume=perhaps": r"resume = 'perhaps' must be true or false",
     "convergence tols=[1e-3,2]": r"tols = \[0\.001, 2\] must lie between",
     "convergence n_far_loads=-1": r"n_far_loads = -1 must lie between 0 and",

@@ -18,7 +18,7 @@ class EquilibriumCriterion(TensorAssembly):
 
         At fixed ones the result is 0, or NaN where the force is not finite.
         """
-        return force * self._free_factors.to(force.dtype)
+        return force * self.free
 
     def relative_residual_of(self, internal: Tensor, force: Tensor) -> Tensor:
         """Return ||R_free|| / ||f||, (B,) [-], the criterion of equilibrium of all solvers.
@@ -71,11 +71,6 @@ class EquilibriumCriterion(TensorAssembly):
         gradient, modulus and gradient. On slivers it exceeds any tolerance.
         """
         return self._rounding * displacement.abs().amax(dim=(1, 2))
-
-    @cached_property
-    def _free_factors(self) -> Tensor:
-        """One at free degrees of freedom, zero at fixed ones: (N, D), faster than the mask."""
-        return self.free.double()
 
     @cached_property
     def _rounding(self) -> float | Tensor:
