@@ -14,7 +14,7 @@ from dpl.evaluation.report import PREDICTION, TOLS, newton_row, simulator_row
 from dpl.evaluation.tables import power, share, show_cells
 from dpl.training.metrics import median
 
-MAX_NAME = 46  # characters of the name of a run
+MAX_NAME = 40  # characters of the name of a run
 ERRORS = ("rel_L2_median", "rel_L2_worst", "e_mean")
 
 
@@ -42,9 +42,9 @@ def compare(folder: Path) -> None:
         for name, members in groups.items()
         if len(members) > 1
     ]
-    times = [f"sim / Newton tol={power(tol)}" for tol in TOLS]
-    columns = (str(folder), "median error", "worst error", "e_mean", "sim(force) [ms]", *times)
-    show_cells("", columns, runs, *([medians] if medians else []))
+    times = [f"sim/Newton tol={power(tol)}" for tol in TOLS]
+    columns = ("", "median error", "worst error", "e_mean", "sim(force) [ms]", *times)
+    show_cells(f"runs below {folder}", columns, runs, *([medians] if medians else []))
 
 
 def _numbers(rows: Mapping[str, Any]) -> list[float]:
@@ -73,7 +73,7 @@ def run_names(folder: Path, runs: list[Path]) -> list[str]:
         return names
     options = [config.options_of_run(run) for run in runs]
     shared = set.intersection(*(set(one) for one in options))
-    order = [key for key in options[0] if key in shared]
+    order = sorted((key for key in options[0] if key in shared), key=lambda key: key.count("."))
     differ = [key for key in order if len({str(one[key]) for one in options}) > 1]
     details = [", ".join(f"{key}={one[key]}" for key in differ) for one in options]
     lines = [f"{name}: {more}" if more else name for name, more in zip(names, details, strict=True)]

@@ -77,9 +77,8 @@ def latencies(simulator: Simulator, load: Load) -> dict[str, Latency]:
 
 def describe(measured: Mapping[str, Latency]) -> str:
     """Return latencies as one line."""
-    loads = next(iter(measured.values())).loads
     described = "; ".join(f"{name} {one}" for name, one in measured.items())
-    return f"latency, 1 thread, {loads} loads: {described}"
+    return f"latency, 1 thread: {described}"
 
 
 def time_interleaved(

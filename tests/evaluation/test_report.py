@@ -205,7 +205,7 @@ def test_the_table_prints_every_row(surrogate, few, tmp_path, capsys, monkeypatc
     out = capsys.readouterr().out
     assert "4 test loads, one at a time, 1 thread" in out
     assert max(len(line.rstrip()) for line in out.splitlines()) <= 100
-    assert "latency, 1 thread, 4 loads: sim(force) p50 " in out
+    assert "latency, 1 thread: sim(force) p50 " in out
     for words in ("linear", "prediction", "paper's hybrid", "Newton, tol=1e-6", "4/4", "p99"):
         assert words in out
 

@@ -45,7 +45,7 @@ def test_export_writes_the_documented_folder(script, trained):
         for engine in ("torch", "onnxruntime"):
             assert 0 < row[f"{engine}_p50"] <= row[f"{engine}_p99"]
     assert list(report["latency"]) == ["sim(force)", "bare network"]
-    assert "latency, 1 thread, 4 loads: sim(force) p50 " in ended.out
+    assert "latency, 1 thread: sim(force) p50 " in ended.out
     meta = json.loads((folder / "meta.json").read_text(), parse_constant=pytest.fail)
     judged = json.loads((trained / "runs/first/evaluation.json").read_text())
     assert meta["errors"] == judged[1]["errors"]
