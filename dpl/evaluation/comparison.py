@@ -14,7 +14,7 @@ from dpl.evaluation.report import PREDICTION, TOLS, newton_row, simulator_row
 from dpl.evaluation.tables import power, share, show_cells
 from dpl.training.metrics import median
 
-MAX_NAME = 40  # characters of the name of a run
+MAX_NAME = 34  # characters of the name of a run
 ERRORS = ("rel_L2_median", "rel_L2_worst", "e_mean")
 
 
@@ -43,7 +43,7 @@ def compare(folder: Path) -> None:
         if len(members) > 1
     ]
     times = [f"sim/Newton tol={power(tol)}" for tol in TOLS]
-    columns = ("", "median error", "worst error", "e_mean", "sim(force) [ms]", *times)
+    columns = ("", "median error", "worst error", "e_mean", "ms sim(force)", *times)
     show_cells(f"runs below {folder}", columns, runs, *([medians] if medians else []))
 
 

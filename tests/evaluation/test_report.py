@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from dpl import Sample
-from dpl.evaluation import compare, evaluate
-from dpl.evaluation.comparison import run_names, timing
+from dpl.evaluation import compare, evaluate, timing
+from dpl.evaluation.comparison import run_names
 from dpl.evaluation.report import SolverResult, measure, save, show
 from dpl.fem import Load, Solution, evaluate_solution
 from dpl.models import FCNN
