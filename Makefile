@@ -22,7 +22,7 @@ setup: .venv/installed
 
 train: setup
 	$(BIN)/python scripts/train.py $(BEAM) data.train=400 model=unrolled run=$(FIRST)/unrolled $(ARGS)
-	$(BIN)/python scripts/train.py $(BEAM) data.train=400 model=fcnn model.width=512 loss=lr_star trainer.max_epochs=40 run=$(FIRST)/fcnn $(ARGS)
+	$(BIN)/python scripts/train.py $(BEAM) data.train=400 model=fcnn model.width=512 loss=lr_star trainer.max_epochs=60 run=$(FIRST)/fcnn $(ARGS)
 	$(BIN)/python scripts/compare.py run=$(FIRST)
 
 demo: runs/demo/evaluation.json
