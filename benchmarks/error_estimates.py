@@ -27,7 +27,7 @@ from dpl.fem import (
     box,
     propeller,
 )
-from dpl.inference import corotational_error
+from dpl.inference import corotational_error, estimate_error
 from dpl.inference.answer import ROUNDOFF
 from dpl.models import FCNN, Correctable, HasCorrection, PODNet, Unrolled
 from dpl.models.newton_choice import MAX_STEPS
@@ -69,8 +69,7 @@ class Estimate:
         corotational: Estimate by `dpl.inference.corotational_error` [-].
         modes: Estimate by Newton's correction in the modes of the model, plus the error outside of
             them [-]; NaN without modes.
-        reported: `error` of the simulator: the smaller one if the load lies in range and the model
-            knows its error outside of its modes, else the corotational one [-].
+        reported: `error` of the simulator, see `dpl.inference.estimate_error` [-].
     """
 
     body: str
@@ -246,10 +245,11 @@ def measured(
             *_, last = states
             u, modes = last.displacement, last.error + newton.outside_error
         error = float((u[0] - exact).norm() / exact.norm())
-        corotational = reported = corotational_error(scene.linear, load, u)
+        corotational, known = corotational_error(scene.linear, load, u), math.inf
         amplitude, _ = scene.loads.project(load.force)
         if newton is not None and newton.outside_error > 0 and amplitude < 1 + ROUNDOFF:
-            reported = min(corotational, modes)
+            known = modes
+        reported = estimate_error(scene.linear, load, u, in_modes=known)
         yield Estimate("", "", "", error, corotational, modes, reported)
 
 

@@ -22,10 +22,10 @@ class Answer:
         displacement: (N, D) [m], a NumPy array or a tensor as the force.
         residual: ||R_free|| / ||f||, evaluated at the displacement [-], see
             `Problem.relative_residual_of`.
-        error: Estimated relative error of the displacement [-], no bound: that of
-            `corotational_error`, or, if it is smaller and the load lies in range, that of a model
-            which knows its error outside of its modes, such as `unrolled`. Infinite if an element
-            is inverted or the prediction is not finite.
+        error: Estimated relative error of the displacement [-], see `estimate_error`: no bound.
+            The estimate in the modes is that of a model which knows its error outside of them, such
+            as `unrolled`, under a load in range. Infinite if an element is inverted or the
+            prediction is not finite.
         volume_ratio: min det F [-]; an element is inverted if it is not above 0.
         converged: True if the residual is below the tolerance of the call (without one, that of
             the scene) and no element is inverted. It is False also where rounding does not allow

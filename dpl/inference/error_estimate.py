@@ -10,6 +10,8 @@ from torch import Tensor
 from dpl.fem import LinearSolver, Load, Newton
 from dpl.fem.problem import Evaluation
 
+SUFFICIENT = 2e-3  # steps leave an error of 1e-3 in the modes, and about as much outside [-]
+
 
 def corotational_error(
     solver: LinearSolver, load: Load, displacement: Tensor, evaluation: Evaluation | None = None
@@ -39,6 +41,31 @@ def corotational_error(
     if whole == 0 or correction == math.inf:
         return math.inf if correction else 0.0
     return correction / whole
+
+
+def estimate_error(
+    solver: LinearSolver,
+    load: Load,
+    displacement: Tensor,
+    evaluation: Evaluation | None = None,
+    *,
+    in_modes: float = math.inf,
+    sufficient: float = SUFFICIENT,
+) -> float:
+    """Return the estimated relative error of a displacement [-].
+
+    It is the smaller one of `corotational_error` and an estimate in the modes of a model. The
+    former is not computed if the latter is small enough.
+
+    Args:
+        solver, load, displacement, evaluation: See `corotational_error`.
+        in_modes: Newton's correction in the modes, relative to the displacement, plus the known
+            error outside of them [-]; infinite if the latter is unknown, or known for other loads.
+        sufficient: Estimate in the modes up to which that is the result [-].
+    """
+    if in_modes <= sufficient:
+        return in_modes
+    return min(in_modes, corotational_error(solver, load, displacement, evaluation))
 
 
 def nearest(newton: Newton, load: Load, guesses: list[Tensor]) -> Tensor:

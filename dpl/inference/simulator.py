@@ -13,7 +13,7 @@ from dpl.fem import Load, Problem, Solution, Status, SubspaceNewton, evaluate_so
 from dpl.fem.solvers import concatenate
 from dpl.inference.answer import Answer, answer_like, summarise
 from dpl.inference.arguments import as_load, as_numbers
-from dpl.inference.error_estimate import corotational_error, nearest
+from dpl.inference.error_estimate import SUFFICIENT, estimate_error, nearest
 from dpl.inference.hybrid import default_hybrid
 from dpl.inference.request import Candidate, Request
 from dpl.inference.training_range import RangeCheck
@@ -205,7 +205,7 @@ class Simulator:
         last: Candidate | None = None
         for last in self._candidates(load, prediction, place, request):
             if request.error is not None:
-                last = self._with_error(load, last)
+                last = self._with_error(load, last, request)
             if best is None or request.rank(last) <= request.rank(best):
                 best = last
             if request.is_met(last) or request.over(self._pace):
@@ -216,15 +216,18 @@ class Simulator:
         kept = (state.residual < tol) & (state.volume_ratio > 0) & ~ended.converged
         status = torch.where(kept, int(Status.CONVERGED), ended.status)
         state = state._replace(status=status, load_factor=ended.load_factor)
-        return self._with_error(load, best._replace(state=state))
+        return self._with_error(load, best._replace(state=state), request)
 
-    def _with_error(self, load: Load, candidate: Candidate) -> Candidate:
+    def _with_error(self, load: Load, candidate: Candidate, request: Request) -> Candidate:
         """Return a solution with its estimated error."""
         if candidate.error is not None:
             return candidate
-        u, evaluation = candidate.state.displacement, candidate.evaluation
-        error = corotational_error(self.scene.linear, load, u, evaluation)
-        return candidate._replace(error=min(error, candidate.error_in_modes))
+        error = estimate_error(
+            self.scene.linear, load, candidate.state.displacement, candidate.evaluation,
+            in_modes=candidate.error_in_modes,
+            sufficient=SUFFICIENT if request.error is None else request.error,
+        )  # fmt: skip
+        return candidate._replace(error=error)
 
     def _candidates(
         self, load: Load, prediction: Tensor, place: RangeCheck, request: Request

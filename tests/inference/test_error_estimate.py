@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+import dpl.inference.error_estimate as error_estimate
 from dpl.fem import Problem, Status, SubspaceNewton, solve
 from dpl.inference import Simulator, corotational_error
 from dpl.inference.answer import summarise
@@ -193,3 +194,29 @@ def test_a_summary_states_inversion_convergence_stability_and_range():
     )
     column = state_of(1e-9, status=Status.UNSTABLE, pivots=2)
     assert "UNSTABLE (2 negative eigenvalues)" in summarise(column, True, 1e-9, 1.0, 0.0, False)
+
+
+def test_the_error_in_modes_counts_in_range_only_and_saves_the_correction(
+    scene, forces, monkeypatch
+):
+    seen = []
+
+    def counted(*arguments):
+        seen.append(arguments)
+        return corotational_error(*arguments)
+
+    monkeypatch.setattr(error_estimate, "corotational_error", counted)
+    sim = simulator_of(scene, 1.0, newton=softest_mode(scene, outside_error=1e-4))
+    inside = sim(forces[0])
+    assert inside.error == pytest.approx(1e-4, rel=1e-3)
+    assert not seen
+    assert sim(forces[0], error=1e-5).error < 1e-6
+    assert len(seen) == 1
+    largest = scene.loads.modes.vectors @ (1.5 * scene.loads.q_max)
+    outside = sim(torch.where(scene.loads.loadable_dofs, largest, 0.0) * scene.force_unit * E)
+    assert outside.out_of_distribution
+    assert outside.error < 1e-6
+    assert len(seen) == 2
+    unknown = simulator_of(scene, 1.0, newton=softest_mode(scene))
+    assert unknown(forces[0]).error < 1e-6
+    assert len(seen) == 3
