@@ -15,6 +15,7 @@ from torch import Tensor
 from benchmarks.ablation import solved
 from dpl import Sample, Scene
 from dpl.data import OfflineData
+from dpl.evaluation.timing import latency
 from dpl.fem import (
     Load,
     ModalLoads,
@@ -41,6 +42,7 @@ STEP_TOL = 1e-3  # estimated error within the modes at which the steps end [-]
 MODES = 60  # of the correction of `pod`
 CUBATURE_TOL = 1e-2  # of its cells [-]
 ESTIMATORS = ("corotational", "modes", "reported")
+REPEATS = 5  # timed calls with each load
 SHARES = (0.05, 0.5, 0.95)  # quantiles of the ratio
 
 
@@ -153,6 +155,16 @@ def _scene(problem: Problem, *, n_modes: int = 5, deflection: float = 0.4) -> Sc
     return Scene(problem, loads, newton)
 
 
+def cost(scene: Scene, samples: Sample) -> str:
+    """Return the times of a corotational estimate and of a residual on one thread as a line."""
+    pairs = list(zip(samples.load.unbatch(), samples.displacement.split(1), strict=True))
+    problem, solver = scene.problem, scene.linear
+    known = [(load, u, problem.evaluate(u)) for load, u in pairs]
+    estimate = latency(lambda one: corotational_error(solver, *one), known, repeats=REPEATS)
+    residual = latency(lambda one: problem.evaluate(one[1]), known, repeats=REPEATS)
+    return f"estimate {estimate.p50:.2f} ms, residual {residual.p50:.2f} ms"
+
+
 def estimates(body: str, scene: Scene, sizes: Sizes, folder: Path) -> Iterator[Estimate]:
     """Train the models of a body and yield the estimates of all predictions.
 
@@ -168,6 +180,7 @@ def estimates(body: str, scene: Scene, sizes: Sizes, folder: Path) -> Iterator[E
     data.prepare_data()
     test = data.samples("test")
     doubled = solved(scene, test.load._replace(force=2 * test.force))
+    print(f"{body}: {cost(scene, test)}", flush=True)
     surrogates = trained(scene, data, sizes.epochs)
     for title, samples in ((IN_RANGE, test), (TWICE, doubled)):
         measure = partial(measured, scene, samples)

@@ -76,6 +76,7 @@ def test_the_command_writes_rows_and_a_figure_and_prints_a_table(script, tmp_pat
     table = ended.out[ended.out.rindex("C 5") :].splitlines()
     assert max(len(line.rstrip()) for line in table) <= 100
     assert "…" not in ended.out
+    assert "beam: estimate" in ended.out
     with (tmp_path / "out/error_estimates.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     names = [row["prediction"] for row in rows if row["loads"] == error_estimates.IN_RANGE]
