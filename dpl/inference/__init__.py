@@ -6,6 +6,7 @@ from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
     from dpl.inference.answer import Answer
+    from dpl.inference.error_estimate import corotational_error, estimate_error, nearest
     from dpl.inference.hybrid import (
         Corrected,
         Corrector,
@@ -14,6 +15,6 @@ if TYPE_CHECKING:
         default_hybrid,
         prefer_prediction,
     )
-    from dpl.inference.simulator import Simulator, nearest
+    from dpl.inference.simulator import Simulator
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -1,6 +1,5 @@
 """Answers of the simulator and their summaries in words."""
 
-import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -11,6 +10,8 @@ from dpl.fem import Solution, Status
 
 MAX_OUT_OF_SPAN = 1e-3  # relative projection residual of forces of the load family [-]
 ROUNDOFF = 1e-9  # relative error of amplitudes [-]
+UNKNOWN = 0.995  # estimated error from which the displacement is called unknown [-]
+LEAST_PERCENTAGE = 1e-4  # smallest estimated error that is given in per cent [-]
 
 
 @dataclass(frozen=True)
@@ -21,12 +22,14 @@ class Answer:
         displacement: (N, D) [m], a NumPy array or a tensor as the force.
         residual: ||R_free|| / ||f||, evaluated at the displacement [-], see
             `Problem.relative_residual_of`.
-        error: Estimated relative error of the displacement [-]: Newton's correction in the modes of
-            the model, and the largest error of held-out loads outside of them. NaN if unknown.
+        error: Estimated relative error of the displacement [-], see `estimate_error`: no bound.
+            The estimate in the modes is that of a model which knows its error outside of them, such
+            as `unrolled`, under a load in range. Infinite if an element is inverted or the
+            prediction is not finite.
         volume_ratio: min det F [-]; an element is inverted if it is not above 0.
         converged: True if the residual is below the tolerance of the call (without one, that of
             the scene) and no element is inverted. It is False also where rounding does not allow
-            this residual.
+            this residual. The estimated error has no part in it.
         negative_pivots: Number of negative eigenvalues of the tangent; -1: not examined.
         amplitude: Largest modal load over the largest of the training [-], see
             `ModalLoads.project`.
@@ -37,7 +40,7 @@ class Answer:
             "hybrid" or "full Newton".
         iterations: Linear solves with a tangent.
         milliseconds: Wall time [ms]; of several loads, the share of each.
-        summary: Residual, stability and range in words.
+        summary: Estimated error, residual, stability and range in words.
     """
 
     displacement: Any
@@ -63,16 +66,24 @@ def summarise(
     out_of_span: float,
     outside: bool,
 ) -> str:
-    """Return the summary of one solution; `kept`: the tolerance is met."""
-    residual = float(state.residual)
-    if kept:
-        words = f"in balance to {residual:.1e} of the load, nothing inverted"
-    elif not float(state.volume_ratio) > 0:
+    """Return the summary of one solution in words: error, residual, stability and range.
+
+    Args:
+        state: The solution.
+        kept: The residual is below the tolerance.
+        error: Estimated relative error of the displacement [-].
+        amplitude, out_of_span: See `Answer`.
+        outside: The load is out of the training range.
+    """
+    if not float(state.volume_ratio) > 0:
         words = "NOT VALID: an element is inverted"
     else:
-        known = f"error about {error:.1e}, " if math.isfinite(error) else ""
-        words = f"an estimate, {known}out of balance by {residual:.1e} of the load"
-        words += ", the least that rounding allows" if state.converged else ""
+        words = f"{_accuracy(error)}, residual {float(state.residual):.1e} of the load"
+        if kept:
+            words += " (converged)"
+        elif state.converged:
+            words += ", the least that rounding allows"
+        words += ", nothing inverted"
     if bool(state.converged):
         pivots = int(state.negative_pivots)
         if pivots > 0:
@@ -88,6 +99,14 @@ def summarise(
     if amplitude > 1 + ROUNDOFF:
         return words + f"; the load is {amplitude:.2g} times the training's largest"
     return words + "; a modulus lies outside the training's range"
+
+
+def _accuracy(error: float) -> str:
+    """Return an estimated relative error in words."""
+    if not error < UNKNOWN:
+        return "displacement unknown, its estimated error exceeds 100 %"
+    size = f"{100 * error:.2g} %" if error >= LEAST_PERCENTAGE else f"{error:.1e}"
+    return f"displacement within about {size} (estimated)"
 
 
 def answer_like(answer: dict[str, Any], *, numpy: bool, single: bool) -> Answer:

@@ -1,4 +1,4 @@
-"""Conversion of the arguments of a call to float64 tensors."""
+"""Conversion of the arguments of a call to float64 tensors and to a load."""
 
 from collections.abc import Mapping, Sequence
 from numbers import Real
@@ -7,6 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+
+from dpl.fem import Load
+from dpl.fem.assembly.equilibrium import FAINT
+from dpl.scene import Scene
 
 
 def as_numbers(name: str, value: Any) -> Tensor:
@@ -92,3 +96,51 @@ def named_columns(name: str, value: Any, names: Sequence[str], count: int) -> Te
             f"({count}, {len(names)}); it is {found}"
         )
     return table
+
+
+def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
+    """Return the arguments of a call as a dimensionless load.
+
+    Args:
+        scene: The scene.
+        force: Nodal forces, (N, D) or (B, N, D) [N] (2D: [N/m]), float64.
+        young: Young's modulus, one number or (B,) [Pa]; None: that of the scene.
+        parameters: Values of the ranges of the law, see `named_columns`.
+
+    Raises:
+        ValueError: An argument has a wrong shape, is not finite, or is out of range.
+    """
+    shape = scene.problem.shape
+    if force.shape[-2:] != shape or force.ndim not in (2, 3) or not force.numel():
+        words = f"({shape[0]}, {shape[1]}) or (B, {shape[0]}, {shape[1]})"
+        raise ValueError(f"force: its shape is {tuple(force.shape)} and must be {words}")
+    force = force.reshape(-1, *shape)
+    if not force.isfinite().all():
+        raise ValueError("force: a number is not finite")
+    moduli = _moduli(scene, young, len(force))
+    values = named_columns("parameters", parameters, list(scene.loads.parameter_ranges), len(force))
+    scene.problem.material.with_parameters(values)  # refuses values that it does not allow
+    force = scene.problem.acting(force)
+    load = scene.load_of(force, moduli, values)
+    sizes = load.force.abs().amax(dim=(1, 2))
+    lost = (sizes < FAINT) & force.any(dim=2).any(dim=1)
+    if bool(lost.any()) or not sizes.isfinite().all():
+        unit = "E L^2" if shape[1] == 3 else "E L"
+        raise ValueError(
+            f"force: its largest entry over {unit} must be 0, or a number from {FAINT:g} that "
+            "float64 holds; check the units of force and young"
+        )
+    return load
+
+
+def _moduli(scene: Scene, young: Any, count: int) -> Tensor:
+    """Return Young's moduli (B,) [Pa] of a call."""
+    low, high = scene.loads.young_range
+    if young is None and low < high:
+        raise ValueError(f"young: the scene has a range, {low:g} to {high:g} Pa; say which")
+    moduli = per_load("young", low if young is None else young, count)
+    if not (moduli > 0).all():
+        raise ValueError("young: a modulus is not above 0 Pa")
+    for modulus in moduli.tolist():
+        scene.problem.check_foundation_modulus(modulus)
+    return moduli

@@ -2,21 +2,21 @@
 
 import math
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Self
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from dpl.fem import Load, Newton, Solution, Status, SubspaceNewton, evaluate_solution
-from dpl.fem.assembly.equilibrium import FAINT
-from dpl.fem.solvers import check_tol, concatenate
-from dpl.inference.answer import MAX_OUT_OF_SPAN, ROUNDOFF, Answer, answer_like, summarise
-from dpl.inference.arguments import as_number, as_numbers, named_columns, per_load
+from dpl.fem import Load, Problem, Solution, Status, SubspaceNewton, evaluate_solution
+from dpl.fem.solvers import concatenate
+from dpl.inference.answer import Answer, answer_like, summarise
+from dpl.inference.arguments import as_load, as_numbers
+from dpl.inference.error_estimate import SUFFICIENT, estimate_error, nearest
 from dpl.inference.hybrid import default_hybrid
+from dpl.inference.request import Candidate, Request
+from dpl.inference.training_range import RangeCheck
 from dpl.models import Correctable, HasCorrection
 from dpl.models.newton_choice import MAX_STEPS
 from dpl.scene import Scene
@@ -30,11 +30,12 @@ MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is eval
 class Simulator:
     """Simulator of a scene with a trained surrogate and the solvers of the scene.
 
-    Called with a force alone, it returns the prediction with its residual. If the model comes with
-    Newton's method in its modes, it also estimates the error, and makes steps of this method while
-    the estimate is too large. With a tolerance, it tries network, linear solution, hybrid and
-    Newton in this order until the tolerance is met; with a budget, while there is time. It keeps
-    the last displacement as an initial guess of the next call (`warm`).
+    Called with a force alone, it returns the prediction with its residual and its estimated error.
+    If the model comes with Newton's method in its modes, it makes steps of this method while the
+    error in the modes is too large. With a tolerance for the residual or the estimated error, it
+    tries network, linear solution, hybrid and Newton in this order until the tolerance is met; with
+    a budget, while there is time. It keeps the last displacement as an initial guess of the next
+    call (`warm`).
 
     Attributes:
         surrogate: The surrogate.
@@ -66,6 +67,7 @@ class Simulator:
         self._before: tuple[Tensor, Tensor] | None = None  # parameters, displacement
         self._pace = 0.0  # time of an iteration [s]
         self.scene.corrector  # noqa: B018  # built here, so that the first call is not slower
+        self.scene.linear.reference.corotational  # noqa: B018  # so is the factor of the estimate
 
     @classmethod
     def corrected(
@@ -115,11 +117,13 @@ class Simulator:
             young: Young's modulus, one number or (B,) [Pa]; optional if the scene has only one.
             parameters: A value for each range of the law, one number or (B,), by its name such as
                 `{"poisson": 0.4}`; or all as an array (B, P).
-            tol: Relative residual of the result [-], at least 1e-15 and below 1.
+            tol: Relative residual of the result [-], at least 1e-15 and below 1; with `error`, both
+                are met.
             budget_ms: Wall time of each load [ms]. An iteration is not started if the time of the
                 last iteration exceeds the rest of the budget.
-            error: Estimated relative error within the modes of the model [-] above which steps of
-                Newton's method in them follow, at most `steps` of them; 1e-3 if left out.
+            error: Estimated relative error of the result [-]. A model with modes makes steps of
+                Newton's method in them first, at most `steps`, while its error within the modes is
+                above `error`; it also does so if `error` is left out, with 1e-3.
             warm: Start from the last displacement if it is nearer to equilibrium than the
                 prediction.
             stability: Factorise the tangent at the result to determine its stability.
@@ -130,153 +134,116 @@ class Simulator:
         """
         begin = time.perf_counter()
         given = as_numbers("force", force)
-        load = self._load(given, young, parameters)
-        tol, budget_ms = as_number("tol", tol), as_number("budget_ms", budget_ms)
-        wanted = self.scene.solver.tol if tol is None else tol
-        check_tol(wanted)
-        error = as_number("error", error)
-        if error is not None and not error > 0:
-            raise ValueError(f"error = {error} must be above 0")
-        if budget_ms is not None and not 0 < budget_ms < math.inf:
-            raise ValueError(f"budget_ms = {budget_ms} must be a number above 0")
-        count = len(load.force)
+        load = as_load(self.scene, given, young, parameters)
+        request = Request.checked(tol, budget_ms, error, warm=warm)
         with one_thread(), torch.inference_mode():
             predictions = self.surrogate.predict(load)
-            amplitude, out_of_span = self.scene.loads.project(load.force)
-            shared = (time.perf_counter() - begin) / count
+            places = RangeCheck.of(self.surrogate, load)
+            shared = (time.perf_counter() - begin) / len(load.force)
             found = []
-            for k, single in enumerate(load.unbatch()):
+            members = load.unbatch(), predictions.split(1), places.split()
+            for single, prediction, place in zip(*members, strict=True):
                 begin = time.perf_counter() - shared
-                request = _Request(tol, budget_ms, error or ERROR, warm, begin)
-                method, state, estimate = self._solve(
-                    single, predictions[k : k + 1], float(amplitude[k]), request
-                )
+                best = self._solve(single, prediction, place, request._replace(begin=begin))
                 if stability:
-                    state = self._with_stability(single, state)
-                self._before = single.parameters, state.displacement
-                taken = 1e3 * (time.perf_counter() - request.begin)
-                found.append((method, state, estimate, taken))
-        methods, states, estimates, times = zip(*found, strict=True)
-        state = concatenate(states)
+                    best = best._replace(state=self._with_stability(single, best.state))
+                self._before = single.parameters, best.state.displacement
+                found.append((best, 1e3 * (time.perf_counter() - begin)))
+            answer = self._reported(found, places, request)
+        return answer_like(answer, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
+
+    def _reported(
+        self,
+        found: Sequence[tuple[Candidate, float]],
+        places: RangeCheck,
+        request: Request,
+    ) -> dict[str, Any]:
+        """Return the fields of `Answer` for solutions with their times [ms]."""
+        state = concatenate([best.state for best, _ in found])
+        wanted = request.residual_tol(self.scene)
         kept = state.converged & (state.residual < wanted)
-        outside = (
-            (amplitude > 1 + ROUNDOFF)
-            | (out_of_span > MAX_OUT_OF_SPAN)
-            | self._outside_modulus_range(load)
-        )
+        errors = torch.tensor([best.error for best, _ in found], dtype=torch.float64)
+        numbers = zip(kept, errors, *places, strict=True)
         words = [
             "no load: at rest"
-            if method == "rest"
-            else summarise(one, bool(ok), estimate, float(a), float(s), bool(out))
-            for method, one, ok, estimate, a, s, out in zip(
-                *(methods, states, kept, estimates, amplitude, out_of_span, outside), strict=True
-            )
+            if best.method == "rest"
+            else summarise(best.state, bool(ok), float(error), float(a), float(s), bool(out))
+            for (best, _), (ok, error, a, s, out) in zip(found, numbers, strict=True)
         ]
-        answer = {
+        return {
             "displacement": self.scene.length * state.displacement,
             "residual": state.residual,
-            "error": torch.tensor(estimates, dtype=torch.float64),
+            "error": errors,
             "volume_ratio": state.volume_ratio,
             "converged": kept,
             "negative_pivots": state.negative_pivots,
-            "amplitude": amplitude,
-            "out_of_span": out_of_span,
-            "out_of_distribution": outside,
-            "method": list(methods),
+            "amplitude": places.amplitude,
+            "out_of_span": places.out_of_span,
+            "out_of_distribution": places.outside,
+            "method": [best.method for best, _ in found],
             "iterations": state.iterations,
-            "milliseconds": torch.tensor(times, dtype=torch.float64),
+            "milliseconds": torch.tensor([taken for _, taken in found], dtype=torch.float64),
             "summary": words,
         }
-        return answer_like(answer, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
-
-    def _load(self, force: Tensor, young: Any, parameters: Any) -> Load:
-        """Return the arguments of a call as a dimensionless load."""
-        shape, scene = self.scene.problem.shape, self.scene
-        if force.shape[-2:] != shape or force.ndim not in (2, 3) or not force.numel():
-            words = f"({shape[0]}, {shape[1]}) or (B, {shape[0]}, {shape[1]})"
-            raise ValueError(f"force: its shape is {tuple(force.shape)} and must be {words}")
-        force = force.reshape(-1, *shape)
-        if not force.isfinite().all():
-            raise ValueError("force: a number is not finite")
-        force = scene.problem.acting(force)
-        low, high = scene.loads.young_range
-        if young is None and low < high:
-            raise ValueError(f"young: the scene has a range, {low:g} to {high:g} Pa; say which")
-        moduli = per_load("young", low if young is None else young, len(force))
-        if not (moduli > 0).all():
-            raise ValueError("young: a modulus is not above 0 Pa")
-        for modulus in moduli.tolist():
-            scene.problem.check_foundation_modulus(modulus)
-        ranges = scene.loads.parameter_ranges
-        values = named_columns("parameters", parameters, list(ranges), len(force))
-        scene.problem.material.with_parameters(values)  # refuses values that it does not allow
-        load = scene.load_of(force, moduli, values)
-        sizes = load.force.abs().amax(dim=(1, 2))
-        lost = (sizes < FAINT) & force.any(dim=2).any(dim=1)
-        if bool(lost.any()) or not sizes.isfinite().all():
-            unit = "E L^2" if shape[1] == 3 else "E L"
-            raise ValueError(
-                f"force: its largest entry over {unit} must be 0, or a number from {FAINT:g} that "
-                "float64 holds; check the units of force and young"
-            )
-        return load
-
-    def _outside_modulus_range(self, load: Load) -> Tensor:
-        """Return True for loads with an input modulus of the network out of range, (B,)."""
-        loads, takes = self.scene.loads, getattr(self.surrogate.net, "extra_inputs", ())
-        pairs = list(zip(load.parameters.T, loads.parameter_ranges.values(), strict=True))
-        if "young" in takes:
-            pairs.append((load.young, loads.young_range))
-        outside = torch.zeros(len(load.force), dtype=torch.bool)
-        for values, (low, high) in pairs:
-            outside |= (values < low) | (values > high)
-        return outside
 
     def _solve(
-        self, load: Load, prediction: Tensor, amplitude: float, request: "_Request"
-    ) -> tuple[str, Solution, float]:
-        """Return the first solution that meets the tolerance, else the best one.
+        self, load: Load, prediction: Tensor, place: RangeCheck, request: Request
+    ) -> Candidate:
+        """Return the first solution that meets the tolerances, else the best one.
 
-        It comes with its method and its estimated relative error, NaN if unknown.
+        Args:
+            load: The load, B = 1.
+            prediction: The prediction of the network, (1, N, D) [-].
+            place: Position of the load relative to the training range.
+            request: Options of the call.
         """
-        scene = self.scene
-        tol = scene.solver.tol if request.tol is None else request.tol
+        scene, tol = self.scene, request.residual_tol(self.scene)
         if not load.force.any() and not scene.problem.moved_supports:
             rest = evaluate_solution(scene.problem, torch.zeros_like(prediction), load, tol)
-            return "rest", rest, 0.0
-        found: tuple[str, Solution, float] | None = None
-        for method, last, error in self._candidates(load, prediction, amplitude, tol, request):
-            if found is None or _rank(last) <= _rank(found[1]):
-                found = method, last, error
-            # converged also if rounding allows no smaller residual
-            if last.converged or request.over(self._pace):
+            return Candidate("rest", rest, 0.0)
+        best: Candidate | None = None
+        last: Candidate | None = None
+        for last in self._candidates(load, prediction, place, request):
+            if request.error is not None:
+                last = self._with_error(load, last, request)
+            if best is None or request.rank(last) <= request.rank(best):
+                best = last
+            if request.is_met(last) or request.over(self._pace):
                 break
-        assert found is not None
-        method, state, error = found
-        return method, state._replace(status=last.status, load_factor=last.load_factor), error
+        assert best is not None
+        assert last is not None
+        ended, state = last.state, best.state
+        kept = (state.residual < tol) & (state.volume_ratio > 0) & ~ended.converged
+        status = torch.where(kept, int(Status.CONVERGED), ended.status)
+        state = state._replace(status=status, load_factor=ended.load_factor)
+        return self._with_error(load, best._replace(state=state), request)
+
+    def _with_error(self, load: Load, candidate: Candidate, request: Request) -> Candidate:
+        """Return a solution with its estimated error."""
+        if candidate.error is not None:
+            return candidate
+        error = estimate_error(
+            self.scene.linear, load, candidate.state.displacement, candidate.evaluation,
+            in_modes=candidate.error_in_modes,
+            sufficient=SUFFICIENT if request.error is None else request.error,
+        )  # fmt: skip
+        return candidate._replace(error=error)
 
     def _candidates(
-        self, load: Load, prediction: Tensor, amplitude: float, tol: float, request: "_Request"
-    ) -> Iterator[tuple[str, Solution, float]]:
-        """Yield the solutions of the methods, the cheapest first, with names and errors."""
-        problem = self.scene.problem
-        state, error = self._corrected(load, prediction, tol, request)
-        yield "corrected" if int(state.iterations) else "network", state, error
-        if request.tol is None and request.budget_ms is None:
+        self, load: Load, prediction: Tensor, place: RangeCheck, request: Request
+    ) -> Iterator[Candidate]:
+        """Yield the solutions of the methods, the cheapest first; see `_solve`."""
+        problem, tol = self.scene.problem, request.iteration_tol(self.scene)
+        first = self._corrected(load, prediction, request)
+        yield first._replace(error_in_modes=math.inf) if place.outside else first
+        if not request.is_more_than_prediction:
             return
-        if amplitude < MAX_LINEAR_AMPLITUDE:
+        if place.amplitude < MAX_LINEAR_AMPLITUDE:
             answer = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
-            yield "linear", evaluate_solution(problem, answer, load, tol), math.nan
-        guess = state.displacement
-        newton = replace(self.scene.corrector, tol=tol)
-        guesses = [guess]
-        if (
-            request.warm
-            and self._before is not None
-            and torch.equal(self._before[0], load.parameters)
-        ):
-            guesses.append(self._before[1])
-        start = guess if len(guesses) == 1 else nearest(newton, load, guesses)
+            yield _evaluated("linear", problem, answer, load, tol)
+        start, before = first.state.displacement, self._before
+        if request.warm and before is not None and torch.equal(before[0], load.parameters):
+            start = nearest(self.scene.newton, load, [start, before[1]])
         clock = time.perf_counter()
         for state in default_hybrid(lambda load: start, self.scene, tol).iterate(load):
             if int(state.iterations):
@@ -284,16 +251,16 @@ class Simulator:
                 self._pace, clock = now - clock, now
             elif not state.converged:  # the initial state, which has been evaluated
                 continue
-            yield "hybrid" if state.from_guess else "full Newton", state, math.nan
+            yield Candidate("hybrid" if state.from_guess else "full Newton", state)
 
-    def _corrected(
-        self, load: Load, prediction: Tensor, tol: float, request: "_Request"
-    ) -> tuple[Solution, float]:
-        """Return the prediction, corrected by Newton's steps in the modes, and its error."""
-        problem = self.scene.problem
+    def _corrected(self, load: Load, prediction: Tensor, request: Request) -> Candidate:
+        """Return the prediction, corrected by Newton's steps in the modes."""
+        problem, tol = self.scene.problem, request.iteration_tol(self.scene)
         if self.newton is None or not bool(prediction.isfinite().all()):
-            return evaluate_solution(problem, prediction, load, tol, from_guess=True), math.nan
-        wanted = request.error if request.tol is None else min(request.error, self.newton.error_tol)
+            return _evaluated("network", problem, prediction, load, tol)
+        wanted = ERROR if request.error is None else request.error
+        if request.tol is not None:
+            wanted = min(wanted, self.newton.error_tol)
         states = self.newton.states(load, guess=prediction, error_tol=wanted, max_iter=self.steps)
         state = next(states)
         while not request.over(0.0) and (following := next(states, None)) is not None:
@@ -302,7 +269,10 @@ class Simulator:
             problem, state.displacement, load, tol,
             iterations=state.iterations, from_guess=True, evaluation=state.evaluation,
         )  # fmt: skip
-        return solution, state.error + self.newton.outside_error
+        outside = self.newton.outside_error  # 0 if it is not known
+        within = state.error + outside if outside > 0 else math.inf
+        method = "corrected" if state.iterations else "network"
+        return Candidate(method, solution, None, within, state.evaluation)
 
     def _with_stability(self, load: Load, state: Solution) -> Solution:
         """Return a solution with the number of negative eigenvalues of its tangent."""
@@ -317,43 +287,12 @@ class Simulator:
         )
 
 
-class _Request(NamedTuple):
-    """Options of a call and the time of its start [s]."""
-
-    tol: float | None
-    budget_ms: float | None
-    error: float
-    warm: bool
-    begin: float
-
-    def over(self, ahead: float) -> bool:
-        """Return True if this time from now [s] exceeds the budget."""
-        if self.budget_ms is None:
-            return False
-        return 1e3 * (time.perf_counter() - self.begin + ahead) > self.budget_ms
-
-
-def nearest(newton: Newton, load: Load, guesses: list[Tensor]) -> Tensor:
-    """Return the guess (1, N, D) with the smallest estimated distance from equilibrium.
-
-    The distance is ||M R(u)|| with the corotated inverse M of K(0), an approximate Newton
-    correction, which unlike the residual does not depend on the stiffness against an error. It is
-    infinite for a guess that inverts an element or is not finite.
-    """
-    preconditioner = newton.with_parameters(load.parameters).linear_solver.corotational
-
-    def distance(guess: Tensor) -> float:
-        internal, volume = preconditioner.problem.evaluate(guess)
-        if not bool(volume > 0):
-            return math.inf
-        right = preconditioner.problem.restrict((load.force - internal)[0])
-        return float(np.linalg.norm(preconditioner.at(guess).apply(right)))
-
-    return min(guesses, key=distance)
-
-
-def _rank(state: Solution) -> tuple[bool, bool, float]:
-    """Return the key by which solutions are sorted: converged, not inverted, residual."""
-    residual = float(state.residual)
-    valid = bool(state.volume_ratio > 0)
-    return not bool(state.converged), not valid, residual if residual == residual else math.inf
+def _evaluated(
+    method: str, problem: Problem, displacement: Tensor, load: Load, tol: float
+) -> Candidate:
+    """Return a displacement as a solution, with its evaluation."""
+    evaluation = problem.with_parameters(load.parameters).evaluate(displacement)
+    state = evaluate_solution(
+        problem, displacement, load, tol, from_guess=method == "network", evaluation=evaluation
+    )
+    return Candidate(method, state, evaluation=evaluation)

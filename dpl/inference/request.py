@@ -1,0 +1,113 @@
+"""Tolerances and budget of a call of the simulator, and the solutions that they choose from."""
+
+import math
+import time
+from typing import Any, NamedTuple, Self
+
+from dpl.fem import Solution
+from dpl.fem.problem import Evaluation
+from dpl.fem.solvers import check_tol
+from dpl.inference.arguments import as_number
+from dpl.scene import Scene
+
+
+class Candidate(NamedTuple):
+    """A solution with its method.
+
+    Attributes:
+        method: As of `Answer`.
+        state: The solution.
+        error: Its estimated relative error [-]; None: not computed.
+        error_in_modes: Its estimated error by the modes of the model [-]; infinite: unknown.
+        evaluation: Internal force and min det F at its displacement, if known.
+    """
+
+    method: str
+    state: Solution
+    error: float | None = None
+    error_in_modes: float = math.inf
+    evaluation: Evaluation | None = None
+
+    @property
+    def known_error(self) -> float:
+        """The estimated error; infinite if it was not computed."""
+        return math.inf if self.error is None else self.error
+
+
+class Request(NamedTuple):
+    """Tolerances and budget of a call.
+
+    Attributes:
+        tol: Relative residual of the result [-]; None: not requested.
+        budget_ms: Wall time of each load [ms]; None: no limit.
+        error: Estimated relative error of the result [-]; None: not requested.
+        warm: Whether the last displacement is a guess too.
+        begin: Time at which the computation began [s].
+    """
+
+    tol: float | None
+    budget_ms: float | None
+    error: float | None
+    warm: bool
+    begin: float = 0.0
+
+    @classmethod
+    def checked(cls, tol: Any, budget_ms: Any, error: Any, *, warm: bool) -> Self:
+        """Return the arguments of a call as numbers.
+
+        Raises:
+            ValueError: An argument is not one number, or out of range.
+        """
+        tol, budget_ms = as_number("tol", tol), as_number("budget_ms", budget_ms)
+        error = as_number("error", error)
+        if tol is not None:
+            check_tol(tol)
+        if error is not None and not error > 0:
+            raise ValueError(f"error = {error} must be above 0")
+        if budget_ms is not None and not 0 < budget_ms < math.inf:
+            raise ValueError(f"budget_ms = {budget_ms} must be a number above 0")
+        return cls(tol, budget_ms, error, warm)
+
+    @property
+    def is_more_than_prediction(self) -> bool:
+        """True if other methods may follow the prediction."""
+        return (self.tol, self.budget_ms, self.error) != (None, None, None)
+
+    def residual_tol(self, scene: Scene) -> float:
+        """Return the residual below which a solution counts as converged [-]."""
+        return scene.solver.tol if self.tol is None else self.tol
+
+    def iteration_tol(self, scene: Scene) -> float:
+        """Return the residual at which iterations end, whatever the estimated error [-]."""
+        tol = self.residual_tol(scene)
+        return tol if self.error is None else min(tol, scene.solver.tol)
+
+    def is_met(self, candidate: Candidate) -> bool:
+        """Return True if a solution meets all tolerances of the call, or is the best possible.
+
+        The latter has converged to `iteration_tol`, or rounding allows no smaller residual.
+        """
+        state = candidate.state
+        if bool(state.converged):
+            return True
+        if self.tol is None and self.error is None:
+            return False
+        kept = self.tol is None or bool((state.residual < self.tol) & (state.volume_ratio > 0))
+        return kept and (self.error is None or candidate.known_error <= self.error)
+
+    def rank(self, candidate: Candidate) -> tuple[bool, bool, float]:
+        """Return the key by which solutions are sorted; the smallest is best.
+
+        It is whether they are not converged, whether an element is inverted, and the estimated
+        error if that has a tolerance, else the residual.
+        """
+        state = candidate.state
+        size = float(state.residual) if self.error is None else candidate.known_error
+        valid = bool(state.volume_ratio > 0)
+        return not bool(state.converged), not valid, size if size == size else math.inf
+
+    def over(self, ahead: float) -> bool:
+        """Return True if this time from now [s] exceeds the budget."""
+        if self.budget_ms is None:
+            return False
+        return 1e3 * (time.perf_counter() - self.begin + ahead) > self.budget_ms

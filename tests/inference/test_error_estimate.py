@@ -1,0 +1,222 @@
+"""Laws of the estimated error: all methods report it, and a tolerance for it is met."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+import dpl.inference.error_estimate as error_estimate
+from dpl.fem import Problem, Status, SubspaceNewton, solve
+from dpl.inference import Simulator, corotational_error
+from dpl.inference.answer import summarise
+from dpl.models import FCNN
+from dpl.training import MSE, Surrogate
+
+E = 4500.0
+
+
+@pytest.fixture(scope="module")
+def loads(scene):
+    """Four loads that need several iterations."""
+    return scene.loads.sample((0, 9), range(4))
+
+
+@pytest.fixture(scope="module")
+def forces(scene, loads):
+    """The same, (B, N, D) [N]."""
+    return loads.force * scene.force_unit * E
+
+
+@pytest.fixture(scope="module")
+def truth(scene, loads):
+    """Their displacements, (B, N, D) [-]."""
+    return solve(scene.solver, loads).displacement
+
+
+def simulator_of(scene, part, **more):
+    """Return a simulator whose network predicts a part of the displacement."""
+    torch.manual_seed(0)
+    surrogate = Surrogate(FCNN(scene, width=4), MSE(), scene)
+    surrogate.predict = lambda load: part * solve(scene.solver, load).displacement
+    return Simulator(surrogate, **more)
+
+
+def softest_mode(scene, **options):
+    """Return Newton's method in one mode."""
+    vectors = scene.loads.modes.vectors[..., :1]
+    return SubspaceNewton(scene.problem, vectors / vectors.norm(), **options)
+
+
+def errors_of(answer, scene, truth):
+    u = answer.displacement / scene.length
+    return (u - truth).flatten(1).norm(dim=1) / truth.flatten(1).norm(dim=1)
+
+
+@pytest.mark.parametrize("part", [0.9, 0.99, 1.001, 1 + 1e-6])
+def test_a_network_without_modes_reports_its_error_within_a_factor_of_two(
+    scene, forces, truth, part
+):
+    answer = simulator_of(scene, part)(forces)
+    assert answer.method == ["network"] * 4
+    ratio = answer.error / errors_of(answer, scene, truth)
+    assert (ratio > 0.5).all()
+    assert (ratio < 2.0).all()
+
+
+def test_the_residual_of_a_prediction_is_evaluated_once(scene, forces, monkeypatch):
+    sim, evaluate, seen = simulator_of(scene, 0.99), Problem.evaluate, []
+    u = sim.surrogate.predict(scene.load_of(forces[:1], torch.tensor([E])))
+    sim.surrogate.predict = lambda load: u
+
+    def counted(problem, displacement):
+        seen.append(displacement)
+        return evaluate(problem, displacement)
+
+    monkeypatch.setattr(Problem, "evaluate", counted)
+    assert math.isfinite(sim(forces[0]).error)
+    assert len(seen) == 1
+
+
+@pytest.mark.parametrize("wanted", [1e-2, 1e-4, 1e-6])
+def test_a_tolerance_for_the_error_is_met_without_modes(scene, forces, truth, wanted):
+    sim = simulator_of(scene, 0.7)
+    answer, exact = sim(forces, error=wanted), sim(forces, tol=scene.solver.tol)
+    assert (answer.error <= wanted).all()
+    assert (errors_of(answer, scene, truth) < 3 * wanted).all()
+    assert set(answer.method) <= {"hybrid", "full Newton"}
+    assert (answer.iterations > 0).all()
+    assert (answer.iterations < exact.iterations).any()
+    assert (answer.iterations <= exact.iterations).all()
+    assert not answer.converged.all()
+    near = simulator_of(scene, 1 + wanted / 10)(forces, error=wanted)
+    assert near.method == ["network"] * 4
+
+
+@pytest.mark.parametrize(("tol", "wanted"), [(1e-2, 1e-6), (1e-7, 1e-1)])
+def test_tolerances_for_residual_and_error_are_both_met(scene, forces, tol, wanted):
+    answer = simulator_of(scene, 0.9)(forces, tol=tol, error=wanted, stability=True)
+    assert (answer.residual < tol).all()
+    assert (answer.error <= wanted).all()
+    assert answer.converged.all()
+    assert all("(converged)" in words and "stable" in words for words in answer.summary)
+    assert (answer.negative_pivots == 0).all()
+
+
+def test_all_methods_report_their_error(scene, forces):
+    sim = simulator_of(scene, -1.0)
+    found = [sim(1e-7 * forces[0], tol=1e-3), sim(forces[0], tol=1e-8)]
+    found.append(simulator_of(scene, math.nan)(forces[0], tol=1e-8))
+    assert [answer.method for answer in found] == ["linear", "full Newton", "full Newton"]
+    assert all(0 < answer.error < 1e-3 for answer in found)
+    assert max(answer.error for answer in found[1:]) < 1e-6
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -3.0, 0.0])
+def test_the_error_of_a_useless_prediction_is_infinite(scene, forces, value):
+    """The body is inverted, or not displaced at all."""
+    sim = simulator_of(scene, 1.0)
+    useless = torch.where(scene.problem.free, value, 0.0).double()
+    sim.surrogate.predict = lambda load: useless[None].expand(load.force.shape)
+    answer = sim(forces[0])
+    assert answer.error == math.inf
+    assert "within" not in answer.summary
+    assert sim(forces[0], error=1e-3).error <= 1e-3
+
+
+def test_steps_in_modes_are_followed_by_the_hybrid_on_request_only(scene, forces):
+    newton = softest_mode(scene)
+    sim = simulator_of(scene, 0.8, newton=newton)
+    plain = sim(forces)
+    assert set(plain.method) <= {"network", "corrected"}
+    assert (plain.error > 1e-3).any(), "one mode is too few"
+    asked = sim(forces, error=1e-3)
+    assert (asked.error <= 1e-3).all()
+    assert "hybrid" in asked.method
+
+
+def test_the_estimate_does_not_depend_on_the_size_of_small_loads(scene, loads):
+    load = loads.unbatch()[0]
+    u = 1.1 * scene.linear.solve(load.force[0])[None]
+    sizes = [1e-6, 1e-100, 1e-200, 1e-280]
+    found = [
+        corotational_error(scene.linear, load._replace(force=size * load.force), size * u)
+        for size in sizes
+    ]
+    assert found == pytest.approx([0.1 / 1.1] * len(sizes), rel=1e-4)
+
+
+def test_a_value_of_the_law_needs_no_factor_for_the_estimate(make_scene):
+    scene = make_scene(poisson=[0.2, 0.4])
+    load = scene.loads.sample((0, 9), [0])
+    load = load._replace(parameters=torch.tensor([[0.337]]).double())
+    exact = solve(scene.solver, load).displacement
+    sim = Simulator(Surrogate(FCNN(scene, width=4), MSE(), scene))
+    sim.surrogate.predict = lambda load: 0.99 * exact
+    solver = scene.linear.with_parameters(load.parameters)
+    solver.__dict__.pop("factor", None)
+    answer = sim(load.force[0] * E * scene.force_unit, parameters=load.parameters)
+    assert answer.error == pytest.approx(0.01, rel=0.5)
+    assert "factor" not in solver.__dict__
+
+
+def state_of(residual=28.0, volume=0.7, status=Status.NOT_CONVERGED, pivots=-1):
+    return SimpleNamespace(
+        residual=residual, volume_ratio=volume, status=status, negative_pivots=pivots,
+        converged=status <= Status.UNSTABLE, load_factor=0.0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (0.00432, "displacement within about 0.43 % (estimated), residual 2.8e+01 of the load"),
+        (0.157, "displacement within about 16 % (estimated), residual"),
+        (1e-4, "displacement within about 0.01 % (estimated), residual"),
+        (9.9e-5, "displacement within about 9.9e-05 (estimated), residual"),
+        (1.3, "displacement unknown, its estimated error exceeds 100 %, residual"),
+        (math.inf, "displacement unknown, its estimated error exceeds 100 %, residual"),
+    ],
+)
+def test_a_summary_begins_with_the_error(error, words):
+    summary = summarise(state_of(), False, error, 0.5, 0.0, False)
+    assert summary.startswith(words)
+    assert summary.endswith("of the load, nothing inverted")
+
+
+def test_a_summary_states_inversion_convergence_stability_and_range():
+    inverted = summarise(state_of(volume=-1.0), False, math.inf, 0.5, 0.0, False)
+    assert inverted == "NOT VALID: an element is inverted"
+    good = state_of(3.7e-8, status=Status.CONVERGED)
+    assert summarise(good, True, 2e-8, 2.5, 0.0, True) == (
+        "displacement within about 2.0e-08 (estimated), residual 3.7e-08 of the load (converged), "
+        "nothing inverted, stability not examined; the load is 2.5 times the training's largest"
+    )
+    column = state_of(1e-9, status=Status.UNSTABLE, pivots=2)
+    assert "UNSTABLE (2 negative eigenvalues)" in summarise(column, True, 1e-9, 1.0, 0.0, False)
+
+
+def test_the_error_in_modes_counts_in_range_only_and_saves_the_correction(
+    scene, forces, monkeypatch
+):
+    seen = []
+
+    def counted(*arguments):
+        seen.append(arguments)
+        return corotational_error(*arguments)
+
+    monkeypatch.setattr(error_estimate, "corotational_error", counted)
+    sim = simulator_of(scene, 1.0, newton=softest_mode(scene, outside_error=1e-4))
+    inside = sim(forces[0])
+    assert inside.error == pytest.approx(1e-4, rel=1e-3)
+    assert not seen
+    assert sim(forces[0], error=1e-5).error < 1e-6
+    assert len(seen) == 1
+    largest = scene.loads.modes.vectors @ (1.5 * scene.loads.q_max)
+    outside = sim(torch.where(scene.loads.loadable_dofs, largest, 0.0) * scene.force_unit * E)
+    assert outside.out_of_distribution
+    assert outside.error < 1e-6
+    assert len(seen) == 2
+    unknown = simulator_of(scene, 1.0, newton=softest_mode(scene))
+    assert unknown(forces[0]).error < 1e-6
+    assert len(seen) == 3
