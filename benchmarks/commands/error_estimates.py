@@ -35,7 +35,7 @@ def main(cfg: DictConfig) -> None:
     for body in cfg.bodies:
         start = time.perf_counter()
         scene = error_estimates.BODIES[body]()
-        print(scene.body(), flush=True)
+        print(*scene.describe()[0], flush=True)
         found += error_estimates.estimates(body, scene, sizes, folder / "data" / body)
         print(f"{body}: {time.perf_counter() - start:.0f} s", flush=True)
     rows = error_estimates.summarised(found)

@@ -105,8 +105,12 @@ def _accuracy(error: float) -> str:
     """Return an estimated relative error in words."""
     if not error < UNKNOWN:
         return "displacement unknown, its estimated error exceeds 100 %"
-    size = f"{100 * error:.2g} %" if error >= LEAST_PERCENTAGE else f"{error:.1e}"
-    return f"displacement within about {size} (estimated)"
+    return f"displacement within about {relative(error)} (estimated)"
+
+
+def relative(error: float) -> str:
+    """Return a relative error as text, in percent unless it is very small."""
+    return f"{100 * error:.2g} %" if error >= LEAST_PERCENTAGE else f"{error:.1e}"
 
 
 def answer_like(answer: dict[str, Any], *, numpy: bool, single: bool) -> Answer:

@@ -4,6 +4,7 @@ import html
 
 import numpy as np
 
+from dpl.inference.answer import relative
 from dpl.viewer.frames import QUANTITIES, Frame
 from dpl.viewer.renderer import N_BANDS, band_colours
 from dpl.viewer.units import engineering, scaled, unit_of_scale
@@ -35,6 +36,7 @@ def result_table(frame: Frame, frame_rate: float, node: int) -> str:
         _row("displacement at the hand", moved, "font-weight:600"),
         _row("computed by", str(answer.method), "font-weight:600"),
         _row("time", f"{answer.milliseconds:.1f} ms, {frame_rate:.0f} fps"),
+        _row("estimated error", relative(float(answer.error)), f"color:{colour}"),
         _row(
             "residual ‖R‖/‖f‖",
             f"{frame.residual:.1e}" if frame.residual else "0",

@@ -89,6 +89,5 @@ def test_a_line_names_both_latencies():
         "bare network": timing.Latency(100, 1.13, 5.04),
     }
     assert timing.describe(measured) == (
-        "latency, 1 thread: sim(force) p50 4.6 ms, p99 110 ms; "
-        "bare network p50 1.1 ms, p99 5 ms"
+        "latency, 1 thread: sim(force) p50 4.6 ms, p99 110 ms; bare network p50 1.1 ms, p99 5 ms"
     )
