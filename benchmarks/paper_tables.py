@@ -14,6 +14,7 @@ from dpl.fem import Load, Newton, Status, solve
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2
 from dpl.training.metrics import default_metrics
+from dpl.visualization import method_colours
 
 # Odot, Haferssas, Cotin (2022), tables 1 to 3: e_mean, e_max, SNR_min [dB], samples. Experiments 3
 # and 3b are one here: they differ in the range of Young's modulus, which no answer depends on.
@@ -203,7 +204,7 @@ def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
 
     sets = list(dict.fromkeys(title for _, title in errors))
     methods = list(dict.fromkeys(method for method, _ in errors))
-    colours = list(dict.fromkeys(method.removesuffix(CORRECTED) for method in methods))
+    colours = method_colours(dict.fromkeys(method.removesuffix(CORRECTED) for method in methods))
     figure = Figure(figsize=(4 * len(sets) + 1.6, 3.8), layout="constrained")
     axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for ax, title in zip(axes, sets, strict=True):
@@ -213,7 +214,7 @@ def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
             ax.semilogy(
                 torch.linspace(0, 100, len(values)),
                 values,
-                color=f"C{colours.index(name)}",
+                color=colours[name],
                 ls="-" if method == name else "--",
                 label=method,
             )

@@ -20,6 +20,7 @@ from dpl.inference import Hybrid
 from dpl.inference.hybrid import Predict
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
+from dpl.visualization import method_colours
 
 LINE_STYLES = ("-", "--", ":", "-.")
 REFERENCE = "robust Newton"  # solver with which times and displacements are compared
@@ -224,6 +225,7 @@ def draw(trials: Sequence[Trial], path: Path) -> None:
     names = list(dict.fromkeys((trial.solver, trial.network) for trial in trials))
     networks = list(dict.fromkeys(network for _, network in names))
     styles: dict[str, str] = {}
+    colours = method_colours(networks)
     for network in networks:
         same = [solver for solver, other in reversed(names) if other == network]
         styles |= dict(zip(same, itertools.cycle(LINE_STYLES), strict=False))
@@ -234,7 +236,7 @@ def draw(trials: Sequence[Trial], path: Path) -> None:
             own = [t for t in trials if (t.tol, t.solver, t.network) == (tol, solver, network)]
             taken = sorted(trial.ms for trial in own if trial.converged)
             part = [100 * k / len(own) for k in range(1, len(taken) + 1)]
-            colour = f"C{networks.index(network)}" if network else "0.3"
+            colour = colours[network] if network else "0.1"
             width = 2 if solver == "hybrid, without tangents" else 1.2
             style = {"color": colour, "ls": styles[solver], "lw": width}
             label = f"{solver}, {network}" if network else solver

@@ -15,13 +15,19 @@ from dpl.scene import Sample
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2, Surrogate
 from dpl.training.metrics import median
+from dpl.visualization import STYLE, method_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Cells = tuple[int, ...]
+WORDS = {
+    "": "prediction, or solution",
+    "corrected": "one step in the modes",
+    "hybrid": "hybrid: each iterate",
+}
 MARKERS = {"corrected": "D", "hybrid": "s", "GPU": "*"}  # of methods; "o" for others
-COLOURS = [f"C{k}" for k in range(10) if k != 7]  # without grey, the colour of references
+LEAST = 1e-12  # errors below are drawn there [-]
 
 
 @dataclass(frozen=True)
@@ -139,38 +145,76 @@ def draw(
     """Draw run time against error of the iterates of solvers: a line or dot for each solver.
 
     Errors of Newton on other meshes and the discretisation error of the mesh of the solvers,
-    `floor` [-], are relative to the limit under refinement.
+    `floor` [-], are relative to the limit under refinement; they have a panel of their own.
     """
-    from matplotlib.figure import Figure
+    import matplotlib.pyplot as plt
 
-    figure = Figure(figsize=(9.5, 5.2), layout="constrained")
-    ax = figure.subplots()
-    colours: dict[str, str] = {}
-    for name in dict.fromkeys(row.solver for row in rows):
-        own = [row for row in rows if row.solver == name and row.error < 1]
-        x, y = [row.ms for row in own], [max(row.error, 1e-12) for row in own]
-        family, _, method = name.partition(", ")
-        family = family.partition(" to ")[0]
-        label = None if family in colours else family
-        free = "0.1" if family == "Newton" else COLOURS[len(colours) % len(COLOURS)]
-        style = {"color": colours.setdefault(family, free), "marker": MARKERS.get(method, "o")}
-        ax.loglog(x, y, lw=1.2, ms=4, label=label, **style)
-        ax.loglog(x[-1:], y[-1:], ms=8, **style)
-    for marker, method in (("D", "corrected"), ("s", "hybrid: each iterate")):
-        ax.plot([], [], color="0.5", ls="", marker=marker, label=f"the same, {method}")
-    _draw_meshes(ax, meshes)
-    if floor is not None:
-        ax.axhline(floor, color="0.3", ls="--", lw=1)
-        ax.annotate(
-            "discretisation error of the mesh", (0.01, floor), xycoords=("axes fraction", "data"),
-            fontsize=8, va="top", xytext=(0, -2), textcoords="offset points",
-        )  # fmt: skip
-    ax.set_xlabel("time of one load, its residual and min det F included, p50 [ms]")
-    ax.set_ylabel("relative error, median of the loads")
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.grid(alpha=0.3)
-    figure.legend(loc="outside right center", fontsize=8)
-    figure.savefig(file, dpi=130)
+    with plt.rc_context(STYLE):
+        count = 2 if meshes else 1
+        figure = plt.figure(figsize=(4.0 * count + 1.0, 4.2), layout="constrained")
+        ratios = [1.6, 1.0][:count]
+        axes = figure.subplots(1, count, squeeze=False, width_ratios=ratios)[0]
+        _draw_methods(axes[0], rows)
+        if meshes:
+            _draw_meshes(axes[1], meshes)
+        if floor is not None:
+            axes[0].axhline(floor, color="0.6", ls="--", lw=0.8, zorder=0)
+            axes[0].annotate(
+                "discretisation error of the mesh", (0.99, floor), ha="right", va="bottom",
+                xycoords=("axes fraction", "data"), color="0.35", fontsize=7.5,
+            )  # fmt: skip
+        for ax in axes:
+            ax.set_xlabel("time of one load [ms], median")
+            ax.xaxis.set_major_formatter("{x:g}")
+            ax.grid(visible=True)
+        axes[0].set_ylabel("relative error, median of the loads")
+        figure.savefig(file, dpi=200)
+        plt.close(figure)
+
+
+def _draw_methods(ax: "Axes", rows: Sequence[Point]) -> None:
+    """Draw each family of solvers in one colour: dots of predictions, lines of iterates."""
+    from matplotlib.patheffects import withStroke
+
+    families = {name: _family(name) for name in dict.fromkeys(row.solver for row in rows)}
+    colours = method_colours(dict.fromkeys(families.values()))
+    final = {name: [row for row in rows if row.solver == name][-1] for name in families}
+    for family, colour in colours.items():
+        names = [name for name, own in families.items() if own == family]
+        if family == "Newton":  # one line through the solutions to all tolerances
+            lines = [sorted((final[name] for name in names), key=lambda row: row.ms)]
+        else:
+            lines = [[row for row in rows if row.solver == name] for name in names]
+        ends = []
+        for line in lines:
+            shown = [row for row in line if row.error < 1]
+            if not shown:
+                continue
+            method = shown[-1].solver.partition(", ")[2]
+            x, y = [row.ms for row in shown], [max(row.error, LEAST) for row in shown]
+            ax.loglog(x, y, color=colour, lw=1.2, ms=3, marker=MARKERS.get(method, "o"))
+            ax.loglog(x[-1:], y[-1:], color=colour, ms=7, marker=MARKERS.get(method, "o"))
+            ends.append((x[0], y[0]))
+        if ends:
+            place = min(ends)
+            above = family != "linear"  # which is near the predictions of poor networks
+            ax.annotate(
+                family, place, color=colour, weight="bold", ha="center",
+                va="bottom" if above else "top", xytext=(0, 7 if above else -7),
+                textcoords="offset points", fontsize=8.5,
+                path_effects=[withStroke(linewidth=3, foreground="white")],
+            )  # fmt: skip
+    ax.set_ylim(top=3)
+    used = {name.partition(", ")[2] for name in families}
+    for method, words in WORDS.items():
+        if method in used:
+            ax.plot([], [], color="0.5", ls="", marker=MARKERS.get(method, "o"), label=words)
+    ax.legend(loc="lower left")
+
+
+def _family(name: str) -> str:
+    """Return the method of a solver without its variant and tolerance."""
+    return name.partition(", ")[0].partition(" to ")[0]
 
 
 def _draw_meshes(ax: "Axes", meshes: Sequence[Discretisation]) -> None:
@@ -179,12 +223,15 @@ def _draw_meshes(ax: "Axes", meshes: Sequence[Discretisation]) -> None:
         family = [mesh for mesh in meshes if mesh.degree == degree]
         if not family:
             continue
-        label = f"Newton, {name} meshes, against\nthe limit (degrees of freedom)"
-        style = {"color": "0.55", "ls": ":", "marker": marker, "ms": 5, "mfc": "none"}
-        ax.loglog([m.ms for m in family], [m.error for m in family], label=label, **style)
-        away = 4, 4 if degree == 1 else -10
+        style = {"color": "0.1", "ls": ":", "marker": marker, "ms": 5, "mfc": "none"}
+        ax.loglog([m.ms for m in family], [m.error for m in family], label=name, **style)
+        away = (5, 4) if degree == 1 else (-2, -12)
         for mesh in family:
             ax.annotate(
                 f"{mesh.dofs:,}", (mesh.ms, mesh.error), fontsize=7, color="0.4",
                 textcoords="offset points", xytext=away,
             )  # fmt: skip
+    ax.set_title("Newton on other meshes (degrees of freedom)")
+    ax.set_ylabel("relative error against the limit of fine meshes")
+    ax.legend(loc="lower left", title="elements")
+    ax.margins(x=0.15)

@@ -6,6 +6,6 @@ from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
     from dpl.visualization.figures import draw_body, error_colours, plot_deformed, plot_errors
-    from dpl.visualization.style import COLOURS, STYLE
+    from dpl.visualization.style import COLOURS, STYLE, method_colours
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)
