@@ -28,7 +28,7 @@ train: setup
 demo: runs/demo/evaluation.json
 	$(BIN)/python scripts/view.py run=runs/demo
 
-runs/demo/evaluation.json: setup
+runs/demo/evaluation.json: | .venv/installed
 	rm -rf runs/demo
 	$(BIN)/python scripts/train.py $(BEAM) data.train=64 model=unrolled run=runs/demo
 

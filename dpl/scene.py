@@ -203,6 +203,7 @@ class Scene:
             problem.material if is_dataclass(problem.material) else type(problem.material).__name__
         )
         force, displacement = self._largest_of_a_few()
+        bends = "" if problem.moved_supports else f", linear deflection {displacement:.3g} m"
         unit = "N" if problem.shape[1] == 3 else "N/m"
         return [
             (
@@ -215,22 +216,22 @@ class Scene:
             ("law", f"{law}, {_modulus(loads.young_range)}"),
             (
                 "loads",
-                f"{type(loads).__name__}; the largest of {FEW}: {force:.3g} {unit}, "
-                f"linear deflection {displacement:.3g} m",
+                f"{type(loads).__name__}; the largest of {FEW}: {force:.3g} {unit}{bends}",
             ),
         ]
 
     def _largest_of_a_few(self) -> tuple[float, float]:
         """Return the largest total force [N] of a few loads, and its linear deflection [m].
 
-        The total is the sum of the magnitudes of the nodal forces.
+        The total is the sum of the magnitudes of the nodal forces. Constants of the law are those
+        at the centre of their ranges.
         """
         load = self.loads.sample((0, DESCRIPTION_STREAM), range(FEW))
         totals = load.force.norm(dim=2).sum(dim=1)
+        totals = totals * load.young * self.force_unit
         k = int(totals.argmax())
-        parameters = load.parameters[k : k + 1]
-        deflection = self.linear.with_parameters(parameters).solve(load.force[k])
-        newtons = float(totals[k] * load.young[k]) * self.force_unit
+        deflection = self.linear.reference.solve(load.force[k])
+        newtons = float(totals[k])
         return newtons, float(deflection.norm(dim=1).max()) * self.length
 
     def skipped_work(self) -> list[str]:

@@ -11,5 +11,5 @@ from dpl.commands.cli import command
 @command("evaluate")
 def main(cfg: DictConfig) -> None:
     """Print a table of all evaluated runs below a folder."""
-    with config.error_in("run", FileNotFoundError):
+    with config.error_in("run", FileNotFoundError, ValueError):
         evaluation.compare(Path(cfg.run))

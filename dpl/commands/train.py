@@ -1,6 +1,8 @@
 """Train and evaluate a surrogate: python scripts/train.py model=fcnn loss=lr_star."""
 
 import math
+import re
+import shlex
 import signal
 import sys
 from pathlib import Path
@@ -73,6 +75,7 @@ def main(cfg: DictConfig) -> float | None:
 def _train(cfg: DictConfig) -> float | None:
     # imported here, since worker processes import this module without needing them
     import torch
+    from lightning.pytorch.loggers import TensorBoardLogger
 
     folder = Path(cfg.folder)
     scene, data, surrogate, trainer = parts(cfg)
@@ -88,10 +91,8 @@ def _train(cfg: DictConfig) -> float | None:
         if leaving.code == 128 + signal.SIGTERM:
             raise
         if trainer.is_global_zero and session.begun:
-            print(
-                f"to resume: {_script('train')} run={_from_here(folder)} ckpt_path=last",
-                file=sys.stderr,
-            )
+            resume = f"{_script('train')} {_run_key(folder)} ckpt_path=last"
+            print(f"to resume: {resume}", file=sys.stderr)
         raise KeyboardInterrupt from leaving
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         ours = isinstance(error, config.ConfigError | DataSetError | training.Diverged)
@@ -113,17 +114,20 @@ def _train(cfg: DictConfig) -> float | None:
         raise training.Diverged(message + "lower optimizer.lr")
     session.finish(trainer, prediction.errors)
     if HydraConfig.get().mode != RunMode.MULTIRUN:
-        show_next_commands(folder)
+        logs = any(isinstance(one, TensorBoardLogger) for one in trainer.loggers)
+        show_next_commands(folder, tensorboard=logs)
     return cli.best_error(trainer)
 
 
-def show_next_commands(folder: Path) -> None:
+def show_next_commands(folder: Path, *, tensorboard: bool) -> None:
     """Print the folder of a run and the commands that use it."""
-    here = _from_here(folder)
-    print(f"\nwritten to {here}; next:")
-    print(f"  {_script('view')} run={here}      # drag the body in the browser")
-    print(f"  {_script('evaluate')} run={here}  # the table above")
-    print(f"  tensorboard --logdir {here}", flush=True)
+    print(f"\nwritten to {_from_here(folder)}; next:")
+    print(f"  {_script('view')} {_run_key(folder)}      # drag the body in the browser")
+    print(f"  {_script('evaluate')} {_run_key(folder)}  # the table above")
+    if tensorboard:
+        own = _own_folder()
+        program = str(own / "tensorboard") if own else "tensorboard"
+        print(f"  {program} --logdir {shlex.quote(_from_here(folder))}", flush=True)
 
 
 def _from_here(folder: Path) -> str:
@@ -132,9 +136,22 @@ def _from_here(folder: Path) -> str:
     return str(folder.absolute().relative_to(Path.cwd()) if inside else folder)
 
 
+def _run_key(folder: Path) -> str:
+    """Return the key `run` of a folder as it is typed, in quotes where Hydra needs them."""
+    here = _from_here(folder)
+    return f"run={here}" if re.fullmatch(r"[\w./-]+", here) else shlex.quote(f"run='{here}'")
+
+
+def _own_folder() -> Path | None:
+    """Return the folder of this interpreter if it lies in the working directory."""
+    own = Path(sys.executable).parent
+    return own.relative_to(Path.cwd()) if Path.cwd() in own.parents else None
+
+
 def _script(name: str) -> str:
     """Return how a command is called: as a script of a checkout or as it is installed."""
-    own = Path(sys.argv[0])
-    if own.suffix == ".py":
-        return f"python {own.with_name(f'{name}.py')}"
-    return f"dpl-{name}"
+    own, script = _own_folder(), Path(sys.argv[0])
+    if script.suffix == ".py":
+        program = str(own / "python") if own else "python"
+        return f"{program} {_from_here(script.with_name(f'{name}.py'))}"
+    return f"{own}/dpl-{name}" if own else f"dpl-{name}"

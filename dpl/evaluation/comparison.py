@@ -14,6 +14,7 @@ from dpl.evaluation.report import PREDICTION, TOLS, newton_row, simulator_row
 from dpl.evaluation.tables import power, share, show_cells
 from dpl.training.metrics import median
 
+SEED = re.compile(r",?\s*seed=\d+")
 MAX_NAME = 34  # characters of the name of a run
 ERRORS = ("rel_L2_median", "rel_L2_worst", "e_mean")
 
@@ -26,22 +27,27 @@ def compare(folder: Path) -> None:
 
     Raises:
         FileNotFoundError: No run below the folder has been evaluated.
+        ValueError: An evaluation has other rows.
     """
     found = sorted(folder.rglob("evaluation.json"))
     if not found:
         raise FileNotFoundError(f"{folder} contains no evaluated run")
     names = run_names(folder, [path.parent for path in found])
     runs: list[list[str]] = []
-    groups: dict[str, list[list[float]]] = {}
+    groups: dict[str, list[tuple[str, list[float]]]] = {}
     for path, name in zip(found, names, strict=True):
-        numbers = _numbers({row["solver"]: row for row in json.loads(path.read_text())})
-        runs.append([name, *_cells(numbers)])
-        groups.setdefault(re.sub(r",?\s*seed=\d+", "", name).strip(", "), []).append(numbers)
-    medians = [
-        [f"median of {len(members)}: {name}", *_cells(median(torch.tensor(members)).tolist())]
-        for name, members in groups.items()
-        if len(members) > 1
-    ]
+        rows = {row["solver"]: row for row in json.loads(path.read_text())}
+        if PREDICTION not in rows:
+            raise ValueError(f"{path} has no row {PREDICTION}; run evaluate.py run={path.parent}")
+        numbers = _numbers(rows)
+        runs.append([_short(name), *_cells(numbers)])
+        groups.setdefault(_without_seed(path.parent, name), []).append((name, numbers))
+    medians = []
+    for members in groups.values():
+        if len(members) > 1:
+            name = _short(SEED.sub("", members[0][0]).strip(", "))
+            middle = median(torch.tensor([numbers for _, numbers in members])).tolist()
+            medians.append([f"median of {len(members)}: {name}", *_cells(middle)])
     times = [f"sim/Newton tol={power(tol)}" for tol in TOLS]
     columns = ("", "median error", "worst error", "e_mean", "ms sim(force)", *times)
     show_cells(f"runs below {folder}", columns, runs, *([medians] if medians else []))
@@ -76,5 +82,16 @@ def run_names(folder: Path, runs: list[Path]) -> list[str]:
     order = sorted((key for key in options[0] if key in shared), key=lambda key: key.count("."))
     differ = [key for key in order if len({str(one[key]) for one in options}) > 1]
     details = [", ".join(f"{key}={one[key]}" for key in differ) for one in options]
-    lines = [f"{name}: {more}" if more else name for name, more in zip(names, details, strict=True)]
-    return [line if len(line) <= MAX_NAME else line[: MAX_NAME - 3] + "..." for line in lines]
+    return [f"{name}: {more}" if more else name for name, more in zip(names, details, strict=True)]
+
+
+def _without_seed(run: Path, name: str) -> str:
+    """Return what a run shares with runs of other seeds: its options, or its name without them."""
+    options = {k: v for k, v in config.options_of_run(run).items() if not k.endswith("seed")}
+    return json.dumps(options, sort_keys=True, default=str) if options else SEED.sub("", name)
+
+
+def _short(name: str) -> str:
+    """Return a name without its middle part if it is long."""
+    half = MAX_NAME // 2 - 1
+    return name if len(name) <= MAX_NAME else f"{name[:half]}...{name[-half:]}"

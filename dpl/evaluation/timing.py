@@ -65,8 +65,9 @@ def percentiles(times: Tensor) -> tuple[float, float]:
 def latencies(simulator: Simulator, load: Load) -> dict[str, Latency]:
     """Return the latencies of a simulator and of its network, by name.
 
-    `sim(force)` predicts, evaluates the residual and min det F, and checks whether the load lies in
-    the training range. The bare network, `surrogate(force, young)`, only predicts.
+    `sim(force)` predicts, evaluates the residual and min det F, estimates the error, and checks
+    whether the load lies in the training range. The bare network, `surrogate(force, young)`, only
+    predicts.
     """
     arguments: list[Any] = [simulator.scene.si_inputs(single) for single in load.unbatch()]
     return {

@@ -65,7 +65,7 @@ def test_training_ends_with_a_table_and_the_next_commands(trained, home):
     assert linear["iterations"] == 1
     assert all(row["errors"]["rel_L2_worst"] < 1e-4 for row in others if "1e-6" in row["solver"])
     assert max(len(line.rstrip()) for line in out.splitlines()) <= 100
-    assert "view.py run=runs/first" in out or "dpl-view run=runs/first" in out
+    assert "view.py run=runs/first" in out
 
 
 def test_a_run_leaves_configuration_checkpoints_events_figure_and_case(trained, home):

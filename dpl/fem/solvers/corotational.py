@@ -117,8 +117,12 @@ class CorotatedFactor:
         return self.factor.negative_pivots
 
     def apply(self, right: Array) -> Array:
-        """Return R K(0)^-1 R^T right, (n,)."""
+        """Return R M R^T right, (n,), M the inverse of K(0) or its preconditioner."""
         return self.matrix @ self.factor.apply(self.matrix.T @ right)
+
+    def solve(self, right: Array, rtol: float) -> Array:
+        """Return R K(0)^-1 R^T right, (n,), to a relative residual, see `Factor.solve`."""
+        return self.matrix @ self.factor.solve(self.matrix.T @ right, rtol)
 
 
 # One explicit signature each: numba's cache can mix up the machine code of several signatures of a

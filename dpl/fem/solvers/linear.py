@@ -62,12 +62,14 @@ class LinearSolver:
     def float32_factor(self) -> Factor:
         """Factor of K(0), in float32 if it is banded: accurate to about 1e-6.
 
-        A body with reflections has one factor for each parity, which are smaller together.
+        A body with reflections has one factor for each parity, which are smaller together. They
+        take longer to compute, so that other parameters than the reference have one whole factor.
         """
         factor = self.factor
         if not isinstance(factor, BandedFactor):
             return factor
-        if len(Parities.of(self.symmetries, self.problem.shape[1]).members) > 1:
+        is_reference = self.problem is self.problem.reference
+        if is_reference and len(Parities.of(self.symmetries, self.problem.shape[1]).members) > 1:
             return ParityFactor.of(self.problem, self.symmetries)
         return factor.to_float32()
 
