@@ -45,9 +45,9 @@ def compare(folder: Path) -> None:
     medians = []
     for members in groups.values():
         if len(members) > 1:
-            name = _short(SEED.sub("", members[0][0]).strip(", "))
+            name = SEED.sub("", members[0][0]).strip(", :")
             middle = median(torch.tensor([numbers for _, numbers in members])).tolist()
-            medians.append([f"median of {len(members)}: {name}", *_cells(middle)])
+            medians.append([_short(f"median of {len(members)}: {name}"), *_cells(middle)])
     times = [f"sim/Newton tol={power(tol)}" for tol in TOLS]
     columns = ("", "median error", "worst error", "e_mean", "ms sim(force)", *times)
     show_cells(f"runs below {folder}", columns, runs, *([medians] if medians else []))

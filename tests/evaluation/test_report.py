@@ -120,6 +120,31 @@ def test_runs_that_differ_in_the_seed_form_a_group(evaluated, tmp_path, capsys, 
     assert sum("seed=" in line for line in lines) == 3
 
 
+def test_runs_of_one_configuration_form_a_group_whatever_their_names(
+    evaluated, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setenv("COLUMNS", "100")
+    model = {"_target_": "dpl.models.FCNN"}
+    for name, seed, width in (("a", 0, 8), ("b", 1, 8), ("c", 0, 16), ("d" * 50, 0, 32)):
+        (tmp_path / name).mkdir()
+        options = {"model": {**model, "width": width}, "seed": seed, "data": {"shuffle_seed": seed}}
+        (tmp_path / name / "config.yaml").write_text(json.dumps(options))
+        save(evaluated[0], tmp_path / name / "evaluation.json")
+    compare(tmp_path)
+    out = capsys.readouterr().out
+    assert out.count("median of") == 1
+    assert "median of 2: a" in out
+    assert max(len(line.rstrip()) for line in out.splitlines()) <= 100
+
+
+def test_an_evaluation_with_other_rows_is_refused_by_its_file(tmp_path):
+    (tmp_path / "evaluation.json").write_text('[{"solver": "network"}]')
+    with pytest.raises(
+        ValueError, match=r"evaluation\.json has no row prediction; run evaluate\.py"
+    ):
+        compare(tmp_path)
+
+
 def test_runs_of_other_names_are_named_by_the_options_that_differ(tmp_path):
     for name, rate in (("a", 0.1), ("b", 0.2)):
         (tmp_path / name).mkdir()

@@ -68,7 +68,7 @@ class LinearSolver:
         factor = self.factor
         if not isinstance(factor, BandedFactor):
             return factor
-        is_reference = self.problem is self.problem.reference
+        is_reference = self.parent is None or self.problem is self.parent.problem.reference
         if is_reference and len(Parities.of(self.symmetries, self.problem.shape[1]).members) > 1:
             return ParityFactor.of(self.problem, self.symmetries)
         return factor.to_float32()
