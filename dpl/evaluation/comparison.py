@@ -81,8 +81,21 @@ def run_names(folder: Path, runs: list[Path]) -> list[str]:
     shared = set.intersection(*(set(one) for one in options))
     order = sorted((key for key in options[0] if key in shared), key=lambda key: key.count("."))
     differ = [key for key in order if len({str(one[key]) for one in options}) > 1]
-    details = [", ".join(f"{key}={one[key]}" for key in differ) for one in options]
-    return [f"{name}: {more}" if more else name for name, more in zip(names, details, strict=True)]
+    return [
+        _with_options(name, [f"{key}={one[key]}" for key in differ])
+        for name, one in zip(names, options, strict=True)
+    ]
+
+
+def _with_options(name: str, options: list[str]) -> str:
+    """Return a name with as many options as fit."""
+    shown = [name]
+    for option in options:
+        longer = [*shown, option]
+        if len(", ".join(longer)) > MAX_NAME:
+            break
+        shown = longer
+    return ": ".join([name, ", ".join(shown[1:])]) if shown[1:] else name
 
 
 def _without_seed(run: Path, name: str) -> str:
