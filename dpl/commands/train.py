@@ -82,7 +82,9 @@ def _train(cfg: DictConfig) -> float | None:
     session = training.LogHyperparameters(config.hyperparameters(cfg))
     trainer.callbacks.append(session)
     if trainer.is_global_zero:
-        config.show_plan(scene, data, surrogate, folder=_from_here(folder))
+        hydra = HydraConfig.get()
+        first = hydra.mode != RunMode.MULTIRUN or hydra.job.num == 0
+        config.show_plan(scene, data, surrogate, folder=_from_here(folder), skipped=first)
         if not trainer.fast_dev_run:
             config.save_config(cfg, folder)
     try:

@@ -263,22 +263,24 @@ def build_trainer(cfg: DictConfig) -> "L.Trainer":
     )
 
 
-def show_plan(scene: Scene, *parts: Any, folder: str | None = None) -> None:
+def show_plan(scene: Scene, *parts: Any, folder: str | None = None, skipped: bool = True) -> None:
     """Print what a run computes, where it is written, and the work that it skips.
 
     Args:
         scene: The scene.
         *parts: Further objects whose work is described, such as data and surrogate.
         folder: Folder of the run.
+        skipped: Print the work that is skipped.
     """
     described = [pair for part in (scene, *parts) for pair in getattr(part, "describe", list)()]
     if folder is not None:
         described.append(("run", folder))
     for name, text in described:
         print(f"{name:<9} {text}")
-    skipped = [line for part in (scene, *parts) for line in part.skipped_work()]
-    print("skipped, because this scene does not need it:")
-    for line in skipped:
+    lines = [line for part in (scene, *parts) for line in part.skipped_work()]
+    if skipped:
+        print("skipped, because this scene does not need it:")
+    for line in lines if skipped else ():
         print(textwrap.fill(line, WIDTH, initial_indent="  - ", subsequent_indent="    "))
     sys.stdout.flush()
     if advice := slow_blas():

@@ -344,7 +344,7 @@ def test_a_command_refuses_with_one_line_and_leaves_nothing(refusals, name):
     assert lines[0].startswith("error: ")
     assert {"poisson": "poisson", "unknown": "material.e"}[name] in lines[0]
     assert "Traceback" not in out + err
-    assert "plan:" not in out
+    assert "skipped, because" not in out
     assert left == []
 
 
