@@ -221,7 +221,7 @@ def test_a_budget_ends_it_and_the_best_so_far_is_returned(scene, forces, clock):
     for budget in range(1, 80, 2):
         answer = simulator_of(scene)(forces[0], tol=1e-10, budget_ms=budget)
         found.append(answer)
-        assert answer.milliseconds <= max(budget, 7) + 2  # the network's answer is always given
+        assert answer.milliseconds < max(budget, 7) + 3.5  # the network's answer is always given
         assert "network" in answer.method or answer.iterations > 0
         assert not answer.converged or answer.iterations == whole.iterations
     counts = [answer.iterations for answer in found]
