@@ -57,14 +57,21 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             over_minutes.remove()
         _draw_variants(variants, [row for row in rows if row.part == ABLATION])
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=130)
+        figure.savefig(path, dpi=200)
 
 
 def _draw_curve(ax: Any, x: Sequence[float], rows: Sequence[Row]) -> None:
+    from matplotlib.ticker import LogLocator
+
     ax.loglog(x, [row.e_mean for row in rows], "o-", color=COLOURS[0], ms=4, label="prediction")
     corrected = [row.e_mean_corrected for row in rows]
     ax.loglog(x, corrected, "s--", color=COLOURS[1], ms=4, label="after one step")
     ax.set_ylabel("$e_{mean}$")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_minor_formatter("")  # labels of minor ticks would overlap
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_major_formatter("{x:.0e}")
     ax.grid(which="both")
     ax.legend(loc="upper right")
 
