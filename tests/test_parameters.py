@@ -506,12 +506,12 @@ def test_a_solver_with_ranges_is_fitted_and_evaluated(wide, sets, tmp_path, monk
         lambda named, *rest: solvers.update(named) or measure(named, *rest),
     )
     rows = evaluate(module, Sample(*(column[:6] for column in test)), tmp_path)
-    assert {row.solver: row.converged for row in rows}["paper's hybrid, tol=1e-6"] == 6
+    assert {row.solver: row.converged for row in rows}["paper's hybrid to 1e-6"] == 6
     linear_solvers = [
         solvers["linear"],
         solvers["Newton, tol=1e-3"].linear_solver,
         solvers["Newton, tol=1e-6"].linear_solver,
-        solvers["paper's hybrid, tol=1e-6"].newton.linear_solver,
+        solvers["paper's hybrid to 1e-6"].newton.linear_solver,
         solvers["sim(force, tol=1e-6)"].simulator.scene.linear,
     ]
     assert len(set(map(id, linear_solvers))) == 5, "no solver reuses a factor of another one"

@@ -84,7 +84,7 @@ def measure(
 def show(rows: Sequence[SolverResult], title: str) -> None:
     """Print the most important numbers of rows as a table."""
     columns = (
-        "", "median error", "worst error", "e_mean", "residual", "converged", "iterations",
+        "", "median error", "worst error", "e_mean", "residual", "converged", "linear solves",
         "ms p50", "ms p99",
     )  # fmt: skip
     cells = []
@@ -126,7 +126,7 @@ def evaluate(
         "linear": replace(_own(scene).linear_solver, tol=tight),
         PREDICTION: Direct(surrogate.predict, scene.problem, tight),
         **_step_in_modes(surrogate, tight),
-        f"paper's hybrid, tol={power(tight)}": Hybrid(
+        f"paper's hybrid to {power(tight)}": Hybrid(
             surrogate.predict, replace(_own(scene), tol=tight), "paper"
         ),
         **{simulator_row(tol): _Simulated(simulator, tol) for tol in tols},

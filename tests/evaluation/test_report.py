@@ -182,7 +182,7 @@ def test_an_evaluation_has_four_rows_that_are_saved(evaluated):
     assert [row.solver for row in rows] == [
         "linear",
         "prediction",
-        "paper's hybrid, tol=1e-6",
+        "paper's hybrid to 1e-6",
         "sim(force, tol=1e-3)",
         "sim(force, tol=1e-6)",
         "Newton, tol=1e-3",
