@@ -110,7 +110,7 @@ class Scene:
             preconditioner = self.linear.with_parameters(load.parameters).corotational
             steps.append(preconditioner.count_iterations(displacement))
         is_short = sum(steps) <= MAX_MEAN_STEPS * len(steps)
-        return replace(self.newton, corotational=is_short, definite_guess=True)
+        return replace(self.newton, corotational=is_short, abandon_indefinite_guess=True)
 
     @property
     def length(self) -> float:
@@ -227,12 +227,10 @@ class Scene:
         at the centre of their ranges.
         """
         load = self.loads.sample((0, DESCRIPTION_STREAM), range(FEW))
-        totals = load.force.norm(dim=2).sum(dim=1)
-        totals = totals * load.young * self.force_unit
+        totals = load.force.norm(dim=2).sum(dim=1) * load.young * self.force_unit
         k = int(totals.argmax())
         deflection = self.linear.reference.solve(load.force[k])
-        newtons = float(totals[k])
-        return newtons, float(deflection.norm(dim=1).max()) * self.length
+        return float(totals[k]), float(deflection.norm(dim=1).max()) * self.length
 
     def skipped_work(self) -> list[str]:
         """Return one line for each computation that this scene does not need."""

@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 import dpl
 from dpl import config, export
 from dpl.commands.cli import command
-from dpl.evaluation import tables
+from dpl.evaluation import PREDICTION, tables
 from dpl.system.files import atomic_write
 from dpl.version import install
 
@@ -132,7 +132,7 @@ def _test_errors(folder: Path) -> dict[str, float] | None:
         return None
     try:
         rows = {row["solver"]: row["errors"] for row in json.loads(path.read_text())}
-        return {str(key): float(value) for key, value in rows["prediction"].items()}
+        return {str(key): float(value) for key, value in rows[PREDICTION].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise config.ConfigError(
             f"run: {path} is not an evaluation; repeat it with python scripts/evaluate.py "

@@ -151,7 +151,7 @@ def _own_folder() -> Path | None:
 
 
 def _script(name: str) -> str:
-    """Return how a command is called: as a script of a checkout or as it is installed."""
+    """Return the text that calls a command, a script of a checkout or an installed program."""
     own, script = _own_folder(), Path(sys.argv[0])
     if script.suffix == ".py":
         program = str(own / "python") if own else "python"

@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import torch
 from dpl import config
 from dpl.evaluation.report import PREDICTION, TOLS, newton_row, simulator_row
 from dpl.evaluation.tables import power, share, show_cells
+from dpl.evaluation.timing import SIMULATOR
 from dpl.training.metrics import median
 
 SEED = re.compile(r",?\s*seed=\d+")
@@ -32,16 +33,17 @@ def compare(folder: Path) -> None:
     found = sorted(folder.rglob("evaluation.json"))
     if not found:
         raise FileNotFoundError(f"{folder} contains no evaluated run")
-    names = run_names(folder, [path.parent for path in found])
+    options = [config.options_of_run(path.parent) for path in found]
+    names = run_names([str(path.parent.relative_to(folder)) for path in found], options)
     runs: list[list[str]] = []
     groups: dict[str, list[tuple[str, list[float]]]] = {}
-    for path, name in zip(found, names, strict=True):
+    for path, name, own in zip(found, names, options, strict=True):
         rows = {row["solver"]: row for row in json.loads(path.read_text())}
         if PREDICTION not in rows:
             raise ValueError(f"{path} has no row {PREDICTION}; run evaluate.py run={path.parent}")
         numbers = _numbers(rows)
         runs.append([_short(name), *_cells(numbers)])
-        groups.setdefault(_without_seed(path.parent, name), []).append((name, numbers))
+        groups.setdefault(_group(name, own), []).append((name, numbers))
     medians = []
     for members in groups.values():
         if len(members) > 1:
@@ -56,7 +58,7 @@ def compare(folder: Path) -> None:
 def _numbers(rows: Mapping[str, Any]) -> list[float]:
     """Return the numbers of a run from the rows of its evaluation by solver; NaN if unknown."""
     prediction = rows[PREDICTION]
-    latency = prediction["latency"].get("sim(force)", {}).get("p50", math.nan)
+    latency = prediction["latency"].get(SIMULATOR, {}).get("p50", math.nan)
     ratios = []
     for tol in TOLS:
         times = [rows.get(row(tol), {}).get("ms", math.nan) for row in (simulator_row, newton_row)]
@@ -69,39 +71,44 @@ def _cells(numbers: list[float]) -> list[str]:
     return [share(middle), share(worst), f"{e_mean:.1e}", *(f"{time:.2g}" for time in times)]
 
 
-def run_names(folder: Path, runs: list[Path]) -> list[str]:
-    """Return short names of runs: their folders, and the options in which they differ.
+def run_names(folders: Sequence[str], options: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return names of runs: their folders, and as many options in which they differ as fit.
 
     The folder of a job of a sweep names these options already.
+
+    Args:
+        folders: Folders of the runs.
+        options: Hyperparameters of each run.
     """
-    names = [str(run.relative_to(folder)) if run != folder else run.name for run in runs]
-    if all("=" in name for name in names) or len(runs) < 2:
-        return names
-    options = [config.options_of_run(run) for run in runs]
+    if all("=" in folder for folder in folders) or len(folders) < 2:
+        return list(folders)
     shared = set.intersection(*(set(one) for one in options))
     order = sorted((key for key in options[0] if key in shared), key=lambda key: key.count("."))
     differ = [key for key in order if len({str(one[key]) for one in options}) > 1]
     return [
-        _with_options(name, [f"{key}={one[key]}" for key in differ])
-        for name, one in zip(names, options, strict=True)
+        _with_options(folder, [f"{key}={one[key]}" for key in differ])
+        for folder, one in zip(folders, options, strict=True)
     ]
 
 
-def _with_options(name: str, options: list[str]) -> str:
-    """Return a name with as many options as fit."""
-    shown = [name]
-    for option in options:
-        longer = [*shown, option]
-        if len(", ".join(longer)) > MAX_NAME:
+def _with_options(folder: str, options: list[str]) -> str:
+    """Return the name of a run with as many options as fit."""
+    name = folder
+    for number, option in enumerate(options):
+        longer = f"{name}{', ' if number else ': '}{option}"
+        if len(longer) > MAX_NAME:
             break
-        shown = longer
-    return ": ".join([name, ", ".join(shown[1:])]) if shown[1:] else name
+        name = longer
+    return name
 
 
-def _without_seed(run: Path, name: str) -> str:
-    """Return what a run shares with runs of other seeds: its options, or its name without them."""
-    options = {k: v for k, v in config.options_of_run(run).items() if not k.endswith("seed")}
-    return json.dumps(options, sort_keys=True, default=str) if options else SEED.sub("", name)
+def _group(name: str, options: Mapping[str, Any]) -> str:
+    """Return a text that is equal for runs that differ only in seeds.
+
+    It contains the options of a run, or its name if these are unknown.
+    """
+    kept = {key: value for key, value in options.items() if not key.endswith("seed")}
+    return json.dumps(kept, sort_keys=True, default=str) if kept else SEED.sub("", name)
 
 
 def _short(name: str) -> str:

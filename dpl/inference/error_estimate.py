@@ -1,14 +1,13 @@
 """Estimate of the error of a displacement by one corotational correction."""
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem import LinearSolver, Load, Newton
 from dpl.fem.problem import Evaluation
+from dpl.fem.rom.subspace_newton import scaled_norm
 
 RTOL = 1e-2  # relative residual of iterative solves for an estimate [-]
 SUFFICIENT = 2e-3  # steps leave an error of 1e-3 in the modes, and about as much outside [-]
@@ -38,7 +37,7 @@ def corotational_error(
         evaluation: Internal force and min det F at u, if known.
     """
     correction = _correction_norm(solver, load, displacement, evaluation)
-    whole = _norm(displacement.numpy().ravel())
+    whole = scaled_norm(displacement.numpy().ravel())
     if whole == 0 or correction == math.inf:
         return math.inf if correction else 0.0
     return correction / whole
@@ -92,12 +91,4 @@ def _correction_norm(
     right = problem.restrict((load.force - internal)[0])
     if not bool(volume > 0) or not np.isfinite(right).all():
         return math.inf
-    return _norm(solver.reference.corotational.at(displacement).solve(right, RTOL))
-
-
-def _norm(vector: NDArray[Any]) -> float:
-    """Return the Euclidean norm, without overflow or underflow of squares."""
-    largest = float(np.abs(vector).max(initial=0))
-    if not 0 < largest < math.inf:
-        return largest
-    return largest * float(np.linalg.norm(vector / largest))
+    return scaled_norm(solver.reference.corotational.at(displacement).solve(right, RTOL))

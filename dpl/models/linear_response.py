@@ -113,7 +113,11 @@ class LinearResponse(nn.Module):
         """Factor of K(0) of the reference body; None where compiled loops use modes."""
         if not self.is_exact or self._scene.loads.parameter_ranges or not self._is_cheap:
             return None
-        return ParityFactor.of(self._scene.linear.reference.problem, self.group)
+        reference = self._scene.linear.reference
+        shared = reference.float32_factor
+        if isinstance(shared, ParityFactor) and len(self.group) == len(reference.symmetries):
+            return shared  # of the same group, in the same order
+        return ParityFactor.of(reference.problem, self.group)
 
     def compiled(self) -> LinearPrediction:
         """Return the linear solution as a part of a compiled prediction.

@@ -145,12 +145,9 @@ def test_an_evaluation_with_other_rows_is_refused_by_its_file(tmp_path):
         compare(tmp_path)
 
 
-def test_runs_of_other_names_are_named_by_the_options_that_differ(tmp_path):
-    for name, rate in (("a", 0.1), ("b", 0.2)):
-        (tmp_path / name).mkdir()
-        options = {"model": {"_target_": "dpl.models.FCNN", "width": 8}, "optimizer": {"lr": rate}}
-        (tmp_path / name / "config.yaml").write_text(json.dumps(options))
-    names = run_names(tmp_path, [tmp_path / "a", tmp_path / "b"])
+def test_runs_of_other_names_are_named_by_the_options_that_differ():
+    options = [{"model": "FCNN", "model.width": 8, "optimizer.lr": rate} for rate in (0.1, 0.2)]
+    names = run_names(["a", "b"], options)
     assert names == ["a: optimizer.lr=0.1", "b: optimizer.lr=0.2"]
 
 

@@ -768,7 +768,7 @@ def test_a_guess_with_an_indefinite_tangent_is_abandoned_if_wanted(linear, monke
     guess = torch.zeros(1, *problem.shape, dtype=torch.float64)
     guess[..., 0] = -0.4 * (problem.points[:, 0] - problem.points[:, 0].min())
     exact = solve(Newton(problem, linear=linear), load)
-    newton = Newton(problem, linear=linear, definite_guess=True)
+    newton = Newton(problem, linear=linear, abandon_indefinite_guess=True)
     if linear != "superlu":  # bands factorise no indefinite matrix themselves
         refused = property(lambda backend: pytest.fail("an indefinite tangent was factorised"))
         monkeypatch.setattr(BandedCholesky, "other", refused)

@@ -17,18 +17,6 @@ E = 4500.0
 
 
 @pytest.fixture(scope="module")
-def loads(scene):
-    """Four loads that need several iterations."""
-    return scene.loads.sample((0, 9), range(4))
-
-
-@pytest.fixture(scope="module")
-def forces(scene, loads):
-    """The same, (B, N, D) [N]."""
-    return loads.force * scene.force_unit * E
-
-
-@pytest.fixture(scope="module")
 def truth(scene, loads):
     """Their displacements, (B, N, D) [-]."""
     return solve(scene.solver, loads).displacement

@@ -33,18 +33,6 @@ def simulator_of(scene, predict=None, **more):
 
 
 @pytest.fixture(scope="module")
-def loads(scene):
-    """Four loads that need several iterations."""
-    return scene.loads.sample((0, 9), range(4))
-
-
-@pytest.fixture(scope="module")
-def forces(scene, loads):
-    """The same, (B, N, D) [N]."""
-    return loads.force * scene.force_unit * E
-
-
-@pytest.fixture(scope="module")
 def truth(scene, loads):
     """Their displacements, (B, N, D) [m]."""
     return scene.length * solve(scene.solver, loads).displacement
@@ -221,7 +209,8 @@ def test_a_budget_ends_it_and_the_best_so_far_is_returned(scene, forces, clock):
     for budget in range(1, 80, 2):
         answer = simulator_of(scene)(forces[0], tol=1e-10, budget_ms=budget)
         found.append(answer)
-        assert answer.milliseconds < max(budget, 7) + 3.5  # the network's answer is always given
+        # the prediction is always given; each reading of the clock takes 1 ms, two for an estimate
+        assert answer.milliseconds < max(budget, 7) + 3.5
         assert "network" in answer.method or answer.iterations > 0
         assert not answer.converged or answer.iterations == whole.iterations
     counts = [answer.iterations for answer in found]

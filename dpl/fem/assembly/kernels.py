@@ -100,7 +100,7 @@ class Kernels:
 
 
 PATIENCE = 2.0  # time after which a compilation is announced [s]
-COMPILING = "compiling element kernels for this law, once per machine: up to 30 s"
+COMPILING = "compiling element kernels for this law, once per machine ..."
 _LOADED: set[tuple[Any, str]] = set()  # kernels and laws compiled or loaded by this process
 
 

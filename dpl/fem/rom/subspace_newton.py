@@ -290,11 +290,11 @@ class SubspaceNewton:
 
     def _norm(self, y: Array) -> float:
         """Return ||s|| of coordinates y in W."""
-        return _norm(self.tangent.scale @ y)
+        return scaled_norm(self.tangent.scale @ y)
 
     def _relative(self, y: Array, displacement: Tensor) -> float:
         """Return ||s|| / ||u||; zero if both are, infinite if only u is zero."""
-        size, whole = self._norm(y), _norm(displacement.flatten().numpy())
+        size, whole = self._norm(y), scaled_norm(displacement.flatten().numpy())
         if whole == 0:
             return math.inf if size else 0.0
         return size / whole
@@ -316,9 +316,9 @@ class _Correction(NamedTuple):
     solve: Callable[[Array], Array]
 
 
-def _norm(vector: Array) -> float:
+def scaled_norm(vector: Array) -> float:
     """Return the Euclidean norm, without overflow or underflow of squares."""
-    largest = float(np.abs(vector).max())
+    largest = float(np.abs(vector).max(initial=0))
     if not 0 < largest < math.inf:
         return largest
     return largest * float(np.linalg.norm(vector / largest))

@@ -55,8 +55,9 @@ class Newton:
             gradients on the new tangent [-]; 0: every tangent is factorised.
         corotational: Precondition conjugate gradients with the factor of K(0), rotated with the
             nodes. Stability is then known only where a tangent was factorised.
-        definite_guess: Start again from rest where the tangent at an iterate from the guess is
-            indefinite. Such iterates seldom lead to a solution, and their tangents cost most.
+        abandon_indefinite_guess: Start again from rest where the tangent at an iterate from the
+            guess is indefinite. Such iterates seldom lead to a solution, and their tangents cost
+            most.
         linear_solver: Solver with the factor of K(0); `dataclasses.replace` keeps it unless
             `problem` or `linear` change.
     """
@@ -72,7 +73,7 @@ class Newton:
     mixed_integration: bool = True
     factor_reuse_tol: float = 0.1
     corotational: bool = False
-    definite_guess: bool = False
+    abandon_indefinite_guess: bool = False
     linear_solver: LinearSolver = field(default=None, repr=False)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
@@ -188,7 +189,7 @@ class Newton:
         if state.support_step.any():
             right = right - problem.tangent_product(u, state.support_step)
         values = problem.restrict(right[0])
-        definite = self.definite_guess and run.from_guess
+        definite = self.abandon_indefinite_guess and run.from_guess
         step = run.tangents.solve(tangent, u, values, rtol, near=near, definite=definite)
         return problem.extend(step)[None] + state.support_step
 
