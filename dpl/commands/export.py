@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 import dpl
 from dpl import config, export
 from dpl.commands.cli import command
-from dpl.evaluation import PREDICTION, tables
+from dpl.evaluation import tables
 from dpl.system.files import atomic_write
 from dpl.version import install
 
@@ -127,6 +127,8 @@ def _report(
 
 def _test_errors(folder: Path) -> dict[str, float] | None:
     """Return the errors of the network on the test set; None if the run was not evaluated."""
+    from dpl.evaluation import PREDICTION
+
     path = folder / "evaluation.json"
     if not path.is_file():
         return None
