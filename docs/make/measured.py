@@ -81,6 +81,20 @@ PARTS = (
         "The test load with the largest displacement.",
     ),
     Part(
+        "error_estimates",
+        "Estimated over true errors",
+        "python scripts/error_estimates.py folder=benchmarks/results",
+        "Quantiles of the ratio for predictions of models that are fitted to 96 loads, on four bodies.",
+        tabulated=False,
+    ),
+    Part(
+        "estimates",
+        "Estimated and true errors",
+        "python scripts/error_estimates.py folder=benchmarks/results",
+        "One row for each load and prediction of the file before.",
+        tabulated=False,
+    ),
+    Part(
         "sizes",
         "Cost against degrees of freedom",
         "python scripts/benchmark.py cases=[sizes] repeats=3 folder=benchmarks/results",
