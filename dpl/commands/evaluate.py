@@ -15,4 +15,4 @@ def main(cfg: DictConfig) -> None:
         raise config.ConfigError("tols = [] must name one tolerance or more")
     trained, surrogate = config.load_run(cfg.run, trust=cfg.trust)
     test = config.load_data(trained, surrogate.scene).samples("test")
-    evaluation.evaluate(surrogate, test, Path(cfg.run), tols=cfg.tols)
+    evaluation.evaluate(surrogate, test, Path(cfg.run), tols=cfg.tols, errors=cfg.errors)

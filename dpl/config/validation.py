@@ -34,7 +34,7 @@ KEYS: Keys = (  # of all commands
     (int, "seed", 0, 2**32 - 1),
     (int, "port", 0, 65535),
     (float, "tol", 1e-15, 1),
-    (Sequence[float], "tols", 1e-15, 1),
+    (Sequence[float], "tols errors", 1e-15, 1),
     (Sequence[int | None], "threads", 1, 10**4),
     (float | Sequence[float], "young", 1e-30, 1e30),  # [Pa]
 )

@@ -55,7 +55,7 @@ def show_cells(title: str, columns: Sequence[str], *sections: Sequence[Sequence[
 
 def share(number: float) -> str:
     """Return a relative number in percent with two digits, in powers of ten below 0.001 %."""
-    if not number >= 1e-5:
+    if not 1e-5 <= number < math.inf:
         return f"{number:.0e}"
     percent = 100 * number
     digits = max(0, 1 - math.floor(math.log10(percent)))

@@ -180,6 +180,7 @@ def test_an_evaluation_has_four_rows_that_are_saved(evaluated):
         "linear",
         "prediction",
         "paper's hybrid to 1e-6",
+        "sim(force, error=1e-3)",
         "sim(force, tol=1e-3)",
         "sim(force, tol=1e-6)",
         "Newton, tol=1e-3",
@@ -202,8 +203,11 @@ def test_the_network_s_row_has_the_latency_of_the_simulator_and_of_the_bare_netw
 
 
 def test_hybrid_simulator_and_newton_answer_every_load(evaluated):
-    linear, prediction, *others = evaluated[0]
-    for row in others:
+    linear, prediction, hybrid, to_error, *others = evaluated[0]
+    assert to_error.converged == 4
+    assert to_error.estimated_error <= 1e-3
+    assert to_error.errors["residual"] > 1e-8
+    for row in (hybrid, *others):
         tol = 1e-3 if "1e-3" in row.solver else 1e-6
         assert row.converged == 4
         assert row.errors["residual"] < tol
@@ -213,8 +217,16 @@ def test_hybrid_simulator_and_newton_answer_every_load(evaluated):
     assert linear.iterations == 1
 
 
+def test_each_row_has_the_median_of_the_estimated_errors(evaluated):
+    linear, *_, newton = evaluated[0]
+    error = linear.errors["rel_L2_median"]
+    assert 0.5 * error < linear.estimated_error < 10 * error
+    assert newton.estimated_error < 1e-6
+
+
 def test_the_tolerances_of_an_evaluation_replace_that_of_the_scene(surrogate, few, tmp_path):
-    rows = evaluate(surrogate, few, tmp_path, tols=[1e-2])
+    rows = evaluate(surrogate, few, tmp_path, tols=[1e-2], errors=[])
+    assert not [row for row in rows if "error=" in row.solver]
     newton = rows[-1]
     assert newton.converged == 4
     assert 1e-8 < newton.errors["residual"] < 1e-2
