@@ -1,12 +1,17 @@
 """Threads of PyTorch and of the BLAS libraries."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
+from typing import TypeVar
 
 import torch
 from threadpoolctl import ThreadpoolController
+
+S = TypeVar("S")
+T = TypeVar("T")
 
 
 def available_cores() -> int:
@@ -44,3 +49,16 @@ def one_thread() -> Iterator[None]:
             yield
     finally:
         torch.set_num_threads(before)
+
+
+def on_threads(call: Callable[[S], T], items: Sequence[S]) -> list[T]:
+    """Return the results of a call for each item, on as many threads as torch uses.
+
+    The threads run in parallel only where the call releases the interpreter lock, as compiled loops
+    with `nogil` do.
+    """
+    count = min(torch.get_num_threads(), len(items))
+    if count < 2:
+        return [call(item) for item in items]
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(call, items))
