@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from typing import TypeVar
 
@@ -36,19 +36,24 @@ def blas() -> ThreadpoolController:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def limited_threads(count: int) -> Iterator[None]:
+    """Let torch and BLAS use `count` threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        with blas().limit(limits=count):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def one_thread() -> AbstractContextManager[None]:
     """Limit torch and BLAS to one thread.
 
     Within one solve, two threads are slower than one, and much slower if the other core is busy.
     Parallel solves therefore use processes.
     """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with blas().limit(limits=1):
-            yield
-    finally:
-        torch.set_num_threads(before)
+    return limited_threads(1)
 
 
 def on_threads(call: Callable[[S], T], items: Sequence[S]) -> list[T]:
