@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 CONSOLE = Console(width=150)
 CASES = (
     *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
-    *("discretisation", "sizes", "deflections"),
+    *("discretisation", "sizes", "deflections", "latency"),
 )
 
 
@@ -200,6 +200,34 @@ def deflections(cfg: DictConfig, backends: list[str]) -> None:
     CONSOLE.print(table)
     write(rows, Path(cfg.folder) / "deflections.csv")
     sizes.draw(rows, Path(cfg.folder) / "deflections.png")
+
+
+def latency(cfg: DictConfig, backends: list[str]) -> None:
+    """Write the wall times of a trained run.
+
+    Raises:
+        ConfigError: No run is named.
+    """
+    from benchmarks import run_latency
+    from dpl.inference import Simulator
+
+    if cfg.run is None:
+        raise config.ConfigError("run = null must name the trained run for cases=[latency]")
+    simulator = Simulator(config.load_run(cfg.run)[1])
+    load = simulator.scene.loads.sample((0, 2), range(cfg.samples))
+    calls = list(run_latency.call_times(simulator, load, repeats=cfg.repeats))
+    table = Table("one load, one thread", "loads", "p50 [ms]", "p99 [ms]")
+    for row in calls:
+        table.add_row(row.call, f"{row.loads}", f"{row.p50:.2f}", f"{row.p99:.2f}")
+    CONSOLE.print(table)
+    rates = list(run_latency.throughputs(simulator, repeats=cfg.repeats))
+    table = Table("predictions in batches", "threads", "loads per second")
+    for rate in rates:
+        table.add_row(f"{rate.batch}", f"{rate.threads}", f"{rate.loads_per_second:.0f}")
+    CONSOLE.print(table)
+    write(calls, Path(cfg.folder) / "latency.csv")
+    write(rates, Path(cfg.folder) / "throughput.csv")
+    write_machine(Path(cfg.folder) / "latency.json")
 
 
 def _listed(rows: list[peers.Time], title: str) -> list[peers.Time]:

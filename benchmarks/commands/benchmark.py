@@ -2,7 +2,8 @@
 
 Long cases on demand: cases=[large] (run alone, it reports its memory), cases=[robustness],
 cases=[generation], cases=[sizes]; errors of other meshes: cases=[discretisation];
-displacements of the test loads: cases=[deflections] count=100.
+displacements of the test loads: cases=[deflections] count=100; latency and throughput of a
+trained run: cases=[latency] run=runs/mine.
 """
 
 from collections.abc import Sequence

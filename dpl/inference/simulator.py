@@ -163,18 +163,16 @@ class Simulator:
         state = concatenate([best.state for best, _ in found])
         wanted = request.residual_tol(self.scene)
         kept = state.converged & (state.residual < wanted)
-        errors = torch.tensor([best.error for best, _ in found], dtype=torch.float64)
-        numbers = zip(kept, errors, *places, strict=True)
+        errors = [best.known_error for best, _ in found]
+        numbers = zip(kept.tolist(), errors, *(column.tolist() for column in places), strict=True)
         words = [
-            "no load: at rest"
-            if best.method == "rest"
-            else summarise(best.state, bool(ok), float(error), float(a), float(s), bool(out))
-            for (best, _), (ok, error, a, s, out) in zip(found, numbers, strict=True)
+            "no load: at rest" if best.method == "rest" else summarise(best.state, *own)
+            for (best, _), own in zip(found, numbers, strict=True)
         ]
         return {
             "displacement": self.scene.length * state.displacement,
             "residual": state.residual,
-            "error": errors,
+            "error": torch.tensor(errors, dtype=torch.float64),
             "volume_ratio": state.volume_ratio,
             "converged": kept,
             "negative_pivots": state.negative_pivots,
@@ -259,7 +257,7 @@ class Simulator:
     def _corrected(self, load: Load, prediction: Tensor, request: Request) -> Candidate:
         """Return the prediction, corrected by Newton's steps in the modes."""
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
-        if self.newton is None or not bool(prediction.isfinite().all()):
+        if self.newton is None or not prediction.abs().amax().isfinite():
             return _evaluated("network", problem, prediction, load, tol)
         wanted = ERROR if request.error is None else request.error
         if request.tol is not None:

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple, Self
 
-import torch
 from torch import Tensor
 
 from dpl.fem import Load
@@ -28,21 +27,20 @@ class RangeCheck(NamedTuple):
         """Return the position of loads relative to the range of a surrogate's scene."""
         amplitude, out_of_span = surrogate.scene.loads.project(load.force)
         outside = (amplitude > 1 + ROUNDOFF) | (out_of_span > MAX_OUT_OF_SPAN)
-        return cls(amplitude, out_of_span, outside | _has_parameter_outside(surrogate, load))
+        for values, (low, high) in _inputs(surrogate, load):
+            outside |= (values < low) | (values > high)
+        return cls(amplitude, out_of_span, outside)
 
     def split(self) -> list[Self]:
         """Return the positions one by one, B = 1."""
+        if len(self.outside) == 1:
+            return [self]
         columns = zip(*(column.split(1) for column in self), strict=True)
         return [type(self)(*column) for column in columns]
 
 
-def _has_parameter_outside(surrogate: Surrogate, load: Load) -> Tensor:
-    """Return True for loads with an input modulus of the network out of range, (B,)."""
+def _inputs(surrogate: Surrogate, load: Load) -> list[tuple[Tensor, tuple[float, float]]]:
+    """Return the moduli (B,) that are inputs of the network, each with its range."""
     loads, takes = surrogate.scene.loads, getattr(surrogate.net, "extra_inputs", ())
-    pairs = list(zip(load.parameters.T, loads.parameter_ranges.values(), strict=True))
-    if "young" in takes:
-        pairs.append((load.young, loads.young_range))
-    outside = torch.zeros(len(load.force), dtype=torch.bool)
-    for values, (low, high) in pairs:
-        outside |= (values < low) | (values > high)
-    return outside
+    pairs = list(zip(load.parameters.unbind(1), loads.parameter_ranges.values(), strict=True))
+    return [*pairs, (load.young, loads.young_range)] if "young" in takes else pairs

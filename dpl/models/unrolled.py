@@ -17,9 +17,9 @@ from dpl.models.newton_choice import LOADS, choose_newton
 from dpl.models.unrolled_fit import Maps, cell_positions, fit_in_best_modes
 from dpl.scene import Sample, Scene
 from dpl.system.checks import check_range
+from dpl.system.threads import on_threads
 
 CELL_STATES = 256  # states at which the cells of a correction are chosen
-MAX_COMPILED = 8  # loads; more of them are predicted together by tensor operations
 MAX_SIZE = 100_000  # of rank, cells and stages
 _AtLaw = tuple[LawArguments, ReducedInverse, ReducedInverse]
 
@@ -212,7 +212,7 @@ class Unrolled(nn.Module):
         return coordinates @ self.modes.mT.to(coordinates)
 
     def _is_compiled(self, force: Tensor, parameters: Tensor) -> bool:
-        """Return True if compiled loops can predict these loads: few, and without derivatives."""
+        """Return True if compiled loops can predict these loads: on the CPU, no derivatives."""
         tracing = torch.compiler.is_compiling() or torch.jit.is_tracing()
         if tracing or force.device.type != "cpu" or force.dtype != torch.float64:
             return False
@@ -220,23 +220,23 @@ class Unrolled(nn.Module):
             force.requires_grad or parameters.requires_grad
         )
         law = self.scene.problem.material
-        return (
-            self.is_fitted
-            and len(force) <= MAX_COMPILED
-            and not differentiable
-            and isinstance(law, InvariantBasedMaterial)
-        )
+        return self.is_fitted and not differentiable and isinstance(law, InvariantBasedMaterial)
 
     def _compiled_fields(self, force: Tensor, parameters: Tensor) -> Tensor:
-        """Return displacements (B, N, D) of forces (B, N, D), one after the other."""
+        """Return displacements (B, N, D) of forces (B, N, D), on the threads of torch."""
         fields = self.prescribed.repeat(force.shape[0], 1, 1)
         material, predict = self.scene.problem.material, self._prediction
-        for one, own, field in zip(force.detach(), parameters.detach(), fields, strict=True):
-            law = cast(InvariantBasedMaterial, material.with_parameters(own[None]))
-            if predict(*self._at_law(law), one.numpy(), field.numpy()):
-                loaded = one.flatten()[None, self.dofs].numpy()
-                exact = self.linear.solve(loaded, own[None])[0]
-                field.view(-1)[self.dofs] += torch.from_numpy(exact)
+        forces, parameters = force.detach(), parameters.detach()
+
+        def misses_linear_solution(k: int) -> bool:
+            law = cast(InvariantBasedMaterial, material.with_parameters(parameters[k : k + 1]))
+            return predict(*self._at_law(law), forces[k].numpy(), fields[k].numpy())
+
+        local = torch.tensor(on_threads(misses_linear_solution, range(len(forces))))
+        if local.any():
+            loaded = forces[local].flatten(1)[:, self.dofs].numpy()
+            exact = torch.from_numpy(self.linear.solve(loaded, parameters[local]))
+            fields.view(len(fields), -1)[local.nonzero(), self.dofs] += exact
         return fields
 
     @property
@@ -258,12 +258,12 @@ class Unrolled(nn.Module):
 
     def _at_law(self, law: InvariantBasedMaterial) -> _AtLaw:
         """Return the law and the reduced bodies of both bases, kept for the last law."""
-        if self._at_last_law is None or not (
-            self._at_last_law[0][0] is self.stiffness and self._at_last_law[0][1] == law
-        ):
-            found = law_arguments(law), self._stiffness.inverse(law), self.linear.inverse(law)
-            self._at_last_law = (self.stiffness, law), found
-        return self._at_last_law[1]
+        last = self._at_last_law  # read once: another thread may replace it
+        if last is not None and last[0][0] is self.stiffness and last[0][1] == law:
+            return last[1]
+        found = law_arguments(law), self._stiffness.inverse(law), self.linear.inverse(law)
+        self._at_last_law = (self.stiffness, law), found
+        return found
 
     def _given_parameters(self, force: Tensor, parameters: Tensor | None) -> Tensor:
         if parameters is not None:

@@ -1,12 +1,17 @@
 """Threads of PyTorch and of the BLAS libraries."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
+from typing import TypeVar
 
 import torch
 from threadpoolctl import ThreadpoolController
+
+S = TypeVar("S")
+T = TypeVar("T")
 
 
 def available_cores() -> int:
@@ -31,16 +36,34 @@ def blas() -> ThreadpoolController:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def limited_threads(count: int) -> Iterator[None]:
+    """Let torch and BLAS use `count` threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        with blas().limit(limits=count):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def one_thread() -> AbstractContextManager[None]:
     """Limit torch and BLAS to one thread.
 
     Within one solve, two threads are slower than one, and much slower if the other core is busy.
     Parallel solves therefore use processes.
     """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with blas().limit(limits=1):
-            yield
-    finally:
-        torch.set_num_threads(before)
+    return limited_threads(1)
+
+
+def on_threads(call: Callable[[S], T], items: Sequence[S]) -> list[T]:
+    """Return the results of a call for each item, on as many threads as torch uses.
+
+    The threads run in parallel only where the call releases the interpreter lock, as compiled loops
+    with `nogil` do.
+    """
+    count = min(torch.get_num_threads(), len(items))
+    if count < 2:
+        return [call(item) for item in items]
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(call, items))

@@ -99,6 +99,29 @@ def test_compiled_and_tensor_predictions_agree(beam, net):
     assert (net(load) - tensors).norm() < 1e-5 * tensors.norm()  # float32 factors
 
 
+@pytest.mark.parametrize("law", [NeoHookeanLn(0.3), NeoHookeanLn((0.1, 0.4))])
+@pytest.mark.parametrize("linear_tol", [0, 5e-4])
+def test_a_batch_on_two_threads_is_predicted_like_its_members(law, linear_tol):
+    """The loads are of several laws, and with `linear_tol` some of them are local."""
+    scene = scene_on(box((3, 1, 1), (4, 3, 3)), law)
+    net = fitted(scene, 20, rank=8, cells=4, stages=1, linear_tol=linear_tol)
+    load = scene.loads.sample(5, range(6))
+    own = load.parameters if net.extra_inputs else load.parameters.new_zeros(6, 0)
+    load.force[::2, :-1] = 0.0
+    single = torch.cat([net(*pair) for pair in zip(load.force.split(1), own.split(1), strict=True)])
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        batch = net(load.force, own)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.allclose(batch, single, rtol=1e-10, atol=1e-12 * float(single.abs().max()))
+    if net.flags_local_loads and not net.solves_every_load():
+        local = net.forward_in_basis(load.force, own)[1]
+        assert local.any()
+        assert not local.all()
+
+
 @pytest.mark.parametrize("name", COMPILED)
 def test_every_compiled_law_agrees(name):
     scene = scene_on(box((2, 1, 1), (3, 2, 2)), LAWS[name])

@@ -310,7 +310,7 @@ def nonlinear_coordinates(law, c, needs, finite, mu, lam, model, linear):
     return total
 
 
-@njit(error_model="numpy", cache=True)
+@njit(error_model="numpy", nogil=True, cache=True)
 def predict(law, c, needs, finite, mu, lam, model, reduced, reduced_linear, force, field):
     """Set the field of a prediction.
 

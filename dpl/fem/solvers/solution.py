@@ -38,6 +38,8 @@ class Load(_Load):
     def unbatch(self) -> "list[Load]":
         """Return the loads one by one, B = 1."""
         count = len(self.force)
+        if count == len(self.young) == len(self.parameters) == 1:
+            return [self]
         columns = self.force, self.young.expand(count), self.parameters.expand(count, -1)
         return [Load(*parts) for parts in zip(*(c.split(1) for c in columns), strict=True)]
 
@@ -154,6 +156,8 @@ def solve(solver: Solver, load: Load) -> Solution:
 
 def concatenate(parts: Sequence[Solution]) -> Solution:
     """Return several solutions as one batch."""
+    if len(parts) == 1:
+        return parts[0]
     return Solution(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 

@@ -1,0 +1,108 @@
+"""Wall times of a trained run: its prediction, the simulator with its options, and batches."""
+
+import statistics
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from dpl.evaluation import latency
+from dpl.fem import Load
+from dpl.inference import Simulator
+from dpl.system.threads import available_cores, limited_threads
+
+BATCHES = (1, 8, 64, 256)  # loads that are predicted by one call
+TOLS = (1e-3, 1e-6)
+
+
+@dataclass(frozen=True)
+class CallTime:
+    """Wall time of one call with one load on one thread.
+
+    Attributes:
+        call: The call.
+        loads: Number of different loads.
+        p50: Median [ms].
+        p99: 99th percentile [ms].
+    """
+
+    call: str
+    loads: int
+    p50: float
+    p99: float
+
+
+@dataclass(frozen=True)
+class Throughput:
+    """Predictions without checks in batches.
+
+    Attributes:
+        batch: Number of loads of a call.
+        threads: Number of threads.
+        loads_per_second: Median over repeated calls [1/s].
+    """
+
+    batch: int
+    threads: int
+    loads_per_second: float
+
+
+def call_times(simulator: Simulator, load: Load, *, repeats: int = 1) -> Iterator[CallTime]:
+    """Yield the wall times of the parts of a call and of calls with several options.
+
+    Calls without a tolerance are also listed by their number of Newton steps in the modes.
+
+    Args:
+        simulator: The simulator.
+        load: The loads.
+        repeats: Number of calls with each load.
+    """
+    problem, predict = simulator.scene.problem, simulator.surrogate.predict
+    singles = load.unbatch()
+    inputs: list[Any] = [simulator.scene.si_inputs(single) for single in singles]
+
+    def row(name: str, call: Any, loads: Sequence[Any]) -> CallTime:
+        found = latency(call, loads, repeats=repeats)
+        return CallTime(name, found.loads, found.p50, found.p99)
+
+    def evaluate(pair: Any) -> None:
+        problem.with_parameters(pair[0].parameters).evaluate(pair[1])
+
+    with torch.inference_mode():
+        pairs = [(single, predict(single)) for single in singles]
+    steps = [int(simulator(**one).iterations[0]) for one in inputs]
+    yield row("surrogate.predict", predict, singles)
+    yield row("residual and min det F", evaluate, pairs)
+    yield row("sim(force)", lambda one: simulator(**one), inputs)
+    for count in sorted(set(steps)):
+        some = [one for one, own in zip(inputs, steps, strict=True) if own == count]
+        yield row(f"  steps in the modes: {count}", lambda one: simulator(**one), some)
+    for tol in TOLS:
+        yield row(f"sim(force, tol={tol:g})", lambda one, t=tol: simulator(**one, tol=t), inputs)
+
+
+def throughputs(
+    simulator: Simulator, *, batches: Sequence[int] = BATCHES, repeats: int = 5
+) -> Iterator[Throughput]:
+    """Yield the numbers of predicted loads per second, on one thread and on all cores.
+
+    Args:
+        simulator: The simulator.
+        batches: Numbers of loads of a call.
+        repeats: Number of timed calls after one that is not timed.
+    """
+    load = simulator.scene.loads.sample((0, 2), range(max(batches)))
+    for threads in sorted({1, available_cores()}):
+        with limited_threads(threads), torch.inference_mode():
+            for batch in batches:
+                some = Load(*(column[:batch] for column in load))
+                times = [_seconds(simulator, some) for _ in range(repeats + 1)]
+                yield Throughput(batch, threads, batch / statistics.median(times[1:]))
+
+
+def _seconds(simulator: Simulator, load: Load) -> float:
+    start = time.perf_counter()
+    simulator.surrogate.predict(load)
+    return time.perf_counter() - start

@@ -1,0 +1,93 @@
+"""The benchmark of a trained run times the calls that it names."""
+
+import pytest
+import torch
+
+from benchmarks import run_latency
+from benchmarks.run_latency import CallTime, Throughput
+from dpl.evaluation.tables import read
+from dpl.inference import Simulator
+from dpl.models import FCNN
+from dpl.system.threads import available_cores
+from dpl.training import MSE, Surrogate
+
+
+@pytest.fixture
+def simulator(scene):
+    torch.manual_seed(0)
+    return Simulator(Surrogate(FCNN(scene, width=8), MSE(), scene).eval())
+
+
+def test_every_call_is_timed_with_every_load(simulator, batch, monkeypatch):
+    given = []
+    call = Simulator.__call__
+
+    def listen(self, force, **options):
+        given.append(options.get("tol"))
+        return call(self, force, **options)
+
+    monkeypatch.setattr(Simulator, "__call__", listen)
+    rows = list(run_latency.call_times(simulator, batch.load))
+    assert [row.call for row in rows] == [
+        "surrogate.predict",
+        "residual and min det F",
+        "sim(force)",
+        "  steps in the modes: 0",
+        "sim(force, tol=0.001)",
+        "sim(force, tol=1e-06)",
+    ]
+    assert {row.loads for row in rows} == {12}
+    assert all(0 < row.p50 <= row.p99 for row in rows)
+    assert min(given.count(tol) for tol in (None, 1e-3, 1e-6)) >= 12
+
+
+def test_loads_are_listed_by_their_number_of_steps(simulator, batch, monkeypatch):
+    call = Simulator.__call__
+
+    def second_half_has_a_step(self, force, **options):
+        answer = call(self, force, **options)
+        later = (force - simulator.scene.si_inputs(batch.load)["force"][6:]).flatten(1).norm(dim=1)
+        answer.iterations[:] = int(later.min() == 0)
+        return answer
+
+    monkeypatch.setattr(Simulator, "__call__", second_half_has_a_step)
+    rows = {row.call: row.loads for row in run_latency.call_times(simulator, batch.load)}
+    assert rows["  steps in the modes: 0"] == rows["  steps in the modes: 1"] == 6
+    assert rows["sim(force)"] == 12
+
+
+def test_batches_are_predicted_whole_on_one_thread_and_on_all_cores(simulator, monkeypatch):
+    seen = []
+    predict = Surrogate.predict
+
+    def listen(self, load):
+        seen.append((torch.get_num_threads(), len(load.force)))
+        return predict(self, load)
+
+    monkeypatch.setattr(Surrogate, "predict", listen)
+    before = torch.get_num_threads()
+    rates = list(run_latency.throughputs(simulator, batches=(1, 3), repeats=2))
+    pairs = [(threads, size) for threads in sorted({1, available_cores()}) for size in (1, 3)]
+    assert seen == [pair for pair in pairs for _ in range(3)]
+    assert [(rate.threads, rate.batch) for rate in rates] == pairs
+    assert all(rate.loads_per_second > 0 for rate in rates)
+    assert torch.get_num_threads() == before
+
+
+def test_the_command_prints_and_writes_both_tables(script, tiny_training, tmp_path):
+    trained = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/a", cwd=tmp_path)
+    assert trained.status == 0, trained.err
+    options = "cases=[latency]", "run=runs/a", "samples=2", "repeats=1"
+    ended = script("benchmark", *options, cwd=tmp_path)
+    assert ended.status == 0, ended.err
+    calls = read(CallTime, tmp_path / "runs/benchmark/latency.csv")
+    rates = read(Throughput, tmp_path / "runs/benchmark/throughput.csv")
+    assert all(row.call.strip() in ended.out for row in calls)
+    assert len(rates) == 4 * len({1, available_cores()})
+    assert max(map(len, ended.out.splitlines()[1:])) <= 100
+
+
+def test_a_run_has_to_be_named(script, tmp_path):
+    ended = script("benchmark", "cases=[latency]", cwd=tmp_path)
+    assert ended.status == 2
+    assert "error: run = null must name the trained run" in ended.err
