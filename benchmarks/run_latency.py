@@ -9,12 +9,16 @@ from typing import Any
 import torch
 
 from dpl.evaluation import latency
+from dpl.evaluation.tables import power
 from dpl.fem import Load
 from dpl.inference import Simulator
 from dpl.system.threads import available_cores, limited_threads
 
 BATCHES = (1, 8, 64, 256)  # loads that are predicted by one call
-TOLS = (1e-3, 1e-6)
+OPTIONS = (  # of calls of the simulator
+    {"error": 1e-3}, {"tol": 1e-3}, {"tol": 1e-6},
+    *({"tol": 1e-8, "budget_ms": budget} for budget in (10.0, 20.0, 50.0, 100.0)),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -79,8 +83,13 @@ def call_times(simulator: Simulator, load: Load, *, repeats: int = 1) -> Iterato
     for count in sorted(set(steps)):
         some = [one for one, own in zip(inputs, steps, strict=True) if own == count]
         yield row(f"  steps in the modes: {count}", lambda one: simulator(**one), some)
-    for tol in TOLS:
-        yield row(f"sim(force, tol={tol:g})", lambda one, t=tol: simulator(**one, tol=t), inputs)
+    for options in OPTIONS:
+        words = "".join(f", {name}={_text(value)}" for name, value in options.items())
+        yield row(f"sim(force{words})", lambda one, o=options: simulator(**one, **o), inputs)
+
+
+def _text(number: float) -> str:
+    return power(number) if number < 1 else f"{number:g}"
 
 
 def throughputs(

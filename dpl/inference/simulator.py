@@ -262,13 +262,14 @@ class Simulator:
         wanted = ERROR if request.error is None else request.error
         if request.tol is not None:
             wanted = min(wanted, self.newton.error_tol)
-        states = self.newton.states(load, guess=prediction, error_tol=wanted, max_iter=self.steps)
-        begin = time.perf_counter()
-        state = next(states)
-        pace = time.perf_counter() - begin  # a step evaluates and corrects as this has done
-        ahead = pace + self._estimate_time
-        while not request.over(ahead) and (following := next(states, None)) is not None:
-            state = following
+        begin, pace = time.perf_counter(), 0.0
+        states = self.newton.states(
+            load, guess=prediction, error_tol=wanted, max_iter=self.steps,
+            is_over=lambda: request.over(pace + self._estimate_time),
+        )  # fmt: skip
+        first = next(states)
+        pace = time.perf_counter() - begin  # each step evaluates and corrects like this
+        *_, state = first, *states
         solution = evaluate_solution(
             problem, state.displacement, load, tol,
             iterations=state.iterations, from_guess=True, evaluation=state.evaluation,

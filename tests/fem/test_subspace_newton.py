@@ -219,6 +219,27 @@ def test_steps_end_at_the_estimated_error(newton, solver, vectors, unseen, truth
     assert solve_from(loose, unseen, astray(vectors, limit, 1e-3)).equal(near[0].displacement)
 
 
+def test_no_evaluation_begins_when_the_time_is_over(newton, vectors, unseen, truth, monkeypatch):
+    whole = SubspaceNewton(newton.problem, vectors, error_tol=1e-6)
+    load, guess = unseen.unbatch()[0], astray(vectors, truth, 0.1)[:1]
+    expected = list(whole.states(load, guess=guess))
+    assert len(expected) > 2
+    calls, evaluate = [], Problem.evaluate
+
+    def count(self, u):
+        calls.append(u)
+        return evaluate(self, u)
+
+    monkeypatch.setattr(Problem, "evaluate", count)
+    for most in range(1, len(expected)):
+        calls.clear()
+        found = list(whole.states(load, guess=guess, is_over=lambda n=most: len(calls) >= n))
+        assert len(calls) == most
+        for a, b in zip(expected, found, strict=False):
+            assert torch.equal(a.displacement, b.displacement)
+        assert found[-1].iterations <= most
+
+
 def test_errors_outside_the_subspace_remain(solver, vectors, unseen, truth):
     free, basis = solver.problem.free, vectors[solver.problem.free]
     guess = truth + torch.where(free, 1e-4 * noise(*truth.shape), 0.0)

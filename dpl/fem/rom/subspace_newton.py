@@ -174,11 +174,17 @@ class SubspaceNewton:
         evaluation: Evaluation | None = None,
         error_tol: float | None = None,
         max_iter: int | None = None,
+        is_over: Callable[[], bool] = lambda: False,
     ) -> Iterator[SubspaceState]:
         """Yield the guess and the state after each step under one load, with estimated errors.
 
-        Residual norms and status are not computed. See `iterate` for the arguments, B = 1;
-        `error_tol` and `max_iter` replace the attributes of the solver.
+        Residual norms and status are not computed.
+
+        Args:
+            load, guess, evaluation: As of `iterate`, B = 1.
+            error_tol, max_iter: Replace the attributes of the solver.
+            is_over: Called before each evaluation of the residual and each tangent of all cells.
+                If it returns True, a step ends, and the states do after the last complete step.
         """
         error_tol = self.error_tol if error_tol is None else error_tol
         max_iter = self.max_iter if max_iter is None else max_iter
@@ -197,17 +203,18 @@ class SubspaceNewton:
         yield state
         best = state
         while correction is not None and not is_last(state):
-            following = self._step(problem, load, state, correction)
-            if following is None and self.cubature is not None:
+            following = self._step(problem, load, state, correction, is_over)
+            if following is None and self.cubature is not None and not is_over():
                 correction = self._correction(problem, load, state, whole=True)
                 if correction is not None:
-                    following = self._step(problem, load, state, correction)
+                    following = self._step(problem, load, state, correction, is_over)
             if following is None:
                 break
             yield (state := following)
             best = state if state.error < best.error else best
-            if not is_last(state):
-                correction = self._correction(problem, load, state)
+            if is_last(state) or is_over():
+                break
+            correction = self._correction(problem, load, state)
         if best is not state:
             yield best._replace(iterations=state.iterations)
 
@@ -260,13 +267,18 @@ class SubspaceNewton:
         return _Correction(y, solve) if np.isfinite(y).all() else None
 
     def _step(
-        self, problem: Problem, load: Load, state: SubspaceState, correction: "_Correction"
+        self,
+        problem: Problem,
+        load: Load,
+        state: SubspaceState,
+        correction: "_Correction",
+        is_over: Callable[[], bool],
     ) -> SubspaceState | None:
-        """Return the state after the longest acceptable step, None if there is none."""
+        """Return the state after the longest acceptable step, None if none was found in time."""
         size, update = self._norm(correction.y), self._update(correction.y)
         lowest = self.min_detF_ratio * min(float(state.evaluation.volume_ratio), 1.0)
         damping = 1.0
-        while damping >= self.min_damping:
+        while damping >= self.min_damping and not is_over():
             u = state.displacement + damping * update
             evaluation = problem.evaluate(u)
             if evaluation.volume_ratio > lowest:
