@@ -64,7 +64,8 @@ def test_without_rounding_the_modes_are_float64(build, sets):
     assert fitted(ablation.WHOLE, build, sets)[1].modes.dtype == torch.float32
 
 
-def test_errors_are_those_of_the_predictions_and_of_a_newton_step(build, sets):
+def test_errors_are_those_of_the_predictions_and_of_a_newton_step(build, sets, monkeypatch):
+    monkeypatch.setattr(Unrolled, "_is_compiled", lambda *_: False)  # as in an ablation
     row, net = fitted(ablation.Variant("", {"rank": 40, "stages": 0}), build, sets)
     test = sets[1]
     predicted, solver = net(test.force), net.correction()
