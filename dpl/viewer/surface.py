@@ -8,7 +8,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem import Problem, fields, surface
+from dpl.fem import Problem, surface
+from dpl.fem.assembly.recovery import Recovery
+from dpl.fem.postprocess import cauchy, von_mises
 from dpl.fem.postprocess import triangles as triangulate
 
 Floats = NDArray[np.float64]
@@ -59,16 +61,15 @@ class Surface:
         return _to_3d(self.problem.points.numpy())[self.nodes]
 
     @cached_property
-    def adjacent_cells(self) -> Problem:
-        """The cells with a node on the surface, which determine the stresses there."""
+    def _patches(self) -> tuple[Problem, Recovery]:
+        """The cells that determine the stresses at the surface, and their recovery."""
         body = self.problem
-        on_surface = torch.zeros(body.shape[0], dtype=torch.bool)
-        on_surface[self.nodes] = True
-        chosen = on_surface[body.cells].any(dim=1)
-        cells = body.cells[chosen]
+        cells, recovery = body.recovery.restricted_to(self.nodes)
+        chosen = torch.from_numpy(cells)
         if body.equal_cells:
-            return replace(body, cells=cells)
-        return replace(body, cells=cells, dN=body.dN[chosen], dV=body.dV[chosen])
+            return replace(body, cells=body.cells[chosen]), recovery
+        parts = {name: getattr(body, name)[chosen] for name in ("cells", "dN", "dV")}
+        return replace(body, **parts), recovery
 
     def deformed_points(self, displacement: Tensor) -> Floats:
         """Return the deformed positions over L, (S, 3) [-], of displacements (N, D) [-]."""
@@ -81,10 +82,10 @@ class Surface:
             displacement: Displacement over L, (N, D) [-].
             parameters: Parameters as in a load, (1, P).
         """
-        body, cells = self.problem.with_parameters(parameters), self.adjacent_cells
+        body, (cells, recovery) = self.problem.with_parameters(parameters), self._patches
         if body is not self.problem:
             cells = replace(cells, material=body.material)
-        return fields(cells, displacement[None]).von_mises[0].numpy()[self.nodes]
+        return von_mises(recovery(cauchy(cells, displacement[None])))[0].numpy()
 
     def middle_node(self, mask: NDArray[np.bool_]) -> int:
         """Return the node of the body in the middle of the marked nodes (S,) of the surface.
