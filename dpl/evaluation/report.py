@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dpl.evaluation.nodal_fields import nodal_fields
 from dpl.evaluation.tables import power, share, show_cells
 from dpl.evaluation.timing import Latency, describe, latencies, percentiles, time_interleaved
 from dpl.fem import LinearSolver, Load, Newton, Problem, Solution, Solver, Status, write_mesh
@@ -199,7 +200,10 @@ def _own(scene: Scene) -> Newton:
 def _draw(
     surrogate: Surrogate, test: Sample, displacements: Mapping[str, Tensor], folder: Path
 ) -> None:
-    """Draw the loads with minimum, median and maximum error; write the last one as VTU."""
+    """Draw the loads with minimum, median and maximum error; write the last one as VTU.
+
+    The file has the fields of `nodal_fields`, with the test solution as the reference.
+    """
     scene, network = surrogate.scene, displacements[PREDICTION]
     error = RelativeL2().measure(network, test)
     order = error.argsort()
@@ -212,12 +216,7 @@ def _draw(
     figure = plot_deformed(scene.problem, test.displacement[chosen], shown, names=names)
     figure.savefig(folder / "shapes.png", dpi=150)
     worst = int(order[-1])
-    length, truth, found = scene.length, test.displacement[worst], network[worst]
-    fields = {
-        "displacement [m]": length * truth,
-        "prediction [m]": length * found,
-        "error [m]": length * (found - truth).norm(dim=1),
-        "force [N]": scene.si_inputs(test.load)["force"][worst],
-    }
-    arrays = {name: field.numpy() for name, field in fields.items()}
+    load = test.load.unbatch()[worst]
+    found = nodal_fields(scene, load, network[worst], test.displacement[worst])
+    arrays = {name: field.numpy() for name, field in found.items()}
     write_mesh(folder / "worst.vtu", scene.problem.mesh_in_metres, arrays)
