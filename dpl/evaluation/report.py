@@ -214,7 +214,7 @@ def _draw(
     ]
     shown = [(name, displacements[name][chosen]) for name in (PREDICTION, "linear")]
     figure = plot_deformed(scene.problem, test.displacement[chosen], shown, names=names)
-    figure.savefig(folder / "shapes.png", dpi=150)
+    figure.savefig(folder / "shapes.png")
     worst = int(order[-1])
     load = test.load.unbatch()[worst]
     found = nodal_fields(scene, load, network[worst], test.displacement[worst])

@@ -10,12 +10,11 @@ from torch import Tensor
 
 from dpl.fem import Problem, surface
 from dpl.fem.assembly.recovery import Recovery
-from dpl.fem.postprocess import cauchy, von_mises
+from dpl.fem.postprocess import cauchy, facet_edges, triangle_normals, von_mises
 from dpl.fem.postprocess import triangles as triangulate
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-SMOOTH = 0.9  # smallest cosine between normals of facets that form a smooth surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,19 +40,12 @@ class Surface:
         """Return the surface of a body."""
         points = _to_3d(problem.points.numpy())
         facets = surface(problem.mesh)
-        normals = triangle_normals(points, facets[:, :3])
-        sides = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
-        edges, index = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
-        facet = np.repeat(np.arange(len(facets)), facets.shape[1])
-        total = np.zeros((len(edges), 3))
-        np.add.at(total, index.ravel(), normals[facet])
-        count = np.bincount(index.ravel(), minlength=len(edges))
-        sharp = (total**2).sum(axis=1) < 2 + 2 * SMOOTH  # |n + m|^2 of two unit normals
+        edges, features = facet_edges(points, facets)
         nodes = np.unique(facets)
         number = np.full(len(points), -1)
         number[nodes] = np.arange(len(nodes))
         edges = number[edges]
-        return cls(problem, nodes, number[triangulate(facets)], edges, edges[sharp | (count == 1)])
+        return cls(problem, nodes, number[triangulate(facets)], edges, edges[features])
 
     @cached_property
     def undeformed(self) -> Floats:
@@ -147,12 +139,6 @@ def _interpolate(p: Floats, q: Floats, v: Floats, w: Floats, level: Floats) -> F
     """Return the points of segments pq, with values v at p and w at q, at a level."""
     share = np.divide(level - v, w - v, out=np.zeros_like(v), where=w > v)
     return p + np.clip(share, 0.0, 1.0)[:, None] * (q - p)
-
-
-def triangle_normals(points: Floats, triangles: Ints) -> Floats:
-    """Return unit normals of triangles, (T, 3)."""
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    return _normalise(np.cross(b - a, c - a))
 
 
 def vertex_normals(points: Floats, triangles: Ints) -> Floats:
