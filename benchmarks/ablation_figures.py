@@ -14,8 +14,9 @@ from torch import Tensor
 from benchmarks.ablation import ABLATION, CURVE, Row
 from dpl import Sample
 from dpl.models import Unrolled
-from dpl.visualization import COLOURS, STYLE, draw_body
+from dpl.visualization import COLOURS, METHOD_COLOURS, STYLE, draw_body
 
+COLOUR = METHOD_COLOURS["unrolled"]
 WIDTH = 100  # of the table [characters]
 COLUMNS = ("loads", "e_mean", "e_max", "SNR", "median", "worst", "+ step", "fit s")
 
@@ -63,9 +64,9 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 def _draw_curve(ax: Any, x: Sequence[float], rows: Sequence[Row]) -> None:
     from matplotlib.ticker import LogLocator
 
-    ax.loglog(x, [row.e_mean for row in rows], "o-", color=COLOURS[0], ms=4, label="prediction")
+    ax.loglog(x, [row.e_mean for row in rows], "o-", color=COLOUR, ms=4, label="prediction")
     corrected = [row.e_mean_corrected for row in rows]
-    ax.loglog(x, corrected, "s--", color=COLOURS[1], ms=4, label="after one step")
+    ax.loglog(x, corrected, "s--", color=COLOUR, mfc="white", ms=4, label="after one step")
     ax.set_ylabel("$e_{mean}$")
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -78,9 +79,9 @@ def _draw_curve(ax: Any, x: Sequence[float], rows: Sequence[Row]) -> None:
 
 def _draw_variants(ax: Any, rows: Sequence[Row]) -> None:
     names = [row.variant for row in rows]
-    ax.plot([row.e_mean for row in rows], names, "o", color=COLOURS[0], ms=5, label="prediction")
+    ax.plot([row.e_mean for row in rows], names, "o", color=COLOUR, ms=5, label="prediction")
     corrected = [row.e_mean_corrected for row in rows]
-    ax.plot(corrected, names, "s", color=COLOURS[1], ms=4, label="after one step")
+    ax.plot(corrected, names, "s", color=COLOUR, mfc="white", ms=4, label="after one step")
     ax.set_xscale("log")
     ax.xaxis.set_minor_formatter("")  # labels of minor ticks would overlap
     ax.invert_yaxis()
@@ -122,7 +123,7 @@ def draw_method(net: Unrolled, test: Sample, path: Path) -> None:
             place = k / len(panels), 0.35
             figure.text(*place, "\N{RIGHTWARDS ARROW}", fontsize=20, ha="center", color="0.3")
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=130)
+        figure.savefig(path, dpi=200)
 
 
 class _Panel(NamedTuple):

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +12,12 @@ from dpl import Scene
 from dpl.data.solving.solve import LoadKey
 from dpl.data.solving.worker_pool import solve_loads
 from dpl.data.storage.manifest import STREAMS
+from dpl.visualization import STYLE
 
 BINS = 20
+AT_LINE: dict[str, Any] = {
+    "xycoords": ("data", "axes fraction"), "textcoords": "offset points"
+}  # of the label of the median  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -62,21 +67,22 @@ def draw(rows: Sequence[Deflection], file: Path) -> None:
         rows: Deflections of one body or several.
         file: Of the picture.
     """
+    import matplotlib as mpl
     from matplotlib.figure import Figure
 
     bodies = by_body(rows)
-    figure = Figure(figsize=(4.2 * len(bodies), 3.2), layout="constrained")
-    axes = figure.subplots(1, len(bodies), squeeze=False)[0]
-    for ax, (name, values) in zip(axes, bodies.items(), strict=True):
-        top = max(values)
-        ax.hist(values, bins=BINS, range=(0, top), color="C0", edgecolor="white", lw=0.5)
-        ax.axvline(median(values), color="0.2", ls="--", lw=1)
-        ax.set_title(
-            f"{name}: {len(values)} test loads\nmedian {median(values):.3f} L, largest {top:.3f} L",
-            fontsize=10,
-        )
-        ax.set_xlabel("largest nodal displacement / L")
-        ax.set_xlim(0, 1.05 * top)
-        ax.yaxis.get_major_locator().set_params(integer=True)
-    axes[0].set_ylabel("loads")
-    figure.savefig(file, dpi=130)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(3.6 * len(bodies), 2.7), layout="constrained")
+        axes = figure.subplots(1, len(bodies), squeeze=False)[0]
+        for ax, (name, values) in zip(axes, bodies.items(), strict=True):
+            top, middle = max(values), median(values)
+            ax.hist(values, bins=BINS, range=(0, top), color="0.6", edgecolor="white", lw=0.5)
+            ax.axvline(middle, color="black", lw=1)
+            ax.annotate(f"median {middle:.3f} L", (middle, 1), (4, -8), **AT_LINE)
+            ax.set_title(f"{name}: {len(values)} test loads, largest {top:.3f} L", loc="left")
+            ax.set_xlabel("largest nodal displacement / L [-]")
+            ax.set_xlim(0, 1.05 * top)
+            ax.set_ylim(0, 1.15 * ax.get_ylim()[1])
+            ax.yaxis.get_major_locator().set_params(integer=True)
+        axes[0].set_ylabel("loads")
+        figure.savefig(file, dpi=200)

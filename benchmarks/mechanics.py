@@ -20,7 +20,7 @@ from rich.table import Table
 from benchmarks import generation as ways
 from benchmarks import peers
 from dpl import Scene, config
-from dpl.evaluation.tables import machine, write, write_machine
+from dpl.evaluation.tables import machine, read, write, write_machine
 from dpl.fem import NeoHookeanLn, SaintVenantKirchhoff, installed_backends
 from dpl.fem.linear import BACKENDS
 from dpl.system.threads import one_thread
@@ -34,6 +34,7 @@ CASES = (
     *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
     *("discretisation", "sizes", "deflections", "latency"),
 )
+FIGURES = "figures"  # the case that draws the rows in `folder` again
 
 
 def run(cfg: DictConfig) -> None:
@@ -43,8 +44,9 @@ def run(cfg: DictConfig) -> None:
         ConfigError: A part or a backend does not exist, or no backend is installed.
     """
     cases = CASES if cfg.cases is None else cfg.cases
-    if unknown := [case for case in cases if case not in CASES]:
-        raise config.ConfigError(f"cases = {unknown[0]!r} must be one of {', '.join(CASES)}")
+    if unknown := [case for case in cases if case not in (*CASES, FIGURES)]:
+        known = ", ".join((*CASES, FIGURES))
+        raise config.ConfigError(f"cases = {unknown[0]!r} must be one of {known}")
     if unknown := [name for name in cfg.linear if name not in ("auto", *BACKENDS)]:
         known = ", ".join(("auto", *BACKENDS))
         raise config.ConfigError(f"linear: {unknown[0]!r} is none of {known}")
@@ -228,6 +230,21 @@ def latency(cfg: DictConfig, backends: list[str]) -> None:
     write(calls, Path(cfg.folder) / "latency.csv")
     write(rates, Path(cfg.folder) / "throughput.csv")
     write_machine(Path(cfg.folder) / "latency.json")
+
+
+def figures(cfg: DictConfig, backends: list[str]) -> None:
+    """Draw the rows of `sizes`, `deflections` and the ablation that are in `folder` again."""
+    from benchmarks import ablation, ablation_figures
+    from benchmarks import deflections as bent
+    from benchmarks import sizes as beams
+
+    folder = Path(cfg.folder)
+    if (path := folder / "sizes.csv").is_file():
+        beams.draw(read(beams.Size, path), path.with_suffix(".png"))
+    if (path := folder / "deflections.csv").is_file():
+        bent.draw(read(bent.Deflection, path), path.with_suffix(".png"))
+    if (path := folder / "unrolled.csv").is_file():
+        ablation_figures.draw(read(ablation.Row, path), path.with_suffix(".png"))
 
 
 def _listed(rows: list[peers.Time], title: str) -> list[peers.Time]:

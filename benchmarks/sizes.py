@@ -3,12 +3,12 @@
 import math
 import multiprocessing
 import resource
-import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from dpl.fem.linear import select_backend
 from dpl.models import FCNN, Unrolled
 from dpl.system.threads import one_thread
 from dpl.training import MSE, Surrogate
+from dpl.visualization import STYLE, method_colours
 
 
 @dataclass(frozen=True)
@@ -119,33 +120,53 @@ def exponent(dofs: Sequence[float], costs: Sequence[float]) -> float:
     return float(np.polyfit(np.log(dofs), np.log(costs), 1)[0])
 
 
+LINES = {  # start of a case: its short name and its method, which determines the colour
+    "factor of K(0)": ("factor of K(0)", "factor of K(0)"),
+    "process": ("whole process, peak", "process"),
+    "linear answer": ("linear", "linear"),
+    "Newton, corotational": ("Newton, corotational, from a prediction", "corotational"),
+    "Newton": ("Newton", "Newton"),
+    "unrolled": ("unrolled", "unrolled"),
+    "fcnn": ("fcnn", "fcnn"),
+}
+PANELS = (  # label, field, drawn lines; each panel has at most four of them
+    ("time of one solution [ms]", "ms", ("factor", "linear", "Newton")),
+    ("time of one prediction [ms]", "ms", ("unrolled", "fcnn")),
+    ("parameters", "parameters", ("fcnn",)),
+    ("memory [MB]", "memory_mb", ("unrolled", "fcnn", "process")),
+)
+
+
 def draw(rows: Sequence[Size], path: Path) -> None:
-    """Draw time, parameters and memory against degrees of freedom, with the exponents of fits."""
+    """Draw times, parameters and memory against degrees of freedom, with the exponents of fits."""
+    import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13.5, 4.4), layout="constrained")
-    panels = figure.subplots(1, 3)
-    families: dict[str, list[Size]] = {}
-    for row in rows:
-        families.setdefault(row.case.partition(" (")[0], []).append(row)
-    one_a_size = list({row.dofs: row for row in rows}.values())
-    families["whole process, peak"] = one_a_size
-    for ax, name in zip(panels, ("ms", "parameters", "memory_mb"), strict=True):
-        for number, (case, family) in enumerate(families.items()):
-            field = "peak_memory_mb" if family is one_a_size and name == "memory_mb" else name
-            known = [(row.dofs, value) for row in family if (value := getattr(row, field))]
-            if not known or (family is one_a_size and field != "peak_memory_mb"):
-                continue
-            x, y = zip(*known, strict=True)
-            label = f"{case}: DOFs^{exponent(x, y):.2f}" if len(x) > 1 else case
-            ax.loglog(x, y, marker="o", ms=4, color=f"C{number}", label=textwrap.fill(label, 40))
-        ax.set_xlabel("degrees of freedom")
-        ax.grid(alpha=0.3)
-        low, high = ax.get_ylim()
-        ax.set_ylim(low, high * (high / low) ** 0.5)  # space for the legend
-        ax.legend(fontsize=7, loc="upper left")
-    for ax, name in zip(
-        panels, ("time of one load [ms]", "parameters", "memory [MB]"), strict=True
-    ):
-        ax.set_ylabel(name)
-    figure.savefig(path, dpi=130)
+    colours = method_colours([method for _, method in LINES.values()])
+    whole = [replace(row, case="process", memory_mb=row.peak_memory_mb) for row in rows]
+    families: dict[str, dict[int, Size]] = {}
+    for row in [*rows, *whole]:
+        start = next(start for start in LINES if row.case.startswith(start))
+        families.setdefault(start, {})[row.dofs] = row
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(8.4, 6.2), layout="constrained")
+        for ax, (label, field, starts) in zip(figure.subplots(2, 2).flat, PANELS, strict=True):
+            for start in (start for start in families if start.startswith(starts)):
+                family = families[start].values()
+                known = [(row.dofs, value) for row in family if (value := getattr(row, field))]
+                if known:
+                    name, method = LINES[start]
+                    _draw_line(ax, known, name, colours[method])
+            ax.set(xscale="log", yscale="log", xlabel="degrees of freedom", ylabel=label)
+            ax.set_xlim(min(row.dofs for row in rows) / 1.3, max(row.dofs for row in rows) * 1.3)
+            low, high = ax.get_ylim()
+            ax.set_ylim(low, high * (high / low) ** 0.35)  # space for the legend
+            ax.grid(visible=True)
+            ax.legend(loc="upper left")
+        figure.savefig(path, dpi=200)
+
+
+def _draw_line(ax: Any, known: Sequence[tuple[int, float]], name: str, colour: str) -> None:
+    x, y = zip(*known, strict=True)
+    label = f"{name}: DOFs$^{{{exponent(x, y):.2f}}}$" if len(x) > 1 else name
+    ax.plot(x, y, "o-", ms=3.5, lw=1.2, color=colour, label=label)

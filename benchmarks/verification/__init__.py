@@ -14,6 +14,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from benchmarks.verification.beams import balance, beam
+from benchmarks.verification.nodal_stress import nodal_stress
 from benchmarks.verification.refinement import cook, locking, order
 from benchmarks.verification.report import Row, Section, summary, table
 from benchmarks.verification.rods import buckling, elastica
@@ -32,6 +33,7 @@ CASES: dict[str, Callable[[Path], Section]] = {
     "beam": beam,
     "buckling": buckling,
     "balance": balance,
+    "nodal_stress": nodal_stress,
 }
 
 

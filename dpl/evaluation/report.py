@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpl.evaluation.nodal_fields import nodal_fields
 from dpl.evaluation.tables import power, share, show_cells
 from dpl.evaluation.timing import Latency, describe, latencies, percentiles, time_interleaved
 from dpl.fem import LinearSolver, Load, Newton, Problem, Solution, Solver, Status, write_mesh
@@ -229,7 +230,10 @@ def _own(scene: Scene) -> Newton:
 def _draw(
     surrogate: Surrogate, test: Sample, displacements: Mapping[str, Tensor], folder: Path
 ) -> None:
-    """Draw the loads with minimum, median and maximum error; write the last one as VTU."""
+    """Draw the loads with minimum, median and maximum error; write the last one as VTU.
+
+    The file has the fields of `nodal_fields`, with the test solution as the reference.
+    """
     scene, network = surrogate.scene, displacements[PREDICTION]
     error = RelativeL2().measure(network, test)
     order = error.argsort()
@@ -240,14 +244,9 @@ def _draw(
     ]
     shown = [(name, displacements[name][chosen]) for name in (PREDICTION, "linear")]
     figure = plot_deformed(scene.problem, test.displacement[chosen], shown, names=names)
-    figure.savefig(folder / "shapes.png", dpi=150)
+    figure.savefig(folder / "shapes.png")
     worst = int(order[-1])
-    length, truth, found = scene.length, test.displacement[worst], network[worst]
-    fields = {
-        "displacement [m]": length * truth,
-        "prediction [m]": length * found,
-        "error [m]": length * (found - truth).norm(dim=1),
-        "force [N]": scene.si_inputs(test.load)["force"][worst],
-    }
-    arrays = {name: field.numpy() for name, field in fields.items()}
+    load = test.load.unbatch()[worst]
+    found = nodal_fields(scene, load, network[worst], test.displacement[worst])
+    arrays = {name: field.numpy() for name, field in found.items()}
     write_mesh(folder / "worst.vtu", scene.problem.mesh_in_metres, arrays)

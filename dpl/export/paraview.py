@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
-from dpl.fem import Load, fields, solve, write_series
-from dpl.scene import Scene
+from dpl.evaluation.nodal_fields import nodal_fields
+from dpl.fem import Load, solve, write_series
 from dpl.training import Surrogate
 
 
@@ -58,26 +57,3 @@ def write_results(
         inside = float(step["von Mises stress [Pa]"].max()), float(step["det F"].min())
         rows.append(ResultRow(k, float(single.young), moved, *inside, error))
     return rows, write_series(path, scene.problem.mesh_in_metres, steps)
-
-
-def nodal_fields(
-    scene: Scene, load: Load, displacement: Tensor, reference: Tensor | None = None
-) -> dict[str, Tensor]:
-    """Return named fields at the nodes in SI units, (N, ...), for one load.
-
-    Both displacements, that to show and the finite-element one, are over L, (N, D) [-].
-    """
-    young = float(load.young)
-    newton = "N" if scene.problem.shape[1] == 3 else "N/m"
-    stress = fields(scene.problem.with_parameters(load.parameters), displacement[None])
-    found = {
-        f"force [{newton}]": young * scene.force_unit * load.force[0],
-        "displacement [m]": scene.length * displacement,
-        "Cauchy stress [Pa]": young * stress.stress[0],
-        "von Mises stress [Pa]": young * stress.von_mises[0],
-        "det F": stress.volume_ratio[0],
-    }
-    if reference is not None:
-        found["reference displacement [m]"] = scene.length * reference
-        found["error [m]"] = scene.length * (displacement - reference).norm(dim=1)
-    return found

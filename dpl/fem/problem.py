@@ -193,6 +193,7 @@ class Problem(EquilibriumCriterion):
         twin = replace(self, material=material)
         for name in ("pattern", "moved_supports", "_operator"):
             twin.__dict__[name] = getattr(self, name)
+        twin.__dict__["_same_mesh"] = self  # its recovery is built at the first use
         if type(material) is type(self.material):
             twin.__dict__["_first"] = self
         return twin

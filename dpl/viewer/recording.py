@@ -11,7 +11,7 @@ import torch
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from dpl.export.paraview import nodal_fields
+from dpl.evaluation.nodal_fields import nodal_fields
 from dpl.fem import write_mesh
 from dpl.fem.mesh import write_collection
 from dpl.system.files import atomic_write

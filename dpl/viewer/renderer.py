@@ -15,11 +15,12 @@ from matplotlib.patches import FancyArrowPatch
 from numpy.typing import NDArray
 from PIL import Image
 
+from dpl.fem.postprocess import triangle_normals
 from dpl.viewer.camera import Camera
 from dpl.viewer.frames import QUANTITIES, Frame
 from dpl.viewer.load_arrow import ARROW_COLOUR, arrow_ends
 from dpl.viewer.supports import SUPPORT_COLOUR, SupportSymbols
-from dpl.viewer.surface import Floats, Surface, contour_bands, triangle_normals, vertex_normals
+from dpl.viewer.surface import Floats, Surface, contour_bands, vertex_normals
 from dpl.viewer.units import scaled, unit_of_scale
 
 COLOUR_MAPS = {"displacement": "viridis", "von Mises stress": "turbo", "error against FE": "magma"}

@@ -8,12 +8,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem import Problem, fields, surface
+from dpl.fem import Problem, surface
+from dpl.fem.assembly.recovery import Recovery
+from dpl.fem.postprocess import cauchy, facet_edges, triangle_normals, von_mises
 from dpl.fem.postprocess import triangles as triangulate
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-SMOOTH = 0.9  # smallest cosine between normals of facets that form a smooth surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,19 +40,12 @@ class Surface:
         """Return the surface of a body."""
         points = _to_3d(problem.points.numpy())
         facets = surface(problem.mesh)
-        normals = triangle_normals(points, facets[:, :3])
-        sides = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
-        edges, index = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
-        facet = np.repeat(np.arange(len(facets)), facets.shape[1])
-        total = np.zeros((len(edges), 3))
-        np.add.at(total, index.ravel(), normals[facet])
-        count = np.bincount(index.ravel(), minlength=len(edges))
-        sharp = (total**2).sum(axis=1) < 2 + 2 * SMOOTH  # |n + m|^2 of two unit normals
+        edges, features = facet_edges(points, facets)
         nodes = np.unique(facets)
         number = np.full(len(points), -1)
         number[nodes] = np.arange(len(nodes))
         edges = number[edges]
-        return cls(problem, nodes, number[triangulate(facets)], edges, edges[sharp | (count == 1)])
+        return cls(problem, nodes, number[triangulate(facets)], edges, edges[features])
 
     @cached_property
     def undeformed(self) -> Floats:
@@ -59,16 +53,15 @@ class Surface:
         return _to_3d(self.problem.points.numpy())[self.nodes]
 
     @cached_property
-    def adjacent_cells(self) -> Problem:
-        """The cells with a node on the surface, which determine the stresses there."""
+    def _patches(self) -> tuple[Problem, Recovery]:
+        """The cells that determine the stresses at the surface, and their recovery."""
         body = self.problem
-        on_surface = torch.zeros(body.shape[0], dtype=torch.bool)
-        on_surface[self.nodes] = True
-        chosen = on_surface[body.cells].any(dim=1)
-        cells = body.cells[chosen]
+        cells, recovery = body.recovery.restricted_to(self.nodes)
+        chosen = torch.from_numpy(cells)
         if body.equal_cells:
-            return replace(body, cells=cells)
-        return replace(body, cells=cells, dN=body.dN[chosen], dV=body.dV[chosen])
+            return replace(body, cells=body.cells[chosen]), recovery
+        parts = {name: getattr(body, name)[chosen] for name in ("cells", "dN", "dV")}
+        return replace(body, **parts), recovery
 
     def deformed_points(self, displacement: Tensor) -> Floats:
         """Return the deformed positions over L, (S, 3) [-], of displacements (N, D) [-]."""
@@ -81,10 +74,10 @@ class Surface:
             displacement: Displacement over L, (N, D) [-].
             parameters: Parameters as in a load, (1, P).
         """
-        body, cells = self.problem.with_parameters(parameters), self.adjacent_cells
+        body, (cells, recovery) = self.problem.with_parameters(parameters), self._patches
         if body is not self.problem:
             cells = replace(cells, material=body.material)
-        return fields(cells, displacement[None]).von_mises[0].numpy()[self.nodes]
+        return von_mises(recovery(cauchy(cells, displacement[None])))[0].numpy()
 
     def middle_node(self, mask: NDArray[np.bool_]) -> int:
         """Return the node of the body in the middle of the marked nodes (S,) of the surface.
@@ -146,12 +139,6 @@ def _interpolate(p: Floats, q: Floats, v: Floats, w: Floats, level: Floats) -> F
     """Return the points of segments pq, with values v at p and w at q, at a level."""
     share = np.divide(level - v, w - v, out=np.zeros_like(v), where=w > v)
     return p + np.clip(share, 0.0, 1.0)[:, None] * (q - p)
-
-
-def triangle_normals(points: Floats, triangles: Ints) -> Floats:
-    """Return unit normals of triangles, (T, 3)."""
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    return _normalise(np.cross(b - a, c - a))
 
 
 def vertex_normals(points: Floats, triangles: Ints) -> Floats:

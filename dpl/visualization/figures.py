@@ -8,95 +8,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem import Problem, surface
-from dpl.fem.postprocess import coarse
+from dpl.visualization.shapes import CARD_DPI, error_scale
 
 if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
-
-CARD_DPI = 140  # resolution of figures for TensorBoard, which shows them small [dots per inch]
-DECADES = 1e-3  # smallest over largest error of the colour scale
-SMALLEST_ERROR = 1e-12  # smallest upper end of the colour scale
-
-
-def plot_deformed(
-    problem: Problem,
-    truth: Tensor,
-    predictions: Sequence[tuple[str, Tensor]],
-    *,
-    names: Sequence[str] = (),
-    upright: bool = False,
-    max_polygons: int | None = None,
-) -> "Figure":
-    """Return a figure of predicted shapes, coloured by the distance to the true positions.
-
-    Columns are loads and rows are predictions. A grey wireframe shows the true shape.
-
-    Args:
-        problem: The body.
-        truth: Displacements over L, (B, N, D) [-].
-        predictions: Pairs of a name and displacements over L, (B, N, D) [-]. The name of a single
-            prediction may be empty.
-        names: Titles of the loads.
-        upright: Put loads in rows and predictions in columns, for TensorBoard's narrow cards.
-        max_polygons: Largest number of polygons per body, see `coarse`; None: all.
-    """
-    polygons, points = surface(problem.mesh), problem.points.cpu().numpy()
-    if max_polygons:
-        polygons = coarse(points, polygons, max_polygons)
-    true, *fields = (u.detach().cpu().numpy() for u in (truth, *(u for _, u in predictions)))
-    errors = [np.linalg.norm(field - true, axis=2) for field in fields]
-    figure, axes = _grid(len(fields), len(true), points.shape[1], names, upright=upright)
-    scale = _error_scale(np.concatenate(errors))
-    extent = np.concatenate([points[None] + true, points[None]])
-    for (row, column), ax in np.ndenumerate(axes):
-        colours = scale.to_rgba(errors[row][column][polygons].mean(axis=1))
-        shape, wireframe = points + fields[row][column], points + true[column]
-        _draw(ax, shape[polygons], facecolors=colours, edgecolors="none")
-        _draw(ax, wireframe[polygons], facecolors="none", edgecolors="0.4", linewidths=0.3)
-        _set_extent(ax, extent, zoom=1.4 if upright else 1.1)
-        title = [names[column]] if row == 0 and names else []
-        ax.set_title("\n".join(filter(None, [*title, predictions[row][0]])), fontsize=9)
-    _add_colour_bar(figure, axes, scale, upright=upright)
-    return figure
-
-
-def _grid(
-    n_predictions: int, n_loads: int, dim: int, names: Sequence[str], *, upright: bool
-) -> tuple["Figure", Any]:
-    """Return a figure and its axes, (predictions, loads)."""
-    from matplotlib.figure import Figure
-
-    rows, columns = (n_loads, n_predictions) if upright else (n_predictions, n_loads)
-    size = (3.6 * columns + 0.8, 2.5 * rows) if upright else (3.6 * columns + 1.2, 2.2 * rows + 0.4)
-    figure = Figure(figsize=size, dpi=CARD_DPI if upright else 100)
-    if upright:  # a constrained layout takes longer to compute than the rest of the figure
-        title = 0.25 + 0.15 * max((name.count("\n") for name in names), default=0)
-        figure.subplots_adjust(0, 0.7 / size[1], 1, 1 - title / size[1], hspace=title / 2)
-    else:
-        figure.set_layout_engine("constrained")
-    kind = {"projection": "3d"} if dim == 3 else {}
-    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw=kind)
-    return figure, axes.T if upright else axes
-
-
-def _error_scale(error: NDArray[Any]) -> "ScalarMappable":
-    """Return a logarithmic colour scale whose upper end is the largest finite error."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LogNorm
-
-    largest = float(error[np.isfinite(error)].max(initial=SMALLEST_ERROR))
-    return ScalarMappable(LogNorm(largest * DECADES, largest, clip=True), "viridis")
-
-
-def _add_colour_bar(figure: "Figure", axes: Any, scale: "ScalarMappable", *, upright: bool) -> None:
-    label = "distance from the true position / L"
-    if not upright:
-        figure.colorbar(scale, ax=axes, label=label, shrink=0.8)
-        return
-    height = figure.get_figheight()
-    below = figure.add_axes((0.1, 0.45 / height, 0.8, 0.1 / height))
-    figure.colorbar(scale, cax=below, orientation="horizontal", label=label).minorticks_off()
 
 
 def draw_body(
@@ -203,4 +119,4 @@ def plot_errors(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "
 
 def error_colours(error: NDArray[Any]) -> NDArray[np.uint8]:
     """Return RGB colours (N, 3) of distances (N,) on the colour scale of `plot_deformed`."""
-    return (_error_scale(error).to_rgba(error)[:, :3] * 255).round().astype(np.uint8)
+    return (error_scale(error).to_rgba(error)[:, :3] * 255).round().astype(np.uint8)

@@ -4,8 +4,9 @@ import matplotlib.image
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 
-from benchmarks import deflections, peers
+from benchmarks import deflections, mechanics, peers
 from dpl.evaluation.tables import read, write
 from dpl.fem import SaintVenantKirchhoff
 
@@ -45,6 +46,12 @@ def test_rows_and_histograms_are_written(rows, tmp_path):
     pixels = matplotlib.image.imread(tmp_path / "deflections.png")
     assert pixels.shape[1] > 2 * pixels.shape[0]
     assert np.ptp(pixels[..., :3]) > 0.5
+
+
+def test_figures_are_drawn_again_from_the_rows_of_a_folder(rows, tmp_path):
+    write(rows, tmp_path / "deflections.csv")
+    mechanics.figures(OmegaConf.create({"folder": str(tmp_path)}), [])
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["deflections.png"]
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import pytest
 
 from benchmarks import sizes as beams
 from dpl.evaluation.tables import write
+from dpl.visualization import METHOD_COLOURS
 
 
 @pytest.mark.slow
@@ -25,3 +26,19 @@ def test_exponents_are_slopes():
     sizes = [10, 100, 1000]
     assert beams.exponent(sizes, [3e-4 * n**1.5 for n in sizes]) == pytest.approx(1.5)
     assert beams.exponent([10], [1.0]) != beams.exponent([10], [1.0])
+
+
+def test_no_panel_has_more_than_four_lines(tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **options: drawn.append(figure))
+    cases = ["factor of K(0), analysis included (band)", "linear answer", "Newton"]
+    cases += ["Newton, corotational, from a guess", "unrolled", "fcnn, as in the paper"]
+    rows = [beams.Size(case, n, 1.0 * n, n, 1.0 * n, n) for case in cases for n in (100, 1000)]
+    beams.draw(rows, tmp_path / "sizes.png")
+    (figure,) = drawn
+    assert [len(ax.lines) for ax in figure.axes] == [4, 2, 1, 3]
+    colours = {line.get_label().split(":")[0]: line.get_color() for line in figure.axes[1].lines}
+    assert colours == {name: METHOD_COLOURS[name] for name in ("unrolled", "fcnn")}
+    assert "DOFs$^{1.00}$" in figure.axes[0].lines[0].get_label()

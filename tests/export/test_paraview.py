@@ -70,6 +70,9 @@ def test_series_contain_the_fields_of_the_predictions_in_si_units(make_scene_of,
         assert np.allclose(data["von Mises stress [Pa]"], 4500.0 * inside.von_mises[k].numpy())
         assert np.allclose(data["det F"], inside.volume_ratio[k].numpy())
         exact = data["reference displacement [m]"][:, :dim] / scene.length
+        known = fields(scene.problem, torch.from_numpy(exact)[None])
+        reference = data["reference Cauchy stress [Pa]"].reshape(nodes, 3, 3)
+        assert np.allclose(reference, 4500.0 * known.stress[0].numpy(), rtol=1e-6)
         balance = scene.problem.relative_residual(
             torch.from_numpy(exact)[None], loads.force[k : k + 1]
         )

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import skfem
 import torch
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from dpl.fem import NeoHookeanLn, Plane, Problem, box, rectangle, surface
 from dpl.fem.postprocess import coarse, triangles
 from dpl.visualization import draw_body, error_colours, plot_deformed, plot_errors
+from dpl.visualization.shapes import project
 
 
 def edges(polygons):
@@ -69,50 +71,95 @@ def test_the_surface_of_a_body_in_2d_is_its_cells(cell, count, corners):
     assert area(flat, polygons) == pytest.approx(8.0)
 
 
+def panels(figure):
+    """Return the axes of a figure without those of colour bars."""
+    return [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
+
+
+def faces(ax):
+    """Return the colours of the polygons of a panel, without those of its lines."""
+    (shape,) = [one for one in ax.collections if isinstance(one, PolyCollection)]
+    areas = [len(path.vertices) > 3 for path in shape.get_paths()]
+    return np.asarray(shape.get_facecolor())[areas]
+
+
 @pytest.mark.parametrize("cell", ["hexahedron", "tetra", "quad", "triangle"])
-def test_a_figure_has_one_row_per_prediction_and_one_column_per_load(make_scene, cell):
+def test_a_figure_has_rows_of_reference_and_predictions_and_one_column_per_load(make_scene, cell):
     plane = {"mesh": rectangle([8.0, 2.0], [5, 3], cell)} if cell in ("quad", "triangle") else {}
     scene = make_scene(**(plane or {"cell": cell}), n_modes=2)
     truth = 0.01 * torch.randn(2, *scene.problem.shape, dtype=torch.float64)
     shown = [("network", truth * 0.9), ("linear", truth * 1.1), ("exact", truth)]
     figure = plot_deformed(scene.problem, truth, shown, names=["first", "second"])
-    axes = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
-    assert len(axes) == 6
-    titles = [ax.get_title() for ax in axes]
-    assert titles[0] == "first\nnetwork"
-    assert titles[1] == "second\nnetwork"
-    assert titles[-1] == "exact"
-    figure.canvas.draw()
+    figure.draw_without_rendering()
+    axes = panels(figure)
+    assert len(axes) == 8
+    assert [ax.get_title(loc="left") for ax in axes[:3]] == ["first", "second", ""]
+    assert [ax.get_ylabel() for ax in axes[::2]] == ["finite elements", *(n for n, _ in shown)]
+    assert [bar.get_ylabel() for bar in figure.axes[8:]] == 3 * ["nodal error / L [-]"]
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_texts_of_a_figure_neither_overlap_nor_leave_it(scene, batch, upright):
+    truth = batch.displacement[:3]
+    names = ["load 1, max displacement 0.4 L\nrelative L2 1.33 %: largest"] * 3
+    shown = [("network", 0.9 * truth), ("linear", 1.1 * truth)]
+    figure = plot_deformed(scene.problem, truth, shown, names=names, upright=upright)
+    figure.draw_without_rendering()
+    texts = [text for ax in figure.axes for text in (*ax.texts, ax.xaxis.label, ax.yaxis.label)]
+    texts += [ax._left_title for ax in panels(figure)]
+    places = {text: text.get_window_extent() for text in texts if text.get_text()}
+    assert len(places) == 3 + 3 + 2
+    width, height = figure.canvas.get_width_height()
+    for text, place in places.items():
+        assert 0 <= place.x0 < place.x1 <= width, text
+        assert 0 <= place.y0 < place.y1 <= height, text
+        assert sum(place.overlaps(other) for other in places.values()) == 1, text
+
+
+def test_predictions_and_reference_lie_within_their_panels(scene, batch):
+    truth = batch.displacement[:1]
+    figure = plot_deformed(scene.problem, truth, [("network", 1.2 * truth)])
+    points = scene.problem.points.numpy()
+    (low, high), (left, right) = (figure.axes[1].get_ylim(), figure.axes[1].get_xlim())
+    for factor in (0.0, 1.0, 1.2):
+        flat, _ = project(points + factor * truth[0].numpy())
+        assert left <= flat[:, 0].min() < flat[:, 0].max() <= right
+        assert low <= flat[:, 1].min() < flat[:, 1].max() <= high
+
+
+def test_near_points_are_nearer_to_the_viewer():
+    flat, depth = project(np.array([[0.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]))
+    assert depth[1] > depth[0], "the view is from the side of negative y"
+    assert flat[2, 1] > flat[0, 1], "z points upwards"
+    assert np.linalg.norm(np.column_stack([flat, depth]), axis=1) == pytest.approx([0, 1, 1])
 
 
 def test_an_exact_prediction_has_one_colour(scene, batch):
     truth = batch.displacement[:1]
     figure = plot_deformed(scene.problem, truth, [("network", truth)])
-    figure.canvas.draw()
-    colours = np.asarray(figure.axes[0].collections[0].get_facecolor())
-    assert not np.ptp(colours, axis=0).any(), "all polygons have the same colour"
+    assert not np.ptp(faces(figure.axes[1]), axis=0).any(), "all polygons have the same colour"
 
 
-def test_a_prediction_that_is_not_finite_is_drawn_without_colour(scene, batch):
+def test_a_prediction_that_is_not_finite_is_left_out(scene, batch):
     truth = batch.displacement[:1]
     broken = torch.full_like(truth, torch.nan)
     figure = plot_deformed(scene.problem, truth, [("network", broken), ("linear", truth)])
-    figure.canvas.draw()
-    colours = [np.asarray(ax.collections[0].get_facecolor()) for ax in figure.axes[:2]]
-    assert not colours[0][:, 3].any(), "transparent"
-    assert colours[1][:, 3].all()
+    figure.draw_without_rendering()
+    kinds = [[type(one) for one in ax.collections] for ax in panels(figure)]
+    assert kinds[1:] == [[LineCollection], [PolyCollection, LineCollection]]
 
 
-def test_nodes_with_larger_errors_are_brighter(make_scene):
-    """Brightness increases with the distance from the true position."""
+@pytest.mark.parametrize("background", [0.0, 1e-3])
+def test_nodes_with_larger_errors_are_brighter(make_scene, background):
+    """Brightness increases with the nodal error, on a linear and on a logarithmic scale."""
     scene = make_scene(mesh=rectangle([8.0, 2.0], [5, 3]), n_modes=2)
     truth = torch.zeros(1, *scene.problem.shape, dtype=torch.float64)
     end = scene.problem.points[:, 0] == scene.problem.points[:, 0].max()
-    wrong = truth + 0.1 * end[:, None]
+    wrong = truth + background + 0.1 * end[:, None]
     figure = plot_deformed(scene.problem, truth, [("network", wrong)])
-    colours = np.asarray(figure.axes[0].collections[0].get_facecolor())
+    assert figure.axes[-1].get_yscale() == ("log" if background else "linear")
     touched = end.numpy()[surface(scene.problem.mesh)].any(axis=1)
-    light = colours[:, :3] @ [0.3, 0.6, 0.1]
+    light = faces(figure.axes[1])[:, :3] @ [0.3, 0.6, 0.1]
     assert touched.sum() == 2
     assert light[touched].min() > light[~touched].max() + 0.3
 
@@ -122,11 +169,11 @@ def test_upright_figures_have_one_row_per_load(make_scene):
     truth = 0.01 * torch.randn(3, *scene.problem.shape, dtype=torch.float64)
     shown = [("network", truth * 0.9), ("linear", truth * 1.1)]
     figure = plot_deformed(scene.problem, truth, shown, names=["a", "b", "c"], upright=True)
-    titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
-    assert sorted(titles) == sorted(["a\nnetwork", "b\nnetwork", "c\nnetwork", *["linear"] * 3])
-    figure.canvas.draw()
-    heights = {ax.get_title(): ax.get_position().y0 for ax in figure.axes}
-    assert heights["a\nnetwork"] > heights["b\nnetwork"] > heights["c\nnetwork"]
+    figure.draw_without_rendering()
+    heights = {ax.get_title(loc="left"): ax.get_position().y0 for ax in panels(figure)}
+    assert heights["a"] > heights["b"] > heights["c"]
+    places = {ax.get_xlabel(): ax.get_position().x0 for ax in panels(figure)}
+    assert places["finite elements"] < places["network"] < places["linear"]
 
 
 @pytest.mark.parametrize("name", BODIES)

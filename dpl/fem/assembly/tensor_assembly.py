@@ -14,6 +14,7 @@ from torch import Tensor
 from dpl.fem.assembly.boundary_conditions import FoundationMatrix
 from dpl.fem.assembly.elements import basis_of
 from dpl.fem.assembly.fbar import fbar_gradient, fbar_stress
+from dpl.fem.assembly.recovery import Recovery
 from dpl.fem.assembly.rigid_body_modes import rigid_body_modes, unconstrained_modes
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.material import Material
@@ -203,6 +204,18 @@ class TensorAssembly:
     def pattern(self) -> Pattern:
         """Sparsity pattern of the tangent."""
         return Pattern.build(self.cells.cpu().numpy(), self.free.cpu().numpy())
+
+    @cached_property
+    def recovery(self) -> Recovery:
+        """Values at nodes from values at quadrature points; a body of another law shares it."""
+        if (twin := self.__dict__.get("_same_mesh")) is not None:
+            return twin.recovery
+        at = np.asarray(self.basis.global_coordinates()).transpose(1, 2, 0)
+        dV = self.dV.expand(len(self.cells), -1)
+        points, cells, boundary, volumes = (
+            part.cpu().numpy() for part in (self.points, self.cells, self.boundary, dV)
+        )
+        return Recovery.build(points, cells, boundary, at, volumes, self.degree)
 
     @cached_property
     def _operator(self) -> Tensor:

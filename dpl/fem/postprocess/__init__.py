@@ -14,6 +14,6 @@ if TYPE_CHECKING:
         fields,
         von_mises,
     )
-    from dpl.fem.postprocess.surface import coarse, triangles
+    from dpl.fem.postprocess.surface import coarse, facet_edges, triangle_normals, triangles
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

@@ -25,8 +25,9 @@ class Fields(NamedTuple):
 def fields(problem: Problem, displacement: Tensor) -> Fields:
     """Return stress and volume ratio at the nodes under displacements (B, N, D) [-].
 
-    Nodal values are volume-weighted means over the adjacent cells. The von Mises stress is that of
-    the nodal stress. min det F of a solution is taken over quadrature points and therefore lower.
+    The components of the stress and det F are fitted by linear functions, see `at_nodes`. The von
+    Mises stress is that of the nodal stress, and therefore never negative. min det F of a solution
+    is taken over quadrature points and differs from the smallest value at a node.
     """
     F = deformation_gradient(problem, displacement)
     stress = at_nodes(problem, cauchy(problem, displacement))
@@ -59,16 +60,8 @@ def von_mises(stress: Tensor) -> Tensor:
 def at_nodes(problem: Problem, values: Tensor) -> Tensor:
     """Return nodal values (B, N, ...) of values at quadrature points (B, E, Q, ...).
 
-    A nodal value is the volume-weighted mean over the adjacent cells: the lumped L2 projection of
-    cell means (Zienkiewicz, Zhu 1987).
+    A nodal value is that of a linear function, fitted to the values in the cells around the node
+    (Zienkiewicz, Zhu 1992), see `dpl.fem.assembly.recovery.Recovery.build`. It is exact for values
+    that are linear in the undeformed coordinates, and may lie outside the range of the values.
     """
-    batch, count, _, *rest = values.shape
-    share = problem.dV.expand(count, -1)  # (E, Q)
-    integral = (values.reshape(batch, count, len(share[0]), -1) * share[..., None]).sum(dim=2)
-    corners = problem.cells.shape[1]  # (B, E, components), at each node of the cell:
-    spread = integral[:, :, None].expand(-1, -1, corners, -1).flatten(1, 2)
-    nodes, where = problem.shape[0], problem.cells.flatten()
-    total = values.new_zeros(batch, nodes, integral.shape[-1]).index_add(1, where, spread)
-    volume = share.sum(dim=1)[:, None].expand(-1, corners).flatten()
-    weight = values.new_zeros(nodes).index_add(0, where, volume)
-    return (total / weight[:, None]).reshape(batch, nodes, *rest)
+    return problem.recovery(values)

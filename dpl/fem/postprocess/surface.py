@@ -1,10 +1,12 @@
-"""The surface of a mesh, as triangles or lines."""
+"""The surface of a mesh, as polygons, triangles or lines."""
 
 from typing import Any
 
 import numpy as np
 import skfem
 from numpy.typing import NDArray
+
+SMOOTH = 0.9  # smallest cosine between normals of facets that form a smooth surface
 
 
 def surface(mesh: skfem.Mesh) -> NDArray[np.int_]:
@@ -34,6 +36,32 @@ def _sides(
     """Return the vectors from the first corner of polygons to the next two, (D, P) each."""
     a, b, c = (points[polygons[:, k]] for k in range(3))
     return (b - a).T, (c - a).T
+
+
+def facet_edges(
+    points: NDArray[Any], polygons: NDArray[np.int_]
+) -> tuple[NDArray[np.int_], NDArray[np.bool_]]:
+    """Return the edges, (K, 2), of polygons (P, corners) and a mask, (K,), of the feature edges.
+
+    Feature edges are at the boundary or between polygons that do not form a smooth surface.
+    """
+    points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+    normals = triangle_normals(points, polygons[:, :3])
+    sides = np.stack([polygons, np.roll(polygons, -1, axis=1)], axis=-1).reshape(-1, 2)
+    edges, index = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
+    polygon = np.repeat(np.arange(len(polygons)), polygons.shape[1])
+    total = np.zeros((len(edges), 3))
+    np.add.at(total, index.ravel(), normals[polygon])
+    count = np.bincount(index.ravel(), minlength=len(edges))
+    sharp = (total**2).sum(axis=1) < 2 + 2 * SMOOTH  # |n + m|^2 of two unit normals
+    return edges, sharp | (count == 1)
+
+
+def triangle_normals(points: NDArray[Any], triangles: NDArray[np.int_]) -> NDArray[Any]:
+    """Return unit normals of triangles, (T, 3), of points (N, 3)."""
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
 
 
 def coarse(points: NDArray[Any], polygons: NDArray[np.int_], most: int) -> NDArray[np.int_]:
