@@ -84,7 +84,8 @@ PARTS = (
         "error_estimates",
         "Estimated over true errors",
         "python scripts/error_estimates.py folder=benchmarks/results",
-        "Quantiles of the ratio for predictions of models that are fitted to 96 loads, on four bodies.",
+        "Quantiles of the ratio for predictions of models that are fitted to 96 loads, on four "
+        "bodies.",
         tabulated=False,
     ),
     Part(
