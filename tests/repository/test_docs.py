@@ -210,6 +210,17 @@ def test_links_out_of_docs_lead_to_pages_of_the_site(make):
     )
 
 
+def test_the_output_of_a_command_becomes_a_picture_that_names_no_host(make):
+    text = "\x1b[31mred\x1b[0m and more\r\nsolving 1/2\rsolving 2/2\n" + 100 * "x" + "\n"
+    drawn = make("terminal").svg(text, "make train")
+    assert ">red<" in drawn
+    assert "make&#160;train" in drawn or "make train" in drawn
+    assert "solving&#160;2/2" in drawn
+    assert "solving&#160;1/2" not in drawn
+    assert f">{100 * 'x'}<" in drawn  # 100 columns, not divided
+    assert not re.search(r"url\(.?https?:|href=.https?:|src=.https?:", drawn)
+
+
 def test_a_notebook_is_stored_with_its_figures_and_shown_with_them(make, tmp_path, monkeypatch):
     executed, links = make("executed"), make("links")
     code = """import matplotlib.pyplot as plt, sys
@@ -392,8 +403,7 @@ def test_the_commands_of_the_quick_start_are_valid(
     """Every job of a command line is composed and checked, and none is started."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("DPL_CONF", str(CONF))
-    resumed = [argument for argument in arguments if argument.startswith("ckpt_path=")]
-    plain = [argument for argument in arguments if argument not in {*LAUNCHED, *resumed}]
+    plain = [argument for argument in arguments if argument not in LAUNCHED]
     line = dry_run.arguments_of(plain, name, folder_of(name))
     with dry_run.initialized(line):
         dry_run.check(line)
@@ -402,17 +412,16 @@ def test_the_commands_of_the_quick_start_are_valid(
 @pytest.mark.slow  # trains eight runs
 @pytest.mark.timeout(900)
 def test_the_commands_of_the_quick_start_work_one_after_the_other(
-    blocks, script, tiny_training, tmp_path
+    blocks, script, tiny_training, tmp_path, monkeypatch
 ):
-    (tmp_path / "runs").mkdir()
     text = (DOCS / "index.md").read_text(encoding="utf-8")
     first = BLOCK.search(text)[3]
-    os.chdir(tmp_path)
+    monkeypatch.chdir(tmp_path)
     exec(compile(first, "index.md", "exec"), {})  # writes the mesh
     tiny = [a for a in tiny_training if not a.startswith(("mesh", "data.train", "model"))]
     for name, arguments in command_lines("index.md"):
         plain = [argument for argument in arguments if argument not in LAUNCHED]
-        if name in ("train", "generate") and not any("ckpt_path" in a for a in plain):
+        if name in ("train", "generate"):
             plain = [a for a in plain if not a.startswith("data.train")] + tiny + ["data.train=24"]
             plain += ["trainer.max_epochs=1"] * (name == "train")
             plain += ["mesh.nodes=[5,3,3]"] * ("mesh=file" not in plain)
