@@ -3,7 +3,7 @@
 import io
 from typing import Any
 
-COLOURS = 192  # colours of the palette of a picture
+COLOURS = 256  # colours of the palette of a picture
 
 
 def small_png(image: Any, **notes: str) -> bytes:
@@ -21,9 +21,8 @@ def small_png(image: Any, **notes: str) -> bytes:
     info = PngInfo()
     for name, text in notes.items():
         info.add_text(name, text)
-    drawn = opaque.convert("RGB").quantize(
-        COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
-    )
+    method = Image.Quantize.MAXCOVERAGE  # keeps colours of small areas, such as ends of a scale
+    drawn = opaque.convert("RGB").quantize(COLOURS, method, 2, dither=Image.Dither.NONE)
     made = io.BytesIO()
     drawn.save(made, "PNG", optimize=True, pnginfo=info)
     return made.getvalue()
