@@ -406,23 +406,25 @@ def test_the_commands_of_the_quick_start_are_valid(
     plain = [argument for argument in arguments if argument not in LAUNCHED]
     line = dry_run.arguments_of(plain, name, folder_of(name))
     with dry_run.initialized(line):
-        dry_run.check(line)
+        single = dry_run.check(line)
+    assert (single is None) == ("-m" in plain)  # the configuration of a single job
 
 
 @pytest.mark.slow  # trains eight runs
 @pytest.mark.timeout(900)
 def test_the_commands_of_the_quick_start_work_one_after_the_other(
-    blocks, script, tiny_training, tmp_path, monkeypatch
+    blocks, script, tmp_path, monkeypatch
 ):
     text = (DOCS / "index.md").read_text(encoding="utf-8")
     first = BLOCK.search(text)[3]
     monkeypatch.chdir(tmp_path)
     exec(compile(first, "index.md", "exec"), {})  # writes the mesh
-    tiny = [a for a in tiny_training if not a.startswith(("mesh", "data.train", "model"))]
+    sizes = ["data.train=24", "data.val=4", "data.test=4", "data.workers=0"]
+    sizes += ["loads.n_modes=3", "solver.linear=superlu"]
     for name, arguments in command_lines("index.md"):
         plain = [argument for argument in arguments if argument not in LAUNCHED]
         if name in ("train", "generate"):
-            plain = [a for a in plain if not a.startswith("data.train")] + tiny + ["data.train=24"]
+            plain = [a for a in plain if not a.startswith("data.train")] + sizes
             plain += ["trainer.max_epochs=1"] * (name == "train")
             plain += ["mesh.nodes=[5,3,3]"] * ("mesh=file" not in plain)
         if name == "view" and not any("animation" in a for a in plain):
