@@ -3,7 +3,8 @@
 # make test:  installation and the checks that CI makes; WORKERS processes share the tests.
 # make mutants: changes of the source that no test notices; ARGS="dpl/training/metrics.py --sample 60".
 # make matrix: the tests under other processor features and thread numbers; see tests/matrix.py.
-# make docs:  the documentation into site/; NOTEBOOKS=false leaves them unexecuted.
+# make docs:  the documentation into site/.
+# make pictures: executes gallery and notebooks and stores their pictures, and the one that moves.
 PYTHON ?= python3
 BIN := .venv/bin
 WORKERS ?= 2
@@ -11,7 +12,7 @@ WORKERS ?= 2
 FIRST := runs/first_$(shell date +%Y-%m-%d_%H-%M-%S)
 BEAM := mesh=paper_beam data.val=50 data.test=50
 
-.PHONY: setup train demo test lint slow matrix mutants docs wheel clean
+.PHONY: setup train demo test lint slow matrix mutants docs pictures wheel clean
 
 setup: .venv/installed
 
@@ -52,7 +53,12 @@ mutants: setup
 	$(BIN)/python tests/mutants.py $(ARGS)
 
 docs: setup
-	NO_MKDOCS_2_WARNING=1 NOTEBOOKS=$(or $(NOTEBOOKS),true) $(BIN)/python -m mkdocs build --strict -f docs/make/mkdocs.yml
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict -f docs/make/mkdocs.yml
+
+pictures: runs/demo/evaluation.json
+	$(BIN)/python docs/make/gallery.py
+	$(BIN)/python docs/make/executed.py
+	$(BIN)/python scripts/view.py run=runs/demo animation=docs/start.gif
 
 wheel: setup
 	$(BIN)/pip wheel --quiet --no-deps -w dist .

@@ -6,6 +6,7 @@ from typing import Any
 import commands
 import executed
 import formulas
+import gallery
 import links
 import measured
 import modules
@@ -28,7 +29,7 @@ def on_config(config: MkDocsConfig) -> None:
         ],
     }
     config.nav = _filled(config.nav, filled)
-    config.watch += [str(path) for path in (CONF, PACKAGE, RESULTS, HERE)]
+    config.watch += [str(path) for path in (CONF, NOTEBOOKS, PACKAGE, RESULTS, HERE)]
 
 
 def _filled(entry: Any, filled: dict[str, list]) -> Any:
@@ -51,7 +52,7 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
         add(page, (ROOT / source).read_text(encoding="utf-8"))
     for path, content in modules.pages():
         add(path, content)
-    for path, content in executed.pages(execute=bool(config.extra["notebooks"])):
+    for path, content in executed.pages():
         add(path, content)
     for path in measured.files():
         add(f"results/{path.name}", path.read_bytes())
@@ -67,6 +68,7 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     if path in INCLUDED:
         markdown = links.rewritten(markdown, INCLUDED[path], path)
     elif (DOCS / path).is_file():
+        markdown = gallery.shown(markdown) if path == gallery.PAGE.name else markdown
         markdown = links.rewritten(measured.filled(markdown), f"docs/{path}", path)
     elif path.startswith("notebooks/"):
         source = (NOTEBOOKS / path.removeprefix("notebooks/")).with_suffix(".ipynb")

@@ -1,7 +1,8 @@
 """Reference pages: one per folder of the package, with the names that its `__init__.py` exports.
 
-A name that several folders export is documented on the page of the innermost one. The other pages
-list it with a link.
+Each page begins with a table of the public names. A name that several folders export is documented
+on the page of the outermost one: the names of the package first, then those of its folders. The
+other pages list it with a link.
 """
 
 import functools
@@ -23,9 +24,10 @@ def package() -> griffe.Module:
 
 @functools.cache
 def exports() -> dict[str, dict[str, str]]:
-    """Return for each folder its public names with the path of their definition, outermost first.
+    """Return for each folder its public names with the path of their definition.
 
-    Public names are those that `__init__.py` imports under `if TYPE_CHECKING:`.
+    The package comes first, then its folders, then the folders in these. Public names are those
+    that `__init__.py` imports under `if TYPE_CHECKING:`.
     """
     found: dict[str, dict[str, str]] = {}
 
@@ -42,15 +44,17 @@ def exports() -> dict[str, dict[str, str]]:
                 collect(module)
 
     collect(package())
-    return found
+    return dict(sorted(found.items(), key=lambda item: item[0].count(".")))
 
 
 @functools.cache
 def documented() -> dict[str, str]:
     """Return for the path of each public definition the name under which it is documented."""
-    return {
-        path: f"{folder}.{name}" for folder, own in exports().items() for name, path in own.items()
-    }
+    found: dict[str, str] = {}
+    for folder, own in exports().items():
+        for name, path in own.items():
+            found.setdefault(path, f"{folder}.{name}")
+    return found
 
 
 def page(folder: str) -> str:
@@ -61,14 +65,12 @@ def page(folder: str) -> str:
 def pages() -> Iterator[tuple[str, str]]:
     """Yield paths and texts of the pages."""
     for folder, names in exports().items():
-        own = [name for name, path in names.items() if documented()[path] == f"{folder}.{name}"]
-        text = [f"::: {folder}", f"    options: {{members: {own or 'false'}}}", ""]
-        if elsewhere := [name for name in names if name not in own]:
-            text += ["## Names from other folders", "", "| name | |", "| --- | --- |"]
-            for name in elsewhere:
-                text.append(
-                    f"| [`{folder}.{name}`][{documented()[names[name]]}] | {summary(names[name])} |"
-                )
+        text = [f"::: {folder}", "    options: {members: false}", "", "| name | |", "| --- | --- |"]
+        for name, path in names.items():
+            text.append(f"| [`{folder}.{name}`][{documented()[path]}] | {summary(path)} |")
+        for name, path in names.items():
+            if documented()[path] == f"{folder}.{name}":
+                text += ["", f"::: {folder}.{name}", "    options: {heading_level: 2}"]
         yield page(folder), "\n".join(text) + "\n"
 
 

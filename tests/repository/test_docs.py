@@ -2,19 +2,24 @@
 
 import ast
 import importlib
+import io
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import hydra
+import matplotlib
 import nbformat
 import pytest
 import torch
 import yaml
 from hydra.core.global_hydra import GlobalHydra
+from PIL import Image
 
+from dpl.commands import dry_run
 from dpl.config import build as run
 from dpl.fem.linear import BACKENDS
 
@@ -85,7 +90,7 @@ def test_every_command_is_listed_with_all_its_keys(make):
         assert command.config.read_text(encoding="utf-8").rstrip() in section, command.name
 
 
-def test_every_public_name_is_documented_once_and_linked_from_the_other_folders(make):
+def test_every_public_name_is_listed_by_its_folders_and_documented_once(make):
     modules = make("modules")
     pages = dict(modules.pages())
     folders = [path.parent for path in (ROOT / "dpl").rglob("__init__.py")]
@@ -93,20 +98,29 @@ def test_every_public_name_is_documented_once_and_linked_from_the_other_folders(
         package = importlib.import_module(".".join(folder.relative_to(ROOT).parts))
         names = [name for name in getattr(package, "__all__", ()) if name != "__version__"]
         for name in names:
-            text = pages[f"api/{package.__name__}.md"]
             full = f"{package.__name__}.{name}"
-            assert (f"'{name}'" in text) != (f"`{full}`" in text), full
+            assert f"[`{full}`][{modules.anchor(full)}]" in pages[f"api/{package.__name__}.md"]
             assert modules.anchor(full) in modules.documented().values()
-    every = [name for text in pages.values() for name in re.findall(r"'(\w+)'", text)]
-    assert len(every) == len(modules.documented())
+    every = [name for text in pages.values() for name in re.findall(r"^::: (\S+)", text, re.M)]
+    assert sorted(every) == sorted([*modules.exports(), *modules.documented().values()])
+
+
+def test_the_reference_begins_with_the_names_of_the_package(make):
+    modules = make("modules")
+    depths = [folder.count(".") for folder in modules.exports()]
+    assert next(iter(modules.exports())) == "dpl"
+    assert depths == sorted(depths)
+    for name in modules.exports()["dpl"]:
+        assert modules.anchor(f"dpl.{name}") == f"dpl.{name}"
 
 
 @pytest.mark.parametrize(
     ("name", "anchor"),
     [
-        ("dpl.fem.Newton", "dpl.fem.solvers.Newton"),
+        ("dpl.fem.Newton", "dpl.fem.Newton"),
         ("dpl.fem.Problem.residual", "dpl.fem.Problem.residual"),
-        ("dpl.fem.solvers.newton.Newton", "dpl.fem.solvers.Newton"),
+        ("dpl.fem.solvers.newton.Newton", "dpl.fem.Newton"),
+        ("dpl.training.Surrogate", "dpl.Surrogate"),
         ("dpl.fem.mesh", "dpl.fem.mesh"),
         ("dpl.fem.solvers.newton", None),
         ("dpl.no_such_name", None),
@@ -196,25 +210,78 @@ def test_links_out_of_docs_lead_to_pages_of_the_site(make):
     )
 
 
-def test_a_notebook_is_executed_once_and_shown_with_its_figures(make, tmp_path, monkeypatch):
+def test_the_output_of_a_command_becomes_a_picture_that_names_no_host(make):
+    text = "\x1b[31mred\x1b[0m and more\r\nsolving 1/2\rsolving 2/2\n" + 100 * "x" + "\n"
+    drawn = make("terminal").svg(text, "make train")
+    assert ">red<" in drawn
+    assert "make&#160;train" in drawn or "make train" in drawn
+    assert "solving&#160;2/2" in drawn
+    assert "solving&#160;1/2" not in drawn
+    assert f">{100 * 'x'}<" in drawn  # 100 columns, not divided
+    assert not re.search(r"url\(.?https?:|href=.https?:|src=.https?:", drawn)
+
+
+def test_a_notebook_is_stored_with_its_figures_and_shown_with_them(make, tmp_path, monkeypatch):
     executed, links = make("executed"), make("links")
-    code = "import matplotlib.pyplot as plt\nplt.plot([1, 2])\nprint('\\x1b[31m40\\x1b[0m', 40 + 2)"
+    code = """import matplotlib.pyplot as plt, sys
+print("\\x1b[31m40\\x1b[0m", 40 + 2)
+print("said", file=sys.stderr)
+plt.plot([1, 2])"""
     cells = [nbformat.v4.new_markdown_cell("# A trial"), nbformat.v4.new_code_cell(code)]
-    nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "1_trial.ipynb")
+    metadata = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
+    trial = tmp_path / "1_trial.ipynb"
+    nbformat.write(nbformat.v4.new_notebook(cells=cells, metadata=metadata), trial)
     monkeypatch.setattr(executed, "NOTEBOOKS", tmp_path)
-    monkeypatch.setattr(executed, "CACHE", tmp_path / "cache")
-    assert executed.title(executed.paths()[0]) == "A trial"
-    (path, text), (figure, content) = executed.pages(execute=True)
-    assert path == "notebooks/1_trial.md"
-    assert "40 42" in text
-    shown = links.rewritten(text, "notebooks/1_trial.ipynb", path)
-    assert f"({figure.removeprefix('notebooks/')})" in shown
-    assert content.startswith(b"\x89PNG")
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    executed.execute(trial)
+    notebook = nbformat.read(trial, as_version=4)
+    nbformat.validate(notebook)
+    text, figure = notebook.cells[1].outputs  # no stderr, no address of the last expression
+    assert text.text == "40 42\n"
+    assert list(figure.data) == ["image/png"]
+    assert notebook.cells[1].execution_count is None
+    assert notebook.metadata.code_sha256 == executed.code_digest(notebook)
+
     monkeypatch.setattr("nbclient.NotebookClient.execute", None)
-    assert dict(executed.pages(execute=True))[path] == text
-    bare = dict(executed.pages(execute=False))
-    assert list(bare) == [path]
-    assert "40 42" not in bare[path]
+    assert executed.title(executed.paths()[0]) == "A trial"
+    (path, page), (name, content) = executed.pages()
+    assert path == "notebooks/1_trial.md"
+    assert "40 42" in page
+    shown = links.rewritten(page, "notebooks/1_trial.ipynb", path)
+    assert f"({name.removeprefix('notebooks/')})" in shown
+    assert content.startswith(b"\x89PNG")
+
+
+def test_the_pictures_of_the_gallery_belong_to_their_code(make):
+    """`make pictures` makes them."""
+    gallery = make("gallery")
+    entries = gallery.entries()
+    text = gallery.PAGE.read_text(encoding="utf-8")
+    assert len(entries) == text.count("\n### ") >= 12
+    assert {entry.path for entry in entries} == set(gallery.FOLDER.glob("*.png"))
+    for entry in entries:
+        assert gallery.stored_digest(entry) == entry.digest, entry.name
+        lines = [line for line in entry.code.splitlines() if line.strip()]
+        assert len(lines) <= 15, entry.name
+        assert f"### {entry.title}\n" in text
+        assert entry.name == re.sub(r"\W+", "-", entry.title.lower())  # the anchor of its title
+        assert f"(#{entry.name})" in gallery.shown(text)
+    assert sum(entry.path.stat().st_size for entry in entries) < 1e6
+
+
+@pytest.mark.parametrize(
+    "long", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["short", "long"]
+)
+def test_the_code_of_the_gallery_draws_its_pictures(make, long, tmp_path, monkeypatch):
+    gallery = make("gallery")
+    names = [e.name for e in gallery.entries() if ("Unrolled" in e.before) == long]  # fitted
+    assert len(names) > 5
+    monkeypatch.chdir(tmp_path)
+    with matplotlib.rc_context():
+        for entry, figure in gallery.figures(names):
+            with Image.open(io.BytesIO(gallery.picture(figure, entry.digest))) as image:
+                assert image.width > 400, entry.name
+                assert image.info["code"] == entry.digest
 
 
 def test_the_examples_of_the_page_on_extensions_work(blocks, monkeypatch):
@@ -315,6 +382,60 @@ def test_the_quick_start_works_on_a_trained_run(blocks, script, tiny_training, t
     assert names["bent"].converged
 
 
+def command_lines(page):
+    """Return names and arguments of the commands that a page shows, as a shell splits them."""
+    text = (DOCS / page).read_text(encoding="utf-8").replace("\\\n", " ")
+    lines = re.findall(r"^python scripts/(\w+)\.py *(.*)$", text, re.M)
+    return [(name, shlex.split(rest, comments=True)) for name, rest in lines]
+
+
+LAUNCHED = {"hydra/launcher=submitit_slurm", "hydra/launcher=submitit_local"}
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [line for line in command_lines("index.md") if line[0] != "compare"],  # has no configuration
+    ids=lambda value: value if isinstance(value, str) else " ".join(value),
+)
+def test_the_commands_of_the_quick_start_are_valid(
+    name, arguments, folder_of, tmp_path, monkeypatch
+):
+    """Every job of a command line is composed and checked, and none is started."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DPL_CONF", str(CONF))
+    plain = [argument for argument in arguments if argument not in LAUNCHED]
+    line = dry_run.arguments_of(plain, name, folder_of(name))
+    with dry_run.initialized(line):
+        single = dry_run.check(line)
+    assert (single is None) == ("-m" in plain)  # the configuration of a single job
+
+
+@pytest.mark.slow  # trains eight runs
+@pytest.mark.timeout(900)
+def test_the_commands_of_the_quick_start_work_one_after_the_other(
+    blocks, script, tmp_path, monkeypatch
+):
+    text = (DOCS / "index.md").read_text(encoding="utf-8")
+    first = BLOCK.search(text)[3]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(first, "index.md", "exec"), {})  # writes the mesh
+    sizes = ["data.train=24", "data.val=4", "data.test=4", "data.workers=0"]
+    sizes += ["loads.n_modes=3", "solver.linear=superlu"]
+    for name, arguments in command_lines("index.md"):
+        plain = [argument for argument in arguments if argument not in LAUNCHED]
+        if name in ("train", "generate"):
+            plain = [a for a in plain if not a.startswith("data.train")] + sizes
+            plain += ["trainer.max_epochs=1"] * (name == "train")
+            plain += ["mesh.nodes=[5,3,3]"] * ("mesh=file" not in plain)
+        if name == "view" and not any("animation" in a for a in plain):
+            continue  # serves the page until it is ended
+        done = script(name, *plain, cwd=tmp_path)
+        assert done.status in (0, None), (name, plain, done.err)
+    assert (tmp_path / "runs/mine/export/model.onnx").is_file()
+    assert (tmp_path / "mine.gif").is_file()
+    assert blocks("index.md")["exact"].residual < 1e-6
+
+
 def test_python_and_yaml_that_are_shown_can_be_read():
     seen = set()
     for path in DOCS.glob("*.md"):
@@ -329,7 +450,7 @@ def test_the_site_is_made_without_a_warning_and_asks_no_other_host_for_anything(
     build = ["build", "--strict", "-f", MAKE / "mkdocs.yml", "-d", site]
     reported = subprocess.run(
         [sys.executable, "-m", "mkdocs", *build],
-        env={**os.environ, "NOTEBOOKS": "false", "NO_MKDOCS_2_WARNING": "1"},
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
         capture_output=True,
         text=True,
         check=False,

@@ -1,5 +1,6 @@
-"""Notebooks as a reader finds them: nothing in them has run yet, and all of it does."""
+"""Notebooks as a reader finds them: with their figures, and all of their code runs."""
 
+import importlib
 import re
 import time
 from pathlib import Path
@@ -21,19 +22,39 @@ def test_there_are_six_and_the_index_names_each():
     assert [path.name for path in NOTEBOOKS if f"({path.name})" not in index] == []
 
 
+@pytest.fixture
+def executed(monkeypatch):
+    """The module that executes and stores notebooks."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "make"))
+    return importlib.import_module("executed")
+
+
 @every
-def test_a_notebook_is_stored_as_it_was_written(path):
+def test_a_notebook_is_stored_with_the_outputs_of_its_code(path, executed):
+    """`make pictures` stores them."""
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     assert (notebook.nbformat, notebook.nbformat_minor) == (4, 5)
-    assert set(notebook.metadata) <= {"kernelspec", "language_info"}
+    assert set(notebook.metadata) == {"code_sha256", "kernelspec", "language_info"}
+    assert notebook.metadata.code_sha256 == executed.code_digest(notebook)
     assert 10 <= len(notebook.cells) <= 25
     assert notebook.cells[0].source.startswith("# ")
     for cell in notebook.cells:
         assert not cell.metadata
         if cell.cell_type == "code":
-            assert cell.outputs == []
             assert cell.execution_count is None
+            assert has_figure(cell) or "plt.subplots(" not in cell.source
+            for output in cell.outputs:
+                assert output == executed.reduced(output) or "image/png" in output.data
+
+
+def has_figure(cell):
+    """Whether a cell has a picture among its outputs."""
+    return any("image/png" in output.get("data", {}) for output in cell.get("outputs", []))
+
+
+def test_the_stored_figures_are_small():
+    assert sum(path.stat().st_size for path in NOTEBOOKS) < 1.5e6
 
 
 @every
@@ -64,7 +85,9 @@ def test_a_notebook_runs_and_leaves_nothing_behind(path, tmp_path, monkeypatch, 
     NotebookClient(notebook, timeout=SECONDS, kernel_name="python3", resources=place).execute()
     print(f"{path.name}: {time.perf_counter() - start:.1f} s")
     outputs = [out for cell in notebook.cells for out in cell.get("outputs", [])]
-    assert sum("image/png" in out.get("data", {}) for out in outputs) >= 5
+    stored = nbformat.read(path, as_version=4).cells
+    assert [has_figure(cell) for cell in notebook.cells] == [has_figure(cell) for cell in stored]
+    assert sum(has_figure(cell) for cell in stored) >= 5
     said = [out.text for out in outputs if out.get("name") == "stderr"]
     assert [text for text in said if "Warning" in text] == []
     assert list(tmp_path.iterdir()) == []
