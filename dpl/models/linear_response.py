@@ -215,10 +215,10 @@ class LinearResponse(nn.Module):
             parameters: Parameters of the law, (B, P).
         """
         if self.is_exact:
-            return self._exact(loaded, parameters)
+            return self.solution(loaded, parameters)
         columns, local = self.in_modes(loaded, parameters)
         if local.any():
-            exact = self._exact(loaded[local], parameters[local])
+            exact = self.solution(loaded[local], parameters[local])
             columns = columns.index_copy(0, local.nonzero()[:, 0], exact)
         return columns
 
@@ -230,7 +230,8 @@ class LinearResponse(nn.Module):
         size = coordinates.square().sum(dim=1)  # of the solution: the modes are orthonormal
         return coordinates @ self.modes.mT.to(loaded), missing > self.tol**2 * (size + missing)
 
-    def _exact(self, loaded: Tensor, parameters: Tensor) -> Tensor:
+    def solution(self, loaded: Tensor, parameters: Tensor) -> Tensor:
+        """Return K(0)^-1 (f - s), (B, n), by the factor for all loads; see `solve`."""
         solved: Tensor = _LinearSolve.apply(loaded, parameters, self)
         return solved
 
