@@ -36,6 +36,7 @@ RTOL = 1e-5  # relative residual of a linear solution whose parameters differ fr
 MAX_ITER = 200
 NO_INVERSE: ReducedInverse = np.zeros((0, 0)), np.zeros(0)
 CHUNK = 256  # loads that are solved at a time
+MAX_SINGLE = 4  # loads that are solved one by one: solves of blocks cost as much as many loads
 
 
 class LinearResponse(nn.Module):
@@ -250,6 +251,8 @@ class LinearResponse(nn.Module):
         """Return K(0)^-1 (f - s), (B, n), of forces (B, n)."""
         right = loaded - support_force(solver.problem)[solver.problem.free]
         factor = solver.float32_factor if self.is_exact else solver.factor
+        if 0 < len(right) <= MAX_SINGLE:
+            return torch.from_numpy(np.stack([factor.solve(one, RTOL) for one in right.numpy()]))
         return torch.from_numpy(factor.solve_many(right.numpy(), RTOL))
 
     def _solve_one(self, loaded: NDArray[np.float64], parameters: Tensor) -> NDArray[np.float64]:
