@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+import dpl
 from dpl import Scene
 from dpl.export.onnx_graph import ExportGraph
 from dpl.fem import (
@@ -222,3 +223,23 @@ def test_without_a_base_nothing_is_solved(scene, batch, monkeypatch):
     assert surrogate.base is None
     assert surrogate.encode(batch) is None
     assert surrogate.predict(batch.load).isfinite().all()
+
+
+@pytest.mark.parametrize("data", ["offline", pytest.param("online", marks=pytest.mark.slow)])
+def test_a_run_is_loaded_evaluated_and_not_exported_as_a_graph(script, tiny, tmp_path, data):
+    sizes = ["data.val=2", "data.test=2", "data.batch_size=4", "data.workers=0"]
+    sizes += {"offline": ["data.train=4", "data.symmetry=true"], "online": ["data.batches=2"]}[data]
+    short = ["model.width=4", "trainer.max_epochs=1", "trainer.check_val_every_n_epoch=1"]
+    options = [*tiny, "experiment=gnn_linear", f"data={data}", *sizes, *short, "run=run"]
+    trained = script("train", *options, cwd=tmp_path)
+    assert trained.status == 0, trained.err
+    simulator = dpl.load(tmp_path / "run")
+    surrogate = simulator.surrogate
+    assert surrogate.net.base == "linear"
+    load = surrogate.scene.loads.sample((0, 0), range(1))
+    with torch.no_grad():
+        assert surrogate.predict(load).isfinite().all()
+    exported = script("export", "run=run", cwd=tmp_path)
+    assert exported.status != 0
+    assert "run: model.base = linear cannot be written as an ONNX graph" in exported.err
+    assert not (tmp_path / "run" / "export" / "model.onnx").exists()
