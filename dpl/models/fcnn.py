@@ -119,7 +119,9 @@ class FCNN(nn.Module):
             stiffness = (young / self.young_max).to(force.dtype)[:, None]
             normalised = ((young - self.young_mean) / self.young_scale).to(force.dtype)[:, None]
             inputs = torch.cat([stiffness * inputs, normalised], dim=1)
-        inputs = torch.cat([inputs, self.scalars(force, amplitude, parameters)], dim=1)
+        if self.scalars.count:
+            values = self.scalars(force, amplitude, parameters)
+            inputs = torch.cat([inputs, values], dim=1)
         whole = torch.zeros_like(force).flatten(1)
         return whole.index_copy(1, self.output_index, self.stages(inputs)).view_as(force)
 

@@ -32,7 +32,7 @@ class ScalarInputs:
     def __call__(
         self, like: Tensor, amplitude: Tensor | None = None, parameters: Tensor | None = None
     ) -> Tensor:
-        """Return the inputs, (B, count).
+        """Return the inputs, (B, count); there must be some.
 
         Args:
             like: Tensor (B, ...) of the dtype and device to return.
@@ -42,7 +42,7 @@ class ScalarInputs:
         Raises:
             ValueError: A required input is None.
         """
-        columns = [like.new_zeros(like.shape[0], 0)]
+        columns = []
         if "amplitude" in self.names:
             if amplitude is None:
                 raise ValueError("amplitude is an input of this network; give amplitudes, (B,)")
