@@ -49,9 +49,10 @@ def export_model(cfg: DictConfig, surrogate: "dpl.Surrogate", folder: Path) -> N
     from dpl.export.metadata import describe
     from dpl.export.reference import solve_reference
 
-    graph, path = export.ExportGraph(surrogate), folder / "model.onnx"
+    path = folder / "model.onnx"
     start = time.perf_counter()
     with config.error_in("run"):
+        graph = export.ExportGraph(surrogate)
         export.export_onnx(graph, path)
     seconds = time.perf_counter() - start
     reference = solve_reference(graph)

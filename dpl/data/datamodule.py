@@ -167,8 +167,8 @@ class OfflineData(L.LightningDataModule):
             leave_cores(self.workers)
             self.sizes |= self.growth.next_sizes()
         module, samples = getattr(self.trainer, "lightning_module", None), self.samples("train")
-        encode = getattr(module, "encode", lambda samples, images: None)
-        data = encode(samples, images=len(self.group) > 1)
+        encode = getattr(module, "encode", lambda samples, group: None)
+        data = encode(samples, self.group)
         if data is None:
             data = Samples(samples, self.group)
         rank, world_size = self.rank_and_world_size

@@ -56,8 +56,17 @@ class ExportGraph(nn.Module):
     """
 
     def __init__(self, surrogate: Surrogate) -> None:
-        """Take a trained surrogate on the CPU."""
+        """Take a trained surrogate on the CPU.
+
+        Raises:
+            ValueError: The surrogate adds linear solutions, which are no tensor operations.
+        """
         super().__init__()
+        if surrogate.base is not None:
+            raise ValueError(
+                "model.base = linear cannot be written as an ONNX graph: each prediction solves "
+                "with a factor of K(0); export a run with model.base = none"
+            )
         self.surrogate = surrogate.eval()
         net = surrogate.net
         self.has_local_output = isinstance(net, FlagsLocalLoads) and net.flags_local_loads

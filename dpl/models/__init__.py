@@ -11,11 +11,13 @@ if TYPE_CHECKING:
     from dpl.models.cnn import CNN
     from dpl.models.fcnn import FCNN
     from dpl.models.gnn import GNN
+    from dpl.models.linear_base import LinearBase
     from dpl.models.pod import PODNet
     from dpl.models.protocols import (
         ClosedFormFit,
         Correctable,
         FlagsLocalLoads,
+        HasBase,
         HasCorrection,
         TrainsInCoordinates,
     )

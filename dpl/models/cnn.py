@@ -8,7 +8,8 @@ from torch import Tensor, nn
 
 from dpl.fem import Problem
 from dpl.models.grid import Immersion, Permutation, cubic_grid, filling, own_grid
-from dpl.models.parameters import normalise_parameters
+from dpl.models.linear_base import Base
+from dpl.models.scalar_inputs import ScalarInputs
 from dpl.scene import Scene
 from dpl.system.memory import refuse_beyond
 
@@ -33,6 +34,7 @@ class CNN(nn.Module):
     """
 
     constant: Tensor
+    share: Tensor
 
     def __init__(
         self,
@@ -41,6 +43,7 @@ class CNN(nn.Module):
         channels: int = 16,
         steps: int | None = None,
         grid: int | None = None,
+        base: Base = "none",
         memory_limit: float | None = None,
     ) -> None:
         """Build the network.
@@ -53,10 +56,11 @@ class CNN(nn.Module):
             grid: Points along the longest side of the bounding box, with about the same spacing on
                 other sides; None for the nodes if they form a regular grid, otherwise for about as
                 many points as nodes.
+            base: "linear" for the nonlinear displacement as output, see `LinearBase`.
             memory_limit: Memory for training on one sample [GB]; None for that of the machine.
 
         Raises:
-            ValueError: `channels`, `steps` or `grid` is out of range.
+            ValueError: `channels`, `steps` or `grid` is out of range, or there is no such base.
             MemoryError: Parameters and one sample would not fit.
         """
         super().__init__()
@@ -64,6 +68,9 @@ class CNN(nn.Module):
             raise ValueError(f"channels = {channels} must be 1 or more")
         if grid is not None and grid < 2:
             raise ValueError(f"grid = {grid} must be 2 or more")
+        self.base = base
+        self.scalars = ScalarInputs(scene, base)
+        self.extra_inputs = self.scalars.names
         problem = scene.problem
         points, dim = problem.points, problem.shape[1]
         own = own_grid(points)
@@ -74,9 +81,10 @@ class CNN(nn.Module):
         self.immersion = Permutation(points, shape) if shape == own else Immersion(points, shape)
         constant = self._constant(problem, shape)
         self.register_buffer("constant", constant, persistent=False)
-        self.parameter_ranges = scene.loads.parameter_ranges
-        self.extra_inputs = ("parameters",) if self.parameter_ranges else ()
-        self.net = UNet(dim + len(constant) + len(self.parameter_ranges), dim, sizes, widths)
+        if base == "linear":  # displacements are averaged, forces summed
+            nodes = self.immersion.spread(torch.ones(1, len(points), 1))
+            self.register_buffer("share", 1 / nodes.clamp(min=1e-6), persistent=False)
+        self.net = UNet(dim + len(constant) + self.scalars.count, dim, sizes, widths)
 
     def _constant(self, problem: Problem, shape: tuple[int, ...]) -> Tensor:
         """Return the constant channels that are not uniform, (C, *shape)."""
@@ -92,20 +100,28 @@ class CNN(nn.Module):
         varying = [channel for channel in channels if channel.min() < channel.max()]
         return torch.stack(varying) if varying else share[:0]
 
-    def forward(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
+    def forward(
+        self, force: Tensor, parameters: Tensor | None = None, amplitude: Tensor | None = None
+    ) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
 
         Args:
-            force: Scaled nodal forces.
+            force: Scaled nodal forces, or scaled linear solutions with a linear base.
             parameters: Parameters of the law, (B, P); required if it has ranges.
+            amplitude: Amplitudes of the linear solutions, (B,); required with a linear base.
         """
         constant = self.constant.expand(force.shape[0], *self.constant.shape)
-        fields = [self.immersion.spread(force), constant]
-        if self.parameter_ranges:
-            values = normalise_parameters(parameters, self.parameter_ranges, force)
+        fields = [self._on_grid(force), constant]
+        if self.scalars.count:
+            values = self.scalars(force, amplitude, parameters)
             sides = fields[0].shape[2:]
             fields.append(values.view(*values.shape, *[1] * len(sides)).expand(-1, -1, *sides))
         return self.immersion.read(self.net(torch.cat(fields, 1)))
+
+    def _on_grid(self, field: Tensor) -> Tensor:
+        """Return a nodal field (B, N, D) on the grid, (B, D, *shape)."""
+        spread: Tensor = self.immersion.spread(field)
+        return spread * self.share if self.base == "linear" else spread
 
     def skipped_work(self) -> list[str]:
         """Return the work that the network saves, one line each."""

@@ -5,7 +5,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from dpl.models.parameters import normalise_parameters
+from dpl.models.linear_base import Base
+from dpl.models.scalar_inputs import ScalarInputs
 from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 
@@ -15,9 +16,9 @@ MAX_LAYERS = 1000
 class FCNN(nn.Module):
     """Linear layers of equal width with PReLU, one slope per unit, between them.
 
-    By default the inputs are the loadable degrees of freedom and the outputs the free ones. With
-    `all_dofs` this is the network of the paper with 4 n^2 + 7 n parameters for n degrees of
-    freedom.
+    By default the inputs are the loadable degrees of freedom, or with a linear base the free ones,
+    and the outputs the free ones. With `all_dofs` this is the network of the paper with 4 n^2 + 7 n
+    parameters for n degrees of freedom.
 
     Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.1.1.
     """
@@ -35,6 +36,7 @@ class FCNN(nn.Module):
         width: int | None = None,
         all_dofs: bool = False,
         young: bool = False,
+        base: Base = "none",
         memory_limit: float | None = None,
     ) -> None:
         """Build the network.
@@ -47,10 +49,12 @@ class FCNN(nn.Module):
             young: Use forces over the largest Young's modulus, and Young's modulus, as inputs. The
                 paper does so for a range of moduli. It adds no information, since u/L depends on
                 f/(E L^2) alone.
+            base: "linear" for the nonlinear displacement as output, see `LinearBase`.
             memory_limit: Memory for training [GB]; None for that of the machine.
 
         Raises:
-            ValueError: `layers` or `width` is out of range.
+            ValueError: `layers` or `width` is out of range, there is no such base, or `young` is
+                combined with a base.
             MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()
@@ -58,17 +62,20 @@ class FCNN(nn.Module):
             raise ValueError(f"layers = {layers} must be 2 or more and at most {MAX_LAYERS}")
         if width is not None and width < 1:
             raise ValueError(f"width = {width} must be 1 or more")
+        if young and base != "none":
+            raise ValueError(f"young = true requires base = none, not {base}")
+        self.base = base
+        self.scalars = ScalarInputs(scene, base)
         everything = torch.ones(scene.problem.shape, dtype=torch.bool)
-        inputs = everything if all_dofs else scene.loads.loadable_dofs
+        loaded = scene.problem.free if base == "linear" else scene.loads.loadable_dofs
+        inputs = everything if all_dofs else loaded
         outputs = everything if all_dofs else scene.problem.free
         low, high = scene.loads.young_range
         self.young_max = high  # [Pa]
         self.young_mean = (low + high) / 2  # [Pa]
         self.young_scale = (high - low) / 2 or high  # [Pa]; without a range the modulus itself
-        self.parameter_ranges = scene.loads.parameter_ranges
-        varying = {"young": young, "parameters": bool(self.parameter_ranges)}
-        self.extra_inputs = tuple(name for name, enters in varying.items() if enters)
-        n_inputs = int(inputs.sum()) + young + len(self.parameter_ranges)
+        self.extra_inputs = (*(("young",) if young else ()), *self.scalars.names)
+        n_inputs = int(inputs.sum()) + young + self.scalars.count
         n_outputs = int(outputs.sum())
         sizes = [n_inputs, *[width or n_outputs] * (layers - 1), n_outputs]
         self.parameters_needed = count_parameters(sizes)
@@ -86,14 +93,19 @@ class FCNN(nn.Module):
         self.stages = nn.Sequential(*stages)
 
     def forward(
-        self, force: Tensor, young: Tensor | None = None, parameters: Tensor | None = None
+        self,
+        force: Tensor,
+        young: Tensor | None = None,
+        parameters: Tensor | None = None,
+        amplitude: Tensor | None = None,
     ) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
 
         Args:
-            force: Scaled nodal forces.
+            force: Scaled nodal forces, or scaled linear solutions with a linear base.
             young: Young's moduli, (B,) [Pa]; required if they are an input, else ignored.
             parameters: Parameters of the law, (B, P); required if it has ranges.
+            amplitude: Amplitudes of the linear solutions, (B,); required with a linear base.
 
         Raises:
             ValueError: A required input is None.
@@ -107,8 +119,8 @@ class FCNN(nn.Module):
             stiffness = (young / self.young_max).to(force.dtype)[:, None]
             normalised = ((young - self.young_mean) / self.young_scale).to(force.dtype)[:, None]
             inputs = torch.cat([stiffness * inputs, normalised], dim=1)
-        if self.parameter_ranges:
-            values = normalise_parameters(parameters, self.parameter_ranges, force)
+        if self.scalars.count:
+            values = self.scalars(force, amplitude, parameters)
             inputs = torch.cat([inputs, values], dim=1)
         whole = torch.zeros_like(force).flatten(1)
         return whole.index_copy(1, self.output_index, self.stages(inputs)).view_as(force)
@@ -119,7 +131,7 @@ class FCNN(nn.Module):
             return []
         return [
             f"{self.parameters_saved:,} of {self.parameters_needed + self.parameters_saved:,} "
-            f"parameters: inputs are {int(self.inputs.sum())} loadable degrees of freedom, outputs "
+            f"parameters: inputs are {int(self.inputs.sum())} degrees of freedom, outputs "
             f"{int(self.outputs.sum())} free ones"
         ]
 

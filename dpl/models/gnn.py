@@ -8,8 +8,9 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu
 
 from dpl.models.graph import Graph, Integers, hierarchy, means
+from dpl.models.linear_base import Base
 from dpl.models.message_passing import Level, Messages
-from dpl.models.parameters import normalise_parameters
+from dpl.models.scalar_inputs import ScalarInputs
 from dpl.scene import Scene
 from dpl.system.memory import refuse_weights
 
@@ -34,7 +35,13 @@ class GNN(nn.Module):
     """
 
     def __init__(
-        self, scene: Scene, *, width: int = 32, levels: int | None = None, passes: int = 1
+        self,
+        scene: Scene,
+        *,
+        width: int = 32,
+        levels: int | None = None,
+        passes: int = 1,
+        base: Base = "none",
     ) -> None:
         """Build the network.
 
@@ -45,9 +52,10 @@ class GNN(nn.Module):
             levels: Number of levels with that of the nodes; 1 for messages between neighbouring
                 nodes only; None for clusters that are twice as wide from level to level.
             passes: Number of V-cycles.
+            base: "linear" for the nonlinear displacement as output, see `LinearBase`.
 
         Raises:
-            ValueError: `width`, `levels` or `passes` is out of range.
+            ValueError: `width`, `levels` or `passes` is out of range, or there is no such base.
             MemoryError: Parameters, gradients and Adam's two moments would not fit.
         """
         super().__init__()
@@ -57,6 +65,9 @@ class GNN(nn.Module):
             raise ValueError(f"levels = {levels} must be 1 or more")
         if not 1 <= passes <= MAX_PASSES:
             raise ValueError(f"passes = {passes} must be 1 or more and at most {MAX_PASSES}")
+        self.base = base
+        self.scalars = ScalarInputs(scene, base)
+        self.extra_inputs = self.scalars.names
         problem = scene.problem
         nodes, dim = problem.shape
         graphs, clusters = hierarchy(problem, levels)
@@ -67,7 +78,8 @@ class GNN(nn.Module):
         flags = np.column_stack([problem.free.numpy(), problem.boundary.numpy()]).astype(float)
         self.levels = nn.ModuleList()
         for k, graph in enumerate(graphs):
-            self.levels.append(Level(graph, flags, nodes, widths[k], first=k == 0))
+            kind = {"first": k == 0, "averages": base == "linear"}
+            self.levels.append(Level(graph, flags, nodes, widths[k], **kind))
             if k < len(clusters):
                 flags = means(flags, clusters[k])
         self.steps = nn.ModuleList(
@@ -76,26 +88,27 @@ class GNN(nn.Module):
         )
         self.sizes = [len(graph.points) for graph in graphs]
         self.complete = graphs[-1].complete
-        self.parameter_ranges = scene.loads.parameter_ranges
-        self.extra_inputs = ("parameters",) if self.parameter_ranges else ()
         self.moduli = nn.ModuleList(
-            nn.Linear(len(self.parameter_ranges), wide) for wide in widths if self.parameter_ranges
+            nn.Linear(self.scalars.count, wide) for wide in widths if self.scalars.count
         )
         self.passes = nn.ModuleList(Pass(dim, widths) for _ in range(passes))
         self.decode = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, dim))
 
-    def forward(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
+    def forward(
+        self, force: Tensor, parameters: Tensor | None = None, amplitude: Tensor | None = None
+    ) -> Tensor:
         """Return the scaled displacement (B, N, D) of a scaled force (B, N, D), float32.
 
         Args:
-            force: Scaled nodal forces.
+            force: Scaled nodal forces, or scaled linear solutions with a linear base.
             parameters: Parameters of the law, (B, P); required if it has ranges.
+            amplitude: Amplitudes of the linear solutions, (B,); required with a linear base.
         """
         states = [
             level(*load) for level, load in zip(self.levels, self.resultants(force), strict=True)
         ]
-        if self.parameter_ranges:
-            values = normalise_parameters(parameters, self.parameter_ranges, force)
+        if self.scalars.count:
+            values = self.scalars(force, amplitude, parameters)
             pairs = zip(states, self.moduli, strict=True)
             states = [state + encoder(values)[None] for state, encoder in pairs]
         for v_cycle in self.passes:

@@ -36,6 +36,7 @@ RTOL = 1e-5  # relative residual of a linear solution whose parameters differ fr
 MAX_ITER = 200
 NO_INVERSE: ReducedInverse = np.zeros((0, 0)), np.zeros(0)
 CHUNK = 256  # loads that are solved at a time
+MAX_SINGLE = 4  # loads that are solved one by one: solves of blocks cost as much as many loads
 
 
 class LinearResponse(nn.Module):
@@ -215,10 +216,10 @@ class LinearResponse(nn.Module):
             parameters: Parameters of the law, (B, P).
         """
         if self.is_exact:
-            return self._exact(loaded, parameters)
+            return self.solution(loaded, parameters)
         columns, local = self.in_modes(loaded, parameters)
         if local.any():
-            exact = self._exact(loaded[local], parameters[local])
+            exact = self.solution(loaded[local], parameters[local])
             columns = columns.index_copy(0, local.nonzero()[:, 0], exact)
         return columns
 
@@ -230,7 +231,8 @@ class LinearResponse(nn.Module):
         size = coordinates.square().sum(dim=1)  # of the solution: the modes are orthonormal
         return coordinates @ self.modes.mT.to(loaded), missing > self.tol**2 * (size + missing)
 
-    def _exact(self, loaded: Tensor, parameters: Tensor) -> Tensor:
+    def solution(self, loaded: Tensor, parameters: Tensor) -> Tensor:
+        """Return K(0)^-1 (f - s), (B, n), by the factor for all loads; see `solve`."""
         solved: Tensor = _LinearSolve.apply(loaded, parameters, self)
         return solved
 
@@ -249,6 +251,8 @@ class LinearResponse(nn.Module):
         """Return K(0)^-1 (f - s), (B, n), of forces (B, n)."""
         right = loaded - support_force(solver.problem)[solver.problem.free]
         factor = solver.float32_factor if self.is_exact else solver.factor
+        if 0 < len(right) <= MAX_SINGLE:
+            return torch.from_numpy(np.stack([factor.solve(one, RTOL) for one in right.numpy()]))
         return torch.from_numpy(factor.solve_many(right.numpy(), RTOL))
 
     def _solve_one(self, loaded: NDArray[np.float64], parameters: Tensor) -> NDArray[np.float64]:

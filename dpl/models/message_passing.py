@@ -21,8 +21,20 @@ class Level(nn.Module):
     features: Tensor
     flags: Tensor
 
-    def __init__(self, graph: Graph, flags: Floats, nodes: int, width: int, *, first: bool) -> None:
-        """Take a graph, flags of its K members (K, D + 1) and the number of nodes of the mesh."""
+    def __init__(
+        self, graph: Graph, flags: Floats, nodes: int, width: int, *, first: bool, averages: bool
+    ) -> None:
+        """Build the encoder.
+
+        Args:
+            graph: The graph of K members.
+            flags: Fractions of fixed degrees of freedom and boundary nodes, (K, D + 1).
+            nodes: Number of nodes of the mesh.
+            width: Channels of the state.
+            first: Members are the nodes of the mesh.
+            averages: The input is a displacement, whose mean over a cluster has its scale, and not
+                a force, whose sum is the resultant.
+        """
         super().__init__()
         count, dim = graph.points.shape
         self.register_buffer("receiver", torch.from_numpy(graph.receiver))
@@ -33,8 +45,8 @@ class Level(nn.Module):
         self.first = first
         self.spacing = graph.spacing
         self.mean_degree = len(graph.sender) / count
-        # geometric mean of the scales of a nodal force and of the sum over a cluster
-        self.load_scale = math.sqrt(count / nodes)
+        # of forces: geometric mean of the scales of a nodal force and of the sum over a cluster
+        self.load_scale = count / nodes if averages else math.sqrt(count / nodes)
         self.load = nn.Linear(dim if first else dim + dim * dim, width, bias=False)
         self.place = nn.Sequential(nn.Linear(dim + 1, width), nn.GELU(), nn.Linear(width, width))
 

@@ -16,7 +16,6 @@ from dpl.models.invariant_basis import (
     pad_columns,
     scatter_fields,
 )
-from dpl.models.parameters import normalise_parameters
 from dpl.models.reduced_samples import (
     ReducedDataset,
     ReducedSamples,
@@ -24,6 +23,7 @@ from dpl.models.reduced_samples import (
     root_mean_square,
     squared_projection_error,
 )
+from dpl.models.scalar_inputs import normalise_parameters
 from dpl.models.symmetric_fields import Orbits, coordinates_of_images, sum_over_images
 from dpl.scene import Sample, Scene
 from dpl.system.memory import refuse_weights

@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 from torch import Tensor
 
 from dpl.fem import SubspaceNewton
+from dpl.models.linear_base import Base
 from dpl.models.reduced_samples import ReducedDataset
 from dpl.scene import Sample
 
@@ -41,6 +42,19 @@ class TrainsInCoordinates(Protocol):
     def network(self, inputs: Tensor) -> Tensor:
         """Return coordinates of displacements (B, R) from coordinates of loads (B, M)."""
         ...
+
+
+@runtime_checkable
+class HasBase(Protocol):
+    """A network that predicts the displacement, or the part that a base lacks.
+
+    With `base = "linear"` it maps scaled linear solutions (B, N, D), and further inputs of
+    `extra_inputs` such as "amplitude", to the scaled nonlinear displacement (B, N, D), see
+    `LinearBase`. `dpl.training.Surrogate` computes the linear solutions, before the training once
+    for all samples of a data set, and adds them. "none" is the same as no attribute.
+    """
+
+    base: Base
 
 
 @runtime_checkable

@@ -1,4 +1,4 @@
-"""Muon for matrices and Adam for all other parameters, as one optimiser."""
+"""Muon for matrices and filters and Adam for all other parameters, as one optimiser."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 # Jordan et al. (2024): iterating this quintic polynomial moves all singular values close to 1
 QUINTIC, ITERATIONS = (3.4445, -4.7750, 2.0315), 5
+LONG = 2  # ratio of the sides of a matrix from which the iteration of its Gram matrix is cheaper
 
 
 def orthogonal(matrix: Tensor) -> Tensor:
@@ -17,25 +18,44 @@ def orthogonal(matrix: Tensor) -> Tensor:
     Singular values that were not tiny lie between 0.7 and 1.2, which is sufficient for optimiser
     steps. The dtype is that of the argument.
 
+    The iterates of a matrix X are P X with polynomials P of X X^T. For a long matrix in float32
+    only P is iterated, so that the whole matrix is multiplied twice and not in every iteration.
+
     Source: Jordan et al. (2024), Muon: an optimizer for hidden layers in neural networks.
     """
     a, b, c = QUINTIC
     tall = matrix.size(0) > matrix.size(1)
     x = matrix.T if tall else matrix
     x = x / x.norm().clamp(min=1e-7)
+    if x.dtype == torch.float32 and x.size(1) >= LONG * x.size(0):
+        x = _polynomial(x @ x.T) @ x
+        return x.T if tall else x
     for _ in range(ITERATIONS):
         gram = x @ x.T
         x = torch.addmm(x, torch.addmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
     return x.T if tall else x
 
 
-class Muon(torch.optim.AdamW):
-    """Muon, orthogonalised momentum, for weight matrices; Adam for biases, slopes and convolutions.
+def _polynomial(gram: Tensor) -> Tensor:
+    """Return P, (n, n), of the last iterate P X, from X X^T, (n, n)."""
+    a, b, c = QUINTIC
+    eye = torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
+    product = eye
+    for _ in range(ITERATIONS):
+        factor = torch.addmm(gram, gram, gram, beta=b, alpha=c) + a * eye
+        product = factor @ product
+        gram = factor @ gram @ factor
+    return product
 
-    Both have the same learning rate: the steps of Muon are scaled to the root mean square of Adam's
-    steps. An accurate fit of a smooth function takes fewer steps than with Adam. Differs from
-    `torch.optim.Muon` in the precision of matrix products: bfloat16 on GPUs only, since CPUs
-    without bfloat16 emulate it far slower than float32.
+
+class Muon(torch.optim.AdamW):
+    """Muon, orthogonalised momentum, for weight matrices; Adam for biases and slopes.
+
+    The weights of a convolution (O, I, ...) count as the matrix (O, I ...) of its filters. Both
+    parts have the same learning rate: the steps of Muon are scaled to the root mean square of
+    Adam's steps. An accurate fit of a smooth function takes fewer steps than with Adam. Differs
+    from `torch.optim.Muon` in the precision of matrix products: bfloat16 on GPUs only, since CPUs
+    without bfloat16 emulate it far slower than float32; and in that it takes all parameters.
 
     Source: Jordan et al. (2024), Muon: an optimizer for hidden layers in neural networks; step size
     of Liu et al. (2025), Muon is scalable for LLM training, section 2.2.
@@ -79,11 +99,11 @@ class Muon(torch.optim.AdamW):
         groups = self.param_groups
         for group in groups:
             for parameter in group["params"]:
-                if parameter.ndim == 2 and parameter.grad is not None:
+                if parameter.ndim > 1 and parameter.grad is not None:
                     self._update(parameter, parameter.grad, **group)
         try:  # Adam updates the others
             self.param_groups = [
-                {**group, "params": [p for p in group["params"] if p.ndim != 2]} for group in groups
+                {**group, "params": [p for p in group["params"] if p.ndim < 2]} for group in groups
             ]
             super().step()
         finally:
@@ -92,7 +112,7 @@ class Muon(torch.optim.AdamW):
 
     def _update(
         self,
-        matrix: Tensor,
+        weights: Tensor,
         gradient: Tensor,
         *,
         lr: float,
@@ -100,12 +120,12 @@ class Muon(torch.optim.AdamW):
         weight_decay: float,
         **_: Any,
     ) -> None:
-        state = self.state[matrix]
+        state = self.state[weights]
         if not state:
-            state["momentum_buffer"] = torch.zeros_like(matrix)
+            state["momentum_buffer"] = torch.zeros_like(weights)
             state["step"] = torch.zeros(())  # Adam expects it in every restored state
         mean = state["momentum_buffer"].lerp_(gradient, 1 - momentum)
-        update = gradient.lerp(mean, momentum)
+        update = gradient.lerp(mean, momentum).flatten(1)
         update = orthogonal(update.bfloat16() if update.is_cuda else update)
-        matrix.mul_(1 - lr * weight_decay)
-        matrix.add_(update, alpha=-0.2 * lr * math.sqrt(max(matrix.shape)))
+        weights.mul_(1 - lr * weight_decay)
+        weights.add_(update.reshape(weights.shape), alpha=-0.2 * lr * math.sqrt(max(update.shape)))

@@ -2,7 +2,7 @@
 
 import random
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, cast
 
 import lightning as L
@@ -11,10 +11,13 @@ import torch
 from torch import Tensor, nn
 
 from dpl.fem import Load
-from dpl.models.protocols import ClosedFormFit, TrainsInCoordinates
+from dpl.fem.symmetry import Symmetry
+from dpl.models.linear_base import LinearBase, check_base
+from dpl.models.protocols import ClosedFormFit, HasBase, TrainsInCoordinates
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.scene import Sample, Scene
 from dpl.training.callbacks.closed_form import ClosedFormTraining
+from dpl.training.linear_samples import LinearBatch, LinearSamples
 from dpl.training.losses.loss import Loss, LossContext
 from dpl.training.losses.supervised import SquaredErrorLoss
 from dpl.training.metrics import default_metrics
@@ -30,7 +33,9 @@ class Surrogate(L.LightningModule):
 
     Attributes:
         net: Module from scaled forces (B, N, D) to scaled displacements (B, N, D). Its optional
-            attribute `extra_inputs` names further inputs: "young", "parameters".
+            attribute `extra_inputs` names further inputs: "young", "parameters", and with a
+            linear base "amplitude".
+        base: The linear solutions that the output of the network is added to; None without.
         scene: The scene.
         loss: The loss.
         batch_errors: Relative L2 errors of the last training batch, (B,); None before the first.
@@ -56,11 +61,13 @@ class Surrogate(L.LightningModule):
                 schedule, stepped every batch; None for a constant learning rate.
 
         Raises:
-            ValueError: The law has ranges and the network no input for parameters.
+            ValueError: The law has ranges and the network no input for parameters, or the network
+                has a base that does not exist or that its training excludes.
         """
         super().__init__()
         self.net, self.loss, self.scene = net, loss, scene
         self._is_closed_form = isinstance(net, ClosedFormFit)
+        self.base = _base_of(net, scene)
         self.batch_errors: Tensor | None = None
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
@@ -89,13 +96,31 @@ class Surrogate(L.LightningModule):
         """
         return self.scene.length * self.predict(self.scene.load_of(force, young, parameters))
 
-    def predict(self, load: Load) -> Tensor:
-        """Return displacements over L, (B, N, D) [-], float64."""
+    def predict(self, load: Load, linear: Tensor | None = None) -> Tensor:
+        """Return displacements over L, (B, N, D) [-], float64.
+
+        Args:
+            load: The loads.
+            linear: Their linear solutions, (B, N, D) [-], if they are known; used with a base only.
+        """
+        if self.base is not None:
+            return self._predict_from_base(
+                self.base, load, self.base.solve(load) if linear is None else linear.double()
+            )
         scaled, more = self.scale_inputs(load)
         return self.unscale_outputs(self.net(scaled, **more))
 
+    def _predict_from_base(self, base: LinearBase, load: Load, linear: Tensor) -> Tensor:
+        """Return displacements over L, (B, N, D) [-], of a network with a linear base."""
+        field, amplitude = base.scale_inputs(linear, self.displacement_scale)
+        more = self._extra_inputs(load, amplitude=amplitude)
+        output = self.unscale_outputs(self.net(field.to(self.dtype), **more))
+        return linear + base.gate(amplitude)[:, None, None] * output
+
     def scale_inputs(self, load: Load) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the inputs of the network: scaled forces (B, N, D), and its extra inputs by name.
+
+        Networks with a linear base have other inputs.
 
         Raises:
             ValueError: The load has not one parameter for each range of the law.
@@ -103,10 +128,14 @@ class Surrogate(L.LightningModule):
         scaled = load.force
         if not self._is_closed_form:
             scaled = (self._effective_force(scaled) / self.force_scale).to(self.dtype)
+        return scaled, self._extra_inputs(load)
+
+    def _extra_inputs(self, load: Load, **computed: Tensor) -> dict[str, Tensor]:
         if load.parameters.shape[-1] != len(names := list(self.scene.loads.parameter_ranges)):
             found = load.parameters.shape[-1]
             raise ValueError(f"Load.parameters has {found} columns; the law has ranges of {names}")
-        return scaled, {name: getattr(load, name) for name in getattr(self.net, "extra_inputs", ())}
+        known = {"young": load.young, "parameters": load.parameters} | computed
+        return {name: known[name] for name in getattr(self.net, "extra_inputs", ())}
 
     def _effective_force(self, force: Tensor) -> Tensor:
         """Return forces (B, N, D) with the values of training on fixed degrees of freedom."""
@@ -138,6 +167,8 @@ class Surrogate(L.LightningModule):
     def skipped_work(self) -> list[str]:
         """Return the work that network and loss save, one line each."""
         lines = [*getattr(self.net, "skipped_work", list)(), *self.loss.skipped_work()]
+        if self.base is not None:
+            lines.append("no learning of linear elasticity: the network adds to K(0)^-1 f")
         if self._trains_in_coordinates:
             lines.append("no fields in training from disk: the loss is computed in coordinates")
         return lines
@@ -146,17 +177,20 @@ class Surrogate(L.LightningModule):
     def _trains_in_coordinates(self) -> bool:
         return isinstance(self.net, TrainsInCoordinates) and isinstance(self.loss, SquaredErrorLoss)
 
-    def training_step(self, batch: Sample | ReducedSamples, batch_idx: int) -> Tensor | None:
+    def training_step(
+        self, batch: Sample | LinearBatch | ReducedSamples, batch_idx: int
+    ) -> Tensor | None:
         """Return the loss of a batch, (); None for a model that has been fitted."""
         if self._is_closed_form:
             return None
         if isinstance(batch, ReducedSamples):
             loss = self._reduced_loss(batch)
         else:
-            prediction = self.predict(batch.load)
-            loss = self.loss(prediction, batch, self.physics)
-            error = (prediction.detach() - batch.displacement).flatten(1).norm(dim=1)
-            size = batch.displacement.flatten(1).norm(dim=1)
+            linear, sample = batch if isinstance(batch, LinearBatch) else (None, batch)
+            prediction = self.predict(sample.load, linear)
+            loss = self.loss(prediction, sample, self.physics)
+            error = (prediction.detach() - sample.displacement).flatten(1).norm(dim=1)
+            size = sample.displacement.flatten(1).norm(dim=1)
             self.batch_errors = error / size.clamp(min=1e-12)
         self.log("loss/train", loss, prog_bar=True, batch_size=len(batch[0]))
         return loss
@@ -170,20 +204,28 @@ class Surrogate(L.LightningModule):
         loss = cast(SquaredErrorLoss, self.loss)
         return loss.from_squared_errors(error, square * batch.mean_square)
 
-    def encode(self, samples: Sample, *, images: bool = False) -> ReducedDataset | None:
-        """Return training samples (S, N, D) in reduced coordinates.
+    def encode(
+        self, samples: Sample, group: Sequence[Symmetry] = ()
+    ) -> ReducedDataset | LinearSamples | None:
+        """Return training samples (S, N, D) in reduced coordinates or with their linear solutions.
 
         In an orthonormal basis the squared error of a displacement is the squared error of its
         coordinates plus the squared projection error. A loss that is a function of squared errors
         therefore needs no fields.
 
-        Returns None if the network or the loss needs fields, or if `images` of the samples under
-        the symmetries of the body are wanted and the network does not compute them.
+        Returns None if the network or the loss needs fields and no linear solutions, or if images
+        of the samples are wanted and the network does not compute them.
+
+        Args:
+            samples: The samples.
+            group: Symmetries of the body whose images of samples are wanted; empty for none.
         """
+        if self.base is not None:
+            return LinearSamples(samples, self.base, group)
         if not self._trains_in_coordinates:
             return None
         net = cast(TrainsInCoordinates, self.net)
-        return None if images and not net.is_symmetric else net.encode(self._scale(samples))
+        return None if len(group) > 1 and not net.is_symmetric else net.encode(self._scale(samples))
 
     def _scale(self, samples: Sample) -> Sample:
         return samples._replace(
@@ -272,6 +314,20 @@ class Surrogate(L.LightningModule):
         """Restore the states of random number generators of a resumed run."""
         if self._random_states is not None:
             set_random_states(self._random_states)
+
+
+def _base_of(net: nn.Module, scene: Scene) -> LinearBase | None:
+    """Return the base of a network, None without.
+
+    Raises:
+        ValueError: There is no such base, or the network is not trained on fields.
+    """
+    if not isinstance(net, HasBase) or net.base == "none":
+        return None
+    check_base(net.base)
+    if isinstance(net, ClosedFormFit | TrainsInCoordinates):
+        raise ValueError(f"{type(net).__name__} requires base = none, not {net.base}")
+    return LinearBase(scene)
 
 
 def scales(scene: Scene, count: int = 256) -> tuple[Tensor, Tensor]:

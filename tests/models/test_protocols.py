@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from dpl.fem import symmetries
 from dpl.models import (
     CNN,
     FCNN,
@@ -71,5 +72,5 @@ def test_a_network_of_another_package_trains_in_coordinates(scene, batch):
     loss = module.training_step(reduced.__getitems__([0, 1, 2]), 0)
     loss.backward()
     assert float(loss) > 0
-    assert module.encode(batch, images=True) is None
+    assert module.encode(batch, symmetries(scene.problem)) is None
     assert Surrogate(OwnNet(scene), LrStar(), scene).encode(batch) is None

@@ -1,0 +1,81 @@
+"""The linear solution as the base of a prediction: networks learn the nonlinear displacement."""
+
+import math
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dpl.fem import Load
+from dpl.models.linear_response import LinearResponse
+from dpl.scene import Scene
+
+Base = Literal["none", "linear"]
+BASES = ("none", "linear")
+
+
+def check_base(base: str) -> None:
+    """Raise ValueError if `base` is not the name of a base."""
+    if base not in BASES:
+        raise ValueError(f"base = {base} must be one of {', '.join(BASES)}")
+
+
+class ScaledLinearSolution(NamedTuple):
+    """A linear solution as input of a network.
+
+    Attributes:
+        field: Linear solution over its root mean square, (B, N, D) [-], float64.
+        amplitude: Root mean square of the linear solution over free degrees of freedom, in units of
+            the displacement scale, (B,) [-], float64.
+    """
+
+    field: Tensor
+    amplitude: Tensor
+
+
+class LinearBase:
+    """The displacement as the linear solution plus the gated output of a network.
+
+    With the linear solution v of a load, the displacement scale s and the amplitude
+    a = rms(v) / s, the network N predicts
+
+        u = v + s a^2 / (1 + a) N(v / rms(v), a).
+
+    The nonlinear part of a hyperelastic displacement is O(|f|^2) at small loads and grows at most
+    as fast as v at large ones; the gate a^2 / (1 + a) does both. The outputs that are wanted are
+    therefore of order one for all loads, and the prediction of a small load is the linear
+    solution. v determines the load, so that it replaces the force as the input of the network.
+
+    Moved supports are part of the linear solution and keep their prescribed displacements.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        """Take the scene, whose factor of K(0) is used."""
+        self._problem = scene.problem
+        self._response = LinearResponse(scene, [], math.inf)  # its factor is float64
+
+    def solve(self, load: Load) -> Tensor:
+        """Return linear solutions, (B, N, D) [-], float64, on the device of the load."""
+        force = load.force.double()
+        free = self._problem.free.to(force.device)
+        values = self._response.solution(force[:, free], load.parameters)
+        prescribed = self._problem.prescribed.to(force)
+        return prescribed.repeat(len(force), 1, 1).masked_scatter(free, values)
+
+    def scale_inputs(self, linear: Tensor, scale: Tensor) -> ScaledLinearSolution:
+        """Return the inputs of a network.
+
+        Args:
+            linear: Linear solutions, (B, N, D) [-].
+            scale: Displacement scale, () [-].
+        """
+        linear = linear.double()
+        square = linear[:, self._problem.free.to(linear.device)].square().mean(dim=1)
+        size = torch.where(square > 0, square, 1.0).sqrt()  # the root has no gradient at zero
+        size = torch.where(square > 0, size, 0.0)
+        field = linear / torch.where(square > 0, size, 1.0)[:, None, None]
+        return ScaledLinearSolution(field, size / scale)
+
+    def gate(self, amplitude: Tensor) -> Tensor:
+        """Return a^2 / (1 + a), (B,), of amplitudes a (B,)."""
+        return amplitude * (amplitude / (1 + amplitude))

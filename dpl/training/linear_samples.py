@@ -1,0 +1,52 @@
+"""Samples with their linear solutions, which are computed once for a data set."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dpl.data.datamodule import Samples
+from dpl.fem.symmetry import Symmetry, images
+from dpl.models.linear_base import LinearBase
+from dpl.scene import Sample
+
+CHUNK = 256  # loads that are solved at a time
+
+
+class LinearBatch(NamedTuple):
+    """A batch of samples and their linear solutions.
+
+    Attributes:
+        linear: Linear solutions, (B, N, D) [-], float32.
+        sample: The samples.
+    """
+
+    linear: Tensor
+    sample: Sample
+
+
+class LinearSamples(Samples):
+    """Samples in memory with their linear solutions, and images of both under symmetries."""
+
+    def __init__(self, samples: Sample, base: LinearBase, group: Sequence[Symmetry] = ()) -> None:
+        """Compute the linear solutions.
+
+        Args:
+            samples: The samples, (S, ...).
+            base: Solver.
+            group: See `Samples`.
+        """
+        super().__init__(samples, group)
+        load = samples.load
+        parts = zip(*(column.split(CHUNK) for column in load), strict=True)
+        solved = [base.solve(type(load)(*part)).float() for part in parts]
+        self.linear = torch.cat(solved)
+
+    def __getitems__(self, indices: list[int]) -> LinearBatch:  # type: ignore[override]
+        """Return a batch."""
+        count = len(self.linear)
+        linear = self.linear[[i % count for i in indices]].double()
+        if self.group:
+            linear = images(linear, self.group, torch.tensor([i // count for i in indices]))
+        return LinearBatch(linear.float(), super().__getitems__(indices))
