@@ -190,8 +190,8 @@ class _Simulated:
         scene = self.simulator.scene
         if scene.loads.parameter_ranges:  # each load has its own K(0), and each solver factorises
             scene.linear.forget_clones()
-        inputs: dict[str, Any] = scene.si_inputs(load)
-        answer = self.simulator(**inputs, **self.tolerance)
+        arguments: dict[str, Any] = {**scene.si_inputs(load), **self.tolerance}
+        answer = self.simulator(**arguments)
         met = answer.converged | (answer.error <= self.tolerance.get("error", -1.0))
         count = torch.zeros_like(answer.iterations)
         yield Solution(
