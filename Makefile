@@ -10,7 +10,7 @@ BIN := .venv/bin
 WORKERS ?= 2
 
 FIRST := runs/first_$(shell date +%Y-%m-%d_%H-%M-%S)
-BEAM := mesh=paper_beam data.val=50 data.test=50
+BEAM := mesh=paper_beam data.train=256 data.val=32 data.test=50
 
 .PHONY: setup train demo test lint slow matrix mutants docs pictures wheel clean
 
@@ -22,8 +22,8 @@ setup: .venv/installed
 	touch $@
 
 train: setup
-	$(BIN)/python scripts/train.py $(BEAM) data.train=400 model=unrolled run=$(FIRST)/unrolled $(ARGS)
-	$(BIN)/python scripts/train.py $(BEAM) data.train=400 model=fcnn model.width=512 loss=lr_star trainer.max_epochs=60 run=$(FIRST)/fcnn $(ARGS)
+	$(BIN)/python scripts/train.py $(BEAM) model=unrolled run=$(FIRST)/unrolled $(ARGS)
+	$(BIN)/python scripts/train.py $(BEAM) model=fcnn model.width=512 loss=lr_star trainer.max_epochs=60 run=$(FIRST)/fcnn $(ARGS)
 	$(BIN)/python scripts/compare.py run=$(FIRST)
 
 demo: runs/demo/evaluation.json
@@ -31,7 +31,7 @@ demo: runs/demo/evaluation.json
 
 runs/demo/evaluation.json: | .venv/installed
 	rm -rf runs/demo
-	$(BIN)/python scripts/train.py $(BEAM) data.train=64 model=unrolled run=runs/demo
+	$(BIN)/python scripts/train.py mesh=paper_beam data.train=64 data.val=16 data.test=16 model=unrolled run=runs/demo
 
 test: lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m 'not slow and not gpu'

@@ -24,6 +24,7 @@ from dpl.system.threads import one_thread
 from dpl.training import Surrogate
 
 ERROR = 1e-3  # estimated relative error above which they are made [-]
+FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
 
 
@@ -217,15 +218,17 @@ class Simulator:
         state = state._replace(status=status, load_factor=ended.load_factor)
         return self._with_error(load, best._replace(state=state), request)
 
-    def _with_error(self, load: Load, candidate: Candidate, request: Request) -> Candidate:
-        """Return a solution with its estimated error."""
+    def _with_error(
+        self, load: Load, candidate: Candidate, request: Request, sufficient: float = SUFFICIENT
+    ) -> Candidate:
+        """Return a solution with its estimated error; see `estimate_error` for `sufficient`."""
         if candidate.error is not None:
             return candidate
         begin = time.perf_counter()
         error = estimate_error(
             self.scene.linear, load, candidate.state.displacement, candidate.evaluation,
             in_modes=candidate.error_in_modes,
-            sufficient=SUFFICIENT if request.error is None else request.error,
+            sufficient=sufficient if request.error is None else request.error,
         )  # fmt: skip
         self._estimate_time = time.perf_counter() - begin
         return candidate._replace(error=error)
@@ -239,12 +242,16 @@ class Simulator:
         yield first._replace(error_in_modes=math.inf) if place.outside else first
         if not request.is_more_than_prediction:
             return
+        guesses, before = [first.state.displacement], self._before
+        is_far = self._with_error(load, first, request, sufficient=FAR).known_error > FAR
+        if is_far or place.amplitude < MAX_LINEAR_AMPLITUDE:
+            linear = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
+            guesses += [linear] * is_far
         if place.amplitude < MAX_LINEAR_AMPLITUDE:
-            answer = self.scene.linear.with_parameters(load.parameters).solve(load.force[0])[None]
-            yield _evaluated("linear", problem, answer, load, tol)
-        start, before = first.state.displacement, self._before
+            yield _evaluated("linear", problem, linear, load, tol)
         if request.warm and before is not None and torch.equal(before[0], load.parameters):
-            start = nearest(self.scene.newton, load, [start, before[1]])
+            guesses.append(before[1])
+        start = nearest(self.scene.newton, load, guesses) if len(guesses) > 1 else guesses[0]
         clock = time.perf_counter()
         for state in default_hybrid(lambda load: start, self.scene, tol).iterate(load):
             if int(state.iterations):

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 import dpl.inference.error_estimate as error_estimate
+import dpl.inference.simulator as simulator_module
 from dpl.fem import LinearSolver, Problem, Status, SubspaceNewton, solve
-from dpl.inference import Simulator, corotational_error
+from dpl.inference import Simulator, corotational_error, default_hybrid
 from dpl.inference.answer import summarise
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
@@ -104,10 +105,28 @@ def test_tolerances_for_residual_and_error_are_both_met(scene, forces, tol, want
 def test_all_methods_report_their_error(scene, forces):
     sim = simulator_of(scene, -1.0)
     found = [sim(1e-7 * forces[0], tol=1e-3), sim(forces[0], tol=1e-8)]
-    found.append(simulator_of(scene, math.nan)(forces[0], tol=1e-8))
-    assert [answer.method for answer in found] == ["linear", "full Newton", "full Newton"]
+    found.append(simulator_of(scene, math.nan)(8 * forces[0], tol=1e-8))
+    assert [answer.method for answer in found] == ["linear", "hybrid", "full Newton"]
     assert all(0 < answer.error < 1e-3 for answer in found)
     assert max(answer.error for answer in found[1:]) < 1e-6
+
+
+@pytest.mark.parametrize("factor", [-1.0, math.nan])
+def test_the_hybrid_starts_from_the_linear_solution_where_a_prediction_is_far(
+    scene, forces, factor, monkeypatch
+):
+    starts = []
+
+    def listen(predict, scene, tol):
+        starts.append(predict(None))
+        return default_hybrid(predict, scene, tol)
+
+    monkeypatch.setattr(simulator_module, "default_hybrid", listen)
+    far, near = simulator_of(scene, factor), simulator_of(scene, 0.99)
+    answers = [sim(0.5 * forces[0], tol=1e-8) for sim in (far, near)]
+    linear = scene.linear.solve(0.5 * forces[0] / scene.force_unit / E)
+    assert [bool(torch.allclose(start[0], linear, rtol=1e-9)) for start in starts] == [True, False]
+    assert all(answer.converged for answer in answers)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -3.0, 0.0])
