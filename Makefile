@@ -1,6 +1,7 @@
 # make train: environment, installation and the main job: two models of the paper's beam, compared.
 # make demo:  a model of the paper's beam, fitted to 64 loads, as a page in the browser.
 # make test:  installation and the checks that CI makes; WORKERS processes share the tests.
+# make slow, make gpu: the tests that take minutes, and those that need a GPU.
 # make mutants: changes of the source that no test notices; ARGS="dpl/training/metrics.py --sample 60".
 # make matrix: the tests under other processor features and thread numbers; see tests/matrix.py.
 # make docs:  the documentation into site/.
@@ -8,20 +9,25 @@
 PYTHON ?= python3
 BIN := .venv/bin
 WORKERS ?= 2
+PIP := $(BIN)/pip install --quiet --no-compile -c constraints.txt  # Python compiles what it imports
 
 FIRST := runs/first_$(shell date +%Y-%m-%d_%H-%M-%S)
 BEAM := mesh=paper_beam data.train=256 data.val=32 data.test=50
 
-.PHONY: setup train demo test lint slow matrix mutants docs pictures wheel clean
+.PHONY: setup train demo test lint slow gpu matrix mutants docs pictures wheel clean
 
 setup: .venv/installed
 
-.venv/installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
+.venv/installed: .venv/run
+	$(PIP) -e '.[dev]'
 	touch $@
 
-train: setup
+.venv/run: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(PIP) -e '.[viewer]'
+	touch $@
+
+train: .venv/run
 	$(BIN)/python scripts/train.py $(BEAM) model=unrolled run=$(FIRST)/unrolled $(ARGS)
 	$(BIN)/python scripts/train.py $(BEAM) model=fcnn model.width=512 loss=lr_star trainer.max_epochs=60 run=$(FIRST)/fcnn $(ARGS)
 	$(BIN)/python scripts/compare.py run=$(FIRST)
@@ -29,9 +35,9 @@ train: setup
 demo: runs/demo/evaluation.json
 	$(BIN)/python scripts/view.py run=runs/demo
 
-runs/demo/evaluation.json: | .venv/installed
+runs/demo/evaluation.json: | .venv/run
 	rm -rf runs/demo
-	$(BIN)/python scripts/train.py mesh=paper_beam data.train=64 data.val=16 data.test=16 model=unrolled run=runs/demo
+	$(BIN)/python scripts/train.py mesh=paper_beam data.train=64 data.val=16 data.test=8 model=unrolled run=runs/demo
 
 test: lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m 'not slow and not gpu'
@@ -45,11 +51,14 @@ lint: setup
 slow: setup
 	$(BIN)/python -m pytest -m 'slow and not gpu' --timeout 1800
 
+gpu: setup
+	$(BIN)/python -m pytest -m gpu
+
 matrix: setup
 	$(BIN)/python tests/matrix.py $(ARGS)
 
 mutants: setup
-	$(BIN)/pip install --quiet -c constraints.txt -e '.[mutation]'
+	$(PIP) -e '.[mutation]'
 	$(BIN)/python tests/mutants.py $(ARGS)
 
 docs: setup
