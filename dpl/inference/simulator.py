@@ -24,6 +24,7 @@ from dpl.system.threads import one_thread
 from dpl.training import Surrogate
 
 ERROR = 1e-3  # estimated relative error above which they are made [-]
+PACE_DECAY = 0.9  # of a time from call to call
 FAR = 0.1  # estimated relative error above which the hybrid may start elsewhere [-]
 MAX_LINEAR_AMPLITUDE = 0.05  # amplitude below which the linear solution is evaluated [-]
 
@@ -66,7 +67,8 @@ class Simulator:
         if newton is not None:
             newton.tangent  # noqa: B018  # built here, so that the first call is not slower
         self._before: tuple[Tensor, Tensor] | None = None  # parameters, displacement
-        self._pace = 0.0  # time of an iteration [s]
+        self._pace = 0.0  # time of the next iteration, as of the last one [s]
+        self._first_pace = 0.0  # time of the start of the hybrid and its first iteration [s]
         self._estimate_time = 0.0  # time of an estimate of the error [s]
         self.scene.corrector  # noqa: B018  # built here, so that the first call is not slower
         self.scene.linear.reference.corotational  # noqa: B018  # so is the factor of the estimate
@@ -238,10 +240,12 @@ class Simulator:
     ) -> Iterator[Candidate]:
         """Yield the solutions of the methods, the cheapest first; see `_solve`."""
         problem, tol = self.scene.problem, request.iteration_tol(self.scene)
+        self._pace = self._first_pace
         first = self._corrected(load, prediction, request)
         yield first._replace(error_in_modes=math.inf) if place.outside else first
         if not request.is_more_than_prediction:
             return
+        clock = time.perf_counter()
         guesses, before = [first.state.displacement], self._before
         is_far = self._with_error(load, first, request, sufficient=FAR).known_error > FAR
         if is_far or place.amplitude < MAX_LINEAR_AMPLITUDE:
@@ -252,11 +256,12 @@ class Simulator:
         if request.warm and before is not None and torch.equal(before[0], load.parameters):
             guesses.append(before[1])
         start = nearest(self.scene.newton, load, guesses) if len(guesses) > 1 else guesses[0]
-        clock = time.perf_counter()
         for state in default_hybrid(lambda load: start, self.scene, tol).iterate(load):
             if int(state.iterations):
                 now = time.perf_counter()
                 self._pace, clock = now - clock, now
+                if int(state.iterations) == 1:
+                    self._first_pace = max(self._pace, PACE_DECAY * self._first_pace)
             elif not state.converged:  # the initial state, which has been evaluated
                 continue
             yield Candidate("hybrid" if state.from_guess else "full Newton", state)
