@@ -11,7 +11,7 @@ BIN := .venv/bin
 WORKERS ?= 2
 PIP := $(BIN)/pip install --quiet --no-compile -c constraints.txt  # Python compiles what it imports
 
-FIRST := runs/first_$(shell date +%Y-%m-%d_%H-%M-%S)
+FIRST := runs/first_$(shell date +%Y-%m-%d_%H-%M)
 BEAM := mesh=paper_beam data.train=256 data.val=32 data.test=50
 
 .PHONY: setup train demo test lint slow gpu matrix mutants docs pictures wheel clean
@@ -28,8 +28,10 @@ setup: .venv/installed
 	touch $@
 
 train: .venv/run
-	$(BIN)/python scripts/train.py $(BEAM) model=unrolled run=$(FIRST)/unrolled $(ARGS)
-	$(BIN)/python scripts/train.py $(BEAM) model=fcnn model.width=512 loss=lr_star trainer.max_epochs=60 run=$(FIRST)/fcnn $(ARGS)
+	$(BIN)/python scripts/train.py model=unrolled \
+	  $(BEAM) run=$(FIRST)/unrolled $(ARGS)
+	$(BIN)/python scripts/train.py model=fcnn model.width=512 loss=lr_star trainer.max_epochs=60 \
+	  $(BEAM) run=$(FIRST)/fcnn $(ARGS)
 	$(BIN)/python scripts/compare.py run=$(FIRST)
 
 demo: runs/demo/evaluation.json

@@ -124,8 +124,8 @@ def _train(cfg: DictConfig) -> float | None:
 def show_next_commands(folder: Path, *, tensorboard: bool) -> None:
     """Print the folder of a run and the commands that use it."""
     print(f"\nwritten to {_from_here(folder)}; next:")
-    print(f"  {_script('view')} {_run_key(folder)}      # drag the body in the browser")
-    print(f"  {_script('evaluate')} {_run_key(folder)}  # the table above")
+    print(f"  {_script('view')} {_run_key(folder)}      # in the browser")
+    print(f"  {_script('evaluate')} {_run_key(folder)}  # this table")
     if tensorboard:
         own = _own_folder()
         program = str(own / "tensorboard") if own else "tensorboard"
