@@ -19,8 +19,8 @@ from tensorboard.plugins.hparams import api_pb2, get_experiment, list_session_gr
 from tensorboard.plugins.hparams.backend_context import Context
 
 ROWS = [
-    *("linear", "prediction", "paper's hybrid to 1e-6", "sim(force, tol=1e-3)"),
-    *("sim(force, tol=1e-6)", "Newton, tol=1e-3", "Newton, tol=1e-6"),
+    *("linear", "prediction", "paper's hybrid to 1e-6", "sim(force, error=1e-3)"),
+    *("sim(force, tol=1e-3)", "sim(force, tol=1e-6)", "Newton, tol=1e-3", "Newton, tol=1e-6"),
 ]
 
 

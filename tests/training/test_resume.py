@@ -34,7 +34,9 @@ from torch import nn
 class Noisy(nn.Module):
     '''A network whose training draws from every generator there is.'''
 
-    def __init__(self, scene, *, layers=0, width=None, all_dofs=False, young=False):
+    def __init__(
+        self, scene, *, layers=0, width=None, all_dofs=False, young=False, base="none"
+    ):
         super().__init__()
         size = scene.problem.points.numel()
         self.dropout, self.linear = nn.Dropout(0.3), nn.Linear(size, size)
