@@ -203,7 +203,8 @@ def _grid(
     columns, lines = (rows, loads) if upright else (loads, rows)
     step = height + (top if upright else 0.0) + GAP
     size = left + columns * (width + GAP) + right, below + lines * step + (0 if upright else top)
-    figure = Figure(figsize=size, dpi=CARD_DPI if upright else DPI, layout="none")
+    figure = Figure(figsize=size, dpi=CARD_DPI if upright else DPI)
+    figure.set_layout_engine("none")  # panels are placed here, whatever the style says
 
     def add(x: float, y: float, w: float, h: float, label: str = "") -> Any:
         room = x / size[0], y / size[1], w / size[0], h / size[1]
