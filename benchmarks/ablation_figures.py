@@ -14,7 +14,7 @@ from torch import Tensor
 from benchmarks.ablation import ABLATION, CURVE, Row
 from dpl import Sample
 from dpl.models import Unrolled
-from dpl.visualization import COLOURS, METHOD_COLOURS, STYLE, draw_body
+from dpl.visualization import COLOURS, DPI, METHOD_COLOURS, STYLE, draw_body
 
 COLOUR = METHOD_COLOURS["unrolled"]
 WIDTH = 100  # of the table [characters]
@@ -58,7 +58,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             over_minutes.remove()
         _draw_variants(variants, [row for row in rows if row.part == ABLATION])
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=200)
+        figure.savefig(path, dpi=DPI)
 
 
 def _draw_curve(ax: Any, x: Sequence[float], rows: Sequence[Row]) -> None:
@@ -123,7 +123,7 @@ def draw_method(net: Unrolled, test: Sample, path: Path) -> None:
             place = k / len(panels), 0.35
             figure.text(*place, "\N{RIGHTWARDS ARROW}", fontsize=20, ha="center", color="0.3")
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=200)
+        figure.savefig(path, dpi=DPI)
 
 
 class _Panel(NamedTuple):

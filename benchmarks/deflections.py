@@ -12,7 +12,7 @@ from dpl import Scene
 from dpl.data.solving.solve import LoadKey
 from dpl.data.solving.worker_pool import solve_loads
 from dpl.data.storage.manifest import STREAMS
-from dpl.visualization import STYLE
+from dpl.visualization import DPI, STYLE
 
 BINS = 20
 AT_LINE: dict[str, Any] = {
@@ -85,4 +85,4 @@ def draw(rows: Sequence[Deflection], file: Path) -> None:
             ax.set_ylim(0, 1.15 * ax.get_ylim()[1])
             ax.yaxis.get_major_locator().set_params(integer=True)
         axes[0].set_ylabel("loads")
-        figure.savefig(file, dpi=200)
+        figure.savefig(file, dpi=DPI)

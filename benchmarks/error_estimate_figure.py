@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.error_estimates import IN_RANGE, TWICE, Estimate, Row
-from dpl.visualization import COLOURS, STYLE
+from dpl.visualization import COLOURS, DPI, STYLE
 
 WIDTH = 100  # of the table [characters]
 BAND = (0.5, 2.0)  # ratios that the figure marks [-]
@@ -64,7 +64,7 @@ def draw(found: Sequence[Estimate], path: Path) -> None:
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4)
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=130)
+        figure.savefig(path, dpi=DPI)
 
 
 def _draw_body(ax: Any, found: Sequence[Estimate]) -> None:

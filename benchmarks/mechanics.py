@@ -233,8 +233,8 @@ def latency(cfg: DictConfig, backends: list[str]) -> None:
 
 
 def figures(cfg: DictConfig, backends: list[str]) -> None:
-    """Draw the rows of `sizes`, `deflections` and the ablation that are in `folder` again."""
-    from benchmarks import ablation, ablation_figures
+    """Draw the figures of `sizes`, `deflections`, ablation and estimated errors from their rows."""
+    from benchmarks import ablation, ablation_figures, error_estimate_figure, error_estimates
     from benchmarks import deflections as bent
     from benchmarks import sizes as beams
 
@@ -245,6 +245,9 @@ def figures(cfg: DictConfig, backends: list[str]) -> None:
         bent.draw(read(bent.Deflection, path), path.with_suffix(".png"))
     if (path := folder / "unrolled.csv").is_file():
         ablation_figures.draw(read(ablation.Row, path), path.with_suffix(".png"))
+    if (path := folder / "estimates.csv").is_file():
+        found = read(error_estimates.Estimate, path)
+        error_estimate_figure.draw(found, folder / "error_estimates.png")
 
 
 def _listed(rows: list[peers.Time], title: str) -> list[peers.Time]:

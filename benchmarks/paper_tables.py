@@ -14,7 +14,7 @@ from dpl.fem import Load, Newton, Status, solve
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2
 from dpl.training.metrics import default_metrics
-from dpl.visualization import method_colours
+from dpl.visualization import DPI, STYLE, method_colours
 
 # Odot, Haferssas, Cotin (2022), tables 1 to 3: e_mean, e_max, SNR_min [dB], samples. Experiments 3
 # and 3b are one here: they differ in the range of Young's modulus, which no answer depends on.
@@ -29,6 +29,8 @@ PAPER: dict[str, dict[str, tuple[float, float | None, float | None, int | None]]
 }
 STREAMS = {"twice": 4, "small": 5}  # of loads; those of samples and scales are below
 CORRECTED = " corrected"  # ends the name of a network that is corrected
+LEAST_DRAWN, MOST_DRAWN = 1e-9, 1e3  # errors beyond are drawn there [-]
+GOLDEN = 0.618034  # distance of successive dots across a row, modulo 1, in heights of a row
 TITLES = {
     "in range": "loads in range",
     "twice": "one to two times the range",
@@ -194,37 +196,33 @@ def save(rows: Sequence[Result], errors: Mapping[tuple[str, str], Tensor], stem:
 
 
 def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
-    """Draw the relative errors of all loads, sorted, a panel for each set of loads.
+    """Draw the relative error of each load as a dot, a row for each method, and the medians.
 
     Args:
-        errors: Relative L2 errors (S,) by method and set.
-        path: Of the picture.
+        errors: Relative L2 errors (S,) by method and set; each set has a panel.
+        path: Path of the picture.
     """
+    import matplotlib as mpl
     from matplotlib.figure import Figure
 
     sets = list(dict.fromkeys(title for _, title in errors))
     methods = list(dict.fromkeys(method for method, _ in errors))
     colours = method_colours(dict.fromkeys(method.removesuffix(CORRECTED) for method in methods))
-    figure = Figure(figsize=(4 * len(sets) + 1.6, 3.8), layout="constrained")
-    axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
-    for ax, title in zip(axes, sets, strict=True):
-        for method in methods:
-            name = method.removesuffix(CORRECTED)
-            values = errors[method, title].sort().values.clamp(min=1e-9)
-            ax.semilogy(
-                torch.linspace(0, 100, len(values)),
-                values,
-                color=colours[name],
-                ls="-" if method == name else "--",
-                label=method,
-            )
-        aim = 50 if title == "small" else 60  # [dB]
-        ax.axhline(10 ** (-aim / 20), color="0.7", ls=":")
-        ax.annotate(f"{aim} dB", (0, 10 ** (-aim / 20)), fontsize=7, color="0.4", va="bottom")
-        ax.set_title(TITLES.get(title, title), fontsize=10)
-        ax.set_xlabel("part of the loads [%]")
-        ax.grid(alpha=0.3)
-    axes[0].set_ylabel("relative L2 error, no more than")
-    handles, names = axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside right center", fontsize=8)
-    figure.savefig(path, dpi=130)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(2.6 * len(sets) + 1.6, 0.3 * len(methods) + 1.0))
+        figure.set_layout_engine("constrained")
+        axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
+        for ax, title in zip(axes, sets, strict=True):
+            for row, method in enumerate(methods):
+                colour = colours[method.removesuffix(CORRECTED)]
+                values = errors[method, title].clamp(min=LEAST_DRAWN, max=MOST_DRAWN).cpu()
+                shift = 0.6 * (torch.arange(len(values)) * GOLDEN % 1 - 0.5)  # dots side by side
+                dots = {"color": colour, "ms": 3, "alpha": 0.35, "mew": 0}
+                ax.plot(values, row + shift, "o", **dots)
+                ax.plot([values.median()] * 2, [row - 0.4, row + 0.4], color=colour, lw=2)
+            ax.set(xscale="log", xlabel="relative L2 error")
+            ax.set_title(TITLES.get(title, title))
+            ax.grid(visible=True, axis="x")
+        axes[0].set_yticks(range(len(methods)), methods)
+        axes[0].invert_yaxis()
+        figure.savefig(path, dpi=DPI)

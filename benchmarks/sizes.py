@@ -21,7 +21,7 @@ from dpl.fem.linear import select_backend
 from dpl.models import FCNN, Unrolled
 from dpl.system.threads import one_thread
 from dpl.training import MSE, Surrogate
-from dpl.visualization import STYLE, method_colours
+from dpl.visualization import DPI, STYLE, method_colours
 
 
 @dataclass(frozen=True)
@@ -124,11 +124,12 @@ LINES = {  # start of a case: its short name and its method, which determines th
     "factor of K(0)": ("factor of K(0)", "factor of K(0)"),
     "process": ("whole process, peak", "process"),
     "linear answer": ("linear", "linear"),
-    "Newton, corotational": ("Newton, corotational, from a prediction", "corotational"),
+    "Newton, corotational": ("Newton from a prediction", "corotational"),
     "Newton": ("Newton", "Newton"),
     "unrolled": ("unrolled", "unrolled"),
     "fcnn": ("fcnn", "fcnn"),
 }
+LABEL_SPACE = 0.85  # part of the axis to the right of the last point, for labels of lines
 PANELS = (  # label, field, drawn lines; each panel has at most four of them
     ("time of one solution [ms]", "ms", ("factor", "linear", "Newton")),
     ("time of one prediction [ms]", "ms", ("unrolled", "fcnn")),
@@ -158,15 +159,15 @@ def draw(rows: Sequence[Size], path: Path) -> None:
                     name, method = LINES[start]
                     _draw_line(ax, known, name, colours[method])
             ax.set(xscale="log", yscale="log", xlabel="degrees of freedom", ylabel=label)
-            ax.set_xlim(min(row.dofs for row in rows) / 1.3, max(row.dofs for row in rows) * 1.3)
-            low, high = ax.get_ylim()
-            ax.set_ylim(low, high * (high / low) ** 0.35)  # space for the legend
+            least, most = min(row.dofs for row in rows), max(row.dofs for row in rows)
+            ax.set_xlim(least / 1.3, most * (most / least) ** LABEL_SPACE)
             ax.grid(visible=True)
-            ax.legend(loc="upper left")
-        figure.savefig(path, dpi=200)
+        figure.savefig(path, dpi=DPI)
 
 
 def _draw_line(ax: Any, known: Sequence[tuple[int, float]], name: str, colour: str) -> None:
     x, y = zip(*known, strict=True)
-    label = f"{name}: DOFs$^{{{exponent(x, y):.2f}}}$" if len(x) > 1 else name
-    ax.plot(x, y, "o-", ms=3.5, lw=1.2, color=colour, label=label)
+    label = f"{name} $\\sim$ DOFs$^{{{exponent(x, y):.2f}}}$" if len(x) > 1 else name
+    ax.plot(x, y, "o-", ms=3.5, lw=1.2, color=colour)
+    place = {"xytext": (6, 0), "textcoords": "offset points", "va": "center", "fontsize": 7.5}
+    ax.annotate(label, (x[-1], y[-1]), color=colour, **place)

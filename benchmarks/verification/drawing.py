@@ -13,7 +13,7 @@ from torch import Tensor
 
 from benchmarks.verification.bodies import Array, lattice
 from dpl.fem import Problem
-from dpl.visualization import COLOURS, STYLE
+from dpl.visualization import COLOURS, DPI, STYLE
 
 MARKS = "osD^vP"
 
@@ -30,7 +30,7 @@ def picture(path: Path, height: float = 3.1) -> Iterator[Any]:
         figure.set_layout_engine("constrained", w_pad=0.06, wspace=0.05)
         yield figure
         drawn = io.BytesIO()
-        figure.savefig(drawn, dpi=150)
+        figure.savefig(drawn, dpi=DPI)
     palette = Image.open(drawn).convert("RGB").quantize(128)  # a third of the size
     palette.save(path, optimize=True)
 

@@ -20,7 +20,7 @@ from dpl.inference import Hybrid
 from dpl.inference.hybrid import Predict
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
-from dpl.visualization import method_colours
+from dpl.visualization import DPI, method_colours
 
 LINE_STYLES = ("-", "--", ":", "-.")
 REFERENCE = "robust Newton"  # solver with which times and displacements are compared
@@ -248,4 +248,4 @@ def draw(trials: Sequence[Trial], path: Path) -> None:
         ax.grid(alpha=0.3, which="both")
     axes[0].set_ylabel("converged loads [%]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
-    figure.savefig(path, dpi=130)
+    figure.savefig(path, dpi=DPI)

@@ -15,7 +15,7 @@ from dpl.scene import Sample
 from dpl.system.threads import one_thread
 from dpl.training import RelativeL2, Surrogate
 from dpl.training.metrics import median
-from dpl.visualization import STYLE, method_colours
+from dpl.visualization import DPI, STYLE, method_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -168,7 +168,7 @@ def draw(
             ax.xaxis.set_major_formatter("{x:g}")
             ax.grid(visible=True)
         axes[0].set_ylabel("relative error, median of the loads")
-        figure.savefig(file, dpi=200)
+        figure.savefig(file, dpi=DPI)
         plt.close(figure)
 
 

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem import Problem, surface
-from dpl.visualization.shapes import CARD_DPI, error_scale
+from dpl.visualization.shapes import error_scale
+from dpl.visualization.style import DPI
 
 if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
@@ -88,7 +89,7 @@ def plot_errors(relative: Tensor, size: Tensor, marked: Sequence[int] = ()) -> "
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(4.4, 5.6), dpi=CARD_DPI)
+    figure = Figure(figsize=(4.4, 5.6), dpi=DPI)
     figure.subplots_adjust(left=0.15, right=0.96, bottom=0.09, top=0.94, hspace=0.25)
     upper, lower = figure.subplots(2, 1, sharey=True)
     error, amplitude = (np.maximum(part.cpu().numpy(), 1e-16) for part in (relative, size))

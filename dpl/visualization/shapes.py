@@ -9,14 +9,13 @@ from torch import Tensor
 
 from dpl.fem import Problem, surface
 from dpl.fem.postprocess import coarse, facet_edges, triangle_normals
+from dpl.visualization.style import DPI
 
 if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
 Array = NDArray[Any]
-DPI = 200  # resolution of figures [dots per inch]
-CARD_DPI = 140  # of figures for TensorBoard, whose files contain many
 DECADES = 1e-3  # smallest over largest error of a logarithmic colour scale
 WIDE = 0.1  # part of the largest error below which a median error needs a logarithmic scale
 SMALLEST_ERROR = 1e-12  # smallest upper end of a colour scale
@@ -203,7 +202,7 @@ def _grid(
     columns, lines = (rows, loads) if upright else (loads, rows)
     step = height + (top if upright else 0.0) + GAP
     size = left + columns * (width + GAP) + right, below + lines * step + (0 if upright else top)
-    figure = Figure(figsize=size, dpi=CARD_DPI if upright else DPI)
+    figure = Figure(figsize=size, dpi=DPI)
     figure.set_layout_engine("none")  # panels are placed here, whatever the style says
 
     def add(x: float, y: float, w: float, h: float, label: str = "") -> Any:

@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Iterable
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+DPI = 200  # resolution of figures [dots per inch]
 METHOD_COLOURS = {  # a method has the same colour in all figures
     "Newton": "0.1",
     "linear": "0.5",
