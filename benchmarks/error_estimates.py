@@ -165,26 +165,34 @@ def cost(scene: Scene, samples: Sample) -> str:
     return f"estimate {estimate.p50:.2f} ms, residual {residual.p50:.2f} ms"
 
 
-def estimates(body: str, scene: Scene, sizes: Sizes, folder: Path) -> Iterator[Estimate]:
-    """Train the models of a body and yield the estimates of all predictions.
-
-    Args:
-        body: Name of the body.
-        scene: The scene.
-        sizes: Numbers of loads and epochs.
-        folder: Folder of the data set.
-    """
+def solved_data(scene: Scene, sizes: Sizes, folder: Path) -> OfflineData:
+    """Return the data set of a scene in a folder; missing loads are solved."""
     data = OfflineData(
         scene, folder=str(folder), train=sizes.train, val=sizes.val, test=sizes.test, workers=0
     )
     data.prepare_data()
-    test = data.samples("test")
+    return data
+
+
+def estimates(
+    body: str, scene: Scene, data: OfflineData, surrogates: Mapping[str, Surrogate], count: int
+) -> Iterator[Estimate]:
+    """Yield the estimates of the linear solution and of trained surrogates.
+
+    Args:
+        body: Name of the body.
+        scene: The scene.
+        data: Its data set.
+        surrogates: Surrogates of the scene, by name.
+        count: Largest number of test loads, which are also doubled.
+    """
+    test = Sample(*(column[:count] for column in data.samples("test")))
     doubled = solved(scene, test.load._replace(force=2 * test.force))
     print(f"{body}: {cost(scene, test)}", flush=True)
-    surrogates = trained(scene, data, sizes.epochs)
+    states = data.samples("train").displacement
     for title, samples in ((IN_RANGE, test), (TWICE, doubled)):
         measure = partial(measured, scene, samples)
-        for name, predict, newton in _predictions(scene, surrogates, data):
+        for name, predict, newton in _predictions(scene, surrogates, states):
             for stepped in (False, True) if newton else (False,):
                 with one_thread(), torch.inference_mode():
                     for found in measure(predict, newton, stepped=stepped):
@@ -213,7 +221,7 @@ def trained(scene: Scene, data: OfflineData, epochs: int) -> dict[str, Surrogate
 
 
 def _predictions(
-    scene: Scene, surrogates: Mapping[str, Surrogate], data: OfflineData
+    scene: Scene, surrogates: Mapping[str, Surrogate], states: Tensor
 ) -> Iterator[tuple[str, Predict, SubspaceNewton | None]]:
     """Yield predictions by name, each with Newton's method in the modes of the model, if any."""
 
@@ -221,7 +229,6 @@ def _predictions(
         return torch.stack([scene.linear.solve(force) for force in load.force])
 
     yield "linear", linear, None
-    states = data.samples("train").displacement
     for name, surrogate in surrogates.items():
         net = surrogate.net
         newton = None

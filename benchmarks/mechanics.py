@@ -245,7 +245,7 @@ def figures(cfg: DictConfig, backends: list[str]) -> None:
         bent.draw(read(bent.Deflection, path), path.with_suffix(".png"))
     if (path := folder / "unrolled.csv").is_file():
         ablation_figures.draw(read(ablation.Row, path), path.with_suffix(".png"))
-    if (path := folder / "estimates.csv").is_file():
+    if (path := folder / "error_estimates_loads.csv").is_file():
         found = read(error_estimates.Estimate, path)
         error_estimate_figure.draw(found, folder / "error_estimates.png")
 

@@ -129,7 +129,7 @@ LINES = {  # start of a case: its short name and its method, which determines th
     "unrolled": ("unrolled", "unrolled"),
     "fcnn": ("fcnn", "fcnn"),
 }
-LABEL_SPACE = 0.85  # part of the axis to the right of the last point, for labels of lines
+LABEL_SPACE = 0.15  # part of the axis to the right of the last point, for labels of lines
 PANELS = (  # label, field, drawn lines; each panel has at most four of them
     ("time of one solution [ms]", "ms", ("factor", "linear", "Newton")),
     ("time of one prediction [ms]", "ms", ("unrolled", "fcnn")),

@@ -1,13 +1,14 @@
 """Calibrate the estimated errors of the simulator: python scripts/error_estimates.py.
 
-Trains models on several bodies and compares the estimated with the true errors of their
-predictions, in range and at twice the range. Writes the ratios of all loads, their quantiles and a
-figure.
+Compares the estimated with the true errors of predictions, in range and at twice the range. Trains
+models on several bodies, or takes those of a folder of runs (run=runs/beam_nh_loss). Writes the
+ratios of all loads, their quantiles and a figure.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
@@ -15,8 +16,11 @@ from benchmarks.commands import CONF
 from dpl import config
 from dpl.commands.cli import command
 
+if TYPE_CHECKING:
+    from benchmarks.error_estimates import Estimate
+
 COUNTS = tuple((int, name, 1, 10**6) for name in ("train", "val", "test", "epochs"))
-KEYS = ((Sequence[str], "bodies"), *COUNTS)
+KEYS = ((Sequence[str], "bodies"), (str, "name"), *COUNTS)
 
 
 @command("error_estimates", conf=CONF, keys=KEYS)
@@ -30,17 +34,37 @@ def main(cfg: DictConfig) -> None:
         names = ", ".join(error_estimates.BODIES)
         raise config.ConfigError(f"bodies = {list(cfg.bodies)} must be some of {names}")
     folder = Path(cfg.folder)
+    found = list(_of_runs(cfg) if cfg.run else _of_bodies(cfg, folder))
+    rows = error_estimates.summarised(found)
+    write(found, folder / f"{cfg.name}_loads.csv")
+    write(rows, folder / f"{cfg.name}.csv")
+    write_machine(folder / f"{cfg.name}.json")
+    error_estimate_figure.draw(found, folder / f"{cfg.name}.png")
+    error_estimate_figure.show(rows)
+
+
+def _of_bodies(cfg: DictConfig, folder: Path) -> Iterator["Estimate"]:
+    """Yield the estimates of models that are trained on each body."""
+    from benchmarks import error_estimates
+
     sizes = error_estimates.Sizes(cfg.train, cfg.val, cfg.test, cfg.epochs)
-    found: list[error_estimates.Estimate] = []
     for body in cfg.bodies:
         start = time.perf_counter()
         scene = error_estimates.BODIES[body]()
         print(*scene.describe()[0], flush=True)
-        found += error_estimates.estimates(body, scene, sizes, folder / "data" / body)
+        data = error_estimates.solved_data(scene, sizes, folder / "data" / body)
+        surrogates = error_estimates.trained(scene, data, sizes.epochs)
+        yield from error_estimates.estimates(body, scene, data, surrogates, sizes.test)
         print(f"{body}: {time.perf_counter() - start:.0f} s", flush=True)
-    rows = error_estimates.summarised(found)
-    write(found, folder / "estimates.csv")
-    write(rows, folder / "error_estimates.csv")
-    write_machine(folder / "error_estimates.json")
-    error_estimate_figure.draw(found, folder / "error_estimates.png")
-    error_estimate_figure.show(rows)
+
+
+def _of_runs(cfg: DictConfig) -> Iterator["Estimate"]:
+    """Yield the estimates of all runs in a folder."""
+    from benchmarks import error_estimates
+
+    runs = config.load_runs(cfg.run)
+    first, surrogate = next(iter(runs.values()))
+    scene = surrogate.scene
+    data = config.load_data(first, scene)
+    surrogates = {name: surrogate for name, (_, surrogate) in runs.items()}
+    yield from error_estimates.estimates(Path(cfg.run).name, scene, data, surrogates, cfg.test)

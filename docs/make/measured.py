@@ -88,10 +88,19 @@ PARTS = (
         tabulated=False,
     ),
     Part(
-        "estimates",
+        "error_estimates_loads",
         "Estimated and true errors",
         "python scripts/error_estimates.py folder=benchmarks/results",
         "One row for each load and prediction of the file before.",
+        tabulated=False,
+    ),
+    Part(
+        r"error_estimates_(beam_\w+?)(?:_loads)?",
+        "Estimated over true errors on `{0}`",
+        "python scripts/error_estimates.py run=runs/{0} name=error_estimates_{0} test=100 "
+        "folder=benchmarks/results",
+        "Predictions of the trained runs of an experiment for its test loads, and for these loads "
+        "doubled.",
         tabulated=False,
     ),
     Part(

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from dpl.fem import Problem
 from dpl.models.grid import Immersion, Permutation, cubic_grid, filling, own_grid
@@ -43,6 +44,7 @@ class CNN(nn.Module):
         channels: int = 16,
         steps: int | None = None,
         grid: int | None = None,
+        smooth: bool = False,
         base: Base = "none",
         memory_limit: float | None = None,
     ) -> None:
@@ -56,6 +58,8 @@ class CNN(nn.Module):
             grid: Points along the longest side of the bounding box, with about the same spacing on
                 other sides; None for the nodes if they form a regular grid, otherwise for about as
                 many points as nodes.
+            smooth: Leave out the residual blocks of the finest grid, which suits displacements
+                that vary little over an element.
             base: "linear" for the nonlinear displacement as output, see `LinearBase`.
             memory_limit: Memory for training on one sample [GB]; None for that of the machine.
 
@@ -84,7 +88,9 @@ class CNN(nn.Module):
         if base == "linear":  # displacements are averaged, forces summed
             nodes = self.immersion.spread(torch.ones(1, len(points), 1))
             self.register_buffer("share", 1 / nodes.clamp(min=1e-6), persistent=False)
-        self.net = UNet(dim + len(constant) + self.scalars.count, dim, sizes, widths)
+        self.smooth = smooth and len(sizes) > 1
+        inputs = dim + len(constant) + self.scalars.count
+        self.net = UNet(inputs, dim, sizes, widths, smooth=self.smooth)
 
     def _constant(self, problem: Problem, shape: tuple[int, ...]) -> Tensor:
         """Return the constant channels that are not uniform, (C, *shape)."""
@@ -129,20 +135,33 @@ class CNN(nn.Module):
         if isinstance(self.immersion, Permutation):
             size = " x ".join(map(str, self.immersion.shape))
             lines.append(f"no interpolation: the nodes form a grid of {size} points")
+        if self.smooth:
+            lines.append("no residual blocks on the finest grid: the displacement is smooth")
         if self.full:
             lines.append("no input for the volume fraction: the body fills the grid")
         return lines
 
 
 class UNet(nn.Module):
-    """Encoder and decoder on a hierarchy of grids, with skip connections.
+    """Encoder and decoder on a hierarchy of grids, with the inputs and residual blocks on each.
 
-    Source: Ronneberger, Fischer, Brox (2015), U-Net; here with strided convolutions instead of
-    pooling, and without normalisation.
+    The means of the inputs around the points of a coarser grid are inputs there, so that global
+    features need not pass the finer grids. The second convolution of each residual block is zero at
+    first.
+
+    Sources: Ronneberger, Fischer, Brox (2015), U-Net; He et al. (2016), Identity mappings in deep
+    residual networks (order of rectifiers and convolutions). Unlike there, grids are coarsened by
+    strided convolutions, parts are added instead of concatenated, and nothing is normalised.
     """
 
     def __init__(
-        self, inputs: int, outputs: int, sizes: list[tuple[int, ...]], widths: list[int]
+        self,
+        inputs: int,
+        outputs: int,
+        sizes: list[tuple[int, ...]],
+        widths: list[int],
+        *,
+        smooth: bool = False,
     ) -> None:
         """Build the network.
 
@@ -151,32 +170,74 @@ class UNet(nn.Module):
             outputs: Output channels.
             sizes: Grid points along each side, from the finest grid to the coarsest.
             widths: Channels of each grid.
+            smooth: See `CNN`.
         """
         super().__init__()
-        dim = len(sizes[0])
-        self.encoders = nn.ModuleList([_pair(inputs, widths[0], dim)])
-        self.decoders, self.descents, self.ascents = (nn.ModuleList() for _ in range(3))
-        for (fine, coarse), (few, many) in zip(pairwise(sizes), pairwise(widths), strict=True):
-            stride = tuple(1 + (n > m) for n, m in zip(fine, coarse, strict=True))
+        self.dim = len(sizes[0])
+        self.strides = [
+            tuple(1 + (n > m) for n, m in zip(*pair, strict=True)) for pair in pairwise(sizes)
+        ]
+        conv, transposed = CONVOLUTION[self.dim], TRANSPOSED[self.dim]
+        self.inlets = nn.ModuleList(conv(inputs, width, 3, 1, 1) for width in widths)
+        self.encoders = nn.ModuleList(
+            nn.Identity() if smooth and level == 0 else Residual(width, self.dim)
+            for level, width in enumerate(widths)
+        )
+        self.decoders = nn.ModuleList(
+            nn.Identity() if smooth and level == 0 else Residual(width, self.dim)
+            for level, width in enumerate(widths[:-1])
+        )
+        self.descents, self.ascents = nn.ModuleList(), nn.ModuleList()
+        levels = zip(pairwise(sizes), pairwise(widths), self.strides, strict=True)
+        for (fine, coarse), (few, many), stride in levels:
             left = tuple(n - s * (m - 1) - 1 for n, m, s in zip(fine, coarse, stride, strict=True))
-            self.descents.append(CONVOLUTION[dim](few, many, 3, stride, 1))
-            self.encoders.append(_pair(many, many, dim))
-            self.ascents.append(TRANSPOSED[dim](many, few, 3, stride, 1, left))
-            self.decoders.append(_pair(2 * few, few, dim))
-        self.last = CONVOLUTION[dim](widths[0], outputs, 1)
+            self.descents.append(conv(few, many, 3, stride, 1))
+            self.ascents.append(transposed(many, few, 3, stride, 1, left))
+        self.last = conv(widths[0], outputs, 1)
         self.rectify = nn.LeakyReLU(LEAK)
         self.apply(_initialise)
 
     def forward(self, field: Tensor) -> Tensor:
         """Return output fields (B, outputs, *sizes[0]) of input fields (B, inputs, *sizes[0])."""
-        field = self.encoders[0](field)
-        skipped = []
-        for descent, encoder in zip(self.descents, self.encoders[1:], strict=True):
-            skipped.append(field)
-            field = encoder(self.rectify(descent(field)))
+        state = self.encoders[0](self.inlets[0](field))
+        skipped = [state]
+        levels = zip(self.strides, self.descents, self.inlets[1:], self.encoders[1:], strict=True)
+        for stride, descent, inlet, encoder in levels:
+            field = _means(field, stride)
+            state = encoder(_sum(descent(self.rectify(state)), inlet(field)))
+            skipped.append(state)
+        skipped.pop()
         for ascent, decoder in zip(reversed(self.ascents), reversed(self.decoders), strict=True):
-            field = decoder(torch.cat([skipped.pop(), ascent(field)], dim=1))
-        return self.last(field)
+            state = decoder(_sum(ascent(self.rectify(state)), skipped.pop()))
+        return self.last(self.rectify(state))
+
+
+class Residual(nn.Module):
+    """Field plus two convolutions of it, each of a rectified field."""
+
+    def __init__(self, width: int, dim: int) -> None:
+        """Take the number of channels and the space dimension."""
+        super().__init__()
+        self.first = CONVOLUTION[dim](width, width, 3, 1, 1)
+        self.second = CONVOLUTION[dim](width, width, 3, 1, 1)
+        self.rectify = nn.LeakyReLU(LEAK)
+
+    def forward(self, field: Tensor) -> Tensor:
+        """Return a field of the same shape, (B, width, *shape)."""
+        return field + self.second(self.rectify(self.first(self.rectify(field))))
+
+
+def _sum(one: Tensor, other: Tensor) -> Tensor:
+    """Return the sum of two fields of equal variance, which the sum keeps."""
+    return (one + other) * math.sqrt(0.5)
+
+
+def _means(field: Tensor, stride: tuple[int, ...]) -> Tensor:
+    """Return the means over the neighbours of every second point of each side that is coarsened."""
+    kernel = tuple(2 * step - 1 for step in stride)
+    padding = tuple(step - 1 for step in stride)
+    pool = avg_pool3d if len(stride) == 3 else avg_pool2d
+    return pool(field, kernel, stride, padding, count_include_pad=False)
 
 
 def _sizes(shape: tuple[int, ...], steps: int | None) -> list[tuple[int, ...]]:
@@ -198,15 +259,10 @@ def _sizes(shape: tuple[int, ...], steps: int | None) -> list[tuple[int, ...]]:
     return sizes
 
 
-def _pair(inputs: int, outputs: int, dim: int) -> nn.Sequential:
-    """Return two convolutions, each followed by a rectifier."""
-    first = CONVOLUTION[dim](inputs, outputs, 3, 1, 1)
-    second = CONVOLUTION[dim](outputs, outputs, 3, 1, 1)
-    return nn.Sequential(first, nn.LeakyReLU(LEAK), second, nn.LeakyReLU(LEAK))
-
-
 def _initialise(module: nn.Module) -> None:
     """Draw weights of a convolution that preserve the variance of values (He et al. 2015)."""
+    if isinstance(module, Residual):  # after its convolutions
+        nn.init.zeros_(module.second.weight)
     if not isinstance(module, nn.Conv2d | nn.Conv3d | nn.ConvTranspose2d | nn.ConvTranspose3d):
         return
     taps = float(module.in_channels * math.prod(module.kernel_size))
@@ -222,8 +278,8 @@ def _refuse_beyond_memory(
 ) -> None:
     """Raise MemoryError if float32 training on one sample would not fit."""
     kernel = 3 ** len(sizes[0])
-    # per level: 2 convolutions down, 2 up with twice the inputs, a strided one and its transpose
-    parameters = sum(9 * kernel * width**2 for width in widths)
+    # per level: 2 convolutions down, 2 up, and one from and to a level of twice the channels
+    parameters = sum(8 * kernel * width**2 for width in widths)
     fields = sum(10 * width * math.prod(size) for size, width in zip(sizes, widths, strict=True))
     needed = (
         parameters * 4 * 4 + fields * 4

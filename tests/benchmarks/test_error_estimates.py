@@ -82,7 +82,7 @@ def test_the_command_writes_rows_and_a_figure_and_prints_a_table(script, tmp_pat
     names = [row["prediction"] for row in rows if row["loads"] == error_estimates.IN_RANGE]
     assert names == ["linear", "fcnn", "pod", "pod + steps", "unrolled", "unrolled + steps"]
     assert {row["loads"] for row in rows} == {error_estimates.IN_RANGE, error_estimates.TWICE}
-    with (tmp_path / "out/estimates.csv").open(newline="") as file:
+    with (tmp_path / "out/error_estimates_loads.csv").open(newline="") as file:
         single = list(csv.DictReader(file))
     assert len(single) == sum(int(row["count"]) for row in rows)
     assert all(float(one["error"]) > 0 for one in single)

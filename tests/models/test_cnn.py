@@ -211,24 +211,36 @@ def test_fields_of_two_and_three_dimensions_are_accepted(body):
     assert answer.dtype == torch.float32
 
 
+@pytest.mark.parametrize("smooth", [False, True])
 @pytest.mark.parametrize("shape", [(17, 5, 5), (40, 10, 10), (7, 2), (2, 13), (31, 6, 3)])
-def test_any_number_of_grid_points_is_accepted(shape):
+def test_any_number_of_grid_points_is_accepted(shape, smooth):
     sizes = cnn._sizes(shape, None)
     assert max(sizes[-1]) <= 3
     assert min(min(size) for size in sizes) == min(min(shape), 2)
-    net = cnn.UNet(2, 3, sizes, [2] * len(sizes))
+    net = cnn.UNet(2, 3, sizes, [2] * len(sizes), smooth=smooth)
     assert net(torch.randn(1, 2, *shape)).shape == (1, 3, *shape)
 
 
+@pytest.mark.parametrize("smooth", [False, True])
 @pytest.mark.parametrize("shape", [(17, 5, 5), (33, 9)])
-def test_every_output_depends_on_every_input(shape):
+def test_every_output_depends_on_every_input(shape, smooth):
     """The gradient at one end with respect to the input at the other is not zero."""
     torch.manual_seed(0)
     sizes = cnn._sizes(shape, None)
-    net = cnn.UNet(1, 1, sizes, [4 * 2**level for level in range(len(sizes))])
+    net = cnn.UNet(1, 1, sizes, [4 * 2**level for level in range(len(sizes))], smooth=smooth)
+    for part in net.modules():
+        if isinstance(part, cnn.Residual):
+            torch.nn.init.normal_(part.second.weight)  # zero at first
     force = torch.zeros(1, 1, *shape, requires_grad=True)
     net(force)[(0, 0, *[-1] * len(shape))].backward()
     assert (force.grad != 0).all()
+
+
+def test_a_smooth_network_has_no_residual_block_on_the_finest_grid(scene):
+    net = network(scene, smooth=True)
+    widths = [part.first.in_channels for part in net.modules() if isinstance(part, cnn.Residual)]
+    assert min(widths) == 2 * net.net.inlets[0].out_channels
+    assert net.skipped_work()[1].startswith("no residual blocks on the finest grid")
 
 
 def test_the_output_for_a_load_does_not_depend_on_its_batch_on_every_mesh(body):
