@@ -112,3 +112,17 @@ def test_the_bodies_are_what_their_names_say():
     assert scene.problem.material.poisson == 0.45
     sides = error_estimates.plate().problem.points
     assert (sides.amax(0) - sides.amin(0)).tolist() == pytest.approx([1.0, 0.5, 0.02])
+
+
+def test_trained_runs_are_compared_in_place_of_bodies(script, tiny_training, tmp_path):
+    short = ["model=fcnn", *tiny_training, "trainer.max_epochs=1", "logger=none"]
+    assert script("train", *short, "run=runs/mine/one", cwd=tmp_path).status == 0
+    ended = script("error_estimates", "run=runs/mine", "name=ours", "test=3", cwd=tmp_path)
+    assert ended.status == 0, ended.err
+    with (tmp_path / "runs/error_estimates/ours.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {(row["body"], row["prediction"]) for row in rows} == {
+        ("mine", "linear"),
+        ("mine", "one"),
+    }
+    assert {row["count"] for row in rows} == {"3"}
