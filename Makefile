@@ -12,6 +12,8 @@ WORKERS ?= 2
 PIP := $(BIN)/pip install --quiet --no-compile -c constraints.txt  # Python compiles what it imports
 
 FIRST := runs/first_$(shell date +%Y-%m-%d_%H-%M)
+DEMO := $(BIN)/python scripts/train.py mesh=paper_beam data.train=64 data.val=16 data.test=8 \
+  model=unrolled model.rank=60 model.cells=80 run=runs/demo
 BEAM := mesh=paper_beam data.train=256 data.val=32 data.test=50
 
 .PHONY: setup train demo test lint slow gpu matrix mutants docs pictures wheel clean
@@ -34,12 +36,13 @@ train: .venv/run
 	  $(BEAM) run=$(FIRST)/fcnn $(ARGS)
 	$(BIN)/python scripts/compare.py run=$(FIRST)
 
-demo: runs/demo/evaluation.json
-	$(BIN)/python scripts/view.py run=runs/demo
+demo: .venv/run
+	if [ -f runs/demo/evaluation.json ]; then $(BIN)/python scripts/view.py run=runs/demo; \
+	  else rm -rf runs/demo; $(DEMO) extras.view=true; fi
 
 runs/demo/evaluation.json: | .venv/run
 	rm -rf runs/demo
-	$(BIN)/python scripts/train.py mesh=paper_beam data.train=64 data.val=16 data.test=8 model=unrolled run=runs/demo
+	$(DEMO)
 
 test: lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m 'not slow and not gpu'

@@ -150,12 +150,22 @@ def check_sweep(overrides: Sequence[str]) -> None:
 
 
 def apply_extras(cfg: DictConfig) -> None:
-    """Apply the group `extras`: print the configuration, ask for tags, silence warnings."""
+    """Apply the group `extras`: print the configuration, ask for tags, silence warnings.
+
+    Raises:
+        ConfigError: `extras.view` cannot be done at the end.
+    """
     extras = cfg.get("extras") or {}
     if extras.get("ignore_warnings"):
         warnings.filterwarnings("ignore")
     if extras.get("enforce_tags") and not cfg.tags:
         raise ConfigError("tags = [] must name one tag or more; or set extras.enforce_tags=false")
+    if extras.get("view"):
+        from dpl.commands.view import require_viewer
+
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            raise ConfigError("extras.view = true needs one run; leave it out of a sweep")
+        require_viewer()
     if extras.get("print_config"):
         print(OmegaConf.to_yaml(cfg, resolve=True))
 

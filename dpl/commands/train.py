@@ -6,7 +6,7 @@ import shlex
 import signal
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -118,7 +118,19 @@ def _train(cfg: DictConfig) -> float | None:
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         logs = any(isinstance(one, TensorBoardLogger) for one in trainer.loggers)
         show_next_commands(folder, tensorboard=logs)
+    if (cfg.get("extras") or {}).get("view"):
+        _view(best, folder)
     return cli.best_error(trainer)
+
+
+def _view(surrogate: "dpl.Surrogate", folder: Path) -> NoReturn:
+    """Serve the page of a trained surrogate at any free port until Ctrl-C."""
+    from dpl import viewer
+    from dpl.commands.view import serve
+
+    policy = viewer.AccessPolicy.bind("127.0.0.1", 0, [])
+    body = viewer.Body(dpl.Simulator(surrogate))
+    serve(body, policy, title=_from_here(folder), folder=folder / "view")
 
 
 def show_next_commands(folder: Path, *, tensorboard: bool) -> None:

@@ -4,6 +4,7 @@ import errno
 import sys
 import time
 from pathlib import Path
+from typing import NoReturn
 
 from omegaconf import DictConfig
 
@@ -22,21 +23,47 @@ def main(cfg: DictConfig) -> None:
     if cfg.animation:
         write_animation(load_body(cfg), Path(cfg.animation))
         return
+    require_viewer()
+    policy = bind(cfg)
+    if not cfg.profile:
+        serve(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
+    from dpl.viewer.frame_rate import measure_frames
+
+    page = viewer.Page(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
     try:
-        from dpl.viewer import Page
-        from dpl.viewer.frame_rate import measure_frames
+        rows, latencies = measure_frames(page)
+        show(rows, "times per frame on the server, and frames received by a client")
+        print(describe(latencies))
+    finally:
+        page.close()
+
+
+def require_viewer() -> None:
+    """Raise a `ConfigError` unless the packages of the viewer are installed."""
+    try:
+        import dpl.viewer.page  # noqa: F401
     except ImportError as error:
         raise config.ConfigError(
             f"the viewer cannot be imported ({error}): {install('viewer')}"
         ) from error
-    policy = bind(cfg)
-    page = Page(load_body(cfg), policy, title=str(cfg.run), folder=Path(cfg.folder))
+
+
+def serve(
+    body: "viewer.Body", policy: "viewer.AccessPolicy", *, title: str, folder: Path
+) -> NoReturn:
+    """Serve the page of a body until Ctrl-C.
+
+    Args:
+        body: The body.
+        policy: Access policy with a bound socket.
+        title: Title of the page.
+        folder: Folder of recordings.
+    """
+    import torch
+
+    torch.set_num_threads(1)
+    page = viewer.Page(body, policy, title=title, folder=folder)
     try:
-        if cfg.profile:
-            rows, latencies = measure_frames(page)
-            show(rows, "times per frame on the server, and frames received by a client")
-            print(describe(latencies))
-            return
         print(f"the page is at {policy.url}  (Ctrl-C ends it)", flush=True)
         while True:
             time.sleep(0.1)

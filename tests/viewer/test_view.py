@@ -36,6 +36,25 @@ def test_the_page_prints_its_address_and_ctrl_c_ends_all_processes(start, member
     assert not members(process.pid)
 
 
+def test_a_training_serves_the_page_of_its_run_at_the_end(start, members, tiny_training, tmp_path):
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    short = ["trainer.max_epochs=1", "extras.view=true", "run=runs/a"]
+    process = start("train", *tiny_training, *short, cwd=tmp_path)
+    lines = iter(process.stdout.readline, "")
+    assert any(line.startswith("the page is at http://127.0.0.1:") for line in lines)
+    os.kill(process.pid, signal.SIGINT)
+    assert process.wait(timeout=240) == 130
+    assert not members(process.pid)
+    assert (tmp_path / "runs/a/evaluation.json").is_file()
+
+
+def test_a_sweep_serves_no_page(script, tiny_training, tmp_path):
+    ended = script("train", "-m", *tiny_training, "seed=0,1", "extras.view=true", cwd=tmp_path)
+    assert ended.status == 2
+    assert "extras.view = true needs one run" in ended.err
+    assert not (tmp_path / "datasets").exists()
+
+
 def test_a_public_host_prints_a_warning(start, home):
     pytest.importorskip("viser", reason="the extra viewer is not installed")
     process = start("view", "run=runs/a", "port=0", "host=0.0.0.0", cwd=home)
