@@ -1,5 +1,5 @@
 # make train: environment, installation and the main job: two models of the paper's beam, compared.
-# make demo:  a model of the paper's beam, fitted to 64 loads, as a page in the browser.
+# make demo:  a model of the paper's beam, fitted to 64 loads, and its page for the browser.
 # make test:  installation and the checks that CI makes; WORKERS processes share the tests.
 # make slow, make gpu: the tests that take minutes, and those that need a GPU.
 # make mutants: changes of the source that no test notices; ARGS="dpl/training/metrics.py --sample 60".
