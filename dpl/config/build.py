@@ -23,7 +23,7 @@ from torch import Tensor
 from dpl import training
 from dpl.config import validation
 from dpl.config.validation import ConfigError
-from dpl.fem import Problem, SingularMatrix
+from dpl.fem import Problem, SingularMatrix, YoungRange
 from dpl.fem.units import Units
 from dpl.scene import Scene
 from dpl.system.blas import slow_blas
@@ -155,7 +155,8 @@ def require_keys(cfg: DictConfig, *keys: str) -> None:
 def build_scene(cfg: DictConfig) -> Scene:
     """Return the scene of a configuration; raise a `ConfigError` that names the invalid key."""
     require_keys(cfg, *SCENE)
-    young = OmegaConf.to_container(cfg.young) if isinstance(cfg.young, ListConfig) else cfg.young
+    is_range = isinstance(cfg.young, ListConfig | DictConfig)
+    young = OmegaConf.to_container(cfg.young) if is_range else cfg.young
     problem = _problem(cfg, _one_modulus(young))
     always = _constant_force(cfg, problem)
     solver = instantiate(cfg, "solver", problem=problem)
@@ -167,10 +168,16 @@ def build_scene(cfg: DictConfig) -> Scene:
     return Scene(problem, loads, solver)
 
 
-def _one_modulus(young: float | list[float]) -> float | None:
-    """Return the modulus of all loads [Pa]; None if they have a range of moduli."""
-    moduli = young if isinstance(young, list) else [young]
-    return moduli[0] if len(set(moduli)) == 1 else None
+def _one_modulus(young: Any) -> float | None:
+    """Return the modulus of all loads [Pa]; None if they have a range of moduli.
+
+    Raises a `ConfigError` if `young` is out of range.
+    """
+    try:
+        moduli = YoungRange.of(young)
+    except ValueError as error:  # its message names the key
+        raise ConfigError(str(error)) from error
+    return moduli.low if moduli.low == moduli.high else None
 
 
 def _constant_force(cfg: DictConfig, problem: Problem) -> Tensor | None:
