@@ -155,6 +155,9 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
             names = {name for name in known if name[0] != "_"} - {"hydra"} | more
             return f"{key}: there is no such key; {validation.suggestion(part, names, place)}"
         node, place = known[part], f"{place}{part}."
+    if isinstance(node, dict) and "_target_" not in node and isinstance(one.value(), list):
+        entry = f"{key}.{next(iter(node), 'ENTRY')}"
+        return f"{key} is a mapping here and cannot become a list; set its entries, such as {entry}"
     return None
 
 

@@ -18,6 +18,7 @@ from dpl.fem import (
     Newton,
     Problem,
     SaintVenantKirchhoff,
+    YoungRange,
     box,
     eigenmodes,
     rectangle,
@@ -555,3 +556,86 @@ def test_a_loose_body_is_refused_before_anything_is_factorised(monkeypatch):
     with pytest.raises(ValueError, match="6 rigid modes are unconstrained"):
         eigenmodes(linear, 3)
     assert "factor" not in linear.__dict__
+
+
+def test_selected_modes_are_those_of_their_numbers(linear):
+    every, chosen = ModalLoads(linear, n_modes=5), ModalLoads(linear, modes=[0, 3, 4])
+    expected = every.eigenmodes
+    assert torch.allclose(chosen.eigenmodes.values, expected.values[[0, 3, 4]], rtol=1e-12, atol=0)
+    assert torch.allclose(
+        chosen.eigenmodes.vectors, expected.vectors[..., [0, 3, 4]], rtol=0, atol=1e-8
+    )
+    assert chosen.n_force == 3 + 3
+
+
+def test_one_mode_of_a_pair_with_equal_eigenvalues_can_be_selected(linear):
+    """The square beam bends alike along y and z: mode 0 is the one that leans on y."""
+    pair = [ModalLoads(linear, modes=[k]).eigenmodes for k in (0, 1)]
+    assert float(pair[0].values) == pytest.approx(float(pair[1].values), rel=1e-9)
+    mean = torch.stack([modes.vectors[..., 0].mean(dim=0) for modes in pair])  # (2, D)
+    assert (mean[0, 1] > 0) & (mean[1, 2] > 0)
+    assert torch.allclose(mean[0, [0, 2]], torch.zeros(2).double(), atol=1e-8)
+    assert torch.allclose(mean[1, :2], torch.zeros(2).double(), atol=1e-8)
+
+
+def test_the_softest_selected_mode_has_the_deflection(linear):
+    loads = ModalLoads(linear, modes=[2, 4], deflection=0.1)
+    moved = linear.solve(loads.q_max[0] * loads.eigenmodes.vectors[..., 0])
+    assert float(moved.norm(dim=1).max()) == pytest.approx(0.1, rel=1e-8)
+
+
+def test_forces_of_selected_modes_are_recognised(linear):
+    loads = ModalLoads(linear, modes=[1, 3])
+    amplitude, residual = loads.project(loads.sample(0, range(4)).force)
+    assert float(residual.max()) < 1e-8
+    assert float(amplitude.max()) <= 1 + 1e-8
+
+
+@pytest.mark.parametrize("modes", [[], [-1], [3, 0], [1, 1], [True], [0.0], [500]])
+def test_a_bad_selection_of_modes_raises_an_error_with_its_name(linear, modes):
+    with pytest.raises(ValueError, match=r"^modes = \["):
+        ModalLoads(linear, modes=modes).eigenmodes  # noqa: B018
+
+
+@pytest.mark.parametrize("distribution", ["uniform", "log"])
+def test_moduli_fill_their_range_by_their_distribution(linear, distribution):
+    """Kolmogorov-Smirnov distance of 2,000 moduli from the distribution that is wanted."""
+    young = {"low": 1e6, "high": 1e11, "distribution": distribution}
+    loads = ModalLoads(linear, n_modes=1, young=young)
+    moduli = loads.young_at(loads.points(0, range(2000))).sort().values
+    assert ((moduli >= 1e6) & (moduli <= 1e11)).all()
+    part = (moduli / 1e6).log10() / 5 if distribution == "log" else (moduli - 1e6) / (1e11 - 1e6)
+    assert float((part - torch.linspace(0, 1, 2000).double()).abs().max()) < 0.04
+    assert torch.allclose(loads.moduli.normalise(moduli), 2 * part - 1, atol=1e-12)
+
+
+def test_a_list_and_a_mapping_of_a_uniform_range_are_the_same(linear):
+    one = ModalLoads(linear, n_modes=1, young=[1.0, 3.0])
+    other = ModalLoads(linear, n_modes=1, young={"low": 1.0, "high": 3.0})
+    assert torch.equal(one.sample(0, range(5)).young, other.sample(0, range(5)).young)
+
+
+@pytest.mark.parametrize("distribution", ["uniform", "log"])
+def test_one_modulus_is_a_range_without_width(distribution):
+    moduli = YoungRange(4500.0, 4500.0, distribution)
+    t = torch.linspace(0, 1, 7).double()
+    assert torch.equal(moduli.at(t), torch.full_like(t, 4500.0))
+    assert float(moduli.normalise(torch.tensor(4500.0).double())) == 0
+    assert moduli.middle == pytest.approx(4500.0)
+
+
+@pytest.mark.parametrize(
+    ("young", "said"),
+    [
+        ({"low": 1.0}, r"young\.high is missing"),
+        ({"low": 1.0, "high": 2.0, "mean": 1.5}, r"young\.mean does not exist"),
+        ({"low": 1.0, "high": 2.0, "distribution": "normal"}, r"young\.distribution = 'normal'"),
+        ({"low": 2.0, "high": 1.0}, r"young = \[2\.0, 1\.0\] must be an ascending range"),
+        ({"low": 0.0, "high": 1.0}, r"young = \[0\.0, 1\.0\]"),
+        ([1.0, 2.0, 3.0], r"young = \[1\.0, 2\.0, 3\.0\] must be a modulus"),
+        (-1.0, r"young = -1\.0 must be a modulus"),
+    ],
+)
+def test_moduli_out_of_range_raise_an_error_with_their_name(linear, young, said):
+    with pytest.raises(ValueError, match=said):
+        ModalLoads(linear, n_modes=1, young=young)
