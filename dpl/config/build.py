@@ -4,7 +4,9 @@ Only this folder and `dpl.commands` import Hydra.
 """
 
 import contextlib
+import datetime
 import functools
+import re
 import sys
 import textwrap
 import typing
@@ -40,6 +42,7 @@ NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its re
     *("run", "folder", "ckpt_path", "data.folder"),
     *("callbacks", "logger", "paths", "extras", "trainer.plugins"),
 }
+TIME = re.compile(r"(?:(\d+):)?(\d+):(\d\d):(\d\d)")  # [DD:]HH:MM:SS
 WIDTH = 100  # characters of a line of the plan
 CANNOT_BE_MADE = (  # errors of a call with invalid arguments
     *(InstantiationException, ValueError, TypeError, ArithmeticError, LookupError),
@@ -265,9 +268,26 @@ def build_trainer(cfg: DictConfig) -> "L.Trainer":
     """Return the trainer of a configuration with its callbacks and loggers."""
     require_keys(cfg, "trainer")
     callbacks, loggers = (list(_parts(cfg, key).values()) for key in ("callbacks", "logger"))
-    return typing.cast(
-        "L.Trainer", instantiate(cfg, "trainer", callbacks=callbacks, logger=loggers or False)
-    )
+    more: dict[str, Any] = {"callbacks": callbacks, "logger": loggers or False}
+    if (limit := cfg.trainer.get("max_time")) is not None:
+        more["max_time"] = _time_limit(limit)
+    return typing.cast("L.Trainer", instantiate(cfg, "trainer", **more))
+
+
+def _time_limit(limit: str | DictConfig) -> datetime.timedelta:
+    """Return the time HH:MM:SS or DD:HH:MM:SS, or the sum of units and numbers."""
+    form = "must be HH:MM:SS, DD:HH:MM:SS or {minutes: NUMBER}, and above 0"
+    units = dict(limit) if isinstance(limit, DictConfig) else {}
+    if isinstance(limit, str) and (found := TIME.fullmatch(limit)):
+        names = ("days", "hours", "minutes", "seconds")
+        units = {name: int(part or 0) for name, part in zip(names, found.groups(), strict=True)}
+    try:
+        time = datetime.timedelta(**units)
+    except (TypeError, OverflowError):
+        time = datetime.timedelta()
+    if time <= datetime.timedelta():
+        raise ConfigError(f"trainer.max_time = {limit} {form}")
+    return time
 
 
 def show_plan(scene: Scene, *parts: Any, folder: str | None = None, skipped: bool = True) -> None:
