@@ -4,6 +4,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from benchmarks.discretisation import BEAM
 from dpl.fem import LinearSolver, NeoHookeanLn, Plane, Problem, box, eigenmodes
@@ -58,11 +59,11 @@ def _modes_of_beam(nodes: Sequence[int], count: int, repeats: int) -> ModesTime:
     times = []
     for _ in range(1 + repeats):
         linear = LinearSolver(problem)
-        factor = _timed(lambda linear=linear: linear.factor)
-        modes = _timed(lambda linear=linear: eigenmodes(linear, count))
+        factor = _timed(partial(getattr, linear, "factor"))
+        modes = _timed(partial(eigenmodes, linear, count))
         times.append((*factor, *modes))
     found = len(eigenmodes(linear, count).values)
-    backend = select_backend("auto", problem.pattern, problem.near_null, many_rhs=True)
+    backend = f"{select_backend('auto', problem.pattern, problem.near_null, many_rhs=True)}"
     middle = [statistics.median(column) for column in zip(*times[1:], strict=True)]
     return ModesTime(
         problem.free.numel(), found, backend, middle[0], middle[2], middle[1], middle[3]

@@ -148,6 +148,8 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
             return f"{key} is an entry of a list, which cannot be removed; write the whole list"
         if part not in known and adds:
             return None
+        if part not in known and place and not isinstance(node, dict | list):
+            return f"{key}: {place[:-1]} = {node} is no mapping here; set {place[:-1]} as a whole"
         if part not in known:
             more = validation.options_of(node) if isinstance(node, dict) else set()
             if is_last and part in more and not one.is_delete():

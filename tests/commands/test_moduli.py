@@ -25,7 +25,7 @@ def test_a_run_over_decades_of_moduli_is_resumed_loaded_evaluated_and_exported(
     resumed = script("train", *more, cwd=home)
     assert resumed.status == 0, resumed.err
     assert "E from 1e+06 to 1e+10 Pa, uniform in log E" in resumed.out
-    other = script("train", *more, "young.distribution=uniform", cwd=home)
+    other = script("train", *more, YOUNG.replace("log", "uniform"), cwd=home)
     assert other.status == 2
     assert "young.distribution was log, is uniform" in other.err
     sim = dpl.load(home / "run")
