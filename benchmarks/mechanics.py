@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 CONSOLE = Console(width=150)
 CASES = (
     *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
-    *("discretisation", "sizes", "deflections", "latency"),
+    *("discretisation", "sizes", "modes", "deflections", "latency"),
 )
 FIGURES = "figures"  # the case that draws the rows in `folder` again
 
@@ -184,6 +184,24 @@ def sizes(cfg: DictConfig, backends: list[str]) -> None:
     CONSOLE.print(table)
     beams.draw(rows, Path(cfg.folder) / "sizes.png")
     write_machine(Path(cfg.folder) / "sizes.json")
+
+
+def modes(cfg: DictConfig, backends: list[str]) -> None:
+    """Write the times of K(0)'s factor and of its modes on beams of growing size."""
+    from benchmarks import modes as beams
+
+    rows = []
+    table = Table("five modes or more of a beam", "DOFs", "factor of K(0) [s]", "modes [s]", "CPU")
+    for row in beams.mode_times(repeats=cfg.repeats):
+        rows.append(row)
+        write(rows, Path(cfg.folder) / "modes.csv")
+        name = f"{row.modes} modes, {row.backend}" if row.backend else "paper"
+        factor = "" if row.factor_s is None else f"{row.factor_s:.3f}"
+        known = (row.factor_cpu_s, row.modes_cpu_s)
+        cpu = "" if None in known else " + ".join(f"{part:.3f}" for part in known)
+        table.add_row(name, f"{row.dofs:,}", factor, f"{row.modes_s:.3f}", cpu)
+    CONSOLE.print(table)
+    write_machine(Path(cfg.folder) / "modes.json")
 
 
 def deflections(cfg: DictConfig, backends: list[str]) -> None:

@@ -11,7 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem import LinearSolver, Load, LoadFamily, Newton, Problem, ReferenceSolver, solve
+from dpl.fem import (
+    LinearSolver,
+    Load,
+    LoadFamily,
+    Newton,
+    Problem,
+    ReferenceSolver,
+    YoungRange,
+    moduli_of,
+    solve,
+)
 from dpl.fem.identity import plain, sha256_of
 from dpl.fem.solvers.solution import as_column
 
@@ -213,7 +223,7 @@ class Scene:
                 f"{problem.points.numel():,} degrees of freedom",
             ),
             ("supports", f"{fixed:,} nodes {moved}{springs}"),
-            ("law", f"{law}, {_modulus(loads.young_range)}"),
+            ("law", f"{law}, {_modulus(moduli_of(loads))}"),
             (
                 "loads",
                 f"{type(loads).__name__}; the largest of {FEW}: {force:.3g} {unit}{bends}",
@@ -236,7 +246,7 @@ class Scene:
         """Return one line for each computation that this scene does not need."""
         problem, loads = self.problem, self.loads
         cells, points = len(problem.cells), problem.dV.shape[1]
-        young = _modulus(loads.young_range)
+        young = _modulus(moduli_of(loads))
         lines = [f"no E input, no samples per E: u/L depends on f/(E L^2) only ({young})"]
         for name, ends in loads.parameter_ranges.items():
             lines.append(
@@ -262,10 +272,13 @@ class Scene:
         return lines + loads.skipped_work()
 
 
-def _modulus(ends: tuple[float, float]) -> str:
+def _modulus(moduli: YoungRange) -> str:
     """Return Young's modulus, or its range, as text."""
-    low, high = ends
-    return f"E = {low:.4g} Pa" if low == high else f"E from {low:.4g} to {high:.4g} Pa"
+    low, high = moduli.low, moduli.high
+    if low == high:
+        return f"E = {low:.4g} Pa"
+    is_log = moduli.distribution == "log"
+    return f"E from {low:.4g} to {high:.4g} Pa{', uniform in log E' if is_log else ''}"
 
 
 def _plain(identity: Any) -> Any:

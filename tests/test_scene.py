@@ -93,6 +93,7 @@ CHANGES = {
     "clamped part": {"fixed": Box((0, 0, 0), (0, 25, 13))},
     "tolerance": {"tol": 1e-6},
     "modes": {"n_modes": 2},
+    "selected modes": {"modes": [0, 1, 2]},
     "deflection": {"deflection": 0.41},
     "patch radius": {"patch_radius": (0.0, 0.5)},
     "distribution": {"distribution": normal},
@@ -133,6 +134,17 @@ def test_the_identity_names_the_options_of_the_loads_and_no_other(make_scene, sc
         {"newton": partial(Newton, max_total_iter=9)},
     ):
         assert make_scene(**options).fingerprint == scene.fingerprint
+
+
+def test_selected_modes_replace_their_number_in_the_identity(make_scene):
+    one, other = (make_scene(modes=[0, 2], n_modes=n) for n in (3, 5))
+    assert one.fingerprint == other.fingerprint != make_scene(modes=[0, 1]).fingerprint
+    assert "n_modes" not in one.identity()["loads"]
+
+
+def test_the_distribution_of_moduli_changes_no_data_set(make_scene, scene):
+    wide = make_scene(young={"low": 1e6, "high": 2e11, "distribution": "log"})
+    assert wide.fingerprint == scene.fingerprint
 
 
 def test_the_order_of_arguments_tells_no_scenes_apart(make_scene):
@@ -226,6 +238,8 @@ def test_the_plan_names_one_modulus_or_the_range(make_scene, scene):
     assert lines_with(scene, "no E input")[0].endswith("(E = 4500 Pa)")
     ranged = make_scene(young=[1e9, 2e11])
     assert lines_with(ranged, "no E input")[0].endswith("(E from 1e+09 to 2e+11 Pa)")
+    decades = make_scene(young={"low": 1e9, "high": 2e11, "distribution": "log"})
+    assert lines_with(decades, "no E input")[0].endswith("2e+11 Pa, uniform in log E)")
 
 
 def test_the_plan_shares_gradients_only_among_equal_cells(make_scene, scene):

@@ -1,9 +1,9 @@
 """Measure run times of the mechanics and of public codes: python scripts/benchmark.py.
 
 Long cases on demand: cases=[large] (run alone, it reports its memory), cases=[robustness],
-cases=[generation], cases=[sizes]; errors of other meshes: cases=[discretisation];
-displacements of the test loads: cases=[deflections] count=100; latency and throughput of a
-trained run: cases=[latency] run=runs/mine.
+cases=[generation], cases=[sizes], cases=[modes] (time of the eigenmodes); errors of other
+meshes: cases=[discretisation]; displacements of the test loads: cases=[deflections] count=100;
+latency and throughput of a trained run: cases=[latency] run=runs/mine.
 """
 
 from collections.abc import Sequence

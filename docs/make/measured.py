@@ -36,7 +36,7 @@ class Part:
 
 PARTS = (
     Part(
-        r"(beam_svk|propeller_nh|beam_nh_loss|beam_young)",
+        r"(beam_svk|propeller_nh|beam_nh_loss|beam_young|beam_young_wide)",
         "All methods on `{0}`",
         "python scripts/results.py name={0}",
         "All runs below `runs/{0}`, the linear solution, POD-Galerkin and the paper: 100 test "
@@ -108,6 +108,13 @@ PARTS = (
         "Cost against degrees of freedom",
         "python scripts/benchmark.py cases=[sizes] repeats=3 folder=benchmarks/results",
         "Beams of 4 to 20 elements across, each in its own process, with random weights.",
+    ),
+    Part(
+        "modes",
+        "Time of the eigenmodes",
+        "python scripts/benchmark.py cases=[modes] folder=benchmarks/results",
+        "Clamped beams, one thread, medians. CPU times exclude the time in which other programs "
+        "used the core. The first row is the paper's.",
     ),
     Part(
         "deflections",

@@ -19,6 +19,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
+from dpl import config
 from dpl.commands import dry_run, help_text
 from dpl.config import CONF, ConfigError, Keys
 from dpl.system.files import DataSetError
@@ -182,10 +183,7 @@ def check_trainer(trainer: Any, cfg: DictConfig) -> None:
     from dpl.training import checkpoints
 
     if cfg.scheduler and trainer.max_epochs == -1 and trainer.max_steps == -1:
-        raise ConfigError(
-            "trainer.max_epochs = -1: the schedule of the learning rate needs an end; set "
-            "trainer.max_epochs or trainer.max_steps, or scheduler=null"
-        )
+        _check_schedule_in_time(cfg)
     if not trainer.fast_dev_run and not any(
         checkpoints.writes_loadable(one, trainer, cfg.folder) for one in trainer.callbacks
     ):
@@ -204,6 +202,23 @@ def check_trainer(trainer: Any, cfg: DictConfig) -> None:
             "again; set trainer.strategy=ddp_spawn, or start each run by torchrun or on a cluster "
             "(hydra/launcher=submitit_slurm)"
         )
+
+
+def _check_schedule_in_time(cfg: DictConfig) -> None:
+    """Raise a `ConfigError` unless a time limit is the end of the learning-rate schedule."""
+    import torch
+
+    reason = "the schedule of the learning rate needs an end"
+    if cfg.trainer.get("max_time") is not None:
+        trial = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+        schedule = config.instantiate(cfg, "scheduler", optimizer=trial, total_steps=1)
+        if isinstance(schedule, torch.optim.lr_scheduler.LambdaLR):
+            return
+        reason += f", and {type(schedule).__name__} does not follow trainer.max_time"
+    raise ConfigError(
+        f"trainer.max_epochs = -1: {reason}; set trainer.max_epochs or trainer.max_steps, or "
+        "scheduler=null"
+    )
 
 
 def best_error(trainer: Any) -> float | None:

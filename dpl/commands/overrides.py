@@ -148,6 +148,8 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
             return f"{key} is an entry of a list, which cannot be removed; write the whole list"
         if part not in known and adds:
             return None
+        if part not in known and place and not isinstance(node, dict | list):
+            return f"{key}: {place[:-1]} = {node} is no mapping here; set {place[:-1]} as a whole"
         if part not in known:
             more = validation.options_of(node) if isinstance(node, dict) else set()
             if is_last and part in more and not one.is_delete():
@@ -155,6 +157,9 @@ def _bad_key(one: Override, base: DictConfig) -> str | None:
             names = {name for name in known if name[0] != "_"} - {"hydra"} | more
             return f"{key}: there is no such key; {validation.suggestion(part, names, place)}"
         node, place = known[part], f"{place}{part}."
+    if isinstance(node, dict) and "_target_" not in node and isinstance(one.value(), list):
+        entry = f"{key}.{next(iter(node), 'ENTRY')}"
+        return f"{key} is a mapping here and cannot become a list; set its entries, such as {entry}"
     return None
 
 

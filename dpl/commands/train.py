@@ -29,6 +29,8 @@ def parts(cfg: DictConfig) -> tuple["dpl.Scene", Any, "dpl.Surrogate", Any]:
         config.check_weights(surrogate, resumed, grows=data.growth is not None)
     trainer = config.build_trainer(cfg)
     cli.check_trainer(trainer, cfg)
+    if resumed is not None:
+        config.check_callbacks(trainer, resumed)
     if data.growth is not None:
         _check_trainer_of_growth(trainer)
     return scene, data, surrogate, trainer

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         to_container,
     )
     from dpl.config.resume import (
+        check_callbacks,
         check_resumed,
         check_weights,
         resumed_config,

@@ -4,7 +4,9 @@ Only this folder and `dpl.commands` import Hydra.
 """
 
 import contextlib
+import datetime
 import functools
+import re
 import sys
 import textwrap
 import typing
@@ -23,7 +25,7 @@ from torch import Tensor
 from dpl import training
 from dpl.config import validation
 from dpl.config.validation import ConfigError
-from dpl.fem import Problem, SingularMatrix
+from dpl.fem import Problem, SingularMatrix, YoungRange
 from dpl.fem.units import Units
 from dpl.scene import Scene
 from dpl.system.blas import slow_blas
@@ -40,6 +42,7 @@ NOT_IDENTITY = {  # keys of the place and the monitoring of a run, not of its re
     *("run", "folder", "ckpt_path", "data.folder"),
     *("callbacks", "logger", "paths", "extras", "trainer.plugins"),
 }
+TIME = re.compile(r"(?:(\d+):)?(\d+):(\d\d):(\d\d)")  # [DD:]HH:MM:SS
 WIDTH = 100  # characters of a line of the plan
 CANNOT_BE_MADE = (  # errors of a call with invalid arguments
     *(InstantiationException, ValueError, TypeError, ArithmeticError, LookupError),
@@ -155,7 +158,8 @@ def require_keys(cfg: DictConfig, *keys: str) -> None:
 def build_scene(cfg: DictConfig) -> Scene:
     """Return the scene of a configuration; raise a `ConfigError` that names the invalid key."""
     require_keys(cfg, *SCENE)
-    young = OmegaConf.to_container(cfg.young) if isinstance(cfg.young, ListConfig) else cfg.young
+    is_range = isinstance(cfg.young, ListConfig | DictConfig)
+    young = OmegaConf.to_container(cfg.young) if is_range else cfg.young
     problem = _problem(cfg, _one_modulus(young))
     always = _constant_force(cfg, problem)
     solver = instantiate(cfg, "solver", problem=problem)
@@ -167,10 +171,16 @@ def build_scene(cfg: DictConfig) -> Scene:
     return Scene(problem, loads, solver)
 
 
-def _one_modulus(young: float | list[float]) -> float | None:
-    """Return the modulus of all loads [Pa]; None if they have a range of moduli."""
-    moduli = young if isinstance(young, list) else [young]
-    return moduli[0] if len(set(moduli)) == 1 else None
+def _one_modulus(young: Any) -> float | None:
+    """Return the modulus of all loads [Pa]; None if they have a range of moduli.
+
+    Raises a `ConfigError` if `young` is out of range.
+    """
+    try:
+        moduli = YoungRange.of(young)
+    except ValueError as error:  # its message names the key
+        raise ConfigError(str(error)) from error
+    return moduli.low if moduli.low == moduli.high else None
 
 
 def _constant_force(cfg: DictConfig, problem: Problem) -> Tensor | None:
@@ -258,9 +268,26 @@ def build_trainer(cfg: DictConfig) -> "L.Trainer":
     """Return the trainer of a configuration with its callbacks and loggers."""
     require_keys(cfg, "trainer")
     callbacks, loggers = (list(_parts(cfg, key).values()) for key in ("callbacks", "logger"))
-    return typing.cast(
-        "L.Trainer", instantiate(cfg, "trainer", callbacks=callbacks, logger=loggers or False)
-    )
+    more: dict[str, Any] = {"callbacks": callbacks, "logger": loggers or False}
+    if (limit := cfg.trainer.get("max_time")) is not None:
+        more["max_time"] = _time_limit(limit)
+    return typing.cast("L.Trainer", instantiate(cfg, "trainer", **more))
+
+
+def _time_limit(limit: str | DictConfig) -> datetime.timedelta:
+    """Return the time HH:MM:SS or DD:HH:MM:SS, or the sum of units and numbers."""
+    form = "must be HH:MM:SS, DD:HH:MM:SS or {minutes: NUMBER}, and above 0"
+    units = dict(limit) if isinstance(limit, DictConfig) else {}
+    if isinstance(limit, str) and (found := TIME.fullmatch(limit)):
+        names = ("days", "hours", "minutes", "seconds")
+        units = {name: int(part or 0) for name, part in zip(names, found.groups(), strict=True)}
+    try:
+        time = datetime.timedelta(**units)
+    except (TypeError, OverflowError):
+        time = datetime.timedelta()
+    if time <= datetime.timedelta():
+        raise ConfigError(f"trainer.max_time = {limit} {form}")
+    return time
 
 
 def show_plan(scene: Scene, *parts: Any, folder: str | None = None, skipped: bool = True) -> None:

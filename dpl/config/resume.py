@@ -170,6 +170,18 @@ def check_weights(
         )
 
 
+def check_callbacks(trainer: Any, checkpoint: dict[str, Any]) -> None:
+    """Check that a trainer continues the average of the weights of the checkpoint to resume.
+
+    Raises:
+        ConfigError: The checkpoint contains averaged weights, and the trainer does not average.
+    """
+    averages = any(isinstance(one, training.AveragedWeights) for one in trainer.callbacks)
+    name = training.AveragedWeights.__name__
+    if not averages and any(str(key).startswith(name) for key in checkpoint["callbacks"]):
+        raise ConfigError("ckpt_path: the run averages its weights; add callbacks=ema")
+
+
 def _changes(theirs: dict[str, Any], ours: dict[str, Any]) -> list[str]:
     """Return the differences that a resumed run must not have from its configuration, as lines."""
     before, now = (

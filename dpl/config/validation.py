@@ -36,7 +36,9 @@ KEYS: Keys = (  # of all commands
     (float, "tol", 1e-15, 1),
     (Sequence[float], "tols errors", 1e-15, 1),
     (Sequence[int | None], "threads", 1, 10**4),
-    (float | Sequence[float], "young", 1e-30, 1e30),  # [Pa]
+    (float | Sequence[float] | Mapping[str, float | str], "young", 1e-30, 1e30),  # [Pa]
+    (float, "young.low young.high", 1e-30, 1e30),
+    (Literal["uniform", "log"], "young.distribution"),
 )
 TRAINING: Keys = (  # of a training; the types are those of signatures, 1e-30 stands for "above 0"
     (object, "data.train", 1, 10**7),
@@ -116,6 +118,7 @@ def check(
     for path, node in iter_nodes(resolved):
         if path in known:
             _check_value(path, node, *known[path])
+            _check_keys(path, node, known)
         if isinstance(node, dict) and "_target_" in node:
             _check_call(path, node, _target(path, node["_target_"], trust=trust))
         elif _is_call(path) and node is not None:
@@ -144,6 +147,16 @@ def _check_value(
         if isinstance(one, int | float) and not least <= one <= most and not unlimited:
             span = f"between {least:g} and {most:.10g}{' or be -1' if key in UNLIMITED else ''}"
             raise ConfigError(f"{key} = {value} must lie {span}")
+
+
+def _check_keys(path: str, node: Any, known: Collection[str]) -> None:
+    """Check the keys of a mapping whose keys are listed in `KEYS`."""
+    names = {key.rpartition(".")[2] for key in known if key.startswith(f"{path}.")}
+    if isinstance(node, dict) and "_target_" not in node and names:
+        for key in map(str, node):
+            if key not in names:
+                message = suggestion(key, names, f"{path}.")
+                raise ConfigError(f"{path}.{key}: there is no such key; {message}")
 
 
 def _target(path: str, name: Any, *, trust: bool) -> Callable[..., Any]:
@@ -285,6 +298,8 @@ def _describe(hint: Any) -> str:
         return " or ".join(map(_describe, arguments))
     if origin is Literal:
         return f"one of {', '.join(map(str, arguments))}"
+    if origin is Mapping:
+        return "a mapping"
     if origin is Sequence:
         return f"a list, each {_describe(arguments[0])}"
     return names.get(hint, str(hint))

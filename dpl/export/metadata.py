@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dpl.export.onnx_graph import ExportGraph, onnx_opset
 from dpl.export.reference import Reference
-from dpl.fem import HasModes, Problem, surface
+from dpl.fem import HasModes, Problem, moduli_of, surface
 from dpl.fem.mesh.writing import flat_cells
 from dpl.fem.postprocess import triangles
 from dpl.scene import Scene
@@ -76,7 +76,13 @@ def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
     loads, field = scene.loads, ["B", *scene.problem.shape]
     known: dict[str, dict[str, Any]] = {
         "force": {"shape": field, "type": "float64", "unit": _force_unit(scene)},
-        "young": {"shape": ["B"], "type": "float64", "unit": "Pa", "range": loads.young_range},
+        "young": {
+            "shape": ["B"],
+            "type": "float64",
+            "unit": "Pa",
+            "range": loads.young_range,
+            "distribution": moduli_of(loads).distribution,
+        },
         "parameters": {
             "shape": ["B", len(loads.parameter_ranges)],
             "type": "float64",

@@ -8,10 +8,11 @@ if TYPE_CHECKING:
     from dpl.fem.assembly.boundary_conditions import DirichletBC, RobinBC
     from dpl.fem.linear.backends import installed_backends
     from dpl.fem.linear.interface import SingularMatrix
-    from dpl.fem.loads.family import HasModes, LoadFamily, RandomLoads
+    from dpl.fem.loads.family import HasModes, HasModuli, LoadFamily, RandomLoads, moduli_of
     from dpl.fem.loads.forces import BodyForce, Traction
     from dpl.fem.loads.modal import ModalLoads
     from dpl.fem.loads.modal_basis import Modes, eigenmodes
+    from dpl.fem.loads.young import YoungRange
     from dpl.fem.materials.invariant_based import InvariantBasedMaterial
     from dpl.fem.materials.linear_elastic import LinearElastic
     from dpl.fem.materials.material import Material, YoungPoissonMaterial

@@ -5,6 +5,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from dpl.fem import moduli_of
 from dpl.models.linear_base import Base
 from dpl.models.scalar_inputs import ScalarInputs
 from dpl.scene import Scene
@@ -47,8 +48,9 @@ class FCNN(nn.Module):
             width: Units of the hidden layers; None for the number of outputs.
             all_dofs: Use all degrees of freedom as inputs and outputs, as in the paper.
             young: Use forces over the largest Young's modulus, and Young's modulus, as inputs. The
-                paper does so for a range of moduli. It adds no information, since u/L depends on
-                f/(E L^2) alone.
+                paper does so for a range of moduli. The second input is E, or log E for moduli with
+                a logarithmic distribution, mapped to [-1, 1]. It adds no information, since u/L
+                depends on f/(E L^2) alone.
             base: "linear" for the nonlinear displacement as output, see `LinearBase`.
             memory_limit: Memory for training [GB]; None for that of the machine.
 
@@ -70,10 +72,7 @@ class FCNN(nn.Module):
         loaded = scene.problem.free if base == "linear" else scene.loads.loadable_dofs
         inputs = everything if all_dofs else loaded
         outputs = everything if all_dofs else scene.problem.free
-        low, high = scene.loads.young_range
-        self.young_max = high  # [Pa]
-        self.young_mean = (low + high) / 2  # [Pa]
-        self.young_scale = (high - low) / 2 or high  # [Pa]; without a range the modulus itself
+        self.moduli = moduli_of(scene.loads)
         self.extra_inputs = (*(("young",) if young else ()), *self.scalars.names)
         n_inputs = int(inputs.sum()) + young + self.scalars.count
         n_outputs = int(outputs.sum())
@@ -116,8 +115,8 @@ class FCNN(nn.Module):
                 raise ValueError(
                     "young is an input of this network; give Young's moduli, (B,) [Pa]"
                 )
-            stiffness = (young / self.young_max).to(force.dtype)[:, None]
-            normalised = ((young - self.young_mean) / self.young_scale).to(force.dtype)[:, None]
+            stiffness = (young / self.moduli.high).to(force.dtype)[:, None]
+            normalised = self.moduli.normalise(young).to(force.dtype)[:, None]
             inputs = torch.cat([stiffness * inputs, normalised], dim=1)
         if self.scalars.count:
             values = self.scalars(force, amplitude, parameters)

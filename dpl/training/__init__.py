@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
+    from dpl.training.callbacks.averaged_weights import AveragedWeights
     from dpl.training.callbacks.closed_form import ClosedFormTraining
     from dpl.training.callbacks.nonfinite_gradients import Diverged, SkipNonFiniteGradients
     from dpl.training.callbacks.tensorboard import LogHyperparameters, LogLearningRate

@@ -2,7 +2,11 @@
 
 import math
 
+import lightning as L
 import torch
+from lightning.pytorch.callbacks import Timer
+
+STEPS_OF_UNLIMITED = 10_000  # of a schedule whose training is limited by time alone
 
 
 def warmup_cosine(
@@ -28,3 +32,31 @@ def warmup_cosine(
         return 0.5 + 0.5 * math.cos(math.pi * min(1.0, (step - rise) / max(1, total_steps - rise)))
 
     return torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+
+
+def total_steps(trainer: L.Trainer) -> int:
+    """Return the number of steps of a schedule; that of a training without limit is arbitrary."""
+    steps = trainer.estimated_stepping_batches
+    return int(steps) if math.isfinite(steps) else STEPS_OF_UNLIMITED
+
+
+def time_fraction(trainer: L.Trainer) -> float:
+    """Return the elapsed part of `trainer.max_time`, the same in all processes; 0 without limit."""
+    for timer in trainer.callbacks:
+        if isinstance(timer, Timer) and (remaining := timer.time_remaining()) is not None:
+            elapsed = timer.time_elapsed()
+            part = elapsed / max(elapsed + remaining, 1e-9)
+            return float(trainer.strategy.broadcast(part))
+    return 0.0
+
+
+def step_in_time(schedule: torch.optim.lr_scheduler.LambdaLR, steps: int, fraction: float) -> None:
+    """Make the next step of a schedule, or a larger one if the time limit is nearer than the end.
+
+    Args:
+        schedule: The schedule, a function of the number of the step.
+        steps: Number of steps in the schedule.
+        fraction: Elapsed part of the time limit.
+    """
+    schedule.last_epoch = max(schedule.last_epoch, math.floor(fraction * steps) - 1)
+    schedule.step()

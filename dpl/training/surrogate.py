@@ -16,11 +16,13 @@ from dpl.models.linear_base import LinearBase, check_base
 from dpl.models.protocols import ClosedFormFit, HasBase, TrainsInCoordinates
 from dpl.models.reduced_samples import ReducedDataset, ReducedSamples
 from dpl.scene import Sample, Scene
+from dpl.training.callbacks.averaged_weights import AveragedWeights
 from dpl.training.callbacks.closed_form import ClosedFormTraining
 from dpl.training.linear_samples import LinearBatch, LinearSamples
 from dpl.training.losses.loss import Loss, LossContext
 from dpl.training.losses.supervised import SquaredErrorLoss
 from dpl.training.metrics import default_metrics
+from dpl.training.schedules import step_in_time, time_fraction, total_steps
 
 SCALE_STREAM = 3  # random stream of the loads for the scales; samples use smaller numbers
 
@@ -58,7 +60,9 @@ class Surrogate(L.LightningModule):
             scene: The scene.
             optimizer: Function of the parameters that returns an optimiser.
             scheduler: Function of an optimiser and `total_steps` that returns a learning-rate
-                schedule, stepped every batch; None for a constant learning rate.
+                schedule, stepped every batch; None for a constant learning rate. With a time limit
+                of the trainer a `LambdaLR` is a function of max(step / total_steps, elapsed part
+                of the time).
 
         Raises:
             ValueError: The law has ranges and the network no input for parameters, or the network
@@ -273,6 +277,11 @@ class Surrogate(L.LightningModule):
         if self.current_epoch + 1 == self.trainer.max_epochs:
             self.trainer.check_val_every_n_epoch = 1
 
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Let the epoch be validated in which a time limit ends the training."""
+        if self.trainer.should_stop:
+            self.trainer.check_val_every_n_epoch = 1
+
     def configure_optimizers(self) -> Any:
         """Return the optimiser with its schedule; None without parameters."""
         if self._is_closed_form:
@@ -282,18 +291,30 @@ class Surrogate(L.LightningModule):
         optimizer = self._optimizer(self.parameters())
         if self._scheduler is None:
             return optimizer
-        steps = int(self.trainer.estimated_stepping_batches)
+        steps = total_steps(self.trainer)
         schedule = {"scheduler": self._scheduler(optimizer, total_steps=steps), "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": schedule}
 
+    def lr_scheduler_step(self, scheduler: Any, metric: Any | None) -> None:
+        """Make a step of the schedule; functions of the step follow a time limit of the trainer."""
+        fraction = time_fraction(self.trainer)
+        if fraction and isinstance(scheduler, torch.optim.lr_scheduler.LambdaLR):
+            step_in_time(scheduler, total_steps(self.trainer), fraction)
+        else:
+            super().lr_scheduler_step(scheduler, metric)
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Store the identity of the scene and the states of random number generators."""
+        """Store the scene, the states of random number generators and averaged weights."""
         checkpoint |= {
             "scene": self.scene.fingerprint,
             "identity": self.scene.identity(),
             "nodes": self.scene.problem.shape[0],
             "random": random_states(),
         }
+        # not a hook of the callback: Lightning calls those only for complete checkpoints
+        for callback in self._trainer.callbacks if self._trainer else ():
+            if isinstance(callback, AveragedWeights):
+                callback.replace_weights(checkpoint)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Check that the checkpoint belongs to this scene.

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem import Load, Solution
+from dpl.fem import Load, Solution, moduli_of
 from dpl.fem.solvers import check_tol
 from dpl.inference import Answer, Simulator
 from dpl.system.threads import one_thread
@@ -100,7 +100,7 @@ class Body:
         self.simulator = simulator
         self.scene = simulator.scene
         self.surface = Surface.of(self.scene.problem)
-        self.young = sum(self.scene.loads.young_range) / 2
+        self.young = moduli_of(self.scene.loads).middle
         ranges = self.scene.loads.parameter_ranges
         self.parameters = {name: sum(ends) / 2 for name, ends in ranges.items()}
         self._without_galerkin = simulator

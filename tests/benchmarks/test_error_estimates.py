@@ -29,7 +29,7 @@ def samples(scene):
 @pytest.fixture(scope="module")
 def newton(scene):
     """Newton's method in three modes, which knows its error outside of them."""
-    vectors = torch.linalg.qr(scene.loads.modes.vectors[..., :3].flatten(0, 1)).Q
+    vectors = torch.linalg.qr(scene.loads.eigenmodes.vectors[..., :3].flatten(0, 1)).Q
     vectors = vectors.reshape(*scene.problem.shape, 3) * scene.problem.free[..., None]
     return SubspaceNewton(scene.problem, vectors, outside_error=2e-3)
 

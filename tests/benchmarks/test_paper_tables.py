@@ -146,6 +146,8 @@ def test_rows_of_the_paper_are_marked_as_such():
     assert row.rel_L2_worst == pytest.approx(0.38, abs=0.005), "the paper's text: 38 %"
     both = paper_tables.paper("beam_young")
     assert [(row.method, row.samples) for row in both] == [("paper", 10650), ("paper, 3b", None)]
+    (wide,) = paper_tables.paper("beam_young_wide")
+    assert (wide.method, wide.e_mean, wide.e_max) == ("paper", 1e-4, None)
     assert paper_tables.paper("mine") == []
 
 

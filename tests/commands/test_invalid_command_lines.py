@@ -44,6 +44,8 @@ NONSENSE = {  # command line -> what the one line says
     "train seed=1 -m seed=2": r"^unrecognized arguments: seed=2; flags such as -m stand before",
     "train --config-dir nowhere": r"^--config-dir = nowhere must be an existing folder$",
     "train --config-name nowhere": r"^Cannot find primary config 'nowhere'",
+    "train experiment=beam_young young=[1,2]": r"^young is a mapping here .* such as young\.low$",
+    "train young.low=1e6": r"^young\.low: young = 4500\.0 is no mapping here; set young",
     "train young=${nowhere}": r"^young: Interpolation key 'nowhere' not found$",
     "train run=null": r"^run = null must be a text",
     "train run=${nowhere}": r"^run = \$\{nowhere\} must be a text",

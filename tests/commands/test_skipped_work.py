@@ -57,7 +57,7 @@ def small(scene, size):
 
 def test_rest_stiffness_is_factorised_once_for_modes_answers_and_first_steps(make_scene, calls):
     scene = make_scene()
-    scene.loads.modes  # noqa: B018
+    scene.loads.eigenmodes  # noqa: B018
     assert calls["factorise"] == 1
     load = scene.loads.sample((0, 0), range(3))
     for force in load.force:
@@ -210,7 +210,7 @@ def test_inputs_and_outputs_are_only_where_something_happens(scene):
 
 def test_a_plan_computes_no_sample(scene, tmp_path, calls):
     module = OfflineData(scene, folder=str(tmp_path / "none"), workers=0)
-    scene.loads.modes  # noqa: B018
+    scene.loads.eigenmodes  # noqa: B018
     calls.clear()
     assert scene.skipped_work()
     (where,) = module.skipped_work()

@@ -48,6 +48,13 @@ BAD = {  # override -> what the message must name
     "young=[1e9]": r"young = ",
     "young=[1e9,2e9,3e9]": r"young = ",
     "young=null": r"young = None",
+    "young={low:1e6}": r"young\.high is missing",
+    "young={low:1e6,hihg:1e9}": r"young\.hihg: there is no such key; did you mean young\.high\?",
+    "young={low:1e9,high:1e6}": r"young = \[1000000000\.0, 1000000\.0\] must be an ascending",
+    "young={low:0,high:1e6}": r"young\.low = 0 must lie between",
+    "young={low:abc,high:1e6}": r"young\.low = 'abc' must be a number",
+    "young={low:1,high:2,distribution:normal}": r"young\.distribution = 'normal' must be one of",
+    "young={low:1,high:2,_target_:os.system}": r"young\.",
     "young=true": r"young = True",
     "mesh.nodes=[5,3]": r"mesh: nodes = \[5, 3\]",
     "mesh.nodes=[5,3,1]": r"mesh: nodes = \[5, 3, 1\]",
@@ -76,6 +83,11 @@ BAD = {  # override -> what the message must name
     "loads.n_modes=0": r"loads: n_modes = 0",
     "loads.n_modes=2.5": r"loads\.n_modes = 2\.5 must be a whole number",
     "loads.n_modes=1000": r"n_modes = 1000",
+    "loads.modes=[3,0]": r"loads: modes = \[3, 0\] must be ascending",
+    "loads.modes=[]": r"loads: modes = \[\] must be ascending",
+    "loads.modes=[-1]": r"loads: modes = \[-1\] must be ascending",
+    "loads.modes=[0.5]": r"loads\.modes = \[0\.5\] must be a list, each a whole number",
+    "loads.modes=[1000]": r"loads: modes = \[1000\] must lie between 0 and",
     "loads.deflection=-0.1": r"loads: deflection = -0\.1",
     "loads.deflection=nan": r"loads\.deflection = nan",
     "loads.patch_radius=[0.5,0.1]": r"loads: patch_radius = \[0\.5, 0\.1\]",
@@ -489,10 +501,13 @@ def test_a_run_comes_back_as_it_was(trained):
     assert cfg.mesh.nodes == [5, 3, 3]
 
 
+@pytest.mark.parametrize(
+    "young", ["[1e6,2.03e11]", "{low:1e6,high:2.03e11}", "{low:1e6,high:2.03e11,distribution:log}"]
+)
 def test_a_run_over_a_range_of_moduli_with_e_as_an_input_comes_back_as_it_was(
-    tiny_training, tmp_path
+    tiny_training, tmp_path, young
 ):
-    wide = ["young=[1e6,2.03e11]", "model.young=true"]
+    wide = [f"young={young}", "model.young=true"]
     surrogate = _trained(tmp_path, *tiny_training, *wide)
     _, again = run_folder.load_run(tmp_path)
     load = surrogate.scene.loads.sample((0, 2), range(4))

@@ -154,8 +154,8 @@ def test_the_first_samples_do_not_depend_on_how_many_there_are(data):
 
 def test_the_modes_are_kept_with_the_data(data, scene):
     kept = data.store.modes()
-    assert torch.equal(kept["values"], scene.loads.modes.values)
-    assert torch.equal(kept["vectors"], scene.loads.modes.vectors)
+    assert torch.equal(kept["values"], scene.loads.eigenmodes.values)
+    assert torch.equal(kept["vectors"], scene.loads.eigenmodes.vectors)
 
 
 def test_the_data_set_carries_fingerprint_seed_and_versions(data, scene):

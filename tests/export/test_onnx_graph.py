@@ -61,6 +61,11 @@ NETWORKS = {
         {"width": 16, "all_dofs": True, "young": True},
         {"young": [1e3, 9e3]},
     ),
+    "fcnn, young, log": (
+        FCNN,
+        {"width": 16, "young": True},
+        {"young": {"low": 1e3, "high": 1e8, "distribution": "log"}},
+    ),
     "fcnn, poisson": (FCNN, {"width": 16}, {"poisson": [0.2, 0.4]}),
     "cnn": (CNN, {"channels": 4}, {}),
     "cnn, immersed": (CNN, {"channels": 4, "grid": 7}, {"young": [1e9, 2e11]}),

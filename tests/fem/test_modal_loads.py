@@ -18,6 +18,7 @@ from dpl.fem import (
     Newton,
     Problem,
     SaintVenantKirchhoff,
+    YoungRange,
     box,
     eigenmodes,
     rectangle,
@@ -164,18 +165,18 @@ def test_small_loads_along_a_mode_move_the_body_along_it(beam, law):
 @pytest.mark.parametrize("deflection", [0.1, 0.4, 1.0])
 def test_the_softest_mode_at_its_largest_reaches_the_deflection(linear, deflection):
     loads = ModalLoads(linear, n_modes=3, deflection=deflection)
-    answer = linear.solve(loads.q_max[0] * loads.modes.vectors[..., 0])
+    answer = linear.solve(loads.q_max[0] * loads.eigenmodes.vectors[..., 0])
     assert float(answer.norm(dim=1).max()) == pytest.approx(deflection, rel=1e-8)
 
 
 def test_largest_modal_loads_have_equal_energy(linear, loads):
     energies = [
         float((force * linear.solve(force)).sum())
-        for force in (q * loads.modes.vectors[..., k] for k, q in enumerate(loads.q_max))
+        for force in (q * loads.eigenmodes.vectors[..., k] for k, q in enumerate(loads.q_max))
     ]
     assert energies == pytest.approx([energies[0]] * len(energies), rel=1e-8)
     assert loads.largest_force == pytest.approx(
-        float((loads.modes.vectors @ loads.q_max).norm()), rel=1e-10
+        float((loads.eigenmodes.vectors @ loads.q_max).norm()), rel=1e-10
     )
 
 
@@ -225,7 +226,7 @@ def test_samples_are_the_loads_of_points(linear, sampling):
     points = loads.points((3, 0), [2, 5])
     assert points.shape == (2, loads.n_random)
     assert points.dtype == torch.float64
-    assert loads.n_random == len(loads.modes.values) + 4
+    assert loads.n_random == len(loads.eigenmodes.values) + 4
     direct = SAMPLINGS[sampling]((3, 0), 5, loads.n_random)
     assert np.array_equal(points[1].numpy(), direct)
     at, sample = loads.loads_at(points), loads.sample((3, 0), [2, 5])
@@ -245,7 +246,7 @@ def test_coordinates_of_a_point_are_the_modal_loads_in_their_order(linear):
     for k in range(5):
         for t, share in ((0.0, -1.0), (0.5, 0.0), (0.75, 0.5)):
             force = loads.loads_at(point_of(loads, *[0.5] * k, t)).force[0]
-            expected = share * loads.q_max[k] * loads.modes.vectors[..., k]
+            expected = share * loads.q_max[k] * loads.eigenmodes.vectors[..., k]
             expected = torch.where(loads.loadable_dofs, expected, 0.0)
             assert torch.allclose(force, expected, rtol=1e-14, atol=0)
 
@@ -316,7 +317,7 @@ def test_a_patch_over_the_whole_body_keeps_the_modal_force(linear):
     loads = ModalLoads(linear, n_modes=3, patch_radius=(2.0, 2.0))
     force = loads.sample((0, 0), [0]).force[0]
     reach = loads.loadable_dofs
-    basis = loads.modes.vectors[reach].numpy()
+    basis = loads.eigenmodes.vectors[reach].numpy()
     q, *_ = np.linalg.lstsq(basis, force[reach].numpy(), rcond=None)
     assert basis @ q == pytest.approx(force[reach].numpy(), abs=1e-12)
     assert (np.abs(q) <= loads.q_max.numpy() * (1 + 1e-9)).all()
@@ -325,7 +326,7 @@ def test_a_patch_over_the_whole_body_keeps_the_modal_force(linear):
 def test_modal_loads_are_uniform_up_to_their_largest(linear, sampling):
     loads = ModalLoads(linear, n_modes=2, patch_radius=(2.0, 2.0), sampling=sampling)
     reach = loads.loadable_dofs
-    basis = np.linalg.pinv(loads.modes.vectors[reach].numpy())
+    basis = np.linalg.pinv(loads.eigenmodes.vectors[reach].numpy())
     drawn = loads.sample((0, 0), range(400)).force[:, reach].numpy() @ basis.T
     share = drawn / loads.q_max.numpy()
     assert np.abs(share).max() <= 1 + 1e-9
@@ -342,7 +343,7 @@ def test_radii_and_centres_vary(loads):
 def test_other_distributions_can_be_plugged_in(linear):
     loads = ModalLoads(linear, n_modes=3, patch_radius=(2.0, 2.0), distribution=constant)
     force = loads.sample((0, 0), [0]).force[0]
-    expected = torch.where(loads.loadable_dofs, loads.modes.vectors @ loads.q_max, 0.0)
+    expected = torch.where(loads.loadable_dofs, loads.eigenmodes.vectors @ loads.q_max, 0.0)
     assert torch.allclose(force, expected, rtol=1e-12, atol=0)
 
     def scaled(t, *, factor):
@@ -403,7 +404,7 @@ def test_spectrum_says_how_large_stiffer_modes_become(linear):
     """1/2: equal energies; 1: equal displacements; 0: equal forces."""
 
     def work(loads):
-        vectors = loads.modes.vectors
+        vectors = loads.eigenmodes.vectors
         forces = [q * vectors[..., k] for k, q in enumerate(loads.q_max)]
         answers = [linear.solve(force) for force in forces]
         pairs = list(zip(forces, answers, strict=True))
@@ -419,7 +420,7 @@ def test_spectrum_says_how_large_stiffer_modes_become(linear):
         for kind, values in enumerate(found):
             spread = max(values) / min(values) - 1
             assert (spread < 1e-8) == (kind == equal)
-        reached = linear.solve(loads.q_max[0] * loads.modes.vectors[..., 0])
+        reached = linear.solve(loads.q_max[0] * loads.eigenmodes.vectors[..., 0])
         assert float(reached.norm(dim=1).max()) == pytest.approx(0.4, rel=1e-8)
 
 
@@ -443,7 +444,7 @@ def test_radius_makes_areas_small_down_to_one_node(linear):
         middle = places[int(0.7 * len(places))]
         reach = (points - middle).norm(dim=1) <= 2 * 1e-2 ** (1 - t)
         inside = reach[:, None] & loads.loadable_dofs
-        assert torch.equal(force != 0, inside & (loads.modes.vectors @ loads.q_max != 0))
+        assert torch.equal(force != 0, inside & (loads.eigenmodes.vectors @ loads.q_max != 0))
 
 
 def test_amplitude_is_one_factor_on_a_whole_load(linear):
@@ -468,7 +469,7 @@ def test_tail_of_the_amplitude_makes_small_loads(linear):
         amplitude=log_tail_mixture,
         sampling="sobol",
     )
-    largest = torch.where(loads.loadable_dofs, loads.modes.vectors @ loads.q_max, 0.0).norm()
+    largest = torch.where(loads.loadable_dofs, loads.eigenmodes.vectors @ loads.q_max, 0.0).norm()
     share = loads.sample(0, range(256)).force.flatten(1).norm(dim=1) / largest
     assert int((share < 1 - 1e-9).sum()) == pytest.approx(64, abs=2)
     assert int((share < 10**-1.5).sum()) == pytest.approx(32, abs=2)
@@ -555,3 +556,86 @@ def test_a_loose_body_is_refused_before_anything_is_factorised(monkeypatch):
     with pytest.raises(ValueError, match="6 rigid modes are unconstrained"):
         eigenmodes(linear, 3)
     assert "factor" not in linear.__dict__
+
+
+def test_selected_modes_are_those_of_their_numbers(linear):
+    every, chosen = ModalLoads(linear, n_modes=5), ModalLoads(linear, modes=[0, 3, 4])
+    expected = every.eigenmodes
+    assert torch.allclose(chosen.eigenmodes.values, expected.values[[0, 3, 4]], rtol=1e-12, atol=0)
+    assert torch.allclose(
+        chosen.eigenmodes.vectors, expected.vectors[..., [0, 3, 4]], rtol=0, atol=1e-8
+    )
+    assert chosen.n_force == 3 + 3
+
+
+def test_one_mode_of_a_pair_with_equal_eigenvalues_can_be_selected(linear):
+    """The square beam bends alike along y and z: mode 0 is the one that leans on y."""
+    pair = [ModalLoads(linear, modes=[k]).eigenmodes for k in (0, 1)]
+    assert float(pair[0].values) == pytest.approx(float(pair[1].values), rel=1e-9)
+    mean = torch.stack([modes.vectors[..., 0].mean(dim=0) for modes in pair])  # (2, D)
+    assert (mean[0, 1] > 0) & (mean[1, 2] > 0)
+    assert torch.allclose(mean[0, [0, 2]], torch.zeros(2).double(), atol=1e-8)
+    assert torch.allclose(mean[1, :2], torch.zeros(2).double(), atol=1e-8)
+
+
+def test_the_softest_selected_mode_has_the_deflection(linear):
+    loads = ModalLoads(linear, modes=[2, 4], deflection=0.1)
+    moved = linear.solve(loads.q_max[0] * loads.eigenmodes.vectors[..., 0])
+    assert float(moved.norm(dim=1).max()) == pytest.approx(0.1, rel=1e-8)
+
+
+def test_forces_of_selected_modes_are_recognised(linear):
+    loads = ModalLoads(linear, modes=[1, 3])
+    amplitude, residual = loads.project(loads.sample(0, range(4)).force)
+    assert float(residual.max()) < 1e-8
+    assert float(amplitude.max()) <= 1 + 1e-8
+
+
+@pytest.mark.parametrize("modes", [[], [-1], [3, 0], [1, 1], [True], [0.0], [500]])
+def test_a_bad_selection_of_modes_raises_an_error_with_its_name(linear, modes):
+    with pytest.raises(ValueError, match=r"^modes = \["):
+        ModalLoads(linear, modes=modes).eigenmodes  # noqa: B018
+
+
+@pytest.mark.parametrize("distribution", ["uniform", "log"])
+def test_moduli_fill_their_range_by_their_distribution(linear, distribution):
+    """Kolmogorov-Smirnov distance of 2,000 moduli from the distribution that is wanted."""
+    young = {"low": 1e6, "high": 1e11, "distribution": distribution}
+    loads = ModalLoads(linear, n_modes=1, young=young)
+    moduli = loads.young_at(loads.points(0, range(2000))).sort().values
+    assert ((moduli >= 1e6) & (moduli <= 1e11)).all()
+    part = (moduli / 1e6).log10() / 5 if distribution == "log" else (moduli - 1e6) / (1e11 - 1e6)
+    assert float((part - torch.linspace(0, 1, 2000).double()).abs().max()) < 0.04
+    assert torch.allclose(loads.moduli.normalise(moduli), 2 * part - 1, atol=1e-12)
+
+
+def test_a_list_and_a_mapping_of_a_uniform_range_are_the_same(linear):
+    one = ModalLoads(linear, n_modes=1, young=[1.0, 3.0])
+    other = ModalLoads(linear, n_modes=1, young={"low": 1.0, "high": 3.0})
+    assert torch.equal(one.sample(0, range(5)).young, other.sample(0, range(5)).young)
+
+
+@pytest.mark.parametrize("distribution", ["uniform", "log"])
+def test_one_modulus_is_a_range_without_width(distribution):
+    moduli = YoungRange(4500.0, 4500.0, distribution)
+    t = torch.linspace(0, 1, 7).double()
+    assert torch.equal(moduli.at(t), torch.full_like(t, 4500.0))
+    assert float(moduli.normalise(torch.tensor(4500.0).double())) == 0
+    assert moduli.middle == pytest.approx(4500.0)
+
+
+@pytest.mark.parametrize(
+    ("young", "said"),
+    [
+        ({"low": 1.0}, r"young\.high is missing"),
+        ({"low": 1.0, "high": 2.0, "mean": 1.5}, r"young\.mean does not exist"),
+        ({"low": 1.0, "high": 2.0, "distribution": "normal"}, r"young\.distribution = 'normal'"),
+        ({"low": 2.0, "high": 1.0}, r"young = \[2\.0, 1\.0\] must be an ascending range"),
+        ({"low": 0.0, "high": 1.0}, r"young = \[0\.0, 1\.0\]"),
+        ([1.0, 2.0, 3.0], r"young = \[1\.0, 2\.0, 3\.0\] must be a modulus"),
+        (-1.0, r"young = -1\.0 must be a modulus"),
+    ],
+)
+def test_moduli_out_of_range_raise_an_error_with_their_name(linear, young, said):
+    with pytest.raises(ValueError, match=said):
+        ModalLoads(linear, n_modes=1, young=young)

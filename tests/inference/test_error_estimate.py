@@ -33,7 +33,7 @@ def simulator_of(scene, part, **more):
 
 def softest_mode(scene, **options):
     """Return Newton's method in one mode."""
-    vectors = scene.loads.modes.vectors[..., :1]
+    vectors = scene.loads.eigenmodes.vectors[..., :1]
     return SubspaceNewton(scene.problem, vectors / vectors.norm(), **options)
 
 
@@ -229,7 +229,7 @@ def test_the_error_in_modes_counts_in_range_only_and_saves_the_correction(
     assert not seen
     assert sim(forces[0], error=1e-5).error < 1e-6
     assert len(seen) == 1
-    largest = scene.loads.modes.vectors @ (1.5 * scene.loads.q_max)
+    largest = scene.loads.eigenmodes.vectors @ (1.5 * scene.loads.q_max)
     outside = sim(torch.where(scene.loads.loadable_dofs, largest, 0.0) * scene.force_unit * E)
     assert outside.out_of_distribution
     assert outside.error < 1e-6

@@ -241,7 +241,7 @@ def test_loads_of_the_family_lie_inside(scene, factor):
 
 def test_how_far_a_load_lies_outside_is_said(scene):
     sim = simulator_of(scene)
-    largest = scene.loads.modes.vectors @ (2.5 * scene.loads.q_max)
+    largest = scene.loads.eigenmodes.vectors @ (2.5 * scene.loads.q_max)
     reach = torch.where(scene.loads.loadable_dofs, largest, 0.0) * scene.force_unit * E
     answer = sim(reach)
     assert answer.out_of_distribution

@@ -288,6 +288,15 @@ def test_youngs_modulus_is_normalised_and_forces_are_relative_to_its_maximum(ove
     assert torch.allclose(inputs[-1:, :-1], scaled), "the stiffest body's are those over E L^2"
 
 
+def test_moduli_with_a_logarithmic_distribution_are_normalised_by_their_logarithm(make_scene):
+    scene = make_scene(young={"low": 1e6, "high": 1e10, "distribution": "log"})
+    net, entered = FCNN(scene, young=True), []
+    net.stages[0].register_forward_hook(lambda _, given, __: entered.append(given[0]))
+    net(torch.ones(3, *scene.problem.shape), torch.tensor([1e6, 1e8, 1e10]).double())
+    assert entered[0][:, -1].tolist() == pytest.approx([-1.0, 0.0, 1.0], abs=1e-6)
+    assert entered[0][:, 0].tolist() == pytest.approx([1e-4, 1e-2, 1.0], rel=1e-6)
+
+
 def test_a_single_modulus_as_an_input_is_normalised_by_itself(scene, batch):
     """The tiny scene has E = 4500 Pa; an increase of 1 % changes the prediction little."""
     torch.manual_seed(0)

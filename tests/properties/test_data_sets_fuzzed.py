@@ -122,7 +122,9 @@ def law(scene, folder: Path, written: dict, *, trusts_digests: bool = True) -> N
         with reported(folder):
             kept = store.modes()
             assert (
-                trusts_digests or flaws or torch.allclose(kept["values"], scene.loads.modes.values)
+                trusts_digests
+                or flaws
+                or torch.allclose(kept["values"], scene.loads.eigenmodes.values)
             )
         for split in STREAMS:
             with reported(folder):

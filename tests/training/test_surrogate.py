@@ -491,7 +491,7 @@ def test_a_checkpoint_contains_the_scales_and_the_normaliser_of_the_residual(sce
     checkpoint = torch.load(tmp_path / "last.ckpt", weights_only=True)
     assert checkpoint["scene"] == scene.fingerprint
     state = checkpoint["state_dict"]
-    expected = float((scene.loads.modes.vectors @ scene.loads.q_max).norm())
+    expected = float((scene.loads.eigenmodes.vectors @ scene.loads.q_max).norm())
     assert float(state["largest_force"]) == pytest.approx(expected, rel=1e-12)
     assert torch.equal(state["force_scale"], scales(scene)[0])
     assert torch.equal(state["displacement_scale"], scales(scene)[1])

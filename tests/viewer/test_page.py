@@ -144,6 +144,12 @@ def test_the_slider_of_youngs_modulus_has_a_unit_with_prefix(make_scene, make_bo
         page.close()
 
 
+def test_the_default_modulus_is_the_middle_of_its_distribution(make_scene, make_body):
+    decades = {"low": 1e6, "high": 1e10, "distribution": "log"}
+    assert make_body(make_scene(young=decades)).young == pytest.approx(1e8)
+    assert make_body(make_scene(young=[1e6, 5e6])).young == 3e6
+
+
 def test_a_random_load_moves_the_hand_to_a_loaded_node(page):
     assert page.worker.wait(240)
     page.sample(None)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.fem.loads.family import HasModes, LoadFamily, RandomLoads
+    from dpl.fem.loads.family import HasModes, HasModuli, LoadFamily, RandomLoads, moduli_of
     from dpl.fem.loads.forces import BodyForce, Traction, body_force, traction
     from dpl.fem.loads.modal import ModalLoads
     from dpl.fem.loads.modal_basis import Modes, eigenmodes
@@ -17,5 +17,6 @@ if TYPE_CHECKING:
         symmetric_uniform,
         uniform01,
     )
+    from dpl.fem.loads.young import YoungRange
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

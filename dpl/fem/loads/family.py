@@ -1,9 +1,9 @@
 """Load families: the interface that the package needs, and a base class for new ones."""
 
-import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dpl.fem.identity import identity_of
 from dpl.fem.loads.sampling import SAMPLINGS, Array
+from dpl.fem.loads.young import Young, YoungRange
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
@@ -121,6 +122,21 @@ class HasModes(Protocol):
         ...
 
 
+@runtime_checkable
+class HasModuli(Protocol):
+    """Load family that names the distribution of its Young's moduli."""
+
+    @property
+    def moduli(self) -> YoungRange:
+        """Range of Young's moduli with its distribution."""
+        ...
+
+
+def moduli_of(loads: LoadFamily) -> YoungRange:
+    """Return the range of the Young's moduli of a family; uniform if it names no distribution."""
+    return loads.moduli if isinstance(loads, HasModuli) else YoungRange(*loads.young_range)
+
+
 @dataclass(frozen=True, eq=False)
 class RandomLoads(LoadFamily):
     """Base of load families: subclasses define the force of a point of the unit cube.
@@ -130,14 +146,15 @@ class RandomLoads(LoadFamily):
 
     Attributes:
         linear: Body, with the factor of its K(0).
-        young: Young's modulus [Pa], or a range [low, high] from which each load draws one.
+        young: Young's modulus [Pa], a range [low, high] from which each load draws one, or a
+            mapping with the attributes of `YoungRange`.
         constant_force: Force that is part of every load, (N, D) [-]; none if left out.
         sampling: "independent" points of the unit cube, or a "sobol" sequence.
     """
 
     linear: LinearSolver
     _: KW_ONLY
-    young: float | Sequence[float] = 1.0
+    young: Young = 1.0
     constant_force: Tensor | None = None
     sampling: str = "independent"
 
@@ -149,9 +166,7 @@ class RandomLoads(LoadFamily):
         """
         if self.sampling not in SAMPLINGS:
             raise ValueError(f"sampling = {self.sampling!r} must be {' or '.join(SAMPLINGS)}")
-        moduli = [self.young] * 2 if isinstance(self.young, int | float) else list(self.young)
-        if len(moduli) != 2 or not 0 < moduli[0] <= moduli[1] < math.inf:
-            raise ValueError(f"young = {self.young} must be a modulus above 0 [Pa] or [low, high]")
+        self.moduli  # noqa: B018  # raises if it is out of range
 
     @property
     @abstractmethod
@@ -170,11 +185,15 @@ class RandomLoads(LoadFamily):
         """Body."""
         return self.linear.problem
 
+    @cached_property
+    def moduli(self) -> YoungRange:
+        """Range of Young's moduli with its distribution."""
+        return YoungRange.of(self.young)
+
     @property
     def young_range(self) -> tuple[float, float]:
         """Smallest and largest Young's modulus [Pa]."""
-        moduli = [self.young] if isinstance(self.young, int | float) else self.young
-        return float(moduli[0]), float(moduli[-1])
+        return self.moduli.low, self.moduli.high
 
     @property
     def parameter_ranges(self) -> Mapping[str, tuple[float, float]]:
@@ -205,8 +224,7 @@ class RandomLoads(LoadFamily):
 
     def young_at(self, points: Tensor) -> Tensor:
         """Return the Young's moduli of points (B, d), (B,) [Pa]."""
-        low, high = self.young_range
-        return low + (high - low) * points[:, self.n_force]
+        return self.moduli.at(points[:, self.n_force])
 
     def parameters_at(self, points: Tensor) -> Tensor:
         """Return the parameters of the law of points (B, d), (B, P), see `parameter_ranges`."""

@@ -8,6 +8,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,6 +46,10 @@ class ModalLoads(RandomLoads):
             energies, 1 for equal deflections, 0 for equal forces.
         radius: Quantile function of the radius, from 0 (smallest) to 1 (largest).
         amplitude: Quantile function of the factor on the whole force, in [0, 1].
+        modes: Numbers of the modes, ascending, counted from 0 for the softest; None for the first
+            `n_modes`. These modes and no others are excited, also if other modes have the same
+            eigenvalue: the basis of an eigenspace is fixed, see `eigenmodes`, so that a number
+            names the same mode on every machine.
     """
 
     n_modes: int = 5
@@ -53,6 +59,7 @@ class ModalLoads(RandomLoads):
     eigenvalue_exponent: float = 0.5
     radius: Quantile = uniform01
     amplitude: Quantile = constant
+    modes: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -62,6 +69,10 @@ class ModalLoads(RandomLoads):
         """
         if self.n_modes < 1:
             raise ValueError(f"n_modes = {self.n_modes} must be 1 or more")
+        if self.modes is not None and not _is_selection(self.modes):
+            raise ValueError(
+                f"modes = {list(self.modes)} must be ascending whole numbers, 0 or more, or null"
+            )
         if not MIN_DEFLECTION <= self.deflection <= 10:
             span = f"between {MIN_DEFLECTION:g} and 10 (times L)"
             raise ValueError(f"deflection = {self.deflection} must lie {span}")
@@ -80,26 +91,33 @@ class ModalLoads(RandomLoads):
                 raise ValueError(f"{name} draws numbers outside [{low:g}, 1]")
 
     @cached_property
-    def modes(self) -> Modes:
+    def eigenmodes(self) -> Modes:
         """Modes that are excited.
 
         Raises:
-            ValueError: See `eigenmodes`.
+            ValueError: There is no such mode; see `eigenmodes`.
             SingularMatrix: See `eigenmodes`.
         """
-        return eigenmodes(self.linear, self.n_modes)
+        if self.modes is None:
+            return eigenmodes(self.linear, self.n_modes)
+        last = self.problem.pattern.size // 3 - 1
+        if self.modes[-1] > last:
+            raise ValueError(f"modes = {list(self.modes)} must lie between 0 and {last}")
+        values, vectors = eigenmodes(self.linear, self.modes[-1] + 1)
+        chosen = list(self.modes)
+        return Modes(values[chosen], vectors[..., chosen].contiguous())
 
     @cached_property
     def q_max(self) -> Tensor:
         """Largest modal loads, (M,) [-]."""
-        values, vectors = self.modes
+        values, vectors = self.eigenmodes
         softest = self.deflection * values[0] / vectors[..., 0].norm(dim=1).max()
         return softest * (values / values[0]) ** self.eigenvalue_exponent
 
     @cached_property
     def modal_forces(self) -> Tensor:
         """Mode times its largest modal load, zero on degrees of freedom without load, (N, D, M)."""
-        return torch.where(self.loadable_dofs[..., None], self.modes.vectors, 0.0) * self.q_max
+        return torch.where(self.loadable_dofs[..., None], self.eigenmodes.vectors, 0.0) * self.q_max
 
     @property
     def largest_force(self) -> float:
@@ -122,7 +140,7 @@ class ModalLoads(RandomLoads):
         largest = low + (high - low) * float(self.radius(np.asarray(radius)))
         distance = (points - centres[int(centre * len(centres))]).norm(dim=1)
         inside = distance <= largest * (1 + 1e-9)
-        return torch.where(inside[:, None] & self.loadable_dofs, self.modes.vectors @ q, 0.0)
+        return torch.where(inside[:, None] & self.loadable_dofs, self.eigenmodes.vectors @ q, 0.0)
 
     def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
         """Return amplitudes (B,) and relative residuals (B,) of a least-squares fit of Phi q.
@@ -157,16 +175,27 @@ class ModalLoads(RandomLoads):
 
     def arrays(self) -> Mapping[str, Tensor]:
         """Return eigenvalues and eigenvectors, see `Modes`."""
-        return self.modes._asdict()
+        return self.eigenmodes._asdict()
+
+    def identity(self) -> dict[str, Any]:
+        """Return the options that decide the loads: `modes` if they are given, else `n_modes`."""
+        unused = "modes" if self.modes is None else "n_modes"
+        return {name: value for name, value in super().identity().items() if name != unused}
 
     def skipped_work(self) -> list[str]:
         """Return a note where a cluster of eigenvalues adds modes."""
-        count = len(self.modes.values)
-        if count == self.n_modes:
+        count = len(self.eigenmodes.values)
+        if self.modes is not None or count == self.n_modes:
             return []
         return [f"{count} modes instead of {self.n_modes}: a cluster of eigenvalues is kept whole"]
 
     def __getstate__(self) -> dict[str, object]:
         """Pickle with the modes, so that workers need not compute them again."""
-        self.modes  # noqa: B018
+        self.eigenmodes  # noqa: B018
         return self.__dict__
+
+
+def _is_selection(modes: Sequence[int]) -> bool:
+    """Return True for one or more ascending whole numbers, 0 or more."""
+    whole = all(isinstance(k, int) and not isinstance(k, bool) and k >= 0 for k in modes)
+    return bool(len(modes)) and whole and all(a < b for a, b in pairwise(modes))
