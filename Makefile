@@ -1,7 +1,9 @@
 # make train: environment, installation and the main job: two models of the paper's beam, compared.
 # make demo:  a model of the paper's beam, fitted to 64 loads, as a page in the browser.
 # make test:  installation and the checks that CI makes; WORKERS processes share the tests.
-# make slow, make gpu: the tests that take minutes, and those that need a GPU.
+# make slow: the tests that take minutes.
+# make gpu: the tests that need a GPU (with DDP on all visible ones), then speed and memory of each
+#   network into benchmarks/results/devices_cuda.csv; ARGS="networks=[fcnn,pod]".
 # make mutants: changes of the source that no test notices; ARGS="dpl/training/metrics.py --sample 60".
 # make matrix: the tests under other processor features and thread numbers; see tests/matrix.py.
 # make docs:  the documentation into site/.
@@ -54,7 +56,8 @@ slow: setup
 	$(BIN)/python -m pytest -m 'slow and not gpu' --timeout 1800
 
 gpu: setup
-	$(BIN)/python -m pytest -m gpu
+	$(BIN)/python -m pytest -m gpu -rs --timeout 1800
+	$(BIN)/python scripts/devices.py device=cuda folder=benchmarks/results $(ARGS)
 
 matrix: setup
 	$(BIN)/python tests/matrix.py $(ARGS)
