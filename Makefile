@@ -5,6 +5,8 @@
 # make gpu: the tests that need a GPU (with DDP on all visible ones), then speed and memory of each
 #   network into benchmarks/results/devices_cuda.csv; ARGS="networks=[fcnn,pod]".
 # make mutants: changes of the source that no test notices; ARGS="dpl/training/metrics.py --sample 60".
+# make paper: trains all runs of the paper's tables, hours on two cores; again: continues. Then tables
+#   and figures in benchmarks/results. ARGS="only_plan=true", "scale=small" (minutes), "groups=[full]".
 # make matrix: the tests under other processor features and thread numbers; see tests/matrix.py.
 # make docs:  the documentation into site/.
 # make pictures: executes gallery and notebooks and stores their pictures, and the one that moves.
@@ -16,7 +18,7 @@ PIP := $(BIN)/pip install --quiet --no-compile -c constraints.txt  # Python comp
 FIRST := runs/first_$(shell date +%Y-%m-%d_%H-%M)
 BEAM := mesh=paper_beam data.train=256 data.val=32 data.test=50
 
-.PHONY: setup train demo test lint slow gpu matrix mutants docs pictures wheel clean
+.PHONY: setup train demo paper test lint slow gpu matrix mutants docs pictures wheel clean
 
 setup: .venv/installed
 
@@ -42,6 +44,9 @@ demo: runs/demo/evaluation.json
 runs/demo/evaluation.json: | .venv/run
 	rm -rf runs/demo
 	$(BIN)/python scripts/train.py mesh=paper_beam data.train=64 data.val=16 data.test=8 model=unrolled run=runs/demo
+
+paper: .venv/run
+	$(BIN)/python scripts/paper.py $(ARGS)
 
 test: lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m 'not slow and not gpu'
