@@ -339,10 +339,11 @@ def test_all_results_without_runs_name_what_is_missing(script, tmp_path):
 
 TINY = [
     "scale=small",
-    "groups=[networks,losses]",
-    "plan.networks.experiments=[beam_svk]",
-    "plan.networks.runs={unrolled:[model=unrolled],fcnn:[model=fcnn,model.width=16,loss=mse]}",
-    "plan.losses.sweep={loss:[mse],seed:[0]}",
+    "groups=[tiny,losses]",
+    "+plan.tiny={experiments:[beam_svk],runs:{unrolled:['model=unrolled'],"
+    "fcnn:['model=fcnn','model.width=16','loss=mse']}}",
+    "plan.losses.sweep.loss=[mse]",
+    "plan.losses.sweep.seed=[0]",
 ]
 
 
@@ -354,6 +355,7 @@ def test_one_command_trains_resumes_and_writes_all_tables(start, tmp_path):
     first = start("paper", *TINY, cwd=tmp_path)
     end = time.monotonic() + 300
     while not (root / "beam_svk/unrolled/config.yaml").is_file() and time.monotonic() < end:
+        assert first.poll() is None, first.communicate()
         time.sleep(0.1)
     first.send_signal(signal.SIGINT)
     _, err = first.communicate(timeout=300)
