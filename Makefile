@@ -1,8 +1,12 @@
 # make train: environment, installation and the main job: two models of the paper's beam, compared.
 # make demo:  a model of the paper's beam, fitted to 64 loads, and its page for the browser.
 # make test:  installation and the checks that CI makes; WORKERS processes share the tests.
-# make slow, make gpu: the tests that take minutes, and those that need a GPU.
+# make slow: the tests that take minutes.
+# make gpu: the tests that need a GPU (with DDP on all visible ones), then speed and memory of each
+#   network into benchmarks/results/devices_cuda.csv; ARGS="networks=[fcnn,pod]".
 # make mutants: changes of the source that no test notices; ARGS="dpl/training/metrics.py --sample 60".
+# make paper: trains all runs of the paper's tables, hours on two cores; again: continues. Then tables
+#   and figures in benchmarks/results. ARGS="only_plan=true", "scale=small" (minutes), "groups=[full]".
 # make matrix: the tests under other processor features and thread numbers; see tests/matrix.py.
 # make docs:  the documentation into site/.
 # make pictures: executes gallery and notebooks and stores their pictures, and the one that moves.
@@ -16,7 +20,7 @@ DEMO := $(BIN)/python scripts/train.py mesh=paper_beam data.train=64 data.val=16
   model=unrolled model.rank=60 model.cells=80 run=runs/demo
 BEAM := mesh=paper_beam data.train=256 data.val=32 data.test=50
 
-.PHONY: setup train demo test lint slow gpu matrix mutants docs pictures wheel clean
+.PHONY: setup train demo paper test lint slow gpu matrix mutants docs pictures wheel clean
 
 setup: .venv/installed
 
@@ -44,6 +48,9 @@ runs/demo/evaluation.json: | .venv/run
 	rm -rf runs/demo
 	$(DEMO)
 
+paper: .venv/run
+	$(BIN)/python scripts/paper.py $(ARGS)
+
 test: lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m 'not slow and not gpu'
 
@@ -57,7 +64,8 @@ slow: setup
 	$(BIN)/python -m pytest -m 'slow and not gpu' --timeout 1800
 
 gpu: setup
-	$(BIN)/python -m pytest -m gpu
+	$(BIN)/python -m pytest -m gpu -rs --timeout 1800
+	$(BIN)/python scripts/devices.py device=cuda folder=benchmarks/results $(ARGS)
 
 matrix: setup
 	$(BIN)/python tests/matrix.py $(ARGS)

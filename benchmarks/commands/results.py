@@ -1,5 +1,11 @@
-"""Compare all methods on one experiment: python scripts/results.py name=beam_svk."""
+"""Compare all methods on one experiment: python scripts/results.py name=beam_svk.
 
+name=all does so for every experiment that has finished runs, and writes the table of losses,
+Newton from predictions, and the numbers of the paper beside all of them. scripts/paper.py trains
+the runs.
+"""
+
+from collections.abc import Sequence
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -8,18 +14,32 @@ from benchmarks.commands import CONF
 from dpl import config
 from dpl.commands.cli import command
 
-KEYS = ((bool, "keep"),)
+KEYS = ((bool, "keep"), (str, "runs"), (Sequence[str], "convergence"))
+ALL = "all"  # name for all experiments
 
 
 @command("results", conf=CONF, keys=KEYS)
 def main(cfg: DictConfig) -> None:
+    """Measure every run of one or of all experiments; write rows, machines and figures."""
+    from benchmarks import all_results
+
+    if cfg.name != ALL:
+        measure(cfg)
+        return
+
+    for line in all_results.run(cfg, measure):
+        print(f"left out: {line}")
+    print(f"written to {cfg.folder}")
+
+
+def measure(cfg: DictConfig) -> None:
     """Measure every run of an experiment; write rows, machine and figure."""
     from benchmarks import paper_tables
     from dpl.evaluation import methods
     from dpl.evaluation.tables import show
     from dpl.models import Correctable
 
-    runs = config.load_runs(cfg.run)
+    runs = config.load_runs(cfg.run, cfg.networks)
     first, surrogate = next(iter(runs.values()))
     scene = surrogate.scene
     data = config.load_data(first, scene)

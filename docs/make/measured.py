@@ -36,6 +36,20 @@ class Part:
 
 PARTS = (
     Part(
+        "paper",
+        "All methods beside the paper",
+        "python scripts/paper.py",
+        "The loads in range of all experiments; `ratio` is e_mean over that of the paper. The "
+        "command trains all runs and writes all tables of the paper.",
+        split="experiment",
+    ),
+    Part(
+        "losses",
+        "Losses",
+        "python scripts/results.py name=all",
+        "Medians over the seeds of all runs below `runs/losses`.",
+    ),
+    Part(
         r"(beam_svk|propeller_nh|beam_nh_loss|beam_young|beam_young_wide)",
         "All methods on `{0}`",
         "python scripts/results.py name={0}",
@@ -65,6 +79,13 @@ PARTS = (
         "Discretisation error on `{0}`",
         "python scripts/benchmark.py cases=[discretisation] folder=benchmarks/results",
         "One load on refined meshes, compared with the limit by Richardson extrapolation.",
+    ),
+    Part(
+        r"devices_(cpu|cuda)",
+        "Networks on the device `{0}`",
+        "python scripts/devices.py device={0} folder=benchmarks/results",
+        "Training steps and predictions of each network on the paper's beam.",
+        split="task",
     ),
     Part(
         "unrolled",

@@ -70,7 +70,8 @@ class LinearBase:
             scale: Displacement scale, () [-].
         """
         linear = linear.double()
-        square = linear[:, self._problem.free.to(linear.device)].square().mean(dim=1)
+        free = self._problem.free.to(linear.device)  # no index: a GPU would wait for its size
+        square = torch.where(free, linear, 0.0).square().sum(dim=(1, 2)) / free.sum()
         size = torch.where(square > 0, square, 1.0).sqrt()  # the root has no gradient at zero
         size = torch.where(square > 0, size, 0.0)
         field = linear / torch.where(square > 0, size, 1.0)[:, None, None]

@@ -3,7 +3,7 @@
 import random
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import lightning as L
 import numpy as np
@@ -255,18 +255,27 @@ class Surrogate(L.LightningModule):
         self.log_dict(self.test_metrics, batch_size=len(batch.force))
 
     def setup(self, stage: str) -> None:
-        """Move the problem to the device of the network, and fit the bases of the network."""
-        problem = self.scene.problem
-        if problem.points.device != self.device:
-            problem = problem.to(self.device)
-        self.physics = LossContext(problem, self.largest_force)
+        """Fit the bases of the network."""
         # before later hooks: schedules load the batches, and encoding them takes the bases
         if stage == "fit" and isinstance(self.net, TrainsInCoordinates) and not self.net.is_fitted:
             self.fit_bases(self.trainer.datamodule.snapshots())
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move the module, and the problem of the loss and of the metrics to the same device.
+
+        All ways to move a module end here. Lightning moves it after the hook `setup`.
+        """
+        super()._apply(fn, recurse)
+        device, problem = self.largest_force.device, self.physics.problem
+        if problem.points.device != device:
+            own = self.scene.problem
+            problem = own if own.points.device == device else own.to(device)
+        self.physics = LossContext(problem, self.largest_force)
         for collection in (self.val_metrics, self.test_metrics):
             for metric in collection.values():
                 if hasattr(metric, "problem"):
                     metric.problem = problem
+        return self
 
     def configure_callbacks(self) -> list[L.Callback]:
         """Return the loss, which is a callback, and that of a model without gradient descent."""

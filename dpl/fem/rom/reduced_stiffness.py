@@ -97,8 +97,8 @@ class ReducedStiffness:
 
     def at(self, law: Material) -> Tensor:
         """Return V^T K(0) [V, p], (R, R + 1), or (B, R, R + 1) for a law of a batch."""
-        A, B, C = self.parts
         mu, lam = (_column(modulus) for modulus in (law.mu, law.lam))
+        A, B, C = self.parts.to(mu.device) if isinstance(mu, Tensor) else self.parts
         return mu * A + lam * B + C
 
 

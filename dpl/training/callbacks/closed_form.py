@@ -3,6 +3,7 @@
 from typing import cast
 
 import lightning as L
+from torch import nn
 
 from dpl.data.datamodule import OfflineData
 from dpl.models.protocols import ClosedFormFit
@@ -26,9 +27,10 @@ class ClosedFormTraining(L.Callback):
             trainer.check_val_every_n_epoch = 1
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Fit the network."""
-        data = _data(trainer)
-        cast(ClosedFormFit, pl_module.net).fit(data.samples("train"), data.samples("val"))
+        """Fit the network, on the CPU: a fit needs factors and compiled loops."""
+        data, net = _data(trainer), cast(nn.Module, pl_module.net)
+        cast(ClosedFormFit, net.cpu()).fit(data.samples("train"), data.samples("val"))
+        net.to(pl_module.device)
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Record the held-out errors; end the training if no further fit is needed."""

@@ -33,7 +33,7 @@ class TrainingTime(L.Callback):
                 "seconds": round(time.perf_counter() - self._start, 3),
                 "steps": trainer.global_step,
                 "threads": torch.get_num_threads(),
-                "device": str(pl_module.device),
+                "device": str(trainer.strategy.root_device),  # the module may have left it
             }
             append_jsonl(self.path, line)
             self._start = 0.0

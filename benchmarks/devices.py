@@ -1,0 +1,287 @@
+"""Speed and memory of networks on one device: training steps and predictions.
+
+The same functions measure a GPU and the processor. Clocks are read after the device has finished.
+The inputs of a training step are in the memory of the device. Loads are those of the scene; targets
+are artificial, because the speed does not depend on them.
+
+A prediction with a linear base solves with a factor of K(0) on the host, in float64, and so does
+one of `unrolled` that applies the factor to each load. A training step has the linear solutions of
+its samples already.
+"""
+
+import gc
+import resource
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.fabric.utilities import move_data_to_device
+from torch import nn
+
+from dpl.data.datamodule import Samples
+from dpl.evaluation.timing import percentiles
+from dpl.fem import Load
+from dpl.models import CNN, FCNN, GNN, PODNet, Unrolled
+from dpl.models.protocols import ClosedFormFit, TrainsInCoordinates
+from dpl.scene import Sample, Scene
+from dpl.training import MSE, Surrogate
+
+Build = Callable[[Scene], nn.Module]
+NETWORKS: dict[str, Build] = {
+    "fcnn": partial(FCNN, width=512),
+    "fcnn linear": partial(FCNN, width=512, base="linear"),
+    "fcnn full": partial(FCNN, all_dofs=True),  # of the paper, 4 n^2 + 7 n parameters
+    "cnn": CNN,
+    "cnn linear": partial(CNN, base="linear"),
+    "gnn": GNN,
+    "gnn linear": partial(GNN, base="linear"),
+    "pod": PODNet,
+    "unrolled": Unrolled,
+}
+TRAINING = "training step"
+RESIDENT, COPIED = "prediction", "prediction with copies"  # inputs on the device; on the host
+LOADS = 256  # different loads; larger batches repeat them
+OUT_OF_MEMORY = (MemoryError, torch.OutOfMemoryError)
+
+
+@dataclass(frozen=True)
+class DeviceTime:
+    """Wall time of one call on a device.
+
+    Attributes:
+        network: Name of the network in `NETWORKS`.
+        device: "cpu" or "cuda".
+        task: "training step" (forward pass, loss, backward pass and optimiser), "prediction"
+            (inputs and result on the device) or "prediction with copies" (both on the host).
+        batch: Number of loads of a call.
+        calls: Number of timed calls.
+        ms: Median wall time of a call [ms].
+        ms_p99: 99th percentile [ms].
+        calls_per_second: 1000 / ms [1/s].
+        loads_per_second: batch * calls_per_second [1/s].
+        parameters: Number of trained parameters.
+        peak_memory_mb: Peak memory of the device during the calls [MB]; on the processor, of the
+            process.
+    """
+
+    network: str
+    device: str
+    task: str
+    batch: int
+    calls: int
+    ms: float
+    ms_p99: float
+    calls_per_second: float
+    loads_per_second: float
+    parameters: int
+    peak_memory_mb: float
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Repetition of calls until a number of calls or a time is reached.
+
+    Attributes:
+        device: The device that is waited for.
+        repeats: Largest number of timed calls.
+        seconds: Time after which no further call begins [s].
+        warm_up: Number of calls before, which are not timed.
+    """
+
+    device: torch.device
+    repeats: int
+    seconds: float
+    warm_up: int = 3
+
+    def times(self, call: Callable[[], object]) -> tuple[list[float], float]:
+        """Return the wall times of a call [ms], at least one, and the peak memory [MB]."""
+        for _ in range(self.warm_up):
+            call()
+        self.wait()
+        self._reset_peak()
+        found: list[float] = []
+        end = time.perf_counter() + self.seconds
+        while not found or (len(found) < self.repeats and time.perf_counter() < end):
+            start = time.perf_counter()
+            call()
+            self.wait()
+            found.append(1e3 * (time.perf_counter() - start))
+        return found, self._peak()
+
+    def wait(self) -> None:
+        """Wait until the device has finished; the processor always has."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+
+    def _reset_peak(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
+            return
+        try:
+            Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM
+        except OSError:
+            return  # the peak is then that of the process since its start
+
+    def _peak(self) -> float:
+        if self.device.type == "cuda":
+            return torch.cuda.max_memory_allocated(self.device) / 1e6
+        status = Path("/proc/self/status")
+        lines = status.read_text().splitlines() if status.is_file() else []
+        peaks = [line.split()[1] for line in lines if line.startswith("VmHWM")]
+        kilobytes = int(peaks[0]) if peaks else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return kilobytes * 1024 / 1e6
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Sizes of the measurement.
+
+    Attributes:
+        batches: Numbers of loads of a training step.
+        predictions: Numbers of loads of a prediction.
+        clock: Device and number of repetitions.
+    """
+
+    batches: Sequence[int]
+    predictions: Sequence[int]
+    clock: Clock
+
+
+def samples_of(scene: Scene, count: int = LOADS) -> Sample:
+    """Return loads with artificial displacements of the size of linear solutions, on the CPU."""
+    load = scene.loads.sample((0, 0), range(count))
+    linear = [
+        scene.linear.with_parameters(one.parameters).solve(one.force[0]) for one in load.unbatch()
+    ]
+    field = torch.stack(linear)
+    bent = field + field * field.norm(dim=-1, keepdim=True)  # `unrolled` fits a nonlinear part
+    return Sample(load.force, bent, load.young, load.parameters)
+
+
+def measure(name: str, scene: Scene, samples: Sample, plan: Plan) -> Iterator[DeviceTime | str]:
+    """Yield the times of a network, and a line of text for each task without enough memory.
+
+    Args:
+        name: Name of the network in `NETWORKS`.
+        scene: The scene.
+        samples: Samples on the CPU.
+        plan: Sizes of the measurement.
+    """
+    try:
+        surrogate = fitted(NETWORKS[name](scene), scene, samples)
+        dataset = surrogate.encode(samples) or Samples(samples)
+        surrogate.to(plan.clock.device)
+    except OUT_OF_MEMORY as error:
+        yield f"{name}: {first_line(error)}"
+        return
+    tasks: list[tuple[str, int, Callable[[], Callable[[], object]]]] = [
+        (task, batch, partial(prediction, surrogate, samples, batch, copies=task == COPIED))
+        for batch in plan.predictions
+        for task in (RESIDENT, COPIED)
+    ]
+    if not isinstance(surrogate.net, ClosedFormFit):
+        for batch in plan.batches:
+            tasks.append((TRAINING, batch, partial(training_step, surrogate, dataset, batch)))
+    for task, batch, build in tasks:
+        try:
+            times, peak = plan.clock.times(build())
+        except OUT_OF_MEMORY as error:
+            yield f"{name}, {task}, batch {batch}: {first_line(error)}"
+        else:
+            yield _row((name, plan.clock.device.type, task, batch), times, surrogate.net, peak)
+        surrogate.zero_grad(set_to_none=True)
+        if plan.clock.device.type == "cuda":
+            gc.collect()
+            torch.cuda.empty_cache()
+
+
+def fitted(net: nn.Module, scene: Scene, samples: Sample) -> Surrogate:
+    """Return the surrogate of a network whose bases or maps are fitted to samples."""
+    surrogate = Surrogate(net, MSE(), scene)
+    if isinstance(net, ClosedFormFit):
+        net.fit(samples, samples)
+    elif isinstance(net, TrainsInCoordinates):
+        surrogate.fit_bases(samples)
+    return surrogate
+
+
+def training_step(surrogate: Surrogate, dataset: Any, batch: int) -> Callable[[], float]:
+    """Return a call that makes one optimiser step with a batch and returns its loss.
+
+    Args:
+        surrogate: The surrogate, on its device.
+        dataset: Samples as `Surrogate.encode` returns them, on the CPU.
+        batch: Number of loads; samples are repeated if there are fewer.
+    """
+    indices = [k % len(dataset) for k in range(batch)]
+    inputs = move_data_to_device(dataset.__getitems__(indices), surrogate.device)
+    surrogate.train()
+    optimizer = surrogate.configure_optimizers()
+
+    def step() -> float:
+        optimizer.zero_grad(set_to_none=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # there is no trainer that logs the loss
+            loss = surrogate.training_step(inputs, 0)
+        assert loss is not None
+        loss.backward()
+        optimizer.step()
+        return float(loss.detach())  # as a progress bar reads it
+
+    return step
+
+
+def prediction(
+    surrogate: Surrogate, samples: Sample, batch: int, *, copies: bool
+) -> Callable[[], torch.Tensor]:
+    """Return a call that predicts a batch.
+
+    Args:
+        surrogate: The surrogate, on its device.
+        samples: Samples on the CPU; they are repeated if there are fewer than `batch`.
+        batch: Number of loads.
+        copies: Copy the loads from the host and the displacements back in each call.
+    """
+    indices = torch.arange(batch) % len(samples.force)
+    host = Load(*(column[indices] for column in samples.load))
+    device = surrogate.device
+    resident = host if copies else _moved(host, device)
+    surrogate.eval()
+
+    @torch.inference_mode()
+    def predict() -> torch.Tensor:
+        if copies:
+            return surrogate.predict(_moved(resident, device)).cpu()
+        return surrogate.predict(resident)
+
+    return predict
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of the message of an error."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _moved(load: Load, device: torch.device) -> Load:
+    return Load(*(column.to(device) for column in load))
+
+
+def _row(
+    key: tuple[str, str, str, int], times: Sequence[float], net: nn.Module, peak: float
+) -> DeviceTime:
+    median, last = percentiles(torch.tensor(times, dtype=torch.float64))
+    return DeviceTime(
+        *key,
+        calls=len(times),
+        ms=median,
+        ms_p99=last,
+        calls_per_second=1e3 / median,
+        loads_per_second=1e3 * key[3] / median,
+        parameters=sum(weights.numel() for weights in net.parameters()),
+        peak_memory_mb=peak,
+    )

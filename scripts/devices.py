@@ -1,0 +1,10 @@
+"""Measure networks on the GPU or the processor: python scripts/devices.py."""
+
+import sys
+from pathlib import Path
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))  # `benchmarks` is not installed
+    from benchmarks.commands.devices import main
+
+    main()

@@ -1,0 +1,113 @@
+"""The measurement of devices: every network is measured, and what is timed is what is named."""
+
+import json
+
+import pytest
+import torch
+
+from benchmarks import device_facts, devices
+from dpl.evaluation.tables import read
+
+CPU = torch.device("cpu")
+QUICK = devices.Plan([4], [1, 8], devices.Clock(CPU, 2, 5.0, warm_up=1))
+
+
+@pytest.fixture(scope="module")
+def samples(scene):
+    return devices.samples_of(scene, 12)
+
+
+@pytest.mark.parametrize("name", devices.NETWORKS)
+def test_every_network_is_measured_at_every_batch(name, scene, samples):
+    rows = list(devices.measure(name, scene, samples, QUICK))
+    tasks = [(devices.RESIDENT, 1), (devices.COPIED, 1), (devices.RESIDENT, 8), (devices.COPIED, 8)]
+    trained = [] if name == "unrolled" else [(devices.TRAINING, 4)]
+    assert [(row.task, row.batch) for row in rows] == tasks + trained
+    for row in rows:
+        assert 0 < row.ms <= row.ms_p99
+        assert row.calls_per_second == pytest.approx(1e3 / row.ms)
+        assert row.loads_per_second == pytest.approx(row.batch * row.calls_per_second)
+        assert row.peak_memory_mb > 50
+        assert (row.parameters > 0) == (name != "unrolled")
+
+
+def test_a_timed_training_step_lowers_the_loss(scene, samples):
+    torch.manual_seed(0)
+    surrogate = devices.fitted(devices.NETWORKS["fcnn"](scene), scene, samples)
+    step = devices.training_step(surrogate, devices.Samples(samples), 12)
+    first = step()
+    for _ in range(20):
+        last = step()
+    assert last < 0.7 * first
+
+
+def test_a_timed_prediction_is_that_of_the_surrogate_with_repeated_loads(scene, samples):
+    surrogate = devices.fitted(devices.NETWORKS["cnn linear"](scene), scene, samples)
+    predict = devices.prediction(surrogate, samples, 30, copies=True)
+    with torch.inference_mode():
+        expected = surrogate.predict(samples.load)
+    found = predict()
+    assert len(found) == 30
+    torch.testing.assert_close(found[12:24], expected)
+    torch.testing.assert_close(found[24:], expected[:6])
+
+
+def test_calls_end_after_the_number_or_the_time():
+    calls = []
+    times, _ = devices.Clock(CPU, 5, 10.0, warm_up=2).times(lambda: calls.append(0))
+    assert (len(times), len(calls)) == (5, 7)
+    times, _ = devices.Clock(CPU, 10**6, 0.02, warm_up=0).times(lambda: calls.append(0))
+    assert len(times) < 10**6
+    times, _ = devices.Clock(CPU, 5, 1e-9, warm_up=0).times(lambda: calls.append(0))
+    assert len(times) == 1, "one call is always timed"
+
+
+def test_a_network_beyond_the_memory_is_named_and_left_out(scene, samples, monkeypatch):
+    def build(scene):
+        raise MemoryError("2 parameters need 9 GB, there are 8 GB")
+
+    monkeypatch.setitem(devices.NETWORKS, "fcnn", build)
+    assert list(devices.measure("fcnn", scene, samples, QUICK)) == [
+        "fcnn: 2 parameters need 9 GB, there are 8 GB"
+    ]
+
+
+def test_without_a_gpu_auto_takes_the_processor_and_cuda_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert device_facts.select_device("auto") == device_facts.select_device("cpu") == CPU
+    with pytest.raises(ValueError, match="needs a GPU"):
+        device_facts.select_device("cuda")
+    with pytest.raises(ValueError, match="must be auto, cpu or cuda"):
+        device_facts.select_device("tpu")
+
+
+def test_with_a_gpu_auto_takes_it(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert device_facts.select_device("auto") == torch.device("cuda")
+    assert device_facts.select_device("cpu") == CPU
+
+
+def test_the_command_writes_rows_and_machine(script, tiny, tmp_path):
+    sizes = ["repeats=2", "samples=8", "predictions=[1]", "batches=[4]", "folder=out"]
+    ended = script("devices", *tiny, *sizes, "device=cpu", "networks=[fcnn,unrolled]", cwd=tmp_path)
+    assert ended.status == 0, ended.err
+    rows = read(devices.DeviceTime, tmp_path / "out/devices_cpu.csv")
+    assert [row.network for row in rows] == ["fcnn"] * 3 + ["unrolled"] * 2
+    facts = json.loads((tmp_path / "out/devices_cpu.json").read_text())
+    assert (facts["device"], facts["torch"]) == ("cpu", torch.__version__)
+
+
+def test_an_unknown_network_ends_with_one_line(script, tiny, tmp_path):
+    ended = script("devices", *tiny, "networks=[rnn]", cwd=tmp_path)
+    assert ended.status == 2
+    assert "error: networks = 'rnn' must be one of fcnn" in ended.err
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("name", devices.NETWORKS)
+def test_every_network_is_measured_on_a_gpu(name, scene, samples):
+    plan = devices.Plan([4], [1, 64], devices.Clock(torch.device("cuda"), 3, 10.0))
+    rows = list(devices.measure(name, scene, samples, plan))
+    assert len(rows) == (4 if name == "unrolled" else 5)
+    assert all(row.device == "cuda" and row.peak_memory_mb > 0 for row in rows)
