@@ -262,7 +262,7 @@ def _sizes(shape: tuple[int, ...], steps: int | None) -> list[tuple[int, ...]]:
 def _initialise(module: nn.Module) -> None:
     """Draw weights of a convolution that preserve the variance of values (He et al. 2015)."""
     if isinstance(module, Residual):  # after its convolutions
-        nn.init.zeros_(module.second.weight)
+        nn.init.zeros_(module.second.get_parameter("weight"))
     if not isinstance(module, nn.Conv2d | nn.Conv3d | nn.ConvTranspose2d | nn.ConvTranspose3d):
         return
     taps = float(module.in_channels * math.prod(module.kernel_size))
