@@ -1,6 +1,7 @@
 """Compare all methods on one experiment: python scripts/results.py name=beam_svk."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
@@ -8,7 +9,11 @@ from benchmarks.commands import CONF
 from dpl import config
 from dpl.commands.cli import command
 
-KEYS = ((bool, "keep"),)
+if TYPE_CHECKING:
+    from dpl import Sample, Scene
+    from dpl.inference.hybrid import Predict
+
+KEYS = ((bool, "keep single"), (float, "deflection", 1e-6, 10))
 
 
 @command("results", conf=CONF, keys=KEYS)
@@ -23,6 +28,9 @@ def main(cfg: DictConfig) -> None:
     first, surrogate = next(iter(runs.values()))
     scene = surrogate.scene
     data = config.load_data(first, scene)
+    if cfg.single:
+        _single(cfg, scene, data.samples("test"), {n: s.predict for n, (_, s) in runs.items()})
+        return
     train = data.samples("train")
 
     def made(key: str, *parts: object) -> methods.Method:
@@ -54,3 +62,18 @@ def main(cfg: DictConfig) -> None:
         rows = paper_tables.with_kept_rows(rows, stem.with_suffix(".csv"))
     show(rows, f"{cfg.name}, one load at a time, 1 thread")
     paper_tables.save(rows, errors, stem)
+
+
+def _single(
+    cfg: DictConfig, scene: "Scene", test: "Sample", predictions: "dict[str, Predict]"
+) -> None:
+    """Measure and draw one large test load."""
+    from benchmarks import single_loads
+    from dpl.evaluation.tables import show
+
+    load = single_loads.choose(test, cfg.deflection)
+    measured, displacements = single_loads.measure(predictions, test, load)
+    rows = [*single_loads.paper(cfg.name), *measured]
+    show(rows, f"{cfg.name}, test load {load}")
+    stem = Path(cfg.folder) / f"{cfg.name}_single"
+    single_loads.save(scene, test, rows, displacements, stem)
