@@ -207,6 +207,21 @@ def test_trials_summaries_and_figure_are_written(scene, loads, networks, tmp_pat
         read(Trial, tmp_path / "a.csv")
 
 
+def test_larger_loads_need_more_iterations_of_plain_newton_and_have_solutions(scene_of):
+    """Robust Newton solves the loads of experiment hybrid_newton_hard with few iterations."""
+    means = {}
+    for name in ("hybrid_newton", "hybrid_newton_hard"):
+        scene = scene_of(f"experiment={name}", "mesh.nodes=[12,5,5]")
+        solvers = solvers_of(scene, {}, 1e-6, names=["plain Newton"])
+        trials = measure(solvers, "in range", load_sets(scene, 10, 0)["in range"], 1e-6)
+        rows = {row.solver: row for row in summary(trials)[:2]}
+        assert rows[newton_starts.REFERENCE].converged == 100
+        means[name] = [rows[key].iterations for key in ("plain Newton", newton_starts.REFERENCE)]
+    (usual, _), (plain, robust) = means.values()
+    assert plain > 1.2 * usual
+    assert plain > 1.2 * robust
+
+
 def test_lines_are_labelled_and_labels_do_not_overlap(monkeypatch, tmp_path):
     """Each network has a panel over iterations and one over time, with four lines."""
     kept = []
