@@ -48,7 +48,8 @@ def draw(trials: Sequence[Trial], path: Path, *, limit: int | None = None) -> No
         for ax, (quantity, label) in zip(column, QUANTITIES, strict=True):
             _draw_panel(ax, own, quantity)
             ax.set(ylim=(0, 104), xlabel=label)
-        column[0].set_title(f"predictions of {network}" if network else "", loc="left")
+        title = f"predictions of {network}" if network else ""
+        column[0].set_title(title, loc="left", fontsize=9.5)
         if limit is not None:
             column[0].axvline(limit, color="0.6", lw=0.8, ls=":")
     for ax in axes[:, 0]:
@@ -59,20 +60,20 @@ def draw(trials: Sequence[Trial], path: Path, *, limit: int | None = None) -> No
 
 def _draw_panel(ax: Any, trials: Sequence[Trial], quantity: str) -> None:
     """Draw one line for each solver of `LINES` that was measured, with a label at its end."""
-    ends = {}
-    right = max(getattr(trial, quantity) for trial in trials)
-    for solver, (label, colour, style) in LINES.items():
-        own = [trial for trial in trials if trial.solver == solver]
-        if not own:
-            continue
+    lines = {solver: [t for t in trials if t.solver == solver] for solver in LINES}
+    lines = {solver: own for solver, own in lines.items() if own}
+    right = max(getattr(trial, quantity) for own in lines.values() for trial in own)
+    heights = []
+    for solver, own in lines.items():
         values = sorted(getattr(trial, quantity) for trial in own if trial.converged)
-        parts = [100 * k / len(own) for k in range(1, len(values) + 1)]
-        start = values[:1]  # the line begins at the axis
-        ax.step([*start, *values, right], [0, *parts, *(parts[-1:] or [0])][-len(values) - 2 :],
-                where="post", color=colour, ls=style, lw=1.4)  # fmt: skip
-        ends[label] = (parts[-1] if parts else 0.0, colour)
-    for (label, (_, colour)), y in zip(ends.items(), _spread([y for y, _ in ends.values()]),
-                                       strict=True):  # fmt: skip
+        parts = [100 * k / len(own) for k in range(len(values) + 1)]
+        heights.append(parts[-1])
+        x = [*(values[:1] or [right]), *values, right]
+        y = [*parts, parts[-1]]
+        _, colour, style = LINES[solver]
+        ax.step(x, y, where="post", color=colour, ls=style, lw=1.4)
+    for solver, y in zip(lines, _spread(heights), strict=True):
+        label, colour, _ = LINES[solver]
         ax.annotate(
             label, (1.0, y), xycoords=("axes fraction", "data"), xytext=(4, 0),
             textcoords="offset points", color=colour, va="center", fontsize=7.5,
@@ -93,6 +94,4 @@ def _spread(heights: Sequence[float]) -> list[float]:
 
 
 def _note(figure: "Figure", tol: float) -> None:
-    figure.suptitle(
-        f"Loads solved to ||R|| / ||f|| < {tol:g}", x=0.01, ha="left", fontsize=9.5
-    )
+    figure.suptitle(f"Loads solved to ||R|| / ||f|| < {tol:g}", x=0.01, ha="left", fontsize=9.5)

@@ -249,4 +249,3 @@ def _summarise(trials: Sequence[Trial], reference: Sequence[Trial]) -> Summary:
         else None,
         deviation=reduced(max, (own.deviation for own, _ in both)),
     )
-
