@@ -125,7 +125,7 @@ def save(
     measured = {row.method: row for row in rows if row.load is not None}
     (load,) = {row.load for row in measured.values()}
     shown = [
-        (f"{name}\nrelative L2 {measured[name].rel_L2:.2g}", field)
+        (f"{name}: relative L2 {measured[name].rel_L2:.1e}", field)
         for name, field in displacements.items()
     ]
     figure = plot_deformed(

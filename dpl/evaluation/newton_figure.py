@@ -72,10 +72,10 @@ def _draw_panel(ax: Any, trials: Sequence[Trial], quantity: str) -> None:
         y = [*parts, parts[-1]]
         _, colour, style = LINES[solver]
         ax.step(x, y, where="post", color=colour, ls=style, lw=1.4)
-    for solver, y in zip(lines, _spread(heights), strict=True):
+    for solver, height in zip(lines, _spread(heights), strict=True):
         label, colour, _ = LINES[solver]
         ax.annotate(
-            label, (1.0, y), xycoords=("axes fraction", "data"), xytext=(4, 0),
+            label, (1.0, height), xycoords=("axes fraction", "data"), xytext=(4, 0),
             textcoords="offset points", color=colour, va="center", fontsize=7.5,
         )  # fmt: skip
     if quantity == "ms":
