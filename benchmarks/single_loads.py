@@ -123,7 +123,7 @@ def save(
     write(rows, stem.with_suffix(".csv"))
     write_machine(stem.with_suffix(".json"))
     measured = {row.method: row for row in rows if row.load is not None}
-    (load,) = {row.load for row in measured.values()}
+    load = next(row.load for row in rows if row.load is not None)
     shown = [
         (f"{name}: relative L2 {measured[name].rel_L2:.1e}", field)
         for name, field in displacements.items()
