@@ -7,6 +7,7 @@ the runs.
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
@@ -14,7 +15,16 @@ from benchmarks.commands import CONF
 from dpl import config
 from dpl.commands.cli import command
 
-KEYS = ((bool, "keep"), (str, "runs"), (Sequence[str], "convergence"))
+if TYPE_CHECKING:
+    from dpl import Sample, Scene
+    from dpl.inference.hybrid import Predict
+
+KEYS = (
+    (bool, "keep single"),
+    (str, "runs"),
+    (Sequence[str], "convergence"),
+    (float, "deflection", 1e-6, 10),
+)
 ALL = "all"  # name for all experiments
 
 
@@ -43,6 +53,9 @@ def measure(cfg: DictConfig) -> None:
     first, surrogate = next(iter(runs.values()))
     scene = surrogate.scene
     data = config.load_data(first, scene)
+    if cfg.single:
+        _single(cfg, scene, data.samples("test"), {n: s.predict for n, (_, s) in runs.items()})
+        return
     train = data.samples("train")
 
     def made(key: str, *parts: object) -> methods.Method:
@@ -74,3 +87,18 @@ def measure(cfg: DictConfig) -> None:
         rows = paper_tables.with_kept_rows(rows, stem.with_suffix(".csv"))
     show(rows, f"{cfg.name}, one load at a time, 1 thread")
     paper_tables.save(rows, errors, stem)
+
+
+def _single(
+    cfg: DictConfig, scene: "Scene", test: "Sample", predictions: "dict[str, Predict]"
+) -> None:
+    """Measure and draw one large test load."""
+    from benchmarks import single_loads
+    from dpl.evaluation.tables import show
+
+    load = single_loads.choose(test, cfg.deflection)
+    measured, displacements = single_loads.measure(predictions, test, load)
+    rows = [*single_loads.paper(cfg.name), *measured]
+    show(rows, f"{cfg.name}, test load {load}")
+    stem = Path(cfg.folder) / f"{cfg.name}_single"
+    single_loads.save(scene, test, rows, displacements, stem)

@@ -67,6 +67,24 @@ PARTS = (
         split="tol",
     ),
     Part(
+        "hybrid_newton_hard",
+        "Newton from predictions, larger loads",
+        "python scripts/convergence.py run=runs/hybrid_newton_hard name=hybrid_newton_hard "
+        "tols=[1e-6] n_far_loads=0 max_plain_iterations=8 "
+        "\"solvers=[plain Newton,'hybrid, paper\\'s rule','hybrid, best rule']\" "
+        "folder=benchmarks/results",
+        "The loads of `experiment=hybrid_newton_hard`: 50 in range and 50 of one to two times the "
+        "range, one at a time on one thread.",
+        split="loads",
+    ),
+    Part(
+        r"(beam_svk|propeller_nh|beam_nh_loss|beam_young|hybrid_newton_hard)_single",
+        "One large load on `{0}`",
+        "python scripts/results.py name={0} single=true",
+        "The test load whose largest nodal displacement is nearest to 0.4 L, as in tables 2, 4 and "
+        "6 and figures 5 to 7 of the paper. Shapes are coloured by the nodal error.",
+    ),
+    Part(
         r"pareto_(beam_svk|propeller_nh)",
         "Run time against error on `{0}`",
         "python scripts/pareto.py run=runs/{0} folder=benchmarks/results "

@@ -3,12 +3,10 @@
 Extends experiment 4 of Odot, Haferssas, Cotin (2022), DeepPhysics.
 """
 
-import itertools
 import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -20,9 +18,8 @@ from dpl.inference import Hybrid
 from dpl.inference.hybrid import Predict
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
-from dpl.visualization import DPI, method_colours
 
-LINE_STYLES = ("-", "--", ":", "-.")
+PLAIN = ("plain Newton", "hybrid, paper's rule")  # solvers without safeguards
 REFERENCE = "robust Newton"  # solver with which times and displacements are compared
 # random streams of the sets of loads; 2 is the stream of the test loads
 STREAMS = {"in range": 2, "twice": 4, "3 times": 7, "5 times": 8}
@@ -97,7 +94,7 @@ class Summary(Setting):
     deviation: float | None = None
 
 
-# Odot, Haferssas, Cotin (2022), table 5: 50 loads in range and 50 of up to twice the range
+# Odot, Haferssas, Cotin (2022), table 7: 50 loads in range and 50 of up to twice the range
 PAPER = [
     Summary("paper: Newton", "", BOTH, math.nan, 100, 46, None, 6.1),
     Summary("paper: hybrid Newton", "", BOTH, math.nan, 100, 71, 66, 5.0),
@@ -118,16 +115,32 @@ def load_sets(scene: Scene, count: int, far: int) -> dict[str, Load]:
 
 
 def solvers_of(
-    scene: Scene, networks: Mapping[str, Predict], tol: float, *, max_total_iter: int | None = None
+    scene: Scene,
+    networks: Mapping[str, Predict],
+    tol: float,
+    *,
+    max_total_iter: int | None = None,
+    step_tol: float = 0.0,
+    names: Sequence[str] | None = None,
 ) -> dict[tuple[str, str], Solver]:
-    """Return the solvers to compare, by name and network, for a relative residual `tol` [-].
+    """Return the solvers to compare, by name and network.
 
-    They iterate at most `max_total_iter` times, by default as often as the scene's solver.
+    Args:
+        scene: The scene.
+        networks: Predictions by the name of their network.
+        tol: Relative residual [-].
+        max_total_iter: Largest number of iterations of the solvers with safeguards; None: that of
+            the scene's solver.
+        step_tol: Norm of a step that ends plain Newton, see `PlainNewton` [-].
+        names: Names of the solvers; None: all. `REFERENCE` is always one of them.
+
+    Raises:
+        ValueError: A name belongs to no solver.
     """
     budget = max_total_iter or scene.newton.max_total_iter
     robust = replace(scene.newton, tol=tol, max_total_iter=budget)
     quick = replace(scene.corrector, tol=tol, max_total_iter=budget)
-    plain = PlainNewton(robust)
+    plain = PlainNewton(robust, step_tol=step_tol)
     solvers: dict[tuple[str, str], Solver] = {
         ("plain Newton", ""): plain,
         ("plain Newton, load steps", ""): replace(
@@ -142,7 +155,11 @@ def solvers_of(
         solvers["hybrid, best rule", name] = Hybrid(predict, quick)
         anderson = AndersonSolver(quick)
         solvers["hybrid, without tangents", name] = Hybrid(predict, quick, steps=anderson)
-    return solvers
+    known = list(dict.fromkeys(name for name, _ in solvers))
+    wanted = {REFERENCE, *(known if names is None else names)}
+    if unknown := wanted.difference(known):
+        raise ValueError(f"{sorted(unknown)} must be names of solvers: {', '.join(known)}")
+    return {key: solver for key, solver in solvers.items() if key[0] in wanted}
 
 
 def measure(
@@ -170,6 +187,28 @@ def measure(
         numbers = zip(*(column.tolist() for column in columns), strict=True)
         trials += [Trial(name, network, title, tol, k, *row) for k, row in enumerate(numbers)]
     return trials
+
+
+def limited(trials: Sequence[Trial], limit: int) -> list[Trial]:
+    """Return the results of `PLAIN` solvers as they are if iterations end at a limit.
+
+    A plain Newton method does not depend on its limit before it is reached. A load that needs more
+    iterations has not converged.
+
+    Args:
+        trials: Results with a larger limit.
+        limit: Largest number of iterations, including one that the paper's rule discards.
+    """
+    return [
+        replace(
+            trial,
+            solver=f"{trial.solver}, at most {limit} iterations",
+            converged=trial.converged and trial.iterations <= limit,
+            iterations=min(trial.iterations, limit),
+        )
+        for trial in trials
+        if trial.solver in PLAIN
+    ]
 
 
 def summary(trials: Sequence[Trial]) -> list[Summary]:
@@ -210,42 +249,3 @@ def _summarise(trials: Sequence[Trial], reference: Sequence[Trial]) -> Summary:
         else None,
         deviation=reduced(max, (own.deviation for own, _ in both)),
     )
-
-
-def draw(trials: Sequence[Trial], path: Path) -> None:
-    """Draw the fraction of converged loads over wall time, one panel for each tolerance.
-
-    Source: Dolan, More (2002), Benchmarking optimization software with performance profiles; here
-    with absolute times.
-    """
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import NullFormatter
-
-    tols = list(dict.fromkeys(trial.tol for trial in trials))
-    names = list(dict.fromkeys((trial.solver, trial.network) for trial in trials))
-    networks = list(dict.fromkeys(network for _, network in names))
-    styles: dict[str, str] = {}
-    colours = method_colours(networks)
-    for network in networks:
-        same = [solver for solver, other in reversed(names) if other == network]
-        styles |= dict(zip(same, itertools.cycle(LINE_STYLES), strict=False))
-    figure = Figure(figsize=(3.6 * len(tols) + 2.6, 3.8), layout="constrained")
-    axes = figure.subplots(1, len(tols), sharex=True, sharey=True, squeeze=False)[0]
-    for ax, tol in zip(axes, tols, strict=True):
-        for solver, network in names:
-            own = [t for t in trials if (t.tol, t.solver, t.network) == (tol, solver, network)]
-            taken = sorted(trial.ms for trial in own if trial.converged)
-            part = [100 * k / len(own) for k in range(1, len(taken) + 1)]
-            colour = colours[network] if network else "0.1"
-            width = 2 if solver == "hybrid, without tangents" else 1.2
-            style = {"color": colour, "ls": styles[solver], "lw": width}
-            label = f"{solver}, {network}" if network else solver
-            ax.step(taken, part, where="post", label=label, **style)
-        ax.set_xscale("log")
-        ax.xaxis.set_minor_formatter(NullFormatter())
-        ax.set(ylim=(0, 102), xlabel="time [ms]")
-        ax.set_title(f"to ||R|| / ||f|| < {tol:g}", fontsize=10)
-        ax.grid(alpha=0.3, which="both")
-    axes[0].set_ylabel("converged loads [%]")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
-    figure.savefig(path, dpi=DPI)

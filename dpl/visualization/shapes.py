@@ -34,6 +34,7 @@ def plot_deformed(
     *,
     names: Sequence[str] = (),
     upright: bool = False,
+    logarithmic: bool = False,
     max_polygons: int | None = None,
 ) -> "Figure":
     """Return a figure of the reference shapes and of predicted shapes beside them.
@@ -49,6 +50,7 @@ def plot_deformed(
         predictions: Pairs of a name and displacements over L, (B, N, D) [-].
         names: Titles of the loads.
         upright: Put loads in rows and predictions in columns, for TensorBoard's narrow cards.
+        logarithmic: Make all scales logarithmic.
         max_polygons: Largest number of polygons per body, see `coarse`; None: all.
     """
     body = _Outlined(problem, max_polygons)
@@ -63,7 +65,7 @@ def plot_deformed(
             ax.set_title(names[load], fontsize=9, loc="left")
     for row, bar, field in zip(axes[1:], bars, fields, strict=True):
         error = np.linalg.norm(field - true, axis=2)
-        scale = error_scale(error)
+        scale = error_scale(error, logarithmic=logarithmic)
         for ax, u, exact, value in zip(row, field, true, error, strict=True):
             if np.isfinite(u).all():
                 body.draw(ax, body.points + u, scale.to_rgba(body.at_polygons(value)), "0.75")
@@ -152,17 +154,19 @@ def project(points: Array) -> tuple[Array, Array]:
     return seen[:, :2], seen[:, 2]
 
 
-def error_scale(error: Array) -> "ScalarMappable":
+def error_scale(error: Array, *, logarithmic: bool = False) -> "ScalarMappable":
     """Return a colour scale whose upper end is the largest finite error.
 
-    It is logarithmic over three decades if half of the positive errors are small, else linear.
+    It is logarithmic over three decades if half of the positive errors are small, else linear;
+    with `logarithmic` it is logarithmic in any case.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm, Normalize
 
     positive = error[np.isfinite(error) & (error > 0)]
     largest = float(positive.max(initial=SMALLEST_ERROR))
-    if len(positive) and np.median(positive) < WIDE * largest:
+    spread = bool(len(positive)) and bool(np.median(positive) < WIDE * largest)
+    if logarithmic or spread:
         return ScalarMappable(LogNorm(largest * DECADES, largest, clip=True), "viridis")
     return ScalarMappable(Normalize(0.0, largest, clip=True), "viridis")
 

@@ -3,13 +3,16 @@
 import csv
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
+from matplotlib.figure import Figure
 
-from dpl.evaluation import newton_starts
+from dpl.evaluation import newton_figure, newton_starts
 from dpl.evaluation.newton_starts import (
     Trial,
+    limited,
     load_sets,
     measure,
     solvers_of,
@@ -18,6 +21,7 @@ from dpl.evaluation.newton_starts import (
 from dpl.evaluation.plain_newton import PlainNewton
 from dpl.evaluation.tables import read, write
 from dpl.fem import Newton, solve
+from dpl.inference import Hybrid
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +52,33 @@ def test_plain_newton_reports_divergence(scene, loads):
     end = solve(PlainNewton(scene.solver), hard)
     assert not end.converged
     assert int(end.iterations) <= 20
+
+
+def test_a_small_step_ends_plain_newton_and_does_not_make_a_state_converged(scene, loads):
+    """The iterations are those without `step_tol` up to the first step whose norm is below it."""
+    load = loads.unbatch()[0]
+    states = list(PlainNewton(scene.solver).iterate(load))
+    steps = [float((b.displacement - a.displacement).norm()) for a, b in pairwise(states)]
+    assert len(steps) > 3
+    tol = 1.01 * steps[2]
+    ended = list(PlainNewton(scene.solver, step_tol=tol).iterate(load))
+    first = next(k for k, step in enumerate(steps) if step < tol)
+    assert len(ended) == first + 2
+    assert not ended[-1].converged
+    assert torch.equal(ended[-1].displacement, states[first + 1].displacement)
+
+
+def test_the_paper_s_hybrid_ends_with_a_small_step_too(scene, loads, networks):
+    load = loads.unbatch()[0]
+    solver = PlainNewton(scene.solver, step_tol=1e3)
+    end = solve(Hybrid(networks["near"], solver, "paper"), load)
+    assert (bool(end.from_guess), int(end.iterations), bool(end.converged)) == (True, 2, False)
+
+
+@pytest.mark.parametrize("options", [{"max_iter": 0}, {"step_tol": -1.0}, {"step_tol": math.nan}])
+def test_options_of_plain_newton_out_of_range_are_refused(scene, options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        PlainNewton(scene.solver, **options)
 
 
 def test_plain_newton_is_quadratic_from_a_guess(scene, loads, networks):
@@ -128,6 +159,25 @@ def test_summaries_count_converged_loads_and_compare_where_both_converged():
     assert (row.ms, row.time_ratio, row.deviation) == (8, 20 / 40, 1e-7)
 
 
+def test_a_limit_counts_loads_as_if_plain_newton_had_stopped_there(scene, loads, networks):
+    names = ["plain Newton", "hybrid, paper's rule"]
+    trials = measure(solvers_of(scene, networks, 1e-8, names=names), "in range", loads, 1e-8)
+    least = min(t.iterations for t in trials if t.solver == "plain Newton")
+    found = [t for t in limited(trials, least) if t.solver.startswith("plain Newton")]
+    stopped = solve(PlainNewton(scene.solver, max_iter=least), loads)
+    assert [t.converged for t in found] == stopped.converged.tolist()
+    assert [t.iterations for t in found] == stopped.iterations.tolist()
+    assert {t.solver for t in limited(trials, 3)} == {f"{n}, at most 3 iterations" for n in names}
+
+
+def test_solvers_are_chosen_by_name(scene, networks):
+    found = solvers_of(scene, networks, 1e-3, names=["hybrid, paper's rule"])
+    paper = [("hybrid, paper's rule", name) for name in networks]
+    assert list(found) == [(newton_starts.REFERENCE, ""), *paper]
+    with pytest.raises(ValueError, match=r"\['fast'\] must be names of solvers: plain Newton, "):
+        solvers_of(scene, networks, 1e-3, names=["fast"])
+
+
 def test_a_solver_that_never_converges_has_no_iterations_and_no_time(scene, loads):
     hard = loads._replace(force=1e5 * loads.force)
     solver = Newton(scene.problem, min_load_step=0.9, max_iter=2)
@@ -147,7 +197,7 @@ def test_trials_summaries_and_figure_are_written(scene, loads, networks, tmp_pat
     ]
     assert [t.ms for t in again] == pytest.approx([t.ms for t in trials], rel=1e-3)
     write(newton_starts.PAPER + summary(trials), tmp_path / "a.csv")
-    newton_starts.draw(trials, tmp_path / "a.png")
+    newton_figure.draw(trials, tmp_path / "a.png", limit=5)
     written = list(csv.DictReader((tmp_path / "a.csv").open()))
     assert len(written) == 2 + 2 * (4 + 2 * 4)
     assert written[1]["used_prediction_pct"] == "66"
@@ -157,10 +207,51 @@ def test_trials_summaries_and_figure_are_written(scene, loads, networks, tmp_pat
         read(Trial, tmp_path / "a.csv")
 
 
+def test_larger_loads_need_more_iterations_of_plain_newton_and_have_solutions(scene_of):
+    """Robust Newton solves the loads of experiment hybrid_newton_hard with few iterations."""
+    means = {}
+    for name in ("hybrid_newton", "hybrid_newton_hard"):
+        scene = scene_of(f"experiment={name}", "mesh.nodes=[12,5,5]")
+        solvers = solvers_of(scene, {}, 1e-6, names=["plain Newton"])
+        trials = measure(solvers, "in range", load_sets(scene, 10, 0)["in range"], 1e-6)
+        rows = {row.solver: row for row in summary(trials)[:2]}
+        assert rows[newton_starts.REFERENCE].converged == 100
+        means[name] = [rows[key].iterations for key in ("plain Newton", newton_starts.REFERENCE)]
+    (usual, _), (plain, robust) = means.values()
+    assert plain > 1.2 * usual
+    assert plain > 1.2 * robust
+
+
+def test_lines_are_labelled_and_labels_do_not_overlap(monkeypatch, tmp_path):
+    """Each network has a panel over iterations and one over time, with four lines."""
+    kept = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: kept.append(self))
+    solvers = [("plain Newton", ""), (newton_starts.REFERENCE, "")]
+    for network in ("a", "b"):
+        solvers += [("hybrid, paper's rule", network), ("hybrid, best rule", network)]
+    trials = [
+        Trial(*solver, "in range", 1e-6, k, k != 3, True, 3 + k, 1, 10.0 + k, 0.0)
+        for solver in solvers
+        for k in range(4)
+    ]
+    newton_figure.draw(trials, tmp_path / "a.png")
+    (figure,) = kept
+    figure.draw_without_rendering()
+    assert len(figure.axes) == 4
+    for ax in figure.axes:
+        labels = {text.get_text(): text.get_window_extent() for text in ax.texts}
+        assert set(labels) == {"plain Newton", "robust Newton", "paper's hybrid", "our hybrid"}
+        assert sum(a.overlaps(b) for a in labels.values() for b in labels.values()) == len(labels)
+        assert len(ax.lines) == 4
+        for line in ax.lines:
+            assert list(line.get_ydata()) == [0, 25, 50, 75, 75]
+
+
 def test_the_script_measures_the_runs_of_a_folder_and_resumes(script, tiny_training, tmp_path):
     ended = script("train", *tiny_training, "trainer.max_epochs=1", "run=runs/e/a", cwd=tmp_path)
     assert ended.status == 0, ended.err[-2000:]
     few = ["run=runs/e", "tols=[1e-3,1e-6,1e-8]", "count=2", "n_far_loads=1"]
+    limit = "max_plain_iterations=6"
     ended = script("convergence", *few, cwd=tmp_path)
     assert ended.status == 0, ended.err[-2000:]
     results, raw = tmp_path / "runs" / "convergence", tmp_path / "runs" / "e" / "hybrid_newton.csv"
@@ -180,6 +271,17 @@ def test_the_script_measures_the_runs_of_a_folder_and_resumes(script, tiny_train
     refused = script("convergence", *few, cwd=tmp_path)
     assert refused.status == 2
     assert "must have the columns" in refused.err
+    raw.unlink()
+    short = ["solvers=[plain Newton]", "tols=[1e-3]", "n_far_loads=0", limit, "name=short"]
+    ended = script("convergence", few[0], few[2], *short, cwd=tmp_path)
+    assert ended.status == 0, ended.err[-2000:]
+    rows = list(csv.DictReader((results / "short.csv").open()))[2:]
+    assert {row["solver"] for row in rows} == {
+        "plain Newton", "robust Newton", "plain Newton, at most 6 iterations",
+    }  # fmt: skip
+    refused = script("convergence", *few, "solvers=[fast]", cwd=tmp_path)
+    assert refused.status == 2
+    assert "solvers: ['fast'] must be names of solvers" in refused.err
     refused = script("convergence", "run=runs/none", cwd=tmp_path)
     assert refused.status == 2
     assert "contains no runs" in refused.err

@@ -164,6 +164,16 @@ def test_nodes_with_larger_errors_are_brighter(make_scene, background):
     assert light[touched].min() > light[~touched].max() + 0.3
 
 
+def test_all_scales_can_be_logarithmic(scene, batch):
+    """Errors of similar size have a linear scale, unless a logarithmic one is requested."""
+    truth = batch.displacement[:1]
+    wrong = [("network", truth + 0.1)]
+    linear = plot_deformed(scene.problem, truth, wrong)
+    logarithmic = plot_deformed(scene.problem, truth, wrong, logarithmic=True)
+    assert linear.axes[-1].get_yscale() == "linear"
+    assert logarithmic.axes[-1].get_yscale() == "log"
+
+
 def test_upright_figures_have_one_row_per_load(make_scene):
     scene = make_scene(n_modes=2)
     truth = 0.01 * torch.randn(3, *scene.problem.shape, dtype=torch.float64)

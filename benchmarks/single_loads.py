@@ -1,0 +1,134 @@
+"""One large load: errors of all networks and a figure of the deformed shapes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from dpl import Sample, Scene
+from dpl.evaluation.tables import write, write_machine
+from dpl.inference.hybrid import Predict
+from dpl.system.threads import one_thread
+from dpl.training.metrics import MaxError, MeanError, MinSNR, RelativeL2
+from dpl.visualization import plot_deformed
+
+# Odot, Haferssas, Cotin (2022), tables 2, 4 and 6: e_mean, e_max, SNR [dB]
+PAPER: dict[str, dict[str, tuple[float, float, float]]] = {
+    "beam_svk": {
+        "paper, beam (a)": (5.4e-5, 0.037, 22.2),
+        "paper, beam (b)": (6.6e-6, 0.0050, 40.2),
+    },
+    "propeller_nh": {
+        "paper, propeller (c)": (2.82e-6, 0.0036, 33.9),
+        "paper, propeller (d)": (8.2e-7, 0.0008, 42.3),
+    },
+    "beam_nh_loss": {
+        "paper, L_r^* (a)": (6.1e-6, 0.027, 38.21),
+        "paper, L_r^* (b)": (1.5e-5, 0.034, 34.7),
+        "paper, MSE (c)": (5.3e-5, 0.034, 25.42),
+        "paper, MSE (d)": (5.5e-5, 0.037, 24.9),
+    },
+    "beam_young": {
+        "paper, beam (a)": (3.9e-5, 0.028, 25.66),
+        "paper, beam (b)": (4.8e-5, 0.038, 25.42),
+        "paper, beam (c)": (4.1e-5, 0.034, 24.25),
+        "paper, beam (d)": (6.8e-5, 0.060, 23.73),
+    },
+}
+
+
+@dataclass(frozen=True)
+class SingleLoad:
+    """Errors of one method for one load.
+
+    Attributes:
+        method: Name of the method.
+        load: Number of the test load; None for the loads of the paper.
+        deflection: Largest nodal displacement over L [-].
+        e_mean: Norm of the error over the number of degrees of freedom [-].
+        e_max: Largest nodal error over L [-].
+        SNR: Signal-to-noise ratio [dB].
+        rel_L2: Norm of the error over that of the displacement [-].
+    """
+
+    method: str
+    load: int | None = None
+    deflection: float | None = None
+    e_mean: float | None = None
+    e_max: float | None = None
+    SNR: float | None = None
+    rel_L2: float | None = None
+
+
+def largest_displacements(test: Sample) -> Tensor:
+    """Return the largest nodal displacement of each load, (S,) [-]."""
+    return test.displacement.norm(dim=2).amax(dim=1)
+
+
+def choose(test: Sample, deflection: float) -> int:
+    """Return the load whose largest nodal displacement over L is nearest to a deflection [-]."""
+    return int((largest_displacements(test) - deflection).abs().argmin())
+
+
+def measure(
+    predictions: Mapping[str, Predict], test: Sample, load: int
+) -> tuple[list[SingleLoad], dict[str, Tensor]]:
+    """Return a row and the displacement (1, N, D) [-] of each method for one load.
+
+    Args:
+        predictions: Functions from a load to displacements, by name.
+        test: Test loads with their solutions.
+        load: Number of the load.
+    """
+    single = Sample(*(column[load : load + 1] for column in test))
+    deflection = float(largest_displacements(single))
+    metrics = MeanError(), MaxError(), MinSNR(), RelativeL2()
+    rows, displacements = [], {}
+    with one_thread(), torch.inference_mode():
+        for name, predict in predictions.items():
+            found = displacements[name] = predict(single.load)
+            errors = (float(metric.measure(found, single)) for metric in metrics)
+            rows.append(SingleLoad(name, load, deflection, *errors))
+    return rows, displacements
+
+
+def paper(experiment: str) -> list[SingleLoad]:
+    """Return the rows of the paper for an experiment; empty if the paper has none."""
+    return [
+        SingleLoad(name, e_mean=e_mean, e_max=e_max, SNR=snr, rel_L2=10 ** (-snr / 20))
+        for name, (e_mean, e_max, snr) in PAPER.get(experiment, {}).items()
+    ]
+
+
+def save(
+    scene: Scene,
+    test: Sample,
+    rows: Sequence[SingleLoad],
+    displacements: Mapping[str, Tensor],
+    stem: Path,
+) -> None:
+    """Write rows as CSV, the machine as JSON, and the deformed shapes as PNG.
+
+    Shapes are coloured by the nodal error on logarithmic scales.
+
+    Args:
+        scene: The scene.
+        test: Test loads with their solutions.
+        rows: Rows of `paper` and `measure`, all measured ones of one load.
+        displacements: Displacements of the methods, (1, N, D) [-].
+        stem: Path of the files without extension.
+    """
+    write(rows, stem.with_suffix(".csv"))
+    write_machine(stem.with_suffix(".json"))
+    measured = {row.method: row for row in rows if row.load is not None}
+    load = next(row.load for row in rows if row.load is not None)
+    shown = [
+        (f"{name}: relative L2 {measured[name].rel_L2:.1e}", field)
+        for name, field in displacements.items()
+    ]
+    figure = plot_deformed(
+        scene.problem, test.displacement[load : load + 1], shown, upright=True, logarithmic=True
+    )
+    figure.savefig(stem.with_suffix(".png"))
