@@ -105,7 +105,11 @@ def _quieten_lightning() -> None:
         logging.getLogger(name).propagate = False
     for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    for message in (".*LeafSpec", "The number of training batches"):
+    for message in (
+        ".*LeafSpec",
+        "The number of training batches",
+        "Checkpoint directory .* exists",
+    ):
         warnings.filterwarnings("ignore", message)
 
 
