@@ -178,7 +178,9 @@ def check_callbacks(trainer: Any, checkpoint: dict[str, Any]) -> None:
     """
     averages = any(isinstance(one, training.AveragedWeights) for one in trainer.callbacks)
     name = training.AveragedWeights.__name__
-    if not averages and any(str(key).startswith(name) for key in checkpoint["callbacks"]):
+    states = checkpoint.get("callbacks")
+    stored = states if isinstance(states, dict) else {}  # another type is refused by Lightning
+    if not averages and any(str(key).startswith(name) for key in stored):
         raise ConfigError("ckpt_path: the run averages its weights; add callbacks=ema")
 
 

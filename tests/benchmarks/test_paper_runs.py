@@ -222,8 +222,8 @@ except subcommands.Interrupted:
 CHILD = """
 import sys, time
 from pathlib import Path
-print("started", flush=True)
 try:
+    print("started", flush=True)
     time.sleep(60)
 except KeyboardInterrupt:
     time.sleep(0.3)

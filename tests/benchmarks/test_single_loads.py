@@ -42,7 +42,7 @@ def test_an_error_of_one_percent_has_40_db(scene, batch, chosen):
 
 
 def test_the_paper_s_single_loads_are_named():
-    assert set(single_loads.PAPER) == set(PAPER)
+    assert set(single_loads.PAPER) < set(PAPER)
     rows = single_loads.paper("beam_svk")
     assert [row.load for row in rows] == [None, None]
     assert rows[1].rel_L2 == pytest.approx(0.0098, abs=1e-4), "40.2 dB"

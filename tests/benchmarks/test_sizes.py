@@ -39,6 +39,7 @@ def test_no_panel_has_more_than_four_lines(tmp_path, monkeypatch):
     beams.draw(rows, tmp_path / "sizes.png")
     (figure,) = drawn
     assert [len(ax.lines) for ax in figure.axes] == [4, 2, 1, 3]
-    colours = {line.get_label().split(":")[0]: line.get_color() for line in figure.axes[1].lines}
-    assert colours == {name: METHOD_COLOURS[name] for name in ("unrolled", "fcnn")}
-    assert "DOFs$^{1.00}$" in figure.axes[0].lines[0].get_label()
+    labels = {text.get_text(): text.get_color() for text in figure.axes[1].texts}
+    names = ("unrolled", "fcnn")
+    assert labels == {f"{name} $\\sim$ DOFs$^{{1.00}}$": METHOD_COLOURS[name] for name in names}
+    assert [line.get_color() for line in figure.axes[1].lines] == list(labels.values())

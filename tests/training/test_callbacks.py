@@ -132,7 +132,7 @@ def test_pictures_are_large_enough_to_read(scene, data, tmp_path):
         picture = np.asarray(Image.open(io.BytesIO(event.encoded_image_string)).convert("L"))
         assert min(picture.shape) > 200
         assert picture.std() > 10, "not empty"
-        assert len(event.encoded_image_string) < 200_000
+        assert len(event.encoded_image_string) < 400_000
 
 
 def test_meshes_can_be_left_out(scene, data, tmp_path):
