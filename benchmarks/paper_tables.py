@@ -30,6 +30,7 @@ PAPER: dict[str, dict[str, tuple[float, float | None, float | None, int | None]]
 }
 STREAMS = {"twice": 4, "small": 5}  # of loads; those of samples and scales are below
 CORRECTED = " corrected"  # ends the name of a network that is corrected
+ON_LINEAR = "_linear"  # ends the name of a network on the linear solution; see conf/experiment
 LEAST_DRAWN, MOST_DRAWN = 1e-9, 1e3  # errors beyond are drawn there [-]
 GOLDEN = 0.618034  # distance of successive dots across a row, modulo 1, in heights of a row
 TITLES = {
@@ -208,14 +209,15 @@ def draw(errors: Mapping[tuple[str, str], Tensor], path: Path) -> None:
 
     sets = list(dict.fromkeys(title for _, title in errors))
     methods = list(dict.fromkeys(method for method, _ in errors))
-    colours = method_colours(dict.fromkeys(method.removesuffix(CORRECTED) for method in methods))
+    families = {m: m.removesuffix(CORRECTED).removesuffix(ON_LINEAR) for m in methods}
+    colours = method_colours(families.values())
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(2.6 * len(sets) + 1.6, 0.3 * len(methods) + 1.0))
         figure.set_layout_engine("constrained")
         axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
         for ax, title in zip(axes, sets, strict=True):
             for row, method in enumerate(methods):
-                colour = colours[method.removesuffix(CORRECTED)]
+                colour = colours[families[method]]
                 values = errors[method, title].clamp(min=LEAST_DRAWN, max=MOST_DRAWN).cpu()
                 shift = 0.6 * (torch.arange(len(values)) * GOLDEN % 1 - 0.5)  # dots side by side
                 dots = {"color": colour, "ms": 3, "alpha": 0.35, "mew": 0}

@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 
 from dpl.fem import Load
 from dpl.models import FCNN, GNN, PODNet
+from dpl.models.cnn import Residual
 from dpl.models.fcnn import count_parameters
 from dpl.system.memory import refuse_weights
 from dpl.training import MSE, Surrogate
@@ -126,6 +127,9 @@ def test_weights_are_a_function_of_the_seed(build):
 
 def test_every_parameter_learns(build, scene, batch):
     surrogate = Surrogate(build(), MSE(), scene)
+    for part in surrogate.modules():
+        if isinstance(part, Residual):
+            torch.nn.init.normal_(part.second.weight)  # zero at first
     surrogate.loss(surrogate.predict(batch.load), batch, surrogate.physics).backward()
     for name, parameter in surrogate.net.named_parameters():
         assert parameter.grad is not None, name
