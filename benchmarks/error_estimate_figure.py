@@ -55,14 +55,14 @@ def draw(found: Sequence[Estimate], path: Path) -> None:
 
     bodies = list(dict.fromkeys(one.body for one in found))
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(3.0 * len(bodies) + 0.6, 3.6), layout="constrained")
+        figure = Figure(figsize=(3.0 * max(len(bodies), 1.4) + 0.6, 3.6), layout="constrained")
         axes = figure.subplots(1, len(bodies), sharey=True, squeeze=False)[0]
         for ax, body in zip(axes, bodies, strict=True):
             _draw_body(ax, [one for one in found if one.body == body])
             ax.set_title(body)
         axes[0].set_ylabel("estimated / true error")
         handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(4, 2 * len(bodies)))
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=DPI)
 
@@ -75,6 +75,8 @@ def _draw_body(ax: Any, found: Sequence[Estimate]) -> None:
             own = [one for one in found if one.loads == loads]
             errors = np.array([one.error for one in own])
             ratios = np.array([getattr(one, name) for one in own]) / errors
+            if np.isnan(ratios).all():
+                continue  # no model has modes
             face = COLOURS[k] if filled else "none"
             ax.plot(
                 errors, ratios, "o", ms=2.8, mfc=face, mec=COLOURS[k], mew=0.5, alpha=0.6,

@@ -263,9 +263,9 @@ def figures(cfg: DictConfig, backends: list[str]) -> None:
         bent.draw(read(bent.Deflection, path), path.with_suffix(".png"))
     if (path := folder / "unrolled.csv").is_file():
         ablation_figures.draw(read(ablation.Row, path), path.with_suffix(".png"))
-    if (path := folder / "error_estimates_loads.csv").is_file():
+    for path in folder.glob("error_estimates*_loads.csv"):
         found = read(error_estimates.Estimate, path)
-        error_estimate_figure.draw(found, folder / "error_estimates.png")
+        error_estimate_figure.draw(found, folder / f"{path.stem.removesuffix('_loads')}.png")
 
 
 def _listed(rows: list[peers.Time], title: str) -> list[peers.Time]:
