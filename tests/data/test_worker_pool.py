@@ -68,7 +68,7 @@ class Asked(GracefulShutdown):
 def fragile(scene, **how):
     linear, modes = scene.solver.linear_solver, scene.loads.eigenmodes
     loads = Fragile(linear, n_modes=3, young=4500.0, **how)
-    loads.__dict__["modes"] = modes
+    loads.__dict__["eigenmodes"] = modes
     return Scene(scene.problem, loads, scene.solver)
 
 
