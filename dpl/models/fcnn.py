@@ -121,8 +121,9 @@ class FCNN(nn.Module):
         if self.scalars.count:
             values = self.scalars(force, amplitude, parameters)
             inputs = torch.cat([inputs, values], dim=1)
+        outputs = self.stages(inputs).to(force.dtype)  # of lower precision with bf16-mixed
         whole = torch.zeros_like(force).flatten(1)
-        return whole.index_copy(1, self.output_index, self.stages(inputs)).view_as(force)
+        return whole.index_copy(1, self.output_index, outputs).view_as(force)
 
     def skipped_work(self) -> list[str]:
         """Return the work that the network saves, one line."""
