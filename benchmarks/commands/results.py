@@ -44,7 +44,7 @@ def main(cfg: DictConfig) -> None:
 
 def measure(cfg: DictConfig) -> None:
     """Measure every run of an experiment; write rows, machine and figure."""
-    from benchmarks import paper_tables
+    from benchmarks import learning_curves, paper_tables
     from dpl.evaluation import methods
     from dpl.evaluation.tables import show
     from dpl.models import Correctable
@@ -87,6 +87,7 @@ def measure(cfg: DictConfig) -> None:
         rows = paper_tables.with_kept_rows(rows, stem.with_suffix(".csv"))
     show(rows, f"{cfg.name}, one load at a time, 1 thread")
     paper_tables.save(rows, errors, stem)
+    learning_curves.save([Path(cfg.run) / name for name in runs], Path(f"{stem}_curves"))
 
 
 def _single(

@@ -58,6 +58,22 @@ PARTS = (
         split="loads",
     ),
     Part(
+        r"(beam_svk|propeller_nh|beam_nh_loss|beam_young|beam_young_wide)_curves",
+        "Learning curves on `{0}`",
+        "python scripts/results.py name={0}",
+        "Median relative L2 error of the validation loads, of all runs below `runs/{0}` that were "
+        "validated more than once.",
+        tabulated=False,
+    ),
+    Part(
+        "transfer",
+        "Networks on other families of loads",
+        "python scripts/transfer.py run=runs/families",
+        "Each network of each family on the test loads of all families: errors of the prediction, "
+        "and Newton from the prediction and from rest.",
+        split="network",
+    ),
+    Part(
         "hybrid_newton",
         "Newton from predictions",
         "python scripts/convergence.py run=runs/beam_svk networks=[fcnn] n_far_loads=0 "

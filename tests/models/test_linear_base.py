@@ -187,6 +187,22 @@ def test_training_reduces_the_error_of_small_and_large_loads(name, scene, batch)
     assert (after < 0.9 * before).all()
 
 
+@pytest.mark.parametrize("base", ["none", "linear"])
+@pytest.mark.parametrize("name", NETS)
+def test_half_precision_products_change_a_prediction_by_their_rounding(name, base, scene, batch):
+    """As with `trainer.precision=bf16-mixed`; a bfloat16 number has 8 digits, in base 2."""
+    torch.manual_seed(0)
+    kind, options = NETS[name]
+    surrogate = Surrogate(kind(scene, base=base, **options), MSE(), scene).eval()
+    linear = LinearBase(scene).solve(batch.load) if base == "linear" else 0.0
+    with torch.no_grad():
+        exact = surrogate.predict(batch.load) - linear
+        with torch.autocast("cpu", torch.bfloat16):
+            rounded = surrogate.predict(batch.load) - linear
+    assert rounded.dtype == torch.float64
+    assert 0 < relative(rounded, exact).max() < 0.1
+
+
 def test_a_checkpoint_has_the_weights_only(surrogate_of, scene, batch):
     one, other = surrogate_of(scene, 0), surrogate_of(scene, 1)
     assert not any(name.startswith("base") for name in one.state_dict())

@@ -1,0 +1,65 @@
+"""Test networks on the loads of other families: python scripts/transfer.py run=runs/families.
+
+The folder has a folder for each family with the runs of its networks, FAMILY/NETWORK. All runs
+have the same body. Test loads are those of the data sets of the runs.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omegaconf import DictConfig
+
+from benchmarks.commands import CONF
+from dpl import config
+from dpl.commands.cli import command
+
+if TYPE_CHECKING:
+    from benchmarks.transfer import Transfer
+    from dpl import Sample
+    from dpl.training import Surrogate
+
+KEYS = ((Sequence[str] | None, "families"), (str, "name"), (int, "count", 1, 10**6))
+
+
+@command("transfer", conf=CONF, keys=KEYS)
+def main(cfg: DictConfig) -> None:
+    """Measure all networks of all families on the test loads of all families."""
+    from benchmarks import transfer
+    from dpl.evaluation.tables import show, write, write_machine
+
+    runs = _runs(cfg)
+    scenes = {name: next(iter(own.values()))[1].scene for name, own in runs.items()}
+    if lines := transfer.differences(scenes):
+        raise config.ConfigError(f"run = {cfg.run}: the bodies of the families differ; {lines[0]}")
+    tests = {name: _test_loads(*next(iter(own.values())), cfg.count) for name, own in runs.items()}
+    stem = Path(cfg.folder) / cfg.name
+    rows: list[Transfer] = []
+    for family, own in runs.items():
+        for network, (_, surrogate) in own.items():
+            print(f"{family}/{network} ...", flush=True)
+            predict, scene = surrogate.predict, surrogate.scene
+            rows += transfer.measure(network, family, predict, scene, tests)
+            write(rows, stem.with_suffix(".csv"))
+    show(rows, "networks on the loads of other families, 1 thread")
+    write_machine(stem.with_suffix(".json"))
+    transfer.draw(rows, stem.with_suffix(".png"))
+
+
+def _runs(cfg: DictConfig) -> "dict[str, dict[str, tuple[DictConfig, Surrogate]]]":
+    """Return configurations and surrogates by family and network."""
+    found = sorted({path.parents[1].name for path in Path(cfg.run).glob("*/*/config.yaml")})
+    if not found:
+        raise config.ConfigError(
+            f"run = {cfg.run} contains no runs; train some with run={cfg.run}/FAMILY/NETWORK"
+        )
+    families = cfg.families or found
+    return {name: config.load_runs(Path(cfg.run) / name, cfg.networks) for name in families}
+
+
+def _test_loads(cfg: DictConfig, surrogate: "Surrogate", count: int) -> "Sample":
+    """Return the first test loads of the data set of a run, with their solutions."""
+    from dpl import Sample
+
+    test = config.load_data(cfg, surrogate.scene).samples("test")
+    return Sample(*(column[:count] for column in test))

@@ -1,0 +1,60 @@
+"""Laws of learning curves."""
+
+import csv
+
+import pytest
+from PIL import Image
+from torch.utils.tensorboard import SummaryWriter
+
+from benchmarks import learning_curves
+from benchmarks.learning_curves import ERROR, Validation
+
+
+def write_events(folder, errors, steps=10):
+    """Log an error after each epoch of `steps` steps, and the epoch at every fifth step."""
+    with SummaryWriter(folder) as log:
+        for epoch, error in errors.items():
+            for step in range(epoch * steps, (epoch + 1) * steps, 5):
+                log.add_scalar("epoch", epoch, step + 4)
+            log.add_scalar(ERROR, error, (epoch + 1) * steps - 1)
+
+
+def test_a_curve_counts_trained_epochs(tmp_path):
+    run = tmp_path / "cnn"
+    write_events(run, {0: 0.5, 3: 0.25})
+    assert learning_curves.curve(run) == [Validation("cnn", 1, 0.5), Validation("cnn", 4, 0.25)]
+
+
+def test_a_resumed_run_has_one_curve(tmp_path):
+    run = tmp_path / "cnn"
+    write_events(run, {0: 0.5, 1: 0.25})
+    write_events(run, {2: 0.125})
+    assert [point.epoch for point in learning_curves.curve(run)] == [1, 2, 3]
+
+
+def test_csv_logs_are_read(tmp_path):
+    path = tmp_path / "fcnn" / "csv" / "metrics.csv"
+    path.parent.mkdir(parents=True)
+    path.write_text(f"epoch,loss/train,{ERROR}\n0,1.0,\n0,,0.5\n5,,0.25\n")
+    expected = [Validation("fcnn", 1, 0.5), Validation("fcnn", 6, 0.25)]
+    assert learning_curves.curve(path.parents[1]) == expected
+
+
+def test_a_run_with_fewer_than_two_validations_has_no_curve(tmp_path):
+    write_events(tmp_path / "once", {0: 0.5})
+    (tmp_path / "unrolled").mkdir()
+    assert learning_curves.curve(tmp_path / "unrolled") == []
+    runs = [tmp_path / "once", tmp_path / "unrolled"]
+    assert not learning_curves.save(runs, tmp_path / "curves")
+    assert not list(tmp_path.glob("curves*"))
+
+
+def test_rows_and_a_picture_are_written(tmp_path):
+    write_events(tmp_path / "fcnn", {0: 0.5, 1: 0.25})
+    write_events(tmp_path / "fcnn_linear", {0: 0.05, 9: 0.004})
+    runs = [tmp_path / "fcnn", tmp_path / "fcnn_linear"]
+    assert learning_curves.save(runs, tmp_path / "curves")
+    rows = list(csv.DictReader((tmp_path / "curves.csv").open()))
+    assert [row["method"] for row in rows] == ["fcnn", "fcnn", "fcnn_linear", "fcnn_linear"]
+    assert float(rows[-1]["rel_L2_median"]) == pytest.approx(0.004)
+    assert Image.open(tmp_path / "curves.png").size == (1120, 680)
