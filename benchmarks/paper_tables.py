@@ -21,7 +21,10 @@ from dpl.visualization import DPI, STYLE, method_colours
 PAPER: dict[str, dict[str, tuple[float, float | None, float | None, int | None]]] = {
     "beam_svk": {"paper": (8.0e-6, 0.03, 8.4, 4095)},
     "propeller_nh": {"paper": (2.7e-6, 0.01, 18.9, 4095)},
-    "beam_nh_loss": {"paper": (7.7e-6, 0.03, 2.7, 4095)},
+    "beam_nh_loss": {
+        "paper": (7.7e-6, 0.03, 2.7, 4095),  # with L_r^*
+        "paper, mse": (5.2e-5, 0.05, -5.1, 4095),
+    },
     "beam_young": {
         "paper": (4.6e-5, 0.09, -2.6, 10650),
         "paper, 3b": (1e-4, None, None, None),

@@ -28,7 +28,7 @@ def main(cfg: DictConfig) -> None:
     runs = config.load_runs(cfg.run, cfg.networks, trust=cfg.trust)
     scene = next(iter(runs.values()))[1].scene
     networks = {name: surrogate.predict for name, (_, surrogate) in runs.items()}
-    sets = newton_starts.load_sets(scene, cfg.count, cfg.n_far_loads)
+    sets = newton_starts.load_sets(scene, cfg.count, cfg.n_far_loads, twice=cfg.twice)
     middle = sorted(cfg.tols)[len(cfg.tols) // 2]
     tasks = [(tol, name) for tol in cfg.tols for name in sets if not name.endswith("times")]
     tasks += [(middle, name) for name in sets if name.endswith("times")]

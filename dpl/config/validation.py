@@ -19,7 +19,7 @@ KEYS: Keys = (  # of all commands
     (dict, "mesh material loads solver data model loss optimizer trainer"),
     (dict | None, "fixed supports forces scheduler callbacks logger paths extras"),
     (dict | None, "galerkin corrected"),
-    (bool, "mean_dilatation trust resume solve_reference profile galerkin_correction"),
+    (bool, "mean_dilatation trust resume twice solve_reference profile galerkin_correction"),
     (str, "name host"),
     (Literal["generate", "verify", "repair"], "action"),
     (Sequence[Literal["model", "results"]], "outputs"),

@@ -101,10 +101,17 @@ PAPER = [
 ]
 
 
-def load_sets(scene: Scene, count: int, far: int) -> dict[str, Load]:
-    """Return `count` test loads, as many scaled by 1 to 2, and `far` loads scaled by 3 and by 5."""
+def load_sets(scene: Scene, count: int, far: int, *, twice: bool = True) -> dict[str, Load]:
+    """Return `count` test loads, as many scaled by 1 to 2, and `far` loads scaled by 3 and by 5.
+
+    Args:
+        scene: The scene.
+        count: Number of loads.
+        far: Number of loads of the last two sets.
+        twice: Whether the second set is returned.
+    """
     part = torch.linspace(0, 1, count, dtype=torch.float64)
-    factors = {"in range": 1 + 0 * part, "twice": 1 + part}
+    factors = {"in range": 1 + 0 * part} | ({"twice": 1 + part} if twice else {})
     factors |= {f"{k} times": torch.full((far,), float(k)).double() for k in (3, 5)}
     sets = {}
     for name, factor in factors.items():
@@ -214,12 +221,13 @@ def limited(trials: Sequence[Trial], limit: int) -> list[Trial]:
 def summary(trials: Sequence[Trial]) -> list[Summary]:
     """Return a summary for each solver, set of loads and tolerance.
 
-    The sets "in range" and "twice" are also combined into the set of the paper, `BOTH`. The loads
-    of a set have the same order for all solvers.
+    The sets "in range" and "twice" are also combined into the set of the paper, `BOTH`, if there
+    are both. The loads of a set have the same order for all solvers.
     """
     groups: dict[tuple[str, float], dict[tuple[str, str], list[Trial]]] = {}
-    both = [replace(trial, loads=BOTH) for trial in trials if trial.loads in ("in range", "twice")]
-    for trial in [*both, *trials]:
+    near = [trial for trial in trials if trial.loads in ("in range", "twice")]
+    both = [replace(trial, loads=BOTH) for trial in near]
+    for trial in [*(both if {t.loads for t in near} == {"in range", "twice"} else []), *trials]:
         group = groups.setdefault((trial.loads, trial.tol), {})
         group.setdefault((trial.solver, trial.network), []).append(trial)
     return [
