@@ -86,12 +86,10 @@ PARTS = (
         "hybrid_newton_hard",
         "Newton from predictions, larger loads",
         "python scripts/convergence.py run=runs/hybrid_newton_hard name=hybrid_newton_hard "
-        "tols=[1e-6] n_far_loads=0 max_plain_iterations=8 "
+        "tols=[1e-6] count=100 twice=false n_far_loads=0 max_plain_iterations=6 "
         "\"solvers=[plain Newton,'hybrid, paper\\'s rule','hybrid, best rule']\" "
         "folder=benchmarks/results",
-        "The loads of `experiment=hybrid_newton_hard`: 50 in range and 50 of one to two times the "
-        "range, one at a time on one thread.",
-        split="loads",
+        "100 loads of `experiment=hybrid_newton_hard`, one at a time on one thread.",
     ),
     Part(
         r"(beam_svk|propeller_nh|beam_nh_loss|beam_young|hybrid_newton_hard)_single",
