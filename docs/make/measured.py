@@ -85,8 +85,9 @@ PARTS = (
     Part(
         "hybrid_newton_hard",
         "Newton from predictions, larger loads",
-        "python scripts/convergence.py run=runs/hybrid_newton_hard name=hybrid_newton_hard "
-        "tols=[1e-6] count=100 twice=false n_far_loads=0 max_plain_iterations=6 "
+        "python scripts/convergence.py run=runs/hybrid_newton_hard "
+        "networks=[unrolled,fcnn] name=hybrid_newton_hard tols=[1e-6] count=100 twice=false "
+        "n_far_loads=0 max_plain_iterations=6 "
         "\"solvers=[plain Newton,'hybrid, paper\\'s rule','hybrid, best rule']\" "
         "folder=benchmarks/results",
         "100 loads of `experiment=hybrid_newton_hard`, one at a time on one thread.",
