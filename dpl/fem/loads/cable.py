@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.loads.combined import CombinedLoads
+from dpl.fem.loads.forces import ROUNDOFF
 from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import check_range, rounded
 from dpl.fem.problem import Problem
@@ -116,5 +117,5 @@ def shape_functions(problem: Problem, points: Array) -> Array:
             raise ValueError(f"the point {place} [m] must lie in the body") from None
         local = basis.mapping.invF(point[:, None, None], tind=cell)
         for k, node in enumerate(basis.element_dofs[:, cell[0]]):
-            row[node] += basis.elem.gbasis(basis.mapping, local, k, tind=cell)[0].value.item()
-    return values
+            row[node] = np.asarray(basis.elem.gbasis(basis.mapping, local, k, tind=cell)[0]).item()
+    return np.where(np.abs(values) > ROUNDOFF, values, 0.0)

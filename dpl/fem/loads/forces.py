@@ -18,7 +18,7 @@ from dpl.fem.mesh.regions import Region, facets_in
 from dpl.fem.problem import Problem
 from dpl.fem.units import vector
 
-ROUNDOFF = 1e-14  # integral of a shape function over the largest that is zero [-]
+ROUNDOFF = 1e-14  # nodal value over the largest that is zero [-]
 Field = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # (D, ...) -> (D, ...)
 
 
@@ -141,7 +141,8 @@ def pressure(problem: Problem, facets: NDArray[np.int_]) -> Tensor:
         facets: Numbers of the facets.
     """
     basis = _facet_basis(problem, facets)
-    return _tested(problem, basis, -np.asarray(basis.normals))
+    force = _tested(problem, basis, -np.asarray(basis.normals))
+    return torch.where(force.abs() > ROUNDOFF * force.abs().max(), force, 0.0)
 
 
 def facet_areas(problem: Problem, facets: NDArray[np.int_]) -> csr_matrix:
@@ -156,7 +157,7 @@ def facet_areas(problem: Problem, facets: NDArray[np.int_]) -> csr_matrix:
     columns = np.tile(np.arange(len(facets)), len(areas))
     nodes = basis.element_dofs.ravel()
     matrix = csr_matrix((np.concatenate(areas), (nodes, columns)), (basis.N, len(facets)))
-    matrix.data[np.abs(matrix.data) < ROUNDOFF * matrix.data.max()] = 0.0
+    matrix.data[np.abs(matrix.data) <= ROUNDOFF * matrix.data.max()] = 0.0
     matrix.eliminate_zeros()  # nodes of the cells that do not lie on the facets
     return matrix
 

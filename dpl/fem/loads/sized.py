@@ -172,9 +172,10 @@ def point_forces(shape: Sequence[int], nodes: Tensor) -> Tensor:
 def softest_node(linear: LinearSolver, nodes: Tensor) -> int:
     """Return a node that yields most to forces of any direction, among `nodes` (n,).
 
-    By Betti's theorem |C_ij|^2 <= |C_ii| |C_jj| for the blocks of the compliance C. If forces at a
-    node move another one further, this one is therefore softer. The search goes to such nodes until
-    there is none; it begins at the node that forces on all nodes move most.
+    The compliance C is positive definite, so that |C_ij|^2 <= |C_ii| |C_jj| for its blocks. If
+    forces at a node move another node further than their own, the other one is therefore softer.
+    The search begins at the node that forces on all nodes move most, and goes to softer nodes until
+    there is none.
     """
     shape = linear.problem.shape
     forces = point_forces(shape, nodes)
