@@ -46,7 +46,7 @@ class CombinedLoads(SizedLoads):
 
     @property
     def unit_force(self) -> float:
-        """Norm of the f_k together [-]."""
+        """Norm of all f_k [-], as if they acted on different nodes."""
         return float(self.problem.acting(self.shapes).norm())
 
     @property

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dpl.fem.loads.family import RandomLoads
 from dpl.fem.loads.sampling import Array
+from dpl.fem.loads.sized import rounded
 
 FITS = 1e-6  # distance from a family up to which a force belongs to it [-]
 
@@ -146,7 +147,8 @@ class MixtureLoads(RandomLoads):
         """Return the options with the identities of the families."""
         members = zip(self.names, self.members, strict=True)
         families = {name: member.identity() for name, member in members}
-        return super().identity() | {"families": families, "weights": self._weights}
+        weights = np.array(self._weights) / sum(self._weights)
+        return super().identity() | {"families": families, "weights": rounded(weights)}
 
     def skipped_work(self) -> list[str]:
         """Return the notes of all families."""
