@@ -8,10 +8,18 @@ if TYPE_CHECKING:
     from dpl.fem.assembly.boundary_conditions import DirichletBC, RobinBC
     from dpl.fem.linear.backends import installed_backends
     from dpl.fem.linear.interface import SingularMatrix
+    from dpl.fem.loads.cable import CableLoads
+    from dpl.fem.loads.face_pressure import FacePressure
+    from dpl.fem.loads.face_tractions import FaceTractions
     from dpl.fem.loads.family import HasModes, HasModuli, LoadFamily, RandomLoads, moduli_of
+    from dpl.fem.loads.file import FileLoads
     from dpl.fem.loads.forces import BodyForce, Traction
+    from dpl.fem.loads.gravity import GravityLoads
+    from dpl.fem.loads.mixture import MixtureLoads
     from dpl.fem.loads.modal import ModalLoads
     from dpl.fem.loads.modal_basis import Modes, eigenmodes
+    from dpl.fem.loads.patch import PatchLoads
+    from dpl.fem.loads.point import PointLoads
     from dpl.fem.loads.young import YoungRange
     from dpl.fem.materials.invariant_based import InvariantBasedMaterial
     from dpl.fem.materials.linear_elastic import LinearElastic

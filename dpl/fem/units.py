@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 class Units(NamedTuple):
     """Length and modulus by which the boundary values of a body are divided.
 
-    All conversions of displacements, tractions, body forces and foundations are methods of this
-    class. Those of nodal forces are `dpl.Scene.load_of` and `dpl.Scene.si_inputs`.
+    All conversions of displacements, tractions, body forces, foundations and sizes of loads are
+    methods of this class. Those of the forces of a call are `dpl.Scene.load_of` and
+    `dpl.Scene.si_inputs`.
 
     Attributes:
         length: L, longest side of the body [m].
@@ -45,6 +46,13 @@ class Units(NamedTuple):
         Arguments and errors are those of `stress`.
         """
         return value * self.length / self._one_modulus(words)
+
+    def force(self, value: NDArray[np.float64], dim: int, words: str) -> NDArray[np.float64]:
+        """Return nodal forces [N] (2D: [N/m]) over E L^(D - 1) [-].
+
+        Arguments and errors are those of `stress`; `dim` is D.
+        """
+        return value / (self._one_modulus(words) * self.length ** (dim - 1))
 
     def _one_modulus(self, words: str) -> float:
         if self.young is None:

@@ -1,5 +1,6 @@
 """conf/ is the only registry: everything in it instantiates, composes and solves."""
 
+import re
 from pathlib import Path
 
 import meshio
@@ -10,7 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 
-from dpl.config import build
+from dpl.config import ConfigError, build
 from dpl.data.solving.solve import LoadKey, solve_load
 from dpl.fem import YoungPoissonMaterial, box, solve
 
@@ -41,16 +42,29 @@ def part(tmp_path):
 
 
 @pytest.fixture
-def overrides(part):
+def forces(tmp_path):
+    """A file of two forces on the beam of 5 x 3 x 3 nodes."""
+    path = tmp_path / "forces.npy"
+    np.save(path, np.random.default_rng(0).normal(size=(2, 45, 3)))
+    return path
+
+
+@pytest.fixture
+def overrides(part, forces):
     """What an option of a group needs besides its name."""
 
     def overrides(group, name):
         needed = {
-            "file": [f"mesh.path={part}"],
-            "tag": ["fixed.name=bore"],
-            "cylinder": ["fixed.radius=0.05"],
+            "mesh=file": [f"mesh.path={part}"],
+            "fixed=tag": ["fixed.name=bore"],
+            "fixed=cylinder": ["fixed.radius=0.05"],
+            "loads=cable": ["loads.cables=[[[5,5,5],[50,10,5],[95,5,5]],[[5,20,20],[95,20,20]]]"],
+            "loads=file": [f"loads.path={forces}"],
+            "loads=pressure": ["loads.region={_target_:dpl.fem.Plane,axis:2,at:max}"],
+            "loads=traction": ["loads.region={_target_:dpl.fem.Plane,axis:0,at:max}"],
         }
-        return [f"{group}={name}", *needed.get(name, [])]
+        option = f"{group}={name}"
+        return [option, *needed.get(option, [])]
 
     return overrides
 
@@ -82,6 +96,17 @@ def test_every_law_answers_loads_on_every_kind_of_mesh(scene_of, material, mesh)
     one = solve_load(scene, LoadKey((0, 0), 0))
     assert one.accepted
     assert one.displacement.any()
+
+
+@pytest.mark.parametrize("name", options("loads"))
+def test_every_load_family_draws_loads_that_newton_answers(scene_of, overrides, name):
+    units = ["loads.factor=null"] if name == "file" else []
+    scene = scene_of(*SMALL["beam"], *overrides("loads", name), *units, "solver.linear=superlu")
+    load = scene.loads.sample((0, 0), range(3))
+    assert solve(scene.solver, load).converged.all()
+    amplitude, distance = scene.loads.project(load.force)
+    assert (amplitude <= 1 + 1e-9).all()
+    assert (distance < 1e-9).all()
 
 
 @pytest.mark.parametrize("material", options("material"))
@@ -178,7 +203,11 @@ def with_defaults(path):
     """Return a file merged with the file of the same group that it changes."""
     node = OmegaConf.load(path)
     for base in set(node.pop("defaults", [])) - {"_self_"}:
-        node = OmegaConf.merge(with_defaults(path.with_name(f"{base}.yaml")), node)
+        name, _, place = base.partition("@")
+        below = with_defaults(path.with_name(f"{name}.yaml"))
+        for key in reversed(place.split(".") if place else []):
+            below = OmegaConf.create({key: below})
+        node = OmegaConf.merge(below, node)
     return node
 
 
@@ -200,14 +229,12 @@ def test_a_debug_option_composes_and_passes_the_check(compose, name):
     assert cfg.trainer.max_epochs <= 50
 
 
-def test_an_option_changes_only_its_group(compose):
+def test_an_option_changes_only_its_group(compose, overrides):
     """Recipes that change several groups are experiments."""
     usual = compose("folder=.", "run=x", command="train")
     chosen = [(group, name) for group in GROUPS for name in options(group)]
     for group, name in chosen:
-        if name in ("file", "tag", "cylinder"):  # these need a further key
-            continue
-        cfg = compose(f"{group}={name}", "folder=.", "run=x", command="train")
+        cfg = compose(*overrides(group, name), "folder=.", "run=x", command="train")
         assert {key for key in cfg if cfg[key] != usual[key]} <= {group}, name
 
 
@@ -339,3 +366,48 @@ def test_the_distribution_of_the_moduli_is_one_key_of_the_experiments(scene_of):
 def test_propeller_is_held_at_its_bore_by_name_or_by_place(scene_of, fixed):
     scene = scene_of("mesh=propeller", *fixed)
     assert int((~scene.problem.free).all(dim=1).sum()) == 175
+
+
+def test_families_of_a_mixture_are_added_changed_and_removed_by_name(scene_of):
+    changes = [
+        "+loads@loads.families.weight=gravity",
+        "loads.families.weight.deflection=0.1",
+        "loads.families.patch.patch_radius=[0.1,0.2]",
+        "~loads.families.modal",
+        "loads.weights={weight:3}",
+    ]
+    loads = scene_of(*SMALL["beam"], "loads=mixture", *changes, "solver.linear=superlu").loads
+    assert loads.names == ("patch", "point", "gravity", "weight")
+    assert loads.members[0].patch_radius == [0.1, 0.2]
+    assert loads.members[3].deflection == 0.1
+    assert loads.sample(0, range(2)).force.any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (["loads=traction"], "loads.region is missing"),
+        (
+            ["loads=point", "young=[1e3,1e4]", "loads.largest=3"],
+            "loads: largest = 3 must be divided",
+        ),
+        (
+            ["loads=patch", "loads.region={_target_:dpl.fem.Plane,axis:0,at:7}"],
+            "loads: region = Plane",
+        ),
+        (["loads=file", "loads.path=none.npy"], "loads: path = none.npy: No such file"),
+        (
+            ["loads=mixture", "loads.families.patch.largest=-1"],
+            "loads: families.patch: largest = -1",
+        ),
+        (
+            ["loads=mixture", "loads.families.patch.size=1"],
+            "loads.families.patch.size: dpl.fem.Patch",
+        ),
+    ],
+)
+def test_invalid_loads_are_refused_in_one_line_that_names_the_key(scene_of, changes, message):
+    plus = [f"+{c}" if c.startswith("loads.families.patch.size") else c for c in changes]
+    with pytest.raises(ConfigError, match=f"^{re.escape(message)}") as caught:
+        scene_of(*SMALL["beam"], *plus, "solver.linear=superlu")
+    assert "\n" not in str(caught.value)

@@ -1,14 +1,23 @@
-"""Families of loads: eigenmodes, modal forces and their sampling, tractions and body forces."""
+"""Load families, their random numbers, and tractions and body forces."""
 
 from typing import TYPE_CHECKING
 
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
+    from dpl.fem.loads.cable import CableLoads
+    from dpl.fem.loads.combined import CombinedLoads, VectorLoads
+    from dpl.fem.loads.face_pressure import FacePressure
+    from dpl.fem.loads.face_tractions import FaceTractions
     from dpl.fem.loads.family import HasModes, HasModuli, LoadFamily, RandomLoads, moduli_of
+    from dpl.fem.loads.file import FileLoads
     from dpl.fem.loads.forces import BodyForce, Traction, body_force, traction
+    from dpl.fem.loads.gravity import GravityLoads
+    from dpl.fem.loads.mixture import MixtureLoads
     from dpl.fem.loads.modal import ModalLoads
     from dpl.fem.loads.modal_basis import Modes, eigenmodes
+    from dpl.fem.loads.patch import PatchLoads
+    from dpl.fem.loads.point import PointLoads
     from dpl.fem.loads.sampling import (
         constant,
         log_tail_mixture,
@@ -17,6 +26,8 @@ if TYPE_CHECKING:
         symmetric_uniform,
         uniform01,
     )
+    from dpl.fem.loads.sized import SizedLoads
+    from dpl.fem.loads.surface import SurfaceLoads
     from dpl.fem.loads.young import YoungRange
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

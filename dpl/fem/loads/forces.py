@@ -11,12 +11,14 @@ import numpy as np
 import skfem
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from dpl.fem.mesh.regions import Region, facets_in
 from dpl.fem.problem import Problem
 from dpl.fem.units import vector
 
+ROUNDOFF = 1e-14  # nodal value over the largest that is zero [-]
 Field = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # (D, ...) -> (D, ...)
 
 
@@ -126,10 +128,42 @@ def traction(problem: Problem, region: Region, stress: Field, scale: float = 1.0
     Raises:
         ValueError: The region holds no boundary facet.
     """
-    mesh = problem.mesh
-    facets = facets_in(region, mesh, scale, problem.origin)
-    basis = skfem.FacetBasis(mesh, problem.basis.elem, facets=facets, intorder=4)
+    facets = facets_in(region, problem.mesh, scale, problem.origin)
+    basis = _facet_basis(problem, facets)
     return _tested(problem, basis, stress(_places(problem, basis)))
+
+
+def pressure(problem: Problem, facets: NDArray[np.int_]) -> Tensor:
+    """Return the nodal forces (N, D) of the pressure 1 on boundary facets, against the normal [-].
+
+    Args:
+        problem: Where it acts.
+        facets: Numbers of the facets.
+    """
+    basis = _facet_basis(problem, facets)
+    force = _tested(problem, basis, -np.asarray(basis.normals))
+    return torch.where(force.abs() > ROUNDOFF * force.abs().max(), force, 0.0)
+
+
+def facet_areas(problem: Problem, facets: NDArray[np.int_]) -> csr_matrix:
+    """Return the integrals of each shape function over each boundary facet, (N, E) [-].
+
+    Args:
+        problem: The body.
+        facets: Numbers of the facets, E of them.
+    """
+    basis = _facet_basis(problem, facets)
+    areas = [(np.asarray(shape[0]) * basis.dx).sum(axis=1) for shape in basis.basis]  # E each
+    columns = np.tile(np.arange(len(facets)), len(areas))
+    nodes = basis.element_dofs.ravel()
+    matrix = csr_matrix((np.concatenate(areas), (nodes, columns)), (basis.N, len(facets)))
+    matrix.data[np.abs(matrix.data) <= ROUNDOFF * matrix.data.max()] = 0.0
+    matrix.eliminate_zeros()  # nodes of the cells that do not lie on the facets
+    return matrix
+
+
+def _facet_basis(problem: Problem, facets: NDArray[np.int_]) -> skfem.FacetBasis:
+    return skfem.FacetBasis(problem.mesh, problem.basis.elem, facets=facets, intorder=4)
 
 
 def _places(problem: Problem, basis: skfem.Basis) -> NDArray[np.float64]:

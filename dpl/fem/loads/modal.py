@@ -4,7 +4,6 @@ Source: Odot, Haferssas, Cotin (2022), DeepPhysics, section 2.2.2: f = Phi q wit
 eigenmodes of K(0), restricted to random areas of the boundary.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
@@ -15,16 +14,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem.loads.family import RandomLoads
+from dpl.fem.loads.fit import fit
 from dpl.fem.loads.modal_basis import Array, Modes, eigenmodes
 from dpl.fem.loads.sampling import Quantile, constant, symmetric_uniform, uniform01
-
-LEAST_SQUARE = 1e-13  # singular value of the normal equations over the largest that counts [-]
-MIN_DEFLECTION = 1e-12  # below it the displacement is rounding error [-]
+from dpl.fem.loads.sized import check_deflection
+from dpl.fem.loads.surface import SurfaceLoads, check_patch_radius
 
 
 @dataclass(frozen=True, eq=False)
-class ModalLoads(RandomLoads):
+class ModalLoads(SurfaceLoads):
     """Random loads f = Phi q on random areas of the boundary.
 
     The modal load q of each mode is a random number of `distribution` times its largest value. For
@@ -73,13 +71,8 @@ class ModalLoads(RandomLoads):
             raise ValueError(
                 f"modes = {list(self.modes)} must be ascending whole numbers, 0 or more, or null"
             )
-        if not MIN_DEFLECTION <= self.deflection <= 10:
-            span = f"between {MIN_DEFLECTION:g} and 10 (times L)"
-            raise ValueError(f"deflection = {self.deflection} must lie {span}")
-        low, high = self.patch_radius if len(self.patch_radius) == 2 else (1, 0)
-        if not 0 <= low <= high < math.inf:
-            found = f"patch_radius = {list(self.patch_radius)}"
-            raise ValueError(f"{found} must be a smallest and a largest radius over L")
+        check_deflection(self.deflection)
+        check_patch_radius(self.patch_radius)
         if not -1 <= self.eigenvalue_exponent <= 2:
             raise ValueError(
                 f"eigenvalue_exponent = {self.eigenvalue_exponent} must lie between -1 and 2"
@@ -159,19 +152,11 @@ class ModalLoads(RandomLoads):
 
     def _fit(self, force: Array) -> tuple[float, float]:
         """Return amplitude and residual of one force, (N, D), see `project`."""
-        unit = float(np.abs(force).max())
-        if unit == 0:
-            return 0.0, 0.0
         loaded = np.flatnonzero(reduce(np.logical_or, (force != 0).T))  # faster than `any(axis=1)`
-        there = force[loaded].ravel() / unit
-        shapes = self.modal_forces.numpy()[loaded].reshape(len(there), -1)
-        U, sizes, Vt = np.linalg.svd(shapes.T @ shapes)
-        inverse = np.where(sizes > LEAST_SQUARE * sizes[0], 1 / np.maximum(sizes, 1e-300), 0.0)
-        q, rest = np.zeros(len(sizes)), there
-        for _ in range(2):  # the second time removes the rounding error of the normal equations
-            q = q + Vt.T @ (inverse * (U.T @ (shapes.T @ rest)))
-            rest = there - shapes @ q
-        return unit * float(np.abs(q).max()), float(np.linalg.norm(rest) / np.linalg.norm(there))
+        there = force[loaded].ravel()
+        shapes = self.modal_forces.numpy()[loaded]
+        q, residual = fit(shapes.reshape(len(there), shapes.shape[-1]), there)
+        return float(np.abs(q).max()), residual
 
     def arrays(self) -> Mapping[str, Tensor]:
         """Return eigenvalues and eigenvectors, see `Modes`."""

@@ -89,3 +89,13 @@ def log_tail_mixture(t: Array, part: float = 0.25, low: float = 1e-3) -> Array:
     if not 0 < part < 1:
         raise ValueError(f"part = {part} must lie between 0 and 1")
     return np.where(t < part, logarithmic(np.minimum(t / part, 1.0), low), 1.0)
+
+
+def direction(t: Array) -> Array:
+    """Return the unit vector (D,), uniform on the sphere, of numbers (D - 1,) in [0, 1)."""
+    angle = 2 * np.pi * t[0]
+    across = np.array([np.cos(angle), np.sin(angle)])
+    if len(t) == 1:
+        return across
+    height = 2 * t[1] - 1  # uniform by Archimedes' theorem
+    return np.append(np.sqrt(1 - height**2) * across, height)

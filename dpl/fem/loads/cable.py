@@ -1,0 +1,121 @@
+"""Cables through a body with random tensions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpl.fem.loads.combined import CombinedLoads
+from dpl.fem.loads.forces import ROUNDOFF
+from dpl.fem.loads.sampling import Array
+from dpl.fem.loads.sized import check_range, rounded
+from dpl.fem.problem import Problem
+
+INWARD = 1e-7  # shift of points on the surface into their cell, over the distance to its centre [-]
+
+
+@dataclass(frozen=True, eq=False)
+class CableLoads(CombinedLoads):
+    """Cables threaded through points of the body, each with a random tension.
+
+    With the unit vectors t along the undeformed cable, the force on an inner point is
+    T (t_next - t_previous), and on an end T towards its neighbour. These are dead loads. The shape
+    functions of its cell distribute the force on a point to nodes.
+
+    The point of a load has the tension of each cable, then Young's modulus and, where the law has
+    ranges, its parameters.
+
+    Attributes:
+        cables: Points of each cable in order, two or more, D coordinates each [m].
+        tension: Smallest and largest tension [N] (2D: [N/m]); None: from 0, `deflection` decides.
+    """
+
+    si_options: ClassVar[tuple[str, ...]] = ("tension", "cables")
+    cables: Sequence[Sequence[Sequence[float]]]
+    tension: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            ValueError: An attribute is out of range, or a point lies outside the body.
+        """
+        check_range("tension", self.tension, "N", least=0.0)
+        super().__post_init__()
+        self.shapes  # noqa: B018  # raises if a cable is invalid
+
+    @property
+    def given_sizes(self) -> Array | None:
+        """Smallest and largest tension over E L^(D - 1), (2,) [-]."""
+        if self.tension is None:
+            return None
+        words, dim = f"tension = {list(self.tension)}", self.problem.shape[1]
+        return self.problem.units.force(np.asarray(self.tension, dtype=np.float64), dim, words)
+
+    @cached_property
+    def shapes(self) -> Tensor:
+        """Force of the tension 1 in each cable, (K, N, D) [-].
+
+        Raises:
+            ValueError: There is no cable, it has no two points, or one lies outside the body.
+        """
+        if not self.cables:
+            raise ValueError("cables = [] must contain a cable: a list of points [m]")
+        return torch.stack([self._shape(k) for k in range(len(self.cables))])
+
+    def _shape(self, number: int) -> Tensor:
+        points = self._points(number)
+        step = np.diff(points, axis=0)
+        length = np.linalg.norm(step, axis=1, keepdims=True)
+        if not (length > 0).all():
+            raise ValueError(f"cables.{number} must not contain the same point twice in a row")
+        pulls = np.diff(step / length, axis=0, prepend=0.0, append=0.0)
+        try:
+            weights = shape_functions(self.problem, points)
+        except ValueError as error:
+            raise ValueError(f"cables.{number}: {error}") from error
+        return torch.from_numpy(weights.T @ pulls)
+
+    def _points(self, number: int) -> Array:
+        """Return the points of a cable over L, (P, D)."""
+        cable, dim = self.cables[number], self.problem.shape[1]
+        sound = len(cable) >= 2 and all(len(point) == dim for point in cable)
+        if not (sound and np.isfinite(cable).all()):
+            raise ValueError(
+                f"cables.{number} = {list(map(list, cable))} must be two or more points of {dim} "
+                "coordinates [m]"
+            )
+        return np.asarray(cable, dtype=np.float64) / self.problem.length - self.problem.origin
+
+    def identity(self) -> dict[str, Any]:
+        """Return the options; the cables are identified by their points over L."""
+        corner = self.problem.points.numpy().min(axis=0)
+        points = [np.round(self._points(k) - corner, 9) + 0.0 for k in range(len(self.cables))]
+        return super().identity() | {"cables": [[rounded(p) for p in cable] for cable in points]}
+
+
+def shape_functions(problem: Problem, points: Array) -> Array:
+    """Return the values of all shape functions at points (P, D) [-] of the body, (P, N).
+
+    Raises:
+        ValueError: A point lies outside the body.
+    """
+    basis, mesh = problem.basis, problem.mesh
+    centres = mesh.p[:, mesh.t].mean(axis=1).T  # (cells, D)
+    values = np.zeros((len(points), basis.N))
+    for row, point in zip(values, points, strict=True):
+        centre = centres[np.linalg.norm(centres - point, axis=1).argmin()]
+        inward = point + INWARD * (centre - point)
+        try:
+            cell = mesh.element_finder(mapping=basis.mapping)(*inward[:, None])
+        except ValueError:
+            place = ((point + problem.origin) * problem.length).tolist()
+            raise ValueError(f"the point {place} [m] must lie in the body") from None
+        local = basis.mapping.invF(point[:, None, None], tind=cell)
+        for k, node in enumerate(basis.element_dofs[:, cell[0]]):
+            row[node] = np.asarray(basis.elem.gbasis(basis.mapping, local, k, tind=cell)[0]).item()
+    return np.where(np.abs(values) > ROUNDOFF, values, 0.0)

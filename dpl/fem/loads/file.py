@@ -1,0 +1,146 @@
+"""Random choices among forces that a user gives in a file."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dpl.fem.identity import plain
+from dpl.fem.loads.combined import CombinedLoads
+from dpl.fem.loads.sampling import Array
+from dpl.fem.loads.sized import check_range
+
+
+@dataclass(frozen=True, eq=False)
+class FileLoads(CombinedLoads):
+    """One of the forces of a file times a random factor.
+
+    The point of a load has the number of the force and the factor, then Young's modulus and, where
+    the law has ranges, its parameters.
+
+    Attributes:
+        path: An array in .npy, or a .npz file with one array: nodal forces (S, N, D) [N] (2D:
+            [N/m]), the nodes in the order of `Problem.points`.
+        factor: Smallest and largest factor; None: `deflection` decides, and the unit of the forces
+            has no effect.
+    """
+
+    si_options: ClassVar[tuple[str, ...]] = ("path", "factor")
+    path: str
+    factor: Sequence[float] | None = (0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        """Check the ranges and the file.
+
+        Raises:
+            ValueError: An attribute is out of range, or the file cannot be used.
+        """
+        check_range("factor", self.factor, "-")
+        super().__post_init__()
+        self.shapes  # noqa: B018  # raises if the file cannot be used
+
+    @cached_property
+    def _forces(self) -> Array:
+        """Forces of the file, (S, N, D) [N]."""
+        try:
+            return read_forces(self.path, self.problem.free.numpy())
+        except (OSError, ValueError, EOFError, BadZipFile) as error:
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+            raise ValueError(f"path = {self.path}: {reason}") from error
+
+    @property
+    def _unit(self) -> float:
+        """Largest component of a force [N]."""
+        return float(np.abs(self._forces).max())
+
+    @cached_property
+    def shapes(self) -> Tensor:
+        """Forces over their largest component, (S, N, D) [-]."""
+        return torch.from_numpy(self._forces / self._unit)
+
+    @property
+    def given_sizes(self) -> Array | None:
+        """Smallest and largest factor times the largest component over E L^(D - 1), (2,) [-]."""
+        if self.factor is None:
+            return None
+        largest = self._unit * np.asarray(self.factor, dtype=np.float64)
+        return self.problem.units.force(largest, self.problem.shape[1], f"path = {self.path} [N]")
+
+    @property
+    def n_force(self) -> int:
+        """2: the number of the force and the factor."""
+        return 2
+
+    def force_at(self, point: Array) -> Tensor:
+        """Return the force (N, D) [-] of a point (2,) of the unit cube."""
+        number = int(point[0] * len(self.shapes))
+        return float(self.size_at(point[1])) * self.shapes[number]
+
+    @property
+    def unit_deflection(self) -> float:
+        """Largest linear deflection [-] of a force of the file over the largest component."""
+        linear = self.linear.reference
+        return max(float(linear.solve(shape).norm(dim=1).max()) for shape in self.shapes)
+
+    @property
+    def unit_force(self) -> float:
+        """Largest norm [-] of a force of the file over the largest component."""
+        return float(self.problem.acting(self.shapes).flatten(1).norm(dim=1).max())
+
+    def project(self, force: Tensor) -> tuple[Tensor, Tensor]:
+        """Return amplitudes (B,) and relative residuals (B,) for the most similar force.
+
+        Args:
+            force: (B, N, D) [-].
+        """
+        shapes = torch.from_numpy(self._acting_shapes)  # (N D, S)
+        own = self.own_force(force).flatten(1)
+        products, squares = own @ shapes, shapes.square().sum(dim=0)
+        best = (products.abs() / squares.sqrt()).argmax(dim=1)
+        factors = products.gather(1, best[:, None])[:, 0] / squares[best]
+        rest = (own - factors[:, None] * shapes[:, best].T).norm(dim=1)
+        return factors.abs() / self.largest_size, rest / own.norm(dim=1).clamp(min=1e-300)
+
+    def identity(self) -> dict[str, Any]:
+        """Return the options; the file is identified by its forces over the largest component."""
+        return super().identity() | {"forces": plain(self.shapes)}
+
+
+def read_forces(path: str, free: NDArray[np.bool_]) -> Array:
+    """Return the forces of a .npy or .npz file, (S, N, D) [N].
+
+    Args:
+        path: The file.
+        free: Free degrees of freedom, (N, D); each force must act on one.
+
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: It does not contain one array of finite forces of this shape.
+    """
+    if Path(path).suffix not in (".npy", ".npz"):
+        raise ValueError("the file must be .npy or .npz")
+    found = np.load(path, allow_pickle=False)
+    if not isinstance(found, np.ndarray):
+        with found as arrays:
+            if len(arrays.files) != 1:
+                raise ValueError(f"the file must contain one array and has {len(arrays.files)}")
+            found = arrays[arrays.files[0]]
+    if found.dtype.kind not in "fiu" or found.shape[1:] != free.shape or not len(found):
+        wanted = ", ".join(map(str, free.shape))
+        raise ValueError(
+            f"the array of {found.dtype} of shape {found.shape} must be numbers (S, {wanted})"
+        )
+    forces = found.astype(np.float64)
+    for number, force in enumerate(forces):
+        if not np.isfinite(force).all():
+            raise ValueError(f"force {number} must have finite components")
+        if not force[free].any():
+            raise ValueError(f"force {number} must act on a free degree of freedom")
+    return forces

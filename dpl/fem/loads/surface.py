@@ -1,0 +1,76 @@
+"""Base of load families that act on the boundary or on a region of it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dpl.fem.identity import plain
+from dpl.fem.loads.family import RandomLoads
+from dpl.fem.mesh.regions import Region, facets_in
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceLoads(RandomLoads):
+    """Base of load families that act on facets of the boundary.
+
+    Attributes:
+        region: Part of the boundary, see `dpl.fem.mesh.facets_in`; None for all of it.
+    """
+
+    _: KW_ONLY
+    region: Region | None = None
+
+    @cached_property
+    def facets(self) -> NDArray[np.int_]:
+        """Numbers of the boundary facets on which these loads act, (E,).
+
+        Raises:
+            ValueError: The region contains no boundary facet.
+        """
+        problem = self.problem
+        if self.region is None:
+            return np.asarray(problem.mesh.boundary_facets())
+        try:
+            return facets_in(self.region, problem.mesh, problem.length, problem.origin)
+        except ValueError as error:
+            raise ValueError(f"region = {error}") from error
+
+    @cached_property
+    def loadable_dofs(self) -> Tensor:
+        """Free degrees of freedom of the nodes of `facets`, (N, D), boolean.
+
+        Raises:
+            ValueError: There are none.
+        """
+        nodes = torch.zeros(self.problem.shape[0], dtype=torch.bool)
+        nodes[self.problem.basis.get_dofs(self.facets).all()] = True
+        loadable = nodes[:, None] & self.problem.free
+        if not loadable.any():
+            words = "the boundary" if self.region is None else f"region = {self.region}"
+            raise ValueError(f"{words} is fixed everywhere; loads must act on a free node")
+        return loadable
+
+    def identity(self) -> dict[str, Any]:
+        """Return the options; a region is identified by the facets that it selects."""
+        options = super().identity()
+        del options["region"]
+        return options if self.region is None else options | {"region": plain(self.facets)}
+
+
+def check_patch_radius(patch_radius: Sequence[float]) -> None:
+    """Check a range of radii over L.
+
+    Raises:
+        ValueError: The radii are not two ascending numbers from 0.
+    """
+    low, high = patch_radius if len(patch_radius) == 2 else (1, 0)
+    if not 0 <= low <= high < math.inf:
+        found = f"patch_radius = {list(patch_radius)}"
+        raise ValueError(f"{found} must be a smallest and a largest radius over L")

@@ -1,0 +1,550 @@
+"""Laws of load families: resultants, units, regions, ranges, and how they recognise their loads."""
+
+import math
+import pickle
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from dpl import Scene
+from dpl.fem import (
+    Box,
+    CableLoads,
+    FacePressure,
+    FaceTractions,
+    FileLoads,
+    GravityLoads,
+    LinearSolver,
+    MixtureLoads,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    PatchLoads,
+    Plane,
+    PointLoads,
+    Problem,
+    box,
+    rectangle,
+    solve,
+)
+from dpl.fem.loads.file import read_forces
+from dpl.fem.loads.sampling import direction
+from dpl.fem.loads.sized import softest_node
+
+END = Plane(0, "max")
+CABLE = [
+    [[0.0, 5.0, 5.0], [50.0, 8.0, 5.0], [100.0, 5.0, 5.0]],
+    [[10.0, 20.0, 20.0], [90.0, 20.0, 20.0]],
+]
+
+
+def body(*, scale=1.0, young=4500.0, nodes=(6, 3, 3)):
+    """A beam 100 x 25 x 25 times `scale` m, held at x = 0."""
+    mesh = box([100.0 * scale, 25.0 * scale, 25.0 * scale], nodes)
+    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), young=young)
+    return LinearSolver(problem, linear="superlu")
+
+
+@pytest.fixture(scope="module")
+def linear():
+    return body()
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory, linear):
+    """A file of three forces."""
+    path = tmp_path_factory.mktemp("forces") / "forces.npy"
+    np.save(path, np.random.default_rng(0).normal(size=(3, *linear.problem.shape)))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def build(path):
+    """Builds each family by name, with options."""
+    families = {
+        "modal": partial(ModalLoads, n_modes=3),
+        "patch": PatchLoads,
+        "point": PointLoads,
+        "traction": partial(FaceTractions, region=END),
+        "pressure": partial(FacePressure, region=END),
+        "gravity": GravityLoads,
+        "cable": partial(CableLoads, cables=CABLE),
+        "file": partial(FileLoads, path=path, factor=None),
+    }
+    families["mixture"] = partial(MixtureLoads, families=dict(families))
+
+    def build(name, linear, **options):
+        return families[name](linear, young=linear.problem.young or [1e3, 1e5], **options)
+
+    return build
+
+
+FAMILIES = (
+    "modal",
+    "patch",
+    "point",
+    "traction",
+    "pressure",
+    "gravity",
+    "cable",
+    "file",
+    "mixture",
+)
+SIZED = FAMILIES[1:-1]
+
+
+def total(force):
+    """Return the resultants of forces (B, N, D), (B, D)."""
+    return force.sum(dim=1)
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_a_load_is_a_function_of_seed_and_number(build, linear, name):
+    loads = build(name, linear)
+    drawn = loads.sample(3, range(6)).force
+    assert torch.equal(drawn, build(name, linear).sample(3, range(6)).force)
+    assert torch.equal(drawn[4:5], loads.sample(3, [4]).force)
+    assert torch.equal(drawn, pickle.loads(pickle.dumps(loads)).sample(3, range(6)).force)
+    assert not torch.equal(drawn, loads.sample(4, range(6)).force)
+    assert loads.points(0, range(2)).shape == (2, loads.n_random)
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_newton_answers_the_loads_of_each_family(build, name):
+    problem = body(nodes=(5, 3, 3)).problem
+    newton = Newton(problem, linear="superlu")
+    if name == "file":  # its nodes are those of the larger beam
+        problem = body().problem
+        newton = Newton(problem, linear="superlu")
+    families = {"families": {"patch": PatchLoads, "gravity": GravityLoads}}
+    loads = build(name, newton.linear_solver, **(families if name == "mixture" else {}))
+    scene = Scene(problem, loads, newton)
+    load = loads.sample(0, range(4))
+    assert solve(scene.solver, load).converged.all()
+    assert scene.describe()[-1][1].startswith(type(loads).__name__)
+    assert len(scene.fingerprint) == 64
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_loads_act_on_loadable_degrees_of_freedom_and_add_the_constant_force(build, linear, name):
+    loads = build(name, linear)
+    drawn = loads.sample(0, range(20)).force
+    free = linear.problem.free
+    assert not drawn[:, free & ~loads.loadable_dofs].any()
+    assert (loads.loadable_dofs <= free).all()
+    constant = torch.full(linear.problem.shape, 1e-3, dtype=torch.float64)
+    more = build(name, linear, constant_force=constant)
+    assert_close(more.sample(0, range(20)).force, drawn + constant, rtol=0, atol=1e-15)
+    for a, b in zip(more.project(drawn + constant), loads.project(drawn), strict=True):
+        assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_own_loads_are_in_range_and_doubled_ones_are_larger(build, linear, name):
+    loads = build(name, linear)
+    force = loads.sample(0, range(40)).force
+    amplitude, distance = loads.project(force)
+    assert amplitude.shape == distance.shape == (40,)
+    assert (amplitude <= 1 + 1e-9).all()
+    assert (distance < 1e-9).all()
+    assert (loads.problem.acting(force).flatten(1).norm(dim=1) <= loads.largest_force * 1.001).all()
+    if name != "mixture":  # the doubled load of one family can belong to another
+        assert_close(loads.project(2 * force)[0], 2 * amplitude, rtol=1e-9, atol=0)
+    zero = loads.project(torch.zeros_like(force[:1]))
+    assert [float(one) for one in zero] == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("name", ["traction", "pressure", "gravity", "cable", "file", "point"])
+def test_other_forces_are_far_from_the_family(build, linear, name):
+    noise = np.random.default_rng(9).normal(size=(2, *linear.problem.shape))
+    _, distance = build(name, linear).project(torch.from_numpy(noise))
+    assert (distance > 0.5).all()
+
+
+@pytest.mark.parametrize("name", SIZED)
+def test_the_largest_load_deflects_the_body_as_far_as_requested(build, linear, name):
+    loads = build(name, linear, deflection=0.3)
+    drawn = loads.sample(0, range(200)).force
+    reached = torch.stack([linear.solve(force).norm(dim=1).max() for force in drawn])
+    assert float(reached.max()) <= 0.3 * (1 + 1e-9)
+    assert float(reached.max()) > (0.05 if name in ("point", "cable") else 0.2)
+    larger = build(name, linear, deflection=0.6).sample(0, range(3)).force
+    assert_close(larger, 2 * drawn[:3], rtol=1e-9, atol=1e-15)
+
+
+def test_the_softest_node_of_a_cantilever_is_at_its_tip(linear):
+    problem = linear.problem
+    nodes = problem.boundary.nonzero()[:, 0]
+    found = softest_node(linear, nodes)
+    assert problem.points[found, 0] == problem.points[:, 0].max()
+    near = (problem.points[:, 0] < 0.5).nonzero()[:, 0]
+    assert problem.points[softest_node(linear, near), 0] == problem.points[near, 0].max()
+
+
+def test_directions_are_uniform_on_the_sphere():
+    for dim in (2, 3):
+        t = np.random.default_rng(0).random((20000, dim - 1))
+        found = np.array([direction(row) for row in t])
+        assert_close(np.linalg.norm(found, axis=1), np.ones(len(t)), rtol=1e-12, atol=0)
+        assert np.abs(found.mean(axis=0)).max() < 0.02
+        assert np.abs(found.T @ found / len(t) - np.eye(dim) / dim).max() < 0.01
+
+
+OPTIONS = {  # in SI units, and the factors of length and of stress by which they are multiplied
+    "patch": {"largest": lambda L, E: 9.0 * E},
+    "point": {"largest": lambda L, E: 900.0 * E * L**2},
+    "traction": {"largest": lambda L, E: 9.0 * E},
+    "pressure": {"pressure": lambda L, E: [-9.0 * E, 20.0 * E]},
+    "gravity": {"density": lambda L, E: 0.01 * E / L, "acceleration": lambda L, E: [1.0, 9.81]},
+    "cable": {
+        "tension": lambda L, E: [100.0 * E * L**2, 900.0 * E * L**2],
+        "cables": lambda L, E: (L * np.array(CABLE[1:])).tolist(),
+    },
+}
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_forces_depend_on_ratios_to_size_and_modulus_only(build, name):
+    found = []
+    for length, stress in ((1.0, 1.0), (3.0, 1.0), (1.0, 7.0)):
+        beam = body(scale=length, young=4500.0 * stress)
+        options = {key: option(length, stress) for key, option in OPTIONS[name].items()}
+        loads = build(name, beam, **options)
+        found.append((loads.sample(0, range(4)).force, loads.identity()))
+        assert "deflection" not in loads.identity()
+    (force, identity), *others = found
+    for other, same in others:
+        assert_close(other, force, rtol=1e-10, atol=1e-16)
+        assert same == identity
+    changed = body(young=9000.0)
+    options = {key: option(1.0, 1.0) for key, option in OPTIONS[name].items()}
+    assert build(name, changed, **options).identity() != identity
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_sizes_in_SI_units_need_one_modulus(build, name):
+    beam = body(young=None)
+    options = {key: option(1.0, 1.0) for key, option in OPTIONS[name].items()}
+    key = next(iter(options))
+    loads = build(name, beam, **options)
+    with pytest.raises(ValueError, match=rf"^{key} = .* must be divided by one Young's modulus"):
+        loads.largest_force  # noqa: B018
+
+
+def sizes_of(force, problem):
+    return total(force) * problem.young * problem.length**2
+
+
+def test_tractions_add_up_to_area_times_stress():
+    linear = body()
+    problem = linear.problem
+    loads = FaceTractions(linear, 12.0, region=END, young=problem.young)
+    drawn = loads.sample(0, range(300))
+    found = sizes_of(drawn.force, problem).norm(dim=1) / 25.0**2  # [Pa]
+    assert 11.5 < float(found.max()) <= 12.0
+    assert float(found.min()) < 0.5
+    middle = torch.tensor([1.0, 0.125, 0.125], dtype=torch.float64)
+    for force in drawn.force[:3]:
+        moment = torch.linalg.cross(problem.points - middle, force).sum(dim=0)
+        assert moment.abs().max() < 1e-15
+
+
+def test_pressure_acts_inwards_and_that_on_a_closed_surface_is_in_balance():
+    linear = body()
+    problem = linear.problem
+    loads = FacePressure(linear, [2.0, 2.0], region=END, young=problem.young)
+    found = sizes_of(loads.sample(0, [0]).force, problem)[0]
+    assert_close(found, torch.tensor([-2.0 * 25**2, 0, 0]).double(), rtol=1e-12, atol=1e-9)
+    force = FacePressure(linear, [2.0, 2.0], young=problem.young).sample(0, [0]).force
+    assert total(force).abs().max() < 1e-16
+    moment = torch.linalg.cross(problem.points, force[0]).sum(dim=0)
+    assert moment.abs().max() < 1e-16
+    assert force.abs().max() > 1e-6
+
+
+def test_gravity_adds_up_to_the_weight():
+    linear = body()
+    problem = linear.problem
+    loads = GravityLoads(linear, 0.01, [9.81, 9.81], young=problem.young)
+    found = sizes_of(loads.sample(0, range(20)).force, problem).norm(dim=1)
+    weight = torch.full((20,), 0.01 * 9.81 * 100 * 25 * 25, dtype=torch.float64)
+    assert_close(found, weight, rtol=1e-12, atol=0)
+
+
+def test_a_cable_is_in_equilibrium_and_pulls_its_ends_together():
+    linear = body()
+    problem = linear.problem
+    loads = CableLoads(linear, CABLE, [70.0, 70.0], young=problem.young)
+    force = loads.sample(0, [0]).force
+    assert total(force).abs().max() < 1e-17
+    moment = torch.linalg.cross(problem.points, force[0]).sum(dim=0)
+    assert moment.abs().max() < 1e-17
+    straight = CableLoads(linear, CABLE[1:], [70.0, 70.0], young=problem.young)
+    pulls = straight.sample(0, [0]).force[0] * problem.young * problem.length**2
+    left = problem.points[:, 0] < 0.5
+    assert_close(pulls[left].sum(dim=0), torch.tensor([70.0, 0, 0]).double(), rtol=1e-12, atol=1e-9)
+    assert not loads.shapes[0][:, 2].any(), "the first cable lies in a plane"
+
+
+def test_the_turn_of_a_cable_is_pulled_towards_the_inside():
+    linear = body()
+    loads = CableLoads(linear, [[[0, 0, 12.5], [50, 25, 12.5], [100, 0, 12.5]]], young=1.0)
+    problem = linear.problem
+    near = (problem.points[:, 0] - 0.5).abs() < 0.25
+    pull = loads.shapes[0][near].sum(dim=0)
+    angle = math.atan2(25, 50)
+    expected = torch.tensor([0.0, -2 * math.sin(angle), 0.0], dtype=torch.float64)
+    assert_close(pull, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
+def test_the_families_of_the_surface_accept_every_element(cell, degree):
+    dim = 3 if cell in ("tetra", "hexahedron") else 2
+    mesh = (box if dim == 3 else rectangle)([2.0, 1.0, 1.0][:dim], [5, 4, 4][:dim], cell)
+    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), degree=degree)
+    linear = LinearSolver(problem, linear="superlu")
+    area = 0.5 ** (dim - 1)
+    for family in (PatchLoads, PointLoads, partial(FaceTractions, region=END)):
+        loads = family(linear)
+        drawn = loads.sample(0, range(10)).force
+        assert drawn.isfinite().all()
+        assert (problem.acting(drawn).flatten(1).norm(dim=1) > 0).all()
+    assert float(loads.weights.sum()) == pytest.approx(area, rel=1e-12)
+    patches = PatchLoads(linear, patch_radius=(10.0, 10.0), region=END)
+    assert float(patches.weights_of(int(patches.centres[0]), 10.0).sum()) == pytest.approx(area)
+    ends = [[0.3] * dim, [1.7, 0.6, 0.4][:dim]]
+    cable = CableLoads(linear, [ends])
+    assert total(cable.shapes).abs().max() < 1e-14
+
+
+def horseshoe(gap):
+    """Two legs 10 m long and 1 m wide along x, `gap` apart and joined at x = 0 only."""
+    mesh = box([10.0, 2.0 + gap, 1.0], [21, 11, 3])
+    middle = mesh.p[:, mesh.t].mean(axis=1)
+    y = np.linspace(0, 2 + gap, 11)
+    inside = (middle[0] > 1.0) & (middle[1] > y[4]) & (middle[1] < y[6])
+    return mesh.remove_elements(np.flatnonzero(inside)).remove_unused_nodes()
+
+
+def test_a_geodesic_disc_does_not_jump_across_a_gap():
+    mesh = horseshoe(0.2)
+    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"))
+    loads = PatchLoads(LinearSolver(problem, linear="superlu"))
+    points = problem.points
+    inner = (points[:, 0] == points[:, 0].max()) & (points[:, 1] < 0.11)
+    tip = int(torch.where(inner, points[:, 1], -1.0).argmax())
+    radius = 0.3  # three times the width of a leg, and more than the gap
+    loaded = loads.weights_of(tip, radius) > 0
+    near = (points - points[tip]).norm(dim=1) < radius / 2
+    assert (near & (points[:, 1] > 0.11)).any(), "the other leg is near"
+    assert loaded.any()
+    assert not loaded[points[:, 1] > 0.12].any()
+    assert (points[loaded, 0] > points[tip, 0] - radius - 1e-9).all()
+
+
+def test_small_discs_have_the_facets_around_their_centre():
+    linear = body(nodes=(9, 5, 5))
+    loads = PatchLoads(linear, 3.0, (0.0, 0.0), young=4500.0, region=END)
+    face = 25.0 / 100 / 4
+    sizes = {round(float(loads.weights_of(int(v), 0.0).sum()) / face**2, 6) for v in loads.centres}
+    assert sizes == {1.0, 2.0, 4.0}, "corners, edges and the middle of the end"
+    for force in loads.sample(0, range(5)).force:
+        assert (linear.problem.points[force.any(dim=1), 0] == 1.0).all()
+
+
+def test_point_forces_act_on_as_many_nodes_as_drawn():
+    linear = body()
+    loads = PointLoads(linear, 50.0, (2, 4), young=4500.0)
+    force = loads.sample(0, range(300)).force
+    counts = force.any(dim=2).sum(dim=1)
+    assert set(counts.tolist()) == {2, 3, 4}
+    largest = force.norm(dim=2).amax() * 4500.0 * 100.0**2
+    assert 48.0 < float(largest) <= 50.0
+    assert not force[:, linear.problem.points[:, 0] == 0].any()
+
+
+@pytest.mark.parametrize("name", ["modal", "patch", "point"])
+def test_a_region_restricts_where_loads_act(build, linear, name):
+    top = Plane(2, "max")
+    usual, loads = build(name, linear), build(name, linear, region=top)
+    force = loads.sample(0, range(20)).force
+    points = linear.problem.points
+    assert force.any()
+    assert not force[:, points[:, 2] < points[:, 2].max()].any()
+    assert "region" not in usual.identity()
+    assert loads.identity() != usual.identity()
+    same = Box([0.0, 0.0, 25.0], [100.0, 25.0, 25.0])  # the same facets
+    assert build(name, linear, region=same).identity() == loads.identity()
+
+
+@pytest.mark.parametrize("name", ["modal", "patch", "point", "traction", "pressure"])
+def test_an_empty_or_fixed_region_is_refused_in_one_line(build, linear, name):
+    with pytest.raises(ValueError, match=r"^region = Plane\(axis=0, at=7.0\) holds no facet"):
+        build(name, linear, region=Plane(0, 7.0)).loadable_dofs  # noqa: B018
+    fixed = build(name, linear, region=Plane(0, "min"))
+    with pytest.raises(ValueError, match=r"fixed everywhere|free node"):
+        (fixed.loadable_dofs, fixed.largest_force)  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("patch", {"largest": 0.0}, "largest = 0.0 must be a number above 0 [Pa], or null"),
+        ("patch", {"largest": math.inf}, "largest = inf must be"),
+        ("patch", {"patch_radius": (0.5, 0.1)}, "patch_radius = [0.5, 0.1] must be"),
+        ("patch", {"deflection": 0.0}, "deflection = 0.0 must lie between"),
+        (
+            "point",
+            {"count": (0, 2)},
+            "count = [0, 2] must be a smallest and a largest number from 1",
+        ),
+        ("point", {"count": (3, 2)}, "count = [3, 2] must"),
+        ("traction", {"largest": -1.0}, "largest = -1.0 must"),
+        ("pressure", {"pressure": (2.0, 1.0)}, "pressure = [2.0, 1.0] must be a smallest and a"),
+        ("pressure", {"pressure": (0.0, 0.0)}, "pressure = [0.0, 0.0] must contain a number other"),
+        ("gravity", {"density": -1.0}, "density = -1.0 must be a number above 0 [kg/m^3]"),
+        ("gravity", {"acceleration": (-1.0, 1.0)}, "acceleration = [-1.0, 1.0] must be"),
+        ("cable", {"tension": (1.0, math.nan)}, "tension = [1.0, nan] must be"),
+        ("cable", {"cables": []}, "cables = [] must contain a cable"),
+        ("cable", {"cables": [[[0.0, 0.0, 0.0]]]}, "cables.0 = [[0.0, 0.0, 0.0]] must be two or"),
+        (
+            "cable",
+            {"cables": [[[0.0, 0.0], [1.0, 1.0]]]},
+            "cables.0 = [[0.0, 0.0], [1.0, 1.0]] must",
+        ),
+        ("cable", {"cables": [[[1, 1, 1], [1, 1, 1]]]}, "cables.0 must not contain the same point"),
+        (
+            "cable",
+            {"cables": [CABLE[0], [[1, 1, 1], [1, 1, 99]]]},
+            "cables.1: the point [1.0, 1.0, 99",
+        ),
+        ("file", {"factor": (1.0,)}, "factor = [1.0] must be"),
+        ("mixture", {"families": {}}, "families must contain one with a weight above 0"),
+        ("mixture", {"weights": {"patch": -1.0}}, "weights.patch = -1.0 must be a number from 0"),
+        ("mixture", {"weights": {"patches": 1.0}}, "weights.patches: there is no such family"),
+    ],
+)
+def test_options_out_of_range_are_refused_in_one_line(build, linear, name, options, message):
+    with pytest.raises(ValueError, match=r".") as caught:
+        build(name, linear, **options)
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
+
+
+def test_more_forces_than_free_nodes_are_refused(linear):
+    with pytest.raises(ValueError, match=r"^count = \[1, 60\] must be at most 41"):
+        PointLoads(linear, count=(1, 60)).largest_force  # noqa: B018
+
+
+def test_an_error_of_a_mixture_names_the_family(linear):
+    families = {"a": GravityLoads, "b": partial(PatchLoads, largest=-1.0)}
+    with pytest.raises(ValueError, match=r"^families\.b: largest = -1.0 must"):
+        MixtureLoads(linear, families)
+    empty = {"b": partial(PatchLoads, region=Plane(0, 7.0))}
+    with pytest.raises(ValueError, match=r"^families\.b: region = Plane"):
+        MixtureLoads(linear, empty).largest_force  # noqa: B018
+    with pytest.raises(TypeError, match=r"families\.c gives dict; it must give a RandomLoads"):
+        MixtureLoads(linear, {"c": dict})
+
+
+def test_loads_of_a_file_are_its_forces_times_a_factor(linear, path):
+    problem = linear.problem
+    loads = FileLoads(linear, path, [0.5, 2.0], young=problem.young)
+    force = loads.sample(0, range(60)).force * problem.young * problem.length**2
+    given = torch.from_numpy(np.load(path))
+    seen = set()
+    for one in force:
+        ratio = one / given  # (S, N, D)
+        (number,) = (ratio.flatten(1).std(dim=1) < 1e-9).nonzero()[:, 0].tolist()
+        assert 0.5 <= float(ratio[number].mean()) <= 2.0
+        seen.add(number)
+    assert seen == {0, 1, 2}
+
+
+def test_a_file_is_identified_by_its_forces(linear, path, tmp_path):
+    copy, other = tmp_path / "copy.npz", tmp_path / "other.npy"
+    np.savez(copy, forces=np.load(path))
+    np.save(other, np.load(path)[:2])
+    one, same, less = (FileLoads(linear, str(p), young=4500.0) for p in (path, copy, other))
+    assert one.identity() == same.identity() != less.identity()
+    assert FileLoads(body(young=9000.0), path, young=9000.0).identity() != one.identity()
+
+
+def test_files_that_cannot_be_used_are_refused_in_one_line(linear, tmp_path):
+    shape = linear.problem.shape
+    bad = {
+        "shape.npy": (np.zeros((2, 3, 3)), "must be numbers of shape|must be numbers (S, 54, 3)"),
+        "flat.npy": (np.ones(shape), "must be numbers (S, 54, 3)"),
+        "none.npy": (np.ones((0, *shape)), "must be numbers (S, 54, 3)"),
+        "text.npy": (np.full((1, *shape), "a"), "must be numbers (S, 54, 3)"),
+        "nan.npy": (np.full((1, *shape), np.nan), "force 0 must have finite components"),
+        "zero.npy": (np.zeros((1, *shape)), "force 0 must act on a free degree of freedom"),
+        "object.npy": (np.array([{}], dtype=object), "allow_pickle=False"),
+        "forces.csv": (None, "the file must be .npy or .npz"),
+        "missing.npy": (None, "No such file or directory"),
+    }
+    for name, (array, message) in bad.items():
+        path = tmp_path / name
+        if array is not None:
+            np.save(path, array)
+        with pytest.raises(ValueError, match=r".") as caught:
+            FileLoads(linear, str(path))
+        assert str(caught.value).startswith(f"path = {path}: ")
+        assert any(part in str(caught.value) for part in message.split("|"))
+        assert "\n" not in str(caught.value)
+    np.savez(tmp_path / "two.npz", a=np.ones(1), b=np.ones(1))
+    (tmp_path / "damaged.npz").write_bytes(b"PK\x03\x04 damaged")
+    (tmp_path / "empty.npy").write_bytes(b"")
+    for name in ("two.npz", "damaged.npz", "empty.npy"):
+        with pytest.raises(ValueError, match=r"^path = .*\.np[yz]: [^\n]+$"):
+            FileLoads(linear, str(tmp_path / name))
+
+
+def test_forces_of_whole_numbers_are_read(tmp_path):
+    np.save(tmp_path / "whole.npy", np.ones((1, 4, 2), dtype=np.int64))
+    assert read_forces(str(tmp_path / "whole.npy"), np.ones((4, 2), bool)).dtype == np.float64
+
+
+def test_a_mixture_draws_its_families_by_weight_and_names_them(linear):
+    families = {"modal": partial(ModalLoads, n_modes=3), "point": PointLoads, "none": GravityLoads}
+    loads = MixtureLoads(linear, families, {"modal": 3.0, "none": 0.0})
+    assert loads.names == ("modal", "point", "none")
+    points = loads.points(0, range(4000))
+    counts = torch.bincount(loads.family_of(points), minlength=3)
+    assert counts[2] == 0
+    assert float(counts[0]) / 4000 == pytest.approx(0.75, abs=0.03)
+    members = loads.family_of(points[:30])
+    force = loads.loads_at(points[:30]).force
+    distances = torch.stack([member.project(force)[1] for member in loads.members[:2]])
+    assert (distances[members, range(30)] < 1e-9).all()
+    for point, one, member in zip(points[:30], force, members.tolist(), strict=True):
+        family = loads.members[member]
+        assert torch.equal(one, family.force_at(point[1 : 1 + family.n_force].numpy()))
+    assert loads.n_random == 2 + max(family.n_force for family in loads.members)
+    assert list(loads.arrays()) == ["modal.values", "modal.vectors"]
+    twice = MixtureLoads(linear, families, {"modal": 6.0, "point": 2.0, "none": 0.0})
+    assert twice.identity() == loads.identity()
+
+
+def test_a_mixture_recognises_the_family_that_fits_best(linear):
+    families = {"end": partial(FaceTractions, region=END), "weight": GravityLoads}
+    loads = MixtureLoads(linear, families)
+    for number, member in enumerate(loads.members):
+        force = 1.5 * member.sample(5, range(4)).force
+        amplitude, distance = loads.project(force)
+        assert_close(amplitude, member.project(force)[0])
+        assert (distance < 1e-9).all(), number
+
+
+def test_mixtures_share_young_and_parameters_of_the_law():
+    mesh = box([4.0, 1.0, 1.0], [5, 3, 3])
+    problem = Problem.build(mesh, NeoHookeanLn([0.2, 0.4]), fixed=Plane(0, "min"), young=None)
+    linear = LinearSolver(problem, linear="superlu")
+    loads = MixtureLoads(linear, {"patch": PatchLoads, "point": PointLoads}, young=[1e3, 1e5])
+    load = loads.sample(0, range(50))
+    assert float(load.young.min()) < 2e4 < 8e4 < float(load.young.max())
+    assert float(load.parameters.min()) < 0.25 < 0.35 < float(load.parameters.max())
