@@ -114,8 +114,7 @@ class RestStiffness:
     @cached_property
     def _matrix(self) -> csr_array:
         problem = self._linear.problem
-        rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-        return full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())
+        return full_matrix(problem.pattern, problem.stiffness_at_rest().numpy())
 
     @cached_property
     def _on_device(self) -> Tensor:

@@ -213,11 +213,12 @@ def beyond_linear(problem: Problem, snapshots: Tensor, lift: LinearSolver | None
 
 
 def support_force(problem: Problem) -> Tensor:
-    """Return K(0) prescribed, (N, D)."""
+    """Return K(0) prescribed plus the follower pressure on the surface at rest, (N, D)."""
     if not problem.moved_supports:
-        return torch.zeros(problem.shape, dtype=torch.float64)
+        return problem.pressure_at_rest
     rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    return problem.tangent_product(rest, problem.prescribed[None])[0]
+    elastic = problem.without_pressure
+    return elastic.tangent_product(rest, problem.prescribed[None])[0] + problem.pressure_at_rest
 
 
 def _linear_solution(lift: LinearSolver, force: Tensor) -> Tensor:
