@@ -3,7 +3,8 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 import skfem
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from dpl.fem.assembly.elements import QUADRATIC
 from dpl.fem.assembly.sparsity import Pattern
+from dpl.fem.identity import plain
 from dpl.fem.mesh.regions import Origin, Region, facets_in
 from dpl.fem.units import Units
 
@@ -35,8 +37,8 @@ class FollowerPressure:
     region: Region
     value: float
 
-    def dimensionless(self, dim: int, units: Units) -> float:
-        """Return p / E [-]; `dim` is not used.
+    def dimensionless(self, units: Units) -> float:
+        """Return p / E [-].
 
         Raises:
             ValueError: `value` is not finite, or the loads have a range of moduli.
@@ -48,6 +50,11 @@ class FollowerPressure:
             raise ValueError(f"{words} must be a finite number [Pa]")
         return float(units.stress(np.array(float(self.value)), words))
 
+    def check(self, mesh: skfem.Mesh, units: Units) -> None:
+        """Check value and region on a mesh [m]; raise the errors of `on`."""
+        self.dimensionless(units)
+        facets_in(self.region, mesh)
+
     def on(self, basis: skfem.Basis, units: Units, origin: Origin = 0.0) -> "PressureSurface":
         """Return the loaded surface; arguments as in `DirichletBC.on`.
 
@@ -55,7 +62,7 @@ class FollowerPressure:
             ValueError: The region contains no boundary facet, or `value` is invalid, see
                 `dimensionless`.
         """
-        pressure = self.dimensionless(basis.mesh.dim(), units)
+        pressure = self.dimensionless(units)
         facets = facets_in(self.region, basis.mesh, units.length, origin)
         return PressureSurface.build(basis, facets, pressure)
 
@@ -104,9 +111,11 @@ class PressureSurface:
         weights = np.take_along_axis(values, local[:, None], axis=2) * surface.dx[..., None]
         along = np.take_along_axis(along, local[:, None, :, None], axis=2)
         return cls(
-            torch.from_numpy(nodes.astype(np.int64)),
-            *(torch.from_numpy(np.ascontiguousarray(x)) for x in (weights, along, tangents)),
-            torch.full((len(facets),), pressure, dtype=torch.float64),
+            nodes=torch.from_numpy(nodes.astype(np.int64)),
+            weights=torch.from_numpy(np.ascontiguousarray(weights)),
+            slopes=torch.from_numpy(np.ascontiguousarray(along)),
+            tangents=torch.from_numpy(tangents),
+            pressure=torch.full((len(facets),), pressure, dtype=torch.float64),
         )
 
     @classmethod
@@ -120,9 +129,19 @@ class PressureSurface:
         """Return the surface with its tensors on a device."""
         return type(self)(*(getattr(self, field.name).to(device) for field in fields(self)))
 
+    def __getstate__(self) -> dict[str, object]:
+        """Return the fields without cached properties."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def identity(self) -> list[Any]:
+        """Return facets and pressures as plain data, arrays as their SHA-256."""
+        return [plain(self.nodes.sort(dim=1).values), plain(self.pressure)]
+
     def scaled(self, factor: float) -> Self:
         """Return the surface under `factor` times its pressure."""
-        return replace(self, pressure=factor * self.pressure)
+        twin = replace(self, pressure=factor * self.pressure)
+        twin.__dict__["_pair_weights"] = self._pair_weights
+        return twin
 
     def force(self, displacement: Tensor) -> Tensor:
         """Return p dV/du, minus the nodal forces of the pressure, (B, N, D) [-].
@@ -193,14 +212,17 @@ class PressureSurface:
 
         The load stiffness of the nodes a and b has the entries epsilon_ikl c_l.
         """
-        slopes = self._slopes(displacement)
-        y1, y2 = self._images(slopes)  # (B, S, Q, 3)
-        first, second = (
-            (self.weights.mT[:, :, None] * self.slopes[..., i].mT[:, None]).flatten(1, 2)
-            for i in (0, 1)
-        )  # (S, A A, Q)
+        y1, y2 = self._images(self._slopes(displacement))  # (B, S, Q, 3)
+        first, second = self._pair_weights
         vectors = (first @ y2 - second @ y1) * self.pressure[:, None, None]
         return vectors.unflatten(2, (self.nodes.shape[1], -1))
+
+    @cached_property
+    def _pair_weights(self) -> tuple[Tensor, Tensor]:
+        """Weights of node a times slopes of node b along t1 and t2, (S, A A, Q) each."""
+        weights, slopes = self.weights.mT[:, :, None], self.slopes.permute(3, 0, 2, 1)
+        first, second = (weights * slopes[:, :, None]).flatten(2, 3)
+        return first, second
 
     def places(self, pattern: Pattern, dim: int) -> Tensor:
         """Return the positions among the nnz of the entries of `stiffness`, (2, S, pairs, 3).

@@ -95,20 +95,26 @@ class TensorAssembly:
         """L and E, by which boundary values are divided."""
         return Units(self.length, self.young)
 
-    def check_foundation_modulus(self, young: float) -> None:
+    @property
+    def has_one_modulus(self) -> bool:
+        """True if the body is divided by one modulus: elastic foundation or follower pressure."""
+        return self.springs is not None or self.pressure is not None
+
+    def check_modulus(self, young: float) -> None:
         """Check the Young's modulus [Pa] of a load on this body.
 
-        Elastic foundations have a fixed stiffness, so that their part in K(0) is that of one
-        modulus. Without foundations all moduli are allowed.
+        Elastic foundations have a fixed stiffness and follower pressures a fixed value, so that
+        their parts in f_int are those of one modulus. Other bodies allow all moduli.
 
         Raises:
-            ValueError: The modulus is not that of the foundations.
+            ValueError: The modulus is not that of the foundation or the pressure.
         """
-        if self.springs is None or self.young is None or math.isclose(young, self.young):
+        if not self.has_one_modulus or self.young is None or math.isclose(young, self.young):
             return
+        part = "pressure" if self.springs is None else "stiffness of the elastic foundation"
         raise ValueError(
-            f"young = {young:g} must be {self.young:g} [Pa], by which the stiffness of the elastic "
-            f"foundation is divided; build another body with young = {young:g}"
+            f"young = {young:g} must be {self.young:g} [Pa], by which the {part} is divided; "
+            f"build another body with young = {young:g}"
         )
 
     @property
@@ -297,18 +303,18 @@ class TensorAssembly:
             tangent = tangent + torch.from_numpy(added[:-1]).to(tangent.device)
         if self.pressure is not None:
             values = self.pressure.stiffness(displacement).flatten(1)
-            total = torch.nn.functional.pad(tangent, (0, 1))
-            for places, sign in zip(self._pressure_places, (1.0, -1.0), strict=True):
-                total.index_add_(1, places, values, alpha=sign)
-            tangent = total[:, :-1]
+            source, target = self._pressure_places
+            both = torch.cat([values, -values], dim=1)[:, source]
+            tangent = tangent.scatter_add(1, target.expand_as(both), both)
         return tangent
 
     @cached_property
-    def _pressure_places(self) -> Tensor:
-        """Positions of the entries of the load stiffness, (2, S pairs 3)."""
+    def _pressure_places(self) -> tuple[Tensor, Tensor]:
+        """Index of each stored entry in (K, -K) of the load stiffness K, and among the nnz."""
         assert self.pressure is not None
-        places = self.pressure.places(self.pattern, self.shape[1])
-        return places.flatten(1).to(self.points.device)
+        places = self.pressure.places(self.pattern, self.shape[1]).flatten()
+        source = (places < len(self.pattern.indices)).nonzero().flatten()
+        return source.to(self.points.device), places[source].to(self.points.device)
 
     def _effective_stress(self, H: Tensor) -> Tensor:
         """Return the stress conjugate to H, (B, E, Q, 3, 3) [-]."""

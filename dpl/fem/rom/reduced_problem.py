@@ -192,6 +192,15 @@ def norm(vector: Tensor) -> float:
     return largest * float(torch.linalg.vector_norm(vector / largest))
 
 
+def refuse_pressure(problem: Problem, name: str) -> None:
+    """Raise a ValueError if the body has a follower pressure; `name` cannot treat it."""
+    if problem.pressure is not None:
+        raise ValueError(
+            f"{name} selects cells and has no follower pressure; use dpl.fem.Newton, or a model "
+            "that predicts nodal displacements (fcnn, cnn, gnn)"
+        )
+
+
 def refuse_range(problem: Problem) -> None:
     """Raise a ValueError if the law has ranges."""
     for name, ends in problem.material.parameter_ranges.items():

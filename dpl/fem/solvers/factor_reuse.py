@@ -5,6 +5,7 @@ from enum import Enum
 
 from torch import Tensor
 
+from dpl.fem.linear.gmres import Map, gmres
 from dpl.fem.linear.interface import (
     UNKNOWN,
     UNSTABLE,
@@ -17,7 +18,6 @@ from dpl.fem.linear.interface import (
     Stability,
     SymmetricProduct,
 )
-from dpl.fem.linear.gmres import Map, gmres
 from dpl.fem.linear.krylov import conjugate_gradients, smallest_ritz_value
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.corotational import CorotatedFactor
@@ -175,12 +175,17 @@ def _sum(first: Map, second: Map) -> Map:
 
 
 def stability_at(problem: Problem, backend: Backend, displacement: Tensor) -> Stability:
-    """Return the stability of the tangent at (1, N, D); a singular one counts as unstable."""
+    """Return the stability of the tangent at (1, N, D); a singular one counts as unstable.
+
+    Under a pressure without potential a positive definite symmetric part is sufficient for
+    stability. It is not necessary: otherwise nothing is known.
+    """
     tangent = problem.linearise(displacement).tangent
     try:
-        return backend.factorise(tangent[0].numpy()).stability()
+        found = backend.factorise(tangent[0].numpy()).stability()
     except SingularMatrix:  # at the critical load itself
-        return UNSTABLE
+        found = UNSTABLE
+    return found if problem.pressure_has_potential or not found.least else UNKNOWN
 
 
 def forcing_term(residual: float, previous: float, *, tol: float, corotational: bool) -> float:

@@ -11,7 +11,6 @@ from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, triu
 from torch import Tensor
