@@ -14,6 +14,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from benchmarks.verification.beams import balance, beam
+from benchmarks.verification.inflation import inflation
 from benchmarks.verification.nodal_stress import nodal_stress
 from benchmarks.verification.refinement import cook, locking, order
 from benchmarks.verification.report import Row, Section, summary, table
@@ -34,6 +35,7 @@ CASES: dict[str, Callable[[Path], Section]] = {
     "buckling": buckling,
     "balance": balance,
     "nodal_stress": nodal_stress,
+    "inflation": inflation,
 }
 
 
