@@ -93,11 +93,12 @@ def sector(dim: int, cells: int, shape: str, *, quadratic: bool) -> skfem.Mesh:
             mesh = {"triangle": skfem.MeshTri2, "quad": skfem.MeshQuad2}[shape].from_mesh(mesh)
         radius, angle = INNER + mesh.doflocs[0], np.pi / 2 * mesh.doflocs[1]
         return replace(mesh, doflocs=radius * np.stack([np.cos(angle), np.sin(angle)]))
-    mesh = box([OUTER] * 3, [2 * cells + 1] * 3, shape)  # the outer cube without the inner one
-    centre = mesh.p[:, mesh.t].mean(axis=1)
-    mesh = mesh.restrict(np.flatnonzero(centre.max(axis=0) > INNER))
-    if quadratic:
-        mesh = {"tetra": skfem.MeshTet2, "hexahedron": skfem.MeshHex2}[shape].from_mesh(mesh)
+    patch = box([1.0] * 3, [cells + 1] * 3)  # coordinates: radius and two of a side of a cube
+    radius = INNER + patch.p[0]
+    at = radius * np.stack([patch.p[1], patch.p[2], np.ones_like(radius)])
+    parts = [skfem.MeshHex(np.roll(at, k, axis=0), patch.t) for k in range(3)]
+    mesh = parts[0] + parts[1] + parts[2]
+    mesh = skfem.MeshHex2.from_mesh(mesh) if quadratic else mesh
     x = mesh.doflocs
     return replace(mesh, doflocs=x * x.max(axis=0) / np.linalg.norm(x, axis=0))
 

@@ -71,19 +71,21 @@ class FollowerPressure:
 class PressureSurface:
     """Boundary facets under a follower pressure, evaluated in batches.
 
-    The normal force on a facet element is y1 x y2 times its reference area, with the images
-    y_i = t_i + du/dt_i of two orthonormal tangents t_i. It is a polynomial of the nodal positions
-    on the facet, which the quadrature integrates exactly. In 2D the second tangent is the unit
-    vector across the plane, which does not deform.
+    The area vector of a deformed facet is y1 x y2, with the derivatives y_i = t_i + du/dxi_i of the
+    positions along the coordinates xi_i of the reference facet. It is a polynomial of the nodal
+    positions on the facet, which the quadrature integrates exactly. In 2D the second tangent is a
+    unit vector across the plane, which does not deform. Points need no inverse mapping, which
+    scikit-fem does not find in all curved cells.
 
     Source: Bonet, Wood (2008), Nonlinear Continuum Mechanics for Finite Element Analysis, section
     8.5 (load stiffness of enclosed boundaries); Schweizerhof, Ramm (1984), Comput. Struct. 18.
 
     Attributes:
         nodes: Nodes of each facet, (S, A).
-        weights: Shape functions times reference areas of the quadrature points, (S, Q, A) [-].
-        slopes: Derivatives of the shape functions along the tangents, (S, Q, A, 2) [-].
-        tangents: Tangents t_i, (S, Q, 3, 2) [-]; t1 x t2 is the outward normal.
+        weights: Shape functions times weights of the quadrature points, (S, Q, A) [-].
+        slopes: Derivatives of the shape functions along xi_1 and xi_2, (S, Q, A, 2) [-].
+        tangents: Derivatives t_i of the positions at rest, (S, Q, 3, 2) [-]; t1 x t2 points out of
+            the body.
         pressure: p / E of each facet, (S,) [-].
     """
 
@@ -96,24 +98,25 @@ class PressureSurface:
     @classmethod
     def build(cls, basis: skfem.Basis, facets: NDArray[np.int_], pressure: float) -> Self:
         """Return the surface of boundary facets (S,) under one pressure [-]."""
-        mesh, dim = basis.mesh, basis.mesh.dim()
-        order = DEGREES[mesh.elem.refdom.brefdom.__name__][type(basis.elem) in QUADRATIC]
-        surface = skfem.FacetBasis(mesh, basis.elem, facets=facets, intorder=order)
-        slopes = np.stack([b[0].grad for b in surface.basis], axis=-1)  # (D, S, Q, cell nodes)
-        values = np.stack([np.asarray(b[0]) for b in surface.basis], axis=-1)
-        values = np.broadcast_to(values, slopes.shape[1:])
-        tangents = _tangents(np.asarray(surface.normals))
-        along = np.einsum("jsqa,sqji->sqai", slopes, tangents[:, :, :dim])
-        # nodes of a facet are those whose shape functions do not vanish on it
-        outside = np.abs(values).max(axis=1) < 1e-12  # (S, cell nodes)
-        local = np.argsort(outside, axis=1, kind="stable")[:, : int((~outside[0]).sum())]
-        nodes = np.take_along_axis(surface.element_dofs.T, local, axis=1)
-        weights = np.take_along_axis(values, local[:, None], axis=2) * surface.dx[..., None]
-        along = np.take_along_axis(along, local[:, None, :, None], axis=2)
+        mesh = basis.mesh
+        cells = mesh.f2t[0, facets]
+        side = (mesh.t2f[:, cells] == facets).argmax(axis=0)  # number of the facet in its cell
+        rules = [_facet_rule(basis, local) for local in range(len(mesh.t2f))]
+        nodes, weights, slopes = (np.stack([rule[k] for rule in rules])[side] for k in range(3))
+        nodes = np.take_along_axis(basis.element_dofs[:, cells].T, nodes, axis=1)
+        X = np.zeros((*nodes.shape, 3))
+        X[..., : mesh.dim()] = basis.doflocs.T[nodes]
+        tangents = np.einsum("sqai,sac->sqci", slopes, X)
+        if mesh.dim() == 2:
+            tangents[..., 2, 1] = 1.0
+        tangents[..., 1] *= _orientation(basis, cells, side)[:, None, None]
+        slopes = slopes * np.stack(
+            [np.ones(len(side)), _orientation(basis, cells, side)], axis=-1
+        )[:, None, None]
         return cls(
             nodes=torch.from_numpy(nodes.astype(np.int64)),
             weights=torch.from_numpy(np.ascontiguousarray(weights)),
-            slopes=torch.from_numpy(np.ascontiguousarray(along)),
+            slopes=torch.from_numpy(np.ascontiguousarray(slopes)),
             tangents=torch.from_numpy(tangents),
             pressure=torch.full((len(facets),), pressure, dtype=torch.float64),
         )
@@ -219,7 +222,7 @@ class PressureSurface:
 
     @cached_property
     def _pair_weights(self) -> tuple[Tensor, Tensor]:
-        """Weights of node a times slopes of node b along t1 and t2, (S, A A, Q) each."""
+        """Weights of node a times slopes of node b along xi_i, (S, A A, Q) each."""
         weights, slopes = self.weights.mT[:, :, None], self.slopes.permute(3, 0, 2, 1)
         first, second = (weights * slopes[:, :, None]).flatten(2, 3)
         return first, second
@@ -239,14 +242,14 @@ class PressureSurface:
         return torch.from_numpy(np.stack([pattern.positions(*pair) for pair in both]))
 
     def _slopes(self, displacement: Tensor) -> Tensor:
-        """Return du/dt_i at the quadrature points, (B, S, Q, 3, 2) [-]; in 2D padded with zeros."""
+        """Return du/dxi_i at the quadrature points, (B, S, Q, 3, 2) [-]; in 2D padded with zeros."""
         at_facets = displacement[:, self.nodes]
         at_facets = torch.nn.functional.pad(at_facets, (0, 3 - at_facets.shape[-1]))
         slopes = self.slopes.transpose(2, 3).flatten(1, 2) @ at_facets  # (B, S, 2 Q, 3)
         return slopes.unflatten(2, (-1, 2)).mT
 
     def _images(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the images y1 and y2 of the tangents, (B, S, Q, 3) each."""
+        """Return y1 and y2, (B, S, Q, 3) each."""
         first, second = (self.tangents + slopes).unbind(-1)
         return first, second
 
@@ -262,14 +265,49 @@ class PressureSurface:
         return total.index_add(1, self.nodes.flatten(), forces.flatten(1, 2))
 
 
-def _tangents(normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return orthonormal tangents t1, t2, (S, Q, 3, 2), with t1 x t2 = n, of normals (D, S, Q)."""
-    normal = np.zeros((*normals.shape[1:], 3))
-    normal[..., : len(normals)] = np.moveaxis(normals, 0, -1)
-    if len(normals) == 2:
-        second = np.broadcast_to([0.0, 0.0, 1.0], normal.shape)
-    else:
-        axis = np.eye(3)[np.abs(normal).argmin(axis=-1)]
-        second = np.cross(normal, axis)
-        second /= np.linalg.norm(second, axis=-1, keepdims=True)
-    return np.stack([np.cross(second, normal), second], axis=-1)
+def _corners(basis: skfem.Basis, local: int) -> NDArray[np.float64]:
+    """Return the first corner and the edges from there of a facet of the reference cell, (D, D)."""
+    cell = basis.mesh.elem.refdom
+    first, second, *_, last = [cell.p[:, k] for k in (*cell.facets[local], cell.facets[local][-1])]
+    edges = [second - first, last - first][: len(first) - 1]
+    return np.stack([first, *edges], axis=-1).astype(np.float64)
+
+
+def _facet_rule(
+    basis: skfem.Basis, local: int
+) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+    """Return numbers of nodes, weights and slopes of a facet of the reference cell.
+
+    They are the numbers (A,) of the nodes in the cell, the shape functions times the weights of the
+    quadrature (Q, A), and their derivatives along the edges (Q, A, 2).
+    """
+    element, corners = basis.elem, _corners(basis, local)
+    facet = basis.mesh.elem.refdom.brefdom
+    order = DEGREES[facet.__name__][type(element) in QUADRATIC]
+    points, weights = skfem.quadrature.get_quadrature(facet, order)
+    at = corners[:, :1] + corners[:, 1:] @ points
+    shapes = [element.lbasis(at, a) for a in range(basis.Nbfun)]
+    values = np.stack([np.broadcast_to(value, weights.shape) for value, _ in shapes], axis=-1)
+    slopes = np.zeros((*values.shape, 2))
+    for a, (_, gradient) in enumerate(shapes):
+        gradient = np.broadcast_to(gradient, at.shape)
+        slopes[:, a, : len(at) - 1] = gradient.T @ corners[:, 1:]
+    # nodes of a facet are those whose shape functions do not vanish on it
+    on = np.flatnonzero(np.abs(values).max(axis=0) > 1e-12)
+    return on, values[:, on] * weights[:, None], slopes[:, on]
+
+
+def _orientation(
+    basis: skfem.Basis, cells: NDArray[np.int_], side: NDArray[np.int_]
+) -> NDArray[np.float64]:
+    """Return 1 where the product of the tangents points out of the cell, else -1, (S,)."""
+    mesh = basis.mesh
+    centre = mesh.elem.refdom.p.mean(axis=1)
+    senses = []
+    for local in range(len(mesh.t2f)):
+        first, *edges = _corners(basis, local).T
+        senses.append(np.linalg.det(np.stack([*edges, first - centre], axis=-1)))
+    J = mesh.mapping().detDF(centre[:, None].astype(np.float64), tind=cells)[:, 0]
+    # in 2D the second tangent is normal to the plane: t1 x e_z is t1, turned clockwise
+    flip = -1.0 if mesh.dim() == 2 else 1.0
+    return flip * np.sign(np.array(senses)[side]) * np.sign(J)
