@@ -14,8 +14,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from benchmarks.verification.beams import balance, beam
-from benchmarks.verification.inflation import inflation
 from benchmarks.verification.nodal_stress import nodal_stress
+from benchmarks.verification.pressurised import inflation
 from benchmarks.verification.refinement import cook, locking, order
 from benchmarks.verification.report import Row, Section, summary, table
 from benchmarks.verification.rods import buckling, elastica
