@@ -110,9 +110,12 @@ class PressureSurface:
         if mesh.dim() == 2:
             tangents[..., 2, 1] = 1.0
         tangents[..., 1] *= _orientation(basis, cells, side)[:, None, None]
-        slopes = slopes * np.stack(
-            [np.ones(len(side)), _orientation(basis, cells, side)], axis=-1
-        )[:, None, None]
+        slopes = (
+            slopes
+            * np.stack([np.ones(len(side)), _orientation(basis, cells, side)], axis=-1)[
+                :, None, None
+            ]
+        )
         return cls(
             nodes=torch.from_numpy(nodes.astype(np.int64)),
             weights=torch.from_numpy(np.ascontiguousarray(weights)),
@@ -242,7 +245,7 @@ class PressureSurface:
         return torch.from_numpy(np.stack([pattern.positions(*pair) for pair in both]))
 
     def _slopes(self, displacement: Tensor) -> Tensor:
-        """Return du/dxi_i at the quadrature points, (B, S, Q, 3, 2) [-]; in 2D padded with zeros."""
+        """Return du/dxi_i at the quadrature points, (B, S, Q, 3, 2) [-]; in 2D with zeros."""
         at_facets = displacement[:, self.nodes]
         at_facets = torch.nn.functional.pad(at_facets, (0, 3 - at_facets.shape[-1]))
         slopes = self.slopes.transpose(2, 3).flatten(1, 2) @ at_facets  # (B, S, 2 Q, 3)
