@@ -83,14 +83,15 @@ class Scene:
     solver: ReferenceSolver
 
     def __post_init__(self) -> None:
-        """Check that elastic foundations and loads have one Young's modulus.
+        """Check that body and loads have one Young's modulus if the body needs one.
 
         Raises:
-            ValueError: The loads have another modulus than the foundations, or a range.
+            ValueError: The loads have another modulus than elastic foundations and follower
+                pressures, or a range.
         """
-        if self.problem.springs is not None:
+        if self.problem.has_one_modulus:
             for young in self.loads.young_range:
-                self.problem.check_foundation_modulus(young)
+                self.problem.check_modulus(young)
 
     @property
     def linear(self) -> LinearSolver:
@@ -137,15 +138,15 @@ class Scene:
         """Return True if samples depend on a boundary value, over E or L, besides random loads."""
         problem = self.problem
         constant = self.loads.constant_force is not None
-        return constant or problem.springs is not None or problem.moved_supports
+        return constant or problem.has_one_modulus or problem.moved_supports
 
     def load_of(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Load:
         """Return nodal forces (B, N, D) [N] (2D: [N/m]) on bodies of moduli (B,) [Pa] as a load.
 
         Args:
             force: Nodal forces.
-            young: E. On a body on elastic foundations it must be that of the foundations, see
-                `Problem.check_foundation_modulus`, which this function does not call.
+            young: E. On a body with an elastic foundation or a follower pressure it must be that of
+                the body, see `Problem.check_modulus`, which this function does not call.
             parameters: Values of the ranges of the law, (B,) or (B, P); required if it has any.
         """
         dimensionless = force.double() / (young.double()[:, None, None] * self.force_unit)
@@ -169,6 +170,7 @@ class Scene:
         problem, points = self.problem, self.problem.points.numpy()
         # Not rounded: the halves among dyadic coordinates would flip with the last bit.
         lattice = np.floor((points - points.min(axis=0)) * 1e9 + 0.3).astype(np.int64)
+        pressure = {} if problem.pressure is None else {"pressure": problem.pressure.identity()}
         return {
             "points": sha256_of(lattice),
             "cells": plain(problem.cells),
@@ -180,6 +182,7 @@ class Scene:
             "law": problem.material.identity(),
             "loads": self.loads.identity(),
             "solver": self.solver.identity(),
+            **pressure,
         }
 
     @cached_property
@@ -209,6 +212,8 @@ class Scene:
         fixed = int((~problem.free).any(dim=1).sum())
         moved = "moved" if problem.moved_supports else "fixed"
         springs = "" if problem.springs is None else ", an elastic foundation"
+        if problem.pressure is not None:
+            springs += f", follower pressure on {len(problem.pressure.nodes):,} facets"
         law = (
             problem.material if is_dataclass(problem.material) else type(problem.material).__name__
         )

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from benchmarks.verification.beams import balance, beam
 from benchmarks.verification.nodal_stress import nodal_stress
+from benchmarks.verification.pressurised import inflation
 from benchmarks.verification.refinement import cook, locking, order
 from benchmarks.verification.report import Row, Section, summary, table
 from benchmarks.verification.rods import buckling, elastica
@@ -34,6 +35,7 @@ CASES: dict[str, Callable[[Path], Section]] = {
     "buckling": buckling,
     "balance": balance,
     "nodal_stress": nodal_stress,
+    "inflation": inflation,
 }
 
 

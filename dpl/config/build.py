@@ -25,7 +25,7 @@ from torch import Tensor
 from dpl import training
 from dpl.config import validation
 from dpl.config.validation import ConfigError
-from dpl.fem import Problem, SingularMatrix, YoungRange
+from dpl.fem import FollowerPressure, Problem, SingularMatrix, YoungRange
 from dpl.fem.units import Units
 from dpl.scene import Scene
 from dpl.system.blas import slow_blas
@@ -160,8 +160,11 @@ def build_scene(cfg: DictConfig) -> Scene:
     require_keys(cfg, *SCENE)
     is_range = isinstance(cfg.young, ListConfig | DictConfig)
     young = OmegaConf.to_container(cfg.young) if is_range else cfg.young
-    problem = _problem(cfg, _one_modulus(young))
-    always = _constant_force(cfg, problem)
+    forces = _parts(cfg, "forces")
+    pressures = {name: f for name, f in forces.items() if isinstance(f, FollowerPressure)}
+    problem = _problem(cfg, _one_modulus(young), pressures)
+    dead = {name: force for name, force in forces.items() if name not in pressures}
+    always = _constant_force(dead, problem)
     solver = instantiate(cfg, "solver", problem=problem)
     linear = solver.linear_solver
     loads = instantiate(cfg, "loads", linear=linear, young=young, constant_force=always)
@@ -183,10 +186,10 @@ def _one_modulus(young: Any) -> float | None:
     return moduli.low if moduli.low == moduli.high else None
 
 
-def _constant_force(cfg: DictConfig, problem: Problem) -> Tensor | None:
+def _constant_force(dead: dict[str, Any], problem: Problem) -> Tensor | None:
     """Return the sum of the tractions and body forces, (N, D) [-]; None if there are none."""
     forces = []
-    for name, part in _parts(cfg, "forces").items():
+    for name, part in dead.items():
         with error_in(f"forces.{name}"):
             forces.append(part.on(problem))
     return torch.stack(forces).sum(dim=0) if forces else None
@@ -201,12 +204,18 @@ def _supports(cfg: DictConfig, mesh: skfem.Mesh, units: Units) -> list[Any]:
     return list(supports.values())
 
 
-def _problem(cfg: DictConfig, young: float | None) -> Problem:
+def _problem(
+    cfg: DictConfig, young: float | None, pressures: dict[str, FollowerPressure]
+) -> Problem:
     with _shown_warnings():
         mesh, material = (instantiate(cfg, key) for key in ("mesh", "material"))
         fixed = instantiate(cfg, "fixed") if cfg.get("fixed") is not None else None
         options = {key: cfg[key] for key in ("degree", "mean_dilatation")} | {"young": young}
         supports = _supports(cfg, mesh, Units(1.0, young))
+        for name, pressure in pressures.items():
+            with error_in(f"forces.{name}"):
+                pressure.check(mesh, Units(1.0, young))
+        options["pressures"] = list(pressures.values())
         try:
             problem = Problem.build(mesh, material, fixed=fixed, supports=supports, **options)
         except ValueError as error:

@@ -58,7 +58,11 @@ EXPECTED_TYPES = {  # base classes of the object that the call under a key retur
         "dpl.fem.assembly.boundary_conditions.DirichletBC",
         "dpl.fem.assembly.boundary_conditions.RobinBC",
     },
-    "forces": {"dpl.fem.loads.forces.Traction", "dpl.fem.loads.forces.BodyForce"},
+    "forces": {
+        "dpl.fem.loads.forces.Traction",
+        "dpl.fem.loads.forces.BodyForce",
+        "dpl.fem.assembly.follower_pressure.FollowerPressure",
+    },
     "solver": {"dpl.fem.solvers.reference.ReferenceSolver"},
     "loads": {"dpl.fem.loads.family.LoadFamily"},
     "data": {"dpl.data.dataset.DataSet", "dpl.data.datamodule.OfflineData"},

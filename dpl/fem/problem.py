@@ -1,7 +1,7 @@
 """Static equilibrium of a body: built from a mesh, evaluated and linearised by compiled loops."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self
@@ -15,6 +15,7 @@ from torch import Tensor
 from dpl.fem.assembly.boundary_conditions import Support, assemble_constraints
 from dpl.fem.assembly.elements import QUADRATIC, basis_of, gradients
 from dpl.fem.assembly.equilibrium import EquilibriumCriterion
+from dpl.fem.assembly.follower_pressure import FollowerPressure, PressureSurface
 from dpl.fem.assembly.kernels import Kernels
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import Material
@@ -45,11 +46,14 @@ class System(NamedTuple):
         force: (B, N, D) [-].
         tangent: Entries of K on the pattern, (B, nnz) [-].
         valid: Whether the strains that it was made at are those of some deformation, (B,).
+        asymmetry: Function x -> (K - K^T) x / 2 at free degrees of freedom, (n,) to (n,), if a
+            follower pressure has no potential; `tangent` is then the symmetric part. Else None.
     """
 
     force: Tensor
     tangent: Tensor
     valid: Tensor
+    asymmetry: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
 
 
 class Problem(EquilibriumCriterion):
@@ -68,6 +72,7 @@ class Problem(EquilibriumCriterion):
         fixed: Region | NDArray[np.bool_] | None = None,
         prescribed: NDArray[np.float64] | None = None,
         supports: Sequence[Support] = (),
+        pressures: Sequence[FollowerPressure] = (),
         degree: int = 1,
         mean_dilatation: bool = False,
         length: float | None = None,
@@ -87,13 +92,15 @@ class Problem(EquilibriumCriterion):
                 if left out.
             supports: Further prescribed displacements [m] and elastic foundations [N/m^3]; the last
                 displacement on a degree of freedom counts.
+            pressures: Follower pressures [Pa], which add up.
             degree: Degree of the displacement, 1 or 2.
             mean_dilatation: Use the mean volume ratio of each cell, so that nearly incompressible
                 bodies of linear quadrilaterals and hexahedra do not lock.
             length: L [m]; the longest side of the body if left out.
             young: Young's modulus [Pa] by which boundary values are divided: stiffnesses of
-                foundations, and the tractions and body forces of `dpl.fem.loads`. The default of
-                1 Pa makes them values over E. None refuses them, for loads of several moduli.
+                foundations, pressures, and the tractions and body forces of `dpl.fem.loads`. The
+                default of 1 Pa makes them values over E. None refuses them, for loads of several
+                moduli.
 
         Raises:
             ValueError: `degree` is neither 1 nor 2, the cell type is unknown, a region is empty, a
@@ -115,9 +122,11 @@ class Problem(EquilibriumCriterion):
                 "mean_dilatation: applies to linear quadrilaterals and hexahedra only; "
                 "set degree=2 instead, quadratic elements hardly lock"
             )
+        units = Units(length, young)
         given, springs = assemble_constraints(
-            basis, Units(length, young), supports, origin=origin, fixed=fixed, prescribed=prescribed
+            basis, units, supports, origin=origin, fixed=fixed, prescribed=prescribed
         )
+        surfaces = [pressure.on(basis, units, origin) for pressure in pressures]
         dN, dV = gradients(basis)
         boundary = np.zeros(basis.N, dtype=bool)
         boundary[basis.get_dofs(mesh.boundary_facets()).all()] = True
@@ -135,6 +144,7 @@ class Problem(EquilibriumCriterion):
             prescribed=torch.from_numpy(np.nan_to_num(given)),
             boundary=torch.from_numpy(boundary),
             springs=springs,
+            pressure=PressureSurface.join(surfaces),
             mean_dilatation=mean_dilatation,
             young=young,
         )
@@ -190,10 +200,7 @@ class Problem(EquilibriumCriterion):
 
     def with_material(self, material: Material) -> Self:
         """Return the body of another law; mesh and pattern are shared, for the same law kernels."""
-        twin = replace(self, material=material)
-        for name in ("pattern", "moved_supports", "_operator"):
-            twin.__dict__[name] = getattr(self, name)
-        twin.__dict__["_same_mesh"] = self  # its recovery is built at the first use
+        twin = self._share(replace(self, material=material))
         if type(material) is type(self.material):
             twin.__dict__["_first"] = self
         return twin
@@ -210,6 +217,33 @@ class Problem(EquilibriumCriterion):
         """
         ranges = self.material.parameter_ranges.values()
         return self.with_parameters(torch.tensor([[sum(ends) / 2 for ends in ranges]]).double())
+
+    def with_pressure_factor(self, factor: float) -> Self:
+        """Return the body under `factor` times its follower pressure; all else is shared."""
+        if self.pressure is None or factor == 1:
+            return self
+        twin = self._share(replace(self, pressure=self.pressure.scaled(factor)))
+        twin.__dict__["_first"] = self.__dict__.get("_first", self)
+        for name in ("_pressure_places", "pressure_has_potential"):
+            twin.__dict__[name] = getattr(self, name)
+        twin.__dict__["pressure_at_rest"] = factor * self.pressure_at_rest
+        return twin
+
+    @cached_property
+    def without_pressure(self) -> Self:
+        """The body without follower pressure; itself if it has none."""
+        if self.pressure is None:
+            return self
+        twin = self._share(replace(self, pressure=None))
+        twin.__dict__["_first"] = self.__dict__.get("_first", self)
+        return twin
+
+    def _share(self, twin: Self) -> Self:
+        """Return another body on the same mesh with the parts that do not depend on the law."""
+        for name in ("pattern", "moved_supports", "_operator"):
+            twin.__dict__[name] = getattr(self, name)
+        twin.__dict__["_same_mesh"] = self  # its recovery is built at the first use
+        return twin
 
     def restrict(self, field: Tensor) -> NDArray[np.float64]:
         """Return the values, (n,), of a nodal field (N, D) at the free degrees of freedom."""
@@ -242,7 +276,7 @@ class Problem(EquilibriumCriterion):
             kernels.force(u.numpy(), out.numpy(), k)
             for k, (u, out) in enumerate(zip(displacement, internal, strict=True))
         ]
-        internal = self._with_springs(internal, displacement)
+        internal = self._with_boundary_forces(internal, displacement)
         return Evaluation(internal, torch.tensor(lowest, dtype=torch.float64))
 
     def relative_residual(self, displacement: Tensor, force: Tensor) -> Tensor:
@@ -261,17 +295,44 @@ class Problem(EquilibriumCriterion):
         force = np.zeros(self.shape)
         values = np.zeros(len(self.pattern.indices) + 1)
         lowest = kernels.system(displacement[0].contiguous().numpy(), gap, force, values)
-        internal = self._with_springs(torch.from_numpy(force)[None], displacement)
-        tangent = self._with_spring_entries(torch.from_numpy(values[:-1])[None])
-        return System(internal, tangent, torch.tensor([lowest > 1e-3]))
+        internal = self._with_boundary_forces(torch.from_numpy(force)[None], displacement)
+        tangent = self._with_boundary_entries(torch.from_numpy(values[:-1])[None], displacement)
+        valid = torch.tensor([lowest > 1e-3])
+        return System(internal, tangent, valid, self._asymmetry(displacement))
+
+    def _asymmetry(
+        self, displacement: Tensor
+    ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
+        """Return `System.asymmetry` at (1, N, D)."""
+        if self.pressure is None or self.pressure_has_potential:
+            return None
+        product = self.pressure.asymmetry(displacement)
+        return lambda x: self.restrict(product(self.extend(x)[None])[0])
+
+    @cached_property
+    def pressure_has_potential(self) -> bool:
+        """True if the follower pressure has a potential; also without one."""
+        return self.pressure is None or self.pressure.has_potential(self.free, self.prescribed)
+
+    def stiffness_at_rest(self) -> Tensor:
+        """Return the entries of K(0), (nnz,) [-], without a follower pressure.
+
+        The linear solution under a pressure is therefore that of the dead load on the surface at
+        rest, and all pressures share one factor.
+        """
+        rest = torch.zeros(1, *self.shape, dtype=torch.float64)
+        return self.without_pressure.linearise(rest).tangent[0]
 
     @torch.no_grad()
     def _reference_system(self, displacement: Tensor, gap: Tensor | None) -> System:
         if gap is None:
             force, tangent = self.internal_force(displacement), self.tangent(displacement)
-            return System(force, tangent, torch.ones(len(force), dtype=torch.bool))
-        lowest = 1 + volume_change(2 * (self.strain(displacement) - gap)).flatten(1).amin(1)
-        return System(*self.mixed_system(displacement, gap), lowest > 1e-3)
+            valid = torch.ones(len(force), dtype=torch.bool)
+        else:
+            force, tangent = self.mixed_system(displacement, gap)
+            valid = 1 + volume_change(2 * (self.strain(displacement) - gap)).flatten(1).amin(1)
+            valid = valid > 1e-3
+        return System(force, tangent, valid, self._asymmetry(displacement))
 
     def update_strain_gap(self, gap: Any, length: float, update: Tensor) -> Any:
         """Return the gap between the strain of u and that of mixed points after a step.

@@ -111,14 +111,15 @@ def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetr
 
 
 def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
-    """Return the operators that commute with a symmetry: constraints, cells and foundation."""
-    springs, body = problem.springs, problem.reference  # laws are isotropic for all constants
-    cells = body if springs is None else replace(body, springs=None)
+    """Return the operators that commute with a symmetry: constraints, cells and boundary terms."""
+    boundary = [part for part in (problem.springs, problem.pressure) if part is not None]
+    body = problem.reference  # laws are isotropic for all constants
+    cells = replace(body, springs=None, pressure=None) if boundary else body
     operators: list[Callable[[Tensor], Tensor]] = [
         lambda field: torch.where(problem.free, field, 0.0),
         lambda field: cells.evaluate(field).internal,
     ]
-    return operators if springs is None else [*operators, springs.force]
+    return [*operators, *(part.force for part in boundary)]
 
 
 def _fields(problem: Problem, points: Array) -> Tensor:

@@ -144,5 +144,5 @@ def _moduli(scene: Scene, young: Any, count: int) -> Tensor:
     if not (moduli > 0).all():
         raise ValueError("young: a modulus is not above 0 Pa")
     for modulus in moduli.tolist():
-        scene.problem.check_foundation_modulus(modulus)
+        scene.problem.check_modulus(modulus)
     return moduli

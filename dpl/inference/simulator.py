@@ -200,7 +200,7 @@ class Simulator:
             request: Options of the call.
         """
         scene, tol = self.scene, request.residual_tol(self.scene)
-        if not load.force.any() and not scene.problem.moved_supports:
+        if not load.force.any() and not scene.problem.is_loaded_at_rest:
             rest = evaluate_solution(scene.problem, torch.zeros_like(prediction), load, tol)
             return Candidate("rest", rest, 0.0)
         best: Candidate | None = None

@@ -257,8 +257,7 @@ class LinearResponse(nn.Module):
 
     def _solve_one(self, loaded: NDArray[np.float64], parameters: Tensor) -> NDArray[np.float64]:
         problem = self._scene.problem.with_parameters(parameters[None])
-        rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-        values = problem.linearise(rest).tangent[0].numpy()
+        values = problem.stiffness_at_rest().numpy()
         product = SymmetricProduct(problem.pattern, values)
         right = loaded - support_force(problem)[self._free].numpy()
         preconditioner = self._scene.linear.reference.float32_factor

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from dpl.fem import InvariantBasedMaterial, SubspaceNewton, symmetries
 from dpl.fem.rom.compiled_prediction import CompiledPrediction, LawArguments, law_arguments
 from dpl.fem.rom.ecsw import Cubature
+from dpl.fem.rom.reduced_problem import refuse_pressure
 from dpl.fem.rom.reduced_stiffness import ReducedInverse, ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.fem.symmetry import cell_images
@@ -125,6 +126,7 @@ class Unrolled(nn.Module):
             raise ValueError(f"linear_tol = {linear_tol} must be 0 or more")
         self.scene = scene
         self.rank, self.sample_count, self.stages = rank, cells, stages
+        refuse_pressure(scene.problem, "model=unrolled")
         constant = scene.loads.constant_force
         also = [] if constant is None else [constant]
         self.group = symmetries(scene.problem, also=also) if symmetry else []

@@ -69,7 +69,10 @@ class Patch:
     def compliance(self) -> Tensor:
         """Linear displacement of the centre under each unit load, (D, M) [-]."""
         linear = self.scene.linear.reference
-        return torch.stack([linear.solve(load)[self.node] for load in self.unit_loads], dim=1)
+        without = linear.solve(torch.zeros(linear.problem.shape, dtype=torch.float64))[self.node]
+        return torch.stack(
+            [linear.solve(load)[self.node] - without for load in self.unit_loads], dim=1
+        )
 
     def force_towards(self, displacement: Tensor, *, max_amplitude: float | None = 1.0) -> Tensor:
         """Return the force (N, D) [-] whose linear response moves the centre by `displacement`.

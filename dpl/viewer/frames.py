@@ -117,7 +117,7 @@ class Body:
     def young_range(self) -> tuple[float, float]:
         """Smallest and largest Young's modulus of a request [Pa]."""
         low, high = self.scene.loads.young_range
-        if low < high or self.scene.problem.springs is not None:  # foundations fix the modulus
+        if low < high or self.scene.problem.has_one_modulus:
             return low, high
         return low / YOUNG_FACTOR, high * YOUNG_FACTOR
 

@@ -174,3 +174,42 @@ def test_values_of_a_body_without_a_modulus_are_values_over_it(make_scene):
     loaded = Traction(Plane(0, "max"), [2e8, 0.0, 0.0]).on(other)
     torch.testing.assert_close(pulled, loaded, rtol=1e-14, atol=1e-18)
     assert Units(4.0).displacement(0.2) == 0.05
+
+
+INFLATE = f"+forces.inflate={{_target_: dpl.fem.FollowerPressure, value: 45.0, {END}}}"
+
+
+def test_a_follower_pressure_in_pascals_shortens_a_bar_as_a_dead_load_at_first(scene_of):
+    scene = scene_of(*BAR, INFLATE)
+    assert scene.loads.constant_force is None
+    x, u = metres(scene)
+    assert u[:, 0] == pytest.approx(-45.0 / E * x, rel=1e-12, abs=1e-12)
+
+
+def test_a_follower_pressure_identifies_a_scene_by_its_ratio_to_the_modulus(scene_of):
+    usual, plain = scene_of(*BAR, INFLATE), scene_of(*BAR)
+    assert "pressure" not in plain.identity()
+    assert usual.fingerprint != plain.fingerprint
+    doubled = scene_of(*BAR, INFLATE.replace("45.0", "90.0"), "young=9e3")
+    assert doubled.fingerprint == usual.fingerprint
+    assert scene_of(*BAR, INFLATE, "young=9e3").fingerprint != usual.fingerprint
+    assert usual.has_boundary_values
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (INFLATE.replace("45.0", "[1.0, 2.0]"), r"forces\.inflate.value"),
+        (INFLATE.replace("45.0", ".inf"), r"forces\.inflate.value"),
+        (INFLATE.replace("45.0", "true"), r"forces\.inflate.value"),
+        (INFLATE.replace("at: max", "at: 7.0"), r"forces\.inflate: .*holds no facet"),
+    ],
+)
+def test_invalid_pressures_of_a_configuration_are_refused_by_key(scene_of, option, message):
+    with pytest.raises(ConfigError, match=message):
+        scene_of(*BAR, option)
+
+
+def test_a_pressure_is_refused_with_a_range_of_moduli(scene_of):
+    with pytest.raises(ConfigError, match=r"forces\.inflate: value = 45.0 .*young is a range"):
+        scene_of(*BAR, INFLATE, "young=[1e3,2e3]")

@@ -14,6 +14,7 @@ from torch import Tensor
 from dpl.fem.assembly.boundary_conditions import FoundationMatrix
 from dpl.fem.assembly.elements import basis_of
 from dpl.fem.assembly.fbar import fbar_gradient, fbar_stress
+from dpl.fem.assembly.follower_pressure import PressureSurface
 from dpl.fem.assembly.recovery import Recovery
 from dpl.fem.assembly.rigid_body_modes import rigid_body_modes, unconstrained_modes
 from dpl.fem.assembly.sparsity import Pattern
@@ -44,6 +45,7 @@ class TensorAssembly:
         prescribed: Displacement of the fixed ones at full load, (N, D) [-]; zero where free.
         boundary: Mask of the nodes on the boundary, (N,).
         springs: Elastic foundation (Robin conditions), or None.
+        pressure: Surface under follower pressure, or None.
         mean_dilatation: True if the points of a cell share its mean volume ratio (F-bar).
         young: Young's modulus by which boundary values are divided [Pa]; None if there is no such
             modulus, see `dpl.fem.units.Units`. No other quantity depends on it.
@@ -62,6 +64,7 @@ class TensorAssembly:
     prescribed: Tensor
     boundary: Tensor
     springs: FoundationMatrix | None = None
+    pressure: PressureSurface | None = None
     mean_dilatation: bool = False
     young: float | None = 1.0
 
@@ -74,6 +77,8 @@ class TensorAssembly:
         }
         if self.springs is not None:
             tensors["springs"] = FoundationMatrix(*(part.to(device) for part in self.springs))
+        if self.pressure is not None:
+            tensors["pressure"] = self.pressure.to(device)
         return replace(self, **tensors)
 
     def __getstate__(self) -> dict[str, object]:
@@ -90,20 +95,26 @@ class TensorAssembly:
         """L and E, by which boundary values are divided."""
         return Units(self.length, self.young)
 
-    def check_foundation_modulus(self, young: float) -> None:
+    @property
+    def has_one_modulus(self) -> bool:
+        """True if the body is divided by one modulus: elastic foundation or follower pressure."""
+        return self.springs is not None or self.pressure is not None
+
+    def check_modulus(self, young: float) -> None:
         """Check the Young's modulus [Pa] of a load on this body.
 
-        Elastic foundations have a fixed stiffness, so that their part in K(0) is that of one
-        modulus. Without foundations all moduli are allowed.
+        Elastic foundations have a fixed stiffness and follower pressures a fixed value, so that
+        their parts in f_int are those of one modulus. Other bodies allow all moduli.
 
         Raises:
-            ValueError: The modulus is not that of the foundations.
+            ValueError: The modulus is not that of the foundation or the pressure.
         """
-        if self.springs is None or self.young is None or math.isclose(young, self.young):
+        if not self.has_one_modulus or self.young is None or math.isclose(young, self.young):
             return
+        part = "pressure" if self.springs is None else "stiffness of the elastic foundation"
         raise ValueError(
-            f"young = {young:g} must be {self.young:g} [Pa], by which the stiffness of the elastic "
-            f"foundation is divided; build another body with young = {young:g}"
+            f"young = {young:g} must be {self.young:g} [Pa], by which the {part} is divided; "
+            f"build another body with young = {young:g}"
         )
 
     @property
@@ -136,25 +147,39 @@ class TensorAssembly:
         return unconstrained_modes(self.points, self.free, self.springs)
 
     def energy(self, displacement: Tensor) -> Tensor:
-        """Return the strain energy over E L^D, including that of the foundation, (B,) [-]."""
+        """Return the energy over E L^D, (B,) [-]: strain energy, foundation and follower pressure.
+
+        The energy of a pressure is its potential only if it has one, see
+        `PressureSurface.has_potential`.
+        """
         H = self._effective_gradient(displacement)
         energy = (self.material.energy(H) * self.dV).sum((-2, -1))
         if self.springs is not None:
             pull = self.springs.force(displacement)
             energy = energy + (pull * displacement).sum((-2, -1)) / 2
+        if self.pressure is not None:
+            energy = energy + self.pressure.work(displacement)
         return energy
 
     def internal_force(self, displacement: Tensor) -> Tensor:
-        """Return f_int, the gradient of the energy, (B, N, D) [-]; reactions at fixed nodes."""
+        """Return f_int, the gradient of the energy, (B, N, D) [-]; reactions at fixed nodes.
+
+        A follower pressure is a part of f_int, because it depends on the displacement.
+        """
         stress = self._effective_stress(self.gradient(displacement))
-        return self._with_springs(self._nodal_forces(stress), displacement)
+        return self._with_boundary_forces(self._nodal_forces(stress), displacement)
 
     def tangent(self, displacement: Tensor) -> Tensor:
-        """Return the entries of K = d f_int / du on `pattern`, (B, nnz) [-]."""
+        """Return the entries of K = d f_int / du on `pattern`, (B, nnz) [-].
+
+        If a follower pressure has no potential, K is the symmetric part.
+        """
         if self.mean_dilatation:
-            return self._with_spring_entries(self._entries(self._cell_tangents(displacement)))
+            return self._with_boundary_entries(
+                self._entries(self._cell_tangents(displacement)), displacement
+            )
         moduli = self.material.tangent(self.gradient(displacement))
-        return self._with_spring_entries(self._assembled(moduli))
+        return self._with_boundary_entries(self._assembled(moduli), displacement)
 
     def strain(self, displacement: Tensor) -> Tensor:
         """Return the Green-Lagrange strain at the quadrature points, (B, E, Q, 3, 3) [-]."""
@@ -178,8 +203,9 @@ class TensorAssembly:
         H = self.gradient(displacement)
         response = self.material.response(green_lagrange(H) - gap)
         stress = response.stress + response.product(gap)
-        force = self._with_springs(self._nodal_forces(stress + H @ stress), displacement)
-        return force, self._with_spring_entries(self._assembled(response.tangent(H)))
+        force = self._with_boundary_forces(self._nodal_forces(stress + H @ stress), displacement)
+        entries = self._assembled(response.tangent(H))
+        return force, self._with_boundary_entries(entries, displacement)
 
     def tangent_product(self, displacement: Tensor, direction: Tensor) -> Tensor:
         """Return K(u) v on all degrees of freedom without assembling K, (B, N, D) [-]."""
@@ -199,6 +225,15 @@ class TensorAssembly:
         if not self.mean_dilatation:
             return H
         return fbar_gradient(self.material, H, self.dV, self.shape[1])
+
+    @cached_property
+    def pressure_at_rest(self) -> Tensor:
+        """f_int at u = 0: the force of the pressure on the surface at rest, (N, D) [-].
+
+        It is minus the nodal forces of a dead load; zero without a pressure.
+        """
+        rest = self.points.new_zeros(1, *self.shape)
+        return rest[0] if self.pressure is None else self.pressure.force(rest)[0]
 
     @cached_property
     def pattern(self) -> Pattern:
@@ -251,20 +286,35 @@ class TensorAssembly:
         force = per_cell.new_zeros(len(per_cell), *self.shape)
         return force.index_add(1, self.cells.flatten(), per_cell.flatten(1, 2))
 
-    def _with_springs(self, internal: Tensor, displacement: Tensor) -> Tensor:
-        """Return internal forces (B, N, D) plus those of the foundation."""
-        if self.springs is None:
-            return internal
-        return internal + self.springs.force(displacement)
+    def _with_boundary_forces(self, internal: Tensor, displacement: Tensor) -> Tensor:
+        """Return internal forces (B, N, D) plus those of foundation and follower pressure."""
+        if self.springs is not None:
+            internal = internal + self.springs.force(displacement)
+        if self.pressure is not None:
+            internal = internal + self.pressure.force(displacement)
+        return internal
 
-    def _with_spring_entries(self, tangent: Tensor) -> Tensor:
-        """Return the entries of the tangent (B, nnz) plus those of the foundation."""
-        if self.springs is None:
-            return tangent
-        rows, columns, stiffness = (part.cpu().numpy() for part in self.springs)
-        places = self.pattern.between(rows, columns)
-        added = np.bincount(places.ravel(), stiffness.ravel(), len(self.pattern.indices) + 1)
-        return tangent + torch.from_numpy(added[:-1]).to(tangent.device)
+    def _with_boundary_entries(self, tangent: Tensor, displacement: Tensor) -> Tensor:
+        """Return the entries of the tangent (B, nnz) plus those of foundation and pressure."""
+        if self.springs is not None:
+            rows, columns, stiffness = (part.cpu().numpy() for part in self.springs)
+            places = self.pattern.between(rows, columns)
+            added = np.bincount(places.ravel(), stiffness.ravel(), len(self.pattern.indices) + 1)
+            tangent = tangent + torch.from_numpy(added[:-1]).to(tangent.device)
+        if self.pressure is not None:
+            values = self.pressure.stiffness(displacement).flatten(1)
+            source, target = self._pressure_places
+            both = torch.cat([values, -values], dim=1)[:, source]
+            tangent = tangent.scatter_add(1, target.expand_as(both), both)
+        return tangent
+
+    @cached_property
+    def _pressure_places(self) -> tuple[Tensor, Tensor]:
+        """Index of each stored entry in (K, -K) of the load stiffness K, and among the nnz."""
+        assert self.pressure is not None
+        places = self.pressure.places(self.pattern, self.shape[1]).flatten()
+        source = (places < len(self.pattern.indices)).nonzero().flatten()
+        return source.to(self.points.device), places[source].to(self.points.device)
 
     def _effective_stress(self, H: Tensor) -> Tensor:
         """Return the stress conjugate to H, (B, E, Q, 3, 3) [-]."""

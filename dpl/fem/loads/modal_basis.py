@@ -53,8 +53,7 @@ def eigenmodes(linear: LinearSolver, count: int) -> Modes:
         raise ValueError(f"n_modes = {count} must lie between 1 and {size // 3}")
     if loose := problem.unconstrained_rigid_body_modes():
         raise ValueError(f"{len(loose)} rigid modes are unconstrained: {', '.join(loose)}")
-    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    stiffness = full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())
+    stiffness = full_matrix(problem.pattern, problem.stiffness_at_rest().numpy())
     inverse = LinearOperator((size, size), matvec=linear.factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).standard_normal(size)
     requested = min(count + 8, size - 2)

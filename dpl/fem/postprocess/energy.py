@@ -79,7 +79,7 @@ class RestStiffness:
         problem, found = self._linear.problem, []
         parameters = force.new_zeros(1, 0) if parameters is None else parameters
         for one, own in zip(force.cpu(), parameters.cpu().expand(len(force), -1), strict=True):
-            right = problem.restrict(one)
+            right = problem.restrict(one - problem.pressure_at_rest)
             key = hash(right.tobytes() + own.numpy().tobytes())
             if key not in self._works:
                 if len(self._works) >= CACHE_SIZE:
@@ -114,8 +114,7 @@ class RestStiffness:
     @cached_property
     def _matrix(self) -> csr_array:
         problem = self._linear.problem
-        rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-        return full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())
+        return full_matrix(problem.pattern, problem.stiffness_at_rest().numpy())
 
     @cached_property
     def _on_device(self) -> Tensor:
@@ -133,7 +132,18 @@ class RestStiffness:
 def potential_energy(
     displacement: Tensor, load: Load, problem: Problem, rest: RestStiffness
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return W(u) - W(0) - f.u (B,), its gradient (B, N, D), and a mask of det F > 0 (B,)."""
+    """Return W(u) - W(0) - f.u (B,), its gradient (B, N, D), and a mask of det F > 0 (B,).
+
+    W includes the potential of a follower pressure.
+
+    Raises:
+        ValueError: A follower pressure has no potential.
+    """
+    if not problem.pressure_has_potential:
+        raise ValueError(
+            "the follower pressure has no potential, because the edge of its surface is free; use "
+            "another loss than energy"
+        )
     force, own = load.force, load.parameters.expand(len(displacement), -1)
     internal, volume = problem.with_parameters(own).evaluate(displacement)
     slope = torch.where(problem.free, internal - force, 0.0)

@@ -201,6 +201,7 @@ class ReducedMesh:
             prescribed=torch.zeros(fields, dtype=torch.float64),
             boundary=torch.zeros(len(nodes), dtype=torch.bool),
             springs=None,
+            pressure=None,
         )
         self.basis = vectors[nodes].flatten(0, 1).contiguous()
         self._size = per_cell * dim
@@ -236,14 +237,12 @@ class ReducedMesh:
 
     def at_rest(self) -> Tensor:
         """Return U, see `tangents`, of the undeformed cells."""
-        rest = torch.zeros(1, *self.problem.shape, dtype=torch.float64)
-        return self.tangents(self.problem.linearise(rest).tangent[0])
+        return self.tangents(self.problem.stiffness_at_rest())
 
 
 def whitening(problem: Problem, vectors: Tensor) -> Tensor:
     """Return L^-T, (R, R), with L L^T = V^T K(0) V; raise a ValueError if there is none."""
-    rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    stiffness = full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())
+    stiffness = full_matrix(problem.pattern, problem.stiffness_at_rest().numpy())
     basis = vectors[problem.free].numpy()
     reduced = torch.from_numpy(basis.T @ (stiffness @ basis))
     lower, failed = torch.linalg.cholesky_ex((reduced + reduced.T) / 2)

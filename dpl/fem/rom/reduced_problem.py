@@ -192,6 +192,15 @@ def norm(vector: Tensor) -> float:
     return largest * float(torch.linalg.vector_norm(vector / largest))
 
 
+def refuse_pressure(problem: Problem, name: str) -> None:
+    """Raise a ValueError if the body has a follower pressure; `name` cannot treat it."""
+    if problem.pressure is not None:
+        raise ValueError(
+            f"{name} selects cells and has no follower pressure; use dpl.fem.Newton, or a model "
+            "that predicts nodal displacements (fcnn, cnn, gnn)"
+        )
+
+
 def refuse_range(problem: Problem) -> None:
     """Raise a ValueError if the law has ranges."""
     for name, ends in problem.material.parameter_ranges.items():
@@ -213,11 +222,12 @@ def beyond_linear(problem: Problem, snapshots: Tensor, lift: LinearSolver | None
 
 
 def support_force(problem: Problem) -> Tensor:
-    """Return K(0) prescribed, (N, D)."""
+    """Return K(0) prescribed plus the follower pressure on the surface at rest, (N, D)."""
     if not problem.moved_supports:
-        return torch.zeros(problem.shape, dtype=torch.float64)
+        return problem.pressure_at_rest
     rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    return problem.tangent_product(rest, problem.prescribed[None])[0]
+    elastic = problem.without_pressure
+    return elastic.tangent_product(rest, problem.prescribed[None])[0] + problem.pressure_at_rest
 
 
 def _linear_solution(lift: LinearSolver, force: Tensor) -> Tensor:

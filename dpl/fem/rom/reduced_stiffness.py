@@ -34,13 +34,12 @@ class ReducedStiffness:
     @classmethod
     def of(cls, problem: Problem, modes: Tensor) -> "ReducedStiffness":
         """Return the stiffness of a body in modes V at its free degrees of freedom, (n, R)."""
-        rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
         columns = modes.double().numpy()
         soft, stiff = LinearElastic(0.0), LinearElastic(0.3)
         products = []
         for law in (soft, stiff):
             body = problem.with_material(law)
-            matrix = full_matrix(body.pattern, body.linearise(rest).tangent[0].numpy())
+            matrix = full_matrix(body.pattern, body.stiffness_at_rest().numpy())
             own = torch.from_numpy(columns.T @ (matrix @ columns))
             moved = support_force(body)[problem.free]
             products.append(torch.cat([(own + own.T) / 2, modes.double().T @ moved[:, None]], 1))

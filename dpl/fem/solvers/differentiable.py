@@ -7,9 +7,14 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dpl.fem.linear.interface import Factor
+from dpl.fem.linear.gmres import Map, gmres
+from dpl.fem.linear.interface import Array, SymmetricProduct
+from dpl.fem.problem import System
+from dpl.fem.solvers.factor_reuse import MAX_GMRES
 from dpl.fem.solvers.newton import Newton
 from dpl.fem.solvers.solution import Load, Solution, Status
+
+ADJOINT_TOL = 1e-12  # relative residual of an adjoint solve with an unsymmetric tangent [-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,8 +22,9 @@ class DifferentiableSolve:
     """Displacement u(f) with f_int(u) = f, differentiable with respect to f.
 
     The forward pass is a Newton solve. In the backward pass a gradient g with respect to u becomes
-    K(u)^-1 g with respect to f, since K(u) du = df on free degrees of freedom. The tangent at the
-    solution is factorised at the first gradient.
+    K(u)^-T g with respect to f, since K(u) du = df on free degrees of freedom. The tangent at the
+    solution is factorised at the first gradient. A follower pressure without potential makes it
+    unsymmetric; the factor of the symmetric part then preconditions GMRES.
 
     The derivative is that of the branch of equilibria on which the solution lies, stable or not.
     There are no second derivatives.
@@ -59,8 +65,8 @@ class DifferentiableSolve:
             *_, last = self.newton.iterate(load, guess=guess)
         return last
 
-    def factors(self, displacement: Tensor, parameters: Tensor | None = None) -> list[Factor]:
-        """Return the factors of the tangents at displacements (B, N, D) [-], one each.
+    def adjoints(self, displacement: Tensor, parameters: Tensor | None = None) -> list[Map]:
+        """Return the functions g -> K(u)^-T g, (n,) to (n,), at displacements (B, N, D) [-].
 
         Args:
             displacement: Displacements of the tangents.
@@ -72,12 +78,24 @@ class DifferentiableSolve:
         problem = self.newton.problem
         if parameters is None:
             parameters = displacement.new_zeros(len(displacement), 0)
-        tangents = [
-            problem.with_parameters(own).linearise(u).tangent[0]
+        systems = [
+            problem.with_parameters(own).linearise(u)
             for u, own in zip(displacement.split(1), parameters.split(1), strict=True)
         ]
-        backend = self.newton.linear_solver.tangent_backend
-        return [backend.factorise(tangent.numpy()) for tangent in tangents]
+        return [self._adjoint(system) for system in systems]
+
+    def _adjoint(self, system: System) -> Map:
+        linear = self.newton.linear_solver
+        values, asymmetry = system.tangent[0].numpy(), system.asymmetry
+        factor = linear.tangent_backend.factorise(values)
+        if asymmetry is None:
+            return factor.solve
+        product = SymmetricProduct(linear.problem.pattern, values)
+
+        def transposed(x: Array) -> Array:
+            return product(x) - asymmetry(x)
+
+        return lambda right: gmres(transposed, factor.apply, right, ADJOINT_TOL, MAX_GMRES)
 
 
 class _Equilibrium(torch.autograd.Function):
@@ -98,7 +116,7 @@ class _Equilibrium(torch.autograd.Function):
             lost = (~answer.converged).nonzero().flatten().tolist()
             states = ", ".join(f"load {k}: {Status(int(answer.status[k]))}" for k in lost)
             raise ValueError(f"no equilibrium to differentiate; of {len(force)} loads, {states}")
-        ctx.parent, ctx.parameters, ctx.factors = parent, parameters, None
+        ctx.parent, ctx.parameters, ctx.adjoints = parent, parameters, None
         ctx.save_for_backward(answer.displacement)
         return answer.displacement
 
@@ -106,11 +124,11 @@ class _Equilibrium(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
         problem = ctx.parent.newton.problem
-        if ctx.factors is None:  # kept: each row of a Jacobian needs them
+        if ctx.adjoints is None:  # kept: each row of a Jacobian needs them
             (displacement,) = ctx.saved_tensors
-            ctx.factors = ctx.parent.factors(displacement, ctx.parameters)
+            ctx.adjoints = ctx.parent.adjoints(displacement, ctx.parameters)
         solved = [
-            problem.extend(factor.solve(problem.restrict(one)))
-            for factor, one in zip(ctx.factors, gradient, strict=True)
+            problem.extend(adjoint(problem.restrict(one)))
+            for adjoint, one in zip(ctx.adjoints, gradient, strict=True)
         ]
         return torch.stack(solved), None, None, None

@@ -5,6 +5,7 @@ from enum import Enum
 
 from torch import Tensor
 
+from dpl.fem.linear.gmres import Map, gmres
 from dpl.fem.linear.interface import (
     UNKNOWN,
     UNSTABLE,
@@ -25,6 +26,8 @@ from dpl.fem.solvers.linear import LinearSolver
 MIN_RITZ_VALUE = 0.05  # smallest eigenvalue of M^-1 K below which the tangent K is factorised
 MAX_CG_STALE = 8  # conjugate gradient steps with a stale factor before the tangent is factorised
 MAX_CG_COROTATED = 16  # the same with the corotated factor of K(0)
+
+MAX_GMRES = 60  # GMRES steps with the factor of the symmetric part of an unsymmetric tangent
 
 
 class Preconditioner(Enum):
@@ -83,6 +86,7 @@ class TangentSolver:
         *,
         near: bool,
         definite: bool = False,
+        asymmetry: Map | None = None,
     ) -> Array:
         """Return K(u)^-1 of a right-hand side (n,), to a relative residual.
 
@@ -93,6 +97,8 @@ class TangentSolver:
             rtol: Relative residual at which conjugate gradients stop [-].
             near: Whether u is near enough to the last iterate to reuse its factor.
             definite: Refuse an indefinite tangent.
+            asymmetry: Function x -> (K - K^T) x / 2, (n,) to (n,); `tangent` is the symmetric part,
+                whose factor preconditions GMRES. None: K is symmetric.
 
         Raises:
             SingularMatrix: The tangent has no factor, or is indefinite and refused.
@@ -113,6 +119,8 @@ class TangentSolver:
             self._last, self._tangent = kind, SymmetricProduct(self._pattern, tangent)
             apply, steps = self._factor.apply, MAX_CG_COROTATED if corotated else MAX_CG_STALE
             with suppress(SingularMatrix):
+                if asymmetry is not None:
+                    return gmres(_sum(self._tangent, asymmetry), apply, right, rtol, steps)
                 return conjugate_gradients(
                     self._tangent, apply, right, rtol, steps, abort_if_slow=corotated
                 )
@@ -126,6 +134,9 @@ class TangentSolver:
             self._factor = self.backend.factorise(tangent)
         if definite and self._factor.negative_pivots:
             raise SingularMatrix("the tangent is indefinite")
+        if asymmetry is not None:
+            whole = _sum(SymmetricProduct(self._pattern, tangent), asymmetry)
+            return gmres(whole, self._factor.apply, right, rtol, MAX_GMRES)
         return self._factor.solve(right, rtol)
 
     def stability(self, u: Tensor) -> Stability:
@@ -158,13 +169,23 @@ class TangentSolver:
         return False
 
 
+def _sum(first: Map, second: Map) -> Map:
+    """Return the function x -> first(x) + second(x)."""
+    return lambda x: first(x) + second(x)
+
+
 def stability_at(problem: Problem, backend: Backend, displacement: Tensor) -> Stability:
-    """Return the stability of the tangent at (1, N, D); a singular one counts as unstable."""
+    """Return the stability of the tangent at (1, N, D); a singular one counts as unstable.
+
+    Under a pressure without potential a positive definite symmetric part is sufficient for
+    stability. It is not necessary: otherwise nothing is known.
+    """
     tangent = problem.linearise(displacement).tangent
     try:
-        return backend.factorise(tangent[0].numpy()).stability()
+        found = backend.factorise(tangent[0].numpy()).stability()
     except SingularMatrix:  # at the critical load itself
-        return UNSTABLE
+        found = UNSTABLE
+    return found if problem.pressure_has_potential or not found.least else UNKNOWN
 
 
 def forcing_term(residual: float, previous: float, *, tol: float, corotational: bool) -> float:

@@ -49,9 +49,7 @@ class LinearSolver:
     @cached_property
     def factor(self) -> Factor:
         """Factor of K(0)."""
-        rest = torch.zeros(1, *self.problem.shape, dtype=torch.float64)
-        values = self.problem.linearise(rest).tangent[0].numpy()
-        return self.backend.factorise(values)
+        return self.backend.factorise(self.problem.stiffness_at_rest().numpy())
 
     @cached_property
     def corotational(self) -> CorotationalPreconditioner:
@@ -137,7 +135,12 @@ class LinearSolver:
         yield evaluate_solution(self.problem, u, load, self.tol, iterations=1, seconds=seconds)
 
     def solve(self, force: Tensor) -> Tensor:
-        """Return K(0)^-1 f, (N, D) [-], for f (N, D) [-]; zero at supports."""
+        """Return K(0)^-1 f, (N, D) [-], for f (N, D) [-]; zero at supports.
+
+        f includes a follower pressure as a dead load on the surface at rest.
+        """
+        if self.problem.pressure is not None:
+            force = force - self.problem.pressure_at_rest
         return self.problem.extend(self.factor.solve(self.problem.restrict(force)))
 
     def __getstate__(self) -> dict[str, object]:

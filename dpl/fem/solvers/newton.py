@@ -1,4 +1,7 @@
-"""Newton-Raphson on the nodal equilibrium f_int(u) = f, with load steps where needed."""
+"""Newton-Raphson on the nodal equilibrium f_int(u) = f, with load steps where needed.
+
+A load factor scales forces, follower pressures and prescribed displacements.
+"""
 
 import math
 import time
@@ -125,7 +128,8 @@ class Newton:
         tangents = TangentSolver(self.linear_solver, corotational=self.corotational)
         run, zero = _Run(tangents, LoadStepping(self.min_load_step)), torch.zeros_like(force)
         one, supports = torch.ones(1, dtype=force.dtype), self.problem.prescribed[None]
-        state = base = _State(zero, zero, one, supports, {})  # at rest, needs no evaluation
+        internal = self.problem.pressure_at_rest[None]
+        state = base = _State(zero, internal, one, supports, {})  # at rest, needs no evaluation
         if (start := self._initial(force, guess)) is not None:
             state, run.from_guess = start, True
         yield self._report(state, force, run)
@@ -162,7 +166,7 @@ class Newton:
             rtol = forcing_term(residual, previous, tol=self.tol, corotational=self.corotational)
             near = k > 0 and residual < self.factor_reuse_tol
             try:
-                update = self._solve(state, factor * force, run, rtol, near=near)
+                update = self._solve(state, force, factor, run, rtol, near=near)
             except SingularMatrix:
                 return
             run.iterations += 1
@@ -176,21 +180,34 @@ class Newton:
                 return
 
     def _solve(
-        self, state: "_State", force: Tensor, run: "_Run", rtol: float, *, near: bool
+        self,
+        state: "_State",
+        force: Tensor,
+        factor: float,
+        run: "_Run",
+        rtol: float,
+        *,
+        near: bool,
     ) -> Tensor:
-        """Return the full Newton step (1, N, D) under a force, with the step of the supports."""
-        problem, u = self.problem, state.displacement
-        internal, tangent = state.internal, None
+        """Return the full Newton step (1, N, D) under `factor` times a load.
+
+        It contains the step of the supports.
+        """
+        problem, u = self.problem.with_pressure_factor(factor), state.displacement
+        internal, tangent, asymmetry = self._internal(state, factor), None, None
         if u.any():
             system = problem.linearise(u, state.gap)
             system = system if system.valid else problem.linearise(u)
             internal, tangent = system.force, system.tangent[0].numpy()
-        right = force - internal
+            asymmetry = system.asymmetry
+        right = factor * force - internal
         if state.support_step.any():
             right = right - problem.tangent_product(u, state.support_step)
         values = problem.restrict(right[0])
         definite = self.abandon_indefinite_guess and run.from_guess
-        step = run.tangents.solve(tangent, u, values, rtol, near=near, definite=definite)
+        step = run.tangents.solve(
+            tangent, u, values, rtol, near=near, definite=definite, asymmetry=asymmetry
+        )
         return problem.extend(step)[None] + state.support_step
 
     def _update(self, state: "_State", update: Tensor, *, halvings: int) -> "_State | None":
@@ -208,7 +225,7 @@ class Newton:
 
     def _initial(self, force: Tensor, guess: Tensor | None) -> "_State | None":
         """Return the state of a guess; None where it is zero, inverted or there is no load."""
-        loaded = force.any() or self.problem.moved_supports
+        loaded = force.any() or self.problem.is_loaded_at_rest
         if guess is None or not guess.any() or not loaded:
             return None
         u = torch.where(self.problem.free, guess, self.problem.prescribed)
@@ -221,9 +238,17 @@ class Newton:
     def _residual(self, state: "_State", force: Tensor, factor: float) -> float:
         """Return the relative residual under `factor` times a load, evaluated once."""
         if factor not in state.residuals:
-            residual = self.problem.relative_residual_of(state.internal, factor * force)
-            state.residuals[factor] = float(residual)
+            body = self.problem.with_pressure_factor(factor)
+            internal = self._internal(state, factor)
+            state.residuals[factor] = float(body.relative_residual_of(internal, factor * force))
         return state.residuals[factor]
+
+    def _internal(self, state: "_State", factor: float) -> Tensor:
+        """Return f_int (1, N, D) at a state, with `factor` times the follower pressure."""
+        pressure = self.problem.pressure
+        if pressure is None or factor == 1:
+            return state.internal
+        return state.internal - (1 - factor) * pressure.force(state.displacement)
 
     def _is_balanced(self, state: "_State", force: Tensor, factor: float, tol: float) -> bool:
         """Return True if a state balances `factor` times a load, to a tolerance or to rounding."""
@@ -233,8 +258,8 @@ class Newton:
             return True
         if not 0.1 * state.previous < residual < 1e-4:  # the residual still falls
             return False
-        u, internal = state.displacement, state.internal
-        return bool(self.problem.is_equilibrium(u, internal, factor * force, tol))
+        body, internal = self.problem.with_pressure_factor(factor), self._internal(state, factor)
+        return bool(body.is_equilibrium(state.displacement, internal, factor * force, tol))
 
     def _report(
         self, state: "_State", force: Tensor, run: "_Run", end: Status | None = None
@@ -275,7 +300,7 @@ class _State(NamedTuple):
 
     Attributes:
         displacement: u, (1, N, D) [-].
-        internal: f_int(u), (1, N, D) [-].
+        internal: f_int(u) under the whole follower pressure, (1, N, D) [-].
         volume_ratio: min det F, (1,) [-].
         support_step: Displacement that the next step has to add at the supports, (1, N, D) [-].
         residuals: Relative residuals by load factor.

@@ -11,7 +11,6 @@ from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, triu
 from torch import Tensor
@@ -63,8 +62,7 @@ class ParityFactor(DirectFactor):
         """
         parities = Parities.of(group, problem.shape[1])
         orbits = SignedOrbits.of_field(parities, group, problem.free)
-        rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-        whole = full_matrix(problem.pattern, problem.linearise(rest).tangent[0].numpy())
+        whole = full_matrix(problem.pattern, problem.stiffness_at_rest().numpy())
         blocks = [_block(whole, orbits, characters) for characters in parities.characters]
         pattern = _UpperPattern.of(blocks)
         backend = BandedCholesky(pattern, _refuse)

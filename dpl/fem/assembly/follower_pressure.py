@@ -1,0 +1,316 @@
+"""Follower pressure: a force along the current normal on the current area of a boundary part."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import skfem
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dpl.fem.assembly.elements import QUADRATIC
+from dpl.fem.assembly.sparsity import Pattern
+from dpl.fem.identity import plain
+from dpl.fem.mesh.regions import Origin, Region, facets_in
+from dpl.fem.units import Units
+
+# shape of the facets -> polynomial degree of N x,1 x x,2 for shape functions of degree 1 and 2
+DEGREES = {"RefLine": (1, 3), "RefTri": (1, 4), "RefQuad": (2, 5)}
+
+
+@dataclass(frozen=True)
+class FollowerPressure:
+    """Pressure of a fluid on a part of the boundary; it follows the deformation.
+
+    The traction on the deformed surface is -p n, with the outward normal n of the deformed body.
+
+    Attributes:
+        region: The boundary facets.
+        value: p [Pa], positive if it pushes on the body. On a problem with E = 1 Pa, the default of
+            `Problem.build`, this is p / E.
+    """
+
+    region: Region
+    value: float
+
+    def dimensionless(self, units: Units) -> float:
+        """Return p / E [-].
+
+        Raises:
+            ValueError: `value` is not finite, or the loads have a range of moduli.
+        """
+        words = f"value = {self.value}"
+        if isinstance(self.value, bool) or not isinstance(self.value, int | float):
+            raise ValueError(f"{words} must be one number [Pa]; a pressure has no direction")
+        if not math.isfinite(self.value):
+            raise ValueError(f"{words} must be a finite number [Pa]")
+        return float(units.stress(np.array(float(self.value)), words))
+
+    def check(self, mesh: skfem.Mesh, units: Units) -> None:
+        """Check value and region on a mesh [m]; raise the errors of `on`."""
+        self.dimensionless(units)
+        facets_in(self.region, mesh)
+
+    def on(self, basis: skfem.Basis, units: Units, origin: Origin = 0.0) -> "PressureSurface":
+        """Return the loaded surface; arguments as in `DirichletBC.on`.
+
+        Raises:
+            ValueError: The region contains no boundary facet, or `value` is invalid, see
+                `dimensionless`.
+        """
+        pressure = self.dimensionless(units)
+        facets = facets_in(self.region, basis.mesh, units.length, origin)
+        return PressureSurface.build(basis, facets, pressure)
+
+
+@dataclass(frozen=True, eq=False)
+class PressureSurface:
+    """Boundary facets under a follower pressure, evaluated in batches.
+
+    The area vector of a deformed facet is y1 x y2, with the derivatives y_i = t_i + du/dxi_i of the
+    positions along the coordinates xi_i of the reference facet. It is a polynomial of the nodal
+    positions on the facet, which the quadrature integrates exactly. In 2D the second tangent is a
+    unit vector across the plane, which does not deform. Points need no inverse mapping, which
+    scikit-fem does not find in all curved cells.
+
+    Source: Bonet, Wood (2008), Nonlinear Continuum Mechanics for Finite Element Analysis, section
+    8.5 (load stiffness of enclosed boundaries); Schweizerhof, Ramm (1984), Comput. Struct. 18.
+
+    Attributes:
+        nodes: Nodes of each facet, (S, A).
+        weights: Shape functions times weights of the quadrature points, (S, Q, A) [-].
+        slopes: Derivatives of the shape functions along xi_1 and xi_2, (S, Q, A, 2) [-].
+        tangents: Derivatives t_i of the positions at rest, (S, Q, 3, 2) [-]; t1 x t2 points out of
+            the body.
+        pressure: p / E of each facet, (S,) [-].
+    """
+
+    nodes: Tensor
+    weights: Tensor
+    slopes: Tensor
+    tangents: Tensor
+    pressure: Tensor
+
+    @classmethod
+    def build(cls, basis: skfem.Basis, facets: NDArray[np.int_], pressure: float) -> Self:
+        """Return the surface of boundary facets (S,) under one pressure [-]."""
+        mesh = basis.mesh
+        cells = mesh.f2t[0, facets]
+        side = (mesh.t2f[:, cells] == facets).argmax(axis=0)  # number of the facet in its cell
+        rules = [_facet_rule(basis, local) for local in range(len(mesh.t2f))]
+        nodes, weights, slopes = (np.stack([rule[k] for rule in rules])[side] for k in range(3))
+        nodes = np.take_along_axis(basis.element_dofs[:, cells].T, nodes, axis=1)
+        X = np.zeros((*nodes.shape, 3))
+        X[..., : mesh.dim()] = basis.doflocs.T[nodes]
+        tangents = np.einsum("sqai,sac->sqci", slopes, X)
+        if mesh.dim() == 2:
+            tangents[..., 2, 1] = 1.0
+        tangents[..., 1] *= _orientation(basis, cells, side)[:, None, None]
+        slopes = (
+            slopes
+            * np.stack([np.ones(len(side)), _orientation(basis, cells, side)], axis=-1)[
+                :, None, None
+            ]
+        )
+        return cls(
+            nodes=torch.from_numpy(nodes.astype(np.int64)),
+            weights=torch.from_numpy(np.ascontiguousarray(weights)),
+            slopes=torch.from_numpy(np.ascontiguousarray(slopes)),
+            tangents=torch.from_numpy(tangents),
+            pressure=torch.full((len(facets),), pressure, dtype=torch.float64),
+        )
+
+    @classmethod
+    def join(cls, parts: Sequence[Self]) -> Self | None:
+        """Return several surfaces as one; None without a part."""
+        if not parts:
+            return None
+        return cls(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(cls)))
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the surface with its tensors on a device."""
+        return type(self)(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+    def __getstate__(self) -> dict[str, object]:
+        """Return the fields without cached properties."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def identity(self) -> list[Any]:
+        """Return facets and pressures as plain data, arrays as their SHA-256."""
+        return [plain(self.nodes.sort(dim=1).values), plain(self.pressure)]
+
+    def scaled(self, factor: float) -> Self:
+        """Return the surface under `factor` times its pressure."""
+        twin = replace(self, pressure=factor * self.pressure)
+        twin.__dict__["_pair_weights"] = self._pair_weights
+        return twin
+
+    def force(self, displacement: Tensor) -> Tensor:
+        """Return p dV/du, minus the nodal forces of the pressure, (B, N, D) [-].
+
+        It is a part of the internal force of a body, since it depends on the displacement.
+        """
+        first, second = self._images(self._slopes(displacement))
+        return self._sum_at_nodes(torch.linalg.cross(first, second), displacement)
+
+    def work(self, displacement: Tensor) -> Tensor:
+        """Return the work against the pressure on the straight way from u = 0 to u, (B,) [-].
+
+        It is p times the volume between the surface at rest and the deformed one, and the potential
+        of `force` if there is one, see `has_potential`.
+        """
+        slopes = self._slopes(displacement)
+        (t1, t2), (h1, h2) = self.tangents.unbind(-1), slopes.unbind(-1)
+        cross = torch.linalg.cross
+        t1, t2 = t1.expand_as(h1), t2.expand_as(h2)
+        normal = cross(t1, t2) + (cross(t1, h2) + cross(h1, t2)) / 2 + cross(h1, h2) / 3
+        return (self._sum_at_nodes(normal, displacement) * displacement).sum((-2, -1))
+
+    def asymmetry(self, displacement: Tensor) -> Callable[[Tensor], Tensor]:
+        """Return the function v -> (A - A^T) v / 2 of the load stiffness A at (1, N, D) [-].
+
+        It maps fields (1, N, D) to fields. The matrix is that of the edge of the surface: the parts
+        of neighbouring facets cancel.
+        """
+        vectors = self._pair_vectors(displacement)  # (1, S, A, A, 3)
+        vectors = (vectors + vectors.transpose(2, 3)) / 2
+
+        def product(field: Tensor) -> Tensor:
+            at_facets = torch.nn.functional.pad(field[:, self.nodes], (0, 3 - field.shape[-1]))
+            forces = torch.linalg.cross(at_facets[:, :, None].expand_as(vectors), vectors).sum(3)
+            return self._sum_of_facets(forces, field)
+
+        return product
+
+    def has_potential(self, free: Tensor, prescribed: Tensor) -> bool:
+        """Return True if the load stiffness is symmetric on the free degrees of freedom.
+
+        This is so if the surface is closed, or if its edge is fixed or remains in planes. The
+        stiffness is linear in u, so that one random displacement decides.
+
+        Args:
+            free: Mask of the free degrees of freedom, (N, D).
+            prescribed: Displacement of the others, (N, D) [-].
+        """
+        random = torch.Generator().manual_seed(0)
+        noise = torch.rand(2, 1, *free.shape, generator=random, dtype=torch.float64) - 0.5
+        u, v = torch.where(free, noise.to(free.device), 0.0)
+        u = 0.1 * u + 0.7 * prescribed
+        product = torch.func.jvp(self.force, (u,), (v,))[1][:, free]
+        return bool(self.asymmetry(u)(v)[:, free].norm() <= 1e-10 * product.norm())
+
+    def stiffness(self, displacement: Tensor) -> Tensor:
+        """Return the symmetric part of the load stiffness, (B, S, A (A - 1)/2, 3) [-].
+
+        The block of the nodes a < b (b slowest) is the cross product with one vector: its entries
+        (i, k) are epsilon_ikl times the component l. Blocks of a node with itself are zero.
+        """
+        b, a = np.tril_indices(self.nodes.shape[1], -1)
+        vectors = self._pair_vectors(displacement)
+        return (vectors[:, :, a, b] - vectors[:, :, b, a]) / 2
+
+    def _pair_vectors(self, displacement: Tensor) -> Tensor:
+        """Return vectors c of all pairs of nodes, (B, S, A, A, 3) [-].
+
+        The load stiffness of the nodes a and b has the entries epsilon_ikl c_l.
+        """
+        y1, y2 = self._images(self._slopes(displacement))  # (B, S, Q, 3)
+        first, second = self._pair_weights
+        vectors = (first @ y2 - second @ y1) * self.pressure[:, None, None]
+        return vectors.unflatten(2, (self.nodes.shape[1], -1))
+
+    @cached_property
+    def _pair_weights(self) -> tuple[Tensor, Tensor]:
+        """Weights of node a times slopes of node b along xi_i, (S, A A, Q) each."""
+        weights, slopes = self.weights.mT[:, :, None], self.slopes.permute(3, 0, 2, 1)
+        first, second = (weights * slopes[:, :, None]).flatten(2, 3)
+        return first, second
+
+    def places(self, pattern: Pattern, dim: int) -> Tensor:
+        """Return the positions among the nnz of the entries of `stiffness`, (2, S, pairs, 3).
+
+        The first row belongs to the entries that are added, the second to those that are
+        subtracted; nnz for entries that are not stored.
+        """
+        nodes = self.nodes.cpu().numpy()
+        b, a = np.tril_indices(nodes.shape[1], -1)
+        numbers = np.pad(pattern.number, ((0, 0), (0, 3 - dim)), constant_values=-1)
+        rows, columns = numbers[nodes[:, a]], numbers[nodes[:, b]]  # (S, pairs, 3)
+        i, k = np.array([1, 2, 0]), np.array([2, 0, 1])  # epsilon_ikl = 1 for l = 0, 1, 2
+        both = [(rows[..., i], columns[..., k]), (rows[..., k], columns[..., i])]
+        return torch.from_numpy(np.stack([pattern.positions(*pair) for pair in both]))
+
+    def _slopes(self, displacement: Tensor) -> Tensor:
+        """Return du/dxi_i at the quadrature points, (B, S, Q, 3, 2) [-]; in 2D with zeros."""
+        at_facets = displacement[:, self.nodes]
+        at_facets = torch.nn.functional.pad(at_facets, (0, 3 - at_facets.shape[-1]))
+        slopes = self.slopes.transpose(2, 3).flatten(1, 2) @ at_facets  # (B, S, 2 Q, 3)
+        return slopes.unflatten(2, (-1, 2)).mT
+
+    def _images(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
+        """Return y1 and y2, (B, S, Q, 3) each."""
+        first, second = (self.tangents + slopes).unbind(-1)
+        return first, second
+
+    def _sum_at_nodes(self, normal: Tensor, displacement: Tensor) -> Tensor:
+        """Return the nodal forces (B, N, D) of p times normals (B, S, Q, 3)."""
+        forces = self.weights.mT @ normal * self.pressure[:, None, None]
+        return self._sum_of_facets(forces, displacement)
+
+    def _sum_of_facets(self, forces: Tensor, displacement: Tensor) -> Tensor:
+        """Return the sums at nodes (B, N, D) of forces of each facet at its nodes (B, S, A, 3)."""
+        forces = forces[..., : displacement.shape[-1]]
+        total = torch.zeros_like(displacement)
+        return total.index_add(1, self.nodes.flatten(), forces.flatten(1, 2))
+
+
+def _corners(basis: skfem.Basis, local: int) -> NDArray[np.float64]:
+    """Return the first corner and the edges from there of a facet of the reference cell, (D, D)."""
+    cell = basis.mesh.elem.refdom
+    first, second, *_, last = [cell.p[:, k] for k in (*cell.facets[local], cell.facets[local][-1])]
+    edges = [second - first, last - first][: len(first) - 1]
+    return np.stack([first, *edges], axis=-1).astype(np.float64)
+
+
+def _facet_rule(
+    basis: skfem.Basis, local: int
+) -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.float64]]:
+    """Return numbers of nodes, weights and slopes of a facet of the reference cell.
+
+    They are the numbers (A,) of the nodes in the cell, the shape functions times the weights of the
+    quadrature (Q, A), and their derivatives along the edges (Q, A, 2).
+    """
+    element, corners = basis.elem, _corners(basis, local)
+    facet = basis.mesh.elem.refdom.brefdom
+    order = DEGREES[facet.__name__][type(element) in QUADRATIC]
+    points, weights = skfem.quadrature.get_quadrature(facet, order)
+    at = corners[:, :1] + corners[:, 1:] @ points
+    shapes = [element.lbasis(at, a) for a in range(basis.Nbfun)]
+    values = np.stack([np.broadcast_to(value, weights.shape) for value, _ in shapes], axis=-1)
+    slopes = np.zeros((*values.shape, 2))
+    for a, (_, gradient) in enumerate(shapes):
+        gradient = np.broadcast_to(gradient, at.shape)
+        slopes[:, a, : len(at) - 1] = gradient.T @ corners[:, 1:]
+    # nodes of a facet are those whose shape functions do not vanish on it
+    on = np.flatnonzero(np.abs(values).max(axis=0) > 1e-12)
+    return on, values[:, on] * weights[:, None], slopes[:, on]
+
+
+def _orientation(
+    basis: skfem.Basis, cells: NDArray[np.int_], side: NDArray[np.int_]
+) -> NDArray[np.float64]:
+    """Return 1 where the product of the tangents points out of the cell, else -1, (S,)."""
+    mesh = basis.mesh
+    centre = mesh.elem.refdom.p.mean(axis=1)
+    senses = []
+    for local in range(len(mesh.t2f)):
+        first, *edges = _corners(basis, local).T
+        senses.append(np.linalg.det(np.stack([*edges, first - centre], axis=-1)))
+    J = mesh.mapping().detDF(centre[:, None].astype(np.float64), tind=cells)[:, 0]
+    # in 2D the second tangent is normal to the plane: t1 x e_z is t1, turned clockwise
+    flip = -1.0 if mesh.dim() == 2 else 1.0
+    return flip * np.sign(np.array(senses)[side]) * np.sign(J)
