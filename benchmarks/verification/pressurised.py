@@ -1,15 +1,16 @@
 """Thick cylinder, thick sphere and a pneumatic finger under internal follower pressure."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import skfem
 import torch
+from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from torch import Tensor
@@ -103,12 +104,12 @@ def sector(dim: int, cells: int, shape: str, *, quadratic: bool) -> skfem.Mesh:
     return replace(mesh, doflocs=x * x.max(axis=0) / np.linalg.norm(x, axis=0))
 
 
-def inner_surface(points: Array) -> Array:
+def inner_surface(points: Array) -> NDArray[np.bool_]:
     """Return a mask of the nodes at the inner radius."""
     return np.linalg.norm(points, axis=1) < INNER + 1e-9
 
 
-def expansion(nu: float, pressure: float, mesh: skfem.Mesh, degree: int, **options) -> float:
+def expansion(nu: float, pressure: float, mesh: skfem.Mesh, degree: int, **options: Any) -> float:
     """Return r(A) / A of a sector with symmetry conditions: the mean over the inner surface."""
     build = partial(Problem.build, mesh, NeoHookeanLn(nu), degree=degree, length=1.0, **options)
     points = build().points.numpy()
@@ -230,7 +231,7 @@ def inflation(folder: Path) -> Section:
     )
 
 
-def _draw(path: Path, curves: dict[str, tuple[Sequence[int], list[float]]]) -> None:
+def _draw(path: Path, curves: Mapping[str, tuple[Sequence[int], list[float]]]) -> None:
     with picture(path, 2.9) as figure:
         axes = panel(figure, 1, "cells through the wall", "relative error of r/R [-]", "")
         for k, (name, (counts, errors)) in enumerate(curves.items()):
