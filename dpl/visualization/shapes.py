@@ -1,5 +1,6 @@
 """Figures of reference and predicted shapes with the nodal errors of the predictions."""
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ WIDE = 0.1  # part of the largest error below which a median error needs a logar
 SMALLEST_ERROR = 1e-12  # smallest upper end of a colour scale
 ELEVATION, AZIMUTH = np.deg2rad((18.0, -60.0))  # of the view
 PANEL = 3.2  # longer side of a panel [inch]
+MOST_ACROSS = 4  # panels of a single load side by side
 GAP, LINE, BAR = 0.08, 0.17, 0.12  # between panels, of a line of text, of a colour bar [inch]
 LABEL = "nodal error / L [-]"
 OUTSIDE = 0.5  # part of the size of a body that predictions extend a panel by at most
@@ -195,7 +197,8 @@ def _grid(
 ) -> tuple["Figure", Any, Any]:
     """Return a figure, its axes (1 + predictions, loads), and axes of the colour bars.
 
-    The panels have the shape of the body. There are `titles` lines above a load.
+    The panels have the shape of the body. There are `titles` lines above a load. The predictions
+    of a single load continue in a next line where there are many.
     """
     from matplotlib.figure import Figure
 
@@ -203,9 +206,13 @@ def _grid(
     width, height = (high - low) * min(PANEL / (high - low))
     top, loads = 0.08 + LINE * titles, len(extents)
     left, below, right = (0.05, 0.75, 0.05) if upright else (0.25, 0.05, 0.85)
-    columns, lines = (rows, loads) if upright else (loads, rows)
-    step = height + (top if upright else 0.0) + GAP
-    size = left + columns * (width + GAP) + right, below + lines * step + (0 if upright else top)
+    across = min(rows, MOST_ACROSS) if upright and loads == 1 else rows
+    folds = math.ceil(rows / across)
+    columns, lines = (across, loads * folds) if upright else (loads, rows)
+    between = below if folds > 1 else 0.0
+    step = height + (top if upright else 0.0) + GAP + between
+    tall = below + lines * step - between + (0 if upright else top)
+    size = left + columns * (width + GAP) + right, tall
     figure = Figure(figsize=size, dpi=DPI)
     figure.set_layout_engine("none")  # panels are placed here, whatever the style says
 
@@ -214,7 +221,7 @@ def _grid(
         return figure.add_axes(room, label=label)
 
     def place(row: int, load: int) -> tuple[float, float]:
-        column, line = (row, load) if upright else (load, row)
+        column, line = (row % across, load * folds + row // across) if upright else (load, row)
         return left + column * (width + GAP), below + (lines - 1 - line) * step
 
     axes = [[add(*place(row, load), width, height) for load in range(loads)] for row in range(rows)]

@@ -300,8 +300,8 @@ def test_the_plan_is_printed_and_nothing_is_started(script, tmp_path):
     ended = script("paper", "only_plan=true", "scale=small", "groups=[full]", cwd=tmp_path)
     assert ended.status == 0, ended.err
     assert "to do" in ended.out
-    assert "runs/small/beam_svk/fcnn_full" in ended.out
-    assert "plan: 1 runs" in ended.out
+    assert "runs/small/beam_nh_loss/fcnn_full_mse" in ended.out
+    assert "plan: 2 runs" in ended.out
     assert max(map(len, ended.out.splitlines())) <= 100
     assert not list(tmp_path.iterdir())
 
@@ -322,12 +322,12 @@ def test_wrong_options_end_with_one_line(script, tmp_path, options, said):
 
 
 def test_a_run_of_other_options_is_refused_before_anything_starts(script, tmp_path):
-    begin(tmp_path / "runs/small/beam_svk/fcnn_full")
-    other = Session("beam_svk/fcnn_full", ("model=cnn",), "finished", 1.0, 2)
+    begin(tmp_path / "runs/small/beam_nh_loss/fcnn_full_mse")
+    other = Session("beam_nh_loss/fcnn_full_mse", ("model=cnn",), "finished", 1.0, 2)
     paper_runs.append(other, tmp_path / "runs/small")
     ended = script("paper", "scale=small", "groups=[full]", cwd=tmp_path)
     assert ended.status == 2
-    assert "runs/small/beam_svk/fcnn_full was trained with other options" in ended.err
+    assert "runs/small/beam_nh_loss/fcnn_full_mse was trained with other options" in ended.err
 
 
 def test_all_results_without_runs_name_what_is_missing(script, tmp_path):

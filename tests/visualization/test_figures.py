@@ -186,6 +186,21 @@ def test_upright_figures_have_one_row_per_load(make_scene):
     assert places["finite elements"] < places["network"] < places["linear"]
 
 
+def test_many_predictions_of_one_load_continue_in_a_second_line(scene, batch):
+    truth = batch.displacement[:1]
+    shown = [(f"network {k}", (1 + 0.1 * k) * truth) for k in range(5)]
+    figure = plot_deformed(scene.problem, truth, shown, upright=True)
+    figure.draw_without_rendering()
+    places = [ax.get_position() for ax in panels(figure)]
+    assert len({round(place.y0, 6) for place in places[:4]}) == 1
+    assert all(place.y1 < places[0].y0 for place in places[4:])
+    assert places[4].x0 == pytest.approx(places[0].x0)
+    texts = [text for ax in figure.axes for text in (ax.xaxis.label, ax.yaxis.label)]
+    boxes = [text.get_window_extent() for text in texts if text.get_text()]
+    assert len(boxes) == 6 + 5
+    assert all(sum(box.overlaps(other) for other in boxes) == 1 for box in boxes)
+
+
 @pytest.mark.parametrize("name", BODIES)
 def test_triangles_cover_the_same_area_as_polygons(name):
     mesh, facets, corners = BODIES[name]
