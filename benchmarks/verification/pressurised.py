@@ -238,4 +238,4 @@ def _draw(path: Path, curves: Mapping[str, tuple[Sequence[int], list[float]]]) -
             measured(axes, counts, errors, k, name)
         axes.set_xscale("log")
         axes.set_yscale("log")
-        axes.legend()
+        axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
