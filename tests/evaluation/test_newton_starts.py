@@ -98,6 +98,7 @@ def test_loads_are_those_of_the_test_set_and_larger_ones(scene):
     factors = sets["twice"].force.flatten(1).norm(dim=1) / drawn.flatten(1).norm(dim=1)
     assert torch.allclose(factors, torch.linspace(1, 2, 6).double())
     assert set(load_sets(scene, 6, 0)) == {"in range", "twice"}
+    assert set(load_sets(scene, 6, 0, twice=False)) == {"in range"}
 
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-8])
@@ -182,10 +183,19 @@ def test_a_solver_that_never_converges_has_no_iterations_and_no_time(scene, load
     hard = loads._replace(force=1e5 * loads.force)
     solver = Newton(scene.problem, min_load_step=0.9, max_iter=2)
     trials = measure({(newton_starts.REFERENCE, ""): solver}, "in range", hard, 1e-8)
-    row, same = summary(trials)
-    assert (row.loads, same.loads) == ("in range and twice", "in range")
+    (row,) = summary(trials)
+    assert row.loads == "in range"
     assert row.converged == 0
     assert row.iterations is row.ms is row.time_ratio is None
+
+
+def test_both_sets_of_the_paper_are_combined_where_there_are_both(scene, loads):
+    trials = measure(solvers_of(scene, {}, 1e-3, names=[]), "in range", loads, 1e-3)
+    twice = [replace(trial, loads="twice") for trial in trials]
+    assert [row.loads for row in summary(trials)] == ["in range"]
+    rows = {row.loads: row.count for row in summary([*trials, *twice])}
+    count = len(loads.force)
+    assert rows == {newton_starts.BOTH: 2 * count, "in range": count, "twice": count}
 
 
 def test_trials_summaries_and_figure_are_written(scene, loads, networks, tmp_path):
@@ -199,7 +209,7 @@ def test_trials_summaries_and_figure_are_written(scene, loads, networks, tmp_pat
     write(newton_starts.PAPER + summary(trials), tmp_path / "a.csv")
     newton_figure.draw(trials, tmp_path / "a.png", limit=5)
     written = list(csv.DictReader((tmp_path / "a.csv").open()))
-    assert len(written) == 2 + 2 * (4 + 2 * 4)
+    assert len(written) == 2 + 4 + 2 * 4
     assert written[1]["used_prediction_pct"] == "66"
     assert written[0]["tol"] == ""
     assert (tmp_path / "a.png").stat().st_size > 10_000
