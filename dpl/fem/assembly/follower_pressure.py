@@ -109,13 +109,9 @@ class PressureSurface:
         tangents = np.einsum("sqai,sac->sqci", slopes, X)
         if mesh.dim() == 2:
             tangents[..., 2, 1] = 1.0
-        tangents[..., 1] *= _orientation(basis, cells, side)[:, None, None]
-        slopes = (
-            slopes
-            * np.stack([np.ones(len(side)), _orientation(basis, cells, side)], axis=-1)[
-                :, None, None
-            ]
-        )
+        outward = _orientation(basis, cells, side)[:, None, None]
+        tangents[..., 1] *= outward
+        slopes[..., 1] *= outward
         return cls(
             nodes=torch.from_numpy(nodes.astype(np.int64)),
             weights=torch.from_numpy(np.ascontiguousarray(weights)),

@@ -6,10 +6,12 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from dpl.fem.assembly.follower_pressure import PressureSurface
 from dpl.fem.loads.combined import CombinedLoads
-from dpl.fem.loads.forces import pressure
+from dpl.fem.loads.forces import ROUNDOFF
 from dpl.fem.loads.sampling import Array
 from dpl.fem.loads.sized import check_range
 from dpl.fem.loads.surface import SurfaceLoads
@@ -50,5 +52,7 @@ class FacePressure(SurfaceLoads, CombinedLoads):
 
     @cached_property
     def shapes(self) -> Tensor:
-        """Force of the pressure 1, (1, N, D) [-]."""
-        return pressure(self.problem, self.facets)[None]
+        """Force of the pressure 1 on the undeformed surface, (1, N, D) [-]."""
+        surface = PressureSurface.build(self.problem.basis, self.facets, 1.0)
+        force = -surface.force(torch.zeros(1, *self.problem.shape, dtype=torch.float64))
+        return torch.where(force.abs() > ROUNDOFF * force.abs().max(), force, 0.0)

@@ -10,7 +10,7 @@ from torch import Tensor
 from dpl.fem.loads.combined import VectorLoads
 from dpl.fem.loads.forces import facet_areas
 from dpl.fem.loads.sampling import Array
-from dpl.fem.loads.sized import check_largest
+from dpl.fem.loads.sized import check_largest, traction_sizes
 from dpl.fem.loads.surface import SurfaceLoads
 
 
@@ -39,9 +39,7 @@ class FaceTractions(SurfaceLoads, VectorLoads):
     @property
     def given_sizes(self) -> Array | None:
         """0 and the largest traction over E, (2,) [-]."""
-        if self.largest is None:
-            return None
-        return self.problem.units.stress(np.array([0.0, self.largest]), f"largest = {self.largest}")
+        return traction_sizes(self.problem.units, self.largest)
 
     @cached_property
     def weights(self) -> Tensor:

@@ -133,18 +133,6 @@ def traction(problem: Problem, region: Region, stress: Field, scale: float = 1.0
     return _tested(problem, basis, stress(_places(problem, basis)))
 
 
-def pressure(problem: Problem, facets: NDArray[np.int_]) -> Tensor:
-    """Return the nodal forces (N, D) of the pressure 1 on boundary facets, against the normal [-].
-
-    Args:
-        problem: Where it acts.
-        facets: Numbers of the facets.
-    """
-    basis = _facet_basis(problem, facets)
-    force = _tested(problem, basis, -np.asarray(basis.normals))
-    return torch.where(force.abs() > ROUNDOFF * force.abs().max(), force, 0.0)
-
-
 def facet_areas(problem: Problem, facets: NDArray[np.int_]) -> csr_matrix:
     """Return the integrals of each shape function over each boundary facet, (N, E) [-].
 

@@ -14,7 +14,13 @@ from torch import Tensor
 
 from dpl.fem.loads.forces import facet_areas
 from dpl.fem.loads.sampling import Array
-from dpl.fem.loads.sized import SizedLoads, check_largest, largest_deflection, softest_node
+from dpl.fem.loads.sized import (
+    SizedLoads,
+    check_largest,
+    largest_deflection,
+    softest_node,
+    traction_sizes,
+)
 from dpl.fem.loads.surface import SurfaceLoads, check_patch_radius
 
 
@@ -51,9 +57,7 @@ class PatchLoads(SurfaceLoads, SizedLoads):
     @property
     def given_sizes(self) -> Array | None:
         """0 and the largest traction over E, (2,) [-]."""
-        if self.largest is None:
-            return None
-        return self.problem.units.stress(np.array([0.0, self.largest]), f"largest = {self.largest}")
+        return traction_sizes(self.problem.units, self.largest)
 
     @property
     def unit_deflection(self) -> float:

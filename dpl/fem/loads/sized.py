@@ -7,12 +7,14 @@ from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dpl.fem.loads.family import RandomLoads
 from dpl.fem.loads.sampling import Array, direction
 from dpl.fem.solvers.linear import LinearSolver
+from dpl.fem.units import Units
 
 MIN_DEFLECTION = 1e-12  # below it the displacement is rounding error [-]
 DIGITS = 12  # digits of a size that identify a family; the last ones depend on units
@@ -148,6 +150,17 @@ def check_range(
         )
     if low == high == 0:
         raise ValueError(f"{name} = {list(value)} must contain a number other than 0 [{unit}]")
+
+
+def traction_sizes(units: Units, largest: float | None) -> Array | None:
+    """Return 0 and a largest traction [Pa] over E, (2,) [-]; None if it is left out.
+
+    Raises:
+        ValueError: The loads have a range of moduli.
+    """
+    if largest is None:
+        return None
+    return units.stress(np.array([0.0, largest]), f"largest = {largest}")
 
 
 def largest_deflection(linear: LinearSolver, axes: Tensor) -> float:
