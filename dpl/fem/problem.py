@@ -238,6 +238,17 @@ class Problem(EquilibriumCriterion):
         twin.__dict__["_first"] = self.__dict__.get("_first", self)
         return twin
 
+    def with_held(self, held: Tensor) -> Self:
+        """Return the body with further degrees of freedom (N, D) fixed where they are at rest."""
+        return replace(self, free=self.free & ~held)
+
+    def with_prescribed(self, prescribed: Tensor) -> Self:
+        """Return the body with other displacements (N, D) [-] of its supports."""
+        twin = self._share(replace(self, prescribed=prescribed))
+        twin.__dict__["_first"] = self.__dict__.get("_first", self)
+        del twin.__dict__["moved_supports"]
+        return twin
+
     def _share(self, twin: Self) -> Self:
         """Return another body on the same mesh with the parts that do not depend on the law."""
         for name in ("pattern", "moved_supports", "_operator"):

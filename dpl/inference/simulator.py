@@ -3,17 +3,21 @@
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any, Self
 
+import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from dpl.fem import Load, Problem, Solution, Status, SubspaceNewton, evaluate_solution
+from dpl.fem.mesh.regions import Region
 from dpl.fem.solvers import concatenate
 from dpl.inference.answer import Answer, answer_like, summarise
 from dpl.inference.arguments import as_load, as_numbers
 from dpl.inference.error_estimate import SUFFICIENT, estimate_error, nearest
+from dpl.inference.grasp import GraspAnswer, Gripper
 from dpl.inference.hybrid import default_hybrid
 from dpl.inference.request import Candidate, Request
 from dpl.inference.training_range import RangeCheck
@@ -155,6 +159,51 @@ class Simulator:
                 found.append((best, 1e3 * (time.perf_counter() - begin)))
             answer = self._reported(found, places, request)
         return answer_like(answer, numpy=not isinstance(force, Tensor), single=given.ndim == 2)
+
+    def grasp(
+        self,
+        region: Region | NDArray[np.bool_],
+        translation: Sequence[float | None],
+        rotation: ArrayLike | None = None,
+        *,
+        force: ArrayLike | Tensor | None = None,
+        young: float | None = None,
+        parameters: Mapping[str, float] | ArrayLike | None = None,
+        tol: float | None = None,
+        warm: bool = False,
+    ) -> GraspAnswer:
+        """Return the displacement of the body while a gripper moves a patch of its boundary.
+
+        The nodes of the patch move as a rigid body. The forces of the gripper are found through
+        predictions of the network, see `predicted_forces`. With a tolerance, Newton's method solves
+        the equilibrium of the body with the patch as a moved support, from this prediction.
+
+        Args:
+            region: The patch: a region of `dpl.fem` in the coordinates of the mesh, or a mask of
+                nodes (N,). Nodes inside the body and supports are not grasped.
+            translation: Displacement of the mean of the patch, (D,) [m]. None leaves a direction
+                free: the patch slides along it without friction.
+            rotation: Rotation vector about the mean of the patch, (3,), in 2D the angle [rad]; none
+                if left out.
+            force: Further nodal forces, (N, D) [N] (2D: [N/m]); the constant forces of the scene if
+                left out.
+            young: Young's modulus [Pa]; optional if the scene has only one.
+            parameters: A value for each range of the law, by its name or as an array (P,).
+            tol: Relative residual of the result [-]; None: the prediction of the network.
+            warm: Begin with the forces of the last call if it grasped the same patch.
+
+        Raises:
+            ValueError: An argument has a wrong shape or is out of range, or the patch has no node
+                that is free to move.
+        """
+        return self._gripper(
+            region, translation, rotation,
+            force=force, young=young, parameters=parameters, tol=tol, warm=warm,
+        )  # fmt: skip
+
+    @cached_property
+    def _gripper(self) -> Gripper:
+        return Gripper(self.surrogate, steps=self.steps)
 
     def _reported(
         self,

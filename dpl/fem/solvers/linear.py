@@ -105,6 +105,16 @@ class LinearSolver:
             self._clones[problem] = replace(self, problem=problem, parent=self)
         return self._clones[problem]
 
+    def with_prescribed(self, prescribed: Tensor) -> "LinearSolver":
+        """Return the solver of the body with other displacements (N, D) [-] of its supports.
+
+        K(0) does not depend on them, and its factors are shared.
+        """
+        twin = replace(self, problem=self.problem.with_prescribed(prescribed), parent=self)
+        for name in ("factor", "float32_factor"):
+            twin.__dict__[name] = getattr(self, name)
+        return twin
+
     def forget_clones(self) -> None:
         """Drop the solvers of other parameters, so that their factors are computed again."""
         self._clones.clear()

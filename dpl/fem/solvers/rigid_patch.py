@@ -1,0 +1,160 @@
+"""A patch of the boundary that a gripper holds: its rigid motion, its compliance, the held body."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from dpl.fem.mesh.regions import Region, nodes_in
+from dpl.fem.problem import Problem
+from dpl.fem.solvers.linear import LinearSolver
+from dpl.fem.solvers.newton import Newton
+
+RTOL = 1e-6  # relative residual of the linear solutions that give the compliance [-]
+
+
+class Wrench(NamedTuple):
+    """Resultant of the forces of a gripper on a patch.
+
+    Attributes:
+        force: (D,) [-].
+        moment: About the centre of the displaced patch, (3,), in 2D (1,) [-].
+    """
+
+    force: Tensor
+    moment: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class RigidPatch:
+    """Nodes of the boundary that move together as a rigid body, in all directions or in some.
+
+    Attributes:
+        linear: Linear solver of the body without the gripper.
+        held: Degrees of freedom whose displacement is prescribed, (N, D), boolean.
+    """
+
+    linear: LinearSolver
+    held: Tensor
+
+    @classmethod
+    def of(
+        cls, linear: LinearSolver, region: Region | NDArray[np.bool_], directions: Sequence[bool]
+    ) -> Self:
+        """Return the patch of the nodes of the boundary in a region.
+
+        Args:
+            linear: Linear solver of the body.
+            region: The region, in the coordinates of the mesh, or a mask of nodes (N,).
+            directions: Directions that the gripper holds, (D,); the patch slides along the others.
+
+        Raises:
+            ValueError: The region has no free node of the boundary, or no direction is held.
+        """
+        problem = linear.problem
+        if isinstance(region, np.ndarray):
+            inside = region
+            if inside.dtype != bool or inside.shape != problem.shape[:1]:
+                raise ValueError(
+                    f"region: an array of {inside.dtype}, {inside.shape}, must be a mask of bool, "
+                    f"({problem.shape[0]},)"
+                )
+        else:
+            inside = nodes_in(region, problem.basis, problem.length, problem.origin)
+        if not any(directions):
+            raise ValueError("translation: the gripper must hold the patch in a direction")
+        nodes = torch.from_numpy(inside) & problem.boundary
+        held = nodes[:, None] & torch.tensor(directions) & problem.free
+        if not held.any():
+            raise ValueError("region: no node of the boundary in it is free to move")
+        return cls(linear, held)
+
+    @property
+    def problem(self) -> Problem:
+        """The body without the gripper."""
+        return self.linear.problem
+
+    @cached_property
+    def nodes(self) -> Tensor:
+        """Mask of the held nodes, (N,)."""
+        return self.held.any(dim=1)
+
+    @cached_property
+    def _dofs(self) -> Tensor:
+        """Numbers of the held degrees of freedom, (m,)."""
+        return self.held.flatten().nonzero()[:, 0]
+
+    def displacement(self, translation: Sequence[float], rotation: Sequence[float]) -> Tensor:
+        """Return the displacement of the held degrees of freedom, (m,) [-].
+
+        Args:
+            translation: Displacement of the mean of the held nodes, (D,) [-].
+            rotation: Rotation vector about it, (3,), in 2D the angle, (1,) [rad].
+        """
+        points = self.problem.points[self.nodes]
+        arms = points - points.mean(dim=0)
+        dim = points.shape[1]
+        vector = rotation if dim == 3 else [0.0, 0.0, *rotation]
+        matrix = torch.from_numpy(Rotation.from_rotvec(vector).as_matrix()[:dim, :dim])
+        moved = arms @ matrix.T - arms + torch.tensor(translation, dtype=torch.float64)
+        return moved[self.held[self.nodes]]
+
+    def at(self, values: Tensor) -> Tensor:
+        """Return the nodal field, (N, D), with values (m,) at held degrees of freedom, else 0."""
+        field = torch.zeros(self.held.numel(), dtype=torch.float64)
+        return field.index_copy(0, self._dofs, values).view(self.held.shape)
+
+    def of_field(self, field: Tensor) -> Tensor:
+        """Return the values, (m,), of a nodal field (N, D) at held degrees of freedom."""
+        return field.reshape(-1)[self._dofs]
+
+    @cached_property
+    def compliance_factor(self) -> Tensor:
+        """Cholesky factor of the linear displacements of the patch by forces on it, (m, m)."""
+        count, free = len(self._dofs), self.problem.free
+        units = torch.zeros(count, self.held.numel(), dtype=torch.float64)
+        units[torch.arange(count), self._dofs] = 1.0
+        right = units.view(count, *self.held.shape)[:, free].numpy()
+        columns = torch.from_numpy(self.linear.float32_factor.solve_many(right, RTOL))
+        compliance = columns[:, self.held[free]]
+        return torch.linalg.cholesky((compliance + compliance.mT) / 2)
+
+    def stiffness_times(self, displacement: Tensor) -> Tensor:
+        """Return the forces, (m,), whose linear solution displaces the patch by (m,) [-]."""
+        return torch.cholesky_solve(displacement[:, None], self.compliance_factor)[:, 0]
+
+    def newton(self, corrector: Newton, displacement: Tensor) -> Newton:
+        """Return Newton's method for the body with the patch displaced by (m,) [-].
+
+        Pattern and factor of K(0) of the held body are computed once.
+
+        Args:
+            corrector: Newton's method of the body, whose options are used.
+            displacement: Displacement of the held degrees of freedom.
+        """
+        prescribed = self.problem.prescribed + self.at(displacement)
+        linear = self._held_linear.with_prescribed(prescribed)
+        return replace(corrector, problem=linear.problem, linear_solver=linear)
+
+    @cached_property
+    def _held_linear(self) -> LinearSolver:
+        """Linear solver of the body with the patch held at rest."""
+        body = self.problem.with_held(self.held)
+        return LinearSolver(body, self.linear.tol, self.linear.linear)
+
+    def wrench(self, force: Tensor, displacement: Tensor) -> Wrench:
+        """Return the resultant of nodal forces (N, D) [-] on the patch at a displacement (N, D)."""
+        forces = force[self.nodes]
+        place = (self.problem.points + displacement)[self.nodes]
+        arms = place - place.mean(dim=0)
+        if arms.shape[1] == 3:
+            moment = torch.linalg.cross(arms, forces).sum(dim=0)
+        else:
+            moment = (arms[:, 0] * forces[:, 1] - arms[:, 1] * forces[:, 0]).sum()[None]
+        return Wrench(forces.sum(dim=0), moment)

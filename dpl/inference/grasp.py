@@ -1,0 +1,355 @@
+"""Grasps: the displacement of a patch is prescribed, its forces are found through a network."""
+
+import math
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from dpl.fem import AndersonSolver, Load, Newton, Solution, evaluate_solution
+from dpl.fem.solvers import check_tol
+from dpl.fem.solvers.rigid_patch import RigidPatch
+from dpl.inference.answer import summarise
+from dpl.inference.arguments import as_load, as_number, as_numbers
+from dpl.inference.error_estimate import corotational_error
+from dpl.inference.hybrid import Hybrid
+from dpl.inference.training_range import RangeCheck
+from dpl.scene import Scene
+from dpl.system.threads import one_thread
+from dpl.training import Surrogate
+
+MAX_ITER = 16  # predictions of the network for one motion
+CORRECTED = 1e-3  # change of a displacement below which its correction ends, over its norm [-]
+MAX_PATCHES = 8  # patches whose compliance and held body are kept
+MEMORY = 8  # iterations from which Anderson's method extrapolates
+EXACT = 1e-12  # error of a motion that counts as met exactly [-]
+MOTION_TOL = 1e-3  # error of the motion at which they end, over its largest displacement [-]
+
+
+@dataclass(frozen=True)
+class GraspAnswer:
+    """Displacement of a body with a grasped patch, and the forces of the gripper.
+
+    Attributes:
+        displacement: (N, D) [m], a NumPy array.
+        force: Resultant of the forces of the gripper on the body, (D,) [N] (2D: [N/m]).
+        moment: Their moment about the centre of the displaced patch, (3,) [N m], in 2D (1,) [N].
+        nodal_force: The forces of the gripper, (N, D) [N]; zero outside of the patch.
+        motion_error: Largest distance of a held node from its prescribed place [m].
+        residual: Relative residual at all other nodes [-], see `Problem.relative_residual_of`; the
+            forces of the gripper count as load.
+        error: Estimated relative error of the displacement [-], see `corotational_error`, plus
+            `motion_error` over the largest displacement of the patch: no bound.
+        volume_ratio: min det F [-]; an element is inverted if it is not above 0.
+        converged: True if the motion is met exactly, the residual is below the tolerance and no
+            element is inverted.
+        amplitude, out_of_span, out_of_distribution: Position of the forces of the gripper relative
+            to the training, see `Answer`. A rigid patch has concentrated forces along its edge,
+            which most trainings do not contain.
+        method: "network", "corrected", "hybrid" or "full Newton".
+        iterations: Predictions of the network and corrections, or linear solves of Newton's method.
+        milliseconds: Wall time [ms].
+        summary: Motion, estimated error, residual and range in words.
+    """
+
+    displacement: Any
+    force: Any
+    moment: Any
+    nodal_force: Any
+    motion_error: float
+    residual: float
+    error: float
+    volume_ratio: float
+    converged: bool
+    amplitude: float
+    out_of_span: float
+    out_of_distribution: bool
+    method: str
+    iterations: int
+    milliseconds: float
+    summary: str
+
+
+class Candidate(NamedTuple):
+    """A state of a body with a grasped patch.
+
+    Attributes:
+        method: See `GraspAnswer`.
+        state: Displacement with residual and min det F, B = 1.
+        force: Forces of the gripper, (m,) [-]; None: those that balance the stresses.
+    """
+
+    method: str
+    state: Solution
+    force: Tensor | None = None
+
+
+class Held(NamedTuple):
+    """An evaluated candidate.
+
+    Attributes:
+        method, state: See `Candidate`.
+        force: Forces of the gripper at held degrees of freedom, (m,) [-].
+        motion_error: Largest distance of a held node from its prescribed place [-].
+        error: Estimated relative error [-].
+    """
+
+    method: str
+    state: Solution
+    force: Tensor
+    motion_error: float
+    error: float
+
+    @property
+    def is_exact(self) -> bool:
+        """True if the state has converged and meets the motion."""
+        return bool(self.state.converged) and self.motion_error <= EXACT
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Key by which states are sorted; the smallest is best."""
+        return not self.is_exact, self.error
+
+
+def predicted_forces(
+    patch: RigidPatch,
+    goal: Tensor,
+    predict: Callable[[Tensor], Tensor],
+    start: Tensor | None = None,
+) -> tuple[Tensor, Tensor, int]:
+    """Return forces of the gripper, (m,) [-], the displacement (N, D) [-] and the predictions made.
+
+    The forces are unknowns at all held degrees of freedom. Each iteration adds the forces that
+    close the gap between predicted and prescribed displacement of the patch in the linear body;
+    Anderson's method extrapolates. The first prediction is exact for small motions. Iterations
+    end when the largest gap is below `MOTION_TOL` of the largest displacement, or after `MAX_ITER`;
+    the result is the iterate with the smallest gap.
+
+    Source: Anderson (1965), J. ACM 12; Walker, Ni (2011), SIAM J. Numer. Anal. 49 (as a least
+    squares problem of differences).
+
+    Args:
+        patch: The patch.
+        goal: Its displacement at held degrees of freedom, (m,) [-].
+        predict: Function from the forces of the gripper (N, D) [-] to a displacement (N, D) [-].
+        start: Forces to start from, (m,); the linear ones if left out.
+    """
+    force = patch.stiffness_times(goal) if start is None else start
+    tolerance = MOTION_TOL * float(goal.abs().max())
+    energy = patch.compliance_factor.mT  # |L^T f| is the energy norm of forces
+    best = (math.inf, force, torch.zeros_like(patch.problem.points))
+    forces: list[Tensor] = []
+    steps: list[Tensor] = []
+    count = 0
+    while count < MAX_ITER:
+        count += 1
+        field = predict(patch.at(force))
+        gap = goal - patch.of_field(field)
+        size = float(gap.abs().max())
+        if size < best[0]:
+            best = size, force, field
+        if not size > tolerance or not math.isfinite(size):
+            break
+        forces, steps = [*forces[-MEMORY:], force], [*steps[-MEMORY:], patch.stiffness_times(gap)]
+        force = force + steps[-1]
+        if len(steps) > 1:
+            changes = torch.stack(steps).diff(dim=0).mT
+            moves = torch.stack(forces).diff(dim=0).mT
+            mix = torch.linalg.lstsq(energy @ changes, energy @ steps[-1][:, None]).solution
+            force = force - ((moves + changes) @ mix)[:, 0]
+    return best[1], best[2], count
+
+
+def evaluated(
+    patch: RigidPatch, goal: Tensor, load: Load, newton: Newton, candidate: Candidate
+) -> Held:
+    """Return a state with the forces of the gripper and the errors of motion and displacement.
+
+    Args:
+        patch: The patch.
+        goal: Its displacement, (m,) [-].
+        load: Other forces on the body, B = 1.
+        newton: Newton's method of the held body.
+        candidate: The state.
+    """
+    method, state, force = candidate
+    u = state.displacement
+    evaluation = newton.problem.with_parameters(load.parameters).evaluate(u)
+    missed = patch.at(goal - patch.of_field(u[0])).norm(dim=1).max()
+    largest = patch.at(goal).norm(dim=1).max().clamp(min=1e-300)
+    error = corotational_error(newton.linear_solver, load, u, evaluation)
+    if force is None:
+        force = patch.of_field(evaluation.internal[0] - load.force[0])
+    return Held(method, state, force, float(missed), error + float(missed / largest))
+
+
+def candidates(
+    goal: Tensor, load: Load, newton: Newton, found: tuple[Tensor, Tensor, int], steps: int
+) -> Iterator[Candidate]:
+    """Yield the prediction under the forces of a gripper, corrected if possible, and equilibrium.
+
+    The correction makes iterations with the corotated factor of K(0) of the held body until the
+    displacement changes by less than `CORRECTED`. The equilibrium is that of Newton's method from
+    the corrected prediction, or from rest where that does not lead to a solution.
+
+    Args:
+        goal, load, newton: See `evaluated`.
+        found: Result of `predicted_forces`.
+        steps: Largest number of iterations of the correction; 0: the prediction is not corrected.
+    """
+    force, field, count = found
+    guess = torch.where(newton.problem.free, field, newton.problem.prescribed)[None]
+    best = corrected(load, newton, guess, steps) if steps else None
+    if best is None:
+        state = evaluate_solution(newton.problem, field[None], load, newton.tol, from_guess=True)
+        yield Candidate("network", state._replace(iterations=state.iterations + count), force)
+    else:
+        guess = best.displacement
+        yield Candidate("corrected", best._replace(iterations=best.iterations + count))
+    *_, last = Hybrid(lambda load: guess, newton).iterate(load)
+    yield Candidate("hybrid" if bool(last.from_guess) else "full Newton", last)
+
+
+def corrected(load: Load, newton: Newton, guess: Tensor, steps: int) -> Solution | None:
+    """Return the iterate of least residual from a guess (1, N, D); None if the guess is inverted."""
+    valid: list[Solution] = []
+    for state in AndersonSolver(newton, max_iter=steps).iterate(load, guess=guess):
+        if not bool(state.volume_ratio > 0):
+            break
+        valid.append(state)
+        last = [one.displacement for one in valid[-2:]]
+        if len(valid) > 1 and (last[1] - last[0]).norm() < CORRECTED * last[1].norm():
+            break
+    return min(valid, key=lambda one: float(one.residual), default=None)
+
+
+class Gripper:
+    """Grasps of a body: patches with their compliances, and the forces of the last grasp of each.
+
+    Attributes:
+        surrogate: The surrogate that predicts displacements.
+        steps: Largest number of corrections of a prediction.
+    """
+
+    def __init__(self, surrogate: Surrogate, *, steps: int) -> None:
+        """Store the surrogate; a patch is prepared when it is grasped for the first time."""
+        self.surrogate, self.steps = surrogate, steps
+        self._patches: OrderedDict[bytes, RigidPatch] = OrderedDict()
+        self._last: tuple[RigidPatch, Tensor] | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the surrogate."""
+        return self.surrogate.scene
+
+    def __call__(
+        self,
+        region: Any,
+        translation: Sequence[float | None],
+        rotation: ArrayLike | None = None,
+        *,
+        force: ArrayLike | Tensor | None = None,
+        young: float | None = None,
+        parameters: Mapping[str, float] | ArrayLike | None = None,
+        tol: float | None = None,
+        warm: bool = False,
+    ) -> GraspAnswer:
+        """Return the displacement of the body with a grasped patch; see `Simulator.grasp`."""
+        begin = time.perf_counter()
+        if (tolerance := as_number("tol", tol)) is not None:
+            check_tol(tolerance)
+        load = self._load(force, young, parameters)
+        patch, goal = self._patch(region, translation, rotation, load)
+        with one_thread(), torch.inference_mode():
+            newton = patch.newton(self.scene.corrector, goal)
+            newton = newton if tolerance is None else replace(newton, tol=tolerance)
+            start = self._last[1] if warm and self._last and self._last[0] is patch else None
+            found = predicted_forces(patch, goal, lambda own: self._predict(load, own), start)
+            self._last = patch, found[0]
+            every = candidates(goal, load, newton, found, self.steps)
+            held = evaluated(patch, goal, load, newton, next(every))
+            if tolerance is not None and not held.is_exact:
+                solved = evaluated(patch, goal, load, newton, next(every))
+                held = min(held, solved, key=lambda one: one.rank)
+            place = RangeCheck.of(
+                self.surrogate, load._replace(force=load.force + patch.at(held.force))
+            )
+        return self._reported(patch, load, held, place, begin)
+
+    def _load(self, force: Any, young: Any, parameters: Any) -> Load:
+        """Return the other forces on the body as a load, B = 1."""
+        scene = self.scene
+        if force is not None:
+            given = as_numbers("force", force)
+            if given.ndim != 2:
+                raise ValueError(f"force: its shape is {tuple(given.shape)}; give one load (N, D)")
+            return as_load(scene, given, young, parameters)
+        rest = torch.zeros(scene.problem.shape, dtype=torch.float64)
+        load = as_load(scene, rest, young, parameters)
+        constant = scene.loads.constant_force
+        return load if constant is None else load._replace(force=constant[None])
+
+    def _patch(
+        self, region: Any, translation: Any, rotation: Any, load: Load
+    ) -> tuple[RigidPatch, Tensor]:
+        """Return the patch and the displacement of its held degrees of freedom, (m,) [-]."""
+        scene, dim = self.scene, self.scene.problem.shape[1]
+        moves = list(translation)
+        if len(moves) != dim:
+            raise ValueError(f"translation = {moves} must be {dim} lengths [m], None where free")
+        lengths = as_numbers("translation", [0.0 if x is None else x for x in moves])
+        count = 3 if dim == 3 else 1
+        turn = as_numbers("rotation", [0.0] * count if rotation is None else rotation).reshape(-1)
+        if len(turn) != count or not lengths.isfinite().all() or not turn.isfinite().all():
+            raise ValueError(
+                f"translation = {moves}, rotation = {turn.tolist()} must be {dim} lengths [m] and "
+                f"{count} angles [rad], all finite"
+            )
+        linear = scene.linear.with_parameters(load.parameters)
+        patch = RigidPatch.of(linear, region, [x is not None for x in moves])
+        key = patch.held.numpy().tobytes() + load.parameters.numpy().tobytes()
+        patch = self._patches.setdefault(key, patch)
+        self._patches.move_to_end(key)
+        if len(self._patches) > MAX_PATCHES:
+            self._patches.popitem(last=False)
+        return patch, patch.displacement((lengths / scene.length).tolist(), turn.tolist())
+
+    def _predict(self, load: Load, own: Tensor) -> Tensor:
+        """Return the displacement (N, D) [-] under a load and forces of the gripper (N, D) [-]."""
+        return self.surrogate.predict(load._replace(force=load.force + own))[0]
+
+    def _reported(
+        self, patch: RigidPatch, load: Load, held: Held, place: RangeCheck, begin: float
+    ) -> GraspAnswer:
+        """Return a state as an answer in SI units."""
+        scene, state = self.scene, held.state
+        unit = float(load.young) * scene.force_unit
+        nodal = patch.at(held.force)
+        wrench = patch.wrench(nodal, state.displacement[0])
+        kept = held.is_exact
+        amplitude, out_of_span, outside = (float(column) for column in place)
+        words = summarise(state, kept, held.error, amplitude, out_of_span, bool(outside))
+        missed = held.motion_error * scene.length
+        return GraspAnswer(
+            displacement=scene.length * state.displacement[0].numpy(),
+            force=unit * wrench.force.numpy(),
+            moment=unit * scene.length * wrench.moment.numpy(),
+            nodal_force=unit * nodal.numpy(),
+            motion_error=missed,
+            residual=float(state.residual),
+            error=held.error,
+            volume_ratio=float(state.volume_ratio),
+            converged=kept,
+            amplitude=amplitude,
+            out_of_span=out_of_span,
+            out_of_distribution=bool(outside),
+            method=held.method,
+            iterations=int(state.iterations),
+            milliseconds=1e3 * (time.perf_counter() - begin),
+            summary=f"motion met to {missed:.1e} m; {words}",
+        )
