@@ -216,7 +216,7 @@ def candidates(
 
 
 def corrected(load: Load, newton: Newton, guess: Tensor, steps: int) -> Solution | None:
-    """Return the iterate of least residual from a guess (1, N, D); None if the guess is inverted."""
+    """Return the iterate of least residual from a guess (1, N, D); None if that is inverted."""
     valid: list[Solution] = []
     for state in AndersonSolver(newton, max_iter=steps).iterate(load, guess=guess):
         if not bool(state.volume_ratio > 0):
