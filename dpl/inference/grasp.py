@@ -23,7 +23,8 @@ from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import Surrogate
 
-MAX_ITER = 16  # predictions of the network for one motion
+MAX_ITER = 16  # predictions of the network for one part of a motion
+PARTS = 2, 4, 8  # numbers of parts into which a motion is divided if that is necessary
 CORRECTED = 1e-3  # change of a displacement below which its correction ends, over its norm [-]
 MAX_PATCHES = 8  # patches whose compliance and held body are kept
 MEMORY = 8  # iterations from which Anderson's method extrapolates
@@ -116,44 +117,89 @@ class Held(NamedTuple):
         return not self.is_exact, self.error
 
 
+class Forces(NamedTuple):
+    """Forces of a gripper with the prediction of a network under them.
+
+    Attributes:
+        force: At held degrees of freedom, (m,) [-].
+        field: Displacement, (N, D) [-].
+        gap: Largest entry of the difference between its patch and the goal [-].
+        predictions: Number of predictions that were made.
+        found: True if the gap is below the tolerance.
+    """
+
+    force: Tensor
+    field: Tensor
+    gap: float
+    predictions: int
+    found: bool
+
+
 def predicted_forces(
     patch: RigidPatch,
-    goal: Tensor,
+    path: Callable[[float], Tensor],
     predict: Callable[[Tensor], Tensor],
     start: Tensor | None = None,
-) -> tuple[Tensor, Tensor, int]:
-    """Return forces of the gripper, (m,) [-], the displacement (N, D) [-] and the predictions made.
+) -> Forces:
+    """Return forces of the gripper that move the patch as prescribed, through a network.
+
+    The forces of the whole motion are sought first. If they are not found, the motion is divided
+    into 2, 4 and 8 parts; the forces of each part start those of the next.
+
+    Args:
+        patch: The patch.
+        path: Function from a part of the motion in [0, 1] to the displacement of the held degrees
+            of freedom, (m,) [-].
+        predict: Function from the forces of the gripper (N, D) [-] to a displacement (N, D) [-].
+        start: Forces to start from, (m,); the linear ones if left out.
+    """
+    first = patch.stiffness_times(path(1.0)) if start is None else start
+    best = balanced_forces(patch, path(1.0), predict, first)
+    total = best.predictions
+    for parts in PARTS:
+        if best.found:
+            break
+        force = patch.stiffness_times(path(1 / parts))
+        for k in range(1, parts + 1):
+            last = balanced_forces(patch, path(k / parts), predict, force)
+            total, force = total + last.predictions, last.force * (k + 1) / k
+        best = min(best, last, key=lambda one: one.gap)
+    return best._replace(predictions=total)
+
+
+def balanced_forces(
+    patch: RigidPatch, goal: Tensor, predict: Callable[[Tensor], Tensor], force: Tensor
+) -> Forces:
+    """Return forces of the gripper under which the predicted patch is displaced by the goal.
 
     The forces are unknowns at all held degrees of freedom. Each iteration adds the forces that
-    close the gap between predicted and prescribed displacement of the patch in the linear body;
-    Anderson's method extrapolates. The first prediction is exact for small motions. Iterations
-    end when the largest gap is below `MOTION_TOL` of the largest displacement, or after `MAX_ITER`;
-    the result is the iterate with the smallest gap.
+    close the gap between predicted and prescribed displacement in the linear body; Anderson's
+    method extrapolates. Iterations end when the gap is below `MOTION_TOL` of the largest
+    displacement, or after `MAX_ITER`; the result has the smallest gap.
 
     Source: Anderson (1965), J. ACM 12; Walker, Ni (2011), SIAM J. Numer. Anal. 49 (as a least
     squares problem of differences).
 
     Args:
-        patch: The patch.
-        goal: Its displacement at held degrees of freedom, (m,) [-].
-        predict: Function from the forces of the gripper (N, D) [-] to a displacement (N, D) [-].
-        start: Forces to start from, (m,); the linear ones if left out.
+        patch, predict: See `predicted_forces`.
+        goal: Displacement of the held degrees of freedom, (m,) [-].
+        force: Forces to start from, (m,) [-].
     """
-    force = patch.stiffness_times(goal) if start is None else start
     tolerance = MOTION_TOL * float(goal.abs().max())
     energy = patch.compliance_factor.mT  # |L^T f| is the energy norm of forces
-    best = (math.inf, force, torch.zeros_like(patch.problem.points))
+    best = Forces(force, torch.zeros_like(patch.problem.points), math.inf, 0, False)
     forces: list[Tensor] = []
     steps: list[Tensor] = []
-    count = 0
-    while count < MAX_ITER:
-        count += 1
+    for count in range(1, MAX_ITER + 1):
         field = predict(patch.at(force))
         gap = goal - patch.of_field(field)
         size = float(gap.abs().max())
-        if size < best[0]:
-            best = size, force, field
-        if not size > tolerance or not math.isfinite(size):
+        found = size <= tolerance
+        better = found or size < best.gap
+        best = (
+            Forces(force, field, size, count, found) if better else best._replace(predictions=count)
+        )
+        if found or not math.isfinite(size):
             break
         forces, steps = [*forces[-MEMORY:], force], [*steps[-MEMORY:], patch.stiffness_times(gap)]
         force = force + steps[-1]
@@ -162,7 +208,7 @@ def predicted_forces(
             moves = torch.stack(forces).diff(dim=0).mT
             mix = torch.linalg.lstsq(energy @ changes, energy @ steps[-1][:, None]).solution
             force = force - ((moves + changes) @ mix)[:, 0]
-    return best[1], best[2], count
+    return best
 
 
 def evaluated(
@@ -188,9 +234,7 @@ def evaluated(
     return Held(method, state, force, float(missed), error + float(missed / largest))
 
 
-def candidates(
-    goal: Tensor, load: Load, newton: Newton, found: tuple[Tensor, Tensor, int], steps: int
-) -> Iterator[Candidate]:
+def candidates(load: Load, newton: Newton, forces: Forces, steps: int) -> Iterator[Candidate]:
     """Yield the prediction under the forces of a gripper, corrected if possible, and equilibrium.
 
     The correction makes iterations with the corotated factor of K(0) of the held body until the
@@ -198,16 +242,18 @@ def candidates(
     the corrected prediction, or from rest where that does not lead to a solution.
 
     Args:
-        goal, load, newton: See `evaluated`.
-        found: Result of `predicted_forces`.
+        load, newton: See `evaluated`.
+        forces: Forces of the gripper by the network.
         steps: Largest number of iterations of the correction; 0: the prediction is not corrected.
     """
-    force, field, count = found
+    field, count = forces.field, forces.predictions
     guess = torch.where(newton.problem.free, field, newton.problem.prescribed)[None]
     best = corrected(load, newton, guess, steps) if steps else None
     if best is None:
         state = evaluate_solution(newton.problem, field[None], load, newton.tol, from_guess=True)
-        yield Candidate("network", state._replace(iterations=state.iterations + count), force)
+        yield Candidate(
+            "network", state._replace(iterations=state.iterations + count), forces.force
+        )
     else:
         guess = best.displacement
         yield Candidate("corrected", best._replace(iterations=best.iterations + count))
@@ -264,14 +310,15 @@ class Gripper:
         if (tolerance := as_number("tol", tol)) is not None:
             check_tol(tolerance)
         load = self._load(force, young, parameters)
-        patch, goal = self._patch(region, translation, rotation, load)
+        patch, path = self._patch(region, translation, rotation, load)
+        goal = path(1.0)
         with one_thread(), torch.inference_mode():
             newton = patch.newton(self.scene.corrector, goal)
             newton = newton if tolerance is None else replace(newton, tol=tolerance)
             start = self._last[1] if warm and self._last and self._last[0] is patch else None
-            found = predicted_forces(patch, goal, lambda own: self._predict(load, own), start)
-            self._last = patch, found[0]
-            every = candidates(goal, load, newton, found, self.steps)
+            forces = predicted_forces(patch, path, lambda own: self._predict(load, own), start)
+            self._last = patch, forces.force
+            every = candidates(load, newton, forces, self.steps)
             held = evaluated(patch, goal, load, newton, next(every))
             if tolerance is not None and not held.is_exact:
                 solved = evaluated(patch, goal, load, newton, next(every))
@@ -296,8 +343,11 @@ class Gripper:
 
     def _patch(
         self, region: Any, translation: Any, rotation: Any, load: Load
-    ) -> tuple[RigidPatch, Tensor]:
-        """Return the patch and the displacement of its held degrees of freedom, (m,) [-]."""
+    ) -> tuple[RigidPatch, Callable[[float], Tensor]]:
+        """Return the patch and the displacement (m,) [-] of its held degrees of freedom.
+
+        The latter is a function of the part of the motion in [0, 1].
+        """
         scene, dim = self.scene, self.scene.problem.shape[1]
         moves = list(translation)
         if len(moves) != dim:
@@ -317,7 +367,10 @@ class Gripper:
         self._patches.move_to_end(key)
         if len(self._patches) > MAX_PATCHES:
             self._patches.popitem(last=False)
-        return patch, patch.displacement((lengths / scene.length).tolist(), turn.tolist())
+        moved = lengths / scene.length
+        return patch, lambda part: patch.displacement(
+            (part * moved).tolist(), (part * turn).tolist()
+        )
 
     def _predict(self, load: Load, own: Tensor) -> Tensor:
         """Return the displacement (N, D) [-] under a load and forces of the gripper (N, D) [-]."""

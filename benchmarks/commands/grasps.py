@@ -1,0 +1,45 @@
+"""Measure random grasps of a trained run: python scripts/grasps.py run=runs/beam."""
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from benchmarks.commands import CONF
+from dpl.commands.cli import command
+
+KEYS = (
+    (str, "name"),
+    (int, "count", 1, 10**6),
+    (int, "seed", 0, 10**9),
+    (int, "amplitudes", 1, 10**4),
+)
+
+
+@command("grasps", conf=CONF, keys=KEYS)
+def main(cfg: DictConfig) -> None:
+    """Measure random grasps: motion, displacement, reactions, estimated error and times."""
+    from benchmarks import grasps
+    from dpl import Simulator, config
+    from dpl.evaluation.tables import show, write, write_machine
+    from dpl.system.threads import one_thread
+
+    _, surrogate = config.load_run(cfg.run)
+    if surrogate.scene.problem.shape[1] != 3:
+        raise config.ConfigError(f"run = {cfg.run} must have a body in 3D")
+    simulator, stem = Simulator(surrogate), Path(cfg.folder) / cfg.name
+    every = list(grasps.random_grasps(surrogate.scene, cfg.count, cfg.seed))
+
+    def say(number: int) -> None:
+        if number % 50 == 0:
+            print(f"{number} of {cfg.count} grasps", flush=True)
+
+    with one_thread():
+        rows, unknown = grasps.measure(simulator, every, say)
+        amplitudes = grasps.against_amplitude(simulator, every[: cfg.amplitudes])
+    show(rows, f"{cfg.count - unknown} random grasps, 1 thread")
+    print(f"without a solution by Newton's method from rest, left out: {unknown}")
+    print(f"slope of the error of the network in the amplitude: {grasps.slope(amplitudes):.2f}")
+    write(rows, stem.with_suffix(".csv"))
+    write(amplitudes, stem.with_name(f"{cfg.name}_amplitude.csv"))
+    write_machine(stem.with_suffix(".json"))
+    grasps.draw(amplitudes, stem.with_suffix(".png"))
