@@ -6,15 +6,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dpl import Scene, Simulator
-from dpl.fem import Load, Sphere, solve
+from dpl import Scene
+from dpl.fem import Load, Sphere
 from dpl.fem.solvers.rigid_patch import RigidPatch
-from dpl.inference import GraspAnswer
 from dpl.inference.grasp import Gripper
 from dpl.visualization import DPI, STYLE
 
@@ -23,6 +23,8 @@ LOADS = 32  # training loads whose largest energy is that of the largest grasp
 HALVINGS = 6  # of the amplitude of the grasps whose errors are drawn against it
 WRONG = 0.01  # relative error of a displacement from which it must be reported [-]
 REPORTED = 1 / 3  # smallest ratio of an estimated error to the error that counts as a report [-]
+NEWTON = "Newton from rest to 1e-6"
+TOL = 1e-6  # relative residual of the methods that iterate to a tolerance [-]
 REFERENCE_TOL = 1e-9  # relative residual of the solutions that errors are relative to [-]
 
 
@@ -133,81 +135,98 @@ def rigid_stiffness(patch: RigidPatch) -> np.ndarray:
     return (stiffness + stiffness.T) / 2
 
 
-def reference(scene: Scene, grasp: Grasp, tol: float = REFERENCE_TOL) -> tuple[Tensor, Tensor, int]:
-    """Return displacement (N, D) [-], forces of the gripper (N, D) [-] and linear solves.
+class Reference(NamedTuple):
+    """Solution of Newton's method.
 
-    Computed by Newton's method from rest.
-
-    Raises:
-        RuntimeError: It does not converge.
+    Attributes:
+        displacement: (N, D) [-].
+        force: Forces of the gripper, (N, D) [-].
+        iterations: Linear solves.
+        milliseconds: Wall time [ms].
     """
-    patch = RigidPatch.of(scene.linear, grasp.region, [True] * 3)
+
+    displacement: Tensor
+    force: Tensor
+    iterations: int
+    milliseconds: float
+
+
+def references(scene: Scene, patch: RigidPatch, grasp: Grasp) -> list[Reference] | None:
+    """Return the solutions of Newton's method from rest to 1e-6 and to `REFERENCE_TOL`.
+
+    None if it does not converge.
+    """
     goal = patch.displacement([x / scene.length for x in grasp.translation], grasp.rotation)
-    newton = replace(patch.newton(scene.newton, goal), tol=tol)
-    rest = torch.zeros(1, *scene.problem.shape, dtype=torch.float64)
-    state = solve(newton, Load(rest, torch.ones(1, dtype=torch.float64)))
-    if not bool(state.converged):
-        raise RuntimeError("no equilibrium found")
-    internal = newton.problem.evaluate(state.displacement).internal[0]
-    return state.displacement[0], torch.where(patch.held, internal, 0.0), int(state.iterations)
+    newton = patch.newton(scene.newton, goal)
+    load = Load(torch.zeros(1, *scene.problem.shape).double(), torch.ones(1).double())
+    found, guess = [], None
+    for tol in (TOL, REFERENCE_TOL):
+        begin = time.perf_counter()
+        *_, state = replace(newton, tol=tol).iterate(load, guess=guess)
+        taken = 1e3 * (time.perf_counter() - begin)
+        if not bool(state.converged):
+            return None
+        guess = state.displacement
+        internal = newton.problem.evaluate(guess).internal[0]
+        force = torch.where(patch.held, internal, 0.0)
+        found.append(Reference(guess[0], force, int(state.iterations), taken))
+    return found
 
 
 def measure(
-    simulator: Simulator, grasps: Sequence[Grasp], done: Callable[[int], None] = lambda k: None
+    gripper: Gripper, grasps: Sequence[Grasp], done: Callable[[int], None] = lambda k: None
 ) -> tuple[list[Row], int]:
     """Return a row for each method, and the number of grasps without a reference solution.
 
     Args:
-        simulator: Simulator of a scene in 3D.
+        gripper: Gripper of a scene in 3D.
         grasps: The grasps.
         done: Called with the number of grasps that are finished.
     """
-    scene = simulator.scene
-    network = Gripper(simulator.surrogate, steps=0)
-    calls: dict[str, Callable[[Grasp], GraspAnswer]] = {
-        "network": lambda g: network(g.region, g.translation, g.rotation),
-        "corrected": lambda g: simulator.grasp(g.region, g.translation, g.rotation),
-        "hybrid to 1e-6": lambda g: simulator.grasp(g.region, g.translation, g.rotation, tol=1e-6),
+    scene = gripper.scene
+    options: dict[str, dict[str, Any]] = {
+        "network": {"steps": 0},
+        "corrected": {},
+        "hybrid to 1e-6": {"tol": TOL},
     }
-    found: dict[str, list[list[float]]] = {
-        name: [] for name in (*calls, "Newton from rest to 1e-6")
-    }
-    unknown = 0
+    found: dict[str, list[list[float]]] = {name: [] for name in (*options, NEWTON)}
+    unit = float(scene.loads.young_range[0]) * scene.force_unit
     for k, grasp in enumerate(grasps):
-        try:
-            exact, forces, _ = reference(scene, grasp)
-            begin = time.perf_counter()
-            displacement, own, iterations = reference(scene, grasp, 1e-6)
-            taken = 1e3 * (time.perf_counter() - begin)
-        except RuntimeError:
-            unknown += 1
+        patch = gripper.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())
+        if (known := references(scene, patch, grasp)) is None:
             continue
-        for name, call in calls.items():
-            call(grasp)  # prepares the patch
-            answer = call(grasp)
-            u = torch.from_numpy(answer.displacement) / scene.length
-            unit = float(scene.loads.young_range[0]) * scene.force_unit
-            row = _errors(
-                scene, grasp, (u, torch.from_numpy(answer.nodal_force) / unit), (exact, forces)
-            )
+        rest, exact = known
+        size = grasp.region.radius / scene.length
+        own = _errors(patch, size, (rest.displacement, rest.force), exact)
+        found[NEWTON].append([*own, 0.0, 1.0, own[0], rest.iterations, rest.milliseconds])
+        for name, more in options.items():
+            answer = gripper(grasp.region, grasp.translation, grasp.rotation, **more)
+            u, force = answer.displacement / scene.length, answer.nodal_force / unit
+            own = _errors(patch, size, (torch.from_numpy(u), torch.from_numpy(force)), exact)
             quality = [answer.motion_error / scene.length, answer.converged, answer.error]
-            found[name].append([*row, *quality, answer.iterations, answer.milliseconds])
-        row = _errors(scene, grasp, (displacement, own), (exact, forces))
-        found["Newton from rest to 1e-6"].append([*row, 0.0, 1.0, row[0], iterations, taken])
+            found[name].append([*own, *quality, answer.iterations, answer.milliseconds])
         done(k + 1)
-    return [_row(name, np.array(rows)) for name, rows in found.items()], unknown
+    return [_row(name, np.array(rows)) for name, rows in found.items()], len(grasps) - len(
+        found[NEWTON]
+    )
 
 
 def _errors(
-    scene: Scene, grasp: Grasp, found: tuple[Tensor, Tensor], exact: tuple[Tensor, Tensor]
+    patch: RigidPatch, radius: float, found: tuple[Tensor, Tensor], exact: Reference
 ) -> list[float]:
-    """Return the relative errors of displacement, force and moment."""
-    patch = RigidPatch.of(scene.linear, grasp.region, [True] * 3)
-    ours, theirs = (patch.wrench(forces, u) for u, forces in (found, exact))
+    """Return the relative errors of displacement, force and moment.
+
+    Args:
+        patch: The patch.
+        radius: Its radius [-].
+        found: Displacement and forces of the gripper, (N, D) [-].
+        exact: The reference.
+    """
+    ours = patch.wrench(found[1], found[0])
+    theirs = patch.wrench(exact.force, exact.displacement)
     force, moment = theirs.force.norm(), theirs.moment.norm()
-    radius = grasp.region.radius / scene.length
     return [
-        float((found[0] - exact[0]).norm() / exact[0].norm()),
+        float((found[0] - exact.displacement).norm() / exact.displacement.norm()),
         float((ours.force - theirs.force).norm() / force),
         float((ours.moment - theirs.moment).norm() / (moment + radius * force)),
     ]
@@ -234,30 +253,43 @@ def _row(method: str, values: np.ndarray) -> Row:
     )
 
 
-def against_amplitude(simulator: Simulator, grasps: Sequence[Grasp]) -> list[Amplitude]:
+def against_amplitude(gripper: Gripper, grasps: Sequence[Grasp]) -> list[Amplitude]:
     """Return the median errors of predictions at decreasing amplitudes; slope two is expected.
 
+    Grasps without a reference solution are left out.
+
     Args:
-        simulator: Simulator of a scene in 3D.
+        gripper: Gripper of a scene in 3D.
         grasps: The grasps at the amplitude 1.
     """
-    scene, network = simulator.scene, Gripper(simulator.surrogate, steps=0)
-    rows = []
-    for factor in (2.0**-k for k in range(HALVINGS + 1)):
-        errors, linear = [], []
-        for grasp in grasps:
-            whole = reference(scene, grasp)[0].norm()
-            small = grasp.scaled(factor)
-            exact = reference(scene, small)[0]
-            answer = network(small.region, small.translation, small.rotation)
-            u = torch.from_numpy(answer.displacement) / scene.length
-            errors.append(float((u - exact).norm() / whole))
-            patch = RigidPatch.of(scene.linear, small.region, [True] * 3)
-            goal = patch.displacement([x / scene.length for x in small.translation], small.rotation)
-            own = scene.linear.solve(patch.at(patch.stiffness_times(goal)))
-            linear.append(float((own - exact).norm() / whole))
-        rows.append(Amplitude(factor, median(errors), median(linear)))
-    return rows
+    errors: dict[float, list[tuple[float, float]]] = {}
+    for grasp in grasps:
+        for factor in (2.0**-k for k in range(HALVINGS + 1)):
+            if (pair := _errors_of_prediction(gripper, grasp, factor)) is not None:
+                errors.setdefault(factor, []).append(pair)
+    columns = {factor: zip(*pairs, strict=True) for factor, pairs in errors.items()}
+    return [Amplitude(factor, *map(median, both)) for factor, both in columns.items()]
+
+
+def _errors_of_prediction(
+    gripper: Gripper, grasp: Grasp, factor: float
+) -> tuple[float, float] | None:
+    """Return the errors of the network and of the linear solution, over the whole displacement.
+
+    None without a reference solution.
+    """
+    scene = gripper.scene
+    patch = gripper.patch(grasp.region, [True] * 3, torch.zeros(1, 0).double())
+    small = grasp.scaled(factor)
+    known, whole = references(scene, patch, small), references(scene, patch, grasp)
+    if known is None or whole is None:
+        return None
+    exact, size = known[-1].displacement, whole[-1].displacement.norm()
+    answer = gripper(small.region, small.translation, small.rotation, steps=0)
+    goal = patch.displacement([x / scene.length for x in small.translation], small.rotation)
+    linear = scene.linear.solve(patch.at(patch.stiffness_times(goal)))
+    u = torch.from_numpy(answer.displacement) / scene.length
+    return float((u - exact).norm() / size), float((linear - exact).norm() / size)
 
 
 def slope(rows: Sequence[Amplitude]) -> float:

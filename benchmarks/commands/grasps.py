@@ -19,14 +19,16 @@ KEYS = (
 def main(cfg: DictConfig) -> None:
     """Measure random grasps: motion, displacement, reactions, estimated error and times."""
     from benchmarks import grasps
-    from dpl import Simulator, config
+    from dpl import config
     from dpl.evaluation.tables import show, write, write_machine
+    from dpl.inference.grasp import Gripper
+    from dpl.models.newton_choice import MAX_STEPS
     from dpl.system.threads import one_thread
 
     _, surrogate = config.load_run(cfg.run)
     if surrogate.scene.problem.shape[1] != 3:
         raise config.ConfigError(f"run = {cfg.run} must have a body in 3D")
-    simulator, stem = Simulator(surrogate), Path(cfg.folder) / cfg.name
+    gripper, stem = Gripper(surrogate, steps=MAX_STEPS), Path(cfg.folder) / cfg.name
     every = list(grasps.random_grasps(surrogate.scene, cfg.count, cfg.seed))
 
     def say(number: int) -> None:
@@ -34,8 +36,8 @@ def main(cfg: DictConfig) -> None:
             print(f"{number} of {cfg.count} grasps", flush=True)
 
     with one_thread():
-        rows, unknown = grasps.measure(simulator, every, say)
-        amplitudes = grasps.against_amplitude(simulator, every[: cfg.amplitudes])
+        rows, unknown = grasps.measure(gripper, every, say)
+        amplitudes = grasps.against_amplitude(gripper, every[: cfg.amplitudes])
     show(rows, f"{cfg.count - unknown} random grasps, 1 thread")
     print(f"without a solution by Newton's method from rest, left out: {unknown}")
     print(f"slope of the error of the network in the amplitude: {grasps.slope(amplitudes):.2f}")

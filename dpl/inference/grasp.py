@@ -24,7 +24,7 @@ from dpl.system.threads import one_thread
 from dpl.training import Surrogate
 
 MAX_ITER = 16  # predictions of the network for one part of a motion
-PARTS = 2, 4, 8  # numbers of parts into which a motion is divided if that is necessary
+PARTS = 2, 4  # numbers of parts into which a motion is divided if that is necessary
 CORRECTED = 1e-3  # change of a displacement below which its correction ends, over its norm [-]
 MAX_PATCHES = 8  # patches whose compliance and held body are kept
 MEMORY = 8  # iterations from which Anderson's method extrapolates
@@ -144,7 +144,10 @@ def predicted_forces(
     """Return forces of the gripper that move the patch as prescribed, through a network.
 
     The forces of the whole motion are sought first. If they are not found, the motion is divided
-    into 2, 4 and 8 parts; the forces of each part start those of the next.
+    into 2 and then into 4 parts; the forces of each part start those of the next.
+
+    Forces keep their direction while the body moves. An equilibrium that is stable only as long as
+    the gripper holds the patch, such as a column that it shortens beyond buckling, is not found.
 
     Args:
         patch: The patch.
@@ -219,13 +222,13 @@ def evaluated(
     Args:
         patch: The patch.
         goal: Its displacement, (m,) [-].
-        load: Other forces on the body, B = 1.
+        load: Other forces on the body, B = 1, without parameters of the law.
         newton: Newton's method of the held body.
         candidate: The state.
     """
     method, state, force = candidate
     u = state.displacement
-    evaluation = newton.problem.with_parameters(load.parameters).evaluate(u)
+    evaluation = newton.problem.evaluate(u)
     missed = patch.at(goal - patch.of_field(u[0])).norm(dim=1).max()
     largest = patch.at(goal).norm(dim=1).max().clamp(min=1e-300)
     error = corotational_error(newton.linear_solver, load, u, evaluation)
@@ -304,8 +307,12 @@ class Gripper:
         parameters: Mapping[str, float] | ArrayLike | None = None,
         tol: float | None = None,
         warm: bool = False,
+        steps: int | None = None,
     ) -> GraspAnswer:
-        """Return the displacement of the body with a grasped patch; see `Simulator.grasp`."""
+        """Return the displacement of the body with a grasped patch; see `Simulator.grasp`.
+
+        `steps` replaces the attribute if it is given.
+        """
         begin = time.perf_counter()
         if (tolerance := as_number("tol", tol)) is not None:
             check_tol(tolerance)
@@ -318,10 +325,11 @@ class Gripper:
             start = self._last[1] if warm and self._last and self._last[0] is patch else None
             forces = predicted_forces(patch, path, lambda own: self._predict(load, own), start)
             self._last = patch, forces.force
-            every = candidates(load, newton, forces, self.steps)
-            held = evaluated(patch, goal, load, newton, next(every))
+            own = Load(load.force, load.young)  # the body of Newton's method has the parameters
+            every = candidates(own, newton, forces, self.steps if steps is None else steps)
+            held = evaluated(patch, goal, own, newton, next(every))
             if tolerance is not None and not held.is_exact:
-                solved = evaluated(patch, goal, load, newton, next(every))
+                solved = evaluated(patch, goal, own, newton, next(every))
                 held = min(held, solved, key=lambda one: one.rank)
             place = RangeCheck.of(
                 self.surrogate, load._replace(force=load.force + patch.at(held.force))
@@ -360,17 +368,25 @@ class Gripper:
                 f"translation = {moves}, rotation = {turn.tolist()} must be {dim} lengths [m] and "
                 f"{count} angles [rad], all finite"
             )
-        linear = scene.linear.with_parameters(load.parameters)
-        patch = RigidPatch.of(linear, region, [x is not None for x in moves])
-        key = patch.held.numpy().tobytes() + load.parameters.numpy().tobytes()
-        patch = self._patches.setdefault(key, patch)
-        self._patches.move_to_end(key)
-        if len(self._patches) > MAX_PATCHES:
-            self._patches.popitem(last=False)
+        patch = self.patch(region, [x is not None for x in moves], load.parameters)
         moved = lengths / scene.length
         return patch, lambda part: patch.displacement(
             (part * moved).tolist(), (part * turn).tolist()
         )
+
+    def patch(self, region: Any, directions: Sequence[bool], parameters: Tensor) -> RigidPatch:
+        """Return a patch, one of the last `MAX_PATCHES` or a new one; see `RigidPatch.of`.
+
+        `parameters` are those of the law, (1, P).
+        """
+        linear = self.scene.linear.with_parameters(parameters)
+        patch = RigidPatch.of(linear, region, directions)
+        key = patch.held.numpy().tobytes() + parameters.numpy().tobytes()
+        patch = self._patches.setdefault(key, patch)
+        self._patches.move_to_end(key)
+        if len(self._patches) > MAX_PATCHES:
+            self._patches.popitem(last=False)
+        return patch
 
     def _predict(self, load: Load, own: Tensor) -> Tensor:
         """Return the displacement (N, D) [-] under a load and forces of the gripper (N, D) [-]."""

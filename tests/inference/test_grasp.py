@@ -1,0 +1,270 @@
+"""Laws of grasps: the motion is met, the forces of the gripper are those of finite elements."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from dpl.fem import Box, DirichletBC, Load, Newton, Plane, Problem, Sphere, rectangle, solve
+from dpl.fem.solvers.rigid_patch import RigidPatch
+from dpl.inference import Simulator
+from dpl.inference.grasp import MOTION_TOL, predicted_forces
+from dpl.models import FCNN
+from dpl.training import MSE, Surrogate
+
+E = 4500.0
+L = 100.0
+END = Plane(axis=0, at="max")
+TRANSLATION = [1.0, 6.0, 3.0]  # longer: a shorter column would buckle under dead forces
+ROTATION = [0.08, 0.03, -0.05]
+ONE = torch.ones(1, dtype=torch.float64)
+
+
+def simulator_of(scene, predict=None, **more):
+    """Return a simulator whose network is a function of a load; left out: the exact solution."""
+    torch.manual_seed(0)
+    surrogate = Surrogate(FCNN(scene, width=4), MSE(), scene)
+    surrogate.predict = predict or (lambda load: solve(scene.newton, load).displacement)
+    return Simulator(surrogate, **more)
+
+
+def linear_network(scene):
+    """Return the prediction of the linear solution."""
+    return lambda load: torch.stack([scene.linear.solve(f) for f in load.force])
+
+
+@pytest.fixture(scope="module")
+def sim(scene):
+    return simulator_of(scene, linear_network(scene))
+
+
+@pytest.fixture(scope="module")
+def solved(sim):
+    return sim.grasp(END, TRANSLATION, ROTATION, tol=1e-9)
+
+
+def end_nodes(scene):
+    return scene.problem.points[:, 0] == 1
+
+
+def with_supports(scene, *supports):
+    """Return the solution of the body of a scene with moved supports, (N, D) [m]."""
+    old = scene.problem
+    body = Problem.build(
+        old.mesh.scaled(L), old.material, fixed=Plane(axis=0, at="min"), supports=supports, length=L
+    )
+    rest = torch.zeros(1, *body.shape, dtype=torch.float64)
+    state = solve(Newton(body, tol=1e-10), Load(rest, ONE))
+    assert state.converged
+    return L * state.displacement[0].numpy()
+
+
+def test_a_translated_patch_is_a_moved_support(scene, sim):
+    found = sim.grasp(END, TRANSLATION, tol=1e-9)
+    exact = with_supports(scene, DirichletBC(END, TRANSLATION))
+    assert found.converged
+    assert np.abs(found.displacement - exact).max() < 1e-7 * L
+
+
+def test_a_direction_without_a_value_is_free(scene, sim):
+    found = sim.grasp(END, [None, 6.0, None], tol=1e-9)
+    exact = with_supports(scene, DirichletBC(END, [None, 6.0, None]))
+    assert np.abs(found.displacement - exact).max() < 1e-7 * L
+    assert (found.nodal_force[:, [0, 2]] == 0).all()
+    assert abs(found.force[1]) > 0
+
+
+def test_the_patch_moves_as_a_rigid_body(scene, solved):
+    where = end_nodes(scene).numpy()
+    before = L * scene.problem.points.numpy()[where]
+    after = before + solved.displacement[where]
+    apart = lambda x: np.linalg.norm(x[:, None] - x[None], axis=-1)  # noqa: E731
+    assert np.allclose(apart(after), apart(before), atol=1e-9 * L)
+    assert np.allclose(after.mean(0) - before.mean(0), TRANSLATION, atol=1e-9 * L)
+    assert solved.motion_error < 1e-12 * L
+
+
+def test_the_gripper_balances_the_supports(scene, solved):
+    """Internal forces have no resultant and no moment about the displaced body."""
+    u = torch.from_numpy(solved.displacement)[None] / L
+    internal = (scene.problem.evaluate(u).internal[0] * E * L**2).numpy()
+    held = ~scene.problem.free.numpy()
+    assert np.allclose(
+        internal[held.any(1)].sum(0), -solved.force, atol=1e-6 * abs(solved.force).max()
+    )
+    where = end_nodes(scene).numpy()
+    assert np.allclose(internal[where], solved.nodal_force[where])
+    place = L * scene.problem.points.numpy() + solved.displacement
+    arms = place - place[where].mean(0)
+    assert np.allclose(np.cross(arms[where], internal[where]).sum(0), solved.moment)
+    assert np.allclose(np.cross(arms, internal).sum(0), 0, atol=1e-6 * abs(solved.moment).max())
+
+
+def test_an_exact_network_meets_the_motion_and_has_the_reaction(scene, solved):
+    found = simulator_of(scene, steps=0).grasp(END, TRANSLATION, ROTATION)
+    assert found.method == "network"
+    assert not found.converged, "a motion that is met to a tolerance is no equilibrium"
+    assert 0 < found.motion_error < 1e-3 * L
+    assert np.linalg.norm(found.force - solved.force) < 0.01 * np.linalg.norm(solved.force)
+    assert np.linalg.norm(found.moment - solved.moment) < 0.01 * np.linalg.norm(solved.moment)
+    wrong = np.linalg.norm(found.displacement - solved.displacement)
+    assert wrong < found.error * np.linalg.norm(solved.displacement) * 3
+    assert wrong < 0.01 * np.linalg.norm(solved.displacement)
+
+
+def test_a_correction_reduces_the_error_and_meets_the_motion(scene, solved, sim):
+    network = simulator_of(scene, linear_network(scene), steps=0)
+    raw, better = (one.grasp(END, TRANSLATION, ROTATION) for one in (network, sim))
+    assert (raw.method, better.method) == ("network", "corrected")
+    off = lambda one: np.linalg.norm(one.displacement - solved.displacement)  # noqa: E731
+    assert off(better) < 0.1 * off(raw)
+    assert better.motion_error < 1e-12 * L
+    assert better.error < raw.error
+
+
+def test_errors_of_a_linear_network_have_slope_two(scene):
+    network, errors = simulator_of(scene, linear_network(scene), steps=0), []
+    for part in (1e-2, 1e-3):
+        motion = [part * x for x in TRANSLATION], [part * x for x in ROTATION]
+        exact = network.grasp(END, *motion, tol=1e-9).displacement
+        errors.append(np.linalg.norm(network.grasp(END, *motion).displacement - exact))
+    assert math.log10(errors[0] / errors[1]) == pytest.approx(2, abs=0.1)
+
+
+def test_a_poor_network_is_reported_and_corrected(scene, solved):
+    poor = simulator_of(scene, lambda load: torch.zeros_like(load.force), steps=0)
+    found = poor.grasp(END, TRANSLATION, ROTATION)
+    assert found.motion_error > 1.0
+    assert found.error > 0.5
+    assert "unknown" in found.summary or "within about" in found.summary
+    exact = poor.grasp(END, TRANSLATION, ROTATION, tol=1e-9)
+    assert exact.converged
+    assert exact.method in ("hybrid", "full Newton")
+    assert np.abs(exact.displacement - solved.displacement).max() < 1e-6 * L
+
+
+def test_a_network_that_is_not_finite_does_not_reach_the_answer_unseen(scene, solved):
+    lost = simulator_of(scene, lambda load: torch.full_like(load.force, math.nan))
+    found = lost.grasp(END, TRANSLATION, ROTATION)
+    off = np.linalg.norm(found.displacement - solved.displacement)
+    assert np.isfinite(found.displacement).all()
+    assert found.error > off / np.linalg.norm(solved.displacement) / 3 > 0
+    exact = lost.grasp(END, TRANSLATION, ROTATION, tol=1e-9)
+    assert exact.converged
+    assert np.abs(exact.displacement - solved.displacement).max() < 1e-6 * L
+
+
+def test_a_motion_whose_forces_are_not_found_is_divided_into_parts(scene):
+    patch = RigidPatch.of(scene.linear, END, [True] * 3)
+    path = lambda part: patch.displacement([0, 0.05 * part, 0], [0, 0, 0])  # noqa: E731
+    sizes = []
+
+    def predict(force):
+        sizes.append(float(force.norm()))
+        return scene.linear.solve(force) * (1.0 if len(sizes) > 1 else math.nan)
+
+    found = predicted_forces(patch, path, predict)
+    assert found.found
+    assert found.predictions == len(sizes) == 3
+    assert np.allclose(sizes, sizes[0] * np.array([1, 0.5, 1]))
+    assert (patch.of_field(found.field) - path(1.0)).abs().max() <= MOTION_TOL * 0.05
+
+
+def test_a_warm_start_needs_fewer_predictions(scene):
+    sim = simulator_of(scene, steps=0)
+    cold = sim.grasp(END, TRANSLATION, ROTATION)
+    again = sim.grasp(END, TRANSLATION, ROTATION, warm=True)
+    assert again.iterations == 1 < cold.iterations
+    other = sim.grasp(Sphere([100, 25, 25], 10.0), [0, 1.0, 0], warm=True)
+    assert other.motion_error < MOTION_TOL * 1.01, "forces of another patch are not used"
+
+
+def test_reactions_scale_with_youngs_modulus_and_displacements_do_not(make_scene):
+    sim = simulator_of(make_scene(young=[1000.0, 9000.0]))
+    soft, stiff = (sim.grasp(END, TRANSLATION, young=E, tol=1e-9) for E in (1000.0, 9000.0))
+    assert np.allclose(soft.displacement, stiff.displacement, atol=1e-9 * L)
+    assert np.allclose(9 * soft.force, stiff.force, rtol=1e-6)
+
+
+def test_parameters_of_the_law_are_those_of_the_call(make_scene):
+    sim = simulator_of(make_scene(poisson=[0.2, 0.4]))
+    one = simulator_of(make_scene(poisson=0.4))
+    found = sim.grasp(END, TRANSLATION, parameters={"poisson": 0.4}, tol=1e-9)
+    exact = one.grasp(END, TRANSLATION, tol=1e-9)
+    assert found.converged
+    assert np.abs(found.displacement - exact.displacement).max() < 1e-7 * L
+    other = sim.grasp(END, TRANSLATION, parameters={"poisson": 0.2}, tol=1e-9)
+    assert np.abs(other.displacement - exact.displacement).max() > 1e-3
+
+
+def test_further_forces_act_at_the_same_time(scene, sim):
+    load = np.zeros(scene.problem.shape)
+    load[scene.problem.points[:, 0] == 0.5, 2] = 1000.0
+    found = sim.grasp(END, [0, 0, 0], force=load, tol=1e-9)
+    assert found.converged
+    u = torch.from_numpy(found.displacement)[None] / L
+    rest = (scene.problem.evaluate(u).internal[0] * E * L**2).numpy() - load
+    free = scene.problem.free & ~end_nodes(scene)[:, None]
+    assert abs(rest[free.numpy()]).max() < 1e-6 * abs(load).max()
+    assert abs(found.displacement[end_nodes(scene).numpy()]).max() == 0
+    assert abs(found.displacement).max() > 1e-3
+
+
+def test_a_mask_of_nodes_is_a_patch_too(scene, sim):
+    mask = end_nodes(scene).numpy()
+    assert np.array_equal(
+        sim.grasp(mask, TRANSLATION, tol=1e-6).displacement,
+        sim.grasp(END, TRANSLATION, tol=1e-6).displacement,
+    )
+
+
+def test_supports_in_the_region_stay_where_they_are(scene, sim):
+    side = Plane(axis=1, at="max")
+    found = sim.grasp(side, [0.0, 1.0, 0.0], tol=1e-9)
+    fixed = ~scene.problem.free.any(dim=1).numpy()
+    assert found.converged
+    assert (found.displacement[fixed] == 0).all()
+
+
+def test_a_body_in_the_plane_turns_by_an_angle(make_scene):
+    scene = make_scene(mesh=rectangle((100.0, 25.0), (5, 3)))
+    sim = simulator_of(scene)
+    end = Plane(axis=0, at="max")
+    found = sim.grasp(end, [0.0, 5.0], 0.2, tol=1e-9)
+    where = (scene.problem.points[:, 0] == 1).numpy()
+    x = L * scene.problem.points.numpy()[where]
+    arms = x - x.mean(0)
+    turned = arms @ np.array([[np.cos(0.2), np.sin(0.2)], [-np.sin(0.2), np.cos(0.2)]])
+    assert found.converged
+    assert np.allclose(found.displacement[where], turned - arms + [0, 5.0], atol=1e-9 * L)
+    assert found.force.shape == (2,)
+    assert found.moment.shape == (1,)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda sim: sim.grasp(Sphere([1e4, 0, 0], 1.0), [0, 0, 0]), "no node"),
+        (lambda sim: sim.grasp(Plane(axis=0, at="min"), [0, 0, 1.0]), "free to move"),
+        (lambda sim: sim.grasp(Box([40, 10, 10], [60, 14, 14]), [0, 0, 1.0]), "boundary"),
+        (lambda sim: sim.grasp(END, [0, 1.0]), "3 lengths"),
+        (lambda sim: sim.grasp(END, [0, math.nan, 0]), "finite"),
+        (lambda sim: sim.grasp(END, [None, None, None]), "hold"),
+        (lambda sim: sim.grasp(END, [0, 0, 0], 0.3), "angles"),
+        (lambda sim: sim.grasp(END, [0, 0, 0], force=[[1.0]]), "force"),
+        (lambda sim: sim.grasp(END, [0, 0, 0], force=np.zeros((2, 45, 3))), "one load"),
+        (lambda sim: sim.grasp(END, [0, 0, 0], tol=2.0), "tol"),
+        (lambda sim: sim.grasp(np.ones(3, dtype=bool), [0, 0, 0]), "mask"),
+        (lambda sim: sim.grasp(END, [0, 0, "a"]), "real numbers"),
+        (lambda sim: sim.grasp(END, [0, 0, 0], young=-1.0), "young"),
+    ],
+)
+def test_invalid_arguments_are_refused_in_one_line(sim, call, words):
+    with pytest.raises(ValueError, match=words) as raised:
+        call(sim)
+    assert "\n" not in str(raised.value)
+
+
+def test_forces_unlike_the_training_are_out_of_distribution(sim):
+    assert sim.grasp(END, [0, 0, 30.0]).out_of_distribution
