@@ -20,6 +20,8 @@ from dpl.visualization import DPI, STYLE
 
 RADII = 0.05, 0.15  # smallest and largest radius of a patch over L [-]
 LOADS = 32  # training loads whose largest energy is that of the largest grasp
+MAX_TRIES = 20  # patches that are drawn for each grasp
+SINGULAR = 1e-9  # smallest over largest stiffness of a patch that can be turned [-]
 HALVINGS = 6  # of the amplitude of the grasps whose errors are drawn against it
 WRONG = 0.01  # relative error of a displacement from which it must be reported [-]
 REPORTED = 1 / 3  # smallest ratio of an estimated error to the error that counts as a report [-]
@@ -106,21 +108,31 @@ def random_grasps(scene: Scene, count: int, seed: int = 0) -> Iterator[Grasp]:
         scene: The body and its training loads.
         count: Number of grasps.
         seed: Of the random numbers.
+
+    Raises:
+        ValueError: The mesh is too coarse: patches have fewer than three nodes.
     """
     rng, problem = np.random.default_rng(seed), scene.problem
     loads = scene.loads.sample((seed, 9), range(LOADS)).force
     largest = max(float((f * scene.linear.solve(f)).sum()) for f in loads)
     centres = np.flatnonzero(scene.loads.loadable_dofs.all(dim=1).numpy())
     places = (problem.points.numpy() + problem.origin) * problem.length
-    for _ in range(count):
+    found = 0
+    for _ in range(MAX_TRIES * count):
         radius = rng.uniform(*RADII) * problem.length
         region = Sphere(places[rng.choice(centres)].tolist(), radius)
         patch = RigidPatch.of(scene.linear, region, [True] * 3)
+        values, vectors = np.linalg.eigh(rigid_stiffness(patch))
+        if values[0] < SINGULAR * values[-1]:  # fewer than three nodes, or all on one line
+            continue
         direction = rng.standard_normal(6)
         direction *= math.sqrt(largest) * rng.uniform() / np.linalg.norm(direction)
-        values, vectors = np.linalg.eigh(rigid_stiffness(patch))
         motion = vectors @ (vectors.T @ direction / np.sqrt(values))
         yield Grasp(region, (problem.length * motion[:3]).tolist(), motion[3:].tolist())
+        found += 1
+        if found == count:
+            return
+    raise ValueError(f"only {found} of {count} patches of this mesh can be turned; refine it")
 
 
 def rigid_stiffness(patch: RigidPatch) -> np.ndarray:

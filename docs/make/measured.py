@@ -66,6 +66,20 @@ PARTS = (
         tabulated=False,
     ),
     Part(
+        "grasps",
+        "Grasps",
+        "python scripts/grasps.py run=runs/beam_nh_loss/unrolled",
+        "Random grasps of the paper's beam: largest error of the motion over L, relative errors of "
+        "displacement, force and moment of the gripper; `silent` counts errors above 1 % that the "
+        "estimated error does not report.",
+    ),
+    Part(
+        "grasps_amplitude",
+        "Grasps of decreasing amplitude",
+        "python scripts/grasps.py run=runs/beam_nh_loss/unrolled",
+        "Median errors of the displacement, over its norm at the amplitude 1.",
+    ),
+    Part(
         "transfer",
         "Networks on other families of loads",
         "python scripts/transfer.py run=runs/families",

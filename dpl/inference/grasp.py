@@ -26,7 +26,7 @@ from dpl.training import Surrogate
 MAX_ITER = 16  # predictions of the network for one part of a motion
 PARTS = 2, 4  # numbers of parts into which a motion is divided if that is necessary
 CORRECTED = 1e-3  # change of a displacement below which its correction ends, over its norm [-]
-MAX_PATCHES = 8  # patches whose compliance and held body are kept
+MAX_PATCHES = 2  # patches whose compliance and held body are kept
 MEMORY = 8  # iterations from which Anderson's method extrapolates
 EXACT = 1e-12  # error of a motion that counts as met exactly [-]
 MOTION_TOL = 1e-3  # error of the motion at which they end, over its largest displacement [-]

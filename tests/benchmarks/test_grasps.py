@@ -1,0 +1,86 @@
+"""Laws of the benchmark of grasps."""
+
+import csv
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import grasps
+from dpl.fem.solvers.rigid_patch import RigidPatch
+from dpl.inference.grasp import Gripper
+from dpl.models import FCNN
+from dpl.training import MSE, Surrogate
+
+TINY = ["mesh.nodes=[5,3,3]", "data.train=16", "data.val=4", "data.test=3", "data.workers=0"]
+
+
+@pytest.fixture(scope="module")
+def gripper(scene):
+    """Gripper whose network is the linear solution."""
+    surrogate = Surrogate(FCNN(scene, width=4), MSE(), scene)
+    surrogate.predict = lambda load: torch.stack([scene.linear.solve(f) for f in load.force])
+    return Gripper(surrogate, steps=6)
+
+
+@pytest.fixture(scope="module")
+def some(scene):
+    return list(grasps.random_grasps(scene, 4))
+
+
+def test_grasps_depend_on_the_seed_alone(scene, some):
+    assert list(grasps.random_grasps(scene, 4)) == some
+    assert list(grasps.random_grasps(scene, 2, seed=1)) != some[:2]
+
+
+def test_the_linear_energy_is_at_most_that_of_the_training(scene, some):
+    loads = scene.loads.sample((0, 9), range(grasps.LOADS)).force
+    largest = max(float((f * scene.linear.solve(f)).sum()) for f in loads)
+    for grasp in some:
+        patch = RigidPatch.of(scene.linear, grasp.region, [True] * 3)
+        motion = np.concatenate([np.array(grasp.translation) / scene.length, grasp.rotation])
+        energy = motion @ grasps.rigid_stiffness(patch) @ motion
+        assert 0 < energy <= largest * (1 + 1e-6)
+
+
+def test_better_methods_have_smaller_errors(gripper, some):
+    rows, unknown = grasps.measure(gripper, some)
+    network, corrected, hybrid, newton = sorted(rows, key=lambda row: -row.rel_L2_median)
+    assert unknown == 0
+    assert network.method == "network"
+    assert corrected.method == "corrected"
+    assert {hybrid.method, newton.method} == {"hybrid to 1e-6", grasps.NEWTON}
+    assert network.motion_worst > 0 == corrected.motion_worst
+    assert hybrid.converged == newton.converged == 100
+    assert hybrid.force_worst < 1e-5
+    assert all(row.silent == 0 for row in rows)
+    assert all(row.count == 4 for row in rows)
+
+
+def test_an_error_that_is_not_reported_is_counted():
+    row = [0.5, 0.0, 0.0, 0.0, 1.0, 0.5, 1.0, 1.0]  # error and estimate agree
+    silent = [0.5, 0.0, 0.0, 0.0, 1.0, 0.1, 1.0, 1.0]
+    unknown = [0.5, 0.0, 0.0, 0.0, 1.0, np.nan, 1.0, 1.0]
+    assert grasps._row("a", np.array([row, silent, unknown])).silent == 2
+
+
+def test_the_error_of_a_linear_network_has_slope_two(gripper, some, tmp_path):
+    rows = grasps.against_amplitude(gripper, some)
+    assert [row.amplitude for row in rows] == [2.0**-k for k in range(grasps.HALVINGS + 1)]
+    assert grasps.slope(rows) == pytest.approx(2, abs=0.3)
+    grasps.draw(rows, tmp_path / "g.png")
+    assert (tmp_path / "g.png").stat().st_size > 1000
+
+
+def test_the_command_writes_rows_and_figure(script, tmp_path):
+    ended = script("train", "model=unrolled", *TINY, "run=runs/one", cwd=tmp_path)
+    assert ended.status == 0, ended.err
+    options = ["run=runs/one", "count=3", "amplitudes=2", "folder=out"]
+    ended = script("grasps", *options, cwd=tmp_path)
+    assert ended.status == 0, ended.err
+    assert "slope of the error of the network" in ended.out
+    with (tmp_path / "out/grasps.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["method"] for row in rows][:3] == ["network", "corrected", "hybrid to 1e-6"]
+    assert rows[2]["converged"] == "100"
+    assert (tmp_path / "out/grasps.png").is_file()
