@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from dpl import Scene
-from dpl.fem import Load, Sphere
-from dpl.fem.solvers.rigid_patch import RigidPatch
-from dpl.inference.grasp import Gripper
+from dpl.fem import Load, RigidPatch, Sphere
+from dpl.inference import Gripper
 from dpl.visualization import DPI, STYLE
 
 RADII = 0.05, 0.15  # smallest and largest radius of a patch over L [-]

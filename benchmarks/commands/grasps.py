@@ -21,7 +21,7 @@ def main(cfg: DictConfig) -> None:
     from benchmarks import grasps
     from dpl import config
     from dpl.evaluation.tables import show, write, write_machine
-    from dpl.inference.grasp import Gripper
+    from dpl.inference import Gripper
     from dpl.models.newton_choice import MAX_STEPS
     from dpl.system.threads import one_thread
 

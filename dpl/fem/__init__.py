@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from dpl.fem.solvers.linear import LinearSolver
     from dpl.fem.solvers.newton import Newton
     from dpl.fem.solvers.reference import ReferenceSolver
+    from dpl.fem.solvers.rigid_patch import RigidPatch
     from dpl.fem.solvers.solution import Load, Solution, Solver, Status, evaluate_solution, solve
     from dpl.fem.symmetry import symmetries
 else:

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from benchmarks import grasps
-from dpl.fem.solvers.rigid_patch import RigidPatch
-from dpl.inference.grasp import Gripper
+from dpl.fem import RigidPatch
+from dpl.inference import Gripper
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
 

@@ -6,8 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem import Box, DirichletBC, Load, Newton, Plane, Problem, Sphere, rectangle, solve
-from dpl.fem.solvers.rigid_patch import RigidPatch
+from dpl.fem import (
+    Box,
+    DirichletBC,
+    Load,
+    Newton,
+    Plane,
+    Problem,
+    RigidPatch,
+    Sphere,
+    rectangle,
+    solve,
+)
 from dpl.inference import Simulator
 from dpl.inference.grasp import MOTION_TOL, predicted_forces
 from dpl.models import FCNN
