@@ -5,31 +5,28 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from dpl.fem import AndersonSolver, Load, Newton, Solution, evaluate_solution
+from dpl.fem import AndersonSolver, Load, Newton, RigidPatch, Solution, evaluate_solution
 from dpl.fem.solvers import check_tol
-from dpl.fem.solvers.rigid_patch import RigidPatch
 from dpl.inference.answer import summarise
 from dpl.inference.arguments import as_load, as_number, as_numbers
 from dpl.inference.error_estimate import corotational_error
+from dpl.inference.grasp_forces import Forces, predicted_forces
 from dpl.inference.hybrid import Hybrid
 from dpl.inference.training_range import RangeCheck
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import Surrogate
 
-MAX_ITER = 16  # predictions of the network for one part of a motion
-PARTS = 2, 4  # numbers of parts into which a motion is divided if that is necessary
 CORRECTED = 1e-3  # change of a displacement below which its correction ends, over its norm [-]
 MAX_PATCHES = 2  # patches whose compliance and held body are kept
-MEMORY = 8  # iterations from which Anderson's method extrapolates
 EXACT = 1e-12  # error of a motion that counts as met exactly [-]
-MOTION_TOL = 1e-3  # error of the motion at which they end, over its largest displacement [-]
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ class GraspAnswer:
         residual: Relative residual at all other nodes [-], see `Problem.relative_residual_of`; the
             forces of the gripper count as load.
         error: Estimated relative error of the displacement [-], see `corotational_error`, plus
-            `motion_error` over the largest displacement of the patch: no bound.
+            `motion_error` over the largest displacement of the body: no bound.
         volume_ratio: min det F [-]; an element is inverted if it is not above 0.
         converged: True if the motion is met exactly, the residual is below the tolerance and no
             element is inverted.
@@ -117,103 +114,6 @@ class Held(NamedTuple):
         return not self.is_exact, self.error
 
 
-class Forces(NamedTuple):
-    """Forces of a gripper with the prediction of a network under them.
-
-    Attributes:
-        force: At held degrees of freedom, (m,) [-].
-        field: Displacement, (N, D) [-].
-        gap: Largest entry of the difference between its patch and the goal [-].
-        predictions: Number of predictions that were made.
-        found: True if the gap is below the tolerance.
-    """
-
-    force: Tensor
-    field: Tensor
-    gap: float
-    predictions: int
-    found: bool
-
-
-def predicted_forces(
-    patch: RigidPatch,
-    path: Callable[[float], Tensor],
-    predict: Callable[[Tensor], Tensor],
-    start: Tensor | None = None,
-) -> Forces:
-    """Return forces of the gripper that move the patch as prescribed, through a network.
-
-    The forces of the whole motion are sought first. If they are not found, the motion is divided
-    into 2 and then into 4 parts; the forces of each part start those of the next.
-
-    Forces keep their direction while the body moves. An equilibrium that is stable only as long as
-    the gripper holds the patch, such as a column that it shortens beyond buckling, is not found.
-
-    Args:
-        patch: The patch.
-        path: Function from a part of the motion in [0, 1] to the displacement of the held degrees
-            of freedom, (m,) [-].
-        predict: Function from the forces of the gripper (N, D) [-] to a displacement (N, D) [-].
-        start: Forces to start from, (m,); the linear ones if left out.
-    """
-    first = patch.stiffness_times(path(1.0)) if start is None else start
-    best = balanced_forces(patch, path(1.0), predict, first)
-    total = best.predictions
-    for parts in PARTS:
-        if best.found:
-            break
-        force = patch.stiffness_times(path(1 / parts))
-        for k in range(1, parts + 1):
-            last = balanced_forces(patch, path(k / parts), predict, force)
-            total, force = total + last.predictions, last.force * (k + 1) / k
-        best = min(best, last, key=lambda one: one.gap)
-    return best._replace(predictions=total)
-
-
-def balanced_forces(
-    patch: RigidPatch, goal: Tensor, predict: Callable[[Tensor], Tensor], force: Tensor
-) -> Forces:
-    """Return forces of the gripper under which the predicted patch is displaced by the goal.
-
-    The forces are unknowns at all held degrees of freedom. Each iteration adds the forces that
-    close the gap between predicted and prescribed displacement in the linear body; Anderson's
-    method extrapolates. Iterations end when the gap is below `MOTION_TOL` of the largest
-    displacement, or after `MAX_ITER`; the result has the smallest gap.
-
-    Source: Anderson (1965), J. ACM 12; Walker, Ni (2011), SIAM J. Numer. Anal. 49 (as a least
-    squares problem of differences).
-
-    Args:
-        patch, predict: See `predicted_forces`.
-        goal: Displacement of the held degrees of freedom, (m,) [-].
-        force: Forces to start from, (m,) [-].
-    """
-    tolerance = MOTION_TOL * float(goal.abs().max())
-    energy = patch.compliance_factor.mT  # |L^T f| is the energy norm of forces
-    best = Forces(force, torch.zeros_like(patch.problem.points), math.inf, 0, False)
-    forces: list[Tensor] = []
-    steps: list[Tensor] = []
-    for count in range(1, MAX_ITER + 1):
-        field = predict(patch.at(force))
-        gap = goal - patch.of_field(field)
-        size = float(gap.abs().max())
-        found = size <= tolerance
-        better = found or size < best.gap
-        best = (
-            Forces(force, field, size, count, found) if better else best._replace(predictions=count)
-        )
-        if found or not math.isfinite(size):
-            break
-        forces, steps = [*forces[-MEMORY:], force], [*steps[-MEMORY:], patch.stiffness_times(gap)]
-        force = force + steps[-1]
-        if len(steps) > 1:
-            changes = torch.stack(steps).diff(dim=0).mT
-            moves = torch.stack(forces).diff(dim=0).mT
-            mix = torch.linalg.lstsq(energy @ changes, energy @ steps[-1][:, None]).solution
-            force = force - ((moves + changes) @ mix)[:, 0]
-    return best
-
-
 def evaluated(
     patch: RigidPatch, goal: Tensor, load: Load, newton: Newton, candidate: Candidate
 ) -> Held:
@@ -230,7 +130,7 @@ def evaluated(
     u = state.displacement
     evaluation = newton.problem.evaluate(u)
     missed = patch.at(goal - patch.of_field(u[0])).norm(dim=1).max()
-    largest = patch.at(goal).norm(dim=1).max().clamp(min=1e-300)
+    largest = u.norm(dim=2).max().clamp(min=1e-300)
     error = corotational_error(newton.linear_solver, load, u, evaluation)
     if force is None:
         force = patch.of_field(evaluation.internal[0] - load.force[0])
@@ -278,7 +178,7 @@ def corrected(load: Load, newton: Newton, guess: Tensor, steps: int) -> Solution
 
 
 class Gripper:
-    """Grasps of a body: patches with their compliances, and the forces of the last grasp of each.
+    """Grasps of a body, with the last patches and the forces of the last grasp.
 
     Attributes:
         surrogate: The surrogate that predicts displacements.
@@ -323,7 +223,9 @@ class Gripper:
             newton = patch.newton(self.scene.corrector, goal)
             newton = newton if tolerance is None else replace(newton, tol=tolerance)
             start = self._last[1] if warm and self._last and self._last[0] is patch else None
-            forces = predicted_forces(patch, path, lambda own: self._predict(load, own), start)
+            scale = self._motion_without(patch, load)
+            predict = partial(self._predict, load)
+            forces = predicted_forces(patch, path, predict, start, scale=scale)
             self._last = patch, forces.force
             own = Load(load.force, load.young)  # the body of Newton's method has the parameters
             every = candidates(own, newton, forces, self.steps if steps is None else steps)
@@ -387,6 +289,13 @@ class Gripper:
         if len(self._patches) > MAX_PATCHES:
             self._patches.popitem(last=False)
         return patch
+
+    def _motion_without(self, patch: RigidPatch, load: Load) -> float:
+        """Return the largest displacement of the patch without the gripper, predicted [-]."""
+        if not bool(load.force.any()):
+            return 0.0
+        size = float(patch.of_field(self.surrogate.predict(load)[0]).abs().max())
+        return size if math.isfinite(size) else 0.0
 
     def _predict(self, load: Load, own: Tensor) -> Tensor:
         """Return the displacement (N, D) [-] under a load and forces of the gripper (N, D) [-]."""

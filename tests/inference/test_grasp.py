@@ -19,7 +19,7 @@ from dpl.fem import (
     solve,
 )
 from dpl.inference import Simulator
-from dpl.inference.grasp import MOTION_TOL, predicted_forces
+from dpl.inference.grasp_forces import MAX_ITER, MOTION_TOL, predicted_forces
 from dpl.models import FCNN
 from dpl.training import MSE, Surrogate
 
@@ -211,6 +211,7 @@ def test_parameters_of_the_law_are_those_of_the_call(make_scene):
 def test_further_forces_act_at_the_same_time(scene, sim):
     load = np.zeros(scene.problem.shape)
     load[scene.problem.points[:, 0] == 0.5, 2] = 1000.0
+    assert simulator_of(scene, steps=0).grasp(END, [0, 0, 0], force=load).iterations < MAX_ITER
     found = sim.grasp(END, [0, 0, 0], force=load, tol=1e-9)
     assert found.converged
     u = torch.from_numpy(found.displacement)[None] / L
