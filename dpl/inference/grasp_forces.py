@@ -11,7 +11,7 @@ from dpl.fem import RigidPatch
 
 MOTION_TOL = 1e-3  # largest error of a motion that is accepted, over its size [-]
 MAX_ITER = 16  # predictions for one part of a motion
-PARTS = 2, 4  # numbers of parts into which a motion is divided if that is necessary
+PARTS = 2, 4, 8  # numbers of parts into which a motion is divided if that is necessary
 MEMORY = 8  # iterations from which Anderson's method extrapolates
 
 
@@ -44,7 +44,7 @@ def predicted_forces(
     """Return forces of the gripper that move the patch as prescribed, through a network.
 
     The forces of the whole motion are sought first. If they are not found, the motion is divided
-    into 2 and then into 4 parts; the forces of each part start those of the next.
+    into 2, 4 and 8 parts; the forces of each part start those of the next.
 
     Forces keep their direction while the body moves. An equilibrium that is stable only as long as
     the gripper holds the patch, such as a column that it shortens beyond buckling, is not found.
