@@ -24,7 +24,7 @@ from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import Surrogate
 
-CORRECTED = 1e-3  # change of a displacement below which its correction ends, over its norm [-]
+CORRECTED = 3e-4  # change of a displacement below which its correction ends, over its norm [-]
 MAX_PATCHES = 2  # patches whose compliance and held body are kept
 EXACT = 1e-12  # error of a motion that counts as met exactly [-]
 
