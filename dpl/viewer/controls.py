@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 from viser import ViserServer
 
 from dpl.fem import HasModes
@@ -13,6 +15,13 @@ from dpl.viewer.units import round_step, unit_for
 
 LABELS = {"poisson": "Poisson's ratio"}  # of parameters
 NETWORK, BUDGET = "network", "best within the budget"
+PULL, GRASP = "pull", "grasp"
+ABOUT = {
+    PULL: "Drag the body to pull it. Click it to place the loaded patch.",
+    GRASP: "Drag the body to move a patch of it as a rigid body. Click it to grasp another patch.",
+}
+RADIUS = {PULL: 0.4, GRASP: 0.15}  # of the patch over L, at first [-]
+AXES = {"x": 0, "y": 1, "z": 2}
 METHODS = {NETWORK: None, **{f"residual below {tol:.0e}": tol for tol in TOLERANCES}}
 
 
@@ -20,13 +29,16 @@ class Controls:
     """Widgets of the panel.
 
     Attributes:
-        radius, direction, amplitude, unlimited, uniform: The patch load.
+        mode: Mode of a drag, `PULL` or `GRASP`.
+        radius: Radius of the patch over L; each mode has its own.
+        direction, amplitude, unlimited, uniform: The patch load, visible in the mode `PULL`.
+        axis, angle: Rotation of the patch, visible in the mode `GRASP`; in 2D there is no axis.
         young: Slider of Young's modulus, in a unit with prefix; `modulus` is its value in Pa.
         parameters: Sliders of the parameters of the law with a range, by name.
         sample, reset, fit: Buttons for a random load, for no load and for the camera.
         method, budget, galerkin, quantity, edges, show_newton: Method and display.
         record, save: Buttons of the recording.
-        of_load, of_moduli, of_settings: The widgets that change load, moduli or settings.
+        of_load, of_moduli, of_settings: The widgets that change load or grasp, moduli or settings.
         follows_frame: True while a drag or a random load determines the load, so that the slider
             shows the amplitude of the frame.
     """
@@ -51,21 +63,26 @@ class Controls:
             self._state = gui.add_html(panel.message(f"Files are saved in {folder}", "inherit"))
             self.save = gui.add_button_group("save as", tuple(SUFFIXES))
         self.follows_frame = False
-        self.of_load = (self.direction, self.amplitude, self.uniform, self.radius)
+        of_patch = (self.radius, self.axis, self.angle)
+        self.of_load = (self.direction, self.amplitude, self.uniform, *of_patch)
         self.of_moduli = (self.young, *self.parameters.values())
         shown = (self.quantity, self.edges, self.show_newton)
         self.of_settings = (self.method, self.budget, self.galerkin, *shown)
 
     def _add_load_controls(self) -> None:
         gui, body, loads = self._gui, self._body, self._body.scene.loads
-        about = "Drag the body to pull it. Click it to place the loaded patch."
-        gui.add_html(panel.message(about, "inherit"))
+        self.mode = gui.add_dropdown("drag", (PULL, GRASP))
+        self._about = gui.add_html("")
         span = loads.patch_radius if isinstance(loads, HasModes) else (0.0, 1.0)
         low, high = float(span[0]), max(float(span[1]), 0.05)
-        self.radius = gui.add_slider("radius / L", 0.0, high, 0.01, min(max(0.4, low), high))
+        first = min(max(RADIUS[PULL], low), high)
+        self._radii = {PULL: first, GRASP: min(RADIUS[GRASP], high)}
+        self.radius = gui.add_slider("radius / L", 0.0, high, 0.01, first)
         upwards = (0.0, 1.0, 0.0) if body.scene.problem.shape[1] == 2 else (0.0, 0.0, 1.0)
         self.direction = gui.add_vector3("direction", upwards, step=0.1)
         self.amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
+        self.axis = gui.add_dropdown("rotation axis", tuple(AXES), initial_value="y")
+        self.angle = gui.add_slider("rotation [°]", -90.0, 90.0, 1.0, 0.0, marks=(-90, 0, 90))
         self._young_unit = unit_for(body.young, "Pa")
         low, high = (value / self._young_unit.factor for value in body.young_range)
         label, middle = f"E [{self._young_unit.name}]", body.young / self._young_unit.factor
@@ -82,6 +99,8 @@ class Controls:
         self.uniform = gui.add_checkbox("uniform force", False, hint=hint)
         self.sample = gui.add_button("Random training load")
         self.reset = gui.add_button("Reset", color="gray")
+        self._shown_mode = PULL
+        self.show_mode()
 
     def _add_method_controls(self) -> None:
         gui, galerkin = self._gui, self._body.has_galerkin
@@ -95,6 +114,25 @@ class Controls:
         self.edges = gui.add_checkbox("mesh edges", False)
         self.show_newton = gui.add_checkbox("compare Newton", False)
         self.fit = gui.add_button("Fit the view", color="gray")
+
+    def show_mode(self) -> None:
+        """Show the controls of the selected mode, with the last radius of this mode."""
+        mode = self.mode.value
+        self._about.content = panel.message(ABOUT[mode], "inherit")
+        self._radii[self._shown_mode] = self.radius.value
+        self.radius.value, self._shown_mode = self._radii[mode], mode
+        for control in (self.direction, self.amplitude, self.unlimited, self.uniform):
+            control.visible = mode == PULL
+        self.angle.visible = mode == GRASP
+        self.axis.visible = mode == GRASP and self._body.scene.problem.shape[1] == 3
+
+    @property
+    def rotation(self) -> Tensor:
+        """Rotation vector of the patch, (3,), in 2D the angle, (1,) [rad]."""
+        angle = torch.tensor([self.angle.value]).double().deg2rad()
+        if self._body.scene.problem.shape[1] == 2:
+            return angle
+        return angle * torch.eye(3, dtype=torch.float64)[AXES[self.axis.value]]
 
     @property
     def modulus(self) -> float:
@@ -140,6 +178,10 @@ class Controls:
     def show_error(self, text: str) -> None:
         """Show why a request cannot be solved; an empty text removes the message."""
         self._error.content = panel.message(text, panel.BAD)
+
+    def show_progress(self, seconds: float) -> None:
+        """Show for how long the solve in progress has taken [s]."""
+        self._error.content = panel.message(f"Solving for {seconds:.0f} s ...")
 
     def show_recording(self, recording: Recording) -> None:
         """Update the label of the record button."""

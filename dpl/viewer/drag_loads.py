@@ -1,9 +1,7 @@
-"""Modal loads on a patch of the body that move a point in a requested direction."""
+"""Patches of the body, and the modal loads on them that move a point in a requested direction."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,20 +10,6 @@ from dpl.fem import HasModes
 from dpl.scene import Scene
 
 RIDGE = 1e-2  # Tikhonov parameter over the squared compliance; limits the use of stiff modes
-
-
-class LoadRequest(NamedTuple):
-    """A load in SI units.
-
-    Attributes:
-        force: (N, D) [N], in 2D [N/m].
-        young: Young's modulus [Pa].
-        parameters: Value of each range of the law, by name.
-    """
-
-    force: Tensor
-    young: float
-    parameters: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +37,12 @@ class Patch:
         mask = (distance <= self.radius * (1 + 1e-9)) & self.scene.loads.loadable_dofs.any(dim=1)
         mask[self.node] = True
         return mask
+
+    @cached_property
+    def held_nodes(self) -> Tensor:
+        """Mask of the nodes that a gripper holds, those of the boundary that are free, (N,)."""
+        problem = self.scene.problem
+        return self.node_mask & problem.boundary & problem.free.any(dim=1)
 
     @cached_property
     def unit_loads(self) -> Tensor:

@@ -16,10 +16,10 @@ from dpl.evaluation import timing
 from dpl.fem import Load
 from dpl.viewer.animation import circular_load
 from dpl.viewer.body_node import DRAG_MESH
-from dpl.viewer.drag_loads import LoadRequest
 from dpl.viewer.frames import QUANTITIES, ViewSettings
 from dpl.viewer.page import Page
 from dpl.viewer.renderer import colour_bands
+from dpl.viewer.requests import LoadRequest
 
 TIMED_FRAMES = 40
 START_UP = 0.5  # time before frames are counted, in which the scene is sent [s]
@@ -53,8 +53,8 @@ def measure_frames(
     A client connects to the page and counts frames for `seconds` [s] per quantity.
     """
     body = page.body
-    loads = [frame.request for frame in circular_load(body)]
-    columns = zip(*map(body.load, loads), strict=True)
+    loads = [frame.load for frame in circular_load(body)]
+    columns = zip(*(load.dimensionless(body.scene) for load in loads), strict=True)
     latencies = timing.latencies(body.simulator, Load(*map(torch.cat, columns)))
     rows = []
     for quantity in QUANTITIES:

@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpl.fem import Load, Solution, moduli_of
+from dpl.fem import Solution, moduli_of
 from dpl.fem.solvers import check_tol
-from dpl.inference import Answer, Simulator
+from dpl.inference import Answer, GraspAnswer, Simulator
 from dpl.system.threads import one_thread
-from dpl.viewer.drag_loads import LoadRequest, Patch
+from dpl.viewer.drag_loads import Patch
+from dpl.viewer.requests import GraspRequest, LoadRequest, ViewRequest
 from dpl.viewer.surface import Floats, Surface
 
 STRESS, ERROR = "von Mises stress", "error against FE"
@@ -58,28 +59,42 @@ class Frame(NamedTuple):
     """A displacement and the values that are shown.
 
     Attributes:
-        request: The load.
+        request: The load or the grasp.
+        load: The load on the body; of a grasp, with the forces of the gripper.
         displacement: (N, D) [m].
         points: Deformed surface over L, (S, 3) [-].
         values: Values of the quantity on the surface, (S,), in the unit of the quantity.
         quantity: Key of `QUANTITIES`.
         answer: Result of the simulator; None for an iterate of Newton.
+        amplitude: Size of the load over the largest of the training [-]; 0 for an iterate.
         iteration: Number of the Newton iteration; -1 for a result of the simulator.
         residual: ||R_free|| / ||f|| [-].
         volume_ratio: min det F [-].
         converged: True if the residual is below the tolerance and no element is inverted.
     """
 
-    request: LoadRequest
+    request: ViewRequest
+    load: LoadRequest
     displacement: Tensor
     points: Floats
     values: Floats
     quantity: str
-    answer: Answer | None
+    answer: Answer | GraspAnswer | None
+    amplitude: float
     iteration: int
     residual: float
     volume_ratio: float
     converged: bool
+
+    @property
+    def grasp(self) -> GraspAnswer | None:
+        """Result of a grasp; None for that of a load or an iterate of Newton."""
+        return self.answer if isinstance(self.answer, GraspAnswer) else None
+
+    @property
+    def hand_force(self) -> Tensor:
+        """Forces of the hand, (N, D) [N]: those of the gripper, or the load."""
+        return self.load.force if self.grasp is None else torch.from_numpy(self.grasp.nodal_force)
 
 
 class Body:
@@ -134,6 +149,15 @@ class Body:
         Raises:
             ValueError: A value is out of its range.
         """
+        constant = self.scene.loads.constant_force
+        total = force if constant is None else force + constant
+        newtons = total * (self.young * self.scene.force_unit)
+        return LoadRequest(newtons, *self._checked_moduli(young, parameters))
+
+    def _checked_moduli(
+        self, young: float | None, parameters: Mapping[str, float] | None
+    ) -> tuple[float, dict[str, float]]:
+        """Return Young's modulus [Pa] and the parameters of the law; defaults replace None."""
         young = self.young if young is None else young
         low, high = self.young_range
         if not low * (1 - 1e-9) <= young <= high * (1 + 1e-9):
@@ -142,9 +166,7 @@ class Body:
         for name, (low, high) in self.scene.loads.parameter_ranges.items():
             if not low <= parameters[name] <= high:
                 raise ValueError(f"{name} = {parameters[name]:g} must lie between {low} and {high}")
-        constant = self.scene.loads.constant_force
-        total = force if constant is None else force + constant
-        return LoadRequest(total * (self.young * self.scene.force_unit), young, parameters)
+        return young, parameters
 
     def zero_load(
         self, young: float | None = None, parameters: Mapping[str, float] | None = None
@@ -153,6 +175,31 @@ class Body:
         force = torch.zeros(self.scene.problem.shape, dtype=torch.float64)
         return self.request(force, young, parameters)
 
+    def grasp(
+        self,
+        nodes: Tensor,
+        translation: Tensor,
+        rotation: Tensor,
+        young: float | None = None,
+        parameters: Mapping[str, float] | None = None,
+    ) -> GraspRequest:
+        """Return the request of a grasp, with the constant force of the scene.
+
+        Args:
+            nodes: Mask of the nodes of the patch, (N,).
+            translation, rotation: See `GraspRequest`.
+            young: Young's modulus [Pa].
+            parameters: Value of each range of the law, by name.
+
+        Raises:
+            ValueError: A value is out of its range, or the patch is empty.
+        """
+        if not nodes.any():
+            raise ValueError(
+                "the patch has no free node of the boundary; click another place or enlarge radius"
+            )
+        return GraspRequest(nodes, translation, rotation, self.zero_load(young, parameters))
+
     def sample(self, index: int) -> LoadRequest:
         """Return a random load of the training distribution."""
         load = self.scene.loads.sample(SAMPLE_STREAM, [index])
@@ -160,70 +207,58 @@ class Body:
         parameters = dict(zip(self.parameters, load.parameters[0].tolist(), strict=True))
         return LoadRequest(load.force[0] * young * self.scene.force_unit, young, parameters)
 
-    def load(self, request: LoadRequest) -> Load:
-        """Return the dimensionless load of a request, with B = 1."""
-        young = torch.tensor([request.young]).double()
-        parameters = torch.tensor([list(request.parameters.values())]).double()
-        return self.scene.load_of(request.force[None], young, parameters)
-
-    def solve(self, request: LoadRequest, settings: ViewSettings) -> Frame:
+    def solve(self, request: ViewRequest, settings: ViewSettings) -> Frame:
         """Return the frame of a request, computed by the simulator."""
-        answer = self._simulate(request, settings)
+        simulator = self.simulator if settings.galerkin else self._without_galerkin
+        answer = request.answer(simulator, settings.tol, settings.budget_ms)
         reference: Tensor | float = 0.0
         if settings.quantity == ERROR:
-            exact = ViewSettings(tol=self.scene.solver.tol)
-            reference = self._simulate(request, exact, warm=True).displacement
-        return self._frame(request, settings.quantity, answer.displacement, answer, reference)
-
-    def _simulate(
-        self, request: LoadRequest, settings: ViewSettings, *, warm: bool = False
-    ) -> Answer:
-        simulator = self.simulator if settings.galerkin else self._without_galerkin
-        return simulator(
-            request.force,
-            young=request.young,
-            tol=settings.tol,
-            budget_ms=settings.budget_ms,
-            warm=warm,
-            parameters=request.parameters,
-        )
+            exact = request.answer(simulator, self.scene.solver.tol, warm=True)
+            reference = torch.as_tensor(exact.displacement)
+        displacement = torch.as_tensor(answer.displacement)
+        load = request.load(answer)
+        return self._frame(request, load, settings.quantity, displacement, answer, reference)
 
     def newton_frames(
-        self, request: LoadRequest, settings: ViewSettings, reference: Frame
+        self, request: ViewRequest, settings: ViewSettings, reference: Frame
     ) -> Iterator[Frame]:
         """Yield the iterates of Newton from zero displacement; errors are against `reference`."""
         exact = reference.displacement if settings.quantity == ERROR else 0.0
+        load, quantity = reference.load, settings.quantity
         with one_thread():
-            for state in self.scene.solver.iterate(self.load(request)):
+            for state in request.newton_states(self.scene):
                 displacement = self.scene.length * state.displacement[0]
-                yield self._frame(request, settings.quantity, displacement, state, exact)
+                yield self._frame(request, load, quantity, displacement, state, exact)
 
     def _frame(
         self,
-        request: LoadRequest,
+        request: ViewRequest,
+        load: LoadRequest,
         quantity: str,
         displacement: Tensor,
-        result: Answer | Solution,
+        result: Answer | GraspAnswer | Solution,
         reference: Tensor | float,
     ) -> Frame:
         """Return the frame of displacements (N, D) [m]; values are relative to `reference`."""
         u = displacement / self.scene.length
-        answer = result if isinstance(result, Answer) else None
+        answer = None if isinstance(result, Solution) else result
         if quantity == STRESS and bool(displacement.any()):  # at rest it is zero up to rounding
             with torch.inference_mode():
-                stress = self.surface.von_mises(u, self.load(request).parameters)
-            values = request.young * stress
+                stress = self.surface.von_mises(u, load.dimensionless(self.scene).parameters)
+            values = load.young * stress
         elif quantity == STRESS:
             values = np.zeros(len(self.surface.nodes))
         else:
             values = (displacement - reference).norm(dim=1).numpy()[self.surface.nodes]
         return Frame(
             request,
+            load,
             displacement,
             self.surface.deformed_points(u),
             values,
             quantity,
             answer,
+            0.0 if answer is None else request.amplitude(answer, self.scene),
             int(result.iterations) if answer is None else -1,
             float(result.residual),
             float(result.volume_ratio),
@@ -258,11 +293,3 @@ def round_up(number: float) -> float:
     power = 10.0 ** math.floor(math.log10(number))
     steps = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
     return power * next((step for step in steps if number <= step * power * (1 + 1e-9)), 10.0)
-
-
-def interpolate(start: LoadRequest, end: LoadRequest, share: float) -> LoadRequest:
-    """Return the load at a share of the way from `start` (0) to `end` (1)."""
-    if share >= 1:
-        return end
-    force = torch.lerp(start.force, end.force, share)
-    return end._replace(force=force, young=start.young + share * (end.young - start.young))

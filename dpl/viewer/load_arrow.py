@@ -1,4 +1,4 @@
-"""Arrow of the total force of a load."""
+"""Arrow of the total force of a load or a gripper."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ def arrow_ends(surface: Surface, frame: Frame) -> Floats | None:
     The axis of the arrow passes through the centre of the nodal forces. The arrow starts where its
     axis leaves the body, so that the body does not hide it; in 2D it starts at the centre.
     """
-    force = frame.request.force.numpy()
+    force = frame.hand_force.numpy()
     total = np.pad(force.sum(axis=0), (0, 3 - force.shape[1]))
     sizes = np.linalg.norm(force, axis=1)
     if not np.linalg.norm(total) > BALANCED * sizes.sum():
@@ -27,8 +27,8 @@ def arrow_ends(surface: Surface, frame: Frame) -> Floats | None:
     weights = sizes[surface.nodes] if sizes[surface.nodes].any() else np.ones(len(points))
     centre = weights @ points / weights.sum()
     start = centre + exit_distance(points, surface.triangles, centre, direction) * direction
-    amplitude = 0.0 if frame.answer is None else float(frame.answer.amplitude)
-    length = ARROW_LENGTH[0] + ARROW_LENGTH[1] * min(max(amplitude, 0.0), MAX_AMPLITUDE)
+    amplitude = min(max(frame.amplitude, 0.0), MAX_AMPLITUDE)
+    length = ARROW_LENGTH[0] + ARROW_LENGTH[1] * amplitude
     return np.stack([start, start + length * direction])
 
 

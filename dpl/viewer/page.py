@@ -3,7 +3,6 @@
 import contextlib
 import io
 import time
-from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,23 +10,23 @@ from typing import Any
 import numpy as np
 import torch
 import viser
-from torch import Tensor
 
 from dpl.viewer import panel
 from dpl.viewer.access import AccessPolicy, check_server, serve_with
 from dpl.viewer.body_node import BodyNode, LocalServer
-from dpl.viewer.controls import Controls
-from dpl.viewer.drag_loads import LoadRequest, Patch
+from dpl.viewer.controls import GRASP, PULL, Controls
 from dpl.viewer.environment import add_environment, move_camera
 from dpl.viewer.frames import Body, ColourScale, Frame
+from dpl.viewer.hands import GraspingHand, Hand, MakeRequest, PullingHand
 from dpl.viewer.layout import Layout
 from dpl.viewer.load_marker import LoadMarker
 from dpl.viewer.recording import SUFFIXES, Recording
 from dpl.viewer.surface import Floats
 from dpl.viewer.worker import Worker
 
-Load = Callable[[float, Mapping[str, float]], LoadRequest]  # E [Pa], parameters -> request
 PICK_RADIUS = 0.02  # distance of a ray to the points that it may pick, beyond the nearest, over L
+
+SLOW = 1.0  # time of a solve from which the page shows it [s]
 
 
 class Page:
@@ -42,7 +41,7 @@ class Page:
         recording: Recording of the shown frames.
         folder: Folder of recordings.
         frame: The most recent frame, if there is one.
-        newton_frame: The most recent iterate of Newton for this load, if there is one.
+        newton_frame: The most recent iterate of Newton for this request, if there is one.
         node: Node at the centre of the patch.
     """
 
@@ -59,9 +58,9 @@ class Page:
         self.frame: Frame | None = None
         self.newton_frame: Frame | None = None
         self._error, self._changed = "", False
-        self._load: Load = body.zero_load
+        self._make_request: MakeRequest = body.zero_load
         self.node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
-        self._drag: tuple[int, Floats, Tensor] | None = None  # node, position, displacement
+        self._grabbed: Floats | None = None  # position of the mouse at the start of a drag
         self._n_samples = 0
         self.worker = Worker(body, self._show, self._show_newton, self._show_error)
         try:
@@ -70,6 +69,10 @@ class Page:
             self.close()
             raise
         self.controls = Controls(self.server, body, title, folder)
+        self._hands: dict[str, Hand] = {
+            PULL: PullingHand(body, self.controls),
+            GRASP: GraspingHand(body, self.controls),
+        }
         self.layout = Layout.of(body, self.node, self.controls.radius.value)
         self._build_scene()
         self._connect()
@@ -80,6 +83,11 @@ class Page:
     def url(self) -> str:
         """Address of the page for the browser, with the token."""
         return self._policy.url
+
+    @property
+    def hand(self) -> Hand:
+        """The selected mode of a drag."""
+        return self._hands[self.controls.mode.value]
 
     def close(self) -> None:
         """Stop worker and server."""
@@ -110,6 +118,7 @@ class Page:
             *((control, self.apply_controls) for control in controls.of_load),
             *((control, self._apply_moduli) for control in controls.of_moduli),
             *((control, self.apply_settings) for control in controls.of_settings),
+            (controls.mode, self.apply_mode),
         ):
             control.on_update(catch(callback))
         for button, callback in (
@@ -123,31 +132,17 @@ class Page:
     # --- events of the browser
 
     async def drag(self, event: Any) -> None:
-        """Load the patch so that the dragged point follows the mouse."""
+        """Pull or grasp the patch so that the dragged point follows the mouse."""
         if self.frame is None:
             return
-        if event.phase == "start" or self._drag is None:
-            position = np.asarray(event.start_position)
-            self.node = self.body.surface.nearest_node(self.frame.points, position)
-            start = self.frame.displacement[self.node] / self.body.scene.length
-            self._drag = self.node, position, start
-        node, position, start = self._drag
-        motion = np.asarray(event.end_position) - position
-        target = start + torch.from_numpy(motion[: len(start)])
+        if event.phase == "start" or self._grabbed is None:
+            self._grabbed = np.asarray(event.start_position)
+            node = self.body.surface.nearest_node(self.frame.points, self._grabbed)
+            self.node = self.hand.take(node, self.frame)
+        motion = torch.from_numpy(np.asarray(event.end_position) - self._grabbed)
         if event.phase == "end":
-            self._drag = None
-        patch = self._patch(node)
-        max_amplitude = None if self.controls.unlimited.value else 1.0
-        self._show_direction(target)
-        self._submit_force(lambda: patch().force_towards(target, max_amplitude=max_amplitude))
-
-    def _show_direction(self, target: Tensor) -> None:
-        """Set direction and, with the next frame, amplitude to those of a drag."""
-        size = float(target.norm())
-        if size > 0:
-            direction = np.pad((target / size).numpy(), (0, 3 - len(target)))
-            self.controls.direction.value = tuple(direction.round(2).tolist())
-        self.controls.follows_frame = True
+            self._grabbed = None
+        self._submit(self.hand.move(motion[: self.body.scene.problem.shape[1]]))
 
     async def click(self, event: Any) -> None:
         """Move the patch to the clicked point."""
@@ -163,15 +158,21 @@ class Page:
         self.apply_controls()
 
     def apply_controls(self, event: Any = None) -> None:
-        """Load the patch as the sliders say; values set by the server are ignored."""
+        """Load or grasp the patch as the sliders say; values set by the server are ignored."""
         if event is not None and event.client is None:
             return
-        self.controls.follows_frame = False
-        patch = self._patch(self.node)
-        dim = self.body.scene.problem.shape[1]
-        direction = torch.tensor(self.controls.direction.value[:dim]).double()
-        amplitude = self.controls.amplitude.value
-        self._submit_force(lambda: patch().force_along(direction, amplitude))
+        self._submit(self.hand.hold(self.node, self.frame))
+
+    def apply_mode(self, event: Any = None) -> None:
+        """Show the controls of the selected mode; the load or the grasp remains."""
+        self._grabbed = None
+        self._release()
+        self.controls.show_mode()
+        self._mark_patch()
+
+    def _release(self) -> None:
+        for hand in self._hands.values():
+            hand.release()
 
     def _apply_moduli(self, event: Any) -> None:
         if event.client is not None:
@@ -185,6 +186,7 @@ class Page:
         for name, value in request.parameters.items():
             self.controls.parameters[name].value = value
         self.controls.follows_frame = True
+        self._release()
         loaded = request.force.any(dim=1).numpy()[self.body.surface.nodes]
         self.node = self.body.surface.middle_node(loaded)
         self._submit(lambda young, given: request._replace(young=young, parameters=given))
@@ -193,12 +195,13 @@ class Page:
     def reset(self, event: Any) -> None:
         """Remove the load and restore the default Young's modulus."""
         self.controls.follows_frame = False
-        self.controls.amplitude.value = 0.0
+        self._release()
+        self.controls.amplitude.value = self.controls.angle.value = 0.0
         self.controls.modulus = self.body.young
         self._submit(self.body.zero_load)
 
     def apply_settings(self, event: Any) -> None:
-        """Solve and show the same load with the selected method and quantity."""
+        """Solve and show the same request with the selected method and quantity."""
         old, settings = self.worker.settings, self.controls.settings()
         if settings.quantity != old.quantity:
             self._scale = ColourScale()
@@ -247,27 +250,18 @@ class Page:
 
     # --- requests to the worker and its results
 
-    def _patch(self, node: int) -> Callable[[], Patch]:
-        """Return a function that makes the patch of a node with the values of the controls."""
-        radius, uniform = self.controls.radius.value, self.controls.uniform.value
-        return partial(self.body.patch, node, radius, uniform=uniform)
-
-    def _submit_force(self, make_force: Callable[[], Tensor]) -> None:
-        """Submit a dimensionless force (N, D), which the worker makes."""
-        self._submit(lambda *moduli: self.body.request(make_force(), *moduli))
-
-    def _submit(self, load: Load | None = None) -> None:
-        """Submit a load, or the last one, with the moduli of the sliders."""
-        self._load = self._load if load is None else load
+    def _submit(self, make_request: MakeRequest | None = None) -> None:
+        """Submit a request, or the last one, with the moduli of the sliders."""
+        self._make_request = make_request or self._make_request
         sliders = self.controls.parameters
         parameters = {name: slider.value for name, slider in sliders.items()}
-        self.worker.submit(partial(self._load, self.controls.modulus, parameters))
+        self.worker.submit(partial(self._make_request, self.controls.modulus, parameters))
         self._mark_patch()
 
     def _mark_patch(self) -> None:
         """Mark the nodes of the patch and remove the error message."""
-        node_mask = self._patch(self.node)().node_mask.numpy()
-        self._marker.mask = node_mask[self.body.surface.nodes]
+        marked = self.hand.marked_nodes(self.node).numpy()
+        self._marker.mask = marked[self.body.surface.nodes]
         self._error = ""
 
     def _show(self, frame: Frame) -> None:
@@ -290,10 +284,16 @@ class Page:
 
     def refresh(self) -> None:
         """Update the readings of the panel; to be called a few times per second."""
-        if not self._changed or self.frame is None:
-            return
+        if (seconds := self.worker.solving_time) > SLOW:
+            self.controls.show_progress(seconds)
+            self._changed = True
+        elif self._changed and self.frame is not None:
+            self._show_readings(self.frame)
+
+    def _show_readings(self, frame: Frame) -> None:
+        """Show the readings of a frame, or why it cannot be used."""
         self._changed = False
-        self.controls.show_frame(self.frame, self._scale.top, self.worker.frame_rate, self.node)
+        self.controls.show_frame(frame, self._scale.top, self.worker.frame_rate, self.node)
         self.controls.show_newton_frame(self.newton_frame, self.worker.settings.show_newton)
-        self.controls.show_error(self._error)
+        self.controls.show_error(self._error or panel.problem_of(frame))
         self.controls.show_recording(self.recording)

@@ -3,7 +3,9 @@
 import html
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from dpl.inference import GraspAnswer
 from dpl.inference.answer import relative
 from dpl.viewer.frames import QUANTITIES, Frame
 from dpl.viewer.renderer import N_BANDS, band_colours
@@ -16,10 +18,11 @@ ROW = (
     '<span style="font-variant-numeric:tabular-nums;text-align:right;{}">{}</span></div>'
 )
 BOX = '<div style="padding:2px 12px 6px;font-size:13.5px">{}</div>'
+MISSED = 0.01  # distance of a patch from the hand over the displacement that is reported [-]
 
 
 def result_table(frame: Frame, frame_rate: float, node: int) -> str:
-    """Return load, method, time, residual, range check and summary of a result of the simulator.
+    """Return forces, method, time, residual, range check and summary of a result of the simulator.
 
     `node` is the node whose displacement is shown, the centre of the patch.
     """
@@ -28,12 +31,9 @@ def result_table(frame: Frame, frame_rate: float, node: int) -> str:
     colour = GOOD if frame.converged else WARNING if frame.volume_ratio > 0 else BAD
     outside = answer.out_of_distribution
     span = f"{'outside' if outside else 'inside'}, amplitude {answer.amplitude:.2f}"
-    force = frame.request.force
-    total = engineering(float(force.sum(dim=0).norm()), "N" if force.shape[1] == 3 else "N/m")
-    moved = engineering(float(frame.displacement[node].norm()), "m")
     rows = [
-        _row("total force", total, "font-weight:600"),
-        _row("displacement at the hand", moved, "font-weight:600"),
+        *(_load_rows(frame) if frame.grasp is None else _gripper_rows(frame, frame.grasp)),
+        _row("displacement at the hand", _length(frame.displacement[node]), "font-weight:600"),
         _row("computed by", str(answer.method), "font-weight:600"),
         _row("time", f"{answer.milliseconds:.1f} ms, {frame_rate:.0f} fps"),
         _row("estimated error", relative(float(answer.error)), f"color:{colour}"),
@@ -43,12 +43,51 @@ def result_table(frame: Frame, frame_rate: float, node: int) -> str:
             f"color:{colour}",
         ),
         _row("min det F", f"{frame.volume_ratio:.3f}"),
-        _row("linear solves", f"{answer.iterations}"),
+        _row("linear solves" if frame.grasp is None else "iterations", f"{answer.iterations}"),
         _row("training range", span, f"color:{BAD if outside else GOOD}"),
         f'<div style="margin-top:6px;padding:6px 9px;border-radius:6px;border-left:3px solid '
         f'{colour};background:{colour}14;line-height:1.35">{html.escape(answer.summary)}</div>',
     ]
     return BOX.format("".join(rows))
+
+
+def _load_rows(frame: Frame) -> list[str]:
+    """Return the total force of a load."""
+    return [_row("total force", _force(frame.load.force.sum(dim=0)), "font-weight:600")]
+
+
+def _gripper_rows(frame: Frame, grasp: GraspAnswer) -> list[str]:
+    """Return force and moment of the gripper, and the distance of the patch from the hand."""
+    moment = float(np.linalg.norm(grasp.moment))
+    unit = "N m" if len(grasp.moment) == 3 else "N"
+    return [
+        _row("force of the gripper", _force(grasp.force), "font-weight:600"),
+        _row("moment of the gripper", engineering(moment, unit), "font-weight:600"),
+        _row("motion error", engineering(grasp.motion_error, "m")),
+    ]
+
+
+def _force(force: ArrayLike) -> str:
+    """Return the size of a force (D,) [N]."""
+    components = np.asarray(force)
+    unit = "N" if len(components) == 3 else "N/m"
+    return engineering(float(np.linalg.norm(components)), unit)
+
+
+def _length(vector: ArrayLike) -> str:
+    """Return the length of a vector [m]."""
+    return engineering(float(np.linalg.norm(np.asarray(vector))), "m")
+
+
+def problem_of(frame: Frame) -> str:
+    """Return why a frame cannot be used, in one line; empty if it can."""
+    if not frame.volume_ratio > 0:
+        return "Not valid: an element is inverted. Move the hand back."
+    missed = 0.0 if frame.grasp is None else frame.grasp.motion_error
+    if not missed > MISSED * float(frame.displacement.norm(dim=1).max()):
+        return ""
+    apart = engineering(missed, "m")
+    return f"The patch is {apart} away from the hand. Move it back, or select a residual as method."
 
 
 def newton_table(frame: Frame | None) -> str:

@@ -75,7 +75,7 @@ class Recording:
         path = self._free_path(folder, ".pvd")
         files = []
         for number, (time, frame) in enumerate(self.frames()):
-            load = self.body.load(frame.request)
+            load = frame.load.dimensionless(scene)
             with torch.inference_mode():
                 fields = nodal_fields(scene, load, frame.displacement / scene.length)
             files.append((time, f"{path.stem}/frame_{number:04d}.vtu"))

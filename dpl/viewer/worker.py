@@ -1,4 +1,4 @@
-"""Thread that solves the most recent load request; earlier requests are dropped."""
+"""Thread that solves the most recent request; earlier requests are dropped."""
 
 import math
 import threading
@@ -6,18 +6,18 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from dpl.viewer.drag_loads import LoadRequest
-from dpl.viewer.frames import Body, Frame, ViewSettings, interpolate
+from dpl.viewer.frames import Body, Frame, ViewSettings
+from dpl.viewer.requests import ViewRequest, distance, interpolate, scale_of
 
-MakeRequest = Callable[[], LoadRequest]
-ARRIVED = 1e-3  # relative distance below which the next load is the requested one
+MakeRequest = Callable[[], ViewRequest]
+ARRIVED = 1e-3  # relative distance below which the next frame is the requested one
 
 
 class Worker(threading.Thread):
-    """Thread that solves loads on the way to the most recent request.
+    """Thread that solves loads and grasps on the way to the most recent request.
 
-    A browser sends drag events 20 times per second. Loads are smoothed exponentially in time, so
-    that the body is drawn up to `max_rate` times per second; each frame is solved.
+    A browser sends drag events 20 times per second. Loads and motions are smoothed exponentially in
+    time, so that the body is drawn up to `max_rate` times per second; each frame is solved.
 
     Attributes:
         body: The body.
@@ -39,7 +39,7 @@ class Worker(threading.Thread):
         Args:
             body: The body.
             on_frame: Receives each frame.
-            on_newton: Receives each iterate of Newton; None when a new load is solved.
+            on_newton: Receives each iterate of Newton; None when a new request is solved.
             on_error: Receives the message of a request that cannot be solved.
             max_rate: Largest number of frames per second [1/s].
             smoothing_time: Time constant of the smoothing [s]; 0: no smoothing.
@@ -54,6 +54,7 @@ class Worker(threading.Thread):
         self._settings = ViewSettings()
         self._submitted, self._finished, self._stopped = 1, 0, False  # counts of requests
         self._times: deque[float] = deque(maxlen=240)
+        self._begin: float | None = None  # of the solve in progress [s]
 
     def submit(
         self, make_request: MakeRequest | None = None, settings: ViewSettings | None = None
@@ -76,6 +77,12 @@ class Worker(threading.Thread):
         times = list(self._times)
         return float(sum(times[-1] - then < 1.0 for then in times))
 
+    @property
+    def solving_time(self) -> float:
+        """Time since the solve in progress began [s]; 0 if there is none."""
+        begin = self._begin
+        return 0.0 if begin is None else time.monotonic() - begin
+
     def wait(self, timeout: float) -> bool:
         """Wait until the most recent request is finished; return False after `timeout` [s]."""
         with self._changed:
@@ -91,7 +98,7 @@ class Worker(threading.Thread):
 
     def run(self) -> None:
         """Solve requests until `stop`."""
-        current: LoadRequest | None = None
+        current: ViewRequest | None = None
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._stopped or self._finished != self._submitted)
@@ -99,6 +106,7 @@ class Worker(threading.Thread):
                     return
                 number, make_request = self._submitted, self._make_request
                 settings = self._settings
+            self._begin = time.monotonic()
             try:
                 current = self._solve(number, make_request(), settings, current)
             except Exception as error:  # one failed request must not end the thread
@@ -106,18 +114,18 @@ class Worker(threading.Thread):
                 self._finish(number)
 
     def _solve(
-        self, number: int, goal: LoadRequest, settings: ViewSettings, current: LoadRequest | None
-    ) -> LoadRequest:
-        """Solve loads from `current` to `goal` until a newer request; return the last load."""
-        if current is None or self._smoothing_time <= 0:
+        self, number: int, goal: ViewRequest, settings: ViewSettings, current: ViewRequest | None
+    ) -> ViewRequest:
+        """Solve from `current` to `goal` until a newer request; return what was solved last."""
+        if current is None or self._smoothing_time <= 0 or not goal.continues(current):
             current = goal
-        size = max(float(current.force.norm()), float(goal.force.norm())) or 1.0
+        scale = scale_of(current, goal)
         self._on_newton(None)
         start = time.monotonic()
         while True:
-            arrived = _distance(current, goal, size) < ARRIVED
+            arrived = distance(current, goal, scale) < ARRIVED
             current = interpolate(current, goal, 1.0 if arrived else self._smoothing(start))
-            start = time.monotonic()
+            self._begin = start = time.monotonic()
             frame = self.body.solve(current, settings)
             self._times.append(time.monotonic())
             self._on_frame(frame)
@@ -125,6 +133,7 @@ class Worker(threading.Thread):
                 break
             if self._is_replaced(number, start + 1 / self._max_rate - time.monotonic()):
                 return current
+        self._begin = None
         if settings.show_newton:
             for iterate in self.body.newton_frames(goal, settings, frame):
                 if self._is_replaced(number, 0.0):
@@ -148,12 +157,7 @@ class Worker(threading.Thread):
             )
 
     def _finish(self, number: int) -> None:
+        self._begin = None
         with self._changed:
             self._finished = number
             self._changed.notify_all()
-
-
-def _distance(request: LoadRequest, goal: LoadRequest, size: float) -> float:
-    """Return the larger of the differences of forces over `size` and of E over the goal's [-]."""
-    force = float((goal.force - request.force).norm()) / size
-    return max(force, abs(goal.young - request.young) / goal.young)

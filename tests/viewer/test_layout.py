@@ -125,7 +125,7 @@ def test_there_is_no_arrow_without_a_total_force(body):
     frame = body.solve(body.zero_load(), ViewSettings())
     force = torch.zeros_like(frame.request.force)
     force[-1, 2], force[-2, 2] = 1.0, -1.0
-    balanced = frame._replace(request=frame.request._replace(force=force))
+    balanced = frame._replace(load=frame.load._replace(force=force))
     assert arrow_ends(body.surface, balanced) is None
 
 

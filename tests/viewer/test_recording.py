@@ -106,8 +106,8 @@ def test_an_image_shows_the_deformed_body_and_the_arrow_of_its_load(body):
     rest = renderer.render(frame._replace(points=body.surface.undeformed), 1.0, [])
     assert np.abs(np.asarray(rest).astype(int) - picture).max() > 50
     assert is_red(picture).sum() > 40, "an arrow of the load"
-    zero = frame.request._replace(force=0 * frame.request.force)
-    unloaded = np.asarray(renderer.render(frame._replace(request=zero), 1.0, []))
+    zero = frame.load._replace(force=0 * frame.load.force)
+    unloaded = np.asarray(renderer.render(frame._replace(load=zero), 1.0, []))
     assert not is_red(unloaded).any()
 
 

@@ -1,0 +1,158 @@
+"""Modes of a drag: the hand pulls the body by a load on a patch, or grasps the patch."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpl.viewer.controls import Controls
+from dpl.viewer.drag_loads import Patch
+from dpl.viewer.frames import Body, Frame
+from dpl.viewer.requests import GraspRequest, LoadRequest, ViewRequest
+
+MakeRequest = Callable[[float, Mapping[str, float]], ViewRequest]  # E [Pa], parameters -> request
+
+
+class Hand(Protocol):
+    """A mode of a drag."""
+
+    def take(self, node: int, frame: Frame) -> int:
+        """Begin a drag at a node of the shown body; return the node at the centre of the patch."""
+        ...
+
+    def move(self, motion: Tensor) -> MakeRequest:
+        """Return the request after a motion of the mouse over L, (D,) [-], since `take`."""
+        ...
+
+    def hold(self, node: int, frame: Frame | None) -> MakeRequest:
+        """Return the request of the sliders for the patch of a node of the shown body."""
+        ...
+
+    def release(self) -> None:
+        """Forget the patch, because another load replaces the request."""
+        ...
+
+    def marked_nodes(self, node: int) -> Tensor:
+        """Mask of the nodes of the patch of a node, (N,)."""
+        ...
+
+
+class PullingHand:
+    """Converts drags and sliders to modal loads on a patch."""
+
+    def __init__(self, body: Body, controls: Controls) -> None:
+        """Store the body and the controls of the load."""
+        self._body, self._controls = body, controls
+        self._node, self._start = 0, torch.zeros(body.scene.problem.shape[1]).double()
+
+    def take(self, node: int, frame: Frame) -> int:
+        """See `Hand`; the patch moves to the node."""
+        self._node, self._start = node, frame.displacement[node] / self._body.scene.length
+        return node
+
+    def move(self, motion: Tensor) -> MakeRequest:
+        """Return the load whose linear response moves the dragged point to the mouse."""
+        target, patch = self._start + motion, self._patch(self._node)
+        max_amplitude = None if self._controls.unlimited.value else 1.0
+        self._show_direction(target)
+        return self._request(lambda: patch().force_towards(target, max_amplitude=max_amplitude))
+
+    def _show_direction(self, target: Tensor) -> None:
+        """Set direction and, with the next frame, amplitude to those of a drag."""
+        size = float(target.norm())
+        if size > 0:
+            direction = np.pad((target / size).numpy(), (0, 3 - len(target)))
+            self._controls.direction.value = tuple(direction.round(2).tolist())
+        self._controls.follows_frame = True
+
+    def hold(self, node: int, frame: Frame | None) -> MakeRequest:
+        """Return the load of the sliders for direction and amplitude."""
+        self._controls.follows_frame = False
+        patch, amplitude = self._patch(node), self._controls.amplitude.value
+        dim = self._body.scene.problem.shape[1]
+        direction = torch.tensor(self._controls.direction.value[:dim]).double()
+        return self._request(lambda: patch().force_along(direction, amplitude))
+
+    def release(self) -> None:
+        """Do nothing: each drag and each slider gives a load of its own."""
+
+    def marked_nodes(self, node: int) -> Tensor:
+        """Mask of the loaded nodes, (N,)."""
+        return self._patch(node)().node_mask
+
+    def _patch(self, node: int) -> Callable[[], Patch]:
+        """Return a function that makes the patch of a node with the values of the controls."""
+        controls = self._controls
+        radius, uniform = controls.radius.value, controls.uniform.value
+        return partial(self._body.patch, node, radius, uniform=uniform)
+
+    def _request(self, make_force: Callable[[], Tensor]) -> MakeRequest:
+        """Return the request of a dimensionless force (N, D), which the worker makes."""
+
+        def make(young: float, parameters: Mapping[str, float]) -> LoadRequest:
+            return self._body.request(make_force(), young, parameters)
+
+        return make
+
+
+class GraspingHand:
+    """Converts drags and sliders to rigid motions of a patch, which it holds until `release`."""
+
+    def __init__(self, body: Body, controls: Controls) -> None:
+        """Store the body and the controls of the grasp."""
+        self._body, self._controls = body, controls
+        self._node: int | None = None  # at the centre of the held patch
+        self._translation = torch.zeros(body.scene.problem.shape[1]).double()
+        self._start = self._translation  # at the begin of the drag
+
+    def take(self, node: int, frame: Frame) -> int:
+        """See `Hand`; a drag within the held patch keeps it."""
+        if self._node is None or not self._patch(self._node).node_mask[node]:
+            self._grip(node, frame)
+        self._start = self._translation
+        return node if self._node is None else self._node
+
+    def move(self, motion: Tensor) -> MakeRequest:
+        """Return the grasp whose translation is that at `take` plus the motion."""
+        self._translation = self._start + motion
+        return self._request()
+
+    def hold(self, node: int, frame: Frame | None) -> MakeRequest:
+        """Return the grasp of the patch of a node, rotated by the angle of the slider."""
+        if node != self._node:
+            self._grip(node, frame)
+        return self._request()
+
+    def release(self) -> None:
+        """Forget the patch."""
+        self._node = None
+
+    def marked_nodes(self, node: int) -> Tensor:
+        """Mask of the held nodes, (N,)."""
+        return self._patch(node).held_nodes
+
+    def _grip(self, node: int, frame: Frame | None) -> None:
+        """Hold the patch of a node where a frame shows it, without a rotation."""
+        held = self._patch(node).held_nodes
+        self._translation = torch.zeros_like(self._translation)
+        if frame is not None and held.any():
+            self._translation = frame.displacement[held].mean(dim=0) / self._body.scene.length
+        self._node, self._controls.angle.value = node, 0.0
+
+    def _patch(self, node: int) -> Patch:
+        return self._body.patch(node, self._controls.radius.value)
+
+    def _request(self) -> MakeRequest:
+        """Return the request of the held patch with the rotation of the controls."""
+        assert self._node is not None
+        self._controls.follows_frame = False
+        nodes = self._patch(self._node).held_nodes
+        translation, rotation = self._translation, self._controls.rotation
+
+        def make(young: float, parameters: Mapping[str, float]) -> GraspRequest:
+            return self._body.grasp(nodes, translation, rotation, young, parameters)
+
+        return make
