@@ -77,6 +77,7 @@ class Page:
         self._build_scene()
         self._connect()
         self._mark_patch()
+        self.worker.submit(settings=self.controls.settings())
         self.worker.start()
 
     @property
