@@ -11,8 +11,6 @@ from dpl.fem.solvers.rigid_patch import RigidPatch
 from dpl.inference import Answer, GraspAnswer, Simulator
 from dpl.scene import Scene
 
-MAX_WARM_ERROR = 0.1  # estimated error from which a grasp does not continue from the last one [-]
-
 
 class LoadRequest(NamedTuple):
     """A load in SI units.
@@ -127,21 +125,11 @@ class GraspRequest(NamedTuple):
     ) -> GraspAnswer:
         """Return the answer of a simulator, which begins with the forces of the last grasp.
 
-        Where the estimated error of the result is large, the answer from the linear forces is
-        computed too, and the better one is returned.
-
         Raises:
             ValueError: There is a budget.
         """
         if budget_ms is not None:
             raise ValueError("method: a grasp has no time limit; select network or a residual")
-        answer = self._grasp(simulator, tol, warm=warm)
-        if warm and not answer.error < MAX_WARM_ERROR:
-            again = self._grasp(simulator, tol, warm=False)
-            answer = again if again.error < answer.error else answer
-        return answer
-
-    def _grasp(self, simulator: Simulator, tol: float | None, *, warm: bool) -> GraspAnswer:
         return simulator.grasp(
             self.nodes.numpy(),
             (self.translation * simulator.scene.length).tolist(),
@@ -175,7 +163,8 @@ class GraspRequest(NamedTuple):
         linear = scene.linear.with_parameters(load.parameters)
         patch = RigidPatch.of(linear, self.nodes.numpy(), [True] * len(self.translation))
         motion = patch.displacement(self.translation.tolist(), self.rotation.tolist())
-        return patch.newton(scene.newton, motion).iterate(load)
+        newton = patch.newton(scene.newton, motion)
+        return newton.iterate(Load(load.force, load.young))  # the body has its parameters
 
 
 ViewRequest = LoadRequest | GraspRequest

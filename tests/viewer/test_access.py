@@ -250,7 +250,8 @@ def test_an_error_in_a_callback_prints_one_line(page, capfd):
     page._submit = None  # every call fails
     page.worker.submit = page.recording.start = page.recording.stop = None
     event = SimpleNamespace(client=object(), target=SimpleNamespace(value="VTU"))
-    for name in ("direction", "amplitude", "uniform", "radius", "young", "edges", "show_newton"):
+    of_load = "direction", "amplitude", "uniform", "radius", "axis", "angle"
+    for name in (*of_load, "young", "edges", "show_newton"):
         (callback,) = getattr(page.controls, name)._impl.update_cb
         callback(event)
         now += MIN_INTERVAL

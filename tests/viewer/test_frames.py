@@ -7,7 +7,6 @@ import torch
 from dpl.fem import NeoHookeanLn, fields, rectangle
 from dpl.viewer import Body
 from dpl.viewer.frames import ERROR, STRESS, ColourScale, ViewSettings, round_up
-from dpl.viewer.requests import interpolate
 from dpl.viewer.surface import Surface, contour_bands
 
 
@@ -248,12 +247,6 @@ def test_a_body_in_2d_is_solved_and_shown(make_scene, make_body):
     assert frame.points.shape == (36, 3)
     assert not frame.points[:, 2].any()
     assert frame.values.shape == (36,)
-
-
-def test_interpolated_loads_start_and_end_at_the_given_loads(body):
-    old, new = body.sample(0), body.sample(1)
-    assert interpolate(old, new, 1.0) is new
-    assert torch.allclose(interpolate(old, new, 0.5).force, (old.force + new.force) / 2)
 
 
 def test_the_colour_scale_has_rounded_ends_and_ignores_small_changes():

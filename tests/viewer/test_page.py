@@ -2,6 +2,8 @@
 
 import asyncio
 import contextlib
+import html
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +15,7 @@ pytest.importorskip("viser", reason="the extra viewer is not installed")
 from dpl.fem import SubspaceNewton, rectangle
 from dpl.inference import Simulator
 from dpl.viewer import AccessPolicy, Body, Page
+from dpl.viewer.controls import GRASP, PULL
 from dpl.viewer.frames import QUANTITIES
 from dpl.viewer.renderer import NEUTRAL
 from dpl.viewer.units import engineering
@@ -58,6 +61,163 @@ def test_a_dragged_point_follows_the_mouse(any_page):
     assert "min det F" in page.controls._result.content
     assert "displacement [m]" in page.controls._legend.content
     assert page._error == ""
+
+
+def select(page, mode):
+    """Select the mode of drags as a browser does."""
+    page.controls.mode.value = mode
+    page.apply_mode()
+
+
+def check_grasps_are_possible(page):
+    """End the test if the law has ranges, which `Simulator.grasp` does not accept."""
+    if page.body.parameters:
+        pytest.xfail("Simulator.grasp gives the held body parameters that it already has")
+
+
+def test_a_grasped_patch_follows_the_mouse(any_page):
+    page = any_page
+    check_grasps_are_possible(page)
+    select(page, GRASP)
+    motion = np.array([0.0, 0.04, 0.0])
+    drag_tip(page, motion)
+    frame, dim = page.frame, page.body.scene.problem.shape[1]
+    held = page.hand.marked_nodes(page.node)
+    moved = frame.displacement[held] / page.body.scene.length
+    assert held.sum() > 1
+    assert torch.allclose(moved, torch.from_numpy(motion[:dim]).expand_as(moved), atol=1e-4)
+    assert page._marker.mask.tolist() == held[page.body.surface.nodes].tolist()
+    assert page._marker.mask.any()
+    assert page._marker._arrow.visible
+    page.refresh()
+    result, grasp = page.controls._result.content, frame.grasp
+    units = ("N", "N m") if dim == 3 else ("N/m", "N")
+    for vector, unit in zip((grasp.force, grasp.moment), units, strict=True):
+        assert engineering(float(np.linalg.norm(vector)), unit) in result
+    assert engineering(grasp.motion_error, "m") in result
+    assert html.escape(grasp.summary) in result
+    assert page.controls._error.content == ""
+    drag_tip(page, motion)
+    moved = page.frame.displacement[held] / page.body.scene.length
+    expected = torch.from_numpy(2 * motion[:dim]).expand_as(moved)
+    assert torch.allclose(moved, expected, atol=1e-4), "a second drag begins where the first ended"
+
+
+def test_the_angle_rotates_a_grasped_patch(any_page):
+    page = any_page
+    check_grasps_are_possible(page)
+    select(page, GRASP)
+    drag_tip(page, np.array([0.0, 0.02, 0.0]))
+    before, dim = page.frame.request, page.body.scene.problem.shape[1]
+    page.controls.axis.value = "z"
+    page.controls.angle.value = 6.0
+    page.apply_controls(SimpleNamespace(client=object()))
+    assert page.worker.wait(240)
+    request = page.frame.request
+    turn = [np.deg2rad(6.0)] if dim == 2 else [0.0, 0.0, np.deg2rad(6.0)]
+    assert request.rotation.tolist() == pytest.approx(turn)
+    assert torch.equal(request.translation, before.translation)
+    page.sample(None)
+    assert page.worker.wait(240)
+    assert page.frame.grasp is None
+    drag_tip(page, np.array([0.0, 0.0, 0.0]))
+    assert not page.frame.request.rotation.any(), "a new grasp begins without a rotation"
+
+
+def test_each_mode_has_its_controls_and_its_radius(any_page):
+    controls = any_page.controls
+    planar = any_page.body.scene.problem.shape[1] == 2
+    of_pull = (controls.direction, controls.amplitude, controls.unlimited, controls.uniform)
+    controls.radius.value = 0.31
+    for mode in (GRASP, PULL):
+        select(any_page, mode)
+        assert {control.visible for control in of_pull} == {mode == PULL}
+        assert controls.angle.visible == (mode == GRASP)
+        assert controls.axis.visible == (mode == GRASP and not planar)
+    assert controls.radius.value == 0.31
+    select(any_page, GRASP)
+    assert controls.radius.value == 0.15
+
+
+def test_a_change_of_the_mode_keeps_the_load(page):
+    assert page.worker.wait(240)
+    drag_tip(page, np.array([0.0, 0.0, 0.05]))
+    frame = page.frame
+    select(page, GRASP)
+    assert page.worker.wait(240)
+    assert page.frame is frame
+    drag_tip(page, np.array([0.0, 0.0, 0.0]))
+    held = page.hand.marked_nodes(page.node)
+    mean = frame.displacement[held].mean(dim=0)
+    assert torch.allclose(page.frame.displacement[held].mean(dim=0), mean, atol=0.01)
+    select(page, PULL)
+    page.reset(None)
+    assert page.worker.wait(240)
+    assert page.frame.answer.method == "rest"
+
+
+def test_a_patch_that_cannot_move_is_reported_in_one_line(page):
+    assert page.worker.wait(240)
+    drag_tip(page, np.array([0.0, 0.0, 0.05]))
+    frame = page.frame
+    select(page, GRASP)
+    page.controls.radius.value = 0.01
+    event = SimpleNamespace(ray_origin=(-3.0, 0.125, 0.125), ray_direction=(1.0, 0.0, 0.0))
+    asyncio.run(page.click(event))
+    assert page.worker.wait(240)
+    page.refresh()
+    assert "the patch has no free node of the boundary" in page.controls._error.content
+    assert page.frame is frame
+    drag_tip(page, np.array([0.0, 0.0, 0.02]))
+    page.refresh()
+    assert page.frame.grasp is not None
+    assert page.controls._error.content == ""
+
+
+def test_a_state_that_cannot_be_used_is_reported_in_one_line(page):
+    assert page.worker.wait(240)
+    select(page, GRASP)
+    drag_tip(page, np.array([0.0, 0.0, 0.04]))
+    good = page.frame
+    far = replace(good.grasp, motion_error=0.5)
+    for frame, words in (
+        (good._replace(volume_ratio=-0.1), "Not valid: an element is inverted"),
+        (good._replace(volume_ratio=float("nan")), "Not valid: an element is inverted"),
+        (good._replace(answer=far), "The patch is 500 mm away from the hand"),
+        (good, ""),
+    ):
+        page._show(frame)
+        page.refresh()
+        content = page.controls._error.content
+        assert words in content
+        assert bool(words) == bool(content)
+
+
+def test_a_grasp_has_no_time_limit(page):
+    assert page.worker.wait(240)
+    select(page, GRASP)
+    drag_tip(page, np.array([0.0, 0.0, 0.04]))
+    page.controls.method.value = "best within the budget"
+    page.apply_settings(None)
+    assert page.worker.wait(240)
+    page.refresh()
+    assert "a grasp has no time limit" in page.controls._error.content
+    page.controls.method.value = "residual below 1e-06"
+    page.apply_settings(None)
+    assert page.worker.wait(240)
+    page.refresh()
+    assert page.controls._error.content == ""
+    assert page.frame.converged
+
+
+def test_a_long_solve_is_reported_until_its_frame_is_shown(page, monkeypatch):
+    assert page.worker.wait(240)
+    with monkeypatch.context() as patched:
+        patched.setattr(type(page.worker), "solving_time", 3.2)
+        page.refresh()
+        assert "Solving for 3 s ..." in page.controls._error.content
+    page.refresh()
+    assert page.controls._error.content == ""
 
 
 def test_sliders_load_the_patch(any_page):
@@ -204,6 +364,7 @@ def test_the_galerkin_correction_is_offered_if_the_simulator_has_one(page, body,
     other = Page(Body(simulator), policy, title="t", folder=tmp_path)
     try:
         assert other.controls.galerkin.visible
+        assert other.worker.settings.galerkin
         other.controls.method.value = "residual below 1e-03"
         other.apply_settings(None)
         other.sample(None)

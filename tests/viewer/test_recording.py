@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ET
 import meshio
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from dpl.viewer.animation import animate_load
@@ -44,6 +45,22 @@ def test_a_series_contains_forces_displacements_stresses_and_volume_ratios(
     again = recording.save_series(tmp_path)
     assert again != path
     assert path.exists()
+
+
+def test_a_series_of_a_grasp_contains_the_forces_of_the_gripper(body, tmp_path):
+    node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
+    motion = torch.tensor([0.0, 0.0, 0.05]).double()
+    request = body.grasp(body.patch(node, 0.3).held_nodes, motion, 0 * motion)
+    frame, recording = body.solve(request, ViewSettings()), Recording(body)
+    recording.start()
+    recording.add(frame, 0.0)
+    path = recording.save_series(tmp_path)
+    data = meshio.read(path.with_suffix("") / "frame_0000.vtu").point_data
+    assert data["force [N]"] == pytest.approx(frame.grasp.nodal_force)
+    assert np.linalg.norm(data["force [N]"].sum(axis=0)) > 1.0
+    assert data["displacement [m]"] == pytest.approx(frame.grasp.displacement)
+    renderer = Renderer.fitting(body.surface, [frame], (640, 360))
+    assert is_red(np.asarray(renderer.render(frame, 1.0, []))).sum() > 40, "an arrow of the force"
 
 
 @pytest.mark.parametrize("kind", [".gif", ".mp4"])

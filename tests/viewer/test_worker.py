@@ -61,6 +61,69 @@ def test_the_load_approaches_zero_load_in_a_few_frames(make_worker, body, shown)
     assert shown[-1].answer.method == "rest"
 
 
+@pytest.fixture
+def patch(body):
+    """The patch at the tip."""
+    return body.patch(int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()]), 0.3)
+
+
+def lifted(body, patch, height):
+    """Return a grasp that lifts a patch by a height over L."""
+    rotation = torch.zeros(3).double()
+    return body.grasp(patch.held_nodes, torch.tensor([0.0, 0.0, height]).double(), rotation)
+
+
+def test_the_motion_of_a_grasped_patch_is_smoothed(make_worker, body, shown, patch):
+    worker = make_worker(smoothing_time=0.05)
+    for height in (0.01, 0.06):
+        before, goal = len(shown), lifted(body, patch, height)
+        worker.submit(lambda goal=goal: goal)
+        assert worker.wait(LONG)
+    assert shown[-1].request is goal
+    heights = [float(frame.request.translation[2]) for frame in shown[before:]]
+    assert len(heights) > 3
+    assert heights == sorted(heights)
+    assert all(0.01 < height <= 0.06 for height in heights)
+    assert all(torch.equal(frame.request.nodes, patch.held_nodes) for frame in shown[before:])
+
+
+def test_there_are_no_frames_between_a_load_and_a_grasp(make_worker, body, shown, patch):
+    worker = make_worker(smoothing_time=0.05)
+    for make in (lambda: lifted(body, patch, 0.05), body.zero_load):
+        before = len(shown)
+        worker.submit(make)
+        assert worker.wait(LONG)
+        assert len(shown) == before + 1
+
+
+def test_newton_is_compared_with_a_grasp(make_worker, body, shown, patch):
+    newton = []
+    worker = make_worker(smoothing_time=0.0, min_frame_time=0.0, on_newton=newton.append)
+    worker.submit(lambda: lifted(body, patch, 0.05), ViewSettings(tol=1e-8, show_newton=True))
+    assert worker.wait(LONG)
+    last = newton[-1]
+    assert last.converged
+    assert last.points == pytest.approx(shown[-1].points, abs=1e-6)
+
+
+def test_the_time_of_a_solve_is_known_while_it_lasts(make_worker, body):
+    worker = make_worker(smoothing_time=0.0)
+    assert worker.solving_time == 0
+    began, end = threading.Event(), threading.Event()
+
+    def make():
+        began.set()
+        end.wait(LONG)
+        raise ValueError("no load")
+
+    worker.submit(make)
+    assert began.wait(LONG)
+    assert worker.solving_time > 0
+    end.set()
+    assert worker.wait(LONG)
+    assert worker.solving_time == 0
+
+
 def test_new_settings_for_the_same_load_give_one_frame(make_worker, body, shown):
     worker = make_worker(smoothing_time=0.05)
     worker.submit(lambda: body.sample(1))

@@ -1,0 +1,178 @@
+"""Requests of loads and grasps: interpolation, answers and the load on the body."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from dpl.viewer.frames import ERROR, ViewSettings
+from dpl.viewer.hands import GraspingHand
+from dpl.viewer.load_arrow import arrow_ends
+from dpl.viewer.requests import distance, interpolate, scale_of
+
+EXACT = ViewSettings(tol=1e-8)
+UP = torch.tensor([0.0, 0.0, 0.08]).double()
+TURN = torch.tensor([0.0, -0.1, 0.0]).double()
+
+
+def tip_patch(body, radius=0.3):
+    node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmax()])
+    return body.patch(node, radius)
+
+
+@pytest.fixture
+def grasp(body):
+    """A grasp of the tip, which moves and rotates."""
+    return body.grasp(tip_patch(body).held_nodes, UP, TURN)
+
+
+def test_interpolated_loads_start_and_end_at_the_given_loads(body):
+    old, new = body.sample(0), body.sample(1)
+    assert interpolate(old, new, 1.0) is new
+    assert torch.allclose(interpolate(old, new, 0.5).force, (old.force + new.force) / 2)
+
+
+def test_interpolated_grasps_have_interpolated_motions_and_moduli(body, grasp):
+    young = 2 * body.young
+    goal = body.grasp(grasp.nodes, 3 * UP, -TURN, young)
+    assert interpolate(grasp, goal, 1.0) is goal
+    middle = interpolate(grasp, goal, 0.25)
+    assert torch.allclose(middle.translation, 1.5 * UP)
+    assert torch.allclose(middle.rotation, 0.5 * TURN)
+    assert middle.young == pytest.approx(1.25 * body.young)
+    assert torch.equal(middle.nodes, grasp.nodes)
+
+
+def test_a_request_continues_only_another_one_of_the_same_patch_and_kind(body, grasp):
+    other = body.grasp(tip_patch(body, 0.1).held_nodes, UP, TURN)
+    assert not torch.equal(other.nodes, grasp.nodes)
+    assert grasp.continues(grasp.at(0 * grasp.coordinates, grasp.young))
+    assert not grasp.continues(other)
+    assert not grasp.continues(body.sample(1))
+    assert not body.sample(1).continues(grasp)
+    assert body.sample(1).continues(body.zero_load())
+
+
+def test_the_distance_of_grasps_is_relative_to_the_larger_motion(body, grasp):
+    rest = grasp.at(0 * grasp.coordinates, grasp.young)
+    scale = scale_of(rest, grasp)
+    assert scale == pytest.approx(float(torch.cat([UP, TURN]).norm()))
+    assert distance(rest, grasp, scale) == pytest.approx(1)
+    assert distance(interpolate(rest, grasp, 0.75), grasp, scale) == pytest.approx(0.25)
+    softer = grasp.at(grasp.coordinates, 0.5 * grasp.young)
+    assert distance(softer, grasp, scale) == pytest.approx(0.5)
+    assert scale_of(rest, rest) == 1.0
+
+
+@pytest.mark.parametrize("settings", [ViewSettings(), EXACT], ids=["network", "1e-8"])
+def test_a_grasped_patch_moves_as_a_rigid_body(body, grasp, settings):
+    frame = body.solve(grasp, settings)
+    points = body.scene.problem.points[grasp.nodes]
+    moved = points + frame.displacement[grasp.nodes] / body.scene.length
+    assert torch.allclose(moved.mean(dim=0), points.mean(dim=0) + UP, atol=1e-3)
+    assert torch.allclose(torch.cdist(moved, moved), torch.cdist(points, points), atol=1e-3)
+    arm = points - points.mean(dim=0)
+    turned = moved - moved.mean(dim=0)
+    # a rotation by a negative angle about y lifts what lies ahead along x
+    ahead = int(arm[:, 0].argmax())
+    lifted = np.sin(0.1) * arm[ahead, 0] + np.cos(0.1) * arm[ahead, 2]
+    assert float(turned[ahead, 2]) == pytest.approx(float(lifted), abs=1e-3)
+    assert frame.grasp is frame.answer
+
+
+def test_the_load_of_a_grasp_has_its_displacement(make_scene, make_body):
+    """The forces of the gripper and the constant forces balance the body, at any modulus."""
+    weight = torch.zeros(45, 3).double()
+    weight[:, 1] = -2e-7
+    body = make_body(make_scene(constant_force=weight))
+    young = 2 * body.young
+    request = body.grasp(tip_patch(body).held_nodes, UP, TURN, young)
+    frame = body.solve(request, EXACT)
+    assert frame.converged
+    gripper = torch.from_numpy(frame.grasp.nodal_force)
+    constant = weight * (body.young * body.scene.force_unit)
+    assert torch.allclose(frame.load.force, gripper + constant)
+    assert not gripper[~request.nodes].any()
+    assert torch.equal(frame.hand_force, gripper)
+    assert frame.load.young == young
+    again = body.solve(frame.load, EXACT)
+    assert again.converged
+    assert torch.allclose(again.displacement, frame.displacement, atol=1e-6 * 8.0)
+
+
+def test_newtons_iterates_of_a_grasp_converge_to_its_displacement(body, grasp):
+    frame = body.solve(grasp, EXACT)
+    iterates = list(body.newton_frames(grasp, EXACT, frame))
+    assert len(iterates) > 2
+    assert iterates[-1].converged
+    assert all(state.grasp is None and state.request is grasp for state in iterates)
+    assert torch.allclose(iterates[-1].displacement, frame.displacement, atol=1e-6 * 8.0)
+
+
+def test_the_error_of_a_grasp_is_against_the_same_motion(body, grasp):
+    values = body.solve(grasp, ViewSettings(quantity=ERROR)).values
+    assert 0 < values.max() < 0.1 * float(UP[2]) * body.scene.length
+    assert body.solve(grasp, ViewSettings(quantity=ERROR, tol=1e-8)).values.max() < 1e-5
+
+
+def test_the_amplitude_of_a_grasp_is_that_of_equal_forces_with_the_same_sum(body):
+    patch = tip_patch(body)
+    frame = body.solve(body.grasp(patch.held_nodes, UP, 0 * TURN), EXACT)
+    equal = body.patch(patch.node, patch.radius, uniform=True).unit_loads[2]  # amplitude 1, along z
+    unit = body.young * body.scene.force_unit * float(equal.sum(dim=0).norm())
+    assert frame.amplitude == pytest.approx(float(np.linalg.norm(frame.grasp.force)) / unit)
+
+
+def test_the_arrow_of_a_grasp_has_the_direction_of_the_grippers_force(body, grasp):
+    frame = body.solve(grasp, EXACT)
+    start, end = arrow_ends(body.surface, frame)
+    direction = (end - start) / np.linalg.norm(end - start)
+    assert direction == pytest.approx(frame.grasp.force / np.linalg.norm(frame.grasp.force))
+    rest = body.solve(grasp.at(0 * grasp.coordinates, grasp.young), ViewSettings())
+    assert arrow_ends(body.surface, rest) is None
+
+
+def test_a_patch_without_free_nodes_is_refused(body):
+    node = int(body.surface.nodes[body.surface.undeformed[:, 0].argmin()])
+    with pytest.raises(ValueError, match="the patch has no free node of the boundary"):
+        body.grasp(body.patch(node, 0.01).held_nodes, UP, TURN)
+
+
+def test_values_out_of_range_are_refused(body, grasp):
+    with pytest.raises(ValueError, match="young = 1 must lie between"):
+        body.grasp(grasp.nodes, UP, TURN, 1.0)
+    with pytest.raises(ValueError, match="a grasp has no time limit"):
+        body.solve(grasp, ViewSettings(tol=1e-6, budget_ms=20.0))
+    with pytest.raises(ValueError, match="all finite"):
+        body.solve(body.grasp(grasp.nodes, float("nan") * UP, TURN), ViewSettings())
+
+
+def test_held_nodes_are_free_nodes_of_the_boundary(body):
+    problem, patch = body.scene.problem, tip_patch(body, 2.0)
+    expected = problem.boundary & problem.free.any(dim=1)
+    assert torch.equal(patch.held_nodes, expected)
+    assert expected.sum() < len(expected)
+
+
+def test_a_hand_takes_a_patch_where_the_body_is_shown(body):
+    rotation = torch.zeros(3).double()
+    controls = SimpleNamespace(
+        radius=SimpleNamespace(value=0.3), angle=SimpleNamespace(value=5.0), rotation=rotation
+    )
+    hand, patch = GraspingHand(body, controls), tip_patch(body)
+    frame = body.solve(body.sample(1), EXACT)
+    assert hand.take(patch.node, frame) == patch.node
+    assert controls.angle.value == 0.0
+    request = hand.move(UP)(body.young, {})
+    mean = frame.displacement[patch.held_nodes].mean(dim=0) / body.scene.length
+    assert mean.norm() > 0.01
+    assert torch.allclose(request.translation, mean + UP)
+    other = int(torch.nonzero(patch.held_nodes)[0])
+    assert other != patch.node
+    assert hand.take(other, frame) == patch.node, "a drag within the patch keeps it"
+    again = hand.move(UP)(body.young, {})
+    assert torch.allclose(again.translation, mean + 2 * UP)
+    assert torch.equal(again.nodes, request.nodes)
+    hand.release()
+    assert hand.take(other, frame) == other
