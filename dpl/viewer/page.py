@@ -170,6 +170,8 @@ class Page:
         self._release()
         self.controls.show_mode()
         self._mark_patch()
+        if self.frame is not None:
+            self._marker.show(self.frame)
 
     def _release(self) -> None:
         for hand in self._hands.values():

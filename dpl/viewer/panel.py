@@ -18,7 +18,7 @@ ROW = (
     '<span style="font-variant-numeric:tabular-nums;text-align:right;{}">{}</span></div>'
 )
 BOX = '<div style="padding:2px 12px 6px;font-size:13.5px">{}</div>'
-MISSED = 0.01  # distance of a patch from the hand over the displacement that is reported [-]
+UNRELIABLE = 0.1  # estimated error of a grasp that is reported [-]
 
 
 def result_table(frame: Frame, frame_rate: float, node: int) -> str:
@@ -83,11 +83,14 @@ def problem_of(frame: Frame) -> str:
     """Return why a frame cannot be used, in one line; empty if it can."""
     if not frame.volume_ratio > 0:
         return "Not valid: an element is inverted. Move the hand back."
-    missed = 0.0 if frame.grasp is None else frame.grasp.motion_error
-    if not missed > MISSED * float(frame.displacement.norm(dim=1).max()):
+    grasp = frame.grasp
+    if grasp is None or grasp.error < UNRELIABLE:
         return ""
-    apart = engineering(missed, "m")
-    return f"The patch is {apart} away from the hand. Move it back, or select a residual as method."
+    apart = engineering(grasp.motion_error, "m")
+    return (
+        f"Not reliable: estimated error {relative(grasp.error)}, the patch is {apart} away from "
+        "the hand. Move the hand back, or select a residual as method."
+    )
 
 
 def newton_table(frame: Frame | None) -> str:

@@ -110,6 +110,31 @@ def test_a_mouse_drag_deforms_the_body(browser, page, tmp_path):
     browser.wait_for_change(before, tmp_path / "after.png")
 
 
+def test_a_grasped_patch_follows_the_mouse_and_rotates(browser, page):
+    browser.control("drag").click()
+    browser.view.get_by_role("option", name="grasp").click()
+    browser.wait_for_text("Click it to grasp another patch.")
+    x, y = browser.body()
+    browser.view.mouse.move(x, y)
+    time.sleep(1)
+    browser.view.mouse.down()
+    for k in range(10):
+        browser.view.mouse.move(x, y - 3 * k)
+        browser.view.wait_for_timeout(80)
+    browser.view.mouse.up()
+    browser.until(lambda: page.frame.grasp is not None and page.worker.wait(0))
+    request = page.frame.request
+    assert request.translation[2] > 0.01, "the patch follows the mouse"
+    moved = page.frame.displacement[request.nodes] / page.body.scene.length
+    assert (moved - request.translation).norm(dim=1).max() < 1e-3
+    browser.wait_for_text("force of the gripper")
+    visible = "xpath=//*[text()='rotation [°]']/following::input[@type!='hidden']"
+    browser.view.locator(visible).first.fill("10")
+    browser.until(lambda: page.frame.request.rotation[1] > 0.17 and page.worker.wait(0))
+    browser.view.get_by_text("Reset", exact=True).click()
+    browser.until(lambda: page.frame.answer.method == "rest")
+
+
 def test_controls_change_colours_method_and_comparison(browser, page, tmp_path):
     browser.view.get_by_text("Random training load").click()
     browser.until(lambda: page.frame.request.force.any())

@@ -137,6 +137,8 @@ def test_each_mode_has_its_controls_and_its_radius(any_page):
     assert controls.radius.value == 0.31
     select(any_page, GRASP)
     assert controls.radius.value == 0.15
+    mask = any_page.hand.marked_nodes(any_page.node)[any_page.body.surface.nodes]
+    assert len(any_page._marker._dots.points) == mask.sum()
 
 
 def test_a_change_of_the_mode_keeps_the_load(page):
@@ -179,11 +181,11 @@ def test_a_state_that_cannot_be_used_is_reported_in_one_line(page):
     select(page, GRASP)
     drag_tip(page, np.array([0.0, 0.0, 0.04]))
     good = page.frame
-    far = replace(good.grasp, motion_error=0.5)
+    far = replace(good.grasp, motion_error=0.5, error=0.37)
     for frame, words in (
         (good._replace(volume_ratio=-0.1), "Not valid: an element is inverted"),
         (good._replace(volume_ratio=float("nan")), "Not valid: an element is inverted"),
-        (good._replace(answer=far), "The patch is 500 mm away from the hand"),
+        (good._replace(answer=far), "estimated error 37 %, the patch is 500 mm away from the hand"),
         (good, ""),
     ):
         page._show(frame)
