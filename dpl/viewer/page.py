@@ -258,8 +258,8 @@ class Page:
         self._make_request = make_request or self._make_request
         sliders = self.controls.parameters
         parameters = {name: slider.value for name, slider in sliders.items()}
+        self._mark_patch()  # first, so that it does not remove an error of this request
         self.worker.submit(partial(self._make_request, self.controls.modulus, parameters))
-        self._mark_patch()
 
     def _mark_patch(self) -> None:
         """Mark the nodes of the patch and remove the error message."""

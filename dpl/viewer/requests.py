@@ -6,8 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dpl.fem import Load, Solution
-from dpl.fem.solvers.rigid_patch import RigidPatch
+from dpl.fem import Load, RigidPatch, Solution
 from dpl.inference import Answer, GraspAnswer, Simulator
 from dpl.scene import Scene
 

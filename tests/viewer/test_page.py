@@ -69,15 +69,8 @@ def select(page, mode):
     page.apply_mode()
 
 
-def check_grasps_are_possible(page):
-    """End the test if the law has ranges, which `Simulator.grasp` does not accept."""
-    if page.body.parameters:
-        pytest.xfail("Simulator.grasp gives the held body parameters that it already has")
-
-
 def test_a_grasped_patch_follows_the_mouse(any_page):
     page = any_page
-    check_grasps_are_possible(page)
     select(page, GRASP)
     motion = np.array([0.0, 0.04, 0.0])
     drag_tip(page, motion)
@@ -105,7 +98,6 @@ def test_a_grasped_patch_follows_the_mouse(any_page):
 
 def test_the_angle_rotates_a_grasped_patch(any_page):
     page = any_page
-    check_grasps_are_possible(page)
     select(page, GRASP)
     drag_tip(page, np.array([0.0, 0.02, 0.0]))
     before, dim = page.frame.request, page.body.scene.problem.shape[1]
@@ -174,6 +166,14 @@ def test_a_patch_that_cannot_move_is_reported_in_one_line(page):
     page.refresh()
     assert page.frame.grasp is not None
     assert page.controls._error.content == ""
+
+
+def test_an_error_that_arises_at_once_is_shown(page, monkeypatch):
+    assert page.worker.wait(240)
+    monkeypatch.setattr(page.worker, "submit", lambda make: page._show_error("cannot be solved"))
+    page.reset(None)
+    page.refresh()
+    assert "cannot be solved" in page.controls._error.content
 
 
 def test_a_state_that_cannot_be_used_is_reported_in_one_line(page):
