@@ -101,7 +101,10 @@ def test_the_load_of_a_grasp_has_its_displacement(make_scene, make_body):
     assert torch.allclose(again.displacement, frame.displacement, atol=1e-6 * 8.0)
 
 
-def test_newtons_iterates_of_a_grasp_converge_to_its_displacement(body, grasp):
+@pytest.mark.parametrize("more", [{}, {"poisson": [0.2, 0.4]}], ids=["one law", "range"])
+def test_newtons_iterates_of_a_grasp_converge_to_its_displacement(make_scene, make_body, more):
+    body = make_body(make_scene(**more))
+    grasp = body.grasp(tip_patch(body).held_nodes, UP, TURN)
     frame = body.solve(grasp, EXACT)
     iterates = list(body.newton_frames(grasp, EXACT, frame))
     assert len(iterates) > 2
