@@ -59,8 +59,9 @@ def test_the_factor_by_parity_solves_like_the_whole(body):
 def test_the_factor_has_fewer_entries(body):
     solver, count = body
     factor = solver.float32_factor
-    assert len(factor.storage) == count
-    assert factor.storage.size < 0.8 * solver.factor.storage.size
+    assert len(factor.blocks.values) == count
+    whole = ParityFactor.of(solver.problem, [])
+    assert factor.blocks.values.size < 0.9 * whole.blocks.values.size
 
 
 def test_the_factor_is_symmetric(body):
