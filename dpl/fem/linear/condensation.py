@@ -131,6 +131,28 @@ def dot(x, row):  # type: ignore[no-untyped-def]
     return total
 
 
+@njit(fastmath=True)
+def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
+    """Subtract A x from y, (F,), for A (F, R) and x (R,); x is read once for four rows."""
+    n = A.shape[1]
+    i = 0
+    while i + 4 <= len(y):
+        a, b, c, d = 0.0, 0.0, 0.0, 0.0
+        for j in range(n):
+            a += A[i, j] * x[j]
+            b += A[i + 1, j] * x[j]
+            c += A[i + 2, j] * x[j]
+            d += A[i + 3, j] * x[j]
+        y[i] -= a
+        y[i + 1] -= b
+        y[i + 2] -= c
+        y[i + 3] -= d
+        i += 4
+    while i < len(y):
+        y[i] -= dot(x, A[i])
+        i += 1
+
+
 @njit(
     [
         void(int64[:, ::1], int64[::1], float32[::1], float64[::1], float64[::1]),
@@ -174,9 +196,13 @@ def condensed_solve(table, unknowns, values, force, solution):  # type: ignore[n
         start, outer = place + count * count, work[:others]
         for j in range(others):
             outer[j] = solution[boundary[j]]
+        own = np.empty(count)
         for i in range(count):
-            row = values[start + i * others : start + (i + 1) * others]
-            solution[pivots[i]] -= dot(outer, row)
+            own[i] = solution[pivots[i]]
+        X = values[start : start + count * others].reshape((count, others))
+        subtract_product(X, outer, own)
+        for i in range(count):
+            solution[pivots[i]] = own[i]
 
 
 def condensed_block_solve(fronts: Fronts, values: NDArray[Any], x: NDArray[Any]) -> None:

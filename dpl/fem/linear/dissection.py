@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 Integers = NDArray[np.int64]
 
 LEAF = 64  # unknowns of a part that is not divided further
-SMALLEST_SIDE = 0.15  # of the unknowns of a part
+SMALLEST_SIDE = 0.05  # of the unknowns of a part
 SAME = 1e-9  # difference of coordinates, over the size of the body, of one layer
 
 

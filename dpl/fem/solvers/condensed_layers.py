@@ -8,10 +8,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from dpl.fem.linear.condensation import Condensed, front_blocks
+from dpl.fem.linear.dissection import Integers
 
 
 class Layer(NamedTuple):
-    """Fronts of the same height, filled to the same size; none depends on another.
+    """Fronts of the same height and similar sizes, filled to one size; none depends on another.
 
     Attributes:
         pivots: Pivots of each front, n where there are fewer, (k, I).
@@ -38,7 +39,11 @@ class CondensedLayers(NamedTuple):
     @classmethod
     def of(cls, blocks: Condensed, device: torch.device) -> Self:
         """Return the blocks on a device, in their dtype."""
-        layers = (_layer(blocks, height) for height in range(blocks.fronts.heights.max() + 1))
+        table, _, heights = blocks.fronts
+        classes = np.rint(2 * np.log2(table[:, 1] - table[:, 0]))  # similar numbers of pivots
+        kinds = sorted(set(zip(heights.tolist(), classes.tolist(), strict=True)))
+        chosen = (np.flatnonzero((heights == h) & (classes == c)) for h, c in kinds)
+        layers = (_layer(blocks, fronts) for fronts in chosen)
         return cls(tuple(Layer(*(part.to(device) for part in layer)) for layer in layers))
 
     def solve(self, right: Tensor) -> Tensor:
@@ -60,11 +65,11 @@ class CondensedLayers(NamedTuple):
         return solution[..., :-1]
 
 
-def _layer(blocks: Condensed, height: int) -> Layer:
-    """Return the fronts of a height."""
+def _layer(blocks: Condensed, numbers: Integers) -> Layer:
+    """Return some fronts, by their numbers."""
     fronts, values = blocks
     every = front_blocks(fronts, values)
-    chosen = [every[k] for k in np.flatnonzero(fronts.heights == height)]
+    chosen = [every[k] for k in numbers]
     size = len(np.unique(fronts.unknowns))
     count = max(len(one.pivots) for one in chosen)
     others = max(1, max(len(one.boundary) for one in chosen))  # graphs have no empty tensors
