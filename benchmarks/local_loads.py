@@ -4,7 +4,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from dpl.evaluation import latency
 from dpl.export import ExportGraph, OnnxSession, export_onnx
 from dpl.export.onnx_graph import missing_packages
 from dpl.fem import Load, PatchLoads, PointLoads, solve
+from dpl.models import Unrolled
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
 from dpl.training import Surrogate
@@ -125,9 +126,9 @@ def _row(
 
 def linear_solution(surrogate: Surrogate, load: Load) -> Tensor:
     """Return the linear solution that a fitted `Unrolled` uses, (1, N, D) [-]."""
-    problem = surrogate.scene.problem
+    problem, net = surrogate.scene.problem, cast(Unrolled, surrogate.net)
     field = problem.prescribed.clone()[None]
-    field[:, problem.free] = surrogate.net.linear(load.force[:, problem.free], load.parameters)
+    field[:, problem.free] = net.linear(load.force[:, problem.free], load.parameters)
     return field
 
 

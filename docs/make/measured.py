@@ -121,6 +121,14 @@ PARTS = (
         split="task",
     ),
     Part(
+        r"local_loads_(\w+)",
+        "Loads on small areas, run `{0}`",
+        "python scripts/benchmark.py cases=[local] run=runs/{0} count=250 repeats=2 "
+        "folder=benchmarks/results",
+        "250 loads of each kind: relative errors of linear solution and prediction, latencies of "
+        "prediction and ONNX graph.",
+    ),
+    Part(
         "unrolled",
         "Learning curve and ablation of `unrolled`",
         "python scripts/ablation.py experiment=beam_nh_loss data.train=1024",

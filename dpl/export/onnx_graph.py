@@ -67,8 +67,8 @@ def export_onnx(graph: ExportGraph, path: Path) -> None:
     example = tuple(scene.si_inputs(scene.loads.sample((0, 0), range(3))).values())
     batch = torch.export.Dim("B", min=1)
     shapes = tuple({0: batch} for _ in example)
-    with torch.no_grad():
-        graph(*example)  # computes what a network keeps, such as blocks of K(0)
+    # computes what a network keeps, such as blocks of K(0); gradients exclude compiled loops
+    graph(*(column.clone().requires_grad_() for column in example))
     with _silence_exporter():
         try:
             # torch.onnx.export alone would fix the batch size without an error; torch.export raises

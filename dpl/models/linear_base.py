@@ -1,5 +1,6 @@
 """The linear solution as the base of a prediction: networks learn the nonlinear displacement."""
 
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import torch
@@ -50,8 +51,11 @@ class LinearBase:
 
     def __init__(self, scene: Scene) -> None:
         """Take the scene."""
-        self._problem = scene.problem
-        self._response = LinearResponse(scene, scene.linear.reference.symmetries)
+        self._scene, self._problem = scene, scene.problem
+
+    @cached_property
+    def _response(self) -> LinearResponse:
+        return LinearResponse(self._scene, self._scene.linear.reference.symmetries)
 
     def solve(self, load: Load) -> Tensor:
         """Return linear solutions, (B, N, D) [-], float64, on the device of the load."""

@@ -139,6 +139,20 @@ def test_a_small_force_on_a_node_has_its_linear_solution(make_graph, name):
     assert relative_differences(found, linear.numpy()).max() < 1e-4
 
 
+def test_a_surrogate_from_a_checkpoint_becomes_a_graph(make_graph, tmp_path):
+    """It has predicted nothing yet, so that the blocks of K(0) are missing."""
+    graph, _ = make_graph("unrolled")
+    before, scene = graph.surrogate, graph.surrogate.scene
+    loaded = Surrogate(Unrolled(scene, rank=12, cells=8, stages=1), MSE(), scene)
+    loaded.load_state_dict(before.state_dict())
+    export_onnx(ExportGraph(loaded), tmp_path / "model.onnx")
+    inputs = sample_check_loads(scene, 2).inputs
+    with torch.no_grad():
+        expected = before(**inputs).numpy()
+    found = OnnxSession(tmp_path / "model.onnx")(**inputs)
+    assert relative_differences(found, expected).max() < 1e-5
+
+
 def test_no_load_is_marked(make_graph):
     for name in ("fcnn", "unrolled", "unrolled, poisson"):
         assert OnnxSession(make_graph(name)[1]).outputs == ["displacement"]
