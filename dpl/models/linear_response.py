@@ -169,7 +169,9 @@ class _Tensors(NamedTuple):
 
 def _full_precision(device: str) -> AbstractContextManager[object]:
     """Return a context without reduced precision of products."""
-    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled() else nullcontext()
+    if torch.is_autocast_enabled(device):
+        return torch.autocast(device, enabled=False)
+    return nullcontext()
 
 
 def moduli(law: Material, count: int) -> tuple[Tensor, Tensor]:

@@ -41,7 +41,7 @@ class ModuliInterpolation:
 
         Its relative error is at most `MAX_ERROR`, or the number of nodes is `MAX_NODES`.
         """
-        if low == high:
+        if high - low < 1e-9:
             return cls((low,), springs)
         for count in range(2, MAX_NODES + 1):
             found = cls(_nodes(low, high, count), springs)
