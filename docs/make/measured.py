@@ -123,10 +123,9 @@ PARTS = (
     Part(
         r"local_loads_(\w+)",
         "Loads on small areas, run `{0}`",
-        "python scripts/benchmark.py cases=[local] run=runs/{0} count=250 repeats=2 "
-        "folder=benchmarks/results",
-        "250 loads of each kind: relative errors of linear solution and prediction, latencies of "
-        "prediction and ONNX graph.",
+        "python scripts/benchmark.py cases=[local] run=runs/{0} folder=benchmarks/results",
+        "Loads of each kind, their number by `count`: relative errors of linear solution and "
+        "prediction, latencies of prediction and ONNX graph.",
     ),
     Part(
         "unrolled",
