@@ -94,7 +94,6 @@ def variants(options: Mapping[str, Sequence[Any]]) -> list[Variant]:
         Variant("H^T H / 2 in first map", change=quadratic_first_feature),
         *(Variant(f"{name} only", change=_OneStress(k)) for name, k in STRESSES.items()),
         Variant("float64, not rounded", change=without_rounding),
-        Variant("linear solution in modes", {"linear_tol": 5e-4}),
     ]
     sizes = [
         Variant(f"{name} = {value}", {name: value})

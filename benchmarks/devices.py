@@ -4,9 +4,7 @@ The same functions measure a GPU and the processor. Clocks are read after the de
 The inputs of a training step are in the memory of the device. Loads are those of the scene; targets
 are artificial, because the speed does not depend on them.
 
-A prediction with a linear base solves with a factor of K(0) on the host, in float64, and so does
-one of `unrolled` that applies the factor to each load. A training step has the linear solutions of
-its samples already.
+A training step of a network with a linear base has the linear solutions of its samples already.
 """
 
 import gc

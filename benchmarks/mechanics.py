@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 CONSOLE = Console(width=150)
 CASES = (
     *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
-    *("discretisation", "sizes", "modes", "deflections", "latency"),
+    *("discretisation", "sizes", "modes", "deflections", "latency", "local"),
 )
 FIGURES = "figures"  # the case that draws the rows in `folder` again
 
@@ -248,6 +248,37 @@ def latency(cfg: DictConfig, backends: list[str]) -> None:
     write(calls, Path(cfg.folder) / "latency.csv")
     write(rates, Path(cfg.folder) / "throughput.csv")
     write_machine(Path(cfg.folder) / "latency.json")
+
+
+def local(cfg: DictConfig, backends: list[str]) -> None:
+    """Write errors and latencies of a trained run of `unrolled` for loads on small areas.
+
+    Raises:
+        ConfigError: No run of `unrolled` is named.
+    """
+    from benchmarks import local_loads
+    from dpl.models import Unrolled
+
+    if cfg.run is None:
+        raise config.ConfigError("run = null must name the trained run for cases=[local]")
+    surrogate = config.load_run(cfg.run)[1]
+    if not isinstance(surrogate.net, Unrolled):
+        raise config.ConfigError(f"run = {cfg.run} must be a run of model=unrolled")
+    rows = list(local_loads.measure(surrogate, cfg.count, repeats=cfg.repeats))
+    table = Table("loads, p50 and p99", "linear error", "error", "predict [ms]", "ONNX [ms]")
+    for row in rows:
+        size = "" if row.deflection is None else f", up to {row.deflection:g} L"
+        errors = (
+            f"{row.linear_p50:.1e} {row.linear_p99:.1e}",
+            f"{row.error_p50:.1e} {row.error_p99:.1e}",
+        )
+        graph = "" if row.onnx_p50 is None else f"{row.onnx_p50:.2f} {row.onnx_p99:.2f}"
+        times = f"{row.predict_p50:.2f} {row.predict_p99:.2f}", graph
+        table.add_row(f"{row.count} {row.loads}{size}", *errors, *times)
+    CONSOLE.print(table)
+    stem = Path(cfg.folder) / f"local_loads_{Path(cfg.run).name}"
+    write(rows, stem.with_suffix(".csv"))
+    write_machine(stem.with_suffix(".json"))
 
 
 def figures(cfg: DictConfig, backends: list[str]) -> None:

@@ -104,8 +104,8 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     bent = linear + linear * linear.norm(dim=-1, keepdim=True)
     samples = Sample(drawn.force, bent, drawn.young, drawn.parameters)
     net.fit(samples, samples)
-    kept = sum(t.nbytes for t in surrogate.state_dict().values()) / 1e6
-    yield row("unrolled", surrogate.predict, memory_mb=kept)
+    kept = sum(t.nbytes for t in surrogate.state_dict().values()) + net.linear.blocks.values.nbytes
+    yield row("unrolled", surrogate.predict, memory_mb=kept / 1e6)
     weights = 4 * dofs**2 + 7 * dofs
     if 4e-9 * weights < memory_limit:
         whole = Surrogate(FCNN(scene, all_dofs=True, memory_limit=1e9), MSE(), scene).eval()

@@ -424,10 +424,8 @@ def test_a_network_that_takes_none_is_refused(wide):
         Surrogate(torch.nn.Flatten(), MSE(), wide)
 
 
-@pytest.mark.parametrize(("tol", "most"), [(0, 1e-3), (torch.inf, 5e-3)])
-def test_small_loads_are_answered_linearly_at_every_poissons_ratio(wide, sets, few, tol, most):
-    """To the tolerance of the factor, or without it to that of Galerkin solutions in the modes."""
-    net = Unrolled(wide, rank=90, cells=8, stages=1, linear_tol=tol, symmetry=False)
+def test_small_loads_are_answered_linearly_at_every_poissons_ratio(wide, sets, few):
+    net = Unrolled(wide, rank=90, cells=8, stages=1, symmetry=False)
     net.fit(sets.samples("train"), sets.samples("val"))
     module = Surrogate(net, MSE(), wide).eval()
     light = few._replace(force=1e-4 * few.force)
@@ -439,7 +437,7 @@ def test_small_loads_are_answered_linearly_at_every_poissons_ratio(wide, sets, f
     def error(field):
         return float(((field - exact).flatten(1).norm(dim=1) / exact.flatten(1).norm(dim=1)).max())
 
-    assert error(found) < most
+    assert error(found) < 1e-3
     assert error(found) < error(reference) / 20
 
 

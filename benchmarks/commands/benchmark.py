@@ -3,7 +3,8 @@
 Long cases on demand: cases=[large] (run alone, it reports its memory), cases=[robustness],
 cases=[generation], cases=[sizes], cases=[modes] (time of the eigenmodes); errors of other
 meshes: cases=[discretisation]; displacements of the test loads: cases=[deflections] count=100;
-latency and throughput of a trained run: cases=[latency] run=runs/mine.
+latency and throughput of a trained run: cases=[latency] run=runs/mine; loads on small areas:
+cases=[local] run=runs/mine count=250.
 """
 
 from collections.abc import Sequence

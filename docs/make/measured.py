@@ -135,6 +135,13 @@ PARTS = (
         split="task",
     ),
     Part(
+        r"local_loads_(\w+)",
+        "Loads on small areas, run `{0}`",
+        "python scripts/benchmark.py cases=[local] run=runs/{0} folder=benchmarks/results",
+        "Loads of each kind, their number by `count`: relative errors of linear solution and "
+        "prediction, latencies of prediction and ONNX graph.",
+    ),
+    Part(
         "unrolled",
         "Learning curve and ablation of `unrolled`",
         "python scripts/ablation.py experiment=beam_nh_loss data.train=1024",

@@ -10,14 +10,12 @@ from torch import Tensor
 from dpl.evaluation import latency
 from dpl.export.onnx_graph import Array, ExportGraph, OnnxSession
 from dpl.fem import Load
-from dpl.models import FlagsLocalLoads
 from dpl.scene import Scene
 
 CHECK_STREAM = (0, 11)  # random stream of the loads of the comparison
 IN_RANGE = "in range"
 AMPLITUDES = {"small": 1e-3, "tiny": 1e-9, "large": 10.0}  # factors on loads in the training range
 N_OUTSIDE = 4  # loads of each kind outside the training range
-ESTIMATE_FACTOR = 3.0  # largest ratio of a missing part to its estimate [-]
 BATCHES = (1, 32)  # batch sizes for which times are measured
 
 
@@ -44,23 +42,12 @@ class OutputDifference:
     Attributes:
         kind: Kind of the loads.
         n_loads: Number of loads.
-        max_error: Largest relative difference ||a - b|| / ||b|| from the torch operations of the
-            graph, or from the surrogate where that is not explained by the basis [-].
-        max_basis_error: Largest relative difference from the surrogate of loads that are not local
-            [-]. It exceeds `max_error` where the surrogate applies a factor of K(0) to every load.
-        n_local: Number of loads that the graph marks as local.
-        max_local_error: Largest relative difference of local loads, which the surrogate solves with
-            the factor of K(0) and the graph does not [-]; NaN if there are none.
-        median_local_error: Median of the same differences [-].
+        max_error: Largest relative difference ||a - b|| / ||b|| [-].
     """
 
     kind: str
     n_loads: int
     max_error: float
-    max_basis_error: float
-    n_local: int
-    max_local_error: float
-    median_local_error: float
 
 
 @dataclass(frozen=True)
@@ -113,38 +100,20 @@ def compare_outputs(
     """Return the differences between an ONNX file and its surrogate for each kind of load.
 
     All loads are evaluated at once, then the first three, then each load alone, to detect a graph
-    with a fixed batch size. A load that only one of the two marks as local has an infinite
-    difference. The difference of other loads from the surrogate counts too, beyond the part that
-    the basis may miss where the surrogate solves every load.
+    with a fixed batch size.
     """
     count = len(loads.kinds)
-    largest, distance = np.zeros(count), np.zeros(count)
-    local = np.zeros(count, dtype=bool)
-    net = graph.surrogate.net
-    solves = isinstance(net, FlagsLocalLoads) and net.solves_every_load()
-    allowed = ESTIMATE_FACTOR * net.linear_tol if solves else 0.0
+    largest = np.zeros(count)
     for part in (slice(0, count), slice(0, 3), *(slice(k, k + 1) for k in range(count))):
         inputs = loads.select(part)
         with torch.inference_mode():
-            in_basis, *flags = (output.numpy() for output in graph(**inputs))
-            surrogate = graph.surrogate(**inputs).numpy()
-        found = session(**inputs)
-        error = relative_differences(found.displacement, in_basis)
-        full_error = relative_differences(found.displacement, surrogate)
-        counts = ~found.local & (full_error > allowed)
-        error = np.where(counts, np.maximum(error, full_error), error)
-        error[found.local != (flags[0] if flags else False)] = np.inf
+            expected = graph(**inputs).numpy()
+        error = relative_differences(session(**inputs), expected)
         largest[part] = np.maximum(largest[part], error)
-        distance[part] = np.maximum(distance[part], full_error)
-        local[part] = found.local
     rows = []
     for kind in dict.fromkeys(loads.kinds):
-        own = np.array([one == kind for one in loads.kinds])
-        marked = distance[own & local]
-        worst, middle = (marked.max(), np.median(marked)) if len(marked) else (np.nan, np.nan)
-        others = float(distance[own & ~local].max(initial=0))
-        numbers = int(own.sum()), float(largest[own].max()), others, len(marked)
-        rows.append(OutputDifference(kind, *numbers, float(worst), float(middle)))
+        own = largest[[one == kind for one in loads.kinds]]
+        rows.append(OutputDifference(kind, len(own), float(own.max())))
     return rows
 
 
@@ -159,13 +128,8 @@ def relative_differences(found: Array, expected: Array) -> Array:
 def measure_latency(
     graph: ExportGraph, session: OnnxSession, loads: CheckLoads, *, calls: int
 ) -> list[BatchLatency]:
-    """Return latencies of surrogate and graph on loads in the training range, `calls` or more.
-
-    Local loads are left out, because the graph does less for them. If all are local, all are used.
-    """
-    local = session(**loads.inputs).local
-    usual = [k for k, kind in enumerate(loads.kinds) if kind == IN_RANGE and not local[k]]
-    usual = usual or list(range(len(local)))
+    """Return latencies of surrogate and graph on loads in the training range, `calls` or more."""
+    usual = [k for k, kind in enumerate(loads.kinds) if kind == IN_RANGE]
     rows = []
     for batch in BATCHES:
         size = min(batch, len(usual))

@@ -15,16 +15,12 @@ from dpl.scene import Scene
 from dpl.training import Surrogate
 from dpl.version import __version__
 
-FORMAT = 3  # version of the keys of meta.json
+FORMAT = 4  # version of the keys of meta.json
 RANGE = (
     "f: a force over E L^(D-1), minus `constant_force`, and 0 at fixed degrees of freedom. "
     "q: the least-squares fit of `modes` to f at the nodes where f is not zero. "
     "In range: max |q| <= 1 and |f - modes q| <= 1e-3 |f| at these nodes. "
     "Without a fit: |f| above `largest_force` is out of range."
-)
-LOCAL = (
-    "the basis of the network does not represent the load: dpl would add the linear solution with "
-    "a factor of K(0), which the graph does not contain; do not use this output"
 )
 SCALING = (
     "input = force / (young force_unit scales.force); network; "
@@ -90,7 +86,6 @@ def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
             "ranges": loads.parameter_ranges,
         },
         "displacement": {"shape": field, "type": "float64", "unit": "m"},
-        "local": {"shape": ["B"], "type": "bool", "unit": "1", "meaning": LOCAL},
     }
     both = {"inputs": graph.inputs, "outputs": graph.outputs}
     named = {key: [{"name": name, **known[name]} for name in names] for key, names in both.items()}

@@ -11,32 +11,16 @@ import logging
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from dpl.models import FlagsLocalLoads
 from dpl.training import Surrogate
 
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
-LOCAL = "local"  # output that marks loads for which dpl would use the factor of K(0)
 Array = NDArray[np.float64]
-
-
-class GraphOutput(NamedTuple):
-    """Outputs of a graph.
-
-    Attributes:
-        displacement: (B, N, D) [m].
-        local: Mask of loads that the basis of the network cannot represent, (B,). dpl solves
-            these with the factor of K(0), which the graph does not contain.
-    """
-
-    displacement: Array
-    local: NDArray[np.bool_]
 
 
 def missing_packages() -> list[str]:
@@ -45,31 +29,19 @@ def missing_packages() -> list[str]:
 
 
 class ExportGraph(nn.Module):
-    """Surrogate without control flow that depends on the values of a load.
-
-    A `FlagsLocalLoads` network solves local loads with a sparse factor of K(0), which is no tensor
-    operation. The graph represents them in the basis like all others; a second output marks them.
+    """Surrogate as a graph of tensor operations.
 
     Attributes:
         surrogate: The trained surrogate.
-        has_local_output: True if the graph has the output `local`.
+        outputs: Names of the outputs, in order.
     """
 
-    def __init__(self, surrogate: Surrogate) -> None:
-        """Take a trained surrogate on the CPU.
+    outputs = ("displacement",)
 
-        Raises:
-            ValueError: The surrogate adds linear solutions, which are no tensor operations.
-        """
+    def __init__(self, surrogate: Surrogate) -> None:
+        """Take a trained surrogate on the CPU."""
         super().__init__()
-        if surrogate.base is not None:
-            raise ValueError(
-                "model.base = linear cannot be written as an ONNX graph: each prediction solves "
-                "with a factor of K(0); export a run with model.base = none"
-            )
         self.surrogate = surrogate.eval()
-        net = surrogate.net
-        self.has_local_output = isinstance(net, FlagsLocalLoads) and net.flags_local_loads
 
     @property
     def inputs(self) -> list[str]:
@@ -77,30 +49,10 @@ class ExportGraph(nn.Module):
         ranges = self.surrogate.scene.loads.parameter_ranges
         return ["force", "young", "parameters"] if ranges else ["force", "young"]
 
-    @property
-    def outputs(self) -> list[str]:
-        """Names of the outputs, in order."""
-        return ["displacement", LOCAL] if self.has_local_output else ["displacement"]
-
-    def forward(
-        self, force: Tensor, young: Tensor, parameters: Tensor | None = None
-    ) -> tuple[Tensor, ...]:
-        """Return displacements (B, N, D) [m], and the mask `local` (B,) if `has_local_output`.
-
-        Args:
-            force: (B, N, D) [N]; in 2D [N/m].
-            young: (B,) [Pa].
-            parameters: (B, P); required if the law has ranges.
-        """
-        module = self.surrogate
-        load = module.scene.load_of(force, young, parameters)
-        scaled, more = module.scale_inputs(load)
-        if not isinstance(module.net, FlagsLocalLoads):
-            return (module.scene.length * module.unscale_outputs(module.net(scaled, **more)),)
-        answer, local = module.net.forward_in_basis(scaled, **more)
-        metres = module.scene.length * module.unscale_outputs(answer)
-        loaded = (force != 0).flatten(1).any(dim=1)  # a zero load is not local
-        return (metres, local & loaded) if self.has_local_output else (metres,)
+    def forward(self, force: Tensor, young: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Return displacements (B, N, D) [m], see `Surrogate.forward`."""
+        found: Tensor = self.surrogate(force, young, parameters)
+        return found
 
 
 def export_onnx(graph: ExportGraph, path: Path) -> None:
@@ -115,6 +67,8 @@ def export_onnx(graph: ExportGraph, path: Path) -> None:
     example = tuple(scene.si_inputs(scene.loads.sample((0, 0), range(3))).values())
     batch = torch.export.Dim("B", min=1)
     shapes = tuple({0: batch} for _ in example)
+    # computes what a network keeps, such as blocks of K(0); gradients exclude compiled loops
+    graph(*(column.clone().requires_grad_() for column in example))
     with _silence_exporter():
         try:
             # torch.onnx.export alone would fix the batch size without an error; torch.export raises
@@ -125,7 +79,7 @@ def export_onnx(graph: ExportGraph, path: Path) -> None:
                 dynamo=True,
                 dynamic_shapes=shapes,
                 input_names=graph.inputs,
-                output_names=graph.outputs,
+                output_names=list(graph.outputs),
                 verbose=False,
             )
             assert exported is not None
@@ -172,13 +126,11 @@ class OnnxSession:
         self.inputs = [one.name for one in self._session.get_inputs()]
         self.outputs = [one.name for one in self._session.get_outputs()]
 
-    def __call__(self, **inputs: Array | Tensor) -> GraphOutput:
-        """Return the outputs for the inputs of `ExportGraph.forward`, by name."""
+    def __call__(self, **inputs: Array | Tensor) -> Array:
+        """Return displacements (B, N, D) [m] of the inputs of `ExportGraph.forward`, by name."""
         arrays = {name: np.asarray(column) for name, column in inputs.items()}
-        found: list[Any] = self._session.run(None, arrays)
-        if LOCAL not in self.outputs:
-            found.append(np.zeros(len(found[0]), dtype=bool))
-        return GraphOutput(*found)
+        found: Array = self._session.run(None, arrays)[0]
+        return found
 
 
 def onnx_opset(path: Path) -> int:

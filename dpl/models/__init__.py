@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from dpl.models.protocols import (
         ClosedFormFit,
         Correctable,
-        FlagsLocalLoads,
         HasBase,
         HasCorrection,
         TrainsInCoordinates,

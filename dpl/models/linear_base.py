@@ -1,6 +1,6 @@
 """The linear solution as the base of a prediction: networks learn the nonlinear displacement."""
 
-import math
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import torch
@@ -50,17 +50,21 @@ class LinearBase:
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Take the scene, whose factor of K(0) is used."""
-        self._problem = scene.problem
-        self._response = LinearResponse(scene, [], math.inf)  # its factor is float64
+        """Take the scene."""
+        self._scene, self._problem = scene, scene.problem
+
+    @cached_property
+    def _response(self) -> LinearResponse:
+        return LinearResponse(self._scene, self._scene.linear.reference.symmetries)
 
     def solve(self, load: Load) -> Tensor:
         """Return linear solutions, (B, N, D) [-], float64, on the device of the load."""
         force = load.force.double()
         free = self._problem.free.to(force.device)
-        values = self._response.solution(force[:, free], load.parameters)
-        prescribed = self._problem.prescribed.to(force)
-        return prescribed.repeat(len(force), 1, 1).masked_scatter(free, values)
+        values = self._response(force[:, free], load.parameters)
+        prescribed = self._problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
+        dofs = free.flatten().nonzero()[:, 0]
+        return prescribed.index_copy(1, dofs, values).view_as(force)
 
     def scale_inputs(self, linear: Tensor, scale: Tensor) -> ScaledLinearSolution:
         """Return the inputs of a network.

@@ -102,32 +102,3 @@ class HasCorrection(Protocol):
     def correction(self) -> SubspaceNewton | None:
         """Return Newton's method in the modes; None before the fit."""
         ...
-
-
-@runtime_checkable
-class FlagsLocalLoads(Protocol):
-    """A network that can predict within a basis and detects loads that the basis cannot represent.
-
-    `forward` solves with a factor of K(0), at least for these loads. An ONNX graph cannot contain
-    it.
-    """
-
-    @property
-    def linear_tol(self) -> float:
-        """Relative projection residual above which a load is local [-]."""
-        ...
-
-    @property
-    def flags_local_loads(self) -> bool:
-        """True if some load can be local."""
-        ...
-
-    def solves_every_load(self) -> bool:
-        """True if `forward` solves with the factor for all loads, not only local ones."""
-        ...
-
-    def forward_in_basis(
-        self, force: Tensor, parameters: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Return displacements (B, N, D) within the basis, and a mask of local loads, (B,)."""
-        ...

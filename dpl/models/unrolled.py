@@ -6,14 +6,19 @@ import torch
 from torch import Tensor, nn
 
 from dpl.fem import InvariantBasedMaterial, SubspaceNewton, symmetries
-from dpl.fem.rom.compiled_prediction import CompiledPrediction, LawArguments, law_arguments
+from dpl.fem.rom.compiled_prediction import (
+    CompiledPrediction,
+    LawArguments,
+    LawWeights,
+    law_arguments,
+)
 from dpl.fem.rom.ecsw import Cubature
 from dpl.fem.rom.reduced_problem import refuse_pressure
 from dpl.fem.rom.reduced_stiffness import ReducedInverse, ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.fem.symmetry import cell_images
 from dpl.models.invariant_basis import orthonormal_fields
-from dpl.models.linear_response import LinearResponse, resize_buffers
+from dpl.models.linear_response import LinearResponse
 from dpl.models.newton_choice import LOADS, choose_newton
 from dpl.models.unrolled_fit import Maps, cell_positions, fit_in_best_modes
 from dpl.scene import Sample, Scene
@@ -22,7 +27,7 @@ from dpl.system.threads import on_threads
 
 CELL_STATES = 256  # states at which the cells of a correction are chosen
 MAX_SIZE = 100_000  # of rank, cells and stages
-_AtLaw = tuple[LawArguments, ReducedInverse, ReducedInverse]
+_AtLaw = tuple[LawArguments, ReducedInverse, LawWeights]
 
 
 class Unrolled(nn.Module):
@@ -50,7 +55,7 @@ class Unrolled(nn.Module):
     commute with them. The answer has the symmetries, those with diagonal matrices exactly and
     others up to the rounding of modes and maps.
 
-    K(0)^-1 f is computed with the factor of K(0) or in modes of its own, see `LinearResponse`.
+    K(0)^-1 f is computed for every load by products with dense blocks, see `LinearResponse`.
 
     The module takes and returns dimensionless float64 fields. It has no trained parameters.
 
@@ -102,7 +107,6 @@ class Unrolled(nn.Module):
         cells: int = 160,
         stages: int = 3,
         symmetry: bool = True,
-        linear_tol: float | None = None,
     ) -> None:
         """Build the module; `fit` computes its contents.
 
@@ -112,9 +116,6 @@ class Unrolled(nn.Module):
             cells: Largest number of sample cells; a few more, if symmetries demand it.
             stages: Largest number of iterations after the first map.
             symmetry: Find the symmetries of the body and build them into the answer.
-            linear_tol: Relative size of the part of the linear solution that modes may miss;
-                beyond it K(0)^-1 f is computed with a factor. 0: for all loads; infinity: for
-                none; None: 0 if that is cheap, else 5e-4.
 
         Raises:
             ValueError: A number is out of range.
@@ -122,8 +123,6 @@ class Unrolled(nn.Module):
         super().__init__()
         check_range(1, MAX_SIZE, rank=rank, cells=cells)
         check_range(0, MAX_SIZE, stages=stages)
-        if linear_tol is not None and not linear_tol >= 0:
-            raise ValueError(f"linear_tol = {linear_tol} must be 0 or more")
         self.scene = scene
         self.rank, self.sample_count, self.stages = rank, cells, stages
         refuse_pressure(scene.problem, "model=unrolled")
@@ -131,7 +130,7 @@ class Unrolled(nn.Module):
         also = [] if constant is None else [constant]
         self.group = symmetries(scene.problem, also=also) if symmetry else []
         self.extra_inputs = ("parameters",) if scene.loads.parameter_ranges else ()
-        self.linear = LinearResponse(scene, self.group, linear_tol)
+        self.linear = LinearResponse(scene, self.group)
         dim = scene.problem.shape[1]
         empty = torch.zeros(0, dtype=torch.float64)
         for name, value in {
@@ -173,29 +172,6 @@ class Unrolled(nn.Module):
         linear = self.linear(loaded, given)
         return self._field(linear + self._at_free_dofs(self.coordinates(loaded, given)))
 
-    def forward_in_basis(
-        self, force: Tensor, parameters: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Return displacements within the modes (B, N, D) and a mask of local loads, (B,)."""
-        given = self._given_parameters(force, parameters)
-        loaded = force.flatten(1)[:, self.dofs]
-        linear, local = self.linear.in_modes(loaded, given)
-        return self._field(linear + self._at_free_dofs(self.coordinates(loaded, given))), local
-
-    @property
-    def linear_tol(self) -> float:
-        """See `FlagsLocalLoads`."""
-        return self.linear.tol
-
-    @property
-    def flags_local_loads(self) -> bool:
-        """See `FlagsLocalLoads`."""
-        return self.linear.tol < torch.inf
-
-    def solves_every_load(self) -> bool:
-        """See `FlagsLocalLoads`."""
-        return self.linear.is_exact
-
     def coordinates(self, loaded: Tensor, parameters: Tensor) -> Tensor:
         """Return coordinates (B, R) of the nonlinear displacement.
 
@@ -230,15 +206,11 @@ class Unrolled(nn.Module):
         material, predict = self.scene.problem.material, self._prediction
         forces, parameters = force.detach(), parameters.detach()
 
-        def misses_linear_solution(k: int) -> bool:
+        def predict_one(k: int) -> None:
             law = cast(InvariantBasedMaterial, material.with_parameters(parameters[k : k + 1]))
-            return predict(*self._at_law(law), forces[k].numpy(), fields[k].numpy())
+            predict(*self._at_law(law), forces[k].numpy(), fields[k].numpy())
 
-        local = torch.tensor(on_threads(misses_linear_solution, range(len(forces))))
-        if local.any():
-            loaded = forces[local].flatten(1)[:, self.dofs].numpy()
-            exact = torch.from_numpy(self.linear.solve(loaded, parameters[local]))
-            fields.view(len(fields), -1)[local.nonzero(), self.dofs] += exact
+        on_threads(predict_one, range(len(forces)))
         return fields
 
     @property
@@ -259,11 +231,11 @@ class Unrolled(nn.Module):
         return self._compiled[1]
 
     def _at_law(self, law: InvariantBasedMaterial) -> _AtLaw:
-        """Return the law and the reduced bodies of both bases, kept for the last law."""
+        """Return the law, the reduced body and weights of the linear solution, kept for one law."""
         last = self._at_last_law  # read once: another thread may replace it
         if last is not None and last[0][0] is self.stiffness and last[0][1] == law:
             return last[1]
-        found = law_arguments(law), self._stiffness.inverse(law), self.linear.inverse(law)
+        found = law_arguments(law), self._stiffness.inverse(law), self.linear.law_weights(law)
         self._at_last_law = (self.stiffness, law), found
         return found
 
@@ -298,7 +270,6 @@ class Unrolled(nn.Module):
             ValueError: There are too few samples, or they are not finite.
         """
         problem = self.scene.problem
-        self.linear.fit(samples.force, self.rank)
         options = {"rank": self.rank, "cells": self.sample_count, "stages": self.stages}
         best, every = fit_in_best_modes(
             problem, self.group, self.linear, (samples, held_out), **options
@@ -354,16 +325,12 @@ class Unrolled(nn.Module):
     def skipped_work(self) -> list[str]:
         """Return the work that the model saves, one line each."""
         members = max(1, len(self.group))
-        lines = ["no gradient descent: the maps are found by linear regression"]
+        lines = [
+            "no gradient descent: the maps are found by linear regression",
+            "no modes for linear solutions: K(0) is condensed into dense blocks",
+        ]
         if members > 1:
             lines.append(f"no learning of {members} symmetries: the maps commute with them")
-        if self.linear.is_exact:
-            lines.append("no modes for linear solutions: a factor of K(0) is applied to each load")
-        elif self.flags_local_loads:
-            lines.append(
-                "no modes for near fields: where the modes miss more than "
-                f"{self.linear.tol:.2g} of the linear solution, K(0)^-1 f is computed"
-            )
         return lines
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
@@ -371,3 +338,11 @@ class Unrolled(nn.Module):
         resize_buffers(self, state, prefix)
         super()._load_from_state_dict(state, prefix, *rest)
         self._stiffness = ReducedStiffness(self.stiffness.detach().cpu().clone()).prepared()
+
+
+def resize_buffers(module: nn.Module, state: dict[str, Any], prefix: str) -> None:
+    """Give the buffers of a module the sizes that they have in a state dict."""
+    for name, buffer in module.named_buffers(recurse=False):
+        found = state.get(f"{prefix}{name}")
+        if isinstance(found, Tensor) and found.ndim == buffer.ndim:
+            setattr(module, name, buffer.new_empty(found.shape))

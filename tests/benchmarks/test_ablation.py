@@ -96,7 +96,7 @@ def test_the_command_writes_rows_and_figures_and_prints_a_table(script, tiny, tm
     assert list(dict.fromkeys(parts)) == list(ablation.PARTS)
     assert {part: parts.count(part) for part in ablation.PARTS} == {
         ablation.CURVE: 2,
-        ablation.ABLATION: 10,
+        ablation.ABLATION: 9,
         ablation.OTHER_LOADS: 4,
     }
     assert all(np.isfinite(float(row["e_mean"])) for row in rows)

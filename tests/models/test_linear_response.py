@@ -1,188 +1,183 @@
-"""Linear solutions: exact by a factor; in modes, with a solve for local loads."""
+"""Linear solutions of all loads by nested static condensation: compiled, as tensors, in ranges."""
+
+from functools import partial
 
 import pytest
 import torch
 
 from dpl import Sample, Scene
-from dpl.fem import DirichletBC, ModalLoads, NeoHookeanLn, Newton, Plane, Problem, box, solve
-from dpl.fem.rom.reduced_problem import support_force
+from dpl.fem import (
+    DirichletBC,
+    ModalLoads,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    RobinBC,
+    box,
+    solve,
+    symmetries,
+)
 from dpl.models import Unrolled, linear_response
 from dpl.models.linear_response import LinearResponse
 
-
-@pytest.fixture(scope="module")
-def spread(scene, batch):
-    """Forces on the whole boundary and on few nodes, dimensionless, (14, N, D)."""
-    return torch.cat([batch.force, sparse(scene, 2), sparse(scene, 60)])
-
-
-def sparse(scene, count, seed=0):
-    """Return a force (1, N, D) on some loadable degrees of freedom."""
-    random = torch.Generator().manual_seed(seed)
-    places = scene.loads.loadable_dofs.flatten().nonzero()[:, 0]
-    places = places[torch.randperm(len(places), generator=random)[:count]]
-    force = torch.zeros(scene.problem.free.numel(), dtype=torch.float64)
-    force[places] = 1e-4 * torch.randn(count, generator=random, dtype=torch.float64)
-    return force.view(1, *scene.problem.shape)
+BEAM = box((4, 1, 1), (7, 4, 4))
+LEFT = Plane(0, 0.0)
+SUPPORTS = {
+    "held": [DirichletBC(LEFT)],
+    "moved": [DirichletBC(LEFT), DirichletBC(Plane(0, 4.0), value=[0.05, None, None])],
+    "on a foundation": [DirichletBC(LEFT), RobinBC(Plane(2, 0.0), 0.1)],
+}
 
 
-def fitted(scene, batch, tol):
-    net = Unrolled(scene, rank=20, cells=8, stages=1, linear_tol=tol)
-    held_out = Sample(*(column[-3:] for column in batch))
-    net.fit(batch, held_out)
+@pytest.fixture(params=SUPPORTS, scope="module")
+def supports(request):
+    return SUPPORTS[request.param]
+
+
+def scene_of(supports, poisson=0.3, **options):
+    body = Problem.build(BEAM, NeoHookeanLn(poisson), supports=supports, **options)
+    newton = Newton(body)
+    return Scene(body, ModalLoads(newton.linear_solver, n_modes=3, deflection=0.1), newton)
+
+
+def nodal_forces(scene, count=6):
+    """Return forces on single nodes of the boundary, of very different sizes."""
+    force = torch.zeros(count, *scene.problem.shape, dtype=torch.float64)
+    random = torch.Generator().manual_seed(0)
+    nodes = scene.loads.loadable_dofs.any(dim=1).nonzero()[:, 0]
+    chosen = nodes[torch.randperm(len(nodes), generator=random)[:count]]
+    for k, node in enumerate(chosen):
+        vector = torch.randn(force.shape[2], generator=random, dtype=torch.float64)
+        force[k, node] = 10.0 ** -(3 * k) * vector
+    return torch.where(scene.problem.free, force, 0.0)
+
+
+def exact(scene, force, parameters):
+    """Return displacements K(0)^-1 (f - s) plus the prescribed ones, (B, N, D)."""
+    fields = []
+    for one, own in zip(force, parameters, strict=True):
+        body = scene.problem.with_parameters(own[None])
+        rest = torch.zeros_like(one)[None]
+        moved = body.tangent_product(rest, body.prescribed[None])[0]
+        solver = scene.linear.with_parameters(own[None])
+        fields.append(solver.solve(torch.where(body.free, one - moved, 0.0)) + body.prescribed)
+    return torch.stack(fields)
+
+
+def relative(found, expected):
+    return float(((found - expected).norm(dim=1) / expected.norm(dim=1)).max())
+
+
+def at_free(scene, fields):
+    return fields[:, scene.problem.free]
+
+
+@pytest.mark.parametrize("group", [True, False], ids=["by parity", "whole"])
+def test_the_linear_solution_of_every_force_is_exact(supports, group):
+    scene = scene_of(supports)
+    response = LinearResponse(scene, symmetries(scene.problem) if group else [])
+    force = nodal_forces(scene)
+    none = force.new_zeros(len(force), 0)
+    found = response(at_free(scene, force), none)
+    assert relative(found, at_free(scene, exact(scene, force, none))) < 1e-5
+
+
+@pytest.mark.parametrize("poisson", [(0.2, 0.4), (-0.3, 0.0), (0.0, 0.49)])
+def test_it_is_exact_for_all_poissons_ratios_of_a_range(supports, poisson):
+    scene = scene_of(supports, poisson)
+    response = LinearResponse(scene, symmetries(scene.problem))
+    force = nodal_forces(scene)
+    ratios = torch.linspace(*poisson, len(force), dtype=torch.float64)[:, None]
+    found = response(at_free(scene, force), ratios)
+    assert relative(found, at_free(scene, exact(scene, force, ratios))) < 2e-4
+
+
+def test_locking_elements_do_not_change_the_bound_of_ranges():
+    scene = scene_of(SUPPORTS["held"], (0.1, 0.45), mean_dilatation=True)
+    response = LinearResponse(scene, symmetries(scene.problem))
+    force = nodal_forces(scene)
+    ratios = torch.linspace(0.1, 0.45, len(force), dtype=torch.float64)[:, None]
+    found = response(at_free(scene, force), ratios)
+    assert relative(found, at_free(scene, exact(scene, force, ratios))) < 2e-4
+
+
+def test_a_zero_force_has_a_zero_solution():
+    scene = scene_of(SUPPORTS["held"])
+    loaded = torch.zeros(2, int(scene.problem.free.sum()), dtype=torch.float64)
+    assert not LinearResponse(scene, [])(loaded, loaded.new_zeros(2, 0)).any()
+
+
+def test_batches_in_parts_are_like_whole_ones(monkeypatch):
+    scene = scene_of(SUPPORTS["held"])
+    loaded = at_free(scene, nodal_forces(scene))
+    response = LinearResponse(scene, [])
+    whole = response(loaded, loaded.new_zeros(6, 0))
+    monkeypatch.setattr(linear_response, "MAX_VALUES", 1)
+    assert relative(response(loaded, loaded.new_zeros(6, 0)), whole) < 1e-6
+
+
+def test_blocks_are_float64_where_float32_is_not_accurate_enough(monkeypatch):
+    scene = scene_of(SUPPORTS["held"])
+    assert LinearResponse(scene, []).blocks.values.dtype == "float32"
+    monkeypatch.setattr(linear_response, "MAX_ROUNDING", 0.0)
+    response = LinearResponse(scene, [])
+    force = nodal_forces(scene)
+    none = force.new_zeros(len(force), 0)
+    found = response(at_free(scene, force), none)
+    assert response.blocks.values.dtype == "float64"
+    assert relative(found, at_free(scene, exact(scene, force, none))) < 1e-11
+
+
+def test_the_solution_is_differentiable():
+    """K(0)^-1 is symmetric: the gradient of g u with respect to f is the solution of g."""
+    scene = scene_of(SUPPORTS["moved"])
+    response = LinearResponse(scene, symmetries(scene.problem))
+    force = nodal_forces(scene)
+    loaded = at_free(scene, force).requires_grad_()
+    none = force.new_zeros(len(force), 0)
+    random = torch.Generator().manual_seed(1)
+    weight = torch.randn(loaded.shape, generator=random, dtype=torch.float64)
+    (gradient,) = torch.autograd.grad((weight * response(loaded, none)).sum(), loaded)
+    at_rest = response(torch.zeros_like(weight), none)
+    assert relative(gradient, response(weight, none) - at_rest) < 1e-4
+
+
+def fitted(scene, count=20):
+    load = scene.loads.sample(0, range(count))
+    states = solve(scene.solver, load).displacement
+    samples = Sample(load.force, states, load.young, load.parameters)
+    net = Unrolled(scene, rank=20, cells=8, stages=1)
+    net.fit(samples, samples)
     return net
 
 
-@pytest.fixture(scope="module")
-def net(scene, batch):
-    return fitted(scene, batch, 5e-4)
+@pytest.mark.parametrize("poisson", [0.3, (0.2, 0.4)], ids=["law", "range"])
+def test_compiled_predictions_of_local_loads_equal_the_tensor_operations(supports, poisson):
+    scene = scene_of(supports, poisson)
+    net = fitted(scene)
+    force = nodal_forces(scene)
+    own = torch.full((6, len(scene.loads.parameter_ranges)), 0.27, dtype=torch.float64)
+    compiled = net(force, own)
+    tensors = net(force.clone().requires_grad_(), own).detach()
+    assert relative(compiled.flatten(1), tensors.flatten(1)) < 1e-5
 
 
-def in_modes(net, force):
-    """Return linear solutions in modes at free degrees of freedom, and the mask of local loads."""
-    loaded = force.flatten(1)[:, net.dofs]
-    return net.linear.in_modes(loaded, loaded.new_zeros(len(loaded), 0))
+def test_a_small_local_load_has_the_linear_solution():
+    scene = scene_of(SUPPORTS["held"])
+    force = 1e-9 * nodal_forces(scene)
+    expected = exact(scene, force, force.new_zeros(6, 0))
+    assert relative(fitted(scene)(force).flatten(1), expected.flatten(1)) < 1e-4
 
 
-def exact_solutions(scene, net, force):
-    return torch.stack([scene.linear.solve(f).flatten()[net.dofs] for f in force])
-
-
-def relative_missing(net, force):
-    """Return norms of the missing parts over those of the Galerkin linear solutions, (B,)."""
-    linear, _ = in_modes(net, force)
-    return (exact_solutions(net.scene, net, force) - linear).norm(dim=1) / linear.norm(dim=1)
-
-
-def is_local(net, force, tol):
-    """Return the mask of local loads for a tolerance, (B,)."""
-    before, net.linear.tol = net.linear.tol, tol
-    try:
-        return in_modes(net, force)[1]
-    finally:
-        net.linear.tol = before
-
-
-def test_the_estimate_is_within_a_factor_of_three(net, spread):
-    missing = relative_missing(net, spread)
-    assert float(missing.max() / missing.min()) > 100
-    for one, force in zip(missing.tolist(), spread, strict=True):
-        tol = one / (1 + one**2) ** 0.5  # relative to the whole linear solution
-        assert is_local(net, force[None], tol / 3)
-        assert not is_local(net, force[None], 3 * tol)
-
-
-def test_only_local_loads_are_solved(net, spread, monkeypatch):
-    solved, original = [], LinearResponse.solve
-
-    def counted(response, loaded, parameters):
-        solved.extend(loaded)
-        return original(response, loaded, parameters)
-
-    monkeypatch.setattr(LinearResponse, "solve", counted)
-    marked = int(net.forward_in_basis(spread)[1].sum())
-    assert 0 < marked < len(spread)
-    net(spread)
-    assert len(solved) == marked
-    for force in spread:
-        net(force[None])
-    assert len(solved) == 2 * marked
-
-
-def test_images_of_a_load_are_local_together(net, spread):
-    assert len(net.group) > 1
-    masks = [is_local(net, symmetry.image(spread), 0.02) for symmetry in net.group]
-    assert masks[0].any()
-    assert not masks[0].all()
-    assert all(torch.equal(mask, masks[0]) for mask in masks)
-
-
-def test_a_solve_replaces_the_linear_solution_in_modes(scene, net, spread):
-    local = spread[net.forward_in_basis(spread)[1]]
-    exact, linear = exact_solutions(scene, net, local), in_modes(net, local)[0]
-    found = (net(local) - net.forward_in_basis(local)[0]).flatten(1)[:, net.dofs]
-    size = exact.norm(dim=1)
-    assert ((found - (exact - linear)).norm(dim=1) < 1e-3 * size).all()
-    assert ((exact - linear).norm(dim=1) > 1e-3 * size).any()
-
-
-def test_a_small_banded_factor_is_applied_to_every_load(scene, batch, spread):
-    """The compiled loops solve by parity, the tensor operations with the whole factor."""
-    net = fitted(scene, batch, None)
-    assert net.linear.is_exact
-    assert len(net.linear.group) > 1
-    assert len(net.linear.compiled().factor.order) < int(scene.problem.free.sum()) / 2
-    small = 1e-6 * spread
-    exact = exact_solutions(scene, net, small)
-    for answer in (net(small), torch.cat([net(one[None]) for one in small])):
-        error = (answer.flatten(1)[:, net.dofs] - exact).norm(dim=1)
-        assert (error < 1e-4 * exact.norm(dim=1)).all()
-    with torch.enable_grad():
-        tensors = net(spread.clone().requires_grad_()).detach()
-    compiled = torch.cat([net(one[None]) for one in spread])
-    assert (compiled - tensors).norm() < 1e-5 * tensors.norm()
-
-
-def test_modes_are_used_where_float32_is_not_accurate_enough(scene, batch, monkeypatch):
-    monkeypatch.setattr(linear_response, "MAX_ROUNDING", 0.0)
-    net = fitted(scene, batch, None)
-    assert not net.linear.is_exact
-    assert fitted(scene, batch, 0.0).linear.is_exact, "as demanded"
-    again = Unrolled(scene, rank=20, cells=8, stages=1)
-    assert again.linear.is_exact
-    again.load_state_dict(net.state_dict())
-    assert not again.linear.is_exact
-    force = batch.force[:2]
-    assert torch.equal(again(force), net(force))
-
-
-def test_predictions_of_local_and_other_loads_do_not_depend_on_the_batch(net, spread):
-    order = torch.randperm(len(spread), generator=torch.Generator().manual_seed(1))
-    parts = torch.cat([net(one[None]) for one in spread[order]])
-    size = float(parts.abs().max())
-    assert torch.allclose(net(spread[order]), parts, rtol=1e-6, atol=1e-7 * size)
-
-
-def test_gradients_of_local_loads_equal_finite_differences(scene, batch):
-    net = fitted(scene, batch, 0.0)  # every load is local
-    force = sparse(scene, 60).requires_grad_()
-    random = torch.Generator().manual_seed(2)
-    way = torch.where(force.detach() != 0, force.detach().abs().max(), 0.0)
-    way = way * torch.randn(force.shape, generator=random, dtype=torch.float64)
-    weight = torch.randn(force.shape, generator=random, dtype=torch.float64)
-    (slope,) = torch.autograd.grad((weight * net(force)).sum(), force)
-    with torch.no_grad():
-        up, down = ((weight * net(force + s * 1e-2 * way)).sum() for s in (1, -1))
-    assert float((slope * way).sum()) == pytest.approx(float(up - down) / 2e-2, rel=1e-2)
-
-
-def test_with_infinite_tolerance_nothing_is_solved(scene, batch, spread, monkeypatch):
-    net = fitted(scene, batch, torch.inf)
-    monkeypatch.setattr(LinearResponse, "solve", None)
-    assert net(spread).any()
-    assert not net.flags_local_loads
-
-
-@pytest.mark.parametrize("tol", [None, 5e-4])
-def test_a_moved_support_is_part_of_the_linear_solution(tol):
-    moved = DirichletBC(region=Plane(0, 4.0), value=[0.05, None, None])
-    body = Problem.build(
-        box((4, 1, 1), (5, 3, 3)), NeoHookeanLn(0.3), fixed=Plane(0, 0.0), supports=[moved]
-    )
-    newton = Newton(body)
-    scene = Scene(body, ModalLoads(newton.linear_solver, n_modes=3, deflection=0.1), newton)
-    load = scene.loads.sample(0, range(20))
-    states = solve(newton, load).displacement
-    samples = Sample(load.force, states, load.young, load.parameters)
-    net = fitted(scene, samples, tol)
-    force = load.force[:4]
-    loaded = force.flatten(1)[:, net.dofs]
-    linear = body.prescribed.repeat(4, 1, 1)
-    linear.view(4, -1)[:, net.dofs] = net.linear(loaded, loaded.new_zeros(4, 0))
-    balance = body.tangent_product(torch.zeros_like(linear), linear) - force
-    size = force.flatten(1).norm(dim=1) + support_force(body).norm()
-    assert (balance[:, body.free].norm(dim=1) < (1e-5 if tol is None else 0.1) * size).all()
-    compiled = torch.cat([net(one[None]) for one in force])
-    with torch.enable_grad():
-        tensors = net(force.clone().requires_grad_()).detach()
-    assert (compiled - tensors).norm() < 1e-5 * tensors.norm()
+def test_images_of_a_load_have_the_images_of_its_solution():
+    scene = scene_of(SUPPORTS["held"])
+    group = symmetries(scene.problem)
+    force = nodal_forces(scene)
+    response = partial(LinearResponse(scene, group), parameters=force.new_zeros(6, 0))
+    assert len(group) == 8
+    for symmetry in group:
+        image = response(at_free(scene, symmetry.image(force)))
+        field = torch.zeros_like(force)
+        field[:, scene.problem.free] = response(at_free(scene, force))
+        assert relative(image, at_free(scene, symmetry.image(field))) < 1e-5

@@ -8,14 +8,13 @@ from dpl.models import (
     CNN,
     FCNN,
     Correctable,
-    FlagsLocalLoads,
     PODNet,
     TrainsInCoordinates,
     Unrolled,
 )
 from dpl.training import MSE, LrStar, Surrogate
 
-KINDS = Correctable, FlagsLocalLoads, TrainsInCoordinates
+KINDS = Correctable, TrainsInCoordinates
 
 
 class OwnNet(torch.nn.Module):
@@ -51,11 +50,11 @@ class OwnNet(torch.nn.Module):
 @pytest.mark.parametrize(
     ("kind", "expected"),
     [
-        (FCNN, (False, False, False)),
-        (CNN, (False, False, False)),
-        (PODNet, (True, False, True)),
-        (Unrolled, (True, True, False)),
-        (OwnNet, (False, False, True)),
+        (FCNN, (False, False)),
+        (CNN, (False, False)),
+        (PODNet, (True, True)),
+        (Unrolled, (True, False)),
+        (OwnNet, (False, True)),
     ],
 )
 def test_capabilities_of_a_network_are_those_whose_methods_it_defines(scene, kind, expected):

@@ -12,7 +12,7 @@ from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import cell_gradients, rotated_strain, rotation, unbalanced_stress
 from dpl.fem.symmetry import cell_images, symmetries
 from dpl.inference import Simulator
-from dpl.models import ClosedFormFit, FlagsLocalLoads, HasCorrection, Unrolled
+from dpl.models import ClosedFormFit, HasCorrection, Unrolled
 from dpl.models.invariant_basis import scatter_fields
 from dpl.models.irreps import representations_of
 from dpl.models.newton_choice import choose_newton
@@ -100,11 +100,10 @@ def test_compiled_and_tensor_predictions_agree(beam, net):
 
 
 @pytest.mark.parametrize("law", [NeoHookeanLn(0.3), NeoHookeanLn((0.1, 0.4))])
-@pytest.mark.parametrize("linear_tol", [0, 5e-4])
-def test_a_batch_on_two_threads_is_predicted_like_its_members(law, linear_tol):
-    """The loads are of several laws, and with `linear_tol` some of them are local."""
+def test_a_batch_on_two_threads_is_predicted_like_its_members(law):
+    """The loads are of several laws, and some of them act on few nodes."""
     scene = scene_on(box((3, 1, 1), (4, 3, 3)), law)
-    net = fitted(scene, 20, rank=8, cells=4, stages=1, linear_tol=linear_tol)
+    net = fitted(scene, 20, rank=8, cells=4, stages=1)
     load = scene.loads.sample(5, range(6))
     own = load.parameters if net.extra_inputs else load.parameters.new_zeros(6, 0)
     load.force[::2, :-1] = 0.0
@@ -116,10 +115,6 @@ def test_a_batch_on_two_threads_is_predicted_like_its_members(law, linear_tol):
     finally:
         torch.set_num_threads(before)
     assert torch.allclose(batch, single, rtol=1e-10, atol=1e-12 * float(single.abs().max()))
-    if net.flags_local_loads and not net.solves_every_load():
-        local = net.forward_in_basis(load.force, own)[1]
-        assert local.any()
-        assert not local.all()
 
 
 @pytest.mark.parametrize("name", COMPILED)
@@ -174,7 +169,7 @@ def test_weights_are_stored_with_the_sizes_of_the_fit(beam, net):
 
 def test_protocols(net):
     assert isinstance(net, ClosedFormFit)
-    assert isinstance(net, FlagsLocalLoads)
+    assert isinstance(net, HasCorrection)
 
 
 def test_the_surrogate_predicts_in_si_units(beam, net):
@@ -198,7 +193,7 @@ def test_fewer_maps_where_they_do_not_help(beam):
     assert len(fitted(beam, 6, stages=30).maps) < 30
 
 
-@pytest.mark.parametrize("wrong", [{"rank": 0}, {"cells": 0}, {"stages": -1}, {"linear_tol": -1}])
+@pytest.mark.parametrize("wrong", [{"rank": 0}, {"cells": 0}, {"stages": -1}])
 def test_numbers_out_of_range_are_refused(beam, wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         Unrolled(beam, **wrong)
@@ -372,7 +367,7 @@ def test_the_held_out_error_is_the_mean_norm_of_the_errors_of_the_map(beam, monk
     assert len(net.group) > 1
     assert len(seen) > 1
     for reported, direct in seen:
-        assert reported == pytest.approx(direct, rel=1e-6)
+        assert reported == pytest.approx(direct, rel=1e-5)  # linear solutions in float32
 
 
 def test_a_trainer_of_the_user_fits_it(beam, tmp_path):

@@ -7,38 +7,21 @@ operations of `dpl.models.Unrolled`.
 
 import inspect
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import float32, float64, njit, void
+from numba import njit
 from numpy.typing import NDArray
 
 from dpl.fem.assembly import sampled_loops
 from dpl.fem.assembly.sampled_loops import rotated_strain, unbalanced_stress
 from dpl.fem.assembly.simd import SIMD_WIDTH
-from dpl.fem.linear import banded
-from dpl.fem.linear.banded import banded_triangular_solve
+from dpl.fem.linear import condensation
+from dpl.fem.linear.condensation import add_product, condensed_solve, dot
 
 SOURCES = sampled_loops.SOURCES + "".join(
-    inspect.getsource(m) for m in (banded, sys.modules[__name__])
+    inspect.getsource(m) for m in (condensation, sys.modules[__name__])
 )
-
-
-@njit(void(float64[::1], float32[:, ::1], float64[::1]), fastmath=True, cache=True)
-def add_product(x, A, y):
-    """Add x A to y, (R,), for x (F,) and A (F, R); four rows where x is zero are not read."""
-    n = A.shape[1]
-    i = 0
-    while i + 4 <= len(x):
-        a, b, c, d = x[i], x[i + 1], x[i + 2], x[i + 3]
-        if a != 0.0 or b != 0.0 or c != 0.0 or d != 0.0:
-            for j in range(n):
-                y[j] += a * A[i, j] + b * A[i + 1, j] + c * A[i + 2, j] + d * A[i + 3, j]
-        i += 4
-    while i < len(x):
-        for j in range(n):
-            y[j] += x[i] * A[i, j]
-        i += 1
 
 
 @njit
@@ -107,23 +90,19 @@ class MapArrays(NamedTuple):
 
 
 class LinearArrays(NamedTuple):
-    """The linear solution K(0)^-1 (f - s) by a factor or, if that has no rows, in modes.
+    """The linear solution K(0)^-1 (f - s) by nested static condensation.
 
     Attributes:
-        factor: Factors of K(0) by parity, (M, m, w), see `dpl.fem.solvers.parity_factor`.
-        order: Orbit of each row of the factors, (m,).
-        supports: s = K(0) p of the prescribed displacement p, by parity, (M, m).
-        basis: Modes of linear solutions.
-        probes: See `dpl.models.linear_response`, (N D, F).
-        tol: Part of the linear solution that the modes miss, above which a load is local.
+        table, unknowns: Fronts of m orbits, see `dpl.fem.linear.condensation.Fronts`.
+        values: Blocks of K Poisson's ratios, by parity, (K, M, V).
+        supports: a, b and c, by parity, (3, M, m): s = mu a + lambda b + c is the force of the
+            prescribed displacement.
     """
 
-    factor: NDArray[np.float32]
-    order: NDArray[np.int64]
+    table: NDArray[np.int64]
+    unknowns: NDArray[np.int64]
+    values: NDArray[Any]
     supports: NDArray[np.float64]
-    basis: BasisArrays
-    probes: NDArray[np.float32]
-    tol: float
 
 
 class ModelArrays(NamedTuple):
@@ -140,15 +119,6 @@ class ModelArrays(NamedTuple):
     basis: BasisArrays
     maps: MapArrays
     linear: LinearArrays
-
-
-@njit(fastmath=True)
-def dot(x, row):
-    """Return the product of a vector and a row of float32."""
-    total = 0.0
-    for j in range(len(x)):
-        total += x[j] * row[j]
-    return total
 
 
 @njit(fastmath=True)
@@ -238,28 +208,29 @@ def add_modes(basis, coordinates, values):
 
 
 @njit
-def set_linear_solution(linear, parts, values):
-    """Set values (M, m) to K(0)^-1 (f - s) of a force by parity (M, m)."""
-    right, order = np.zeros(len(linear.order), np.float32), linear.order
+def set_linear_solution(linear, weights, moduli, parts, values):
+    """Set values (M, m) to K(0)^-1 (f - s) of a force by parity (M, m).
+
+    Args:
+        linear: The arrays of the linear solution.
+        weights: Factors of the Poisson's ratios, (K,).
+        moduli: mu, lambda and 1, (3,).
+        parts: The force by parity, (M, m).
+        values: The solution.
+    """
+    right, work = np.empty(parts.shape[1]), np.empty(parts.shape[1])
+    solution = np.empty(parts.shape[1])
+    values[:] = 0.0
     for p in range(len(parts)):
-        size = 0.0
-        for j in range(len(order)):
-            size = max(size, abs(parts[p, j] - linear.supports[p, j]))
-        if size > 0.0:  # scaled to order one, so that float32 holds it
-            for j in range(len(order)):
-                right[j] = (parts[p, order[j]] - linear.supports[p, order[j]]) / size
-            solved = banded_triangular_solve(linear.factor[p], right)
-            for j in range(len(order)):
-                values[p, order[j]] = size * solved[j]
-
-
-@njit
-def is_local(linear, force, coordinates):
-    """Return True if the modes miss too much of the linear solution with these coordinates."""
-    products = np.zeros(linear.probes.shape[1])
-    add_product(force, linear.probes, products)
-    missing = (products * products).mean() if len(products) else 0.0
-    return missing > linear.tol**2 * ((coordinates * coordinates).sum() + missing)
+        right[:] = parts[p]
+        for i in range(3):
+            right -= moduli[i] * linear.supports[i, p]
+        if (right != 0.0).any():
+            for k in range(len(weights)):
+                work[:] = right
+                blocks = linear.values[k, p]
+                condensed_solve(linear.table, linear.unknowns, blocks, work, solution)
+                values[p] += weights[k] * solution
 
 
 @njit
@@ -311,33 +282,21 @@ def nonlinear_coordinates(law, c, needs, finite, mu, lam, model, linear):
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def predict(law, c, needs, finite, mu, lam, model, reduced, reduced_linear, force, field):
+def predict(law, c, needs, finite, mu, lam, model, reduced, of_law, force, field):
     """Set the field of a prediction.
 
     Args:
         law, c, needs, finite, mu, lam: The law, see `dpl.fem.assembly.kernels`.
         model: The arrays of the model.
         reduced: (V^T K(0) V)^-1, (R, R), and V^T K(0) p of the prescribed displacement p, (R,).
-        reduced_linear: The same of the modes of linear solutions.
+        of_law: Weights and moduli of the law, see `set_linear_solution`.
         force: f, (N D,).
-        field: Displacement at free degrees of freedom, (N D,); of a local load without the
-            linear solution.
-
-    Returns:
-        True for a local load.
+        field: Displacement at free degrees of freedom, (N D,).
     """
     parts = force_by_parity(model.orbits, force)
-    values = np.zeros(parts.shape)
-    local = False
-    if len(model.linear.order):
-        set_linear_solution(model.linear, parts, values)
-    else:
-        coordinates = galerkin(model.linear.basis, reduced_linear[0], reduced_linear[1], parts)
-        local = is_local(model.linear, force, coordinates)
-        if not local:
-            add_modes(model.linear.basis, coordinates, values)
+    values = np.empty(parts.shape)
+    set_linear_solution(model.linear, of_law[0], of_law[1], parts, values)
     linear = galerkin(model.basis, reduced[0], reduced[1], parts)
     found = nonlinear_coordinates(law, c, needs, finite, mu, lam, model, linear)
     add_modes(model.basis, found, values)
     set_field(model.orbits, values, field)
-    return local

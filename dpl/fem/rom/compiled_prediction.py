@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -22,10 +22,10 @@ from dpl.fem.assembly.prediction_loops import (
     predict,
 )
 from dpl.fem.assembly.simd import SIMD_WIDTH
+from dpl.fem.linear.condensation import Fronts
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedInverse
-from dpl.fem.solvers.parity_factor import ParityFactor
 from dpl.fem.symmetry import Symmetry
 
 Array = NDArray[np.float64]
@@ -92,16 +92,13 @@ class CompiledPrediction:
         fields = SignedOrbits.of_field(parities, group, free)
         images = positions[parities.members]
         one, two = (SignedOrbits.of_tensors(parities, images, k, SIMD_WIDTH) for k in (1, 2))
-        of_modes, of_linear = _ByParity(parities, parity), _ByParity(parities, linear.parity)
+        of_modes = _ByParity(parities, parity)
         flat = gradients.flatten(1).T  # (C D D, R + 1)
         rest = torch.where(one.weight > 0, flat[one.images, -1], 0.0)
         none = torch.zeros(0, *two.images.shape, of_modes.most)
         others = torch.stack([of_modes.rows(two, matrix) for matrix in maps]) if len(maps) else none
         dofs = free.flatten().nonzero()[:, 0]
-        spread = linear.probes.new_zeros(free.numel(), linear.probes.shape[1])
-        spread[dofs] = linear.probes
-        supports = fields.by_parity(linear.supports[free], parities)
-        factor = linear.factor
+        supports = [fields.by_parity(part[free], parities) for part in linear.supports]
         arrays = ModelArrays(
             orbits=OrbitArrays(
                 characters=parities.characters.numpy(),
@@ -121,12 +118,10 @@ class CompiledPrediction:
                 limits=_double(limits),
             ),
             linear=LinearArrays(
-                factor=factor.storage if factor else np.zeros((1, 0, 1), np.float32),
-                order=factor.order if factor else np.zeros(0, np.int64),
-                supports=_double(supports),
-                basis=of_linear.basis(fields, linear.modes),
-                probes=_single(spread),
-                tol=min(linear.tol, np.finfo(float).max ** 0.25),
+                table=linear.fronts.table,
+                unknowns=linear.fronts.unknowns,
+                values=linear.values,
+                supports=_double(torch.stack(supports)),
             ),
         )
         return cls(arrays)
@@ -135,45 +130,48 @@ class CompiledPrediction:
         self,
         law: LawArguments,
         reduced: ReducedInverse,
-        linear: ReducedInverse,
+        of_law: "LawWeights",
         force: Array,
         field: Array,
-    ) -> bool:
-        """Set the displacement at free degrees of freedom; return True for a local load.
-
-        The displacement under a local load lacks the linear solution.
+    ) -> None:
+        """Set the displacement at free degrees of freedom.
 
         Args:
             law: The law, see `law_arguments`.
             reduced: (V^T K(0) V)^-1, (R, R), and V^T K(0) p, (R,).
-            linear: The same of the modes of linear solutions.
+            of_law: The law as the linear solution needs it.
             force: Nodal forces, (N, D).
             field: Displacement, (N, D), contiguous.
         """
         flat = np.ascontiguousarray(force).reshape(-1)
-        data = self.arrays, reduced, linear, flat, field.reshape(-1)
-        return bool(call_compiled(predict, *law, *data))
+        data = self.arrays, reduced, of_law, flat, field.reshape(-1)
+        call_compiled(predict, *law, *data)
 
 
 class LinearPrediction(NamedTuple):
-    """The linear solution of a compiled prediction, by a factor or in modes.
+    """The linear solution of a compiled prediction.
 
     Attributes:
-        factor: Factor of K(0); None if the modes are used.
-        supports: K(0) p, (N, D), of the prescribed displacement p.
-        modes: L at free degrees of freedom, (n, R).
-        parity: Parity of each of these modes, (R,).
-        probes: Fields whose products with a force estimate the missing part, (n, F).
-        tol: Relative size of the part of the linear solution that the modes miss, above which a
-            load is local.
+        fronts: Fronts of K(0).
+        values: Blocks of K Poisson's ratios, by parity, (K, M, V).
+        supports: See `dpl.fem.rom.reduced_problem.support_forces`, (3, N, D).
     """
 
-    factor: ParityFactor | None
+    fronts: Fronts
+    values: NDArray[Any]
     supports: Tensor
-    modes: Tensor
-    parity: Tensor
-    probes: Tensor
-    tol: float
+
+
+class LawWeights(NamedTuple):
+    """A law as a linear solution needs it.
+
+    Attributes:
+        weights: Factors of the Poisson's ratios, (K,).
+        moduli: mu and lambda at rest over Young's modulus, and 1, (3,).
+    """
+
+    weights: Array
+    moduli: Array
 
 
 class _ByParity:

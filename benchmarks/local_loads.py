@@ -1,0 +1,143 @@
+"""Loads on small areas: errors and latencies of a trained run and of its ONNX graph."""
+
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpl.evaluation import latency
+from dpl.export import ExportGraph, OnnxSession, export_onnx
+from dpl.export.onnx_graph import missing_packages
+from dpl.fem import Load, PatchLoads, PointLoads, solve
+from dpl.models import Unrolled
+from dpl.scene import Scene
+from dpl.system.threads import one_thread
+from dpl.training import Surrogate
+
+DEFLECTIONS = (1e-3, 0.05)  # largest linear deflection of the local loads over L [-]
+RADIUS = 0.05  # largest radius of a patch over L [-]
+STREAM = (0, 14)  # random stream of the loads
+FAMILIES: dict[str, Callable[..., Any]] = {
+    "point force": lambda linear, **more: PointLoads(linear, count=(1, 1), **more),
+    "small patch": lambda linear, **more: PatchLoads(linear, patch_radius=(0.0, RADIUS), **more),
+}
+RUN = "loads of the run"
+
+
+@dataclass(frozen=True)
+class LocalLoads:
+    """Errors and latencies of one kind of loads on one thread.
+
+    Attributes:
+        loads: Name of the kind.
+        deflection: Largest linear deflection over L [-]; None for the loads of the run.
+        count: Number of loads with a stable equilibrium.
+        linear_p50, linear_p99: Percentiles of the relative error of the linear solution [-].
+        error_p50, error_p99: The same of the prediction, against Newton [-].
+        predict_p50, predict_p99: Percentiles of the wall time of a prediction [ms].
+        onnx_p50, onnx_p99: The same of the ONNX graph; None if its packages are missing.
+        onnx_error: Largest relative difference of graph and prediction [-]; None like these.
+    """
+
+    loads: str
+    deflection: float | None
+    count: int
+    linear_p50: float
+    linear_p99: float
+    error_p50: float
+    error_p99: float
+    predict_p50: float
+    predict_p99: float
+    onnx_p50: float | None = None
+    onnx_p99: float | None = None
+    onnx_error: float | None = None
+
+
+def measure(surrogate: Surrogate, count: int, *, repeats: int = 1) -> Iterator[LocalLoads]:
+    """Yield the rows of local loads and of the loads of the run.
+
+    Args:
+        surrogate: A trained `dpl.models.Unrolled` as a surrogate.
+        count: Number of loads of each kind.
+        repeats: Number of timed calls with each load.
+    """
+    scene = surrogate.scene
+    session = None
+    if not missing_packages():
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "model.onnx"
+            export_onnx(ExportGraph(surrogate), path)
+            session = OnnxSession(path)
+    with one_thread():
+        for name, deflection, load in kinds(scene, count):
+            yield _row(surrogate, session, name, deflection, load, repeats)
+
+
+def kinds(scene: Scene, count: int) -> Iterator[tuple[str, float | None, Load]]:
+    """Yield name, deflection and `count` loads of each kind."""
+    yield RUN, None, scene.loads.sample(STREAM, range(count))
+    for deflection in DEFLECTIONS:
+        for name, make in FAMILIES.items():
+            family = make(scene.linear, deflection=deflection)
+            yield name, deflection, family.sample(STREAM, range(count))
+
+
+def _row(
+    surrogate: Surrogate,
+    session: OnnxSession | None,
+    name: str,
+    deflection: float | None,
+    load: Load,
+    repeats: int,
+) -> LocalLoads:
+    scene = surrogate.scene
+    both = [(one, solve(scene.newton, one)) for one in load.unbatch()]  # together: much memory
+    singles = [one for one, solution in both if solution.converged]
+    exact = torch.cat([solution.displacement for _, solution in both if solution.converged])
+    with torch.inference_mode():
+        found = torch.cat([surrogate.predict(one) for one in singles])
+        linear = torch.cat([linear_solution(surrogate, one) for one in singles])
+    solved = torch.cat([next(scene.linear.iterate(one)).displacement for one in singles])
+    numbers: dict[str, float] = {
+        **_percentiles("linear", relative_errors(linear, solved)),
+        **_percentiles("error", relative_errors(found, exact)),
+    }
+    times = latency(surrogate.predict, singles, repeats=repeats)
+    numbers |= {"predict_p50": times.p50, "predict_p99": times.p99}
+    if session is not None:
+        numbers |= _graph_numbers(session, scene, singles, found, repeats)
+    return LocalLoads(name, deflection, len(singles), **numbers)
+
+
+def _graph_numbers(
+    session: OnnxSession, scene: Scene, singles: list[Load], found: Tensor, repeats: int
+) -> dict[str, float]:
+    """Return latencies of a graph and its largest difference from predictions (B, N, D) [-]."""
+    inputs = [scene.si_inputs(one) for one in singles]
+    arrays = [{key: part.numpy() for key, part in one.items()} for one in inputs]
+    times = latency(lambda one: session(**one), arrays, repeats=repeats)
+    graph = torch.from_numpy(np.concatenate([session(**one) for one in arrays])) / scene.length
+    difference = float(relative_errors(graph, found).max())
+    return {"onnx_p50": times.p50, "onnx_p99": times.p99, "onnx_error": difference}
+
+
+def linear_solution(surrogate: Surrogate, load: Load) -> Tensor:
+    """Return the linear solution that a fitted `Unrolled` uses, (1, N, D) [-]."""
+    problem, net = surrogate.scene.problem, cast(Unrolled, surrogate.net)
+    field = problem.prescribed.clone()[None]
+    field[:, problem.free] = net.linear(load.force[:, problem.free], load.parameters)
+    return field
+
+
+def relative_errors(found: Tensor, expected: Tensor) -> Tensor:
+    """Return relative L2 errors, (B,)."""
+    return (found - expected).flatten(1).norm(dim=1) / expected.flatten(1).norm(dim=1)
+
+
+def _percentiles(name: str, errors: Tensor) -> dict[str, float]:
+    return {f"{name}_p{q}": float(np.percentile(errors.numpy(), q)) for q in (50, 99)}

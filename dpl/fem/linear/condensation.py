@@ -1,0 +1,252 @@
+"""Solution by nested static condensation: dense blocks instead of triangular factors.
+
+The unknowns of a front are condensed as the interior of a substructure is: with F the matrix of the
+front after the elimination of its children, I its pivots and J its boundary,
+
+    forward, children first:  g = F_II^-1 f_I,   f_J <- f_J - X^T f_I,   X = F_II^-1 F_IJ
+    backward, parents first:  u_I = g - X u_J
+
+The blocks are stored as they are multiplied, so that a solution consists of products of dense
+matrices and vectors. A front without forces below it is left out of the forward pass.
+
+Sources: Guyan (1965), AIAA J. 3 (static condensation); George (1973) and Duff, Reid (1983), see
+`dpl.fem.linear.dissection`.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import float32, float64, int64, njit, void
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from dpl.fem.linear.dissection import Integers, nested_dissection
+from dpl.fem.linear.interface import SingularMatrix
+
+
+class Fronts(NamedTuple):
+    """Fronts of a matrix, children before their parents, as arrays.
+
+    Attributes:
+        table: First and last position of the pivots among the unknowns, last position of the
+            boundary, and position of the blocks among the values of each front, (S, 4).
+        unknowns: Pivots and boundary of one front after the other, (T,).
+        heights: 0 of fronts without children, else one more than the largest of theirs, (S,).
+    """
+
+    table: Integers
+    unknowns: Integers
+    heights: Integers
+
+
+class Condensed(NamedTuple):
+    """Blocks of P matrices with the same fronts.
+
+    Attributes:
+        fronts: The fronts.
+        values: F_II^-1 and X of one front after the other, row by row, (P, V).
+    """
+
+    fronts: Fronts
+    values: NDArray[Any]
+
+
+def condense(matrices: Sequence[csr_array], points: NDArray[np.float64]) -> Condensed:
+    """Return the blocks in float64 of symmetric positive definite matrices.
+
+    Args:
+        matrices: P matrices, (n, n), of similar structure.
+        points: Position of each unknown, by which the fronts are chosen, (n, D).
+
+    Raises:
+        SingularMatrix: A matrix is not positive definite.
+    """
+    graph = csr_array(sum(abs(matrix) for matrix in matrices))
+    tree = nested_dissection(graph, points)
+    updates: dict[int, NDArray[np.float64]] = {}
+    table, heights, blocks = [], np.zeros(len(tree), np.int64), []
+    first = place = 0
+    for k, front in enumerate(tree):
+        both, count = np.concatenate([front.pivots, front.boundary]), len(front.pivots)
+        F = np.zeros((len(matrices), len(both), len(both)))
+        for own, matrix in zip(F, matrices, strict=True):
+            own[:count] = matrix[front.pivots][:, both].toarray()
+        F[:, count:, :count] = F[:, :count, count:].mT
+        position = dict(zip(both.tolist(), range(len(both)), strict=True))
+        for child in front.children:
+            where = np.array([position[j] for j in tree[child].boundary.tolist()], np.int64)
+            F[:, where[:, None], where] += updates.pop(child)
+            heights[k] = max(heights[k], heights[child] + 1)
+        inverse = _inverse(F[:, :count, :count])
+        X = inverse @ F[:, :count, count:]
+        updates[k] = F[:, count:, count:] - F[:, count:, :count] @ X
+        table.append((first, first + count, first + len(both), place))
+        first, place = first + len(both), place + count * len(both)
+        blocks += [inverse.reshape(len(F), -1), X.reshape(len(F), -1)]
+    unknowns = np.concatenate([part for front in tree for part in front[:2]])
+    fronts = Fronts(np.array(table), unknowns, heights)
+    return Condensed(fronts, np.concatenate(blocks, axis=1))
+
+
+def _inverse(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return inverses, (P, I, I), exactly symmetric."""
+    try:
+        roots = np.linalg.inv(np.linalg.cholesky(matrices))
+    except np.linalg.LinAlgError as error:
+        raise SingularMatrix("the matrix is not positive definite") from error
+    return np.asarray(roots.mT @ roots)
+
+
+@njit(
+    [
+        void(float64[::1], float32[:, ::1], float64[::1]),
+        void(float64[::1], float64[:, ::1], float64[::1]),
+    ],
+    fastmath=True,
+    cache=True,
+)
+def add_product(x, A, y):  # type: ignore[no-untyped-def]
+    """Add x A to y, (R,), for x (F,) and A (F, R); four rows where x is zero are not read."""
+    n = A.shape[1]
+    i = 0
+    while i + 4 <= len(x):
+        a, b, c, d = x[i], x[i + 1], x[i + 2], x[i + 3]
+        if a != 0.0 or b != 0.0 or c != 0.0 or d != 0.0:
+            for j in range(n):
+                y[j] += a * A[i, j] + b * A[i + 1, j] + c * A[i + 2, j] + d * A[i + 3, j]
+        i += 4
+    while i < len(x):
+        for j in range(n):
+            y[j] += x[i] * A[i, j]
+        i += 1
+
+
+@njit(fastmath=True)
+def dot(x, row):  # type: ignore[no-untyped-def]
+    """Return the product of a vector (F,) of float64 and a row (F,) of any type."""
+    total = 0.0
+    for j in range(len(x)):
+        total += x[j] * row[j]
+    return total
+
+
+@njit(fastmath=True)
+def subtract_product(A, x, y):  # type: ignore[no-untyped-def]
+    """Subtract A x from y, (F,), for A (F, R) and x (R,); x is read once for four rows."""
+    n = A.shape[1]
+    i = 0
+    while i + 4 <= len(y):
+        a, b, c, d = 0.0, 0.0, 0.0, 0.0
+        for j in range(n):
+            a += A[i, j] * x[j]
+            b += A[i + 1, j] * x[j]
+            c += A[i + 2, j] * x[j]
+            d += A[i + 3, j] * x[j]
+        y[i] -= a
+        y[i + 1] -= b
+        y[i + 2] -= c
+        y[i + 3] -= d
+        i += 4
+    while i < len(y):
+        y[i] -= dot(x, A[i])
+        i += 1
+
+
+@njit(
+    [
+        void(int64[:, ::1], int64[::1], float32[::1], float64[::1], float64[::1]),
+        void(int64[:, ::1], int64[::1], float64[::1], float64[::1], float64[::1]),
+    ],
+    cache=True,
+)
+def condensed_solve(table, unknowns, values, force, solution):  # type: ignore[no-untyped-def]
+    """Set `solution` (n,) to K^-1 f.
+
+    Args:
+        table, unknowns: See `Fronts`.
+        values: Blocks of one matrix, (V,).
+        force: f, (n,), float64; overwritten.
+        solution: (n,), float64.
+    """
+    work = np.zeros(len(force))
+    for s in range(len(table)):
+        first, middle, last, place = table[s]
+        pivots, boundary = unknowns[first:middle], unknowns[middle:last]
+        count, others = len(pivots), len(boundary)
+        square = count * count
+        own, is_loaded = np.empty(count), False
+        for i in range(count):
+            own[i] = force[pivots[i]]
+            is_loaded = is_loaded or own[i] != 0.0
+        inner, passed = np.zeros(count), work[:others]
+        if is_loaded:
+            passed[:] = 0.0
+            add_product(own, values[place : place + square].reshape((count, count)), inner)
+            X = values[place + square : place + square + count * others]
+            add_product(own, X.reshape((count, others)), passed)
+            for j in range(others):
+                force[boundary[j]] -= passed[j]
+        for i in range(count):
+            solution[pivots[i]] = inner[i]
+    for s in range(len(table) - 1, -1, -1):
+        first, middle, last, place = table[s]
+        pivots, boundary = unknowns[first:middle], unknowns[middle:last]
+        count, others = len(pivots), len(boundary)
+        start, outer = place + count * count, work[:others]
+        for j in range(others):
+            outer[j] = solution[boundary[j]]
+        own = np.empty(count)
+        for i in range(count):
+            own[i] = solution[pivots[i]]
+        X = values[start : start + count * others].reshape((count, others))
+        subtract_product(X, outer, own)
+        for i in range(count):
+            solution[pivots[i]] = own[i]
+
+
+def condensed_block_solve(fronts: Fronts, values: NDArray[Any], x: NDArray[Any]) -> None:
+    """Replace right-hand sides (n, k) by solutions, k at once.
+
+    Args:
+        fronts: See `Fronts`.
+        values: Blocks of one matrix, (V,).
+        x: Right-hand sides, (n, k), of the same dtype.
+    """
+    blocks = front_blocks(fronts, values)
+    for pivots, boundary, inverse, X in blocks:
+        own = x[pivots]
+        x[boundary] -= X.T @ own
+        x[pivots] = inverse @ own
+    for pivots, boundary, _, X in reversed(blocks):
+        x[pivots] -= X @ x[boundary]
+
+
+class FrontBlocks(NamedTuple):
+    """Blocks of one front; further axes in front of those of the blocks are matrices.
+
+    Attributes:
+        pivots: I, (I,).
+        boundary: J, (J,).
+        inverse: F_II^-1, (..., I, I).
+        coupling: X, (..., I, J).
+    """
+
+    pivots: Integers
+    boundary: Integers
+    inverse: NDArray[Any]
+    coupling: NDArray[Any]
+
+
+def front_blocks(fronts: Fronts, values: NDArray[Any]) -> list[FrontBlocks]:
+    """Return views of the blocks of each front, children first, from values (..., V)."""
+    found = []
+    for first, middle, last, place in fronts.table.tolist():
+        count, others = middle - first, last - middle
+        end = place + count * count
+        inverse = values[..., place:end].reshape(*values.shape[:-1], count, count)
+        coupling = values[..., end : end + count * others]
+        coupling = coupling.reshape(*values.shape[:-1], count, others)
+        pivots, boundary = fronts.unknowns[first:middle], fronts.unknowns[middle:last]
+        found.append(FrontBlocks(pivots, boundary, inverse, coupling))
+    return found

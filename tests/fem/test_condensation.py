@@ -1,0 +1,131 @@
+"""Nested dissection and condensation solve like a dense factorisation, for all kinds of graphs."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import norm
+from scipy.sparse import block_diag, csr_array, diags_array, eye_array, kron
+
+from dpl.fem.linear.condensation import (
+    Condensed,
+    condense,
+    condensed_block_solve,
+    condensed_solve,
+    front_blocks,
+)
+from dpl.fem.linear.dissection import LEAF, nested_dissection
+from dpl.fem.linear.interface import SingularMatrix
+from dpl.fem.solvers.condensed_layers import CondensedLayers
+
+
+def laplacian(shape):
+    """Return the matrix of a grid, (n, n), and the positions of its unknowns, (n, D)."""
+    total = csr_array((1, 1))
+    for count in shape:
+        chain = diags_array([-np.ones(count - 1)] * 2, offsets=[-1, 1])
+        one = chain + 2.1 * eye_array(count)
+        total = kron(total, eye_array(count)) + kron(eye_array(total.shape[0]), one)
+    axes = np.meshgrid(*map(np.arange, shape), indexing="ij")
+    return csr_array(total), np.stack([axis.ravel() for axis in axes], axis=1).astype(float)
+
+
+def ring(count):
+    """Return the matrix and positions of a closed chain."""
+    matrix = diags_array([-np.ones(count - 1)] * 2, offsets=[-1, 1]).tolil()
+    matrix[0, count - 1] = matrix[count - 1, 0] = -1
+    angle = 2 * np.pi * np.arange(count) / count
+    return csr_array(matrix + 2.1 * eye_array(count)), np.stack([np.cos(angle), np.sin(angle)], 1)
+
+
+def two_parts():
+    """Return two grids without a coupling at the same place."""
+    matrix, points = laplacian((9, 10))
+    return csr_array(block_diag([matrix, matrix])), np.concatenate([points, points])
+
+
+def full():
+    """Return a full matrix, which has no separator."""
+    random = np.random.default_rng(0).standard_normal((90, 90))
+    return csr_array(random @ random.T + 90 * np.eye(90)), random[:, :2]
+
+
+GRAPHS = {
+    "line": laplacian((200,)),
+    "plane": laplacian((15, 16)),
+    "solid": laplacian((7, 8, 9)),
+    "one leaf": laplacian((3, 3)),
+    "ring": ring(300),
+    "two parts": two_parts(),
+    "full": full(),
+}
+
+
+@pytest.fixture(params=GRAPHS, scope="module")
+def graph(request):
+    return GRAPHS[request.param]
+
+
+def test_each_unknown_is_a_pivot_once_and_boundaries_are_eliminated_later(graph):
+    matrix, points = graph
+    fronts = nested_dissection(abs(matrix), points)
+    pivots = np.concatenate([front.pivots for front in fronts])
+    assert sorted(pivots) == list(range(matrix.shape[0]))
+    number = np.empty(len(pivots), int)
+    for k, front in enumerate(fronts):
+        number[front.pivots] = k
+    for k, front in enumerate(fronts):
+        assert (number[front.boundary] > k).all()
+        for child in front.children:
+            allowed = np.concatenate([front.pivots, front.boundary])
+            assert np.isin(fronts[child].boundary, allowed).all()
+
+
+def test_a_solid_is_divided_into_small_parts():
+    fronts = nested_dissection(abs(GRAPHS["solid"][0]), GRAPHS["solid"][1])
+    assert max(len(front.pivots) for front in fronts if not front.children) <= LEAF
+
+
+def test_all_solutions_equal_those_of_a_dense_factorisation(graph):
+    matrix, points = graph
+    size = matrix.shape[0]
+    blocks = condense([matrix, 2 * matrix], points)
+    random = np.random.default_rng(1).standard_normal((size, 3))
+    random[:, 2] = np.arange(size) == size // 2  # one entry: fronts without forces are left out
+    exact = np.linalg.solve(matrix.toarray(), random)
+    many = random.copy()
+    condensed_block_solve(blocks.fronts, blocks.values[0], many)
+    assert norm(many - exact) < 1e-11 * norm(exact)
+    for dtype, most in ((np.float64, 1e-11), (np.float32, 1e-5)):
+        values = blocks.values.astype(dtype)
+        for right, expected in zip(random.T, exact.T, strict=True):
+            solution = np.full(size, np.nan)
+            table, unknowns, _ = blocks.fronts
+            condensed_solve(table, unknowns, values[1], right.copy(), solution)
+            assert norm(2 * solution - expected) < most * norm(expected)
+
+
+def test_the_tensor_operations_equal_the_loops(graph):
+    matrix, points = graph
+    blocks = condense([matrix, 3 * matrix], points)
+    layers = CondensedLayers.of(blocks, torch.device("cpu"))
+    right = np.random.default_rng(2).standard_normal((2, 4, matrix.shape[0]))
+    found = layers.solve(torch.from_numpy(right)).numpy()
+    for k, values in enumerate(blocks.values):
+        expected = right[k].T.copy()
+        condensed_block_solve(blocks.fronts, values, expected)
+        assert norm(found[k].T - expected) < 1e-11 * norm(expected)
+
+
+def test_the_blocks_of_a_solid_are_smaller_than_its_inverse():
+    matrix, points = GRAPHS["solid"]
+    blocks = condense([matrix], points)
+    assert blocks.values.size < 0.5 * matrix.shape[0] ** 2
+    parts = front_blocks(*Condensed(blocks.fronts, blocks.values[0]))
+    assert sum(one.inverse.size + one.coupling.size for one in parts) == blocks.values.size
+    assert all((one.inverse == one.inverse.T).all() for one in parts)
+
+
+def test_an_indefinite_matrix_is_refused():
+    matrix, points = GRAPHS["plane"]
+    with pytest.raises(SingularMatrix, match="not positive definite"):
+        condense([matrix, matrix - eye_array(matrix.shape[0])], points)
