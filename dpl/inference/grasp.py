@@ -248,8 +248,10 @@ class Gripper:
             return as_load(scene, given, young, parameters)
         rest = torch.zeros(scene.problem.shape, dtype=torch.float64)
         load = as_load(scene, rest, young, parameters)
-        constant = scene.loads.constant_force
-        return load if constant is None else load._replace(force=constant[None])
+        if (constant := scene.loads.constant_force) is None:
+            return load
+        modulus = scene.loads.young_range[0]  # by which the constant force is divided
+        return load._replace(force=constant[None] * (modulus / load.young))
 
     def _patch(
         self, region: Any, translation: Any, rotation: Any, load: Load

@@ -222,6 +222,18 @@ def test_further_forces_act_at_the_same_time(scene, sim):
     assert abs(found.displacement).max() > 1e-3
 
 
+def test_a_constant_force_of_the_scene_acts_if_no_force_is_given(scene, make_scene):
+    force = torch.zeros(scene.problem.shape, dtype=torch.float64)
+    force[scene.problem.points[:, 0] == 0.5, 2] = 1e-5
+    sim = simulator_of(make_scene(constant_force=force))
+    newtons = force * E * L**2
+    for young in (E, 2 * E):
+        left_out = sim.grasp(END, [0, 0, 0], young=young, tol=1e-9)
+        given = sim.grasp(END, [0, 0, 0], force=newtons, young=young, tol=1e-9)
+        assert abs(left_out.displacement).max() > 1e-4
+        assert np.allclose(left_out.displacement, given.displacement, atol=1e-9 * L)
+
+
 def test_a_mask_of_nodes_is_a_patch_too(scene, sim):
     mask = end_nodes(scene).numpy()
     assert np.array_equal(
