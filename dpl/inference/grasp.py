@@ -331,5 +331,5 @@ class Gripper:
             method=held.method,
             iterations=int(state.iterations),
             milliseconds=1e3 * (time.perf_counter() - begin),
-            summary=f"motion met to {missed:.1e} m; {words}",
+            summary=f"motion error {missed:.1e} m; {words}",
         )
