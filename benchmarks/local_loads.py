@@ -12,7 +12,8 @@ from torch import Tensor
 
 from dpl.evaluation import latency
 from dpl.export import ExportGraph, OnnxSession, export_onnx
-from dpl.export.onnx_graph import missing_packages
+from dpl.export.comparison import relative_differences
+from dpl.export.onnx_graph import Array, missing_packages
 from dpl.fem import Load, PatchLoads, PointLoads, solve
 from dpl.models import Unrolled
 from dpl.scene import Scene
@@ -104,8 +105,8 @@ def _row(
         linear = torch.cat([linear_solution(surrogate, one) for one in singles])
     solved = torch.cat([next(scene.linear.iterate(one)).displacement for one in singles])
     numbers: dict[str, float] = {
-        **_percentiles("linear", relative_errors(linear, solved)),
-        **_percentiles("error", relative_errors(found, exact)),
+        **_percentiles("linear", relative_differences(linear.numpy(), solved.numpy())),
+        **_percentiles("error", relative_differences(found.numpy(), exact.numpy())),
     }
     times = latency(surrogate.predict, singles, repeats=repeats)
     numbers |= {"predict_p50": times.p50, "predict_p99": times.p99}
@@ -121,8 +122,8 @@ def _graph_numbers(
     inputs = [scene.si_inputs(one) for one in singles]
     arrays = [{key: part.numpy() for key, part in one.items()} for one in inputs]
     times = latency(lambda one: session(**one), arrays, repeats=repeats)
-    graph = torch.from_numpy(np.concatenate([session(**one) for one in arrays])) / scene.length
-    difference = float(relative_errors(graph, found).max())
+    graph = np.concatenate([session(**one) for one in arrays]) / scene.length
+    difference = float(relative_differences(graph, found.numpy()).max())
     return {"onnx_p50": times.p50, "onnx_p99": times.p99, "onnx_error": difference}
 
 
@@ -134,10 +135,5 @@ def linear_solution(surrogate: Surrogate, load: Load) -> Tensor:
     return field
 
 
-def relative_errors(found: Tensor, expected: Tensor) -> Tensor:
-    """Return relative L2 errors, (B,)."""
-    return (found - expected).flatten(1).norm(dim=1) / expected.flatten(1).norm(dim=1)
-
-
-def _percentiles(name: str, errors: Tensor) -> dict[str, float]:
-    return {f"{name}_p{q}": float(np.percentile(errors.numpy(), q)) for q in (50, 99)}
+def _percentiles(name: str, errors: Array) -> dict[str, float]:
+    return {f"{name}_p{q}": float(np.percentile(errors, q)) for q in (50, 99)}
