@@ -51,7 +51,7 @@ class Sample(_Sample):
         force: (B, N, D) [-].
         displacement: (B, N, D) [-].
         young: (B,) [Pa].
-        parameters: Values of the ranges of the law, (B, P); may be left out if it has none.
+        parameters: Values of `Problem.parameter_ranges`, (B, P); may be left out if there are none.
     """
 
     __slots__ = ()
@@ -147,7 +147,7 @@ class Scene:
             force: Nodal forces.
             young: E. On a body with an elastic foundation or a follower pressure it must be that of
                 the body, see `Problem.check_modulus`, which this function does not call.
-            parameters: Values of the ranges of the law, (B,) or (B, P); required if it has any.
+            parameters: Values of `Problem.parameter_ranges`, (B,) or (B, P); required if there are any.
         """
         dimensionless = force.double() / (young.double()[:, None, None] * self.force_unit)
         parameters = None if parameters is None else parameters.double()
@@ -171,6 +171,8 @@ class Scene:
         # Not rounded: the halves among dyadic coordinates would flip with the last bit.
         lattice = np.floor((points - points.min(axis=0)) * 1e9 + 0.3).astype(np.int64)
         pressure = {} if problem.pressure is None else {"pressure": problem.pressure.identity()}
+        if problem.pressure_ranges:  # parameters of samples are in Pa
+            pressure |= {"pressure_ranges": dict(problem.pressure_ranges), "young": problem.young}
         return {
             "points": sha256_of(lattice),
             "cells": plain(problem.cells),
@@ -214,6 +216,8 @@ class Scene:
         springs = "" if problem.springs is None else ", an elastic foundation"
         if problem.pressure is not None:
             springs += f", follower pressure on {len(problem.pressure.nodes):,} facets"
+        for name, (low, high) in problem.pressure_ranges.items():
+            springs += f", {name} from {low:.4g} to {high:.4g} Pa"
         law = (
             problem.material if is_dataclass(problem.material) else type(problem.material).__name__
         )
@@ -253,11 +257,14 @@ class Scene:
         cells, points = len(problem.cells), problem.dV.shape[1]
         young = _modulus(moduli_of(loads))
         lines = [f"no E input, no samples per E: u/L depends on f/(E L^2) only ({young})"]
-        for name, ends in loads.parameter_ranges.items():
+        for name, ends in problem.material.parameter_ranges.items():
             lines.append(
                 f"one set of modes and scales for {name} = {ends[0]:.4g} to {ends[1]:.4g}, those "
                 f"of {sum(ends) / 2:.4g}; each load has its own, an input, and a K(0) of its own"
             )
+        if problem.pressure_ranges:
+            names = ", ".join(problem.pressure_ranges)
+            lines.append(f"one K(0) for all pressures ({names}): it is that without pressure")
         if problem.springs is None:
             lines.append("no springs, nothing of theirs assembled")
         if problem.equal_cells:
@@ -269,7 +276,7 @@ class Scene:
             f"{2 * len(problem.pattern.indices) - problem.pattern.size:,}: "
             "symmetric, pattern and ordering analysed once"
         )
-        if not loads.parameter_ranges:
+        if not problem.material.parameter_ranges:
             lines.append(
                 "K(0) factorised once for modes, linear answers and every first Newton step"
             )

@@ -220,18 +220,18 @@ def test_a_load_that_does_not_say_which_is_refused(wide, few):
     silent = Load(few.force, few.young)
     for solver in (wide.solver, wide.linear):
         with pytest.raises(
-            ValueError, match=r"has 0 parameters and the law has ranges of \['poisson'\]"
+            ValueError, match=r"has 0 parameters and the body has ranges of \['poisson'\]"
         ):
             solve(solver, silent)
     with pytest.raises(
-        ValueError, match=r"Load.parameters has 0 columns; the law has ranges of \['poisson'\]"
+        ValueError, match=r"Load.parameters has 0 columns; the body has ranges of \['poisson'\]"
     ):
         Surrogate(FCNN(wide, width=4), MSE(), wide).predict(silent)
 
 
 def test_a_scene_of_one_refuses_to_predict_for_another(scene, few):
     with pytest.raises(
-        ValueError, match=r"Load.parameters has 1 columns; the law has ranges of \[\]"
+        ValueError, match=r"Load.parameters has 1 columns; the body has ranges of \[\]"
     ):
         Surrogate(FCNN(scene, width=4), MSE(), scene).predict(few.load)
 

@@ -12,6 +12,7 @@ import textwrap
 import typing
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import hydra
@@ -215,7 +216,9 @@ def _problem(
         for name, pressure in pressures.items():
             with error_in(f"forces.{name}"):
                 pressure.check(mesh, Units(1.0, young))
-        options["pressures"] = list(pressures.values())
+        options["pressures"] = [
+            replace(pressure, name=pressure.name or name) for name, pressure in pressures.items()
+        ]
         try:
             problem = Problem.build(mesh, material, fixed=fixed, supports=supports, **options)
         except ValueError as error:

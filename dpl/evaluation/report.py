@@ -188,7 +188,9 @@ class _Simulated:
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield the answer of the simulator."""
         scene = self.simulator.scene
-        if scene.loads.parameter_ranges:  # each load has its own K(0), and each solver factorises
+        if (
+            scene.problem.material.parameter_ranges
+        ):  # each load has its own K(0), and each solver factorises
             scene.linear.forget_clones()
         arguments: dict[str, Any] = {**scene.si_inputs(load), **self.tolerance}
         answer = self.simulator(**arguments)
@@ -222,7 +224,7 @@ def _step_in_modes(surrogate: Surrogate, tol: float) -> dict[str, Solver]:
 def _own(scene: Scene) -> Newton:
     """Return Newton's method of a scene; with a factor of K(0) of its own if loads differ in it."""
     newton = scene.newton
-    if not scene.loads.parameter_ranges:
+    if not scene.problem.material.parameter_ranges:
         return newton
     return replace(newton, linear_solver=LinearSolver(newton.problem, newton.tol, newton.linear))
 

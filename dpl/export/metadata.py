@@ -69,6 +69,7 @@ def describe(
 def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
     """Return file and operator set, and name, shape, type and unit of each input and output."""
     scene = graph.surrogate.scene
+    pressures = scene.problem.pressure_ranges
     loads, field = scene.loads, ["B", *scene.problem.shape]
     known: dict[str, dict[str, Any]] = {
         "force": {"shape": field, "type": "float64", "unit": _force_unit(scene)},
@@ -82,7 +83,7 @@ def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
         "parameters": {
             "shape": ["B", len(loads.parameter_ranges)],
             "type": "float64",
-            "unit": "1",
+            "unit": ["Pa" if name in pressures else "1" for name in loads.parameter_ranges],
             "ranges": loads.parameter_ranges,
         },
         "displacement": {"shape": field, "type": "float64", "unit": "m"},

@@ -112,9 +112,10 @@ def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetr
 
 def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
     """Return the operators that commute with a symmetry: constraints, cells and boundary terms."""
-    boundary = [part for part in (problem.springs, problem.pressure) if part is not None]
-    body = problem.reference  # laws are isotropic for all constants
-    cells = replace(body, springs=None, pressure=None) if boundary else body
+    pressure = None if problem.pressure is None else problem.pressure.generic
+    boundary = [part for part in (problem.springs, pressure) if part is not None]
+    body = problem.reference.without_pressure  # laws are isotropic for all constants
+    cells = body if problem.springs is None else replace(body, springs=None)
     operators: list[Callable[[Tensor], Tensor]] = [
         lambda field: torch.where(problem.free, field, 0.0),
         lambda field: cells.evaluate(field).internal,

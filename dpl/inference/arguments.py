@@ -105,7 +105,7 @@ def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
         scene: The scene.
         force: Nodal forces, (N, D) or (B, N, D) [N] (2D: [N/m]), float64.
         young: Young's modulus, one number or (B,) [Pa]; None: that of the scene.
-        parameters: Values of the ranges of the law, see `named_columns`.
+        parameters: Values of the ranges of the body, see `named_columns`.
 
     Raises:
         ValueError: An argument has a wrong shape, is not finite, or is out of range.
@@ -119,7 +119,8 @@ def as_load(scene: Scene, force: Tensor, young: Any, parameters: Any) -> Load:
         raise ValueError("force: a number is not finite")
     moduli = _moduli(scene, young, len(force))
     values = named_columns("parameters", parameters, list(scene.loads.parameter_ranges), len(force))
-    scene.problem.material.with_parameters(values)  # refuses values that it does not allow
+    own = scene.problem.law_parameters(values)
+    scene.problem.material.with_parameters(own)  # refuses values that it does not allow
     force = scene.problem.acting(force)
     load = scene.load_of(force, moduli, values)
     sizes = load.force.abs().amax(dim=(1, 2))

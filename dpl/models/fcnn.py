@@ -103,7 +103,7 @@ class FCNN(nn.Module):
         Args:
             force: Scaled nodal forces, or scaled linear solutions with a linear base.
             young: Young's moduli, (B,) [Pa]; required if they are an input, else ignored.
-            parameters: Parameters of the law, (B, P); required if it has ranges.
+            parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
             amplitude: Amplitudes of the linear solutions, (B,); required with a linear base.
 
         Raises:

@@ -101,7 +101,7 @@ class GNN(nn.Module):
 
         Args:
             force: Scaled nodal forces, or scaled linear solutions with a linear base.
-            parameters: Parameters of the law, (B, P); required if it has ranges.
+            parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
             amplitude: Amplitudes of the linear solutions, (B,); required with a linear base.
         """
         states = [

@@ -61,7 +61,9 @@ class LinearBase:
         """Return linear solutions, (B, N, D) [-], float64, on the device of the load."""
         force = load.force.double()
         free = self._problem.free.to(force.device)
-        values = self._response(force[:, free], load.parameters)
+        if self._problem.pressure_ranges:
+            force = force - self._problem.ranged_pressure_at_rest(load.parameters.to(force))
+        values = self._response(force[:, free], self._problem.law_parameters(load.parameters))
         prescribed = self._problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
         dofs = free.flatten().nonzero()[:, 0]
         return prescribed.index_copy(1, dofs, values).view_as(force)

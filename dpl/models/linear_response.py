@@ -46,8 +46,8 @@ class LinearResponse:
     @cached_property
     def interpolation(self) -> ModuliInterpolation:
         """Weights of the Poisson's ratios for which K(0) is condensed."""
-        law, ranges = self._scene.problem.material, self._scene.loads.parameter_ranges
-        ends = list(itertools.product(*ranges.values()))
+        law = self._scene.problem.material
+        ends = list(itertools.product(*law.parameter_ranges.values()))
         mu, lam = moduli(law.with_parameters(torch.tensor(ends, dtype=torch.float64)), len(ends))
         ratio = lam / (2 * (lam + mu))
         springs = self._scene.problem.springs is not None
@@ -73,7 +73,7 @@ class LinearResponse:
 
     @cached_property
     def _supports(self) -> Tensor:
-        return support_forces(self._scene.problem.reference)
+        return support_forces(self._scene.problem.without_ranged_pressure.reference)
 
     def compiled(self) -> LinearPrediction:
         """Return the linear solution as a part of a compiled prediction."""

@@ -163,7 +163,7 @@ class PODNet(nn.Module):
 
         Args:
             force: Scaled nodal forces.
-            parameters: Parameters of the law, (B, P); required if it has ranges.
+            parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
         """
         encoded = self.encode_loads(self.input_orbits.images(force))
         inputs = self.append_parameters(encoded @ self.input_map, parameters)

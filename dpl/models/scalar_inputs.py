@@ -1,4 +1,4 @@
-"""Numbers of a load as inputs of networks: parameters of the law and the amplitude."""
+"""Numbers of a load as inputs of networks: its parameters and the amplitude."""
 
 from collections.abc import Mapping
 
@@ -18,7 +18,7 @@ class ScalarInputs:
     """
 
     def __init__(self, scene: Scene, base: str) -> None:
-        """Take the scene with the ranges of its law, and the base, see `LinearBase`.
+        """Take the scene with its ranges, and the base, see `LinearBase`.
 
         Raises:
             ValueError: There is no such base.
@@ -37,7 +37,7 @@ class ScalarInputs:
         Args:
             like: Tensor (B, ...) of the dtype and device to return.
             amplitude: Amplitudes of the linear solutions, (B,); required with a linear base.
-            parameters: Parameters of the law, (B, P); required if it has ranges.
+            parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
 
         Raises:
             ValueError: A required input is None.
@@ -55,10 +55,10 @@ class ScalarInputs:
 def normalise_parameters(
     parameters: Tensor | None, ranges: Mapping[str, tuple[float, float]], like: Tensor
 ) -> Tensor:
-    """Return parameters of the law mapped linearly from their ranges to [-1, 1], (B, P).
+    """Return parameters mapped linearly from their ranges to [-1, 1], (B, P).
 
     Args:
-        parameters: Parameters of the law, (B, P).
+        parameters: Values of `Problem.parameter_ranges`, (B, P).
         ranges: Range of each, by name.
         like: Tensor of the dtype and device to return.
 

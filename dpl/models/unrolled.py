@@ -163,7 +163,7 @@ class Unrolled(nn.Module):
 
         Args:
             force: Nodal forces.
-            parameters: Parameters of the law, (B, P); required if it has ranges.
+            parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
         """
         given = self._given_parameters(force, parameters)
         if self._is_compiled(force, given):

@@ -65,7 +65,7 @@ class Surrogate(L.LightningModule):
                 of the time).
 
         Raises:
-            ValueError: The law has ranges and the network no input for parameters, or the network
+            ValueError: The body has ranges and the network no input for parameters, or the network
                 has a base that does not exist or that its training excludes.
         """
         super().__init__()
@@ -75,11 +75,13 @@ class Surrogate(L.LightningModule):
         self.batch_errors: Tensor | None = None
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
+        pressures = scene.problem.pressure_ranges
         for name, ends in scene.loads.parameter_ranges.items():
             if "parameters" not in getattr(net, "extra_inputs", ()):
+                key = f"forces.{name}.value" if name in pressures else f"material.{name}"
                 raise ValueError(
-                    f"material.{name} is a range, {list(ends)}, and {type(net).__name__} has no "
-                    f"input for it; set material.{name} to a number or choose another model"
+                    f"{key} is a range, {list(ends)}, and {type(net).__name__} has no input for "
+                    f"it; set {key} to a number or choose another model"
                 )
         largest_force = torch.tensor(scene.loads.largest_force, dtype=torch.float64)
         names = ("force_scale", "displacement_scale", "largest_force")
@@ -96,7 +98,7 @@ class Surrogate(L.LightningModule):
         Args:
             force: Nodal forces, (B, N, D) [N].
             young: Young's moduli, (B,) [Pa].
-            parameters: Parameters of the law, (B, P); required if it has ranges.
+            parameters: Values of `Problem.parameter_ranges`, (B, P); required if there are any.
         """
         return self.scene.length * self.predict(self.scene.load_of(force, young, parameters))
 
@@ -127,7 +129,7 @@ class Surrogate(L.LightningModule):
         Networks with a linear base have other inputs.
 
         Raises:
-            ValueError: The load has not one parameter for each range of the law.
+            ValueError: The load has not one parameter for each range of the body.
         """
         scaled = load.force
         if not self._is_closed_form:
@@ -137,7 +139,7 @@ class Surrogate(L.LightningModule):
     def _extra_inputs(self, load: Load, **computed: Tensor) -> dict[str, Tensor]:
         if load.parameters.shape[-1] != len(names := list(self.scene.loads.parameter_ranges)):
             found = load.parameters.shape[-1]
-            raise ValueError(f"Load.parameters has {found} columns; the law has ranges of {names}")
+            raise ValueError(f"Load.parameters has {found} columns; the body has ranges of {names}")
         known = {"young": load.young, "parameters": load.parameters} | computed
         return {name: known[name] for name in getattr(self.net, "extra_inputs", ())}
 

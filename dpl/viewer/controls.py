@@ -34,7 +34,7 @@ class Controls:
         direction, amplitude, unlimited, uniform: The patch load, visible in the mode `PULL`.
         axis, angle: Rotation of the patch, visible in the mode `GRASP`; in 2D there is no axis.
         young: Slider of Young's modulus, in a unit with prefix; `modulus` is its value in Pa.
-        parameters: Sliders of the parameters of the law with a range, by name.
+        parameters: Sliders of the ranges of law and pressures, by name.
         sample, reset, fit: Buttons for a random load, for no load and for the camera.
         method, budget, galerkin, quantity, edges, show_newton: Method and display.
         record, save: Buttons of the recording.
@@ -87,8 +87,10 @@ class Controls:
         low, high = (value / self._young_unit.factor for value in body.young_range)
         label, middle = f"E [{self._young_unit.name}]", body.young / self._young_unit.factor
         self.young = gui.add_slider(label, low, high, round_step(low, high), middle)
+        pressures = {name: f"{name} [Pa]" for name in body.scene.problem.pressure_ranges}
+        labels = LABELS | pressures
         self.parameters = {
-            name: gui.add_slider(LABELS.get(name, name), *ends, round_step(*ends), value)
+            name: gui.add_slider(labels.get(name, name), *ends, round_step(*ends), value)
             for (name, ends), value in zip(
                 loads.parameter_ranges.items(), body.parameters.values(), strict=True
             )

@@ -199,7 +199,8 @@ def test_a_follower_pressure_identifies_a_scene_by_its_ratio_to_the_modulus(scen
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        (INFLATE.replace("45.0", "[1.0, 2.0]"), r"forces\.inflate.value"),
+        (INFLATE.replace("45.0", "[2.0, 1.0]"), r"forces\.inflate: value.* two that ascend"),
+        (INFLATE.replace("45.0", "[1.0, 2.0, 3.0]"), r"forces\.inflate: value.* no direction"),
         (INFLATE.replace("45.0", ".inf"), r"forces\.inflate.value"),
         (INFLATE.replace("45.0", "true"), r"forces\.inflate.value"),
         (INFLATE.replace("at: max", "at: 7.0"), r"forces\.inflate: .*holds no facet"),
@@ -208,6 +209,14 @@ def test_a_follower_pressure_identifies_a_scene_by_its_ratio_to_the_modulus(scen
 def test_invalid_pressures_of_a_configuration_are_refused_by_key(scene_of, option, message):
     with pytest.raises(ConfigError, match=message):
         scene_of(*BAR, option)
+
+
+def test_a_range_of_pressures_has_the_name_of_the_force_and_is_in_pascals(scene_of):
+    scene = scene_of(*BAR, INFLATE.replace("45.0", "[0.0, 45.0]"))
+    assert scene.loads.parameter_ranges == {"inflate": (0.0, 45.0)}
+    doubled = scene_of(*BAR, INFLATE.replace("45.0", "[0.0, 90.0]"), "young=9e3")
+    assert doubled.fingerprint != scene.fingerprint  # its samples have other parameters
+    assert "inflate from 0 to 45 Pa" in dict(scene.describe())["supports"]
 
 
 def test_a_pressure_is_refused_with_a_range_of_moduli(scene_of):

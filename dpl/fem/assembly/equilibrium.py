@@ -59,7 +59,8 @@ class EquilibriumCriterion(TensorAssembly):
         if self.moved_supports:
             loads.append((internal * (self.prescribed != 0)).flatten(1))
         if self.pressure is not None:
-            loads.append(self.acting(self.pressure_at_rest[None]).flatten(1))
+            at_rest = self.pressure_at_rest.reshape(-1, *self.shape)
+            loads.append(self.acting(at_rest).flatten(1))
         unit = reduce(torch.maximum, [load.abs().amax(1) for load in loads])  # NaN if an entry is
         unit = torch.where(unit == 0, 1.0, unit)
         unit = torch.where((unit >= FAINT) & (unit < torch.inf), unit, torch.nan)

@@ -18,6 +18,7 @@ from dpl.fem.identity import plain
 from dpl.fem.mesh.regions import Origin, Region, facets_in
 from dpl.fem.units import Units
 
+CONSTANT = -1  # `PressureSurface.column` of a pressure that is one number
 # shape of the facets -> polynomial degree of N x,1 x x,2 for shape functions of degree 1 and 2
 DEGREES = {"RefLine": (1, 3), "RefTri": (1, 4), "RefQuad": (2, 5)}
 
@@ -30,33 +31,52 @@ class FollowerPressure:
 
     Attributes:
         region: The boundary facets.
-        value: p [Pa], positive if it pushes on the body. On a problem with E = 1 Pa, the default of
-            `Problem.build`, this is p / E.
+        value: p [Pa], positive if it pushes on the body; or a range [low, high], of which each load
+            has its own p, see `Problem.parameter_ranges`. On a problem with E = 1 Pa, the default
+            of `Problem.build`, this is p / E.
+        name: Name of the parameter of a range; "pressure" if left out.
     """
 
     region: Region
-    value: float
+    value: float | Sequence[float]
+    name: str | None = None
+
+    @property
+    def range(self) -> tuple[float, float] | None:
+        """Smallest and largest p [Pa]; None if `value` is no pair."""
+        pair = self.value if isinstance(self.value, Sequence) and len(self.value) == 2 else None
+        return None if pair is None else (float(pair[0]), float(pair[1]))
 
     def dimensionless(self, units: Units) -> float:
-        """Return p / E [-].
+        """Return p / E [-]; NaN for a range, until a load says which.
 
         Raises:
-            ValueError: `value` is not finite, or the loads have a range of moduli.
+            ValueError: `value` is neither a finite number nor a range of finite numbers, or the
+                loads have a range of moduli.
         """
-        words = f"value = {self.value}"
-        if isinstance(self.value, bool) or not isinstance(self.value, int | float):
-            raise ValueError(f"{words} must be one number [Pa]; a pressure has no direction")
-        if not math.isfinite(self.value):
-            raise ValueError(f"{words} must be a finite number [Pa]")
-        return float(units.stress(np.array(float(self.value)), words))
+        is_pair = isinstance(self.value, Sequence) and len(self.value) == 2
+        ends = list(self.value) if isinstance(self.value, list | tuple) else [self.value]
+        words = f"value = {ends if is_pair else self.value}"
+        numbers = [end for end in ends if isinstance(end, int | float) and end is not True]
+        if len(numbers) < len(ends) or len(ends) > 1 + is_pair:
+            raise ValueError(
+                f"{words} must be one number or a range [low, high] [Pa]; a pressure has no "
+                "direction"
+            )
+        if not all(map(math.isfinite, numbers)) or (is_pair and not numbers[0] < numbers[1]):
+            raise ValueError(f"{words} must be a finite number, or two that ascend [Pa]")
+        pressure = float(units.stress(np.array(float(numbers[0])), words))
+        return math.nan if is_pair else pressure
 
     def check(self, mesh: skfem.Mesh, units: Units) -> None:
         """Check value and region on a mesh [m]; raise the errors of `on`."""
         self.dimensionless(units)
         facets_in(self.region, mesh)
 
-    def on(self, basis: skfem.Basis, units: Units, origin: Origin = 0.0) -> "PressureSurface":
-        """Return the loaded surface; arguments as in `DirichletBC.on`.
+    def on(
+        self, basis: skfem.Basis, units: Units, origin: Origin = 0.0, column: int = CONSTANT
+    ) -> "PressureSurface":
+        """Return the loaded surface; arguments as in `DirichletBC.on` and `PressureSurface.build`.
 
         Raises:
             ValueError: The region contains no boundary facet, or `value` is invalid, see
@@ -64,7 +84,7 @@ class FollowerPressure:
         """
         pressure = self.dimensionless(units)
         facets = facets_in(self.region, basis.mesh, units.length, origin)
-        return PressureSurface.build(basis, facets, pressure)
+        return PressureSurface.build(basis, facets, pressure, column)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +106,9 @@ class PressureSurface:
         slopes: Derivatives of the shape functions along xi_1 and xi_2, (S, Q, A, 2) [-].
         tangents: Derivatives t_i of the positions at rest, (S, Q, 3, 2) [-]; t1 x t2 points out of
             the body.
-        pressure: p / E of each facet, (S,) [-].
+        pressure: p / E of each facet, (S,) [-], or (B, S) for each member of a batch.
+        column: Number of the pressure with a range that acts on each facet, (S,); `CONSTANT` where
+            the pressure is one number.
     """
 
     nodes: Tensor
@@ -94,10 +116,17 @@ class PressureSurface:
     slopes: Tensor
     tangents: Tensor
     pressure: Tensor
+    column: Tensor
 
     @classmethod
-    def build(cls, basis: skfem.Basis, facets: NDArray[np.int_], pressure: float) -> Self:
-        """Return the surface of boundary facets (S,) under one pressure [-]."""
+    def build(
+        cls,
+        basis: skfem.Basis,
+        facets: NDArray[np.int_],
+        pressure: float,
+        column: int = CONSTANT,
+    ) -> Self:
+        """Return the surface of boundary facets (S,) under one pressure [-], see the attributes."""
         mesh = basis.mesh
         cells = mesh.f2t[0, facets]
         side = (mesh.t2f[:, cells] == facets).argmax(axis=0)  # number of the facet in its cell
@@ -118,6 +147,7 @@ class PressureSurface:
             slopes=torch.from_numpy(np.ascontiguousarray(slopes)),
             tangents=torch.from_numpy(tangents),
             pressure=torch.full((len(facets),), pressure, dtype=torch.float64),
+            column=torch.full((len(facets),), column),
         )
 
     @classmethod
@@ -137,11 +167,32 @@ class PressureSurface:
 
     def identity(self) -> list[Any]:
         """Return facets and pressures as plain data, arrays as their SHA-256."""
-        return [plain(self.nodes.sort(dim=1).values), plain(self.pressure)]
+        facets = [plain(self.nodes.sort(dim=1).values), plain(self.pressure.nan_to_num())]
+        return [*facets, plain(self.column)] if self.n_ranges else facets
+
+    @property
+    def n_ranges(self) -> int:
+        """Number of pressures with a range."""
+        return int(self.column.max()) + 1
 
     def scaled(self, factor: float) -> Self:
         """Return the surface under `factor` times its pressure."""
-        twin = replace(self, pressure=factor * self.pressure)
+        return self._with_pressure(factor * self.pressure)
+
+    def with_values(self, values: Tensor) -> Self:
+        """Return the surface with pressures over E in place of the ranges, (1, P) or (B, P) [-]."""
+        own = values[:, self.column.clamp(min=0)]
+        pressure = torch.where(self.column == CONSTANT, self.pressure, own)
+        return self._with_pressure(pressure[0] if len(pressure) == 1 else pressure)
+
+    @property
+    def generic(self) -> Self:
+        """The surface with a different pressure in place of each range; itself without ranges."""
+        values = torch.arange(1.0, self.n_ranges + 1).to(self.pressure)
+        return self.with_values(values[None]) if self.n_ranges else self
+
+    def _with_pressure(self, pressure: Tensor) -> Self:
+        twin = replace(self, pressure=pressure)
         twin.__dict__["_pair_weights"] = self._pair_weights
         return twin
 
@@ -216,7 +267,7 @@ class PressureSurface:
         """
         y1, y2 = self._images(self._slopes(displacement))  # (B, S, Q, 3)
         first, second = self._pair_weights
-        vectors = (first @ y2 - second @ y1) * self.pressure[:, None, None]
+        vectors = (first @ y2 - second @ y1) * self.pressure[..., None, None]
         return vectors.unflatten(2, (self.nodes.shape[1], -1))
 
     @cached_property
@@ -254,7 +305,7 @@ class PressureSurface:
 
     def _sum_at_nodes(self, normal: Tensor, displacement: Tensor) -> Tensor:
         """Return the nodal forces (B, N, D) of p times normals (B, S, Q, 3)."""
-        forces = self.weights.mT @ normal * self.pressure[:, None, None]
+        forces = self.weights.mT @ normal * self.pressure[..., None, None]
         return self._sum_of_facets(forces, displacement)
 
     def _sum_of_facets(self, forces: Tensor, displacement: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
 """Energy, internal force and tangent of a body as batched tensor operations."""
 
 import math
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -49,6 +50,8 @@ class TensorAssembly:
         mean_dilatation: True if the points of a cell share its mean volume ratio (F-bar).
         young: Young's modulus by which boundary values are divided [Pa]; None if there is no such
             modulus, see `dpl.fem.units.Units`. No other quantity depends on it.
+        pressure_ranges: Smallest and largest value [Pa] of each follower pressure that differs
+            between loads, by name.
     """
 
     mesh: skfem.Mesh
@@ -67,13 +70,14 @@ class TensorAssembly:
     pressure: PressureSurface | None = None
     mean_dilatation: bool = False
     young: float | None = 1.0
+    pressure_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def to(self, device: torch.device | str) -> Self:
         """Return the same body with its tensors on a device."""
         tensors: dict[str, Any] = {
-            field.name: value.to(device)
-            for field in fields(self)
-            if isinstance(value := getattr(self, field.name), Tensor)
+            each.name: value.to(device)
+            for each in fields(self)
+            if isinstance(value := getattr(self, each.name), Tensor)
         }
         if self.springs is not None:
             tensors["springs"] = FoundationMatrix(*(part.to(device) for part in self.springs))
@@ -83,7 +87,7 @@ class TensorAssembly:
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields without cached properties."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @cached_property
     def basis(self) -> skfem.Basis:
@@ -230,10 +234,13 @@ class TensorAssembly:
     def pressure_at_rest(self) -> Tensor:
         """f_int at u = 0: the force of the pressure on the surface at rest, (N, D) [-].
 
-        It is minus the nodal forces of a dead load; zero without a pressure.
+        It is minus the nodal forces of a dead load; zero without a pressure. (B, N, D) if each
+        member of a batch has its own pressure.
         """
-        rest = self.points.new_zeros(1, *self.shape)
-        return rest[0] if self.pressure is None else self.pressure.force(rest)[0]
+        count = 1 if self.pressure is None else len(torch.atleast_2d(self.pressure.pressure))
+        rest = self.points.new_zeros(count, *self.shape)
+        forces = rest if self.pressure is None else self.pressure.force(rest)
+        return forces[0] if count == 1 else forces
 
     @cached_property
     def pattern(self) -> Pattern:

@@ -41,7 +41,7 @@ class CombinedLoads(SizedLoads):
     @property
     def unit_deflection(self) -> float:
         """Largest linear deflection [-] of the sum of all f_k, if their signs add up at a node."""
-        moved = [self.linear.reference.solve(shape).norm(dim=1) for shape in self.shapes]
+        moved = [self.linear.reference.solve_force(shape).norm(dim=1) for shape in self.shapes]
         return float(torch.stack(moved).sum(dim=0).max())
 
     @property

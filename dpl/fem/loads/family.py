@@ -39,7 +39,7 @@ class LoadFamily(Protocol):
 
     @property
     def parameter_ranges(self) -> Mapping[str, tuple[float, float]]:
-        """Ranges of the parameters of the law, by name; empty if it has none."""
+        """Ranges of what differs between loads beside these, see `Problem.parameter_ranges`."""
         ...
 
     @property
@@ -197,8 +197,8 @@ class RandomLoads(LoadFamily):
 
     @property
     def parameter_ranges(self) -> Mapping[str, tuple[float, float]]:
-        """Ranges of the parameters of the law, by name; empty if it has none."""
-        return self.problem.material.parameter_ranges
+        """Ranges of what differs between loads beside these, see `Problem.parameter_ranges`."""
+        return self.problem.parameter_ranges
 
     @property
     def loadable_dofs(self) -> Tensor:

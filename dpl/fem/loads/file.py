@@ -87,7 +87,7 @@ class FileLoads(CombinedLoads):
     def unit_deflection(self) -> float:
         """Largest linear deflection [-] of a force of the file over the largest component."""
         linear = self.linear.reference
-        return max(float(linear.solve(shape).norm(dim=1).max()) for shape in self.shapes)
+        return max(float(linear.solve_force(shape).norm(dim=1).max()) for shape in self.shapes)
 
     @property
     def unit_force(self) -> float:

@@ -170,7 +170,7 @@ def largest_deflection(linear: LinearSolver, axes: Tensor) -> float:
         linear: The body.
         axes: The forces (K, N, D) [-].
     """
-    moved = torch.stack([linear.solve(force) for force in axes], dim=-1)  # (N, D, K)
+    moved = torch.stack([linear.solve_force(force) for force in axes], dim=-1)  # (N, D, K)
     return float(torch.linalg.matrix_norm(moved, 2).max())
 
 
@@ -194,7 +194,7 @@ def softest_node(linear: LinearSolver, nodes: Tensor) -> int:
     forces = point_forces(shape, nodes)
     found: int | None = None
     while True:
-        moved = torch.stack([linear.solve(force) for force in forces], dim=-1)  # (N, D, D)
+        moved = torch.stack([linear.solve_force(force) for force in forces], dim=-1)  # (N, D, D)
         sizes = torch.linalg.matrix_norm(moved, 2)
         best = int(nodes[int(sizes[nodes].argmax())])
         if found is not None and not sizes[best] > sizes[found] * (1 + 1e-9):

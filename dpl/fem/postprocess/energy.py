@@ -46,7 +46,7 @@ class RestStiffness:
             parameters: Parameters of the loads, (B, P); P = 0 by default.
         """
         problem = self.problem
-        if parameters is None or not parameters.shape[-1]:
+        if parameters is None or not problem.material.parameter_ranges:
             free, image = problem.free, torch.zeros_like(field)
             columns = field.detach()[:, free].T
             if field.device.type == "cpu":
@@ -54,7 +54,7 @@ class RestStiffness:
             else:
                 image[:, free] = (self._on_device @ columns).T
             return image
-        law = problem.with_parameters(parameters).material
+        law = problem.material.with_parameters(problem.law_parameters(parameters))
         moduli = [torch.as_tensor(m).flatten().to(field) for m in (law.lam, law.mu)]
         moduli.append(torch.ones_like(moduli[0]))
         known = [(hooke.lam, hooke.mu, 1.0) for hooke in HOOKEAN]
@@ -79,13 +79,13 @@ class RestStiffness:
         problem, found = self._linear.problem, []
         parameters = force.new_zeros(1, 0) if parameters is None else parameters
         for one, own in zip(force.cpu(), parameters.cpu().expand(len(force), -1), strict=True):
-            right = problem.restrict(one - problem.pressure_at_rest)
+            linear = self._linear.with_parameters(own[None])
+            right = problem.restrict(one - linear.problem.pressure_at_rest)
             key = hash(right.tobytes() + own.numpy().tobytes())
             if key not in self._works:
                 if len(self._works) >= CACHE_SIZE:
                     self._works.clear()
-                factor = self._linear.with_parameters(own[None]).factor
-                self._works[key] = float(right @ factor.solve(right, 1e-3)) / 2
+                self._works[key] = float(right @ linear.factor.solve(right, 1e-3)) / 2
             found.append(self._works[key])
         return torch.tensor(found, dtype=force.dtype, device=force.device)
 

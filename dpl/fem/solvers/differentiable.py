@@ -70,7 +70,7 @@ class DifferentiableSolve:
 
         Args:
             displacement: Displacements of the tangents.
-            parameters: Parameters of the law, (B, P).
+            parameters: Values of `Problem.parameter_ranges`, (B, P).
 
         Raises:
             SingularMatrix: A tangent is singular.

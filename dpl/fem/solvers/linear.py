@@ -49,6 +49,8 @@ class LinearSolver:
     @cached_property
     def factor(self) -> Factor:
         """Factor of K(0)."""
+        if self.parent and self._shares_stiffness:
+            return self.parent.factor
         return self.backend.factorise(self.problem.stiffness_at_rest().numpy())
 
     @cached_property
@@ -63,6 +65,8 @@ class LinearSolver:
         A body with reflections has one factor for each parity, which are smaller together. They
         take longer to compute, so that other parameters than the reference have one whole factor.
         """
+        if self.parent and self._shares_stiffness:
+            return self.parent.float32_factor
         factor = self.factor
         if not isinstance(factor, BandedFactor):
             return factor
@@ -70,6 +74,11 @@ class LinearSolver:
         if is_reference and len(Parities.of(self.symmetries, self.problem.shape[1]).members) > 1:
             return ParityFactor.of(self.problem, self.symmetries)
         return factor.to_float32()
+
+    @property
+    def _shares_stiffness(self) -> bool:
+        """True if K(0) is that of the parent: only a pressure or the motion of supports differs."""
+        return self.parent is not None and self.problem.material is self.parent.problem.material
 
     @cached_property
     def symmetries(self) -> list[Symmetry]:
@@ -110,10 +119,7 @@ class LinearSolver:
 
         K(0) does not depend on them, and its factors are shared.
         """
-        twin = replace(self, problem=self.problem.with_prescribed(prescribed), parent=self)
-        for name in ("factor", "float32_factor"):
-            twin.__dict__[name] = getattr(self, name)
-        return twin
+        return replace(self, problem=self.problem.with_prescribed(prescribed), parent=self)
 
     def forget_clones(self) -> None:
         """Drop the solvers of other parameters, so that their factors are computed again."""
@@ -149,8 +155,10 @@ class LinearSolver:
 
         f includes a follower pressure as a dead load on the surface at rest.
         """
-        if self.problem.pressure is not None:
-            force = force - self.problem.pressure_at_rest
+        return self.solve_force(force - self.problem.pressure_at_rest)
+
+    def solve_force(self, force: Tensor) -> Tensor:
+        """Return K(0)^-1 f as `solve` does, without a follower pressure."""
         return self.problem.extend(self.factor.solve(self.problem.restrict(force)))
 
     def __getstate__(self) -> dict[str, object]:

@@ -25,8 +25,8 @@ class Load(_Load):
     Attributes:
         force: Nodal forces over E L^2 (E L in 2D), (B, N, D) [-].
         young: Young's moduli E, (B,) [Pa]; dimensionless solutions do not depend on them.
-        parameters: Values of the ranges of the law, (B, P), see `Material.parameter_ranges`; may
-            be left out if it has none, P = 0.
+        parameters: Values of `Problem.parameter_ranges`, (B, P); may be left out if there are none,
+            P = 0.
     """
 
     __slots__ = ()
