@@ -56,8 +56,20 @@ def differences(scenes: Mapping[str, Scene]) -> list[str]:
     ]
 
 
+def newton_iterations(scene: Scene, test: Sample) -> float:
+    """Return the mean number of linear solves of Newton's method from rest, on one thread."""
+    with one_thread():
+        *_, found = scene.newton.iterate(test.load)
+    return float(found.iterations[found.converged].double().mean())
+
+
 def measure(
-    network: str, trained_on: str, predict: Predict, scene: Scene, tests: Mapping[str, Sample]
+    network: str,
+    trained_on: str,
+    predict: Predict,
+    scene: Scene,
+    tests: Mapping[str, Sample],
+    newton: Mapping[str, float],
 ) -> Iterator[Transfer]:
     """Yield the row of a network for each set of test loads, computed on one thread.
 
@@ -67,6 +79,7 @@ def measure(
         predict: Function from a load to displacements (B, N, D) [-].
         scene: Scene of the training.
         tests: Test loads with their solutions, by family.
+        newton: `newton_iterations` of these loads, by family.
     """
     hybrid = default_hybrid(predict, scene)
     for family, test in tests.items():
@@ -74,8 +87,7 @@ def measure(
             found = torch.cat([predict(load) for load in test.load.unbatch()])
             errors = RelativeL2().measure(found, test)
             *_, solved = hybrid.iterate(test.load)
-            *_, newton = scene.newton.iterate(test.load)
-        done, own = solved.converged, newton.converged
+        done = solved.converged
         yield Transfer(
             *(network, trained_on, family, len(errors)),
             rel_L2_median=float(median(errors)),
@@ -83,7 +95,7 @@ def measure(
             SNR_min=float(MinSNR().measure(found, test).min()),
             converged=100 * float(done.double().mean()),
             hybrid_iterations=float(solved.iterations[done].double().mean()),
-            newton_iterations=float(newton.iterations[own].double().mean()),
+            newton_iterations=newton[family],
         )
 
 

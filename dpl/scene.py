@@ -147,7 +147,8 @@ class Scene:
             force: Nodal forces.
             young: E. On a body with an elastic foundation or a follower pressure it must be that of
                 the body, see `Problem.check_modulus`, which this function does not call.
-            parameters: Values of `Problem.parameter_ranges`, (B,) or (B, P); required if there are any.
+            parameters: Values of `Problem.parameter_ranges`, (B,) or (B, P); required if there are
+                any.
         """
         dimensionless = force.double() / (young.double()[:, None, None] * self.force_unit)
         parameters = None if parameters is None else parameters.double()
@@ -170,9 +171,11 @@ class Scene:
         problem, points = self.problem, self.problem.points.numpy()
         # Not rounded: the halves among dyadic coordinates would flip with the last bit.
         lattice = np.floor((points - points.min(axis=0)) * 1e9 + 0.3).astype(np.int64)
-        pressure = {} if problem.pressure is None else {"pressure": problem.pressure.identity()}
+        pressure: dict[str, object] = {}
+        if problem.pressure is not None:
+            pressure["pressure"] = problem.pressure.identity()
         if problem.pressure_ranges:  # parameters of samples are in Pa
-            pressure |= {"pressure_ranges": dict(problem.pressure_ranges), "young": problem.young}
+            pressure |= {"pressure_ranges": problem.pressure_ranges, "young": problem.young}
         return {
             "points": sha256_of(lattice),
             "cells": plain(problem.cells),

@@ -34,12 +34,13 @@ def main(cfg: DictConfig) -> None:
         raise config.ConfigError(f"run = {cfg.run}: the bodies of the families differ; {lines[0]}")
     tests = {name: _test_loads(*next(iter(own.values())), cfg.count) for name, own in runs.items()}
     stem = Path(cfg.folder) / cfg.name
+    newton = {name: transfer.newton_iterations(scenes[name], test) for name, test in tests.items()}
     rows: list[Transfer] = []
     for family, own in runs.items():
         for network, (_, surrogate) in own.items():
             print(f"{family}/{network} ...", flush=True)
             predict, scene = surrogate.predict, surrogate.scene
-            rows += transfer.measure(network, family, predict, scene, tests)
+            rows += transfer.measure(network, family, predict, scene, tests, newton)
             write(rows, stem.with_suffix(".csv"))
     show(rows, "networks on the loads of other families, 1 thread")
     write_machine(stem.with_suffix(".json"))

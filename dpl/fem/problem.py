@@ -212,8 +212,8 @@ class Problem(EquilibriumCriterion):
         """Return the problem with values (B, P) in place of all ranges."""
         count = len(self.material.parameter_ranges)
         body = self.with_material(self.material.with_parameters(parameters[:, :count]))
-        if self.pressure is None or not self.pressure_ranges:
-            return body if count else self
+        if self.pressure is None or self.young is None or not self.pressure_ranges:
+            return body
         pressures = parameters[:, count:] / self.young
         twin = body._with_pressure(self.pressure.with_values(pressures))
         twin.__dict__["pressure_has_potential"] = self.pressure_has_potential

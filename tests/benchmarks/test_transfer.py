@@ -29,7 +29,8 @@ def test_a_row_has_the_errors_of_predictions_and_the_solves_from_them(scene, tes
     def predict(load):
         return 1.01 * solve(scene.solver, load).displacement
 
-    rows = list(transfer.measure("near", "modal", predict, scene, tests_of))
+    newton = {name: transfer.newton_iterations(scene, test) for name, test in tests_of.items()}
+    rows = list(transfer.measure("near", "modal", predict, scene, tests_of, newton))
     assert [(row.network, row.trained_on, row.tested_on) for row in rows] == [
         ("near", "modal", "modal"),
         ("near", "modal", "small"),
