@@ -49,12 +49,12 @@ def main(cfg: DictConfig) -> None:
 
 def _runs(cfg: DictConfig) -> "dict[str, dict[str, tuple[DictConfig, Surrogate]]]":
     """Return configurations and surrogates by family and network."""
-    found = sorted({path.parents[1].name for path in Path(cfg.run).glob("*/*/config.yaml")})
+    found = {path.parents[1].name for path in Path(cfg.run).glob("*/*/config.yaml")}
     if not found:
         raise config.ConfigError(
             f"run = {cfg.run} contains no runs; train some with run={cfg.run}/FAMILY/NETWORK"
         )
-    families = cfg.families or found
+    families = cfg.families or sorted(found, key=lambda name: (name == "mixture", name))
     return {name: config.load_runs(Path(cfg.run) / name, cfg.networks) for name in families}
 
 

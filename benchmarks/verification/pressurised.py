@@ -19,7 +19,6 @@ from benchmarks.verification.bodies import Array
 from benchmarks.verification.drawing import measured, panel, picture
 from benchmarks.verification.report import Row, Section
 from dpl.fem import (
-    Box,
     FollowerPressure,
     Load,
     NeoHookeanLn,
@@ -28,7 +27,9 @@ from dpl.fem import (
     Problem,
     Solution,
     Status,
+    Tag,
     box,
+    finger,
     rectangle,
     solve,
 )
@@ -131,24 +132,14 @@ def under_pressure(problem: Problem, factor: float, tol: float = 1e-10) -> Solut
     return found
 
 
-def finger(cells: Sequence[int], pressure: float) -> Problem:
-    """Return a finger of hexahedra with a chamber near its upper side, E = 1.
-
-    It is fixed at x = 0. One cell is wall on each side of the chamber, and half of the cells below.
-    """
-    nx, ny, nz = cells
-    mesh = box(list(FINGER), [n + 1 for n in cells])
-    lower = [FINGER[0] / nx, FINGER[1] / ny, FINGER[2] / 2]
-    upper = [FINGER[0] * (1 - 1 / nx), FINGER[1] * (1 - 1 / ny), FINGER[2] * (1 - 1 / nz)]
-    centre = mesh.p[:, mesh.t].mean(axis=1).T
-    chamber = ((centre > lower) & (centre < upper)).all(axis=1)
-    inflate = FollowerPressure(Box(lower, upper), pressure)
+def pneumatic_finger(cells: Sequence[int], pressure: float) -> Problem:
+    """Return the finger of `dpl.fem.finger`, fixed at x = 0, E = 1."""
     return Problem.build(
-        mesh.restrict(np.flatnonzero(~chamber)),
+        finger(FINGER, cells),
         NeoHookeanLn(0.4),
         fixed=Plane(0, "min"),
         mean_dilatation=True,
-        pressures=[inflate],
+        pressures=[FollowerPressure(Tag("chamber"), pressure)],
     )
 
 
@@ -173,7 +164,7 @@ def energy_balance(
 
     The integral of p dV is p V minus the integral of V dp.
     """
-    problem = finger(cells, pressure)
+    problem = pneumatic_finger(cells, pressure)
     surface = problem.pressure
     assert surface is not None
 

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from dpl.fem.materials.ogden import OgdenK2
     from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
     from dpl.fem.materials.yeoh import YeohK2
+    from dpl.fem.mesh.finger_mesh import finger
     from dpl.fem.mesh.generators import box, rectangle
     from dpl.fem.mesh.propeller_mesh import propeller
     from dpl.fem.mesh.reading import read_mesh

@@ -23,8 +23,13 @@ from benchmarks.stress.broken_meshes import (
 )
 from dpl.fem import (
     Cylinder,
+    FollowerPressure,
+    NeoHookeanLn,
+    Plane,
+    Problem,
     Tag,
     box,
+    finger,
     propeller,
     read_mesh,
     rectangle,
@@ -150,6 +155,25 @@ def scaled_jacobian(mesh: skfem.MeshHex) -> np.ndarray:
             edges.append(edge / np.linalg.norm(edge, axis=0))
         smallest = np.minimum(smallest, np.linalg.det(np.stack(edges).transpose(2, 0, 1)))
     return smallest
+
+
+def test_finger_has_a_closed_chamber_within_its_walls():
+    mesh = finger([8.0, 4.0, 6.0], [8, 4, 6])
+    assert len(mesh.t.T) == 8 * 4 * 6 - 6 * 2 * 2
+    facets = mesh.boundaries["chamber"]
+    assert len(facets) == 2 * (6 * 2 + 6 * 2 + 2 * 2)
+    corners = mesh.p[:, np.unique(mesh.facets[:, facets])]
+    np.testing.assert_allclose(corners.min(axis=1), [1, 1, 3])
+    np.testing.assert_allclose(corners.max(axis=1), [7, 3, 5])
+    chamber = FollowerPressure(Tag("chamber"), 1.0)
+    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), pressures=[chamber])
+    assert float(problem.pressure_at_rest.sum(dim=0).abs().max()) < 1e-12, "it is closed"
+
+
+@pytest.mark.parametrize("cells", [[2, 4, 4], [8, 2, 4], [8, 4, 5], [8, 4], [8, 4, 2]])
+def test_finger_without_walls_is_an_error_of_one_line(cells):
+    with pytest.raises(ValueError, match=r"cells = .* must be at least \[3, 3, 4\]"):
+        finger(cells=cells)
 
 
 def test_propeller_has_the_size_of_the_papers():
