@@ -117,7 +117,8 @@ def random_grasps(scene: Scene, count: int, seed: int = 0) -> Iterator[Grasp]:
     rng, problem = np.random.default_rng(seed), scene.problem
     loads = scene.loads.sample((seed, 9), range(LOADS)).force
     largest = max(float((f * scene.linear.solve(f)).sum()) for f in loads)
-    centres = np.flatnonzero(scene.loads.loadable_dofs.all(dim=1).numpy())
+    loaded = scene.loads.loadable_dofs.all(dim=1) & problem.boundary
+    centres = np.flatnonzero(loaded.numpy())
     places = (problem.points.numpy() + problem.origin) * problem.length
     found = 0
     for _ in range(MAX_TRIES * count):

@@ -181,6 +181,19 @@ def test_a_motion_whose_forces_are_not_found_is_divided_into_parts(scene):
     assert (patch.of_field(found.field) - path(1.0)).abs().max() <= MOTION_TOL * 0.05
 
 
+def test_a_motion_that_the_network_misses_is_closed_by_the_linear_displacement(scene):
+    """The network does not move at all: a jump of the patch inverts the elements beside it."""
+    deaf = simulator_of(scene, lambda load: torch.zeros_like(load.force))
+    motion = [-26.0, 4.0, 2.0]  # m; cells are 25 m long
+    patch = RigidPatch.of(scene.linear, END, [True] * 3)
+    goal = patch.at(patch.displacement([x / L for x in motion], ROTATION))
+    moved = patch.moved_to(goal, torch.zeros_like(goal))
+    torch.testing.assert_close(patch.of_field(moved), patch.of_field(goal), rtol=0, atol=1e-6)
+    assert float(scene.problem.evaluate(goal[None]).volume_ratio) < 0
+    assert float(scene.problem.evaluate(moved[None]).volume_ratio) > 0.3
+    assert deaf.grasp(END, motion, ROTATION).method == "corrected"
+
+
 def test_a_warm_start_needs_fewer_predictions(scene):
     sim = simulator_of(scene, steps=0)
     cold = sim.grasp(END, TRANSLATION, ROTATION)
