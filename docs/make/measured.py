@@ -81,10 +81,25 @@ PARTS = (
     ),
     Part(
         "transfer",
-        "Networks on other families of loads",
-        "python scripts/transfer.py run=runs/families",
-        "Each network of each family on the test loads of all families: errors of the prediction, "
+        "All load families on the beam",
+        "python scripts/transfer.py networks=[unrolled] count=50",
+        "The network of each family on the test loads of all families: errors of the prediction, "
         "and Newton from the prediction and from rest.",
+        split="trained_on",
+    ),
+    Part(
+        "transfer_bracket",
+        "All load families on a bracket from a mesh file",
+        "python scripts/transfer.py run=runs/families_bracket name=transfer_bracket count=50",
+        "The same for quadratic tetrahedra and half as many training loads.",
+        split="trained_on",
+    ),
+    Part(
+        "local_networks",
+        "Networks on loads of small areas",
+        "python scripts/transfer.py families=[modal,modal_small,point] name=local_networks "
+        "count=50",
+        "All networks of three families on the test loads of these families.",
         split="network",
     ),
     Part(

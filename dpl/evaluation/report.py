@@ -188,9 +188,7 @@ class _Simulated:
     def iterate(self, load: Load) -> Iterator[Solution]:
         """Yield the answer of the simulator."""
         scene = self.simulator.scene
-        if (
-            scene.problem.material.parameter_ranges
-        ):  # each load has its own K(0), and each solver factorises
+        if scene.problem.material.parameter_ranges:  # each load has its own K(0) and factor
             scene.linear.forget_clones()
         arguments: dict[str, Any] = {**scene.si_inputs(load), **self.tolerance}
         answer = self.simulator(**arguments)

@@ -43,6 +43,7 @@ def describe(
     """
     module, scene = graph.surrogate, graph.surrogate.scene
     loads, problem = scene.loads, scene.problem
+    law_ranges = problem.material.parameter_ranges
     count = sum(parameter.numel() for parameter in module.net.parameters())
     return {
         "format": FORMAT,
@@ -58,7 +59,7 @@ def describe(
             "loadable": _indices(loads.loadable_dofs),
         },
         "scales": _scales(module),
-        "material": {**_law(scene), "young": loads.young_range, **loads.parameter_ranges},
+        "material": {**_law(scene), "young": loads.young_range, **law_ranges},
         "range": _range(scene),
         "errors": errors,
         "reference": reference.describe(),

@@ -129,13 +129,13 @@ class Problem(EquilibriumCriterion):
         ranges: dict[str, tuple[float, float]] = {}
         surfaces = []
         for one in pressures:
-            column = CONSTANT if one.range is None else len(ranges)
+            column = CONSTANT if len(one.ends) == 1 else len(ranges)
             surfaces.append(one.on(basis, units, origin, column))
-            if one.range is not None:
-                name = one.name or "pressure"
+            if column != CONSTANT:
+                name, (low, high) = one.name or "pressure", one.ends
                 if name in (*ranges, *material.parameter_ranges):
                     raise ValueError(f"pressures: two ranges have the name {name}; set another")
-                ranges[name] = one.range
+                ranges[name] = float(low), float(high)
         dN, dV = gradients(basis)
         boundary = np.zeros(basis.N, dtype=bool)
         boundary[basis.get_dofs(mesh.boundary_facets()).all()] = True

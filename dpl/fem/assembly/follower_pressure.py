@@ -38,14 +38,13 @@ class FollowerPressure:
     """
 
     region: Region
-    value: float | Sequence[float]
+    value: float | list[float]
     name: str | None = None
 
     @property
-    def range(self) -> tuple[float, float] | None:
-        """Smallest and largest p [Pa]; None if `value` is no pair."""
-        pair = self.value if isinstance(self.value, Sequence) and len(self.value) == 2 else None
-        return None if pair is None else (float(pair[0]), float(pair[1]))
+    def ends(self) -> list[float]:
+        """Smallest and largest p [Pa] of a range, or the one value."""
+        return [*self.value] if isinstance(self.value, list | tuple) else [self.value]
 
     def dimensionless(self, units: Units) -> float:
         """Return p / E [-]; NaN for a range, until a load says which.
@@ -54,19 +53,17 @@ class FollowerPressure:
             ValueError: `value` is neither a finite number nor a range of finite numbers, or the
                 loads have a range of moduli.
         """
-        is_pair = isinstance(self.value, Sequence) and len(self.value) == 2
-        ends = list(self.value) if isinstance(self.value, list | tuple) else [self.value]
-        words = f"value = {ends if is_pair else self.value}"
-        numbers = [end for end in ends if isinstance(end, int | float) and end is not True]
-        if len(numbers) < len(ends) or len(ends) > 1 + is_pair:
+        ends, words = self.ends, f"value = {self.value}"
+        numbers = [x for x in ends if isinstance(x, int | float) and not isinstance(x, bool)]
+        if len(numbers) < len(ends) or len(ends) not in (1, 2):
             raise ValueError(
                 f"{words} must be one number or a range [low, high] [Pa]; a pressure has no "
                 "direction"
             )
-        if not all(map(math.isfinite, numbers)) or (is_pair and not numbers[0] < numbers[1]):
+        if not all(map(math.isfinite, ends)) or sorted(set(ends)) != ends:
             raise ValueError(f"{words} must be a finite number, or two that ascend [Pa]")
-        pressure = float(units.stress(np.array(float(numbers[0])), words))
-        return math.nan if is_pair else pressure
+        pressure = float(units.stress(np.array(float(ends[0])), words))
+        return pressure if len(ends) == 1 else math.nan
 
     def check(self, mesh: skfem.Mesh, units: Units) -> None:
         """Check value and region on a mesh [m]; raise the errors of `on`."""

@@ -49,8 +49,8 @@ class LinearSolver:
     @cached_property
     def factor(self) -> Factor:
         """Factor of K(0)."""
-        if self.parent and self._shares_stiffness:
-            return self.parent.factor
+        if self._twin:
+            return self._twin.factor
         return self.backend.factorise(self.problem.stiffness_at_rest().numpy())
 
     @cached_property
@@ -65,8 +65,8 @@ class LinearSolver:
         A body with reflections has one factor for each parity, which are smaller together. They
         take longer to compute, so that other parameters than the reference have one whole factor.
         """
-        if self.parent and self._shares_stiffness:
-            return self.parent.float32_factor
+        if self._twin:
+            return self._twin.float32_factor
         factor = self.factor
         if not isinstance(factor, BandedFactor):
             return factor
@@ -76,9 +76,10 @@ class LinearSolver:
         return factor.to_float32()
 
     @property
-    def _shares_stiffness(self) -> bool:
-        """True if K(0) is that of the parent: only a pressure or the motion of supports differs."""
-        return self.parent is not None and self.problem.material is self.parent.problem.material
+    def _twin(self) -> "LinearSolver | None":
+        """The parent if it has the same K(0): only a pressure or the motion of supports differs."""
+        parent = self.parent
+        return parent if parent and parent.problem.material is self.problem.material else None
 
     @cached_property
     def symmetries(self) -> list[Symmetry]:
