@@ -56,7 +56,7 @@ def test_help_follows_the_options_of_the_command_line(script, tmp_path):
     ended = script("train", "--help", "mesh=propeller", "optimizer.lr=0.25", cwd=tmp_path)
     assert "mesh.blades = 5" in ended.out
     assert "optimizer.lr = 0.25" in ended.out
-    assert "beam, file, paper_beam, propeller*, rectangle" in " ".join(ended.out.split())
+    assert "beam, file, finger, paper_beam, propeller*, rectangle" in " ".join(ended.out.split())
     assert "circle of the tips [m]" in ended.out, "the comment of a key"
 
 
