@@ -1,7 +1,7 @@
 """Follower pressure: a force along the current normal on the current area of a boundary part."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Self
@@ -82,6 +82,27 @@ class FollowerPressure:
         pressure = self.dimensionless(units)
         facets = facets_in(self.region, basis.mesh, units.length, origin)
         return PressureSurface.build(basis, facets, pressure, column)
+
+
+def ranges_of(
+    pressures: Sequence[FollowerPressure], *, taken: Collection[str]
+) -> tuple[list[int], dict[str, tuple[float, float]]]:
+    """Return `PressureSurface.column` of each pressure, and the ranges [Pa] by name.
+
+    Raises:
+        ValueError: Two ranges have one name, or one of the names that are `taken`.
+    """
+    columns: list[int] = []
+    ranges: dict[str, tuple[float, float]] = {}
+    for one in pressures:
+        is_range = len(one.ends) == 2
+        columns.append(len(ranges) if is_range else CONSTANT)
+        if is_range:
+            name, (low, high) = one.name or "pressure", one.ends
+            if name in (*ranges, *taken):
+                raise ValueError(f"pressures: two ranges have the name {name}; set another")
+            ranges[name] = low, high
+    return columns, ranges
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,167 @@
+"""Bodies that differ from another in law, parameters, pressure or supports, and share the rest."""
+
+from dataclasses import replace
+from functools import cached_property
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from dpl.fem.assembly.equilibrium import EquilibriumCriterion
+from dpl.fem.assembly.follower_pressure import PressureSurface
+from dpl.fem.materials.material import Material
+
+MAX_CLONES = 64  # bodies of other parameters that are kept
+
+
+class BodyVariants(EquilibriumCriterion):
+    """Body that makes others on its mesh, which share pattern, gradients and kernels with it."""
+
+    def with_parameters(self, parameters: Tensor) -> Self:
+        """Return the problem with other parameters; mesh, pattern and kernels are shared.
+
+        Args:
+            parameters: Values of `parameter_ranges`, (B, P). P = 0 returns the problem itself. With
+                B > 1 each member of a batch has its own: such a problem has energies, forces and
+                residuals, but no tangent.
+
+        Raises:
+            ValueError: The problem has another number of ranges, or the law does not allow a value.
+        """
+        ranges = self.parameter_ranges
+        if parameters.shape[-1] != len(ranges):
+            raise ValueError(
+                f"a load has {parameters.shape[-1]} parameters and the body has ranges of "
+                f"{list(ranges)}; give Load(force, young, parameters) one value for each"
+            )
+        if not ranges:
+            return self
+        parameters = parameters.detach().to(self.points.device, torch.float64)
+        if len(parameters) > 1:
+            return self._with_values(parameters)
+        values = tuple(parameters[0].tolist())
+        if values not in self._clones:
+            if len(self._clones) >= MAX_CLONES:
+                self._clones.clear()
+            self._clones[values] = self._with_values(parameters)
+        return self._clones[values]
+
+    def _with_values(self, parameters: Tensor) -> Self:
+        """Return the problem with values (B, P) in place of all ranges."""
+        count = len(self.material.parameter_ranges)
+        body = self.with_material(self.material.with_parameters(parameters[:, :count]))
+        if self.pressure is None or self.young is None or not self.pressure_ranges:
+            return body
+        pressures = parameters[:, count:] / self.young
+        twin = body._with_pressure(self.pressure.with_values(pressures))
+        twin.__dict__["pressure_has_potential"] = self.pressure_has_potential
+        return twin
+
+    @property
+    def parameter_ranges(self) -> dict[str, tuple[float, float]]:
+        """Ranges of what differs between loads beside forces and Young's modulus, by name.
+
+        They are the ranges of the law [-], then those of follower pressures [Pa].
+        """
+        return {**self.material.parameter_ranges, **self.pressure_ranges}
+
+    def law_parameters(self, parameters: Tensor) -> Tensor:
+        """Return those of the parameters (B, P) that belong to the law."""
+        return parameters[:, : len(self.material.parameter_ranges)]
+
+    def ranged_pressure_at_rest(self, parameters: Tensor) -> Tensor:
+        """Return f_int at u = 0 of the pressures with a range alone, (B, N, D) [-].
+
+        Args:
+            parameters: Values of `parameter_ranges`, (B, P).
+        """
+        own = parameters[:, len(self.material.parameter_ranges) :]
+        return torch.einsum("bp,pnd->bnd", own, self._unit_pressures.to(own))
+
+    @cached_property
+    def _unit_pressures(self) -> Tensor:
+        """f_int at u = 0 of each pressure with a range of 1 Pa alone, (P, N, D) [1/Pa]."""
+        if self.pressure is None or self.young is None:
+            return self.points.new_zeros(0, *self.shape)
+        rest = self.points.new_zeros(len(self.pressure_ranges), *self.shape)
+        units = torch.eye(len(rest)).to(rest) / self.young
+        constant = self.without_ranged_pressure.pressure_at_rest
+        return self.pressure.with_values(units).force(rest) - constant
+
+    def with_material(self, material: Material) -> Self:
+        """Return the body of another law; mesh and pattern are shared, for the same law kernels."""
+        twin = self._share(replace(self, material=material))
+        if type(material) is type(self.material):
+            twin.__dict__["_first"] = self
+        return twin
+
+    @cached_property
+    def _clones(self) -> dict[tuple[float, ...], Self]:
+        return {}
+
+    @cached_property
+    def reference(self) -> Self:
+        """The problem at the centre of all ranges; itself without a range.
+
+        Modes, scales and largest loads are those of this problem.
+        """
+        ranges = self.parameter_ranges.values()
+        return self.with_parameters(torch.tensor([[sum(ends) / 2 for ends in ranges]]).double())
+
+    def with_pressure_factor(self, factor: float) -> Self:
+        """Return the body under `factor` times its follower pressure; all else is shared."""
+        if self.pressure is None or factor == 1:
+            return self
+        twin = self._with_pressure(self.pressure.scaled(factor))
+        twin.__dict__["pressure_has_potential"] = self.pressure_has_potential
+        twin.__dict__["pressure_at_rest"] = factor * self.pressure_at_rest
+        return twin
+
+    def _with_pressure(self, pressure: PressureSurface) -> Self:
+        """Return the body with another pressure on the same facets; all else is shared."""
+        twin = self._share(replace(self, pressure=pressure, pressure_ranges={}))
+        twin.__dict__["_first"] = self.__dict__.get("_first", self)
+        twin.__dict__["_pressure_places"] = self._pressure_places
+        return twin
+
+    @cached_property
+    def without_pressure(self) -> Self:
+        """The body without follower pressure; itself if it has none."""
+        if self.pressure is None:
+            return self
+        twin = self._share(replace(self, pressure=None, pressure_ranges={}))
+        twin.__dict__["_first"] = self.__dict__.get("_first", self)
+        return twin
+
+    @property
+    def without_ranged_pressure(self) -> Self:
+        """The body with 0 in place of each pressure with a range; itself if there is none."""
+        if self.pressure is None or not self.pressure_ranges:
+            return self
+        zeros = self.pressure.pressure.new_zeros(1, len(self.pressure_ranges))
+        return self._with_pressure(self.pressure.with_values(zeros))
+
+    def with_held(self, held: Tensor) -> Self:
+        """Return the body with further degrees of freedom (N, D) fixed where they are at rest."""
+        return replace(self, free=self.free & ~held)
+
+    def with_prescribed(self, prescribed: Tensor) -> Self:
+        """Return the body with other displacements (N, D) [-] of its supports."""
+        twin = self._share(replace(self, prescribed=prescribed))
+        twin.__dict__["_first"] = self.__dict__.get("_first", self)
+        del twin.__dict__["moved_supports"]
+        return twin
+
+    def _share(self, twin: Self) -> Self:
+        """Return another body on the same mesh with the parts that do not depend on the law."""
+        for name in ("pattern", "moved_supports", "_operator"):
+            twin.__dict__[name] = getattr(self, name)
+        twin.__dict__["_same_mesh"] = self  # its recovery is built at the first use
+        return twin
+
+    @cached_property
+    def pressure_has_potential(self) -> bool:
+        """True if the follower pressure has a potential; also without one."""
+        if self.pressure is None:
+            return True
+        return self.pressure.generic.has_potential(self.free, self.prescribed)
