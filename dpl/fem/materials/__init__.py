@@ -5,6 +5,14 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
+    from dpl.fem.materials.demiray import DemirayK2
+    from dpl.fem.materials.fibre_energies import (
+        FibreEnergy,
+        Guccione,
+        HolzapfelGasserOgdenFibres,
+        HolzapfelOgdenFibres,
+    )
+    from dpl.fem.materials.fibre_reinforced import FibreDirections, FibreReinforced
     from dpl.fem.materials.invariant_based import InvariantBasedMaterial
     from dpl.fem.materials.linear_elastic import LinearElastic
     from dpl.fem.materials.material import Material, Response, YoungPoissonMaterial
@@ -17,6 +25,7 @@ if TYPE_CHECKING:
     )
     from dpl.fem.materials.ogden import OgdenK2
     from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
+    from dpl.fem.materials.volumetric import VolumetricK2, VolumetricK4
     from dpl.fem.materials.yeoh import YeohK2
 else:
     __all__, __getattr__, __dir__ = public_names(__name__)

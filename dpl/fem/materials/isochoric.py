@@ -1,4 +1,4 @@
-"""Derivatives of energies that are polynomials of isochoric invariants."""
+"""Derivatives of energies that are functions of isochoric invariants."""
 
 from typing import Any
 
@@ -22,10 +22,25 @@ def polynomial_derivatives(c: Any, i1: Any, i2: Any, m1: Any, q: Any, qJ: Any) -
         i1, i2, m1: As in `InvariantBasedMaterial.invariant_derivatives`.
         q, qJ: J U' and J (J U')'.
     """
+    x = (1 + m1) * i1 + 3 * m1
+    f1, f11 = c[0] + x * (2 * c[1] + 3 * c[2] * x), 2 * c[1] + 6 * c[2] * x
+    return isochoric_derivatives(f1, f11, c[3], i1, i2, m1, q, qJ)
+
+
+def isochoric_derivatives(
+    f1: Any, f11: Any, f2: Any, i1: Any, i2: Any, m1: Any, q: Any, qJ: Any
+) -> tuple[Any, ...]:
+    """Return `invariant_derivatives` of f(x) + f2 y + U(J), x = Ib1 - 3 and y = Ib2 - 3.
+
+    Args:
+        f1, f11: f' and f''.
+        f2: Factor of y.
+        i1, i2, m1: As in `InvariantBasedMaterial.invariant_derivatives`.
+        q, qJ: J U' and J (J U')'.
+    """
     m = 1 + m1
     x = m * i1 + 3 * m1
-    f1, f11 = c[0] + x * (2 * c[1] + 3 * c[2] * x), 2 * c[1] + 6 * c[2] * x
-    I1, I2, f2 = x + 3, m * m * (3 + i2), c[3]  # of the isochoric part
+    I1, I2 = x + 3, m * m * (3 + i2)  # of the isochoric part
     W2, W22 = f2 * m * m, 0.0
     rest = q - 2 / 3 * f1 * m * i1 - 4 / 3 * f2 * m * m * i2
     p = q - 2 / 3 * f1 * I1 - 4 / 3 * f2 * I2

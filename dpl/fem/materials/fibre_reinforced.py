@@ -1,0 +1,230 @@
+"""Laws with fibres: an isotropic matrix and the energy of fibres, with a frame for each cell."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+import skfem
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dpl.fem.materials.fibre_energies import FibreEnergy, components
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.material import Material, Response
+from dpl.fem.materials.tensors import green_lagrange
+
+ORTHONORMAL = 1e-6  # largest entry of Q^T Q - I
+COMPONENT = ((0, 3, 5), (3, 1, 4), (5, 4, 2))  # number of each component ij
+
+
+class FibreDirections:
+    """Specification of the fibre frames of a body."""
+
+    def on(self, basis: skfem.Basis, origin: NDArray[np.float64] | float, length: float) -> Tensor:
+        """Return the frames of the cells, (E, 3, 3), or (1, 3, 3) if all are equal [-].
+
+        The columns of a frame are the directions of fibre, sheet and normal: orthonormal, and
+        right-handed. They are evaluated at the centre of each cell.
+
+        Args:
+            basis: scikit-fem basis of one displacement component.
+            origin: Origin of the mesh of the basis in its own unit, (D,).
+            length: Length unit of that mesh [m].
+        """
+        raise NotImplementedError
+
+    def constant(self) -> Tensor | None:
+        """Return the frame (1, 3, 3) [-] of all cells of any body; None if it needs a body."""
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class FibreReinforced(Material):
+    """Anisotropic law: the energy of an isotropic matrix plus that of fibres in a frame.
+
+    W = matrix.energy(H) + fibres.energy(Q^T (C - I) Q), Q the fibre frame of the cell. The matrix
+    has the volumetric term; the fibres have the full strain, see `FibreEnergy`.
+
+    Frames are tensors with the cells as first axis; the law then takes H of (B, E, Q, 3, 3), cells
+    at axis -4. One frame for all cells takes any H.
+
+    Source: Holzapfel, Gasser, Ogden (2000), J. Elast. 61.
+
+    Attributes:
+        matrix: The isotropic law, without ranges.
+        fibres: The energy of the fibres.
+        directions: Fibre directions; after `on` the frames (E, 3, 3) or (1, 3, 3) [-], columns f, s
+            and n.
+
+    Raises:
+        ValueError: `matrix` is linear or has ranges, or frames are not orthonormal.
+    """
+
+    matrix: InvariantBasedMaterial
+    fibres: FibreEnergy
+    directions: FibreDirections | Tensor
+
+    def check_constants(self) -> None:
+        """See `Material.check_constants`."""
+        if not (isinstance(self.matrix, InvariantBasedMaterial) and self.matrix.finite):
+            name = type(self.matrix).__name__
+            raise ValueError(f"matrix = {name} must be a law of the invariants for finite strains")
+        if self.matrix.parameter_ranges:
+            raise ValueError(
+                f"matrix has ranges of {list(self.matrix.parameter_ranges)} and must have values"
+            )
+        if isinstance(self.directions, Tensor) and not torch.compiler.is_compiling():
+            _check_frames(self.directions)
+
+    def __eq__(self, other: object) -> bool:
+        """Return True for a law of the same constants and frames."""
+        return isinstance(other, FibreReinforced) and self.identity() == other.identity()
+
+    def __hash__(self) -> int:
+        """Return a hash that equal laws share."""
+        return hash((type(self), self.matrix, self.fibres))
+
+    def on(self, basis: skfem.Basis, origin: NDArray[np.float64] | float, length: float) -> Self:
+        """Return the law with the frames of a body; arguments as in `FibreDirections.on`.
+
+        Raises:
+            ValueError: The directions do not fit the body.
+        """
+        if isinstance(self.directions, Tensor):
+            cells = basis.mesh.t.shape[1]
+            if len(self.directions) not in (1, cells):
+                raise ValueError(
+                    f"directions has frames of {len(self.directions)} cells and must have those of "
+                    f"{cells}"
+                )
+            return self
+        return replace(self, directions=self.directions.on(basis, origin, length))
+
+    def of_cells(self, cells: Tensor) -> Self:
+        """Return the law at some cells, given by index (K,) or mask (E,)."""
+        if len(self.frames) == 1:
+            return self
+        return replace(self, directions=self.frames[cells.to(self.frames.device)])
+
+    @property
+    def frames(self) -> Tensor:
+        """Fibre frames (E, 3, 3) or (1, 3, 3) [-].
+
+        Raises:
+            ValueError: The directions need a body.
+        """
+        if isinstance(self.directions, Tensor):
+            return self.directions
+        if (frames := self.directions.constant()) is None:
+            raise ValueError(
+                f"directions = {type(self.directions).__name__} must be evaluated on a body first; "
+                "call FibreReinforced.on"
+            )
+        return frames
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        Q = self._rotation(H)
+        return self.matrix.energy(H) + self.fibres.energy(Q.mT @ (2 * green_lagrange(H)) @ Q)
+
+    def response(self, E: Tensor) -> Response:
+        """Return stress and moduli, see `Material.response`."""
+        isotropic, fibres = self.matrix.response(E), self._fibre_response(E)
+        return Response(isotropic.stress + fibres.stress, isotropic.moduli + fibres.moduli)
+
+    def stress(self, H: Tensor) -> Tensor:
+        """Return the first Piola-Kirchhoff stress, see `Material.stress`."""
+        Q = self._rotation(H)
+        e = components(Q.mT @ (2 * green_lagrange(H)) @ Q)
+        S = Q @ _tensor(self.fibres.strain_derivatives(self.fibres.constants, e)[0], e) @ Q.mT
+        return self.matrix.stress(H) + S + H @ S
+
+    def tangent(self, H: Tensor) -> Tensor:
+        """Return dP/dF, see `Material.tangent`."""
+        return self.matrix.tangent(H) + self._fibre_response(green_lagrange(H)).tangent(H)
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus at rest over Young's modulus, the average over all directions [-]."""
+        normal, mixed = self._fibre_traces
+        return self.matrix.mu + (3 * mixed - normal) / 30
+
+    @property
+    def lam(self) -> float:
+        """First Lame parameter at rest over Young's modulus, the average over directions [-].
+
+        Source: Voigt (1889), Ann. Phys. 274: the average over all rotations of the moduli D has the
+        D_iikk and D_ikik of D.
+        """
+        normal, mixed = self._fibre_traces
+        return self.matrix.lam + (2 * normal - mixed) / 15
+
+    @property
+    def _fibre_traces(self) -> tuple[float, float]:
+        """D_iikk and D_ikik of the moduli D of the fibres at rest, which no rotation changes."""
+        rest = (torch.zeros((), dtype=torch.float64),) * 6
+        D = self.fibres.strain_derivatives(self.fibres.constants, rest)[1]
+        matrix = _moduli(D, rest)
+        return float(matrix[::4, ::4].sum()), float(matrix.trace())
+
+    def _rotation(self, H: Tensor) -> Tensor:
+        """Return the frames with an axis for the points, (E, 1, 3, 3), or (3, 3) if all are equal.
+
+        Device and type are those of H.
+        """
+        frames = self.frames.to(H)
+        return frames[0] if len(frames) == 1 else frames[:, None]
+
+    def _fibre_response(self, E: Tensor) -> Response:
+        """Return stress and moduli of the fibres at Green-Lagrange strains E (..., 3, 3)."""
+        Q = self._rotation(E)
+        e = components(Q.mT @ (2 * E) @ Q)
+        S, D = self.fibres.strain_derivatives(self.fibres.constants, e)
+        pairs = torch.einsum("...ik,...jl->...ijkl", Q, Q).flatten(-4, -3).flatten(-2)
+        moduli = pairs @ _moduli(D, e) @ pairs.mT
+        moduli = moduli.unflatten(-2, (3, 3)).unflatten(-1, (3, 3))
+        return Response(Q @ _tensor(S, e) @ Q.mT, moduli)
+
+
+def _tensor(S: tuple[Any, ...], e: tuple[Tensor, ...]) -> Tensor:
+    """Return the symmetric tensor (..., 3, 3) of six components."""
+    parts = _tensors(S, e)
+    return torch.stack([parts[v] for row in COMPONENT for v in row], -1).unflatten(-1, (3, 3))
+
+
+def _moduli(D: tuple[Any, ...], e: tuple[Tensor, ...]) -> Tensor:
+    """Return the matrix (..., 9, 9) of the pairs ij and kl of the moduli.
+
+    Args:
+        D: The 21 moduli of `FibreEnergy.strain_derivatives`.
+        e: Components of the strain.
+    """
+    parts = iter(_tensors(D, e))
+    upper = {(v, w): next(parts) for v in range(6) for w in range(v, 6)}
+    pairs = [v for row in COMPONENT for v in row]
+    entries = [upper[min(v, w), max(v, w)] for v in pairs for w in pairs]
+    return torch.stack(entries, -1).unflatten(-1, (9, 9))
+
+
+def _tensors(entries: tuple[Any, ...], e: tuple[Tensor, ...]) -> list[Tensor]:
+    """Return numbers and tensors as tensors of one shape; type and device are those of e."""
+    full = [x if isinstance(x, Tensor) else torch.full_like(e[0], x) for x in entries]
+    return list(torch.broadcast_tensors(*full))
+
+
+def _check_frames(frames: Tensor) -> None:
+    """Check that frames are (E, 3, 3) and orthonormal.
+
+    Raises:
+        ValueError: They are not.
+    """
+    if frames.dim() != 3 or frames.shape[1:] != (3, 3) or not len(frames):
+        raise ValueError(f"directions of shape {tuple(frames.shape)} must have (cells, 3, 3)")
+    gap = frames.mT @ frames - torch.eye(3, dtype=frames.dtype, device=frames.device)
+    bad = ~(gap.abs().flatten(1).amax(1) <= ORTHONORMAL)
+    if bad.any():
+        raise ValueError(
+            f"directions must have orthonormal columns; {int(bad.sum())} of {len(frames)} frames "
+            "do not"
+        )

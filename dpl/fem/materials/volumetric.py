@@ -1,0 +1,70 @@
+"""Energies of the volume alone, as matrix of laws of fibres that resist shear as well."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.tensors import volume_change
+
+
+@dataclass(frozen=True)
+class VolumetricK2(InvariantBasedMaterial):
+    """Volumetric energy bulk/2 (J - 1)^2.
+
+    It does not resist shear, so that it is no law of a body without the fibres of
+    `FibreReinforced`.
+
+    Source: The volumetric term of Abaqus (D1 = 2/bulk).
+
+    Attributes:
+        bulk: Bulk modulus over E [-].
+    """
+
+    bulk: float
+
+    def check_constants(self) -> None:
+        """See `Material.check_constants`."""
+        if not 0 < self.bulk < math.inf:
+            raise ValueError(f"bulk = {self.bulk} must be above 0")
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        return self.bulk / 2 * volume_change(H).square()
+
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """Return bulk."""
+        return (self.bulk,)
+
+    @staticmethod
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
+        """See `InvariantBasedMaterial.invariant_derivatives`."""
+        p = c[0] * j * (1 + j)
+        return p, 0.0, p, 0.0, 0.0, 0.0, 0.0, 0.0, c[0] * (1 + j) * (1 + 2 * j)
+
+
+@dataclass(frozen=True)
+class VolumetricK4(VolumetricK2):
+    """Volumetric energy bulk/4 (J^2 - 1 - 2 ln J); see `VolumetricK2`.
+
+    Source: Simo, Taylor (1991), CMAME 85, eq. 2.5.
+    """
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, see `Material.energy`."""
+        j = volume_change(H)
+        return self.bulk / 4 * (j * (2 + j) - 2 * torch.log1p(j))
+
+    @staticmethod
+    def invariant_derivatives(
+        c: Any, i1: Any, i2: Any, j: Any, log_j: Any, m1: Any
+    ) -> tuple[Any, ...]:
+        """See `InvariantBasedMaterial.invariant_derivatives`."""
+        p = c[0] / 2 * j * (2 + j)
+        return p, 0.0, p, 0.0, 0.0, 0.0, 0.0, 0.0, c[0] * (1 + j) * (1 + j)
