@@ -44,10 +44,16 @@ if TYPE_CHECKING:
     from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
     from dpl.fem.materials.volumetric import VolumetricK2, VolumetricK4
     from dpl.fem.materials.yeoh import YeohK2
+    from dpl.fem.mesh.fibre_directions import (
+        ConstantFibres,
+        FibreData,
+        FibreFunction,
+        LaplaceFibres,
+    )
     from dpl.fem.mesh.finger_mesh import finger
     from dpl.fem.mesh.generators import box, rectangle
     from dpl.fem.mesh.propeller_mesh import propeller
-    from dpl.fem.mesh.reading import read_mesh
+    from dpl.fem.mesh.reading import read_cell_data, read_mesh
     from dpl.fem.mesh.regions import Box, Cylinder, Plane, Sphere, Tag
     from dpl.fem.mesh.writing import write_mesh, write_mesh_exactly, write_series
     from dpl.fem.postprocess.stress import Fields, fields

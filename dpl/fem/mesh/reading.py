@@ -1,6 +1,7 @@
 """Read mesh files, with their named sets of cells and facets."""
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import meshio
@@ -68,6 +69,45 @@ def read_mesh(path: str | Path) -> skfem.Mesh:
     if repairs:
         warnings.warn(f"{path}: {'; '.join(repairs)}", stacklevel=2)
     return mesh
+
+
+def read_cell_data(path: str | Path, names: Sequence[str]) -> list[Array]:
+    """Return named fields on the cells of a mesh file, (E,) or (E, components) each.
+
+    Their rows are those of the cells of `read_mesh`, in this order.
+
+    Args:
+        path: The file, which need not be trusted, see `dpl.fem.mesh.sandbox`.
+        names: Names of the fields.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file cannot be read, or has no such field with a row for each cell.
+    """
+    path = Path(path)
+    raw = read(path)
+    try:
+        kind = _cell_type(raw)
+        return [_cell_field(raw, kind, name) for name in names]
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _cell_field(raw: meshio.Mesh, kind: str, name: str) -> Array:
+    """Return a field on the cells of one type, (E,) or (E, components)."""
+    if name not in raw.cell_data:
+        known = ", ".join(map(repr, sorted(raw.cell_data)[:20])) or "none"
+        raise ValueError(f"has no cell data {name!r}; there are: {known}")
+    pairs = [
+        (block.data, np.asarray(values, dtype=np.float64))
+        for block, values in zip(raw.cells, raw.cell_data[name], strict=False)
+        if block.type == kind
+    ]
+    cells = sum(len(block.data) for block in raw.cells if block.type == kind)
+    widths = {values.shape[1:] for _, values in pairs}
+    if len(widths) != 1 or sum(len(values) for _, values in pairs) != cells:
+        raise ValueError(f"cell data {name!r} must have one row for each of {cells} cells")
+    return np.concatenate([values for _, values in pairs])
 
 
 def to_mesh(raw: meshio.Mesh) -> tuple[skfem.Mesh, list[str]]:

@@ -1,0 +1,259 @@
+"""Fibre directions of a body: constant, from a function, from data, or by Laplace's equation.
+
+Frames have the columns fibre f, sheet s and normal n = f x s. Where a law depends on f alone, the
+sheet may be left out: it is z x f, or x where the fibre lies along z.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import skfem
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import diags_array
+from scipy.sparse.linalg import cg
+from skfem.models.poisson import laplace
+from torch import Tensor
+
+from dpl.fem.materials.fibre_reinforced import FibreDirections
+from dpl.fem.mesh.reading import read_cell_data
+from dpl.fem.mesh.regions import Origin, Region, facets_in
+from dpl.fem.mesh.validation import listed
+
+PARALLEL = 1e-6  # sine of the angle below which two directions are parallel
+LAPLACE_TOL = 1e-10  # relative residual of Laplace's equation
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ConstantFibres(FibreDirections):
+    """One direction in the whole body.
+
+    Attributes:
+        fibre: Direction f of any length, 3 components, or 2 in a 2D body.
+        sheet: Direction in the plane of f and s; default: see the module.
+
+    Raises:
+        ValueError: A direction is zero or not finite, or the two are parallel.
+    """
+
+    fibre: Sequence[float]
+    sheet: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the attributes."""
+        self.constant()
+
+    def constant(self) -> Tensor:
+        """Return the frame, (1, 3, 3) [-]."""
+        sheet = None if self.sheet is None else np.array([self.sheet])
+        return frames_of(np.array([self.fibre]), sheet)
+
+    def on(self, basis: skfem.Basis, origin: Origin, length: float) -> Tensor:
+        """Return the frame, (1, 3, 3) [-], see `FibreDirections.on`."""
+        if len(self.fibre) < basis.mesh.dim():
+            raise ValueError(f"fibre = {list(self.fibre)} must have {basis.mesh.dim()} components")
+        return self.constant()
+
+
+@dataclass(frozen=True)
+class FibreFunction(FibreDirections):
+    """Directions as a function of the place.
+
+    Attributes:
+        function: Function of points (E, D) [m] that returns the directions f, (E, 3) or (E, 2), or
+            a tuple of f and s. Lengths are arbitrary.
+    """
+
+    function: Callable[[Array], Any]
+
+    def on(self, basis: skfem.Basis, origin: Origin, length: float) -> Tensor:
+        """Return the frames, (E, 3, 3) [-], see `FibreDirections.on`."""
+        found = self.function(cell_centres(basis, origin, length))
+        fibre, sheet = found if isinstance(found, tuple) else (found, None)
+        return _frames_on(basis, fibre, sheet)
+
+
+@dataclass(frozen=True, eq=False)
+class FibreData(FibreDirections):
+    """Directions of each cell, as arrays or from a mesh file.
+
+    Attributes:
+        fibre: Directions f, (E, 3) or (E, 2), or the name of such cell data in `file`.
+        sheet: The same for s.
+        file: File with this cell data; its cells are those of the mesh.
+
+    Raises:
+        ValueError: There are names without a file, or a file without names.
+    """
+
+    fibre: str | Sequence[Sequence[float]] | Array
+    sheet: str | Sequence[Sequence[float]] | Array | None = None
+    file: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check the attributes."""
+        for name, value in (("fibre", self.fibre), ("sheet", self.sheet)):
+            if value is not None and isinstance(value, str) != (self.file is not None):
+                raise ValueError(
+                    f"{name} must be the name of cell data if there is a file, and an array if not"
+                )
+
+    def on(self, basis: skfem.Basis, origin: Origin, length: float) -> Tensor:
+        """Return the frames, (E, 3, 3) [-], see `FibreDirections.on`."""
+        if self.file is None:
+            return _frames_on(basis, self.fibre, self.sheet)
+        names = [name for name in (self.fibre, self.sheet) if isinstance(name, str)]
+        data = read_cell_data(self.file, names)
+        return _frames_on(basis, *data)
+
+
+@dataclass(frozen=True)
+class LaplaceFibres(FibreDirections):
+    """Directions in a wall, rotating from one surface to the other.
+
+    The solution phi of Laplace's equation, 0 on `inner` and 1 on `outer`, gives the transmural
+    direction t = grad phi / |grad phi|, which is the sheet direction. Fibres lie in the plane
+    across t, at the angle inner_angle + (outer_angle - inner_angle) phi to the circumferential
+    direction `longitudinal` x t, and turn towards `longitudinal`.
+
+    Source: Bayer, Blake, Plank, Trayanova (2012), Ann. Biomed. Eng. 40; with a given long axis
+    instead of the apicobasal solution, and sheets along t.
+
+    Attributes:
+        inner, outer: Surfaces of the wall.
+        longitudinal: Long axis of any length, 3 components; [0, 0, 1] in a 2D body.
+        inner_angle, outer_angle: Angles on the surfaces [rad].
+
+    Raises:
+        ValueError: The axis is zero or not finite, or an angle is not finite.
+    """
+
+    inner: Region
+    outer: Region
+    longitudinal: Sequence[float]
+    inner_angle: float
+    outer_angle: float
+
+    def __post_init__(self) -> None:
+        """Check the attributes."""
+        _unit_vectors("longitudinal", np.array([self.longitudinal]))
+        for name in ("inner_angle", "outer_angle"):
+            if not math.isfinite(value := getattr(self, name)):
+                raise ValueError(f"{name} = {value} must be a finite number [rad]")
+
+    def on(self, basis: skfem.Basis, origin: Origin, length: float) -> Tensor:
+        """Return the frames, (E, 3, 3) [-], see `FibreDirections.on`.
+
+        Raises:
+            ValueError: A surface contains no boundary facet, the surfaces touch, a part of the body
+                is connected to none of them, or the axis is parallel to t.
+        """
+        surfaces = [
+            facets_in(part, basis.mesh, length, origin) for part in (self.inner, self.outer)
+        ]
+        depth, gradient = _laplace(basis, *(basis.get_dofs(facets).all() for facets in surfaces))
+        transmural = _unit_vectors("gradient between inner and outer", gradient)
+        axis = _unit_vectors("longitudinal", np.array([self.longitudinal]))
+        around = np.cross(axis, transmural)
+        parallel = np.linalg.norm(around, axis=1) < PARALLEL
+        _refuse(parallel, "longitudinal must not be parallel to the transmural direction")
+        around = _unit_vectors("circumferential direction", around)
+        angle = (self.inner_angle + (self.outer_angle - self.inner_angle) * depth)[:, None]
+        fibre = np.cos(angle) * around + np.sin(angle) * np.cross(transmural, around)
+        return frames_of(fibre, transmural)
+
+
+def cell_centres(basis: skfem.Basis, origin: Origin, length: float) -> Array:
+    """Return the means of the vertices of the cells in the coordinates of the user, (E, D) [m]."""
+    vertices = basis.mesh.p[:, basis.mesh.t]  # (D, vertices, E)
+    return np.ascontiguousarray((vertices.mean(axis=1).T + origin) * length)
+
+
+def frames_of(fibre: Array, sheet: Array | None = None) -> Tensor:
+    """Return right-handed orthonormal frames, (E, 3, 3) [-], of directions of any length.
+
+    Args:
+        fibre: Directions f, (E, 3) or (E, 2).
+        sheet: Directions s, whose part across f is taken; default: z x f, or x where f
+            lies along z.
+
+    Raises:
+        ValueError: A direction is zero or not finite, or the two are parallel.
+    """
+    f = _unit_vectors("fibre", fibre)
+    if sheet is None:
+        across = np.cross([0.0, 0.0, 1.0], f)
+        along_z = np.linalg.norm(across, axis=1, keepdims=True) < PARALLEL
+        sheet = np.where(along_z, [1.0, 0.0, 0.0], across)
+    s = _unit_vectors("sheet", sheet)
+    s = s - (s * f).sum(1, keepdims=True) * f
+    _refuse(np.linalg.norm(s, axis=1) < PARALLEL, "sheet must not be parallel to fibre")
+    s = s / np.linalg.norm(s, axis=1, keepdims=True)
+    s = s - (s * f).sum(1, keepdims=True) * f  # again, for directions that are nearly parallel
+    s = s / np.linalg.norm(s, axis=1, keepdims=True)
+    return torch.from_numpy(np.stack([f, s, np.cross(f, s)], axis=-1))
+
+
+def _frames_on(basis: skfem.Basis, fibre: Any, sheet: Any = None) -> Tensor:
+    """Return frames of directions for each cell of a body, (E, 3, 3) [-]."""
+    cells, dim = basis.mesh.t.shape[1], basis.mesh.dim()
+    for name, given in (("fibre", fibre), ("sheet", sheet)):
+        shape = np.shape(given)
+        if given is not None and shape not in ((cells, dim), (cells, 3)):
+            raise ValueError(f"{name} of shape {shape} must have ({cells}, {dim}), a row per cell")
+    sheet = None if sheet is None else np.asarray(sheet, dtype=np.float64)
+    return frames_of(np.asarray(fibre, dtype=np.float64), sheet)
+
+
+def _unit_vectors(name: str, vectors: Array) -> Array:
+    """Return vectors (E, 2) or (E, 3) divided by their lengths, (E, 3) [-]."""
+    vectors = np.asarray(vectors, dtype=np.float64)
+    if vectors.ndim != 2 or vectors.shape[1] not in (2, 3):
+        raise ValueError(f"{name} = {vectors.tolist()} must have 2 or 3 components")
+    vectors = np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
+    largest = np.abs(vectors).max(axis=1, keepdims=True)
+    _refuse(~((largest > 0) & np.isfinite(largest))[:, 0], f"{name} must be finite and not zero")
+    vectors = vectors / largest  # squares of it neither overflow nor vanish
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def _refuse(bad: NDArray[np.bool_], message: str) -> None:
+    """Raise a ValueError with the numbers of the cells for which `bad` (E,) is True."""
+    if bad.any():
+        where = f" (cells {listed(np.flatnonzero(bad))})" if len(bad) > 1 else ""
+        raise ValueError(message + where)
+
+
+def _laplace(
+    basis: skfem.Basis, inner: NDArray[np.int_], outer: NDArray[np.int_]
+) -> tuple[Array, Array]:
+    """Return the solution of Laplace's equation (E,) [-] and its gradient (E, D) at cell centres.
+
+    Args:
+        basis: Scalar basis.
+        inner, outer: Degrees of freedom where the solution is 0 and 1.
+    """
+    if len(both := np.intersect1d(inner, outer)):
+        raise ValueError(f"inner and outer must not touch; they share {len(both)} nodes")
+    values = np.zeros(basis.N)
+    values[outer] = 1.0
+    free = np.setdiff1d(np.arange(basis.N), np.concatenate([inner, outer]))
+    matrix = laplace.assemble(basis).tocsr()
+    if len(free):
+        block = matrix[free][:, free]
+        right = -(matrix @ values)[free]
+        inverse = diags_array(1 / block.diagonal())
+        values[free], failed = cg(block, right, rtol=LAPLACE_TOL, M=inverse)
+        if failed:
+            raise ValueError(
+                "inner and outer must be surfaces of one wall: no solution between them"
+            )
+    centre = basis.mesh.elem.refdom.p.mean(axis=1, keepdims=True)
+    at_centre = skfem.CellBasis(basis.mesh, basis.elem, quadrature=(centre, np.ones(1)))
+    field = at_centre.interpolate(values)
+    return np.asarray(field)[:, 0], np.ascontiguousarray(field.grad[:, :, 0].T)
