@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from dpl.fem import (
+    FibreReinforced,
     InvariantBasedMaterial,
     LinearElastic,
     Material,
@@ -224,6 +225,13 @@ def finite(law) -> Material:
 
 
 @pytest.fixture
+def without_fibres(law) -> None:
+    """Skip laws with fibres, which test_fibre_materials.py tests."""
+    if isinstance(law, FibreReinforced):
+        pytest.skip("holds for isotropic laws only")
+
+
+@pytest.fixture
 def gradients() -> Tensor:
     """Displacement gradients of uninverted F, far from rest."""
     random = torch.Generator().manual_seed(0)
@@ -308,6 +316,7 @@ def test_simple_shear_has_the_tabulated_stresses(laws, name):
         assert [P[0][2], P[1][2], P[2][0], P[2][1]] == [pytest.approx(0, abs=1e-15)] * 4
 
 
+@pytest.mark.usefixtures("without_fibres")
 @pytest.mark.parametrize("shear", [0.1, 0.5, 1.0, 2.0])
 def test_normal_stresses_of_simple_shear_are_universal(law, shear):
     """The relation is sigma11 - sigma22 = shear sigma12 for every isotropic law."""
@@ -372,6 +381,7 @@ def test_differences_of_stress_follow_the_tangent(law, gradients):
     assert_close(product, slope, rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.usefixtures("without_fibres")
 @pytest.mark.parametrize(
     "stretches",
     [(1.0, 1.0, 1.0), (1.3, 1.3, 1.3), (1.4, 0.9, 0.9), (1.2, 1.2 + 3e-7, 0.8)],
@@ -416,6 +426,7 @@ def test_rotated_body_feels_the_rotated_stress(finite, gradients, rotation):
     assert_close(finite.energy(turned), finite.energy(gradients), rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.usefixtures("without_fibres")
 def test_material_has_no_preferred_direction(law, gradients, rotation):
     """Body and load turned alike: true for the linear law too."""
     turned = rotation @ gradients @ rotation.T
@@ -424,6 +435,7 @@ def test_material_has_no_preferred_direction(law, gradients, rotation):
     assert_close(law.energy(turned), law.energy(gradients), rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.usefixtures("without_fibres")
 def test_material_cut_in_another_direction_is_the_same(finite, gradients, rotation):
     """P(F Q) = P(F) Q."""
     turned = (EYE + gradients) @ rotation - EYE
@@ -460,6 +472,7 @@ def test_moduli_are_those_of_young_and_poisson():
     assert digits(0.8333333333, 10) == SVK.bulk
 
 
+@pytest.mark.usefixtures("without_fibres")
 def test_moduli_at_rest_are_those_of_the_tangent(law):
     """Young's modulus need not be 1: MR and Yeoh have a shear modulus of 0.4, Ogden of 0.42."""
     A = law.tangent(torch.zeros(3, 3, dtype=torch.float64))
@@ -477,6 +490,7 @@ def test_rubbers_have_their_shear_and_bulk_modulus_at_rest(laws, name, shear):
     assert laws[name].lam + 2 / 3 * shear == pytest.approx(2.0, rel=1e-14)
 
 
+@pytest.mark.usefixtures("without_fibres")
 @pytest.mark.parametrize("size", [1e-10, 1e-14])
 def test_tiny_gradients_keep_the_digits_of_hooke(law, gradients, size):
     """With F = I + H a strain of 1e-10 would keep six digits."""
