@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -221,9 +221,6 @@ class Scene:
             springs += f", follower pressure on {len(problem.pressure.nodes):,} facets"
         for name, (low, high) in problem.pressure_ranges.items():
             springs += f", {name} from {low:.4g} to {high:.4g} Pa"
-        law = (
-            problem.material if is_dataclass(problem.material) else type(problem.material).__name__
-        )
         force, displacement = self._largest_of_a_few()
         bends = "" if problem.moved_supports else f", linear deflection {displacement:.3g} m"
         unit = "N" if problem.shape[1] == 3 else "N/m"
@@ -235,7 +232,7 @@ class Scene:
                 f"{problem.points.numel():,} degrees of freedom",
             ),
             ("supports", f"{fixed:,} nodes {moved}{springs}"),
-            ("law", f"{law}, {_modulus(moduli_of(loads))}"),
+            ("law", f"{problem.material.describe()}, {_modulus(moduli_of(loads))}"),
             (
                 "loads",
                 f"{type(loads).__name__}; the largest of {FEW}: {force:.3g} {unit}{bends}",

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from dataclasses import dataclass
 
 import lightning as L
 import numpy as np
@@ -111,12 +112,17 @@ def test_a_law_without_ranges_has_no_parameters():
         law.with_parameters(values(0.3))
 
 
-def test_a_batch_of_a_law_with_moduli_of_its_own_is_refused_in_words():
-    class Own(YeohK2):
-        ranged = ("bulk",)
+def test_a_batch_of_a_law_without_moduli_as_functions_is_refused_in_words():
+    @dataclass(frozen=True)
+    class Own(Material):
+        ranged = ("stiffness",)
+        stiffness: float
 
-    law = Own(0.2, -0.02, 0.005, (1.0, 2.0)).with_parameters(torch.tensor([[1.2], [1.8]]).double())
-    with pytest.raises(ValueError, match="Own: a law with ranges must derive from YoungPoisson"):
+        def energy(self, H):
+            return self.stiffness * H.square().sum((-2, -1))
+
+    law = Own((1.0, 2.0)).with_parameters(torch.tensor([[1.2], [1.8]]).double())
+    with pytest.raises(ValueError, match="Own: a law with ranges must define mu and lam"):
         law.mu  # noqa: B018
 
 

@@ -35,7 +35,7 @@ if typing.TYPE_CHECKING:
     import lightning as L
 
 SCENE = (  # keys of a scene; those of a surrogate
-    *("mesh", "degree", "mean_dilatation", "supports", "forces"),
+    *("mesh", "degree", "mean_dilatation", "regions", "supports", "forces"),
     *("material", "young", "loads", "solver"),
 )
 NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")
@@ -209,13 +209,18 @@ def _problem(
     cfg: DictConfig, young: float | None, pressures: dict[str, FollowerPressure]
 ) -> Problem:
     with _shown_warnings():
-        mesh, material = (instantiate(cfg, key) for key in ("mesh", "material"))
+        mesh, regions = instantiate(cfg, "mesh"), _parts(cfg, "regions")
+        several = validation.names_several("material", cfg.material)
+        material = _parts(cfg, "material") if several else instantiate(cfg, "material")
+        if regions and not several:
+            raise ConfigError("regions: the body has one law; give each region one, material.NAME")
         fixed = instantiate(cfg, "fixed") if cfg.get("fixed") is not None else None
         options = {key: cfg[key] for key in ("degree", "mean_dilatation")} | {"young": young}
         supports = _supports(cfg, mesh, Units(1.0, young))
         for name, pressure in pressures.items():
             with error_in(f"forces.{name}"):
                 pressure.check(mesh, Units(1.0, young))
+        options["regions"] = regions
         options["pressures"] = [
             replace(pressure, name=pressure.name or name) for name, pressure in pressures.items()
         ]
@@ -224,7 +229,7 @@ def _problem(
         except ValueError as error:
             message = str(error)
             key = "fixed or supports: " if cfg.supports else "fixed: "
-            named = message.startswith(tuple(options))
+            named = message.startswith((*options, "material"))
             raise ConfigError(message if named else key + message) from error
     if not problem.free.any():
         raise ConfigError("fixed or supports: all nodes are fixed; fix fewer nodes")

@@ -17,7 +17,7 @@ from typing import Any, Literal
 Keys = Sequence[tuple[Any, ...]]  # rows of type, names, and smallest and largest value of keys
 KEYS: Keys = (  # of all commands
     (dict, "mesh material loads solver data model loss optimizer trainer"),
-    (dict | None, "fixed supports forces scheduler callbacks logger paths extras"),
+    (dict | None, "fixed regions supports forces scheduler callbacks logger paths extras"),
     (dict | None, "galerkin corrected"),
     (bool, "mean_dilatation trust resume twice solve_reference profile galerkin_correction"),
     (str, "name host"),
@@ -54,6 +54,7 @@ EXPECTED_TYPES = {  # base classes of the object that the call under a key retur
     "mesh": {"skfem.mesh.mesh.Mesh"},
     "material": {"dpl.fem.materials.material.Material"},
     "fixed": {f"dpl.fem.mesh.regions.{n}" for n in ("Plane", "Box", "Sphere", "Cylinder", "Tag")},
+    "regions": {f"dpl.fem.mesh.regions.{n}" for n in ("Plane", "Box", "Sphere", "Cylinder", "Tag")},
     "supports": {
         "dpl.fem.assembly.boundary_conditions.DirichletBC",
         "dpl.fem.assembly.boundary_conditions.RobinBC",
@@ -74,7 +75,12 @@ EXPECTED_TYPES = {  # base classes of the object that the call under a key retur
     "callbacks": {"lightning.pytorch.callbacks.callback.Callback"},
     "logger": {"lightning.pytorch.loggers.logger.Logger"},
 }
-SEVERAL = ("supports", "forces", "callbacks", "logger")  # keys with calls by name
+PARTS_OF_LAWS = {  # base classes of the objects that a law may contain
+    "dpl.fem.materials.cell_field.CellField",
+    "dpl.fem.materials.fibre_energies.FibreEnergy",
+    "dpl.fem.materials.fibre_reinforced.FibreDirections",
+}
+SEVERAL = ("regions", "supports", "forces", "callbacks", "logger")  # keys with calls by name
 PROTOCOLS = EXPECTED_TYPES["solver"] | EXPECTED_TYPES["loads"]  # a class needs their members only
 TRUSTED_RESULTS = {  # of functions that a run may name: they compute and have no other effect
     "skfem.mesh.mesh.Mesh",
@@ -127,7 +133,7 @@ def check(
             _check_keys(path, node, known)
         if isinstance(node, dict) and "_target_" in node:
             _check_call(path, node, _target(path, node["_target_"], trust=trust))
-        elif _is_call(path) and node is not None:
+        elif _is_call(path, resolved) and node is not None:
             raise ConfigError(f"{path} = {node!r} must be a call: its _target_ is missing")
 
 
@@ -135,10 +141,16 @@ def _by_name(keys: Keys) -> dict[str, tuple[Any, ...]]:
     return {name: (kind, *limits) for kind, names, *limits in keys for name in names.split()}
 
 
-def _is_call(path: str) -> bool:
+def names_several(key: str, node: Any) -> bool:
+    """Return True if a node has calls by name: `SEVERAL`, and `material` if its regions differ."""
+    several_laws = key == "material" and isinstance(node, Mapping) and "_target_" not in node
+    return key in SEVERAL or several_laws
+
+
+def _is_call(path: str, resolved: Mapping[str, Any]) -> bool:
     """Return True if the value at a path must be a mapping with `_target_`."""
     key, *below = path.split(".")
-    return len(below) == (key in SEVERAL) and key in EXPECTED_TYPES
+    return len(below) == names_several(key, resolved.get(key)) and key in EXPECTED_TYPES
 
 
 def _check_value(
@@ -194,7 +206,7 @@ def _is_trusted(target: Any) -> bool:
     """
     module = getattr(target, "__module__", None) or ""
     if inspect.isclass(target):
-        kinds = set().union(*EXPECTED_TYPES.values())
+        kinds = PARTS_OF_LAWS.union(*EXPECTED_TYPES.values())
         return f"{module}.".startswith(OWN_PACKAGES) and is_instance_of(target, kinds)
     if not inspect.isfunction(target) or not module.startswith("dpl."):
         return False

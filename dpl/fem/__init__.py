@@ -22,7 +22,14 @@ if TYPE_CHECKING:
     from dpl.fem.loads.patch import PatchLoads
     from dpl.fem.loads.point import PointLoads
     from dpl.fem.loads.young import YoungRange
+    from dpl.fem.materials.cell_field import CellField
     from dpl.fem.materials.demiray import DemirayK2
+    from dpl.fem.materials.fibre_directions import (
+        ConstantFibres,
+        FibreData,
+        FibreFunction,
+        LaplaceFibres,
+    )
     from dpl.fem.materials.fibre_energies import (
         FibreEnergy,
         Guccione,
@@ -30,6 +37,7 @@ if TYPE_CHECKING:
         HolzapfelOgdenFibres,
     )
     from dpl.fem.materials.fibre_reinforced import FibreDirections, FibreReinforced
+    from dpl.fem.materials.heterogeneous import Heterogeneous
     from dpl.fem.materials.invariant_based import InvariantBasedMaterial
     from dpl.fem.materials.linear_elastic import LinearElastic
     from dpl.fem.materials.material import Material, YoungPoissonMaterial
@@ -44,12 +52,6 @@ if TYPE_CHECKING:
     from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
     from dpl.fem.materials.volumetric import VolumetricK2, VolumetricK4
     from dpl.fem.materials.yeoh import YeohK2
-    from dpl.fem.mesh.fibre_directions import (
-        ConstantFibres,
-        FibreData,
-        FibreFunction,
-        LaplaceFibres,
-    )
     from dpl.fem.mesh.finger_mesh import finger
     from dpl.fem.mesh.generators import box, rectangle
     from dpl.fem.mesh.propeller_mesh import propeller

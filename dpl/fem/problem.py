@@ -1,7 +1,7 @@
 """Static equilibrium of a body: built from a mesh, evaluated and linearised by compiled loops."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
@@ -14,9 +14,10 @@ from torch import Tensor
 from dpl.fem.assembly.boundary_conditions import Support, assemble_constraints
 from dpl.fem.assembly.elements import QUADRATIC, basis_of, gradients
 from dpl.fem.assembly.follower_pressure import FollowerPressure, PressureSurface, ranges_of
-from dpl.fem.assembly.kernels import Kernels
+from dpl.fem.assembly.kernels import GroupedKernels, Kernels
+from dpl.fem.assembly.numba_laws import CompiledLaw
 from dpl.fem.assembly.variants import BodyVariants
-from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.heterogeneous import Heterogeneous
 from dpl.fem.materials.material import Material
 from dpl.fem.materials.tensors import volume_change
 from dpl.fem.mesh.generators import aspect_ratio, longest_side, near_origin
@@ -64,8 +65,9 @@ class Problem(BodyVariants):
     def build(
         cls,
         mesh: skfem.Mesh,
-        material: Material,
+        material: Material | Mapping[str, Material],
         *,
+        regions: Mapping[str, Region] | None = None,
         fixed: Region | NDArray[np.bool_] | None = None,
         prescribed: NDArray[np.float64] | None = None,
         supports: Sequence[Support] = (),
@@ -82,7 +84,8 @@ class Problem(BodyVariants):
 
         Args:
             mesh: scikit-fem mesh [m]. A quadratic mesh overrides `degree`.
-            material: The law.
+            material: The law; or the laws of several regions, by name, see `Heterogeneous`.
+            regions: Regions of these laws, by name.
             fixed: Fixed part: a region (all components of its nodes), nodes (N,), or degrees of
                 freedom (N, D).
             prescribed: Displacement over `length` at fixed degrees of freedom, (N, D) [-]; zero
@@ -123,6 +126,9 @@ class Problem(BodyVariants):
         given, springs = assemble_constraints(
             basis, units, supports, origin=origin, fixed=fixed, prescribed=prescribed
         )
+        if isinstance(material, Mapping):
+            material = Heterogeneous(material, regions or {})
+        material = material.on(basis, length, origin)
         columns, ranges = ranges_of(pressures, taken=material.parameter_ranges)
         both = zip(pressures, columns, strict=True)
         surfaces = [one.on(basis, units, origin, column) for one, column in both]
@@ -156,8 +162,7 @@ class Problem(BodyVariants):
         """Return one line for each reason why linear elements will lock."""
         lines, shape = [], self.mesh.elem.refdom.name.lower()
         constant = self.dV.shape[1] == 1
-        highest = [[high for _, high in self.material.parameter_ranges.values()]]
-        nu = self.material.with_parameters(torch.tensor(highest).double()).poisson_ratio
+        nu = self.material.largest_poisson_ratio
         if self.degree == 1 and nu >= 0.45 and not self.mean_dilatation:
             remedy = "degree=2" if constant else "degree=2 or mean_dilatation=true"
             lines.append(f"linear {shape} elements lock at Poisson's ratio {nu:.4g}: set {remedy}")
@@ -269,7 +274,7 @@ class Problem(BodyVariants):
         wider = length**2 * self.quadratic_strain(update)
         return wider if gap is None else (1 - length) * gap + wider
 
-    def _kernels(self, displacement: Tensor) -> Kernels | None:
+    def _kernels(self, displacement: Tensor) -> Kernels | GroupedKernels | None:
         """Return the compiled loops, None where there are none.
 
         Raises:
@@ -284,14 +289,19 @@ class Problem(BodyVariants):
         return self._compiled if displacement.device.type == "cpu" else None
 
     @cached_property
-    def _compiled(self) -> Kernels | None:
-        law = self.material
-        if self.mean_dilatation or not isinstance(law, InvariantBasedMaterial):
+    def _compiled(self) -> Kernels | GroupedKernels | None:
+        groups = self.material.groups(len(self.cells))
+        laws = [law for law, _ in groups if isinstance(law, CompiledLaw)]
+        if self.mean_dilatation or len(laws) < len(groups):
             return None
         first = self.__dict__.get("_first", self).reference
         if first is not self and first._compiled is not None:
-            return first._compiled.with_moduli(law)
-        # Copies: sending a problem to a worker process moves the memory of its tensors.
-        cells, dN, dV = (tensor.numpy().copy() for tensor in (self.cells, self.dN, self.dV))
-        places = self.pattern.places
-        return Kernels(law, cells, dN, dV, places.reshape(len(places), -1))
+            return first._compiled.with_moduli(laws)
+        places = self.pattern.places.reshape(len(self.cells), -1)
+        kernels = []
+        for law, (_, chosen) in zip(laws, groups, strict=True):
+            # Copies: sending a problem to a worker process moves the memory of its tensors.
+            dN, dV = (one if self.equal_cells else one[chosen] for one in (self.dN, self.dV))
+            arrays = (one.numpy().copy() for one in (self.cells[chosen], dN, dV))
+            kernels.append(Kernels(law, *arrays, places[chosen.numpy()]))
+        return kernels[0] if len(kernels) == 1 else GroupedKernels(kernels)

@@ -114,7 +114,7 @@ def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
     """Return the operators that commute with a symmetry: constraints, cells and boundary terms."""
     pressure = None if problem.pressure is None else problem.pressure.generic
     boundary = [part for part in (problem.springs, pressure) if part is not None]
-    body = problem.reference.without_pressure  # laws are isotropic for all constants
+    body = problem.generic.without_pressure
     cells = body if problem.springs is None else replace(body, springs=None)
     operators: list[Callable[[Tensor], Tensor]] = [
         lambda field: torch.where(problem.free, field, 0.0),

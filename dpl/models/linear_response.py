@@ -1,6 +1,5 @@
 """The linear solution K(0)^-1 f of every load, by nested static condensation."""
 
-import itertools
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from typing import NamedTuple
@@ -10,13 +9,12 @@ import torch
 from torch import Tensor
 
 from dpl.fem.linear.condensation import Condensed, condense, condensed_block_solve
-from dpl.fem.materials.linear_elastic import LinearElastic
 from dpl.fem.materials.material import Material
 from dpl.fem.rom.compiled_prediction import LawWeights, LinearPrediction
-from dpl.fem.rom.moduli_interpolation import ModuliInterpolation
-from dpl.fem.rom.reduced_problem import support_forces
+from dpl.fem.rom.stiffness_interpolation import StiffnessInterpolation
 from dpl.fem.solvers.condensed_layers import CondensedLayers
 from dpl.fem.solvers.parity_factor import OrbitForm
+from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import Symmetry
 from dpl.scene import Scene
 
@@ -30,8 +28,8 @@ class LinearResponse:
     K(0) is condensed once into dense blocks, one set for each parity of fields under the
     reflections of the body (`dpl.fem.linear.condensation`). A solution is a sequence of products
     with them, the same for every load: there is no basis that a load on a small area could miss.
-    If the law has ranges, K(0)^-1 is a sum of the inverses for a few Poisson's ratios
-    (`ModuliInterpolation`).
+    If the law has ranges, K(0)^-1 is a sum of the inverses for a few parameters
+    (`StiffnessInterpolation`).
 
     The blocks depend on the scene only and are computed when they are first used.
     """
@@ -44,14 +42,14 @@ class LinearResponse:
     # ------------------------------------------------------------------ blocks
 
     @cached_property
-    def interpolation(self) -> ModuliInterpolation:
-        """Weights of the Poisson's ratios for which K(0) is condensed."""
-        law = self._scene.problem.material
-        ends = list(itertools.product(*law.parameter_ranges.values()))
-        mu, lam = moduli(law.with_parameters(torch.tensor(ends, dtype=torch.float64)), len(ends))
-        ratio = lam / (2 * (lam + mu))
-        springs = self._scene.problem.springs is not None
-        return ModuliInterpolation.of(float(ratio.min()), float(ratio.max()), springs=springs)
+    def terms(self) -> StiffnessTerms:
+        """Terms of K(0) of the body."""
+        return StiffnessTerms.of(self._scene.problem.without_ranged_pressure)
+
+    @cached_property
+    def interpolation(self) -> StiffnessInterpolation:
+        """Weights of the parameters for which K(0) is condensed."""
+        return StiffnessInterpolation.of_terms(self.terms)
 
     @cached_property
     def _form(self) -> OrbitForm:
@@ -59,13 +57,14 @@ class LinearResponse:
 
     @cached_property
     def blocks(self) -> Condensed:
-        """Blocks of K Poisson's ratios and M parities, values (K M, V) in float32.
+        """Blocks of K nodes of the interpolation and M parities, values (K M, V) in float32.
 
         They are float64 if the solutions of random forces lose more than `MAX_ROUNDING`.
         """
         bodies, nodes = [self._scene.problem.reference], self.interpolation.nodes
         if len(nodes) > 1:
-            bodies = [bodies[0].with_material(LinearElastic(poisson)) for poisson in nodes]
+            laws = [self.terms.body(torch.tensor(one).double()).material for one in nodes]
+            bodies = [bodies[0].with_material(law) for law in laws]
         matrices = [matrix for one in bodies for matrix in self._form.matrices(one)]
         exact = condense(matrices, self._form.points)
         rounded = exact._replace(values=exact.values.astype(np.float32))
@@ -73,7 +72,7 @@ class LinearResponse:
 
     @cached_property
     def _supports(self) -> Tensor:
-        return support_forces(self._scene.problem.without_ranged_pressure.reference)
+        return self.terms.support_forces()
 
     def compiled(self) -> LinearPrediction:
         """Return the linear solution as a part of a compiled prediction."""
@@ -83,9 +82,9 @@ class LinearResponse:
 
     def law_weights(self, law: Material) -> LawWeights:
         """Return the numbers of a law that `compiled` needs; its moduli are numbers."""
-        mu, lam = moduli(law, 1)
-        weights = self.interpolation.weights(mu, lam)[0]
-        return LawWeights(weights.numpy(), np.array([float(mu), float(lam), 1.0]))
+        factors = self.terms.factors(law)
+        weights = self.interpolation.weights(factors)[0]
+        return LawWeights(weights.numpy(), np.array([*factors[0].tolist(), 1.0]))
 
     # ------------------------------------------------------------------ solution
 
@@ -106,14 +105,14 @@ class LinearResponse:
     def _solve(self, loaded: Tensor, parameters: Tensor) -> Tensor:
         own = self._tensors(loaded.device)
         law = self._scene.problem.material.with_parameters(parameters)
-        mu, lam = (modulus.to(loaded) for modulus in moduli(law, loaded.shape[0]))
+        factors = self.terms.factors(law).to(loaded).expand(loaded.shape[0], -1)
         if own.supports is not None:
-            a, b, c = own.supports.to(loaded)
-            loaded = loaded - mu[:, None] * a - lam[:, None] * b - c
+            supports = own.supports.to(loaded)
+            loaded = loaded - factors @ supports[:-1] - supports[-1]
         size = loaded.abs().amax(dim=1, keepdim=True)
         size = torch.where(size > 0, size, 1.0)  # of order one, so that float32 holds it
         scaled = (loaded / size).to(own.scales)
-        weights = self.interpolation.weights(mu, lam).to(scaled)  # (B, K)
+        weights = self.interpolation.weights(factors).to(scaled)  # (B, K)
         parts = own.characters @ (own.scales * scaled[:, own.images])  # (B, M, m)
         count = weights.shape[1]
         solved = own.layers.solve(parts.transpose(0, 1).repeat(count, 1, 1))  # (K M, B, m)
@@ -155,7 +154,8 @@ class _Tensors(NamedTuple):
         scales: Signs times weights of the orbits, (M, m).
         characters: Factor of each parity under each symmetry, (M, M).
         places: Position of each free degree of freedom among the images, (n,).
-        supports: See `support_forces`, at free degrees of freedom, (3, n); None if they are zero.
+        supports: See `StiffnessTerms.support_forces`, at free degrees of freedom, (T + 1, n); None
+            if they are zero.
     """
 
     layers: CondensedLayers
@@ -172,13 +172,6 @@ def _full_precision(device: str) -> AbstractContextManager[object]:
     if torch.is_autocast_enabled(device):
         return torch.autocast(device, enabled=False)
     return nullcontext()
-
-
-def moduli(law: Material, count: int) -> tuple[Tensor, Tensor]:
-    """Return Lame parameters at rest over Young's modulus, (count,) each [-]."""
-    both = (torch.as_tensor(modulus, dtype=torch.float64) for modulus in (law.mu, law.lam))
-    mu, lam = (modulus.reshape(-1).expand(count) for modulus in both)
-    return mu, lam
 
 
 def _difference(blocks: Condensed, exact: Condensed) -> float:

@@ -5,7 +5,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from dpl.fem import InvariantBasedMaterial, SubspaceNewton, symmetries
+from dpl.fem import InvariantBasedMaterial, Material, SubspaceNewton, symmetries
+from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.rom.compiled_prediction import (
     CompiledPrediction,
     LawArguments,
@@ -69,7 +70,7 @@ class Unrolled(nn.Module):
         modes: V at free degrees of freedom, (n, R).
         parity: Parity of each mode, (R,), see `dpl.fem.parity`.
         stiffness: V^T K(0) [V, p] by its dependence on the moduli, see `ReducedStiffness`,
-            (3, R, R + 1); p is the prescribed displacement.
+            (T + 1, R, R + 1); p is the prescribed displacement.
         cells: Numbers of the sample cells, (C,).
         gradients: G and the gradients of p, (R + 1, C, D, D).
         first_map: B_0, (C D D, R).
@@ -151,6 +152,7 @@ class Unrolled(nn.Module):
             self.register_buffer(name, value)
         self._stiffness = ReducedStiffness(self.stiffness)
         self._compiled: tuple[Tensor, CompiledPrediction] | None = None
+        self._law: tuple[Tensor, Material] | None = None
         self._at_last_law: tuple[tuple[Tensor, Any], _AtLaw] | None = None
         dofs = scene.problem.free.flatten().nonzero()[:, 0]
         self.register_buffer("dofs", dofs, persistent=False)
@@ -179,11 +181,20 @@ class Unrolled(nn.Module):
             loaded: Forces at free degrees of freedom, (B, n).
             parameters: Parameters of the law, (B, P).
         """
-        law = self.scene.problem.material.with_parameters(parameters)
-        linear = self._stiffness.solve(law, loaded @ self.modes.to(loaded))
+        law = self.scene.problem.material
+        factors = self.linear.terms.factors(law.with_parameters(parameters))
+        linear = self._stiffness.solve(factors, loaded @ self.modes.to(loaded))
         cells = SampleCells(self.gradients.to(linear))
         matrices = self.first_map.to(linear), list(self.maps.to(linear))
-        return Maps(cells, *matrices, self.limits)(law, linear)
+        of_cells = self._law_of_samples.with_parameters(parameters)
+        return Maps(cells, *matrices, self.limits)(of_cells, linear)
+
+    @property
+    def _law_of_samples(self) -> Material:
+        """Law of the sample cells, perhaps with ranges."""
+        if self._law is None or self._law[0] is not self.cells:
+            self._law = self.cells, self.scene.problem.material.of_cells(self.cells.cpu())
+        return self._law[1]
 
     def _at_free_dofs(self, coordinates: Tensor) -> Tensor:
         """Return V c at free degrees of freedom, (B, n), of c (B, R)."""
@@ -197,7 +208,7 @@ class Unrolled(nn.Module):
         differentiable = torch.is_grad_enabled() and (
             force.requires_grad or parameters.requires_grad
         )
-        law = self.scene.problem.material
+        law = one_law(self.scene.problem.reference.material)
         return self.is_fitted and not differentiable and isinstance(law, InvariantBasedMaterial)
 
     def _compiled_fields(self, force: Tensor, parameters: Tensor) -> Tensor:
@@ -207,7 +218,7 @@ class Unrolled(nn.Module):
         forces, parameters = force.detach(), parameters.detach()
 
         def predict_one(k: int) -> None:
-            law = cast(InvariantBasedMaterial, material.with_parameters(parameters[k : k + 1]))
+            law = material.with_parameters(parameters[k : k + 1])
             predict(*self._at_law(law), forces[k].numpy(), fields[k].numpy())
 
         on_threads(predict_one, range(len(forces)))
@@ -230,12 +241,15 @@ class Unrolled(nn.Module):
             self._compiled = self.maps, prediction
         return self._compiled[1]
 
-    def _at_law(self, law: InvariantBasedMaterial) -> _AtLaw:
+    def _at_law(self, law: Material) -> _AtLaw:
         """Return the law, the reduced body and weights of the linear solution, kept for one law."""
         last = self._at_last_law  # read once: another thread may replace it
         if last is not None and last[0][0] is self.stiffness and last[0][1] == law:
             return last[1]
-        found = law_arguments(law), self._stiffness.inverse(law), self.linear.law_weights(law)
+        of_cells = one_law(law.of_cells(self.cells[self._prediction.cells]))
+        reduced = self._stiffness.inverse(self.linear.terms.factors(law))
+        arguments = law_arguments(cast("InvariantBasedMaterial", of_cells))
+        found = arguments, reduced, self.linear.law_weights(law)
         self._at_last_law = (self.stiffness, law), found
         return found
 

@@ -11,6 +11,7 @@ from dpl.fem.materials.material import Material
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells, cell_gradients
+from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.fem.symmetry import Symmetry, cell_images
 from dpl.models.invariant_basis import (
     group_actions,
@@ -106,21 +107,21 @@ def sample_weights(displacement: Tensor) -> Tensor:
 
 
 def in_coordinates(
-    problem: Problem, modes: Tensor, stiffness: ReducedStiffness, samples: Sample, rest: Tensor
+    terms: StiffnessTerms, modes: Tensor, stiffness: ReducedStiffness, samples: Sample, rest: Tensor
 ) -> Columns:
     """Return samples in coordinates of the modes.
 
     Args:
-        problem: The body.
+        terms: Terms of K(0).
         modes: V, (n, R).
         stiffness: V^T K(0) V.
         samples: The samples, (S, N, D).
         rest: Their displacements minus the linear solutions, (S, n).
     """
-    parts = []
+    parts, problem = [], terms.problem
     for part, own in zip(_chunks(samples), rest.split(CHUNK), strict=True):
-        law = problem.material.with_parameters(part.parameters)
-        linear = stiffness.solve(law, part.force[:, problem.free] @ modes)
+        factors = terms.factors(problem.material.with_parameters(part.parameters))
+        linear = stiffness.solve(factors, part.force[:, problem.free] @ modes)
         weights = sample_weights(part.displacement[:, problem.free])
         parts.append(Columns(linear, own @ modes, weights, part.parameters))
     return Columns(*(torch.cat(column) for column in zip(*parts, strict=True)))
@@ -170,7 +171,7 @@ class Regression:
         """Start from the linear solution.
 
         Args:
-            law: The law, perhaps with ranges.
+            law: The law of the cells, perhaps with ranges.
             cells: The sample cells.
             action: Symmetries of the cells and the coordinates.
             fitted, held: Samples to fit to, and to choose by.
@@ -278,7 +279,8 @@ def fit_maps(
         columns = orbits.symmetrised(gradients.flatten(1).T, parity_of_fields, parities)
         # rounded before the fit: the maps cancel digits, so that G must stay what it is
         sample_cells = SampleCells(columns.T.reshape(gradients.shape).float().double())
-        regression = Regression(problem.material, sample_cells, action, *samples)
+        law = problem.material.of_cells(numbers)
+        regression = Regression(law, sample_cells, action, *samples)
         while len(regression.ridges) <= stages and regression.add_map():
             pass
         if best is not None and regression.errors[-1] >= best[1].errors[-1]:
@@ -334,9 +336,9 @@ def fit_in_best_modes(
     count = every.shape[1]
     while count:
         modes, symmetry = every[:, :count], (actions[:, :count, :count], parity[:count])
-        stiffness = ReducedStiffness.of(problem, modes).prepared()
+        stiffness = ReducedStiffness.of(linear.terms, modes).prepared()
         fitted, held = (
-            in_coordinates(problem, modes, stiffness, *pair)
+            in_coordinates(linear.terms, modes, stiffness, *pair)
             for pair in zip(both, rests, strict=True)
         )
         sets = fitted, held

@@ -34,7 +34,7 @@ INNER_ANGLE, OUTER_ANGLE = 1.0, -0.8  # [rad]
 def frames_on(spec, mesh: skfem.Mesh, degree: int = 1) -> Tensor:
     """Return the frames of the body that `Problem.build` makes of a mesh [m]."""
     body = Problem.build(mesh, NeoHookeanLn(0.3), degree=degree)
-    frames = spec.on(body.basis, body.origin, body.length)
+    frames = spec.on(body.basis, body.length, body.origin)
     assert frames.dtype == torch.float64
     eye = torch.eye(3, dtype=torch.float64)
     assert_close(frames.mT @ frames, eye.expand_as(frames), rtol=0, atol=1e-14)
@@ -183,9 +183,9 @@ def test_law_takes_the_frames_of_its_directions():
     law = FibreReinforced(VolumetricK2(2.0), Guccione(0.2, 8, 2, 4), wall())
     mesh = quarter_cylinder(2)
     body = Problem.build(mesh, NeoHookeanLn(0.3))
-    known = law.on(body.basis, body.origin, body.length)
+    known = law.on(body.basis, body.length, body.origin)
     assert_close(known.frames, frames_on(wall(), mesh), rtol=0, atol=0)
-    assert known.on(body.basis, body.origin, body.length) is known
+    assert known.on(body.basis, body.length, body.origin) is known
 
 
 # ------------------------------------------------------------------ Laplace's equation

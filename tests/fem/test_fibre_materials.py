@@ -515,7 +515,7 @@ def test_forces_of_a_body_are_the_gradient_of_its_energy(name, generator):
     spec = FibreFunction(lambda x: torch.cos(torch.from_numpy(x * [1.0, 2.0, 3.0])).numpy())
     law = FibreReinforced(MATRICES[name], FIBRES[name], spec)
     body = Problem.build(mesh, NeoHookeanIsoK4(0.3))
-    law = law.on(body.basis, body.origin, body.length)
+    law = law.on(body.basis, body.length, body.origin)
     body = body.with_material(law)
     assert law.frames.shape == (12, 3, 3)
     u = 0.05 * torch.rand(1, *body.shape, generator=generator, dtype=torch.float64)
@@ -548,7 +548,7 @@ def test_law_needs_its_directions(fibres, gradients):
     body = Problem.build(box([1.0, 1.0, 1.0], [2, 2, 2]), NeoHookeanIsoK4(0.3))
     known = FibreReinforced(VolumetricK2(1.0), fibres, EYE.expand(3, 3, 3))
     with pytest.raises(ValueError, match="frames of 3 cells and must have those of 1"):
-        known.on(body.basis, body.origin, body.length)
+        known.on(body.basis, body.length, body.origin)
 
 
 @pytest.mark.parametrize(

@@ -303,7 +303,7 @@ PARTS = {
 
 def name_of(module: ModuleType) -> str:
     """Return the name of the type of a module's law, by which its machine code is found."""
-    return Law(module.Mine, "code of the loops").kind.name
+    return Law(module.Mine, 2, "code of the loops").kind.name
 
 
 @pytest.mark.parametrize("part", PARTS)
@@ -316,7 +316,7 @@ def test_type_of_a_law_changes_with_the_source_of_its_derivatives(written, part)
 
 
 def test_type_of_a_law_changes_with_the_code_of_the_loops():
-    first, other = (Law(NeoHookeanLn, code).kind.name for code in ("one", "another"))
+    first, other = (Law(NeoHookeanLn, 2, code).kind.name for code in ("one", "another"))
     assert first != other
 
 

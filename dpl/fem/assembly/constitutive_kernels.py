@@ -9,12 +9,16 @@ import math
 import numpy as np
 from numba import njit
 
-from dpl.fem.assembly.numba_laws import derivatives_of
+from dpl.fem.assembly.numba_laws import derivatives_of, has_fibres, set_fibre_derivatives
 from dpl.fem.assembly.simd import SIMD_WIDTH, load, store
 
 VOIGT = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2]])
 FIRST = np.array([0, 1, 2, 0, 1, 0])  # the two indices of each Voigt index
 SECOND = np.array([0, 1, 2, 1, 2, 2])
+SCRATCH_ROWS = 131  # of the work of `stress`
+UPPER = np.zeros((6, 6), dtype=np.int64)  # number of an entry in the upper triangle of the moduli
+UPPER[np.triu_indices(6)] = np.arange(21)
+UPPER = np.maximum(UPPER, UPPER.T)
 
 
 @njit
@@ -95,7 +99,8 @@ def invert(e, X):
 def stress(law, c, needs, e, j, X, S, scratch, D, moduli):
     """Set S and X = C^-1, and with `moduli` D = dS/dE (rows 6 I + J), at e with det F = 1 + j.
 
-    The stress of laws with ln J is NaN where det F is negative.
+    The constants c are rows of vectors. The stress of laws with ln J is NaN where det F is
+    negative.
     """
     e0, e1, e2 = load(e, 0), load(e, 1), load(e, 2)
     e3, e4, e5 = load(e, 3), load(e, 4), load(e, 5)
@@ -125,6 +130,54 @@ def stress(law, c, needs, e, j, X, S, scratch, D, moduli):
         store(S, v, stress)
     if moduli:
         differentiate(derivatives, i1, e, X, scratch, D)
+    if has_fibres(law):
+        add_fibres(law, c, e, S, scratch, D, moduli)
+
+
+@njit
+def add_fibres(law, c, e, S, scratch, D, moduli):
+    """Add stress and, with `moduli`, moduli of fibres to S and D at e.
+
+    T has the rows 6 I + K: the factors from a component K of a stress in the fibre frame to the
+    component I. It transforms strains as well.
+    """
+    first = c.shape[0] - 9  # of the frame
+    T, M = scratch[26:62], scratch[62:98]
+    for v in range(6):
+        i, j = FIRST[v], SECOND[v]
+        for w in range(6):
+            a, b = FIRST[w], SECOND[w]
+            factor = load(c, first + 3 * i + a) * load(c, first + 3 * j + b)
+            if w > 2:
+                factor = factor + load(c, first + 3 * i + b) * load(c, first + 3 * j + a)
+            store(T, 6 * v + w, factor)
+    local, found = scratch[98:104], scratch[104:131]
+    for w in range(6):
+        total = load(T, w) * load(e, 0)
+        for v in range(1, 6):
+            twice = 1.0 if v < 3 else 2.0
+            total = total + twice * load(T, 6 * v + w) * load(e, v)
+        store(local, w, total if w < 3 else 0.5 * total)
+    set_fibre_derivatives(law, c, local, found, moduli)
+    for v in range(6):
+        total = load(S, v)
+        for w in range(6):
+            total = total + load(T, 6 * v + w) * load(found, w)
+        store(S, v, total)
+    if moduli:
+        for v in range(6):
+            for w in range(6):
+                total = 0.0 * load(T, 0)
+                for k in range(6):
+                    total = total + load(T, 6 * v + k) * load(found, 6 + UPPER[k, w])
+                store(M, 6 * v + w, total)
+        for v in range(6):
+            for w in range(v, 6):
+                total = load(D, 6 * v + w)
+                for k in range(6):
+                    total = total + load(M, 6 * v + k) * load(T, 6 * w + k)
+                store(D, 6 * v + w, total)
+                store(D, 6 * w + v, total)
 
 
 @njit

@@ -35,6 +35,21 @@ def gather(field, cells, start, count, out):
 
 
 @njit
+def gather_constants(c, start, count, out):
+    """Copy the constants of a block of cells from c (E, n) to `out`, (n, SIMD_WIDTH).
+
+    Constants of all cells (1, n) are copied for the first block only.
+    """
+    several = c.shape[0] > 1
+    if not several and start > 0:
+        return
+    for lane in range(SIMD_WIDTH):
+        cell = start + min(lane, count - 1) if several else 0
+        for k in range(c.shape[1]):
+            out[k, lane] = c[cell, k]
+
+
+@njit
 def gather_shape(dN, dV, start, count, g, weight):
     """Copy gradients to g (Q, 3 a + j, lane) and volumes to weight (zero in unused lanes).
 
@@ -137,6 +152,8 @@ def scatter_entries(K, places, count, values):
 def add_system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values):
     """Add force to (N, D) and, unless empty, tangent to (nnz + 1,) at displacements u (N, D).
 
+    The constants of the law are (E, n), or (1, n) for all cells.
+
     With `gap` (blocks, Q, 6, SIMD_WIDTH) stress and moduli are evaluated at the strain of u minus
     the gap, and the stress is extrapolated linearly to the strain of u. Returns the minimum of
     det F - 1, with a gap that of det C - 1 of the reduced strains.
@@ -146,11 +163,13 @@ def add_system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, valu
     ue, fe, g, weight = rows(3 * n), rows(3 * n), np.zeros((Q, 3 * n, SIMD_WIDTH)), rows(Q)
     H, P, D, A, C = rows(9), rows(9), rows(36), rows(81), rows(27)
     e, X, S, T = rows(6), rows(6), rows(6), rows(6)
-    K, scratch, low = rows(places.shape[1]), rows(26), np.inf
+    K, low = rows(places.shape[1]), np.inf
+    scratch, constants = rows(point.SCRATCH_ROWS), rows(c.shape[1])
     for start in range(0, len(cells), SIMD_WIDTH):
         block, count = start // SIMD_WIDTH, min(SIMD_WIDTH, len(cells) - start)
         gather(u, cells, start, count, ue)
         gather_shape(dN, dV, start, count, g, weight)
+        gather_constants(c, start, count, constants)
         fe[:] = 0.0
         if moduli:
             K[:] = 0.0
@@ -163,7 +182,7 @@ def add_system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, valu
             store(scratch, 0, change)
             low = minimum(scratch, count, low)
             j = change / (1.0 + sqrt(1.0 + change)) if mixed else change
-            point.stress(law, c, needs, e, j, X, S, scratch, D, moduli)
+            point.stress(law, constants, needs, e, j, X, S, scratch, D, moduli)
             for r in range(9):
                 store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
             if moduli:

@@ -78,17 +78,17 @@ class EquilibriumCriterion(TensorAssembly):
         return self._rounding * displacement.abs().amax(dim=(1, 2))
 
     @cached_property
-    def _rounding(self) -> float | Tensor:
+    def _rounding(self) -> Tensor:
+        """Bound over the largest displacement, (1,) or (B,) [-]."""
         size = self.dN.norm(dim=-1)  # (E or 1, Q, A)
-        moduli, each = self.material.lam + 2 * self.material.mu, 1.0
-        if isinstance(moduli, Tensor):
-            moduli, each = 1.0, moduli.flatten()
-        terms = moduli * (self.dV[..., None] * size * size.sum(-1, keepdim=True)).sum(1)
-        terms = terms.expand(len(self.cells), -1)[None, ..., None]
-        fixed = ~self.free.any(dim=1)
-        summed = self._sum_at_nodes(terms.expand(-1, -1, -1, self.shape[1]))[0, :, 0]
-        summed = torch.where(fixed, 0.0, summed)
-        return torch.finfo(torch.float64).eps * float(summed.norm()) * each
+        terms = (self.dV[..., None] * size * size.sum(-1, keepdim=True)).sum(1)
+        moduli = self.material.lam + 2 * self.material.mu
+        moduli = torch.as_tensor(moduli, dtype=terms.dtype, device=terms.device)  # to (B, E, 1)
+        terms = (moduli.reshape((1,) * (3 - moduli.ndim) + moduli.shape) * terms)[..., None]
+        terms = terms.expand(-1, len(self.cells), -1, self.shape[1])
+        summed = self._sum_at_nodes(terms)[..., 0]
+        summed = torch.where(self.free.any(dim=1), summed, 0.0)
+        return torch.finfo(torch.float64).eps * summed.norm(dim=1)
 
     @property
     def is_loaded_at_rest(self) -> bool:

@@ -6,7 +6,6 @@ Source: Nagtegaal, Parks, Rice (1974), CMAME 4; Simo, Taylor, Pister (1985), CMA
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import Material
 from dpl.fem.materials.tensors import inverse_transpose, volume_change
 
@@ -16,12 +15,7 @@ def fbar_gradient(material: Material, H: Tensor, dV: Tensor, dim: int) -> Tensor
 
     The volumes dV of the points are (E or 1, Q) [-].
     """
-    return _fbar(H, dV, dim)[0] if finite(material) else _bbar(H, dV, dim)
-
-
-def finite(material: Material) -> bool:
-    """Return True for a law of finite strain."""
-    return not isinstance(material, InvariantBasedMaterial) or material.finite
+    return _fbar(H, dV, dim)[0] if material.finite else _bbar(H, dV, dim)
 
 
 def _bbar(H: Tensor, dV: Tensor, dim: int) -> Tensor:
@@ -51,7 +45,7 @@ def _fbar(H: Tensor, dV: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
 
 def fbar_stress(material: Material, H: Tensor, dV: Tensor, dim: int) -> Tensor:
     """Return the stress conjugate to H, (B, E, Q, 3, 3) [-]; arguments as in `fbar_gradient`."""
-    if not finite(material):
+    if not material.finite:
         stress = material.stress(_bbar(H, dV, dim))
         return _bbar(stress, dV, dim)  # the averaging is self-adjoint
     averaged, ratio, plane = _fbar(H, dV, dim)

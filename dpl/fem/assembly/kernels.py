@@ -1,11 +1,11 @@
-"""Compiled internal force and tangent of a body of an isotropic law."""
+"""Compiled internal force and tangent of a body."""
 
 import contextlib
 import copy
 import math
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from multiprocessing import parent_process
 from pathlib import Path
@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpl.fem.assembly import element_loops
-from dpl.fem.assembly.numba_laws import Law, required_terms
+from dpl.fem.assembly.numba_laws import CompiledLaw, Law, required_terms
 from dpl.fem.assembly.simd import SIMD_WIDTH
-from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 
 Array = NDArray[np.float64]
 NO_GAP = np.zeros((0, 0, 0, SIMD_WIDTH))
@@ -29,7 +28,7 @@ class Kernels:
 
     def __init__(
         self,
-        material: InvariantBasedMaterial,
+        material: CompiledLaw,
         cells: NDArray[np.int64],
         dN: Array,
         dV: Array,
@@ -50,17 +49,16 @@ class Kernels:
         self.dV = dV
         self.places = _in_blocks(places)
         self._law = (
-            Law(type(material), element_loops.SOURCES),
+            Law.of(material, element_loops.SOURCES),
             required_terms(material),
             float(material.finite),
         )
-        self._constants = np.array([material.constants])  # (1 or B, constants)
+        self._constants = constants_of(material)
 
-    def with_moduli(self, material: InvariantBasedMaterial) -> "Kernels":
-        """Return the kernels of the same body with other moduli of the same law."""
+    def with_moduli(self, materials: Sequence[CompiledLaw]) -> "Kernels":
+        """Return the kernels of the same body with other moduli of its one law."""
         other = copy.copy(self)
-        constants = np.broadcast_arrays(*(np.ravel(c) for c in material.constants))
-        other._constants = np.stack(constants, axis=1)
+        other._constants = constants_of(*materials)
         return other
 
     def force(self, u: Array, out: Array, member: int = 0) -> float:
@@ -97,6 +95,44 @@ class Kernels:
         return call_compiled(
             kernel, self._law[0], gap, length, update, self.cells, self.dN, self.dV
         )
+
+
+class GroupedKernels:
+    """Kernels of a body of several laws: one for the cells of each class of law."""
+
+    def __init__(self, groups: Sequence[Kernels]) -> None:
+        """Take the kernels of the groups."""
+        self._groups = groups
+
+    def with_moduli(self, materials: Sequence[CompiledLaw]) -> "GroupedKernels":
+        """Return the kernels of the same body with other moduli of the same laws."""
+        pairs = zip(self._groups, materials, strict=True)
+        return GroupedKernels([kernels.with_moduli([material]) for kernels, material in pairs])
+
+    def force(self, u: Array, out: Array, member: int = 0) -> float:
+        """Add the internal force, see `Kernels.force`."""
+        return min(kernels.force(u, out, member) for kernels in self._groups)
+
+    def system(self, u: Array, gap: Sequence[Array] | None, out: Array, values: Array) -> float:
+        """Add force and tangent, see `Kernels.system`."""
+        gaps = [None] * len(self._groups) if gap is None else gap
+        pairs = zip(self._groups, gaps, strict=True)
+        return min(kernels.system(u, own, out, values) for kernels, own in pairs)
+
+    def update_strain_gap(
+        self, gap: Sequence[Array] | None, length: float, update: Array
+    ) -> list[Array]:
+        """Return the strain gap of each group, see `Kernels.update_strain_gap`."""
+        gaps = [None] * len(self._groups) if gap is None else gap
+        pairs = zip(self._groups, gaps, strict=True)
+        return [kernels.update_strain_gap(own, length, update) for kernels, own in pairs]
+
+
+def constants_of(material: CompiledLaw) -> Array:
+    """Return the constants of a law, (B or 1, E or 1, n)."""
+    constants = [np.asarray(c, dtype=np.float64) for c in material.constants]
+    constants = [c.reshape((1,) * (3 - c.ndim) + c.shape) for c in constants]
+    return np.ascontiguousarray(np.concatenate(np.broadcast_arrays(*constants), axis=-1))
 
 
 PATIENCE = 2.0  # time after which a compilation is announced [s]

@@ -7,10 +7,17 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 from numba import njit, types
 from numba.extending import NativeValue, models, overload, register_model, typeof_impl, unbox
 
+from dpl.fem.assembly.simd import load, store
+from dpl.fem.materials import arithmetic
+from dpl.fem.materials.fibre_energies import FibreEnergy
+from dpl.fem.materials.fibre_reinforced import FibreReinforced
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+
+CompiledLaw = InvariantBasedMaterial | FibreReinforced
 
 
 class _LawType(types.Type):
@@ -21,7 +28,8 @@ class _LawType(types.Type):
     """
 
 
-_COMPILED: dict[str, Any] = {}  # name of the type -> compiled invariant derivatives
+# name of the type -> calls of the compiled derivatives by invariants and by strains of fibres
+_COMPILED: dict[str, tuple[Any, Any]] = {}
 
 
 @dataclass(frozen=True)
@@ -29,41 +37,93 @@ class Law:
     """A law as an argument of a kernel.
 
     Attributes:
-        material: Class of the law.
+        material: Class of the isotropic law.
+        n_constants: Number of its constants.
         sources: Source code of the kernels, for the digest.
+        fibres: Class of the energy of fibres, or None.
+        n_fibre_constants: Number of its constants. They follow those of the isotropic law, and the
+            entries of the fibre frame, row by row, follow them.
     """
 
     material: type[InvariantBasedMaterial]
+    n_constants: int
     sources: str
+    fibres: type[FibreEnergy] | None = None
+    n_fibre_constants: int = 0
+
+    @classmethod
+    def of(cls, material: CompiledLaw, sources: str) -> "Law":
+        """Return a law as an argument of a kernel."""
+        if isinstance(material, FibreReinforced):
+            matrix, fibres = material.matrix, material.fibres
+            counts = len(matrix.constants), len(fibres.constants)
+            return cls(type(matrix), counts[0], sources, type(fibres), counts[1])
+        return cls(type(material), len(material.constants), sources)
 
     @cached_property
     def kind(self) -> _LawType:
         """The law's type in numba."""
-        if (self.material, self.sources) not in _KINDS:
-            _KINDS[self.material, self.sources] = _kind(self.material, self.sources)
-        return _KINDS[self.material, self.sources]
+        if self not in _KINDS:
+            _KINDS[self] = _kind(self)
+        return _KINDS[self]
 
 
-_KINDS: dict[tuple[type[InvariantBasedMaterial], str], _LawType] = {}
+_KINDS: dict[Law, _LawType] = {}
 
 
-def _kind(material: type[InvariantBasedMaterial], sources: str) -> _LawType:
+def _kind(law: Law) -> _LawType:
     """Return the type of a law."""
-    function = material.invariant_derivatives
-    code = repr(_code_of(function)) + sources
+    functions = [law.material.invariant_derivatives]
+    functions += [law.fibres.strain_derivatives] if law.fibres else []
+    code = repr([_code_of(function) for function in functions]) + law.sources
     digest = hashlib.sha256(code.encode()).hexdigest()[:16]
-    name = f"{material.__qualname__}{digest}"
+    name = f"{law.material.__qualname__}{law.fibres.__qualname__ if law.fibres else ''}{digest}"
     if name not in _COMPILED:
-        _COMPILED[name] = _compile(function)
+        invariants, *fibres = map(_compile, functions)
+        at = law.n_constants
+        _COMPILED[name] = (
+            _call_of_invariants(invariants, at),
+            _call_of_fibres(fibres[0], range(at, at + law.n_fibre_constants)) if fibres else None,
+        )
     return _LawType(name)
 
 
-def required_terms(material: InvariantBasedMaterial) -> int:
+def _call_of_invariants(function: Any, count: int) -> Any:
+    """Return the call of a function whose constants are the first rows of vectors of an array.
+
+    numba needs the length of the tuple of constants when it compiles.
+    """
+    constants = "".join(f"load(c, {k}), " for k in range(count))
+    arguments = "i1, i2, j, log_j, m1"
+    source = f"lambda law, c, {arguments}: function(({constants}), {arguments})"
+    return eval(source, {"function": function, "load": load})  # of numbers only
+
+
+def _call_of_fibres(function: Any, rows: range) -> Any:
+    """Return the call of a function with constants in some rows that stores stress and moduli."""
+    constants = "".join(f"load(c, {k}), " for k in rows)
+    strain = "".join(f"load(e, {k}), " for k in range(6))
+    lines = [
+        "def call(law, c, e, out, moduli):",
+        f"    S, D = function(({constants}), ({strain}))",
+        *(f"    store(out, {k}, S[{k}])" for k in range(6)),
+        "    if moduli:",
+        *(f"        store(out, {6 + k}, D[{k}])" for k in range(21)),
+    ]
+    scope = {"function": function, "load": load, "store": store}
+    exec("\n".join(lines), scope)  # of numbers only
+    return scope["call"]
+
+
+def required_terms(material: CompiledLaw) -> int:
     """Return the terms that a law needs: 0 no C^-1, 1 C^-1, 2 also ln J, 3 also J^(-2/3)."""
+    if isinstance(material, FibreReinforced):
+        material = material.matrix
+    constants = tuple(float(torch.as_tensor(c).flatten()[0]) for c in material.constants)
 
     def evaluate(**values: float) -> tuple[float, ...]:
         arguments = dict.fromkeys(("i1", "i2", "j", "log_j", "m1"), 0.0) | values
-        return material.invariant_derivatives(material.constants, **arguments)
+        return material.invariant_derivatives(constants, **arguments)
 
     if np.isnan(evaluate(m1=np.nan)).any():
         return 3
@@ -79,11 +139,16 @@ def _globals(function: Any) -> dict[str, Any]:
     return {name: scope[name] for name in function.__code__.co_names if name in scope}
 
 
+def _is_source(value: Any) -> bool:
+    """Return True for a function whose source is compiled, and which is not overloaded."""
+    return inspect.isfunction(value) and value.__module__ != arithmetic.__name__
+
+
 def _code_of(function: Any) -> tuple[Any, ...]:
     """Return the code of a function and, recursively, of the globals that it uses."""
     code = function.__code__
     parts = [
-        (name, _code_of(value) if inspect.isfunction(value) else repr(value))
+        (name, _code_of(value) if _is_source(value) else getattr(value, "__name__", repr(value)))
         for name, value in sorted(_globals(function).items())
     ]
     return code.co_code, code.co_consts, code.co_names, parts
@@ -93,7 +158,7 @@ def _compile(function: Any) -> Any:
     """Return a function compiled together with the functions that it calls."""
     scope = dict(function.__globals__)
     for name, value in _globals(function).items():
-        if inspect.isfunction(value):
+        if _is_source(value):
             scope[name] = _compile(value)
     return njit(type(function)(function.__code__, scope, function.__name__))
 
@@ -114,11 +179,37 @@ def _unbox_law(kind: Any, value: Any, context: Any) -> NativeValue:
 
 
 def derivatives_of(law, c, i1, i2, j, log_j, m1):
-    """Return the invariant derivatives of a law; callable in compiled code only."""
+    """Return the invariant derivatives of a law; callable in compiled code only.
+
+    Its constants c are rows of vectors, (constants, SIMD_WIDTH).
+    """
     raise NotImplementedError
 
 
 @overload(derivatives_of)
 def _overloaded(law, c, i1, i2, j, log_j, m1):
-    function = _COMPILED[law.name]
-    return lambda law, c, i1, i2, j, log_j, m1: function(c, i1, i2, j, log_j, m1)
+    return _COMPILED[law.name][0]
+
+
+def set_fibre_derivatives(law, c, e, out, moduli):
+    """Set `out` (27, SIMD_WIDTH) to stress and, with `moduli`, moduli of the fibres of a law.
+
+    Callable in compiled code only. The strains e are in the frame of the fibres, (6, SIMD_WIDTH).
+    """
+    raise NotImplementedError
+
+
+@overload(set_fibre_derivatives)
+def _overloaded_fibres(law, c, e, out, moduli):
+    return _COMPILED[law.name][1]
+
+
+def has_fibres(law):
+    """Return True for a law with fibres, as a constant of compiled code."""
+    raise NotImplementedError
+
+
+@overload(has_fibres)
+def _overloaded_has_fibres(law):
+    found = _COMPILED[law.name][1] is not None
+    return (lambda law: True) if found else (lambda law: False)

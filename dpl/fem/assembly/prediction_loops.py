@@ -13,14 +13,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from dpl.fem.assembly import sampled_loops
+from dpl.fem.assembly import element_loops, sampled_loops
+from dpl.fem.assembly.element_loops import gather_constants, rows
 from dpl.fem.assembly.sampled_loops import rotated_strain, unbalanced_stress
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.linear import condensation
 from dpl.fem.linear.condensation import add_product, condensed_solve, dot
 
-SOURCES = sampled_loops.SOURCES + "".join(
-    inspect.getsource(m) for m in (condensation, sys.modules[__name__])
+SOURCES = (
+    element_loops.SOURCES
+    + sampled_loops.SOURCES
+    + "".join(inspect.getsource(m) for m in (condensation, sys.modules[__name__]))
 )
 
 
@@ -214,7 +217,7 @@ def set_linear_solution(linear, weights, moduli, parts, values):
     Args:
         linear: The arrays of the linear solution.
         weights: Factors of the Poisson's ratios, (K,).
-        moduli: mu, lambda and 1, (3,).
+        moduli: Factors of the terms of K(0), and 1, (T + 1,).
         parts: The force by parity, (M, m).
         values: The solution.
     """
@@ -223,7 +226,7 @@ def set_linear_solution(linear, weights, moduli, parts, values):
     values[:] = 0.0
     for p in range(len(parts)):
         right[:] = parts[p]
-        for i in range(3):
+        for i in range(len(moduli)):
             right -= moduli[i] * linear.supports[i, p]
         if (right != 0.0).any():
             for k in range(len(weights)):
@@ -246,11 +249,11 @@ def set_field(orbits, values, field):
 
 
 @njit(error_model="numpy")
-def nonlinear_coordinates(law, c, needs, finite, mu, lam, model, linear):
+def nonlinear_coordinates(law, c, needs, finite, model, linear):
     """Return coordinates (R,) of the nonlinear displacement.
 
     Args:
-        law, c, needs, finite, mu, lam: The law, see `dpl.fem.assembly.kernels`.
+        law, c, needs, finite: The law, see `dpl.fem.rom.compiled_prediction.law_arguments`.
         model: The arrays of the model.
         linear: Coordinates of the Galerkin linear solution, (R,).
     """
@@ -263,6 +266,7 @@ def nonlinear_coordinates(law, c, needs, finite, mu, lam, model, linear):
     blocks = stress.reshape((shape[0], 18, SIMD_WIDTH))
     set_gradients(model, linear, own, parts, HL)
     linear_blocks, present = HL.reshape(shape), H.reshape(shape)
+    constants = rows(c.shape[1])
     for k in range(shape[0]):
         rotated_strain(linear_blocks[k], features[k])
     maps, step = model.maps, np.zeros(len(linear))
@@ -272,8 +276,9 @@ def nonlinear_coordinates(law, c, needs, finite, mu, lam, model, linear):
     for i in range(len(maps.others)):
         set_gradients(model, linear + total, own, parts, H)
         for k in range(shape[0]):
+            gather_constants(c, SIMD_WIDTH * k, SIMD_WIDTH, constants)
             unbalanced_stress(
-                law, c, needs, finite, mu, lam, present[k], linear_blocks[k], work, blocks[k]
+                law, constants, needs, finite, present[k], linear_blocks[k], work, blocks[k]
             )
         set_step(model, maps.map_signs, maps.others[i], stress, both, own, step)
         size = limit_step(step, maps.limits[i + 1] * size)
@@ -282,11 +287,11 @@ def nonlinear_coordinates(law, c, needs, finite, mu, lam, model, linear):
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def predict(law, c, needs, finite, mu, lam, model, reduced, of_law, force, field):
+def predict(law, c, needs, finite, model, reduced, of_law, force, field):
     """Set the field of a prediction.
 
     Args:
-        law, c, needs, finite, mu, lam: The law, see `dpl.fem.assembly.kernels`.
+        law, c, needs, finite: The law, see `dpl.fem.rom.compiled_prediction.law_arguments`.
         model: The arrays of the model.
         reduced: (V^T K(0) V)^-1, (R, R), and V^T K(0) p of the prescribed displacement p, (R,).
         of_law: Weights and moduli of the law, see `set_linear_solution`.
@@ -297,6 +302,6 @@ def predict(law, c, needs, finite, mu, lam, model, reduced, of_law, force, field
     values = np.empty(parts.shape)
     set_linear_solution(model.linear, of_law[0], of_law[1], parts, values)
     linear = galerkin(model.basis, reduced[0], reduced[1], parts)
-    found = nonlinear_coordinates(law, c, needs, finite, mu, lam, model, linear)
+    found = nonlinear_coordinates(law, c, needs, finite, model, linear)
     add_modes(model.basis, found, values)
     set_field(model.orbits, values, field)

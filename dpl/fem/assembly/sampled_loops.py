@@ -66,10 +66,11 @@ def set_cofactors(X, out):
 
 
 @njit(error_model="numpy")
-def unbalanced_stress(law, c, needs, finite, mu, lam, H, linear, work, out):
+def unbalanced_stress(law, c, needs, finite, H, linear, work, out):
     """Set out (18, width) to R^T dP and dP at H (9, width); H is overwritten.
 
-    See `dpl.fem.rom.sampled_stress.unbalanced_stress`. `work` is (100, width).
+    See `dpl.fem.rom.sampled_stress.unbalanced_stress`. The last two constants c (n + 2, width) are
+    mu and lambda. `work` is (100, width).
     """
     e, X, S, scratch = work[0:6], work[6:12], work[12:18], work[18:44]
     F, minors, D = work[44:53], work[53:62], work[62:98]
@@ -80,6 +81,7 @@ def unbalanced_stress(law, c, needs, finite, mu, lam, H, linear, work, out):
                 H[r, k] = 0.0
     point.strain(H, finite, e)
     point.stress(law, c, needs, e, point.volume_change(H), X, S, scratch, D, False)
+    mu, lam = load(c, c.shape[0] - 2), load(c, c.shape[0] - 1)
     trace = load(linear, 0) + load(linear, 4) + load(linear, 8)
     for i in range(3):
         for j in range(3):

@@ -13,6 +13,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, models, overload, register_model
 
+from dpl.fem.materials import arithmetic
+
 SIMD_WIDTH = 8 if llvm.get_host_cpu_features().get("avx512f") else 4
 _VECTOR = ir.VectorType(ir.DoubleType(), SIMD_WIDTH)
 _FLAGS = ("contract", "reassoc", "nsz")  # allow fused multiply-adds, preserve NaN and infinity
@@ -62,16 +64,63 @@ def store(typing: Any, array: Any, row: Any, value: Any) -> Any:
     return types.void(array, row, value), code
 
 
+def _call(builder: Any, name: str, args: Any) -> Any:
+    """Return the result of one of LLVM's functions of vectors."""
+    kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(args))
+    name = f"llvm.{name}.v{SIMD_WIDTH}f64"
+    return builder.call(builder.module.declare_intrinsic(name, (), kind), args)
+
+
 @intrinsic
 def sqrt(typing: Any, x: Any) -> Any:
     """Return the square root of each lane."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(_VECTOR, [_VECTOR])
-        name = f"llvm.sqrt.v{SIMD_WIDTH}f64"
-        return builder.call(builder.module.declare_intrinsic(name, (), kind), args)
+        return _call(builder, "sqrt", args)
 
     return SIMD_VECTOR(x), code
+
+
+@intrinsic
+def _exp(typing: Any, x: Any) -> Any:
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return _call(builder, "exp", args)
+
+    return SIMD_VECTOR(x), code
+
+
+@intrinsic
+def _positive_part(typing: Any, x: Any) -> Any:
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        nothing = ir.Constant(_VECTOR, [0.0] * SIMD_WIDTH)
+        negative = builder.fcmp_ordered("<", args[0], nothing)
+        return builder.select(negative, nothing, args[0])  # NaN stays
+
+    return SIMD_VECTOR(x), code
+
+
+@intrinsic
+def _step(typing: Any, x: Any) -> Any:
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        zeros, ones = (ir.Constant(_VECTOR, [value] * SIMD_WIDTH) for value in (0.0, 1.0))
+        return builder.select(builder.fcmp_ordered(">=", args[0], zeros), ones, zeros)
+
+    return SIMD_VECTOR(x), code
+
+
+@overload(arithmetic.exp)
+def _overloaded_exp(x):
+    return lambda x: _exp(x)
+
+
+@overload(arithmetic.positive_part)
+def _overloaded_positive_part(x):
+    return lambda x: _positive_part(x)
+
+
+@overload(arithmetic.step)
+def _overloaded_step(x):
+    return lambda x: _step(x)
 
 
 def _vector(context: Any, builder: Any, value: Any, kind: Any) -> Any:

@@ -91,7 +91,11 @@ class BodyVariants(EquilibriumCriterion):
     def with_material(self, material: Material) -> Self:
         """Return the body of another law; mesh and pattern are shared, for the same law kernels."""
         twin = self._share(replace(self, material=material))
-        if type(material) is type(self.material):
+        laws = [
+            [(type(law), len(cells)) for law, cells in one.groups(len(self.cells))]
+            for one in (material, self.material)
+        ]
+        if laws[0] == laws[1]:
             twin.__dict__["_first"] = self
         return twin
 
@@ -107,6 +111,17 @@ class BodyVariants(EquilibriumCriterion):
         """
         ranges = self.parameter_ranges.values()
         return self.with_parameters(torch.tensor([[sum(ends) / 2 for ends in ranges]]).double())
+
+    @property
+    def generic(self) -> Self:
+        """The problem with parameters of which no two are equal fractions of their ranges.
+
+        Laws of two regions are equal for these parameters only if they are for all.
+        """
+        ranges = list(self.parameter_ranges.values())
+        parts = [(k + 1) / (len(ranges) + 1) for k in range(len(ranges))]
+        values = [low + t * (high - low) for t, (low, high) in zip(parts, ranges, strict=True)]
+        return self.with_parameters(torch.tensor([values]).double())
 
     def with_pressure_factor(self, factor: float) -> Self:
         """Return the body under `factor` times its follower pressure; all else is shared."""

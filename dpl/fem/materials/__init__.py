@@ -5,7 +5,14 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
+    from dpl.fem.materials.cell_field import CellField
     from dpl.fem.materials.demiray import DemirayK2
+    from dpl.fem.materials.fibre_directions import (
+        ConstantFibres,
+        FibreData,
+        FibreFunction,
+        LaplaceFibres,
+    )
     from dpl.fem.materials.fibre_energies import (
         FibreEnergy,
         Guccione,
@@ -13,6 +20,7 @@ if TYPE_CHECKING:
         HolzapfelOgdenFibres,
     )
     from dpl.fem.materials.fibre_reinforced import FibreDirections, FibreReinforced
+    from dpl.fem.materials.heterogeneous import Heterogeneous
     from dpl.fem.materials.invariant_based import InvariantBasedMaterial
     from dpl.fem.materials.linear_elastic import LinearElastic
     from dpl.fem.materials.material import Material, Response, YoungPoissonMaterial

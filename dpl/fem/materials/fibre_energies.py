@@ -6,18 +6,20 @@ order.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from dpl.fem.materials.arithmetic import exp, positive_part, step
+from dpl.fem.materials.parameters import Constant, Parametrised
 
 COMPONENTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))  # rows and columns, in their order
 
 
-class FibreEnergy:
+class FibreEnergy(Parametrised):
     """Energy of fibres as a function of the local strain, with its derivatives.
 
     The derivatives are plain arithmetic on numbers of any kind, as those of
@@ -56,17 +58,6 @@ class FibreEnergy:
         """
         raise NotImplementedError
 
-    def __post_init__(self) -> None:
-        """Check the constants of a dataclass."""
-        self.check_constants()
-
-    def check_constants(self) -> None:
-        """Check the values of the constants.
-
-        Raises:
-            ValueError: The energy does not allow a value.
-        """
-
 
 @dataclass(frozen=True)
 class Guccione(FibreEnergy):
@@ -83,10 +74,12 @@ class Guccione(FibreEnergy):
         bfs: Exponent of shear between the two [-].
     """
 
-    c: float
-    bf: float
-    bt: float
-    bfs: float
+    ranged: ClassVar[tuple[str, ...]] = ("c", "bf", "bt", "bfs")
+
+    c: Constant
+    bf: Constant
+    bt: Constant
+    bfs: Constant
 
     def check_constants(self) -> None:
         """See `FibreEnergy.check_constants`."""
@@ -141,9 +134,11 @@ class HolzapfelGasserOgdenFibres(FibreEnergy):
         families: 2, or 1 for the fibres at +angle alone.
     """
 
-    k1: float
-    k2: float
-    kappa: float = 0.0
+    ranged: ClassVar[tuple[str, ...]] = ("k1", "k2", "kappa")
+
+    k1: Constant
+    k2: Constant
+    kappa: Constant = 0.0
     angle: float = 0.0
     families: int = 2
 
@@ -211,12 +206,14 @@ class HolzapfelOgdenFibres(FibreEnergy):
         bf, bs, bfs: Exponents [-].
     """
 
-    af: float
-    bf: float
-    as_: float
-    bs: float
-    afs: float
-    bfs: float
+    ranged: ClassVar[tuple[str, ...]] = ("af", "bf", "as_", "bs", "afs", "bfs")
+
+    af: Constant
+    bf: Constant
+    as_: Constant
+    bs: Constant
+    afs: Constant
+    bfs: Constant
 
     def check_constants(self) -> None:
         """See `FibreEnergy.check_constants`."""
@@ -247,6 +244,42 @@ class HolzapfelOgdenFibres(FibreEnergy):
         D1 = (4 * f2, 0.0, 0.0, 0.0, 0.0, 0.0)
         D2 = (4 * s2, 0.0, 0.0, 0.0, 0.0)
         return S, D1 + D2 + (0.0, 0.0, 0.0, 0.0, g2, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class LinearFibres(FibreEnergy):
+    """Quadratic energy E : D : E / 2, the limit of the others at small strains.
+
+    Attributes:
+        moduli: The 21 moduli of `strain_derivatives` over E [-].
+    """
+
+    moduli: Sequence[float]
+
+    def energy(self, e: Tensor) -> Tensor:
+        """Return the energy density, see `FibreEnergy.energy`."""
+        S = self.strain_derivatives(self.moduli, components(e))[0]
+        twice = [1, 1, 1, 2, 2, 2]
+        return sum(k / 4 * s * x for k, s, x in zip(twice, S, components(e), strict=True))
+
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """Return the moduli."""
+        return tuple(self.moduli)
+
+    @staticmethod
+    def strain_derivatives(c: Any, e: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """See `FibreEnergy.strain_derivatives`."""
+        E11, E22, E33, E12, E23, E13 = e[0] / 2, e[1] / 2, e[2] / 2, e[3], e[4], e[5]
+        S = (
+            c[0] * E11 + c[1] * E22 + c[2] * E33 + c[3] * E12 + c[4] * E23 + c[5] * E13,
+            c[1] * E11 + c[6] * E22 + c[7] * E33 + c[8] * E12 + c[9] * E23 + c[10] * E13,
+            c[2] * E11 + c[7] * E22 + c[11] * E33 + c[12] * E12 + c[13] * E23 + c[14] * E13,
+            c[3] * E11 + c[8] * E22 + c[12] * E33 + c[15] * E12 + c[16] * E23 + c[17] * E13,
+            c[4] * E11 + c[9] * E22 + c[13] * E33 + c[16] * E12 + c[18] * E23 + c[19] * E13,
+            c[5] * E11 + c[10] * E22 + c[14] * E33 + c[17] * E12 + c[19] * E23 + c[20] * E13,
+        )
+        return S, tuple(c[k] for k in range(21))
 
 
 def components(e: Tensor) -> tuple[Tensor, ...]:

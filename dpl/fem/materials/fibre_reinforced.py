@@ -1,19 +1,21 @@
 """Laws with fibres: an isotropic matrix and the energy of fibres, with a frame for each cell."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
-import numpy as np
 import skfem
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from dpl.fem.materials.fibre_energies import FibreEnergy, components
+from dpl.fem.materials.fibre_energies import FibreEnergy, LinearFibres, components
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import Material, Response
+from dpl.fem.materials.parameters import Composed
 from dpl.fem.materials.tensors import green_lagrange
+from dpl.fem.mesh.regions import Origin
 
+_REST = (torch.zeros(1, 1, dtype=torch.float64),) * 6  # components of no strain
 ORTHONORMAL = 1e-6  # largest entry of Q^T Q - I
 COMPONENT = ((0, 3, 5), (3, 1, 4), (5, 4, 2))  # number of each component ij
 
@@ -21,7 +23,7 @@ COMPONENT = ((0, 3, 5), (3, 1, 4), (5, 4, 2))  # number of each component ij
 class FibreDirections:
     """Specification of the fibre frames of a body."""
 
-    def on(self, basis: skfem.Basis, origin: NDArray[np.float64] | float, length: float) -> Tensor:
+    def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
         """Return the frames of the cells, (E, 3, 3), or (1, 3, 3) if all are equal [-].
 
         The columns of a frame are the directions of fibre, sheet and normal: orthonormal, and
@@ -40,7 +42,7 @@ class FibreDirections:
 
 
 @dataclass(frozen=True, eq=False)
-class FibreReinforced(Material):
+class FibreReinforced(Composed, Material):
     """Anisotropic law: the energy of an isotropic matrix plus that of fibres in a frame.
 
     W = matrix.energy(H) + fibres.energy(Q^T (C - I) Q), Q the fibre frame of the cell. The matrix
@@ -52,28 +54,27 @@ class FibreReinforced(Material):
     Source: Holzapfel, Gasser, Ogden (2000), J. Elast. 61.
 
     Attributes:
-        matrix: The isotropic law, without ranges.
+        matrix: The isotropic law.
         fibres: The energy of the fibres.
         directions: Fibre directions; after `on` the frames (E, 3, 3) or (1, 3, 3) [-], columns f, s
             and n.
 
     Raises:
-        ValueError: `matrix` is linear or has ranges, or frames are not orthonormal.
+        ValueError: `matrix` is linear, or frames are not orthonormal.
     """
 
     matrix: InvariantBasedMaterial
     fibres: FibreEnergy
     directions: FibreDirections | Tensor
 
-    def check_constants(self) -> None:
-        """See `Material.check_constants`."""
-        if not (isinstance(self.matrix, InvariantBasedMaterial) and self.matrix.finite):
+    def __post_init__(self) -> None:
+        """Check matrix and frames."""
+        is_linear = isinstance(self.fibres, LinearFibres)  # a term of K(0), which is used at rest
+        if not (
+            isinstance(self.matrix, InvariantBasedMaterial) and (self.matrix.finite or is_linear)
+        ):
             name = type(self.matrix).__name__
             raise ValueError(f"matrix = {name} must be a law of the invariants for finite strains")
-        if self.matrix.parameter_ranges:
-            raise ValueError(
-                f"matrix has ranges of {list(self.matrix.parameter_ranges)} and must have values"
-            )
         if isinstance(self.directions, Tensor) and not torch.compiler.is_compiling():
             _check_frames(self.directions)
 
@@ -85,27 +86,44 @@ class FibreReinforced(Material):
         """Return a hash that equal laws share."""
         return hash((type(self), self.matrix, self.fibres))
 
-    def on(self, basis: skfem.Basis, origin: NDArray[np.float64] | float, length: float) -> Self:
+    @property
+    def parts(self) -> Mapping[str, Any]:
+        """See `Composed.parts`."""
+        return {"matrix": self.matrix, "fibres": self.fibres}
+
+    def with_parts(self, parts: Mapping[str, Any]) -> Self:
+        """See `Composed.with_parts`."""
+        return replace(self, **parts)
+
+    def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
         """Return the law with the frames of a body; arguments as in `FibreDirections.on`.
 
         Raises:
             ValueError: The directions do not fit the body.
         """
-        if isinstance(self.directions, Tensor):
-            cells = basis.mesh.t.shape[1]
-            if len(self.directions) not in (1, cells):
-                raise ValueError(
-                    f"directions has frames of {len(self.directions)} cells and must have those of "
-                    f"{cells}"
-                )
-            return self
-        return replace(self, directions=self.directions.on(basis, origin, length))
+        directions, cells = self.directions, basis.mesh.t.shape[1]
+        if not isinstance(directions, Tensor):
+            directions = directions.on(basis, length, origin)
+        if len(directions) not in (1, cells):
+            raise ValueError(
+                f"directions has frames of {len(directions)} cells and must have those of {cells}"
+            )
+        if directions is self.directions:
+            return super().on(basis, length, origin)
+        return replace(super().on(basis, length, origin), directions=directions)
 
     def of_cells(self, cells: Tensor) -> Self:
-        """Return the law at some cells, given by index (K,) or mask (E,)."""
+        """Return the law at some cells (C,), see `Parametrised.of_cells`."""
+        law = super().of_cells(cells)
         if len(self.frames) == 1:
-            return self
-        return replace(self, directions=self.frames[cells.to(self.frames.device)])
+            return law
+        return replace(law, directions=self.frames[cells.to(self.frames.device)])
+
+    @property
+    def constants(self) -> tuple[Any, ...]:
+        """Constants of matrix and fibres, then the entries of the frames, (E or 1, 1) each."""
+        entries = self.frames.flatten(1).unbind(1)
+        return *self.matrix.constants, *self.fibres.constants, *(x[:, None] for x in entries)
 
     @property
     def frames(self) -> Tensor:
@@ -145,13 +163,16 @@ class FibreReinforced(Material):
         return self.matrix.tangent(H) + self._fibre_response(green_lagrange(H)).tangent(H)
 
     @property
-    def mu(self) -> float:
-        """Shear modulus at rest over Young's modulus, the average over all directions [-]."""
+    def mu(self) -> Tensor:  # type: ignore[override]
+        """Shear modulus at rest over Young's modulus, the average over all directions [-].
+
+        (E or 1, 1), or (B, E or 1, 1).
+        """
         normal, mixed = self._fibre_traces
         return self.matrix.mu + (3 * mixed - normal) / 30
 
     @property
-    def lam(self) -> float:
+    def lam(self) -> Tensor:  # type: ignore[override]
         """First Lame parameter at rest over Young's modulus, the average over directions [-].
 
         Source: Voigt (1889), Ann. Phys. 274: the average over all rotations of the moduli D has the
@@ -161,12 +182,41 @@ class FibreReinforced(Material):
         return self.matrix.lam + (2 * normal - mixed) / 15
 
     @property
-    def _fibre_traces(self) -> tuple[float, float]:
-        """D_iikk and D_ikik of the moduli D of the fibres at rest, which no rotation changes."""
-        rest = (torch.zeros((), dtype=torch.float64),) * 6
-        D = self.fibres.strain_derivatives(self.fibres.constants, rest)[1]
-        matrix = _moduli(D, rest)
-        return float(matrix[::4, ::4].sum()), float(matrix.trace())
+    def _fibre_traces(self) -> tuple[Tensor, Tensor]:
+        """D_iikk and D_ikik of the moduli D of the fibres at rest, which no rotation changes.
+
+        They are (E or 1, 1), or (B, E or 1, 1).
+        """
+        matrix = _moduli(self._rest_moduli(), _REST)
+        return matrix[..., ::4, ::4].sum((-2, -1)), matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
+
+    def _rest_moduli(self) -> tuple[Any, ...]:
+        """Return the 21 moduli of the fibres at rest."""
+        return self.fibres.strain_derivatives(self.fibres.constants, _REST)[1]
+
+    def rest_stress(self, H: Tensor) -> Tensor:
+        """Return the stress of small strains, see `Material.rest_stress`."""
+        Q = self._rotation(H)
+        strain = Q.mT @ (H + H.mT) @ Q / 2
+        D = _moduli(self._rest_moduli(), _REST).to(H)[..., None, :, :]
+        S = (D @ strain.flatten(-2)[..., None])[..., 0].unflatten(-1, (3, 3))
+        return self.matrix.rest_stress(H) + Q @ S @ Q.mT
+
+    @property
+    def rest_moduli(self) -> Tensor:
+        """See `Material.rest_moduli`; those of the matrix, then the 21 of the fibres."""
+        matrix, own = self.matrix.rest_moduli, _tensors(self._rest_moduli(), _REST)
+        rows = [one if one.ndim == 3 else one[None] for one in own]
+        count = max(len(matrix), len(rows[0]))
+        fibres = [row.expand(count, -1, -1).flatten(1) for row in rows]
+        return torch.cat([matrix.expand(count, -1), *fibres], dim=1)
+
+    def linear_law(self, moduli: Tensor) -> "FibreReinforced":
+        """See `Material.linear_law`."""
+        first, rest = moduli.split([count := self.matrix.rest_moduli.shape[1], len(moduli) - count])
+        columns = rest.view(21, -1, 1)
+        fibres = LinearFibres(columns.flatten().tolist() if columns.shape[1] == 1 else [*columns])
+        return replace(self, matrix=self.matrix.linear_law(first), fibres=fibres)
 
     def _rotation(self, H: Tensor) -> Tensor:
         """Return the frames with an axis for the points, (E, 1, 3, 3), or (3, 3) if all are equal.

@@ -1,6 +1,6 @@
 """Laws of the invariants of C, which are compiled."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,12 +25,7 @@ class InvariantBasedMaterial(Material):
         S = (rest + 2 W2 i1) I - 4 W2 E - p (I - X),   I - X = 2 E X,
 
     where rest, W2 and p are the first of these derivatives. No terms cancel at zero strain.
-
-    Attributes:
-        finite: False for the one law whose strain is the symmetric part of H.
     """
-
-    finite: ClassVar[bool] = True
 
     @property
     def constants(self) -> tuple[float, ...]:

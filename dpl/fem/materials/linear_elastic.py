@@ -6,6 +6,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.material import YoungPoissonMaterial
 from dpl.fem.materials.saint_venant_kirchhoff import SaintVenantKirchhoff
 from dpl.fem.materials.tensors import (
     broadcast_modulus,
@@ -15,18 +17,19 @@ from dpl.fem.materials.tensors import (
 )
 
 
-@dataclass(frozen=True)
-class LinearElastic(SaintVenantKirchhoff):
+class Hookean(InvariantBasedMaterial):
     """Linear elasticity: lambda/2 (tr eps)^2 + mu eps:eps, eps = (H + H^T)/2.
-
-    Exact where rotations are small. The tangent does not depend on the displacement: one Newton
-    iteration solves any load under which det F stays above `Newton.min_detF_ratio` everywhere.
-    Below that the step is shortened. There is no solution where the linear one has det F <= 0.
 
     Source: Bonet, Wood (2008), eq. 6.29 at small strains.
     """
 
     finite: ClassVar[bool] = False
+    invariant_derivatives = staticmethod(SaintVenantKirchhoff.invariant_derivatives)
+
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """Return lambda and mu."""
+        return self.lam, self.mu
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
@@ -51,3 +54,37 @@ class LinearElastic(SaintVenantKirchhoff):
     def has_response(self) -> bool:
         """No: its stress is no function of the Green-Lagrange strain."""
         return False
+
+
+@dataclass(frozen=True)
+class LinearElastic(YoungPoissonMaterial, Hookean):
+    """Linear elasticity of small strains.
+
+    Exact where rotations are small. The tangent does not depend on the displacement: one Newton
+    iteration solves any load under which det F stays above `Newton.min_detF_ratio` everywhere.
+    Below that the step is shortened. There is no solution where the linear one has det F <= 0.
+    """
+
+
+@dataclass(frozen=True)
+class LameElastic(Hookean):
+    """Linear elasticity with any Lame parameters, a term of a stiffness; see `StiffnessTerms`.
+
+    Attributes:
+        shear, first: mu and lambda over Young's modulus [-]; numbers or fields.
+    """
+
+    ranged: ClassVar[tuple[str, ...]] = ("shear", "first")
+
+    shear: float
+    first: float
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus over Young's modulus [-]."""
+        return self.shear
+
+    @property
+    def lam(self) -> float:
+        """First Lame parameter over Young's modulus [-]."""
+        return self.first

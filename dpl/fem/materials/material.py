@@ -7,15 +7,16 @@ its stress as a difference of terms that cancel at rest.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from itertools import product
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dpl.fem.identity import identity_of
-from dpl.fem.materials.tensors import green_lagrange
+from dpl.fem.materials.parameters import Parametrised
+from dpl.fem.materials.tensors import broadcast_modulus, green_lagrange, trace
 
 
 class Response(NamedTuple):
@@ -41,19 +42,21 @@ class Response(NamedTuple):
         return A + torch.einsum("ik,...JL->...iJkL", eye, self.stress)
 
 
-class Material:
-    """Isotropic hyperelastic law, its moduli over Young's modulus E.
+class Material(Parametrised):
+    """Hyperelastic law, its moduli over Young's modulus E.
 
     A law is its `energy`; `stress` and `tangent` follow by automatic differentiation. A subclass
     may give its `response` to strains as well: the two then follow from that, and Newton can take
     strains as unknowns. A law of the invariants (`InvariantBasedMaterial`) is compiled too.
 
+    Strains of a law with fields or of a batch are (B, E, Q, 3, 3), see `Parametrised`. A law with
+    ranges must have `mu` and `lam` as functions of its constants.
+
     Attributes:
-        ranged: Names of the constants that may be ranges [low, high]; their law must derive from
-            `YoungPoissonMaterial`, whose moduli at rest are known for a batch.
+        finite: False for the one law whose strain is the symmetric part of H.
     """
 
-    ranged: ClassVar[tuple[str, ...]] = ()
+    finite: ClassVar[bool] = True
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density over E, (...,) [-], of H (..., 3, 3) [-]."""
@@ -93,6 +96,19 @@ class Material:
         """Return class name and parameters as plain data."""
         return identity_of(self)
 
+    def describe(self) -> str:
+        """Return the law in words: its class, numbers and ranges."""
+        if not is_dataclass(self):
+            return type(self).__name__
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        words = []
+        for name, value in values.items():
+            if isinstance(value, Tensor):
+                words.append(f"{name} from {value.min():.4g} to {value.max():.4g}")
+            elif not (name == "young" and value == 1):
+                words.append(f"{name}={value!r}")
+        return f"{type(self).__name__}({', '.join(words)})"
+
     @property
     def mu(self) -> float:
         """Shear modulus at rest over Young's modulus [-]."""
@@ -108,130 +124,98 @@ class Material:
         """Poisson's ratio at rest [-]."""
         return self.lam / (2 * (self.lam + self.mu))
 
+    def rest_stress(self, H: Tensor) -> Tensor:
+        """Return the stress of small strains, A(0) : H, (..., 3, 3) [-]."""
+        pressure = self.lam * trace(H)
+        eye = torch.eye(3, dtype=H.dtype, device=H.device)
+        return broadcast_modulus(self.mu, 2) * (H + H.mT) + pressure[..., None, None] * eye
+
+    @property
+    def rest_moduli(self) -> Tensor:
+        """Moduli at rest of all cells, a vector (1, M) or (B, M) [-], see `linear_law`.
+
+        They are mu and lambda, of a field those of each cell.
+        """
+        both = [torch.as_tensor(modulus, dtype=torch.float64) for modulus in (self.mu, self.lam)]
+        rows = [m if m.ndim == 3 else m.reshape(1, -1, 1) for m in both]
+        return torch.cat(torch.broadcast_tensors(*rows), dim=1)[..., 0]
+
+    def linear_law(self, moduli: Tensor) -> "Material":
+        """Return the law of small strains with moduli in the order of `rest_moduli`, (M,)."""
+        from dpl.fem.materials.linear_elastic import LameElastic
+
+        both = moduli.view(2, -1)
+        if both.shape[1] == 1:
+            return LameElastic(*both[:, 0].tolist())
+        return LameElastic(*both[..., None])
+
+    @property
+    def largest_poisson_ratio(self) -> float:
+        """Largest Poisson's ratio at rest of all cells and parameters [-]."""
+        ends = list(product(*self.parameter_ranges.values()))
+        laws = [self.with_parameters(torch.tensor([end], dtype=torch.float64)) for end in ends]
+        ratios = [torch.as_tensor(law.poisson_ratio, dtype=torch.float64) for law in laws]
+        return max(float(ratio.max()) for ratio in ratios)
+
     @property
     def _at_rest(self) -> Tensor:
         if self.is_batched:
             raise ValueError(
-                f"{type(self).__name__}: a law with ranges must derive from YoungPoissonMaterial"
+                f"{type(self).__name__}: a law with ranges must define mu and lam, as "
+                "YoungPoissonMaterial does"
             )
         return self.tangent(torch.zeros(1, 3, 3, dtype=torch.float64))[0]
 
-    @property
-    def parameter_ranges(self) -> dict[str, tuple[float, float]]:
-        """Ranges of the constants of which each load has values of its own, by name.
-
-        A law with ranges has no moduli: it answers nothing before `with_parameters`.
-        """
-        values = {name: getattr(self, name) for name in self.ranged}
-        return {name: tuple(v) for name, v in values.items() if isinstance(v, Sequence)}
-
-    @property
-    def is_batched(self) -> bool:
-        """True if each member of a batch has constants of its own, see `with_parameters`."""
-        return any(isinstance(getattr(self, name), Tensor) for name in self.ranged)
-
-    def with_parameters(self, parameters: Tensor) -> Self:
-        """Return the law with values in place of its ranges.
-
-        Args:
-            parameters: Values in the order of `parameter_ranges`, (B, P). With B > 1 each member
-                of a batch has its own, and the law takes strains (B, E, Q, 3, 3).
-
-        Raises:
-            ValueError: The law has another number of ranges, or does not allow a value.
-        """
-        names = tuple(self.parameter_ranges)
-        if parameters.shape[-1] != len(names):
-            raise ValueError(f"parameters: {type(self).__name__} has ranges of {list(names)}")
-        if not names:
-            return self
-        law: Any = self  # a dataclass if it has ranges
-        if not torch.compiler.is_compiling():  # a traced graph has no values to check
-            if len(parameters) == 1:
-                return replace(law, **dict(zip(names, parameters[0].tolist(), strict=True)))
-            for extreme in (parameters.amin(0), parameters.amax(0)):
-                self.with_parameters(extreme[None])
-        # beside cells and points, so that numbers of a point, (B, E, Q), take their own
-        columns = parameters.T[..., None, None]
-        return replace(law, **dict(zip(names, columns, strict=True)))
-
-    def __post_init__(self) -> None:
-        """Check the constants of a dataclass, and both ends of its ranges.
-
-        Raises:
-            ValueError: The law does not allow a value, or a range is none.
-        """
-        if self.is_batched:
-            return
-        ranges = self.parameter_ranges
-        for name, ends in ranges.items():
-            if len(ends) != 2 or not ends[0] < ends[1]:
-                raise ValueError(
-                    f"{name} = {list(ends)} must be a range [low, high], low below high"
-                )
-            object.__setattr__(self, name, tuple(map(float, ends)))
-        if not ranges:
-            self.check_constants()
-            return
-        for corner in product(*ranges.values()):
-            self.with_parameters(torch.tensor([corner], dtype=torch.float64))
-
-    def check_constants(self) -> None:
-        """Check the values of the constants.
-
-        Raises:
-            ValueError: The law does not allow a value.
-        """
+    def groups(self, count: int) -> "list[tuple[Material, Tensor]]":
+        """Return laws of one class and the numbers of the cells of each, of a body of E cells."""
+        return [(self, torch.arange(count))]
 
 
 @dataclass(frozen=True)
 class YoungPoissonMaterial(Material):
-    """Law that at rest is Hooke's, with Young's modulus 1: such laws can be swapped fairly.
+    """Law that at rest is Hooke's: such laws can be swapped fairly.
 
     Attributes:
         poisson: Poisson's ratio at rest [-], in (-1, 0.5); or a range [low, high], of which each
-            load has its own.
+            load has its own, or a field.
+        young: Young's modulus at rest over that of the scene [-], of a body of several laws; or a
+            range or a field.
     """
 
-    ranged: ClassVar[tuple[str, ...]] = ("poisson",)
+    ranged: ClassVar[tuple[str, ...]] = ("poisson", "young")
 
     poisson: float | Sequence[float]
+    young: float | Sequence[float] = 1.0
 
     def check_constants(self) -> None:
         """See `Material.check_constants`."""
-        if not -1.0 < self._one < 0.5:
+        if not -1.0 < self._number("poisson") < 0.5:
             raise ValueError(
                 f"poisson = {self.poisson} must lie between -1 and 0.5 (both excluded)"
             )
+        if not 0.0 < self._number("young") < math.inf:
+            raise ValueError(f"young = {self.young} must be above 0")
+
+    def identity(self) -> dict[str, Any]:
+        """See `Material.identity`; a law with the modulus of the scene has no `young`."""
+        exclude = ["young"] if isinstance(self.young, int | float) and self.young == 1 else []
+        return identity_of(self, exclude=exclude)
 
     @property
     def mu(self) -> float:
         """Shear modulus over Young's modulus [-]."""
-        return 1.0 / (2.0 * (1.0 + self._one))
+        return self._number("young") / (2.0 * (1.0 + self._number("poisson")))
 
     @property
     def lam(self) -> float:
         """First Lame parameter over Young's modulus [-]."""
-        return self._one / ((1.0 + self._one) * (1.0 - 2.0 * self._one))
+        nu = self._number("poisson")
+        return self._number("young") * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
 
     @property
     def bulk(self) -> float:
         """Bulk modulus over Young's modulus [-]."""
         return self.lam + 2 / 3 * self.mu
-
-    @property
-    def _one(self) -> float:
-        """Poisson's ratio; (B, 1, 1) of a batch, which goes through the same arithmetic.
-
-        Raises:
-            ValueError: It is a range.
-        """
-        if isinstance(self.poisson, Sequence):
-            raise ValueError(
-                f"poisson = {list(self.poisson)} is a range; choose a value with "
-                "Problem.with_parameters, or give Load.parameters for each load"
-            )
-        return self.poisson
 
 
 def check_moduli(name: str, shear: float, bulk: float, constants: Iterable[float]) -> None:

@@ -1,7 +1,8 @@
 """Mooney-Rivlin with isochoric invariants."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -19,26 +20,41 @@ class MooneyRivlinK2(InvariantBasedMaterial):
     Source: Rivlin (1948); the volumetric term is that of Abaqus (D1 = 2/bulk).
 
     Attributes:
-        c10, c01, bulk: Moduli over E [-].
+        c10, c01, bulk: Moduli over E [-]; numbers, ranges [low, high] or fields.
     """
 
-    c10: float
-    c01: float
-    bulk: float
+    ranged: ClassVar[tuple[str, ...]] = ("c10", "c01", "bulk")
+
+    c10: float | Sequence[float]
+    c01: float | Sequence[float]
+    bulk: float | Sequence[float]
 
     def check_constants(self) -> None:
         """See `Material.check_constants`: the body must resist shear and compression."""
-        check_moduli("2 (c10 + c01)", 2 * (self.c10 + self.c01), self.bulk, vars(self).values())
+        c10, *_, c01, bulk = self.constants
+        check_moduli("2 (c10 + c01)", 2 * (c10 + c01), bulk, self.constants)
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus at rest over Young's modulus [-]."""
+        return 2 * (self._number("c10") + self._number("c01"))
+
+    @property
+    def lam(self) -> float:
+        """First Lame parameter at rest over Young's modulus [-]."""
+        return self._number("bulk") - 2 / 3 * self.mu
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
         i1, i2, j = isochoric_invariants(H)
-        return self.c10 * i1 + self.c01 * i2 + self.bulk / 2 * j.square()
+        c10, *_, c01, bulk = self.constants
+        return c10 * i1 + c01 * i2 + bulk / 2 * j.square()
 
     @property
     def constants(self) -> tuple[float, ...]:
         """Return c10, 0, 0, c01 and bulk."""
-        return self.c10, 0.0, 0.0, self.c01, self.bulk
+        c10, c01, bulk = map(self._number, ("c10", "c01", "bulk"))
+        return c10, 0.0, 0.0, c01, bulk
 
     @staticmethod
     def invariant_derivatives(

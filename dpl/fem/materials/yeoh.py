@@ -1,7 +1,8 @@
 """Yeoh with isochoric invariants."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -17,27 +18,43 @@ class YeohK2(InvariantBasedMaterial):
     Source: Yeoh (1993), Rubber Chem. Technol. 66; the volumetric term is that of Abaqus.
 
     Attributes:
-        c10, c20, c30, bulk: Moduli over E [-]. Shear modulus at rest 2 c10.
+        c10, c20, c30, bulk: Moduli over E [-]; numbers, ranges [low, high] or fields. The shear
+            modulus at rest is 2 c10.
     """
 
-    c10: float
-    c20: float
-    c30: float
-    bulk: float
+    ranged: ClassVar[tuple[str, ...]] = ("c10", "c20", "c30", "bulk")
+
+    c10: float | Sequence[float]
+    c20: float | Sequence[float]
+    c30: float | Sequence[float]
+    bulk: float | Sequence[float]
 
     def check_constants(self) -> None:
         """See `Material.check_constants`: the body must resist shear and compression."""
-        check_moduli("2 c10", 2 * self.c10, self.bulk, vars(self).values())
+        c10, *_, bulk = self.constants
+        check_moduli("2 c10", 2 * c10, bulk, self.constants)
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus at rest over Young's modulus [-]."""
+        return 2 * self._number("c10")
+
+    @property
+    def lam(self) -> float:
+        """First Lame parameter at rest over Young's modulus [-]."""
+        return self._number("bulk") - 2 / 3 * self.mu
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
         i1, _, j = isochoric_invariants(H)
-        return i1 * (self.c10 + i1 * (self.c20 + i1 * self.c30)) + self.bulk / 2 * j.square()
+        c10, c20, c30, _, bulk = self.constants
+        return i1 * (c10 + i1 * (c20 + i1 * c30)) + bulk / 2 * j.square()
 
     @property
     def constants(self) -> tuple[float, ...]:
         """Return c10, c20, c30, 0 and bulk."""
-        return self.c10, self.c20, self.c30, 0.0, self.bulk
+        c10, c20, c30, bulk = map(self._number, ("c10", "c20", "c30", "bulk"))
+        return c10, c20, c30, 0.0, bulk
 
     @staticmethod
     def invariant_derivatives(

@@ -5,17 +5,20 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
-    from dpl.fem.mesh.fibre_directions import (
-        ConstantFibres,
-        FibreData,
-        FibreFunction,
-        LaplaceFibres,
-    )
     from dpl.fem.mesh.finger_mesh import finger
     from dpl.fem.mesh.generators import box, rectangle
     from dpl.fem.mesh.propeller_mesh import propeller
     from dpl.fem.mesh.reading import read_cell_data, read_mesh
-    from dpl.fem.mesh.regions import Box, Cylinder, Plane, Sphere, Tag, facets_in, nodes_in
+    from dpl.fem.mesh.regions import (
+        Box,
+        Cylinder,
+        Plane,
+        Sphere,
+        Tag,
+        cells_in,
+        facets_in,
+        nodes_in,
+    )
     from dpl.fem.mesh.validation import check_mesh
     from dpl.fem.mesh.writing import write_collection, write_mesh, write_mesh_exactly, write_series
 else:

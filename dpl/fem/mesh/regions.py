@@ -1,7 +1,8 @@
 """Regions of a body, which select nodes and facets for boundary conditions and loads.
 
 A region is a function that maps points (N, D) [m] to a mask (N,), or a `Tag`, the name of a part of
-the mesh. `nodes_in` and `facets_in` take both.
+the mesh. `nodes_in`, `facets_in` and `cells_in`
+take both.
 """
 
 import math
@@ -226,6 +227,35 @@ def facets_in(
     if not len(facets):
         raise ValueError(f"{_name(region)} holds no facet of the boundary")
     return facets
+
+
+def cells_in(
+    region: Region, mesh: skfem.Mesh, scale: float = 1.0, origin: Origin = 0.0
+) -> NDArray[np.int_]:
+    """Return the cells in a region in ascending order.
+
+    Args:
+        region: The region. It contains the cells whose centres, the means of the vertices, lie
+            inside. A `Tag` contains its cells.
+        mesh: The body.
+        scale: Length unit of the mesh [m].
+        origin: Origin of the mesh in its own unit, (D,).
+
+    Raises:
+        ValueError: The region contains no cell, the tag does not exist or is one of facets, or the
+            region does not return a mask (N,).
+    """
+    if isinstance(region, Tag):
+        if region.name not in (mesh.subdomains or {}):
+            region.facets(mesh)  # raises if the mesh has no such name
+            raise ValueError(f"{region} names facets and must name cells")
+        cells = np.sort(np.asarray(mesh.subdomains[region.name]))
+    else:
+        centres = mesh.p[:, mesh.t].mean(axis=1).T
+        cells = np.flatnonzero(_inside(region, (centres + origin) * scale))
+    if not len(cells):
+        raise ValueError(f"{_name(region)} holds no cell of the mesh")
+    return cells
 
 
 def _inside(region: Callable, points: NDArray[np.float64]) -> NDArray[np.bool_]:

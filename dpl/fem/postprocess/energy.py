@@ -9,14 +9,13 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from dpl.fem.linear.interface import full_matrix
-from dpl.fem.materials import LinearElastic
 from dpl.fem.problem import Problem
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
+from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 
 ENTRIES = 16_000  # entries of displacements per evaluation, so that strains fit into the cache
 CACHE_SIZE = 1_000_000  # loads whose work is cached
-HOOKEAN = tuple(map(LinearElastic, (0.0, 0.2, 0.4)))  # laws whose K(0) span those of all others
 STEP = 1e-5  # step of the displacement gradient in difference quotients of forces [-]
 
 
@@ -38,8 +37,7 @@ class RestStiffness:
     def product(self, field: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return K(0) v, (B, N, D) [-]; zero at fixed degrees of freedom.
 
-        At rest every law is Hooke's, K(0) = lambda K1 + mu K2 + foundation. K(0) of any
-        parameters is therefore a linear combination of three.
+        K(0) of any parameters is a linear combination of a few matrices, see `StiffnessTerms`.
 
         Args:
             field: v, (B, N, D) [-].
@@ -55,16 +53,20 @@ class RestStiffness:
                 image[:, free] = (self._on_device @ columns).T
             return image
         law = problem.material.with_parameters(problem.law_parameters(parameters))
-        moduli = [torch.as_tensor(m).flatten().to(field) for m in (law.lam, law.mu)]
-        moduli.append(torch.ones_like(moduli[0]))
-        known = [(hooke.lam, hooke.mu, 1.0) for hooke in HOOKEAN]
-        shares = torch.linalg.solve(field.new_tensor(known).T, torch.stack(moduli))  # (3, B)
-        parts = torch.stack([rest.product(field) for rest in self._spanning])
-        return torch.einsum("kb,kbnd->bnd", shares, parts)
+        factors = self._terms.factors(law).to(field)
+        parts = torch.stack([rest.product(field) for rest in self._rest_of_terms])
+        image = torch.einsum("bk,kbnd->bnd", factors.expand(len(field), -1), parts)
+        if problem.springs is not None:
+            image = image + torch.where(problem.free, problem.springs.force(field), 0.0)
+        return image
 
     @cached_property
-    def _spanning(self) -> "list[RestStiffness]":
-        return [RestStiffness(self.problem.with_material(hooke)) for hooke in HOOKEAN]
+    def _terms(self) -> StiffnessTerms:
+        return StiffnessTerms.of(self.problem)
+
+    @cached_property
+    def _rest_of_terms(self) -> "list[RestStiffness]":
+        return [RestStiffness(body) for body in self._terms.bodies]
 
     def linear_strain_energy(self, force: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Return f.K(0)^-1 f / 2, the strain energy of the linear solution, (B,) [-].
@@ -97,10 +99,10 @@ class RestStiffness:
         """Return the strain energy at rest W(0), (1,) or (B,) [-]; it is not zero for every law."""
         if not parameters.shape[-1]:
             return self._energy
-        body = self.problem.with_parameters(parameters)
-        nothing = body.points.new_zeros(1, 1, 1, 3, 3)
-        volume = body.dV.expand(len(body.cells), -1).sum()
-        return volume * body.material.energy(nothing).flatten().expand(len(parameters))
+        body = self.problem.with_parameters(parameters).without_pressure
+        nothing = body.points.new_zeros(1, len(body.cells), 1, 3, 3)
+        volumes = body.dV.sum(1).expand(len(body.cells))
+        return (body.material.energy(nothing)[..., 0] * volumes).sum(1).expand(len(parameters))
 
     @cached_property
     def _energy(self) -> Tensor:

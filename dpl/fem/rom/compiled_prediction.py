@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dpl.fem.assembly.kernels import call_compiled
+from dpl.fem.assembly.kernels import call_compiled, constants_of
 from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.assembly.prediction_loops import (
     SOURCES,
@@ -23,6 +23,7 @@ from dpl.fem.assembly.prediction_loops import (
 )
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.linear.condensation import Fronts
+from dpl.fem.materials.heterogeneous import as_field
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedInverse
@@ -38,14 +39,19 @@ class LawArguments(NamedTuple):
     constants: Array
     required_terms: int
     finite: float
-    mu: float
-    lam: float
 
 
 def law_arguments(law: InvariantBasedMaterial) -> LawArguments:
-    """Return a law with numbers as moduli as the arguments of a compiled loop."""
-    moduli = required_terms(law), float(law.finite), float(law.mu), float(law.lam)
-    return LawArguments(Law(type(law), SOURCES), np.array(law.constants, dtype=float), *moduli)
+    """Return a law as the arguments of a compiled loop.
+
+    The law belongs to the sample cells in the order of the loop. Its constants are followed by mu
+    and lambda, (1, n + 2) or (C, n + 2).
+    """
+    rows = [constants_of(law)[0], *(as_field(one, 1) for one in (law.mu, law.lam))]
+    count = max(map(len, rows))
+    constants = np.concatenate([np.broadcast_to(row, (count, row.shape[1])) for row in rows], 1)
+    terms = required_terms(law), float(law.finite)
+    return LawArguments(Law.of(law, SOURCES), constants, *terms)
 
 
 @dataclass(frozen=True)
@@ -54,9 +60,11 @@ class CompiledPrediction:
 
     Attributes:
         arrays: Its matrices.
+        cells: Position among the sample cells of each cell of the loops, (C,).
     """
 
     arrays: ModelArrays
+    cells: Tensor
 
     @classmethod
     def of(
@@ -124,7 +132,8 @@ class CompiledPrediction:
                 supports=_double(torch.stack(supports)),
             ),
         )
-        return cls(arrays)
+        blocks = one.images.unflatten(1, (-1, 9, SIMD_WIDTH))
+        return cls(arrays, blocks[:, :, 0].flatten() // dim**2)
 
     def __call__(
         self,
@@ -153,8 +162,8 @@ class LinearPrediction(NamedTuple):
 
     Attributes:
         fronts: Fronts of K(0).
-        values: Blocks of K Poisson's ratios, by parity, (K, M, V).
-        supports: See `dpl.fem.rom.reduced_problem.support_forces`, (3, N, D).
+        values: Blocks of K nodes of the interpolation, by parity, (K, M, V).
+        supports: See `StiffnessTerms.support_forces`, (T + 1, N, D).
     """
 
     fronts: Fronts
@@ -166,8 +175,8 @@ class LawWeights(NamedTuple):
     """A law as a linear solution needs it.
 
     Attributes:
-        weights: Factors of the Poisson's ratios, (K,).
-        moduli: mu and lambda at rest over Young's modulus, and 1, (3,).
+        weights: Weights of the nodes, (K,).
+        moduli: Factors of the terms of K(0), and 1, (T + 1,).
     """
 
     weights: Array

@@ -193,6 +193,7 @@ class ReducedMesh:
         self.nodes = nodes
         self.problem = replace(
             problem,
+            material=problem.material.of_cells(cells),
             points=problem.points[nodes],
             cells=torch.arange(len(nodes)).view(-1, per_cell),
             dN=of_cells(problem.dN),

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dpl.fem.materials.linear_elastic import LinearElastic
 from dpl.fem.problem import Problem
 from dpl.fem.rom.ecsw import Cubature, ReducedMesh, whitening
 from dpl.fem.solvers.linear import LinearSolver
@@ -229,14 +228,6 @@ def support_force(problem: Problem) -> Tensor:
     rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
     elastic = problem.without_pressure
     return elastic.tangent_product(rest, problem.prescribed[None])[0] + problem.pressure_at_rest
-
-
-def support_forces(problem: Problem) -> Tensor:
-    """Return a, b and c with `support_force` = mu a + lambda b + c for all laws, (3, N, D)."""
-    laws = [LinearElastic(poisson) for poisson in (0.0, 0.3, 0.4)]
-    forces = torch.stack([support_force(problem.with_material(law)) for law in laws])
-    factors = torch.tensor([[law.mu, law.lam, 1.0] for law in laws], dtype=torch.float64)
-    return torch.einsum("ij,jnd->ind", torch.linalg.inv(factors), forces)
 
 
 def _linear_solution(lift: LinearSolver, force: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
-"""Reduced stiffness at rest as a function of the moduli of the law."""
+"""Reduced stiffness at rest as a function of the parameters of the law."""
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import scipy.linalg
@@ -11,104 +11,84 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.linear.interface import full_matrix
-from dpl.fem.materials.linear_elastic import LinearElastic
-from dpl.fem.materials.material import Material
 from dpl.fem.problem import Problem
-from dpl.fem.rom.reduced_problem import support_force
+from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 
 ReducedInverse = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
 class ReducedStiffness:
-    """V^T K(0) [V, p] = mu A + lambda B + C, since every law is isotropic at rest.
+    """V^T K(0) [V, p] = sum_k a_k A_k + C, with the factors a of a law, see `StiffnessTerms`.
 
     p is the prescribed displacement and C is that of the springs.
 
     Attributes:
-        parts: A, B and C, (3, R, R + 1).
+        parts: A_1, ..., A_T and C, (T + 1, R, R + 1).
     """
 
     parts: Tensor
 
     @classmethod
-    def of(cls, problem: Problem, modes: Tensor) -> "ReducedStiffness":
+    def of(cls, terms: StiffnessTerms, modes: Tensor) -> "ReducedStiffness":
         """Return the stiffness of a body in modes V at its free degrees of freedom, (n, R)."""
-        columns = modes.double().numpy()
-        soft, stiff = LinearElastic(0.0), LinearElastic(0.3)
-        products = []
-        for law in (soft, stiff):
-            body = problem.with_material(law)
+        columns, free = modes.double().numpy(), terms.problem.free
+        supports, products = terms.support_forces()[:-1, free], []
+        for body, moved in zip(terms.bodies, supports, strict=True):
             matrix = full_matrix(body.pattern, body.stiffness_at_rest().numpy())
             own = torch.from_numpy(columns.T @ (matrix @ columns))
-            moved = support_force(body)[problem.free]
             products.append(torch.cat([(own + own.T) / 2, modes.double().T @ moved[:, None]], 1))
-        springs = _springs(problem, modes.double())
-        first, second = products[0] - springs, products[1] - springs
-        mu = first / soft.mu
-        return cls(torch.stack([mu, (second - stiff.mu * mu) / stiff.lam, springs]))
+        return cls(torch.stack([*products, _springs(terms.problem, modes.double())]))
 
     def prepared(self) -> Self:
         """Return the stiffness with its factors, which a traced graph takes as constants."""
-        if not self._has_springs and self.parts.numel():
+        if self._is_diagonal and self.parts.numel():
             self._spectrum  # noqa: B018  # computed and kept
         return self
 
-    def solve(self, law: Material, right: Tensor) -> Tensor:
+    def solve(self, factors: Tensor, right: Tensor) -> Tensor:
         """Return the coordinates (B, R) of Galerkin linear solutions.
 
-        Without springs A and B are diagonal in one basis, W^T A W = I and W^T B W = diag(b), so
-        that the inverse is W diag(1 / (mu + lambda b)) W^T for all moduli.
+        Without springs two terms are diagonal in one basis, W^T A_1 W = I and W^T A_2 W = diag(b),
+        so that the inverse is W diag(1 / (a_1 + a_2 b)) W^T for all factors.
 
         Args:
-            law: The law; of a batch, each member has moduli of its own.
+            factors: a, (1, T) or (B, T).
             right: V^T f, (B, R).
         """
-        if self._has_springs:
-            whole = self.at(law).to(right)
-            right = right - whole[..., -1]
-            return torch.linalg.solve(whole[..., :-1], right[..., None])[..., 0]
-        mu, lam = (_row(modulus) for modulus in (law.mu, law.lam))
-        A, B, _ = self.parts[..., -1].to(right)
+        factors = factors.to(right)
+        right = right - factors @ self.parts[:-1, :, -1].to(right) - self.parts[-1, :, -1].to(right)
+        if not self._is_diagonal:
+            whole = self.at(factors)[..., :-1]
+            return torch.linalg.solve(whole, right[..., None])[..., 0]
         vectors, values = (part.to(right) for part in self._spectrum)
-        return ((right - mu * A - lam * B) @ vectors / (mu + lam * values)) @ vectors.T
+        return (right @ vectors / (factors @ values)) @ vectors.T
 
-    def inverse(self, law: Material) -> ReducedInverse:
-        """Return (V^T K(0) V)^-1, (R, R), and V^T K(0) p, (R,), of a law with numbers as moduli."""
-        if self._has_springs:
-            whole = self.at(law).numpy()
+    def inverse(self, factors: Tensor) -> ReducedInverse:
+        """Return (V^T K(0) V)^-1, (R, R), and V^T K(0) p, (R,), of factors (1, T)."""
+        whole = self.at(factors)[0].numpy()
+        if not self._is_diagonal:
             return np.ascontiguousarray(np.linalg.inv(whole[:, :-1])), whole[:, -1].copy()
-        mu, lam = float(law.mu), float(law.lam)
         vectors, values = (part.numpy() for part in self._spectrum)
-        A, B, _ = self.parts[..., -1].numpy()
-        return (vectors / (mu + lam * values)) @ vectors.T, mu * A + lam * B
+        return (vectors / (factors[0].numpy() @ values)) @ vectors.T, whole[:, -1].copy()
 
     @cached_property
-    def _has_springs(self) -> bool:
-        return bool(self.parts[2].any())
+    def _is_diagonal(self) -> bool:
+        """Whether all terms are diagonal in one basis: at most two, and no springs."""
+        return len(self.parts) <= 3 and not self.parts[-1].any()
 
     @cached_property
     def _spectrum(self) -> tuple[Tensor, Tensor]:
-        """W, (R, R), and b, (R,), see `solve`."""
-        A, B = (part[:, :-1].numpy() for part in self.parts[:2].cpu())
-        values, vectors = scipy.linalg.eigh(B, A)
-        return torch.from_numpy(vectors), torch.from_numpy(values)
+        """W, (R, R), and diagonals of the terms, 1 and b, (T, R); see `solve`."""
+        terms = [part[:, :-1].numpy() for part in self.parts[:-1].cpu()]
+        values, vectors = scipy.linalg.eigh(terms[-1], terms[0])
+        diagonals = [np.ones_like(values), values][: len(terms)]
+        return torch.from_numpy(vectors), torch.from_numpy(np.stack(diagonals))
 
-    def at(self, law: Material) -> Tensor:
-        """Return V^T K(0) [V, p], (R, R + 1), or (B, R, R + 1) for a law of a batch."""
-        mu, lam = (_column(modulus) for modulus in (law.mu, law.lam))
-        A, B, C = self.parts.to(mu.device) if isinstance(mu, Tensor) else self.parts
-        return mu * A + lam * B + C
-
-
-def _column(modulus: Any) -> Any:
-    """Return a modulus that multiplies matrices: a number, or (B, 1, 1)."""
-    return modulus.reshape(-1, 1, 1) if isinstance(modulus, Tensor) else modulus
-
-
-def _row(modulus: Any) -> Any:
-    """Return a modulus that multiplies rows: a number, or (B, 1)."""
-    return modulus.reshape(-1, 1) if isinstance(modulus, Tensor) else modulus
+    def at(self, factors: Tensor) -> Tensor:
+        """Return V^T K(0) [V, p], (B, R, R + 1), of factors (B, T)."""
+        parts = self.parts.to(factors)
+        return torch.einsum("bk,kij->bij", factors, parts[:-1]) + parts[-1]
 
 
 def _springs(problem: Problem, modes: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dpl.fem.assembly.sampled_loops import MIN_VOLUME_RATIO, POLAR_ITER, SERIES_ANGLE
 from dpl.fem.materials.material import Material
-from dpl.fem.materials.tensors import broadcast_modulus, cofactor, trace, volume_change
+from dpl.fem.materials.tensors import cofactor, volume_change
 from dpl.fem.problem import Problem
 
 
@@ -101,10 +101,7 @@ def unbalanced_stress(law: Material, H: Tensor, linear: Tensor) -> Tensor:
     """
     valid = volume_change(H) > MIN_VOLUME_RATIO - 1
     H = torch.where(valid[..., None, None], H, 0.0)
-    mu, lam = (broadcast_modulus(modulus, 2) for modulus in (law.mu, law.lam))
-    eye = torch.eye(3, dtype=H.dtype, device=H.device)
-    pressure = lam * trace(linear)[..., None, None]
-    stress = law.stress(H) - mu * (linear + linear.mT) - pressure * eye
+    stress = law.stress(H) - law.rest_stress(linear)
     return torch.stack([rotation(H).mT @ stress, stress], dim=-3)
 
 

@@ -8,14 +8,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.assembly import reduced_loops
-from dpl.fem.assembly.kernels import call_compiled
-from dpl.fem.assembly.numba_laws import Law, required_terms
+from dpl.fem.assembly.kernels import call_compiled, constants_of
+from dpl.fem.assembly.numba_laws import CompiledLaw, Law, required_terms
 from dpl.fem.linear.interface import full_matrix
-from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.heterogeneous import one_law
 from dpl.fem.materials.material import Material
 from dpl.fem.problem import Problem
 from dpl.fem.rom.ecsw import Cubature, whitening
 from dpl.fem.rom.reduced_stiffness import ReducedStiffness
+from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -60,6 +61,7 @@ class SampledTangent:
         dim, rank = problem.shape[1], self.rows.shape[1]
         white = torch.from_numpy(self._white).view(*problem.shape, rank)
         basis = torch.einsum("cair,caj->cijr", white[nodes], mean)
+        self._cells = chosen.cells
         self._nodes = nodes.contiguous().numpy()
         self._dN = mean[:, None].contiguous().numpy()
         self._dV = (volume * chosen.weights.double())[:, None].contiguous().numpy()
@@ -77,21 +79,21 @@ class SampledTangent:
         """
         if whole or not self._has_cells:
             return self._projection(problem, problem.linearise(displacement[None]).tangent[0])
-        product = self._moduli_change_product(problem.material, displacement)
+        product = self._moduli_change_product(problem, displacement)
         rank = product.shape[2]
         change = self._basis.reshape(-1, rank).T @ product.reshape(-1, rank)
         return self._at_rest(problem.material) + change
 
-    def _moduli_change_product(self, law: Material, displacement: Tensor) -> Single:
+    def _moduli_change_product(self, problem: Problem, displacement: Tensor) -> Single:
         """Return w vol (A(H) - A(0)) G, (C, D D, R)."""
-        if not isinstance(law, InvariantBasedMaterial):
+        law = one_law(problem.material.of_cells(self._cells))
+        if not isinstance(law, CompiledLaw):
             return self._reference_product(law, displacement)
         out = np.empty_like(self._basis)
-        constants = np.array(law.constants, dtype=np.float64)
         u = displacement.contiguous().numpy()
         call_compiled(
             reduced_loops.moduli_change_product,
-            *(Law(type(law), reduced_loops.SOURCES), constants),
+            *(Law.of(law, reduced_loops.SOURCES), constants_of(law)[0]),
             *(self._required_terms, float(law.finite)),
             *(u, self._nodes, self._dN, self._dV, self._basis, out),
         )
@@ -102,8 +104,8 @@ class SampledTangent:
         dim = self.problem.shape[1]
         at_cells = displacement[torch.from_numpy(self._nodes)]
         H = torch.einsum("cai,caj->cij", at_cells, torch.from_numpy(self._dN[:, 0]))
-        H = torch.nn.functional.pad(H, (0, 3 - dim, 0, 3 - dim))
-        change = law.tangent(H) - law.tangent(torch.zeros_like(H[:1]))
+        H = torch.nn.functional.pad(H, (0, 3 - dim, 0, 3 - dim))[None, :, None]
+        change = (law.tangent(H) - law.tangent(torch.zeros_like(H)))[0, :, 0]
         change = (
             change[:, :dim, :dim, :dim, :dim] * torch.from_numpy(self._dV)[..., None, None, None]
         )
@@ -111,15 +113,15 @@ class SampledTangent:
 
     @cached_property
     def _required_terms(self) -> int:
-        law = self.problem.reference.material
-        assert isinstance(law, InvariantBasedMaterial)
+        law = one_law(self.problem.reference.material)
+        assert isinstance(law, CompiledLaw)
         return required_terms(law)
 
     def _at_rest(self, law: Material) -> Array:
         """Return W^T K(0) W, (R, R), of a law of the body."""
         if not self.problem.material.parameter_ranges:
             return self._one
-        return self._stiffness.at(law)[:, :-1].numpy()
+        return self._stiffness.at(self._terms.factors(law))[0, :, :-1].numpy()
 
     @cached_property
     def _one(self) -> Array:
@@ -128,7 +130,11 @@ class SampledTangent:
     @cached_property
     def _stiffness(self) -> ReducedStiffness:
         free = self.problem.free.flatten().numpy()
-        return ReducedStiffness.of(self.problem, torch.from_numpy(self._white[free]))
+        return ReducedStiffness.of(self._terms, torch.from_numpy(self._white[free]))
+
+    @cached_property
+    def _terms(self) -> StiffnessTerms:
+        return StiffnessTerms.of(self.problem)
 
     def _projection(self, problem: Problem, tangent: Tensor) -> Array:
         """Return W^T K W of the entries (nnz,) of a tangent."""

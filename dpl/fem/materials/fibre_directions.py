@@ -53,7 +53,7 @@ class ConstantFibres(FibreDirections):
         sheet = None if self.sheet is None else np.array([self.sheet])
         return frames_of(np.array([self.fibre]), sheet)
 
-    def on(self, basis: skfem.Basis, origin: Origin, length: float) -> Tensor:
+    def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
         """Return the frame, (1, 3, 3) [-], see `FibreDirections.on`."""
         if len(self.fibre) < basis.mesh.dim():
             raise ValueError(f"fibre = {list(self.fibre)} must have {basis.mesh.dim()} components")
@@ -71,9 +71,9 @@ class FibreFunction(FibreDirections):
 
     function: Callable[[Array], Any]
 
-    def on(self, basis: skfem.Basis, origin: Origin, length: float) -> Tensor:
+    def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
         """Return the frames, (E, 3, 3) [-], see `FibreDirections.on`."""
-        found = self.function(cell_centres(basis, origin, length))
+        found = self.function(cell_centres(basis, length, origin))
         fibre, sheet = found if isinstance(found, tuple) else (found, None)
         return _frames_on(basis, fibre, sheet)
 
@@ -103,7 +103,7 @@ class FibreData(FibreDirections):
                     f"{name} must be the name of cell data if there is a file, and an array if not"
                 )
 
-    def on(self, basis: skfem.Basis, origin: Origin, length: float) -> Tensor:
+    def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
         """Return the frames, (E, 3, 3) [-], see `FibreDirections.on`."""
         if self.file is None:
             return _frames_on(basis, self.fibre, self.sheet)
@@ -146,7 +146,7 @@ class LaplaceFibres(FibreDirections):
             if not math.isfinite(value := getattr(self, name)):
                 raise ValueError(f"{name} = {value} must be a finite number [rad]")
 
-    def on(self, basis: skfem.Basis, origin: Origin, length: float) -> Tensor:
+    def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
         """Return the frames, (E, 3, 3) [-], see `FibreDirections.on`.
 
         Raises:
@@ -168,7 +168,7 @@ class LaplaceFibres(FibreDirections):
         return frames_of(fibre, transmural)
 
 
-def cell_centres(basis: skfem.Basis, origin: Origin, length: float) -> Array:
+def cell_centres(basis: skfem.Basis, length: float, origin: Origin) -> Array:
     """Return the means of the vertices of the cells in the coordinates of the user, (E, D) [m]."""
     vertices = basis.mesh.p[:, basis.mesh.t]  # (D, vertices, E)
     return np.ascontiguousarray((vertices.mean(axis=1).T + origin) * length)

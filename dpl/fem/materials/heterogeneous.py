@@ -1,0 +1,279 @@
+"""Bodies of several laws: each region of cells has its own."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple, Self, cast
+
+import numpy as np
+import skfem
+import torch
+from torch import Tensor
+
+from dpl.fem.identity import plain
+from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.material import Material, Response
+from dpl.fem.materials.parameters import Composed
+from dpl.fem.mesh.regions import Origin, Region, Tag, cells_in
+
+OTHER = "other"  # region of the cells that belong to no other region
+
+
+@dataclass(frozen=True, eq=False)
+class Heterogeneous(Composed, Material):
+    """Laws of the regions of a body.
+
+    A parameter of a law has the name of its region before its own: core.poisson. Cells whose laws
+    are of one class of isotropic laws are evaluated together.
+
+    Attributes:
+        laws: Law of each region, by name.
+        regions: The regions, by name. A name that is not there is a tag of cells of the mesh, or
+            `other`, the cells of no other region.
+        layout: Cells of the laws; None before `on`.
+
+    Raises:
+        ValueError: There is no law, or laws of small and of finite strains are mixed.
+    """
+
+    laws: Mapping[str, Material]
+    regions: Mapping[str, Region]
+    layout: "Layout | None" = None
+
+    def __post_init__(self) -> None:
+        """Check the laws."""
+        if not self.laws:
+            raise ValueError("material: there is no law; give at least one region a law")
+        if len({law.finite for law in self.laws.values()}) > 1:
+            raise ValueError(
+                "material: LinearElastic is a law of small strains; give it to all regions or none"
+            )
+        if unknown := sorted(set(self.regions) - set(self.laws)):
+            raise ValueError(f"regions: {unknown[0]} has no law; add material.{unknown[0]}")
+
+    @property
+    def finite(self) -> bool:  # type: ignore[override]
+        """See `Material.finite`."""
+        return all(law.finite for law in self.laws.values())
+
+    # ------------------------------------------------------------------ cells
+
+    def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Self:
+        """Return the laws of the cells of a body, see `Material.on`.
+
+        Raises:
+            ValueError: A region contains no cell, or a cell belongs to two regions or to none.
+        """
+        count = basis.mesh.nelements
+        index = np.full(count, -1)
+        for k, name in enumerate(self.laws):
+            if name == OTHER and name not in self.regions:
+                continue
+            region = self.regions.get(name) or Tag(name)
+            try:
+                cells = cells_in(region, basis.mesh, length, origin)
+            except ValueError as error:
+                remedy = "" if name in self.regions else f"; define regions.{name}"
+                raise ValueError(f"material.{name}: {error}{remedy}") from error
+            if (twice := cells[index[cells] >= 0]).size:
+                both = f"{list(self.laws)[index[twice[0]]]} and {name}"
+                raise ValueError(f"regions: {twice.size} cells belong to both {both}")
+            index[cells] = k
+        if (free := np.flatnonzero(index < 0)).size and OTHER not in self.laws:
+            raise ValueError(
+                f"regions: {free.size} of {count} cells belong to no region; add material.{OTHER}"
+            )
+        if OTHER in self.laws and OTHER not in self.regions:
+            if not free.size:
+                raise ValueError(f"material.{OTHER}: all cells belong to other regions; leave it")
+            index[free] = list(self.laws).index(OTHER)
+        bound = super().on(basis, length, origin)
+        layout = Layout.of(self.laws.values(), torch.from_numpy(index))
+        return replace(bound, layout=layout)
+
+    def of_cells(self, cells: Tensor) -> Self:
+        """See `Material.of_cells`."""
+        layout = Layout.of(self.laws.values(), self._layout.index[cells])
+        return replace(super().of_cells(cells), layout=layout)
+
+    @property
+    def _layout(self) -> "Layout":
+        if self.layout is None:
+            raise ValueError("the cells of the regions are not known; use Problem.build")
+        return self.layout
+
+    def groups(self, count: int) -> list[tuple[Material, Tensor]]:
+        """See `Material.groups`."""
+        return self._groups
+
+    @cached_property
+    def _groups(self) -> list[tuple[Material, Tensor]]:
+        """Laws that are evaluated together and their cells, in ascending order."""
+        laws = list(self.laws.values())
+        return [
+            (merge_laws([laws[k] for k in numbers], parts, order), cells)
+            for numbers, parts, order, cells in self._layout.groups
+        ]
+
+    # ------------------------------------------------------------------ parameters
+
+    @property
+    def parts(self) -> Mapping[str, Material]:
+        """See `Composed.parts`."""
+        return self.laws
+
+    def with_parts(self, parts: Mapping[str, Any]) -> Self:
+        """See `Composed.with_parts`."""
+        return replace(self, laws=parts)
+
+    def identity(self) -> dict[str, Any]:
+        """See `Material.identity`; of the regions, the cells count and not their definition."""
+        laws = {name: law.identity() for name, law in self.laws.items()}
+        return {"name": type(self).__name__, "laws": laws, "cells": plain(self._layout.index)}
+
+    def describe(self) -> str:
+        """See `Material.describe`."""
+        return "; ".join(f"{name}: {law.describe()}" for name, law in self.laws.items())
+
+    # ------------------------------------------------------------------ evaluation
+
+    @property
+    def has_response(self) -> bool:
+        """See `Material.has_response`."""
+        return all(law.has_response for law in self.laws.values())
+
+    def energy(self, H: Tensor) -> Tensor:
+        """Return the energy density, (B, E, Q) [-], see `Material.energy`."""
+        return self._of_all_cells(lambda law, H: law.energy(H), H)
+
+    def stress(self, H: Tensor) -> Tensor:
+        """Return the first Piola-Kirchhoff stress, see `Material.stress`."""
+        return self._of_all_cells(lambda law, H: law.stress(H), H)
+
+    def tangent(self, H: Tensor) -> Tensor:
+        """Return dP/dF, see `Material.tangent`."""
+        return self._of_all_cells(lambda law, H: law.tangent(H), H)
+
+    def rest_stress(self, H: Tensor) -> Tensor:
+        """Return the stress of small strains, see `Material.rest_stress`."""
+        return self._of_all_cells(lambda law, H: law.rest_stress(H), H)
+
+    def response(self, E: Tensor) -> Response:
+        """Return stress and moduli, see `Material.response`."""
+        parts = [law.response(E[:, cells]) for law, cells in self._groups]
+        order = self._layout.order
+        joined = (torch.cat(one, dim=1)[:, order] for one in zip(*parts, strict=True))
+        return Response(*joined)
+
+    def _of_all_cells(self, of: Callable[[Material, Tensor], Tensor], H: Tensor) -> Tensor:
+        """Return a function of a law and H (B, E, Q, 3, 3) with the law of each cell."""
+        if len(self._groups) == 1:
+            return of(self._groups[0][0], H)
+        parts = [of(law, H[:, cells]) for law, cells in self._groups]
+        return torch.cat(parts, dim=1)[:, self._layout.order]
+
+    @property
+    def rest_moduli(self) -> Tensor:
+        """See `Material.rest_moduli`; those of the laws one after the other."""
+        parts = [law.rest_moduli for law in self.laws.values()]
+        count = max(map(len, parts))
+        return torch.cat([part.expand(count, -1) for part in parts], dim=1)
+
+    def linear_law(self, moduli: Tensor) -> "Heterogeneous":
+        """See `Material.linear_law`."""
+        counts = [law.rest_moduli.shape[1] for law in self.laws.values()]
+        parts = zip(self.laws.items(), moduli.split(counts), strict=True)
+        return replace(self, laws={name: law.linear_law(own) for (name, law), own in parts})
+
+    @property
+    def largest_poisson_ratio(self) -> float:
+        """See `Material.largest_poisson_ratio`."""
+        return max(law.largest_poisson_ratio for law in self.laws.values())
+
+    @property
+    def mu(self) -> Tensor:  # type: ignore[override]
+        """Shear modulus at rest over Young's modulus of the cells, (E, 1) or (B, E, 1) [-]."""
+        return self._moduli(lambda law: law.mu)
+
+    @property
+    def lam(self) -> Tensor:  # type: ignore[override]
+        """First Lame parameter at rest over Young's modulus, (E, 1) or (B, E, 1) [-]."""
+        return self._moduli(lambda law: law.lam)
+
+    def _moduli(self, of: Callable[[Material], Any]) -> Tensor:
+        parts = [as_field(of(law), len(cells)) for law, cells in self._groups]
+        return join_fields(parts)[..., self._layout.order, :]
+
+
+class Layout(NamedTuple):
+    """Cells of the laws of a heterogeneous body.
+
+    Attributes:
+        index: Number of the law of each cell, (E,).
+        groups: For each group of laws of one class their numbers, the cells of each, the order that
+            sorts these, and all cells of the group in ascending order.
+        order: Position of each cell in the cells of the groups, (E,).
+    """
+
+    index: Tensor
+    groups: tuple[tuple[list[int], list[Tensor], Tensor, Tensor], ...]
+    order: Tensor
+
+    @classmethod
+    def of(cls, laws: Iterable[Material], index: Tensor) -> "Layout":
+        """Return the cells of laws, from the number of the law of each cell."""
+        numbers: dict[Any, list[int]] = {}
+        for k, law in enumerate(laws):
+            if (index == k).any():
+                key = type(law) if isinstance(law, InvariantBasedMaterial) else k
+                numbers.setdefault(key, []).append(k)
+        groups = []
+        for own in numbers.values():
+            parts = [(index == k).nonzero()[:, 0] for k in own]
+            order = torch.cat(parts).argsort()
+            groups.append((own, parts, order, torch.cat(parts)[order]))
+        return cls(index, tuple(groups), torch.cat([cells for *_, cells in groups]).argsort())
+
+
+def one_law(material: Material) -> Material:
+    """Return the law of a heterogeneous body whose laws are of one class, else the material."""
+    if isinstance(material, Heterogeneous) and len(material._groups) == 1:
+        return material._groups[0][0]
+    return material
+
+
+def as_field(value: Any, count: int) -> Tensor:
+    """Return a constant as a field of cells, (E, 1), or of a batch, (B, E, 1)."""
+    tensor = torch.as_tensor(value, dtype=torch.float64)
+    tensor = tensor.reshape((1,) * (2 - tensor.ndim) + tensor.shape)
+    return tensor.expand(*tensor.shape[:-2], count, 1)
+
+
+def join_fields(fields: Sequence[Tensor]) -> Tensor:
+    """Return fields of groups of cells, (E, 1) or (B, E, 1), as one field of all these cells."""
+    batch = torch.broadcast_shapes(*(field.shape[:-2] for field in fields))
+    return torch.cat([field.expand(*batch, *field.shape[-2:]) for field in fields], dim=-2)
+
+
+def merge_laws(laws: Sequence[Material], parts: Sequence[Tensor], order: Tensor) -> Material:
+    """Return laws of one class on different cells as one law with fields.
+
+    Args:
+        laws: The laws.
+        parts: Cells of each.
+        order: Order of all these cells in the result.
+    """
+    laws = [law.of_cells(cells) for law, cells in zip(laws, parts, strict=True)]
+    if len(laws) == 1:
+        return laws[0]
+    values: dict[str, Any] = {}
+    for name in laws[0].ranged:
+        own = [getattr(law, name) for law in laws]
+        if ranges := [value for value in own if isinstance(value, Sequence)]:
+            values[name] = ranges[0]  # such a law has no moduli yet
+        elif any(isinstance(value, Tensor) for value in own) or len(set(own)) > 1:
+            columns = [as_field(v, len(cells)) for v, cells in zip(own, parts, strict=True)]
+            values[name] = join_fields(columns)[..., order, :]
+        else:
+            values[name] = own[0]
+    return replace(cast("Any", laws[0]), **values)

@@ -1,0 +1,129 @@
+"""K(0) of a body as a sum of a few matrices whose factors are functions of the parameters."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+import torch
+from scipy.linalg import qr
+from torch import Tensor
+
+from dpl.fem.materials.material import Material
+from dpl.fem.problem import Problem
+
+SAMPLES = 64  # points of the parameters at which moduli are compared
+INDEPENDENT = 1e-10  # part of the largest modulus below which a direction counts as rounding [-]
+MAX_CORNERS = 6  # parameters of which all corners of the ranges are samples
+
+
+@dataclass(frozen=True, eq=False)
+class StiffnessTerms:
+    """K(0) = sum_k a_k K_k + C with factors a_k of the law and stiffness C of the foundation.
+
+    The moduli of a law at rest are a vector, see `Material.rest_moduli`, on which K(0) depends
+    linearly. Over all parameters these vectors span a space of few dimensions, of which `vectors`
+    is a basis. A homogeneous isotropic law has the factors mu and lambda. Otherwise the basis
+    consists of moduli of the law itself, so that the matrices K_k are positive definite.
+
+    Attributes:
+        problem: The body; its law may have ranges.
+        vectors: Moduli of the terms, (T, M).
+    """
+
+    problem: Problem
+    vectors: Tensor
+
+    @classmethod
+    def of(cls, problem: Problem) -> "StiffnessTerms":
+        """Return the terms of a body with the fewest matrices."""
+        law = problem.material
+        values = law.with_parameters(_samples(law)).rest_moduli
+        if values.shape[1] == 2:  # mu and lambda
+            return cls(problem, torch.eye(2, dtype=torch.float64))
+        _, R, order = qr(values.numpy().T, mode="economic", pivoting=True)
+        size = np.abs(np.diag(R))
+        return cls(problem, values[torch.from_numpy(order[: (size > INDEPENDENT * size[0]).sum()])])
+
+    def __len__(self) -> int:
+        """Return the number of terms, T."""
+        return len(self.vectors)
+
+    def factors(self, law: Material) -> Tensor:
+        """Return the factors a of a law, (1, T), or of the members of a batch, (B, T)."""
+        moduli = law.rest_moduli
+        return moduli if moduli.shape[1] == 2 else moduli @ self._inverse.to(moduli)
+
+    @cached_property
+    def _inverse(self) -> Tensor:
+        """Pseudoinverse of the vectors, (M, T)."""
+        return torch.linalg.pinv(self.vectors)
+
+    @cached_property
+    def bodies(self) -> list[Problem]:
+        """Linear elastic bodies whose stiffness at rest is K_k, without foundation and pressure."""
+        return [self.body(row) for row in torch.eye(len(self), dtype=torch.float64)]
+
+    def body(self, factors: Tensor) -> Problem:
+        """Return the linear elastic body of factors (T,), without foundation and pressure."""
+        law = self.problem.reference.material.linear_law(factors @ self.vectors)
+        body = self.problem.without_pressure.with_material(law)
+        return body if body.springs is None else replace(body, springs=None)
+
+    def support_forces(self) -> Tensor:
+        """Return forces of moved supports and of the pressure at rest, (T + 1, N, D) [-].
+
+        They are K_k p of the prescribed displacement p, and C p plus the force of the pressure.
+        """
+        problem = self.problem
+        rest, p = torch.zeros(1, *problem.shape, dtype=torch.float64), problem.prescribed[None]
+        moved = problem.moved_supports
+        forces = [b.tangent_product(rest, p)[0] if moved else rest[0] for b in self.bodies]
+        constant = problem.pressure_at_rest
+        if problem.springs is not None and moved:
+            constant = constant + problem.springs.force(p)[0]
+        return torch.stack([*forces, constant])
+
+    @cached_property
+    def eigenvalues(self) -> tuple[float, float]:
+        """Smallest and largest ratio of the energies of the two terms of any displacement.
+
+        An energy is a sum over points, so that the ratio lies between those of the moduli of the
+        cells, strain by strain.
+
+        Raises:
+            ValueError: There are not two terms.
+        """
+        if len(self) != 2:
+            raise ValueError(f"there are {len(self)} terms; this is known for two")
+        rest = torch.zeros(1, len(self.problem.cells), 1, 3, 3, dtype=torch.float64)
+        A, B = (_matrices(body.material.tangent(rest)[0, :, 0]) for body in self.bodies)
+        inverse = torch.linalg.inv(torch.linalg.cholesky(A))
+        ratios = torch.linalg.eigvalsh(inverse @ B @ inverse.mT)
+        return float(ratios.min()), float(ratios.max())
+
+    @property
+    def sampled_factors(self) -> Tensor:
+        """Factors at corners and random points of the parameters, (S, T)."""
+        law = self.problem.material
+        return self.factors(law.with_parameters(_samples(law)))
+
+
+def _matrices(moduli: Tensor) -> Tensor:
+    """Return moduli (E, 3, 3, 3, 3) as quadratic forms of six strains, (E, 6, 6)."""
+    i, j = torch.tensor([0, 1, 2, 0, 1, 0]), torch.tensor([0, 1, 2, 1, 2, 2])
+    return moduli[:, i[:, None], j[:, None], i, j]
+
+
+def _samples(law: Material) -> Tensor:
+    """Return points of the parameters of a law, (S, P): corners and random points."""
+    ranges = list(law.parameter_ranges.values())
+    if not ranges:
+        return torch.zeros(1, 0, dtype=torch.float64)
+    low, high = torch.tensor(ranges, dtype=torch.float64).T
+    random = torch.Generator().manual_seed(0)
+    points = torch.rand(SAMPLES, len(ranges), generator=random, dtype=torch.float64)
+    if len(ranges) <= MAX_CORNERS:
+        corners = torch.tensor(list(product((0.0, 1.0), repeat=len(ranges))), dtype=torch.float64)
+        points = torch.cat([corners, points])
+    return low + points * (high - low)

@@ -1,0 +1,106 @@
+"""Solutions for all parameters of a range from those for a few of them."""
+
+import numpy as np
+import pytest
+import torch
+
+from dpl.fem import NeoHookeanLn, Plane, Problem, Sphere
+from dpl.fem.rom.stiffness_interpolation import StiffnessInterpolation
+from dpl.fem.solvers.stiffness_terms import StiffnessTerms
+
+ISOTROPIC = (0.0, 1.5)  # ratios of the energies of lambda and mu
+
+
+def moduli(poisson):
+    nu = np.atleast_1d(poisson)
+    return np.stack([1 / (2 * (1 + nu)), nu / ((1 + nu) * (1 - 2 * nu))], axis=1)
+
+
+def diagonal(factors, b, c=0.0):
+    return 1 / (factors[:, 0] + factors[:, 1] * b + c)
+
+
+def of_range(low, high, **options):
+    return StiffnessInterpolation.of(moduli(np.linspace(low, high, 101)), ISOTROPIC, **options)
+
+
+def weights_at(interpolation, factors):
+    return interpolation.weights(torch.from_numpy(factors))[0].numpy()
+
+
+@pytest.mark.parametrize("ends", [(0.2, 0.4), (0.0, 0.45), (0.0, 0.49), (-0.4, 0.1)])
+@pytest.mark.parametrize("springs", [False, True])
+def test_every_component_of_a_solution_is_interpolated_to_the_bound(ends, springs):
+    found = of_range(*ends, springs=springs)
+    nodes = np.array(found.nodes)
+    random = np.random.default_rng(0)
+    for poisson in random.uniform(*ends, 20):
+        weights = weights_at(found, moduli(poisson))
+        for b in random.uniform(*ISOTROPIC, 10):
+            for c in (0.0, *(10.0 ** random.uniform(-4, 4, 5) if springs else ())):
+                value = weights @ diagonal(nodes, b, c)
+                assert value == pytest.approx(diagonal(moduli(poisson), b, c)[0], rel=2e-4)
+
+
+def test_the_weights_of_a_node_are_those_of_its_solution():
+    found = of_range(0.2, 0.4)
+    for k, node in enumerate(found.nodes):
+        weights = weights_at(found, np.array([node]))
+        assert weights == pytest.approx(np.eye(len(found.nodes))[k], abs=1e-5)
+
+
+def test_one_ratio_needs_one_solution():
+    found = of_range(0.3, 0.3)
+    assert np.array(found.nodes) == pytest.approx(moduli(0.3))
+    assert weights_at(found, moduli(0.3)) == pytest.approx([1.0])
+
+
+def test_wider_ranges_need_more_solutions():
+    counts = [len(of_range(0.0, high).nodes) for high in (0.1, 0.3, 0.45, 0.49)]
+    assert counts == sorted(set(counts))
+    assert counts[-1] < 12
+
+
+def inclusion(grid, young):
+    laws = {"core": NeoHookeanLn(0.3, young), "other": NeoHookeanLn(0.4)}
+    region = {"core": Sphere([0.0, 0.0, 0.0], 0.7)}
+    return Problem.build(grid("hexahedron"), laws, regions=region, fixed=Plane(0, "min"))
+
+
+def test_energies_of_a_stiff_inclusion_are_between_those_of_its_parts(grid):
+    """One stiffness with a range: two terms, whose energies differ by at most that range."""
+    terms = StiffnessTerms.of(inclusion(grid, young=[1.0, 100.0]))
+    assert len(terms) == 2
+    assert max(terms.eigenvalues) / min(terms.eigenvalues) == pytest.approx(100.0)
+
+
+@pytest.mark.parametrize("young", [1.0, 3.7, 41.0, 100.0])
+def test_solutions_of_a_stiff_inclusion_are_interpolated(grid, young):
+    problem = inclusion(grid, young=[1.0, 100.0])
+    terms = StiffnessTerms.of(problem)
+    found = StiffnessInterpolation.of_terms(terms)
+    body = problem.with_parameters(torch.tensor([[young]]).double())
+    weights = found.weights(terms.factors(body.material))[0].numpy()
+    matrices = [terms.body(torch.tensor(node).double()) for node in found.nodes]
+    exact = full(body)
+    right = np.random.default_rng(0).standard_normal(len(exact))
+    each = [np.linalg.solve(full(matrix), right) for matrix in matrices]
+    answer = np.linalg.solve(exact, right)
+    assert np.linalg.norm(weights @ each - answer) < 2e-4 * np.linalg.norm(answer)
+
+
+def full(body):
+    one = torch.eye(int(body.free.sum())).double()
+    fields = torch.zeros(len(one), *body.shape).double()
+    fields[:, body.free] = one
+    return body.tangent_product(torch.zeros_like(fields), fields)[:, body.free].numpy()
+
+
+def test_two_stiffnesses_with_ranges_have_too_many_terms(grid):
+    laws = {"core": NeoHookeanLn(0.3, young=[1.0, 9.0]), "other": NeoHookeanLn([0.2, 0.4])}
+    region = {"core": Sphere([0.0, 0.0, 0.0], 0.7)}
+    problem = Problem.build(grid("hexahedron"), laws, regions=region, fixed=Plane(0, "min"))
+    terms = StiffnessTerms.of(problem)
+    assert len(terms) == 3
+    with pytest.raises(ValueError, match="a sum of 3 matrices"):
+        StiffnessInterpolation.of_terms(terms)
