@@ -5,7 +5,7 @@ from pathlib import Path
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from dpl.fem import InvariantBasedMaterial, Material, YoungPoissonMaterial
+from dpl.fem import FibreReinforced, InvariantBasedMaterial, Material, YoungPoissonMaterial
 
 FILES = sorted((Path(__file__).parents[1] / "conf" / "material").glob("*.yaml"))
 LAWS: dict[str, Material] = {
@@ -13,3 +13,4 @@ LAWS: dict[str, Material] = {
 }
 HOOKEAN = [type(law) for law in LAWS.values() if isinstance(law, YoungPoissonMaterial)]
 COMPILED = [name for name, law in LAWS.items() if isinstance(law, InvariantBasedMaterial)]
+ISOTROPIC = [name for name, law in LAWS.items() if not isinstance(law, FibreReinforced)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import skfem
 import torch
-from laws import LAWS
+from laws import ISOTROPIC, LAWS
 from torch import Tensor
 
 from dpl.fem import (
@@ -40,6 +40,12 @@ def laws() -> dict[str, Material]:
 @pytest.fixture(params=LAWS)
 def any_law(request) -> Material:
     """Each of all laws."""
+    return LAWS[request.param]
+
+
+@pytest.fixture(params=ISOTROPIC)
+def isotropic_law(request) -> Material:
+    """Each law without fibres."""
     return LAWS[request.param]
 
 
