@@ -260,7 +260,7 @@ class Scene:
         for name, ends in problem.material.parameter_ranges.items():
             lines.append(
                 f"one set of modes and scales for {name} = {ends[0]:.4g} to {ends[1]:.4g}, those "
-                f"of {sum(ends) / 2:.4g}; each load has its own, an input, and a K(0) of its own"
+                f"of {ends.middle:.4g}; each load has its own, an input, and a K(0) of its own"
             )
         if problem.pressure_ranges:
             names = ", ".join(problem.pressure_ranges)

@@ -40,6 +40,8 @@ def plain(value: Any) -> Any:
     """Return a value as plain data: real numbers as floats, so that 1 and 1.0 are equal, arrays as
     their SHA-256, dataclasses by name and options, functions by name.
     """
+    if getattr(value, "is_log", False):  # a range with another distribution
+        return {"low": float(value[0]), "high": float(value[1]), "distribution": "log"}
     if isinstance(value, Mapping):
         return {key: plain(one) for key, one in value.items()}
     if isinstance(value, list | tuple):

@@ -302,6 +302,6 @@ class Problem(BodyVariants):
         for law, (_, chosen) in zip(laws, groups, strict=True):
             # Copies: sending a problem to a worker process moves the memory of its tensors.
             dN, dV = (one if self.equal_cells else one[chosen] for one in (self.dN, self.dV))
-            arrays = (one.numpy().copy() for one in (self.cells[chosen], dN, dV))
-            kernels.append(Kernels(law, *arrays, places[chosen.numpy()]))
+            parts = self.cells[chosen].numpy(), dN.numpy(), dV.numpy(), places[chosen.numpy()]
+            kernels.append(Kernels(law, *(part.copy() for part in parts)))
         return kernels[0] if len(kernels) == 1 else GroupedKernels(kernels)

@@ -1,5 +1,6 @@
 """Position of loads relative to the range of the training."""
 
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 from torch import Tensor
@@ -39,7 +40,7 @@ class RangeCheck(NamedTuple):
         return [type(self)(*column) for column in columns]
 
 
-def _inputs(surrogate: Surrogate, load: Load) -> list[tuple[Tensor, tuple[float, float]]]:
+def _inputs(surrogate: Surrogate, load: Load) -> Sequence[tuple[Tensor, tuple[float, float]]]:
     """Return the moduli (B,) that are inputs of the network, each with its range."""
     loads, takes = surrogate.scene.loads, getattr(surrogate.net, "extra_inputs", ())
     pairs = list(zip(load.parameters.unbind(1), loads.parameter_ranges.values(), strict=True))

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from dpl.fem.ranges import ParameterRange
 from dpl.models.linear_base import check_base
 from dpl.scene import Scene
 
@@ -53,9 +54,9 @@ class ScalarInputs:
 
 
 def normalise_parameters(
-    parameters: Tensor | None, ranges: Mapping[str, tuple[float, float]], like: Tensor
+    parameters: Tensor | None, ranges: Mapping[str, ParameterRange], like: Tensor
 ) -> Tensor:
-    """Return parameters mapped linearly from their ranges to [-1, 1], (B, P).
+    """Return parameters mapped from their ranges to [-1, 1], (B, P).
 
     Args:
         parameters: Values of `Problem.parameter_ranges`, (B, P).
@@ -67,5 +68,5 @@ def normalise_parameters(
     """
     if parameters is None:
         raise ValueError(f"parameters are an input of this network; give {list(ranges)}, (B, P)")
-    low, high = parameters.new_tensor(list(ranges.values())).T
-    return ((2 * parameters - (low + high)) / (high - low)).to(like)
+    pairs = zip(ranges.values(), parameters.unbind(1), strict=True)
+    return torch.stack([ends.normalise(column) for ends, column in pairs], dim=1).to(like)

@@ -117,7 +117,7 @@ class Body:
         self.surface = Surface.of(self.scene.problem)
         self.young = moduli_of(self.scene.loads).middle
         ranges = self.scene.loads.parameter_ranges
-        self.parameters = {name: sum(ends) / 2 for name, ends in ranges.items()}
+        self.parameters = {name: ends.middle for name, ends in ranges.items()}
         self._without_galerkin = simulator
         if self.has_galerkin:
             self._without_galerkin = Simulator(simulator.surrogate, steps=0)

@@ -82,8 +82,8 @@ class EquilibriumCriterion(TensorAssembly):
         """Bound over the largest displacement, (1,) or (B,) [-]."""
         size = self.dN.norm(dim=-1)  # (E or 1, Q, A)
         terms = (self.dV[..., None] * size * size.sum(-1, keepdim=True)).sum(1)
-        moduli = self.material.lam + 2 * self.material.mu
-        moduli = torch.as_tensor(moduli, dtype=terms.dtype, device=terms.device)  # to (B, E, 1)
+        modulus = self.material.lam + 2 * self.material.mu
+        moduli = torch.as_tensor(modulus, dtype=terms.dtype, device=terms.device)  # to (B, E, 1)
         terms = (moduli.reshape((1,) * (3 - moduli.ndim) + moduli.shape) * terms)[..., None]
         terms = terms.expand(-1, len(self.cells), -1, self.shape[1])
         summed = self._sum_at_nodes(terms)[..., 0]

@@ -73,7 +73,7 @@ _KINDS: dict[Law, _LawType] = {}
 
 def _kind(law: Law) -> _LawType:
     """Return the type of a law."""
-    functions = [law.material.invariant_derivatives]
+    functions: list[Any] = [law.material.invariant_derivatives]
     functions += [law.fibres.strain_derivatives] if law.fibres else []
     code = repr([_code_of(function) for function in functions]) + law.sources
     digest = hashlib.sha256(code.encode()).hexdigest()[:16]
@@ -201,7 +201,8 @@ def set_fibre_derivatives(law, c, e, out, moduli):
 
 @overload(set_fibre_derivatives)
 def _overloaded_fibres(law, c, e, out, moduli):
-    return _COMPILED[law.name][1]
+    # numba types the call for laws without fibres too; LLVM removes it
+    return _COMPILED[law.name][1] or (lambda law, c, e, out, moduli: None)
 
 
 def has_fibres(law):

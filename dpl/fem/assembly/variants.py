@@ -10,6 +10,7 @@ from torch import Tensor
 from dpl.fem.assembly.equilibrium import EquilibriumCriterion
 from dpl.fem.assembly.follower_pressure import PressureSurface
 from dpl.fem.materials.material import Material
+from dpl.fem.ranges import ParameterRange
 
 MAX_CLONES = 64  # bodies of other parameters that are kept
 
@@ -58,12 +59,14 @@ class BodyVariants(EquilibriumCriterion):
         return twin
 
     @property
-    def parameter_ranges(self) -> dict[str, tuple[float, float]]:
+    def parameter_ranges(self) -> dict[str, ParameterRange]:
         """Ranges of what differs between loads beside forces and Young's modulus, by name.
 
         They are the ranges of the law [-], then those of follower pressures [Pa].
         """
-        return {**self.material.parameter_ranges, **self.pressure_ranges}
+        pressures = self.pressure_ranges.items()
+        own = {name: ParameterRange.of(name, ends) for name, ends in pressures}
+        return {**self.material.parameter_ranges, **own}
 
     def law_parameters(self, parameters: Tensor) -> Tensor:
         """Return those of the parameters (B, P) that belong to the law."""
@@ -92,7 +95,7 @@ class BodyVariants(EquilibriumCriterion):
         """Return the body of another law; mesh and pattern are shared, for the same law kernels."""
         twin = self._share(replace(self, material=material))
         laws = [
-            [(type(law), len(cells)) for law, cells in one.groups(len(self.cells))]
+            [(law.classes, len(cells)) for law, cells in one.groups(len(self.cells))]
             for one in (material, self.material)
         ]
         if laws[0] == laws[1]:
@@ -105,12 +108,12 @@ class BodyVariants(EquilibriumCriterion):
 
     @cached_property
     def reference(self) -> Self:
-        """The problem at the centre of all ranges; itself without a range.
+        """The problem at the middle of all ranges; itself without a range.
 
         Modes, scales and largest loads are those of this problem.
         """
         ranges = self.parameter_ranges.values()
-        return self.with_parameters(torch.tensor([[sum(ends) / 2 for ends in ranges]]).double())
+        return self.with_parameters(torch.tensor([[ends.middle for ends in ranges]]).double())
 
     @property
     def generic(self) -> Self:
@@ -119,8 +122,7 @@ class BodyVariants(EquilibriumCriterion):
         Laws of two regions are equal for these parameters only if they are for all.
         """
         ranges = list(self.parameter_ranges.values())
-        parts = [(k + 1) / (len(ranges) + 1) for k in range(len(ranges))]
-        values = [low + t * (high - low) for t, (low, high) in zip(parts, ranges, strict=True)]
+        values = [ends.at((k + 1) / (len(ranges) + 1)) for k, ends in enumerate(ranges)]
         return self.with_parameters(torch.tensor([values]).double())
 
     def with_pressure_factor(self, factor: float) -> Self:

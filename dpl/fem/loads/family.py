@@ -14,6 +14,7 @@ from dpl.fem.identity import identity_of
 from dpl.fem.loads.sampling import SAMPLINGS, Array
 from dpl.fem.loads.young import Young, YoungRange
 from dpl.fem.problem import Problem
+from dpl.fem.ranges import ParameterRange
 from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.solution import Load
 
@@ -38,7 +39,7 @@ class LoadFamily(Protocol):
         ...
 
     @property
-    def parameter_ranges(self) -> Mapping[str, tuple[float, float]]:
+    def parameter_ranges(self) -> Mapping[str, ParameterRange]:
         """Ranges of what differs between loads beside these, see `Problem.parameter_ranges`."""
         ...
 
@@ -196,7 +197,7 @@ class RandomLoads(LoadFamily):
         return self.moduli.low, self.moduli.high
 
     @property
-    def parameter_ranges(self) -> Mapping[str, tuple[float, float]]:
+    def parameter_ranges(self) -> Mapping[str, ParameterRange]:
         """Ranges of what differs between loads beside these, see `Problem.parameter_ranges`."""
         return self.problem.parameter_ranges
 
@@ -228,9 +229,10 @@ class RandomLoads(LoadFamily):
 
     def parameters_at(self, points: Tensor) -> Tensor:
         """Return the parameters of the law of points (B, d), (B, P), see `parameter_ranges`."""
-        ranges = points.new_tensor(list(self.parameter_ranges.values())).reshape(-1, 2)
-        low, high = ranges.T
-        return low + (high - low) * points[:, self.n_force + 1 :]
+        own = points[:, self.n_force + 1 :]
+        pairs = zip(self.parameter_ranges.values(), own.unbind(1), strict=True)
+        columns = [ends.at(column) for ends, column in pairs]
+        return torch.stack(columns, dim=1) if columns else own
 
     def sample(
         self, seed: int | Sequence[int], indices: Sequence[int], *, amplitude: float = 1.0

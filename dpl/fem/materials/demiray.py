@@ -1,7 +1,7 @@
 """Demiray's exponential law with the isochoric first invariant."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -10,6 +10,7 @@ from dpl.fem.materials.arithmetic import exp
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.isochoric import isochoric_derivatives, isochoric_invariants
 from dpl.fem.materials.material import check_moduli
+from dpl.fem.materials.parameters import Constant
 
 
 @dataclass(frozen=True)
@@ -27,9 +28,11 @@ class DemirayK2(InvariantBasedMaterial):
         bulk: Bulk modulus over E [-].
     """
 
-    a: float
-    b: float
-    bulk: float
+    ranged: ClassVar[tuple[str, ...]] = ("a", "b", "bulk")
+
+    a: Constant
+    b: Constant
+    bulk: Constant
 
     def check_constants(self) -> None:
         """See `Material.check_constants`."""
@@ -40,12 +43,23 @@ class DemirayK2(InvariantBasedMaterial):
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
         i1, _, j = isochoric_invariants(H)
-        return self.a / (2 * self.b) * torch.expm1(self.b * i1) + self.bulk / 2 * j.square()
+        half, b, bulk = self.constants
+        return half / b * torch.expm1(b * i1) + bulk / 2 * j.square()
 
     @property
     def constants(self) -> tuple[float, ...]:
         """Return a/2, b and bulk."""
-        return self.a / 2, self.b, self.bulk
+        return self._number("a") / 2, self._number("b"), self._number("bulk")
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus at rest over Young's modulus [-]."""
+        return self.constants[0] * 2
+
+    @property
+    def lam(self) -> float:
+        """First Lame parameter at rest over Young's modulus [-]."""
+        return self._number("bulk") - 2 / 3 * self.mu
 
     @staticmethod
     def invariant_derivatives(

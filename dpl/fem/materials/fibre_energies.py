@@ -279,7 +279,7 @@ class LinearFibres(FibreEnergy):
             c[4] * E11 + c[9] * E22 + c[13] * E33 + c[16] * E12 + c[18] * E23 + c[19] * E13,
             c[5] * E11 + c[10] * E22 + c[14] * E33 + c[17] * E12 + c[19] * E23 + c[20] * E13,
         )
-        return S, tuple(c[k] for k in range(21))
+        return S, c
 
 
 def components(e: Tensor) -> tuple[Tensor, ...]:

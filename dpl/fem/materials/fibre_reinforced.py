@@ -87,6 +87,11 @@ class FibreReinforced(Composed, Material):
         return hash((type(self), self.matrix, self.fibres))
 
     @property
+    def classes(self) -> tuple[type, ...]:
+        """See `Material.classes`."""
+        return type(self), type(self.matrix), type(self.fibres)
+
+    @property
     def parts(self) -> Mapping[str, Any]:
         """See `Composed.parts`."""
         return {"matrix": self.matrix, "fibres": self.fibres}
@@ -198,7 +203,7 @@ class FibreReinforced(Composed, Material):
         """Return the stress of small strains, see `Material.rest_stress`."""
         Q = self._rotation(H)
         strain = Q.mT @ (H + H.mT) @ Q / 2
-        D = _moduli(self._rest_moduli(), _REST).to(H)[..., None, :, :]
+        D = _moduli(self._rest_moduli(), _REST).to(H)
         S = (D @ strain.flatten(-2)[..., None])[..., 0].unflatten(-1, (3, 3))
         return self.matrix.rest_stress(H) + Q @ S @ Q.mT
 
@@ -216,7 +221,7 @@ class FibreReinforced(Composed, Material):
         first, rest = moduli.split([count := self.matrix.rest_moduli.shape[1], len(moduli) - count])
         columns = rest.view(21, -1, 1)
         fibres = LinearFibres(columns.flatten().tolist() if columns.shape[1] == 1 else [*columns])
-        return replace(self, matrix=self.matrix.linear_law(first), fibres=fibres)
+        return self.with_parts({"matrix": self.matrix.linear_law(first), "fibres": fibres})
 
     def _rotation(self, H: Tensor) -> Tensor:
         """Return the frames with an axis for the points, (E, 1, 3, 3), or (3, 3) if all are equal.

@@ -15,6 +15,7 @@ from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.material import Material, Response
 from dpl.fem.materials.parameters import Composed
 from dpl.fem.mesh.regions import Origin, Region, Tag, cells_in
+from dpl.fem.ranges import ParameterRange
 
 OTHER = "other"  # region of the cells that belong to no other region
 
@@ -93,7 +94,7 @@ class Heterogeneous(Composed, Material):
 
     def of_cells(self, cells: Tensor) -> Self:
         """See `Material.of_cells`."""
-        layout = Layout.of(self.laws.values(), self._layout.index[cells])
+        layout = Layout.of(self.laws.values(), self._layout.law_of_cell[cells])
         return replace(super().of_cells(cells), layout=layout)
 
     @property
@@ -129,7 +130,7 @@ class Heterogeneous(Composed, Material):
     def identity(self) -> dict[str, Any]:
         """See `Material.identity`; of the regions, the cells count and not their definition."""
         laws = {name: law.identity() for name, law in self.laws.items()}
-        return {"name": type(self).__name__, "laws": laws, "cells": plain(self._layout.index)}
+        return {"name": type(self).__name__, "laws": laws, "cells": plain(self._layout.law_of_cell)}
 
     def describe(self) -> str:
         """See `Material.describe`."""
@@ -209,13 +210,13 @@ class Layout(NamedTuple):
     """Cells of the laws of a heterogeneous body.
 
     Attributes:
-        index: Number of the law of each cell, (E,).
+        law_of_cell: Number of the law of each cell, (E,).
         groups: For each group of laws of one class their numbers, the cells of each, the order that
             sorts these, and all cells of the group in ascending order.
         order: Position of each cell in the cells of the groups, (E,).
     """
 
-    index: Tensor
+    law_of_cell: Tensor
     groups: tuple[tuple[list[int], list[Tensor], Tensor, Tensor], ...]
     order: Tensor
 
@@ -269,7 +270,7 @@ def merge_laws(laws: Sequence[Material], parts: Sequence[Tensor], order: Tensor)
     values: dict[str, Any] = {}
     for name in laws[0].ranged:
         own = [getattr(law, name) for law in laws]
-        if ranges := [value for value in own if isinstance(value, Sequence)]:
+        if ranges := [value for value in own if isinstance(value, ParameterRange)]:
             values[name] = ranges[0]  # such a law has no moduli yet
         elif any(isinstance(value, Tensor) for value in own) or len(set(own)) > 1:
             columns = [as_field(v, len(cells)) for v, cells in zip(own, parts, strict=True)]

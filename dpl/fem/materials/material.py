@@ -6,7 +6,7 @@ its stress as a difference of terms that cancel at rest.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from itertools import product
 from typing import Any, ClassVar, NamedTuple
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.identity import identity_of
-from dpl.fem.materials.parameters import Parametrised
+from dpl.fem.materials.parameters import Constant, Parametrised
 from dpl.fem.materials.tensors import broadcast_modulus, green_lagrange, trace
 
 
@@ -91,6 +91,11 @@ class Material(Parametrised):
             return self.response(green_lagrange(H)).tangent(H)
         hessian = torch.func.vmap(torch.func.hessian(self.energy))
         return hessian(H.reshape(-1, 3, 3)).reshape(*H.shape, 3, 3)
+
+    @property
+    def classes(self) -> tuple[type, ...]:
+        """Classes of the law and its parts, for each of which kernels are compiled once."""
+        return (type(self),)
 
     def identity(self) -> dict[str, Any]:
         """Return class name and parameters as plain data."""
@@ -184,8 +189,8 @@ class YoungPoissonMaterial(Material):
 
     ranged: ClassVar[tuple[str, ...]] = ("poisson", "young")
 
-    poisson: float | Sequence[float]
-    young: float | Sequence[float] = 1.0
+    poisson: Constant
+    young: Constant = 1.0
 
     def check_constants(self) -> None:
         """See `Material.check_constants`."""

@@ -1,6 +1,5 @@
 """Mooney-Rivlin with isochoric invariants."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -9,6 +8,7 @@ from torch import Tensor
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.materials.isochoric import isochoric_invariants, polynomial_derivatives
 from dpl.fem.materials.material import check_moduli
+from dpl.fem.materials.parameters import Constant
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class MooneyRivlinK2(InvariantBasedMaterial):
 
     ranged: ClassVar[tuple[str, ...]] = ("c10", "c01", "bulk")
 
-    c10: float | Sequence[float]
-    c01: float | Sequence[float]
-    bulk: float | Sequence[float]
+    c10: Constant
+    c01: Constant
+    bulk: Constant
 
     def check_constants(self) -> None:
         """See `Material.check_constants`: the body must resist shear and compression."""

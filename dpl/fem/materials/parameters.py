@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import skfem
 import torch
@@ -11,16 +11,21 @@ from torch import Tensor
 
 from dpl.fem.materials.cell_field import CellField
 from dpl.fem.mesh.regions import Origin
+from dpl.fem.ranges import ParameterRange, is_range
 
-Constant = float | Sequence[float] | CellField  # number, range or field
+if TYPE_CHECKING:
+    Constant = Any  # a batch of values goes through the same arithmetic
+else:
+    # number, range or field
+    Constant = float | Sequence[float] | Mapping[str, float | str] | CellField
 
 
 class Parametrised:
     """Dataclass whose constants are numbers, ranges or fields.
 
-    A constant with a range has a value for each load. Constants are then numbers, fields with a
-    value for each cell (E, 1), or, in a batch, values for each member (B, 1, 1). They multiply
-    quantities of the points, (B, E, Q).
+    A constant with a range, [low, high] or {low, high, distribution}, has a value for each load.
+    Constants are then numbers, fields with a value for each cell (E, 1), or, in a batch, values for
+    each member (B, 1, 1). They multiply quantities of the points, (B, E, Q).
 
     Attributes:
         ranged: Names of the constants that may be ranges [low, high] or fields.
@@ -29,13 +34,13 @@ class Parametrised:
     ranged: ClassVar[tuple[str, ...]] = ()
 
     @property
-    def parameter_ranges(self) -> dict[str, tuple[float, float]]:
+    def parameter_ranges(self) -> dict[str, ParameterRange]:
         """Ranges of the constants of which each load has values of its own, by name.
 
         A law with ranges has no moduli: it answers nothing before `with_parameters`.
         """
         values = {name: getattr(self, name) for name in self.ranged}
-        return {name: tuple(v) for name, v in values.items() if isinstance(v, Sequence)}
+        return {name: v for name, v in values.items() if isinstance(v, ParameterRange)}
 
     @property
     def is_batched(self) -> bool:
@@ -100,6 +105,9 @@ class Parametrised:
         Raises:
             ValueError: The law does not allow a value, or a range is none.
         """
+        for name in self.ranged:
+            if is_range(value := getattr(self, name)):
+                object.__setattr__(self, name, ParameterRange.of(name, value))
         unknown = any(hasattr(getattr(self, name), "on") for name in self.ranged)
         if self.is_batched or unknown:
             return
@@ -107,14 +115,7 @@ class Parametrised:
             for extreme in (torch.amin, torch.amax):
                 replace(cast("Any", self), **{n: float(extreme(v)) for n, v in fields.items()})
             return
-        ranges = self.parameter_ranges
-        for name, ends in ranges.items():
-            if len(ends) != 2 or not ends[0] < ends[1]:
-                raise ValueError(
-                    f"{name} = {list(ends)} must be a range [low, high], low below high"
-                )
-            object.__setattr__(self, name, tuple(map(float, ends)))
-        if not ranges:
+        if not (ranges := self.parameter_ranges):
             self.check_constants()
             return
         for corner in product(*ranges.values()):
@@ -127,7 +128,7 @@ class Parametrised:
             ValueError: It is a range.
         """
         value = getattr(self, name)
-        if isinstance(value, Sequence):
+        if isinstance(value, ParameterRange):
             raise ValueError(
                 f"{name} = {list(value)} is a range; choose a value with "
                 "Problem.with_parameters, or give Load.parameters for each load"
@@ -155,7 +156,7 @@ class Composed(Parametrised):
         raise NotImplementedError
 
     @property
-    def parameter_ranges(self) -> dict[str, tuple[float, float]]:
+    def parameter_ranges(self) -> dict[str, ParameterRange]:
         """See `Parametrised.parameter_ranges`."""
         return self._by_part(lambda part: part.parameter_ranges)
 

@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
+from dpl.fem.materials.parameters import Constant
 from dpl.fem.materials.tensors import volume_change
 
 
@@ -24,7 +25,9 @@ class VolumetricK2(InvariantBasedMaterial):
         bulk: Bulk modulus over E [-].
     """
 
-    bulk: float
+    ranged: ClassVar[tuple[str, ...]] = ("bulk",)
+
+    bulk: Constant
 
     def check_constants(self) -> None:
         """See `Material.check_constants`."""
@@ -33,12 +36,22 @@ class VolumetricK2(InvariantBasedMaterial):
 
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
-        return self.bulk / 2 * volume_change(H).square()
+        return self._number("bulk") / 2 * volume_change(H).square()
 
     @property
     def constants(self) -> tuple[float, ...]:
         """Return bulk."""
-        return (self.bulk,)
+        return (self._number("bulk"),)
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus at rest [-]: zero."""
+        return 0.0
+
+    @property
+    def lam(self) -> float:
+        """First Lame parameter at rest over Young's modulus [-]."""
+        return self._number("bulk")
 
     @staticmethod
     def invariant_derivatives(
@@ -59,7 +72,7 @@ class VolumetricK4(VolumetricK2):
     def energy(self, H: Tensor) -> Tensor:
         """Return the energy density, see `Material.energy`."""
         j = volume_change(H)
-        return self.bulk / 4 * (j * (2 + j) - 2 * torch.log1p(j))
+        return self._number("bulk") / 4 * (j * (2 + j) - 2 * torch.log1p(j))
 
     @staticmethod
     def invariant_derivatives(

@@ -23,7 +23,6 @@ from dpl.fem.assembly.prediction_loops import (
 )
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.linear.condensation import Fronts
-from dpl.fem.materials.heterogeneous import as_field
 from dpl.fem.materials.invariant_based import InvariantBasedMaterial
 from dpl.fem.parity import Parities, SignedOrbits
 from dpl.fem.rom.reduced_stiffness import ReducedInverse
@@ -47,7 +46,7 @@ def law_arguments(law: InvariantBasedMaterial) -> LawArguments:
     The law belongs to the sample cells in the order of the loop. Its constants are followed by mu
     and lambda, (1, n + 2) or (C, n + 2).
     """
-    rows = [constants_of(law)[0], *(as_field(one, 1) for one in (law.mu, law.lam))]
+    rows = [constants_of(law)[0], *(np.reshape(one, (-1, 1)) for one in (law.mu, law.lam))]
     count = max(map(len, rows))
     constants = np.concatenate([np.broadcast_to(row, (count, row.shape[1])) for row in rows], 1)
     terms = required_terms(law), float(law.finite)

@@ -120,10 +120,9 @@ def _samples(law: Material) -> Tensor:
     ranges = list(law.parameter_ranges.values())
     if not ranges:
         return torch.zeros(1, 0, dtype=torch.float64)
-    low, high = torch.tensor(ranges, dtype=torch.float64).T
     random = torch.Generator().manual_seed(0)
     points = torch.rand(SAMPLES, len(ranges), generator=random, dtype=torch.float64)
     if len(ranges) <= MAX_CORNERS:
         corners = torch.tensor(list(product((0.0, 1.0), repeat=len(ranges))), dtype=torch.float64)
         points = torch.cat([corners, points])
-    return low + points * (high - low)
+    return torch.stack([ends.at(t) for ends, t in zip(ranges, points.T, strict=True)], dim=1)
