@@ -1,0 +1,255 @@
+"""Bodies of several laws: each cell has its own, with and without compiled loops."""
+
+import numpy as np
+import pytest
+import skfem
+import torch
+
+from dpl.fem import (
+    Box,
+    CellField,
+    ConstantFibres,
+    FibreReinforced,
+    Guccione,
+    Heterogeneous,
+    LinearElastic,
+    Load,
+    MooneyRivlinK2,
+    NeoHookeanLn,
+    Newton,
+    OgdenK2,
+    Plane,
+    Problem,
+    SaintVenantKirchhoff,
+    Tag,
+    VolumetricK2,
+    YeohK2,
+    solve,
+    symmetries,
+)
+from dpl.fem.postprocess import RestStiffness
+
+LEFT = {"core": Box([0.0, 0.0, 0.0], [0.5, 1.0, 1.0])}
+FIBRES = FibreReinforced(VolumetricK2(5.0), Guccione(0.4, 8.0, 2.0, 4.0), ConstantFibres([1, 1, 0]))
+PAIRS = {
+    "one class": (NeoHookeanLn(0.3, 10.0), NeoHookeanLn(0.2)),
+    "two classes": (YeohK2(2.0, -0.1, 0.05, 20.0), SaintVenantKirchhoff(0.3)),
+    "fibres": (FIBRES, NeoHookeanLn(0.3)),
+    "not compiled": (OgdenK2([1.0], [2.0], 5.0), MooneyRivlinK2(0.15, 0.05, 2.0)),
+}
+
+
+class Reference(Problem):
+    """A problem without compiled loops."""
+
+    def _kernels(self, displacement):
+        return None
+
+
+def grid(cells=(6, 2, 2)):
+    ticks = [np.linspace(0, side, n + 1) for side, n in zip((1, 0.3, 0.3), cells, strict=True)]
+    return skfem.MeshHex.init_tensor(*ticks)
+
+
+def body(core, other, mesh=None, **options):
+    laws = {"core": core, "other": other}
+    options = {"regions": LEFT, "fixed": Plane(0, "min")} | options
+    return Problem.build(mesh or grid(), laws, **options)
+
+
+def displacement(problem, size=0.01):
+    random = torch.Generator().manual_seed(0)
+    return size * torch.randn(1, *problem.shape, generator=random, dtype=torch.float64)
+
+
+def end_load(problem, size=2e-4):
+    force = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    force[:, problem.points[:, 0] > 0.99, 2] = -size
+    return Load(force, torch.ones(1))
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_loops_of_several_laws_are_those_of_the_tensors(pair):
+    problem = body(*PAIRS[pair])
+    plain, u = Reference(**problem.__getstate__()), displacement(problem)
+    found, expected = problem.linearise(u), plain.linearise(u)
+    for name in ("force", "tangent"):
+        a, b = getattr(found, name), getattr(expected, name)
+        assert (a - b).abs().max() < 1e-13 * b.abs().max()
+    gap = problem.update_strain_gap(None, 1.0, u)
+    mixed = problem.linearise(u, gap)
+    again = plain.linearise(u, plain.update_strain_gap(None, 1.0, u))
+    assert (mixed.force - again.force).abs().max() < 1e-13 * again.force.abs().max()
+    assert problem.evaluate(u).volume_ratio == pytest.approx(plain.evaluate(u).volume_ratio)
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_force_is_the_slope_of_the_energy(pair):
+    problem, step = body(*PAIRS[pair]), 1e-5
+    u, v = displacement(problem), displacement(problem).flip(1)
+    rise = problem.energy(u + step * v) - problem.energy(u - step * v)
+    slope = (problem.internal_force(u) * v).sum()
+    assert float(rise / (2 * step)) == pytest.approx(float(slope), rel=1e-7)
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_the_tangent_is_the_slope_of_the_force(pair):
+    problem, step = body(*PAIRS[pair]), 1e-5
+    u, v = displacement(problem), displacement(problem).flip(1)
+    change = problem.internal_force(u + step * v) - problem.internal_force(u - step * v)
+    product = problem.tangent_product(u, v)
+    assert (change / (2 * step) - product).abs().max() < 1e-7 * product.abs().max()
+
+
+def test_regions_of_one_law_are_a_body_of_this_law():
+    law = NeoHookeanLn(0.3)
+    problem, one = body(law, law), Problem.build(grid(), law, fixed=Plane(0, "min"))
+    u = displacement(one)
+    assert torch.equal(problem.evaluate(u).internal, one.evaluate(u).internal)
+    assert len(symmetries(problem)) == len(symmetries(one))
+
+
+def test_a_stiff_half_is_no_image_of_the_soft_one():
+    """A body fixed nowhere has 16 symmetries; those that swap the halves are lost."""
+    free = {"fixed": np.zeros(len(grid().p.T), dtype=bool)}
+    law = NeoHookeanLn(0.3)
+    assert len(symmetries(body(law, law, **free))) == 16
+    assert len(symmetries(body(NeoHookeanLn(0.3, 2.0), law, **free))) == 8
+    ranges = body(NeoHookeanLn(0.3, [1, 9]), NeoHookeanLn(0.3, [1, 9]), **free)
+    assert len(symmetries(ranges)) == 8  # also where both are equal in the middle of their ranges
+
+
+def test_a_bar_of_two_laws_in_series_has_the_sum_of_their_strains():
+    """Uniaxial stress without Poisson's effect: exact in linear elements."""
+    problem = body(LinearElastic(0.0, 4.0), LinearElastic(0.0), fixed=Plane(0, "min"))
+    force = torch.zeros(1, *problem.shape, dtype=torch.float64)
+    area = torch.zeros(problem.shape[0], dtype=torch.float64)
+    end = (problem.points[:, 0] > 0.99).nonzero()[:, 0]
+    for y in problem.points[end, 1].unique():
+        for z in problem.points[end, 2].unique():
+            at = (problem.points[end, 1:] - torch.stack([y, z])).abs().amax(1) < 1e-9
+            inner = [1.0 if 0.01 < float(c) < 0.29 else 0.5 for c in (y, z)]
+            area[end[at]] = inner[0] * inner[1] * 0.15**2
+    force[0, :, 0] = 1e-4 * area
+    u = solve(Newton(problem), Load(force, torch.ones(1))).displacement
+    stress = 1e-4
+    middle = (problem.points[:, 0] - 0.5).abs() < 1e-9
+    assert u[0, middle, 0].numpy() == pytest.approx(stress * 0.5 / 4, rel=1e-9)
+    assert u[0, end, 0].numpy() == pytest.approx(stress * (0.5 / 4 + 0.5), rel=1e-9)
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_newton_solves_bodies_of_several_laws(pair):
+    problem = body(*PAIRS[pair])
+    solution = solve(Newton(problem), end_load(problem))
+    assert solution.converged.all()
+    assert solution.displacement.abs().max() > 0.01
+
+
+def test_a_field_of_stiffness_is_that_of_its_values():
+    def stiffness(points):
+        return 1 + 9 * (points[:, 0] < 0.5)
+
+    field = Problem.build(grid(), NeoHookeanLn(0.3, CellField(stiffness)), fixed=Plane(0, "min"))
+    problem = body(NeoHookeanLn(0.3, 10.0), NeoHookeanLn(0.3))
+    u = displacement(problem)
+    assert torch.equal(field.linearise(u).tangent, problem.linearise(u).tangent)
+    assert field.material.describe() == "NeoHookeanLn(poisson=0.3, young from 1 to 10)"
+
+
+def test_tags_of_cells_name_regions():
+    mesh = grid().with_subdomains({"core": lambda x: x[0] < 0.5})
+    problem = body(*PAIRS["one class"], mesh=mesh, regions={})
+    expected = body(*PAIRS["one class"])
+    u = displacement(problem)
+    assert torch.equal(problem.evaluate(u).internal, expected.evaluate(u).internal)
+    tagged = body(*PAIRS["one class"], mesh=mesh, regions={"core": Tag("core")})
+    assert torch.equal(tagged.evaluate(u).internal, expected.evaluate(u).internal)
+
+
+def test_parameters_have_the_name_of_their_region():
+    problem = body(NeoHookeanLn(0.3, [1, 100]), YeohK2([0.1, 0.3], 0.0, 0.0, 2.0))
+    assert problem.parameter_ranges == {"core.young": (1, 100), "other.c10": (0.1, 0.3)}
+    values = torch.tensor([[5.0, 0.2], [80.0, 0.15]]).double()
+    batch, u = problem.with_parameters(values), displacement(problem).expand(2, -1, -1)
+    for k, (young, c10) in enumerate(values.tolist()):
+        one = body(NeoHookeanLn(0.3, young), YeohK2(c10, 0.0, 0.0, 2.0))
+        for name in ("energy", "internal_force", "roundoff_bound"):
+            found, expected = getattr(batch, name)(u)[k], getattr(one, name)(u[k : k + 1])[0]
+            assert torch.allclose(found, expected, rtol=1e-12, atol=1e-18), name
+        found = batch.evaluate(u.contiguous()).internal[k]
+        assert torch.allclose(found, one.internal_force(u[:1])[0], rtol=1e-10, atol=1e-16)
+
+
+def test_products_with_the_stiffness_at_rest_are_those_of_each_member():
+    problem = body(NeoHookeanLn(0.3, [1, 100]), NeoHookeanLn([0.1, 0.4]))
+    values = torch.tensor([[5.0, 0.2], [80.0, 0.35]]).double()
+    v = displacement(problem).expand(2, -1, -1)
+    found = RestStiffness(problem).product(v, values)
+    for k in range(2):
+        one = problem.with_parameters(values[k : k + 1])
+        expected = one.tangent_product(torch.zeros_like(v[:1]), v[k : k + 1])
+        expected = torch.where(one.free, expected, 0.0)
+        free = torch.where(one.free, v[k : k + 1], 0.0)
+        expected = one.tangent_product(torch.zeros_like(v[:1]), free)[0] * one.free
+        assert (found[k] - expected).abs().max() < 1e-12 * expected.abs().max()
+
+
+def test_ranges_may_be_logarithmic():
+    spread = {"low": 1.0, "high": 100.0, "distribution": "log"}
+    problem = body(NeoHookeanLn(0.3, spread), NeoHookeanLn(0.3))
+    ends = problem.parameter_ranges["core.young"]
+    assert ends == (1, 100)
+    assert ends.middle == pytest.approx(10)
+    assert float(ends.at(torch.tensor(0.25).double())) == pytest.approx(10**0.5)
+    assert ends.normalise(torch.tensor([1.0, 10.0, 100.0])).tolist() == pytest.approx([-1, 0, 1])
+    identity = problem.material.identity()["laws"]["core"]["young"]
+    assert identity == {"low": 1.0, "high": 100.0, "distribution": "log"}
+    assert problem.reference.material.laws["core"].young == pytest.approx(10)
+
+
+BROKEN = {
+    "regions: 4 cells belong to both core and end": {
+        "laws": {"core": NeoHookeanLn(0.3), "end": NeoHookeanLn(0.3), "other": NeoHookeanLn(0.3)},
+        "regions": LEFT | {"end": Box([0.4, 0.0, 0.0], [1.0, 1.0, 1.0])},
+    },
+    "regions: 12 of 24 cells belong to no region; add material.other": {
+        "laws": {"core": NeoHookeanLn(0.3)},
+    },
+    "all cells belong to other regions": {
+        "laws": {"core": NeoHookeanLn(0.3), "other": NeoHookeanLn(0.3)},
+        "regions": {"core": Box([0.0, 0.0, 0.0], [2.0, 1.0, 1.0])},
+    },
+    "material.core: Box.* holds no cell": {
+        "laws": {"core": NeoHookeanLn(0.3), "other": NeoHookeanLn(0.3)},
+        "regions": {"core": Box([5.0, 0.0, 0.0], [6.0, 1.0, 1.0])},
+    },
+    "material.cor: Tag.*no tags at all; define regions.cor": {
+        "laws": {"cor": NeoHookeanLn(0.3), "other": NeoHookeanLn(0.3)},
+        "regions": {},
+    },
+    "regions: core has no law; add material.core": {"laws": {"other": NeoHookeanLn(0.3)}},
+    "LinearElastic is a law of small strains": {
+        "laws": {"core": LinearElastic(0.3), "other": NeoHookeanLn(0.3)},
+    },
+    "material: there is no law": {"laws": {}, "regions": {}},
+}
+
+
+@pytest.mark.parametrize("message", BROKEN)
+def test_invalid_regions_are_refused_in_one_line(message):
+    options = {"regions": LEFT} | BROKEN[message]
+    with pytest.raises(ValueError, match=message) as caught:
+        Problem.build(grid(), options["laws"], regions=options["regions"])
+    assert "\n" not in str(caught.value)
+
+
+def test_a_law_whose_cells_are_not_known_says_so():
+    with pytest.raises(ValueError, match="use Problem.build"):
+        Heterogeneous({"core": NeoHookeanLn(0.3)}, LEFT).energy(torch.zeros(1, 1, 1, 3, 3))
+
+
+@pytest.mark.parametrize("values", [[1.0, 2.0], np.full(24, np.nan)])
+def test_a_field_without_a_number_for_each_cell_is_refused(values):
+    with pytest.raises(ValueError, match="must be 24 finite numbers, one for each cell"):
+        Problem.build(grid(), NeoHookeanLn(0.3, CellField(np.asarray(values))))
