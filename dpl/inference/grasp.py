@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dpl.fem import AndersonSolver, Load, Newton, RigidPatch, Solution, evaluate_solution
-from dpl.fem.solvers import check_tol
 from dpl.inference.answer import summarise
-from dpl.inference.arguments import as_load, as_number, as_numbers
+from dpl.inference.arguments import as_load, as_numbers
 from dpl.inference.error_estimate import corotational_error
 from dpl.inference.grasp_forces import Forces, predicted_forces
 from dpl.inference.hybrid import Hybrid
+from dpl.inference.request import Budget, Request
 from dpl.inference.training_range import RangeCheck
 from dpl.scene import Scene
 from dpl.system.threads import one_thread
@@ -52,6 +52,8 @@ class GraspAnswer:
         method: "network", "corrected", "hybrid" or "full Newton".
         iterations: Predictions of the network and corrections, or linear solves of Newton's method.
         milliseconds: Wall time [ms].
+        stopped: True if the budget ended the search for the forces, the correction or Newton's
+            method.
         summary: Motion, estimated error, residual and range in words.
     """
 
@@ -70,6 +72,7 @@ class GraspAnswer:
     method: str
     iterations: int
     milliseconds: float
+    stopped: bool
     summary: str
 
 
@@ -138,7 +141,7 @@ def evaluated(
 
 
 def candidates(
-    patch: RigidPatch, load: Load, newton: Newton, forces: Forces, steps: int
+    patch: RigidPatch, load: Load, newton: Newton, forces: Forces, steps: int, budget: Budget
 ) -> Iterator[Candidate]:
     """Yield the prediction under the forces of a gripper, corrected if possible, and equilibrium.
 
@@ -152,11 +155,12 @@ def candidates(
         patch, load, newton: See `evaluated`.
         forces: Forces of the gripper by the network.
         steps: Largest number of iterations of the correction; 0: the prediction is not corrected.
+        budget: Ends correction and Newton's method; their last states are yielded.
     """
     field, count, goal = forces.field, forces.predictions, newton.problem.prescribed
     near = field if forces.found else patch.moved_to(goal, field)
     guess = torch.where(newton.problem.free, near, goal)[None]
-    best = corrected(load, newton, guess, steps) if steps else None
+    best = corrected(load, newton, guess, steps, budget) if steps else None
     if best is None:
         state = evaluate_solution(newton.problem, field[None], load, newton.tol, from_guess=True)
         yield Candidate(
@@ -165,11 +169,18 @@ def candidates(
     else:
         guess = best.displacement
         yield Candidate("corrected", best._replace(iterations=best.iterations + count))
-    *_, last = Hybrid(lambda load: guess, newton).iterate(load)
+    clock = time.perf_counter()
+    for last in Hybrid(lambda load: guess, newton).iterate(load):
+        now = time.perf_counter()
+        pace, clock = now - clock, now
+        if not last.converged and budget.over(pace):
+            break
     yield Candidate("hybrid" if bool(last.from_guess) else "full Newton", last)
 
 
-def corrected(load: Load, newton: Newton, guess: Tensor, steps: int) -> Solution | None:
+def corrected(
+    load: Load, newton: Newton, guess: Tensor, steps: int, budget: Budget
+) -> Solution | None:
     """Return the iterate of least residual from a guess (1, N, D); None if that is inverted."""
     valid: list[Solution] = []
     for state in AndersonSolver(newton, max_iter=steps).iterate(load, guess=guess):
@@ -178,6 +189,8 @@ def corrected(load: Load, newton: Newton, guess: Tensor, steps: int) -> Solution
         valid.append(state)
         last = [one.displacement for one in valid[-2:]]
         if len(valid) > 1 and (last[1] - last[0]).norm() < CORRECTED * last[1].norm():
+            break
+        if len(valid) <= steps and budget.over():
             break
     return min(valid, key=lambda one: float(one.residual), default=None)
 
@@ -211,7 +224,9 @@ class Gripper:
         young: float | None = None,
         parameters: Mapping[str, float] | ArrayLike | None = None,
         tol: float | None = None,
+        budget_ms: float | None = None,
         warm: bool = False,
+        sliding: bool = False,
         steps: int | None = None,
     ) -> GraspAnswer:
         """Return the displacement of the body with a grasped patch; see `Simulator.grasp`.
@@ -219,30 +234,30 @@ class Gripper:
         `steps` replaces the attribute if it is given.
         """
         begin = time.perf_counter()
-        if (tolerance := as_number("tol", tol)) is not None:
-            check_tol(tolerance)
+        request = Request.checked(tol, budget_ms, None, warm=warm)._replace(begin=begin)
+        budget = Budget(request)
         load = self._load(force, young, parameters)
-        patch, path = self._patch(region, translation, rotation, load)
+        patch, path = self._patch(region, translation, rotation, load, sliding=sliding)
         goal = path(1.0)
         with one_thread(), torch.inference_mode():
             newton = patch.newton(self.scene.corrector, goal)
-            newton = newton if tolerance is None else replace(newton, tol=tolerance)
+            newton = newton if request.tol is None else replace(newton, tol=request.tol)
             start = self._last[1] if warm and self._last and self._last[0] is patch else None
             scale = self._motion_without(patch, load)
             predict = partial(self._predict, load)
-            forces = predicted_forces(patch, path, predict, start, scale=scale)
+            forces = predicted_forces(patch, path, predict, start, scale=scale, is_over=budget.over)
             self._last = patch, forces.force
             own = Load(load.force, load.young)  # the body of Newton's method has the parameters
             count = self.steps if steps is None else steps
-            every = candidates(patch, own, newton, forces, count)
+            every = candidates(patch, own, newton, forces, count, budget)
             held = evaluated(patch, goal, own, newton, next(every))
-            if tolerance is not None and not held.is_exact:
+            if request.tol is not None and not held.is_exact and not budget.over():
                 solved = evaluated(patch, goal, own, newton, next(every))
                 held = min(held, solved, key=lambda one: one.rank)
             place = RangeCheck.of(
                 self.surrogate, load._replace(force=load.force + patch.at(held.force))
             )
-        return self._reported(patch, load, held, place, begin)
+        return self._reported(patch, load, held, place, request, stopped=budget.spent)
 
     def _load(self, force: Any, young: Any, parameters: Any) -> Load:
         """Return the other forces on the body as a load, B = 1."""
@@ -260,7 +275,7 @@ class Gripper:
         return load._replace(force=constant[None] * (modulus / load.young))
 
     def _patch(
-        self, region: Any, translation: Any, rotation: Any, load: Load
+        self, region: Any, translation: Any, rotation: Any, load: Load, *, sliding: bool
     ) -> tuple[RigidPatch, Callable[[float], Tensor]]:
         """Return the patch and the displacement (m,) [-] of its held degrees of freedom.
 
@@ -278,19 +293,27 @@ class Gripper:
                 f"translation = {moves}, rotation = {turn.tolist()} must be {dim} lengths [m] and "
                 f"{count} angles [rad], all finite"
             )
-        patch = self.patch(region, [x is not None for x in moves], load.parameters)
+        directions = [x is not None for x in moves]
+        patch = self.patch(region, directions, load.parameters, sliding=sliding)
         moved = lengths / scene.length
         return patch, lambda part: patch.displacement(
             (part * moved).tolist(), (part * turn).tolist()
         )
 
-    def patch(self, region: Any, directions: Sequence[bool], parameters: Tensor) -> RigidPatch:
+    def patch(
+        self,
+        region: Any,
+        directions: Sequence[bool],
+        parameters: Tensor,
+        *,
+        sliding: bool = False,
+    ) -> RigidPatch:
         """Return a patch, one of the last `MAX_PATCHES` or a new one; see `RigidPatch.of`.
 
         `parameters` are those of the law, (1, P).
         """
         linear = self.scene.linear.with_parameters(parameters)
-        patch = RigidPatch.of(linear, region, directions)
+        patch = RigidPatch.of(linear, region, directions, sliding=sliding)
         key = patch.held.numpy().tobytes() + parameters.numpy().tobytes()
         patch = self._patches.setdefault(key, patch)
         self._patches.move_to_end(key)
@@ -310,7 +333,14 @@ class Gripper:
         return self.surrogate.predict(load._replace(force=load.force + own))[0]
 
     def _reported(
-        self, patch: RigidPatch, load: Load, held: Held, place: RangeCheck, begin: float
+        self,
+        patch: RigidPatch,
+        load: Load,
+        held: Held,
+        place: RangeCheck,
+        request: Request,
+        *,
+        stopped: bool,
     ) -> GraspAnswer:
         """Return a state as an answer in SI units."""
         scene, state = self.scene, held.state
@@ -320,6 +350,8 @@ class Gripper:
         kept = held.is_exact
         amplitude, out_of_span, outside = (float(column) for column in place)
         words = summarise(state, kept, held.error, amplitude, out_of_span, bool(outside))
+        if stopped:
+            words += f"; stopped by the budget of {request.budget_ms:g} ms"
         missed = held.motion_error * scene.length
         return GraspAnswer(
             displacement=scene.length * state.displacement[0].numpy(),
@@ -336,6 +368,7 @@ class Gripper:
             out_of_distribution=bool(outside),
             method=held.method,
             iterations=int(state.iterations),
-            milliseconds=1e3 * (time.perf_counter() - begin),
+            milliseconds=1e3 * (time.perf_counter() - request.begin),
+            stopped=stopped,
             summary=f"motion error {missed:.1e} m; {words}",
         )

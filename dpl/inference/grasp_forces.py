@@ -15,6 +15,11 @@ PARTS = 2, 4, 8  # numbers of parts into which a motion is divided if that is ne
 MEMORY = 8  # iterations from which Anderson's method extrapolates
 
 
+def never() -> bool:
+    """Return False: the time is not limited."""
+    return False
+
+
 class Forces(NamedTuple):
     """Forces of a gripper with the prediction of a network under them.
 
@@ -40,6 +45,7 @@ def predicted_forces(
     start: Tensor | None = None,
     *,
     scale: float = 0.0,
+    is_over: Callable[[], bool] = never,
 ) -> Forces:
     """Return forces of the gripper that move the patch as prescribed, through a network.
 
@@ -57,19 +63,23 @@ def predicted_forces(
         start: Forces to start from, (m,); the linear ones if left out.
         scale: Size of the motion of the patch without the gripper [-]; errors are relative to it or
             to the prescribed motion, whichever is larger.
+        is_over: Returns True if no further prediction may be made; there is always one.
     """
     scale = max(scale, float(path(1.0).abs().max()))
     first = patch.stiffness_times(path(1.0)) if start is None else start
-    best = balanced_forces(patch, path(1.0), predict, first, scale)
+    best = balanced_forces(patch, path(1.0), predict, first, scale, is_over)
     total = best.predictions
     for parts in PARTS:
         if best.found:
             break
         force = patch.stiffness_times(path(1 / parts))
         for k in range(1, parts + 1):
-            last = balanced_forces(patch, path(k / parts), predict, force, scale)
+            if is_over():
+                break
+            last = balanced_forces(patch, path(k / parts), predict, force, scale, is_over)
             total, force = total + last.predictions, last.force * (k + 1) / k
-        best = min(best, last, key=lambda one: one.gap)
+        else:
+            best = min(best, last, key=lambda one: one.gap)
     return best._replace(predictions=total)
 
 
@@ -79,6 +89,7 @@ def balanced_forces(
     predict: Callable[[Tensor], Tensor],
     force: Tensor,
     scale: float,
+    is_over: Callable[[], bool] = never,
 ) -> Forces:
     """Return forces of the gripper under which the predicted patch is displaced by the goal.
 
@@ -91,7 +102,7 @@ def balanced_forces(
     squares problem of differences).
 
     Args:
-        patch, predict, scale: See `predicted_forces`.
+        patch, predict, scale, is_over: See `predicted_forces`.
         goal: Displacement of the held degrees of freedom, (m,) [-].
         force: Forces to start from, (m,) [-].
     """
@@ -108,7 +119,7 @@ def balanced_forces(
         best = (
             Forces(force, field, size, count, found) if better else best._replace(predictions=count)
         )
-        if found or not math.isfinite(size):
+        if found or not math.isfinite(size) or is_over():
             break
         forces, steps = [*forces[-MEMORY:], force], [*steps[-MEMORY:], patch.stiffness_times(gap)]
         force = force + steps[-1]

@@ -111,3 +111,20 @@ class Request(NamedTuple):
         if self.budget_ms is None:
             return False
         return 1e3 * (time.perf_counter() - self.begin + ahead) > self.budget_ms
+
+
+class Budget:
+    """Budget of a call that records whether it has ended a computation.
+
+    Attributes:
+        spent: True if a computation ended because of it.
+    """
+
+    def __init__(self, request: Request) -> None:
+        """Store a request, whose time has begun."""
+        self._request, self.spent = request, False
+
+    def over(self, ahead: float = 0.0) -> bool:
+        """Return True if this time from now [s] exceeds the budget; the caller then ends."""
+        self.spent = self.spent or self._request.over(ahead)
+        return self.spent

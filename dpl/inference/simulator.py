@@ -170,7 +170,9 @@ class Simulator:
         young: float | None = None,
         parameters: Mapping[str, float] | ArrayLike | None = None,
         tol: float | None = None,
+        budget_ms: float | None = None,
         warm: bool = False,
+        sliding: bool = False,
     ) -> GraspAnswer:
         """Return the displacement of the body while a gripper moves a patch of its boundary.
 
@@ -190,15 +192,21 @@ class Simulator:
             young: Young's modulus [Pa]; optional if the scene has only one.
             parameters: A value for each range of the law, by its name or as an array (P,).
             tol: Relative residual of the result [-]; None: the prediction of the network.
+            budget_ms: Wall time [ms]. No prediction is started after it, and no iteration of Newton
+                that would exceed it. A new patch is prepared and one prediction made in any case.
             warm: Begin with the forces of the last call if it grasped the same patch.
+            sliding: Hold the largest part of the patch that faces one way along a coordinate axis,
+                along this axis alone, as a flat plate does that is lubricated and does not lift
+                off. Components of the motion across have no effect.
 
         Raises:
-            ValueError: An argument has a wrong shape or is out of range, or the patch has no node
-                that is free to move.
+            ValueError: An argument has a wrong shape or is out of range, the patch has no node that
+                is free to move, or a patch that slides faces no axis.
         """
         return self._gripper(
             region, translation, rotation,
-            force=force, young=young, parameters=parameters, tol=tol, warm=warm,
+            force=force, young=young, parameters=parameters, tol=tol, budget_ms=budget_ms,
+            warm=warm, sliding=sliding,
         )  # fmt: skip
 
     @cached_property

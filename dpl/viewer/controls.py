@@ -32,7 +32,8 @@ class Controls:
         mode: Mode of a drag, `PULL` or `GRASP`.
         radius: Radius of the patch over L; each mode has its own.
         direction, amplitude, unlimited, uniform: The patch load, visible in the mode `PULL`.
-        axis, angle: Rotation of the patch, visible in the mode `GRASP`; in 2D there is no axis.
+        axis, angle, sliding: Rotation of the patch and whether it slides, visible in the mode
+            `GRASP`; in 2D there is no axis.
         young: Slider of Young's modulus, in a unit with prefix; `modulus` is its value in Pa.
         parameters: Sliders of the ranges of law and pressures, by name.
         sample, reset, fit: Buttons for a random load, for no load and for the camera.
@@ -63,7 +64,7 @@ class Controls:
             self._state = gui.add_html(panel.message(f"Files are saved in {folder}", "inherit"))
             self.save = gui.add_button_group("save as", tuple(SUFFIXES))
         self.follows_frame = False
-        of_patch = (self.radius, self.axis, self.angle)
+        of_patch = (self.radius, self.axis, self.angle, self.sliding)
         self.of_load = (self.direction, self.amplitude, self.uniform, *of_patch)
         self.of_moduli = (self.young, *self.parameters.values())
         shown = (self.quantity, self.edges, self.show_newton)
@@ -83,6 +84,8 @@ class Controls:
         self.amplitude = gui.add_slider("amplitude", -2.0, 2.0, 0.01, 0.0, marks=(-1, 0, 1))
         self.axis = gui.add_dropdown("rotation axis", tuple(AXES), initial_value="y")
         self.angle = gui.add_slider("rotation [°]", -90.0, 90.0, 1.0, 0.0, marks=(-90, 0, 90))
+        hint = "hold the patch along its normal alone, so that it slides in its plane"
+        self.sliding = gui.add_checkbox("sliding", False, hint=hint)
         self._young_unit = unit_for(body.young, "Pa")
         low, high = (value / self._young_unit.factor for value in body.young_range)
         label, middle = f"E [{self._young_unit.name}]", body.young / self._young_unit.factor
@@ -125,7 +128,7 @@ class Controls:
         self.radius.value, self._shown_mode = self._radii[mode], mode
         for control in (self.direction, self.amplitude, self.unlimited, self.uniform):
             control.visible = mode == PULL
-        self.angle.visible = mode == GRASP
+        self.angle.visible = self.sliding.visible = mode == GRASP
         self.axis.visible = mode == GRASP and self._body.scene.problem.shape[1] == 3
 
     @property

@@ -6,7 +6,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from dpl.fem import HasModes
+from dpl.fem import HasModes, RigidPatch
 from dpl.scene import Scene
 
 RIDGE = 1e-2  # Tikhonov parameter over the squared compliance; limits the use of stiff modes
@@ -43,6 +43,19 @@ class Patch:
         """Mask of the nodes that a gripper holds, those of the boundary that are free, (N,)."""
         problem = self.scene.problem
         return self.node_mask & problem.boundary & problem.free.any(dim=1)
+
+    @cached_property
+    def sliding_nodes(self) -> Tensor:
+        """Mask of the nodes that are held while the patch slides, (N,); none if it cannot."""
+        problem = self.scene.problem
+        try:
+            directions = [True] * problem.shape[1]
+            held = RigidPatch.of(
+                self.scene.linear, self.held_nodes.numpy(), directions, sliding=True
+            )
+        except ValueError:
+            return torch.zeros_like(self.held_nodes)
+        return held.nodes
 
     @cached_property
     def unit_loads(self) -> Tensor:

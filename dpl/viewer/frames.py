@@ -182,6 +182,8 @@ class Body:
         rotation: Tensor,
         young: float | None = None,
         parameters: Mapping[str, float] | None = None,
+        *,
+        sliding: bool = False,
     ) -> GraspRequest:
         """Return the request of a grasp, with the constant force of the scene.
 
@@ -190,15 +192,18 @@ class Body:
             translation, rotation: See `GraspRequest`.
             young: Young's modulus [Pa].
             parameters: Value of each range of the law, by name.
+            sliding: See `GraspRequest`.
 
         Raises:
             ValueError: A value is out of its range, or the patch is empty.
         """
         if not nodes.any():
+            lacks = "facet across x, y or z" if sliding else "free node"
             raise ValueError(
-                "the patch has no free node of the boundary; click another place or enlarge radius"
+                f"the patch has no {lacks} of the boundary; click another place or enlarge radius"
             )
-        return GraspRequest(nodes, translation, rotation, self.zero_load(young, parameters))
+        others = self.zero_load(young, parameters)
+        return GraspRequest(nodes, translation, rotation, others, sliding)
 
     def sample(self, index: int) -> LoadRequest:
         """Return a random load of the training distribution."""
@@ -214,6 +219,11 @@ class Body:
         reference: Tensor | float = 0.0
         if settings.quantity == ERROR:
             exact = request.answer(simulator, self.scene.solver.tol, warm=True)
+            if isinstance(exact, GraspAnswer) and exact.stopped:
+                raise ValueError(
+                    f"colours: no finite-element solution of this grasp after "
+                    f"{exact.milliseconds / 1e3:.1f} s; move the hand back"
+                )
             reference = torch.as_tensor(exact.displacement)
         displacement = torch.as_tensor(answer.displacement)
         load = request.load(answer)

@@ -132,11 +132,12 @@ class GraspingHand:
 
     def marked_nodes(self, node: int) -> Tensor:
         """Mask of the held nodes, (N,)."""
-        return self._patch(node).held_nodes
+        patch = self._patch(node)
+        return patch.sliding_nodes if self._controls.sliding.value else patch.held_nodes
 
     def _grip(self, node: int, frame: Frame | None) -> None:
         """Hold the patch of a node where a frame shows it, without a rotation."""
-        held = self._patch(node).held_nodes
+        held = self.marked_nodes(node)
         self._translation = torch.zeros_like(self._translation)
         if frame is not None and held.any():
             self._translation = frame.displacement[held].mean(dim=0) / self._body.scene.length
@@ -149,10 +150,12 @@ class GraspingHand:
         """Return the request of the held patch with the rotation of the controls."""
         assert self._node is not None
         self._controls.follows_frame = False
-        nodes = self._patch(self._node).held_nodes
+        nodes, sliding = self.marked_nodes(self._node), bool(self._controls.sliding.value)
         translation, rotation = self._translation, self._controls.rotation
 
         def make(young: float, parameters: Mapping[str, float]) -> GraspRequest:
-            return self._body.grasp(nodes, translation, rotation, young, parameters)
+            return self._body.grasp(
+                nodes, translation, rotation, young, parameters, sliding=sliding
+            )
 
         return make

@@ -298,5 +298,6 @@ class Page:
         self._changed = False
         self.controls.show_frame(frame, self._scale.top, self.worker.frame_rate, self.node)
         self.controls.show_newton_frame(self.newton_frame, self.worker.settings.show_newton)
-        self.controls.show_error(self._error or panel.problem_of(frame))
+        has_budget = self.worker.settings.budget_ms is not None
+        self.controls.show_error(self._error or panel.problem_of(frame, has_budget=has_budget))
         self.controls.show_recording(self.recording)

@@ -79,11 +79,19 @@ def _length(vector: ArrayLike) -> str:
     return engineering(float(np.linalg.norm(np.asarray(vector))), "m")
 
 
-def problem_of(frame: Frame) -> str:
-    """Return why a frame cannot be used, in one line; empty if it can."""
+def problem_of(frame: Frame, *, has_budget: bool = False) -> str:
+    """Return why a frame cannot be used, in one line; empty if it can.
+
+    With a budget the user has chosen the time after which a grasp stops, so that this is no reason.
+    """
     if not frame.volume_ratio > 0:
         return "Not valid: an element is inverted. Move the hand back."
     grasp = frame.grasp
+    if grasp is not None and grasp.stopped and not has_budget:
+        return (
+            f"Not solved: stopped after {grasp.milliseconds / 1e3:.1f} s with an estimated error "
+            f"of {relative(grasp.error)}. Move the hand back."
+        )
     if grasp is None or grasp.error < UNRELIABLE:
         return ""
     apart = engineering(grasp.motion_error, "m")

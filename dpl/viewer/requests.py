@@ -10,6 +10,8 @@ from dpl.fem import Load, RigidPatch, Solution
 from dpl.inference import Answer, GraspAnswer, Simulator
 from dpl.scene import Scene
 
+GRASP_LIMIT_MS = 5000.0  # wall time of a grasp with any other method than a budget [ms]
+
 
 class LoadRequest(NamedTuple):
     """A load in SI units.
@@ -82,12 +84,14 @@ class GraspRequest(NamedTuple):
         translation: Displacement of the mean of the patch over L, (D,) [-].
         rotation: Rotation vector about it, (3,), in 2D the angle, (1,) [rad].
         others: The other forces on the body, and the moduli.
+        sliding: True if the patch slides in the plane across its normal, see `Simulator.grasp`.
     """
 
     nodes: Tensor
     translation: Tensor
     rotation: Tensor
     others: LoadRequest
+    sliding: bool = False
 
     @property
     def young(self) -> float:
@@ -106,7 +110,9 @@ class GraspRequest(NamedTuple):
 
     def continues(self, other: "ViewRequest") -> bool:
         """Return True if the page interpolates from another request to this one."""
-        return isinstance(other, GraspRequest) and torch.equal(self.nodes, other.nodes)
+        if not isinstance(other, GraspRequest) or self.sliding != other.sliding:
+            return False
+        return torch.equal(self.nodes, other.nodes)
 
     def at(self, coordinates: Tensor, young: float) -> "GraspRequest":
         """Return the grasp with another motion and another modulus [Pa]."""
@@ -124,11 +130,8 @@ class GraspRequest(NamedTuple):
     ) -> GraspAnswer:
         """Return the answer of a simulator, which begins with the forces of the last grasp.
 
-        Raises:
-            ValueError: There is a budget.
+        Without a budget it takes `GRASP_LIMIT_MS` at most.
         """
-        if budget_ms is not None:
-            raise ValueError("method: a grasp has no time limit; select network or a residual")
         return simulator.grasp(
             self.nodes.numpy(),
             (self.translation * simulator.scene.length).tolist(),
@@ -137,7 +140,9 @@ class GraspRequest(NamedTuple):
             young=self.young,
             parameters=self.parameters,
             tol=tol,
+            budget_ms=GRASP_LIMIT_MS if budget_ms is None else budget_ms,
             warm=warm,
+            sliding=self.sliding,
         )
 
     def load(self, answer: Answer | GraspAnswer) -> LoadRequest:
@@ -160,7 +165,8 @@ class GraspRequest(NamedTuple):
         """Yield the iterates of Newton's method from rest, with the patch as a moved support."""
         load = self.others.dimensionless(scene)
         linear = scene.linear.with_parameters(load.parameters)
-        patch = RigidPatch.of(linear, self.nodes.numpy(), [True] * len(self.translation))
+        directions = [True] * len(self.translation)
+        patch = RigidPatch.of(linear, self.nodes.numpy(), directions, sliding=self.sliding)
         motion = patch.displacement(self.translation.tolist(), self.rotation.tolist())
         newton = patch.newton(scene.newton, motion)
         return newton.iterate(Load(load.force, load.young))  # the body has its parameters

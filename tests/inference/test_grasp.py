@@ -85,6 +85,58 @@ def test_a_direction_without_a_value_is_free(scene, sim):
     assert abs(found.force[1]) > 0
 
 
+def test_a_sliding_patch_is_a_roller_that_moves(scene, sim):
+    """The normal motion is met, the reaction in the plane of the patch is zero."""
+    for region, axis, motion in (
+        (END, 0, [6.0, 1.0, -2.0]),
+        (Box([40, 0, 25], [100, 25, 25]), 2, [3.0, 0.0, 1.5]),
+    ):
+        found = sim.grasp(region, motion, tol=1e-9, sliding=True)
+        normal = [g if i == axis else None for i, g in enumerate(motion)]
+        exact = with_supports(scene, DirichletBC(region, normal))
+        assert found.converged
+        assert np.abs(found.displacement - exact).max() < 1e-7 * L
+        across = [i for i in range(3) if i != axis]
+        assert (found.nodal_force[:, across] == 0).all()
+        assert abs(found.force[axis]) > 0
+        assert np.abs(found.displacement[:, across]).max() > 1e-3
+        held = np.abs(found.nodal_force[:, axis]) > 0
+        assert np.allclose(found.displacement[held, axis], motion[axis], atol=1e-9 * L)
+
+
+def test_a_sliding_patch_that_turns_has_the_normal_displacement_of_the_rotation(scene, sim):
+    found = sim.grasp(END, [1.0, 0.0, 0.0], ROTATION, tol=1e-9, sliding=True)
+    rigid = sim.grasp(END, [1.0, 0.0, 0.0], ROTATION, tol=1e-9)
+    where = end_nodes(scene).numpy()
+    assert found.converged
+    assert np.allclose(found.displacement[where, 0], rigid.displacement[where, 0], atol=1e-9 * L)
+    assert (found.nodal_force[:, 1:] == 0).all()
+    assert np.abs(rigid.nodal_force[:, 1:]).max() > 0
+
+
+def test_a_plate_holds_the_largest_flat_part_of_a_patch(scene):
+    """A ball around an edge has nodes of two faces; the plate touches the larger one."""
+    points = scene.problem.points
+    region = Box([50.0, 0.0, 0.0], [100.0, 25.0, 25.0])
+    above = Box([50.0, 0.0, 12.0], [100.0, 25.0, 25.0])  # top, end and parts of two sides
+    for part, axis, place in ((END, 0, 1.0), (above, 2, 0.25)):
+        patch = RigidPatch.of(scene.linear, part, [True] * 3, sliding=True)
+        assert patch.held.any(dim=0).tolist() == [i == axis for i in range(3)]
+        assert (points[patch.nodes, axis] == place).all()
+    whole = RigidPatch.of(scene.linear, region, [True] * 3, sliding=True)
+    assert whole.held.any(dim=0).sum() == 1
+    again = RigidPatch.of(scene.linear, whole.nodes.numpy(), [True] * 3, sliding=True)
+    assert torch.equal(again.held, whole.held)
+
+
+def test_a_network_finds_the_forces_of_a_sliding_patch(scene):
+    found = simulator_of(scene, steps=0).grasp(END, [2.0, 0.0, 0.0], ROTATION, sliding=True)
+    exact = simulator_of(scene).grasp(END, [2.0, 0.0, 0.0], ROTATION, sliding=True, tol=1e-9)
+    assert found.method == "network"
+    assert found.motion_error < 1e-3 * L
+    assert abs(found.force[0] - exact.force[0]) < 0.01 * abs(exact.force[0])
+
+
 def test_the_patch_moves_as_a_rigid_body(scene, solved):
     where = end_nodes(scene).numpy()
     before = L * scene.problem.points.numpy()[where]
@@ -194,6 +246,42 @@ def test_a_motion_that_the_network_misses_is_closed_by_the_linear_displacement(s
     assert deaf.grasp(END, motion, ROTATION).method == "corrected"
 
 
+def test_a_budget_ends_the_search_for_forces(scene):
+    """Of a network that moves the other way, whose forces are never found."""
+    slow = simulator_of(scene, lambda load: -linear_network(scene)(load), steps=0)
+    free = slow.grasp(END, TRANSLATION)
+    found = slow.grasp(END, TRANSLATION, budget_ms=1e-3)
+    assert (free.stopped, found.stopped) == (False, True)
+    assert found.iterations == 1 < free.iterations
+    assert found.motion_error > 0
+    assert found.summary.endswith("stopped by the budget of 0.001 ms")
+    assert np.isfinite(found.displacement).all()
+
+
+def test_a_budget_ends_newtons_method_and_the_answer_is_the_best_state(scene, monkeypatch):
+    sim = simulator_of(scene, linear_network(scene))
+    sim.grasp(END, TRANSLATION, ROTATION)  # prepares the patch
+    now, original = [0.0], Newton.iterate
+
+    def slowly(newton, *more, **options):
+        for state in original(newton, *more, **options):
+            yield state
+            now[0] += 10.0
+
+    monkeypatch.setattr(Newton, "iterate", slowly)
+    monkeypatch.setattr("dpl.inference.grasp.time.perf_counter", lambda: now[0])
+    found = sim.grasp(END, TRANSLATION, ROTATION, tol=1e-14, budget_ms=15e3)
+    assert found.stopped
+    assert not found.converged
+    assert "stopped by the budget" in found.summary
+    assert found.motion_error < 1e-12 * L
+    now[0] = 0.0
+    met = sim.grasp(END, TRANSLATION, ROTATION, tol=1e-6, budget_ms=1e6)
+    assert met.converged
+    assert not met.stopped
+    assert "budget" not in met.summary
+
+
 def test_a_warm_start_needs_fewer_predictions(scene):
     sim = simulator_of(scene, steps=0)
     cold = sim.grasp(END, TRANSLATION, ROTATION)
@@ -294,6 +382,9 @@ def test_a_body_in_the_plane_turns_by_an_angle(make_scene):
         (lambda sim: sim.grasp(np.ones(3, dtype=bool), [0, 0, 0]), "mask"),
         (lambda sim: sim.grasp(END, [0, 0, "a"]), "real numbers"),
         (lambda sim: sim.grasp(END, [0, 0, 0], young=-1.0), "young"),
+        (lambda sim: sim.grasp(END, [0, 0, 0], budget_ms=0), "budget_ms"),
+        (lambda sim: sim.grasp(END, [None, 0, 0], sliding=True), "hold"),
+        (lambda sim: sim.grasp(Sphere([100, 25, 25], 1.0), [0, 0, 0], sliding=True), "sliding"),
     ],
 )
 def test_invalid_arguments_are_refused_in_one_line(sim, call, words):

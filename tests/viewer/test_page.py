@@ -124,7 +124,7 @@ def test_each_mode_has_its_controls_and_its_radius(any_page):
     for mode in (GRASP, PULL):
         select(any_page, mode)
         assert {control.visible for control in of_pull} == {mode == PULL}
-        assert controls.angle.visible == (mode == GRASP)
+        assert controls.angle.visible == controls.sliding.visible == (mode == GRASP)
         assert controls.axis.visible == (mode == GRASP and not planar)
     assert controls.radius.value == 0.31
     select(any_page, GRASP)
@@ -195,21 +195,39 @@ def test_a_state_that_cannot_be_used_is_reported_in_one_line(page):
         assert bool(words) == bool(content)
 
 
-def test_a_grasp_has_no_time_limit(page):
+def test_a_grasp_that_takes_too_long_is_stopped_and_reported(page, monkeypatch):
+    monkeypatch.setattr("dpl.viewer.requests.GRASP_LIMIT_MS", 1e-3)
     assert page.worker.wait(240)
     select(page, GRASP)
     drag_tip(page, np.array([0.0, 0.0, 0.04]))
+    page.refresh()
+    assert page.frame.grasp.stopped
+    assert "Not solved: stopped after 0." in page.controls._error.content
     page.controls.method.value = "best within the budget"
+    page.controls.budget.value = 1e4
     page.apply_settings(None)
     assert page.worker.wait(240)
     page.refresh()
-    assert "a grasp has no time limit" in page.controls._error.content
-    page.controls.method.value = "residual below 1e-06"
-    page.apply_settings(None)
-    assert page.worker.wait(240)
-    page.refresh()
-    assert page.controls._error.content == ""
     assert page.frame.converged
+    assert page.controls._error.content == ""
+
+
+def test_a_sliding_patch_moves_along_its_normal(any_page):
+    page = any_page
+    select(page, GRASP)
+    page.controls.sliding.value = True
+    page.controls.radius.value = 0.3
+    drag_tip(page, np.array([0.02, 0.01, 0.0]))
+    request, grasp = page.frame.request, page.frame.grasp
+    assert request.sliding
+    assert page._error == ""
+    pushed = np.abs(grasp.nodal_force).max(axis=0) > 0
+    assert pushed.sum() == 1
+    normal = int(pushed.argmax())
+    moved = page.frame.displacement[request.nodes, normal] / page.body.scene.length
+    assert torch.allclose(moved, request.translation[normal].expand_as(moved), atol=1e-4)
+    mask = request.nodes[page.body.surface.nodes]
+    assert page._marker.mask.tolist() == mask.tolist(), "the nodes that are pushed are marked"
 
 
 def test_a_long_solve_is_reported_until_its_frame_is_shown(page, monkeypatch):

@@ -9,7 +9,7 @@ import torch
 from dpl.viewer.frames import ERROR, ViewSettings
 from dpl.viewer.hands import GraspingHand
 from dpl.viewer.load_arrow import arrow_ends
-from dpl.viewer.requests import distance, interpolate, scale_of
+from dpl.viewer.requests import GRASP_LIMIT_MS, distance, interpolate, scale_of
 
 EXACT = ViewSettings(tol=1e-8)
 UP = torch.tensor([0.0, 0.0, 0.08]).double()
@@ -145,10 +145,50 @@ def test_a_patch_without_free_nodes_is_refused(body):
 def test_values_out_of_range_are_refused(body, grasp):
     with pytest.raises(ValueError, match="young = 1 must lie between"):
         body.grasp(grasp.nodes, UP, TURN, 1.0)
-    with pytest.raises(ValueError, match="a grasp has no time limit"):
-        body.solve(grasp, ViewSettings(tol=1e-6, budget_ms=20.0))
     with pytest.raises(ValueError, match="all finite"):
         body.solve(body.grasp(grasp.nodes, float("nan") * UP, TURN), ViewSettings())
+
+
+def test_a_sliding_grasp_continues_only_another_one(body, grasp):
+    sliding = grasp._replace(sliding=True)
+    assert sliding.continues(sliding)
+    assert not sliding.continues(grasp)
+    assert sliding.at(sliding.coordinates, sliding.young).sliding
+
+
+def test_a_sliding_patch_moves_along_its_normal_alone(body):
+    nodes = tip_patch(body).sliding_nodes
+    motion = torch.tensor([0.05, 0.3, 0.3]).double()
+    frame = body.solve(body.grasp(nodes, motion, 0 * TURN, sliding=True), EXACT)
+    moved = frame.displacement[nodes] / body.scene.length
+    assert frame.converged
+    assert torch.allclose(moved[:, 0], motion[0].expand(int(nodes.sum())), atol=1e-9)
+    assert moved[:, 1:].abs().max() < 0.05
+    assert not frame.hand_force[:, 1:].any()
+    *_, last = body.newton_frames(frame.request, EXACT, frame)
+    assert torch.allclose(last.displacement, frame.displacement, atol=1e-6 * 8.0)
+
+
+def test_a_patch_without_a_facet_across_an_axis_cannot_slide(body):
+    nodes = body.patch(tip_patch(body).node, 0.01).sliding_nodes
+    with pytest.raises(ValueError, match="the patch has no facet across x, y or z"):
+        body.grasp(nodes, UP, TURN, sliding=True)
+
+
+def test_a_grasp_without_a_budget_has_the_limit_of_the_page(body, grasp):
+    asked = []
+    simulator = SimpleNamespace(
+        scene=body.scene, grasp=lambda *motion, **options: asked.append(options["budget_ms"])
+    )
+    grasp.answer(simulator, None)
+    grasp.answer(simulator, 1e-8, 20.0)
+    assert asked == [GRASP_LIMIT_MS, 20.0]
+
+
+def test_errors_without_a_reference_are_not_shown(body, grasp, monkeypatch):
+    monkeypatch.setattr("dpl.viewer.requests.GRASP_LIMIT_MS", 1e-3)
+    with pytest.raises(ValueError, match="no finite-element solution of this grasp after"):
+        body.solve(grasp, ViewSettings(quantity=ERROR))
 
 
 def test_held_nodes_are_free_nodes_of_the_boundary(body):
@@ -161,7 +201,10 @@ def test_held_nodes_are_free_nodes_of_the_boundary(body):
 def test_a_hand_takes_a_patch_where_the_body_is_shown(body):
     rotation = torch.zeros(3).double()
     controls = SimpleNamespace(
-        radius=SimpleNamespace(value=0.3), angle=SimpleNamespace(value=5.0), rotation=rotation
+        radius=SimpleNamespace(value=0.3),
+        angle=SimpleNamespace(value=5.0),
+        sliding=SimpleNamespace(value=False),
+        rotation=rotation,
     )
     hand, patch = GraspingHand(body, controls), tip_patch(body)
     frame = body.solve(body.sample(1), EXACT)

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
+import skfem
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -17,6 +18,7 @@ from dpl.fem.solvers.linear import LinearSolver
 from dpl.fem.solvers.newton import Newton
 
 RTOL = 1e-6  # relative residual of the linear solutions that give the compliance [-]
+FACING = 0.966  # smallest cosine, of 15 degrees, between a facet's normal and the axis it faces [-]
 
 
 class Wrench(NamedTuple):
@@ -45,7 +47,12 @@ class RigidPatch:
 
     @classmethod
     def of(
-        cls, linear: LinearSolver, region: Region | NDArray[np.bool_], directions: Sequence[bool]
+        cls,
+        linear: LinearSolver,
+        region: Region | NDArray[np.bool_],
+        directions: Sequence[bool],
+        *,
+        sliding: bool = False,
     ) -> Self:
         """Return the patch of the nodes of the boundary in a region.
 
@@ -53,9 +60,12 @@ class RigidPatch:
             linear: Linear solver of the body.
             region: The region, in the coordinates of the mesh, or a mask of nodes (N,).
             directions: Directions that the gripper holds, (D,); the patch slides along the others.
+            sliding: Hold the largest flat part of the patch along its normal alone, see
+                `flat_part`.
 
         Raises:
-            ValueError: The region has no free node of the boundary, or no direction is held.
+            ValueError: The region has no free node of the boundary, no direction is held, or a
+                sliding patch has no flat part.
         """
         problem = linear.problem
         if isinstance(region, np.ndarray):
@@ -67,10 +77,13 @@ class RigidPatch:
                 )
         else:
             inside = nodes_in(region, problem.basis, problem.length, problem.origin)
-        if not any(directions):
+        nodes, held_axes = torch.from_numpy(inside) & problem.boundary, list(directions)
+        if sliding:
+            nodes, axis = flat_part(problem, nodes)
+            held_axes = [held and i == axis for i, held in enumerate(directions)]
+        if not any(held_axes):
             raise ValueError("translation: the gripper must hold the patch in a direction")
-        nodes = torch.from_numpy(inside) & problem.boundary
-        held = nodes[:, None] & torch.tensor(directions) & problem.free
+        held = nodes[:, None] & torch.tensor(held_axes) & problem.free
         if not held.any():
             raise ValueError("region: no node of the boundary in it is free to move")
         return cls(linear, held)
@@ -168,3 +181,38 @@ class RigidPatch:
         else:
             moment = (arms[:, 0] * forces[:, 1] - arms[:, 1] * forces[:, 0]).sum()[None]
         return Wrench(forces.sum(dim=0), moment)
+
+
+def flat_part(problem: Problem, nodes: Tensor) -> tuple[Tensor, int]:
+    """Return the largest part of a patch that faces one way along an axis, (N,), and the axis.
+
+    It consists of the facets whose normals are within 15 degrees of the axis: the part of the
+    patch that a flat plate across the axis touches.
+
+    Args:
+        problem: The body.
+        nodes: Mask of the nodes of the patch, (N,).
+
+    Raises:
+        ValueError: No facet of the patch is across an axis.
+    """
+    basis, mesh = problem.basis, problem.mesh
+    corners = nodes.numpy()[basis.nodal_dofs[0]]
+    facets = mesh.boundary_facets()
+    facets = facets[corners[mesh.facets[:, facets]].all(axis=0)]
+    areas = np.zeros((len(facets), 2 * mesh.dim()))
+    if len(facets):  # scikit-fem interprets an empty set as the whole boundary
+        boundary = skfem.FacetBasis(mesh, basis.elem, facets=facets)
+        weighted = np.asarray(boundary.normals) * boundary.dx
+        total, area = weighted.sum(axis=2).T, boundary.dx.sum(axis=1)[:, None]
+        both = np.hstack([total, -total])
+        areas = np.where(both >= FACING * area, area, 0.0)
+    if not areas.any():
+        raise ValueError(
+            "sliding: no facet of the patch is within 15 degrees across x, y or z; grasp another "
+            "part, or enlarge the patch"
+        )
+    way = int(areas.sum(axis=0).round(12).argmax())
+    inside = np.zeros(len(nodes), dtype=bool)
+    inside[basis.get_dofs(facets[areas[:, way] > 0]).all()] = True
+    return torch.from_numpy(inside) & nodes, way % mesh.dim()
