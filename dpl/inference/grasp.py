@@ -141,25 +141,22 @@ def evaluated(
 
 
 def candidates(
-    patch: RigidPatch, load: Load, newton: Newton, forces: Forces, steps: int, budget: Budget
+    load: Load, newton: Newton, forces: Forces, steps: int, budget: Budget
 ) -> Iterator[Candidate]:
     """Yield the prediction under the forces of a gripper, corrected if possible, and equilibrium.
 
     The correction makes iterations with the corotated factor of K(0) of the held body until the
-    displacement changes by less than `CORRECTED`. They start from the prediction; where that misses
-    the motion, from its sum with the linear displacement that closes the gap, which inverts fewer
-    elements beside the patch. The equilibrium is that of Newton's method from
+    displacement changes by less than `CORRECTED`. The equilibrium is that of Newton's method from
     the corrected prediction, or from rest where that does not lead to a solution.
 
     Args:
-        patch, load, newton: See `evaluated`.
+        load, newton: See `evaluated`.
         forces: Forces of the gripper by the network.
         steps: Largest number of iterations of the correction; 0: the prediction is not corrected.
         budget: Ends correction and Newton's method; their last states are yielded.
     """
-    field, count, goal = forces.field, forces.predictions, newton.problem.prescribed
-    near = field if forces.found else patch.moved_to(goal, field)
-    guess = torch.where(newton.problem.free, near, goal)[None]
+    field, count = forces.field, forces.predictions
+    guess = torch.where(newton.problem.free, field, newton.problem.prescribed)[None]
     best = corrected(load, newton, guess, steps, budget) if steps else None
     if best is None:
         state = evaluate_solution(newton.problem, field[None], load, newton.tol, from_guess=True)
@@ -249,7 +246,7 @@ class Gripper:
             self._last = patch, forces.force
             own = Load(load.force, load.young)  # the body of Newton's method has the parameters
             count = self.steps if steps is None else steps
-            every = candidates(patch, own, newton, forces, count, budget)
+            every = candidates(own, newton, forces, count, budget)
             held = evaluated(patch, goal, own, newton, next(every))
             if request.tol is not None and not held.is_exact and not budget.over():
                 solved = evaluated(patch, goal, own, newton, next(every))

@@ -26,9 +26,9 @@ class Forces(NamedTuple):
     Attributes:
         force: At held degrees of freedom, (m,) [-].
         field: Displacement, (N, D) [-].
-        gap: Largest entry of the difference between its patch and the goal [-].
+        gap: Largest entry of the difference between the predicted patch and the goal [-].
         predictions: Number of predictions that were made.
-        found: True if the gap is below the tolerance.
+        found: True if the gap is below the tolerance. Otherwise `predicted_forces` has closed it.
     """
 
     force: Tensor
@@ -50,7 +50,9 @@ def predicted_forces(
     """Return forces of the gripper that move the patch as prescribed, through a network.
 
     The forces of the whole motion are sought first. If they are not found, the motion is divided
-    into 2, 4 and 8 parts; the forces of each part start those of the next.
+    into 2, 4 and 8 parts; the forces of each part start those of the next. If the network predicts
+    the motion under no forces, the linear displacement that closes the gap is added to the nearest
+    prediction, and its forces to those of the prediction.
 
     Forces keep their direction while the body moves. An equilibrium that is stable only as long as
     the gripper holds the patch, such as a column that it shortens beyond buckling, is not found.
@@ -80,7 +82,21 @@ def predicted_forces(
             total, force = total + last.predictions, last.force * (k + 1) / k
         else:
             best = min(best, last, key=lambda one: one.gap)
-    return best._replace(predictions=total)
+    best = best._replace(predictions=total)
+    return best if best.found else closed(patch, path(1.0), best)
+
+
+def closed(patch: RigidPatch, goal: Tensor, forces: Forces) -> Forces:
+    """Return forces and displacement plus the linear ones that move the patch to its goal.
+
+    Args:
+        patch: The patch.
+        goal: Displacement of the held degrees of freedom, (m,) [-].
+        forces: Forces with their prediction.
+    """
+    added = patch.stiffness_times(goal - patch.of_field(forces.field))
+    field = forces.field + patch.linear.solve_force(patch.at(added))
+    return forces._replace(force=forces.force + added, field=field)
 
 
 def balanced_forces(
@@ -107,7 +123,8 @@ def balanced_forces(
         force: Forces to start from, (m,) [-].
     """
     energy = patch.compliance_factor.mT  # |L^T f| is the energy norm of forces
-    best = Forces(force, torch.zeros_like(patch.problem.points), math.inf, 0, False)
+    rest = torch.zeros_like(patch.problem.points)
+    best = Forces(torch.zeros_like(force), rest, math.inf, 0, False)
     forces: list[Tensor] = []
     steps: list[Tensor] = []
     for count in range(1, MAX_ITER + 1):

@@ -142,16 +142,6 @@ class RigidPatch:
         """Return the forces, (m,), whose linear solution displaces the patch by (m,) [-]."""
         return torch.cholesky_solve(displacement[:, None], self.compliance_factor)[:, 0]
 
-    def moved_to(self, goal: Tensor, displacement: Tensor) -> Tensor:
-        """Return a displacement (N, D) [-] plus the linear one that moves the patch to its goal.
-
-        Args:
-            goal: Displacement of the body whose values on the patch count, (N, D) [-].
-            displacement: Displacement of the body, (N, D) [-].
-        """
-        forces = self.at(self.stiffness_times(self.of_field(goal - displacement)))
-        return displacement + self.linear.solve_force(forces)
-
     def newton(self, corrector: Newton, displacement: Tensor) -> Newton:
         """Return Newton's method for the body with the patch displaced by (m,) [-].
 
