@@ -57,6 +57,8 @@ class Row:
     Attributes:
         method: "network", "corrected", "hybrid to 1e-6" or "Newton from rest to 1e-6".
         count: Number of grasps.
+        found: Part of the grasps with forces under which the network predicts the motion [%]; 100
+            for Newton's method from rest.
         motion_met: Part of the grasps with all held nodes within 1e-3 L of their places [%].
         rel_L2_median, rel_L2_p95, rel_L2_worst: Relative L2 errors of displacements [-].
         force_median, force_p95, force_worst: Relative errors of the resultant force [-].
@@ -69,6 +71,7 @@ class Row:
 
     method: str
     count: int
+    found: float
     motion_met: float
     rel_L2_median: float
     rel_L2_p95: float
@@ -214,13 +217,14 @@ def measure(
         rest, exact = known
         size = grasp.region.radius / scene.length
         own = _errors(patch, size, (rest.displacement, rest.force), exact)
-        found[NEWTON].append([*own, 0.0, 1.0, own[0], rest.iterations, rest.milliseconds])
+        found[NEWTON].append([*own, 0.0, 1.0, own[0], rest.iterations, rest.milliseconds, 1.0])
         for name, more in options.items():
             answer = gripper(grasp.region, grasp.translation, grasp.rotation, **more)
             u, force = answer.displacement / scene.length, answer.nodal_force / unit
             own = _errors(patch, size, (torch.from_numpy(u), torch.from_numpy(force)), exact)
             quality = [answer.motion_error / scene.length, answer.converged, answer.error]
-            found[name].append([*own, *quality, answer.iterations, answer.milliseconds])
+            work = [answer.iterations, answer.milliseconds, answer.forces_found]
+            found[name].append([*own, *quality, *work])
         done(k + 1)
     return [_row(name, np.array(rows)) for name, rows in found.items()], len(grasps) - len(
         found[NEWTON]
@@ -249,12 +253,13 @@ def _errors(
 
 
 def _row(method: str, values: np.ndarray) -> Row:
-    """Return the row of a method from its numbers, (count, 8), in the order of `measure`."""
-    error, force, moment, motion, converged, estimate, iterations, taken = values.T
+    """Return the row of a method from its numbers, (count, 9), in the order of `measure`."""
+    error, force, moment, motion, converged, estimate, iterations, taken, predicted = values.T
     silent = (error > WRONG) & ~(estimate > REPORTED * error)
     return Row(
         method=method,
         count=len(values),
+        found=100 * float(predicted.mean()),
         motion_met=100 * float((motion <= MET).mean()),
         rel_L2_median=median(error.tolist()),
         rel_L2_p95=float(np.quantile(error, 0.95)),

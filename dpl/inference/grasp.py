@@ -52,6 +52,8 @@ class GraspAnswer:
         method: "network", "corrected", "hybrid" or "full Newton".
         iterations: Predictions of the network and corrections, or linear solves of Newton's method.
         milliseconds: Wall time [ms].
+        forces_found: True if the network predicts the motion under forces that were found. False:
+            the linear displacement closes the gap of the nearest prediction.
         stopped: True if the budget ended the search for the forces, the correction or Newton's
             method.
         summary: Motion, estimated error, residual and range in words.
@@ -72,6 +74,7 @@ class GraspAnswer:
     method: str
     iterations: int
     milliseconds: float
+    forces_found: bool
     stopped: bool
     summary: str
 
@@ -254,7 +257,7 @@ class Gripper:
             place = RangeCheck.of(
                 self.surrogate, load._replace(force=load.force + patch.at(held.force))
             )
-        return self._reported(patch, load, held, place, request, stopped=budget.spent)
+        return self._reported(patch, load, held, place, forces, budget)
 
     def _load(self, force: Any, young: Any, parameters: Any) -> Load:
         """Return the other forces on the body as a load, B = 1."""
@@ -335,9 +338,8 @@ class Gripper:
         load: Load,
         held: Held,
         place: RangeCheck,
-        request: Request,
-        *,
-        stopped: bool,
+        forces: Forces,
+        budget: Budget,
     ) -> GraspAnswer:
         """Return a state as an answer in SI units."""
         scene, state = self.scene, held.state
@@ -347,8 +349,8 @@ class Gripper:
         kept = held.is_exact
         amplitude, out_of_span, outside = (float(column) for column in place)
         words = summarise(state, kept, held.error, amplitude, out_of_span, bool(outside))
-        if stopped:
-            words += f"; stopped by the budget of {request.budget_ms:g} ms"
+        if budget.spent:
+            words += f"; stopped by the budget of {budget.request.budget_ms:g} ms"
         missed = held.motion_error * scene.length
         return GraspAnswer(
             displacement=scene.length * state.displacement[0].numpy(),
@@ -365,7 +367,8 @@ class Gripper:
             out_of_distribution=bool(outside),
             method=held.method,
             iterations=int(state.iterations),
-            milliseconds=1e3 * (time.perf_counter() - request.begin),
-            stopped=stopped,
+            milliseconds=1e3 * (time.perf_counter() - budget.request.begin),
+            forces_found=forces.found,
+            stopped=budget.spent,
             summary=f"motion error {missed:.1e} m; {words}",
         )

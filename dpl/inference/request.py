@@ -117,14 +117,15 @@ class Budget:
     """Budget of a call that records whether it has ended a computation.
 
     Attributes:
+        request: The call.
         spent: True if a computation ended because of it.
     """
 
     def __init__(self, request: Request) -> None:
         """Store a request, whose time has begun."""
-        self._request, self.spent = request, False
+        self.request, self.spent = request, False
 
     def over(self, ahead: float = 0.0) -> bool:
         """Return True if this time from now [s] exceeds the budget; the caller then ends."""
-        self.spent = self.spent or self._request.over(ahead)
+        self.spent = self.spent or self.request.over(ahead)
         return self.spent

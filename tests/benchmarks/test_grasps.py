@@ -54,13 +54,14 @@ def test_better_methods_have_smaller_errors(gripper, some):
     assert hybrid.converged == newton.converged == 100
     assert hybrid.force_worst < 1e-5
     assert all(row.silent == 0 for row in rows)
+    assert all(row.found == 100 for row in rows)
     assert all(row.count == 4 for row in rows)
 
 
 def test_an_error_that_is_not_reported_is_counted():
-    row = [0.5, 0.0, 0.0, 0.0, 1.0, 0.5, 1.0, 1.0]  # error and estimate agree
-    silent = [0.5, 0.0, 0.0, 0.0, 1.0, 0.1, 1.0, 1.0]
-    unknown = [0.5, 0.0, 0.0, 0.0, 1.0, np.nan, 1.0, 1.0]
+    row = [0.5, 0.0, 0.0, 0.0, 1.0, 0.5, 1.0, 1.0, 1.0]  # error and estimate agree
+    silent = [0.5, 0.0, 0.0, 0.0, 1.0, 0.1, 1.0, 1.0, 1.0]
+    unknown = [0.5, 0.0, 0.0, 0.0, 1.0, np.nan, 1.0, 1.0, 1.0]
     assert grasps._row("a", np.array([row, silent, unknown])).silent == 2
 
 

@@ -166,6 +166,7 @@ def test_the_gripper_balances_the_supports(scene, solved):
 def test_an_exact_network_meets_the_motion_and_has_the_reaction(scene, solved):
     found = simulator_of(scene, steps=0).grasp(END, TRANSLATION, ROTATION)
     assert found.method == "network"
+    assert found.forces_found
     assert not found.converged, "a motion that is met to a tolerance is no equilibrium"
     assert 0 < found.motion_error < 1e-3 * L
     assert np.linalg.norm(found.force - solved.force) < 0.01 * np.linalg.norm(solved.force)
@@ -200,6 +201,7 @@ def test_a_poor_network_is_reported_and_corrected(scene, solved):
     off = np.linalg.norm(found.displacement - solved.displacement)
     off /= np.linalg.norm(solved.displacement)
     assert found.motion_error < 1e-6 * L
+    assert not found.forces_found
     assert found.error > off / 3 > 1e-3
     assert found.summary.startswith(f"motion error {found.motion_error:.1e} m; displacement")
     exact = poor.grasp(END, TRANSLATION, ROTATION, tol=1e-9)
