@@ -93,7 +93,7 @@ def planned(
     Args:
         plan: Groups by name, see `benchmarks/conf/paper.yaml`.
         groups: Names of groups; None for all.
-        scale: Further options by experiment; those of "all" are added to each run.
+        scale: Further options by experiment, then by path; those of "all" are added to each run.
         more: Further options of all runs.
 
     Raises:
@@ -121,8 +121,10 @@ def _group(
             for values in itertools.product(*sweep.values()):
                 swept = [f"{key}={value}" for key, value in zip(sweep, values, strict=True)]
                 title = "-".join([own, *map(str, values)])
-                every = [*with_experiment(experiment, options), *swept, *sizes, *more]
-                yield Run(name, f"{folder}/{title}", last_of_each_key(every))
+                path = f"{folder}/{title}"
+                own_sizes = [*sizes, *scale.get(path, ())]
+                every = [*with_experiment(experiment, options), *swept, *own_sizes, *more]
+                yield Run(name, path, last_of_each_key(every))
 
 
 def with_experiment(experiment: str, options: Sequence[str]) -> list[str]:

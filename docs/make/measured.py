@@ -82,9 +82,18 @@ PARTS = (
     Part(
         "transfer",
         "All load families on the beam",
-        "python scripts/transfer.py networks=[unrolled] count=50",
+        "python scripts/transfer.py networks=[unrolled] count=50 families=[cable,gravity,modal,"
+        "modal_small,patch,point,pressure,traction,mixture]",
         "The network of each family on the test loads of all families: errors of the prediction, "
         "and Newton from the prediction and from rest.",
+        split="trained_on",
+    ),
+    Part(
+        "transfer_file",
+        "Forces of a file on the beam",
+        "python scripts/transfer.py families=[file,modal,mixture] networks=[unrolled] "
+        "name=transfer_file count=50",
+        "The same for the forces of fingertips in `benchmarks/loads/fingertips.npz`.",
         split="trained_on",
     ),
     Part(

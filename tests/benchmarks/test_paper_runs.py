@@ -63,6 +63,13 @@ def test_a_recipe_is_combined_with_the_experiment_and_sizes_replace_options():
     assert sum("max_epochs" in one for one in runs["beam_svk/fcnn"].options) == 1
 
 
+def test_sizes_of_a_run_replace_those_of_its_experiment():
+    sizes = SIZES | {"beam_svk/fcnn": ["mesh.nodes=[6,3,3]"]}
+    runs = {run.path: run.options for run in paper_runs.planned(PLAN, ["one"], sizes)}
+    assert "mesh.nodes=[6,3,3]" in runs["beam_svk/fcnn"]
+    assert "mesh.nodes=[5,3,3]" in runs["beam_svk/pod"]
+
+
 def test_an_unknown_group_and_a_path_of_two_runs_are_refused():
     with pytest.raises(ValueError, match="groups = 'two' must be one of one, losses"):
         planned(["two"])

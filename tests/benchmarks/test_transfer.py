@@ -1,8 +1,12 @@
 """Laws of the comparison of networks on other families of loads."""
 
 import csv
+import runpy
 import shutil
+import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -42,6 +46,16 @@ def test_a_row_has_the_errors_of_predictions_and_the_solves_from_them(scene, tes
         assert pytest.approx(40.0864, abs=1e-2) == row.SNR_min
         assert row.converged == 100
     assert rows[0].newton_iterations > rows[1].newton_iterations, "small loads are nearly linear"
+
+
+def test_the_file_of_fingertips_is_what_its_program_writes(tmp_path, monkeypatch):
+    folder, copy = Path(transfer.__file__).parent / "loads", tmp_path / "forces.npz"
+    monkeypatch.setattr(sys, "argv", ["fingertips", str(copy)])
+    runpy.run_path(str(folder / "fingertips.py"), run_name="__main__")
+    forces, stored = (np.load(path)["forces"] for path in (copy, folder / "fingertips.npz"))
+    np.testing.assert_allclose(forces, stored, rtol=1e-5)
+    assert forces.shape == (32, 4000, 3)
+    assert forces.any(axis=(1, 2)).all()
 
 
 def test_scenes_of_another_body_are_named(scene, make_scene):
