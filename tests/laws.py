@@ -8,8 +8,9 @@ from omegaconf import OmegaConf
 from dpl.fem import FibreReinforced, InvariantBasedMaterial, Material, YoungPoissonMaterial
 
 FILES = sorted((Path(__file__).parents[1] / "conf" / "material").glob("*.yaml"))
-LAWS: dict[str, Material] = {
-    path.stem: instantiate(OmegaConf.load(path), _convert_="all") for path in FILES
+NODES = {path.stem: OmegaConf.load(path) for path in FILES}
+LAWS: dict[str, Material] = {  # not those of several regions
+    name: instantiate(node, _convert_="all") for name, node in NODES.items() if "_target_" in node
 }
 HOOKEAN = [type(law) for law in LAWS.values() if isinstance(law, YoungPoissonMaterial)]
 COMPILED = [name for name, law in LAWS.items() if isinstance(law, InvariantBasedMaterial)]

@@ -143,8 +143,9 @@ def _by_name(keys: Keys) -> dict[str, tuple[Any, ...]]:
 
 def names_several(key: str, node: Any) -> bool:
     """Return True if a node has calls by name: `SEVERAL`, and `material` if its regions differ."""
-    several_laws = key == "material" and isinstance(node, Mapping) and "_target_" not in node
-    return key in SEVERAL or several_laws
+    if key != "material" or not node or not isinstance(node, Mapping):
+        return key in SEVERAL
+    return "_target_" not in node and all(isinstance(law, Mapping) for law in node.values())
 
 
 def _is_call(path: str, resolved: Mapping[str, Any]) -> bool:
