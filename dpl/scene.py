@@ -87,7 +87,7 @@ class Scene:
 
         Raises:
             ValueError: The loads have another modulus than elastic foundations and follower
-                pressures, or a range.
+                loads, or a range.
         """
         if self.problem.has_one_modulus:
             for young in self.loads.young_range:
@@ -145,7 +145,7 @@ class Scene:
 
         Args:
             force: Nodal forces.
-            young: E. On a body with an elastic foundation or a follower pressure it must be that of
+            young: E. On a body with an elastic foundation or with follower loads it must be that of
                 the body, see `Problem.check_modulus`, which this function does not call.
             parameters: Values of `Problem.parameter_ranges`, (B,) or (B, P); required if there are
                 any.
@@ -171,11 +171,9 @@ class Scene:
         problem, points = self.problem, self.problem.points.numpy()
         # Not rounded: the halves among dyadic coordinates would flip with the last bit.
         lattice = np.floor((points - points.min(axis=0)) * 1e9 + 0.3).astype(np.int64)
-        pressure: dict[str, object] = {}
-        if problem.pressure is not None:
-            pressure["pressure"] = problem.pressure.identity()
-        if problem.pressure_ranges:  # parameters of samples are in Pa
-            pressure |= {"pressure_ranges": problem.pressure_ranges, "young": problem.young}
+        loads = problem.follower_loads.identity()
+        if problem.follower_loads.ranges:  # parameters of samples are in Pa
+            loads["young"] = problem.young
         return {
             "points": sha256_of(lattice),
             "cells": plain(problem.cells),
@@ -187,7 +185,7 @@ class Scene:
             "law": problem.material.identity(),
             "loads": self.loads.identity(),
             "solver": self.solver.identity(),
-            **pressure,
+            **loads,
         }
 
     @cached_property
@@ -217,9 +215,9 @@ class Scene:
         fixed = int((~problem.free).any(dim=1).sum())
         moved = "moved" if problem.moved_supports else "fixed"
         springs = "" if problem.springs is None else ", an elastic foundation"
-        if problem.pressure is not None:
-            springs += f", follower pressure on {len(problem.pressure.nodes):,} facets"
-        for name, (low, high) in problem.pressure_ranges.items():
+        for term in problem.follower_loads.terms:
+            springs += f", {term.describe()}"
+        for name, (low, high) in problem.follower_loads.ranges.items():
             springs += f", {name} from {low:.4g} to {high:.4g} Pa"
         force, displacement = self._largest_of_a_few()
         bends = "" if problem.moved_supports else f", linear deflection {displacement:.3g} m"
@@ -262,9 +260,9 @@ class Scene:
                 f"one set of modes and scales for {name} = {ends[0]:.4g} to {ends[1]:.4g}, those "
                 f"of {ends.middle:.4g}; each load has its own, an input, and a K(0) of its own"
             )
-        if problem.pressure_ranges:
-            names = ", ".join(problem.pressure_ranges)
-            lines.append(f"one K(0) for all pressures ({names}): it is that without pressure")
+        if problem.follower_loads.ranges:
+            names = ", ".join(problem.follower_loads.ranges)
+            lines.append(f"one K(0) for all values of {names}: it is that without follower loads")
         if problem.springs is None:
             lines.append("no springs, nothing of theirs assembled")
         if problem.equal_cells:

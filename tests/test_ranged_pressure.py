@@ -36,7 +36,7 @@ def body(*pressures, poisson=0.3):
     """Return a clamped bar under pressures [Pa]."""
     law = NeoHookeanLn(poisson)
     mesh = box([0.4, 0.1, 0.1], [7, 3, 3])
-    return Problem.build(mesh, law, fixed=Plane(0, "min"), pressures=pressures, young=YOUNG)
+    return Problem.build(mesh, law, fixed=Plane(0, "min"), follower_loads=pressures, young=YOUNG)
 
 
 def scene_on(problem, deflection=0.1):
@@ -155,7 +155,7 @@ def test_models_without_an_input_for_it_are_refused_by_key(scene):
 def test_the_energy_of_a_batch_has_the_force_of_the_pressure_as_its_gradient(load):
     """A closed surface has a potential, for all values of its range."""
     scene = scene_on(body(FollowerPressure(everywhere, [20.0, 200.0])))
-    assert scene.problem.pressure_has_potential
+    assert scene.problem.has_potential
     surrogate = Surrogate(FCNN(scene, width=8, base="linear"), PotentialEnergyLoss(), scene)
     samples = scene.loads.sample(0, range(3))
     found = solve(scene.solver, samples)

@@ -115,18 +115,18 @@ def expansion(nu: float, pressure: float, mesh: skfem.Mesh, degree: int, **optio
     build = partial(Problem.build, mesh, NeoHookeanLn(nu), degree=degree, length=1.0, **options)
     points = build().points.numpy()
     inflate = FollowerPressure(inner_surface, pressure)
-    problem = build(fixed=points < 1e-9, pressures=[inflate])
+    problem = build(fixed=points < 1e-9, follower_loads=[inflate])
     u = under_pressure(problem, 1.0).displacement[0]
-    assert problem.pressure is not None
+    assert problem.follower_loads is not None
     # the volume that the surface has passed, from its current radius
-    volume = -float(problem.pressure.work(u[None])) / pressure
+    volume = -float(problem.follower_loads.work(u[None])) / pressure
     dim, part = mesh.dim(), {2: math.pi / 4, 3: math.pi / 6}[mesh.dim()]
     return (volume / part / INNER**dim + 1) ** (1 / dim)
 
 
 def under_pressure(problem: Problem, factor: float, tol: float = 1e-10) -> Solution:
     """Return the equilibrium under a part of the pressure and no other load."""
-    newton = Newton(problem.with_pressure_factor(factor), tol=tol)
+    newton = Newton(problem.with_follower_factor(factor), tol=tol)
     found = solve(newton, Load(torch.zeros(1, *problem.shape).double(), torch.ones(1)))
     assert found.converged.all(), str(Status(int(found.status)))
     return found
@@ -139,7 +139,7 @@ def pneumatic_finger(cells: Sequence[int], pressure: float) -> Problem:
         NeoHookeanLn(0.4),
         fixed=Plane(0, "min"),
         mean_dilatation=True,
-        pressures=[FollowerPressure(Tag("chamber"), pressure)],
+        follower_loads=[FollowerPressure(Tag("chamber"), pressure)],
     )
 
 
@@ -165,7 +165,7 @@ def energy_balance(
     The integral of p dV is p V minus the integral of V dp.
     """
     problem = pneumatic_finger(cells, pressure)
-    surface = problem.pressure
+    surface = problem.follower_loads
     assert surface is not None
 
     def volume(u: Tensor) -> float:
@@ -175,7 +175,7 @@ def energy_balance(
     nodes, weights = np.polynomial.legendre.leggauss(points)
     inner = [volume(under_pressure(problem, x).displacement) for x in (nodes + 1) / 2]
     u = under_pressure(problem, 1.0).displacement
-    strain = float(problem.without_pressure.energy(u))
+    strain = float(problem.without_follower_loads.energy(u))
     tip = u[0, problem.points[:, 0] > problem.points[:, 0].max() - 1e-9].mean(dim=0)
     return Balance(strain, volume(u) - float(weights @ inner) / 2, float(tip.norm()))
 

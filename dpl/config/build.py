@@ -26,7 +26,8 @@ from torch import Tensor
 from dpl import training
 from dpl.config import validation
 from dpl.config.validation import ConfigError
-from dpl.fem import FollowerPressure, Problem, SingularMatrix, YoungRange
+from dpl.fem import Problem, SingularMatrix, YoungRange
+from dpl.fem.assembly.follower_loads import FollowerLoad
 from dpl.fem.units import Units
 from dpl.scene import Scene
 from dpl.system.blas import slow_blas
@@ -162,9 +163,9 @@ def build_scene(cfg: DictConfig) -> Scene:
     is_range = isinstance(cfg.young, ListConfig | DictConfig)
     young = OmegaConf.to_container(cfg.young) if is_range else cfg.young
     forces = _parts(cfg, "forces")
-    pressures = {name: f for name, f in forces.items() if isinstance(f, FollowerPressure)}
-    problem = _problem(cfg, _one_modulus(young), pressures)
-    dead = {name: force for name, force in forces.items() if name not in pressures}
+    follower = {name: f for name, f in forces.items() if isinstance(f, FollowerLoad)}
+    problem = _problem(cfg, _one_modulus(young), follower)
+    dead = {name: force for name, force in forces.items() if name not in follower}
     always = _constant_force(dead, problem)
     solver = instantiate(cfg, "solver", problem=problem)
     linear = solver.linear_solver
@@ -205,9 +206,7 @@ def _supports(cfg: DictConfig, mesh: skfem.Mesh, units: Units) -> list[Any]:
     return list(supports.values())
 
 
-def _problem(
-    cfg: DictConfig, young: float | None, pressures: dict[str, FollowerPressure]
-) -> Problem:
+def _problem(cfg: DictConfig, young: float | None, follower: dict[str, Any]) -> Problem:
     with _shown_warnings():
         mesh, regions = instantiate(cfg, "mesh"), _parts(cfg, "regions")
         several = validation.names_several("material", cfg.material)
@@ -217,19 +216,19 @@ def _problem(
         fixed = instantiate(cfg, "fixed") if cfg.get("fixed") is not None else None
         options = {key: cfg[key] for key in ("degree", "mean_dilatation")} | {"young": young}
         supports = _supports(cfg, mesh, Units(1.0, young))
-        for name, pressure in pressures.items():
+        for name, load in follower.items():
             with error_in(f"forces.{name}"):
-                pressure.check(mesh, Units(1.0, young))
+                load.check(mesh, Units(1.0, young))
         options["regions"] = regions
-        options["pressures"] = [
-            replace(pressure, name=pressure.name or name) for name, pressure in pressures.items()
+        options["follower_loads"] = [
+            replace(load, name=load.name or name) for name, load in follower.items()
         ]
         try:
             problem = Problem.build(mesh, material, fixed=fixed, supports=supports, **options)
         except ValueError as error:
-            message = str(error)
+            message = str(error).replace("follower_loads", "forces", 1)
             key = "fixed or supports: " if cfg.supports else "fixed: "
-            named = message.startswith((*options, "material"))
+            named = message.startswith((*options, "material", "forces"))
             raise ConfigError(message if named else key + message) from error
     if not problem.free.any():
         raise ConfigError("fixed or supports: all nodes are fixed; fix fewer nodes")

@@ -63,6 +63,7 @@ EXPECTED_TYPES = {  # base classes of the object that the call under a key retur
         "dpl.fem.loads.forces.Traction",
         "dpl.fem.loads.forces.BodyForce",
         "dpl.fem.assembly.follower_pressure.FollowerPressure",
+        "dpl.fem.assembly.active_stress.ActiveStress",
     },
     "solver": {"dpl.fem.solvers.reference.ReferenceSolver"},
     "loads": {"dpl.fem.loads.family.LoadFamily"},

@@ -99,7 +99,7 @@ class DataSet:
         wanted = sum(self.sizes.values())
         there = wanted - sum(len(self.store.missing(*split)) for split in self.sizes.items())
         same = " with these boundary values over E and L" if self.scene.has_boundary_values else ""
-        sizes = "size" if self.scene.problem.pressure_ranges else "size and Young's modulus"
+        sizes = "size" if self.scene.problem.follower_loads.ranges else "size and Young's modulus"
         lines = [
             f"one data set for every {sizes} of this body{same}: "
             f"{self.store.folder}, of scene {self.scene.fingerprint[:12]}"

@@ -70,7 +70,7 @@ def describe(
 def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
     """Return file and operator set, and name, shape, type and unit of each input and output."""
     scene = graph.surrogate.scene
-    pressures = scene.problem.pressure_ranges
+    stresses = scene.problem.follower_loads.ranges
     loads, field = scene.loads, ["B", *scene.problem.shape]
     known: dict[str, dict[str, Any]] = {
         "force": {"shape": field, "type": "float64", "unit": _force_unit(scene)},
@@ -84,7 +84,7 @@ def _model(graph: ExportGraph, path: Path) -> dict[str, Any]:
         "parameters": {
             "shape": ["B", len(loads.parameter_ranges)],
             "type": "float64",
-            "unit": ["Pa" if name in pressures else "1" for name in loads.parameter_ranges],
+            "unit": ["Pa" if name in stresses else "1" for name in loads.parameter_ranges],
             "ranges": loads.parameter_ranges,
         },
         "displacement": {"shape": field, "type": "float64", "unit": "m"},

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from dpl.system.lazy import public_names
 
 if TYPE_CHECKING:
+    from dpl.fem.assembly.active_stress import ActiveStress
     from dpl.fem.assembly.boundary_conditions import DirichletBC, RobinBC
     from dpl.fem.assembly.follower_pressure import FollowerPressure
     from dpl.fem.linear.backends import installed_backends

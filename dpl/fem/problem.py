@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dpl.fem.assembly.boundary_conditions import Support, assemble_constraints
 from dpl.fem.assembly.elements import QUADRATIC, basis_of, gradients
-from dpl.fem.assembly.follower_pressure import FollowerPressure, PressureSurface, ranges_of
+from dpl.fem.assembly.follower_loads import FollowerLoad, FollowerLoads
 from dpl.fem.assembly.kernels import GroupedKernels, Kernels
 from dpl.fem.assembly.numba_laws import CompiledLaw
 from dpl.fem.assembly.variants import BodyVariants
@@ -45,7 +45,7 @@ class System(NamedTuple):
         tangent: Entries of K on the pattern, (B, nnz) [-].
         valid: Whether the strains that it was made at are those of some deformation, (B,).
         asymmetry: Function x -> (K - K^T) x / 2 at free degrees of freedom, (n,) to (n,), if a
-            follower pressure has no potential; `tangent` is then the symmetric part. Else None.
+            follower load has no potential; `tangent` is then the symmetric part. Else None.
     """
 
     force: Tensor
@@ -71,7 +71,7 @@ class Problem(BodyVariants):
         fixed: Region | NDArray[np.bool_] | None = None,
         prescribed: NDArray[np.float64] | None = None,
         supports: Sequence[Support] = (),
-        pressures: Sequence[FollowerPressure] = (),
+        follower_loads: Sequence[FollowerLoad] = (),
         degree: int = 1,
         mean_dilatation: bool = False,
         length: float | None = None,
@@ -92,15 +92,16 @@ class Problem(BodyVariants):
                 if left out.
             supports: Further prescribed displacements [m] and elastic foundations [N/m^3]; the last
                 displacement on a degree of freedom counts.
-            pressures: Follower pressures [Pa], which add up; values or ranges.
+            follower_loads: Follower pressures and active stresses [Pa], which add up; values or
+                ranges.
             degree: Degree of the displacement, 1 or 2.
             mean_dilatation: Use the mean volume ratio of each cell, so that nearly incompressible
                 bodies of linear quadrilaterals and hexahedra do not lock.
             length: L [m]; the longest side of the body if left out.
             young: Young's modulus [Pa] by which boundary values are divided: stiffnesses of
-                foundations, pressures, and the tractions and body forces of `dpl.fem.loads`. The
-                default of 1 Pa makes them values over E. None refuses them, for loads of several
-                moduli.
+                foundations, follower loads, and the tractions and body forces of `dpl.fem.loads`.
+                The default of 1 Pa makes them values over E. None refuses them, for loads of
+                several moduli.
 
         Raises:
             ValueError: `degree` is neither 1 nor 2, the cell type is unknown, a region is empty, a
@@ -129,9 +130,6 @@ class Problem(BodyVariants):
         if isinstance(material, Mapping):
             material = Heterogeneous(material, regions or {})
         material = material.on(basis, length, origin)
-        columns, ranges = ranges_of(pressures, taken=material.parameter_ranges)
-        both = zip(pressures, columns, strict=True)
-        surfaces = [one.on(basis, units, origin, column) for one, column in both]
         dN, dV = gradients(basis)
         boundary = np.zeros(basis.N, dtype=bool)
         boundary[basis.get_dofs(mesh.boundary_facets()).all()] = True
@@ -149,10 +147,9 @@ class Problem(BodyVariants):
             prescribed=torch.from_numpy(np.nan_to_num(given)),
             boundary=torch.from_numpy(boundary),
             springs=springs,
-            pressure=PressureSurface.join(surfaces),
+            follower_loads=FollowerLoads.build(follower_loads, basis, units, material, origin),
             mean_dilatation=mean_dilatation,
             young=young,
-            pressure_ranges=ranges,
         )
         for line in problem.locking_warnings():
             warnings.warn(line, stacklevel=2)
@@ -233,19 +230,19 @@ class Problem(BodyVariants):
         self, displacement: Tensor
     ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]] | None:
         """Return `System.asymmetry` at (1, N, D)."""
-        if self.pressure is None or self.pressure_has_potential:
+        if self.has_potential:
             return None
-        product = self.pressure.asymmetry(displacement)
+        product = self.follower_loads.asymmetry(displacement)
         return lambda x: self.restrict(product(self.extend(x)[None])[0])
 
     def stiffness_at_rest(self) -> Tensor:
-        """Return the entries of K(0), (nnz,) [-], without a follower pressure.
+        """Return the entries of K(0), (nnz,) [-], without follower loads.
 
-        The linear solution under a pressure is therefore that of the dead load on the surface at
-        rest, and all pressures share one factor.
+        The linear solution under follower loads is therefore that of dead loads on the body at
+        rest, and all their values share one factor.
         """
         rest = torch.zeros(1, *self.shape, dtype=torch.float64)
-        return self.without_pressure.linearise(rest).tangent[0]
+        return self.without_follower_loads.linearise(rest).tangent[0]
 
     @torch.no_grad()
     def _reference_system(self, displacement: Tensor, gap: Tensor | None) -> System:

@@ -111,16 +111,16 @@ def symmetries(problem: Problem, *, also: Sequence[Tensor] = ()) -> list[Symmetr
 
 
 def _operators(problem: Problem) -> list[Callable[[Tensor], Tensor]]:
-    """Return the operators that commute with a symmetry: constraints, cells and boundary terms."""
-    pressure = None if problem.pressure is None else problem.pressure.generic
-    boundary = [part for part in (problem.springs, pressure) if part is not None]
-    body = problem.generic.without_pressure
+    """Return the operators that commute with a symmetry: constraints, cells and loads."""
+    loads = [term.generic.force for term in problem.follower_loads.terms]
+    springs = [] if problem.springs is None else [problem.springs.force]
+    body = problem.generic.without_follower_loads
     cells = body if problem.springs is None else replace(body, springs=None)
     operators: list[Callable[[Tensor], Tensor]] = [
         lambda field: torch.where(problem.free, field, 0.0),
         lambda field: cells.evaluate(field).internal,
     ]
-    return [*operators, *(part.force for part in boundary)]
+    return [*operators, *springs, *loads]
 
 
 def _fields(problem: Problem, points: Array) -> Tensor:

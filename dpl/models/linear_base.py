@@ -61,8 +61,8 @@ class LinearBase:
         """Return linear solutions, (B, N, D) [-], float64, on the device of the load."""
         force = load.force.double()
         free = self._problem.free.to(force.device)
-        if self._problem.pressure_ranges:
-            force = force - self._problem.ranged_pressure_at_rest(load.parameters.to(force))
+        if self._problem.follower_loads.ranges:
+            force = force - self._problem.ranged_force_at_rest(load.parameters.to(force))
         values = self._response(force[:, free], self._problem.law_parameters(load.parameters))
         prescribed = self._problem.prescribed.to(force).flatten().expand(force.shape[0], -1)
         dofs = free.flatten().nonzero()[:, 0]

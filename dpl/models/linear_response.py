@@ -44,7 +44,7 @@ class LinearResponse:
     @cached_property
     def terms(self) -> StiffnessTerms:
         """Terms of K(0) of the body."""
-        return StiffnessTerms.of(self._scene.problem.without_ranged_pressure)
+        return StiffnessTerms.of(self._scene.problem.without_ranged_loads)
 
     @cached_property
     def interpolation(self) -> StiffnessInterpolation:

@@ -14,7 +14,7 @@ from dpl.fem.rom.compiled_prediction import (
     law_arguments,
 )
 from dpl.fem.rom.ecsw import Cubature
-from dpl.fem.rom.reduced_problem import refuse_pressure
+from dpl.fem.rom.reduced_problem import refuse_follower_loads
 from dpl.fem.rom.reduced_stiffness import ReducedInverse, ReducedStiffness
 from dpl.fem.rom.sampled_stress import SampleCells
 from dpl.fem.symmetry import cell_images
@@ -126,7 +126,7 @@ class Unrolled(nn.Module):
         check_range(0, MAX_SIZE, stages=stages)
         self.scene = scene
         self.rank, self.sample_count, self.stages = rank, cells, stages
-        refuse_pressure(scene.problem, "model=unrolled")
+        refuse_follower_loads(scene.problem, "model=unrolled")
         constant = scene.loads.constant_force
         also = [] if constant is None else [constant]
         self.group = symmetries(scene.problem, also=also) if symmetry else []

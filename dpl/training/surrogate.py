@@ -75,10 +75,10 @@ class Surrogate(L.LightningModule):
         self.batch_errors: Tensor | None = None
         self._random_states: dict[str, Any] | None = None  # of a resumed run
         self._optimizer, self._scheduler = optimizer, scheduler
-        pressures = scene.problem.pressure_ranges
+        stresses = scene.problem.follower_loads.ranges
         for name, ends in scene.loads.parameter_ranges.items():
             if "parameters" not in getattr(net, "extra_inputs", ()):
-                key = f"forces.{name}.value" if name in pressures else f"material.{name}"
+                key = f"forces.{name}.value" if name in stresses else f"material.{name}"
                 raise ValueError(
                     f"{key} is a range, {list(ends)}, and {type(net).__name__} has no input for "
                     f"it; set {key} to a number or choose another model"

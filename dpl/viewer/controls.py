@@ -35,7 +35,7 @@ class Controls:
         axis, angle, sliding: Rotation of the patch and whether it slides, visible in the mode
             `GRASP`; in 2D there is no axis.
         young: Slider of Young's modulus, in a unit with prefix; `modulus` is its value in Pa.
-        parameters: Sliders of the ranges of law and pressures, by name.
+        parameters: Sliders of the ranges of law and follower loads, by name.
         sample, reset, fit: Buttons for a random load, for no load and for the camera.
         method, budget, galerkin, quantity, edges, show_newton: Method and display.
         record, save: Buttons of the recording.
@@ -90,8 +90,8 @@ class Controls:
         low, high = (value / self._young_unit.factor for value in body.young_range)
         label, middle = f"E [{self._young_unit.name}]", body.young / self._young_unit.factor
         self.young = gui.add_slider(label, low, high, round_step(low, high), middle)
-        pressures = {name: f"{name} [Pa]" for name in body.scene.problem.pressure_ranges}
-        labels = LABELS | pressures
+        stresses = {name: f"{name} [Pa]" for name in body.scene.problem.follower_loads.ranges}
+        labels = LABELS | stresses
         self.parameters = {
             name: gui.add_slider(labels.get(name, name), *ends, round_step(*ends), value)
             for (name, ends), value in zip(

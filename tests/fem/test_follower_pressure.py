@@ -45,7 +45,7 @@ def bodies(kind, grid, bend):
     cell, degree = kind
     mesh = grid(cell, 2, 0.15)
     closed = Problem.build(
-        mesh, NH, degree=degree, pressures=[FollowerPressure(everywhere, 0.3)], length=1.0
+        mesh, NH, degree=degree, follower_loads=[FollowerPressure(everywhere, 0.3)], length=1.0
     )
     side = grid(cell, 2)
     opened = Problem.build(
@@ -53,7 +53,7 @@ def bodies(kind, grid, bend):
         NH,
         fixed=Plane(0, "min"),
         degree=degree,
-        pressures=[FollowerPressure(END, 0.3)],
+        follower_loads=[FollowerPressure(END, 0.3)],
         length=1.0,
     )
     return {p: bend(p.points, seed=3) for p in (closed, opened)}
@@ -65,7 +65,7 @@ def no_load(problem):
 
 def test_uniform_pressure_on_a_closed_surface_has_no_resultant(bodies):
     problem, u = next(iter(bodies.items()))
-    force = problem.pressure.force(u)[0]
+    force = problem.follower_loads.force(u)[0]
     x, size = (problem.points + u[0]), force.abs().sum()
     assert force.sum(dim=0).abs().max() < 1e-14 * size
     dipole = x.T @ force  # also without moment: p V times the identity
@@ -80,18 +80,18 @@ def test_forces_rotate_with_the_body(bodies):
         if torch.linalg.det(Q) < 0:
             Q = torch.stack([-Q[:, 0], *Q.T[1:]], dim=1)
         turned = ((problem.points + u) @ Q.T) - problem.points
-        force = problem.pressure.force(u) @ Q.T
-        assert_close(problem.pressure.force(turned), force, rtol=1e-12, atol=1e-14)
+        force = problem.follower_loads.force(u) @ Q.T
+        assert_close(problem.follower_loads.force(turned), force, rtol=1e-12, atol=1e-14)
 
 
 def test_load_stiffness_is_the_derivative_of_the_force(bodies):
     """By central differences, to 1e-7; the tangent holds its symmetric part."""
     for problem, u in bodies.items():
         v = torch.from_numpy(np.random.default_rng(2).normal(size=u.shape)) * problem.free
-        step, surface = 1e-4, problem.pressure
+        step, surface = 1e-4, problem.follower_loads
         slope = (surface.force(u + step * v) - surface.force(u - step * v)) / (2 * step)
         system = problem.linearise(u)
-        elastic = problem.without_pressure.linearise(u)
+        elastic = problem.without_follower_loads.linearise(u)
         matrix = full_matrix(problem.pattern, (system.tangent - elastic.tangent)[0].numpy())
         found = matrix @ problem.restrict(v[0])
         if system.asymmetry is not None:
@@ -103,8 +103,8 @@ def test_load_stiffness_is_the_derivative_of_the_force(bodies):
 
 def test_force_is_the_gradient_of_the_work_if_there_is_a_potential(bodies):
     closed, opened = bodies
-    assert closed.pressure_has_potential
-    assert not opened.pressure_has_potential
+    assert closed.has_potential
+    assert not opened.has_potential
     u = bodies[closed].requires_grad_()
     (slope,) = torch.autograd.grad(closed.energy(u).sum(), u)
     assert_close(slope, closed.internal_force(u).detach(), rtol=1e-10, atol=1e-13)
@@ -119,21 +119,19 @@ def test_potential_exists_where_the_edge_is_fixed_or_slides_in_a_plane(grid):
         for at in ("min", "max")
     ]
     bottom = Plane(2, "min")
-    assert Problem.build(
-        mesh, NH, fixed=bottom, supports=sides, pressures=[top]
-    ).pressure_has_potential
+    assert Problem.build(mesh, NH, fixed=bottom, supports=sides, follower_loads=[top]).has_potential
     assert not Problem.build(
-        mesh, NH, fixed=bottom, supports=sides[:3], pressures=[top]
-    ).pressure_has_potential
+        mesh, NH, fixed=bottom, supports=sides[:3], follower_loads=[top]
+    ).has_potential
 
 
 def test_work_is_pressure_times_volume(grid):
     """A cube of side 1 under pressure that grows to side 1.2."""
     problem = Problem.build(
-        grid("tetra"), NH, pressures=[FollowerPressure(everywhere, 0.3)], length=1.0
+        grid("tetra"), NH, follower_loads=[FollowerPressure(everywhere, 0.3)], length=1.0
     )
     u = 0.2 * problem.points[None]
-    assert float(problem.pressure.work(u)) == pytest.approx(0.3 * (1.2**3 - 1), rel=1e-13)
+    assert float(problem.follower_loads.work(u)) == pytest.approx(0.3 * (1.2**3 - 1), rel=1e-13)
 
 
 def test_small_pressure_acts_as_a_dead_load_on_the_surface_at_rest(kind, grid):
@@ -143,7 +141,7 @@ def test_small_pressure_acts_as_a_dead_load_on_the_surface_at_rest(kind, grid):
     dead = Problem.build(mesh, NH, fixed=Plane(0, "min"), degree=degree, length=1.0)
     problem = Problem.build(
         mesh, NH, fixed=Plane(0, "min"), degree=degree, length=1.0,
-        pressures=[FollowerPressure(END, p)],
+        follower_loads=[FollowerPressure(END, p)],
     )  # fmt: skip
     value = [-p] + [0.0] * (mesh.dim() - 1)
     force = Traction(END, value).on(dead)
@@ -161,7 +159,7 @@ def beam_under_pressure():
     def build(p, law=NH):
         mesh = box([4.0, 1.0, 1.0], [9, 3, 3])
         return Problem.build(
-            mesh, law, fixed=Plane(0, "min"), pressures=[FollowerPressure(Plane(2, "max"), p)]
+            mesh, law, fixed=Plane(0, "min"), follower_loads=[FollowerPressure(Plane(2, "max"), p)]
         )
 
     return build
@@ -195,7 +193,7 @@ def test_load_steps_and_the_corotated_factor_lead_to_the_same_solution(beam_unde
 
 def test_half_the_pressure_is_half_the_load_factor(beam_under_pressure):
     whole, half = beam_under_pressure(4e-3), beam_under_pressure(2e-3)
-    found = solve(Newton(whole.with_pressure_factor(0.5)), no_load(whole))
+    found = solve(Newton(whole.with_follower_factor(0.5)), no_load(whole))
     expected = solve(Newton(half), no_load(half))
     assert_close(found.displacement, expected.displacement, rtol=1e-9, atol=1e-12)
 
@@ -247,11 +245,11 @@ def test_pressure_beyond_the_limit_point_has_no_valid_equilibrium():
 
 def test_nothing_changes_without_pressure(grid):
     problem = Problem.build(grid("hexahedron"), NH, fixed=Plane(0, "min"))
-    assert problem.pressure is None
-    assert problem.with_pressure_factor(0.5) is problem
-    assert problem.without_pressure is problem
-    assert problem.pressure_has_potential
-    assert not problem.pressure_at_rest.any()
+    assert not problem.follower_loads
+    assert problem.with_follower_factor(0.5) is problem
+    assert problem.without_follower_loads is problem
+    assert problem.has_potential
+    assert not problem.force_at_rest.any()
 
 
 def test_pressure_counts_for_symmetries(grid):
@@ -259,9 +257,9 @@ def test_pressure_counts_for_symmetries(grid):
     clamped = {"fixed": Plane(0, "min")}
     assert len(symmetries(Problem.build(mesh, NH, **clamped))) == 8
     one_side = Problem.build(
-        mesh, NH, **clamped, pressures=[FollowerPressure(Plane(2, "max"), 0.1)]
+        mesh, NH, **clamped, follower_loads=[FollowerPressure(Plane(2, "max"), 0.1)]
     )
-    around = Problem.build(mesh, NH, **clamped, pressures=[FollowerPressure(END, 0.1)])
+    around = Problem.build(mesh, NH, **clamped, follower_loads=[FollowerPressure(END, 0.1)])
     assert len(symmetries(one_side)) == 2
     assert len(symmetries(around)) == 8
 
@@ -272,24 +270,26 @@ def test_pressures_add_up(grid):
     several = Problem.build(
         mesh,
         NH,
-        pressures=[FollowerPressure(r, v) for r, v in zip(regions, (1, 2, 3), strict=True)],
+        follower_loads=[FollowerPressure(r, v) for r, v in zip(regions, (1, 2, 3), strict=True)],
     )
-    force = several.pressure_at_rest.sum(dim=0)
+    force = several.force_at_rest.sum(dim=0)
     assert_close(force, torch.tensor([4.0, 2.0], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("value", [float("nan"), [1.0, 0.0], True, "soft"])
 def test_invalid_pressures_are_refused(value, grid):
     with pytest.raises(ValueError, match=r"value = .* must be .*\[Pa\]"):
-        Problem.build(grid("quad"), NH, pressures=[FollowerPressure(END, value)])
+        Problem.build(grid("quad"), NH, follower_loads=[FollowerPressure(END, value)])
 
 
 def test_pressure_needs_one_modulus(grid):
     with pytest.raises(ValueError, match="young is a range"):
-        Problem.build(grid("quad"), NH, pressures=[FollowerPressure(END, 1.0)], young=None)
-    problem = Problem.build(grid("quad"), NH, pressures=[FollowerPressure(END, 5.0)], young=50.0)
-    assert_close(problem.pressure_at_rest.sum(dim=0)[0].item(), 0.1)
-    with pytest.raises(ValueError, match="by which the pressure is divided"):
+        Problem.build(grid("quad"), NH, follower_loads=[FollowerPressure(END, 1.0)], young=None)
+    problem = Problem.build(
+        grid("quad"), NH, follower_loads=[FollowerPressure(END, 5.0)], young=50.0
+    )
+    assert_close(problem.force_at_rest.sum(dim=0)[0].item(), 0.1)
+    with pytest.raises(ValueError, match="by which the follower pressure is divided"):
         problem.check_modulus(40.0)
 
 
@@ -340,7 +340,7 @@ def test_pressure_on_a_strip_in_the_plane(grid):
     mesh = rectangle([5.0, 1.0], [21, 5], "quad")
     problem = Problem.build(
         mesh, SaintVenantKirchhoff(0.3), fixed=Plane(0, "min"),
-        pressures=[FollowerPressure(Plane(1, "max"), 1e-3)],
+        follower_loads=[FollowerPressure(Plane(1, "max"), 1e-3)],
     )  # fmt: skip
     found = solve(Newton(problem), no_load(problem))
     assert int(found.status) == Status.CONVERGED

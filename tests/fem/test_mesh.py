@@ -166,8 +166,10 @@ def test_finger_has_a_closed_chamber_within_its_walls():
     np.testing.assert_allclose(corners.min(axis=1), [1, 1, 3])
     np.testing.assert_allclose(corners.max(axis=1), [7, 3, 5])
     chamber = FollowerPressure(Tag("chamber"), 1.0)
-    problem = Problem.build(mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), pressures=[chamber])
-    assert float(problem.pressure_at_rest.sum(dim=0).abs().max()) < 1e-12, "it is closed"
+    problem = Problem.build(
+        mesh, NeoHookeanLn(0.3), fixed=Plane(0, "min"), follower_loads=[chamber]
+    )
+    assert float(problem.force_at_rest.sum(dim=0).abs().max()) < 1e-12, "it is closed"
 
 
 @pytest.mark.parametrize("cells", [[2, 4, 4], [8, 2, 4], [8, 4, 5], [8, 4], [8, 4, 2]])

@@ -27,8 +27,8 @@ class EquilibriumCriterion(TensorAssembly):
         work and change no displacement, so they do not count. Where supports are moved, reactions
         do work: ||f|| is then at least the norm of the reactions on the degrees of freedom whose
         prescribed displacement is not 0. Reactions of supports that are not moved never count.
-        Under a follower pressure ||f|| is at least the norm of its nodal forces on the surface at
-        rest. They are a measure that does not change with the displacement.
+        Under follower loads ||f|| is at least the norm of their nodal forces on the body at rest,
+        a measure that does not change with the displacement.
 
         Norms are taken of multiples of the largest force, so that no square underflows or
         overflows. Without forces the result is ||R_free|| itself. It is NaN for a force that is
@@ -58,8 +58,8 @@ class EquilibriumCriterion(TensorAssembly):
         loads = [self.acting(force).flatten(1)]
         if self.moved_supports:
             loads.append((internal * (self.prescribed != 0)).flatten(1))
-        if self.pressure is not None:
-            at_rest = self.pressure_at_rest.reshape(-1, *self.shape)
+        if self.follower_loads:
+            at_rest = self.force_at_rest.reshape(-1, *self.shape)
             loads.append(self.acting(at_rest).flatten(1))
         unit = reduce(torch.maximum, [load.abs().amax(1) for load in loads])  # NaN if an entry is
         unit = torch.where(unit == 0, 1.0, unit)
@@ -92,8 +92,8 @@ class EquilibriumCriterion(TensorAssembly):
 
     @property
     def is_loaded_at_rest(self) -> bool:
-        """True if u = 0 is no equilibrium without forces: moved supports or a pressure."""
-        return self.moved_supports or bool(self.pressure_at_rest.any())
+        """True if u = 0 is no equilibrium without forces: moved supports, follower loads."""
+        return self.moved_supports or bool(self.force_at_rest.any())
 
     @cached_property
     def moved_supports(self) -> bool:

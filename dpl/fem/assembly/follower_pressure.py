@@ -1,10 +1,9 @@
 """Follower pressure: a force along the current normal on the current area of a boundary part."""
 
-import math
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import skfem
@@ -13,18 +12,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.assembly.elements import QUADRATIC
+from dpl.fem.assembly.follower_loads import CONSTANT, FollowerLoad, FollowerTerm
 from dpl.fem.assembly.sparsity import Pattern
-from dpl.fem.identity import plain
+from dpl.fem.materials.material import Material
 from dpl.fem.mesh.regions import Origin, Region, facets_in
 from dpl.fem.units import Units
 
-CONSTANT = -1  # `PressureSurface.column` of a pressure that is one number
 # shape of the facets -> polynomial degree of N x,1 x x,2 for shape functions of degree 1 and 2
 DEGREES = {"RefLine": (1, 3), "RefTri": (1, 4), "RefQuad": (2, 5)}
 
 
 @dataclass(frozen=True)
-class FollowerPressure:
+class FollowerPressure(FollowerLoad):
     """Pressure of a fluid on a part of the boundary; it follows the deformation.
 
     The traction on the deformed surface is -p n, with the outward normal n of the deformed body.
@@ -37,77 +36,38 @@ class FollowerPressure:
         name: Name of the parameter of a range; "pressure" if left out.
     """
 
+    default_name: ClassVar[str] = "pressure"
+    direction_hint: ClassVar[str] = "a pressure has no direction"
     region: Region
     value: float | list[float]
     name: str | None = None
 
-    @property
-    def ends(self) -> list[float]:
-        """Smallest and largest p [Pa] of a range, or the one value."""
-        return [*self.value] if isinstance(self.value, list | tuple) else [self.value]
-
-    def dimensionless(self, units: Units) -> float:
-        """Return p / E [-]; NaN for a range, until a load says which.
-
-        Raises:
-            ValueError: `value` is neither a finite number nor a range of finite numbers, or the
-                loads have a range of moduli.
-        """
-        ends, words = self.ends, f"value = {self.value}"
-        numbers = [x for x in ends if isinstance(x, int | float) and not isinstance(x, bool)]
-        if len(numbers) < len(ends) or len(ends) not in (1, 2):
-            raise ValueError(
-                f"{words} must be one number or a range [low, high] [Pa]; a pressure has no "
-                "direction"
-            )
-        if not all(map(math.isfinite, ends)) or sorted(set(ends)) != ends:
-            raise ValueError(f"{words} must be a finite number, or two that ascend [Pa]")
-        pressure = float(units.stress(np.array(float(ends[0])), words))
-        return pressure if len(ends) == 1 else math.nan
-
     def check(self, mesh: skfem.Mesh, units: Units) -> None:
-        """Check value and region on a mesh [m]; raise the errors of `on`."""
+        """See `FollowerLoad.check`."""
         self.dimensionless(units)
         facets_in(self.region, mesh)
 
     def on(
-        self, basis: skfem.Basis, units: Units, origin: Origin = 0.0, column: int = CONSTANT
+        self,
+        basis: skfem.Basis,
+        units: Units,
+        material: Material,
+        origin: Origin = 0.0,
+        column: int = CONSTANT,
     ) -> "PressureSurface":
-        """Return the loaded surface; arguments as in `DirichletBC.on` and `PressureSurface.build`.
+        """Return the loaded surface, see `FollowerLoad.on`.
 
         Raises:
-            ValueError: The region contains no boundary facet, or `value` is invalid, see
-                `dimensionless`.
+            ValueError: The region contains no boundary facet, or `value` is invalid.
         """
         pressure = self.dimensionless(units)
         facets = facets_in(self.region, basis.mesh, units.length, origin)
         return PressureSurface.build(basis, facets, pressure, column)
 
 
-def ranges_of(
-    pressures: Sequence[FollowerPressure], *, taken: Collection[str]
-) -> tuple[list[int], dict[str, tuple[float, float]]]:
-    """Return `PressureSurface.column` of each pressure, and the ranges [Pa] by name.
-
-    Raises:
-        ValueError: Two ranges have one name, or one of the names that are `taken`.
-    """
-    columns: list[int] = []
-    ranges: dict[str, tuple[float, float]] = {}
-    for one in pressures:
-        is_range = len(one.ends) == 2
-        columns.append(len(ranges) if is_range else CONSTANT)
-        if is_range:
-            name, (low, high) = one.name or "pressure", one.ends
-            if name in (*ranges, *taken):
-                raise ValueError(f"pressures: two ranges have the name {name}; set another")
-            ranges[name] = low, high
-    return columns, ranges
-
-
 @dataclass(frozen=True, eq=False)
-class PressureSurface:
-    """Boundary facets under a follower pressure, evaluated in batches.
+class PressureSurface(FollowerTerm):
+    """Boundary facets under a follower pressure. `value` is p / E.
 
     The area vector of a deformed facet is y1 x y2, with the derivatives y_i = t_i + du/dxi_i of the
     positions along the coordinates xi_i of the reference facet. It is a polynomial of the nodal
@@ -119,22 +79,18 @@ class PressureSurface:
     8.5 (load stiffness of enclosed boundaries); Schweizerhof, Ramm (1984), Comput. Struct. 18.
 
     Attributes:
-        nodes: Nodes of each facet, (S, A).
         weights: Shape functions times weights of the quadrature points, (S, Q, A) [-].
         slopes: Derivatives of the shape functions along xi_1 and xi_2, (S, Q, A, 2) [-].
         tangents: Derivatives t_i of the positions at rest, (S, Q, 3, 2) [-]; t1 x t2 points out of
             the body.
-        pressure: p / E of each facet, (S,) [-], or (B, S) for each member of a batch.
-        column: Number of the pressure with a range that acts on each facet, (S,); `CONSTANT` where
-            the pressure is one number.
     """
 
-    nodes: Tensor
+    kind: ClassVar[str] = "follower pressure"
+    key: ClassVar[str] = "pressure"
+    independent: ClassVar[tuple[str, ...]] = ("_pair_weights",)
     weights: Tensor
     slopes: Tensor
     tangents: Tensor
-    pressure: Tensor
-    column: Tensor
 
     @classmethod
     def build(
@@ -164,55 +120,13 @@ class PressureSurface:
             weights=torch.from_numpy(np.ascontiguousarray(weights)),
             slopes=torch.from_numpy(np.ascontiguousarray(slopes)),
             tangents=torch.from_numpy(tangents),
-            pressure=torch.full((len(facets),), pressure, dtype=torch.float64),
+            value=torch.full((len(facets),), pressure, dtype=torch.float64),
             column=torch.full((len(facets),), column),
         )
 
-    @classmethod
-    def join(cls, parts: Sequence[Self]) -> Self | None:
-        """Return several surfaces as one; None without a part."""
-        if not parts:
-            return None
-        return cls(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(cls)))
-
-    def to(self, device: torch.device | str) -> Self:
-        """Return the surface with its tensors on a device."""
-        return type(self)(*(getattr(self, field.name).to(device) for field in fields(self)))
-
-    def __getstate__(self) -> dict[str, object]:
-        """Return the fields without cached properties."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def identity(self) -> list[Any]:
-        """Return facets and pressures as plain data, arrays as their SHA-256."""
-        facets = [plain(self.nodes.sort(dim=1).values), plain(self.pressure.nan_to_num())]
-        return [*facets, plain(self.column)] if self.n_ranges else facets
-
-    @property
-    def n_ranges(self) -> int:
-        """Number of pressures with a range."""
-        return int(self.column.max()) + 1
-
-    def scaled(self, factor: float) -> Self:
-        """Return the surface under `factor` times its pressure."""
-        return self._with_pressure(factor * self.pressure)
-
-    def with_values(self, values: Tensor) -> Self:
-        """Return the surface with pressures over E in place of the ranges, (1, P) or (B, P) [-]."""
-        own = values[:, self.column.clamp(min=0)]
-        pressure = torch.where(self.column == CONSTANT, self.pressure, own)
-        return self._with_pressure(pressure[0] if len(pressure) == 1 else pressure)
-
-    @property
-    def generic(self) -> Self:
-        """The surface with a different pressure in place of each range; itself without ranges."""
-        values = torch.arange(1.0, self.n_ranges + 1).to(self.pressure)
-        return self.with_values(values[None]) if self.n_ranges else self
-
-    def _with_pressure(self, pressure: Tensor) -> Self:
-        twin = replace(self, pressure=pressure)
-        twin.__dict__["_pair_weights"] = self._pair_weights
-        return twin
+    def describe(self) -> str:
+        """See `FollowerTerm.describe`."""
+        return f"follower pressure on {len(self.nodes):,} facets"
 
     def force(self, displacement: Tensor) -> Tensor:
         """Return p dV/du, minus the nodal forces of the pressure, (B, N, D) [-].
@@ -220,7 +134,7 @@ class PressureSurface:
         It is a part of the internal force of a body, since it depends on the displacement.
         """
         first, second = self._images(self._slopes(displacement))
-        return self._sum_at_nodes(torch.linalg.cross(first, second), displacement)
+        return self._sum_of_normals(torch.linalg.cross(first, second), displacement)
 
     def work(self, displacement: Tensor) -> Tensor:
         """Return the work against the pressure on the straight way from u = 0 to u, (B,) [-].
@@ -233,7 +147,7 @@ class PressureSurface:
         cross = torch.linalg.cross
         t1, t2 = t1.expand_as(h1), t2.expand_as(h2)
         normal = cross(t1, t2) + (cross(t1, h2) + cross(h1, t2)) / 2 + cross(h1, h2) / 3
-        return (self._sum_at_nodes(normal, displacement) * displacement).sum((-2, -1))
+        return (self._sum_of_normals(normal, displacement) * displacement).sum((-2, -1))
 
     def asymmetry(self, displacement: Tensor) -> Callable[[Tensor], Tensor]:
         """Return the function v -> (A - A^T) v / 2 of the load stiffness A at (1, N, D) [-].
@@ -247,7 +161,7 @@ class PressureSurface:
         def product(field: Tensor) -> Tensor:
             at_facets = torch.nn.functional.pad(field[:, self.nodes], (0, 3 - field.shape[-1]))
             forces = torch.linalg.cross(at_facets[:, :, None].expand_as(vectors), vectors).sum(3)
-            return self._sum_of_facets(forces, field)
+            return self._sum_at_nodes(forces[..., : field.shape[-1]], field)
 
         return product
 
@@ -269,14 +183,16 @@ class PressureSurface:
         return bool(self.asymmetry(u)(v)[:, free].norm() <= 1e-10 * product.norm())
 
     def stiffness(self, displacement: Tensor) -> Tensor:
-        """Return the symmetric part of the load stiffness, (B, S, A (A - 1)/2, 3) [-].
+        """Return the symmetric part of the load stiffness, (B, 2 S A (A - 1)/2 3) [-].
 
         The block of the nodes a < b (b slowest) is the cross product with one vector: its entries
-        (i, k) are epsilon_ikl times the component l. Blocks of a node with itself are zero.
+        (i, k) are epsilon_ikl times the component l. Blocks of a node with itself are zero. The
+        vectors come first, then the same with the opposite sign.
         """
         b, a = np.tril_indices(self.nodes.shape[1], -1)
         vectors = self._pair_vectors(displacement)
-        return (vectors[:, :, a, b] - vectors[:, :, b, a]) / 2
+        entries = ((vectors[:, :, a, b] - vectors[:, :, b, a]) / 2).flatten(1)
+        return torch.cat([entries, -entries], dim=1)
 
     def _pair_vectors(self, displacement: Tensor) -> Tensor:
         """Return vectors c of all pairs of nodes, (B, S, A, A, 3) [-].
@@ -285,7 +201,7 @@ class PressureSurface:
         """
         y1, y2 = self._images(self._slopes(displacement))  # (B, S, Q, 3)
         first, second = self._pair_weights
-        vectors = (first @ y2 - second @ y1) * self.pressure[..., None, None]
+        vectors = (first @ y2 - second @ y1) * self.value[..., None, None]
         return vectors.unflatten(2, (self.nodes.shape[1], -1))
 
     @cached_property
@@ -295,19 +211,17 @@ class PressureSurface:
         first, second = (weights * slopes[:, :, None]).flatten(2, 3)
         return first, second
 
-    def places(self, pattern: Pattern, dim: int) -> Tensor:
-        """Return the positions among the nnz of the entries of `stiffness`, (2, S, pairs, 3).
-
-        The first row belongs to the entries that are added, the second to those that are
-        subtracted; nnz for entries that are not stored.
-        """
+    def places(self, pattern: Pattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """See `FollowerTerm.places`."""
         nodes = self.nodes.cpu().numpy()
         b, a = np.tril_indices(nodes.shape[1], -1)
-        numbers = np.pad(pattern.number, ((0, 0), (0, 3 - dim)), constant_values=-1)
+        missing = 3 - pattern.number.shape[1]
+        numbers = np.pad(pattern.number, ((0, 0), (0, missing)), constant_values=-1)
         rows, columns = numbers[nodes[:, a]], numbers[nodes[:, b]]  # (S, pairs, 3)
         i, k = np.array([1, 2, 0]), np.array([2, 0, 1])  # epsilon_ikl = 1 for l = 0, 1, 2
         both = [(rows[..., i], columns[..., k]), (rows[..., k], columns[..., i])]
-        return torch.from_numpy(np.stack([pattern.positions(*pair) for pair in both]))
+        target = np.stack([pattern.positions(*pair) for pair in both]).flatten()
+        return np.arange(target.size), target
 
     def _slopes(self, displacement: Tensor) -> Tensor:
         """Return du/dxi_i at the quadrature points, (B, S, Q, 3, 2) [-]; in 2D with zeros."""
@@ -321,16 +235,10 @@ class PressureSurface:
         first, second = (self.tangents + slopes).unbind(-1)
         return first, second
 
-    def _sum_at_nodes(self, normal: Tensor, displacement: Tensor) -> Tensor:
+    def _sum_of_normals(self, normal: Tensor, displacement: Tensor) -> Tensor:
         """Return the nodal forces (B, N, D) of p times normals (B, S, Q, 3)."""
-        forces = self.weights.mT @ normal * self.pressure[..., None, None]
-        return self._sum_of_facets(forces, displacement)
-
-    def _sum_of_facets(self, forces: Tensor, displacement: Tensor) -> Tensor:
-        """Return the sums at nodes (B, N, D) of forces of each facet at its nodes (B, S, A, 3)."""
-        forces = forces[..., : displacement.shape[-1]]
-        total = torch.zeros_like(displacement)
-        return total.index_add(1, self.nodes.flatten(), forces.flatten(1, 2))
+        forces = self.weights.mT @ normal[..., : displacement.shape[-1]]
+        return self._sum_at_nodes(forces * self.value[..., None, None], displacement)
 
 
 def _corners(basis: skfem.Basis, local: int) -> NDArray[np.float64]:

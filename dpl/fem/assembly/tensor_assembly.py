@@ -1,8 +1,7 @@
 """Energy, internal force and tangent of a body as batched tensor operations."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -15,7 +14,7 @@ from torch import Tensor
 from dpl.fem.assembly.boundary_conditions import FoundationMatrix
 from dpl.fem.assembly.elements import basis_of
 from dpl.fem.assembly.fbar import fbar_gradient, fbar_stress
-from dpl.fem.assembly.follower_pressure import PressureSurface
+from dpl.fem.assembly.follower_loads import NO_LOADS, FollowerLoads, Places
 from dpl.fem.assembly.recovery import Recovery
 from dpl.fem.assembly.rigid_body_modes import rigid_body_modes, unconstrained_modes
 from dpl.fem.assembly.sparsity import Pattern
@@ -46,12 +45,10 @@ class TensorAssembly:
         prescribed: Displacement of the fixed ones at full load, (N, D) [-]; zero where free.
         boundary: Mask of the nodes on the boundary, (N,).
         springs: Elastic foundation (Robin conditions), or None.
-        pressure: Surface under follower pressure, or None.
+        follower_loads: Loads whose forces depend on the displacement: pressures, active stress.
         mean_dilatation: True if the points of a cell share its mean volume ratio (F-bar).
         young: Young's modulus by which boundary values are divided [Pa]; None if there is no such
             modulus, see `dpl.fem.units.Units`. No other quantity depends on it.
-        pressure_ranges: Smallest and largest value [Pa] of each follower pressure that differs
-            between loads, by name.
     """
 
     mesh: skfem.Mesh
@@ -67,10 +64,9 @@ class TensorAssembly:
     prescribed: Tensor
     boundary: Tensor
     springs: FoundationMatrix | None = None
-    pressure: PressureSurface | None = None
+    follower_loads: FollowerLoads = NO_LOADS
     mean_dilatation: bool = False
     young: float | None = 1.0
-    pressure_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def to(self, device: torch.device | str) -> Self:
         """Return the same body with its tensors on a device."""
@@ -81,9 +77,7 @@ class TensorAssembly:
         }
         if self.springs is not None:
             tensors["springs"] = FoundationMatrix(*(part.to(device) for part in self.springs))
-        if self.pressure is not None:
-            tensors["pressure"] = self.pressure.to(device)
-        return replace(self, **tensors)
+        return replace(self, **tensors, follower_loads=self.follower_loads.to(device))
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields without cached properties."""
@@ -101,21 +95,22 @@ class TensorAssembly:
 
     @property
     def has_one_modulus(self) -> bool:
-        """True if the body is divided by one modulus: elastic foundation or follower pressure."""
-        return self.springs is not None or self.pressure is not None
+        """True if the body is divided by one modulus: elastic foundation or follower loads."""
+        return self.springs is not None or bool(self.follower_loads)
 
     def check_modulus(self, young: float) -> None:
         """Check the Young's modulus [Pa] of a load on this body.
 
-        Elastic foundations have a fixed stiffness and follower pressures a fixed value, so that
+        Elastic foundations have a fixed stiffness and follower loads a fixed stress, so that
         their parts in f_int are those of one modulus. Other bodies allow all moduli.
 
         Raises:
-            ValueError: The modulus is not that of the foundation or the pressure.
+            ValueError: The modulus is not that of the foundation or the follower loads.
         """
         if not self.has_one_modulus or self.young is None or math.isclose(young, self.young):
             return
-        part = "pressure" if self.springs is None else "stiffness of the elastic foundation"
+        part = self.follower_loads.kinds
+        part = part if self.springs is None else "stiffness of the elastic foundation"
         raise ValueError(
             f"young = {young:g} must be {self.young:g} [Pa], by which the {part} is divided; "
             f"build another body with young = {young:g}"
@@ -151,24 +146,24 @@ class TensorAssembly:
         return unconstrained_modes(self.points, self.free, self.springs)
 
     def energy(self, displacement: Tensor) -> Tensor:
-        """Return the energy over E L^D, (B,) [-]: strain energy, foundation and follower pressure.
+        """Return the energy over E L^D, (B,) [-]: strain energy, foundation and follower loads.
 
-        The energy of a pressure is its potential only if it has one, see
-        `PressureSurface.has_potential`.
+        The energy of a follower load is its potential only if it has one, see
+        `FollowerTerm.has_potential`.
         """
         H = self._effective_gradient(displacement)
         energy = (self.material.energy(H) * self.dV).sum((-2, -1))
         if self.springs is not None:
             pull = self.springs.force(displacement)
             energy = energy + (pull * displacement).sum((-2, -1)) / 2
-        if self.pressure is not None:
-            energy = energy + self.pressure.work(displacement)
+        if self.follower_loads:
+            energy = energy + self.follower_loads.work(displacement)
         return energy
 
     def internal_force(self, displacement: Tensor) -> Tensor:
         """Return f_int, the gradient of the energy, (B, N, D) [-]; reactions at fixed nodes.
 
-        A follower pressure is a part of f_int, because it depends on the displacement.
+        Follower loads are a part of f_int, because they depend on the displacement.
         """
         stress = self._effective_stress(self.gradient(displacement))
         return self._with_boundary_forces(self._nodal_forces(stress), displacement)
@@ -176,7 +171,7 @@ class TensorAssembly:
     def tangent(self, displacement: Tensor) -> Tensor:
         """Return the entries of K = d f_int / du on `pattern`, (B, nnz) [-].
 
-        If a follower pressure has no potential, K is the symmetric part.
+        If a follower load has no potential, K is the symmetric part.
         """
         if self.mean_dilatation:
             return self._with_boundary_entries(
@@ -231,15 +226,14 @@ class TensorAssembly:
         return fbar_gradient(self.material, H, self.dV, self.shape[1])
 
     @cached_property
-    def pressure_at_rest(self) -> Tensor:
-        """f_int at u = 0: the force of the pressure on the surface at rest, (N, D) [-].
+    def force_at_rest(self) -> Tensor:
+        """f_int at u = 0: the force of the follower loads on the body at rest, (N, D) [-].
 
-        It is minus the nodal forces of a dead load; zero without a pressure. (B, N, D) if each
-        member of a batch has its own pressure.
+        It is minus the nodal forces of dead loads; zero without follower loads. (B, N, D) if each
+        member of a batch has its own stresses.
         """
-        count = 1 if self.pressure is None else len(torch.atleast_2d(self.pressure.pressure))
-        rest = self.points.new_zeros(count, *self.shape)
-        forces = rest if self.pressure is None else self.pressure.force(rest)
+        count = self.follower_loads.n_members
+        forces = self.follower_loads.force(self.points.new_zeros(count, *self.shape))
         return forces[0] if count == 1 else forces
 
     @cached_property
@@ -294,34 +288,30 @@ class TensorAssembly:
         return force.index_add(1, self.cells.flatten(), per_cell.flatten(1, 2))
 
     def _with_boundary_forces(self, internal: Tensor, displacement: Tensor) -> Tensor:
-        """Return internal forces (B, N, D) plus those of foundation and follower pressure."""
+        """Return internal forces (B, N, D) plus those of foundation and follower loads."""
         if self.springs is not None:
             internal = internal + self.springs.force(displacement)
-        if self.pressure is not None:
-            internal = internal + self.pressure.force(displacement)
+        if self.follower_loads:
+            internal = internal + self.follower_loads.force(displacement)
         return internal
 
     def _with_boundary_entries(self, tangent: Tensor, displacement: Tensor) -> Tensor:
-        """Return the entries of the tangent (B, nnz) plus those of foundation and pressure."""
+        """Return entries of the tangent (B, nnz) plus those of foundation and follower loads."""
         if self.springs is not None:
             rows, columns, stiffness = (part.cpu().numpy() for part in self.springs)
             places = self.pattern.between(rows, columns)
             added = np.bincount(places.ravel(), stiffness.ravel(), len(self.pattern.indices) + 1)
             tangent = tangent + torch.from_numpy(added[:-1]).to(tangent.device)
-        if self.pressure is not None:
-            values = self.pressure.stiffness(displacement).flatten(1)
-            source, target = self._pressure_places
-            both = torch.cat([values, -values], dim=1)[:, source]
-            tangent = tangent.scatter_add(1, target.expand_as(both), both)
+        if self.follower_loads:
+            tangent = self.follower_loads.add_stiffness(
+                tangent, displacement, self._follower_places
+            )
         return tangent
 
     @cached_property
-    def _pressure_places(self) -> tuple[Tensor, Tensor]:
-        """Index of each stored entry in (K, -K) of the load stiffness K, and among the nnz."""
-        assert self.pressure is not None
-        places = self.pressure.places(self.pattern, self.shape[1]).flatten()
-        source = (places < len(self.pattern.indices)).nonzero().flatten()
-        return source.to(self.points.device), places[source].to(self.points.device)
+    def _follower_places(self) -> Places:
+        """Places of the stiffness of the follower loads on the pattern."""
+        return self.follower_loads.places(self.pattern, self.points.device)
 
     def _effective_stress(self, H: Tensor) -> Tensor:
         """Return the stress conjugate to H, (B, E, Q, 3, 3) [-]."""

@@ -1,4 +1,4 @@
-"""Bodies that differ from another in law, parameters, pressure or supports, and share the rest."""
+"""Bodies with another law, parameters, follower loads or supports that share all else."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dpl.fem.assembly.equilibrium import EquilibriumCriterion
-from dpl.fem.assembly.follower_pressure import PressureSurface
+from dpl.fem.assembly.follower_loads import NO_LOADS, FollowerLoads
 from dpl.fem.materials.material import Material
 from dpl.fem.ranges import ParameterRange
 
@@ -51,45 +51,43 @@ class BodyVariants(EquilibriumCriterion):
         """Return the problem with values (B, P) in place of all ranges."""
         count = len(self.material.parameter_ranges)
         body = self.with_material(self.material.with_parameters(parameters[:, :count]))
-        if self.pressure is None or self.young is None or not self.pressure_ranges:
+        if not self.follower_loads.ranges or self.young is None:
             return body
-        pressures = parameters[:, count:] / self.young
-        twin = body._with_pressure(self.pressure.with_values(pressures))
-        twin.__dict__["pressure_has_potential"] = self.pressure_has_potential
+        stresses = parameters[:, count:] / self.young
+        twin = body._with_follower_loads(self.follower_loads.with_values(stresses))
+        twin.__dict__["has_potential"] = self.has_potential
         return twin
 
     @property
     def parameter_ranges(self) -> dict[str, ParameterRange]:
         """Ranges of what differs between loads beside forces and Young's modulus, by name.
 
-        They are the ranges of the law [-], then those of follower pressures [Pa].
+        They are the ranges of the law [-], then those of follower loads [Pa].
         """
-        pressures = self.pressure_ranges.items()
-        own = {name: ParameterRange.of(name, ends) for name, ends in pressures}
-        return {**self.material.parameter_ranges, **own}
+        return {**self.material.parameter_ranges, **self.follower_loads.ranges}
 
     def law_parameters(self, parameters: Tensor) -> Tensor:
         """Return those of the parameters (B, P) that belong to the law."""
         return parameters[:, : len(self.material.parameter_ranges)]
 
-    def ranged_pressure_at_rest(self, parameters: Tensor) -> Tensor:
-        """Return f_int at u = 0 of the pressures with a range alone, (B, N, D) [-].
+    def ranged_force_at_rest(self, parameters: Tensor) -> Tensor:
+        """Return f_int at u = 0 of the follower loads with a range alone, (B, N, D) [-].
 
         Args:
             parameters: Values of `parameter_ranges`, (B, P).
         """
         own = parameters[:, len(self.material.parameter_ranges) :]
-        return torch.einsum("bp,pnd->bnd", own, self._unit_pressures.to(own))
+        return torch.einsum("bp,pnd->bnd", own, self._unit_forces_at_rest.to(own))
 
     @cached_property
-    def _unit_pressures(self) -> Tensor:
-        """f_int at u = 0 of each pressure with a range of 1 Pa alone, (P, N, D) [1/Pa]."""
-        if self.pressure is None or self.young is None:
-            return self.points.new_zeros(0, *self.shape)
-        rest = self.points.new_zeros(len(self.pressure_ranges), *self.shape)
+    def _unit_forces_at_rest(self) -> Tensor:
+        """f_int at u = 0 of each follower load with a range at 1 Pa alone, (P, N, D) [1/Pa]."""
+        rest = self.points.new_zeros(len(self.follower_loads.ranges), *self.shape)
+        if not len(rest) or self.young is None:
+            return rest
         units = torch.eye(len(rest)).to(rest) / self.young
-        constant = self.without_ranged_pressure.pressure_at_rest
-        return self.pressure.with_values(units).force(rest) - constant
+        constant = self.without_ranged_loads.force_at_rest
+        return self.follower_loads.with_values(units).force(rest) - constant
 
     def with_material(self, material: Material) -> Self:
         """Return the body of another law; mesh and pattern are shared, for the same law kernels."""
@@ -125,38 +123,38 @@ class BodyVariants(EquilibriumCriterion):
         values = [ends.at((k + 1) / (len(ranges) + 1)) for k, ends in enumerate(ranges)]
         return self.with_parameters(torch.tensor([values]).double())
 
-    def with_pressure_factor(self, factor: float) -> Self:
-        """Return the body under `factor` times its follower pressure; all else is shared."""
-        if self.pressure is None or factor == 1:
+    def with_follower_factor(self, factor: float) -> Self:
+        """Return the body under `factor` times its follower loads; all else is shared."""
+        if not self.follower_loads or factor == 1:
             return self
-        twin = self._with_pressure(self.pressure.scaled(factor))
-        twin.__dict__["pressure_has_potential"] = self.pressure_has_potential
-        twin.__dict__["pressure_at_rest"] = factor * self.pressure_at_rest
+        twin = self._with_follower_loads(self.follower_loads.scaled(factor))
+        twin.__dict__["has_potential"] = self.has_potential
+        twin.__dict__["force_at_rest"] = factor * self.force_at_rest
         return twin
 
-    def _with_pressure(self, pressure: PressureSurface) -> Self:
-        """Return the body with another pressure on the same facets; all else is shared."""
-        twin = self._share(replace(self, pressure=pressure, pressure_ranges={}))
+    def _with_follower_loads(self, loads: FollowerLoads) -> Self:
+        """Return the body with other stresses on the same facets and cells; all else is shared."""
+        twin = self._share(replace(self, follower_loads=loads))
         twin.__dict__["_first"] = self.__dict__.get("_first", self)
-        twin.__dict__["_pressure_places"] = self._pressure_places
+        twin.__dict__["_follower_places"] = self._follower_places
         return twin
 
     @cached_property
-    def without_pressure(self) -> Self:
-        """The body without follower pressure; itself if it has none."""
-        if self.pressure is None:
+    def without_follower_loads(self) -> Self:
+        """The body without follower loads; itself if it has none."""
+        if not self.follower_loads:
             return self
-        twin = self._share(replace(self, pressure=None, pressure_ranges={}))
+        twin = self._share(replace(self, follower_loads=NO_LOADS))
         twin.__dict__["_first"] = self.__dict__.get("_first", self)
         return twin
 
     @property
-    def without_ranged_pressure(self) -> Self:
-        """The body with 0 in place of each pressure with a range; itself if there is none."""
-        if self.pressure is None or not self.pressure_ranges:
+    def without_ranged_loads(self) -> Self:
+        """The body with 0 in place of each follower load with a range; itself if there is none."""
+        if not self.follower_loads.ranges:
             return self
-        zeros = self.pressure.pressure.new_zeros(1, len(self.pressure_ranges))
-        return self._with_pressure(self.pressure.with_values(zeros))
+        zeros = self.points.new_zeros(1, len(self.follower_loads.ranges))
+        return self._with_follower_loads(self.follower_loads.with_values(zeros))
 
     def with_held(self, held: Tensor) -> Self:
         """Return the body with further degrees of freedom (N, D) fixed where they are at rest."""
@@ -177,8 +175,6 @@ class BodyVariants(EquilibriumCriterion):
         return twin
 
     @cached_property
-    def pressure_has_potential(self) -> bool:
-        """True if the follower pressure has a potential; also without one."""
-        if self.pressure is None:
-            return True
-        return self.pressure.generic.has_potential(self.free, self.prescribed)
+    def has_potential(self) -> bool:
+        """True if the follower loads have a potential; also without one."""
+        return self.follower_loads.has_potential(self.free, self.prescribed)

@@ -242,6 +242,20 @@ class FibreReinforced(Composed, Material):
         return Response(Q @ _tensor(S, e) @ Q.mT, moduli)
 
 
+def fibre_frames(material: Material, count: int) -> Tensor:
+    """Return the fibre frames of the law of each cell, (E, 3, 3) [-]; NaN where it has no fibres.
+
+    Args:
+        material: The law, after `Material.on`.
+        count: E, the number of cells.
+    """
+    frames = torch.full((count, 3, 3), torch.nan, dtype=torch.float64)
+    for law, cells in material.groups(count):
+        if isinstance(law, FibreReinforced):
+            frames[cells] = law.frames
+    return frames
+
+
 def _tensor(S: tuple[Any, ...], e: tuple[Tensor, ...]) -> Tensor:
     """Return the symmetric tensor (..., 3, 3) of six components."""
     parts = _tensors(S, e)

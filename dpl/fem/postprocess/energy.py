@@ -82,7 +82,7 @@ class RestStiffness:
         parameters = force.new_zeros(1, 0) if parameters is None else parameters
         for one, own in zip(force.cpu(), parameters.cpu().expand(len(force), -1), strict=True):
             linear = self._linear.with_parameters(own[None])
-            right = problem.restrict(one - linear.problem.pressure_at_rest)
+            right = problem.restrict(one - linear.problem.force_at_rest)
             key = hash(right.tobytes() + own.numpy().tobytes())
             if key not in self._works:
                 if len(self._works) >= CACHE_SIZE:
@@ -99,7 +99,7 @@ class RestStiffness:
         """Return the strain energy at rest W(0), (1,) or (B,) [-]; it is not zero for every law."""
         if not parameters.shape[-1]:
             return self._energy
-        body = self.problem.with_parameters(parameters).without_pressure
+        body = self.problem.with_parameters(parameters).without_follower_loads
         nothing = body.points.new_zeros(1, len(body.cells), 1, 3, 3)
         volumes = body.dV.sum(1).expand(len(body.cells))
         return (body.material.energy(nothing)[..., 0] * volumes).sum(1).expand(len(parameters))
@@ -136,12 +136,12 @@ def potential_energy(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return W(u) - W(0) - f.u (B,), its gradient (B, N, D), and a mask of det F > 0 (B,).
 
-    W includes the potential of a follower pressure.
+    W includes the potential of follower loads.
 
     Raises:
         ValueError: A follower pressure has no potential.
     """
-    if not problem.pressure_has_potential:
+    if not problem.has_potential:
         raise ValueError(
             "the follower pressure has no potential, because the edge of its surface is free; use "
             "another loss than energy"

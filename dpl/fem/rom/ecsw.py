@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_triangular
 from torch import Tensor
 
+from dpl.fem.assembly.follower_loads import NO_LOADS
 from dpl.fem.linear.interface import full_matrix
 from dpl.fem.problem import Problem
 
@@ -202,7 +203,7 @@ class ReducedMesh:
             prescribed=torch.zeros(fields, dtype=torch.float64),
             boundary=torch.zeros(len(nodes), dtype=torch.bool),
             springs=None,
-            pressure=None,
+            follower_loads=NO_LOADS,
         )
         self.basis = vectors[nodes].flatten(0, 1).contiguous()
         self._size = per_cell * dim

@@ -20,7 +20,7 @@ from dpl.fem.rom.reduced_problem import (
     beyond_linear,
     broyden,
     norm,
-    refuse_pressure,
+    refuse_follower_loads,
     refuse_range,
 )
 from dpl.fem.solvers.linear import LinearSolver
@@ -118,7 +118,7 @@ class PODGalerkin:
             ValueError: `rank` is out of range, see `pod`.
         """
         refuse_range(problem)
-        refuse_pressure(problem, cls.__name__)
+        refuse_follower_loads(problem, cls.__name__)
         basis = pod(beyond_linear(problem, snapshots, lift), rank).vectors
         vectors = torch.zeros(*problem.shape, rank, dtype=torch.float64)
         vectors[problem.free] = basis
@@ -154,7 +154,7 @@ class PODGalerkin:
     def __post_init__(self) -> None:
         """Check the ranges."""
         refuse_range(self.problem)
-        refuse_pressure(self.problem, type(self).__name__)
+        refuse_follower_loads(self.problem, type(self).__name__)
         check_steps(self, parts=("reduced_tol", "min_detF_ratio", "min_load_step"))
         if tuple(self.vectors.shape[:2]) != self.problem.shape:
             found, wanted = tuple(self.vectors.shape), (*self.problem.shape, "R")

@@ -192,12 +192,12 @@ def norm(vector: Tensor) -> float:
     return largest * float(torch.linalg.vector_norm(vector / largest))
 
 
-def refuse_pressure(problem: Problem, name: str) -> None:
-    """Raise a ValueError if the body has a follower pressure; `name` cannot treat it."""
-    if problem.pressure is not None:
+def refuse_follower_loads(problem: Problem, name: str) -> None:
+    """Raise a ValueError if the body has follower loads; `name` cannot treat them."""
+    if problem.follower_loads:
         raise ValueError(
-            f"{name} selects cells and has no follower pressure; use dpl.fem.Newton, or a model "
-            "that predicts nodal displacements (fcnn, cnn, gnn)"
+            f"{name} selects cells and has no {problem.follower_loads.kinds}; use "
+            "dpl.fem.Newton, or a model that predicts nodal displacements (fcnn, cnn, gnn)"
         )
 
 
@@ -222,12 +222,12 @@ def beyond_linear(problem: Problem, snapshots: Tensor, lift: LinearSolver | None
 
 
 def support_force(problem: Problem) -> Tensor:
-    """Return K(0) prescribed plus the follower pressure on the surface at rest, (N, D)."""
+    """Return K(0) prescribed plus the follower loads on the body at rest, (N, D)."""
     if not problem.moved_supports:
-        return problem.pressure_at_rest
+        return problem.force_at_rest
     rest = torch.zeros(1, *problem.shape, dtype=torch.float64)
-    elastic = problem.without_pressure
-    return elastic.tangent_product(rest, problem.prescribed[None])[0] + problem.pressure_at_rest
+    elastic = problem.without_follower_loads
+    return elastic.tangent_product(rest, problem.prescribed[None])[0] + problem.force_at_rest
 
 
 def _linear_solution(lift: LinearSolver, force: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dpl.fem.problem import Evaluation, Problem
 from dpl.fem.rom.ecsw import Cubature, cubature
-from dpl.fem.rom.reduced_problem import refuse_pressure
+from dpl.fem.rom.reduced_problem import refuse_follower_loads
 from dpl.fem.rom.sampled_tangent import Array, SampledTangent, Single
 from dpl.fem.solvers.solution import Load, Solution, check_tol, evaluate_solution, run_lockstep
 
@@ -119,7 +119,7 @@ class SubspaceNewton:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        refuse_pressure(self.problem, type(self).__name__)
+        refuse_follower_loads(self.problem, type(self).__name__)
         check_tol(self.tol)
         for name in ("error_tol", "min_damping", "min_detF_ratio"):
             if not 0 < getattr(self, name) <= 1:

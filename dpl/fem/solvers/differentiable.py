@@ -23,7 +23,7 @@ class DifferentiableSolve:
 
     The forward pass is a Newton solve. In the backward pass a gradient g with respect to u becomes
     K(u)^-T g with respect to f, since K(u) du = df on free degrees of freedom. The tangent at the
-    solution is factorised at the first gradient. A follower pressure without potential makes it
+    solution is factorised at the first gradient. A follower load without potential makes it
     unsymmetric; the factor of the symmetric part then preconditions GMRES.
 
     The derivative is that of the branch of equilibria on which the solution lies, stable or not.

@@ -177,7 +177,7 @@ def _sum(first: Map, second: Map) -> Map:
 def stability_at(problem: Problem, backend: Backend, displacement: Tensor) -> Stability:
     """Return the stability of the tangent at (1, N, D); a singular one counts as unstable.
 
-    Under a pressure without potential a positive definite symmetric part is sufficient for
+    Under a follower load without potential a positive definite symmetric part is sufficient for
     stability. It is not necessary: otherwise nothing is known.
     """
     tangent = problem.linearise(displacement).tangent
@@ -185,7 +185,7 @@ def stability_at(problem: Problem, backend: Backend, displacement: Tensor) -> St
         found = backend.factorise(tangent[0].numpy()).stability()
     except SingularMatrix:  # at the critical load itself
         found = UNSTABLE
-    return found if problem.pressure_has_potential or not found.least else UNKNOWN
+    return found if problem.has_potential or not found.least else UNKNOWN
 
 
 def forcing_term(residual: float, previous: float, *, tol: float, corotational: bool) -> float:

@@ -77,7 +77,7 @@ class LinearSolver:
 
     @property
     def _twin(self) -> "LinearSolver | None":
-        """The parent if it has the same K(0): only a pressure or the motion of supports differs."""
+        """The parent if it has the same K(0): only follower loads or moved supports differ."""
         parent = self.parent
         return parent if parent and parent.problem.material is self.problem.material else None
 
@@ -154,12 +154,12 @@ class LinearSolver:
     def solve(self, force: Tensor) -> Tensor:
         """Return K(0)^-1 f, (N, D) [-], for f (N, D) [-]; zero at supports.
 
-        f includes a follower pressure as a dead load on the surface at rest.
+        f includes follower loads as dead loads on the body at rest.
         """
-        return self.solve_force(force - self.problem.pressure_at_rest)
+        return self.solve_force(force - self.problem.force_at_rest)
 
     def solve_force(self, force: Tensor) -> Tensor:
-        """Return K(0)^-1 f as `solve` does, without a follower pressure."""
+        """Return K(0)^-1 f as `solve` does, without follower loads."""
         return self.problem.extend(self.factor.solve(self.problem.restrict(force)))
 
     def __getstate__(self) -> dict[str, object]:

@@ -1,6 +1,6 @@
 """Newton-Raphson on the nodal equilibrium f_int(u) = f, with load steps where needed.
 
-A load factor scales forces, follower pressures and prescribed displacements.
+A load factor scales forces, follower loads and prescribed displacements.
 """
 
 import math
@@ -128,7 +128,7 @@ class Newton:
         tangents = TangentSolver(self.linear_solver, corotational=self.corotational)
         run, zero = _Run(tangents, LoadStepping(self.min_load_step)), torch.zeros_like(force)
         one, supports = torch.ones(1, dtype=force.dtype), self.problem.prescribed[None]
-        internal = self.problem.pressure_at_rest[None]
+        internal = self.problem.force_at_rest[None]
         state = base = _State(zero, internal, one, supports, {})  # at rest, needs no evaluation
         if (start := self._initial(force, guess)) is not None:
             state, run.from_guess = start, True
@@ -193,7 +193,7 @@ class Newton:
 
         It contains the step of the supports.
         """
-        problem, u = self.problem.with_pressure_factor(factor), state.displacement
+        problem, u = self.problem.with_follower_factor(factor), state.displacement
         internal, tangent, asymmetry = self._internal(state, factor), None, None
         if u.any():
             system = problem.linearise(u, state.gap)
@@ -238,17 +238,17 @@ class Newton:
     def _residual(self, state: "_State", force: Tensor, factor: float) -> float:
         """Return the relative residual under `factor` times a load, evaluated once."""
         if factor not in state.residuals:
-            body = self.problem.with_pressure_factor(factor)
+            body = self.problem.with_follower_factor(factor)
             internal = self._internal(state, factor)
             state.residuals[factor] = float(body.relative_residual_of(internal, factor * force))
         return state.residuals[factor]
 
     def _internal(self, state: "_State", factor: float) -> Tensor:
-        """Return f_int (1, N, D) at a state, with `factor` times the follower pressure."""
-        pressure = self.problem.pressure
-        if pressure is None or factor == 1:
+        """Return f_int (1, N, D) at a state, with `factor` times the follower loads."""
+        loads = self.problem.follower_loads
+        if not loads or factor == 1:
             return state.internal
-        return state.internal - (1 - factor) * pressure.force(state.displacement)
+        return state.internal - (1 - factor) * loads.force(state.displacement)
 
     def _is_balanced(self, state: "_State", force: Tensor, factor: float, tol: float) -> bool:
         """Return True if a state balances `factor` times a load, to a tolerance or to rounding."""
@@ -258,7 +258,7 @@ class Newton:
             return True
         if not 0.1 * state.previous < residual < 1e-4:  # the residual still falls
             return False
-        body, internal = self.problem.with_pressure_factor(factor), self._internal(state, factor)
+        body, internal = self.problem.with_follower_factor(factor), self._internal(state, factor)
         return bool(body.is_equilibrium(state.displacement, internal, factor * force, tol))
 
     def _report(
@@ -300,7 +300,7 @@ class _State(NamedTuple):
 
     Attributes:
         displacement: u, (1, N, D) [-].
-        internal: f_int(u) under the whole follower pressure, (1, N, D) [-].
+        internal: f_int(u) under the whole follower loads, (1, N, D) [-].
         volume_ratio: min det F, (1,) [-].
         support_step: Displacement that the next step has to add at the supports, (1, N, D) [-].
         residuals: Relative residuals by load factor.

@@ -61,25 +61,25 @@ class StiffnessTerms:
 
     @cached_property
     def bodies(self) -> list[Problem]:
-        """Linear elastic bodies whose stiffness at rest is K_k, without foundation and pressure."""
+        """Linear elastic bodies of the stiffness K_k, without foundation and follower loads."""
         return [self.body(row) for row in torch.eye(len(self), dtype=torch.float64)]
 
     def body(self, factors: Tensor) -> Problem:
-        """Return the linear elastic body of factors (T,), without foundation and pressure."""
+        """Return the linear elastic body of factors (T,), without foundation and follower loads."""
         law = self.problem.reference.material.linear_law(factors @ self.vectors)
-        body = self.problem.without_pressure.with_material(law)
+        body = self.problem.without_follower_loads.with_material(law)
         return body if body.springs is None else replace(body, springs=None)
 
     def support_forces(self) -> Tensor:
-        """Return forces of moved supports and of the pressure at rest, (T + 1, N, D) [-].
+        """Return forces of moved supports and of follower loads at rest, (T + 1, N, D) [-].
 
-        They are K_k p of the prescribed displacement p, and C p plus the force of the pressure.
+        They are K_k p of the prescribed displacement p, and C p plus the forces of follower loads.
         """
         problem = self.problem
         rest, p = torch.zeros(1, *problem.shape, dtype=torch.float64), problem.prescribed[None]
         moved = problem.moved_supports
         forces = [b.tangent_product(rest, p)[0] if moved else rest[0] for b in self.bodies]
-        constant = problem.pressure_at_rest
+        constant = problem.force_at_rest
         if problem.springs is not None and moved:
             constant = constant + problem.springs.force(p)[0]
         return torch.stack([*forces, constant])

@@ -1,0 +1,160 @@
+"""Active stress: tension of muscle along the fibres of a body."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+import skfem
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from dpl.fem.assembly.elements import gradients
+from dpl.fem.assembly.follower_loads import CONSTANT, FollowerLoad, FollowerTerm
+from dpl.fem.assembly.sparsity import Pattern
+from dpl.fem.identity import plain
+from dpl.fem.materials.fibre_reinforced import FibreDirections, fibre_frames
+from dpl.fem.materials.material import Material
+from dpl.fem.mesh.regions import Origin, Region, cells_in
+from dpl.fem.units import Units
+
+
+@dataclass(frozen=True)
+class ActiveStress(FollowerLoad):
+    """Tension of muscle along its fibres, the second Piola-Kirchhoff stress T f f^T.
+
+    f is the unit vector of the fibre at rest. The stress adds to that of the law. Its energy is
+    the integral of T/2 f.(C - I) f over the body at rest, so that a positive T shortens the fibres.
+    The strain is that of the displacement itself, also in a body with `mean_dilatation`.
+
+    Source: Land et al. (2015), Proc. R. Soc. A 471, 20150641, problem 3.
+
+    Attributes:
+        value: T [Pa]; or a range [low, high], of which each load has its own T, see
+            `Problem.parameter_ranges`. On a problem with E = 1 Pa, the default of `Problem.build`,
+            this is T / E.
+        region: The cells; None for all.
+        directions: Fibre directions f, see `dpl.fem.FibreDirections`; None for those of the law.
+        name: Name of the parameter of a range; "active_stress" if left out.
+    """
+
+    default_name: ClassVar[str] = "active_stress"
+    direction_hint: ClassVar[str] = "it acts along the fibres, see directions"
+    value: float | list[float]
+    region: Region | None = None
+    directions: FibreDirections | None = None
+    name: str | None = None
+
+    def check(self, mesh: skfem.Mesh, units: Units) -> None:
+        """See `FollowerLoad.check`."""
+        self.dimensionless(units)
+        self._cells(mesh, units.length)
+
+    def on(
+        self,
+        basis: skfem.Basis,
+        units: Units,
+        material: Material,
+        origin: Origin = 0.0,
+        column: int = CONSTANT,
+    ) -> "ActiveFibres":
+        """Return the active fibres, see `FollowerLoad.on`.
+
+        Raises:
+            ValueError: The region contains no cell, no fibre directions are known in one of its
+                cells, or `value` is invalid.
+        """
+        tension = self.dimensionless(units)
+        cells = self._cells(basis.mesh, units.length, origin)
+        if self.directions is None:
+            frames = fibre_frames(material, basis.mesh.nelements)
+        else:
+            frames = self.directions.on(basis, units.length, origin)
+            frames = frames.expand(basis.mesh.nelements, -1, -1)
+        fibre = frames.numpy()[cells, : basis.mesh.dim(), 0]  # column f; in 2D its part in plane
+        if unknown := int(np.isnan(fibre).any(axis=1).sum()):
+            raise ValueError(
+                f"no fibre directions are known in {unknown} of {len(cells)} cells; set "
+                "directions, or a region of cells whose law has fibres"
+            )
+        dN, dV = (np.broadcast_to(x, (basis.nelems, *x.shape[1:])) for x in gradients(basis))
+        slopes = np.einsum("cqad,cd->cqa", dN[cells], fibre)
+        return ActiveFibres(
+            nodes=torch.from_numpy(basis.element_dofs.T[cells].astype(np.int64)),
+            value=torch.full((len(cells),), tension, dtype=torch.float64),
+            column=torch.full((len(cells),), column),
+            cells=torch.from_numpy(cells.astype(np.int64)),
+            fibre=torch.from_numpy(fibre),
+            slopes=torch.from_numpy(slopes),
+            volumes=torch.from_numpy(dV[cells]),
+        )
+
+    def _cells(self, mesh: skfem.Mesh, length: float, origin: Origin = 0.0) -> NDArray[np.int_]:
+        """Return the numbers of the cells, (S,)."""
+        if self.region is None:
+            return np.arange(mesh.nelements)
+        return cells_in(self.region, mesh, length, origin)
+
+
+@dataclass(frozen=True, eq=False)
+class ActiveFibres(FollowerTerm):
+    """Cells with active fibres. `value` is T / E.
+
+    The nodal force is affine in the displacement: T times the integral of (grad N_a . f) F f, with
+    F f = f + du/df. Its derivative is T times the integral of (grad N_a . f)(grad N_b . f) for each
+    component of the displacement: constant and symmetric.
+
+    Attributes:
+        cells: Numbers of the cells, (S,).
+        fibre: Direction f, (S, D) [-]; in 2D its components in the plane.
+        slopes: Derivatives of the shape functions along f, (S, Q, A) [-].
+        volumes: Volumes of the quadrature points, (S, Q) [-].
+    """
+
+    kind: ClassVar[str] = "active stress"
+    key: ClassVar[str] = "active_stress"
+    independent: ClassVar[tuple[str, ...]] = ("_unit_stiffness",)
+    cells: Tensor
+    fibre: Tensor
+    slopes: Tensor
+    volumes: Tensor
+
+    def identity(self) -> list[Any]:
+        """See `FollowerTerm.identity`; with the fibre directions."""
+        return [*super().identity(), plain(self.fibre)]
+
+    def describe(self) -> str:
+        """See `FollowerTerm.describe`."""
+        return f"active stress in {len(self.cells):,} cells"
+
+    def force(self, displacement: Tensor) -> Tensor:
+        """Return the part of the internal force, (B, N, D) [-]."""
+        image = self.fibre[:, None] + self.slopes @ displacement[:, self.nodes]  # F f
+        forces = (self.slopes * self.volumes[..., None]).mT @ image
+        return self._sum_at_nodes(forces * self.value[..., None, None], displacement)
+
+    def work(self, displacement: Tensor) -> Tensor:
+        """Return the energy, the integral of T/2 f.(C - I) f, (B,) [-]."""
+        change = self.slopes @ displacement[:, self.nodes]  # du/df, (B, S, Q, D)
+        strain = ((self.fibre[:, None] + change / 2) * change).sum(-1)
+        return ((strain * self.volumes).sum(-1) * self.value).sum(-1)
+
+    def stiffness(self, displacement: Tensor) -> Tensor:
+        """Return entries of d force / du for pairs of nodes a <= b, b slowest, (B, M) [-]."""
+        entries = (self.value[..., None] * self._unit_stiffness).flatten(-2)
+        return entries.expand(len(displacement), -1)
+
+    @cached_property
+    def _unit_stiffness(self) -> Tensor:
+        """`stiffness` of T = E for pairs of nodes, (S, A (A + 1)/2) [-]."""
+        matrices = (self.slopes * self.volumes[..., None]).mT @ self.slopes
+        b, a = np.tril_indices(self.nodes.shape[1])
+        return matrices[:, a, b]
+
+    def places(self, pattern: Pattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """See `FollowerTerm.places`."""
+        own = pattern.places[self.cells.cpu().numpy()]  # (S, pairs, D, D)
+        target = own.diagonal(axis1=-2, axis2=-1).astype(np.int64)
+        source = np.arange(target[..., 0].size).repeat(target.shape[-1])
+        return source, target.flatten()
