@@ -13,7 +13,9 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from benchmarks.verification.artery import artery
 from benchmarks.verification.beams import balance, beam
+from benchmarks.verification.cardiac import cardiac
 from benchmarks.verification.nodal_stress import nodal_stress
 from benchmarks.verification.pressurised import inflation
 from benchmarks.verification.refinement import cook, locking, order
@@ -36,6 +38,8 @@ CASES: dict[str, Callable[[Path], Section]] = {
     "balance": balance,
     "nodal_stress": nodal_stress,
     "inflation": inflation,
+    "cardiac": cardiac,
+    "artery": artery,
 }
 
 

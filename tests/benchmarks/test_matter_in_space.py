@@ -1,0 +1,60 @@
+"""Bodies with fibres and of several laws, on coarse meshes, against known solutions."""
+
+import math
+
+import numpy as np
+import pytest
+import skfem
+
+from benchmarks.verification.artery import ARTERIES, exact_radius, radii
+from benchmarks.verification.cardiac import ENDO, EPI, TIP, beam_tips, inflated_apex
+from benchmarks.verification.ventricle import BASE, LONG, SHORT, WALL, endocardium, ventricle
+
+
+def capped_volume(short: float, long: float) -> float:
+    """Return the volume [mm^3] of an ellipsoid with the half axes short, short and long below z."""
+    return math.pi * short**2 * (BASE + long - (BASE**3 + long**3) / (3 * long**2))
+
+
+@pytest.mark.parametrize(("quarter", "share"), [(True, 0.25), (False, 1.0)])
+def test_the_ventricle_has_its_volume_and_no_degenerate_cell(quarter, share):
+    mesh = ventricle(2, 6, 2, quarter=quarter).mesh
+    dx = skfem.Basis(mesh, skfem.ElementHex2()).dx
+    wall = capped_volume(SHORT + WALL, LONG + WALL) - capped_volume(SHORT, LONG)
+    assert dx.sum() == pytest.approx(share * wall, rel=1e-4)
+    jacobian = mesh.mapping().detDF(np.full((3, 1), 0.5))
+    corners = mesh.mapping().detDF(np.array([[0.0, 1.0]] * 3))
+    assert (corners.min(axis=1) > 0.2 * jacobian[:, 0]).all()
+
+
+def test_fibres_of_the_ventricle_lie_in_the_wall():
+    """They are unit vectors in the ellipsoid of their depth; in the middle they are hoops."""
+    v = ventricle(2, 6, 3)
+    fibres = v.fibres()
+    assert np.linalg.norm(fibres, axis=1) == pytest.approx(1.0)
+    assert (v.along * v.around).sum(axis=1) == pytest.approx(0.0, abs=1e-12)
+    middle = np.abs(v.depth - 0.5) < 1e-9
+    assert middle.sum() == len(v.depth) / 3
+    assert np.abs(fibres[middle] * v.around[middle]).sum(axis=1).min() > 0
+    assert (fibres[middle] * v.around[middle]).sum(axis=1) == pytest.approx(1.0)
+    points = v.mesh.doflocs.T
+    assert endocardium(points).sum() > 0
+
+
+def test_the_beam_of_muscle_bends_as_in_the_benchmark():
+    """Land et al. (2015), problem 1."""
+    assert beam_tips((10, 2, 2), (2e2, 2e3)) == pytest.approx([float(TIP)] * 2, rel=0.01)
+
+
+def test_the_ventricle_expands_as_in_the_benchmark():
+    """Land et al. (2015), problem 2."""
+    ((inner, outer),) = inflated_apex((2, 6, 1), (1e2,))
+    assert inner == pytest.approx(float(ENDO), rel=5e-3)
+    assert outer == pytest.approx(float(EPI), rel=5e-3)
+
+
+@pytest.mark.parametrize("name", ARTERIES)
+def test_an_artery_of_two_layers_expands_as_its_integral(name):
+    layers, pressure = ARTERIES[name]
+    (found,) = radii(layers, pressure, (4, 24), (1e3,))
+    assert found == pytest.approx(exact_radius(layers, pressure), rel=1.5e-3)
