@@ -129,12 +129,12 @@ def radii(
                 DirichletBC(Plane(0, 0.0), [0.0, None]),
                 DirichletBC(Plane(1, 0.0), [None, 0.0]),
             ],
-            pressures=[FollowerPressure(_inside, pressure)],
+            follower_loads=[FollowerPressure(_inside, pressure)],
             length=1.0,
         )
 
     problem = body(bulks[0])
-    *_, start = follow(problem.with_pressure_factor, (0.1, 0.25, 0.5, 0.75, 1.0))
+    *_, start = follow(problem.with_follower_factor, (0.1, 0.25, 0.5, 0.75, 1.0))
     places = problem.points.numpy() + problem.origin
     inner = _inside(places)
     solutions = follow(lambda x: body(1 / x), [1 / bulk for bulk in bulks], start)

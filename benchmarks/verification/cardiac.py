@@ -52,7 +52,7 @@ def beam(cells: Cells, bulk: float) -> Problem:
         law,
         fixed=Plane(0, "min"),
         degree=2,
-        pressures=[FollowerPressure(Plane(2, "min"), 0.004)],
+        follower_loads=[FollowerPressure(Plane(2, "min"), 0.004)],
         length=1.0,
     )
 
@@ -80,7 +80,7 @@ def inflated(cells: Cells, bulk: float) -> Problem:
             DirichletBC(Plane(2, "max")),
         ],
         degree=2,
-        pressures=[FollowerPressure(endocardium, 10.0)],
+        follower_loads=[FollowerPressure(endocardium, 10.0)],
         length=1.0,
     )
 
@@ -92,7 +92,7 @@ def inflated_apex(
     problem = inflated(cells, bulks[0])
     points = problem.points.numpy() + problem.origin
     nodes = [apex(points, depth) for depth in (0.0, 1.0)]
-    *_, first = follow(problem.with_pressure_factor, PRESSURE_STEPS)
+    *_, first = follow(problem.with_follower_factor, PRESSURE_STEPS)
     solutions = follow(lambda x: inflated(cells, 1 / x), [1 / bulk for bulk in bulks], first)
     found = [[points[node, 2] + float(u[0, node, 2]) for node in nodes] for u in solutions]
     return [(inner, outer) for inner, outer in found]
@@ -130,8 +130,8 @@ def cardiac(folder: Path) -> Section:
         "volumetric energy κ/4 (J² − 1 − 2 ln J). The paper shows the solutions of 11 codes in "
         "figures and reports differences of typically 0.5 % between them, which is the tolerance "
         "(1 % on the coarsest meshes). The digits of the references are those of one of these "
-        "codes on its finest meshes, FEniCS with Taylor-Hood elements (Pezzuto, summary_results.txt in "
-        "github.com/finsberg/mechbench).",
+        "codes on its finest meshes, FEniCS with Taylor-Hood elements (Pezzuto, "
+        "summary_results.txt in github.com/finsberg/mechbench).",
         rows,
         [("cardiac.png", "Relative difference from the reference against the bulk modulus.")],
     )
