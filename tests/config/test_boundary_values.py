@@ -222,3 +222,42 @@ def test_a_range_of_pressures_has_the_name_of_the_force_and_is_in_pascals(scene_
 def test_a_pressure_is_refused_with_a_range_of_moduli(scene_of):
     with pytest.raises(ConfigError, match=r"forces\.inflate: value = 45.0 .*young is a range"):
         scene_of(*BAR, INFLATE, "young=[1e3,2e3]")
+
+
+FIBRES = "directions: {_target_: dpl.fem.ConstantFibres, fibre: [1.0, 0.0, 0.0]}"
+MUSCLE = f"+forces.muscle={{_target_: dpl.fem.ActiveStress, value: 45.0, {FIBRES}}}"
+OUTSIDE = "region: {_target_: dpl.fem.Box, lower: [500, 0, 0], upper: [501, 1, 1]}"
+
+
+def test_an_active_stress_in_pascals_shortens_a_bar_by_its_ratio_to_the_modulus_at_first(scene_of):
+    scene = scene_of(*BAR, MUSCLE)
+    assert scene.loads.constant_force is None
+    x, u = metres(scene)
+    assert u[:, 0] == pytest.approx(-45.0 / E * x, rel=1e-12, abs=1e-12)
+
+
+def test_an_active_stress_has_the_name_of_the_force_and_the_directions_of_the_law(scene_of):
+    law = ["material=guccione", "material.directions.fibre=[1.0,0.0,0.0]"]
+    own = MUSCLE.replace(f", {FIBRES}", "").replace("45.0", "[0.0, 45.0]")
+    scene = scene_of(BAR[0], *BAR[-2:], *law, own)
+    assert scene.loads.parameter_ranges == {"muscle": (0.0, 45.0)}
+    assert "muscle from 0 to 45 Pa" in dict(scene.describe())["supports"]
+    force = scene.problem.ranged_force_at_rest(torch.tensor([[45.0]]).double())[0]
+    expected = scene_of(*BAR, MUSCLE).problem.force_at_rest
+    torch.testing.assert_close(force, expected, rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (MUSCLE.replace(f", {FIBRES}", ""), r"forces\.muscle: no fibre directions are known"),
+        (MUSCLE.replace("45.0", "[2.0, 1.0]"), r"forces\.muscle: value.* two that ascend"),
+        (MUSCLE.replace("45.0", "[1.0, 2.0, 3.0]"), r"forces\.muscle: value.* along the fibres"),
+        (MUSCLE.replace("45.0", ".inf"), r"forces\.muscle.value"),
+        (MUSCLE.replace("[1.0, 0.0, 0.0]", "[0.0, 0.0, 0.0]"), r"forces\.muscle.*fibre must be"),
+        (MUSCLE.replace(FIBRES, f"{FIBRES}, {OUTSIDE}"), r"forces\.muscle: .*holds no cell"),
+    ],
+)
+def test_invalid_active_stresses_of_a_configuration_are_refused_by_key(scene_of, option, message):
+    with pytest.raises(ConfigError, match=message):
+        scene_of(*BAR, option)

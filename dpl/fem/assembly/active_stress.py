@@ -126,7 +126,7 @@ class ActiveFibres(FollowerTerm):
 
     def describe(self) -> str:
         """See `FollowerTerm.describe`."""
-        return f"active stress in {len(self.cells):,} cells"
+        return f"active stress in {len(self.cells.unique()):,} cells"
 
     def force(self, displacement: Tensor) -> Tensor:
         """Return the part of the internal force, (B, N, D) [-]."""
