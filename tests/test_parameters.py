@@ -2,7 +2,7 @@
 
 import json
 import pickle
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import lightning as L
 import numpy as np
@@ -256,10 +256,21 @@ def test_gradients_of_exact_answers_are_those_of_the_body_of_each_load(wide, few
     alone = few.force[1:2].clone().requires_grad_()
     DifferentiableSolve(one.solver)(Load(alone, few.young[1:2])).square().sum().backward()
     assert torch.allclose(force.grad[1], alone.grad[0], rtol=1e-6, atol=1e-12)
-    with pytest.raises(ValueError, match="requires a gradient"):
-        DifferentiableSolve(wide.solver)(
-            Load(few.force, few.young, few.parameters.clone().requires_grad_())
-        )
+
+
+def test_exact_answers_are_differentiable_in_the_parameters(wide, few):
+    exact, step = DifferentiableSolve(replace(wide.solver, tol=1e-12)), 1e-5
+    for count in (1, 3):
+        load = Load(*(column[:count] for column in few))
+
+        def size(parameters, load=load):
+            return exact(load._replace(parameters=parameters)).square().sum(dim=(1, 2))
+
+        parameters = load.parameters.clone().requires_grad_()
+        size(parameters).sum().backward()
+        change = size(load.parameters + step) - size(load.parameters - step)
+        slope = parameters.grad[:, 0].numpy()
+        assert slope == pytest.approx((change / (2 * step)).numpy(), rel=1e-5)
 
 
 def test_a_scene_with_a_range_goes_to_another_process(wide):

@@ -36,7 +36,7 @@ if typing.TYPE_CHECKING:
     import lightning as L
 
 SCENE = (  # keys of a scene; those of a surrogate
-    *("mesh", "degree", "mean_dilatation", "regions", "supports", "forces"),
+    *("mesh", "degree", "mean_dilatation", "supports", "forces"),
     *("material", "young", "loads", "solver"),
 )
 NETWORK = ("model", "loss", "optimizer", "scheduler", "seed")

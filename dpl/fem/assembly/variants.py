@@ -24,7 +24,8 @@ class BodyVariants(EquilibriumCriterion):
         Args:
             parameters: Values of `parameter_ranges`, (B, P). P = 0 returns the problem itself. With
                 B > 1 each member of a batch has its own: such a problem has energies, forces and
-                residuals, but no tangent.
+                residuals, but no tangent. It is differentiable in parameters that require a
+                gradient.
 
         Raises:
             ValueError: The problem has another number of ranges, or the law does not allow a value.
@@ -37,8 +38,8 @@ class BodyVariants(EquilibriumCriterion):
             )
         if not ranges:
             return self
-        parameters = parameters.detach().to(self.points.device, torch.float64)
-        if len(parameters) > 1:
+        parameters = parameters.to(self.points.device, torch.float64)
+        if len(parameters) > 1 or parameters.requires_grad:
             return self._with_values(parameters)
         values = tuple(parameters[0].tolist())
         if values not in self._clones:

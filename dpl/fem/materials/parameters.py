@@ -78,8 +78,9 @@ class Parametrised:
         """Return the law with values in place of its ranges.
 
         Args:
-            parameters: Values in the order of `parameter_ranges`, (B, P). With B > 1 each member
-                of a batch has its own, and the law takes strains (B, E, Q, 3, 3).
+            parameters: Values in the order of `parameter_ranges`, (B, P). With B > 1, or if they
+                require a gradient, each member of a batch has its own, and the law takes strains
+                (B, E, Q, 3, 3).
 
         Raises:
             ValueError: The law has another number of ranges, or does not allow a value.
@@ -91,9 +92,10 @@ class Parametrised:
             return self
         law: Any = self  # a dataclass if it has ranges
         if not torch.compiler.is_compiling():  # a traced graph has no values to check
-            if len(parameters) == 1:
-                return replace(law, **dict(zip(names, parameters[0].tolist(), strict=True)))
-            for extreme in (parameters.amin(0), parameters.amax(0)):
+            values = parameters.detach()
+            if len(parameters) == 1 and not parameters.requires_grad:
+                return replace(law, **dict(zip(names, values[0].tolist(), strict=True)))
+            for extreme in (values.amin(0), values.amax(0)):
                 self.with_parameters(extreme[None])
         # beside cells and points, so that numbers of a point, (B, E, Q), take their own
         columns = parameters.T[..., None, None]

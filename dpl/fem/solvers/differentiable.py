@@ -1,4 +1,4 @@
-"""Equilibrium as a differentiable function of the load, by one adjoint solve per gradient."""
+"""Equilibrium as a differentiable function of load and parameters, by one adjoint solve each."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,10 +19,11 @@ ADJOINT_TOL = 1e-12  # relative residual of an adjoint solve with an unsymmetric
 
 @dataclass(frozen=True, eq=False)
 class DifferentiableSolve:
-    """Displacement u(f) with f_int(u) = f, differentiable with respect to f.
+    """Displacement u(f, p) with f_int(u, p) = f, differentiable with respect to f and p.
 
     The forward pass is a Newton solve. In the backward pass a gradient g with respect to u becomes
-    K(u)^-T g with respect to f, since K(u) du = df on free degrees of freedom. The tangent at the
+    a = K(u)^-T g with respect to f, since K(u) du = df on free degrees of freedom, and
+    -a . df_int/dp with respect to the parameters p of the body. The tangent at the
     solution is factorised at the first gradient. A follower load without potential makes it
     unsymmetric; the factor of the symmetric part then preconditions GMRES.
 
@@ -42,21 +43,17 @@ class DifferentiableSolve:
         """Return displacements over L, (B, N, D) [-], float64.
 
         Args:
-            load: The load; differentiable in `force`, (B, N, D) [-].
+            load: The load; differentiable in `force`, (B, N, D) [-], and `parameters`, (B, P).
             guess: Displacement to start from, (B, N, D) [-]; zero if left out.
 
         Raises:
-            ValueError: A load of the batch has no solution (see `solution`), the load is not on
-                the CPU, or its parameters require a gradient.
+            ValueError: A load of the batch has no solution (see `solution`), or the load is not on
+                the CPU.
             SingularMatrix: In the backward pass, if the tangent at a solution is singular, that is
                 at a critical load.
         """
         if load.force.device.type != "cpu":
             raise ValueError(f"load.force is on {load.force.device} and must be on the cpu")
-        if load.parameters.requires_grad:
-            raise ValueError(
-                "load.parameters requires a gradient; solutions are differentiable in forces only"
-            )
         return _Equilibrium.apply(load.force.double(), load.parameters, guess, self)
 
     def solution(self, load: Load, *, guess: Tensor | None = None) -> Solution:
@@ -110,6 +107,7 @@ class _Equilibrium(torch.autograd.Function):
         parent: DifferentiableSolve,
     ) -> Tensor:
         guess = None if guess is None else guess.detach()
+        parameters = parameters.detach()
         load = Load(force.detach(), torch.ones(len(force), dtype=torch.float64), parameters)
         answer = parent.solution(load, guess=guess)
         if not answer.converged.all():
@@ -122,13 +120,20 @@ class _Equilibrium(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
-        problem = ctx.parent.newton.problem
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor | None, None, None]:
+        problem, (displacement,) = ctx.parent.newton.problem, ctx.saved_tensors
         if ctx.adjoints is None:  # kept: each row of a Jacobian needs them
-            (displacement,) = ctx.saved_tensors
             ctx.adjoints = ctx.parent.adjoints(displacement, ctx.parameters)
         solved = [
             problem.extend(adjoint(problem.restrict(one)))
             for adjoint, one in zip(ctx.adjoints, gradient, strict=True)
         ]
-        return torch.stack(solved), None, None, None
+        adjoint_field = torch.stack(solved)
+        if not ctx.needs_input_grad[1]:
+            return adjoint_field, None, None, None
+        with torch.enable_grad():
+            parameters = ctx.parameters.expand(len(displacement), -1).clone().requires_grad_()
+            internal = problem.with_parameters(parameters).internal_force(displacement)
+            work = (internal * adjoint_field).sum()
+            (slope,) = torch.autograd.grad(work, parameters)
+        return adjoint_field, -slope, None, None
