@@ -261,7 +261,7 @@ def test_gradients_of_exact_answers_are_those_of_the_body_of_each_load(wide, few
 def test_exact_answers_are_differentiable_in_the_parameters(wide, few):
     exact, step = DifferentiableSolve(replace(wide.solver, tol=1e-12)), 1e-5
     for count in (1, 3):
-        load = Load(*(column[:count] for column in few))
+        load = Load(few.force[:count], few.young[:count], few.parameters[:count])
 
         def size(parameters, load=load):
             return exact(load._replace(parameters=parameters)).square().sum(dim=(1, 2))
