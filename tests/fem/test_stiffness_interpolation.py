@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from dpl.fem import NeoHookeanLn, Plane, Problem, Sphere
+from dpl.fem import (
+    ConstantFibres,
+    FibreReinforced,
+    Guccione,
+    NeoHookeanLn,
+    Plane,
+    Problem,
+    Sphere,
+    VolumetricK2,
+    YeohK2,
+)
 from dpl.fem.rom.stiffness_interpolation import StiffnessInterpolation
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 
@@ -104,3 +114,29 @@ def test_two_stiffnesses_with_ranges_have_too_many_terms(grid):
     assert len(terms) == 3
     with pytest.raises(ValueError, match="a sum of 3 matrices"):
         StiffnessInterpolation.of_terms(terms)
+
+
+FIBRES = FibreReinforced(
+    VolumetricK2([1.0, 3.0]), Guccione([0.1, 1.0], 8.0, 2.0, 4.0), ConstantFibres([1, 1, 0])
+)
+BODIES = {  # laws of the core and of the rest, and the number of terms
+    "one law": (NeoHookeanLn(0.3), NeoHookeanLn(0.3), 1),
+    "two stiffnesses": (NeoHookeanLn(0.3, [1, 9]), NeoHookeanLn(0.2, [1, 9]), 2),
+    "moduli of Yeoh's law": (YeohK2([0.1, 0.4], 0.0, 0.0, 3.0), NeoHookeanLn(0.3), 2),
+    "fibres": (FIBRES, NeoHookeanLn(0.3), 3),
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_stiffness_is_the_sum_of_its_terms(grid, name):
+    core, other, count = BODIES[name]
+    region = {"core": Sphere([0.0, 0.0, 0.0], 0.7)}
+    laws = {"core": core, "other": other}
+    problem = Problem.build(grid("hexahedron"), laws, regions=region, fixed=Plane(0, "min"))
+    terms = StiffnessTerms.of(problem)
+    assert len(terms) == count
+    body = problem.generic
+    parts = [one.stiffness_at_rest() for one in terms.bodies]
+    found = (terms.factors(body.material)[0, :, None] * torch.stack(parts)).sum(dim=0)
+    expected = body.stiffness_at_rest()
+    assert (found - expected).abs().max() < 1e-12 * expected.abs().max()

@@ -87,6 +87,11 @@ class FibreReinforced(Composed, Material):
         return hash((type(self), self.matrix, self.fibres))
 
     @property
+    def finite(self) -> bool:  # type: ignore[override]
+        """See `Material.finite`; False for a term of K(0) only."""
+        return self.matrix.finite
+
+    @property
     def classes(self) -> tuple[type, ...]:
         """See `Material.classes`."""
         return type(self), type(self.matrix), type(self.fibres)

@@ -24,8 +24,8 @@ OTHER = "other"  # region of the cells that belong to no other region
 class Heterogeneous(Composed, Material):
     """Laws of the regions of a body.
 
-    A parameter of a law has the name of its region before its own: core.poisson. Cells whose laws
-    are of one class of isotropic laws are evaluated together.
+    A parameter of a law has the name of its region before its own: core.poisson. Cells with
+    isotropic laws of one class are evaluated together.
 
     Attributes:
         laws: Law of each region, by name.
@@ -86,7 +86,7 @@ class Heterogeneous(Composed, Material):
             )
         if OTHER in self.laws and OTHER not in self.regions:
             if not free.size:
-                raise ValueError(f"material.{OTHER}: all cells belong to other regions; leave it")
+                raise ValueError(f"material.{OTHER}: all cells belong to other regions; remove it")
             index[free] = list(self.laws).index(OTHER)
         bound = super().on(basis, length, origin)
         layout = Layout.of(self.laws.values(), torch.from_numpy(index))
