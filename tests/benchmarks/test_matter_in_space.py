@@ -8,6 +8,7 @@ import skfem
 
 from benchmarks.verification.artery import ARTERIES, exact_radius, radii
 from benchmarks.verification.cardiac import ENDO, EPI, TIP, beam_tips, inflated_apex
+from benchmarks.verification.composites import RATIOS, REMOTE, ball_strain, bent, eshelby
 from benchmarks.verification.ventricle import BASE, LONG, SHORT, WALL, endocardium, ventricle
 
 
@@ -58,3 +59,22 @@ def test_an_artery_of_two_layers_expands_as_its_integral(name):
     layers, pressure = ARTERIES[name]
     (found,) = radii(layers, pressure, (4, 24), (1e3,))
     assert found == pytest.approx(exact_radius(layers, pressure), rel=1.5e-3)
+
+
+@pytest.mark.parametrize("ratio", RATIOS)
+def test_a_beam_of_two_layers_bends_as_its_transformed_section(ratio):
+    curvature, error = bent(ratio, cells=3)
+    assert curvature == pytest.approx(1.0, rel=1e-8)
+    assert error < 1e-8
+
+
+def test_a_stiff_ball_in_a_large_matrix_has_the_strain_of_eshelby():
+    """Eshelby (1957); the error falls with the size of the cells and of the matrix."""
+    exact = eshelby(REMOTE)
+    errors = {}
+    for cells, size in ((1, 4.0), (1, 16.0), (2, 16.0)):
+        strain, deviation = ball_strain(cells, size, REMOTE)
+        errors[cells, size] = np.linalg.norm(strain - exact) / np.linalg.norm(exact)
+    assert deviation < 5e-3
+    assert errors[2, 16.0] < errors[1, 16.0] < errors[1, 4.0]
+    assert errors[2, 16.0] < 5e-3
