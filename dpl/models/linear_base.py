@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 
 from dpl.fem import Load
+from dpl.fem.rom.stiffness_interpolation import check_terms
+from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 from dpl.models.linear_response import LinearResponse
 from dpl.scene import Scene
 
@@ -50,8 +52,13 @@ class LinearBase:
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Take the scene."""
+        """Take the scene.
+
+        Raises:
+            ValueError: The linear solution is not known for all parameters, see `check_terms`.
+        """
         self._scene, self._problem = scene, scene.problem
+        check_terms(StiffnessTerms.of(scene.problem))
 
     @cached_property
     def _response(self) -> LinearResponse:

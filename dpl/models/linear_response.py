@@ -11,7 +11,7 @@ from torch import Tensor
 from dpl.fem.linear.condensation import Condensed, condense, condensed_block_solve
 from dpl.fem.materials.material import Material
 from dpl.fem.rom.compiled_prediction import LawWeights, LinearPrediction
-from dpl.fem.rom.stiffness_interpolation import StiffnessInterpolation
+from dpl.fem.rom.stiffness_interpolation import StiffnessInterpolation, check_terms
 from dpl.fem.solvers.condensed_layers import CondensedLayers
 from dpl.fem.solvers.parity_factor import OrbitForm
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
@@ -35,8 +35,13 @@ class LinearResponse:
     """
 
     def __init__(self, scene: Scene, group: list[Symmetry]) -> None:
-        """Take the scene and the symmetries of the body."""
+        """Take the scene and the symmetries of the body.
+
+        Raises:
+            ValueError: K(0) depends on the parameters in more ways than can be interpolated.
+        """
         self._scene, self._group = scene, group
+        check_terms(self.terms)
         self._on_device: dict[torch.device, _Tensors] = {}
 
     # ------------------------------------------------------------------ blocks
