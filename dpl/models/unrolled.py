@@ -152,7 +152,7 @@ class Unrolled(nn.Module):
             self.register_buffer(name, value)
         self._stiffness = ReducedStiffness(self.stiffness)
         self._compiled: tuple[Tensor, CompiledPrediction] | None = None
-        self._law: tuple[Tensor, Material] | None = None
+        self._law_of_samples = scene.problem.material  # perhaps with ranges
         self._at_last_law: tuple[tuple[Tensor, Any], _AtLaw] | None = None
         dofs = scene.problem.free.flatten().nonzero()[:, 0]
         self.register_buffer("dofs", dofs, persistent=False)
@@ -189,12 +189,10 @@ class Unrolled(nn.Module):
         of_cells = self._law_of_samples.with_parameters(parameters)
         return Maps(cells, *matrices, self.limits)(of_cells, linear)
 
-    @property
-    def _law_of_samples(self) -> Material:
-        """Law of the sample cells, perhaps with ranges."""
-        if self._law is None or self._law[0] is not self.cells:
-            self._law = self.cells, self.scene.problem.material.of_cells(self.cells.cpu())
-        return self._law[1]
+    def _prepare(self) -> None:
+        """Prepare what a traced graph takes as constants, after the buffers have changed."""
+        self._stiffness = ReducedStiffness(self.stiffness.detach().cpu().clone()).prepared()
+        self._law_of_samples = self.scene.problem.material.of_cells(self.cells.cpu())
 
     def _at_free_dofs(self, coordinates: Tensor) -> Tensor:
         """Return V c at free degrees of freedom, (B, n), of c (B, R)."""
@@ -290,7 +288,7 @@ class Unrolled(nn.Module):
         )
         for name, buffer in best._asdict().items():
             setattr(self, name, buffer)
-        self._stiffness = ReducedStiffness(self.stiffness).prepared()
+        self._prepare()
         self.fitted = torch.tensor(True)
         self._fit_newton(every, samples, held_out)
 
@@ -351,7 +349,7 @@ class Unrolled(nn.Module):
         """Take the sizes of the checkpoint, which the fit has chosen."""
         resize_buffers(self, state, prefix)
         super()._load_from_state_dict(state, prefix, *rest)
-        self._stiffness = ReducedStiffness(self.stiffness.detach().cpu().clone()).prepared()
+        self._prepare()
 
 
 def resize_buffers(module: nn.Module, state: dict[str, Any], prefix: str) -> None:

@@ -217,9 +217,9 @@ class FibreReinforced(Composed, Material):
         """See `Material.rest_moduli`; those of the matrix, then the 21 of the fibres."""
         matrix, own = self.matrix.rest_moduli, _tensors(self._rest_moduli(), _REST)
         rows = [one if one.ndim == 3 else one[None] for one in own]
-        count = max(len(matrix), len(rows[0]))
-        fibres = [row.expand(count, -1, -1).flatten(1) for row in rows]
-        return torch.cat([matrix.expand(count, -1), *fibres], dim=1)
+        batch = torch.broadcast_shapes(matrix.shape[:1], rows[0].shape[:1])
+        fibres = [row.expand(*batch, -1, -1).flatten(1) for row in rows]
+        return torch.cat([matrix.expand(*batch, -1), *fibres], dim=1)
 
     def linear_law(self, moduli: Tensor) -> "FibreReinforced":
         """See `Material.linear_law`."""

@@ -177,8 +177,8 @@ class Heterogeneous(Composed, Material):
     def rest_moduli(self) -> Tensor:
         """See `Material.rest_moduli`; those of the laws one after the other."""
         parts = [law.rest_moduli for law in self.laws.values()]
-        count = max(map(len, parts))
-        return torch.cat([part.expand(count, -1) for part in parts], dim=1)
+        batch = torch.broadcast_shapes(*(part.shape[:1] for part in parts))
+        return torch.cat([part.expand(*batch, -1) for part in parts], dim=1)
 
     def linear_law(self, moduli: Tensor) -> "Heterogeneous":
         """See `Material.linear_law`."""
