@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 CONSOLE = Console(width=150)
 CASES = (
     *("scenes", "pieces", "propeller", "large", "robustness", "generation"),
-    *("discretisation", "sizes", "modes", "deflections", "latency", "local"),
+    *("discretisation", "sizes", "modes", "laws", "deflections", "latency", "local"),
 )
 FIGURES = "figures"  # the case that draws the rows in `folder` again
 
@@ -202,6 +202,19 @@ def modes(cfg: DictConfig, backends: list[str]) -> None:
         table.add_row(name, f"{row.dofs:,}", factor, f"{row.modes_s:.3f}", cpu)
     CONSOLE.print(table)
     write_machine(Path(cfg.folder) / "modes.json")
+
+
+def laws(cfg: DictConfig, backends: list[str]) -> None:
+    """Write the times of tangent and residual of bodies of several laws and with fibres."""
+    from benchmarks import law_costs
+
+    rows = list(law_costs.law_costs(repeats=8 * cfg.repeats))
+    table = Table("tangent and residual, compiled", "DOFs", "ms", "over one isotropic law")
+    for row in rows:
+        table.add_row(row.body, f"{row.dofs:,}", f"{row.ms:.2f}", f"{row.ratio:.2f}")
+    CONSOLE.print(table)
+    write(rows, Path(cfg.folder) / "law_costs.csv")
+    write_machine(Path(cfg.folder) / "law_costs.json")
 
 
 def deflections(cfg: DictConfig, backends: list[str]) -> None:

@@ -1,8 +1,9 @@
 """Measure run times of the mechanics and of public codes: python scripts/benchmark.py.
 
 Long cases on demand: cases=[large] (run alone, it reports its memory), cases=[robustness],
-cases=[generation], cases=[sizes], cases=[modes] (time of the eigenmodes); errors of other
-meshes: cases=[discretisation]; displacements of the test loads: cases=[deflections] count=100;
+cases=[generation], cases=[sizes], cases=[modes] (time of the eigenmodes), cases=[laws] (bodies of
+several laws and with fibres); errors of other meshes: cases=[discretisation]; displacements of the
+test loads: cases=[deflections] count=100;
 latency and throughput of a trained run: cases=[latency] run=runs/mine; loads on small areas:
 cases=[local] run=runs/mine count=250.
 """
