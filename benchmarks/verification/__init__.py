@@ -17,6 +17,7 @@ from benchmarks.verification.artery import artery
 from benchmarks.verification.beams import balance, beam
 from benchmarks.verification.cardiac import cardiac
 from benchmarks.verification.composites import composites
+from benchmarks.verification.contraction import contraction
 from benchmarks.verification.nodal_stress import nodal_stress
 from benchmarks.verification.pressurised import inflation
 from benchmarks.verification.refinement import cook, locking, order
@@ -40,6 +41,7 @@ CASES: dict[str, Callable[[Path], Section]] = {
     "nodal_stress": nodal_stress,
     "inflation": inflation,
     "cardiac": cardiac,
+    "contraction": contraction,
     "artery": artery,
     "composites": composites,
 }

@@ -216,6 +216,13 @@ PARTS = (
         "used the core. The first row is the paper's.",
     ),
     Part(
+        "law_costs",
+        "Time of bodies of several laws",
+        "python scripts/benchmark.py cases=[laws] folder=benchmarks/results",
+        "Tangent and residual of the paper's beam by compiled loops, one thread, medians of 40; "
+        "the ratios are medians over pairs that were timed alternately.",
+    ),
+    Part(
         "deflections",
         "Displacements of the test loads",
         "python scripts/benchmark.py cases=[deflections] count=100 folder=benchmarks/results",

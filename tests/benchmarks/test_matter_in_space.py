@@ -9,6 +9,7 @@ import skfem
 from benchmarks.verification.artery import ARTERIES, exact_radius, radii
 from benchmarks.verification.cardiac import ENDO, EPI, TIP, beam_tips, inflated_apex
 from benchmarks.verification.composites import RATIOS, REMOTE, ball_strain, bent, eshelby
+from benchmarks.verification.contraction import contracted_apex
 from benchmarks.verification.ventricle import BASE, LONG, SHORT, WALL, endocardium, ventricle
 
 
@@ -52,6 +53,13 @@ def test_the_ventricle_expands_as_in_the_benchmark():
     ((inner, outer),) = inflated_apex((2, 6, 1), (1e2,))
     assert inner == pytest.approx(float(ENDO), rel=5e-3)
     assert outer == pytest.approx(float(EPI), rel=5e-3)
+
+
+def test_the_ventricle_contracts_against_its_pressure():
+    """Land et al. (2015), problem 3; so coarse a mesh has an error of a millimetre."""
+    ((inner, outer),) = contracted_apex(2, (1e2,), patch=1, rings=3)
+    assert inner == pytest.approx(-12.347, abs=2.5)
+    assert outer == pytest.approx(-15.452, abs=2.5)
 
 
 @pytest.mark.parametrize("name", ARTERIES)
