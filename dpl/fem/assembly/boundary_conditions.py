@@ -153,7 +153,8 @@ def assemble_constraints(
             fixed if isinstance(fixed, np.ndarray) else nodes_in(fixed, basis, units.length, origin)
         )
         if not where.any():
-            raise ValueError(f"fixed = {fixed} must contain a node of the mesh")
+            words = "mask" if isinstance(fixed, np.ndarray) else f"{fixed}"
+            raise ValueError(f"fixed = {words} must contain a node of the mesh")
         everywhere = np.broadcast_to(where[:, None] if where.ndim == 1 else where, shape)
         given = np.where(everywhere, 0.0 if prescribed is None else prescribed, np.nan)
     for support in supports:
