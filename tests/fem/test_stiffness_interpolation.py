@@ -112,7 +112,7 @@ def test_two_stiffnesses_with_ranges_have_too_many_terms(grid):
     problem = Problem.build(grid("hexahedron"), laws, regions=region, fixed=Plane(0, "min"))
     terms = StiffnessTerms.of(problem)
     assert len(terms) == 3
-    with pytest.raises(ValueError, match="change K.0. in 3 independent ways"):
+    with pytest.raises(ValueError, match="in 3 independent ways"):
         StiffnessInterpolation.of_terms(terms)
 
 
