@@ -26,7 +26,7 @@ from benchmarks.verification.rods import buckling, elastica
 from benchmarks.verification.twisted import twist
 from benchmarks.verification.uniaxial import laws
 
-__all__ = ["CASES", "Row", "Section", "measure", "page"]
+__all__ = ["CASES", "LONG", "Row", "Section", "measure", "page"]
 
 CASES: dict[str, Callable[[Path], Section]] = {
     "laws": laws,
@@ -45,6 +45,8 @@ CASES: dict[str, Callable[[Path], Section]] = {
     "artery": artery,
     "composites": composites,
 }
+
+LONG = ("contraction",)  # cases that take more than ten minutes
 
 
 def measure(name: str, folder: Path) -> Section:

@@ -7,6 +7,7 @@ those of `benchmarks.verification.cardiac`.
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks.verification.cardiac import SPREAD
 from benchmarks.verification.continuation import follow
 from benchmarks.verification.drawing import measured, panel, picture
 from benchmarks.verification.report import Row, Section
@@ -62,14 +63,10 @@ def contraction(folder: Path) -> Section:
     """Solve problem 3 with a growing number of layers of cells."""
     found = {layers: contracted_apex(layers) for layers in LAYERS}
     rows = []
-    last, before = LAYERS[-1], LAYERS[-2]
     for k, (side, text) in enumerate((("endo", ENDO), ("epi", EPI))):
         for layers in LAYERS:
             name = f"{layers} layers, κ = {BULKS[-1]:g} kPa: z of the apex, {side} [mm]"
-            rows.append(Row(name, text, found[layers][-1][k], 0.12))
-        share = (last / before) ** 2
-        limit = (share * found[last][-1][k] - found[before][-1][k]) / (share - 1)
-        rows.append(Row(f"extrapolated: z of the apex, {side} [mm]", text, limit, 0.02))
+            rows.append(Row(name, text, found[layers][-1][k], SPREAD))
     with picture(folder / "contraction.png", 2.9) as figure:
         axes = panel(figure, 1, "bulk modulus [kPa]", "z of the apex, endo [mm]", "")
         for k, layers in enumerate(LAYERS):
@@ -85,9 +82,13 @@ def contraction(folder: Path) -> Section:
         "Piola-Kirchhoff) of 60 kPa along the fibres, both raised together. The whole ellipsoid is "
         f"meshed with hexahedra of degree 2: {2 * PATCH} × {2 * PATCH} cells at the apex and "
         f"{RINGS} rings of {8 * PATCH} cells. References: as in the passive problems. Each cell "
-        "has one fibre direction, so that the direction makes a step of 180°/n between n layers; "
-        "the error of this falls as 1/n². *Extrapolated* are the values of the last two meshes. "
-        "The tolerance is 12 %, and 2 % for the extrapolated values.",
+        "has one fibre direction, so that the direction makes a step of 180°/n between n layers. "
+        "The tolerance is 0.5 %, as in the passive problems.",
         rows,
         [("contraction.png", "z of the apex inside against the bulk modulus; line: reference.")],
+        [
+            "The differences are larger than those between the codes of the paper, and these "
+            "meshes do not show convergence. The step of the fibre direction between layers is one cause; "
+            "directions at the quadrature points are not implemented."
+        ],
     )
