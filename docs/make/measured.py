@@ -66,6 +66,14 @@ PARTS = (
         tabulated=False,
     ),
     Part(
+        r"(inclusion|fibre_beam)",
+        "Parameters of several materials: `{0}`",
+        "python scripts/results.py name={0} galerkin=null corrected=null",
+        "Networks with parameters of the material as inputs, see "
+        "[materials in space](materials.md).",
+        split="loads",
+    ),
+    Part(
         "grasps",
         "Grasps",
         "python scripts/grasps.py run=runs/beam_nh_loss/unrolled",

@@ -282,7 +282,7 @@ def test_what_a_key_gives_must_be_of_its_kind(compose, tiny, made):
     cfg = compose(*tiny)
     cfg.forces = {"weight": {"_target_": made}}
     with pytest.raises(
-        ConfigError, match=r"forces\.weight gives .*; it must give BodyForce or Follo"
+        ConfigError, match=r"forces\.weight gives .*; it must give ActiveStress or Body"
     ):
         build.build_scene(cfg)
 

@@ -20,7 +20,7 @@ from dpl.models.newton_choice import choose_newton
 from dpl.models.stage_regression import GroupAction, Rows, fit_map, weighted_error
 from dpl.scene import Sample, Scene
 from dpl.training import MSE, Surrogate
-from tests.laws import COMPILED, LAWS
+from tests.laws import COMPILED, ISOTROPIC, LAWS
 
 SMALL = {"rank": 20, "cells": 8, "stages": 2}
 
@@ -247,7 +247,7 @@ def test_rotation_is_the_polar_factor():
     assert (rotation(H) - U @ V).abs().max() < 1e-2
 
 
-@pytest.mark.parametrize("name", list(LAWS))
+@pytest.mark.parametrize("name", [*ISOTROPIC, "guccione"])  # others: no stress in compression
 def test_unbalanced_stress_is_of_second_order(name):
     H = 1e-6 * torch.randn(4, 3, 3, generator=torch.Generator().manual_seed(0)).double()
     assert unbalanced_stress(LAWS[name], H, H).abs().max() < 1e-9

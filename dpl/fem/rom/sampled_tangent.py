@@ -109,7 +109,7 @@ class SampledTangent:
         change = (
             change[:, :dim, :dim, :dim, :dim] * torch.from_numpy(self._dV)[..., None, None, None]
         )
-        return change.reshape(len(H), dim * dim, dim * dim).float().numpy() @ self._basis
+        return change.reshape(-1, dim * dim, dim * dim).float().numpy() @ self._basis
 
     @cached_property
     def _required_terms(self) -> int:
