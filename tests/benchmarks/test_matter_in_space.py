@@ -58,8 +58,8 @@ def test_the_ventricle_expands_as_in_the_benchmark():
 def test_the_ventricle_contracts_against_its_pressure():
     """Land et al. (2015), problem 3; so coarse a mesh has an error of a millimetre."""
     ((inner, outer),) = contracted_apex(2, (1e2,), patch=1, rings=3)
-    assert inner == pytest.approx(-12.347, abs=2.5)
-    assert outer == pytest.approx(-15.452, abs=2.5)
+    assert inner == pytest.approx(-12.347, abs=1.3)
+    assert outer == pytest.approx(-15.452, abs=1.3)
 
 
 @pytest.mark.parametrize("name", ARTERIES)
