@@ -88,7 +88,8 @@ def contraction(folder: Path) -> Section:
         [("contraction.png", "z of the apex inside against the bulk modulus; line: reference.")],
         [
             "The differences are larger than those between the codes of the paper, and these "
-            "meshes do not show convergence. The step of the fibre direction between layers is one "
-            "cause; directions at the quadrature points are not implemented."
+            "meshes do not show convergence. The step of the fibre direction between layers may be "
+            "a cause, which was not tested separately; directions at the quadrature points are not "
+            "implemented."
         ],
     )

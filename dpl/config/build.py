@@ -11,7 +11,7 @@ import sys
 import textwrap
 import typing
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -206,7 +206,7 @@ def _supports(cfg: DictConfig, mesh: skfem.Mesh, units: Units) -> list[Any]:
     return list(supports.values())
 
 
-def _problem(cfg: DictConfig, young: float | None, follower: dict[str, Any]) -> Problem:
+def _problem(cfg: DictConfig, young: float | None, follower: Mapping[str, FollowerLoad]) -> Problem:
     with _shown_warnings():
         mesh, regions = instantiate(cfg, "mesh"), _parts(cfg, "regions")
         several = validation.names_several("material", cfg.material)
@@ -221,7 +221,8 @@ def _problem(cfg: DictConfig, young: float | None, follower: dict[str, Any]) -> 
                 load.check(mesh, Units(1.0, young))
         options["regions"] = regions
         options["follower_loads"] = [
-            replace(load, name=load.name or name) for name, load in follower.items()
+            replace(typing.cast("Any", load), name=load.name or name)
+            for name, load in follower.items()
         ]
         try:
             problem = Problem.build(mesh, material, fixed=fixed, supports=supports, **options)

@@ -50,11 +50,12 @@ TRAINING: Keys = (  # of a training; the types are those of signatures, 1e-30 st
     (object, "trainer.limit_train_batches", 1e-30, 10**9),
 )
 UNLIMITED = {"trainer.max_epochs", "trainer.max_steps"}  # keys for which -1 means no limit
+REGIONS = {f"dpl.fem.mesh.regions.{name}" for name in ("Plane", "Box", "Sphere", "Cylinder", "Tag")}
 EXPECTED_TYPES = {  # base classes of the object that the call under a key returns
     "mesh": {"skfem.mesh.mesh.Mesh"},
     "material": {"dpl.fem.materials.material.Material"},
-    "fixed": {f"dpl.fem.mesh.regions.{n}" for n in ("Plane", "Box", "Sphere", "Cylinder", "Tag")},
-    "regions": {f"dpl.fem.mesh.regions.{n}" for n in ("Plane", "Box", "Sphere", "Cylinder", "Tag")},
+    "fixed": REGIONS,
+    "regions": REGIONS,
     "supports": {
         "dpl.fem.assembly.boundary_conditions.DirichletBC",
         "dpl.fem.assembly.boundary_conditions.RobinBC",

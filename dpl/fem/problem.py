@@ -297,8 +297,9 @@ class Problem(BodyVariants):
         places = self.pattern.places.reshape(len(self.cells), -1)
         kernels = []
         for law, (_, chosen) in zip(laws, groups, strict=True):
-            # Copies: sending a problem to a worker process moves the memory of its tensors.
-            dN, dV = (one if self.equal_cells else one[chosen] for one in (self.dN, self.dV))
-            parts = self.cells[chosen].numpy(), dN.numpy(), dV.numpy(), places[chosen.numpy()]
-            kernels.append(Kernels(law, *(part.copy() for part in parts)))
+            # An index by numbers copies: sending a problem to a worker moves the memory of tensors.
+            numbers = chosen.numpy()
+            own = [0] if self.equal_cells else numbers
+            dN, dV = self.dN.numpy()[own], self.dV.numpy()[own]
+            kernels.append(Kernels(law, self.cells.numpy()[numbers], dN, dV, places[numbers]))
         return kernels[0] if len(kernels) == 1 else GroupedKernels(kernels)

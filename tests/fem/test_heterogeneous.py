@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import skfem
 import torch
+from laws import LAWS
 
 from dpl.fem import (
     Box,
@@ -68,9 +69,12 @@ def end_load(problem, size=2e-4):
     return Load(force, torch.ones(1))
 
 
-@pytest.mark.parametrize("pair", PAIRS)
+FIBRE_LAWS = {name: (law, law) for name, law in LAWS.items() if isinstance(law, FibreReinforced)}
+
+
+@pytest.mark.parametrize("pair", [*PAIRS, *FIBRE_LAWS])
 def test_loops_of_several_laws_are_those_of_the_tensors(pair):
-    problem = body(*PAIRS[pair])
+    problem = body(*(PAIRS | FIBRE_LAWS)[pair])
     plain, u = Reference(**problem.__getstate__()), displacement(problem)
     found, expected = problem.linearise(u), plain.linearise(u)
     for name in ("force", "tangent"):

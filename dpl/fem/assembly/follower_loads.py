@@ -174,9 +174,9 @@ class FollowerTerm:
         raise NotImplementedError
 
     def places(self, pattern: Pattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return which entry of `stiffness` is added at which position among the nnz, (K,) each.
+        """Return the numbers of entries of `stiffness` and their positions in K, (P,) each.
 
-        Positions of nnz are those of entries that are not stored.
+        A position is among the nnz stored values of K; nnz for entries that K does not store.
         """
         raise NotImplementedError
 

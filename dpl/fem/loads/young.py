@@ -7,7 +7,8 @@ from typing import Any
 
 from torch import Tensor
 
-DISTRIBUTIONS = ("uniform", "log")
+from dpl.fem.ranges import DISTRIBUTIONS, ParameterRange
+
 Young = float | Sequence[float] | Mapping[str, Any]  # a number, [low, high], or options of a range
 
 
@@ -63,16 +64,18 @@ class YoungRange:
         return cls(float(moduli[0]), float(moduli[1]))
 
     @property
+    def _range(self) -> ParameterRange:
+        return ParameterRange(self.low, self.high, is_log=self.distribution == "log")
+
+    @property
     def middle(self) -> float:
         """Mean of the ends of the range [Pa]; their geometric mean for "log"."""
-        is_log = self.distribution == "log"
-        return math.sqrt(self.low * self.high) if is_log else (self.low + self.high) / 2
+        return self._range.middle
 
     def at(self, t: Tensor) -> Tensor:
         """Return the moduli [Pa] of numbers in [0, 1), of the same shape."""
-        if self.distribution == "log":
-            return (self.low * (self.high / self.low) ** t).clamp(self.low, self.high)
-        return self.low + (self.high - self.low) * t
+        moduli: Tensor = self._range.at(t)
+        return moduli.clamp(self.low, self.high) if self._range.is_log else moduli
 
     def normalise(self, young: Tensor) -> Tensor:
         """Return moduli [Pa] mapped from the range to [-1, 1], linearly in E or in log E.

@@ -223,7 +223,8 @@ class FibreReinforced(Composed, Material):
 
     def linear_law(self, moduli: Tensor) -> "FibreReinforced":
         """See `Material.linear_law`."""
-        first, rest = moduli.split([count := self.matrix.rest_moduli.shape[1], len(moduli) - count])
+        count = self.matrix.rest_moduli.shape[1]
+        first, rest = moduli[:count], moduli[count:]
         columns = rest.view(21, -1, 1)
         fibres = LinearFibres(columns.flatten().tolist() if columns.shape[1] == 1 else [*columns])
         return self.with_parts({"matrix": self.matrix.linear_law(first), "fibres": fibres})

@@ -74,7 +74,7 @@ class ReducedStiffness:
 
     @cached_property
     def _is_diagonal(self) -> bool:
-        """Whether all terms are diagonal in one basis: at most two, and no springs."""
+        """True if one basis makes all terms diagonal: there are at most two, and no springs."""
         return len(self.parts) <= 3 and not self.parts[-1].any()
 
     @cached_property
