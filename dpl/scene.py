@@ -172,6 +172,7 @@ class Scene:
         # Not rounded: the halves among dyadic coordinates would flip with the last bit.
         lattice = np.floor((points - points.min(axis=0)) * 1e9 + 0.3).astype(np.int64)
         loads = problem.follower_loads.identity()
+        functions = problem.volume_functions
         if problem.follower_loads.ranges:  # parameters of samples are in Pa
             loads["young"] = problem.young
         return {
@@ -179,7 +180,7 @@ class Scene:
             "cells": plain(problem.cells),
             "free": plain(problem.free),
             "degree": problem.degree,
-            "mean_dilatation": problem.mean_dilatation,
+            "mean_dilatation": functions is not None and {"functions": functions.shape[-1]},
             "prescribed": plain(problem.prescribed),
             "springs": plain(problem.springs or ()),
             "law": problem.material.identity(),

@@ -15,6 +15,7 @@ from dpl.fem.assembly.boundary_conditions import Support, assemble_constraints
 from dpl.fem.assembly.elements import QUADRATIC, basis_of, gradients
 from dpl.fem.assembly.follower_loads import FollowerLoad, FollowerLoads
 from dpl.fem.assembly.kernels import GroupedKernels, Kernels
+from dpl.fem.assembly.mean_dilatation import CellVolumes, MixedGap, volume_gap
 from dpl.fem.assembly.numba_laws import CompiledLaw
 from dpl.fem.assembly.variants import BodyVariants
 from dpl.fem.materials.heterogeneous import Heterogeneous
@@ -23,6 +24,8 @@ from dpl.fem.materials.tensors import volume_change
 from dpl.fem.mesh.generators import aspect_ratio, longest_side, near_origin
 from dpl.fem.mesh.regions import Region
 from dpl.fem.units import Units, check_young
+
+MIN_MIXED_VOLUME = 1e-3  # volume ratio of mixed integration points below which they are not used
 
 
 class Evaluation(NamedTuple):
@@ -95,8 +98,8 @@ class Problem(BodyVariants):
             follower_loads: Follower pressures and active stresses [Pa], which add up; values or
                 ranges.
             degree: Degree of the displacement, 1 or 2.
-            mean_dilatation: Use the mean volume ratio of each cell, so that nearly incompressible
-                bodies of linear quadrilaterals and hexahedra do not lock.
+            mean_dilatation: Project the volume ratio in each cell, so that nearly incompressible
+                bodies of quadrilaterals and hexahedra do not lock, see `CellVolumes`.
             length: L [m]; the longest side of the body if left out.
             young: Young's modulus [Pa] by which boundary values are divided: stiffnesses of
                 foundations, follower loads, and the tractions and body forces of `dpl.fem.loads`.
@@ -118,9 +121,9 @@ class Problem(BodyVariants):
         mesh, origin = near_origin(mesh)
         mesh, origin = mesh.scaled(1.0 / length), origin / length
         basis = basis_of(mesh, degree)
-        if mean_dilatation and (degree == 2 or basis.dx.shape[1] == 1):
+        if mean_dilatation and mesh.elem.refdom.name not in ("Quadrilateral", "Hexahedral"):
             raise ValueError(
-                "mean_dilatation: applies to linear quadrilaterals and hexahedra only; "
+                "mean_dilatation: applies to quadrilaterals and hexahedra only; "
                 "set degree=2 instead, quadratic elements hardly lock"
             )
         units = Units(length, young)
@@ -131,6 +134,11 @@ class Problem(BodyVariants):
             material = Heterogeneous(material, regions or {})
         material = material.on(basis, length, origin)
         dN, dV = gradients(basis)
+        functions = None
+        if mean_dilatation:
+            at = np.asarray(basis.global_coordinates())[:, : len(dV)].transpose(1, 2, 0)
+            both = torch.from_numpy(np.ascontiguousarray(at)), torch.from_numpy(dV.copy())
+            functions = CellVolumes.of(*both, linear=degree == 2).functions
         boundary = np.zeros(basis.N, dtype=bool)
         boundary[basis.get_dofs(mesh.boundary_facets()).all()] = True
         problem = cls(
@@ -148,7 +156,7 @@ class Problem(BodyVariants):
             boundary=torch.from_numpy(boundary),
             springs=springs,
             follower_loads=FollowerLoads.build(follower_loads, basis, units, material, origin),
-            mean_dilatation=mean_dilatation,
+            volume_functions=functions,
             young=young,
         )
         for line in problem.locking_warnings():
@@ -160,7 +168,7 @@ class Problem(BodyVariants):
         lines, shape = [], self.mesh.elem.refdom.name.lower()
         constant = self.dV.shape[1] == 1
         nu = self.material.largest_poisson_ratio
-        if self.degree == 1 and nu >= 0.45 and not self.mean_dilatation:
+        if self.degree == 1 and nu >= 0.45 and self.volumes is None:
             remedy = "degree=2" if constant else "degree=2 or mean_dilatation=true"
             lines.append(f"linear {shape} elements lock at Poisson's ratio {nu:.4g}: set {remedy}")
         aspect = float(aspect_ratio(self.mesh).max()) if self.degree == 1 else 0.0
@@ -223,7 +231,7 @@ class Problem(BodyVariants):
         lowest = kernels.system(displacement[0].contiguous().numpy(), gap, force, values)
         internal = self._with_boundary_forces(torch.from_numpy(force)[None], displacement)
         tangent = self._with_boundary_entries(torch.from_numpy(values[:-1])[None], displacement)
-        valid = torch.tensor([lowest > 1e-3])
+        valid = torch.tensor([lowest > MIN_MIXED_VOLUME])
         return System(internal, tangent, valid, self._asymmetry(displacement))
 
     def _asymmetry(
@@ -245,31 +253,48 @@ class Problem(BodyVariants):
         return self.without_follower_loads.linearise(rest).tangent[0]
 
     @torch.no_grad()
-    def _reference_system(self, displacement: Tensor, gap: Tensor | None) -> System:
+    def _reference_system(self, displacement: Tensor, gap: Any) -> System:
         if gap is None:
             force, tangent = self.internal_force(displacement), self.tangent(displacement)
             valid = torch.ones(len(force), dtype=torch.bool)
         else:
             force, tangent = self.mixed_system(displacement, gap)
-            valid = 1 + volume_change(2 * (self.strain(displacement) - gap)).flatten(1).amin(1)
-            valid = valid > 1e-3
+            strain_gap = gap.strain if isinstance(gap, MixedGap) else gap
+            lowest = volume_change(2 * (self.strain(displacement) - strain_gap)).flatten(1).amin(1)
+            if self.volumes is not None:
+                change = volume_change(self.gradient(displacement))
+                mean = self.volumes.at_points(self.volumes.coefficients(change) - gap.volume)
+                lowest = torch.minimum(lowest, mean.flatten(1).amin(1))
+            valid = 1 + lowest > MIN_MIXED_VOLUME
         return System(force, tangent, valid, self._asymmetry(displacement))
 
-    def update_strain_gap(self, gap: Any, length: float, update: Tensor) -> Any:
+    def update_strain_gap(
+        self, gap: Any, length: float, update: Tensor, displacement: Tensor | None = None
+    ) -> Any:
         """Return the gap between the strain of u and that of mixed points after a step.
 
         Points move with the strain's linear change along length * update and close as much of the
-        gap that there was; what the change is short of is the gap.
+        gap that there was; what the change is short of is the gap. With mean dilatation the same
+        holds for the volume changes of the cells, and the gap has two parts, see `MixedGap`.
 
         Args:
             gap: Before the step; None: none.
             length: Part of the step that is taken.
             update: The full step, (1, N, D) [-].
+            displacement: u after the step, (1, N, D) [-]; needed with mean dilatation only.
         """
         if (kernels := self._kernels(update)) is not None:
-            return kernels.update_strain_gap(gap, length, update[0].contiguous().numpy())
+            u = None if displacement is None else displacement[0].contiguous().numpy()
+            return kernels.update_strain_gap(gap, length, update[0].contiguous().numpy(), u)
         wider = length**2 * self.quadratic_strain(update)
-        return wider if gap is None else (1 - length) * gap + wider
+        if self.volumes is None or displacement is None:
+            return wider if gap is None else (1 - length) * gap + wider
+        step = length * self.gradient(update)
+        volume = volume_gap(self.gradient(displacement), step, self.volumes)
+        if gap is None:
+            return MixedGap(wider, volume)
+        left = 1 - length
+        return MixedGap(left * gap.strain + wider, left * gap.volume + volume)
 
     def _kernels(self, displacement: Tensor) -> Kernels | GroupedKernels | None:
         """Return the compiled loops, None where there are none.
@@ -289,7 +314,7 @@ class Problem(BodyVariants):
     def _compiled(self) -> Kernels | GroupedKernels | None:
         groups = self.material.groups(len(self.cells))
         laws = [law for law, _ in groups if isinstance(law, CompiledLaw)]
-        if self.mean_dilatation or len(laws) < len(groups):
+        if len(laws) < len(groups):
             return None
         first = self.__dict__.get("_first", self).reference
         if first is not self and first._compiled is not None:
@@ -301,5 +326,6 @@ class Problem(BodyVariants):
             numbers = chosen.numpy()
             own = [0] if self.equal_cells else numbers
             dN, dV = self.dN.numpy()[own], self.dV.numpy()[own]
-            kernels.append(Kernels(law, self.cells.numpy()[numbers], dN, dV, places[numbers]))
+            psi = None if self.volume_functions is None else self.volume_functions.numpy()[own]
+            kernels.append(Kernels(law, self.cells.numpy()[numbers], dN, dV, places[numbers], psi))
         return kernels[0] if len(kernels) == 1 else GroupedKernels(kernels)

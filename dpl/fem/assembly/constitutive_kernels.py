@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from dpl.fem.assembly.numba_laws import derivatives_of, has_fibres, set_fibre_derivatives
-from dpl.fem.assembly.simd import SIMD_WIDTH, load, store
+from dpl.fem.assembly.simd import SIMD_WIDTH, load, sqrt, store
 
 VOIGT = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2]])
 FIRST = np.array([0, 1, 2, 0, 1, 0])  # the two indices of each Voigt index
@@ -50,6 +50,14 @@ def volume_change(H):
     g, h, i = load(H, 6), load(H, 7), load(H, 8)
     minors = a * e - b * d + e * i - f * h + a * i - c * g
     return a + e + i + minors + a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
+@njit
+def change_of_volume(H, finite):
+    """Return det(I + H) - 1, for a law of small strains tr H."""
+    if finite == 0.0:
+        return load(H, 0) + load(H, 4) + load(H, 8)
+    return volume_change(H)
 
 
 @njit
@@ -132,6 +140,85 @@ def stress(law, c, needs, e, j, X, S, scratch, D, moduli):
         differentiate(derivatives, i1, e, X, scratch, D)
     if has_fibres(law):
         add_fibres(law, c, e, S, scratch, D, moduli)
+
+
+@njit
+def dilatation(law, c, needs, finite, bulk, j, scratch):
+    """Return dU/dJ and d2U/dJ2 at J = 1 + j of the energy U that mean dilatation projects.
+
+    `bulk` is the bulk modulus that stays at the points. See `dpl.fem.assembly.mean_dilatation`.
+    """
+    store(scratch, 0, j)
+    for lane in range(SIMD_WIDTH):
+        log_j = math.log1p(scratch[0, lane])
+        scratch[0, lane] = log_j
+        scratch[1, lane] = math.expm1(-2 / 3 * log_j)
+        scratch[2, lane] = math.expm1(2 / 3 * log_j)
+    e = load(scratch, 2)  # normal components of 2 E
+    if finite == 0.0:
+        e = 2 / 3 * j  # of small strains with tr H = j
+    i1 = 3.0 * e
+    i2 = 2.0 * i1 + 3.0 * e * e
+    found = derivatives_of(law, c, i1, i2, j, load(scratch, 0), load(scratch, 1))
+    rest, W2, pressure, W11, W12, W22, W1J, W2J, pJ = found
+    x = 1.0 / (1.0 + e)
+    S = rest + 2.0 * W2 * i1 - 2.0 * W2 * e - pressure * e * x
+    t2 = 2.0 * (2.0 + i1) - 2.0 * e
+    D = 2.0 * (2.0 * W11 + W12 * t2 + W1J * x) + t2 * (2.0 * W12 + W22 * t2 + W2J * x)
+    D = 3.0 * (D + x * (2.0 * W1J + W2J * t2 + pJ * x)) - 2.0 * pressure * x * x + 8.0 * W2
+    squared = 1.0 + finite * e  # of the stretch
+    p, modulus = S / sqrt(squared), (D - finite * S / squared) / (3.0 * squared)
+    if finite == 0.0:
+        return p - bulk * j, modulus - bulk
+    inverse = 1.0 / (1.0 + j)
+    half = 0.5 * bulk
+    return p - half * j * (2.0 + j) * inverse, modulus - half - half * inverse * inverse
+
+
+@njit
+def add_pressure(p, modulus, J, X, finite, S, D, moduli):
+    """Add the stress p J X and, with `moduli`, its moduli for dp/dJ = modulus to S and D."""
+    for v in range(6):
+        store(S, v, load(S, v) + p * J * load(X, v))
+    if moduli:
+        own = finite * p * J
+        both = own + modulus * J * J
+        for v in range(6):
+            i, k = FIRST[v], SECOND[v]
+            for w in range(v, 6):
+                m, n = FIRST[w], SECOND[w]
+                pair = load(X, VOIGT[i, m]) * load(X, VOIGT[k, n])
+                pair = pair + load(X, VOIGT[i, n]) * load(X, VOIGT[k, m])
+                d = load(D, 6 * v + w) + both * load(X, v) * load(X, w) - own * pair
+                store(D, 6 * v + w, d)
+                store(D, 6 * w + v, d)
+
+
+@njit
+def volume_slope(F, X, J, finite, out):
+    """Set out to dJ/dF = J F X, for a law of small strains to I (rows 3 i + j)."""
+    for i in range(3):
+        for k in range(3):
+            total = load(F, 3 * i) * load(X, VOIGT[0, k])
+            total = total + load(F, 3 * i + 1) * load(X, VOIGT[1, k])
+            total = total + load(F, 3 * i + 2) * load(X, VOIGT[2, k])
+            store(out, 3 * i + k, total * J)
+
+
+@njit
+def second_volume_change(H, step):
+    """Return J(F) - J(F - A) - cof(F - A) : A of F = I + H and the step A."""
+    double, third = 0.0 * load(H, 0), 0.0 * load(H, 0)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for c in range(3):
+            d, e = (c + 1) % 3, (c + 2) % 3
+            minor = load(step, 3 * j + d) * load(step, 3 * k + e)
+            minor = minor - load(step, 3 * j + e) * load(step, 3 * k + d)
+            double = double + minor * (load(H, 3 * i + c) + (1.0 if i == c else 0.0))
+            if i == 0:
+                third = third + minor * load(step, c)
+    return double - 2.0 * third
 
 
 @njit

@@ -148,23 +148,133 @@ def scatter_entries(K, places, count, values):
             values[places[r, lane]] += K[r, lane]
 
 
+@njit
+def gather_functions(psi, start, count, out):
+    """Copy the functions of the volume change, (E or 1, Q, M), to out (Q, M, lane)."""
+    several = psi.shape[0] > 1
+    if not several and start > 0:
+        return
+    for lane in range(SIMD_WIDTH):
+        cell = start + min(lane, count - 1) if several else 0
+        for q in range(psi.shape[1]):
+            for m in range(psi.shape[2]):
+                out[q, m, lane] = psi[cell, q, m]
+
+
+@njit
+def value_of(coefficients, functions):
+    """Return the value of a polynomial (M,) at a point with function values (M,)."""
+    value = load(coefficients, 0) * load(functions, 0)
+    for m in range(1, coefficients.shape[0]):
+        value = value + load(coefficients, m) * load(functions, m)
+    return value
+
+
+@njit
+def add_projected(value, functions, out):
+    """Add a value times the functions of a point to coefficients."""
+    for m in range(out.shape[0]):
+        store(out, m, load(out, m) + value * load(functions, m))
+
+
+@njit
+def pressures_of_cells(law, c, needs, finite, points, functions, gap, work, out, count, low):
+    """Set the coefficients of the pressures of a block of cells and their derivatives.
+
+    `points` are displacements, gradients and volumes, and `functions` those of the volume change
+    and the bulk modulus that stays at the points. `out` are the pressure p (M, lane) at the volume
+    change of u minus `gap` (M, lane), or of u if there is none; its linear extrapolation to the
+    volume change of u; and the derivative of p (M M, lane). Returns the minimum of `low` and the
+    volume changes.
+    """
+    ue, g, weight = points
+    psi, bulk = functions
+    H, j, scratch = work
+    p, ahead, D = out
+    M, mixed = psi.shape[1], len(gap) > 0
+    for part in out:
+        part[:] = 0.0
+    j[:] = 0.0
+    for q in range(psi.shape[0]):
+        gradient(ue, g[q], H)
+        add_projected(load(weight, q) * point.change_of_volume(H, finite), psi[q], j)
+    if mixed:
+        for m in range(M):
+            store(j, m, load(j, m) - load(gap, m))
+    for q in range(psi.shape[0]):
+        change = value_of(j, psi[q])
+        store(scratch, 0, change)
+        if mixed:
+            low = minimum(scratch, count, low)
+        pressure, modulus = point.dilatation(law, c, needs, finite, load(bulk, 0), change, scratch)
+        add_projected(load(weight, q) * pressure, psi[q], p)
+        if mixed:
+            pressure = pressure + modulus * value_of(gap, psi[q])
+        add_projected(load(weight, q) * pressure, psi[q], ahead)
+        for m in range(M):
+            factor = load(weight, q) * modulus * load(psi[q], m)
+            add_projected(factor, psi[q], D[m * M : (m + 1) * M])
+    return low
+
+
+@njit
+def add_slopes(F, X, J, finite, weight, psi, g, P, slopes):
+    """Add the nodal forces of dJ/dF times each function of a point to slopes (M, 3 a + i)."""
+    point.volume_slope(F, X, J, finite, P)
+    for a in range(g.shape[0] // 3):
+        g0, g1, g2 = load(g, 3 * a), load(g, 3 * a + 1), load(g, 3 * a + 2)
+        for i in range(3):
+            force = load(P, 3 * i) * g0 + load(P, 3 * i + 1) * g1 + load(P, 3 * i + 2) * g2
+            for m in range(slopes.shape[0]):
+                at = slopes[m]
+                store(at, 3 * a + i, load(at, 3 * a + i) + weight * load(psi, m) * force)
+
+
+@njit
+def add_volumetric_stiffness(slopes, D, dim, C, K):
+    """Add slopes D slopes^T to K, see `add_stiffness`."""
+    M = slopes.shape[0]
+    for m in range(M):
+        for r in range(slopes.shape[1]):
+            total = load(D, m * M) * load(slopes[0], r)
+            for n in range(1, M):
+                total = total + load(D, m * M + n) * load(slopes[n], r)
+            store(C, r, total)
+        first = 0
+        for b in range(slopes.shape[1] // 3):
+            for i in range(dim):
+                for a in range(b + 1):
+                    at = first + (a * dim + i) * dim
+                    left = load(slopes[m], 3 * a + i)
+                    for k in range(dim):
+                        store(K, at + k, load(K, at + k) + left * load(C, 3 * b + k))
+            first += (b + 1) * dim * dim
+
+
 @njit(error_model="numpy", cache=True)
-def add_system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, values):
+def add_system(law, c, needs, finite, u, gap, cells, dN, dV, volumes, places, force, values):
     """Add force to (N, D) and, unless empty, tangent to (nnz + 1,) at displacements u (N, D).
 
-    The constants of the law are (E, n), or (1, n) for all cells.
+    The constants of the law are (E, n), or (1, n) for all cells. `volumes` are the functions of the
+    volume change of mean dilatation, (E or 1, Q, M), with M = 0 without it, and the bulk modulus
+    that stays at the points, (E or 1, 1); see `dpl.fem.assembly.mean_dilatation`.
 
-    With `gap` (blocks, Q, 6, SIMD_WIDTH) stress and moduli are evaluated at the strain of u minus
-    the gap, and the stress is extrapolated linearly to the strain of u. Returns the minimum of
-    det F - 1, with a gap that of det C - 1 of the reduced strains.
+    With the gaps (blocks, Q, 6, SIMD_WIDTH) and (blocks, M, SIMD_WIDTH) stress and moduli are
+    evaluated at the strain of u minus the first, and pressures at the volume change minus the
+    second; both are extrapolated linearly. Returns the minimum of det F - 1, with gaps that of
+    det C - 1 of the reduced strains and of the reduced volume changes.
     """
-    n, Q, dim = cells.shape[1], dN.shape[1], dN.shape[3]
-    mixed, moduli = len(gap) > 0, len(values) > 0
+    (strain_gap, volume_gap), (psi, stays) = gap, volumes
+    n, Q, dim, M = cells.shape[1], dN.shape[1], dN.shape[3], psi.shape[2]
+    mixed, moduli = len(strain_gap) > 0, len(values) > 0
     ue, fe, g, weight = rows(3 * n), rows(3 * n), np.zeros((Q, 3 * n, SIMD_WIDTH)), rows(Q)
-    H, P, D, A, C = rows(9), rows(9), rows(36), rows(81), rows(27)
-    e, X, S, T = rows(6), rows(6), rows(6), rows(6)
+    H, P, D, A, C = rows(9), rows(9), rows(36), rows(81), rows(max(27, 3 * n))
+    e, X, S, T, ahead = rows(6), rows(6), rows(6), rows(6), rows(6)
     K, low = rows(places.shape[1]), np.inf
     scratch, constants = rows(point.SCRATCH_ROWS), rows(c.shape[1])
+    functions, slopes = np.zeros((Q, M, SIMD_WIDTH)), np.zeros((M, 3 * n, SIMD_WIDTH))
+    pressures, work, bulk = (rows(M), rows(M), rows(M * M)), (rows(9), rows(M), scratch), rows(1)
+    no_gap = rows(0)
     for start in range(0, len(cells), SIMD_WIDTH):
         block, count = start // SIMD_WIDTH, min(SIMD_WIDTH, len(cells) - start)
         gather(u, cells, start, count, ue)
@@ -173,44 +283,99 @@ def add_system(law, c, needs, finite, u, gap, cells, dN, dV, places, force, valu
         fe[:] = 0.0
         if moduli:
             K[:] = 0.0
+        if M > 0:
+            gather_functions(psi, start, count, functions)
+            slopes[:] = 0.0
+            gather_constants(stays, start, count, bulk)
+            own, points = volume_gap[block] if mixed else no_gap, (ue, g, weight)
+            low = pressures_of_cells(
+                *(law, constants, needs, finite, points, (functions, bulk), own, work),
+                *(pressures, count, low),
+            )
         for q in range(Q):
             gradient(ue, g[q], H)
             point.strain(H, finite, e)
             change = point.volume_change(H)
+            J = 1.0 + finite * change
             if mixed:
-                change = point.reduce_strain(gap[block, q], e)
+                change = point.reduce_strain(strain_gap[block, q], e)
             store(scratch, 0, change)
             low = minimum(scratch, count, low)
             j = change / (1.0 + sqrt(1.0 + change)) if mixed else change
             point.stress(law, constants, needs, e, j, X, S, scratch, D, moduli)
+            if M > 0:
+                own_j = j if finite > 0.0 else point.change_of_volume(H, finite)
+                if finite == 0.0:
+                    for v in range(6):
+                        store(X, v, 1.0 if v < 3 else 0.0)
+                pressure, modulus = point.dilatation(
+                    law, constants, needs, finite, load(bulk, 0), own_j, scratch
+                )
+                own_J = 1.0 + finite * j
+                point.add_pressure(-pressure, -modulus, own_J, X, finite, S, D, moduli)
+            for v in range(6):
+                store(ahead, v, load(S, v))
+            if mixed:
+                point.extrapolate(D, strain_gap[block, q], ahead)
+            if M > 0:
+                if mixed:
+                    point.strain(H, finite, e)
+                    point.invert(e, X)
+                p, p_ahead, _ = pressures
+                for pressure, own_S, own_D in ((p_ahead, ahead, False), (p, S, moduli)):
+                    value = value_of(pressure, functions[q])
+                    point.add_pressure(value, 0.0, J, X, finite, own_S, D, own_D)
             for r in range(9):
                 store(H, r, finite * load(H, r) + (1.0 if r % 4 == 0 else 0.0))
             if moduli:
                 point.push_forward(H, D, S, load(weight, q), finite, T, A)
                 add_stiffness(A, g[q], dim, C, K)
-            if mixed:
-                point.extrapolate(D, gap[block, q], S)
-            add_forces(H, S, load(weight, q), g[q], P, fe)
+                if M > 0:
+                    add_slopes(H, X, J, finite, load(weight, q), functions[q], g[q], P, slopes)
+            add_forces(H, ahead, load(weight, q), g[q], P, fe)
         scatter(fe, cells, start, count, force)
         if moduli:
+            if M > 0:
+                add_volumetric_stiffness(slopes, pressures[2], dim, C, K)
             scatter_entries(K, places[block], count, values)
     return low
 
 
 @njit(error_model="numpy", cache=True)
-def update_gap(law, gap, length, update, cells, dN, dV):
-    """Return (1 - length) gap + length^2 dH^T dH of a step (N, D), (blocks, Q, 6, SIMD_WIDTH)."""
-    n, Q = cells.shape[1], dN.shape[1]
-    updated = np.zeros((-(-len(cells) // SIMD_WIDTH), Q, 6, SIMD_WIDTH))
+def update_gap(law, gap, length, update, u, cells, dN, dV, psi):
+    """Return the gaps of strain and of volume after a step (N, D) to u (N, D), see `add_system`.
+
+    They are (1 - length) gap plus what the step changes nonlinearly; that of the strain is
+    length^2 dH^T dH.
+    """
+    strain_gap, volume_gap = gap
+    n, Q, M = cells.shape[1], dN.shape[1], psi.shape[2]
+    blocks = -(-len(cells) // SIMD_WIDTH)
+    strains = np.zeros((blocks, Q, 6, SIMD_WIDTH))
+    volumes = np.zeros((blocks, M, SIMD_WIDTH))
     ue, g, weight, H = rows(3 * n), np.zeros((Q, 3 * n, SIMD_WIDTH)), rows(Q), rows(9)
+    at, deformed, functions = rows(3 * n), rows(9), np.zeros((Q, M, SIMD_WIDTH))
     for start in range(0, len(cells), SIMD_WIDTH):
         block, count = start // SIMD_WIDTH, min(SIMD_WIDTH, len(cells) - start)
         gather(update, cells, start, count, ue)
         gather_shape(dN, dV, start, count, g, weight)
+        if M > 0:
+            gather(u, cells, start, count, at)
+            gather_functions(psi, start, count, functions)
+            if len(volume_gap) > 0:
+                for m in range(M):
+                    store(volumes[block], m, (1.0 - length) * load(volume_gap[block], m))
         for q in range(Q):
             gradient(ue, g[q], H)
-            if len(gap) > 0:
+            if len(strain_gap) > 0:
                 for v in range(6):
-                    store(updated[block, q], v, (1.0 - length) * load(gap[block, q], v))
-            point.quadratic(H, length * length, updated[block, q])
-    return updated
+                    old = load(strain_gap[block, q], v)
+                    store(strains[block, q], v, (1.0 - length) * old)
+            point.quadratic(H, length * length, strains[block, q])
+            if M > 0:
+                gradient(at, g[q], deformed)
+                for r in range(9):
+                    store(H, r, length * load(H, r))
+                change = point.second_volume_change(deformed, H)
+                add_projected(load(weight, q) * change, functions[q], volumes[block])
+    return strains, volumes

@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpl.fem.assembly import element_loops
+from dpl.fem.assembly.mean_dilatation import point_bulk
 from dpl.fem.assembly.numba_laws import CompiledLaw, Law, required_terms
 from dpl.fem.assembly.simd import SIMD_WIDTH
 
 Array = NDArray[np.float64]
-NO_GAP = np.zeros((0, 0, 0, SIMD_WIDTH))
+Gap = tuple[Array, Array]  # of strains and of volume changes
+NO_GAP = np.zeros((0, 0, 0, SIMD_WIDTH)), np.zeros((0, 0, SIMD_WIDTH))
 NO_VALUES = np.zeros(0)
 
 
@@ -33,6 +35,7 @@ class Kernels:
         dN: Array,
         dV: Array,
         places: NDArray[np.int32],
+        functions: Array | None = None,
     ) -> None:
         """Store the arrays; numba compiles at the first call and caches the code on disk.
 
@@ -43,22 +46,31 @@ class Kernels:
             dV: Volumes of the quadrature points, (E or 1, Q).
             places: Position of each entry of a cell matrix among the nnz + 1 values, the last one
                 for entries that are not stored, (E, A (A + 1)/2 D^2).
+            functions: Functions of the volume change of mean dilatation, (E or 1, Q, M).
         """
         self.cells = cells
         self.dN = dN
         self.dV = dV
         self.places = _in_blocks(places)
+        has_volumes = functions is not None
+        none = np.zeros((1, dN.shape[1], 0))
+        self.functions = none if functions is None else np.ascontiguousarray(functions)
         self._law = (
             Law.of(material, element_loops.SOURCES),
-            required_terms(material),
+            max(required_terms(material), int(has_volumes and material.finite)),
             float(material.finite),
         )
-        self._constants = constants_of(material)
+        self._set_constants([material])
+
+    def _set_constants(self, materials: Sequence[CompiledLaw]) -> None:
+        self._constants = constants_of(*materials)
+        none = np.zeros((1, 1, 1))
+        self._bulk = as_columns([point_bulk(*materials)]) if self.functions.shape[2] else none
 
     def with_moduli(self, materials: Sequence[CompiledLaw]) -> "Kernels":
         """Return the kernels of the same body with other moduli of its one law."""
         other = copy.copy(self)
-        other._constants = constants_of(*materials)
+        other._set_constants(materials)
         return other
 
     def force(self, u: Array, out: Array, member: int = 0) -> float:
@@ -69,10 +81,9 @@ class Kernels:
             out: Internal force, (N, D).
             member: Index of the moduli, where each member of a batch has its own.
         """
-        moduli = self._constants[member if len(self._constants) > 1 else 0]
-        return self._add(moduli, u, NO_GAP, out, NO_VALUES)
+        return self._add(member, u, NO_GAP, out, NO_VALUES)
 
-    def system(self, u: Array, gap: Array | None, out: Array, values: Array) -> float:
+    def system(self, u: Array, gap: Gap | None, out: Array, values: Array) -> float:
         """Add force (N, D) and tangent (nnz + 1,) at u; return min det C of mixed points.
 
         Raises:
@@ -80,21 +91,25 @@ class Kernels:
         """
         if len(self._constants) > 1:
             raise ValueError("parameters must be the same for all loads; linearise them one by one")
-        lowest = self._add(self._constants[0], u, NO_GAP if gap is None else gap, out, values)
+        lowest = self._add(0, u, NO_GAP if gap is None else gap, out, values)
         return math.inf if gap is None else lowest
 
-    def _add(self, moduli: Array, u: Array, gap: Array, out: Array, values: Array) -> float:
+    def _add(self, member: int, u: Array, gap: Gap, out: Array, values: Array) -> float:
         law, needs, finite = self._law
-        arrays = (self.cells, self.dN, self.dV, self.places)
+        moduli, bulk = (x[member if len(x) > 1 else 0] for x in (self._constants, self._bulk))
+        body = self.cells, self.dN, self.dV, (self.functions, bulk), self.places
         system = element_loops.add_system
-        return 1 + call_compiled(system, law, moduli, needs, finite, u, gap, *arrays, out, values)
+        return 1 + call_compiled(system, law, moduli, needs, finite, u, gap, *body, out, values)
 
-    def update_strain_gap(self, gap: Array | None, length: float, update: Array) -> Array:
-        """Return the strain of u minus the strain of the mixed integration points after a step."""
+    def update_strain_gap(
+        self, gap: Gap | None, length: float, update: Array, u: Array | None = None
+    ) -> Gap:
+        """Return the gaps of the mixed integration points after a step to u."""
         gap, kernel = NO_GAP if gap is None else gap, element_loops.update_gap
-        return call_compiled(
-            kernel, self._law[0], gap, length, update, self.cells, self.dN, self.dV
-        )
+        u = np.zeros_like(update) if u is None else u
+        body = self.cells, self.dN, self.dV, self.functions
+        found: Gap = call_compiled(kernel, self._law[0], gap, length, update, u, *body)
+        return found
 
 
 class GroupedKernels:
@@ -113,26 +128,31 @@ class GroupedKernels:
         """Add the internal force, see `Kernels.force`."""
         return min(kernels.force(u, out, member) for kernels in self._groups)
 
-    def system(self, u: Array, gap: Sequence[Array] | None, out: Array, values: Array) -> float:
+    def system(self, u: Array, gap: Sequence[Gap] | None, out: Array, values: Array) -> float:
         """Add force and tangent, see `Kernels.system`."""
         gaps = [None] * len(self._groups) if gap is None else gap
         pairs = zip(self._groups, gaps, strict=True)
         return min(kernels.system(u, own, out, values) for kernels, own in pairs)
 
     def update_strain_gap(
-        self, gap: Sequence[Array] | None, length: float, update: Array
-    ) -> list[Array]:
+        self, gap: Sequence[Gap] | None, length: float, update: Array, u: Array | None = None
+    ) -> list[Gap]:
         """Return the strain gap of each group, see `Kernels.update_strain_gap`."""
         gaps = [None] * len(self._groups) if gap is None else gap
         pairs = zip(self._groups, gaps, strict=True)
-        return [kernels.update_strain_gap(own, length, update) for kernels, own in pairs]
+        return [kernels.update_strain_gap(own, length, update, u) for kernels, own in pairs]
 
 
 def constants_of(material: CompiledLaw) -> Array:
     """Return the constants of a law, (B or 1, E or 1, n)."""
-    constants = [np.asarray(c, dtype=np.float64) for c in material.constants]
-    constants = [c.reshape((1,) * (3 - c.ndim) + c.shape) for c in constants]
-    return np.ascontiguousarray(np.concatenate(np.broadcast_arrays(*constants), axis=-1))
+    return as_columns(material.constants)
+
+
+def as_columns(values: Sequence[Any]) -> Array:
+    """Return numbers, fields or values of a batch as (B or 1, E or 1, n)."""
+    columns = [np.asarray(value, dtype=np.float64) for value in values]
+    columns = [c.reshape((1,) * (3 - c.ndim) + c.shape) for c in columns]
+    return np.ascontiguousarray(np.concatenate(np.broadcast_arrays(*columns), axis=-1))
 
 
 PATIENCE = 2.0  # time after which a compilation is announced [s]

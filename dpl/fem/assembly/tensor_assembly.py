@@ -11,10 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dpl.fem.assembly import mean_dilatation
 from dpl.fem.assembly.boundary_conditions import FoundationMatrix
 from dpl.fem.assembly.elements import basis_of
-from dpl.fem.assembly.fbar import fbar_gradient, fbar_stress
 from dpl.fem.assembly.follower_loads import NO_LOADS, FollowerLoads, Places
+from dpl.fem.assembly.mean_dilatation import CellVolumes
 from dpl.fem.assembly.recovery import Recovery
 from dpl.fem.assembly.rigid_body_modes import rigid_body_modes, unconstrained_modes
 from dpl.fem.assembly.sparsity import Pattern
@@ -46,7 +47,8 @@ class TensorAssembly:
         boundary: Mask of the nodes on the boundary, (N,).
         springs: Elastic foundation (Robin conditions), or None.
         follower_loads: Loads whose forces depend on the displacement: pressures, active stress.
-        mean_dilatation: True if the points of a cell share its mean volume ratio (F-bar).
+        volume_functions: Functions of the volume change in the cells, (E or 1, Q, M), see
+            `CellVolumes`; None without mean dilatation.
         young: Young's modulus by which boundary values are divided [Pa]; None if there is no such
             modulus, see `dpl.fem.units.Units`. No other quantity depends on it.
     """
@@ -65,7 +67,7 @@ class TensorAssembly:
     boundary: Tensor
     springs: FoundationMatrix | None = None
     follower_loads: FollowerLoads = NO_LOADS
-    mean_dilatation: bool = False
+    volume_functions: Tensor | None = None
     young: float | None = 1.0
 
     def to(self, device: torch.device | str) -> Self:
@@ -134,7 +136,13 @@ class TensorAssembly:
     @property
     def supports_mip(self) -> bool:
         """True if `mixed_system` is available: mixed integration points (MIP)."""
-        return self.material.has_response and not self.mean_dilatation
+        return self.material.has_response
+
+    @property
+    def volumes(self) -> CellVolumes | None:
+        """Polynomials of the volume change in the cells; None without mean dilatation."""
+        functions = self.volume_functions
+        return None if functions is None else CellVolumes(functions, self.dV)
 
     @property
     def near_null(self) -> NDArray[np.float64]:
@@ -151,8 +159,12 @@ class TensorAssembly:
         The energy of a follower load is its potential only if it has one, see
         `FollowerTerm.has_potential`.
         """
-        H = self._effective_gradient(displacement)
-        energy = (self.material.energy(H) * self.dV).sum((-2, -1))
+        H = self.gradient(displacement)
+        if self.volumes is None:
+            density = self.material.energy(H)
+        else:
+            density = mean_dilatation.energy(self.material, H, self.volumes)
+        energy = (density * self.dV).sum((-2, -1))
         if self.springs is not None:
             pull = self.springs.force(displacement)
             energy = energy + (pull * displacement).sum((-2, -1)) / 2
@@ -165,20 +177,20 @@ class TensorAssembly:
 
         Follower loads are a part of f_int, because they depend on the displacement.
         """
-        stress = self._effective_stress(self.gradient(displacement))
-        return self._with_boundary_forces(self._nodal_forces(stress), displacement)
+        forces = self._nodal_forces(self.stress(displacement))
+        return self._with_boundary_forces(forces, displacement)
 
     def tangent(self, displacement: Tensor) -> Tensor:
         """Return the entries of K = d f_int / du on `pattern`, (B, nnz) [-].
 
         If a follower load has no potential, K is the symmetric part.
         """
-        if self.mean_dilatation:
-            return self._with_boundary_entries(
-                self._entries(self._cell_tangents(displacement)), displacement
-            )
-        moduli = self.material.tangent(self.gradient(displacement))
-        return self._with_boundary_entries(self._assembled(moduli), displacement)
+        H = self.gradient(displacement)
+        if self.volumes is None:
+            entries = self._assembled(self.material.tangent(H))
+        else:
+            entries = self._assembled(*mean_dilatation.tangent(self.material, H, self.volumes))
+        return self._with_boundary_entries(entries, displacement)
 
     def strain(self, displacement: Tensor) -> Tensor:
         """Return the Green-Lagrange strain at the quadrature points, (B, E, Q, 3, 3) [-]."""
@@ -189,22 +201,27 @@ class TensorAssembly:
         dH = self.gradient(update)
         return dH.mT @ dH / 2
 
-    def mixed_system(self, displacement: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
+    def mixed_system(self, displacement: Tensor, gap: Any) -> tuple[Tensor, Tensor]:
         """Return force (B, N, D) and tangent (B, nnz) with mixed integration points (MIP).
 
         The strain at each quadrature point is an independent unknown, which the point eliminates.
         Stress and moduli are evaluated at the strain of u minus `gap`, (B, E, Q, 3, 3), and the
         stress is extrapolated linearly to the strain of u. With a zero gap the results are
-        `internal_force` and `tangent`.
+        `internal_force` and `tangent`. With mean dilatation the gap is a `MixedGap`, and volume
+        changes and pressures of the cells are unknowns too.
 
         Source: Magisano, Leonetti, Garcea (2017), CMAME 313, section 3.
         """
         H = self.gradient(displacement)
-        response = self.material.response(green_lagrange(H) - gap)
-        stress = response.stress + response.product(gap)
-        force = self._with_boundary_forces(self._nodal_forces(stress + H @ stress), displacement)
-        entries = self._assembled(response.tangent(H))
-        return force, self._with_boundary_entries(entries, displacement)
+        parts: tuple[Tensor, ...]
+        if self.volumes is None:
+            response = self.material.response(green_lagrange(H) - gap)
+            S = response.stress + response.product(gap)
+            stress, parts = S + H @ S, (response.tangent(H),)
+        else:
+            stress, parts = mean_dilatation.mixed_system(self.material, H, gap, self.volumes)
+        force = self._with_boundary_forces(self._nodal_forces(stress), displacement)
+        return force, self._with_boundary_entries(self._assembled(*parts), displacement)
 
     def tangent_product(self, displacement: Tensor, direction: Tensor) -> Tensor:
         """Return K(u) v on all degrees of freedom without assembling K, (B, N, D) [-]."""
@@ -217,13 +234,10 @@ class TensorAssembly:
 
     def stress(self, displacement: Tensor) -> Tensor:
         """Return the first Piola-Kirchhoff stress over E at the quadrature points, (B,E,Q,3,3)."""
-        return self.material.stress(self._effective_gradient(displacement))
-
-    def _effective_gradient(self, displacement: Tensor) -> Tensor:
         H = self.gradient(displacement)
-        if not self.mean_dilatation:
-            return H
-        return fbar_gradient(self.material, H, self.dV, self.shape[1])
+        if self.volumes is None:
+            return self.material.stress(H)
+        return mean_dilatation.stress(self.material, H, self.volumes)
 
     @cached_property
     def force_at_rest(self) -> Tensor:
@@ -313,36 +327,26 @@ class TensorAssembly:
         """Places of the stiffness of the follower loads on the pattern."""
         return self.follower_loads.places(self.pattern, self.points.device)
 
-    def _effective_stress(self, H: Tensor) -> Tensor:
-        """Return the stress conjugate to H, (B, E, Q, 3, 3) [-]."""
-        if not self.mean_dilatation:
-            return self.material.stress(H)
-        return fbar_stress(self.material, H, self.dV, self.shape[1])
+    def _assembled(
+        self, moduli: Tensor, slope: Tensor | None = None, stiffness: Tensor | None = None
+    ) -> Tensor:
+        """Return the entries of the tangent (B, nnz) of dP/dF (B, E, Q, 3, 3, 3, 3).
 
-    def _cell_tangents(self, displacement: Tensor) -> Tensor:
-        """Return the derivatives of the cell forces (B, E A D D A), laid out aikb."""
-        at_cells = displacement[:, self.cells]  # (B, E, A, D)
-        nodes, dim = at_cells.shape[-2:]
-
-        def forces(local: Tensor) -> Tensor:
-            return self._cell_forces(self._effective_stress(self._cell_gradient(local.mT)))
-
-        def along(direction: Tensor) -> Tensor:
-            return torch.func.jvp(forces, (at_cells,), (direction.expand_as(at_cells),))[1]
-
-        directions = torch.eye(nodes * dim, dtype=displacement.dtype, device=displacement.device)
-        columns = torch.func.vmap(along)(directions.view(-1, nodes, dim))  # (bk, B, E, A, D)
-        columns = columns.unflatten(0, (nodes, dim))
-        return columns.permute(2, 3, 4, 5, 1, 0).flatten(1)
-
-    def _assembled(self, moduli: Tensor) -> Tensor:
-        """Return the entries of the tangent (B, nnz) of dP/dF (B, E, Q, 3, 3, 3, 3)."""
+        With mean dilatation `slope` and `stiffness` are those of `PointTangent`.
+        """
         samples, dim = len(moduli), self.shape[1]
         A = moduli[..., :dim, :dim, :dim, :dim] * self.dV[..., None, None, None, None]
         A = A.transpose(-4, -3)  # (B, E, Q, j, i, k, l)
         right = A.flatten(-4, -2) @ self.dN.mT  # (B, E, Q, jik, A)
         right = right.unflatten(-2, (dim, dim * dim)).flatten(-2).flatten(-3, -2)  # (B, E, Qj, ikA)
-        return self._entries((self._operator @ right).reshape(samples, -1))
+        matrices = self._operator @ right  # (B, E, A, ikA)
+        if slope is not None and self.volume_functions is not None:
+            functions = self.volume_functions.mT[..., None, None]  # (E, M, Q, 1, 1)
+            each = [self._cell_forces(slope * functions[:, m]) for m in range(functions.shape[1])]
+            slopes = torch.stack(each, dim=2)  # (B, E, M, A, D)
+            volumetric = torch.einsum("bemai,bemn,benck->beaikc", slopes, stiffness, slopes)
+            matrices = matrices + volumetric.flatten(-3)
+        return self._entries(matrices.reshape(samples, -1))
 
     def _entries(self, matrices: Tensor) -> Tensor:
         """Return the tangent (B, nnz) of cell matrices (B, E A D D A), laid out aikb."""

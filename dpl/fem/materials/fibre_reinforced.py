@@ -156,6 +156,14 @@ class FibreReinforced(Composed, Material):
         Q = self._rotation(H)
         return self.matrix.energy(H) + self.fibres.energy(Q.mT @ (2 * green_lagrange(H)) @ Q)
 
+    def volumetric_energy(self, j: Tensor) -> Tensor:
+        """See `Material.volumetric_energy`."""
+        return self.matrix.volumetric_energy(j)
+
+    def pressure(self, j: Tensor) -> Tensor:
+        """See `Material.pressure`."""
+        return self.matrix.pressure(j)
+
     def response(self, E: Tensor) -> Response:
         """Return stress and moduli, see `Material.response`."""
         isotropic, fibres = self.matrix.response(E), self._fibre_response(E)

@@ -147,6 +147,14 @@ class Heterogeneous(Composed, Material):
         """Return the energy density, (B, E, Q) [-], see `Material.energy`."""
         return self._of_all_cells(lambda law, H: law.energy(H), H)
 
+    def volumetric_energy(self, j: Tensor) -> Tensor:
+        """See `Material.volumetric_energy`."""
+        return self._of_all_cells(lambda law, j: law.volumetric_energy(j), j)
+
+    def pressure(self, j: Tensor) -> Tensor:
+        """See `Material.pressure`."""
+        return self._of_all_cells(lambda law, j: law.pressure(j), j)
+
     def stress(self, H: Tensor) -> Tensor:
         """Return the first Piola-Kirchhoff stress, see `Material.stress`."""
         return self._of_all_cells(lambda law, H: law.stress(H), H)

@@ -92,6 +92,24 @@ class Material(Parametrised):
         hessian = torch.func.vmap(torch.func.hessian(self.energy))
         return hessian(H.reshape(-1, 3, 3)).reshape(*H.shape, 3, 3)
 
+    def volumetric_energy(self, j: Tensor) -> Tensor:
+        """Return U(J), the energy density over E of F = J^(1/3) I, (...,) [-], at J - 1 = j.
+
+        Of a law with fibres it is that of the matrix, of a law of small strains that of tr H = j.
+        """
+        return self.energy(self._dilatation(j)[1])
+
+    def pressure(self, j: Tensor) -> Tensor:
+        """Return dU/dJ, see `volumetric_energy`, (...,) [-]."""
+        stretch, H = self._dilatation(j)
+        return self.stress(H)[..., 0, 0] / stretch.square()
+
+    def _dilatation(self, j: Tensor) -> tuple[Tensor, Tensor]:
+        """Return stretch (...,) and H (..., 3, 3) [-] of a change of volume alone."""
+        growth = torch.expm1(torch.log1p(j) / 3) if self.finite else j / 3
+        H = growth[..., None, None] * torch.eye(3, dtype=j.dtype, device=j.device)
+        return (1 + growth if self.finite else torch.ones_like(j)), H
+
     @property
     def classes(self) -> tuple[type, ...]:
         """Classes of the law and its parts, for each of which kernels are compiled once."""

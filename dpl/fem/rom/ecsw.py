@@ -191,6 +191,9 @@ class ReducedMesh:
         def of_cells(tensor: Tensor) -> Tensor:
             return tensor.expand(len(problem.cells), *tensor.shape[1:])[cells].contiguous()
 
+        functions = problem.volume_functions
+        if functions is not None:  # orthonormal with the weighted volumes
+            functions = of_cells(functions) / weights[:, None, None].sqrt()
         self.nodes = nodes
         self.problem = replace(
             problem,
@@ -199,6 +202,7 @@ class ReducedMesh:
             cells=torch.arange(len(nodes)).view(-1, per_cell),
             dN=of_cells(problem.dN),
             dV=of_cells(problem.dV) * weights[:, None],
+            volume_functions=functions,
             free=torch.ones(fields, dtype=torch.bool),
             prescribed=torch.zeros(fields, dtype=torch.float64),
             boundary=torch.zeros(len(nodes), dtype=torch.bool),

@@ -169,7 +169,8 @@ class ReducedProblem:
         if not problem.supports_mip:
             return new
         update = (new.cell_displacement - state.cell_displacement) / new.length
-        return new._replace(gap=problem.update_strain_gap(state.gap, new.length, update))
+        u = new.cell_displacement
+        return new._replace(gap=problem.update_strain_gap(state.gap, new.length, update, u))
 
 
 def broyden(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:

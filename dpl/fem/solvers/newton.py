@@ -221,7 +221,9 @@ class Newton:
         new = longest_valid_step(state_after, bound, halvings=halvings)
         if new is None or not (self.mixed_integration and self.problem.supports_mip):
             return new
-        return new._replace(gap=self.problem.update_strain_gap(state.gap, new.length, update))
+        u = new.displacement
+        gap = self.problem.update_strain_gap(state.gap, new.length, update, u)
+        return new._replace(gap=gap)
 
     def _initial(self, force: Tensor, guess: Tensor | None) -> "_State | None":
         """Return the state of a guess; None where it is zero, inverted or there is no load."""
