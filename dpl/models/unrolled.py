@@ -192,7 +192,7 @@ class Unrolled(nn.Module):
     def _prepare(self) -> None:
         """Prepare what a traced graph takes as constants, after the buffers have changed."""
         self._stiffness = ReducedStiffness(self.stiffness.detach().cpu().clone()).prepared()
-        self._law_of_samples = self.scene.problem.material.of_cells(self.cells.cpu())
+        self._law_of_samples = self.scene.problem.material.of_cells(self.cells.cpu()).centred()
 
     def _at_free_dofs(self, coordinates: Tensor) -> Tensor:
         """Return V c at free degrees of freedom, (B, n), of c (B, R)."""
@@ -244,7 +244,7 @@ class Unrolled(nn.Module):
         last = self._at_last_law  # read once: another thread may replace it
         if last is not None and last[0][0] is self.stiffness and last[0][1] == law:
             return last[1]
-        of_cells = one_law(law.of_cells(self.cells[self._prediction.cells]))
+        of_cells = one_law(law.of_cells(self.cells[self._prediction.cells]).centred())
         reduced = self._stiffness.inverse(self.linear.terms.factors(law))
         arguments = law_arguments(cast("InvariantBasedMaterial", of_cells))
         found = arguments, reduced, self.linear.law_weights(law)

@@ -279,7 +279,7 @@ def fit_maps(
         columns = orbits.symmetrised(gradients.flatten(1).T, parity_of_fields, parities)
         # rounded before the fit: the maps cancel digits, so that G must stay what it is
         sample_cells = SampleCells(columns.T.reshape(gradients.shape).float().double())
-        law = problem.material.of_cells(numbers)
+        law = problem.material.of_cells(numbers).centred()
         regression = Regression(law, sample_cells, action, *samples)
         while len(regression.ridges) <= stages and regression.add_map():
             pass

@@ -71,15 +71,17 @@ class ActiveStress(FollowerLoad):
             frames = fibre_frames(material, basis.mesh.nelements)
         else:
             frames = self.directions.on(basis, units.length, origin)
-            frames = frames.expand(basis.mesh.nelements, -1, -1)
-        fibre = frames.numpy()[cells, : basis.mesh.dim(), 0]  # column f; in 2D its part in plane
-        if unknown := int(np.isnan(fibre).any(axis=1).sum()):
+            frames = frames if frames.ndim == 4 else frames[:, None]
+            frames = frames.expand(basis.mesh.nelements, -1, -1, -1)
+        # column f; in 2D its part in plane
+        fibre = frames.numpy()[cells, :, : basis.mesh.dim(), 0]
+        if unknown := int(np.isnan(fibre).any(axis=(1, 2)).sum()):
             raise ValueError(
                 f"no fibre directions are known in {unknown} of {len(cells)} cells; set "
                 "directions, or a region of cells whose law has fibres"
             )
         dN, dV = (np.broadcast_to(x, (basis.nelems, *x.shape[1:])) for x in gradients(basis))
-        slopes = np.einsum("cqad,cd->cqa", dN[cells], fibre)
+        slopes = (dN[cells] @ fibre[..., None])[..., 0]
         return ActiveFibres(
             nodes=torch.from_numpy(basis.element_dofs.T[cells].astype(np.int64)),
             value=torch.full((len(cells),), tension, dtype=torch.float64),
@@ -107,7 +109,7 @@ class ActiveFibres(FollowerTerm):
 
     Attributes:
         cells: Numbers of the cells, (S,).
-        fibre: Direction f, (S, D) [-]; in 2D its components in the plane.
+        fibre: Direction f, (S, Q or 1, D) [-]; in 2D its components in the plane.
         slopes: Derivatives of the shape functions along f, (S, Q, A) [-].
         volumes: Volumes of the quadrature points, (S, Q) [-].
     """
@@ -130,14 +132,14 @@ class ActiveFibres(FollowerTerm):
 
     def force(self, displacement: Tensor) -> Tensor:
         """Return the part of the internal force, (B, N, D) [-]."""
-        image = self.fibre[:, None] + self.slopes @ displacement[:, self.nodes]  # F f
+        image = self.fibre + self.slopes @ displacement[:, self.nodes]  # F f
         forces = (self.slopes * self.volumes[..., None]).mT @ image
         return self._sum_at_nodes(forces * self.value[..., None, None], displacement)
 
     def work(self, displacement: Tensor) -> Tensor:
         """Return the energy, the integral of T/2 f.(C - I) f, (B,) [-]."""
         change = self.slopes @ displacement[:, self.nodes]  # du/df, (B, S, Q, D)
-        strain = ((self.fibre[:, None] + change / 2) * change).sum(-1)
+        strain = ((self.fibre + change / 2) * change).sum(-1)
         return ((strain * self.volumes).sum(-1) * self.value).sum(-1)
 
     def stiffness(self, displacement: Tensor) -> Tensor:

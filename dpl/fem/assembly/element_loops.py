@@ -50,6 +50,22 @@ def gather_constants(c, start, count, out):
 
 
 @njit
+def gather_frame(frames, q, start, count, c):
+    """Copy the fibre frames of a point, from (E or 1, Q or 1, 9), to the last rows of constants c.
+
+    What all points or cells share is copied for the first of them only.
+    """
+    several, points = frames.shape[0] > 1, frames.shape[1] > 1
+    if (not points and q > 0) or (not several and not points and start > 0):
+        return
+    first = c.shape[0] - frames.shape[2]
+    for lane in range(SIMD_WIDTH):
+        cell = start + min(lane, count - 1) if several else 0
+        for k in range(frames.shape[2]):
+            c[first + k, lane] = frames[cell, q if points else 0, k]
+
+
+@njit
 def gather_shape(dN, dV, start, count, g, weight):
     """Copy gradients to g (Q, 3 a + j, lane) and volumes to weight (zero in unused lanes).
 
@@ -252,10 +268,13 @@ def add_volumetric_stiffness(slopes, D, dim, C, K):
 
 
 @njit(error_model="numpy", cache=True)
-def add_system(law, c, needs, finite, u, gap, cells, dN, dV, volumes, places, force, values):
+def add_system(
+    law, c, frames, needs, finite, u, gap, cells, dN, dV, volumes, places, force, values
+):
     """Add force to (N, D) and, unless empty, tangent to (nnz + 1,) at displacements u (N, D).
 
-    The constants of the law are (E, n), or (1, n) for all cells. `volumes` are the functions of the
+    The constants of the law are (E, n), or (1, n) for all cells, the fibre frames
+    (E or 1, Q or 1, 9), or (1, 1, 0) for a law without fibres. `volumes` are the functions of the
     volume change of mean dilatation, (E or 1, Q, M), with M = 0 without it, and the bulk modulus
     that stays at the points, (E or 1, 1); see `dpl.fem.assembly.mean_dilatation`.
 
@@ -271,7 +290,7 @@ def add_system(law, c, needs, finite, u, gap, cells, dN, dV, volumes, places, fo
     H, P, D, A, C = rows(9), rows(9), rows(36), rows(81), rows(max(27, 3 * n))
     e, X, S, T, ahead = rows(6), rows(6), rows(6), rows(6), rows(6)
     K, low = rows(places.shape[1]), np.inf
-    scratch, constants = rows(point.SCRATCH_ROWS), rows(c.shape[1])
+    scratch, constants = rows(point.SCRATCH_ROWS), rows(c.shape[1] + frames.shape[2])
     functions, slopes = np.zeros((Q, M, SIMD_WIDTH)), np.zeros((M, 3 * n, SIMD_WIDTH))
     pressures, work, bulk = (rows(M), rows(M), rows(M * M)), (rows(9), rows(M), scratch), rows(1)
     no_gap = rows(0)
@@ -293,6 +312,7 @@ def add_system(law, c, needs, finite, u, gap, cells, dN, dV, volumes, places, fo
                 *(pressures, count, low),
             )
         for q in range(Q):
+            gather_frame(frames, q, start, count, constants)
             gradient(ue, g[q], H)
             point.strain(H, finite, e)
             change = point.volume_change(H)

@@ -18,6 +18,7 @@ from dpl.fem.assembly import element_loops
 from dpl.fem.assembly.mean_dilatation import point_bulk
 from dpl.fem.assembly.numba_laws import CompiledLaw, Law, required_terms
 from dpl.fem.assembly.simd import SIMD_WIDTH
+from dpl.fem.materials.fibre_reinforced import FibreReinforced
 
 Array = NDArray[np.float64]
 Gap = tuple[Array, Array]  # of strains and of volume changes
@@ -60,17 +61,17 @@ class Kernels:
             max(required_terms(material), int(has_volumes and material.finite)),
             float(material.finite),
         )
-        self._set_constants([material])
+        self._set_constants(material)
 
-    def _set_constants(self, materials: Sequence[CompiledLaw]) -> None:
-        self._constants = constants_of(*materials)
-        none = np.zeros((1, 1, 1))
-        self._bulk = as_columns([point_bulk(*materials)]) if self.functions.shape[2] else none
+    def _set_constants(self, material: CompiledLaw) -> None:
+        self._constants = as_columns(material.constants)
+        self._frames = frames_of(material)
+        self._bulk = as_columns([point_bulk(material) if self.functions.shape[2] else 0.0])
 
     def with_moduli(self, materials: Sequence[CompiledLaw]) -> "Kernels":
         """Return the kernels of the same body with other moduli of its one law."""
         other = copy.copy(self)
-        other._set_constants(materials)
+        other._set_constants(*materials)
         return other
 
     def force(self, u: Array, out: Array, member: int = 0) -> float:
@@ -99,7 +100,8 @@ class Kernels:
         moduli, bulk = (x[member if len(x) > 1 else 0] for x in (self._constants, self._bulk))
         body = self.cells, self.dN, self.dV, (self.functions, bulk), self.places
         system = element_loops.add_system
-        return 1 + call_compiled(system, law, moduli, needs, finite, u, gap, *body, out, values)
+        law_arguments = law, moduli, self._frames, needs, finite
+        return 1 + call_compiled(system, *law_arguments, u, gap, *body, out, values)
 
     def update_strain_gap(
         self, gap: Gap | None, length: float, update: Array, u: Array | None = None
@@ -144,8 +146,20 @@ class GroupedKernels:
 
 
 def constants_of(material: CompiledLaw) -> Array:
-    """Return the constants of a law, (B or 1, E or 1, n)."""
-    return as_columns(material.constants)
+    """Return the constants of a law with one frame in each cell, (B or 1, E or 1, n).
+
+    The entries of the frames, row by row, follow the other constants.
+    """
+    return as_columns([*material.constants, *frames_of(material)[:, 0].T[..., None]])
+
+
+def frames_of(material: CompiledLaw) -> Array:
+    """Return the fibre frames of a law, (E or 1, Q or 1, 9), or (1, 1, 0) without fibres."""
+    if not isinstance(material, FibreReinforced):
+        return np.zeros((1, 1, 0))
+    frames = material.frames.numpy()
+    frames = frames if frames.ndim == 4 else frames[:, None]
+    return np.ascontiguousarray(frames.reshape(*frames.shape[:2], 9))
 
 
 def as_columns(values: Sequence[Any]) -> Array:

@@ -65,17 +65,19 @@ class FibreFunction(FibreDirections):
     """Directions as a function of the place.
 
     Attributes:
-        function: Function of points (E, D) [m] that returns the directions f, (E, 3) or (E, 2), or
-            a tuple of f and s. Lengths are arbitrary.
+        function: Function of points (n, D) [m] that returns the directions f, (n, 3) or (n, 2), or
+            a tuple of f and s. Lengths are arbitrary. It is called with the quadrature points.
     """
 
     function: Callable[[Array], Any]
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
-        """Return the frames, (E, 3, 3) [-], see `FibreDirections.on`."""
-        found = self.function(cell_centres(basis, length, origin))
+        """Return the frames of the points, (E, Q, 3, 3) [-], see `FibreDirections.on`."""
+        at = np.asarray(basis.global_coordinates())
+        points = (at.reshape(len(at), -1).T + origin) * length
+        found = self.function(np.ascontiguousarray(points))
         fibre, sheet = found if isinstance(found, tuple) else (found, None)
-        return _frames_on(basis, fibre, sheet)
+        return _frames_on(basis, fibre, sheet, points=at.shape[2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +110,8 @@ class FibreData(FibreDirections):
         if self.file is None:
             return _frames_on(basis, self.fibre, self.sheet)
         names = [name for name in (self.fibre, self.sheet) if isinstance(name, str)]
-        data = read_cell_data(self.file, names)
-        return _frames_on(basis, *data)
+        fibre, *sheet = read_cell_data(self.file, names)
+        return _frames_on(basis, fibre, sheet[0] if sheet else None)
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ class LaplaceFibres(FibreDirections):
                 raise ValueError(f"{name} = {value} must be a finite number [rad]")
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
-        """Return the frames, (E, 3, 3) [-], see `FibreDirections.on`.
+        """Return the frames of the points, (E, Q, 3, 3) [-], see `FibreDirections.on`.
 
         Raises:
             ValueError: A surface contains no boundary facet, the surfaces touch, a part of the body
@@ -157,82 +159,87 @@ class LaplaceFibres(FibreDirections):
             facets_in(part, basis.mesh, length, origin) for part in (self.inner, self.outer)
         ]
         depth, gradient = _laplace(basis, *(basis.get_dofs(facets).all() for facets in surfaces))
-        transmural = _unit_vectors("gradient between inner and outer", gradient)
+        points = len(gradient) // basis.mesh.nelements
+        transmural = _unit_vectors("gradient between inner and outer", gradient, points)
         axis = _unit_vectors("longitudinal", np.array([self.longitudinal]))
         around = np.cross(axis, transmural)
         parallel = np.linalg.norm(around, axis=1) < PARALLEL
-        _refuse(parallel, "longitudinal must not be parallel to the transmural direction")
-        around = _unit_vectors("circumferential direction", around)
+        _refuse(parallel, "longitudinal must not be parallel to the transmural direction", points)
+        around = _unit_vectors("circumferential direction", around, points)
         angle = (self.inner_angle + (self.outer_angle - self.inner_angle) * depth)[:, None]
         fibre = np.cos(angle) * around + np.sin(angle) * np.cross(transmural, around)
-        return frames_of(fibre, transmural)
+        return frames_of(fibre, transmural, points=points).unflatten(0, (-1, points))
 
 
-def cell_centres(basis: skfem.Basis, length: float, origin: Origin) -> Array:
-    """Return the means of the vertices of the cells in the coordinates of the user, (E, D) [m]."""
-    vertices = basis.mesh.p[:, basis.mesh.t]  # (D, vertices, E)
-    return np.ascontiguousarray((vertices.mean(axis=1).T + origin) * length)
-
-
-def frames_of(fibre: Array, sheet: Array | None = None) -> Tensor:
+def frames_of(fibre: Array, sheet: Array | None = None, *, points: int = 1) -> Tensor:
     """Return right-handed orthonormal frames, (E, 3, 3) [-], of directions of any length.
 
     Args:
         fibre: Directions f, (E, 3) or (E, 2).
         sheet: Directions s, whose part across f is taken; default: z x f, or x where f
             lies along z.
+        points: Rows of each cell, for the message of an error.
 
     Raises:
         ValueError: A direction is zero or not finite, or the two are parallel.
     """
-    f = _unit_vectors("fibre", fibre)
+    f = _unit_vectors("fibre", fibre, points)
     if sheet is None:
         across = np.cross([0.0, 0.0, 1.0], f)
         along_z = np.linalg.norm(across, axis=1, keepdims=True) < PARALLEL
         sheet = np.where(along_z, [1.0, 0.0, 0.0], across)
-    s = _unit_vectors("sheet", sheet)
+    s = _unit_vectors("sheet", sheet, points)
     s = s - (s * f).sum(1, keepdims=True) * f
-    _refuse(np.linalg.norm(s, axis=1) < PARALLEL, "sheet must not be parallel to fibre")
+    _refuse(np.linalg.norm(s, axis=1) < PARALLEL, "sheet must not be parallel to fibre", points)
     s = s / np.linalg.norm(s, axis=1, keepdims=True)
     s = s - (s * f).sum(1, keepdims=True) * f  # again, for directions that are nearly parallel
     s = s / np.linalg.norm(s, axis=1, keepdims=True)
     return torch.from_numpy(np.stack([f, s, np.cross(f, s)], axis=-1))
 
 
-def _frames_on(basis: skfem.Basis, fibre: Any, sheet: Any = None) -> Tensor:
-    """Return frames of directions for each cell of a body, (E, 3, 3) [-]."""
+def _frames_on(basis: skfem.Basis, fibre: Any, sheet: Any = None, points: int = 0) -> Tensor:
+    """Return frames of directions for the cells of a body, (E, 3, 3), or for their points [-].
+
+    With `points` in each cell, rows of the directions are those of the points, and the result is
+    (E, Q, 3, 3).
+    """
     cells, dim = basis.mesh.t.shape[1], basis.mesh.dim()
+    rows = cells * max(points, 1)
     for name, given in (("fibre", fibre), ("sheet", sheet)):
         shape = np.shape(given)
-        if given is not None and shape not in ((cells, dim), (cells, 3)):
-            raise ValueError(f"{name} of shape {shape} must have ({cells}, {dim}), a row per cell")
+        if given is not None and shape not in ((rows, dim), (rows, 3)):
+            each = "point" if points else "cell"
+            raise ValueError(f"{name} of shape {shape} must have ({rows}, {dim}), a row per {each}")
     sheet = None if sheet is None else np.asarray(sheet, dtype=np.float64)
-    return frames_of(np.asarray(fibre, dtype=np.float64), sheet)
+    frames = frames_of(np.asarray(fibre, dtype=np.float64), sheet, points=max(points, 1))
+    return frames.unflatten(0, (cells, points)) if points else frames
 
 
-def _unit_vectors(name: str, vectors: Array) -> Array:
+def _unit_vectors(name: str, vectors: Array, points: int = 1) -> Array:
     """Return vectors (E, 2) or (E, 3) divided by their lengths, (E, 3) [-]."""
     vectors = np.asarray(vectors, dtype=np.float64)
     if vectors.ndim != 2 or vectors.shape[1] not in (2, 3):
         raise ValueError(f"{name} = {vectors.tolist()} must have 2 or 3 components")
     vectors = np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
     largest = np.abs(vectors).max(axis=1, keepdims=True)
-    _refuse(~((largest > 0) & np.isfinite(largest))[:, 0], f"{name} must be finite and not zero")
+    bad = ~((largest > 0) & np.isfinite(largest))[:, 0]
+    _refuse(bad, f"{name} must be finite and not zero", points)
     vectors = vectors / largest  # squares of it neither overflow nor vanish
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def _refuse(bad: NDArray[np.bool_], message: str) -> None:
-    """Raise a ValueError with the numbers of the cells for which `bad` (E,) is True."""
+def _refuse(bad: NDArray[np.bool_], message: str, points: int = 1) -> None:
+    """Raise a ValueError with the numbers of the cells with `bad` (E Q,) at one of Q points."""
     if bad.any():
-        where = f" (cells {listed(np.flatnonzero(bad))})" if len(bad) > 1 else ""
+        cells = np.unique(np.flatnonzero(bad) // points)
+        where = f" (cells {listed(cells)})" if len(bad) > 1 else ""
         raise ValueError(message + where)
 
 
 def _laplace(
     basis: skfem.Basis, inner: NDArray[np.int_], outer: NDArray[np.int_]
 ) -> tuple[Array, Array]:
-    """Return the solution of Laplace's equation (E,) [-] and its gradient (E, D) at cell centres.
+    """Return the solution of Laplace's equation (E Q,) [-] and its gradient (E Q, D) at points.
 
     Args:
         basis: Scalar basis.
@@ -253,7 +260,6 @@ def _laplace(
             raise ValueError(
                 "inner and outer must be surfaces of one wall: no solution between them"
             )
-    centre = basis.mesh.elem.refdom.p.mean(axis=1, keepdims=True)
-    at_centre = skfem.CellBasis(basis.mesh, basis.elem, quadrature=(centre, np.ones(1)))
-    field = at_centre.interpolate(values)
-    return np.asarray(field)[:, 0], np.ascontiguousarray(field.grad[:, :, 0].T)
+    field = basis.interpolate(values)
+    slopes = field.grad.reshape(len(field.grad), -1)
+    return np.asarray(field).ravel(), np.ascontiguousarray(slopes.T)

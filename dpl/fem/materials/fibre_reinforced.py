@@ -1,4 +1,4 @@
-"""Laws with fibres: an isotropic matrix and the energy of fibres, with a frame for each cell."""
+"""Laws with fibres: an isotropic matrix and the energy of fibres in their frames."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,10 +24,11 @@ class FibreDirections:
     """Specification of the fibre frames of a body."""
 
     def on(self, basis: skfem.Basis, length: float, origin: Origin) -> Tensor:
-        """Return the frames of the cells, (E, 3, 3), or (1, 3, 3) if all are equal [-].
+        """Return the frames of a body [-].
 
         The columns of a frame are the directions of fibre, sheet and normal: orthonormal, and
-        right-handed. They are evaluated at the centre of each cell.
+        right-handed. Frames are those of the quadrature points, (E, Q, 3, 3), of the cells,
+        (E, 3, 3), or (1, 3, 3) if all are equal.
 
         Args:
             basis: scikit-fem basis of one displacement component.
@@ -49,15 +50,16 @@ class FibreReinforced(Composed, Material):
     has the volumetric term; the fibres have the full strain, see `FibreEnergy`.
 
     Frames are tensors with the cells as first axis; the law then takes H of (B, E, Q, 3, 3), cells
-    at axis -4. One frame for all cells takes any H.
+    at axis -4. One frame for all cells takes any H. A frame is that of a quadrature point, or of
+    all points of a cell.
 
     Source: Holzapfel, Gasser, Ogden (2000), J. Elast. 61.
 
     Attributes:
         matrix: The isotropic law.
         fibres: The energy of the fibres.
-        directions: Fibre directions; after `on` the frames (E, 3, 3) or (1, 3, 3) [-], columns f, s
-            and n.
+        directions: Fibre directions; after `on` the frames (E, Q, 3, 3), (E, 3, 3) or (1, 3, 3)
+            [-], columns f, s and n.
 
     Raises:
         ValueError: `matrix` is linear, or frames are not orthonormal.
@@ -129,15 +131,24 @@ class FibreReinforced(Composed, Material):
             return law
         return replace(law, directions=self.frames[cells.to(self.frames.device)])
 
+    def centred(self) -> Self:
+        """Return the law with one frame in each cell, the rotation next to the mean of its frames.
+
+        See `Parametrised.centred`.
+        """
+        if self.frames.ndim == 3:
+            return super().centred()
+        U, _, V = torch.linalg.svd(self.frames.mean(1))
+        return replace(super().centred(), directions=U @ V)
+
     @property
     def constants(self) -> tuple[Any, ...]:
-        """Constants of matrix and fibres, then the entries of the frames, (E or 1, 1) each."""
-        entries = self.frames.flatten(1).unbind(1)
-        return *self.matrix.constants, *self.fibres.constants, *(x[:, None] for x in entries)
+        """Constants of matrix and fibres."""
+        return *self.matrix.constants, *self.fibres.constants
 
     @property
     def frames(self) -> Tensor:
-        """Fibre frames (E, 3, 3) or (1, 3, 3) [-].
+        """Fibre frames (E, Q, 3, 3), (E, 3, 3) or (1, 3, 3) [-].
 
         Raises:
             ValueError: The directions need a body.
@@ -238,11 +249,13 @@ class FibreReinforced(Composed, Material):
         return self.with_parts({"matrix": self.matrix.linear_law(first), "fibres": fibres})
 
     def _rotation(self, H: Tensor) -> Tensor:
-        """Return the frames with an axis for the points, (E, 1, 3, 3), or (3, 3) if all are equal.
+        """Return the frames of the points, (E, Q or 1, 3, 3), or (3, 3) if all are equal.
 
         Device and type are those of H.
         """
         frames = self.frames.to(H)
+        if frames.ndim == 4:
+            return frames
         return frames[0] if len(frames) == 1 else frames[:, None]
 
     def _fibre_response(self, E: Tensor) -> Response:
@@ -257,16 +270,21 @@ class FibreReinforced(Composed, Material):
 
 
 def fibre_frames(material: Material, count: int) -> Tensor:
-    """Return the fibre frames of the law of each cell, (E, 3, 3) [-]; NaN where it has no fibres.
+    """Return the fibre frames of the law of each cell, (E, Q or 1, 3, 3) [-]; NaN without fibres.
 
     Args:
         material: The law, after `Material.on`.
         count: E, the number of cells.
     """
-    frames = torch.full((count, 3, 3), torch.nan, dtype=torch.float64)
-    for law, cells in material.groups(count):
-        if isinstance(law, FibreReinforced):
-            frames[cells] = law.frames
+    laws = [
+        (law.frames if law.frames.ndim == 4 else law.frames[:, None], cells)
+        for law, cells in material.groups(count)
+        if isinstance(law, FibreReinforced)
+    ]
+    points = max((own.shape[1] for own, _ in laws), default=1)
+    frames = torch.full((count, points, 3, 3), torch.nan, dtype=torch.float64)
+    for own, cells in laws:
+        frames[cells] = own
     return frames
 
 
@@ -297,17 +315,20 @@ def _tensors(entries: tuple[Any, ...], e: tuple[Tensor, ...]) -> list[Tensor]:
 
 
 def _check_frames(frames: Tensor) -> None:
-    """Check that frames are (E, 3, 3) and orthonormal.
+    """Check that frames are (E, 3, 3) or (E, Q, 3, 3) and orthonormal.
 
     Raises:
         ValueError: They are not.
     """
-    if frames.dim() != 3 or frames.shape[1:] != (3, 3) or not len(frames):
-        raise ValueError(f"directions of shape {tuple(frames.shape)} must have (cells, 3, 3)")
+    if frames.dim() not in (3, 4) or frames.shape[-2:] != (3, 3) or not frames.numel():
+        raise ValueError(
+            f"directions of shape {tuple(frames.shape)} must have (cells, 3, 3) or "
+            "(cells, points, 3, 3)"
+        )
     gap = frames.mT @ frames - torch.eye(3, dtype=frames.dtype, device=frames.device)
     bad = ~(gap.abs().flatten(1).amax(1) <= ORTHONORMAL)
     if bad.any():
         raise ValueError(
-            f"directions must have orthonormal columns; {int(bad.sum())} of {len(frames)} frames "
-            "do not"
+            f"directions must have orthonormal columns; in {int(bad.sum())} of {len(frames)} cells "
+            "they do not"
         )

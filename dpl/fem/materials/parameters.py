@@ -74,6 +74,13 @@ class Parametrised:
         chosen = {name: values[cells] for name, values in self.fields.items()}
         return replace(cast("Any", self), **chosen) if chosen else self
 
+    def centred(self) -> Self:
+        """Return the law without differences between the points of a cell, for one point of each.
+
+        Only fibre frames may differ between points.
+        """
+        return self
+
     def with_parameters(self, parameters: Tensor) -> Self:
         """Return the law with values in place of its ranges.
 
@@ -183,6 +190,10 @@ class Composed(Parametrised):
     def of_cells(self, cells: Tensor) -> Self:
         """See `Parametrised.of_cells`."""
         return self._changed(lambda part: part.of_cells(cells))
+
+    def centred(self) -> Self:
+        """See `Parametrised.centred`."""
+        return self._changed(lambda part: part.centred())
 
     def _changed(self, change: Callable[[Parametrised], Parametrised]) -> Self:
         parts = {key: change(part) for key, part in self.parts.items()}

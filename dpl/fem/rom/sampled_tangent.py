@@ -86,7 +86,7 @@ class SampledTangent:
 
     def _moduli_change_product(self, problem: Problem, displacement: Tensor) -> Single:
         """Return w vol (A(H) - A(0)) G, (C, D D, R)."""
-        law = one_law(problem.material.of_cells(self._cells))
+        law = one_law(problem.material.of_cells(self._cells).centred())
         if not isinstance(law, CompiledLaw):
             return self._reference_product(law, displacement)
         out = np.empty_like(self._basis)
