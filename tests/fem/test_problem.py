@@ -25,7 +25,6 @@ from dpl.fem import (
     Plane,
     Problem,
     SaintVenantKirchhoff,
-    Traction,
     box,
     rectangle,
     solve,
@@ -708,110 +707,6 @@ def test_strain_of_no_deformation_is_not_valid(kind, law, grid):
             wide = body.update_strain_gap(gap, 0.0, squeezed) if length == 1.0 else length * gap
             found = body.linearise(torch.zeros_like(squeezed), wide).valid
             assert found.tolist() == [valid]
-
-
-@pytest.fixture(params=["quad", "hexahedron"])
-def dilated(request, any_law, grid) -> Problem:
-    """Bodies of unequal linear cells whose points share their cell's mean volume ratio."""
-    mesh = grid(request.param, 2, 0.15)
-    held = mesh.p[0] < 0.2
-    return Problem.build(mesh, any_law, fixed=held, length=1.0, mean_dilatation=True)
-
-
-def standard(problem: Problem) -> Problem:
-    """Return the same body whose points keep their own volume ratio."""
-    return replace(problem, mean_dilatation=False)
-
-
-def test_force_of_mean_dilatation_is_the_slope_of_its_energy(dilated, bend):
-    u = bend(dilated.points, 2).requires_grad_()
-    assert (dilated.volume_ratio(u) > 0.3).all()
-    (slope,) = torch.autograd.grad(dilated.energy(u).sum(), u)
-    assert_close(dilated.internal_force(u.detach()), slope, rtol=1e-9, atol=1e-13)
-    assert (slope - standard(dilated).internal_force(u.detach())).abs().max() > 1e-4
-
-
-def test_tangent_of_mean_dilatation_is_the_slope_of_its_force(dilated, bend):
-    u, v = bend(dilated.points), bend(dilated.points, seed=1) * dilated.free
-    ahead, behind = (dilated.internal_force(u + h * v) for h in (1e-6, -1e-6))
-    slope = ((ahead - behind) / 2e-6)[0][dilated.free].numpy()
-    K = full_matrix(dilated.pattern, dilated.tangent(u)[0].numpy())
-    assert K @ v[0][dilated.free].numpy() == pytest.approx(slope, rel=1e-6, abs=1e-8)
-    product = dilated.tangent_product(u, v)[0][dilated.free].numpy()
-    assert K @ v[0][dilated.free].numpy() == pytest.approx(product, rel=1e-10, abs=1e-13)
-
-
-def test_tangent_of_mean_dilatation_is_symmetric(dilated, bend):
-    """Variational, unlike the F-bar of de Souza Neto (1996)."""
-    u, v, w = (bend(dilated.points, seed=seed) for seed in range(3))
-    one = (dilated.tangent_product(u, v) * w).sum()
-    assert_close(one, (dilated.tangent_product(u, w) * v).sum(), rtol=1e-11, atol=0)
-
-
-def test_mean_dilatation_changes_no_homogeneous_deformation(dilated):
-    dim = dilated.shape[1]
-    random = torch.Generator().manual_seed(2)
-    H = torch.rand(dim, dim, generator=random, dtype=torch.float64) * 0.4 - 0.2
-    u, plain = (dilated.points @ H.T)[None], standard(dilated)
-    for method in ("energy", "internal_force", "stress", "volume_ratio"):
-        found, expected = getattr(dilated, method)(u), getattr(plain, method)(u)
-        assert_close(found, expected, rtol=1e-11, atol=1e-13)
-
-
-@pytest.mark.parametrize("cell", ["quad", "hexahedron"])
-def test_mean_dilatation_passes_the_patch_test(cell, any_law, grid):
-    """The boundary is moved linearly, the inner nodes follow exactly."""
-    mesh = grid(cell, 3, 0.2, inside=True)
-    dim = len(mesh.p)
-    H = np.array([[0.2, 0.2, -0.1], [0.05, -0.05, 0.15], [-0.08, 0.12, 0.1]])[:dim, :dim]
-    outside = np.zeros(mesh.p.shape[1], dtype=bool)
-    outside[mesh.boundary_nodes()] = True
-    problem = Problem.build(
-        mesh, any_law, fixed=outside, prescribed=mesh.p.T @ H.T, length=1.0, mean_dilatation=True
-    )
-    load = Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
-    answer = solve(Newton(problem, tol=1e-12, linear="superlu"), load)
-    assert answer.converged.all()
-    expected = problem.points @ torch.from_numpy(H).T
-    assert_close(answer.displacement[0], expected, rtol=0, atol=1e-11)
-    stress = problem.stress(answer.displacement)
-    assert_close(stress, stress[:, :1, :1].expand_as(stress), rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize("cell", ["quad", "hexahedron"])
-def test_mean_dilatation_does_not_lock(cell):
-    """At nu = 0.4999 the compliance is within 6 % of quadratic cells, which hardly lock."""
-    size, nodes = ([10.0, 2.0], [21, 5]) if cell == "quad" else ([10.0, 2.0, 2.0], [21, 5, 3])
-    build = rectangle if cell == "quad" else box
-    law, sags = NeoHookeanLn(0.4999), {}
-    options = {"locked": {}, "dilated": {"mean_dilatation": True}, "quadratic": {"degree": 2}}
-    for name, option in options.items():
-        mesh = build(size, nodes, cell)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            problem = Problem.build(mesh, law, fixed=Plane(0, "min"), **option)
-        value = [0.0, -1e-6, 0.0][: len(size)]
-        force = Traction(Plane(0, "max"), value).on(problem)
-        sags[name] = (LinearSolver(problem, linear="superlu").solve(force) * force).sum().item()
-    assert sags["locked"] < 0.5 * sags["quadratic"]
-    assert sags["dilated"] == pytest.approx(sags["quadratic"], rel=0.06)
-
-
-@pytest.mark.parametrize("cell", ["triangle", "quad", "tetra", "hexahedron"])
-def test_mean_dilatation_is_refused_of_quadratic_cells(grid, cell):
-    with pytest.raises(ValueError, match="mean_dilatation"):
-        Problem.build(grid(cell), NH, degree=2, mean_dilatation=True)
-
-
-@pytest.mark.parametrize("cell", ["triangle", "tetra"])
-def test_mean_dilatation_is_refused_of_cells_of_one_strain(grid, cell):
-    with pytest.raises(ValueError, match="mean_dilatation"):
-        Problem.build(grid(cell), NH, mean_dilatation=True)
-
-
-def test_mean_dilatation_is_refused_for_a_mesh_that_is_quadratic(grid):
-    with pytest.raises(ValueError, match="mean_dilatation"):
-        Problem.build(skfem.MeshHex2.from_mesh(grid("hexahedron")), NH, mean_dilatation=True)
 
 
 @pytest.mark.parametrize(

@@ -74,7 +74,9 @@ class ActiveStress(FollowerLoad):
             frames = frames if frames.ndim == 4 else frames[:, None]
             frames = frames.expand(basis.mesh.nelements, -1, -1, -1)
         # column f; in 2D its part in plane
-        fibre = frames.numpy()[cells, :, : basis.mesh.dim(), 0]
+        fibre = frames.expand(-1, basis.dx.shape[1], -1, -1).numpy()[
+            cells, :, : basis.mesh.dim(), 0
+        ]
         if unknown := int(np.isnan(fibre).any(axis=(1, 2)).sum()):
             raise ValueError(
                 f"no fibre directions are known in {unknown} of {len(cells)} cells; set "
@@ -109,7 +111,7 @@ class ActiveFibres(FollowerTerm):
 
     Attributes:
         cells: Numbers of the cells, (S,).
-        fibre: Direction f, (S, Q or 1, D) [-]; in 2D its components in the plane.
+        fibre: Direction f, (S, Q, D) [-]; in 2D its components in the plane.
         slopes: Derivatives of the shape functions along f, (S, Q, A) [-].
         volumes: Volumes of the quadrature points, (S, Q) [-].
     """

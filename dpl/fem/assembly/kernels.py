@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dpl.fem.assembly import element_loops
-from dpl.fem.assembly.mean_dilatation import point_bulk
 from dpl.fem.assembly.numba_laws import CompiledLaw, Law, required_terms
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.materials.fibre_reinforced import FibreReinforced
 
 Array = NDArray[np.float64]
-Gap = tuple[Array, Array]  # of strains and of volume changes
-NO_GAP = np.zeros((0, 0, 0, SIMD_WIDTH)), np.zeros((0, 0, SIMD_WIDTH))
+Gap = Array | tuple[Array, Array]  # of strains, with mean dilatation of strains and volume changes
+NO_GAP = np.zeros((0, 0, 0, SIMD_WIDTH))
+NO_VOLUME_GAP = np.zeros((0, 0, SIMD_WIDTH))
 NO_VALUES = np.zeros(0)
 
 
@@ -66,7 +66,7 @@ class Kernels:
     def _set_constants(self, material: CompiledLaw) -> None:
         self._constants = as_columns(material.constants)
         self._frames = frames_of(material)
-        self._bulk = as_columns([point_bulk(material) if self.functions.shape[2] else 0.0])
+        self._bulk = as_columns([material.point_bulk if self.functions.shape[2] else 0.0])
 
     def with_moduli(self, materials: Sequence[CompiledLaw]) -> "Kernels":
         """Return the kernels of the same body with other moduli of its one law."""
@@ -101,16 +101,16 @@ class Kernels:
         body = self.cells, self.dN, self.dV, (self.functions, bulk), self.places
         system = element_loops.add_system
         law_arguments = law, moduli, self._frames, needs, finite
-        return 1 + call_compiled(system, *law_arguments, u, gap, *body, out, values)
+        return 1 + call_compiled(system, *law_arguments, u, _both(gap), *body, out, values)
 
     def update_strain_gap(
         self, gap: Gap | None, length: float, update: Array, u: Array | None = None
     ) -> Gap:
         """Return the gaps of the mixed integration points after a step to u."""
-        gap, kernel = NO_GAP if gap is None else gap, element_loops.update_gap
+        kernel, body = element_loops.update_gap, (self.cells, self.dN, self.dV, self.functions)
         u = np.zeros_like(update) if u is None else u
-        body = self.cells, self.dN, self.dV, self.functions
-        found: Gap = call_compiled(kernel, self._law[0], gap, length, update, u, *body)
+        both = call_compiled(kernel, self._law[0], _both(gap), length, update, u, *body)
+        found: Gap = both if self.functions.shape[2] else both[0]
         return found
 
 
@@ -143,6 +143,13 @@ class GroupedKernels:
         gaps = [None] * len(self._groups) if gap is None else gap
         pairs = zip(self._groups, gaps, strict=True)
         return [kernels.update_strain_gap(own, length, update, u) for kernels, own in pairs]
+
+
+def _both(gap: Gap | None) -> tuple[Array, Array]:
+    """Return the gaps of strains and of volume changes; empty ones for none."""
+    if isinstance(gap, tuple):
+        return gap
+    return NO_GAP if gap is None else gap, NO_VOLUME_GAP
 
 
 def constants_of(material: CompiledLaw) -> Array:

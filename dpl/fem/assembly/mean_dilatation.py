@@ -3,16 +3,15 @@
 The energy of a law is W(F) - U(J) + U(Jm). Jm is the projection of J = det F onto polynomials of
 the place in each cell: constants in linear quadrilaterals and hexahedra, linear functions in
 quadratic ones. U(J) is the energy of a change of volume alone, see `Material.volumetric_energy`,
-minus s/4 (J^2 - 1 - 2 ln J), so that a bulk modulus s of the order of the shear modulus stays at
-the points. Nearly incompressible bodies then do not lock. Without s, fibres under tension can
-invert points of a cell without a change of Jm. For a law of small strains J - 1 is tr H, and the
-energy of s is s/2 (tr H)^2.
+minus s/4 (J^2 - 1 - 2 ln J), so that a bulk modulus s, see `Material.point_bulk`, stays at the
+points. Nearly incompressible bodies then do not lock. For a law of small strains J - 1 is tr H, and
+the energy of s is s/2 (tr H)^2.
 
 Source: Nagtegaal, Parks, Rice (1974), CMAME 4; Simo, Taylor, Pister (1985), CMAME 51, section 3;
 Sussman, Bathe (1987), Comput. Struct. 26, the elements 4/1, 9/3, 8/1 and 27/4.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,8 +27,6 @@ from dpl.fem.materials.tensors import (
     trace,
     volume_change,
 )
-
-POINT_BULK = 2.0  # bulk modulus of the points over the shear modulus at rest, s over mu
 
 
 class CellVolumes(NamedTuple):
@@ -183,21 +180,16 @@ def _slope(material: Material, H: Tensor) -> Tensor:
     return cofactor(H + eye) if material.finite else eye.expand_as(H)
 
 
-def point_bulk(material: Material) -> Any:
-    """Return s, a number, (E, 1) or (B, E or 1, 1) [-]."""
-    return POINT_BULK * material.mu
-
-
 def _projected_energy(material: Material, j: Tensor) -> Tensor:
     """Return U at J - 1 = j, (B, E, Q) [-]."""
     own = j * (2 + j) / 4 - torch.log1p(j) / 2 if material.finite else j.square() / 2
-    return material.volumetric_energy(j) - point_bulk(material) * own
+    return material.volumetric_energy(j) - material.point_bulk * own
 
 
 def _pressure(material: Material, j: Tensor) -> Tensor:
     """Return U' at J - 1 = j, (B, E, Q) [-]."""
     own = j * (2 + j) / (2 + 2 * j) if material.finite else j
-    return material.pressure(j) - point_bulk(material) * own
+    return material.pressure(j) - material.point_bulk * own
 
 
 def _pressure_and_modulus(material: Material, j: Tensor) -> tuple[Tensor, Tensor]:

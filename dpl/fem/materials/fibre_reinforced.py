@@ -175,6 +175,15 @@ class FibreReinforced(Composed, Material):
         """See `Material.pressure`."""
         return self.matrix.pressure(j)
 
+    @property
+    def point_bulk(self) -> Tensor:
+        """See `Material.point_bulk`; twice the shear modulus at rest.
+
+        The energy of the fibres depends on the volume too. Without this modulus, fibres under
+        tension can invert points of a cell without a change of its projected volume.
+        """
+        return 2 * self.mu
+
     def response(self, E: Tensor) -> Response:
         """Return stress and moduli, see `Material.response`."""
         isotropic, fibres = self.matrix.response(E), self._fibre_response(E)

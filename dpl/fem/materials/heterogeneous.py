@@ -209,6 +209,11 @@ class Heterogeneous(Composed, Material):
         """First Lame parameter at rest over Young's modulus, (E, 1) or (B, E, 1) [-]."""
         return self._moduli(lambda law: law.lam)
 
+    @property
+    def point_bulk(self) -> Tensor:
+        """See `Material.point_bulk`, (E, 1) or (B, E, 1) [-]."""
+        return self._moduli(lambda law: law.point_bulk)
+
     def _moduli(self, of: Callable[[Material], Any]) -> Tensor:
         parts = [as_field(of(law), len(cells)) for law, cells in self._groups]
         return join_fields(parts)[..., self._layout.order, :]

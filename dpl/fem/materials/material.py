@@ -104,6 +104,15 @@ class Material(Parametrised):
         stretch, H = self._dilatation(j)
         return self.stress(H)[..., 0, 0] / stretch.square()
 
+    @property
+    def point_bulk(self) -> Any:
+        """Bulk modulus over E that mean dilatation leaves to the quadrature points [-].
+
+        A number, (E, 1) or (B, E or 1, 1). Zero if the energy without that of `volumetric_energy`
+        does not depend on the volume.
+        """
+        return 0.0
+
     def _dilatation(self, j: Tensor) -> tuple[Tensor, Tensor]:
         """Return stretch (...,) and H (..., 3, 3) [-] of a change of volume alone."""
         growth = torch.expm1(torch.log1p(j) / 3) if self.finite else j / 3

@@ -1,0 +1,277 @@
+"""Mean dilatation: volume ratios projected in linear and quadratic cells, and Newton's method."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from dpl.fem import (
+    ActiveStress,
+    ConstantFibres,
+    DirichletBC,
+    FibreFunction,
+    FibreReinforced,
+    FollowerPressure,
+    Guccione,
+    LinearElastic,
+    LinearSolver,
+    Load,
+    NeoHookeanIsoK2,
+    NeoHookeanLn,
+    Newton,
+    Plane,
+    Problem,
+    Status,
+    Traction,
+    VolumetricK4,
+    box,
+    rectangle,
+    solve,
+)
+from dpl.fem.linear import full_matrix
+
+
+@pytest.fixture(params=[("quad", 1), ("quad", 2), ("hexahedron", 1)], ids=str)
+def dilated(request, any_law, grid) -> Problem:
+    """Bodies of unequal cells with projected volume ratios."""
+    cell, degree = request.param
+    mesh = grid(cell, 2, 0.15)
+    return Problem.build(
+        mesh,
+        any_law,
+        fixed=lambda points: points[:, 0] < 0.2,
+        degree=degree,
+        length=1.0,
+        mean_dilatation=True,
+    )
+
+
+def standard(problem: Problem) -> Problem:
+    """Return the same body whose points keep their own volume ratio."""
+    return replace(problem, volume_functions=None)
+
+
+def test_force_of_mean_dilatation_is_the_slope_of_its_energy(dilated, bend):
+    u = bend(dilated.points, 2).requires_grad_()
+    assert (dilated.volume_ratio(u) > 0.3).all()
+    (slope,) = torch.autograd.grad(dilated.energy(u).sum(), u)
+    assert_close(dilated.internal_force(u.detach()), slope, rtol=1e-9, atol=1e-13)
+    assert (slope - standard(dilated).internal_force(u.detach())).abs().max() > 1e-4
+
+
+def test_tangent_of_mean_dilatation_is_the_slope_of_its_force(dilated, bend):
+    u, v = bend(dilated.points), bend(dilated.points, seed=1) * dilated.free
+    ahead, behind = (dilated.internal_force(u + h * v) for h in (1e-6, -1e-6))
+    slope = ((ahead - behind) / 2e-6)[0][dilated.free].numpy()
+    K = full_matrix(dilated.pattern, dilated.tangent(u)[0].numpy())
+    assert K @ v[0][dilated.free].numpy() == pytest.approx(slope, rel=1e-6, abs=1e-8)
+    product = dilated.tangent_product(u, v)[0][dilated.free].numpy()
+    assert K @ v[0][dilated.free].numpy() == pytest.approx(product, rel=1e-10, abs=1e-13)
+
+
+def test_tangent_of_mean_dilatation_is_symmetric(dilated, bend):
+    """Variational, unlike the F-bar of de Souza Neto (1996)."""
+    u, v, w = (bend(dilated.points, seed=seed) for seed in range(3))
+    one = (dilated.tangent_product(u, v) * w).sum()
+    assert_close(one, (dilated.tangent_product(u, w) * v).sum(), rtol=1e-11, atol=0)
+
+
+def test_mean_dilatation_changes_no_homogeneous_deformation(dilated):
+    dim = dilated.shape[1]
+    random = torch.Generator().manual_seed(2)
+    H = torch.rand(dim, dim, generator=random, dtype=torch.float64) * 0.4 - 0.2
+    u, plain = (dilated.points @ H.T)[None], standard(dilated)
+    for method in ("energy", "internal_force", "stress", "volume_ratio"):
+        found, expected = getattr(dilated, method)(u), getattr(plain, method)(u)
+        assert_close(found, expected, rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("cell", ["quad", "hexahedron"])
+def test_mean_dilatation_passes_the_patch_test(cell, any_law, grid):
+    """The boundary is moved linearly, the inner nodes follow exactly."""
+    mesh = grid(cell, 3, 0.2, inside=True)
+    dim = len(mesh.p)
+    H = np.array([[0.2, 0.2, -0.1], [0.05, -0.05, 0.15], [-0.08, 0.12, 0.1]])[:dim, :dim]
+    outside = np.zeros(mesh.p.shape[1], dtype=bool)
+    outside[mesh.boundary_nodes()] = True
+    problem = Problem.build(
+        mesh, any_law, fixed=outside, prescribed=mesh.p.T @ H.T, length=1.0, mean_dilatation=True
+    )
+    load = Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
+    answer = solve(Newton(problem, tol=1e-12, linear="superlu"), load)
+    assert answer.converged.all()
+    expected = problem.points @ torch.from_numpy(H).T
+    assert_close(answer.displacement[0], expected, rtol=0, atol=1e-11)
+    stress = problem.stress(answer.displacement)
+    assert_close(stress, stress[:, :1, :1].expand_as(stress), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("cell", ["quad", "hexahedron"])
+def test_mean_dilatation_does_not_lock(cell):
+    """At nu = 0.4999 the compliance is within 6 % of quadratic cells, which hardly lock."""
+    size, nodes = ([10.0, 2.0], [21, 5]) if cell == "quad" else ([10.0, 2.0, 2.0], [21, 5, 3])
+    build = rectangle if cell == "quad" else box
+    law, sags = NeoHookeanLn(0.4999), {}
+    options = {"locked": {}, "dilated": {"mean_dilatation": True}, "quadratic": {"degree": 2}}
+    for name, option in options.items():
+        mesh = build(size, nodes, cell)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            problem = Problem.build(mesh, law, fixed=Plane(0, "min"), **option)
+        value = [0.0, -1e-6, 0.0][: len(size)]
+        force = Traction(Plane(0, "max"), value).on(problem)
+        sags[name] = (LinearSolver(problem, linear="superlu").solve(force) * force).sum().item()
+    assert sags["locked"] < 0.5 * sags["quadratic"]
+    assert sags["dilated"] == pytest.approx(sags["quadratic"], rel=0.06)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "tetra"])
+def test_mean_dilatation_is_refused_of_simplices(grid, cell, degree):
+    with pytest.raises(ValueError, match="mean_dilatation"):
+        Problem.build(grid(cell), NeoHookeanLn(0.3), degree=degree, mean_dilatation=True)
+
+
+def test_forces_of_mean_dilatation_are_objective(dilated, bend):
+    """A rigid motion rotates them; tolerance 1e-12."""
+    dim, u = dilated.shape[1], bend(dilated.points)
+    if not dilated.material.finite:
+        pytest.skip("forces of small strains are not objective")
+    skew = torch.tensor([[0, -0.4, 0.9], [0.4, 0, -0.2], [-0.9, 0.2, 0]], dtype=torch.float64)
+    turn = torch.matrix_exp(skew[:dim, :dim])
+    force = dilated.internal_force(u)
+    moved = (dilated.points + u) @ turn.T + 0.3 - dilated.points
+    assert (dilated.internal_force(moved) - force @ turn.T).norm() < 1e-12 * force.norm()
+
+
+def test_linear_law_of_mean_dilatation_is_linear(beam, pull):
+    """A linear problem converges in exactly one iteration."""
+    problem = beam(LinearElastic(0.3), mean_dilatation=True)
+    answer = solve(Newton(problem), Load(pull(problem, 20.0), torch.ones(1)))
+    assert answer.iterations.item() == 1
+
+
+def test_beam_of_mean_dilatation_keeps_its_volume(beam, pull):
+    """The volume ratio of each cell tends to 1 as nu tends to 1/2, that of its points need not."""
+    problem = beam(NeoHookeanLn(0.4999), 4, 2, mean_dilatation=True)
+    force = pull(problem, 20.0)
+    answer = solve(Newton(problem), Load(force, torch.ones(1)))
+    assert answer.status.item() == Status.CONVERGED
+    F = torch.einsum("eai,eqaj->eqij", answer.displacement[0][problem.cells], problem.dN)
+    J = torch.linalg.det(F + torch.eye(3, dtype=torch.float64))
+    weight = problem.dV / problem.dV.sum(dim=1, keepdim=True)
+    assert ((J * weight).sum(dim=1) - 1).abs().max() < 1e-3
+    assert (J - 1).abs().max() > 1e-2
+
+
+class Reference(Problem):
+    """A problem without compiled loops."""
+
+    def _kernels(self, displacement):
+        return None
+
+
+def test_loops_of_mean_dilatation_are_those_of_the_tensors(dilated, bend):
+    """Force and tangent, and those of mixed points after two steps."""
+    if dilated._compiled is None:
+        pytest.skip("the law has no compiled loops")
+    plain = Reference(**dilated.__getstate__())
+    u, v, w = (0.3 * bend(dilated.points, seed=seed) for seed in range(3))
+    gaps = [None, None]
+    for step, length in ((v, 1.0), (w, 0.25)):
+        gaps = [
+            body.update_strain_gap(gap, length, step, u)
+            for body, gap in zip((dilated, plain), gaps, strict=True)
+        ]
+    for pair in [(None, None)] + [gaps] * dilated.supports_mip:
+        found, expected = dilated.linearise(u, pair[0]), plain.linearise(u, pair[1])
+        assert found.valid.item()
+        for name in ("force", "tangent"):
+            one, other = getattr(found, name), getattr(expected, name)
+            assert (one - other).abs().max() < 1e-13 * other.abs().max()
+
+
+def test_volume_gap_is_what_the_linear_change_of_volume_falls_short_of(grid, bend):
+    body = Reference.build(
+        grid("quad", 2, 0.15), NeoHookeanLn(0.4), degree=2, length=1.0, mean_dilatation=True
+    )
+    u, v = bend(body.points), bend(body.points, seed=1)
+
+    def volumes(displacement):
+        F = body.gradient(displacement) + torch.eye(3, dtype=torch.float64)
+        return body.volumes.coefficients(torch.linalg.det(F))
+
+    slope = torch.func.jvp(volumes, (u,), (v,))[1]
+    end = u + 0.25 * v
+    first = body.update_strain_gap(None, 1.0, v, u + v)
+    found = body.update_strain_gap(first, 0.25, v, end).volume
+    expected = volumes(end) - volumes(u) - 0.25 * slope + 0.75 * first.volume
+    assert_close(found, expected, rtol=1e-10, atol=1e-13)
+
+
+def poisson(ratio: float) -> float:
+    """Return Poisson's ratio where the bulk modulus is so many shear moduli."""
+    return (3 * ratio - 2) / (6 * ratio + 2)
+
+
+def solved(problem: Problem, **options):
+    """Return the solution without a force."""
+    load = Load(torch.zeros(1, *problem.shape, dtype=torch.float64), torch.ones(1))
+    return solve(Newton(problem, **options), load)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_iterations_do_not_depend_on_the_bulk_modulus(degree):
+    """A cantilever that bends by half of its length; bulk over shear modulus from 10 to 1e5."""
+    mesh, counts = box([4.0, 1.0, 1.0], [13, 4, 4] if degree == 1 else [7, 3, 3]), []
+    for bulk in (10.0, 1e3, 1e5):
+        problem = Problem.build(
+            mesh, NeoHookeanIsoK2(poisson(bulk)), fixed=Plane(0, "min"), degree=degree, length=1.0,
+            mean_dilatation=True, follower_loads=[FollowerPressure(Plane(2, "max"), 4e-3)],
+        )  # fmt: skip
+        solution = solved(problem, tol=1e-6)
+        assert solution.converged.item()
+        counts.append(solution.iterations.item())
+    assert max(counts) <= min(counts) + 4
+    assert max(counts) <= 9
+
+
+def muscle(bulk: float, **options) -> Problem:
+    """Return a bar of Guccione's law whose fibres turn across it, contracting by 5 times C."""
+
+    def turning(points):
+        angle = np.pi * (points[:, 2] - 0.5)
+        return np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+
+    law = FibreReinforced(VolumetricK4(bulk), Guccione(1.0, 8.0, 2.0, 4.0), FibreFunction(turning))
+    return Problem.build(
+        box([2.0, 1.0, 1.0], [5, 3, 3]), law, supports=[DirichletBC(Plane(0, "min"))], degree=2,
+        length=1.0, follower_loads=[ActiveStress(5.0)], mean_dilatation=True, **options,
+    )  # fmt: skip
+
+
+def test_contraction_near_incompressibility_converges_from_rest():
+    """Bulk over shear modulus of 1e4 and more; the volume of each cell is kept."""
+    problem = muscle(1e5)
+    solution = solved(problem, tol=1e-6)
+    assert solution.converged.item()
+    change = problem.gradient(solution.displacement)
+    J = torch.linalg.det(change + torch.eye(3, dtype=torch.float64))
+    mean = (J * problem.dV).sum(-1) / problem.dV.sum(-1)
+    assert (mean - 1).abs().max() < 1e-3
+    assert solution.displacement.abs().max() > 0.3
+
+
+def test_bulk_modulus_of_the_points_is_that_of_laws_with_fibres_only():
+    """It vanishes from the energy of a homogeneous change of volume."""
+    law = FibreReinforced(
+        VolumetricK4(9.0), Guccione(1.0, 8.0, 2.0, 4.0), ConstantFibres([1, 0, 0])
+    )
+    assert law.point_bulk.item() == pytest.approx(2 * law.mu.item())
+    assert NeoHookeanLn(0.3).point_bulk == 0.0
+    problem = muscle(9.0)
+    u = 0.05 * problem.points[None]
+    assert_close(problem.energy(u), replace(problem, volume_functions=None).energy(u))
