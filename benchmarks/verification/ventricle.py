@@ -10,7 +10,6 @@ Source: Land et al. (2015), Proc. R. Soc. A 471:20150641, problems 2 and 3.
 from dataclasses import replace
 from functools import reduce
 from operator import add
-from typing import NamedTuple
 
 import numpy as np
 import skfem
@@ -21,38 +20,15 @@ from dpl.fem import box
 
 SHORT, LONG, WALL, BASE = 7.0, 17.0, 3.0, 5.0  # endocardial half axes, thickness, z of the base
 ON_SURFACE = 1e-6  # largest value of the equation of a surface at its nodes
+DEPTH_ITER = 20  # Newton iterations for the depth of a point
 PATCH = 0.35  # half side of the square patch at the apex in the plane of parameters
 EDGE, BULGE = 0.26, 0.12  # half side of this patch in the unit disc, and curvature of its sides
 
 
-class Ventricle(NamedTuple):
-    """A mesh of the wall.
-
-    Attributes:
-        mesh: Hexahedra [mm].
-        depth: t of the centre of each cell, (E,) [-].
-        along, around: Unit vectors dX/du and dX/dv there, (E, 3) [-].
-    """
-
-    mesh: skfem.Mesh
-    depth: Array
-    along: Array
-    around: Array
-
-    def fibres(self, inner: float = 90.0, outer: float = -90.0) -> Array:
-        """Return sin(a) dX/du + cos(a) dX/dv of each cell, (E, 3) [-].
-
-        Args:
-            inner, outer: Angle a on endocardium and epicardium [degrees], linear in t.
-        """
-        angle = np.radians(inner + (outer - inner) * self.depth)[:, None]
-        return np.asarray(np.sin(angle) * self.along + np.cos(angle) * self.around)
-
-
 def ventricle(
     patch: int, rings: int, layers: int, *, quarter: bool = False, degree: int = 2
-) -> Ventricle:
-    """Return the wall as a square patch of cells at the apex and rings of cells around it.
+) -> skfem.Mesh:
+    """Return hexahedra [mm] of the wall: a square patch at the apex and rings of cells around it.
 
     Args:
         patch: Cells along a half side of the patch; a quarter of a ring has 2 `patch` cells.
@@ -74,14 +50,38 @@ def ventricle(
         ring = [(x, y), (-y, x), (-x, -y), (y, -x)]
     parts = [skfem.MeshHex(np.stack([*sector, t]), strip.t) for sector in ring]
     mesh = reduce(add, parts, square)
-    angle, v, depth = _polar(mesh.p[:, mesh.t].mean(axis=1))
-    short, long, _ = _axes(depth)
-    across_axis = short * np.cos(angle)
-    along = np.stack([across_axis * np.cos(v), across_axis * np.sin(v), long * np.sin(angle)]).T
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    around = np.stack([-np.sin(v), np.cos(v), np.zeros_like(v)]).T
     mesh = skfem.MeshHex2.from_mesh(mesh) if degree == 2 else mesh
-    return Ventricle(replace(mesh, doflocs=_placed(mesh.doflocs)), depth, along, around)
+    return replace(mesh, doflocs=_placed(mesh.doflocs))
+
+
+def fibres(points: Array, inner: float = 90.0, outer: float = -90.0) -> Array:
+    """Return sin(a) dX/du + cos(a) dX/dv, divided by the lengths of these slopes, (n, 3) [-].
+
+    Args:
+        points: Points of the wall, (n, 3) [mm].
+        inner, outer: Angle a on endocardium and epicardium [degrees], linear in t.
+    """
+    depth = depth_of(points)
+    short, long, _ = _axes(depth)
+    x, y, z = points.T
+    angle, v = np.arctan2(np.hypot(x, y) / short, -z / long), np.arctan2(y, x)
+    across_axis = short * np.cos(angle)
+    along = np.stack([across_axis * np.cos(v), across_axis * np.sin(v), long * np.sin(angle)])
+    along /= np.linalg.norm(along, axis=0)
+    around = np.stack([-np.sin(v), np.cos(v), np.zeros_like(v)])
+    a = np.radians(inner + (outer - inner) * depth)
+    return np.asarray(np.sin(a) * along + np.cos(a) * around).T
+
+
+def depth_of(points: Array) -> Array:
+    """Return t of points of the wall, (n,) [-], by Newton's method from the middle."""
+    radius, z = np.hypot(points[:, 0], points[:, 1]), points[:, 2]
+    depth = np.full(len(points), 0.5)
+    for _ in range(DEPTH_ITER):
+        short, long, _ = _axes(depth)
+        slope = -2 * WALL * (radius**2 / short**3 + z**2 / long**3)
+        depth = depth - ((radius / short) ** 2 + (z / long) ** 2 - 1) / slope
+    return depth
 
 
 def endocardium(points: Array) -> NDArray[np.bool_]:
