@@ -114,8 +114,13 @@ def robustness(cfg: DictConfig, backends: list[str]) -> dict[str, dict[str, floa
         "beam, NH-ln": partial(peers.beam_scene, NeoHookeanLn(0.3)),
         "beam, SVK": partial(peers.beam_scene, SaintVenantKirchhoff(0.3)),
         "propeller, NH-ln": peers.propeller_scene,
+        "beam, fibres": peers.fibre_scene,
+        "beam, stiff core": peers.inclusion_scene,
     }
-    results = peers.robustness(builders, cfg.count, cfg.workers)
+    if unknown := sorted(set(cfg.bodies or ()) - set(builders)):
+        raise config.ConfigError(f"bodies: {unknown[0]} must be one of {list(builders)}")
+    chosen = {name: builders[name] for name in cfg.bodies or builders}
+    results = peers.robustness(chosen, cfg.count, cfg.workers)
     table = Table("random loads", *next(iter(results.values())))
     for name, row in results.items():
         table.add_row(name, *(f"{value:.4g}" for value in row.values()))

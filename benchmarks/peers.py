@@ -26,6 +26,10 @@ from dpl import Scene
 from dpl.data.solving.solve import LoadKey
 from dpl.data.solving.worker_pool import solve_loads
 from dpl.fem import (
+    Box,
+    ConstantFibres,
+    FibreReinforced,
+    Guccione,
     Load,
     Material,
     ModalLoads,
@@ -36,6 +40,7 @@ from dpl.fem import (
     SaintVenantKirchhoff,
     Solution,
     Tag,
+    VolumetricK4,
     box,
     propeller,
     solve,
@@ -269,11 +274,36 @@ def propeller_scene(linear: str = "auto", deflection: float = 0.055) -> Scene:
     )
 
 
-def beam_scene(law: Material) -> Scene:
-    """Return the paper's beam with its loads, deflections up to 0.4 L."""
-    problem = Problem.build(box(LONG, [40, 10, 10]), law, fixed=Plane(0, "min"))
+def beam_scene(law: Material | Mapping[str, Material], **options: Any) -> Scene:
+    """Return the paper's beam with its loads, deflections up to 0.4 L.
+
+    Args:
+        law: The law, or the laws of regions.
+        options: Options of `Problem.build`.
+    """
+    problem = Problem.build(box(LONG, [40, 10, 10]), law, fixed=Plane(0, "min"), **options)
     newton = Newton(problem)
     return Scene(problem, ModalLoads(newton.linear_solver, deflection=0.4, young=4500.0), newton)
+
+
+def fibre_scene() -> Scene:
+    """Return the paper's beam with oblique fibres of Guccione's law, nearly incompressible.
+
+    Each load has its own stiffness of the fibres, 0.1 to 1, and bulk modulus, 10 to 1e4.
+    """
+    law = FibreReinforced(
+        VolumetricK4({"low": 10.0, "high": 1e4, "distribution": "log"}),
+        Guccione({"low": 0.1, "high": 1.0, "distribution": "log"}, 8.0, 2.0, 4.0),
+        ConstantFibres([2.0, 1.0, 0.0]),
+    )
+    return beam_scene(law, mean_dilatation=True)
+
+
+def inclusion_scene() -> Scene:
+    """Return the paper's beam with a core, 1 to 1,000 times as stiff, another one for each load."""
+    stiff = {"low": 1.0, "high": 1e3, "distribution": "log"}
+    laws = {"core": NeoHookeanLn(0.3, stiff), "other": NeoHookeanLn(0.3)}
+    return beam_scene(laws, regions={"core": Box([25.0, 7.5, 7.5], [75.0, 17.5, 17.5])})
 
 
 def propellers(linear: str, loads: int) -> Time:
@@ -324,6 +354,8 @@ def robustness(
 ) -> dict[str, dict[str, float]]:
     """Return the numbers of random loads that are solved in one step and with load steps.
 
+    For the others the solver states a reason, and no solution.
+
     Args:
         scenes: Functions that build the scenes, by name.
         loads: Number of loads of each scene.
@@ -342,6 +374,7 @@ def robustness(
             "loads": loads,
             "in one step": len(done),
             "with load steps": len(done) + sum(o.accepted for o in second),
+            "no stable solution": sum(not o.accepted for o in second),
             "iterations": statistics.mean(o.iterations for o in done),
             "seconds": statistics.median(o.seconds for o in done),
             "min det F": min(o.volume_ratio for o in done),

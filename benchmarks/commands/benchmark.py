@@ -17,7 +17,7 @@ from dpl.commands.cli import command
 
 KEYS = (
     (Sequence[str], "linear"),
-    (Sequence[str] | None, "cases"),
+    (Sequence[str] | None, "cases bodies"),
     (dict, "reference_codes"),
     (int, "workers", 0, 1024),
     (Sequence[int], "cells_across", 1, 1000),
