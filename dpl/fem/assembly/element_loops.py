@@ -287,13 +287,13 @@ def add_system(
     n, Q, dim, M = cells.shape[1], dN.shape[1], dN.shape[3], psi.shape[2]
     mixed, moduli = len(strain_gap) > 0, len(values) > 0
     ue, fe, g, weight = rows(3 * n), rows(3 * n), np.zeros((Q, 3 * n, SIMD_WIDTH)), rows(Q)
-    H, P, D, A, C = rows(9), rows(9), rows(36), rows(81), rows(max(27, 3 * n))
+    H, P, D, A, C = rows(9), rows(9), rows(36), rows(81), rows(27)
     e, X, S, T, ahead = rows(6), rows(6), rows(6), rows(6), rows(6)
     K, low = rows(places.shape[1]), np.inf
     scratch, constants = rows(point.SCRATCH_ROWS), rows(c.shape[1] + frames.shape[2])
     functions, slopes = np.zeros((Q, M, SIMD_WIDTH)), np.zeros((M, 3 * n, SIMD_WIDTH))
     pressures, work, bulk = (rows(M), rows(M), rows(M * M)), (rows(9), rows(M), scratch), rows(1)
-    no_gap = rows(0)
+    no_gap, CV = rows(0), rows(3 * n)
     for start in range(0, len(cells), SIMD_WIDTH):
         block, count = start // SIMD_WIDTH, min(SIMD_WIDTH, len(cells) - start)
         gather(u, cells, start, count, ue)
@@ -356,7 +356,7 @@ def add_system(
         scatter(fe, cells, start, count, force)
         if moduli:
             if M > 0:
-                add_volumetric_stiffness(slopes, pressures[2], dim, C, K)
+                add_volumetric_stiffness(slopes, pressures[2], dim, CV, K)
             scatter_entries(K, places[block], count, values)
     return low
 
