@@ -1,5 +1,7 @@
 """Follower loads with a range: each load has its own value, and all share one K(0)."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch.testing import assert_close
@@ -93,6 +95,17 @@ def load(scene):
 @pytest.fixture(scope="module")
 def solution(scene, load):
     return solve(scene.solver, load)
+
+
+def test_a_range_may_be_logarithmic():
+    """The values of loads are uniform in their logarithm."""
+    load = FollowerPressure(BELOW, {"low": 0.1, "high": 1e3, "distribution": "log"}, name="air")
+    scene = scene_on(body(load))
+    drawn = scene.loads.sample(0, range(200)).parameters[:, 0]
+    assert scene.problem.parameter_ranges["air"].is_log
+    assert drawn.log10().mean().item() == pytest.approx(1.0, abs=0.3)
+    with pytest.raises(ValueError, match=r"follower_loads.air: value.* above 0 for a logarithmic"):
+        body(replace(load, value={"low": 0.0, "high": 1e3, "distribution": "log"}))
 
 
 def test_each_load_is_solved_with_its_own_value(name, scene, load, solution):

@@ -199,7 +199,7 @@ def test_a_follower_pressure_identifies_a_scene_by_its_ratio_to_the_modulus(scen
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        (INFLATE.replace("45.0", "[2.0, 1.0]"), r"forces\.inflate: value.* two that ascend"),
+        (INFLATE.replace("45.0", "[2.0, 1.0]"), r"forces\.inflate: value.* low below high"),
         (INFLATE.replace("45.0", "[1.0, 2.0, 3.0]"), r"forces\.inflate: value.* no direction"),
         (INFLATE.replace("45.0", ".inf"), r"forces\.inflate.value"),
         (INFLATE.replace("45.0", "true"), r"forces\.inflate.value"),
@@ -251,7 +251,7 @@ def test_an_active_stress_has_the_name_of_the_force_and_the_directions_of_the_la
     ("option", "message"),
     [
         (MUSCLE.replace(f", {FIBRES}", ""), r"forces\.muscle: no fibre directions are known"),
-        (MUSCLE.replace("45.0", "[2.0, 1.0]"), r"forces\.muscle: value.* two that ascend"),
+        (MUSCLE.replace("45.0", "[2.0, 1.0]"), r"forces\.muscle: value.* low below high"),
         (MUSCLE.replace("45.0", "[1.0, 2.0, 3.0]"), r"forces\.muscle: value.* along the fibres"),
         (MUSCLE.replace("45.0", ".inf"), r"forces\.muscle.value"),
         (MUSCLE.replace("[1.0, 0.0, 0.0]", "[0.0, 0.0, 0.0]"), r"forces\.muscle.*fibre must be"),

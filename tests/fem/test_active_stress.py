@@ -301,8 +301,11 @@ def test_reduced_solvers_refuse_an_active_stress(beam):
     ("load", "message"),
     [
         (ActiveStress(0.1), "no fibre directions are known in 8 of 8 cells; set directions"),
-        (ActiveStress(float("nan"), directions=ALONG_X), r"value = nan must be a finite number"),
-        (ActiveStress([1.0, 0.0], directions=ALONG_X), r"value = .* two that ascend"),
+        (
+            ActiveStress(float("nan"), directions=ALONG_X),
+            "value = nan must be a finite number or",
+        ),
+        (ActiveStress([1.0, 0.0], directions=ALONG_X), r"value = .* low below high"),
         (ActiveStress([1.0, 0.0, 0.0], directions=ALONG_X), r"value = .* along the fibres"),
         (ActiveStress(0.1, region=Box([5, 5, 5], [6, 6, 6])), "holds no cell"),
         (ActiveStress(0.1, directions=ConstantFibres([1.0, 0.0])), "must have 3 components"),

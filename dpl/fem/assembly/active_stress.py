@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.assembly.elements import gradients
-from dpl.fem.assembly.follower_loads import CONSTANT, FollowerLoad, FollowerTerm
+from dpl.fem.assembly.follower_loads import CONSTANT, FollowerLoad, FollowerTerm, Stress
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.identity import plain
 from dpl.fem.materials.fibre_reinforced import FibreDirections, fibre_frames
@@ -41,7 +41,7 @@ class ActiveStress(FollowerLoad):
 
     default_name: ClassVar[str] = "active_stress"
     direction_hint: ClassVar[str] = "it acts along the fibres, see directions"
-    value: float | list[float]
+    value: Stress
     region: Region | None = None
     directions: FibreDirections | None = None
     name: str | None = None

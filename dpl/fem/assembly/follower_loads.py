@@ -18,9 +18,10 @@ from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.identity import plain
 from dpl.fem.materials.material import Material
 from dpl.fem.mesh.regions import Origin
-from dpl.fem.ranges import ParameterRange
+from dpl.fem.ranges import ParameterRange, is_range
 from dpl.fem.units import Units
 
+Stress = float | Sequence[float] | Mapping[str, float | str]  # number or range
 CONSTANT = -1  # `FollowerTerm.column` of a load that is one number
 
 Places = Sequence[tuple[Tensor, Tensor]]
@@ -30,15 +31,15 @@ class FollowerLoad:
     """Specification of a follower load: a stress on a part of a body.
 
     Attributes:
-        value: The stress [Pa]; or a range [low, high], of which each load has its own, see
-            `Problem.parameter_ranges`. On a problem with E = 1 Pa, the default of `Problem.build`,
-            this is the stress over E.
+        value: The stress [Pa]; or a range [low, high] or {low, high, distribution}, of which each
+            load has its own, see `Problem.parameter_ranges`. On a problem with E = 1 Pa, the
+            default of `Problem.build`, this is the stress over E.
         name: Name of the parameter of a range; `default_name` if left out.
     """
 
     default_name: ClassVar[str]
     direction_hint: ClassVar[str]  # says why `value` is no vector
-    value: float | list[float]
+    value: Stress
     name: str | None
 
     @property
@@ -47,27 +48,32 @@ class FollowerLoad:
         return self.name or self.default_name
 
     @property
-    def ends(self) -> list[float]:
-        """Smallest and largest stress [Pa] of a range, or the one value."""
-        return [*self.value] if isinstance(self.value, list | tuple) else [self.value]
+    def range(self) -> ParameterRange | None:
+        """Range of the stress [Pa]; None if it is one number.
+
+        Raises:
+            ValueError: `value` is neither a finite number nor a range.
+        """
+        if is_range(self.value):
+            try:
+                return ParameterRange.of("value", self.value)
+            except ValueError as error:
+                raise ValueError(f"{error}; {self.direction_hint}") from error
+        if not isinstance(self.value, int | float) or not math.isfinite(self.value):
+            raise ValueError(f"value = {self.value} must be a finite number or a range [Pa]")
+        return None
 
     def dimensionless(self, units: Units) -> float:
         """Return the stress over E [-]; NaN for a range, until a load says which.
 
         Raises:
-            ValueError: `value` is neither a finite number nor a range of finite numbers, or the
-                loads have a range of moduli.
+            ValueError: `value` is neither a finite number nor a range, or the loads have a range
+                of moduli.
         """
-        ends, words = self.ends, f"value = {self.value}"
-        numbers = [x for x in ends if isinstance(x, int | float) and not isinstance(x, bool)]
-        if len(numbers) < len(ends) or len(ends) not in (1, 2):
-            raise ValueError(
-                f"{words} must be one number or a range [low, high] [Pa]; {self.direction_hint}"
-            )
-        if not all(map(math.isfinite, ends)) or sorted(set(ends)) != ends:
-            raise ValueError(f"{words} must be a finite number, or two that ascend [Pa]")
-        stress = float(units.stress(np.array(float(ends[0])), words))
-        return stress if len(ends) == 1 else math.nan
+        ends = self.range
+        one = ends[0] if ends else self.value
+        stress = float(units.stress(np.array(one, dtype=np.float64), f"value = {self.value}"))
+        return math.nan if ends else stress
 
     def check(self, mesh: skfem.Mesh, units: Units) -> None:
         """Check value and region on a mesh [m]; raise the errors of `on`."""
@@ -237,15 +243,15 @@ class FollowerLoads:
         for load in loads:
             name = load.parameter
             try:
-                is_range = math.isnan(load.dimensionless(units))
-                if is_range and name in (*ranges, *material.parameter_ranges):
+                ends = load.range
+                if ends and name in (*ranges, *material.parameter_ranges):
                     raise ValueError(f"two ranges have the name {name}; set another")
-                column = len(ranges) if is_range else CONSTANT
+                column = len(ranges) if ends else CONSTANT
                 term = load.on(basis, units, material, origin, column)
             except ValueError as error:
                 raise ValueError(f"follower_loads.{name}: {error}") from error
-            if is_range:
-                ranges[name] = ParameterRange(*load.ends)
+            if ends:
+                ranges[name] = ends
             terms.setdefault(type(term), []).append(term)
         return cls(tuple(kind.join(own) for kind, own in terms.items()), ranges)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dpl.fem.assembly.elements import QUADRATIC
-from dpl.fem.assembly.follower_loads import CONSTANT, FollowerLoad, FollowerTerm
+from dpl.fem.assembly.follower_loads import CONSTANT, FollowerLoad, FollowerTerm, Stress
 from dpl.fem.assembly.sparsity import Pattern
 from dpl.fem.materials.material import Material
 from dpl.fem.mesh.regions import Origin, Region, facets_in
@@ -39,7 +39,7 @@ class FollowerPressure(FollowerLoad):
     default_name: ClassVar[str] = "pressure"
     direction_hint: ClassVar[str] = "a pressure has no direction"
     region: Region
-    value: float | list[float]
+    value: Stress
     name: str | None = None
 
     def check(self, mesh: skfem.Mesh, units: Units) -> None:
