@@ -86,7 +86,7 @@ def _costs(cells: int, memory_limit: float, loads: int) -> Iterator[Size]:
     first = 1e3 * (time.perf_counter() - start)
     name = select_backend("auto", problem.pattern, problem.near_null, many_rhs=True)
     yield Size(f"factor of K(0), analysis included ({name})", dofs, first)
-    yield row("linear answer", lambda load: newton.linear_solver.solve(load.force[0]))
+    yield row("linear solution", lambda load: newton.linear_solver.solve(load.force[0]))
     answers = {float(load.force.norm()): solve(newton, load).displacement for load in singles}
     yield row("Newton", lambda load: solve(newton, load))
     corotational = replace(newton, corotational=True)
@@ -123,7 +123,7 @@ def exponent(dofs: Sequence[float], costs: Sequence[float]) -> float:
 LINES = {  # start of a case: its short name and its method, which determines the colour
     "factor of K(0)": ("factor of K(0)", "factor of K(0)"),
     "process": ("whole process, peak", "process"),
-    "linear answer": ("linear", "linear"),
+    "linear solution": ("linear", "linear"),
     "Newton, corotational": ("Newton from a prediction", "corotational"),
     "Newton": ("Newton", "Newton"),
     "unrolled": ("unrolled", "unrolled"),

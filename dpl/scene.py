@@ -277,9 +277,9 @@ class Scene:
         )
         if not problem.material.parameter_ranges:
             lines.append(
-                "K(0) factorised once for modes, linear answers and every first Newton step"
+                "K(0) factorised once for modes, linear solutions and every first Newton step"
             )
-        lines.append("no factorisation for loads whose linear answer meets the tolerance")
+        lines.append("no factorisation for loads whose linear solution meets the tolerance")
         return lines + loads.skipped_work()
 
 

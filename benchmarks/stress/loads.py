@@ -218,7 +218,7 @@ def cases() -> list[Case]:
     )
     bent_beam = "w/L = .302130893; plain Newton takes load steps for it"
     found.append(Case("T5", "slender beam 20 x 1 x 1, NH-ln, PL^2/EI = 1", bent_beam, slender_beam))
-    small = "u/q of the linear answer to 1e-6; no load: rest, 0 iterations"
+    small = "u/q of the linear solution to 1e-6; no load: rest, 0 iterations"
     found += [
         Case("T6", f"{name}, q = 1e-2 to 1e-12 Pa, and none", small, partial(small_loads, name))
         for name in LAWS

@@ -316,7 +316,7 @@ def cases() -> list[Case]:
     expected = "refused with its parameters, before any memory is taken"
     found.append(Case("T23", "the paper's network, 107,811 DOF, 128 GB", expected, too_large))
     expected = "Newton's answers in range; beyond, an answer or a status"
-    description = "hybrids from the linear answer, 1e-9 to 25 times the range"
+    description = "hybrids from the linear solution, 1e-9 to 25 times the range"
     return [*found, Case("sweep", description, expected, load_sweep)]
 
 

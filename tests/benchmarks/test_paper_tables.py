@@ -25,7 +25,7 @@ def sets(scene, batch):
 
 @pytest.fixture(scope="module")
 def rows(scene, batch, sets):
-    """Rows and errors of the linear answer and of the truth itself, by method and set."""
+    """Rows and errors of the linear solution and of the truth itself, by method and set."""
     known = {
         tuple(f.flatten().tolist()): u for s in sets.values() for f, u in zip(*s[:2], strict=True)
     }

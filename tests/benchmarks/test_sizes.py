@@ -33,7 +33,7 @@ def test_no_panel_has_more_than_four_lines(tmp_path, monkeypatch):
 
     drawn = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **options: drawn.append(figure))
-    cases = ["factor of K(0), analysis included (band)", "linear answer", "Newton"]
+    cases = ["factor of K(0), analysis included (band)", "linear solution", "Newton"]
     cases += ["Newton, corotational, from a guess", "unrolled", "fcnn, as in the paper"]
     rows = [beams.Size(case, n, 1.0 * n, n, 1.0 * n, n) for case in cases for n in (100, 1000)]
     beams.draw(rows, tmp_path / "sizes.png")

@@ -50,7 +50,7 @@ def says(scene, words):
 
 
 def small(scene, size):
-    """Loads so small that the linear answer meets the tolerance."""
+    """Loads so small that the linear solution meets the tolerance."""
     load = scene.loads.sample((0, 0), range(3))
     return Load(size * load.force, load.young)
 
@@ -70,7 +70,9 @@ def test_rest_stiffness_is_factorised_once_for_modes_answers_and_first_steps(mak
         next(states)
         next(states)  # the first step
     assert calls["factorise"] == 1
-    assert says(scene, "K(0) factorised once for modes, linear answers and every first Newton step")
+    assert says(
+        scene, "K(0) factorised once for modes, linear solutions and every first Newton step"
+    )
 
 
 def test_pattern_and_ordering_are_analysed_once(make_scene, calls, monkeypatch):
@@ -107,7 +109,7 @@ def test_loads_whose_linear_answer_meets_the_tolerance_cost_no_factorisation(mak
     assert (answer.iterations == 1).all()
     assert "factorise" not in calls
     assert "tangent" not in calls
-    assert says(scene, "no factorisation for loads whose linear answer meets the tolerance")
+    assert says(scene, "no factorisation for loads whose linear solution meets the tolerance")
 
 
 def test_the_zero_load_costs_nothing(make_scene, calls):

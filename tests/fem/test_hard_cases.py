@@ -166,7 +166,7 @@ ELEMENTS = {  # cell, degree, cells along and across
 
 @pytest.fixture(scope="module")
 def compliance(beam, pull):
-    """Work of the linear answer to a load on the end of the beam, each computed once."""
+    """Work of the linear solution to a load on the end of the beam, each computed once."""
 
     @cache
     def compliance(nu: float, cell: str, degree: int, cells: tuple[int, int], mean: bool = False):

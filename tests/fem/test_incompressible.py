@@ -183,7 +183,7 @@ CYLINDER = {0.3: 4.5825e-3, 0.49: 5.039925e-3, 0.499: 5.06024925e-3, 0.4999: 5.0
 def bore(nu: float, cells: tuple[int, int], **options) -> float:
     """Return u_r at the bore of the thick cylinder of MacNeal and Harder, p = 1, E = 1000.
 
-    It is the linear answer: mean dilatation is for laws of finite strain, whose K(0) is Hooke's.
+    It is the linear solution: mean dilatation is for laws of finite strain, whose K(0) is Hooke's.
     """
     law = NeoHookeanLn(nu) if options.get("mean_dilatation") else LinearElastic(nu)
     polar = skfem.MeshQuad.init_tensor(

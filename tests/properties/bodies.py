@@ -140,7 +140,7 @@ class Push:
     Attributes:
         kind: "noise" on all nodes, at one "point", "traction" on a side, "weight", or "squeeze":
             pressure on the end, towards the held one.
-        size: Largest displacement of its linear answer over L.
+        size: Largest displacement of its linear solution over L.
         seed: Of what is random.
     """
 
@@ -263,7 +263,7 @@ def pushes(draw, body: Body, low: float = 1e-9, high: float = 10.0) -> Push:
     Args:
         draw: Hypothesis'.
         body: What it acts on.
-        low, high: Bounds of its linear answer over L.
+        low, high: Bounds of its linear solution over L.
     """
     kinds = ["noise", "point", "weight"]
     if body.support not in ("clamps", "moved") or body.counts[0] > 2:

@@ -240,7 +240,7 @@ def test_spread_loads_have_their_sum_and_their_moment(body, value):
         assert moment.norm() <= 1e-11 * total.norm() * (1 + body.shift)
 
 
-# ---------------------------------------------------------------- the linear answer
+# ---------------------------------------------------------------- the linear solution
 
 
 @given(case=cases(supports=UNMOVED), other=seeds, data=st.data())
