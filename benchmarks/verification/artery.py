@@ -161,7 +161,7 @@ def artery(folder: Path) -> Section:
                 within = 5e-6 if cells == CELLS[-1] and bulk == BULKS[-1] else 1e-2
                 rows.append(Row(f"{title}, κ/μ = {bulk:g}: r/R", f"{exact:.6f}", x, within))
     with picture(folder / "artery.png", 2.9) as figure:
-        axes = panel(figure, 1, "κ / μ [-]", "relative error of r/R [-]", "")
+        axes = panel(figure, 1, "κ / μ [-]", "relative error of r/R [-]", "", columns=1)
         for k, (name, errors) in enumerate(curves.items()):
             measured(axes, BULKS, errors, k, name)
         axes.set(xscale="log", yscale="log")

@@ -53,7 +53,8 @@ class Newton:
         min_detF_ratio: Smallest ratio of min det F after and before a step [-].
         linear: Backend of the sparse solves, see `dpl.fem.linear.make_backend`.
         mixed_integration: Treat the strains at the quadrature points as independent unknowns
-            (Magisano, Leonetti, Garcea 2017), for laws that support it: fewer iterations.
+            (Magisano, Leonetti, Garcea 2017), for laws that support it: fewer iterations. With mean
+            dilatation the volume changes and pressures of the cells are unknowns as well.
         factor_reuse_tol: Relative residual below which the last factor preconditions conjugate
             gradients on the new tangent [-]; 0: every tangent is factorised.
         corotational: Precondition conjugate gradients with the factor of K(0), rotated with the
