@@ -12,91 +12,30 @@ import numpy as np
 from numba import njit
 
 from dpl.fem.assembly import constitutive_kernels as point
-from dpl.fem.assembly import numba_laws, simd
+from dpl.fem.assembly import lanes, numba_laws, simd, volume_loops
+from dpl.fem.assembly.lanes import (
+    gather,
+    gather_constants,
+    gather_frame,
+    gather_shape,
+    gradient,
+    minimum,
+    rows,
+    scatter,
+    scatter_entries,
+)
 from dpl.fem.assembly.simd import SIMD_WIDTH, load, sqrt, store
+from dpl.fem.assembly.volume_loops import (
+    add_projected,
+    add_slopes,
+    add_volumetric_stiffness,
+    gather_functions,
+    pressures_of_cells,
+    value_of,
+)
 
-SOURCES = "".join(inspect.getsource(m) for m in (simd, numba_laws, point, sys.modules[__name__]))
-
-
-@njit
-def rows(count):
-    """Return a workspace of vectors, (count, SIMD_WIDTH)."""
-    return np.zeros((count, SIMD_WIDTH))
-
-
-@njit
-def gather(field, cells, start, count, out):
-    """Copy a nodal field (N, D) to rows 3 a + i of `out`, one cell per lane."""
-    for lane in range(SIMD_WIDTH):
-        cell = start + min(lane, count - 1)
-        for a in range(cells.shape[1]):
-            for i in range(field.shape[1]):
-                out[3 * a + i, lane] = field[cells[cell, a], i]
-
-
-@njit
-def gather_constants(c, start, count, out):
-    """Copy the constants of a block of cells from c (E, n) to `out`, (n, SIMD_WIDTH).
-
-    Constants of all cells (1, n) are copied for the first block only.
-    """
-    several = c.shape[0] > 1
-    if not several and start > 0:
-        return
-    for lane in range(SIMD_WIDTH):
-        cell = start + min(lane, count - 1) if several else 0
-        for k in range(c.shape[1]):
-            out[k, lane] = c[cell, k]
-
-
-@njit
-def gather_frame(frames, q, start, count, c):
-    """Copy the fibre frames of a point, from (E or 1, Q or 1, 9), to the last rows of constants c.
-
-    What all points or cells share is copied for the first of them only.
-    """
-    several, points = frames.shape[0] > 1, frames.shape[1] > 1
-    if (not points and q > 0) or (not several and not points and start > 0):
-        return
-    first = c.shape[0] - frames.shape[2]
-    for lane in range(SIMD_WIDTH):
-        cell = start + min(lane, count - 1) if several else 0
-        for k in range(frames.shape[2]):
-            c[first + k, lane] = frames[cell, q if points else 0, k]
-
-
-@njit
-def gather_shape(dN, dV, start, count, g, weight):
-    """Copy gradients to g (Q, 3 a + j, lane) and volumes to weight (zero in unused lanes).
-
-    Equal cells share one set. It is copied for the first block and for an incomplete block.
-    """
-    several = dN.shape[0] > 1
-    if not several and start > 0 and count == SIMD_WIDTH:
-        return
-    for q in range(dN.shape[1]):
-        for lane in range(SIMD_WIDTH):
-            cell = start + min(lane, count - 1) if several else 0
-            weight[q, lane] = dV[cell, q] if lane < count else 0.0
-            for a in range(dN.shape[2]):
-                for j in range(dN.shape[3]):
-                    g[q, 3 * a + j, lane] = dN[cell, q, a, j]
-
-
-@njit
-def gradient(ue, g, H):
-    """Set H (rows 3 i + j) to sum_a u_a g_a^T."""
-    for i in range(3):
-        u = load(ue, i)
-        h0, h1, h2 = u * load(g, 0), u * load(g, 1), u * load(g, 2)
-        for r in range(3, g.shape[0], 3):
-            u = load(ue, r + i)
-            h0 = h0 + u * load(g, r)
-            h1 = h1 + u * load(g, r + 1)
-            h2 = h2 + u * load(g, r + 2)
-        store(H, 3 * i, h0)
-        store(H, 3 * i + 1, h1)
-        store(H, 3 * i + 2, h2)
+_MODULES = simd, lanes, numba_laws, point, volume_loops, sys.modules[__name__]
+SOURCES = "".join(inspect.getsource(module) for module in _MODULES)
 
 
 @njit
@@ -136,135 +75,6 @@ def add_stiffness(A, g, dim, C, K):
                 if dim == 3:
                     store(K, at + 2, load(K, at + 2) + g0 * e0 + g1 * e1 + g2 * e2)
         first += (b + 1) * dim * dim
-
-
-@njit
-def minimum(values, count, low):
-    """Return the minimum of `low` and `count` values; NaN counts as -inf."""
-    for lane in range(count):
-        value = values[0, lane]
-        low = min(low, value if value == value else -np.inf)
-    return low
-
-
-@njit
-def scatter(fe, cells, start, count, force):
-    """Add the nodal forces of a block of cells to force (N, D)."""
-    for lane in range(count):
-        for a in range(cells.shape[1]):
-            for i in range(force.shape[1]):
-                force[cells[start + lane, a], i] += fe[3 * a + i, lane]
-
-
-@njit
-def scatter_entries(K, places, count, values):
-    """Add the entries of the matrices of a block of cells to values (nnz + 1,)."""
-    for r in range(K.shape[0]):
-        for lane in range(count):
-            values[places[r, lane]] += K[r, lane]
-
-
-@njit
-def gather_functions(psi, start, count, out):
-    """Copy the functions of the volume change, (E or 1, Q, M), to out (Q, M, lane)."""
-    several = psi.shape[0] > 1
-    if not several and start > 0:
-        return
-    for lane in range(SIMD_WIDTH):
-        cell = start + min(lane, count - 1) if several else 0
-        for q in range(psi.shape[1]):
-            for m in range(psi.shape[2]):
-                out[q, m, lane] = psi[cell, q, m]
-
-
-@njit
-def value_of(coefficients, functions):
-    """Return the value of a polynomial (M,) at a point with function values (M,)."""
-    value = load(coefficients, 0) * load(functions, 0)
-    for m in range(1, coefficients.shape[0]):
-        value = value + load(coefficients, m) * load(functions, m)
-    return value
-
-
-@njit
-def add_projected(value, functions, out):
-    """Add a value times the functions of a point to coefficients."""
-    for m in range(out.shape[0]):
-        store(out, m, load(out, m) + value * load(functions, m))
-
-
-@njit
-def pressures_of_cells(law, c, needs, finite, points, functions, gap, work, out, count, low):
-    """Set the coefficients of the pressures of a block of cells and their derivatives.
-
-    `points` are displacements, gradients and volumes, and `functions` those of the volume change
-    and the bulk modulus that stays at the points. `out` are the pressure p (M, lane) at the volume
-    change of u minus `gap` (M, lane), or of u if there is none; its linear extrapolation to the
-    volume change of u; and the derivative of p (M M, lane). Returns the minimum of `low` and the
-    volume changes.
-    """
-    ue, g, weight = points
-    psi, bulk = functions
-    H, j, scratch = work
-    p, ahead, D = out
-    M, mixed = psi.shape[1], len(gap) > 0
-    for part in out:
-        part[:] = 0.0
-    j[:] = 0.0
-    for q in range(psi.shape[0]):
-        gradient(ue, g[q], H)
-        add_projected(load(weight, q) * point.change_of_volume(H, finite), psi[q], j)
-    if mixed:
-        for m in range(M):
-            store(j, m, load(j, m) - load(gap, m))
-    for q in range(psi.shape[0]):
-        change = value_of(j, psi[q])
-        store(scratch, 0, change)
-        if mixed:
-            low = minimum(scratch, count, low)
-        pressure, modulus = point.dilatation(law, c, needs, finite, load(bulk, 0), change, scratch)
-        add_projected(load(weight, q) * pressure, psi[q], p)
-        if mixed:
-            pressure = pressure + modulus * value_of(gap, psi[q])
-        add_projected(load(weight, q) * pressure, psi[q], ahead)
-        for m in range(M):
-            factor = load(weight, q) * modulus * load(psi[q], m)
-            add_projected(factor, psi[q], D[m * M : (m + 1) * M])
-    return low
-
-
-@njit
-def add_slopes(F, X, J, finite, weight, psi, g, P, slopes):
-    """Add the nodal forces of dJ/dF times each function of a point to slopes (M, 3 a + i)."""
-    point.volume_slope(F, X, J, finite, P)
-    for a in range(g.shape[0] // 3):
-        g0, g1, g2 = load(g, 3 * a), load(g, 3 * a + 1), load(g, 3 * a + 2)
-        for i in range(3):
-            force = load(P, 3 * i) * g0 + load(P, 3 * i + 1) * g1 + load(P, 3 * i + 2) * g2
-            for m in range(slopes.shape[0]):
-                at = slopes[m]
-                store(at, 3 * a + i, load(at, 3 * a + i) + weight * load(psi, m) * force)
-
-
-@njit
-def add_volumetric_stiffness(slopes, D, dim, C, K):
-    """Add slopes D slopes^T to K, see `add_stiffness`."""
-    M = slopes.shape[0]
-    for m in range(M):
-        for r in range(slopes.shape[1]):
-            total = load(D, m * M) * load(slopes[0], r)
-            for n in range(1, M):
-                total = total + load(D, m * M + n) * load(slopes[n], r)
-            store(C, r, total)
-        first = 0
-        for b in range(slopes.shape[1] // 3):
-            for i in range(dim):
-                for a in range(b + 1):
-                    at = first + (a * dim + i) * dim
-                    left = load(slopes[m], 3 * a + i)
-                    for k in range(dim):
-                        store(K, at + k, load(K, at + k) + left * load(C, 3 * b + k))
-            first += (b + 1) * dim * dim
 
 
 @njit(error_model="numpy", cache=True)

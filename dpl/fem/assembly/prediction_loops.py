@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from dpl.fem.assembly import element_loops, sampled_loops
-from dpl.fem.assembly.element_loops import gather_constants, rows
+from dpl.fem.assembly.lanes import gather_constants, rows
 from dpl.fem.assembly.sampled_loops import rotated_strain, unbalanced_stress
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.linear import condensation

@@ -11,7 +11,7 @@ from numba import njit
 
 from dpl.fem.assembly import constitutive_kernels as point
 from dpl.fem.assembly import element_loops
-from dpl.fem.assembly.element_loops import (
+from dpl.fem.assembly.lanes import (
     gather,
     gather_constants,
     gather_shape,
