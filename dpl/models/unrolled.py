@@ -191,7 +191,9 @@ class Unrolled(nn.Module):
 
     def _prepare(self) -> None:
         """Prepare what a traced graph takes as constants, after the buffers have changed."""
-        self._stiffness = ReducedStiffness(self.stiffness.detach().cpu().clone()).prepared()
+        iteration = self.linear.iteration if self.linear.is_iterated else None
+        parts = self.stiffness.detach().cpu().clone()
+        self._stiffness = ReducedStiffness(parts, iteration).prepared()
         self._law_of_samples = self.scene.problem.material.of_cells(self.cells.cpu())
 
     def _at_free_dofs(self, coordinates: Tensor) -> Tensor:

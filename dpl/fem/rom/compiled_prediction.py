@@ -29,6 +29,8 @@ from dpl.fem.rom.reduced_stiffness import ReducedInverse
 from dpl.fem.symmetry import Symmetry
 
 Array = NDArray[np.float64]
+NO_ROWS = np.zeros(0, np.int64)
+NO_ENTRIES = np.zeros((0, 0))
 
 
 class LawArguments(NamedTuple):
@@ -129,6 +131,9 @@ class CompiledPrediction:
                 unknowns=linear.fronts.unknowns,
                 values=linear.values,
                 supports=_double(torch.stack(supports)),
+                first_entry=linear.first_entry,
+                columns=linear.columns,
+                steps=linear.steps,
             ),
         )
         blocks = one.images.unflatten(1, (-1, 9, SIMD_WIDTH))
@@ -161,25 +166,31 @@ class LinearPrediction(NamedTuple):
 
     Attributes:
         fronts: Fronts of K(0).
-        values: Blocks of K nodes of the interpolation, by parity, (K, M, V).
+        values: Blocks of K nodes, by parity, (K, M, V).
         supports: See `StiffnessTerms.support_forces`, (T + 1, N, D).
+        first_entry, columns, steps: See `LinearArrays`; empty and 0 if K(0)^-1 is interpolated.
     """
 
     fronts: Fronts
     values: NDArray[Any]
     supports: Tensor
+    first_entry: NDArray[np.int64] = NO_ROWS
+    columns: NDArray[np.int64] = NO_ROWS
+    steps: int = 0
 
 
 class LawWeights(NamedTuple):
     """A law as a linear solution needs it.
 
     Attributes:
-        weights: Weights of the nodes, (K,).
+        weights: Weights of the nodes, (K,); none if solutions are iterated.
         moduli: Factors of the terms of K(0), and 1, (T + 1,).
+        entries: Entries of K(0) by parity, (M, nnz), if solutions are iterated.
     """
 
     weights: Array
     moduli: Array
+    entries: Array = NO_ENTRIES
 
 
 class _ByParity:
