@@ -18,7 +18,7 @@ from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-MAX_ERROR = 3e-4  # energy norm of the error over that of the solution [-]
+MAX_ERROR = 1e-4  # energy norm of the error over that of the solution [-]
 MAX_STEPS = 200  # largest value of `StiffnessIteration.bound`
 PROBES = 16  # parameters for which the number of steps is measured
 LONG = 2  # factor on the number of steps of the measurement, see `count_steps`
