@@ -11,7 +11,12 @@ from torch.nn.functional import pad
 
 from dpl.fem.linear.condensation import Condensed, condense, condensed_block_solve
 from dpl.fem.materials.material import Material
-from dpl.fem.rom.compiled_prediction import LawWeights, LinearPrediction
+from dpl.fem.rom.compiled_prediction import (
+    IterationArrays,
+    LawEntries,
+    LawWeights,
+    LinearPrediction,
+)
 from dpl.fem.rom.iterated_inverse import IteratedInverse
 from dpl.fem.rom.stiffness_interpolation import StiffnessInterpolation
 from dpl.fem.rom.stiffness_iteration import (
@@ -114,14 +119,14 @@ class LinearResponse:
         if not self.is_iterated:
             return found
         first_entry, columns, _ = self.iterated.matrices
-        return found._replace(first_entry=first_entry, columns=columns, steps=self.iterated.steps)
+        return found._replace(iteration=IterationArrays(first_entry, columns, self.iterated.steps))
 
-    def law_weights(self, law: Material) -> LawWeights:
+    def law_weights(self, law: Material) -> LawWeights | LawEntries:
         """Return the numbers of a law that `compiled` needs; its moduli are numbers."""
         factors = self.terms.factors(law)
         moduli = np.array([*factors[0].tolist(), 1.0])
         if self.is_iterated:
-            return LawWeights(np.zeros(0), moduli, self.iterated.matrices.at(moduli))
+            return LawEntries(moduli, self.iterated.matrices.at(moduli))
         return LawWeights(self.interpolation.weights(factors)[0].numpy(), moduli)
 
     # ------------------------------------------------------------------ solution

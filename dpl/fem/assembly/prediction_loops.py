@@ -18,7 +18,7 @@ from dpl.fem.assembly.element_loops import gather_constants, rows
 from dpl.fem.assembly.sampled_loops import rotated_strain, unbalanced_stress
 from dpl.fem.assembly.simd import SIMD_WIDTH
 from dpl.fem.linear import condensation
-from dpl.fem.linear.condensation import add_product, condensed_iteration, condensed_solve, dot
+from dpl.fem.linear.condensation import add_product, condensed_solve, dot
 
 SOURCES = (
     element_loops.SOURCES
@@ -97,21 +97,15 @@ class LinearArrays(NamedTuple):
 
     Attributes:
         table, unknowns: Fronts of m orbits, see `dpl.fem.linear.condensation.Fronts`.
-        values: Blocks of K parameters, by parity, (K, M, V).
-        supports: Forces of the prescribed displacement, by term of K(0) and by parity,
-            (T + 1, M, m). s is their sum with the moduli of the law as factors.
-        first_entry, columns: CSR structure of K(0) of one parity, (m + 1,) and (nnz,), if
-            solutions are iterated.
-        steps: Number of steps of a solution; 0 if it is interpolated.
+        values: Blocks of K Poisson's ratios, by parity, (K, M, V).
+        supports: a, b and c, by parity, (3, M, m): s = mu a + lambda b + c is the force of the
+            prescribed displacement.
     """
 
     table: NDArray[np.int64]
     unknowns: NDArray[np.int64]
     values: NDArray[Any]
     supports: NDArray[np.float64]
-    first_entry: NDArray[np.int64]
-    columns: NDArray[np.int64]
-    steps: int
 
 
 class ModelArrays(NamedTuple):
@@ -217,14 +211,13 @@ def add_modes(basis, coordinates, values):
 
 
 @njit
-def set_linear_solution(linear, weights, moduli, entries, parts, values):
+def set_linear_solution(linear, weights, moduli, parts, values):
     """Set values (M, m) to K(0)^-1 (f - s) of a force by parity (M, m).
 
     Args:
         linear: The arrays of the linear solution.
-        weights: Factors of the parameters, (K,), if solutions are interpolated.
+        weights: Factors of the Poisson's ratios, (K,).
         moduli: Factors of the terms of K(0), and 1, (T + 1,).
-        entries: Entries of K(0) by parity, (M, nnz), if solutions are iterated.
         parts: The force by parity, (M, m).
         values: The solution.
     """
@@ -235,18 +228,7 @@ def set_linear_solution(linear, weights, moduli, entries, parts, values):
         right[:] = parts[p]
         for i in range(len(moduli)):
             right -= moduli[i] * linear.supports[i, p]
-        if linear.steps > 0:
-            matrix = linear.first_entry, linear.columns, entries[p]
-            condensed_iteration(
-                linear.table,
-                linear.unknowns,
-                linear.values[0, p],
-                matrix,
-                right,
-                linear.steps,
-                values[p],
-            )
-        elif (right != 0.0).any():
+        if (right != 0.0).any():
             for k in range(len(weights)):
                 work[:] = right
                 blocks = linear.values[k, p]
@@ -312,13 +294,13 @@ def predict(law, c, needs, finite, model, reduced, of_law, force, field):
         law, c, needs, finite: The law, see `dpl.fem.rom.compiled_prediction.law_arguments`.
         model: The arrays of the model.
         reduced: (V^T K(0) V)^-1, (R, R), and V^T K(0) p of the prescribed displacement p, (R,).
-        of_law: Weights, moduli and entries of K(0) of the law, see `set_linear_solution`.
+        of_law: Weights and moduli of the law, see `set_linear_solution`.
         force: f, (N D,).
         field: Displacement at free degrees of freedom, (N D,).
     """
     parts = force_by_parity(model.orbits, force)
     values = np.empty(parts.shape)
-    set_linear_solution(model.linear, of_law[0], of_law[1], of_law[2], parts, values)
+    set_linear_solution(model.linear, of_law[0], of_law[1], parts, values)
     linear = galerkin(model.basis, reduced[0], reduced[1], parts)
     found = nonlinear_coordinates(law, c, needs, finite, model, linear)
     add_modes(model.basis, found, values)

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
+from dpl.fem.assembly import iterated_prediction_loops
+from dpl.fem.assembly.iterated_prediction_loops import IterationArrays, predict_iterated
 from dpl.fem.assembly.kernels import call_compiled, constants_of
 from dpl.fem.assembly.numba_laws import Law, required_terms
 from dpl.fem.assembly.prediction_loops import (
@@ -29,8 +31,6 @@ from dpl.fem.rom.reduced_stiffness import ReducedInverse
 from dpl.fem.symmetry import Symmetry
 
 Array = NDArray[np.float64]
-NO_ROWS = np.zeros(0, np.int64)
-NO_ENTRIES = np.zeros((0, 0))
 
 
 class LawArguments(NamedTuple):
@@ -42,17 +42,21 @@ class LawArguments(NamedTuple):
     finite: float
 
 
-def law_arguments(law: InvariantBasedMaterial) -> LawArguments:
+def law_arguments(law: InvariantBasedMaterial, *, iterated: bool = False) -> LawArguments:
     """Return a law as the arguments of a compiled loop.
 
-    The law belongs to the sample cells in the order of the loop. Its constants are followed by mu
-    and lambda, (1, n + 2) or (C, n + 2).
+    Its constants are followed by mu and lambda, (1, n + 2) or (C, n + 2).
+
+    Args:
+        law: The law of the sample cells in the order of the loop.
+        iterated: True for the loops of iterated linear solutions.
     """
+    sources = iterated_prediction_loops.SOURCES if iterated else SOURCES
     rows = [constants_of(law)[0], *(np.reshape(one, (-1, 1)) for one in (law.mu, law.lam))]
     count = max(map(len, rows))
     constants = np.concatenate([np.broadcast_to(row, (count, row.shape[1])) for row in rows], 1)
     terms = required_terms(law), float(law.finite)
-    return LawArguments(Law.of(law, SOURCES), constants, *terms)
+    return LawArguments(Law.of(law, sources), constants, *terms)
 
 
 @dataclass(frozen=True)
@@ -62,10 +66,12 @@ class CompiledPrediction:
     Attributes:
         arrays: Its matrices.
         cells: Position among the sample cells of each cell of the loops, (C,).
+        iteration: Structure of K(0) if linear solutions are iterated.
     """
 
     arrays: ModelArrays
     cells: Tensor
+    iteration: IterationArrays | None
 
     @classmethod
     def of(
@@ -131,19 +137,16 @@ class CompiledPrediction:
                 unknowns=linear.fronts.unknowns,
                 values=linear.values,
                 supports=_double(torch.stack(supports)),
-                first_entry=linear.first_entry,
-                columns=linear.columns,
-                steps=linear.steps,
             ),
         )
         blocks = one.images.unflatten(1, (-1, 9, SIMD_WIDTH))
-        return cls(arrays, blocks[:, :, 0].flatten() // dim**2)
+        return cls(arrays, blocks[:, :, 0].flatten() // dim**2, linear.iteration)
 
     def __call__(
         self,
         law: LawArguments,
         reduced: ReducedInverse,
-        of_law: "LawWeights",
+        of_law: "LawWeights | LawEntries",
         force: Array,
         field: Array,
     ) -> None:
@@ -157,8 +160,11 @@ class CompiledPrediction:
             field: Displacement, (N, D), contiguous.
         """
         flat = np.ascontiguousarray(force).reshape(-1)
-        data = self.arrays, reduced, of_law, flat, field.reshape(-1)
-        call_compiled(predict, *law, *data)
+        data = reduced, of_law, flat, field.reshape(-1)
+        if self.iteration is None:
+            call_compiled(predict, *law, self.arrays, *data)
+        else:
+            call_compiled(predict_iterated, *law, self.arrays, self.iteration, *data)
 
 
 class LinearPrediction(NamedTuple):
@@ -168,29 +174,37 @@ class LinearPrediction(NamedTuple):
         fronts: Fronts of K(0).
         values: Blocks of K nodes, by parity, (K, M, V).
         supports: See `StiffnessTerms.support_forces`, (T + 1, N, D).
-        first_entry, columns, steps: See `LinearArrays`; empty and 0 if K(0)^-1 is interpolated.
+        iteration: Structure of K(0) if solutions are iterated; then K = 1.
     """
 
     fronts: Fronts
     values: NDArray[Any]
     supports: Tensor
-    first_entry: NDArray[np.int64] = NO_ROWS
-    columns: NDArray[np.int64] = NO_ROWS
-    steps: int = 0
+    iteration: IterationArrays | None = None
 
 
 class LawWeights(NamedTuple):
-    """A law as a linear solution needs it.
+    """A law as an interpolated linear solution needs it.
 
     Attributes:
-        weights: Weights of the nodes, (K,); none if solutions are iterated.
+        weights: Weights of the nodes, (K,).
         moduli: Factors of the terms of K(0), and 1, (T + 1,).
-        entries: Entries of K(0) by parity, (M, nnz), if solutions are iterated.
     """
 
     weights: Array
     moduli: Array
-    entries: Array = NO_ENTRIES
+
+
+class LawEntries(NamedTuple):
+    """A law as an iterated linear solution needs it.
+
+    Attributes:
+        moduli: Factors of the terms of K(0), and 1, (T + 1,).
+        entries: Entries of K(0) by parity, (M, nnz).
+    """
+
+    moduli: Array
+    entries: Array
 
 
 class _ByParity:
