@@ -169,8 +169,12 @@ def test_tensor_operations_do_the_same_steps(steps):
 @pytest.mark.parametrize("scale", [1e-200, 1e200])
 def test_the_size_of_a_force_does_not_matter(scale):
     matrix, near, force = system()
-    one, other = iterated(matrix, near, force, 5)[1], iterated(matrix, near, scale * force, 5)[1]
+    one, other = (iterated(matrix, near, size * force, 5)[1] for size in (1.0, scale))
     assert np.abs(other / scale - one).max() < 1e-12 * np.abs(one).max()
+    inverse, product = torch.from_numpy(np.linalg.inv(near)), torch.from_numpy(matrix)
+    right = torch.from_numpy(scale * force)
+    found = conjugate_gradients(lambda x: x @ product, lambda x: x @ inverse, right, 5)
+    assert np.abs(found.numpy() / scale - one).max() < 1e-9 * np.abs(one).max()
 
 
 def test_the_measured_number_of_steps_is_enough_and_no_more_than_the_bound(terms):

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
+_State = tuple[Any, Tensor, Tensor, Tensor, Tensor]  # steps, x, residual, direction, r . z
 
 MAX_ERROR = 1e-4  # energy norm of the error over that of the solution [-]
 MAX_STEPS = 200  # largest value of `StiffnessIteration.bound`
@@ -195,30 +196,42 @@ def conjugate_gradients(
     right: Tensor,
     steps: int,
 ) -> Tensor:
-    """Return K^-1 f, (..., n), after a fixed number of steps, as tensor operations.
+    """Return K^-1 f, (..., n), as tensor operations.
 
     Systems whose error is below `CONVERGED` are left as they are. See `condensed_iteration`, which
-    does the same for one system.
+    does the same for one system. An exported graph contains the step once, in a loop.
 
     Args:
         product: Function x -> K x, (..., n).
         precondition: Function r -> M^-1 r, (..., n), symmetric positive definite.
         right: f, (..., n).
-        steps: Number of steps.
+        steps: Largest number of steps.
     """
-    x, residual = torch.zeros_like(right), right
-    direction = least = before = right.new_zeros(())
-    for k in range(steps):
-        z = precondition(residual)
+    size = right.abs().amax(dim=-1, keepdim=True)  # squares of a scaled force do not overflow
+    size = torch.where(size > 0, size, 1.0)
+    right = (right / size).contiguous()
+    first = (right * precondition(right)).sum(dim=-1, keepdim=True)
+    least = CONVERGED**2 * first
+
+    def step(k: Any, x: Tensor, residual: Tensor, direction: Tensor, last: Tensor) -> _State:
+        z = precondition(residual).contiguous()
         rz = (residual * z).sum(dim=-1, keepdim=True)
-        if k == 0:
-            least, before = CONVERGED**2 * rz, torch.ones_like(rz)
-        is_open = rz > least
-        direction = z + rz / before * direction
+        direction = z + rz / torch.where(last > least, last, 1.0) * direction
         image = product(direction)
-        curvature = (direction * image).sum(dim=-1, keepdim=True)
-        length = torch.where(is_open, rz / torch.where(is_open, curvature, 1.0), 0.0)
-        x = x + length * direction
-        residual = residual - length * image
-        before = torch.where(is_open, rz, 1.0)
-    return x
+        is_open = rz > least
+        curvature = torch.where(is_open, (direction * image).sum(dim=-1, keepdim=True), 1.0)
+        length = torch.where(is_open, rz / curvature, 0.0)
+        return k + 1, x + length * direction, residual - length * image, direction, rz
+
+    def is_open(k: Any, x: Tensor, residual: Tensor, direction: Tensor, last: Tensor) -> Tensor:
+        return (k < steps) & (last > least).any()
+
+    zero = torch.zeros_like(right)
+    state: _State = (0, zero, right, zero, first)
+    if torch.compiler.is_compiling():
+        counter = torch.zeros((), dtype=torch.int64, device=right.device)
+        start = counter, zero, right.clone(), zero.clone(), first.clone()
+        return size * cast("_State", torch.while_loop(is_open, step, start))[1]
+    for _ in range(steps):
+        state = step(*state)
+    return size * state[1]
