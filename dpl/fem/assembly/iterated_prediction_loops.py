@@ -32,8 +32,8 @@ class IterationArrays(NamedTuple):
         steps: Number of steps of a solution.
     """
 
-    first_entry: NDArray[np.int64]
-    columns: NDArray[np.int64]
+    first_entry: NDArray[np.int32]
+    columns: NDArray[np.int32]
     steps: int
 
 

@@ -16,7 +16,7 @@ from dpl.fem.solvers.parity_factor import OrbitForm
 from dpl.fem.solvers.stiffness_terms import StiffnessTerms
 
 Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
+Integers = NDArray[np.int32]
 _State = tuple[Any, Tensor, Tensor, Tensor, Tensor]  # steps, x, residual, direction, r . z
 
 MAX_ERROR = 1e-4  # energy norm of the error over that of the solution [-]
@@ -114,8 +114,8 @@ class TermMatrices(NamedTuple):
         entries = [_entries(one, structure) for one in every]
         shape = len(matrices), len(matrices[0]), -1
         return cls(
-            structure.indptr.astype(np.int64),
-            structure.indices.astype(np.int64),
+            structure.indptr.astype(np.int32),
+            structure.indices.astype(np.int32),
             np.stack(entries).reshape(shape),
         )
 
