@@ -195,10 +195,11 @@ def conjugate_gradients(
     precondition: Callable[[Tensor], Tensor],
     right: Tensor,
     steps: int,
+    converged: float = CONVERGED,
 ) -> Tensor:
     """Return K^-1 f, (..., n), as tensor operations.
 
-    Systems whose error is below `CONVERGED` are left as they are. See `condensed_iteration`, which
+    Systems whose error is below `converged` are left as they are. See `condensed_iteration`, which
     does the same for one system. An exported graph contains the step once, in a loop.
 
     Args:
@@ -206,12 +207,13 @@ def conjugate_gradients(
         precondition: Function r -> M^-1 r, (..., n), symmetric positive definite.
         right: f, (..., n).
         steps: Largest number of steps.
+        converged: Energy norm of the error over that of the solution [-].
     """
     size = right.abs().amax(dim=-1, keepdim=True)  # squares of a scaled force do not overflow
     size = torch.where(size > 0, size, 1.0)
     right = (right / size).contiguous()
     first = (right * precondition(right)).sum(dim=-1, keepdim=True)
-    least = CONVERGED**2 * first
+    least = converged**2 * first
 
     def step(k: Any, x: Tensor, residual: Tensor, direction: Tensor, last: Tensor) -> _State:
         z = precondition(residual).contiguous()
