@@ -14,7 +14,7 @@ from dpl.fem.problem import Problem
 
 SAMPLES = 64  # points of the parameters at which moduli are compared
 INDEPENDENT = 1e-10  # part of the largest modulus below which a direction counts as rounding [-]
-MAX_CELLS = 64  # different cells by which condition numbers are bounded
+MAX_CELLS = 32  # different cells by which condition numbers are bounded
 MAX_CORNERS = 6  # parameters of which all corners of the ranges are samples
 
 
